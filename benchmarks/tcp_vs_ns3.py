@@ -21,7 +21,7 @@ from benchmarks.radio_vs_ns3 import Ns3, build
 from sim_backends.network.packets import Packet
 from sim_backends.network.tcp.connection import Tcp, TcpSample
 from sim_backends.network.tcp.tcp_options import TcpOptions
-from tests.helpers.scripted_wire import ScriptedWire, losing
+from tests.helpers.scripted_wire import ScriptedWire, lose_packets
 
 RATE_MBIT_S: Final = 10
 DELAY_MS: Final = 10
@@ -113,7 +113,7 @@ def run_cosim(control: Control, losses: Losses, seconds: float = SECONDS) -> Run
         DELAY_MS * 1_000_000,
         rate_bit_s=RATE_MBIT_S * 1_000_000,
         queue_packets=QUEUE_PACKETS,
-        script=losing({"a": frozenset(losses.data), "b": frozenset(losses.acks)}),
+        script=lose_packets({"a": frozenset(losses.data), "b": frozenset(losses.acks)}),
     )
     transport = wire.transports["tcp"] = Tcp(wire, TcpOptions(congestion=control), log=samples.append)
     for number in range(MAX_PACKETS):

@@ -1,4 +1,4 @@
-"""Fixtures shared by several folders, and settings of all tests: no time limit on examples, long test files first."""
+"""Shared fixtures, and settings of all tests: examples have no time limit, and long test files run first."""
 
 import gc
 import signal
@@ -16,18 +16,18 @@ __all__ = ["server"]
 
 pytest_plugins = ("pytester", "tests.helpers.leaks", "tests.helpers.reruns")
 
-# Tests started in the background of a shell ignore SIGINT, and so would all programs that they start.
+# Tests that a shell starts in the background ignore SIGINT, and the programs that they start would also ignore it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# A busy machine makes any example slow. `make test` uses `ci`, which is the profile of hypothesis with fewer
-# examples, the same ones each time. `make nightly` uses `nightly`, with other examples each time.
+# Any example may be slow on a busy machine. `make test` uses `ci`, which is the profile of hypothesis with fewer
+# examples, which are the same in each run. `make nightly` uses `nightly`, with different examples in each run.
 settings.register_profile("fieldkit", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("ci", settings.get_profile("ci"), max_examples=25)
 settings.register_profile("nightly", settings.get_profile("fieldkit"), print_blob=True)
 settings.load_profile("fieldkit")
 
-# Files that take long, the longest first, because a long file that starts late would run alone at the end. Those that
-# run several trials in parallel (`known_loss`) are separated, so that they do not compete.
+# Files that take long, the longest first, because a long file that starts late would run alone at the end. Files that
+# run several trials in parallel (`known_loss`) are separated, so that they do not run at the same time.
 _LONG: Final = (
     "test_docs",
     "test_drive",
@@ -120,12 +120,12 @@ _READERS: Final = (
     ("fieldkit.ros.bags.bag", "_READER"),
     ("fieldkit.ros.bags.contents", "_WORKER"),
 )
-"""Modules of packages that a copy may lack, and their readers."""
+"""The readers of modules that a copy of the repository may not have."""
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _stop_readers() -> Iterator[None]:
-    """Stop the file readers: each would wait a minute for another file, and the process check would wait for it."""
+    """Stop the file readers: each would wait a minute for a further file, and the process check would wait for it."""
     yield
     position_files._GPX_READER.stop()
     for name, reader in _READERS:
@@ -133,23 +133,23 @@ def _stop_readers() -> Iterator[None]:
             getattr(module, reader).stop()
 
 
-# Objects created by collection live until the end of the run, so the garbage collector must not scan them.
+# Objects that the collection creates live until the end of the run, so the garbage collector must not scan them.
 gc.disable()
 
 
 def pytest_collection_finish() -> None:
-    """Restrict garbage collection to objects created by tests."""
+    """Restrict garbage collection to objects that tests create."""
     gc.freeze()
     gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Move long files to the front and keep the order of the others."""
+    """Move long files to the front, without a change of the order of the others."""
     items.sort(key=lambda item: _LONG.index(item.path.stem) if item.path.stem in _LONG else len(_LONG))
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Print the text that passing tests recorded as the property `result`, for use in issues."""
+    """Print the property `result` of passing tests, for use in issues."""
     for report in terminalreporter.stats.get("passed", []):
         for name, text in report.user_properties:
             if name == "result":

@@ -1,4 +1,4 @@
-"""Packages import each other in one direction, and each dependency has one importing module (style, rule 11)."""
+"""Packages import each other in one direction, and each dependency is imported by few modules."""
 
 import ast
 import pkgutil
@@ -29,7 +29,7 @@ MAY_IMPORT = {
     "analysis": set(),
     "backends": {"config", "remote"},
     "lab": {"backends", "config"},
-    "agent": set(),  # it runs on robots, where not even `core` is available: see tests/agent
+    "agent": set(),  # it runs on robots without `core`: see tests/agent
     "steps": {"agent", "backends", "config", "measure", "remote"},
     "telemetry": {"backends", "config", "measure", "remote", "steps"},
     "trial": {"analysis", "backends", "config", "measure", "remote", "steps", "telemetry"},
@@ -51,7 +51,7 @@ MAY_IMPORT = {
         "telemetry",
         "trial",
     },
-    # Found by entry points:
+    # The following packages are loaded through entry points.
     "ros": {
         "agent",
         "analysis",
@@ -103,20 +103,21 @@ WALK = ROOT / "docs" / "walk.md"
 """The introduction for new contributors."""
 
 OTHER_TEST_FOLDERS = {"benchmarks", "data", "e2e", "fuzz", "helpers"}
-"""Folders of tests that belong to no shipped package: benchmarks, real outputs, whole runs, fuzzing, shared helpers.
+"""Folders of tests that belong to no shipped package: benchmarks, real outputs, end-to-end tests, fuzzing and
+helpers.
 """
 
 ONE_IMPORTER = {
     "yaml": "fieldkit/config/documents.py",
     "pydantic": "fieldkit/config/schema.py",
     "pydantic_core": "fieldkit/config/schema.py",
-    # One module per format: CSV is read into columns, columns are written as Parquet or into an index. Simulators,
-    # which may import none of these, write their own tables.
+    # There is one module per format: CSV is read into columns, and columns are written as Parquet or into an index.
+    # Simulators must not import these modules, so they write their tables with other modules.
     "pyarrow": "fieldkit/analysis/parsing.py fieldkit/analysis/datasets.py fieldkit/analysis/table_index.py "
     "fieldkit/export/table.py "
     "sim_backends/cosim/recording/packet_tables.py sim_backends/cosim/sweeps/sweep_dataset.py",
     "distributed": "fieldkit/core/cluster.py",
-    # Messages of trials, messages of co-simulation recordings, and recovery of truncated bags.
+    # These modules recover truncated bags, and write the messages of trials and of co-simulation recordings.
     "mcap": "fieldkit/ros/bags/salvage.py fieldkit/export/mcap.py sim_backends/cosim/recording/mcap.py",
     # Trials and simulations draw different figures; `report.theme` defines their style.
     "matplotlib": "fieldkit/report/drawing.py fieldkit/report/figures.py sim_backends/cosim/plots.py",
@@ -124,18 +125,18 @@ ONE_IMPORTER = {
     "gpxpy": "fieldkit/measure/positions/gpx_reader.py",
     "jmespath": "fieldkit/measure/evidence/program_output.py",
     "re2": "fieldkit/measure/evidence/program_output.py",
-    # Connections, and key formats.
+    # These modules contain connections and key formats.
     "paramiko": "fieldkit/remote/keys.py fieldkit/remote/link.py",
     "keyring": "fieldkit/remote/passwords.py",
-    # The width of texts on a terminal.
+    # These modules display text on a terminal.
     "rich": "fieldkit/cli/display.py fieldkit/cli/event_words.py",
     "argcomplete": "fieldkit/cli/commands/completion.py",
-    # Messages of the drone, and, in a separate process, reading its log.
+    # These modules read a drone's log in a separate process, and write the messages of an emulated drone.
     "pymavlink": "fieldkit/motion/logs/tlog_reader.py sim_backends/emulated/autopilot/mavlink_frames.py",
     "lz4": "fieldkit/ros/bags/salvage.py",
     "cyclonedds": "fieldkit/agent/messaging/dds.py",
     "zenoh": "fieldkit/agent/messaging/zenoh.py",
-    # On a robot, and in the relay of an emulated robot's sensors to its master.
+    # One module runs on a robot, and the other relays the sensors of an emulated robot to its master.
     "rospy": "fieldkit/agent/messaging/ros1.py sim_backends/emulated/robot/ros_relay.py",
     "rclpy": "fieldkit/agent/messaging/ros2.py",
     "cryptography": "sim_backends/emulated/provisioning.py",
@@ -144,9 +145,9 @@ ONE_IMPORTER = {
 
 
 PROVIDED: Final = {"pytest", "rclpy", "rosgraph", "roslib", "rospy"}
-"""Modules provided by the environment that imports them: pytest runs the plugin, ROS is installed on the robot."""
+"""Modules that the environment provides: pytest runs the plugin, and ROS is installed on the robot."""
 PACKAGE_PARTS: Final = {"pydantic_core": "pydantic", "pandas": "pandas"}
-"""Modules that belong to another package, which pins their version; pandas is used only by pyarrow on request."""
+"""Modules that belong to the package that pins their version; only pyarrow uses pandas, and only on request."""
 
 
 def modules(package: str) -> list[Path]:
@@ -168,13 +169,13 @@ def _iter_imported_names(path: Path) -> Iterator[str]:
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-def package_name(dotted: str) -> str:
-    parts = dotted.split(".")
+def package_name(dotted_names: str) -> str:
+    parts = dotted_names.split(".")
     return parts[1] if len(parts) > 1 else ""
 
 
 @pytest.mark.parametrize("own_package", sorted({path.relative_to(ROOT).parts[1] for path in modules("fieldkit")}))
-def test_imports_point_one_way(own_package: str) -> None:
+def test_imports_point_in_one_direction(own_package: str) -> None:
     paths = [path for path in modules("fieldkit") if path.relative_to(ROOT).parts[1] == own_package]
     for path, name in ((module, name) for module in paths for name in imported_names(module)):
         assert not name.startswith("sim_backends"), f"{path} imports {name}"
@@ -199,11 +200,11 @@ def test_imports_point_one_way(own_package: str) -> None:
 def test_only_entry_points_lead_to_a_product(package: str, importers: tuple[str, ...]) -> None:
     """`tests/e2e/test_borders.py` removes these packages and runs tests of the harness.
 
-    Robots drive by messages of ROS, and emulated robots publish them.
+    `fieldkit.motion` sends messages of ROS to drive robots, and emulated robots publish messages of ROS.
     """
-    inside = (package.replace(".", "/"), *importers)
+    importing_paths = (package.replace(".", "/"), *importers)
     for path in modules("fieldkit") + modules("sim_backends"):
-        if not str(path.relative_to(ROOT)).startswith(inside):
+        if not str(path.relative_to(ROOT)).startswith(importing_paths):
             names = imported_names(path)
             assert not any(name == package or name.startswith(f"{package}.") for name in names), path
 
@@ -219,20 +220,21 @@ NAMING_MOTION: Final = {
 }
 
 
-def test_the_harness_does_not_name_what_motion_adds() -> None:
-    """Neither its sections of profiles and procedures nor its permissions."""
+def test_the_harness_does_not_name_keys_and_permissions_of_motion() -> None:
+    """These are sections of profiles and procedures, and permissions."""
     harness = [path.relative_to(ROOT / "fieldkit") for path in modules("fieldkit")]
-    naming = {
+    naming_modules = {
         str(path)
         for path in harness
         if path.parts[0] not in {"motion", "agent"}
         and NAMES_OF_MOTION.search((ROOT / "fieldkit" / path).read_text(encoding="utf-8"))
     }
-    assert naming == NAMING_MOTION.keys()
+    assert naming_modules == NAMING_MOTION.keys()
 
 
-# Commands of other packages declare arguments, display and draw like fieldkit's commands (docs/add-a-command.md), and
-# measure a simulated trial like one of robots.
+# Commands of other packages may use these modules to declare arguments, to display and to draw like fieldkit's
+# commands
+# (docs/add-a-command.md), and to measure a simulated trial like a trial with robots.
 COMMAND_SEAMS = (
     "fieldkit.trial.simulated",
     "fieldkit.cli.shared_arguments",
@@ -283,13 +285,17 @@ def test_required_and_imported_packages_are_the_same() -> None:
         )
     }
     paths = modules("fieldkit") + modules("sim_backends")
-    tops = {name.split(".")[0] for path in paths for name in imported_names(path)}
-    outside = (tops | PACKAGE_PARTS.keys()) - sys.stdlib_module_names - PROVIDED - {"fieldkit", "sim_backends"}
+    top_level_names = {name.split(".")[0] for path in paths for name in imported_names(path)}
+    external_names = (
+        (top_level_names | PACKAGE_PARTS.keys()) - sys.stdlib_module_names - PROVIDED - {"fieldkit", "sim_backends"}
+    )
     owners = packages_distributions()
-    owned = {
-        owner.lower() for top in outside for owner in ([PACKAGE_PARTS[top]] if top in PACKAGE_PARTS else owners[top])
+    owner_names = {
+        owner.lower()
+        for name in external_names
+        for owner in ([PACKAGE_PARTS[name]] if name in PACKAGE_PARTS else owners[name])
     }
-    assert owned == {name.lower() for name in required}
+    assert owner_names == {name.lower() for name in required}
 
 
 def test_the_library_does_not_mention_emulated() -> None:
@@ -303,17 +309,17 @@ def test_the_library_does_not_mention_emulated() -> None:
 
 
 def subpackages(package: str) -> list[Path]:
-    """Return the folders of a package that have modules, without the package itself."""
+    """Return the folders with modules below a package."""
     return sorted({path.parent for path in modules(package)} - {ROOT / package})
 
 
 def imports_between(folder: Path) -> dict[str, set[str]]:
-    """Return, for each package in a folder, the other packages there that its modules import.
+    """Return, for each package in a folder, the other packages of the folder that its modules import.
 
     Modules directly in the folder count as a package with the folder's name.
     """
-    inside = {entry.name for entry in folder.iterdir() if (entry / "__init__.py").exists()}
-    package_of = {path.stem: folder.name for path in folder.glob("*.py")} | {name: name for name in inside}
+    subpackage_names = {entry.name for entry in folder.iterdir() if (entry / "__init__.py").exists()}
+    package_of = {path.stem: folder.name for path in folder.glob("*.py")} | {name: name for name in subpackage_names}
     prefix = ".".join(folder.relative_to(ROOT).parts) + "."
     imports: dict[str, set[str]] = {name: set() for name in package_of.values()}
     for path in modules(str(folder.relative_to(ROOT))):
@@ -332,14 +338,16 @@ def imports_between(folder: Path) -> dict[str, set[str]]:
 def test_packages_have_no_import_cycles(folder: str) -> None:
     graph = imports_between(ROOT / folder)
     assert len(graph) > 2
-    assert set(TopologicalSorter(graph).static_order()) == graph.keys(), "raises CycleError, which names the packages"
+    assert set(TopologicalSorter(graph).static_order()) == graph.keys(), (
+        "static_order raises CycleError, which names the packages"
+    )
 
 
 def test_a_package_has_a_limited_number_of_modules() -> None:
     for folder in subpackages("fieldkit") + subpackages("sim_backends"):
         names = {path.stem for path in folder.glob("*.py")} - {"__init__"}
         if folder.name == "steps":
-            names -= kinds.builtin_names()  # the module of a kind has the name used in procedures
+            names -= kinds.builtin_names()  # the module of a kind has the kind's name in procedures
         assert len(names) <= MAX_MODULES, folder
 
 
@@ -361,8 +369,10 @@ def code_spans(text: str) -> list[str]:
 
 
 def test_names_in_the_walk_exist() -> None:
-    dotted = [name for name in code_spans(WALK.read_text(encoding="utf-8")) if re.fullmatch(r"[a-z_]+(\.\w+)+", name)]
-    for name in (name for name in dotted if not name.endswith((".csv", ".yaml"))):
+    dotted_names = [
+        name for name in code_spans(WALK.read_text(encoding="utf-8")) if re.fullmatch(r"[a-z_]+(\.\w+)+", name)
+    ]
+    for name in (name for name in dotted_names if not name.endswith((".csv", ".yaml"))):
         pkgutil.resolve_name(f"fieldkit.{name}")
 
 
@@ -386,7 +396,7 @@ def test_the_walk_names_each_method_of_a_step() -> None:
     }
 
 
-# External federates are used by these modules of the co-simulation only.
+# Only these modules of the co-simulation use external federates.
 FEDERATE_SEAMS = {
     "sim_backends/cosim/federates.py": {"protocols"},
     "sim_backends/cosim/scenario/external.py": {
@@ -417,7 +427,7 @@ def test_the_co_simulation_has_one_seam_to_external_federates() -> None:
 
 
 def test_class_names_are_unique() -> None:
-    """Each class name is unique, private classes included, so that a search finds one class."""
+    """Each class name is unique, also of private classes, so that a search finds one class."""
     places_by_name: dict[str, list[str]] = {}
     for path in modules("fieldkit") + modules("sim_backends"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -18,7 +18,7 @@ from fieldkit.agent.links import link_files
 from fieldkit.core.deadline import Deadline
 from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
 from tests.helpers import drones
-from tests.helpers.host import alive
+from tests.helpers.host import is_running
 from tests.helpers.mavlink_router import MavlinkRouter
 from tests.helpers.sshd import wait_until
 
@@ -73,7 +73,7 @@ def test_all_programs_stop_in_time_after_a_signal(tmp_path: Path) -> None:
                 began_s = time.monotonic()
                 assert [process.wait(60) for process in (pilot, guard)] == [landing.REFUSED] * 2
                 ended_s = time.monotonic() - began_s
-                wait_until(lambda: not alive(server), Deadline.after(60))
+                wait_until(lambda: not is_running(server), Deadline.after(60))
         assert ended_s >= NO_HEARTBEAT_S
         assert autopilot.vehicle.is_armed, "it received no command"
     for log in logs:

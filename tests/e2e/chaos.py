@@ -1,6 +1,6 @@
-"""Trials during faults: links cut, sshd killed, robots rebooted, fieldkit killed and resumed, by a seed.
+"""Trials with random faults: links are cut, sshd is killed, robots reboot, and fieldkit is killed and resumed.
 
-`python -m tests.e2e.chaos --faults 200` is the soak test of `make soak`; tests/e2e/test_chaos.py runs short ones.
+`python -m tests.e2e.chaos --faults 200` is the soak test of `make soak`; tests/e2e/test_chaos.py runs short trials.
 """
 
 import argparse
@@ -28,10 +28,10 @@ from tests.helpers.texts import procedure
 
 MAX_STARTS: Final = 60
 RECOVERY_NS: Final = 5 * 10**9
-"""Time for which a fault may have effects after its end; for example a killed server restarts only later."""
+"""Time for which a fault may have effects after its end; for example, a killed server takes time to restart."""
 
 VOIDS_PER_FAULT: Final = 2
-"""The attempt during the fault, and one that started before the fault ended."""
+"""A fault makes at most two attempts void: the attempt during the fault, and one that starts before its end."""
 
 POLL_S: Final = 5.0
 
@@ -56,13 +56,13 @@ class InjectedFault:
 
     Attributes:
         kind: Kind of the fault.
-        began_ns: Start time, in nanoseconds since 1970 UTC.
-        over_ns: End time.
+        started_ns: Start time, in nanoseconds since 1970 UTC.
+        ended_ns: End time.
     """
 
     kind: str
-    began_ns: int
-    over_ns: int
+    started_ns: int
+    ended_ns: int
 
 
 @dataclass(frozen=True)
@@ -72,13 +72,13 @@ class VoidAttempt:
     Attributes:
         name: Name of its folder.
         reason: Reason in the journal.
-        began_ns: Start time, in nanoseconds since 1970 UTC.
+        started_ns: Start time, in nanoseconds since 1970 UTC.
         ended_ns: Time of its entry in the journal.
     """
 
     name: str
     reason: str
-    began_ns: int
+    started_ns: int
     ended_ns: int
 
 
@@ -89,16 +89,16 @@ def unexplained(voids: Sequence[VoidAttempt], faults: Sequence[InjectedFault]) -
         voids: The void attempts.
         faults: The injected faults, which do not overlap.
     """
-    remaining = sorted([*faults] * VOIDS_PER_FAULT, key=lambda fault: fault.began_ns)
+    remaining = sorted([*faults] * VOIDS_PER_FAULT, key=lambda fault: fault.started_ns)
     unexplained_voids = []
     # Faults do not overlap, so each attempt matches consecutive faults, and the first one is assigned to it.
     for void in sorted(voids, key=lambda void: void.ended_ns):
-        matching = (
+        matching_faults = (
             fault
             for fault in remaining
-            if fault.began_ns <= void.ended_ns and void.began_ns <= fault.over_ns + RECOVERY_NS
+            if fault.started_ns <= void.ended_ns and void.started_ns <= fault.ended_ns + RECOVERY_NS
         )
-        if cause := next(matching, None):
+        if cause := next(matching_faults, None):
             remaining.remove(cause)
         else:
             unexplained_voids.append(void)
@@ -197,7 +197,7 @@ class Chaos:
         return self._finish(self._process)
 
     def _finish(self, process: subprocess.Popen[str]) -> Run:
-        """Wait for the end of fieldkit; kill it if attempts become void without a reason, which could last hours."""
+        """Wait until fieldkit exits; kill it if a fault does not explain a void attempt, to save time."""
         deadline = Deadline.after(LIMIT_S)
         while True:
             try:
@@ -208,7 +208,7 @@ class Chaos:
                     process.kill()
 
     def _unexplained(self) -> list[VoidAttempt]:
-        """Return the void attempts so far that no fault explains."""
+        """Return the previous void attempts that no fault explains."""
         return (
             unexplained(_voids(only_trial(self._field_robots.folder)), self.tally.faults)
             if self._trial_exists()
@@ -225,14 +225,14 @@ class Chaos:
             "robot rebooted": lambda role: inject(Fault(FaultKind.REBOOT, role)),
             "fieldkit killed": self._kill,
         }
-        if not self._deck:  # each kind is used once before any is repeated
+        if not self._deck:  # each kind of fault is used once before a kind is repeated
             self._deck = self._random.sample(list(faults), k=len(faults))
         kind = self._deck.pop()
         role = self._random.choice((Role.SENDER, Role.RECEIVER))
         self._budget -= 1
-        began_ns = time.time_ns()
+        started_ns = time.time_ns()
         faults[kind](role)
-        self.tally.faults.append(InjectedFault(kind, began_ns, time.time_ns()))
+        self.tally.faults.append(InjectedFault(kind, started_ns, time.time_ns()))
 
     def _cut(self, role: Role) -> None:
         self._field_robots.links.cut(role)
@@ -250,7 +250,7 @@ class Chaos:
         self._process.kill()
 
     def _judge(self) -> None:
-        """Check the folder of the trial, and that nothing is left on the robots."""
+        """Check the folder of the trial, and that no jobs remain on the robots."""
         lab, tally = self._field_robots.folder, self.tally
         trial = only_trial(lab)
         table = rows(trial)
@@ -292,9 +292,9 @@ def _voids(trial: Path) -> list[VoidAttempt]:
 
 
 def chaos(folder: Path, *, seed: int, repeats: int, faults: int, debian: bool = True) -> FaultTrialResult:
-    """Run one trial of `repeats` per protocol with `faults` faults, in the empty folder `folder`.
+    """Run one trial with `repeats` repeats per protocol and `faults` faults, in the empty folder `folder`.
 
-    The robots have Debian's ROS, or the built-in one.
+    The robots have Debian's ROS if `debian` is True, and the built-in ROS otherwise.
     """
     with start_field_robots(folder, site=DEFAULT_SITE if debian else None) as field_robots:
         return Chaos(field_robots, seed=seed, repeats=repeats, faults=faults).run()
@@ -308,27 +308,27 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--built-in-ros", action="store_true", help="robots without Debian's ROS")
     arguments = parser.parse_args()
-    injected = lost = 0
+    fault_count = lost_count = 0
     seed = arguments.seed
     problems = []
-    while injected < arguments.faults:
+    while fault_count < arguments.faults:
         with tempfile.TemporaryDirectory(prefix="fieldkit-soak-") as folder:
             tally = chaos(
                 Path(folder),
                 seed=seed,
                 repeats=arguments.repeats,
-                faults=arguments.faults - injected,
+                faults=arguments.faults - fault_count,
                 debian=not arguments.built_in_ros,
             )
         print(f"seed {seed}: {tally}", flush=True)
-        injected += len(tally.faults)
-        lost += tally.lost
+        fault_count += len(tally.faults)
+        lost_count += tally.lost
         problems += tally.problems
         seed += 1
     for problem in problems:
         print(f"PROBLEM: {problem}")
-    print(f"faults injected: {injected}, repeats lost: {lost}")
-    return int(bool(lost or problems))
+    print(f"faults injected: {fault_count}, repeats lost: {lost_count}")
+    return int(bool(lost_count or problems))
 
 
 if __name__ == "__main__":

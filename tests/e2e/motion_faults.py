@@ -1,8 +1,9 @@
-"""The fault matrix of moving robots: part of `make soak`; tests/e2e/test_motion_faults.py runs a few of its cells.
+"""The fault matrix of moving robots, a part of `make soak`; tests/e2e/test_motion_faults.py runs a few of its cells.
 
-`python -m tests.e2e.motion_faults --runs 10 --cells 'rover/*' --jobs 2` prints an outcome per line, then the tables
-of `docs/stopping.md`; `--write docs/stopping.md` writes them there. With `--results FILE` outcomes are appended to a
-file, trials in the file are not repeated, and the tables contain all outcomes of the file.
+`python -m tests.e2e.motion_faults --runs 10 --cells 'rover/*' --jobs 2` prints an outcome per line and then the
+tables
+of `docs/stopping.md`; `--write docs/stopping.md` also writes the tables to that page. With `--results FILE`, outcomes
+are appended to a file, trials in the file are not repeated, and the tables contain all outcomes of the file.
 """
 
 import argparse
@@ -25,14 +26,14 @@ from tests.helpers.motion_outcomes import MotionOutcome
 from tests.helpers.motion_trials import MotionTrial
 
 _TRIALS_PER_LAB: Final = 50
-"""Number of trials after which a lab is replaced by a new one."""
+"""Number of trials after which a worker starts a new lab."""
 
 _Task = tuple[str, int]
-"""Name of a cell, and seed."""
+"""The name of a cell and a seed."""
 
 
 def observe(cells: Iterable[tuple[MotionCell, int]]) -> Iterator[MotionOutcome]:
-    """Yield the outcomes of trials in order, each of a cell with its seed, in one lab."""
+    """Run a trial for each cell and seed in one lab, and yield the outcomes in order."""
     with tempfile.TemporaryDirectory(prefix="fieldkit-motion-") as folder, motion_lab(Path(folder)) as lab:
         for number, (cell, seed) in enumerate(cells):
             trial_folder = Path(folder, f"trial-{number}")
@@ -41,8 +42,8 @@ def observe(cells: Iterable[tuple[MotionCell, int]]) -> Iterator[MotionOutcome]:
 
 
 def _work(tasks: "Queue[_Task | None]", outcomes: "Queue[str | None]") -> None:
-    """Run trials until none are left; None marks the end."""
-    by_name = {cell.name: cell for cell in CELLS}
+    """Run trials until the queue of tasks yields None; then put None into `outcomes`."""
+    cells_by_name = {cell.name: cell for cell in CELLS}
 
     def next_tasks() -> Iterator[tuple[MotionCell, int]]:
         for _ in range(_TRIALS_PER_LAB):
@@ -50,7 +51,7 @@ def _work(tasks: "Queue[_Task | None]", outcomes: "Queue[str | None]") -> None:
             if task is None:
                 tasks.put(None)  # for the other workers, and for the next lab
                 return
-            yield by_name[task[0]], task[1]
+            yield cells_by_name[task[0]], task[1]
 
     is_finished = False
     try:
@@ -65,7 +66,7 @@ def _work(tasks: "Queue[_Task | None]", outcomes: "Queue[str | None]") -> None:
 
 
 def all_outcomes(tasks: Sequence[_Task], jobs: int) -> Iterator[MotionOutcome]:
-    """Yield the outcomes of trials as they end; `jobs` run in parallel, each in a lab of its process."""
+    """Yield the outcomes of trials as they end; `jobs` processes run trials in parallel, each in its own lab."""
     context = multiprocessing.get_context("spawn")
     task_queue: Queue[_Task | None] = context.Queue()
     outcome_queue: Queue[str | None] = context.Queue()
@@ -93,25 +94,25 @@ def main() -> int:
     parser.add_argument(
         "--cells", default="*", help="patterns of robot/parties/fault/phase, with commas between them"
     )
-    parser.add_argument("--runs", type=int, default=1, help="of each cell")
+    parser.add_argument("--runs", type=int, default=1, help="number of trials of each cell")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--jobs", type=int, default=2, help="labs at the same time")
-    parser.add_argument("--sample", type=int, default=0, help="only so many trials of these, at random")
-    parser.add_argument("--results", type=Path, help="file of outcomes, to which new ones are added")
-    parser.add_argument("--write", type=Path, help="page that gets the tables")
-    parser.add_argument("--list", action="store_true", help="list the cells, and run nothing")
+    parser.add_argument("--jobs", type=int, default=2, help="number of labs that run at the same time")
+    parser.add_argument("--sample", type=int, default=0, help="number of trials to select at random; 0 for all")
+    parser.add_argument("--results", type=Path, help="file to which outcomes are appended")
+    parser.add_argument("--write", type=Path, help="page to which the tables are written")
+    parser.add_argument("--list", action="store_true", help="list the cells without running trials")
     arguments = parser.parse_args()
     cells = select_cells(arguments.cells)
     if arguments.list:
         print("\n".join(cell.name for cell in cells))
         return 0
     stored_outcomes = _read(arguments.results)
-    done = {(outcome.cell, outcome.seed) for outcome in stored_outcomes}
+    completed_trials = {(outcome.cell, outcome.seed) for outcome in stored_outcomes}
     tasks = [
         (cell.name, seed)
         for seed in range(arguments.seed, arguments.seed + arguments.runs)
         for cell in cells
-        if (cell.name, seed) not in done
+        if (cell.name, seed) not in completed_trials
     ]
     random.Random(arguments.seed).shuffle(tasks)
     tasks = tasks[: arguments.sample] if arguments.sample else tasks
@@ -131,7 +132,7 @@ def main() -> int:
             )
             if value is not None
         )
-        print(f"{outcome.cell}: {times or 'went on'} {'; '.join(outcome.problems) and 'BEYOND: '}", end="")
+        print(f"{outcome.cell}: {times or 'continued'} {'; '.join(outcome.problems) and 'BEYOND: '}", end="")
         print("; ".join(outcome.problems), flush=True)
     load = max((outcome.load for outcome in outcomes), default=0.0)
     conditions = (
@@ -143,7 +144,7 @@ def main() -> int:
         motion_table.write(arguments.write, text)
     beyond = sum(bool(outcome.problems) for outcome in outcomes)
     if missing := len(stored_outcomes) + len(tasks) - len(outcomes):
-        sys.exit(f"{missing} trials did not end: see the errors above")
+        sys.exit(f"{missing} trials did not end; see the errors above")
     print(f"trials: {len(outcomes)}, beyond their bounds: {beyond}; {time.monotonic() - start_s:.0f} s")
     return int(beyond > 0)
 

@@ -1,4 +1,4 @@
-"""`fieldkit abort` on robots that outlive fieldkit: it ends their jobs even if another robot cannot be reached."""
+"""`fieldkit abort` on robots that outlive fieldkit; it stops their jobs even if another robot is unreachable."""
 
 import re
 from pathlib import Path
@@ -22,7 +22,7 @@ ANNA = Holder("trial-a", "anna@one", "trial-a")
 
 
 @pytest.mark.emulated
-def test_abort_ends_the_jobs_and_names_the_robot_out_of_reach(tmp_path: Path) -> None:
+def test_abort_stops_the_jobs_and_names_the_unreachable_robot(tmp_path: Path) -> None:
     with start_field_robots(tmp_path) as field_robots:
         shells = field_robots.testbed.shells
         sender, receiver = (field_robots.cast[role].name for role in (Role.SENDER, Role.RECEIVER))

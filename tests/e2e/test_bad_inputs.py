@@ -1,4 +1,4 @@
-"""Every bad input of docs/errors.md, reproduced: one clear message with a remedy, and the right exit code."""
+"""Every bad input of docs/errors.md produces the listed message and remedy, and the listed exit code."""
 
 import re
 from collections.abc import Callable
@@ -54,7 +54,7 @@ Setup = Callable[[Path], str]
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the table in docs/errors.md; `...` stands for parts that differ from lab to lab."""
+    """A row of a table in docs/errors.md; `...` stands for text that differs between labs."""
 
     situation: str
     code: int
@@ -75,9 +75,9 @@ def table(section: str) -> dict[str, Row]:
 
 def _without_backticks(cell: str) -> str:
     """Return a cell without the backticks that mark code."""
-    bare = cell.strip()
-    marks = len(bare) - len(bare.lstrip("`"))
-    return bare[marks:-marks].strip() if marks else bare
+    text = cell.strip()
+    backticks = len(text) - len(text.lstrip("`"))
+    return text[backticks:-backticks].strip() if backticks else text
 
 
 def site(text: str = LAB, *changes: str, command: str = DRY) -> Setup:
@@ -88,7 +88,7 @@ def site(text: str = LAB, *changes: str, command: str = DRY) -> Setup:
     return setup
 
 
-def own_file(kind: Kind, name: str, *changes: str, command: str = DRY) -> Setup:
+def changed_copy(kind: Kind, name: str, *changes: str, command: str = DRY) -> Setup:
     def setup(lab: Path) -> str:
         labs.copy_shipped(lab, kind, name, *changes)
         return command
@@ -114,11 +114,11 @@ def campaign(*changes: str, started: bool = False) -> Setup:
     return setup
 
 
-def typed(command: str) -> Setup:
+def without_files(command: str) -> Setup:
     return lambda lab: command
 
 
-def two_runs(command: str, **changes: Any) -> Setup:  # noqa: ANN401 (as replace)
+def with_two_runs(command: str, **changes: Any) -> Setup:  # noqa: ANN401 (as replace)
     """Write two runs in the folders `a` and `b`, the second with `changes`."""
 
     def setup(lab: Path) -> str:
@@ -130,24 +130,24 @@ def two_runs(command: str, **changes: Any) -> Setup:  # noqa: ANN401 (as replace
     return setup
 
 
-TYPED: dict[str, Setup] = {
-    "a distance without a unit": typed("trial los 30"),
-    "an unknown unit": typed("trial los 30feet"),
-    "a distance of zero": typed("trial los 0m"),
-    "a duration without a unit": typed("trial los 30ft --record 2"),
-    "a recording of zero seconds": typed("trial los 30ft --record 0s"),
-    "an unknown procedure": typed("trial lso 30ft"),
-    "an unknown backend": typed("trial los 30ft --backend emulatd"),
-    "the field backend without a site file": typed("trial los 30ft --backend field"),
-    "a missing site file": typed("trial los 30ft --site nope.yaml"),
-    "a folder for trials that cannot be created": typed("trial los 30ft --out /proc/trials"),
-    "an unknown robot profile": typed("robots show turtlebot"),
-    "an unknown column": typed("columns show iploss"),
-    "a missing file of answers": typed("trial los 30ft --answers nope.txt"),
+COMMAND_LINE_CASES: dict[str, Setup] = {
+    "a distance without a unit": without_files("trial los 30"),
+    "an unknown unit": without_files("trial los 30feet"),
+    "a distance of zero": without_files("trial los 0m"),
+    "a duration without a unit": without_files("trial los 30ft --record 2"),
+    "a recording of zero seconds": without_files("trial los 30ft --record 0s"),
+    "an unknown procedure": without_files("trial lso 30ft"),
+    "an unknown backend": without_files("trial los 30ft --backend emulatd"),
+    "the field backend without a site file": without_files("trial los 30ft --backend field"),
+    "a missing site file": without_files("trial los 30ft --site nope.yaml"),
+    "a folder for trials that cannot be created": without_files("trial los 30ft --out /proc/trials"),
+    "an unknown robot profile": without_files("robots show turtlebot"),
+    "an unknown column": without_files("columns show iploss"),
+    "a missing file of answers": without_files("trial los 30ft --answers nope.txt"),
     "a report in a folder that is not writable": lambda lab: (
         f"report {tables.write(lab, [lawns.row()])} -o /proc/report.html"
     ),
-    "a report in a missing folder": typed("report . -o there/report.html"),
+    "a report in a missing folder": without_files("report . -o there/report.html"),
     "a report in place of another file": lambda lab: (
         f"report . -o {tables.write(lab, [lawns.row()], 'all.csv').relative_to(lab)}"
     ),
@@ -155,29 +155,29 @@ TYPED: dict[str, Setup] = {
         f"report {tables.write(lab, [lawns.row()])} --figures /proc/figures"
     ),
     "an unknown repeat": lambda lab: f"report {tables.write(lab, [lawns.row()])} --repeat udp-07",
-    "a folder that is not a trial": typed("resume nowhere"),
-    "a folder without a manifest": typed("verify ."),
-    "an unknown format": typed("export . --format parket -o out.parquet"),
+    "a folder that is not a trial": without_files("resume nowhere"),
+    "a folder without a manifest": without_files("verify ."),
+    "an unknown format": without_files("export . --format parket -o out.parquet"),
     "an export to an existing file": lambda lab: (
         (lab / "out.csv").write_bytes(b""),
         "export . --format csv -o out.csv",
     )[1],
-    "an export to a missing folder": typed("export . --format csv -o there/out.csv"),
-    "several trials in one MCAP file": typed("export one other --format mcap -o out.mcap"),
-    "two runs that are not comparable": two_runs("compare a b", procedure_sha256="ffff"),
-    "two runs without a common condition": two_runs("compare a b", distance_m=16.764),
-    "a threshold for an unknown quantity": two_runs("compare a b --threshold iploss=2%"),
-    "a threshold for a quantity that no run has": two_runs("compare a b --threshold rtt_loss=2%"),
-    "a threshold without a value": two_runs("compare a b --threshold ip_loss"),
-    "a threshold without a unit": two_runs("compare a b --threshold ip_loss=2"),
-    "a threshold of zero": two_runs("compare a b --threshold ip_loss=0%"),
-    "a lab that is not running": typed("lab ps"),
-    "a lab without robots": typed("lab up --robots 0"),
+    "an export to a missing folder": without_files("export . --format csv -o there/out.csv"),
+    "several trials in one MCAP file": without_files("export one other --format mcap -o out.mcap"),
+    "two runs that are not comparable": with_two_runs("compare a b", procedure_sha256="ffff"),
+    "two runs without a common condition": with_two_runs("compare a b", distance_m=16.764),
+    "a threshold for an unknown quantity": with_two_runs("compare a b --threshold iploss=2%"),
+    "a threshold for a quantity that no run has": with_two_runs("compare a b --threshold rtt_loss=2%"),
+    "a threshold without a value": with_two_runs("compare a b --threshold ip_loss"),
+    "a threshold without a unit": with_two_runs("compare a b --threshold ip_loss=2"),
+    "a threshold of zero": with_two_runs("compare a b --threshold ip_loss=0%"),
+    "a lab that is not running": without_files("lab ps"),
+    "a lab without robots": without_files("lab up --robots 0"),
     "a lab of a backend that cannot start robots": site(FIELD, command="lab up --backend field"),
-    "a figure with an unknown suffix": typed("lab plot -o lab.gif"),
+    "a figure with an unknown suffix": without_files("lab plot -o lab.gif"),
 }
 
-WRITTEN: dict[str, Setup] = {
+YAML_CASES: dict[str, Setup] = {
     "a key with a typo": site(LAB, "robots:", "robotz:"),
     "a missing key": site(LAB, "{profile: duckiedrone}", "{}"),
     "a key written twice": site(LAB, "roles:", "backend: emulated\nroles:"),
@@ -215,33 +215,33 @@ WRITTEN: dict[str, Setup] = {
     "a robot without a host in the field": site(LAB, "backend: emulated", "backend: field"),
     "a password in the site file": site(LAB, "{profile: duckiedrone}", "{profile: duckiedrone, password: s3same}"),
     "a file that is not UTF-8": lambda lab: ((lab / "fieldkit.yaml").write_bytes(b"backend: \xff"), DRY)[1],
-    "an unknown kind of step": own_file("procedures", "los", "  - ping:", "  - pong:"),
-    "a step for a role that does not exist": own_file("procedures", "los", "{robot: sender", "{robot: senderr"),
-    "a payload that no packet can carry": own_file("procedures", "los", "udp: 8192", "udp: 65508"),
-    "a second step of a kind": own_file(
+    "an unknown kind of step": changed_copy("procedures", "los", "  - ping:", "  - pong:"),
+    "a step for a role that does not exist": changed_copy("procedures", "los", "{robot: sender", "{robot: senderr"),
+    "a payload that no packet can carry": changed_copy("procedures", "los", "udp: 8192", "udp: 65508"),
+    "a second step of a kind": changed_copy(
         "procedures", "los", "during:", "during:\n        - ping: {from: sender, to: receiver}"
     ),
-    "one robot that captures twice": own_file(
+    "one robot that captures twice": changed_copy(
         "procedures", "los", "robots: [sender, receiver]", "robots: [sender, sender]"
     ),
-    "an unknown variable": own_file(
+    "an unknown variable": changed_copy(
         "procedures",
         "los",
         "        - ping: {",
         "        - for: {each: {n: [1, 2]}, during: [ping: {name: 'p{m}'}]}\n        - ping: {",
     ),
-    "two transfers to one port in one capture": own_file(
+    "two transfers to one port in one capture": changed_copy(
         "procedures",
         "los",
         "        # The",
         "        - transfer: {name: more, from: sender, to: receiver}\n        # The",
     ),
-    "a received file named as the bag": own_file("procedures", "los", "into: recv.bag", "into: scan.bag"),
-    "a rate without a unit": own_file("robots", "turtlebot3_burger", "rate: 5Hz", "rate: 5"),
-    "a profile whose name differs from its file": own_file(
+    "a received file named as the bag": changed_copy("procedures", "los", "into: recv.bag", "into: scan.bag"),
+    "a rate without a unit": changed_copy("robots", "turtlebot3_burger", "rate: 5Hz", "rate: 5"),
+    "a profile whose name differs from its file": changed_copy(
         "robots", "duckiedrone", "name: duckiedrone", "name: drone"
     ),
-    "a record command without its topics": own_file("robots", "turtlebot3_burger", '"{topics}"]', "]"),
+    "a record command without its topics": changed_copy("robots", "turtlebot3_burger", '"{topics}"]', "]"),
     "a campaign without a seed": campaign("seed: 7\n", ""),
     "one distance twice": campaign("20ft", "3.048m"),
     "an exception that matches no trial": campaign("seed: 7", "seed: 7\nexcept: [{distance: 55ft}]"),
@@ -250,8 +250,10 @@ WRITTEN: dict[str, Setup] = {
 }
 
 
-def read(*rows: RepeatRow, options: str = "", other: RepeatRow | None = None, cut: int | None = None) -> Setup:
-    """Write the table of a trial, optionally a second one of the same trial, optionally with its last line cut."""
+def with_trial_table(
+    *rows: RepeatRow, options: str = "", other: RepeatRow | None = None, cut: int | None = None
+) -> Setup:
+    """Write the table of a trial, optionally without its last `cut` characters; `other` is a different copy of it."""
 
     def setup(lab: Path) -> str:
         path = tables.write(lab / "trials" / "a", rows)
@@ -281,7 +283,7 @@ def with_changed_trial(command: str, change: Callable[[Path], object]) -> Setup:
     """Write a complete trial and apply a change to it."""
 
     def setup(lab: Path) -> str:
-        folder = recorded.make(lab / "made").rename(lab / "a")
+        folder = recorded.make(lab / "recorded").rename(lab / "a")
         Ledger(plans.read_plan(folder), folder, Stop()).summarize()
         change(folder)
         return command
@@ -303,23 +305,27 @@ def add_journal_entry(trial: Path) -> None:
     journal.append(trial, JournalEntry(1, repeat.protocol, repeat.number, 1, Status.RUNNING))
 
 
-READ: dict[str, Setup] = {
-    "a missing path": typed("aggregate nowhere"),
-    "a folder without a trial": typed("aggregate ."),
+STORED_TRIAL_CASES: dict[str, Setup] = {
+    "a missing path": without_files("aggregate nowhere"),
+    "a folder without a trial": without_files("aggregate ."),
     "a table of something else": lambda lab: ((lab / "a.csv").write_text("time,x\n1,2\n"), "aggregate a.csv")[1],
-    "a truncated line": read(*tables.repeats(tables.ROW, 3), cut=20),
-    "a cell that is not a number": read(replace(tables.ROW, distance_m="near")),
-    "a table of a newer fieldkit": read(replace(tables.ROW, schema_version=99)),
-    "two copies of a trial that differ": read(tables.ROW, other=replace(tables.ROW, transfer_s=2.0)),
+    "a truncated line": with_trial_table(*tables.repeats(tables.ROW, 3), cut=20),
+    "a cell that is not a number": with_trial_table(replace(tables.ROW, distance_m="near")),
+    "a table of a newer fieldkit": with_trial_table(replace(tables.ROW, schema_version=99)),
+    "two copies of a trial that differ": with_trial_table(tables.ROW, other=replace(tables.ROW, transfer_s=2.0)),
     "trials in which no repeat has ended": with_empty_trial("aggregate trials"),
     "trials whose tables were deleted": with_empty_trial("aggregate trials", with_table=False),
-    "a table without a line": lambda lab: (read()(lab), "aggregate trials/a/trial.csv")[1],
-    "a table alone to rebuild from": read(tables.ROW, options="--rebuild"),
-    "an unknown column in --by": read(tables.ROW, options="--by distanse"),
-    "an unknown quantity": read(tables.ROW, options="--quantity ip_los"),
-    "a width without a unit": read(tables.ROW, options="--width 2"),
-    "a width with the unit of another quantity": read(tables.ROW, options="--width 1ms --quantity ip_loss"),
-    "a LaTeX table of a quantity without values": read(tables.ROW, options="--format latex --quantity jitter_s"),
+    "a table without a line": lambda lab: (with_trial_table()(lab), "aggregate trials/a/trial.csv")[1],
+    "a table alone to rebuild from": with_trial_table(tables.ROW, options="--rebuild"),
+    "an unknown column in --by": with_trial_table(tables.ROW, options="--by distanse"),
+    "an unknown quantity": with_trial_table(tables.ROW, options="--quantity ip_los"),
+    "a width without a unit": with_trial_table(tables.ROW, options="--width 2"),
+    "a width with the unit of another quantity": with_trial_table(
+        tables.ROW, options="--width 1ms --quantity ip_loss"
+    ),
+    "a LaTeX table of a quantity without values": with_trial_table(
+        tables.ROW, options="--format latex --quantity jitter_s"
+    ),
     "a link in the folder of a trial": with_changed_trial("rebuild a", replace_table_by_link),
     "evidence that was changed after the measurement": with_changed_trial("rebuild a", add_evidence),
     "a journal with an impossible entry": with_changed_trial("rebuild a", add_journal_entry),
@@ -328,7 +334,11 @@ READ: dict[str, Setup] = {
     ),
 }
 
-SECTIONS: dict[str, dict[str, Setup]] = {"Command line": TYPED, "YAML files": WRITTEN, "Stored trials": READ}
+SECTIONS: dict[str, dict[str, Setup]] = {
+    "Command line": COMMAND_LINE_CASES,
+    "YAML files": YAML_CASES,
+    "Stored trials": STORED_TRIAL_CASES,
+}
 
 
 @pytest.mark.parametrize(("section", "cases"), SECTIONS.items())
@@ -351,12 +361,12 @@ def test_a_bad_input_gives_one_message_with_a_remedy(
 
 def check(row: Row, code: int, err: str) -> None:
     assert err.count("error: ") == 1, err
-    message = output_text(row.message, err)
+    message = search_text(row.message, err)
     assert message, (row.message, err)
-    assert output_text(row.remedy, err[message.end() :]), (row.remedy, err)
+    assert search_text(row.remedy, err[message.end() :]), (row.remedy, err)
     assert code == row.code, err
 
 
-def output_text(pattern: str, text: str) -> re.Match[str] | None:
-    words = (re.escape(part) for part in pattern.split("..."))
-    return re.search(".*?".join(words), text, re.DOTALL)
+def search_text(pattern: str, text: str) -> re.Match[str] | None:
+    parts = (re.escape(part) for part in pattern.split("..."))
+    return re.search(".*?".join(parts), text, re.DOTALL)

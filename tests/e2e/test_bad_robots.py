@@ -1,4 +1,4 @@
-"""Errors of robots and of connections to them, reproduced on emulated robots: the last section of docs/errors.md."""
+"""The errors of robots and connections in the last section of docs/errors.md, reproduced on emulated robots."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -20,11 +20,11 @@ from tests.helpers.sshd import free_port, make_key
 pytestmark = pytest.mark.emulated
 
 TRIAL = "trial los 5m --topology masterless --protocol tcp --repeats 1 --record 1s --yes"
-BEGIN = "mkdir -p .fieldkit/other/one/.jobs"
+MAKE_FOLDER = "mkdir -p .fieldkit/other/one/.jobs"
 
 
 class Testbed:
-    """A lab's folder with the site file of running robots, and the changes of a case."""
+    """The folder of a lab with the site file of running robots; a case changes both."""
 
     def __init__(self, folder: Path, field_robots: FieldRobots) -> None:
         self.folder = folder
@@ -32,27 +32,27 @@ class Testbed:
         self.undo = ExitStack()
         self._write("fieldkit.yaml", (field_robots.folder / "fieldkit.yaml").read_text(encoding="utf-8"))
 
-    def change(self, pattern: str, by: str) -> None:
-        """Change the sender's line of the site file."""
+    def change(self, pattern: str, replacement: str) -> None:
+        """Replace a pattern in the sender's line of the site file."""
         lines = (self.folder / "fieldkit.yaml").read_text(encoding="utf-8").splitlines()
         (index,) = (number for number, line in enumerate(lines) if "turtlebot-1: {" in line)
-        changed = re.sub(pattern, by, lines[index])
-        assert changed != lines[index]
-        lines[index] = changed
+        changed_line = re.sub(pattern, replacement, lines[index])
+        assert changed_line != lines[index]
+        lines[index] = changed_line
         self._write("fieldkit.yaml", "\n".join(lines) + "\n")
 
-    def on(self, role: Role, script: str) -> None:
+    def run_on(self, role: Role, script: str) -> None:
         shell = self.field_robots.testbed.shells[role]
         shell.run(("sh", "-c", script), deadline=Deadline.after(20))
 
     def start(self, role: Role, *argv: str) -> None:
-        """Start a job on a robot that ends with the case."""
+        """Start a job on a robot; it is stopped at the end of the case."""
         shell = self.field_robots.testbed.shells[role]
         jobs.install(shell, Deadline.after(30))
-        self.on(role, BEGIN)
+        self.run_on(role, MAKE_FOLDER)
         job = Job(".fieldkit/other/one", "job", argv, limit_s=120, log="log")
         jobs.start(shell, job)
-        self.undo.callback(self.on, role, "rm -r .fieldkit/other")
+        self.undo.callback(self.run_on, role, "rm -r .fieldkit/other")
         self.undo.callback(jobs.stop, shell, job)
 
     def _write(self, name: str, text: str) -> None:
@@ -62,9 +62,9 @@ class Testbed:
 Setup = Callable[[Testbed], str]
 
 
-def site(pattern: str, by: str) -> Setup:
+def site(pattern: str, replacement: str) -> Setup:
     def setup(lab: Testbed) -> str:
-        lab.change(pattern, by)
+        lab.change(pattern, replacement)
         return TRIAL
 
     return setup
@@ -92,32 +92,32 @@ def closed_port(lab: Testbed) -> str:
 
 
 def changed_key(lab: Testbed) -> str:
-    other = " ".join(make_key(lab.folder / "other").split()[:2])
-    lab.change(r"host_key: [^}]*", f"host_key: {other}")
+    other_key = " ".join(make_key(lab.folder / "other").split()[:2])
+    lab.change(r"host_key: [^}]*", f"host_key: {other_key}")
     return TRIAL
 
 
-def unknown_login(lab: Testbed) -> str:
+def unauthorized_login(lab: Testbed) -> str:
     make_key(lab.folder / "stranger")
     lab.change(r"key: \S+login", f"key: {lab.folder}/stranger")
     return TRIAL
 
 
-def port_taken(lab: Testbed) -> str:
-    lab.on(Role.RECEIVER, "setsid -f nc.traditional -l -p 1234 </dev/null >/dev/null 2>&1")
-    lab.undo.callback(lab.on, Role.RECEIVER, "nc.traditional -q 0 127.0.0.1 1234 </dev/null")
+def occupied_port(lab: Testbed) -> str:
+    lab.run_on(Role.RECEIVER, "setsid -f nc.traditional -l -p 1234 </dev/null >/dev/null 2>&1")
+    lab.undo.callback(lab.run_on, Role.RECEIVER, "nc.traditional -q 0 127.0.0.1 1234 </dev/null")
     return TRIAL
 
 
-def leftover(lab: Testbed) -> str:
+def leftover_job(lab: Testbed) -> str:
     lab.start(Role.SENDER, "sleep", "100")
     return TRIAL
 
 
 def full_robot(lab: Testbed) -> str:
-    lab.on(Role.SENDER, "mkdir -p .fieldkit && mount -t tmpfs -o size=20m tmpfs .fieldkit")
-    # The shells of a connection that was just closed may still run there.
-    lab.undo.callback(lab.on, Role.SENDER, "until umount .fieldkit; do sleep 0.1; done")
+    lab.run_on(Role.SENDER, "mkdir -p .fieldkit && mount -t tmpfs -o size=20m tmpfs .fieldkit")
+    # The shells of a connection that was just closed may still run in the folder.
+    lab.undo.callback(lab.run_on, Role.SENDER, "until umount .fieldkit; do sleep 0.1; done")
     return TRIAL
 
 
@@ -129,7 +129,7 @@ ON_ROBOTS: dict[str, Setup] = {
     "an unknown host name": site(r"host: 127.0.0.1", "host: turtlebot.invalid"),
     "a robot that does not listen": closed_port,
     "a wrong user": site("user: root", "user: pi"),
-    "a login key that is not authorized on the robot": unknown_login,
+    "a login key that is not authorized on the robot": unauthorized_login,
     "a missing login key": site(r"key: \S+login", "key: /no/such/key"),
     "a host key that changed": changed_key,
     "an invalid host key": site(r"host_key: [^}]*", "host_key: AAAA"),
@@ -138,8 +138,8 @@ ON_ROBOTS: dict[str, Setup] = {
     "a missing tool": profile("netcat: nc.traditional", "netcat: nc.imaginary"),
     "a missing setup file": profile("/opt/ros/noetic/setup.bash", "/opt/ros/melodic/setup.bash"),
     "no right to capture": profile("capture_right: direct", "capture_right: sudo"),
-    "a port that is in use": port_taken,
-    "a job left by another trial": leftover,
+    "a port that is in use": occupied_port,
+    "a job left by another trial": leftover_job,
     "a robot whose disk is full": full_robot,
     "a topic without messages": procedure("[/scan]", "[/nothing]"),
     "no person to place the robots": unused_address,

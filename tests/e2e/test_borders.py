@@ -1,4 +1,4 @@
-"""The harness works without `fieldkit.motion` and `fieldkit.ros`: its tests pass in a copy without them."""
+"""The harness works without `fieldkit.motion` and `fieldkit.ros`: its tests pass in a copy without these packages."""
 
 import json
 import os
@@ -25,7 +25,7 @@ LIMIT_S: Final = 900.0
 COPIED: Final = ("fieldkit", "sim_backends", "tests", "robots", "procedures", "pyproject.toml")
 REMOVED: Final = ("fieldkit/motion", "fieldkit/ros", "tests/motion", "tests/ros")
 SECTIONS: Final = re.compile(r"^(drive|mavlink):.*\n(?:[ \t].*\n)*", re.MULTILINE)
-"""Sections of shipped profiles that the package defines, with the lines below them."""
+"""Sections of shipped profiles that `fieldkit.motion` defines, with their lines."""
 HARNESS_TESTS: Final = (
     "tests/analysis/test_expectations.py",
     "tests/backends/test_backend_registry.py",
@@ -51,7 +51,7 @@ HARNESS_TESTS: Final = (
     "tests/trial/test_trial_rows.py",
     "tests/trial/test_trial_store.py",
 )
-"""A quick part of the tests of each package of the harness."""
+"""Tests of each package of the harness that take little time."""
 STEPS_OF_PRODUCTS: Final = {
     "fly": "{robot: sender, height: 2m, during: [ping: {from: sender, to: receiver}]}",
     "record": "{robot: sender, topics: [/scan], duration: 2s}",
@@ -76,7 +76,7 @@ def entry_points() -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the repository without the packages and its sections, with metadata as after an installation."""
+    """A copy of the repository without the packages and their sections, with metadata as after an installation."""
     folder = tmp_path_factory.mktemp("border")
     for name in COPIED:
         if (ROOT / name).is_dir():
@@ -106,7 +106,7 @@ for line in sys.stdin:
             code = end.code
     print(json.dumps([code, out.getvalue(), err.getvalue()]), flush=True)
 """
-"""Runs commands of the copy in one process, which imports the packages only once."""
+"""Runs commands of the copy in one process, so that the packages are imported only once."""
 Fieldkit = Callable[..., Run]
 
 
@@ -115,7 +115,7 @@ def run_in(copy: Path) -> Iterator[Fieldkit]:
     """A function that runs `fieldkit` of the copy in a folder."""
     with subprocess.Popen(
         (sys.executable, "-c", RUNNER),
-        cwd=copy,  # it is the first folder in which modules are searched
+        cwd=copy,  # modules are searched in this folder first
         env=os.environ | {"PYTHONPATH": str(copy)},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -133,9 +133,9 @@ def run_in(copy: Path) -> Iterator[Fieldkit]:
 
 
 def test_tests_of_the_harness_pass_without_the_products(copy: Path) -> None:
-    chosen = "not motion and not ros and not emulated and not quiet and not nightly"
-    options = ("-q", "-p", "no:cacheprovider", "--hypothesis-profile", "ci", "-m", chosen)
-    done = subprocess.run(
+    markers = "not motion and not ros and not emulated and not quiet and not nightly"
+    options = ("-q", "-p", "no:cacheprovider", "--hypothesis-profile", "ci", "-m", markers)
+    completed = subprocess.run(
         (sys.executable, "-m", "pytest", *options, *HARNESS_TESTS),
         cwd=copy,
         env=os.environ | {"PYTHONPATH": str(copy)},
@@ -145,60 +145,60 @@ def test_tests_of_the_harness_pass_without_the_products(copy: Path) -> None:
         timeout=LIMIT_S,
         check=False,
     )
-    assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-2000:]
+    assert completed.returncode == 0, completed.stdout[-5000:] + completed.stderr[-2000:]
 
 
 def test_a_trial_is_planned_without_the_products(run_in: Fieldkit, tmp_path: Path) -> None:
     write_procedure(tmp_path, "plain", PLAIN)
-    done = run_in(tmp_path, "trial", "plain", "30ft", "--dry-run")
-    assert done.code == 0, done.err
-    listed = run_in(tmp_path, "columns")
-    assert listed.code == 0, listed.err
-    assert "rtt_sent" in listed.out
+    run = run_in(tmp_path, "trial", "plain", "30ft", "--dry-run")
+    assert run.code == 0, run.err
+    columns_run = run_in(tmp_path, "columns")
+    assert columns_run.code == 0, columns_run.err
+    assert "rtt_sent" in columns_run.out
 
 
 @pytest.mark.parametrize(("kind", "step"), STEPS_OF_PRODUCTS.items())
-def test_a_kind_of_a_removed_package_is_reported(run_in: Fieldkit, tmp_path: Path, kind: str, step: str) -> None:
+def test_a_step_kind_of_a_removed_package_is_rejected(run_in: Fieldkit, tmp_path: Path, kind: str, step: str) -> None:
     write_procedure(tmp_path, kind, PROCEDURE.replace("KIND", kind).replace("STEP", step))
-    done = run_in(tmp_path, "trial", kind, "5m", "--dry-run")
-    assert done.code == 2
-    assert f"unknown key {kind}" in done.err
-    assert "other kinds of step need a package that is not installed" in " ".join(done.err.split())
+    run = run_in(tmp_path, "trial", kind, "5m", "--dry-run")
+    assert run.code == 2
+    assert f"unknown key {kind}" in run.err
+    assert "other kinds of step need a package that is not installed" in " ".join(run.err.split())
 
 
 # The robots of the default lab.
 @pytest.mark.parametrize(("profile", "key"), [("turtlebot3_burger", "drive"), ("duckiedrone", "mavlink")])
-def test_a_profile_with_a_section_of_the_removed_package_is_refused(
+def test_a_profile_with_a_section_of_the_removed_package_is_rejected(
     run_in: Fieldkit, tmp_path: Path, profile: str, key: str
 ) -> None:
     (tmp_path / "robots").mkdir()
     shutil.copy(ROOT / "robots" / f"{profile}.yaml", tmp_path / "robots")
     write_procedure(tmp_path, "plain", PLAIN)
-    done = run_in(tmp_path, "trial", "plain", "30ft", "--dry-run")
-    assert done.code == 2, done.out
+    run = run_in(tmp_path, "trial", "plain", "30ft", "--dry-run")
+    assert run.code == 2, run.out
     message = f"unknown key {key}; it needs the package fieldkit.motion, which is not installed"
-    assert message in " ".join(done.err.split())
+    assert message in " ".join(run.err.split())
 
 
-def test_a_stored_trial_with_such_a_profile_is_refused(run_in: Fieldkit, tmp_path: Path) -> None:
+def test_a_stored_trial_with_such_a_profile_is_rejected(run_in: Fieldkit, tmp_path: Path) -> None:
     plan = los_plan()
     trial = tmp_path / plan.trial
     trial.mkdir()
     (trial / "trial.yaml").write_text(schema.dump(plan), encoding="utf-8")
     for words in (("resume",), ("rebuild",)):
-        done = run_in(tmp_path, *words, str(trial))
-        assert done.code == 2, done.out
-        assert "it needs the package fieldkit.motion" in " ".join(done.err.split())
+        run = run_in(tmp_path, *words, str(trial))
+        assert run.code == 2, run.out
+        assert "it needs the package fieldkit.motion" in " ".join(run.err.split())
 
 
-def test_a_procedure_with_a_section_of_the_removed_package_is_refused(run_in: Fieldkit, tmp_path: Path) -> None:
+def test_a_procedure_with_a_section_of_the_removed_package_is_rejected(run_in: Fieldkit, tmp_path: Path) -> None:
     (tmp_path / "procedures").mkdir()
     text = (ROOT / "procedures" / "los.yaml").read_text(encoding="utf-8").replace("name: los", "name: guarded")
     (tmp_path / "procedures" / "guarded.yaml").write_text(f"{text}on_abort: {{receiver: land}}\n", encoding="utf-8")
-    done = run_in(tmp_path, "trial", "guarded", "5m", "--dry-run")
-    assert done.code == 2, done.out
+    run = run_in(tmp_path, "trial", "guarded", "5m", "--dry-run")
+    assert run.code == 2, run.out
     message = "unknown key on_abort; it needs the package fieldkit.motion, which is not installed"
-    assert message in " ".join(done.err.split())
+    assert message in " ".join(run.err.split())
 
 
 @pytest.mark.parametrize("command", ["trial", "resume", "campaign"])

@@ -1,4 +1,4 @@
-"""A campaign, end to end: killed and run again on emulated robots; skipped trials and notes on the field backend."""
+"""Campaigns end to end: one is killed and run again; another skips trials and records notes on the field backend."""
 
 import json
 import subprocess
@@ -29,7 +29,7 @@ seed: 7
 """
 
 
-def begin(lab: Path, distances: str) -> Path:
+def write_lab(lab: Path, distances: str) -> Path:
     built_in_ros(lab)
     (lab / "lawn.yaml").write_text(CAMPAIGN.format(distances=distances), encoding="utf-8")
     return lab / "trials" / "campaign_lawn"
@@ -48,16 +48,16 @@ def trials(folder: Path) -> list[Path]:
 
 
 def test_a_campaign_killed_in_a_trial_continues_and_has_each_trial_once(tmp_path: Path) -> None:
-    folder = begin(tmp_path, "10ft, 20ft")
+    folder = write_lab(tmp_path, "10ft, 20ft")
     process = start(tmp_path, "campaign", "lawn.yaml", "--json")
     wait_for_line(process, '"campaign_went"')
     wait_for_line(process, '"transfer"')
-    family = descendants(process.pid)
+    process_ids = descendants(process.pid)
     process.kill()
     process.wait(60)
     assert process.stdout is not None
     process.stdout.close()
-    wait_for_end(family, within_s=60.0)
+    wait_for_end(process_ids, within_s=60.0)
     with (folder / "journal.jsonl").open("a", encoding="utf-8") as file:
         file.write('{"utc_ns": 17952')
     before = trials(folder)
@@ -77,35 +77,35 @@ def test_a_campaign_killed_in_a_trial_continues_and_has_each_trial_once(tmp_path
     for trial in trials(folder):
         assert [row["status"] for row in rows(trial) if row["status"] != "void"] == ["valid"]
     assert run_here(tmp_path, "verify", str(before[1])).code == 0
-    left = [event["left_s"] for event in run.events("campaign_went")]
-    assert left == sorted(left, reverse=True)
-    assert left[-1] == 0
+    remaining_s = [event["left_s"] for event in run.events("campaign_went")]
+    assert remaining_s == sorted(remaining_s, reverse=True)
+    assert remaining_s[-1] == 0
 
-    again = run_here(tmp_path, "campaign", "lawn.yaml")
-    assert again.code == 0, again.err
-    assert "4 of 4 trials are done" in again.out
+    second_run = run_here(tmp_path, "campaign", "lawn.yaml")
+    assert second_run.code == 0, second_run.err
+    assert "4 of 4 trials are done" in second_run.out
     assert len(trials(folder)) == 4
 
 
-def answered(lab: Path, *answers: str) -> Run:
+def run_with_answers(lab: Path, *answers: str) -> Run:
     (lab / "answers.txt").write_text("".join(f"{answer}\n" for answer in answers), encoding="utf-8")
     return run_here(lab, "campaign", "lawn.yaml", "--answers", "answers.txt", "--json")
 
 
-def test_skipped_trials_are_offered_again_and_notes_are_kept(tmp_path: Path) -> None:
-    folder = begin(tmp_path, "10ft")
+def test_skipped_trials_are_offered_again_and_notes_are_stored(tmp_path: Path) -> None:
+    folder = write_lab(tmp_path, "10ft")
     with start_field_robots(tmp_path, topology=Topology.MASTER):
         site = tmp_path / "fieldkit.yaml"
         roles = "roles: {masterless: {sender: turtlebot-1, receiver: duckiedrone-1}, "
         site.write_text(site.read_text(encoding="utf-8").replace("roles: {", roles), encoding="utf-8")
 
-        nothing = answered(tmp_path, "s", "", "s", "", "s", "", "s")
-        assert nothing.code == 1, nothing.err
-        assert "run the same command again" in nothing.err
+        skipped_run = run_with_answers(tmp_path, "s", "", "s", "", "s", "", "s")
+        assert skipped_run.code == 1, skipped_run.err
+        assert "run the same command again" in skipped_run.err
         assert trials(folder) == [], "skipped trials leave no folder"
 
-        first, second = nothing.events("campaign_planned")[0]["trials"]
-        run = answered(tmp_path, "s", "n rigged by Ann", "n wet grass", "", "")
+        first, second = skipped_run.events("campaign_planned")[0]["trials"]
+        run = run_with_answers(tmp_path, "s", "n rigged by Ann", "n wet grass", "", "")
         assert run.code == 0, run.err
         questions = [event["text"] for event in run.events("request")]
         move = {
@@ -121,16 +121,16 @@ def test_skipped_trials_are_offered_again_and_notes_are_kept(tmp_path: Path) -> 
         }
         assert questions == [move[first], rig[second], move[second], rig[first], move[first]]
         assert [event["may_skip"] for event in run.events("request")] == [True, False, True, False, True]
-    noted, plain = ((trial / "trial.yaml").read_text(encoding="utf-8") for trial in trials(folder))
-    assert "notes: campaign lawn; rigged by Ann; wet grass\n" in noted
-    assert "notes: campaign lawn\n" in plain
+    first_plan, second_plan = ((trial / "trial.yaml").read_text(encoding="utf-8") for trial in trials(folder))
+    assert "notes: campaign lawn; rigged by Ann; wet grass\n" in first_plan
+    assert "notes: campaign lawn\n" in second_plan
     assert [entry["note"] for entry in journal(folder) if entry["what"] == "placed"] == ["wet grass", ""]
     assert count_events(folder)[first, "skipped"] == 3
     assert count_events(folder)[first, "ended"] == count_events(folder)[second, "ended"] == 1
 
 
 def test_a_program_can_answer_through_a_pipe(tmp_path: Path) -> None:
-    folder = begin(tmp_path, "10ft")
+    folder = write_lab(tmp_path, "10ft")
     with start_field_robots(tmp_path, topology=Topology.MASTERLESS):
         text = (tmp_path / "lawn.yaml").read_text(encoding="utf-8").replace("[master, masterless]", "[masterless]")
         (tmp_path / "lawn.yaml").write_text(text, encoding="utf-8")

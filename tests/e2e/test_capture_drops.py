@@ -1,4 +1,4 @@
-"""Packets lost by tcpdump: values of a topic that depend on its captures are withheld, and a transfer is void."""
+"""If tcpdump drops packets, values of a topic that need its captures are withheld, and a transfer is void."""
 
 import re
 from collections.abc import Iterator
@@ -69,16 +69,18 @@ def with_drops(attempt: tuple[Plan, Path, journal.Attempt], capture: str) -> tup
     return verdict.problems, verdict.measured
 
 
-def delayed(measured: Measured) -> Iterator[str]:
-    """Yield the columns of time that the subscriber's program distorts too much, because this machine is busy."""
+def withheld_times(measured: Measured) -> Iterator[str]:
+    """Yield the columns of times that are withheld because this machine delayed the subscriber's program."""
     yield from (name for name in TIMES if "its program was delayed" in measured.missing.get(name, ""))
 
 
 @pytest.mark.parametrize("role", ["sender", "receiver"])
-def test_a_topic_keeps_the_values_from_its_logs(attempt: tuple[Plan, Path, journal.Attempt], role: str) -> None:
+def test_values_from_the_logs_of_a_topic_are_not_withheld(
+    attempt: tuple[Plan, Path, journal.Attempt], role: str
+) -> None:
     problems, measured = with_drops(attempt, f"topic.{role}")
     assert problems == ()
-    assert measured.values.keys() >= NEEDS_NO_CAPTURE - {*delayed(measured)}, measured.missing
+    assert measured.values.keys() >= NEEDS_NO_CAPTURE - {*withheld_times(measured)}, measured.missing
     reason = f"the capture of {role} lacks 12 packets that its kernel dropped"
     assert {measured.missing[name] for name in NEEDS_CAPTURES} == {reason}
     assert measured.values["topic_capture_withheld"] == reason
@@ -93,6 +95,6 @@ def test_without_drops_nothing_is_withheld(attempt: tuple[Plan, Path, journal.At
     assert "topic_capture_withheld" not in verdict.measured.values
 
 
-def test_a_transfer_needs_its_whole_capture(attempt: tuple[Plan, Path, journal.Attempt]) -> None:
+def test_a_transfer_is_void_if_its_capture_is_incomplete(attempt: tuple[Plan, Path, journal.Attempt]) -> None:
     problems, _ = with_drops(attempt, "transfer.sender")
     assert problems == ("transfer: sender capture: its kernel dropped 12 packets, its interface 0",)

@@ -1,4 +1,4 @@
-"""A topic between emulated robots: its repeat is valid, and invalid after a change of its subscriber's log."""
+"""The repeat of a topic between emulated robots is valid, and invalid after a change of the subscriber's log."""
 
 import struct
 import zlib
@@ -29,8 +29,8 @@ STREAM = procedure(
 )
 
 
-def shifted(content: bytes, by_ns: int) -> bytes:
-    """Return a log whose samples arrived later by this time, with a matching checksum."""
+def shift_arrivals(content: bytes, by_ns: int) -> bytes:
+    """Return a log whose samples arrive `by_ns` later, with a matching checksum."""
     head, size = len(records.MAGIC), records.RECORD.size
     rows = [list(records.RECORD.unpack_from(content, at)) for at in range(head, len(content), size)]
     for row in rows:
@@ -53,8 +53,8 @@ def test_a_changed_log_of_a_real_stream_is_detected(tmp_path: Path) -> None:
         log = folder / f"{name}.receiver-topic.bin"
         content = log.read_bytes()
         for changed, reason in (
-            (shifted(content, 50_000_000), "later than its capture for every sample"),
-            (shifted(content, -5_000_000), "earlier than their packets in its capture"),
+            (shift_arrivals(content, 50_000_000), "later than its capture for every sample"),
+            (shift_arrivals(content, -5_000_000), "earlier than their packets in its capture"),
             (content[:-40] + struct.pack("<d", 1.5) + content[-32:], "its checksum is wrong"),
         ):
             log.write_bytes(changed)

@@ -1,4 +1,4 @@
-"""Trials of 12 repeats with faults, each with another seed: none is lost, measured twice or void without a cause."""
+"""In trials with faults, no repeat is lost or measured twice, and no attempt is void without a fault."""
 
 import os
 import subprocess
@@ -14,7 +14,7 @@ IN_CI = 3
 """Seed of the trial in CI."""
 AT_NIGHT = (1, 2, 4, 5)
 DEBIAN = {1, 2}
-"""Seeds with Debian's ROS on the robots, which takes a third of the processor time of all programs."""
+"""Seeds of trials with Debian's ROS, which takes a third of the processor time of all programs."""
 FAULTS = 6
 REPEATS = 5
 """Repeats per protocol; if a trial ends before the last fault, another trial gets the remaining faults."""
@@ -23,20 +23,20 @@ LIMIT_S = 900
 
 @pytest.mark.emulated
 def test_no_repeat_is_lost_in_a_trial_with_faults(record_property: Callable[[str, object], None]) -> None:
-    (printed,) = outputs(IN_CI)
-    record_property("result", printed)
+    (output,) = outputs(IN_CI)
+    record_property("result", output)
 
 
 @pytest.mark.emulated
 @pytest.mark.nightly
 def test_no_repeat_of_four_more_trials_is_lost(record_property: Callable[[str, object], None]) -> None:
-    for printed in outputs(*AT_NIGHT):
-        record_property("result", printed)
+    for output in outputs(*AT_NIGHT):
+        record_property("result", output)
 
 
 def outputs(*seeds: int) -> list[str]:
-    """Run a trial per seed in parallel, as trials mostly wait; check the outputs and return them."""
-    running = [
+    """Run a trial per seed in parallel, because trials mostly wait; check the outputs and return them."""
+    processes = [
         subprocess.Popen(
             (
                 sys.executable,
@@ -58,16 +58,16 @@ def outputs(*seeds: int) -> list[str]:
         )
         for seed in seeds
     ]
-    printed = [process.communicate(timeout=LIMIT_S)[0] for process in running]
-    for process, text in zip(running, printed, strict=True):
+    texts = [process.communicate(timeout=LIMIT_S)[0] for process in processes]
+    for process, text in zip(processes, texts, strict=True):
         assert process.returncode == 0, text
         assert f"faults injected: {FAULTS}, repeats lost: 0" in text
         assert f"{2 * REPEATS} repeats planned, {2 * REPEATS} valid" in text
-    return [text.strip() for text in printed]
+    return [text.strip() for text in texts]
 
 
-def void(began_ns: int, ended_ns: int) -> VoidAttempt:
-    return VoidAttempt("tcp-01.void1", "why", began_ns, ended_ns)
+def void(started_ns: int, ended_ns: int) -> VoidAttempt:
+    return VoidAttempt("tcp-01.void1", "why", started_ns, ended_ns)
 
 
 FAULTS_AT = (InjectedFault("link cut", 100, 200), InjectedFault("fieldkit killed", RECOVERY_NS * 3, RECOVERY_NS * 3))

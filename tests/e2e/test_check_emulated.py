@@ -1,4 +1,4 @@
-"""`fieldkit check`, end to end: a ready lab, and labs with one injected fault each."""
+"""`fieldkit check` end to end, in a lab that is ready and in labs with a fault."""
 
 import subprocess
 import sys
@@ -33,7 +33,7 @@ def failed(run: Run) -> set[tuple[str, str]]:
 
 @pytest.fixture(scope="module")
 def field_robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FieldRobots]:
-    """Robots with Debian's ROS, whose programs are checked."""
+    """Robots with Debian's ROS, because its programs are checked."""
     with start_field_robots(tmp_path_factory.mktemp("lab"), site=DEFAULT_SITE) as robots:
         yield robots
 
@@ -45,7 +45,7 @@ def lab(field_robots: FieldRobots, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_ready_lab_is_ok_in_every_line(tmp_path: Path) -> None:
+def test_all_checks_of_a_lab_that_is_ready_are_ok(tmp_path: Path) -> None:
     run = run_here(tmp_path, "check")
     assert run.code == 0, run.out + run.err
     assert list(tmp_path.iterdir()) == []
@@ -63,20 +63,22 @@ def test_a_ready_lab_is_ok_in_every_line(tmp_path: Path) -> None:
         "battery",
     ):
         assert [line for line in lines if line.split()[0] == "ok" and check in line], check
-    assert "\x1b" not in run.out, "no terminal codes off a terminal"
+    assert "\x1b" not in run.out, "the output has no terminal codes if it is not a terminal"
 
 
-def test_the_field_backend_is_ok_and_leaves_nothing_on_the_robots(field_robots: FieldRobots, lab: Path) -> None:
+def test_checks_of_the_field_backend_are_ok_and_leave_no_files_on_the_robots(
+    field_robots: FieldRobots, lab: Path
+) -> None:
     run = run_here(lab, *CHECK)
     assert run.code == 0, run.out + run.err
     scan = findings_by_check(run)["turtlebot-1", "topic /scan"]
     assert scan["status"] == "ok"
     for shell in field_robots.testbed.shells.values():
-        left = shell.run(("ls", jobs.HOME), deadline=Deadline.after(30)).stdout.decode().split()
-        assert [name for name in left if not name.startswith("job-")] == []
+        file_names = shell.run(("ls", jobs.HOME), deadline=Deadline.after(30)).stdout.decode().split()
+        assert [name for name in file_names if not name.startswith("job-")] == []
 
 
-def test_each_fault_is_reported_with_its_remedy_and_the_rest_is_checked(field_robots: FieldRobots, lab: Path) -> None:
+def test_each_fault_is_reported_with_its_remedy_and_all_else_is_checked(field_robots: FieldRobots, lab: Path) -> None:
     copy_shipped(lab, "robots", "turtlebot3_burger", "netcat: nc.traditional", "netcat: nc.imaginary")
     copy_shipped(lab, "robots", "duckiedrone", "capture_right: direct", "capture_right: sudo")
     receiver = field_robots.testbed.shells[Role.RECEIVER]
@@ -114,7 +116,7 @@ def test_a_silent_topic_is_detected_before_the_trial(lab: Path) -> None:
 
 def test_an_unreachable_robot_does_not_prevent_checks_of_the_others(field_robots: FieldRobots, lab: Path) -> None:
     site = (lab / "fieldkit.yaml").read_text(encoding="utf-8")
-    # 192.0.2.0/24 is for documentation (RFC 5737) and not in use. The other robot's radio has another address.
+    # 192.0.2.0/24 is reserved for documentation (RFC 5737). The other robot's radio has a different address.
     address = field_robots.cast[Role.RECEIVER].address
     site = site.replace(f"port: {field_robots.links.port(Role.SENDER)}", "port: 1").replace(address, "192.0.2.1")
     (lab / "fieldkit.yaml").write_text(site, encoding="utf-8")
@@ -187,9 +189,9 @@ def test_a_trial_reports_warnings_and_stops_at_failures(lab: Path) -> None:
 
 
 def test_a_machine_without_a_hosts_file_is_sufficient(tmp_path: Path) -> None:
-    """Like a minimal Debian; its `/etc` is in a separate mount namespace."""
+    """A minimal Debian has no `/etc/hosts`; the changed `/etc` is in a separate mount namespace."""
     built_in_ros(tmp_path)
     script = 'cp -a /etc "$0" && rm -f "$0/hosts" && mount --bind "$0" /etc && test ! -e /etc/hosts && exec "$@"'
     argv = ("unshare", "--mount", "sh", "-c", script, str(tmp_path / "etc"), sys.executable, "-m", "fieldkit", *CHECK)
-    done = subprocess.run(argv, check=False, cwd=tmp_path, capture_output=True, text=True, timeout=LIMIT_S)
-    assert done.returncode == 0, done.stderr + done.stdout
+    completed = subprocess.run(argv, check=False, cwd=tmp_path, capture_output=True, text=True, timeout=LIMIT_S)
+    assert completed.returncode == 0, completed.stderr + completed.stdout

@@ -1,4 +1,4 @@
-"""`fieldkit check --ros`, end to end: robots with ROS 2, and real faults in their network namespaces."""
+"""`fieldkit check --ros` end to end, on robots with ROS 2 and with faults in their network namespaces."""
 
 from pathlib import Path
 
@@ -46,8 +46,8 @@ def test_faults_of_the_ros_network_are_reported_with_evidence(
         )
         run = run_here(tmp_path, "check", "--ros", "--topology", "master", "--json")
         for shell in robots.testbed.shells.values():
-            left = shell.run(("ls", ".fieldkit"), deadline=Deadline.after(60)).stdout.decode().split()
-            assert [name for name in left if not name.startswith(("job-", "agent-"))] == []
+            file_names = shell.run(("ls", ".fieldkit"), deadline=Deadline.after(60)).stdout.decode().split()
+            assert [name for name in file_names if not name.startswith(("job-", "agent-"))] == []
     findings = {(finding["robot"], finding["check"]): finding for finding in run.events("finding")}
     statuses = {key: finding["status"] for key, finding in findings.items() if finding["status"] != "ok"}
     assert statuses == {

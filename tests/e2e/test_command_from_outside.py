@@ -1,4 +1,4 @@
-"""A command of another package: the example of docs/add-a-command.md, loaded by its entry point, and broken ones."""
+"""Commands of other packages: the example of docs/add-a-command.md, and commands that cannot be loaded."""
 
 import os
 import re
@@ -19,33 +19,38 @@ Fieldkit = Callable[..., subprocess.CompletedProcess[str]]
 
 
 def install(folder: Path, package: str, group: str, points: dict[str, str]) -> None:
-    about = folder / f"{package}-1.0.dist-info"
-    about.mkdir(parents=True)
-    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n", encoding="utf-8")
+    metadata = folder / f"{package}-1.0.dist-info"
+    metadata.mkdir(parents=True)
+    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n", encoding="utf-8")
     lines = [f"{name} = {target}" for name, target in points.items()]
     text = "\n".join(["[console_scripts]", "other = worst_command:run", f"[{group}]", *lines, "[last]", "a = b:c"])
-    (about / "entry_points.txt").write_text(text, encoding="utf-8")
+    (metadata / "entry_points.txt").write_text(text, encoding="utf-8")
 
 
 @pytest.fixture
 def fieldkit(tmp_path: Path) -> Fieldkit:
-    """Return a function that runs fieldkit with installed packages: the page's example, and broken ones."""
+    """A function that runs fieldkit with installed packages: the page's example, and broken packages."""
     page = PAGE.read_text(encoding="utf-8")
     (source,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     (entry,) = re.findall(r'^    \[project\.entry-points\."(.*)"\]\n    (\w+) = "(.*)"$', page, re.MULTILINE)
     group, name, target = entry
-    installed = tmp_path / "installed"
-    broken = {"absent": "no_such_package:add", "failing": "failing:add", "unfinished": "failing:later", name: target}
-    install(installed, "worst_command", group, broken | {"trial": "failing:add"})
-    install(installed, "double", group, {"twice": "double:add"})
-    install(installed, "again", group, {"twice": "again:add"})
-    (installed / f"{target.partition(':')[0]}.py").write_text(source, encoding="utf-8")
-    (installed / "failing.py").write_text(
+    packages = tmp_path / "installed"
+    entry_points = {
+        "absent": "no_such_package:add",
+        "failing": "failing:add",
+        "unfinished": "failing:later",
+        name: target,
+    }
+    install(packages, "worst_command", group, entry_points | {"trial": "failing:add"})
+    install(packages, "double", group, {"twice": "double:add"})
+    install(packages, "again", group, {"twice": "again:add"})
+    (packages / f"{target.partition(':')[0]}.py").write_text(source, encoding="utf-8")
+    (packages / "failing.py").write_text(
         "def add(parser):\n    raise RuntimeError('not today')\n\n\n"
         "def later(parser):\n    parser.set_defaults(run='no_such_package:run')\n",
         encoding="utf-8",
     )
-    environment = os.environ | {"PYTHONPATH": f"{installed}{os.pathsep}{ROOT}"}
+    environment = os.environ | {"PYTHONPATH": f"{packages}{os.pathsep}{ROOT}"}
 
     def run(*words: str, **variables: str) -> subprocess.CompletedProcess[str]:
         command = (sys.executable, "-m", "fieldkit", *words)
@@ -63,9 +68,9 @@ def fieldkit(tmp_path: Path) -> Fieldkit:
 
 
 def test_the_command_runs_with_its_declared_options(fieldkit: Fieldkit) -> None:
-    done = fieldkit("worst", str(TRIAL))
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[2].split() == ["udp-1", "0.125"]
+    completed = fieldkit("worst", str(TRIAL))
+    assert completed.returncode == 0, completed.stderr
+    assert completed.stdout.splitlines()[2].split() == ["udp-1", "0.125"]
     assert fieldkit("worst", str(TRIAL), "--by", "rtt_loss").stdout.splitlines()[2].split() == ["udp-2", "0.9"]
 
 
@@ -104,6 +109,6 @@ def test_a_broken_package_is_named_when_its_command_is_used(fieldkit: Fieldkit, 
     assert "\n  remedy: " in result.stderr
 
 
-def test_other_commands_work_and_keep_their_names_despite_broken_packages(fieldkit: Fieldkit) -> None:
+def test_broken_packages_do_not_affect_other_commands_and_their_names(fieldkit: Fieldkit) -> None:
     assert "usage: fieldkit trial" in fieldkit("trial", "--help").stdout
     assert fieldkit("columns", "show", "ip_loss").returncode == 0

@@ -1,4 +1,4 @@
-"""The conformance suite for every connection from fieldkit to a robot."""
+"""Runs the conformance suite on every kind of connection from fieldkit to a robot."""
 
 import subprocess
 from collections.abc import Callable, Iterator
@@ -72,22 +72,22 @@ def emulated(folder: Path, control: str) -> Iterator[tuple[Cast, EmulatedTestbed
         yield cast, testbed
 
 
-def rebooting(testbed: Testbed) -> Callable[[], object]:
+def make_reboot(testbed: Testbed) -> Callable[[], object]:
     return partial(testbed.inject, Fault(FaultKind.REBOOT, Role.SENDER))
 
 
 class OfTestbed(ShellConformance, BackendConformance, RebootConformance):
-    """All suites, on the testbed of the fixture `opened`."""
+    """All suites, on the cast and testbed of the fixture `cast_and_testbed`."""
 
     @pytest.fixture(scope="class")
     @classmethod
-    def cast(cls, opened: tuple[Cast, Testbed]) -> Cast:
-        return opened[0]
+    def cast(cls, cast_and_testbed: tuple[Cast, Testbed]) -> Cast:
+        return cast_and_testbed[0]
 
     @pytest.fixture(scope="class")
     @classmethod
-    def testbed(cls, opened: tuple[Cast, Testbed]) -> Testbed:
-        return opened[1]
+    def testbed(cls, cast_and_testbed: tuple[Cast, Testbed]) -> Testbed:
+        return cast_and_testbed[1]
 
     @pytest.fixture
     def topology(self) -> Topology:
@@ -97,14 +97,14 @@ class OfTestbed(ShellConformance, BackendConformance, RebootConformance):
 class TestEmulated(OfTestbed):
     @pytest.fixture(scope="class")
     @classmethod
-    def opened(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Cast, Testbed]]:
-        with emulated(tmp_path_factory.mktemp("separate"), "separate") as opened:
-            yield opened
+    def cast_and_testbed(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Cast, Testbed]]:
+        with emulated(tmp_path_factory.mktemp("separate"), "separate") as cast_and_testbed:
+            yield cast_and_testbed
 
     @pytest.fixture(scope="class")
     @classmethod
-    def subject(cls, opened: tuple[Cast, EmulatedTestbed]) -> Subject:
-        testbed = opened[1]
+    def subject(cls, cast_and_testbed: tuple[Cast, EmulatedTestbed]) -> Subject:
+        testbed = cast_and_testbed[1]
         robot = testbed.robots[Role.SENDER]
 
         def loopback(state: str) -> None:
@@ -115,26 +115,26 @@ class TestEmulated(OfTestbed):
 
     @pytest.fixture
     def reboot(self, testbed: Testbed) -> Callable[[], object]:
-        return rebooting(testbed)
+        return make_reboot(testbed)
 
 
 class TestEmulatedOverTheRadio(OfTestbed):
     @pytest.fixture(scope="class")
     @classmethod
-    def opened(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Cast, Testbed]]:
-        with emulated(tmp_path_factory.mktemp("radio"), "radio") as opened:
-            yield opened
+    def cast_and_testbed(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Cast, Testbed]]:
+        with emulated(tmp_path_factory.mktemp("radio"), "radio") as cast_and_testbed:
+            yield cast_and_testbed
 
     @pytest.fixture(scope="class")
     @classmethod
-    def subject(cls, opened: tuple[Cast, EmulatedTestbed]) -> Subject:
-        testbed = opened[1]
+    def subject(cls, cast_and_testbed: tuple[Cast, EmulatedTestbed]) -> Subject:
+        testbed = cast_and_testbed[1]
         robot = testbed.robots[Role.SENDER]
         return Subject(testbed.shells[Role.SENDER], robot.switch_off, robot.switch_on, GIVE_UP_S)
 
     @pytest.fixture
     def reboot(self, testbed: Testbed) -> Callable[[], object]:
-        return rebooting(testbed)
+        return make_reboot(testbed)
 
 
 class TestField(OfTestbed):
@@ -146,7 +146,7 @@ class TestField(OfTestbed):
 
     @pytest.fixture(scope="class")
     @classmethod
-    def opened(cls, field_robots: FieldRobots) -> Iterator[tuple[Cast, Testbed]]:
+    def cast_and_testbed(cls, field_robots: FieldRobots) -> Iterator[tuple[Cast, Testbed]]:
         site = field_robots.folder / "fieldkit.yaml"
         site.write_text(f"patience: {RECONNECT_TIMEOUT_S:g}s\n{site.read_text(encoding='utf-8')}", encoding="utf-8")
         backend = load_backend("field", *load_site(site))
@@ -156,10 +156,10 @@ class TestField(OfTestbed):
 
     @pytest.fixture(scope="class")
     @classmethod
-    def subject(cls, field_robots: FieldRobots, opened: tuple[Cast, Testbed]) -> Subject:
+    def subject(cls, field_robots: FieldRobots, cast_and_testbed: tuple[Cast, Testbed]) -> Subject:
         cut, restore = (partial(act, Role.SENDER) for act in (field_robots.links.cut, field_robots.links.restore))
-        return Subject(opened[1].shells[Role.SENDER], cut, restore, GIVE_UP_S)
+        return Subject(cast_and_testbed[1].shells[Role.SENDER], cut, restore, GIVE_UP_S)
 
     @pytest.fixture
     def reboot(self, field_robots: FieldRobots) -> Callable[[], object]:
-        return rebooting(field_robots.testbed)
+        return make_reboot(field_robots.testbed)

@@ -1,4 +1,4 @@
-"""`control: radio` with the sender out of range for a while: jobs continue, and nothing is measured twice."""
+"""With `control: radio`, jobs continue while the sender is out of range, and no job runs twice."""
 
 import subprocess
 import threading
@@ -62,8 +62,8 @@ def is_sending(testbed: EmulatedTestbed) -> bool:
 
 
 @dataclass
-class Observed:
-    """Notes of a trial, and the jobs of its sender before and after a moment."""
+class Observations:
+    """The notes of a trial, and the jobs of its sender before the outage and before the evidence is collected."""
 
     notes: list[str] = field(default_factory=list)
     before: dict[str, str] = field(default_factory=dict)
@@ -71,7 +71,7 @@ class Observed:
 
 
 @contextmanager
-def captured(testbed: EmulatedTestbed, path: Path) -> Iterator[None]:
+def capture(testbed: EmulatedTestbed, path: Path) -> Iterator[None]:
     """Capture the packets of the transfer and of SSH on the sender's radio."""
     enter = ("nsenter", f"--net={inside(testbed)}/ns/net")
     options = ("-n", "-U", "--immediate-mode", "-s", "128", "-B", "4096", "-Z", "root", "-w", str(path))
@@ -88,7 +88,8 @@ def captured(testbed: EmulatedTestbed, path: Path) -> Iterator[None]:
 def control_packets_during_transfer(path: Path) -> list[str]:
     """Return the SSH packets of fieldkit or a robot over the radio during the transfer.
 
-    Bare acknowledgements are omitted, and so are the packets by which the kernels end a broken connection: TCP
+    Pure acknowledgements are omitted. The packets with which the kernels close a broken connection are also omitted:
+    TCP
     retransmits unacknowledged data with exponential backoff, and receives a reset.
     """
     packets = list(rdpcap(str(path)))
@@ -100,13 +101,13 @@ def control_packets_during_transfer(path: Path) -> list[str]:
     control = [packet for packet in packets if TCP in packet and 22 in (packet[TCP].sport, packet[TCP].dport)]
     assert control
     assert times
-    newest = [packet[TCP].sport for packet in control if packet[TCP].flags == "S"][-1]
+    newest_port = [packet[TCP].sport for packet in control if packet[TCP].flags == "S"][-1]
     ends: dict[tuple[int, int], int] = {}
     control_packets = []
     for packet in control:
         tcp = packet[TCP]
         direction, end = (tcp.sport, tcp.dport), tcp.seq + len(tcp.payload)
-        is_kernel_cleanup = newest not in direction and (end <= ends.get(direction, 0) or tcp.flags == "R")
+        is_kernel_cleanup = newest_port not in direction and (end <= ends.get(direction, 0) or tcp.flags == "R")
         ends[direction] = max(end, ends.get(direction, 0))
         if (
             min(times) < float(packet.time) < max(times)
@@ -117,19 +118,19 @@ def control_packets_during_transfer(path: Path) -> list[str]:
     return control_packets
 
 
-def run_with_outage(lab_folder: Path, protocol: Protocol, phase: str, is_under_way: UnderWay) -> Observed:
-    """Run a trial of one repeat whose sender leaves the range when `is_under_way` is True in `phase`."""
+def run_with_outage(lab_folder: Path, protocol: Protocol, phase: str, is_under_way: UnderWay) -> Observations:
+    """Run a trial of one repeat; its sender leaves the range in `phase` as soon as `is_under_way` returns True."""
     backend = EmulatedBackend(*load_site(lab_folder / SITE_FILE))
     request = TrialRequest(
         load_procedure("quick"), parse_distance("5m"), protocols=(protocol,), repeats=1, record_s=RECORD_S
     )
     cast = backend.cast(request.effective_topology)
     plan = make_plan(request, backend="emulated", cast=cast, now=datetime.now(UTC))
-    observed = Observed()
+    observations = Observations()
 
     def leave_range() -> None:
         wait_until(lambda: is_under_way(testbed), Deadline.after(60))
-        observed.before = jobs_of(testbed)
+        observations.before = jobs_of(testbed)
         testbed.inject(Fault(FaultKind.OUT_OF_RANGE, Role.SENDER, OUTAGE_S))
 
     outage = threading.Thread(target=leave_range)
@@ -137,19 +138,19 @@ def run_with_outage(lab_folder: Path, protocol: Protocol, phase: str, is_under_w
     def watch(event: Event) -> None:
         match event:
             case Note(text):
-                observed.notes.append(text)
+                observations.notes.append(text)
             case PhaseStarted(name) if name == phase:
                 outage.start()
             case PhaseStarted("collect evidence"):
-                observed.after = jobs_of(testbed)
+                observations.after = jobs_of(testbed)
 
-    with backend.open(cast, seed=1, sink=watch, operator=Unattended()) as opened:
-        assert isinstance(opened, EmulatedTestbed)
-        testbed = opened
-        with captured(testbed, lab_folder / "radio.pcap"):
+    with backend.open(cast, seed=1, sink=watch, operator=Unattended()) as opened_testbed:
+        assert isinstance(opened_testbed, EmulatedTestbed)
+        testbed = opened_testbed
+        with capture(testbed, lab_folder / "radio.pcap"):
             run_trial(plan, testbed, lab_folder / "trials", watch)
         outage.join()
-    return observed
+    return observations
 
 
 @pytest.mark.parametrize(
@@ -160,26 +161,28 @@ def run_with_outage(lab_folder: Path, protocol: Protocol, phase: str, is_under_w
         (Protocol.UDP, "transfer", is_sending),
     ],
 )
-def test_evidence_of_a_sender_that_was_out_of_range_is_fetched_and_nothing_runs_twice(
+def test_evidence_of_a_sender_that_was_out_of_range_is_fetched_and_no_job_runs_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, protocol: Protocol, phase: str, is_under_way: UnderWay
 ) -> None:
     folder = make_lab(tmp_path / "lab", RADIO)
     site = folder / SITE_FILE
     site.write_text(site.read_text(encoding="utf-8") + "control: radio\n", encoding="utf-8")
     monkeypatch.chdir(folder)
-    observed = run_with_outage(folder, protocol, phase, is_under_way)
+    observations = run_with_outage(folder, protocol, phase, is_under_way)
     for state in ("lost", "open again"):
-        link_was_reported = any(f"link is {state}" in note for note in observed.notes)
+        link_was_reported = any(f"link is {state}" in note for note in observations.notes)
         # A TCP transfer is longer than the outage, and an idle connection is not affected by it.
         assert link_was_reported is (phase == "record" or protocol is Protocol.UDP)
     assert control_packets_during_transfer(folder / "radio.pcap") == []
-    assert observed.before.keys() == ({"record"} if phase == "record" else {"record", "capture", "send"})
-    assert observed.after.keys() == {"record", "capture", "send", "ping"}
-    assert observed.after.items() >= observed.before.items(), "the jobs are those that ran when the link died"
+    assert observations.before.keys() == ({"record"} if phase == "record" else {"record", "capture", "send"})
+    assert observations.after.keys() == {"record", "capture", "send", "ping"}
+    assert observations.after.items() >= observations.before.items(), (
+        "the jobs that ran during the outage are the same jobs"
+    )
     trial = only_trial(folder)
     (row,) = rows(trial)
     assert row["status"] == "valid", row["reason"]
-    assert 0 < int(row["bag_messages"]) <= 11, "2 s of a 5 Hz laser, less what it takes to subscribe"
+    assert 0 < int(row["bag_messages"]) <= 11, "2 s of a 5 Hz laser, minus the time to subscribe"
     packets = rdpcap(str(trial / "repeats" / f"{protocol}-01" / "sender.pcap"))
     ports = {packet[layer].sport for packet in packets for layer in (TCP, UDP) if layer in packet}
     assert len(ports - {1234}) == 1, "each netcat sends from its own port"

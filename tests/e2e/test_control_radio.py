@@ -1,4 +1,4 @@
-"""`control: radio`: SSH crosses the radio under test, and the measured values stay correct."""
+"""With `control: radio`, SSH uses the radio under test, and the measured values are still correct."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,7 +27,7 @@ FETCHED_BYTES = 1_000_000
 LAPTOP_ADDRESS = bytes((10, 42, 0, 254))
 
 
-def at(distance: str, topology: Topology) -> Placement:
+def placement(distance: str, topology: Topology) -> Placement:
     return Placement(Scenario.LOS, topology, parse_distance(distance))
 
 
@@ -55,28 +55,28 @@ def emulation(request: pytest.FixtureRequest) -> Iterator[EmulatedTestbed]:
     with testbed.bring_up(
         cast, options=EmulatedOptions(radio=radio), world=load_world("lawn"), ros=ros, seed=1, control=Control.RADIO
     ) as robots:
-        robots.place(at("10m", request.param))
+        robots.place(placement("10m", request.param))
         yield robots
 
 
 @pytest.mark.emulated
 def test_ssh_crosses_the_medium_like_the_packets_of_any_station(emulation: EmulatedTestbed) -> None:
-    done = emulation.shells[Role.SENDER].run(
+    completed = emulation.shells[Role.SENDER].run(
         ("head", "-c", str(FETCHED_BYTES), "/dev/zero"), deadline=Deadline.after(30)
     )
-    assert len(done.stdout) == FETCHED_BYTES
+    assert len(completed.stdout) == FETCHED_BYTES
     master = Role.RELAY in emulation.robots
     last_hop = "duckiedrone-1" if master else "turtlebot-1"
 
     samples: list[MediumStats] = []
 
-    def at_rest() -> bool:  # no packet is in flight on a hop or to the laptop
+    def is_idle() -> bool:  # no packet is in flight on a hop or to the laptop
         samples.append(stats := emulation.medium.stats())
         hop = stats.links[last_hop, "laptop"]
         return hop.sent == hop.delivered == stats.ports["laptop"].delivered_packets
 
-    wait_until(at_rest, Deadline.after(30))
-    stats = samples[-1]  # a later one may be taken while a packet is in flight
+    wait_until(is_idle, Deadline.after(30))
+    stats = samples[-1]  # in a later sample, a packet may be in flight
     assert stats.ports["laptop"].delivered_packets > FETCHED_BYTES / 1500
     assert stats.links["turtlebot-1", "laptop"].sent == (0 if master else stats.ports["laptop"].delivered_packets)
     assert stats.links["turtlebot-1", emulation.robots[Role.RECEIVER].name].sent == 0
@@ -85,16 +85,16 @@ def test_ssh_crosses_the_medium_like_the_packets_of_any_station(emulation: Emula
 @pytest.mark.emulated
 def test_a_robot_out_of_range_is_unreachable_until_it_returns(emulation: EmulatedTestbed) -> None:
     topology = Topology.MASTER if Role.RELAY in emulation.robots else Topology.MASTERLESS
-    emulation.place(at("1km", topology))
+    emulation.place(placement("1km", topology))
     with pytest.raises(LinkError):
         emulation.shells[Role.SENDER].run(("true",), deadline=Deadline.after(0.5))
-    emulation.place(at("10m", topology))
+    emulation.place(placement("10m", topology))
     assert emulation.shells[Role.SENDER].run(("echo", "back"), deadline=Deadline.after(30)).stdout == b"back\n"
 
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("radio", mark_nightly(["{fading: false}", "{loss: 10%}"]))
-def test_a_trial_ends_valid_and_captures_no_ssh_packets(tmp_path: Path, radio: str) -> None:
+def test_a_trial_is_valid_and_captures_no_ssh_packets(tmp_path: Path, radio: str) -> None:
     folder = make_lab(tmp_path / "lab", radio)
     site = folder / "fieldkit.yaml"
     site.write_text(site.read_text(encoding="utf-8") + "control: radio\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""`fieldkit cosim run` with radios of 802.11n, ac and ax: a saturated stream, and errors of impossible radios."""
+"""`fieldkit cosim run` with radios of 802.11n, ac and ax, in a fast stream, and errors of impossible radios."""
 
 import csv
 import io
@@ -27,13 +27,13 @@ def run(lab: Path, radio: str) -> Run:
     return run_here(lab, "cosim", "run", "wide.yaml", "--format", "csv")
 
 
-def loss(finished: Run) -> float:
-    assert finished.code == 0, finished.err
-    (row,) = csv.DictReader(io.StringIO(finished.out))
+def loss(completed_run: Run) -> float:
+    assert completed_run.code == 0, completed_run.err
+    (row,) = csv.DictReader(io.StringIO(completed_run.out))
     return float(row["loss"])
 
 
-def test_a_wide_radio_with_aggregates_carries_what_80211g_cannot(tmp_path: Path) -> None:
+def test_a_wide_radio_with_aggregation_carries_a_stream_that_80211g_cannot(tmp_path: Path) -> None:
     """The stream needs 64 Mbit/s."""
     wide = "{standard: 802.11ax 5 GHz, phy: {width_mhz: 80, streams: 2}}"
     assert loss(run(tmp_path, wide)) < 0.01
@@ -49,6 +49,6 @@ def test_a_wide_radio_with_aggregates_carries_what_80211g_cannot(tmp_path: Path)
     ],
 )
 def test_an_impossible_radio_is_rejected_with_its_reason(tmp_path: Path, radio: str, message: str) -> None:
-    finished = run(tmp_path, radio)
-    assert finished.code != 0
-    assert message in " ".join(finished.err.split())
+    completed_run = run(tmp_path, radio)
+    assert completed_run.code != 0
+    assert message in " ".join(completed_run.err.split())

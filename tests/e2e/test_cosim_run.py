@@ -1,4 +1,4 @@
-"""`fieldkit cosim run` on the command line: output, recordings, bad inputs, Ctrl-C, pipes."""
+"""`fieldkit cosim run` on the command line: output, recordings, bad inputs, Ctrl-C and pipes."""
 
 import csv
 import io
@@ -64,7 +64,7 @@ def event_hash(run: Run) -> str:
     return line
 
 
-def test_it_prints_each_flow_in_every_format(lab: Path) -> None:
+def test_each_flow_is_printed_in_every_format(lab: Path) -> None:
     table = cosim(lab, "run", "pass.yaml")
     assert table.code == 0, table.err
     assert "state/bob" in table.out
@@ -98,11 +98,11 @@ def test_all_seeds_of_the_scenario_are_run_by_default(lab: Path) -> None:
     assert seeds("shootout", "--policy", "scheduled") == ["2"]
     cosim(lab, "run", "pass.yaml", "--duration", "100ms", "--out", "sim")
     assert sorted(path.parent.name for path in (lab / "sim").glob("*/run.json")) == ["seed-3", "seed-7"]
-    rejected = cosim(lab, "run", "pass.yaml", "--set", "seeds=[1, 1]")
-    assert (rejected.code, "a seed is listed twice" in rejected.err) == (2, True)
+    rejected_run = cosim(lab, "run", "pass.yaml", "--set", "seeds=[1, 1]")
+    assert (rejected_run.code, "a seed is listed twice" in rejected_run.err) == (2, True)
 
 
-def test_a_folder_has_a_recording_for_each_seed_and_equal_runs_are_equal(lab: Path) -> None:
+def test_a_folder_has_a_recording_per_seed_and_is_reproducible(lab: Path) -> None:
     for name in ("one", "two"):
         run = cosim(lab, "run", "pass.yaml", "--seeds", "2", "--out", f"{name}/sim")
         assert run.code == 0, run.err
@@ -122,10 +122,10 @@ def test_a_folder_has_a_recording_for_each_seed_and_equal_runs_are_equal(lab: Pa
 
 def test_a_recording_reproduces_the_numbers_and_can_be_plotted(lab: Path) -> None:
     original = cosim(lab, "run", "pass.yaml", "--out", "sim")
-    replayed = cosim(lab, "replay", "sim")
-    assert replayed.code == 0, replayed.err
-    assert event_hash(replayed) == event_hash(original)
-    assert replayed.out.splitlines()[1:4] == original.out.splitlines()[1:4]
+    replayed_run = cosim(lab, "replay", "sim")
+    assert replayed_run.code == 0, replayed_run.err
+    assert event_hash(replayed_run) == event_hash(original)
+    assert replayed_run.out.splitlines()[1:4] == original.out.splitlines()[1:4]
     assert cosim(lab, "plot", "sim", "--out", "run.svg").code == 0
     assert "state/bob" in (lab / "run.svg").read_text(encoding="utf-8")
 
@@ -133,22 +133,22 @@ def test_a_recording_reproduces_the_numbers_and_can_be_plotted(lab: Path) -> Non
 def test_replay_and_plot_reject_invalid_recordings(lab: Path) -> None:
     cosim(lab, "run", "pass.yaml", "--seeds", "2", "--duration", "100ms", "--out", "sim")
     for words in (("replay", "sim"), ("plot", "sim")):
-        rejected = cosim(lab, *words)
-        assert (rejected.code, "give the folder of one recording: sim/seed-1" in rejected.err) == (4, True), (
-            rejected.err
+        rejected_run = cosim(lab, *words)
+        assert (rejected_run.code, "give the folder of one recording: sim/seed-1" in rejected_run.err) == (4, True), (
+            rejected_run.err
         )
     assert "there is no recording" in cosim(lab, "replay", ".").err
-    damaged = next((lab / "sim" / "seed-1" / "packets").iterdir())
-    damaged.write_bytes(damaged.read_bytes()[:-1])
-    rejected = cosim(lab, "replay", "sim/seed-1")
-    assert (rejected.code, "was changed after the run" in rejected.err) == (4, True), rejected.err
+    damaged_file = next((lab / "sim" / "seed-1" / "packets").iterdir())
+    damaged_file.write_bytes(damaged_file.read_bytes()[:-1])
+    rejected_run = cosim(lab, "replay", "sim/seed-1")
+    assert (rejected_run.code, "was changed after the run" in rejected_run.err) == (4, True), rejected_run.err
     assert "use the suffix .svg, .pdf, .png" in cosim(lab, "plot", "sim/seed-2", "--out", "run.txt").err
     manifest = read_manifest(lab / "sim" / "seed-2")
     about = replace(manifest.about, scenario="- of another version")
     write_manifest(lab / "sim" / "seed-2", replace(manifest, about=about, scenario_hash=about.scenario_hash))
     for command in ("replay", "plot"):
-        rejected = cosim(lab, command, "sim/seed-2")
-        assert (rejected.code, "its scenario cannot be read" in rejected.err) == (4, True), rejected.err
+        rejected_run = cosim(lab, command, "sim/seed-2")
+        assert (rejected_run.code, "its scenario cannot be read" in rejected_run.err) == (4, True), rejected_run.err
 
 
 @pytest.mark.parametrize(
@@ -175,13 +175,13 @@ def test_replay_and_plot_reject_invalid_recordings(lab: Path) -> None:
 def test_bad_input_is_reported_with_a_remedy(lab: Path, words: tuple[str, ...], message: str, remedy: str) -> None:
     (lab / "taken").mkdir()
     (lab / "taken" / "file").touch()
-    rejected = cosim(lab, *words)
-    assert rejected.code == 2, rejected.out + rejected.err
-    assert rejected.err.startswith("error: ")
-    assert message in rejected.err
-    assert remedy in rejected.err
-    assert not rejected.out
-    assert "Traceback" not in rejected.err
+    rejected_run = cosim(lab, *words)
+    assert rejected_run.code == 2, rejected_run.out + rejected_run.err
+    assert rejected_run.err.startswith("error: ")
+    assert message in rejected_run.err
+    assert remedy in rejected_run.err
+    assert not rejected_run.out
+    assert "Traceback" not in rejected_run.err
 
 
 def test_ctrl_c_keeps_the_recording(lab: Path) -> None:
@@ -194,9 +194,9 @@ def test_ctrl_c_keeps_the_recording(lab: Path) -> None:
     assert "Traceback" not in run.err
     (row,) = rows((lab / "sim" / "trial.csv").read_text(encoding="utf-8"))
     assert (row["status"], row["reason"].partition(" at ")[0]) == ("failed", "interrupted")
-    replayed = cosim(lab, "replay", "sim")
-    assert "(interrupted)" in replayed.err
-    assert event_hash(replayed) == event_hash(run), "the recording equals the output"
+    replayed_run = cosim(lab, "replay", "sim")
+    assert "(interrupted)" in replayed_run.err
+    assert event_hash(replayed_run) == event_hash(run), "the recording equals the output"
 
 
 def test_ctrl_c_stops_a_run_of_many_seeds_and_keeps_finished_ones(lab: Path) -> None:
@@ -211,23 +211,23 @@ def test_ctrl_c_stops_a_run_of_many_seeds_and_keeps_finished_ones(lab: Path) -> 
     finished_seeds = sorted(
         int(path.parent.name.removeprefix("seed-")) for path in (lab / "sim").glob("seed-*/trial.csv")
     )
-    printed = [int(line.split()[0]) for line in run.out.splitlines() if " state/bob " in line]
-    assert printed
+    printed_seeds = [int(line.split()[0]) for line in run.out.splitlines() if " state/bob " in line]
+    assert printed_seeds
     # One more seed may have finished after the last report.
-    assert set(printed) <= set(finished_seeds)
-    assert f"interrupted: {len(printed)} of 10000 seeds had finished" in run.err
-    aggregated = run_here(lab, "aggregate", "sim", "--format", "csv")
-    assert aggregated.code == 0, aggregated.err
+    assert set(printed_seeds) <= set(finished_seeds)
+    assert f"interrupted: {len(printed_seeds)} of 10000 seeds had finished" in run.err
+    aggregate_run = run_here(lab, "aggregate", "sim", "--format", "csv")
+    assert aggregate_run.code == 0, aggregate_run.err
 
 
-def test_a_policy_without_a_window_ends_the_run_and_keeps_the_recording(lab: Path) -> None:
-    # The publisher is at rest, and the subscriber reaches 0.9 m/s: 0.5 ms minus 0.9 ms.
+def test_a_policy_that_finds_no_window_ends_the_run_and_keeps_the_recording(lab: Path) -> None:
+    # The publisher is stationary, and the subscriber reaches 0.9 m/s, so the window would be 0.5 ms - 0.9 ms.
     raw = ("--policy", "velocity_aware_raw", "--window", "0.5ms", "--set", "physics.step=0.1ms")
     run = cosim(lab, "run", "pass.yaml", *raw, "--out", "sim")
     assert run.code == 2
     assert "w + (Vp - Vs)/1000" in run.err
-    replayed = cosim(lab, "replay", "sim", "--format", "csv")
-    assert 0 < int(rows(replayed.out)[0]["sent"]) < 100
+    replayed_run = cosim(lab, "replay", "sim", "--format", "csv")
+    assert 0 < int(rows(replayed_run.out)[0]["sent"]) < 100
 
 
 def test_faults_are_reported_with_recovered_flows_and_times(lab: Path) -> None:
@@ -249,7 +249,7 @@ def test_faults_are_reported_with_recovered_flows_and_times(lab: Path) -> None:
     row = rows_by_trial["sim/ping/ann"]
     assert (row["rtt_sent"], row["rtt_received"], row["rtt_payload_bytes"]) == ("10", "6", "56")
     assert float(row["rtt_loss"]) == pytest.approx(0.4)
-    # Both directions take some 0.1 ms; the policy delays nothing, but a responder resumes only at the end of a
+    # Each direction takes about 0.1 ms. The policy delays no packets, but a responder resumes only at the end of a
     # window.
     assert 0 < float(row["rtt_min_s"]) <= float(row["rtt_median_s"]) <= float(row["rtt_max_s"]) < 0.01
     assert not rows_by_trial["sim/state/bob"]["rtt_sent"]
@@ -264,9 +264,9 @@ def test_an_unresponsive_federate_is_named_and_the_recording_is_kept(lab: Path) 
     run = cosim(lab, "run", "pass.yaml", "--set", stall, "--deadline", "200ms", "--out", "sim")
     assert run.code == 3
     assert "network has not answered for 0.2 s: request to advance from 0.19" in run.err
-    replayed = cosim(lab, "replay", "sim")
-    assert "(failed): UnansweredError: network has not answered" in replayed.err
-    assert event_hash(replayed) == event_hash(run)
+    replayed_run = cosim(lab, "replay", "sim")
+    assert "(failed): UnansweredError: network has not answered" in replayed_run.err
+    assert event_hash(replayed_run) == event_hash(run)
     assert "--deadline 30s" in cosim(lab, "run", "pass.yaml", "--deadline", "0s").err
 
 
@@ -279,17 +279,17 @@ def test_a_recording_has_a_capture_per_robot_and_can_be_converted_to_mcap(lab: P
     with (lab / "sim.mcap").open("rb") as file:
         topics = {channel.topic for _, channel, _ in make_reader(file).iter_messages()}
     assert topics == {"/tf", "/states/ann", "/states/bob", "/packets/state/bob"}
-    rejected = cosim(lab, "replay", "sim", "--mcap", "none/sim.mcap")
-    assert (rejected.code, "choose another --mcap" in rejected.err) == (2, True), rejected.err
+    rejected_run = cosim(lab, "replay", "sim", "--mcap", "none/sim.mcap")
+    assert (rejected_run.code, "choose another --mcap" in rejected_run.err) == (2, True), rejected_run.err
 
 
 def test_equal_seeds_give_equal_hashes_under_any_load(lab: Path) -> None:
-    """Run alone, and while other processes use all processors."""
+    """One run is alone on the machine, and the other runs while processes use all processors."""
     alone = cosim(lab, "run", "pass.yaml", "--seed", "7")
-    with ExitStack() as busy:
+    with ExitStack() as load:
         for _ in os.sched_getaffinity(0):
-            process = busy.enter_context(subprocess.Popen((sys.executable, "-c", "while True: pass")))
-            busy.callback(process.kill)
+            process = load.enter_context(subprocess.Popen((sys.executable, "-c", "while True: pass")))
+            load.callback(process.kill)
         under_load = cosim(lab, "run", "pass.yaml", "--seed", "7")
     assert (alone.code, under_load.code) == (0, 0), alone.err + under_load.err
     assert event_hash(alone) == event_hash(under_load)
@@ -318,9 +318,9 @@ def test_fieldkit_reads_simulations_like_trials(lab: Path) -> None:
     for form in ("csv", "parquet"):
         assert run_here(lab, "export", "scheduled", "--format", form, "-o", f"all.{form}").code == 0
     assert len(rows((lab / "all.csv").read_text(encoding="utf-8"))) == 2
-    rejected = run_here(lab, "export", "scheduled/seed-1", "--format", "mcap", "-o", "one.mcap")
-    assert rejected.code == 2, "a simulation has no timeline of a trial"
-    assert "Traceback" not in rejected.err
+    rejected_run = run_here(lab, "export", "scheduled/seed-1", "--format", "mcap", "-o", "one.mcap")
+    assert rejected_run.code == 2, "a simulation has no timeline of a trial"
+    assert "Traceback" not in rejected_run.err
 
 
 def is_loss_row(row: dict[str, str]) -> bool:

@@ -27,18 +27,18 @@ def lab(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_every_policy_has_a_row_and_exact_ones_have_no_error(lab: Path) -> None:
+def test_every_policy_has_a_row_and_exact_policies_have_no_error(lab: Path) -> None:
     run = cosim(lab, "shootout", "pass.yaml", "--format", "csv", "--seeds", "2")
     assert run.code == 0, run.err
     rows_by_policy = {row["policy"]: row for row in rows(run.out)}
     assert tuple(rows_by_policy) == POLICIES
     for policy in POLICIES[:2]:
         exact = {name: float(value) for name, value in rows_by_policy[policy].items() if "error" in name}
-        # Positions are those of the last step of the physics.
+        # Positions are known only at the steps of the physics.
         position_errors_m = [exact.pop(f"position_error_{statistic}_m") for statistic in ("mean", "p95", "max")]
         assert set(exact.values()) == {0.0}
         assert 0 < position_errors_m[0] <= position_errors_m[2] <= 1.0 * 0.001 + 1e-9, "1 m/s for a step of 1 ms"
-    # Half a window of 10 ms: arrivals anywhere in a window wait for its end.
+    # An arrival waits for the end of its window, which takes half a window on average.
     assert 0 < float(rows_by_policy["scheduled"]["delivery_error_mean_s"]) <= 0.010
     assert float(rows_by_policy["scheduled"]["exchanges_per_s"]) == pytest.approx(100)
     assert int(float(rows_by_policy["sliding_window"]["causality_violations"])) > 0
@@ -60,13 +60,13 @@ def test_the_table_explains_its_columns_within_100_characters(lab: Path) -> None
     run = cosim(lab, "shootout", "pass.yaml", "--duration", "100ms", "--window", "10ms,20ms")
     assert run.code == 0, run.err
     assert max(map(len, run.out.splitlines())) <= 100
-    for head in ("time (ms)", "p95", "max", "fate (%)", "late", "added", "position (mm)", "per s", "speed"):
-        assert head in run.out
-        assert f"{head.partition(' (')[0]}: " in " ".join(run.out.split()), "the column is explained"
+    for title in ("time (ms)", "p95", "max", "fate (%)", "late", "added", "position (mm)", "per s", "speed"):
+        assert title in run.out
+        assert f"{title.partition(' (')[0]}: " in " ".join(run.out.split()), "the column is explained"
 
 
 def test_a_window_commensurate_with_traffic_is_reported_with_a_better_one(lab: Path) -> None:
-    """The stream of 50 Hz is sent every two windows of 10 ms; the proposed window causes no note."""
+    """A packet of the stream of 50 Hz is sent every two windows of 10 ms. The proposed window causes no note."""
     options = ("--duration", "400ms", "--policy", "scheduled")
     run = cosim(lab, "shootout", "pass.yaml", *options, "--window", "10ms")
     assert run.code == 0, run.err
@@ -89,7 +89,7 @@ def test_the_figure_names_every_policy_and_is_reproducible(lab: Path) -> None:
 
 
 def test_orders_are_reported_for_any_transport(lab: Path) -> None:
-    """A sampled arrival waits for half of its window on average, by the first order."""
+    """A sampled arrival waits for half of its window on average, so the error is of first order."""
     path = lab / "pass.yaml"
     tcp = "  - {kind: stream, name: map, from: bob, to: ann, protocol: tcp, rate: 10Hz, size_bytes: 20000}\n"
     path.write_text(path.read_text(encoding="utf-8") + tcp, encoding="utf-8")
@@ -133,8 +133,8 @@ def test_a_run_reports_the_same_followers_as_its_recording(lab: Path) -> None:
     )
     assert "spacing (cm)" in result.out
     assert len(list((lab / "sim" / "captures").iterdir())) == 3
-    replayed = cosim(lab, "replay", "sim")
-    assert replayed.out.partition("followers\n")[2] == result.out.partition("followers\n")[2], replayed.err
+    replayed_run = cosim(lab, "replay", "sim")
+    assert replayed_run.out.partition("followers\n")[2] == result.out.partition("followers\n")[2], replayed_run.err
     report = json.loads(cosim(lab, "replay", "sim", "--format", "json").out)
     assert report.keys() == {"flows", "followers"}
     (row,) = report["followers"]
@@ -150,11 +150,11 @@ def test_the_table_of_a_shootout_can_be_plotted_again(lab: Path) -> None:
     assert (lab / "one.svg").read_text(encoding="utf-8") == (lab / "two.svg").read_text(encoding="utf-8")
     for text in ("policy,sent\na,1\n", table.out.partition("\n")[0], "\x00"):
         (lab / "all.csv").write_text(text, encoding="utf-8")
-        rejected = cosim(lab, "plot", "all.csv", "--out", "two.svg")
-        assert (rejected.code, "--format csv" in rejected.err) == (4, True), rejected.err
+        rejected_run = cosim(lab, "plot", "all.csv", "--out", "two.svg")
+        assert (rejected_run.code, "--format csv" in rejected_run.err) == (4, True), rejected_run.err
 
 
-def test_the_cost_of_a_bound_is_reported_with_the_fixed_windows_that_keep_it(lab: Path) -> None:
+def test_the_cost_of_a_bound_is_reported_with_the_fixed_windows_that_satisfy_it(lab: Path) -> None:
     # The husky drives at 0.9 m/s from the start, 11 mm in 12.5 ms.
     words = ("shootout", "pass.yaml", "--bound", "--seeds", "2", "--duration", "300ms")
     run = cosim(lab, *words, "--format", "csv")
@@ -170,10 +170,10 @@ def test_the_cost_of_a_bound_is_reported_with_the_fixed_windows_that_keep_it(lab
         int(row["exchanges"]) for row in (first, second)
     )
     assert f"{factor:.3g} times as many; the longest windows of the single runs need" in report
-    rejected = cosim(lab, "shootout", "pass.yaml", "--bound", "--set", "policy.bound_db=1")
-    assert (rejected.code, "bound_db limits the error of path loss" in rejected.err) == (2, True)
-    rejected = cosim(lab, "shootout", "pass.yaml", "--bound", "--figure", "b.svg")
-    assert (rejected.code, "has no figure" in rejected.err) == (2, True)
+    rejected_run = cosim(lab, "shootout", "pass.yaml", "--bound", "--set", "policy.bound_db=1")
+    assert (rejected_run.code, "bound_db limits the error of path loss" in rejected_run.err) == (2, True)
+    rejected_run = cosim(lab, "shootout", "pass.yaml", "--bound", "--figure", "b.svg")
+    assert (rejected_run.code, "has no figure" in rejected_run.err) == (2, True)
 
 
 def test_the_satisfaction_loop_reports_each_round(lab: Path) -> None:
@@ -190,11 +190,11 @@ def test_the_satisfaction_loop_reports_each_round(lab: Path) -> None:
     first, second = rows(unsatisfied.out)
     assert float(second["window_s"]) == pytest.approx(float(first["median_window_s"]))
     assert float(second["window_s"]) > 0.01, "bob accelerates, and the rule selects longer windows"
-    rejected = cosim(lab, "satisfy", "pass.yaml", "--threshold", "101%")
-    assert (rejected.code, "--threshold 10%" in rejected.err) == (2, True)
+    rejected_run = cosim(lab, "satisfy", "pass.yaml", "--threshold", "101%")
+    assert (rejected_run.code, "--threshold 10%" in rejected_run.err) == (2, True)
 
 
-def test_a_policy_without_a_window_is_reported_and_the_others_continue(lab: Path) -> None:
+def test_a_policy_that_finds_no_window_is_reported_and_the_others_continue(lab: Path) -> None:
     run = cosim(
         lab,
         "shootout",
@@ -224,8 +224,8 @@ def test_a_policy_without_a_window_is_reported_and_the_others_continue(lab: Path
     ],
 )
 def test_bad_input_is_reported_with_a_remedy(lab: Path, words: tuple[str, ...], message: str, remedy: str) -> None:
-    rejected = cosim(lab, "shootout", "pass.yaml", *words)
-    assert rejected.code == 2, rejected.out + rejected.err
-    assert message in rejected.err
-    assert remedy in rejected.err
-    assert not rejected.out
+    rejected_run = cosim(lab, "shootout", "pass.yaml", *words)
+    assert rejected_run.code == 2, rejected_run.out + rejected_run.err
+    assert message in rejected_run.err
+    assert remedy in rejected_run.err
+    assert not rejected_run.out

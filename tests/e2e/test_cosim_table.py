@@ -17,7 +17,7 @@ def test_csv_contains_every_cell_with_its_verdict(tmp_path: Path) -> None:
     first = cells[0]
     assert (first["line"], first["distance_m"], first["protocol"]) == ("los", "20", "topic")
     assert (float(first["delay_paper_s"]), float(first["loss_paper"])) == (0.01, 0)
-    # Ten packets of 320 bytes over Wi-Fi.
+    # The delay of ten packets of 320 bytes over Wi-Fi.
     assert 10 * 1e-4 < float(first["delay_s"]) < 10 * 1e-3
     assert first["delay_agreement"] in {"agrees", "above", "below"}
     last = cells[-1]
@@ -26,7 +26,7 @@ def test_csv_contains_every_cell_with_its_verdict(tmp_path: Path) -> None:
     assert (float(last["loss"]), last["loss_agreement"]) == (1, "above")
 
 
-def test_the_text_table_has_the_printed_digits_and_a_count(tmp_path: Path) -> None:
+def test_the_text_table_has_the_digits_of_the_paper_and_a_count(tmp_path: Path) -> None:
     run = cosim(tmp_path, "table", "emane", "--seeds", "1", "--set", "duration=1s")
     assert run.code == 0, run.err
     assert "5.377" in run.out
@@ -48,8 +48,8 @@ def test_the_text_table_has_the_printed_digits_and_a_count(tmp_path: Path) -> No
 def test_bad_input_is_reported_with_a_remedy(
     tmp_path: Path, words: tuple[str, ...], message: str, remedy: str
 ) -> None:
-    rejected = cosim(tmp_path, "table", *words)
-    assert rejected.code == 2, rejected.out + rejected.err
-    assert message in rejected.err
-    assert remedy in rejected.err
-    assert not rejected.out
+    rejected_run = cosim(tmp_path, "table", *words)
+    assert rejected_run.code == 2, rejected_run.out + rejected_run.err
+    assert message in rejected_run.err
+    assert remedy in rejected_run.err
+    assert not rejected_run.out

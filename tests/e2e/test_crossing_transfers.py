@@ -1,4 +1,4 @@
-"""Simultaneous transfers and pings on emulated robots: each is measured as if it were alone."""
+"""Simultaneous transfers and pings on emulated robots; each is measured as if it ran alone."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -77,8 +77,9 @@ def attempts(trial: Path, protocol: Protocol) -> list[tuple[Plan, Path, Values]]
 
 
 def packet_keys(capture: list[Row], transfer: Transfer, protocol: int) -> Iterator[tuple[bool, Row]]:
-    """Yield, for each packet between the ends of a transfer, True if it has the port, and its id and fragment
-    position.
+    """Yield two values per packet between the ends of a transfer.
+
+    They are True if the packet has the port of the transfer, and the packet's id and fragment position.
     """
     ends = tuple(
         0xFFFF << 32 | int(IPv4Address(address)) for address in (transfer.sender_address, transfer.receiver_address)
@@ -90,7 +91,7 @@ def packet_keys(capture: list[Row], transfer: Transfer, protocol: int) -> Iterat
 
 def test_the_losses_of_each_udp_transfer_equal_those_counted_by_scapy(trial: Path) -> None:
     """Scapy identifies a transfer's datagrams by port, and their other fragments by the id of the first."""
-    lost = 0
+    lost_packets = 0
     for plan, folder, values in attempts(trial, Protocol.UDP):
         captures = {role: dissected(folder / f"{role}.pcap") for role in (Role.SENDER, Role.RECEIVER, Role.RELAY)}
         for transfer in planned_evidence.transfers(plan, Protocol.UDP):
@@ -98,15 +99,17 @@ def test_the_losses_of_each_udp_transfer_equal_those_counted_by_scapy(trial: Pat
             ids = {key[0] for is_first, key in sent_keys if is_first}
             sent_packets = Counter(key for _, key in sent_keys if key[0] in ids)
             received_packets = Counter(key for _, key in packet_keys(captures[transfer.destination], transfer, UDP))
-            arrived = sum((sent_packets & received_packets).values())
+            arrived_packets = sum((sent_packets & received_packets).values())
             name = transfer.name
             assert values[f"{name}.ip_packets_sent"] == sent_packets.total()
-            assert values[f"{name}.ip_packets_received"] == arrived == values[f"{name}.delay_packets"]
+            assert values[f"{name}.ip_packets_received"] == arrived_packets == values[f"{name}.delay_packets"]
             assert values[f"{name}.datagrams_sent"] == len(ids) == values[f"{name}.paper_packets"]
-            lost += sent_packets.total() - arrived
-            sent, received = ((folder / file).read_bytes() for file in (transfer.sent_file, transfer.received_file))
-            assert values[f"{name}.file_loss"] == 1 - len(received) / len(sent)
-    assert lost, "the radio loses one packet in twenty"
+            lost_packets += sent_packets.total() - arrived_packets
+            sent_data, received_data = (
+                (folder / file).read_bytes() for file in (transfer.sent_file, transfer.received_file)
+            )
+            assert values[f"{name}.file_loss"] == 1 - len(received_data) / len(sent_data)
+    assert lost_packets, "the radio loses one packet in twenty"
 
 
 def test_each_tcp_transfer_is_complete_and_counts_only_its_frames(trial: Path) -> None:
@@ -114,8 +117,8 @@ def test_each_tcp_transfer_is_complete_and_counts_only_its_frames(trial: Path) -
         captures = {role: dissected(folder / f"{role}.pcap") for role in (Role.SENDER, Role.RECEIVER, Role.RELAY)}
         for transfer in planned_evidence.transfers(plan, Protocol.TCP):
             name = transfer.name
-            frames = sum(is_own for is_own, _ in packet_keys(captures[transfer.source], transfer, TCP))
-            assert values[f"{name}.ip_packets_sent"] == frames
+            frame_count = sum(has_port for has_port, _ in packet_keys(captures[transfer.source], transfer, TCP))
+            assert values[f"{name}.ip_packets_sent"] == frame_count
             assert values[f"{name}.tcp_unique_bytes"] == (folder / transfer.sent_file).stat().st_size
             assert (values[f"{name}.byte_loss"], values[f"{name}.hash_match"]) == (0, True)
 
@@ -131,7 +134,7 @@ def test_each_ping_and_each_capture_counts_only_its_packets(trial: Path, protoco
 
 
 def test_the_delays_of_simultaneous_transfers_are_measured(trial: Path) -> None:
-    """Emulated robots share one clock; traffic in the other direction is used to measure the offset."""
+    """Emulated robots share one clock, so the offset is 0; it is measured from the traffic in both directions."""
     for _, _, values in attempts(trial, Protocol.UDP):
         for name in ("up", "down"):
             offset_s, error_s = (values[f"{name}.clock_offset{suffix}_s"] for suffix in ("", "_error"))

@@ -1,4 +1,4 @@
-"""The documentation is correct: its commands run, its keys, options, codes and links exist."""
+"""The documentation is correct: its commands run, and its keys, options, exit codes and links exist."""
 
 import ast
 import inspect
@@ -31,13 +31,13 @@ from tests.helpers.runs import run_here
 PAGES = sorted([*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md")])
 COMMAND_S = 600.0
 DEBIAN_ROS = {"README.md", "tutorial.md"}
-"""Pages whose trials use Debian's ROS if it is installed; the others use the built-in one to save time."""
-OWN_SITE = re.compile(r"fieldkit\.yaml|^ls|fieldkit (init|lab)|fieldkit --?")
+"""Pages whose trials use Debian's ROS if it is installed; the other pages use the built-in ROS to save time."""
+NEEDS_NO_SITE = re.compile(r"fieldkit\.yaml|^ls|fieldkit (init|lab)|fieldkit --?")
 """Commands that need a folder without a site file."""
 
-PLAIN = re.compile(r"fieldkit (?!lab (?:up|shell))(?P<words>[^|<>;&$'\"\n]*)(?P<rest>[|>][^\n]*)?")
-"""A command that this process can run; `fieldkit lab up` would leave a fork of it in the background, and `lab shell`
-would replace it."""
+PLAIN = re.compile(r"fieldkit (?!lab (?:up|shell))(?P<words>[^|<>;&$'\"\n]*)(?P<shell_part>[|>][^\n]*)?")
+"""A command that this process can run. `fieldkit lab up` would leave a fork of the process in the background, and
+`lab shell` would replace the process."""
 
 TOPIC = re.compile(r"fieldkit docs ([a-z][a-z0-9_-]*)")
 MARKDOWN_FILE = re.compile(r"[\w/-]+\.md\b")
@@ -69,7 +69,7 @@ class Command:
 
 
 def shape(output: str) -> list[str]:
-    """Return the sorted lines of an output without run-dependent parts: numbers and column widths."""
+    """Return the sorted lines of an output without the parts that differ between runs: numbers and column widths."""
     return sorted(re.sub(r"[ ─]+", " ", re.sub(r"[0-9a-f]{12,}|[0-9][0-9.T]*Z?", "N", output)).splitlines())
 
 
@@ -87,8 +87,8 @@ def commands(page: Path) -> Iterator[Command]:
                 if line.endswith("<<'EOF'"):
                     while texts[-1][-1] != "EOF":
                         texts[-1].append(next(lines))
-            elif announced := re.fullmatch(r"# exit code (\d+)", line):
-                codes[-1] = int(announced[1])
+            elif declared_code := re.fullmatch(r"# exit code (\d+)", line):
+                codes[-1] = int(declared_code[1])
             else:
                 outputs[-1].append(f"{line}\n")
         for text, code, output in zip(texts, codes, outputs, strict=True):
@@ -102,22 +102,22 @@ def make_targets() -> set[str]:
 def run_command(text: str, folder: Path) -> tuple[int, str]:
     """Run a command in a folder; return its exit code and its output.
 
-    `fieldkit` with plain words runs in this process, and a shell runs only the rest of its line, `| grep 'x'`.
+    `fieldkit` with plain words runs in this process, and a shell runs only the remainder of its line, `| grep 'x'`.
     """
     if (plain := PLAIN.fullmatch(text)) is None:
         return run_in_shell(text, folder)
-    words = [path for word in plain["words"].split() for path in expanded(word, folder)]
-    with Path(os.devnull).open(encoding="utf-8") as nothing, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "stdin", nothing)
+    words = [path for word in plain["words"].split() for path in expand(word, folder)]
+    with Path(os.devnull).open(encoding="utf-8") as empty_file, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stdin", empty_file)
         run = run_here(folder, *words)
-    if not plain["rest"]:
+    if not plain["shell_part"]:
         return run.code, run.err + run.out
-    code, output = run_in_shell(f"cat {plain['rest']}", folder, run.out)
+    code, output = run_in_shell(f"cat {plain['shell_part']}", folder, run.out)
     return code, run.err + output
 
 
-def expanded(word: str, folder: Path) -> list[str]:
-    """Return the paths that match a pattern, relative to the folder; the word itself if none does."""
+def expand(word: str, folder: Path) -> list[str]:
+    """Return the paths that match a pattern, relative to the folder; the word itself if no path matches."""
     paths = sorted(folder.glob(word)) if "*" in word else []
     return [str(path.relative_to(folder)) for path in paths] or [word]
 
@@ -139,7 +139,7 @@ def run_in_shell(text: str, folder: Path, stdin: str = "") -> tuple[int, str]:
 
 def run_commands(page: Path, folder: Path) -> None:
     """Run the commands of a page in an empty folder."""
-    if page.name not in DEBIAN_ROS and not any(OWN_SITE.search(command.text) for command in commands(page)):
+    if page.name not in DEBIAN_ROS and not any(NEEDS_NO_SITE.search(command.text) for command in commands(page)):
         built_in_ros(folder)
     for command in commands(page):
         if target := re.fullmatch(r"make ([a-z]+)", command.text):
@@ -156,7 +156,8 @@ COMMAND_PAGES = sorted(
 )
 
 
-# pytest-xdist runs the tests of a class in one process; two classes distribute the pages, by number of commands.
+# pytest-xdist runs the tests of a class in one process. Two classes distribute the pages, sorted by their number of
+# commands, over two processes.
 @pytest.mark.emulated
 class TestFirstHalf:
     @pytest.mark.parametrize("page", COMMAND_PAGES[::2], ids=page_id)
@@ -211,14 +212,16 @@ def test_the_example_of_a_backend_has_the_members_of_its_protocols() -> None:
 def test_the_reference_is_up_to_date() -> None:
     generated = reference.pages()
     assert {path.name for path in reference.FOLDER.glob("*.md")} == set(generated)
-    differing = [name for name, text in generated.items() if (reference.FOLDER / name).read_text("utf-8") != text]
-    assert not differing, "write them again: .venv/bin/python -m docs.generator"
+    differing_pages = [
+        name for name, text in generated.items() if (reference.FOLDER / name).read_text("utf-8") != text
+    ]
+    assert not differing_pages, "write them again: .venv/bin/python -m docs.generator"
 
 
 def test_every_row_of_the_reference_has_a_meaning() -> None:
     for name, text in reference.pages().items():
-        empty = [line for line in text.splitlines() if line.startswith("| ") and line.endswith("|  |")]
-        assert not empty, name
+        incomplete_rows = [line for line in text.splitlines() if line.startswith("| ") and line.endswith("|  |")]
+        assert not incomplete_rows, name
 
 
 def test_a_key_has_the_meaning_of_its_field_and_not_of_an_attribute_of_the_base_class() -> None:
@@ -226,11 +229,11 @@ def test_a_key_has_the_meaning_of_its_field_and_not_of_an_attribute_of_the_base_
     assert meanings["`columns`"] == "Columns of `trial.csv`, each read from the output."
 
 
-def test_every_page_has_a_place_in_the_sidebar() -> None:
+def test_every_page_is_in_the_sidebar() -> None:
     navigation = (ROOT / ".ci" / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:\n")[2]
-    listed = re.findall(r"([\w/-]+\.md)$", navigation, re.MULTILINE)
+    listed_pages = re.findall(r"([\w/-]+\.md)$", navigation, re.MULTILINE)
     pages = [str(page.relative_to(ROOT / "docs")) for page in PAGES if page.is_relative_to(ROOT / "docs")]
-    assert sorted(listed) == sorted(pages)
+    assert sorted(listed_pages) == sorted(pages)
 
 
 def test_every_guide_named_by_a_command_exists() -> None:
@@ -257,6 +260,6 @@ def test_messages_refer_only_to_installed_pages() -> None:
     texts = list(visible_texts())
     topics = [(place, topic) for place, text in texts for topic in TOPIC.findall(text)]
     assert len(topics) > 10
-    wrong = [(place, topic) for place, topic in topics if topic not in documentation.topics()]
+    unknown_topics = [(place, topic) for place, topic in topics if topic not in documentation.topics()]
     files = [(place, name) for place, text in texts for name in MARKDOWN_FILE.findall(text)]
-    assert (wrong, files) == ([], [])
+    assert (unknown_topics, files) == ([], [])

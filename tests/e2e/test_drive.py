@@ -1,4 +1,4 @@
-"""Robots that drive, end to end: over ROS 1, DDS and Zenoh, with the field backend on the laptop."""
+"""Robots that drive in trials, over ROS 1, DDS and Zenoh, with the field backend on the laptop."""
 
 import json
 import math
@@ -62,7 +62,7 @@ ROSTOPIC_MESSAGES = {
 PLACEMENT = Placement(Scenario.LOS, Topology.MASTER, parse_distance("5m"))
 SPEED_M_S = 0.6
 LEASE_S = 2.0
-"""Lease of the tests in which it expires, and the time within which an order must stop a robot."""
+"""Lease of the tests in which it expires, and time limit for a command to stop a robot."""
 LONG_LEASE_S = 30.0
 """Lease of the other tests, so that a busy machine does not stop a robot."""
 SETUP = ("/opt/ros/noetic/setup.bash",)
@@ -106,7 +106,7 @@ RUN = ("trial", "drive", "5m", "--yes", "--allow-motion")
 
 @pytest.fixture(scope="module")
 def rovers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FieldRobots]:
-    """Robots that outlive fieldkit; one of them is fast, so that the tests take less time."""
+    """Robots that outlive fieldkit; they are fast, so that the tests take less time."""
     folder = tmp_path_factory.mktemp("rovers")
     profile = rover_profile(fence_m=30.0, lease_s=LONG_LEASE_S)
     for name in ("robots", "procedures"):
@@ -125,7 +125,7 @@ def rovers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FieldRobots]:
 
 @pytest.fixture
 def field_robots(rovers: FieldRobots, monkeypatch: pytest.MonkeyPatch) -> FieldRobots:
-    """The same robots at their initial positions, reachable, without remains of an earlier trial."""
+    """The same robots at their initial positions, with intact links and without files and jobs of earlier trials."""
     monkeypatch.chdir(rovers.folder)
     for role, shell in rovers.testbed.shells.items():
         rovers.links.restore(role)
@@ -141,14 +141,16 @@ def track_of(field_robots: FieldRobots, role: Role) -> list[TrackPoint]:
 
 
 def place_at(track: list[TrackPoint], utc_ns: int) -> Vector:
-    """Return the position of the robot by the oracle, interpolated linearly."""
+    """Return the position of the robot at a time, interpolated linearly in its true track."""
     after = bisect_left(track, utc_ns, key=lambda point: point.utc_ns)
     before, now = track[max(after - 1, 0)], track[min(after, len(track) - 1)]
     assert before.position_m is not None
     assert now.position_m is not None
     share = (utc_ns - before.utc_ns) / max(now.utc_ns - before.utc_ns, 1)
-    x, y, z = (b + min(share, 1.0) * (n - b) for b, n in zip(before.position_m, now.position_m, strict=True))
-    return x, y, z
+    x_m, y_m, z_m = (
+        start + min(share, 1.0) * (end - start) for start, end in zip(before.position_m, now.position_m, strict=True)
+    )
+    return x_m, y_m, z_m
 
 
 def test_robots_drive_there_and_back_and_the_true_track_equals_their_odometry(field_robots: FieldRobots) -> None:
@@ -161,24 +163,24 @@ def test_robots_drive_there_and_back_and_the_true_track_equals_their_odometry(fi
     trial = only_trial(field_robots.folder)
     (repeat,) = (trial / "repeats").iterdir()
     (row,) = rows(trial)
-    # Over ROS 1, with positions relative to the sender; over ROS 2 with DDS, facing the other way; over Zenoh, with
-    # stamped velocities.
-    for role, name, sign, way_m in (
+    # The receiver uses ROS 1. The sender uses ROS 2 with DDS and faces in the opposite direction. The relay uses
+    # Zenoh and stamped velocities.
+    for role, name, sign, path_m in (
         (Role.RECEIVER, "", 1, (0.4, 0.0)),
         (Role.SENDER, "outer.", -1, (0.3, 0.3)),
         (Role.RELAY, "zenoh.", 1, (0.0, 0.3)),
     ):
         log = [json.loads(line) for line in (repeat / f"{name}drive.jsonl").read_text(encoding="ascii").splitlines()]
         assert (log[-1]["ended"], log[-1]["phase"]) == ("home", "home")
-        assert max(entry["x_m"] for entry in log) == pytest.approx(way_m[0], abs=0.1)
-        assert max(entry["y_m"] for entry in log) == pytest.approx(way_m[1], abs=0.1)
+        assert max(entry["x_m"] for entry in log) == pytest.approx(path_m[0], abs=0.1)
+        assert max(entry["y_m"] for entry in log) == pytest.approx(path_m[1], abs=0.1)
         start_m, track = starts_m[role], track_of(field_robots, role)
         assert start_m is not None
         for entry in log:
             east_m, north_m, _ = place_at(track, entry["utc_ns"])
-            off_m = east_m - start_m[0] - sign * entry["x_m"], north_m - start_m[1] - sign * entry["y_m"]
-            assert max(map(abs, off_m)) < 0.25, entry  # a quarter of a second at 0.6 m/s, on a busy machine
-        # The last entry is of a robot at rest.
+            error_m = east_m - start_m[0] - sign * entry["x_m"], north_m - start_m[1] - sign * entry["y_m"]
+            assert max(map(abs, error_m)) < 0.25, entry  # the distance in 0.4 s at 0.6 m/s, on a busy machine
+        # The robot is stationary at the last entry.
         end_m = track[-1].position_m
         assert end_m is not None
         assert sign * (end_m[0] - start_m[0]) == pytest.approx(log[-1]["x_m"], abs=0.01)
@@ -190,7 +192,7 @@ def test_robots_drive_there_and_back_and_the_true_track_equals_their_odometry(fi
         farthest_m = max(math.dist(point.position_m or start_m, start_m) for point in track)
         assert row[f"{name}drive_ended"] == "home"
         assert float(row[f"{name}drive_farthest_m"]) == pytest.approx(farthest_m, abs=0.02)
-        assert float(row[f"{name}drive_out_m"]) == pytest.approx(math.hypot(*way_m), abs=0.1)
+        assert float(row[f"{name}drive_out_m"]) == pytest.approx(math.hypot(*path_m), abs=0.1)
         assert float(row[f"{name}drive_back_off_m"]) == pytest.approx(math.dist(end_m, start_m), abs=0.01)
         assert 0 < float(row[f"{name}drive_speed_median_m_s"]) <= float(row[f"{name}drive_speed_max_m_s"])
         assert float(row[f"{name}drive_speed_max_m_s"]) == pytest.approx(max(speeds), abs=0.25)
@@ -218,7 +220,7 @@ def test_a_robot_of_an_interactive_lab_can_be_driven(
         )
         with closing(shell):
             topic = ("rostopic", "pub", "-r", "10", "/cmd_vel", kind, ROSTOPIC_MESSAGES[kind])
-            # Until its input ends.
+            # The program publishes until its input is closed.
             driver = ("sh", "-c", '"$@" & cat >/dev/null; kill $!', "sh", *with_environment(topic, setup=SETUP))
             session = shell.begin(driver, deadline=Deadline.after(30))
             wait_until(lambda: lab.place_m("robot-1")[0] > place_m[0] + 0.1, Deadline.after(60))
@@ -255,14 +257,14 @@ def test_killing_fieldkit_stops_the_robot(field_robots: FieldRobots) -> None:
 
 @pytest.fixture
 def _short_lease(field_robots: FieldRobots) -> Iterator[None]:
-    """Let the lease of the receiver expire soon after the laptop's last order."""
+    """Use a short lease for the receiver."""
     with changed_rover(field_robots, f"lease: {LONG_LEASE_S:g}s", f"lease: {LEASE_S:g}s"):
         yield
 
 
 @contextmanager
 def driving(field_robots: FieldRobots, procedure: str = DRIVE) -> "Iterator[subprocess.Popen[str]]":
-    """Run a trial until its robot drives; kill it at the end if it still runs."""
+    """Start a trial and wait until its robot drives; kill the trial after the body if it still runs."""
     (field_robots.folder / "procedures" / "drive.yaml").write_text(procedure, encoding="utf-8")
     process = start(field_robots.folder, *RUN)
     try:
@@ -276,10 +278,10 @@ def driving(field_robots: FieldRobots, procedure: str = DRIVE) -> "Iterator[subp
 
 
 def standstill_s(field_robots: FieldRobots, since_ns: int) -> float:
-    """Return the time from `since_ns` until the receiver stopped by the true track; it must not move afterwards."""
+    """Return the time from `since_ns` until the receiver stopped, from its true track."""
     wait_until(lambda: (now := receiver_motion(field_robots)) is not None and not now.is_moving, Deadline.after(60))
-    moments = [point for point in track_of(field_robots, Role.RECEIVER) if point.utc_ns >= since_ns]
-    moving = [point.utc_ns for point in moments if math.hypot(*point.velocity_m_s) > 0]
+    points = [point for point in track_of(field_robots, Role.RECEIVER) if point.utc_ns >= since_ns]
+    moving = [point.utc_ns for point in points if math.hypot(*point.velocity_m_s) > 0]
     return (max(moving, default=since_ns) - since_ns) / 1e9
 
 
@@ -288,9 +290,9 @@ def test_the_first_signal_stops_the_robot_immediately(field_robots: FieldRobots,
     with driving(field_robots) as process:
         sent_ns = time.time_ns()
         process.send_signal(number)
-        took_s = standstill_s(field_robots, sent_ns)
+        stopped_after_s = standstill_s(field_robots, sent_ns)
         run = finish(process)
-    assert took_s < LEASE_S, "by the order, not by its lease"
+    assert stopped_after_s < LEASE_S, "by the order, not by its lease"
     assert "stopping: rover-1 stops where it is" in run.err
     assert "rover-1: stopped (stationary)" in run.err
     assert run.code == 130
@@ -299,16 +301,16 @@ def test_the_first_signal_stops_the_robot_immediately(field_robots: FieldRobots,
 
 
 def assert_held(field_robots: FieldRobots, reason: str) -> None:
-    """Assert that the stopped motion is held, and that its repeat is void for the same reason."""
+    """Assert that the robot may not move before a confirmation, and that its repeat is void for the same reason."""
     trial = only_trial(field_robots.folder)
     assert motions(trial) == ["origin", "begun", "held"]
     last_entry = json.loads((trial / "motion.jsonl").read_text(encoding="utf-8").splitlines()[-1])
     assert reason in last_entry["reason"]
     assert [(row["status"], row["reason"]) for row in rows(trial)] == [("void", reason)]
     stopped_m = place_m(field_robots)
-    again = run_here(field_robots.folder, "resume", str(trial), *RESUME)
-    assert again.code == 5, again.err
-    assert f"rover-1: {last_entry['reason']}" in again.err
+    second_run = run_here(field_robots.folder, "resume", str(trial), *RESUME)
+    assert second_run.code == 5, second_run.err
+    assert f"rover-1: {last_entry['reason']}" in second_run.err
     assert place_m(field_robots) == pytest.approx(stopped_m, abs=0.01)
 
 
@@ -318,33 +320,33 @@ def test_ctrl_c_at_a_terminal_stops_the_robot_immediately(field_robots: FieldRob
     words = ("setsid", "--ctty", sys.executable, "-m", "fieldkit", *RUN)
     process = subprocess.Popen(words, cwd=field_robots.folder, stdin=terminal, stdout=terminal, stderr=terminal)
     os.close(terminal)
-    shown: list[bytes] = []
+    output_parts: list[bytes] = []
 
     def read() -> None:
-        with suppress(OSError):  # the end of a terminal
+        with suppress(OSError):  # the terminal was closed
             while data := os.read(master, 1 << 16):
-                shown.append(data)
+                output_parts.append(data)
 
     reader = threading.Thread(target=read)
     reader.start()
     try:
         wait_until(lambda: drives(field_robots) or process.poll() is not None, Deadline.after(180))
-        assert process.poll() is None, shown
+        assert process.poll() is None, output_parts
         sent_ns = time.time_ns()
         os.write(master, b"\x03")
-        took_s = standstill_s(field_robots, sent_ns)
+        stopped_after_s = standstill_s(field_robots, sent_ns)
         assert process.wait(timeout=180) == 130
     finally:
         process.kill()
         process.wait()
         reader.join()
         os.close(master)
-    assert took_s < LEASE_S, "by the order, not by its lease"
-    text = b"".join(shown).decode()
+    assert stopped_after_s < LEASE_S, "by the order, not by its lease"
+    text = b"".join(output_parts).decode()
     assert text.index("stopping: rover-1") < text.index("rover-1: stopped (stationary)")
 
 
-@pytest.mark.nightly  # CI stops a robot on its way out
+@pytest.mark.nightly  # CI stops a robot on its outward path
 def test_ctrl_c_while_the_robot_drives_back_stops_it(field_robots: FieldRobots) -> None:
     (field_robots.folder / "procedures" / "drive.yaml").write_text(SHORT, encoding="utf-8")
     home_m = place_m(field_robots)
@@ -356,20 +358,20 @@ def test_ctrl_c_while_the_robot_drives_back_stops_it(field_robots: FieldRobots) 
         )
         sent_ns = time.time_ns()
         process.send_signal(signal.SIGINT)
-        took_s = standstill_s(field_robots, sent_ns)
+        stopped_after_s = standstill_s(field_robots, sent_ns)
         run = finish(process)
     finally:
         process.kill()
         wait_for_end({process.pid}, within_s=60.0)
-    assert took_s < LEASE_S, "by the order, not by its lease"
+    assert stopped_after_s < LEASE_S, "by the order, not by its lease"
     assert run.code == 130
-    assert math.dist(place_m(field_robots), home_m) > 0.3, "on its way"
+    assert math.dist(place_m(field_robots), home_m) > 0.3, "it has not reached its home"
     assert_held(field_robots, "stopped by the operator")
 
 
 @contextmanager
 def changed_rover(field_robots: FieldRobots, old: str, new: str) -> Iterator[None]:
-    """Change the profile of the receiver while the body runs."""
+    """Change the profile of the receiver for the duration of the context."""
     profile = field_robots.folder / "robots" / "rover.yaml"
     text = profile.read_text(encoding="utf-8")
     profile.write_text(replace_text(text, old, new), encoding="utf-8")
@@ -406,7 +408,7 @@ def test_stop_from_another_terminal_works_while_fieldkit_is_suspended(field_robo
         process.send_signal(signal.SIGSTOP)
         sent_ns = time.time_ns()
         run = run_here(field_robots.folder, "stop", "--all")
-        took_s = standstill_s(field_robots, sent_ns)
+        stopped_after_s = standstill_s(field_robots, sent_ns)
         assert run.code == 0, run.err + run.out
         assert sorted(run.out.splitlines()) == [
             "rover-1: stopped (stationary)",
@@ -414,22 +416,25 @@ def test_stop_from_another_terminal_works_while_fieldkit_is_suspended(field_robo
             "rover-3: no program of fieldkit moves it; nothing was sent to it",
         ]
         process.send_signal(signal.SIGCONT)
-        ended = finish(process)
-    assert ended.code == 3, ended.err
-    assert "stopped the robots at" in ended.err
-    assert standstill_s(field_robots, sent_ns + int(1e9 * took_s) + 1) == 0.0, "nothing moved again"
-    again = run_here(field_robots.folder, "stop", "rover-1")
-    assert (again.code, again.out) == (0, "rover-1: no program of fieldkit moves it; nothing was sent to it\n")
+        trial_run = finish(process)
+    assert trial_run.code == 3, trial_run.err
+    assert "stopped the robots at" in trial_run.err
+    assert standstill_s(field_robots, sent_ns + int(1e9 * stopped_after_s) + 1) == 0.0, "nothing moved again"
+    second_run = run_here(field_robots.folder, "stop", "rover-1")
+    assert (second_run.code, second_run.out) == (
+        0,
+        "rover-1: no program of fieldkit moves it; nothing was sent to it\n",
+    )
     field_robots.links.cut(Role.SENDER)
-    partly = run_here(field_robots.folder, "stop", "--all")
-    assert partly.code == 3
-    assert "rover-2: NOT REACHED: stop it by hand" in partly.out
-    assert "rover-1: no program of fieldkit moves it" in partly.out
+    partial_run = run_here(field_robots.folder, "stop", "--all")
+    assert partial_run.code == 3
+    assert "rover-2: NOT REACHED: stop it by hand" in partial_run.out
+    assert "rover-1: no program of fieldkit moves it" in partial_run.out
 
 
 def test_ctrl_c_while_the_program_starts_prevents_motion(field_robots: FieldRobots) -> None:
     (field_robots.folder / "procedures" / "drive.yaml").write_text(DRIVE, encoding="utf-8")
-    began_ns = time.time_ns()
+    started_ns = time.time_ns()
     process = start(field_robots.folder, *RUN, "--json")
     wait_for_line(process, '"move rover-1"')
     process.send_signal(signal.SIGINT)
@@ -437,7 +442,9 @@ def test_ctrl_c_while_the_program_starts_prevents_motion(field_robots: FieldRobo
     assert run.code == 130
     assert "stopping: " in run.err
     speeds = [
-        math.hypot(*point.velocity_m_s) for point in track_of(field_robots, Role.RECEIVER) if point.utc_ns > began_ns
+        math.hypot(*point.velocity_m_s)
+        for point in track_of(field_robots, Role.RECEIVER)
+        if point.utc_ns > started_ns
     ]
     assert max(speeds, default=0.0) == 0.0
     assert not [
@@ -474,14 +481,14 @@ def test_stop_of_a_suspended_agent_prevents_further_velocities(field_robots: Fie
     assert standstill_s(field_robots, stationary_since_ns) == 0.0
     trial = only_trial(field_robots.folder)
     assert motions(trial) == ["origin", "begun", "held"]
-    again = run_here(field_robots.folder, "resume", str(trial), *RESUME)
-    assert again.code == 5, again.err
-    assert "no robot moves until a person confirms: rover-1" in again.err
+    second_run = run_here(field_robots.folder, "resume", str(trial), *RESUME)
+    assert second_run.code == 5, second_run.err
+    assert "no robot moves until a person confirms: rover-1" in second_run.err
     assert standstill_s(field_robots, stationary_since_ns) == 0.0
 
 
 def command_line(pid: int) -> list[bytes]:
-    """Return the command line of an agent's process; empty if it is another process, or has ended."""
+    """Return the command line of a process; empty if it is not an agent or has exited."""
     with suppress(OSError):
         words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
         return words if b"python" in words[0] and any(b"/agent-" in word for word in words) else []
@@ -517,7 +524,7 @@ def motions(trial: Path) -> list[str]:
 
 
 @pytest.mark.usefixtures("_short_lease")
-def test_after_a_fault_nothing_moves_before_it_is_confirmed(field_robots: FieldRobots) -> None:
+def test_after_a_fault_no_robot_moves_before_a_confirmation(field_robots: FieldRobots) -> None:
     (field_robots.folder / "procedures" / "drive.yaml").write_text(AFTER, encoding="utf-8")
     home_m = place_m(field_robots)
     process = start(field_robots.folder, *RUN)
@@ -534,24 +541,28 @@ def test_after_a_fault_nothing_moves_before_it_is_confirmed(field_robots: FieldR
     assert 0.1 < math.dist(stopped_m, home_m) < FAR_M
     trial = only_trial(field_robots.folder)
     assert motions(trial) == ["origin", "begun", "held"]
-    # --yes is no confirmation, in any run.
-    again = run_here(field_robots.folder, "resume", str(trial), *RESUME)
-    assert again.code == 5, again.err
-    assert "no order from the laptop for 2 s" in again.err
+    # --yes is not a confirmation.
+    second_run = run_here(field_robots.folder, "resume", str(trial), *RESUME)
+    assert second_run.code == 5, second_run.err
+    assert "no order from the laptop for 2 s" in second_run.err
     assert place_m(field_robots) == pytest.approx(stopped_m, abs=0.01)
-    # Pressing Enter does not confirm either: the default is to stop.
+    # Enter is not a confirmation either, because the default answer is to stop.
     answers = field_robots.folder / "answers"
     answers.write_text("\n\n", encoding="utf-8")
-    enter = run_here(field_robots.folder, "resume", str(trial), "--answers", str(answers), "--allow-motion")
-    assert enter.code == 5, enter.err
+    enter_run = run_here(field_robots.folder, "resume", str(trial), "--answers", str(answers), "--allow-motion")
+    assert enter_run.code == 5, enter_run.err
     assert place_m(field_robots) == pytest.approx(stopped_m, abs=0.01)
-    # With the option the robot first drives back along its path, and then as at the start.
-    begun_ns = track_of(field_robots, Role.RECEIVER)[-1].utc_ns
-    option = run_here(field_robots.folder, "resume", str(trial), *RESUME, "--allow-motion-after-fault")
-    assert option.code == 0, option.err
-    track = [point for point in track_of(field_robots, Role.RECEIVER) if point.utc_ns > begun_ns and point.position_m]
-    off_m = [math.dist(point.position_m or home_m, home_m) for point in track]
-    assert max(off_m) == pytest.approx(FAR_M, abs=0.3), "not as far again from where it stopped"
+    # With the option, the robot drives back along its path and then repeats the complete drive.
+    started_ns = track_of(field_robots, Role.RECEIVER)[-1].utc_ns
+    option_run = run_here(field_robots.folder, "resume", str(trial), *RESUME, "--allow-motion-after-fault")
+    assert option_run.code == 0, option_run.err
+    track = [
+        point for point in track_of(field_robots, Role.RECEIVER) if point.utc_ns > started_ns and point.position_m
+    ]
+    error_m = [math.dist(point.position_m or home_m, home_m) for point in track]
+    assert max(error_m) == pytest.approx(FAR_M, abs=0.3), (
+        "it does not drive the whole distance again from where it stopped"
+    )
     assert place_m(field_robots) == pytest.approx(home_m, abs=0.3)
     assert motions(trial)[3:] == ["allowed", *("begun", "ended") * 2]
 
@@ -577,7 +588,7 @@ def test_a_suspended_driver_does_not_continue_until_a_person_confirms(field_robo
     try:
         wait_during(process, lambda: drives(field_robots))
         send("STOP")
-        wait_until(lambda: stationary(field_robots), Deadline.after(60))  # by the base's own time limit
+        wait_until(lambda: stationary(field_robots), Deadline.after(60))  # after the time limit of the base
         stopped_m, since_s = place_m(field_robots), time.monotonic()
         wait_until(lambda: time.monotonic() > since_s + 1.0, Deadline.after(60))
         send("CONT")
@@ -592,6 +603,6 @@ def test_a_suspended_driver_does_not_continue_until_a_person_confirms(field_robo
     answers = field_robots.folder / "answers"
     answers.write_text("\nconfirm\n", encoding="utf-8")
     field_robots.testbed.place(PLACEMENT)
-    confirmed = run_here(field_robots.folder, "resume", str(trial), "--answers", str(answers), "--allow-motion")
-    assert confirmed.code == 0, confirmed.err
+    confirmed_run = run_here(field_robots.folder, "resume", str(trial), "--answers", str(answers), "--allow-motion")
+    assert confirmed_run.code == 0, confirmed_run.err
     assert motions(trial)[2:6] == ["held", "confirmed", "origin", "begun"]

@@ -1,4 +1,4 @@
-"""A driving robot: held after a fault, with one fence for all trials of a campaign; and stopped."""
+"""A driving robot in campaigns: it is held after a fault, and it has one fence for all trials."""
 
 import json
 import math
@@ -19,11 +19,11 @@ pytestmark = pytest.mark.emulated
 FENCE_M = 2.5
 PATH_M = 1.0
 BEYOND_M = 0.3
-"""Braking from 0.6 m/s at 2 m/s² takes 0.09 m, two cycles of the loop 0.06 m; the rest is a margin for a busy
-machine.
+"""The robot brakes from 0.6 m/s at 2 m/s² in 0.09 m, and moves 0.06 m in two cycles of its loop. The remainder is a
+margin for a busy machine.
 """
 LEASE_S = 30.0
-"""Longer than a test, so that no robot of these tests is stopped by its lease."""
+"""Longer than a test, so that the lease stops no robot in these tests."""
 CAMPAIGN = """\
 name: lawn
 procedures: [drive]
@@ -33,8 +33,8 @@ protocols: [udp]
 repeats: 1
 seed: 1
 """
-MOTION = ("--allow-motion",)
-UNASKED = (*MOTION, "--yes")
+ALLOW_MOTION = ("--allow-motion",)
+WITHOUT_QUESTIONS = (*ALLOW_MOTION, "--yes")
 OPTION = "--allow-motion-after-fault"
 
 
@@ -64,7 +64,7 @@ def answers(lab: RoverLab, *lines: str) -> tuple[str, str]:
 
 
 def assert_unmoved(lab: RoverLab, run: Run, reason: str, since_ns: int) -> None:
-    """Assert that a run ended for a reason that needs a person, and that the rover did not move."""
+    """Assert that a run ended because a person must act, and that the rover did not move."""
     assert run.code == 5, run.err
     assert reason in run.err
     track = lab.track_m(since_ns)
@@ -75,30 +75,31 @@ def test_a_fault_holds_the_robot_of_a_campaign_and_its_fence_applies_to_all_tria
     out, site = "held", ("--site", RECEIVER_SITE)
     lab.write_procedure(Role.RECEIVER, PATH_M)
     lab.place_at("5m")
-    home_m, begun_ns = lab.place_m, time.time_ns()
-    process = start(lab.folder, "campaign", "lawn.yaml", "--out", out, *site, *UNASKED)
+    home_m, started_ns = lab.place_m, time.time_ns()
+    process = start(lab.folder, "campaign", "lawn.yaml", "--out", out, *site, *WITHOUT_QUESTIONS)
     try:
         lab.wait_until_it_drives(process)
         process.send_signal(signal.SIGINT)
-        stopped = finish(process)
+        stopped_run = finish(process)
     finally:
         process.kill()
         wait_for_end({process.pid}, within_s=60.0)
-    assert stopped.code == 130, stopped.err
-    assert "before rover-1 moves again, a person must put it at its place and type confirm" in stopped.out
+    assert stopped_run.code == 130, stopped_run.err
+    assert "before rover-1 moves again, a person must put it at its place and type confirm" in stopped_run.out
     assert motions(lab, out) == ["origin", "begun", "held"]
 
     since_ns = time.time_ns()
-    assert_unmoved(lab, campaign(lab, out, *site, *UNASKED), "rover-1: stopped by the operator", since_ns)
-    assert len(trials(lab, out)) == 1, "no other trial began"
+    assert_unmoved(lab, campaign(lab, out, *site, *WITHOUT_QUESTIONS), "rover-1: stopped by the operator", since_ns)
+    assert len(trials(lab, out)) == 1, "no other trial started"
 
-    # With the option: first back along its path, then out again from its origin, which also applies to the next
-    # trial.
-    option = campaign(lab, out, *site, *UNASKED, OPTION)
-    assert option.code == 0, option.err
+    # With the option, the robot drives back along its path and then out again from its origin. The origin also
+    # applies
+    # to the next trial.
+    option_run = campaign(lab, out, *site, *WITHOUT_QUESTIONS, OPTION)
+    assert option_run.code == 0, option_run.err
     assert motions(lab, out) == ["origin", "begun", "held", "allowed", *("begun", "ended") * 2], "one origin"
     assert [row["status"] for trial in trials(lab, out) for row in rows(trial)] == ["void", "valid", "valid"]
-    farthest_m = max(math.dist(place_m, home_m) for place_m in lab.track_m(begun_ns))
+    farthest_m = max(math.dist(place_m, home_m) for place_m in lab.track_m(started_ns))
     assert farthest_m == pytest.approx(PATH_M, abs=BEYOND_M), (
         "not the whole distance again from the point of the stop"
     )
@@ -111,7 +112,7 @@ def test_a_robot_outside_its_fence_does_not_start_in_the_next_trial_of_a_campaig
     lab.write_procedure(Role.RECEIVER, 0.4)
     lab.place_at("5m")
     home_m = lab.place_m
-    process = start(lab.folder, "campaign", "lawn.yaml", "--out", out, *site, *UNASKED)
+    process = start(lab.folder, "campaign", "lawn.yaml", "--out", out, *site, *WITHOUT_QUESTIONS)
     try:
         lab.wait_until_it_drives(process)
         process.send_signal(signal.SIGINT)
@@ -121,12 +122,12 @@ def test_a_robot_outside_its_fence_does_not_start_in_the_next_trial_of_a_campaig
         wait_for_end({process.pid}, within_s=60.0)
     lab.drive_forward(FENCE_M)
     since_ns = time.time_ns()
-    result = campaign(lab, out, *site, *UNASKED, OPTION)
+    result = campaign(lab, out, *site, *WITHOUT_QUESTIONS, OPTION)
     assert_unmoved(lab, result, f"outside its fence of {FENCE_M:g} m", since_ns)
 
-    # A person puts it back and confirms this: a new origin, which applies to both trials.
+    # A person puts the robot back and confirms this. The robot gets a new origin, which applies to both trials.
     lab.place_at("5m")
-    run = campaign(lab, out, *site, *MOTION, *answers(lab, "", "confirm", ""))
+    run = campaign(lab, out, *site, *ALLOW_MOTION, *answers(lab, "", "confirm", ""))
     assert run.code == 0, run.err
     assert motions(lab, out)[-6:] == ["confirmed", "origin", "begun", "ended", "begun", "ended"]
     assert lab.place_m == pytest.approx(home_m, abs=0.1)
@@ -137,44 +138,46 @@ def test_with_yes_a_robot_does_not_start_at_an_unconfirmed_position(lab: RoverLa
     lab.write_procedure(Role.SENDER, 0.4)
     lab.place_at("5m")
     since_ns = time.time_ns()
-    several = run_here(lab.folder, "trial", "drive", "5m", "10m", "--out", out, *UNASKED)
-    assert several.code == 2, several.err
-    assert "rover-1 moves without a person and must be at another place for 10m" in several.err
+    two_distances_run = run_here(lab.folder, "trial", "drive", "5m", "10m", "--out", out, *WITHOUT_QUESTIONS)
+    assert two_distances_run.code == 2, two_distances_run.err
+    assert "rover-1 moves without a person and must be at another place for 10m" in two_distances_run.err
     assert set(lab.track_m(since_ns)) <= {lab.place_m}
 
-    first = campaign(lab, out, *UNASKED)
-    assert first.code == 5, first.err
-    assert "rover-1 must be at another place than before, and --yes does not confirm that it is there" in first.err
+    first_run = campaign(lab, out, *WITHOUT_QUESTIONS)
+    assert first_run.code == 5, first_run.err
+    assert (
+        "rover-1 must be at another place than before, and --yes does not confirm that it is there" in first_run.err
+    )
     assert motions(lab, out) == ["origin", "begun", "ended"]
     assert [[row["status"] for row in rows(trial)] for trial in trials(lab, out)] == [["valid"], []]
 
-    # A person confirms the position: its origin, and so its fence, is at the new position.
+    # After a person has confirmed the position, the origin and the fence are at the new position.
     (distance,) = (name for name in ("5m", "10m") if name in trials(lab, out)[1].name)
     lab.place_at(distance)
-    home_m, begun_ns = lab.place_m, time.time_ns()
-    second = campaign(lab, out, *MOTION, *answers(lab, ""))
-    assert second.code == 0, second.err
+    home_m, started_ns = lab.place_m, time.time_ns()
+    second_run = campaign(lab, out, *ALLOW_MOTION, *answers(lab, ""))
+    assert second_run.code == 0, second_run.err
     assert motions(lab, out) == ["origin", "begun", "ended"] * 2
-    farthest_m = max(math.dist(place_m, home_m) for place_m in lab.track_m(begun_ns))
+    farthest_m = max(math.dist(place_m, home_m) for place_m in lab.track_m(started_ns))
     assert farthest_m == pytest.approx(0.4, abs=BEYOND_M)
 
 
 def test_stop_stops_a_robot_after_fieldkit_was_killed(lab: RoverLab) -> None:
     lab.write_procedure(Role.SENDER, FENCE_M - BEYOND_M)
     lab.place_at("5m")
-    process = start(lab.folder, "trial", "drive", "5m", "--out", "killed", *UNASKED)
+    process = start(lab.folder, "trial", "drive", "5m", "--out", "killed", *WITHOUT_QUESTIONS)
     try:
         lab.wait_until_it_drives(process)
     finally:
         process.kill()
         process.communicate()
-    # An error of the site file that does not concern the robots must not prevent stopping them.
+    # An error of the site file that does not affect the robots must not prevent the stop.
     (lab.folder / "broken.yaml").write_text(
         (lab.folder / "fieldkit.yaml").read_text(encoding="utf-8") + "no such key: 1\n", encoding="utf-8"
     )
-    stopped = run_here(lab.folder, "stop", "--all", "--site", "broken.yaml")
-    assert stopped.code == 0, stopped.out + stopped.err
-    assert sorted(stopped.out.splitlines()) == [
+    stop_run = run_here(lab.folder, "stop", "--all", "--site", "broken.yaml")
+    assert stop_run.code == 0, stop_run.out + stop_run.err
+    assert sorted(stop_run.out.splitlines()) == [
         "box-1: no program of fieldkit moves it; nothing was sent to it",
         "rover-1: stopped (stationary)",
     ]

@@ -1,4 +1,4 @@
-"""A robot that drives away, end to end: its positions, the packets that reached it, and its rows."""
+"""A trial with a robot that drives away: its positions, the packets that reached it, and its rows."""
 
 import csv
 import signal
@@ -20,7 +20,7 @@ from tests.helpers.texts import site
 
 pytestmark = pytest.mark.emulated
 
-# A link that ends in one place.
+# Without fading and shadowing, the link ends at one distance.
 SITE = site(
     {"turtlebot-1": "turtlebot3_burger", "duckiedrone-1": "quick"},
     emulated="ros: builtin, record_air: true, radio: {fading: false, shadowing_db: 0.0}",
@@ -32,16 +32,16 @@ RATES = {mode.name: mode.rate_bit_s for mode in N_MODES}
 
 @pytest.fixture
 def lab(tmp_path: Path) -> Path:
-    """Return a lab with a drone faster than the shipped one, and a driveaway for it, which saves time."""
+    """A lab with a drone that is faster than the shipped one, and a procedure for it, to save time."""
     (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
     for folder, old, new, changes in (
         ("robots", "duckiedrone", "quick", {"max_speed_m_s: 3.0": "max_speed_m_s: 4.0"}),
         ("procedures", "driveaway", "rush", {"speed: 2m/s": "speed: 4m/s"}),
     ):
         text = (ROOT / folder / f"{old}.yaml").read_text(encoding="utf-8")
-        for was, becomes in (changes | {f"name: {old}": f"name: {new}"}).items():
-            assert was in text
-            text = text.replace(was, becomes)
+        for old_text, new_text in (changes | {f"name: {old}": f"name: {new}"}).items():
+            assert old_text in text
+            text = text.replace(old_text, new_text)
         (tmp_path / folder).mkdir()
         (tmp_path / folder / f"{new}.yaml").write_text(text, encoding="utf-8")
     return tmp_path
@@ -84,7 +84,9 @@ def test_the_link_slows_down_and_ends_at_the_distance_of_the_model(lab: Path) ->
     receiver_track = [point for point in points if point.role is Role.RECEIVER]
     assert {point.position_m for point in points if point.role is Role.SENDER} == {(3.0, 6.0, 0.2)}
     east_m = [point.position_m[0] for point in receiver_track if point.position_m is not None]
-    assert (east_m[0], max(east_m), east_m[-1]) == (43.0, 43.0 + PATH_M, 43.0), "there, and back at its place"
+    assert (east_m[0], max(east_m), east_m[-1]) == (43.0, 43.0 + PATH_M, 43.0), (
+        "it drives out and returns to its start"
+    )
     assert all(earlier < later for earlier, later in pairwise(east_m[:-1]))
     assert len(east_m) > PATH_M / 2, "positions along the whole path"
     assert {point.velocity_m_s for point in receiver_track[1:-2]} == {(SPEED_M_S, 0.0, 0.0)}
@@ -92,12 +94,13 @@ def test_the_link_slows_down_and_ends_at_the_distance_of_the_model(lab: Path) ->
 
     end_m = range_m()
     assert 60 < end_m < 40 + PATH_M, "the route leads out of range"
-    sent = frames(folder, points)
-    received_m = [metres for metres, _, received in sent if received]
+    sent_frames = frames(folder, points)
+    received_m = [metres for metres, _, is_received in sent_frames if is_received]
     assert end_m - 10 < max(received_m) <= end_m
-    nearest_m = min(metres for metres, _, _ in sent)  # the robot already drives while the programs start
+    nearest_m = min(metres for metres, _, _ in sent_frames)  # the robot already drives while the programs start
     near_bit_s, far_bit_s = (
-        [RATES[m] for metres, m, _ in sent if 0 <= metres - low <= 10] for low in (nearest_m, end_m - 10)
+        [RATES[mode] for metres, mode, _ in sent_frames if 0 <= metres - low_m <= 10]
+        for low_m in (nearest_m, end_m - 10)
     )
     assert sum(near_bit_s) / len(near_bit_s) > 1.2 * sum(far_bit_s) / len(far_bit_s)
 
@@ -116,7 +119,7 @@ def test_the_link_slows_down_and_ends_at_the_distance_of_the_model(lab: Path) ->
     assert run_here(lab, "verify", str(trial)).code == 0
 
 
-def test_a_trial_that_is_stopped_during_the_move_saves_its_state(lab: Path) -> None:
+def test_a_trial_that_is_stopped_during_the_move_records_that_it_was_interrupted(lab: Path) -> None:
     process = start(lab, "trial", "rush", "10m", "--repeats", "1", "--protocol", "tcp", "--record", "1s", "--json")
     wait_for_line(process, '"ping"')
     process.send_signal(signal.SIGTERM)
@@ -126,7 +129,7 @@ def test_a_trial_that_is_stopped_during_the_move_saves_its_state(lab: Path) -> N
     assert (row["status"], row["reason"]) == ("void", "interrupted")
 
 
-def test_a_robot_that_is_too_slow_is_rejected_before_anything_moves(lab: Path) -> None:
+def test_a_robot_that_is_too_slow_is_rejected_before_a_robot_moves(lab: Path) -> None:
     (lab / "fieldkit.yaml").write_text(SITE.replace("profile: quick", "profile: turtlebot3_burger"))
     path = lab / "procedures" / "rush.yaml"
     path.write_text(path.read_text().replace("      within_limits: true\n", ""))

@@ -1,4 +1,4 @@
-"""Drones in trials: one flies away in MuJoCo during a transfer, and none stays in the air without its laptop."""
+"""Drones in trials: one flies away in MuJoCo during a transfer, and drones land if fieldkit is stopped or killed."""
 
 import math
 import os
@@ -24,8 +24,8 @@ from tests.helpers.texts import procedure, site
 
 pytestmark = pytest.mark.emulated
 
-# The drone is in range where it hovers, and out of range 20 m farther. At the default of `late_bound`, 0.1 s, a busy
-# machine makes a repeat void: 0.07 s were measured at a load of 26.
+# The drone is in range at its start, and out of range 20 m farther. With the default of `late_bound`, 0.1 s, a repeat
+# on a busy machine may be void: a lateness of 0.07 s was measured at a load of 26.
 SITE = site(
     {"turtlebot-1": "turtlebot3_burger", "duckiedrone-1": "duckiedrone"},
     emulated="ros: builtin, radio: {fading: false, shadowing_db: 0.0, noise_floor_dbm: -59, mode: n0}, "
@@ -61,7 +61,7 @@ def lab(folder: Path, during: str) -> Path:
     return folder
 
 
-def test_a_drone_flies_away_and_the_row_contains_it(tmp_path: Path) -> None:
+def test_the_row_of_a_repeat_describes_the_flight_of_the_drone(tmp_path: Path) -> None:
     (lab(tmp_path, TRANSFER) / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
     run = run_here(tmp_path, "trial", "flyaway", "3m")
     assert run.code == 0, run.err
@@ -93,9 +93,9 @@ def test_a_drone_flies_away_and_the_row_contains_it(tmp_path: Path) -> None:
     assert "flew " in run.out
 
 
-# A drone of each family; both are real robots for fieldkit. Landings by their programs start soon.
+# One drone of each family of autopilots. fieldkit uses both like real robots.
 DRONES = site({"copter-1": "copter", "duckiedrone-1": "duckiedrone"}, emulated="ros: builtin")
-GIVEN_UP = procedure(
+PROCEDURE_WITH_LEASE = procedure(
     "givenup",
     """\
 - fly:
@@ -124,8 +124,8 @@ while beat is None or beat.base_mode & 128:
     beat = drone.recv_match(type="HEARTBEAT", blocking=True, timeout=0.5) or beat
 """
 NEAR_M = 0.6
-"""Distance to home; it flew three times as far."""
-NEWEST = 'cat "$(ls -t .fieldkit/*/*/fly.log | head -n 1)"'
+"""Maximum distance from home after the return; the drone flies three times as far."""
+PRINT_NEWEST_LOG = 'cat "$(ls -t .fieldkit/*/*/fly.log | head -n 1)"'
 
 
 START_M: dict[Role, Vector] = {}
@@ -144,7 +144,7 @@ def field_robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FieldRobo
     (folder / "drones.yaml").write_text(DRONES, encoding="utf-8")
     with ExitStack() as stack:
         with pytest.MonkeyPatch.context() as patch:
-            patch.chdir(folder)  # profiles are searched there
+            patch.chdir(folder)  # profiles are searched in the working folder
             field_robots = stack.enter_context(start_field_robots(folder, site=folder / "drones.yaml"))
         START_M.update(places_m(field_robots))
         yield field_robots
@@ -153,13 +153,13 @@ def field_robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FieldRobo
 def test_the_first_ctrl_c_lets_an_arducopter_return_and_waits_for_the_ground(field_robots: FieldRobots) -> None:
     set_parameter(field_robots, Role.SENDER, "RTL_ALT", 100)
     set_parameter(field_robots, Role.SENDER, "WPNAV_RADIUS", 10)
-    process = flying(field_robots, Role.SENDER, abort="return", lease="60s")
-    wait_until(lambda: far_m(field_robots, Role.SENDER) > 1.5, Deadline.after(60))
+    process = start_flight(field_robots, Role.SENDER, abort="return", lease="60s")
+    wait_until(lambda: distance_from_start_m(field_robots, Role.SENDER) > 1.5, Deadline.after(60))
     process.send_signal(signal.SIGINT)
-    stopped = finish(process)
-    assert stopped.code == 130
+    stopped_run = finish(process)
+    assert stopped_run.code == 130
     stop_line, return_line, ground_line = map(
-        stopped.err.index,
+        stopped_run.err.index,
         (
             "stopping: copter-1 returns automatically, if it is in the air: this takes up to about ",
             "copter-1: coming down (return)",
@@ -167,47 +167,47 @@ def test_the_first_ctrl_c_lets_an_arducopter_return_and_waits_for_the_ground(fie
         ),
     )
     assert stop_line < return_line < ground_line
-    assert height_m(field_robots, Role.SENDER) < 1e-3, "confirmed when it is there"
+    assert height_m(field_robots, Role.SENDER) < 1e-3, "the landing is reported when the drone is on the ground"
     assert_landed(field_robots, Role.SENDER, "return: the job was cancelled")
-    assert far_m(field_robots, Role.SENDER) < NEAR_M
+    assert distance_from_start_m(field_robots, Role.SENDER) < NEAR_M
     wait_until(lambda: not agents(), Deadline.after(60))
 
 
-def test_a_drone_continues_without_its_laptop_until_abort(field_robots: FieldRobots) -> None:
-    """If fieldkit is killed, the drone lands when its lease ends; `fieldkit abort` ends its job before that."""
-    process = flying(field_robots, Role.RECEIVER, abort="land", lease="60s")
+def test_a_drone_flies_without_its_laptop_until_abort(field_robots: FieldRobots) -> None:
+    """If fieldkit is killed, the drone lands when its lease expires; `fieldkit abort` stops its job earlier."""
+    process = start_flight(field_robots, Role.RECEIVER, abort="land", lease="60s")
     process.kill()
     process.communicate(timeout=60)
     wait_for_end({process.pid}, within_s=60.0)
     assert agents()
     assert height_m(field_robots, Role.RECEIVER) > 0.2, "it still flies"
-    aborted = run_here(field_robots.folder, "abort", "--yes")
-    assert aborted.code == 0
-    assert "/fly " in aborted.out, aborted.err
+    abort_run = run_here(field_robots.folder, "abort", "--yes")
+    assert abort_run.code == 0
+    assert "/fly " in abort_run.out, abort_run.err
     assert_landed(field_robots, Role.RECEIVER, "land: the job was cancelled")
     wait_until(lambda: not agents(), Deadline.after(60))
 
 
 def test_a_second_ctrl_c_does_not_wait_for_the_landing(field_robots: FieldRobots) -> None:
-    process = flying(field_robots, Role.RECEIVER, abort="land", lease="60s")
+    process = start_flight(field_robots, Role.RECEIVER, abort="land", lease="60s")
     assert process.stderr is not None
     process.send_signal(signal.SIGINT)
     assert any("duckiedrone-1: coming down (land)" in line for line in process.stderr)
     process.send_signal(signal.SIGINT)
-    stopped = finish(process)
-    assert stopped.code == 130
-    assert "the order to stop was sent" in stopped.err
+    stopped_run = finish(process)
+    assert stopped_run.code == 130
+    assert "the order to stop was sent" in stopped_run.err
     assert_landed(field_robots, Role.RECEIVER, "land: the job was cancelled")
     wait_until(lambda: not agents(), Deadline.after(60))
 
 
 def test_stop_lands_a_drone_after_fieldkit_was_killed(field_robots: FieldRobots) -> None:
-    process = flying(field_robots, Role.RECEIVER, abort="land", lease="60s")
+    process = start_flight(field_robots, Role.RECEIVER, abort="land", lease="60s")
     process.kill()
     process.communicate(timeout=60)
-    stopped = run_here(field_robots.folder, "stop", "--all")
-    assert stopped.code == 0, stopped.err
-    assert sorted(stopped.out.splitlines()) == [
+    stopped_run = run_here(field_robots.folder, "stop", "--all")
+    assert stopped_run.code == 0, stopped_run.err
+    assert sorted(stopped_run.out.splitlines()) == [
         "copter-1: no program of fieldkit moves it; nothing was sent to it",
         "duckiedrone-1: coming down (land)",
     ]
@@ -216,18 +216,16 @@ def test_stop_lands_a_drone_after_fieldkit_was_killed(field_robots: FieldRobots)
 
 
 def set_parameter(field_robots: FieldRobots, role: Role, name: str, value: float) -> None:
-    """Set a parameter of an autopilot, for example the minimum return height or the distance at which it starts to
-    land.
-    """
+    """Set a parameter of an autopilot."""
     program = SET_PARAMETER.format(name=name, value=value)
     field_robots.testbed.shells[role].run((sys.executable, "-c", program), deadline=Deadline.after(60))
 
 
-def flying(field_robots: FieldRobots, role: Role, *, abort: str, lease: str) -> "subprocess.Popen[str]":
-    """Wait for stopped motors after a landing; start a trial, and return when its drone is in the air."""
+def start_flight(field_robots: FieldRobots, role: Role, *, abort: str, lease: str) -> "subprocess.Popen[str]":
+    """Wait until the motors are stopped, start a trial, and return when its drone is in the air."""
     field_robots.testbed.shells[role].run((sys.executable, "-c", STATIONARY_DRONE), deadline=Deadline.after(60))
     (field_robots.folder / "procedures").mkdir(exist_ok=True)
-    text = GIVEN_UP
+    text = PROCEDURE_WITH_LEASE
     for word, value in (("ROLE", role), ("HOW", abort), ("LEASE", lease)):
         text = text.replace(word, value)
     (field_robots.folder / "procedures/givenup.yaml").write_text(text, encoding="utf-8")
@@ -238,37 +236,37 @@ def flying(field_robots: FieldRobots, role: Role, *, abort: str, lease: str) -> 
 
 
 def assert_landed(field_robots: FieldRobots, role: Role, reason: str) -> None:
-    """Wait until the drone is on the ground, and check the reason that its program reports for the landing."""
+    """Wait until the drone is on the ground, and check the reason for the landing in the log of its program."""
     wait_until(lambda: height_m(field_robots, role) < 1e-3, Deadline.after(60))
     shell = field_robots.testbed.shells[role]
-    assert reason in shell.run(("sh", "-c", NEWEST), deadline=Deadline.after(30)).stdout.decode()
+    assert reason in shell.run(("sh", "-c", PRINT_NEWEST_LOG), deadline=Deadline.after(30)).stdout.decode()
 
 
-def moved_m(field_robots: FieldRobots, role: Role) -> Vector:
-    """Return the distance of the drone from its initial position, by the lab."""
+def displacement_m(field_robots: FieldRobots, role: Role) -> Vector:
+    """Return the true position of the drone relative to its initial position."""
     now_m, start_m = places_m(field_robots)[role], START_M[role]
     return now_m[0] - start_m[0], now_m[1] - start_m[1], now_m[2] - start_m[2]
 
 
 def places_m(field_robots: FieldRobots) -> dict[Role, Vector]:
-    """Return the present positions, and discard earlier ones, because tests poll them a hundred times per second."""
+    """Return the present positions; the oracle drops earlier ones, because tests poll a hundred times per second."""
     track = field_robots.testbed.oracle.track(time.time_ns())
     return {point.role: point.position_m for point in track if point.position_m is not None}
 
 
-def far_m(field_robots: FieldRobots, role: Role) -> float:
-    return math.hypot(*moved_m(field_robots, role)[:2])
+def distance_from_start_m(field_robots: FieldRobots, role: Role) -> float:
+    return math.hypot(*displacement_m(field_robots, role)[:2])
 
 
 def height_m(field_robots: FieldRobots, role: Role) -> float:
-    return moved_m(field_robots, role)[2]
+    return displacement_m(field_robots, role)[2]
 
 
 def agents() -> list[str]:
-    """Return the command lines of fieldkit's agents on our robots."""
+    """Return the command lines of fieldkit's agents on the emulated robots."""
     command_lines = []
     for pid in descendants(os.getpid()):
-        with suppress(OSError):  # the process has ended
+        with suppress(OSError):  # the process has exited
             words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
             command_lines += [" ".join(map(os.fsdecode, words))] if any(b"/agent-" in word for word in words) else []
     return command_lines

@@ -1,7 +1,6 @@
-"""Consecutive repeats of a flight fly the same path: an emulated ArduCopter in the field backend, by true
-positions.
+"""Consecutive repeats of a flight of an emulated ArduCopter follow the same path.
 
-The field backend leaves the drone as it landed: an ArduCopter has turned its nose towards home.
+The field backend does not move the drone between repeats, and an ArduCopter turns towards home when it returns.
 """
 
 import math
@@ -44,7 +43,7 @@ steps:
 
 
 def flights(places_m: Sequence[Vector]) -> Iterator[list[Vector]]:
-    """Yield the positions of each flight, from the last one on the ground before it to the first one after it."""
+    """Yield the positions of each flight, with the last position on the ground before it and the first after it."""
     ground_m, flight = places_m[0][2], [places_m[0]]
     for place_m in places_m:
         if place_m[2] > ground_m + AIRBORNE_M:
@@ -57,7 +56,7 @@ def flights(places_m: Sequence[Vector]) -> Iterator[list[Vector]]:
 
 
 def farthest_m(flight: Sequence[Vector], start_m: Vector) -> tuple[float, float]:
-    """Return the farthest position of a flight relative to a start, east and north."""
+    """Return the position of a flight that is farthest from the start, relative to the start: east, north."""
     east_m, north_m, _ = max(flight, key=lambda place_m: math.dist(place_m[:2], start_m[:2]))
     return east_m - start_m[0], north_m - start_m[1]
 
@@ -80,21 +79,21 @@ def test_consecutive_repeats_fly_the_same_path(repeats: int, tmp_path: Path, mon
         assert run.code == 0, run.err
         track = [place for place in field_robots.testbed.oracle.track(0) if place.role is Role.RECEIVER]
     places_m = [place.position_m for place in track if place.position_m is not None]
-    flown = list(flights(places_m))
+    recorded_flights = list(flights(places_m))
     home_m = places_m[0]
-    for flight in flown:
-        apath_m, aside_m = farthest_m(flight, home_m)
-        assert 0.4 * PATH_M < apath_m < 1.3 * PATH_M, (
-            "it is ordered back before the end of its path if the machine is busy"
+    for flight in recorded_flights:
+        east_m, north_m = farthest_m(flight, home_m)
+        assert 0.4 * PATH_M < east_m < 1.3 * PATH_M, (
+            "on a busy machine, the drone must return before the end of its path"
         )
-        assert abs(aside_m) < 0.3
+        assert abs(north_m) < 0.3
     # On a busy machine the pilot may be suspended; it then lands the drone, and the attempt is void.
     results = [row for row in rows(only_trial(tmp_path)) if row["status"] != "void"]
     assert [row["status"] for row in results] == ["valid"] * repeats
     attempts = sum(int(row["attempt"]) for row in results)
-    assert len(flown) <= attempts
+    assert len(recorded_flights) <= attempts
     if attempts == repeats:
-        assert len(flown) == repeats
-        for row, flight in zip(results, flown, strict=True):
+        assert len(recorded_flights) == repeats
+        for row, flight in zip(results, recorded_flights, strict=True):
             assert math.dist(flight[-1][:2], home_m[:2]) < 0.5, "it came back"
             assert float(row["fly_farthest_m"]) == pytest.approx(farthest_m(flight, home_m)[0], abs=0.3)

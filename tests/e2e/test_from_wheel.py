@@ -1,4 +1,4 @@
-"""What a wheel installs: pages for `fieldkit docs`, which needs no network, and the plugin for pytest."""
+"""The contents of the wheel: the pages of `fieldkit docs`, which need no network, and the plugin for pytest."""
 
 import shutil
 import subprocess
@@ -18,7 +18,7 @@ EXAMPLE = ROOT / "docs" / "examples" / "teleop"
 
 @pytest.fixture(scope="module")
 def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return wheels.installed(tmp_path_factory.mktemp("wheel"))
+    return wheels.install_wheel(tmp_path_factory.mktemp("wheel"))
 
 
 def page(python: Path, topic: str) -> Path:
@@ -44,14 +44,14 @@ def test_a_topic_is_an_installed_page_about_it(python: Path, topic: str, text: s
 
 
 def test_every_link_leads_to_an_installed_page(python: Path) -> None:
-    assert site_links.broken(page(python, "index").parent) == []
+    assert site_links.broken_links(page(python, "index").parent) == []
 
 
-def test_search_works_from_files(python: Path) -> None:
-    requested: list[str] = []
+def test_the_search_of_the_pages_needs_no_server(python: Path) -> None:
+    requested_urls: list[str] = []
 
     def record_request(request: Request) -> None:
-        requested.append(request.url)
+        requested_urls.append(request.url)
 
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=["--no-sandbox"])
@@ -62,28 +62,30 @@ def test_search_works_from_files(python: Path) -> None:
         tab.keyboard.type("netcat")
         tab.wait_for_selector(".md-search-result__item")
         browser.close()
-    assert not [url for url in requested if not url.startswith(("file:", "data:", "about:", "blob:"))]
+    assert not [url for url in requested_urls if not url.startswith(("file:", "data:", "about:", "blob:"))]
 
 
 @pytest.fixture
 def example(tmp_path: Path) -> Path:
-    """The example after a user has copied it."""
+    """A copy of the example, as a user would make it."""
     return Path(shutil.copytree(EXAMPLE, tmp_path / "teleop", ignore=shutil.ignore_patterns("__pycache__")))
 
 
 def test_the_example_passes(python: Path, example: Path) -> None:
-    where = subprocess.run(
+    import_run = subprocess.run(
         (python, "-c", "import fieldkit; print(fieldkit.__file__)"), cwd=example, capture_output=True, check=True
     )
-    assert Path(where.stdout.decode().strip()).is_relative_to(python.parents[1])
-    done = suites.run(example, python=str(python), import_folders=())
-    assert (done.code, set(done.results.values()), len(done.results)) == (0, {"passed"}, 3), done.output
+    assert Path(import_run.stdout.decode().strip()).is_relative_to(python.parents[1])
+    suite_run = suites.run(example, python=str(python), import_folders=())
+    assert (suite_run.code, set(suite_run.results.values()), len(suite_run.results)) == (0, {"passed"}, 3), (
+        suite_run.output
+    )
     assert not (example / "fieldkit-results").exists()
 
 
 def test_the_sources_of_programs_in_cpp_are_installed(python: Path) -> None:
     (packages,) = (python.parents[1] / "lib").glob("python*/site-packages")
-    sources, installed = (
+    repository_files, installed_files = (
         {
             path.relative_to(root).as_posix()
             for path in (root / "sim_backends").rglob("*")
@@ -91,5 +93,5 @@ def test_the_sources_of_programs_in_cpp_are_installed(python: Path) -> None:
         }
         for root in (ROOT, packages)
     )
-    assert "sim_backends/federates/cpp/fieldkit/frames.h" in installed
-    assert installed == sources
+    assert "sim_backends/federates/cpp/fieldkit/frames.h" in installed_files
+    assert installed_files == repository_files

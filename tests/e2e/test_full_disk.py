@@ -1,4 +1,4 @@
-"""The laptop's disk fills up during a trial: the trial stops cleanly, and continues when there is space again."""
+"""If the laptop's disk is full during a trial, the trial stops with a message and can be resumed."""
 
 import os
 import subprocess
@@ -45,7 +45,7 @@ def test_a_full_disk_stops_the_trial_and_resume_continues_after_cleaning_up(tmp_
     out.mkdir()
     lab.mkdir()
     built_in_ros(out)
-    done = subprocess.run(
+    completed = subprocess.run(
         ("unshare", "--mount", "sh", "-c", SCRIPT, "sh", str(out), sys.executable, str(lab)),
         capture_output=True,
         text=True,
@@ -54,7 +54,7 @@ def test_a_full_disk_stops_the_trial_and_resume_continues_after_cleaning_up(tmp_
         env=os.environ | {"PYTHONUNBUFFERED": "1"},
     )
     outputs = {name: (out / name).read_text(encoding="utf-8") for name in ("first", "full", "second", "small")}
-    assert done.returncode == 0, (done.stderr, outputs)
+    assert completed.returncode == 0, (completed.stderr, outputs)
     for name in ("first", "full"):
         assert "free some space, then: fieldkit resume trials/" in outputs[name]
         assert outputs[name].endswith("exit code 2\n")

@@ -1,4 +1,4 @@
-"""The pictures of docs/gallery.md are those that benchmarks.studies.gallery generates."""
+"""benchmarks.studies.gallery generates the pictures of docs/gallery.md."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""One tool at a time hangs on a robot, during its work or when queried for its version: the trial still ends."""
+"""A trial ends even if a tool on a robot hangs, during its work or in response to a query of its version."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,7 +25,7 @@ PROCEDURE = procedure(
 """,
 )
 
-# Responds to version queries like the real tool, and hangs during its work.
+# This script responds to version queries like the real tool, and hangs during its work.
 HANGS_AT_WORK = """\
 #!/bin/sh
 case "$*" in -V | -h | --help | -L* | *127.0.0.1*) exec {program} "$@" ;; esac
@@ -48,15 +48,17 @@ def lab(field_robots: FieldRobots, tmp_path: Path) -> Path:
 
 
 def replace_tool(field_robots: FieldRobots, lab: Path, tool: str, program: str, script: str) -> None:
-    """Set a program of the robot in place of a tool in the sender's profile."""
-    place_program(field_robots, tool, script.format(program=program))
+    """Replace a tool of the sender by a script."""
+    install_script(field_robots, tool, script.format(program=program))
     copy_shipped(lab, "robots", "turtlebot3_burger", f"  {tool}: {program}\n", f"  {tool}: /root/{tool}\n")
 
 
-def place_program(field_robots: FieldRobots, name: str, script: str) -> None:
+def install_script(field_robots: FieldRobots, name: str, script: str) -> None:
     for shell in field_robots.testbed.shells.values():
-        place = 'cat >"$1" && chmod 755 "$1"'
-        shell.run(("sh", "-c", place, "sh", f"/root/{name}"), stdin=script.encode(), deadline=Deadline.after(30))
+        write_script = 'cat >"$1" && chmod 755 "$1"'
+        shell.run(
+            ("sh", "-c", write_script, "sh", f"/root/{name}"), stdin=script.encode(), deadline=Deadline.after(30)
+        )
 
 
 @pytest.mark.parametrize(
@@ -67,7 +69,7 @@ def place_program(field_robots: FieldRobots, name: str, script: str) -> None:
         ("ping", "ping", "ping"),
     ],
 )
-def test_a_hanging_tool_is_ended_at_its_limit(
+def test_a_hanging_tool_is_terminated_at_its_time_limit(
     field_robots: FieldRobots, lab: Path, tool: str, program: str, message: str
 ) -> None:
     replace_tool(field_robots, lab, tool, program, HANGS_AT_WORK)
@@ -96,11 +98,11 @@ def test_a_tool_that_hangs_on_version_queries_is_rejected_before_repeat_1(
     assert "remedy" in run.err
 
 
-def test_a_hanging_recorder_is_ended_at_its_limit(field_robots: FieldRobots, lab: Path) -> None:
+def test_a_hanging_recorder_is_terminated_at_its_time_limit(field_robots: FieldRobots, lab: Path) -> None:
     copy_shipped(
         lab, "robots", "turtlebot3_burger", '[rosbag, record, "--duration', '[/root/rosbag, record, "--duration'
     )
-    place_program(field_robots, "rosbag", HANGS_AT_WORK.replace("-V |", "*--help* | -V |").format(program="rosbag"))
+    install_script(field_robots, "rosbag", HANGS_AT_WORK.replace("-V |", "*--help* | -V |").format(program="rosbag"))
     run = run_here(lab, "trial", "short", "5m", "--yes")
     assert run.code == 4, run.err
     (row,) = rows(only_trial(lab))

@@ -1,4 +1,4 @@
-"""Texts of robots and operators in every output: no output passes control characters on to a terminal or viewer."""
+"""No output contains control characters, even if texts of robots and operators contain them."""
 
 import csv
 import io
@@ -23,9 +23,9 @@ from tests.helpers.tables import ROW, RepeatRow, replace, write
 
 HOSTILE = "=a\x1b[31mb\x07\x7f\x9b5m\u202ec\u2066\u200fd\u2028e"
 TEXTS = ("procedure", "scenario", "backend", "distance", "sender", "reason")
-WRITTEN_TO_FILES = "export"
+FILE_COMMAND = "export"
 BARE_PRINT = {"fieldkit/cli/display.py", "fieldkit/cli/operators.py", "fieldkit/cli/commands/completion.py"}
-"""Modules that may print: the one that escapes texts, fieldkit's prompts, and the script of a shell."""
+"""Modules that may print: the module that escapes texts, the prompts, and the script for shell completion."""
 
 
 def formats() -> Iterator[tuple[str, str]]:
@@ -64,7 +64,7 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def assert_shown(text: str) -> None:
+def assert_printable(text: str) -> None:
     assert {char for char in text if not (char.isprintable() or char in "\n\N{NO-BREAK SPACE}")} == set()
 
 
@@ -83,8 +83,8 @@ def texts_in(form: str, path: Path) -> Iterator[str]:
 
 def words(command: str, form: str, hostile: Path, out: Path) -> Sequence[str]:
     a, b = (str(next(hostile.glob(f"{name}*"))) for name in "ab")
-    named = {"aggregate": (str(hostile),), "compare": (a, b, "--force"), "export": (f"{a}/los", "-o", str(out))}
-    return (command, *named[command], "--format", form)
+    arguments = {"aggregate": (str(hostile),), "compare": (a, b, "--force"), "export": (f"{a}/los", "-o", str(out))}
+    return (command, *arguments[command], "--format", form)
 
 
 @pytest.mark.parametrize(("command", "form"), [*formats(), ("report", "html")])
@@ -97,16 +97,18 @@ def test_no_output_contains_control_characters(
     else:
         assert main([*words(command, form, hostile, out)]) == 0
     captured = capsys.readouterr()
-    assert_shown(captured.out)
-    assert_shown(captured.err)
-    written = list(texts_in(form, out)) if out.exists() else [captured.out]
+    assert_printable(captured.out)
+    assert_printable(captured.err)
+    output_texts = list(texts_in(form, out)) if out.exists() else [captured.out]
     assert out.exists() is (command in {"export", "report"})
-    for text in written:
-        assert_shown(text)
+    for text in output_texts:
+        assert_printable(text)
     if form != "mcap":
-        assert any("?[31mb" in text or "\\u001b[31mb" in text for text in written), "the texts contain the sequence"
+        assert any("?[31mb" in text or "\\u001b[31mb" in text for text in output_texts), (
+            "the texts contain the sequence"
+        )
     if form == "csv":
-        cells = [cell for line in csv.reader(io.StringIO(written[0])) for cell in line]
+        cells = [cell for line in csv.reader(io.StringIO(output_texts[0])) for cell in line]
         assert not [cell for cell in cells if cell.startswith("=")]
 
 
@@ -129,9 +131,9 @@ def round_trip(row: RepeatRow) -> dict[str, object]:
 
 @given(st.tuples(*[st.text(st.characters(exclude_categories=["C", "Z"]), max_size=12)] * 3))
 def test_a_table_that_is_read_again_has_equal_texts(texts: tuple[str, str, str]) -> None:
-    columns_read = dict(zip(("distance", "reason", "sender"), texts, strict=True))
-    columns_read = {name: "" if text in {"nan", "NaN"} else text for name, text in columns_read.items()}
-    assert round_trip(replace(ROW, **columns_read)) == columns_read
+    expected_texts = dict(zip(("distance", "reason", "sender"), texts, strict=True))
+    expected_texts = {name: "" if text in {"nan", "NaN"} else text for name, text in expected_texts.items()}
+    assert round_trip(replace(ROW, **expected_texts)) == expected_texts
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=25)
@@ -143,4 +145,4 @@ def test_any_text_of_a_condition_is_printable_in_any_format(
     code = main(["aggregate", str(table), "--by", "distance,protocol", "--format", form])
     captured = capsys.readouterr()
     assert code == 0, captured.err
-    assert_shown(captured.out + captured.err)
+    assert_printable(captured.out + captured.err)

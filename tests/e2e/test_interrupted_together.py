@@ -1,4 +1,4 @@
-"""Ctrl-C during simultaneous steps: all of them end, and the repeat is reported as interrupted."""
+"""Ctrl-C during simultaneous steps stops all of them, and the repeat is reported as interrupted."""
 
 import json
 import signal
@@ -31,15 +31,15 @@ PROCEDURE = procedure(
 
 
 def wait_for_all(process: "subprocess.Popen[str]", names: list[str]) -> None:
-    """Return when all of these steps have started, in any order."""
+    """Wait until all of these steps have started, in any order."""
     assert process.stdout is not None
-    left = list(names)
+    pending_names = list(names)
     for line in process.stdout:
-        if (name := json.loads(line).get("name")) in left:
-            left.remove(name)
-        if not left:
+        if (name := json.loads(line).get("name")) in pending_names:
+            pending_names.remove(name)
+        if not pending_names:
             return
-    raise AssertionError(f"never began: {left}")
+    raise AssertionError(f"these steps did not start: {pending_names}")
 
 
 def test_ctrl_c_ends_all_simultaneous_steps(tmp_path: Path, untouched: NamespaceComparison) -> None:
@@ -53,14 +53,14 @@ def test_ctrl_c_ends_all_simultaneous_steps(tmp_path: Path, untouched: Namespace
         process.terminate()
         finish(process)
         raise
-    family = descendants(process.pid)
+    process_ids = descendants(process.pid)
     process.send_signal(signal.SIGINT)
     assert process.stderr is not None
     assert any("Ctrl-C again" in line for line in process.stderr)
     process.send_signal(signal.SIGINT)
-    stopped = finish(process)
-    assert stopped.code == 130, stopped.err
-    wait_for_end(family, within_s=60.0)
+    stopped_run = finish(process)
+    assert stopped_run.code == 130, stopped_run.err
+    wait_for_end(process_ids, within_s=60.0)
     untouched()
     (row,) = rows(only_trial(tmp_path))
     assert (row["repeat"], row["status"], row["reason"]) == ("1", "void", "interrupted")

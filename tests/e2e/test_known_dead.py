@@ -1,4 +1,4 @@
-"""A radio that carries nothing, measured by a complete trial."""
+"""A complete trial over a radio that delivers no packets."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from tests.helpers.known_radio import make_lab, run_all
 pytestmark = pytest.mark.emulated
 
 
-def test_a_transfer_over_a_dead_link_is_ended_at_its_limit_and_measured(tmp_path: Path) -> None:
+def test_a_transfer_over_a_dead_link_is_stopped_at_its_limit_and_measured(tmp_path: Path) -> None:
     lab = make_lab(tmp_path / "dead", "{loss: 100%}")
     procedure = lab / "procedures" / "quick.yaml"
     procedure.write_text(procedure.read_text(encoding="utf-8").replace("limit: 600s", "limit: 10s"), encoding="utf-8")
@@ -23,6 +23,6 @@ def test_a_transfer_over_a_dead_link_is_ended_at_its_limit_and_measured(tmp_path
             "false",
         )
         assert row["one_way_withheld"] == "no packet of the transfer is in both captures"
-        assert row["transfer_s"] == row["delay_s"] == "", "missing is empty"
+        assert row["transfer_s"] == row["delay_s"] == "", "a missing value is empty"
         assert row["delay_packets"] == "0"
         assert row["rtt_loss"] == "1"

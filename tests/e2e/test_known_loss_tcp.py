@@ -1,4 +1,4 @@
-"""A radio with known loss, measured by complete trials over TCP: every byte arrives; retransmissions count."""
+"""Complete trials over TCP and a radio with a known loss: every byte arrives, and retransmissions are counted."""
 
 from collections.abc import Sequence
 
@@ -9,9 +9,8 @@ from tests.helpers.runs import total
 
 pytestmark = pytest.mark.emulated
 
-# With a loss of 30 % in each direction every second round trip fails and TCP doubles its timer each time: one
-# transfer in ten takes a minute or more, so 20 took up to 450 s. The assertions on each transfer and on their sum
-# need fewer.
+# With a loss of 30 % in each direction, every second round trip fails, and TCP doubles its timer each time. One
+# transfer in ten takes a minute or more, so 20 transfers took up to 450 s. The assertions need fewer transfers.
 SHARE_AT = dict.fromkeys(LOSSES_PERCENT, 1.0) | {30: 0.4}
 
 
@@ -46,7 +45,7 @@ def test_tcp_delivers_every_byte_and_retransmissions_are_counted(
         assert row["hash_match"] == "true"
         assert row["tcp_unique_bytes"] == row["sent_bytes"] == row["received_bytes"]
         assert float(row["file_loss"]) == 0
-    if percent >= 10:  # at 1 % there may be no loss in the few packets of CI
+    if percent >= 10:  # at 1 %, no packet may be lost in the short trials of CI
         assert total(table, "tcp_retransmitted_segments") > 0
         assert sum(float(row["tcp_byte_loss"]) for row in table) > 0
 
@@ -55,22 +54,22 @@ def test_tcp_delivers_every_byte_and_retransmissions_are_counted(
 def test_packets_received_twice_are_those_that_tcp_sent_twice(
     lossy_tcp: dict[str, list[dict[str, str]]], percent: int
 ) -> None:
-    """The radio is a queue that copies nothing, and TUN devices do not aggregate packets."""
+    """The radio is a queue that duplicates no packets, and TUN devices do not aggregate packets."""
     for row in lossy_tcp[str(percent)]:
-        number = {name: int(value) for name, value in row.items() if name.startswith("tcp_") and value.isdigit()}
-        assert number["tcp_received_bytes"] == number["tcp_unique_bytes"] + number["tcp_duplicated_bytes"]
-        assert number["tcp_spurious_segments"] <= number["tcp_retransmitted_segments"]
+        counts = {name: int(value) for name, value in row.items() if name.startswith("tcp_") and value.isdigit()}
+        assert counts["tcp_received_bytes"] == counts["tcp_unique_bytes"] + counts["tcp_duplicated_bytes"]
+        assert counts["tcp_spurious_segments"] <= counts["tcp_retransmitted_segments"]
         for name in ("tcp_reordered_segments", "tcp_doubtful_segments", "tcp_superframes"):
-            assert number[name] == 0, name
+            assert counts[name] == 0, name
 
 
 def test_tcp_retransmits_mostly_lost_packets(lossy_tcp: dict[str, list[dict[str, str]]]) -> None:
-    """Needless retransmissions follow a lost acknowledgment that no later one replaces, or a pause of the machine."""
+    """Spurious retransmissions follow a lost acknowledgment that no later one replaces, or a pause of the machine."""
     without_loss = lossy_tcp["0"]
     for row in without_loss:
-        assert row["tcp_retransmitted_segments"] == row["tcp_spurious_segments"], "nothing was lost"
-    paused = sum(row["tcp_retransmitted_segments"] != "0" for row in without_loss)
-    assert paused <= len(without_loss) / 2, "a machine may be busy, but not in every repeat"
+        assert row["tcp_retransmitted_segments"] == row["tcp_spurious_segments"], "no packet was lost"
+    paused_repeats = sum(row["tcp_retransmitted_segments"] != "0" for row in without_loss)
+    assert paused_repeats <= len(without_loss) / 2, "a machine may be busy, but not in every repeat"
     spurious, retransmitted = (
         sum(total(table, f"tcp_{kind}_segments") for table in lossy_tcp.values())
         for kind in ("spurious", "retransmitted")

@@ -1,4 +1,4 @@
-"""A radio with known loss, measured by complete trials over UDP: the measured loss must be the configured loss."""
+"""Complete trials over UDP and a radio with a known loss: the measured loss must be the configured loss."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,8 @@ from tests.helpers.runs import total
 pytestmark = pytest.mark.emulated
 
 FOUR_SIGMA = 0.99994
-"""The captured packets differ from run to run, and so do the radio's random draws for them."""
+"""The confidence level of four standard deviations. The captured packets and the radio's random draws for them differ
+between runs."""
 FRAGMENTS = 6  # of a datagram of 8,192 bytes in packets of 1,500
 
 
@@ -23,7 +24,7 @@ def lossy_udp(
 ) -> dict[str, list[dict[str, str]]]:
     base = tmp_path_factory.mktemp("udp")
 
-    # 200 messages a second make a bag of some 80 kB: 60 packets a repeat.
+    # 200 messages per second result in a bag of about 80 kB, which is 60 packets per repeat.
     def measure(losses: Sequence[int]) -> dict[str, Table]:
         labs = [make_lab(base / str(loss), f"{{loss: {loss}%, rate: 50Mbit/s}}", topic="/imu") for loss in losses]
         tables = run_all(labs, "--protocol", "udp", "--repeats", str(request.param))
@@ -48,7 +49,7 @@ def test_udp_ip_loss_is_the_loss_of_the_link(lossy_udp: dict[str, list[dict[str,
 def test_runs_of_independent_losses_have_the_lengths_of_the_closed_form(
     lossy_udp: dict[str, list[dict[str, str]]], percent: int
 ) -> None:
-    """Starts of runs cannot be adjacent, which determines the variance of their number; run lengths are geometric."""
+    """Starts of runs cannot be adjacent, which determines the variance of their number. The lengths are geometric."""
     table, loss = lossy_udp[str(percent)], percent / 100
     sent, bursts = total(table, "ip_packets_sent"), total(table, "ip_loss_bursts")
     start = loss * (1 - loss)
@@ -64,20 +65,20 @@ def test_runs_of_independent_losses_have_the_lengths_of_the_closed_form(
         assert longest < math.log(1e4 * sent * (1 - loss), 1 / loss)
 
 
-def test_the_radio_is_a_queue_that_copies_nothing(lossy_udp: dict[str, list[dict[str, str]]]) -> None:
+def test_the_radio_neither_reorders_nor_duplicates_packets(lossy_udp: dict[str, list[dict[str, str]]]) -> None:
     for table in lossy_udp.values():
         for name in ("ip_packets_reordered", "ip_packets_duplicated", "ip_packets_doubtful"):
             assert total(table, name) == 0, name
 
 
 @pytest.mark.parametrize("percent", EACH_LOSS)
-def test_datagram_loss_is_larger_as_six_fragments_predict(
+def test_datagram_loss_is_the_loss_of_at_least_one_of_six_fragments(
     lossy_udp: dict[str, list[dict[str, str]]], percent: int
 ) -> None:
     table = lossy_udp[str(percent)]
     loss, repeats = percent / 100, len(table)
     sent, received = total(table, "datagrams_sent"), total(table, "datagrams_received")
-    # The last datagram of every repeat is the rest of the file, with a different number of fragments.
+    # The last datagram of every repeat has the remainder of the file and a different number of fragments.
     fragments_of_last = total(table, "ip_packets_sent") - FRAGMENTS * (sent - repeats)
     delivered = (sent - repeats) * (1 - loss) ** FRAGMENTS + repeats * (1 - loss) ** (fragments_of_last / repeats)
     interval = scipy.stats.binomtest(sent - received, sent).proportion_ci(
@@ -90,26 +91,26 @@ def test_datagram_loss_is_larger_as_six_fragments_predict(
 
 
 @pytest.mark.parametrize("percent", EACH_LOSS)
-def test_the_air_delay_is_that_of_packets_that_arrived(
+def test_the_air_delay_is_measured_for_the_packets_that_arrived(
     lossy_udp: dict[str, list[dict[str, str]]], percent: int
 ) -> None:
     table = lossy_udp[str(percent)]
-    # Occasionally a retransmitted packet of ROS comes between them.
+    # Occasionally ROS retransmits a packet during the transfer.
     missing = [int(row["delay_packets"]) - int(row["ip_packets_received"]) for row in table]
     assert min(missing) >= 0
     assert missing.count(0) > len(table) // 2
 
 
 def test_the_parts_of_the_delay_are_those_of_a_link_of_50_mbit_s(lossy_udp: dict[str, list[dict[str, str]]]) -> None:
-    alone = [row for row in lossy_udp["0"] if row["delay_packets"] == row["ip_packets_received"]]
-    assert alone
-    for row in alone:
-        # Each packet has an IP header of 20 bytes, each datagram a UDP header of 8.
+    undisturbed_rows = [row for row in lossy_udp["0"] if row["delay_packets"] == row["ip_packets_received"]]
+    assert undisturbed_rows
+    for row in undisturbed_rows:
+        # Each packet has an IP header of 20 bytes, and each datagram has a UDP header of 8 bytes.
         packets = int(row["ip_packets_received"])
         size_bytes = int(row["sent_bytes"]) + 8 * int(row["datagrams_sent"]) + 20 * packets
         assert float(row["delay_transmission_s"]) == pytest.approx(8 * size_bytes / 50e6 / packets, rel=1e-6)
     queuing_s, transmission_s = (
-        median(float(row[f"delay_{part}_s"]) for row in alone) for part in ("queuing", "transmission")
+        median(float(row[f"delay_{part}_s"]) for row in undisturbed_rows) for part in ("queuing", "transmission")
     )
     assert queuing_s > transmission_s, "the six fragments of a datagram arrive together"
 

@@ -1,4 +1,4 @@
-"""A radio of known rate: throughput must be that rate, and equal to the radio's air log."""
+"""A radio of known rate: the throughput must equal this rate and the rate in the radio's air log."""
 
 import csv
 from itertools import pairwise
@@ -30,7 +30,8 @@ def test_throughput_is_the_rate_of_the_link_and_goodput_excludes_headers(tmp_pat
         share = 8192 / UDP_PACKETS if row["protocol"] == "udp" else 1448 / (1448 + TCP_HEADERS)
         completion_s = 8 * int(row["received_bytes"]) / float(row["goodput_bit_s"])
         if row["protocol"] == "tcp":
-            # The time of TCP's goodput starts at the SYN. On a busy machine nc sends its first byte some 10 ms later.
+            # The time of TCP's goodput starts at the SYN. On a busy machine, nc sends its first byte about 10 ms
+            # later.
             completion_s -= before_data_s(only_trial(tmp_path / "lab") / f"repeats/tcp-{int(row['repeat']):02}")
         assert 8 * int(row["received_bytes"]) / completion_s == pytest.approx(1e6 * share, rel=0.02), row["protocol"]
 
@@ -46,7 +47,7 @@ def before_data_s(repeat: Path) -> float:
 
 
 def test_throughput_equals_that_of_the_radios_air_log(tmp_path: Path) -> None:
-    """The radio's log has the time and length of each received frame; ping starts a second after a UDP transfer."""
+    """The radio's log has the time and size of each received frame; the ping starts a second after the transfer."""
     lab = make_lab(tmp_path / "air", "{fading: false}, record_air: true", topic="/imu", repeats=1)
     run: Run = run_here(lab, "trial", "quick", "5m", "--protocol", "udp", "--record", "5s")
     assert run.code == 0, run.err
@@ -63,7 +64,7 @@ def test_throughput_equals_that_of_the_radios_air_log(tmp_path: Path) -> None:
         (index for index, (before, after) in enumerate(pairwise(frames)) if after[0] - before[0] > PAUSE_NS),
         len(frames) - 1,
     )
-    sent = frames[: last + 1]
-    assert len(sent) >= 200
-    rate = 8e9 * sum(size for _, size in sent[1:]) / (sent[-1][0] - sent[0][0])
+    transfer_frames = frames[: last + 1]
+    assert len(transfer_frames) >= 200
+    rate = 8e9 * sum(size for _, size in transfer_frames[1:]) / (transfer_frames[-1][0] - transfer_frames[0][0])
     assert float(row["throughput_bit_s"]) == pytest.approx(rate, rel=0.05)

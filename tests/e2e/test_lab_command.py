@@ -1,4 +1,4 @@
-"""`fieldkit lab` on the command line: robots stay up, plain ssh and scp reach them, and nothing is left behind."""
+"""`fieldkit lab` on the command line: robots run until `lab down`, and the ordinary ssh and scp reach them."""
 
 import contextlib
 import json
@@ -29,7 +29,7 @@ from tests.helpers.runs import fieldkit, run_here, start
 
 pytestmark = pytest.mark.emulated
 
-WITHIN_S: Final = 60.0
+TIMEOUT_S: Final = 60.0
 SITE: Final = """\
 backend: field
 robots:
@@ -56,19 +56,19 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def run_plain(lab_folder: Path, *argv: str) -> str:
-    """Run a program without any of fieldkit's environment."""
-    done = subprocess.run(
+    """Run a program without the environment variables of fieldkit."""
+    completed = subprocess.run(
         argv,
         cwd=lab_folder,
         env={"PATH": os.environ["PATH"]},
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
-        timeout=WITHIN_S,
+        timeout=TIMEOUT_S,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    assert completed.returncode == 0, completed.stderr
+    return completed.stdout
 
 
 def process_of(lab_folder: Path) -> int:
@@ -111,12 +111,12 @@ DRIVE_SCRIPT: Final = "trap 'touch .jobs/drive/stationary; exit' INT; echo up; w
 
 
 def test_stop_reaches_the_robots_of_a_lab(lab: Path) -> None:
-    """The program has the driver's command line, by which `fieldkit stop` recognizes it in every case."""
+    """The program has the command line of the driver, by which `fieldkit stop` recognizes it."""
     attempt = jobs.work_folder("trial-a", "tcp-01-1")
     argv = ("sh", "-c", DRIVE_SCRIPT, "python3", "../../agent-0123456789ab.pyz", "drive", '{"over": "ros1"}')
-    driver = Job(attempt, "drive", argv, WITHIN_S, "drive.log", ready="log:up")
+    driver = Job(attempt, "drive", argv, TIMEOUT_S, "drive.log", ready="log:up")
     with lab_shells.open_shells(folder.of_directory(lab)) as shells:
-        jobs.install(shells["ground-1"], Deadline.after(WITHIN_S))
+        jobs.install(shells["ground-1"], Deadline.after(TIMEOUT_S))
         evidence.begin(shells["ground-1"], attempt, "sender", "lo")
         jobs.start(shells["ground-1"], driver)
         stopped = run_here(lab, "stop", "--all", "--backend", "emulated")
@@ -124,11 +124,14 @@ def test_stop_reaches_the_robots_of_a_lab(lab: Path) -> None:
             0,
             ["air-1: no program of fieldkit moves it; nothing was sent to it", "ground-1: stopped (stationary)"],
         )
-        assert not jobs.list_running(shells["ground-1"], Deadline.after(WITHIN_S))
-    again = run_here(lab, "stop", "ground-1", "--backend", "emulated")
-    assert (again.code, again.out) == (0, "ground-1: no program of fieldkit moves it; nothing was sent to it\n")
-    unknown = run_here(lab, "stop", "ground-2", "--backend", "emulated")
-    assert (unknown.code, "did you mean 'ground-1'?" in unknown.err) == (2, True)
+        assert not jobs.list_running(shells["ground-1"], Deadline.after(TIMEOUT_S))
+    second_run = run_here(lab, "stop", "ground-1", "--backend", "emulated")
+    assert (second_run.code, second_run.out) == (
+        0,
+        "ground-1: no program of fieldkit moves it; nothing was sent to it\n",
+    )
+    unknown_robot_run = run_here(lab, "stop", "ground-2", "--backend", "emulated")
+    assert (unknown_robot_run.code, "did you mean 'ground-1'?" in unknown_robot_run.err) == (2, True)
 
 
 def test_rsync_reaches_the_robots(lab: Path) -> None:
@@ -140,14 +143,14 @@ def test_rsync_reaches_the_robots(lab: Path) -> None:
 
 
 def test_ssh_rejects_a_robot_with_another_host_key(lab: Path) -> None:
-    """The robots' connections are swapped: the pinned host key must detect this."""
+    """The robots' connections are swapped, which the pinned host key must reveal."""
     text = (lab / "ssh.conf").read_text(encoding="utf-8")
     (lab / "swapped.conf").write_text(text.replace("%n", "air-1"), encoding="utf-8")
-    done = subprocess.run(
+    completed = subprocess.run(
         ("ssh", "-F", "swapped.conf", "ground-1", "true"), cwd=lab, capture_output=True, text=True, check=False
     )
-    assert done.returncode == 255
-    assert "Host key verification failed" in done.stderr
+    assert completed.returncode == 255
+    assert "Host key verification failed" in completed.stderr
 
 
 def test_robots_reach_each_other_over_their_radio(lab: Path) -> None:
@@ -155,18 +158,18 @@ def test_robots_reach_each_other_over_their_radio(lab: Path) -> None:
     assert "2 packets transmitted, 2 received" in output
 
 
-def test_a_robot_that_is_moved_away_is_unreachable_until_it_is_back(lab: Path) -> None:
+def test_a_robot_out_of_range_is_unreachable_until_it_returns(lab: Path) -> None:
     """With exponent 3 and 17 dBm, the weakest detectable frame of -82 dBm comes from 91 m."""
     lab_folder = folder.of_directory(lab)
     assert run_here(lab, "lab", "move", "air-1", "--to", "202.5m", "197.5m").code == 0
     moved = run_here(lab, "lab", "move", "air-1", "--by", "-100m", "-0.1km", "100m")
     assert moved.out == "air-1 is at 102.5, 97.5, 100.2 (m east, north, up)\n"
     assert fieldkit(lab, "lab", "shell", "ground-1", "ping", "-c", "3", "-i", "0.2", "-W", "1", "air-1").code == 1
-    above = requests.overview(lab_folder)
-    assert above.robots == {"ground-1": (197.5, 197.5), "air-1": (102.5, 97.5)}
-    assert not above.links[0].linked
+    overview = requests.overview(lab_folder)
+    assert overview.robots == {"ground-1": (197.5, 197.5), "air-1": (102.5, 97.5)}
+    assert not overview.links[0].linked
     assert run_here(lab, "lab", "plot").out == "lab.svg\n"
-    assert f">{above.links[0].snr_db:.0f} dB<" in (lab / "lab.svg").read_text(encoding="utf-8")
+    assert f">{overview.links[0].snr_db:.0f} dB<" in (lab / "lab.svg").read_text(encoding="utf-8")
     assert run_here(lab, "lab", "move", "air-1", "--to", "207.5m", "197.5m").code == 0
     assert requests.state(lab_folder).robots[1].place_m == (207.5, 197.5, 0.2)
     assert fieldkit(lab, "lab", "shell", "ground-1", "ping", "-c", "1", "-w", "30", "-i", "0.2", "air-1").code == 0
@@ -184,11 +187,11 @@ def ahead_m(lab: Path) -> float:
     return median(float(scan.ranges[0]) for scan in scans)
 
 
-def test_another_robot_reflects_the_laser_and_the_range_follows_it(lab: Path) -> None:
+def test_the_laser_measures_the_range_to_another_robot(lab: Path) -> None:
     """The cylinder of a Duckiedrone has a radius of 0.2 m; beam 0 points east, like the robot."""
     for east_m in (199.5, 200.5):
         assert run_here(lab, "lab", "move", "air-1", "--to", f"{east_m}m", "197.5m").code == 0
-        # Standard error of the median of 8 or more scans with noise of 0.015 m.
+        # The tolerance is far above the standard error of the median of 8 or more scans with noise of 0.015 m.
         assert ahead_m(lab) == pytest.approx(east_m - 197.5 - 0.2, abs=0.05)
     assert run_here(lab, "lab", "move", "air-1", "--to", "207.5m", "197.5m").code == 0
     assert ahead_m(lab) == math.inf
@@ -244,12 +247,12 @@ def test_a_shell_has_a_terminal(lab: Path) -> None:
         while data := os.read(controller, 4096):
             output += data
     os.close(controller)
-    assert shell.wait(WITHIN_S) == 0
+    assert shell.wait(TIMEOUT_S) == 0
     assert b"/dev/pts/" in output
     assert b"\nground-1" in output
 
 
-def test_sockets_and_keys_of_the_robots_are_closed_to_other_users(lab: Path) -> None:
+def test_other_users_have_no_access_to_sockets_and_keys_of_the_robots(lab: Path) -> None:
     lab_folder = folder.of_directory(lab)
     assert stat.S_IMODE(lab_folder.path.stat().st_mode) == 0o700
     for path in (lab_folder.socket, lab_folder.key):
@@ -271,44 +274,44 @@ def test_an_unknown_robot_is_rejected(lab: Path) -> None:
 
 @pytest.mark.parametrize("request_", ["move", "move air-1", "move air-1 {}", "move air-1 []", "what", ""])
 def test_an_invalid_request_gets_no_response(lab: Path, request_: str) -> None:
-    with socket.socket(socket.AF_UNIX) as confused:
-        confused.connect(str(folder.of_directory(lab).socket))
-        confused.sendall(f"{request_}\n".encode())
-        assert confused.recv(1) == b""
+    with socket.socket(socket.AF_UNIX) as client:
+        client.connect(str(folder.of_directory(lab).socket))
+        client.sendall(f"{request_}\n".encode())
+        assert client.recv(1) == b""
     assert len(requests.state(folder.of_directory(lab)).robots) == 2
 
 
 def test_a_silent_client_does_not_block_others_for_long(lab: Path) -> None:
-    with socket.socket(socket.AF_UNIX) as unanswered:
-        unanswered.connect(str(folder.of_directory(lab).socket))
+    with socket.socket(socket.AF_UNIX) as silent_client:
+        silent_client.connect(str(folder.of_directory(lab).socket))
         assert "air-1" in run_here(lab, "lab", "ps").out
 
 
-def test_down_leaves_nothing(tmp_path: Path, untouched: NamespaceComparison) -> None:
+def test_down_leaves_no_processes_files_or_interfaces(tmp_path: Path, untouched: NamespaceComparison) -> None:
     (tmp_path / "fieldkit.yaml").write_text("emulated: {ros: builtin}\nrobots: {}\nroles: {}\n", encoding="utf-8")
     started = fieldkit(tmp_path, "lab", "up", "--robots", "2", "--profile", "duckiedrone")
     assert started.code == 0, started.err
     process = process_of(tmp_path)
-    lived = {process} | descendants(process)
-    assert len(lived) > 2 * 3
+    process_ids = {process} | descendants(process)
+    assert len(process_ids) > 2 * 3
     state = requests.state(folder.of_directory(tmp_path))
     assert [robot.name for robot in state.robots] == ["robot-1", "robot-2"]
     assert {robot.profile for robot in state.robots} == {"duckiedrone"}
     assert fieldkit(tmp_path, "lab", "down").out == "the robots are down\n"
-    wait_for_end(lived, within_s=0.0)
+    wait_for_end(process_ids, within_s=0.0)
     untouched()
     assert not folder.of_directory(tmp_path).path.exists()
 
 
-def test_a_lab_that_is_killed_leaves_nothing_and_can_come_up_again(
+def test_a_killed_lab_leaves_no_processes_and_can_be_started_again(
     tmp_path: Path, untouched: NamespaceComparison
 ) -> None:
     (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
     assert fieldkit(tmp_path, "lab", "up").code == 0
     process = process_of(tmp_path)
-    lived = descendants(process)
+    process_ids = descendants(process)
     os.kill(process, 9)
-    wait_for_end(lived | {process}, within_s=WITHIN_S)
+    wait_for_end(process_ids | {process}, within_s=TIMEOUT_S)
     untouched()
     listing = run_here(tmp_path, "lab", "ps")
     assert (listing.code, "remedy: fieldkit lab up" in listing.err) == (2, True)
@@ -321,10 +324,10 @@ def test_a_lab_in_the_foreground_ends_with_ctrl_c(tmp_path: Path) -> None:
     started = start(tmp_path, "lab", "up", "--foreground")
     assert started.stdout is not None
     assert started.stdout.readline() == "2 robots up, until Ctrl-C\n"
-    lived = descendants(started.pid)
+    process_ids = descendants(started.pid)
     started.send_signal(2)
-    assert started.wait(WITHIN_S) == 0
-    wait_for_end(lived, within_s=0.0)
+    assert started.wait(TIMEOUT_S) == 0
+    wait_for_end(process_ids, within_s=0.0)
 
 
 @pytest.mark.parametrize("robots", mark_nightly([("--robots", "1"), ()]))

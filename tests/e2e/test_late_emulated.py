@@ -1,4 +1,4 @@
-"""A repeat in which the emulator was too late is not a measurement."""
+"""A repeat in which the emulator was too late is not valid."""
 
 from pathlib import Path
 
@@ -25,6 +25,6 @@ def test_a_repeat_with_excessive_lateness_does_not_count(tmp_path: Path) -> None
     assert row["reason"].endswith(" ms; the bound is 0.001 ms")
     assert int(row["emulator_too_late"]) >= int(row["ip_packets_received"])
     assert 1e-6 < float(row["emulator_late_p99_s"]) <= float(row["emulator_late_max_s"])
-    written = (trial / "trial.csv").read_bytes()
+    table = (trial / "trial.csv").read_bytes()
     assert run_here(lab, "rebuild", str(trial)).code == 0
-    assert (trial / "trial.csv").read_bytes() == written
+    assert (trial / "trial.csv").read_bytes() == table

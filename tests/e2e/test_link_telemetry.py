@@ -1,4 +1,4 @@
-"""Link statistics of radio drivers, end to end: compared with captures, the kernel's counters and the air log."""
+"""Link statistics of radio drivers, compared with captures, the kernel's counters and the air log."""
 
 import csv
 import re
@@ -11,21 +11,24 @@ from tests.helpers.texts import site
 
 pytestmark = pytest.mark.emulated
 
-# Without fading the SNR is always 23.1 dB, too little for n7: half of the frames of 1,500 bytes are lost, and a fifth
-# of those of 500 bytes. The probability that repeats of 11 and 20 frames need no retry is at most one in 10,000.
+# Without fading, the SNR is always 23.1 dB, which is too low for n7: half of the frames of 1,500 bytes are lost, and
+# a
+# fifth of the frames of 500 bytes. Repeats of 11 and 20 frames need no retry with a probability of at most 1e-4.
 SITE = site(emulated="ros: builtin, record_air: true, radio: {mode: n7, fading: false, noise_floor_dbm: -84.2}")
 
 
 def kernel_packets(folder: Path, role: str) -> dict[str, int]:
     """Return the kernel's packet counts of the interface during the repeat."""
-    moments = []
+    counts_at_moments = []
     for moment in ("before", "after"):
         text = (folder / f"{role}-{moment}.txt").read_text(encoding="utf-8")
         fields = re.search(r"^ *wlan0: *(.+)$", text, re.MULTILINE)
         assert fields
         counts = fields[1].split()
-        moments.append({"rx": int(counts[1]), "tx": int(counts[9])})
-    return {direction: moments[1][direction] - moments[0][direction] for direction in ("rx", "tx")}
+        counts_at_moments.append({"rx": int(counts[1]), "tx": int(counts[9])})
+    return {
+        direction: counts_at_moments[1][direction] - counts_at_moments[0][direction] for direction in ("rx", "tx")
+    }
 
 
 def test_radios_kernels_captures_and_the_air_log_have_equal_counts(tmp_path: Path) -> None:
@@ -58,5 +61,7 @@ def test_radios_kernels_captures_and_the_air_log_have_equal_counts(tmp_path: Pat
             assert float(row[f"{role}_signal_min_dbm"]) <= float(row[f"{role}_signal_median_dbm"]) < -40
             assert float(row[f"{role}_tx_rate_bit_s"]) == 65e6
             assert 0 < float(row[f"{role}_busy_share"]) < 1
-            assert row[f"{role}_roams"] == row[f"{role}_beacon_losses"] == "", "which this air does not have"
-        assert sum(int(row[f"{role}_tx_retries"]) for role in ("sender", "receiver")) > 0, "or it would say nothing"
+            assert row[f"{role}_roams"] == row[f"{role}_beacon_losses"] == "", (
+                "the emulated radio has no roaming and no beacons"
+            )
+        assert sum(int(row[f"{role}_tx_retries"]) for role in ("sender", "receiver")) > 0, "the test needs retries"

@@ -1,4 +1,4 @@
-"""Robots with several links, end to end: each step uses its link, and packets move to another one when it is lost."""
+"""Robots with several links: each step uses its link, and packets use another link if one is lost."""
 
 from pathlib import Path
 
@@ -63,7 +63,7 @@ steps:
 """
 
 
-def test_each_step_uses_its_link_and_packets_move_to_another_one(tmp_path: Path) -> None:
+def test_each_step_uses_its_link_and_packets_use_another_link_if_one_is_lost(tmp_path: Path) -> None:
     links = "links: {wifi: wlan0, cell: wwan0, either: lo}\n\nradio:"
     copy_shipped(tmp_path, "robots", "turtlebot3_burger", "radio:", links)
     (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
@@ -71,13 +71,13 @@ def test_each_step_uses_its_link_and_packets_move_to_another_one(tmp_path: Path)
     assert run.code == 0, run.out + run.err
     (row,) = rows(only_trial(tmp_path))
     assert row["status"] == "valid"
-    # The cell's delay of 100 ms applies in both directions.
+    # The delay of 100 ms of the cellular link applies in both directions.
     assert float(row["cell.rtt_min_s"]) >= 0.2
     assert float(row["wifi.rtt_median_s"]) < 0.1
     assert float(row["cell.file_loss"]) == 0
     assert float(row["cell.transfer_s"]) >= 0.2
     assert float(row["cell.delay_propagation_s"]) >= 0.1
-    # The Wi-Fi was gone for the 8 s of the fault; packets continued earlier, over the cell.
+    # The Wi-Fi was lost for the 8 s of the fault; packets continued earlier over the cellular link.
     assert float(row["link_down_outage_s"]) >= 7.5
     assert 0.5 < float(row["rtt_gap_s"]) < 7.5
     assert float(row["rtt_min_s"]) < 0.1

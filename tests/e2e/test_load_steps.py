@@ -1,4 +1,4 @@
-"""iperf3, soak and run on emulated robots without ROS: results compared with captures, and errors."""
+"""The steps iperf3, soak and run on emulated robots without ROS: results compared with captures, and errors."""
 
 from contextlib import chdir
 from pathlib import Path
@@ -21,7 +21,7 @@ HEAD = procedure(
     protocols="udp",
 )
 
-# The program leaves the job's process group, which ends with the job.
+# The program leaves the job's process group, because the group is killed at the end of the job.
 KILL_SOON = """  - run:
       robot: ROBOT
       argv:
@@ -71,8 +71,9 @@ def flows(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, str]]
 
 
 RTO_SHARE = 0.2 / 5
-"""Bytes behind a lost segment reach iperf3 up to a retransmission timeout later than the capture: at least 200 ms in
-Linux, of a test of 5 s."""
+"""Bytes after a lost segment reach iperf3 later than the capture, by up to a retransmission timeout. The timeout is
+at
+least 200 ms in Linux, and the test takes 5 s."""
 
 
 @pytest.mark.parametrize("name", FLOWS)
@@ -90,7 +91,7 @@ def test_iperf3_and_captures_agree_on_the_loss(flows: dict[str, dict[str, str]],
     row = flows[name]
     reported, captured = float(row["iperf3_loss"]), float(row["iperf3_captured_loss"])
     percent = {"udp-lossy": 10, "udp-reverse": 5}[name]
-    # iperf3 does not count datagrams that are lost at the very end.
+    # iperf3 does not count datagrams that are lost at the end.
     assert abs(reported - captured) <= 0.02 * percent / 100 + 1e-9
     assert abs(captured - percent / 100) < 0.04
     assert row["iperf3_retransmits"] == ""
@@ -104,13 +105,14 @@ def test_tcp_retransmitted_the_losses_of_the_radio(flows: dict[str, dict[str, st
     assert lossy["iperf3_loss"] == ""
 
 
-WRONG = {
+FAILING_STEPS = {
     "client-killed": KILL_SOON.replace("ROBOT", "sender") + f"  - {load('udp', '1Mbit/s')}\n",
     "server-killed": KILL_SOON.replace("ROBOT", "receiver") + f"  - {load('udp', '1Mbit/s')}\n",
     "limit": "  - iperf3: {from: sender, to: receiver, rate: 1Mbit/s, size: 5MB, limit: 2s}\n",
     "load-killed": (
         "  - soak: {from: sender, to: receiver, during: [run: {robot: sender, "
-        # Until this is on record: a load that ends while fieldkit stops it is not an error.
+        # The step waits until the exit is recorded, because a load that exits while fieldkit stops it is not an
+        # error.
         "command: sh -c 'kill -KILL $(pidof iperf3); until test -s .jobs/soak/exit; do sleep 0.05; done'}]}\n"
     ),
     "code": "  - run: {robot: receiver, command: sh -c 'echo no; exit 3'}\n",
@@ -128,10 +130,10 @@ REASONS = {
 
 
 @pytest.fixture(scope="module")
-def wrong(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Run, Path]]:
-    """Trials that go wrong, in order on the same robots."""
+def failed_trials(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Run, Path]]:
+    """Trials that fail, in sequence on the same robots."""
     base = tmp_path_factory.mktemp("wrong")
-    labs = {name: lab(base / name, steps) for name, steps in WRONG.items()}
+    labs = {name: lab(base / name, steps) for name, steps in FAILING_STEPS.items()}
     first = labs["code"]
     with chdir(first), start_field_robots(first, site=first / SITE_FILE) as robots:
         site_text = (robots.folder / SITE_FILE).read_text(encoding="utf-8")
@@ -141,18 +143,18 @@ def wrong(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Run, Path
 
 
 @pytest.mark.parametrize("name", REASONS)
-def test_errors_are_reported_and_no_repeat_is_valid(wrong: dict[str, tuple[Run, Path]], name: str) -> None:
-    run, folder = wrong[name]
+def test_errors_are_reported_and_no_repeat_is_valid(failed_trials: dict[str, tuple[Run, Path]], name: str) -> None:
+    run, folder = failed_trials[name]
     assert run.code == 4, run.err + run.out
     (row,) = rows(only_trial(folder))
     assert row["status"] == "failed"
     assert REASONS[name] in row["reason"], row["reason"]
-    left = run_here(folder, "rebuild", str(only_trial(folder)))
-    assert left.code == 0, left.err
+    rebuild_run = run_here(folder, "rebuild", str(only_trial(folder)))
+    assert rebuild_run.code == 0, rebuild_run.err
 
 
-def test_a_missing_program_is_reported_before_the_first_repeat(wrong: dict[str, tuple[Run, Path]]) -> None:
-    run, folder = wrong["missing-program"]
+def test_a_missing_program_is_reported_before_the_first_repeat(failed_trials: dict[str, tuple[Run, Path]]) -> None:
+    run, folder = failed_trials["missing-program"]
     assert run.code == 3, run.err
     assert "no-such-tool: not found" in run.err
     assert "install no-such-tool, or correct the command of this run in the procedure" in run.err

@@ -1,4 +1,4 @@
-"""The figures of docs/studies/middleware.md equal its table, including the numbers of samples and intervals."""
+"""The figures of docs/studies/middleware.md equal its table, with the numbers of samples and the intervals."""
 
 import re
 
@@ -36,15 +36,15 @@ def test_every_point_of_the_loss_figure_has_its_interval_and_its_number_of_sampl
 
 def test_a_bimodal_loss_is_marked_in_the_table() -> None:
     table = TABLE.read_text(encoding="utf-8")
-    marked = [line.split(",") for line in table.splitlines() if line.endswith(f",{middleware_table.BIMODAL}")]
-    assert [row[:5] for row in marked] == [
+    bimodal_rows = [line.split(",") for line in table.splitlines() if line.endswith(f",{middleware_table.BIMODAL}")]
+    assert [row[:5] for row in bimodal_rows] == [
         ["1000000", "reliable", "Zenoh", "2", str(metres)] for metres in (20, 40, 60, 80)
     ]
 
 
-def test_the_table_is_written_again_from_its_cells() -> None:
-    written = middleware_table.text(middleware_table.cells(TABLE), list(middleware.STYLES))
-    assert written == TABLE.read_text(encoding="utf-8")
+def test_the_table_can_be_generated_from_its_cells() -> None:
+    table_text = middleware_table.text(middleware_table.cells(TABLE), list(middleware.STYLES))
+    assert table_text == TABLE.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(("size_bytes", "samples", "lost"), [(1_000, 80, 0), (1_000, 80, 20), (1_000_000, 20, 15)])
@@ -59,20 +59,20 @@ def test_the_interval_counts_samples_within_half_a_second_as_one(size_bytes: int
 
 
 def test_the_intervals_quoted_on_the_page_are_those_of_its_table() -> None:
-    by_cell = {
+    cells_by_key = {
         (cell.middleware, cell.kind, cell.size_bytes, cell.robots, cell.distance_m): cell
         for cell in middleware_table.cells(TABLE)
     }
     text = PAGE.read_text(encoding="utf-8")
-    for key, quoted in (
+    for key, quoted_text in (
         (("Fast DDS", "reliable", 1_000_000, 2, 20.0), "75 % [53, 89]"),
         (("Fast DDS, tuned", "reliable", 1_000_000, 2, 20.0), "5 % [1, 24]"),
         (("Fast DDS", "reliable", 10_000, 5, 60.0), "30 % [20, 42]"),
     ):
-        cell = by_cell[key]
+        cell = cells_by_key[key]
         assert cell.loss is not None
         assert cell.loss_low is not None
         assert cell.loss_high is not None
-        assert f"{100 * cell.loss:.0f} % [{100 * cell.loss_low:.0f}, {100 * cell.loss_high:.0f}]" == quoted
-        assert quoted in text
-    assert "95 % [76, 99]" not in text  # Zenoh's images, for which two repeats have no rate
+        assert f"{100 * cell.loss:.0f} % [{100 * cell.loss_low:.0f}, {100 * cell.loss_high:.0f}]" == quoted_text
+        assert quoted_text in text
+    assert "95 % [76, 99]" not in text  # the rate of Zenoh's images cannot be estimated from two repeats

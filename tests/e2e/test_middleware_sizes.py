@@ -1,4 +1,4 @@
-"""A sample of the shipped campaign of message sizes on a link of known loss, and the settings recommended by it."""
+"""A part of the shipped campaign of message sizes on a link with a known loss, and the settings it recommends."""
 
 import re
 from pathlib import Path
@@ -17,10 +17,8 @@ REPEATS = 2
 
 
 @pytest.fixture(scope="module")
-def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with trials of the shipped procedure, restricted to its smallest samples, tuned settings and
-    blocking.
-    """
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with trials of the shipped procedure, with only its smallest samples, tuned settings and blocking."""
     home = tmp_path_factory.mktemp("sizes")
     text = (ROOT / "procedures" / "middleware_sizes.yaml").read_text(encoding="utf-8")
     text = text.replace("name: middleware_sizes", "name: sizes_sample", 1).replace("[last, all]", "[all]")
@@ -37,17 +35,17 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return home
 
 
-def test_recommended_settings_are_written_with_their_evidence(measured: Path) -> None:
-    out = measured / "passed"
+def test_recommended_settings_are_written_with_their_evidence(lab: Path) -> None:
+    out = lab / "passed"
     words = ("middleware", "recommend", "trials", "-o", str(out), "--repeats", str(REPEATS), "--max-loss", "20%")
-    run = run_here(measured, *words)
+    run = run_here(lab, *words)
     assert run.code == 0, run.out + run.err
     assert sorted(path.name for path in out.iterdir()) == ["cyclonedds.xml", "zenoh.json5"]
     assert len(re.findall(r"(?m)^passed: (dds|zenoh)", run.out)) == 2, run.out
     for path in out.iterdir():
         text = path.read_text(encoding="utf-8")
         assert f"{REPEATS} of {REPEATS} repeats are valid" in text
-        assert only_trial(measured).name in text
+        assert only_trial(lab).name in text
         assert "loss at most 20 %, in each repeat" in text
     domain = ET.parse(out / "cyclonedds.xml").getroot().find("Domain")
     assert domain is not None
@@ -64,9 +62,9 @@ def test_recommended_settings_are_written_with_their_evidence(measured: Path) ->
         (("--repeats", str(REPEATS), "--max-loss", "20%", "--share", "90%"), "undecided.*\n.*29 repeats are needed"),
     ],
 )
-def test_without_evidence_nothing_is_written(measured: Path, criterion: tuple[str, ...], reason: str) -> None:
-    out = measured / "nothing"
-    run = run_here(measured, "middleware", "recommend", "trials", "-o", str(out), *criterion)
+def test_without_evidence_no_settings_are_written(lab: Path, criterion: tuple[str, ...], reason: str) -> None:
+    out = lab / "nothing"
+    run = run_here(lab, "middleware", "recommend", "trials", "-o", str(out), *criterion)
     assert run.code == 1, run.out + run.err
     assert re.search(reason, run.out), run.out
     assert "passed:" not in run.out

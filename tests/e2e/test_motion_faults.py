@@ -1,6 +1,4 @@
-"""Cells of the fault matrix of moving robots: each failing part and each fault once, within bounds
-(docs/stopping.md).
-"""
+"""Cells of the fault matrix of moving robots (docs/stopping.md) that contain each party and each fault."""
 
 import os
 import subprocess
@@ -30,17 +28,17 @@ SAMPLE = (
     "copter/operator/ctrl-c/back",
 )
 IN_CI = ("rover/fieldkit+operator/stop/out", "px4/guard/suspend/climbing", "copter/pilot+guard/suspend/there")
-"""Cells of the sample in CI, one of each robot; they run in parallel. `make nightly` runs the others."""
+"""The cells that CI runs in parallel, one for each robot; `make nightly` runs the others."""
 AT_NIGHT = tuple(name for name in SAMPLE if name not in IN_CI)
 JOBS = 3
 LIMIT_S = 600
 
 
 def outcomes_of(names: Sequence[str], folder: Path) -> dict[str, MotionOutcome]:
-    """Run the command once for several cells, as trials mostly wait."""
+    """Run several cells in parallel, because trials mostly wait; return the outcomes by the cell's name."""
     results = folder / "results.jsonl"
     words = ("--cells", ",".join(names), "--jobs", str(JOBS), "--results", str(results))
-    done = subprocess.run(
+    completed = subprocess.run(
         (sys.executable, "-m", "tests.e2e.motion_faults", *words),
         cwd=ROOT,
         capture_output=True,
@@ -49,7 +47,7 @@ def outcomes_of(names: Sequence[str], folder: Path) -> dict[str, MotionOutcome]:
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         check=False,
     )
-    assert done.returncode in {0, 1}, done.stdout + done.stderr
+    assert completed.returncode in {0, 1}, completed.stdout + completed.stderr
     lines = Path(results).read_text(encoding="utf-8").splitlines()
     return {outcome.cell: outcome for outcome in map(MotionOutcome.of, lines)}
 
@@ -65,9 +63,11 @@ def outcomes_at_night(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Mot
 
 
 @pytest.mark.emulated
-@pytest.mark.quiet  # the bounds hold on a machine that is not overloaded
+@pytest.mark.quiet  # the bounds apply to a machine that is not overloaded
 @pytest.mark.parametrize("name", IN_CI)
-def test_a_robot_stops_within_the_bounds_and_stays_at_rest(name: str, outcomes: dict[str, MotionOutcome]) -> None:
+def test_a_robot_stops_within_the_bounds_and_remains_stationary(
+    name: str, outcomes: dict[str, MotionOutcome]
+) -> None:
     assert outcomes[name].problems == (), outcomes[name]
 
 

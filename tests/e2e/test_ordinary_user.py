@@ -1,4 +1,4 @@
-"""Emulated robots without root: a complete trial by an ordinary user, and each permission that the user may lack."""
+"""Emulated robots of an ordinary user: a complete trial, and the errors if a permission is missing."""
 
 import csv
 import signal
@@ -19,7 +19,7 @@ FIELDKIT: Final = (sys.executable, "-m", "fieldkit")
 TRIAL: Final = ("trial", "los", "30ft", "--repeats", "1", "--record", "1s")
 BEFORE_THE_TABLE: Final = "--- trial.csv"
 
-WHOLE = f"""
+COMPLETE_TRIAL = f"""
 [ "$(id -u)" = {ordinary_user.UID} ]
 "$@" {" ".join(TRIAL)} && "$@" verify trials/*
 [ -z "$(find /tmp /var/tmp /dev/shm /run -user {ordinary_user.NAME})" ]
@@ -54,11 +54,21 @@ cmp there back
 [ -z "$(find /tmp /var/tmp /dev/shm /run -user {ordinary_user.NAME})" ]
 """
 
-# Run as the user in a separate user namespace in which no other can be created; the setting is per namespace.
-NO_MORE = 'echo 0 > /proc/sys/user/max_user_namespaces; exec "$@"'
-IN_A_FULL_NAMESPACE = ("unshare", "--user", "--map-current-user", "--keep-caps", "--", "sh", "-c", NO_MORE, "sh")
+# The command runs in a user namespace in which no further user namespace can be created.
+FORBID_NAMESPACES = 'echo 0 > /proc/sys/user/max_user_namespaces; exec "$@"'
+WITHOUT_USER_NAMESPACES = (
+    "unshare",
+    "--user",
+    "--map-current-user",
+    "--keep-caps",
+    "--",
+    "sh",
+    "-c",
+    FORBID_NAMESPACES,
+    "sh",
+)
 
-LACKS: dict[str, str] = {
+MISSING_PERMISSIONS: dict[str, str] = {
     "no uidmap": "mount --bind /dev/null /usr/bin/newuidmap",
     "no subordinate ids": ": > /etc/subuid; : > /etc/subgid",
     "too few subordinate groups": f"echo {ordinary_user.NAME}:300000:1000 > /etc/subgid",
@@ -96,46 +106,46 @@ def run(*words: str, change: str = "") -> Run:
 
 
 def test_a_complete_trial_of_an_ordinary_user(untouched: NamespaceComparison) -> None:
-    done = run("sh", "-e", "-c", WHOLE, "sh", *FIELDKIT)
-    assert done.code == 0, done.err
-    output, _, content = done.out.partition(BEFORE_THE_TABLE)
+    completed = run("sh", "-e", "-c", COMPLETE_TRIAL, "sh", *FIELDKIT)
+    assert completed.code == 0, completed.err
+    output, _, content = completed.out.partition(BEFORE_THE_TABLE)
     assert "2 valid" in output
     tcp, udp = csv.DictReader(content.strip().splitlines())
     for row in (tcp, udp):
         assert row["status"] == "valid"
-        assert 0 < int(row["rtt_received"]) <= int(row["rtt_sent"]), "echoes fade"
+        assert 0 < int(row["rtt_received"]) <= int(row["rtt_sent"]), "fading may lose echoes"
     assert tcp["hash_match"] == "true"
     assert int(udp["datagrams_received"]) > 0
     untouched()
 
 
 def test_a_lab_of_an_ordinary_user(untouched: NamespaceComparison) -> None:
-    done = run("sh", "-e", "-c", LAB, "sh", *FIELDKIT)
-    assert done.code == 0, done.out + done.err
-    assert "2 robots up" in done.out
-    assert "robot-2 is at" in done.out
-    assert "the robots are down" in done.out
+    completed = run("sh", "-e", "-c", LAB, "sh", *FIELDKIT)
+    assert completed.code == 0, completed.out + completed.err
+    assert "2 robots up" in completed.out
+    assert "robot-2 is at" in completed.out
+    assert "the robots are down" in completed.out
     untouched()
 
 
-def test_kill_9_of_an_ordinary_users_trial_leaves_nothing(untouched: NamespaceComparison) -> None:
+def test_a_killed_trial_of_an_ordinary_user_leaves_no_processes_or_interfaces(untouched: NamespaceComparison) -> None:
     process = start(*FIELDKIT, *TRIAL, "--json")
     wait_for_line(process, '"transfer"')
-    family = descendants(process.pid)
-    assert ordinary_user.UID in owners(family)
-    assert len(family) > 10, "three robots with their programs, and the medium"
+    process_ids = descendants(process.pid)
+    assert ordinary_user.UID in owners(process_ids)
+    assert len(process_ids) > 10, "three robots with their programs, and the medium"
     process.send_signal(signal.SIGKILL)
     process.communicate()
-    wait_for_end(family, within_s=60.0)
+    wait_for_end(process_ids, within_s=60.0)
     untouched()
 
 
 def test_the_page_lists_the_tested_errors() -> None:
-    assert list(table("On this machine")) == list(LACKS)
+    assert list(table("On this machine")) == list(MISSING_PERMISSIONS)
 
 
 @pytest.mark.parametrize("row", table("On this machine").values(), ids=lambda row: row.situation)
 def test_a_missing_permission_gives_one_message_with_a_remedy(row: Row) -> None:
-    within = IN_A_FULL_NAMESPACE if "kernel that forbids" in row.situation else ()
-    done = run(*within, *FIELDKIT, *TRIAL, change=LACKS[row.situation])
-    check(row, done.code, done.err)
+    wrapper = WITHOUT_USER_NAMESPACES if "kernel that forbids" in row.situation else ()
+    completed = run(*wrapper, *FIELDKIT, *TRIAL, change=MISSING_PERMISSIONS[row.situation])
+    check(row, completed.code, completed.err)

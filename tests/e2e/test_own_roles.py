@@ -1,6 +1,4 @@
-"""Robots in custom roles of a procedure: placed, measured and listed in the table; robots without a role are not
-used.
-"""
+"""Robots in custom roles of a procedure are placed, measured and listed in the table; other robots are not used."""
 
 from pathlib import Path
 
@@ -50,7 +48,7 @@ def lab(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_robot_in_a_custom_role_takes_part(lab: Path) -> None:
+def test_a_robot_in_a_custom_role_is_used(lab: Path) -> None:
     assert run_here(lab, "trial", "rivals", "10m").code == 0
     trial = only_trial(lab)
     (row,) = rows(trial)
@@ -69,9 +67,9 @@ def test_a_robot_in_a_custom_role_takes_part(lab: Path) -> None:
     }
 
 
-def test_an_unassigned_role_is_reported_before_anything_starts(lab: Path) -> None:
+def test_an_unassigned_role_is_reported_before_the_trial_starts(lab: Path) -> None:
     (lab / "fieldkit.yaml").write_text(SITE.replace("rival: turtlebot-2, ", ""), encoding="utf-8")
-    done = run_here(lab, "trial", "rivals", "10m")
-    assert done.code == 2
-    assert "no robot has the role rival in topology masterless" in done.err
+    run = run_here(lab, "trial", "rivals", "10m")
+    assert run.code == 2
+    assert "no robot has the role rival in topology masterless" in run.err
     assert not (lab / "trials").exists()

@@ -14,7 +14,7 @@ from fieldkit.core.errors import ConfigurationError
 from tests.helpers.paths import ROOT
 
 DOCS = ROOT / "docs"
-LONGEST_BYTES = 20_000
+MAX_PAGE_BYTES = 20_000
 TOTAL_BYTES = 300_000
 CHANGELOG_BYTES = 6_000
 GENERATED = {"reference.md", "errors.md", "evidence.md"}
@@ -35,7 +35,7 @@ def page_id(page: Path) -> str:
 
 
 def untested_commands(page: Path) -> Iterator[str]:
-    """Yield fieldkit commands of indented blocks and tables, which no other test runs."""
+    """Yield the commands of fieldkit in indented blocks and tables; no other test runs them."""
     text = FENCE.sub("", page.read_text(encoding="utf-8"))
     lines = re.sub(r"\\\n\s*", " ", text).splitlines()
     commands = [line.strip() for line in lines if re.match(r" {4,}fieldkit [a-z-]", line)]
@@ -65,18 +65,18 @@ def test_the_parser_accepts_commands_that_no_test_runs(command: str) -> None:
     cli.parser().parse_args(arguments)
 
 
-def test_the_parser_refuses_a_wrong_option() -> None:
+def test_the_parser_rejects_a_wrong_option() -> None:
     with pytest.raises(ConfigurationError):
         cli.parser().parse_args(command_words("fieldkit trial los 30ft --repeat 3x --nope"))
 
 
 @pytest.mark.parametrize("page", HAND_WRITTEN, ids=page_id)
 def test_a_hand_written_page_has_a_limited_length(page: Path) -> None:
-    assert page.stat().st_size <= LONGEST_BYTES
+    assert page.stat().st_size <= MAX_PAGE_BYTES
 
 
 WRITTEN_BY_PROGRAMS = re.compile(rb"<!-- written by [\w.:/ ]*-->.*?<!-- (?:written by|end of)[^>]*-->", re.DOTALL)
-"""Tables of measurements that the program of a benchmark writes into its page."""
+"""Tables of measurements that a benchmark writes into its page."""
 
 
 def test_all_hand_written_pages_have_a_limited_total_length() -> None:
@@ -103,7 +103,7 @@ def test_the_paper_is_introduced_where_it_is_first_mentioned(page: Path) -> None
 
 
 def labels() -> tuple[set[str], set[str]]:
-    """Return the labels of all figures in the code; for labels with variable parts the longest constant part."""
+    """Return the constant labels of all figures in the code, and the longest constant part of the other labels."""
     all_labels, parts = set(), set()
     for path in (ROOT / "fieldkit").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

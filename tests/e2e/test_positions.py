@@ -1,6 +1,4 @@
-"""True positions of robots, end to end: compared with odometry and satellite positions, and with a GPX track added
-later.
-"""
+"""True positions of robots compared with odometry, satellite positions and a GPX track that is added later."""
 
 import math
 from collections.abc import Mapping
@@ -81,14 +79,15 @@ def true_separation(trial: Path) -> Separation:
 
 
 def max_update_distance_m(trial: Path) -> float:
-    """Return the maximum distance moved by the receiver between two updates of the medium; 0.1 m if they were on
-    time.
+    """Return the maximum distance that the receiver moved between two updates of the medium.
+
+    It is 0.1 m if the updates were on time.
     """
     track_points = track.read(trial / "repeats" / "udp-01" / "track.csv")
-    places = [
+    positions_m = [
         point.position_m for point in track_points if point.role is Role.RECEIVER and point.position_m is not None
     ]
-    return max(math.dist(*pair) for pair in pairwise(places[:-1])) + 1e-3
+    return max(math.dist(*pair) for pair in pairwise(positions_m[:-1])) + 1e-3
 
 
 def separation_by_columns(trial: Path) -> Separation:
@@ -99,7 +98,7 @@ def separation_by_columns(trial: Path) -> Separation:
 
 
 def assert_similar(first: Separation, second: Separation, *, within_m: float) -> None:
-    """Assert that both have the same distances, and the same speeds except for corners and noise."""
+    """Assert that two separations have equal distances, and equal speeds except for corners and noise."""
     assert astuple(first)[:4] == pytest.approx(astuple(second)[:4], abs=within_m)
     assert first.relative_speed_m_s == pytest.approx(second.relative_speed_m_s, abs=0.1 * SPEED_M_S)
     assert first.sender_speed_m_s == second.sender_speed_m_s == 0
@@ -115,7 +114,7 @@ def test_odometry_equals_the_true_positions_and_the_motion_of_the_robot(lab: Pat
     folder = trial / "repeats" / "udp-01"
     samples = bag.positions(folder / "track_receiver.bag", "/odom", "")["rows"]
     steps_m = [math.dist(before[2:4], after[2:4]) for before, after in pairwise(samples)]
-    assert sum(steps_m) == pytest.approx(6.0, abs=0.1), "4 m away and 2 m to the left, a corner cut"
+    assert sum(steps_m) == pytest.approx(6.0, abs=0.1), "4 m away and 2 m to the left, minus a cut corner"
     assert samples[-1][2:4] == pytest.approx([4.0, 2.0])
     assert samples[-1][5] == pytest.approx(math.pi / 2)
     moving = {round(sample[2] + sample[3], 3): sample[1] for sample in samples if 0 < sample[2] < 4}
@@ -125,9 +124,9 @@ def test_odometry_equals_the_true_positions_and_the_motion_of_the_robot(lab: Pat
     before = (trial / "trial.csv").read_bytes()
     assert run_here(lab, "rebuild", str(trial)).out.endswith("the same bytes as before\n")
     assert (trial / "trial.csv").read_bytes() == before
-    listed = run_here(lab, "positions", str(trial)).out
-    assert listed.startswith("udp-01  rtt: 10.")
-    assert listed.endswith(" m, sender as placed, receiver /odom\n")
+    output = run_here(lab, "positions", str(trial)).out
+    assert output.startswith("udp-01  rtt: 10.")
+    assert output.endswith(" m, sender as placed, receiver /odom\n")
 
 
 def test_satellite_positions_equal_the_true_positions(lab: Path) -> None:
@@ -137,7 +136,7 @@ def test_satellite_positions_equal_the_true_positions(lab: Path) -> None:
     file.write_text(WALK.replace("{receiver: {topic: /odom, facing: away}}", robots), encoding="utf-8")
     trial = run_walk(lab)
     expected, measured = true_separation(trial), separation_by_columns(trial)
-    # A fix has a standard deviation of 0.1 m; extremes deviate by three times that.
+    # A fix has a standard deviation of 0.1 m, and extremes deviate by three standard deviations.
     assert measured.distance_mean_m == pytest.approx(expected.distance_mean_m, abs=0.15)
     assert (measured.distance_min_m, measured.distance_max_m) == pytest.approx(
         (expected.distance_min_m, expected.distance_max_m), abs=0.5
@@ -145,12 +144,15 @@ def test_satellite_positions_equal_the_true_positions(lab: Path) -> None:
 
 
 def gpx(path: Path, places: tuple[TrackPoint, ...], late_s: float) -> None:
-    """Write the path of the receiver like the phone of an accompanying person, whose clock is late."""
+    """Write the path of the receiver as a phone of an accompanying person, whose clock is `late_s` late."""
     points = []
-    for point, following in pairwise(point for point in places if point.role is Role.RECEIVER):
+    for point, next_point in pairwise(point for point in places if point.role is Role.RECEIVER):
         assert point.position_m is not None
         place = f'lat="{point.position_m[1] / EARTH_M[1]:.9f}" lon="{point.position_m[0] / EARTH_M[0]:.9f}"'
-        for utc_ns in (*range(point.utc_ns, following.utc_ns - 1_000_000, 200_000_000), following.utc_ns - 1_000_000):
+        for utc_ns in (
+            *range(point.utc_ns, next_point.utc_ns - 1_000_000, 200_000_000),
+            next_point.utc_ns - 1_000_000,
+        ):
             at = datetime.fromtimestamp(utc_ns / 1e9 - late_s, UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
             points.append(f"<trkpt {place}><ele>{point.position_m[2]}</ele><time>{at}</time></trkpt>")
     text = f"<trk><trkseg>{''.join(points)}</trkseg></trk>"
@@ -162,9 +164,10 @@ def tables(trial: Path) -> Mapping[str, bytes]:
 
 
 def test_gpx_of_an_accompanying_person_can_be_added_and_removed_later(lab: Path) -> None:
-    without = WALK.replace("  - track:\n", "").replace("      robots: {receiver: {topic: /odom, facing: away}}\n", "")
-    without = without.replace("      during:\n        - move:", "  - move:", 1)
-    (lab / "procedures" / "walk.yaml").write_text(without, encoding="utf-8")
+    procedure_text = WALK.replace("  - track:\n", "")
+    procedure_text = procedure_text.replace("      robots: {receiver: {topic: /odom, facing: away}}\n", "")
+    procedure_text = procedure_text.replace("      during:\n        - move:", "  - move:", 1)
+    (lab / "procedures" / "walk.yaml").write_text(procedure_text, encoding="utf-8")
     trial = run_walk(lab)
     before, expected = tables(trial), true_separation(trial)
     assert_similar(separation_by_columns(trial), expected, within_m=1e-6)

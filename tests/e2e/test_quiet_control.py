@@ -1,4 +1,4 @@
-"""Nothing crosses a control connection during the measurement of a transfer or a ping."""
+"""No packet uses a control connection during the measurement of a transfer or a ping."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -26,7 +26,7 @@ from fieldkit.trial.request import TrialRequest, make_plan
 from tests.helpers.labs import built_in_ros
 from tests.helpers.plans import steps_of
 
-# Busy robots respond to the command that starts a program when the program already sends.
+# A busy robot may respond to the command that starts a program when the program already sends.
 pytestmark = [pytest.mark.emulated, pytest.mark.quiet]
 
 FOLDER = ".fieldkit/quiet/{}"
@@ -74,7 +74,7 @@ def test_the_control_connection_is_silent_during_measurements(
         evidence.begin(emulation.shells[role], folder, role, "wlan0")
         for watch_job in watches:
             jobs.start(emulation.shells[role], watch_job)
-        for _ in range(5):  # its packets show that the capture of the control connection works
+        for _ in range(5):  # the packets of these commands show that the capture of the control connection works
             emulation.shells[role].run(("true",), deadline=Deadline.after(30))
     emulation.shells[Role.SENDER].run(
         ("sh", "-c", f"head -c 200000 /dev/zero >{folder}/scan.bag"), deadline=Deadline.after(30)
@@ -87,15 +87,15 @@ def test_the_control_connection_is_silent_during_measurements(
     for role in ENDS:
         for watch_job in watches:
             jobs.stop(emulation.shells[role], watch_job, settle=f"{watch_job.name.removeprefix('watch-')}.pcap")
-        into = tmp_path / role
-        into.mkdir()
-        fetching.fetch(emulation.shells[role], folder, role, "wlan0", into)
-        control, radio = (pcap.read(into / name).packets for name in ("lo.pcap", "wlan0.pcap"))
-        spoken_ns = control.time_ns[control.tcp_payload_bytes > 0]
-        assert len(spoken_ns) > 10, "the capture of the control connection works"
-        transferred = (radio.sport == 1234) | (radio.dport == 1234)
-        for name, measured in (("transfer", transferred), ("ping", radio.protocol == 1)):
-            times_ns = radio.time_ns[measured]
+        evidence_folder = tmp_path / role
+        evidence_folder.mkdir()
+        fetching.fetch(emulation.shells[role], folder, role, "wlan0", evidence_folder)
+        control, radio = (pcap.read(evidence_folder / name).packets for name in ("lo.pcap", "wlan0.pcap"))
+        control_ns = control.time_ns[control.tcp_payload_bytes > 0]
+        assert len(control_ns) > 10, "the capture of the control connection works"
+        is_transfer = (radio.sport == 1234) | (radio.dport == 1234)
+        for name, is_measured in (("transfer", is_transfer), ("ping", radio.protocol == 1)):
+            times_ns = radio.time_ns[is_measured]
             assert len(times_ns) > 10, name
-            during = (spoken_ns > times_ns.min()) & (spoken_ns < times_ns.max())
-            assert not np.any(during), f"{role}: {during.sum()} segments of SSH during the {name}"
+            is_during = (control_ns > times_ns.min()) & (control_ns < times_ns.max())
+            assert not np.any(is_during), f"{role}: {is_during.sum()} segments of SSH during the {name}"

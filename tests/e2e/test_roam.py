@@ -1,4 +1,4 @@
-"""A robot that moves from one access point to the other, end to end: columns, samples and a refused topology."""
+"""A trial with a robot that moves from one access point to another: columns, samples and a rejected topology."""
 
 from pathlib import Path
 
@@ -40,24 +40,24 @@ def lab(tmp_path: Path) -> Path:
 
 
 def test_a_robot_that_moves_to_another_access_point_has_one_handover(lab: Path) -> None:
-    ended = run_here(lab, "trial", "stroll", "4m", "--yes")
-    assert ended.code == 0, ended.out + ended.err
+    run = run_here(lab, "trial", "stroll", "4m", "--yes")
+    assert run.code == 0, run.out + run.err
     trial = only_trial(lab)
     (row,) = rows(trial)
     assert row["status"] == "valid"
     assert (row["roam_ap_before"], row["roam_ap_after"]) == ("west", "east")
     assert (row["roam_handovers"], row["roam_ping_pongs"]) == ("1", "0")
-    # The frames of an association need 8 ms or more; a busy machine may delay pings.
+    # The frames of an association take 8 ms or more, and a busy machine may delay pings.
     assert 0.02 <= float(row["roam_gap_s"]) < 5
     assert int(row["roam_lost"]) <= int(row["rtt_sent"]) - int(row["rtt_received"])
     (folder,) = (trial / "repeats").iterdir()
     cells = [sample.cell for sample in link_samples.read(folder / "link.csv")[Role.SENDER]]
-    assert set(cells) == {"west"}, "the other robot stays at its access point"
+    assert set(cells) == {"west"}, "the other robot uses one access point"
 
 
 def test_a_robot_cannot_be_an_access_point_beside_others(tmp_path: Path) -> None:
     text = site(TURTLEBOTS_AND_DRONE, emulated=f"ros: builtin, {RADIO}")
     (tmp_path / "fieldkit.yaml").write_text(text, encoding="utf-8")
-    ended = run_here(tmp_path, "trial", "los", "4m", "--topology", "master", "--dry-run")
-    assert ended.code != 0
-    assert "no robot can be an access point" in ended.out + ended.err
+    run = run_here(tmp_path, "trial", "los", "4m", "--topology", "master", "--dry-run")
+    assert run.code != 0
+    assert "no robot can be an access point" in run.out + run.err

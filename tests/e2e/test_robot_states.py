@@ -1,6 +1,6 @@
-"""Trials with a wrong clock, a throttled computer and a busy channel, on emulated robots whose programs report it.
+"""Trials on emulated robots whose programs report a wrong clock, a throttled computer and a busy channel.
 
-Row, table and report name the condition, and `compare` does not attribute a difference to the compared factor.
+The row, the table and the report name these conditions, and `compare` rejects a comparison with the trial.
 """
 
 from pathlib import Path
@@ -40,11 +40,11 @@ case "$*" in
 *) exit 1 ;;
 esac
 """
-"""A radio on channel 6, on which others use SHARE per cent of the time."""
+"""A program `iw` for a radio on channel 6, on which other stations use SHARE per cent of the time."""
 
 
 def lab(folder: Path, **scripts: str) -> Path:
-    """Return a lab whose receiver has these programs."""
+    """Run a trial in a lab whose receiver has these programs; return the lab."""
     folder.mkdir()
     lines = "".join(
         f"        {name}: |\n" + "".join(f"          {line}\n" for line in script.strip().splitlines())
@@ -55,25 +55,25 @@ def lab(folder: Path, **scripts: str) -> Path:
     site = f"{texts.site()}emulated:\n  ros: builtin\n  late_bound: 2s\n{robots}"
     (folder / "fieldkit.yaml").write_text(site, encoding="utf-8")
     write_procedure(folder, PROCEDURE)
-    done = run_here(folder, "trial", "pings", "5m", "--yes")
-    assert done.code == 0, done.err
+    run = run_here(folder, "trial", "pings", "5m", "--yes")
+    assert run.code == 0, run.err
     return folder
 
 
 def test_conditions_of_robots_are_named_and_not_compared(tmp_path: Path) -> None:
-    plain = lab(tmp_path / "plain", vcgencmd="echo throttled=0x50000", iw=IW.replace("SHARE", "5"))
-    bad = lab(tmp_path / "bad", chronyc=SLOW, vcgencmd="echo throttled=0x50005", iw=IW.replace("SHARE", "60"))
-    (row,) = rows(only_trial(plain))
+    normal_lab = lab(tmp_path / "plain", vcgencmd="echo throttled=0x50000", iw=IW.replace("SHARE", "5"))
+    marked_lab = lab(tmp_path / "bad", chronyc=SLOW, vcgencmd="echo throttled=0x50005", iw=IW.replace("SHARE", "60"))
+    (row,) = rows(only_trial(normal_lab))
     assert (row["marks"], row["marks_reason"]) == ("none", "")
     assert row["receiver_power_state"] == "normal", "it was throttled before this repeat"
     assert float(row["receiver_others_airtime_share"]) == pytest.approx(0.05, abs=0.05)
     assert (row["receiver_channel"], row["receiver_other_networks"]) == ("6 (2437 MHz), width 20 MHz", "1")
     assert row["receiver_regulatory_domain"] == "DE"
-    plan = plans.read_plan(only_trial(plain))
+    plan = plans.read_plan(only_trial(normal_lab))
     assert plan.radios == {
         Role.RECEIVER: {"channel": row["receiver_channel"], "regulatory_domain": row["receiver_regulatory_domain"]}
     }
-    (row,) = rows(only_trial(bad))
+    (row,) = rows(only_trial(marked_lab))
     assert row["status"] == "valid"
     names = "wrong clock and under-voltage and throttled and busy channel"
     assert row["marks"] == names
@@ -84,16 +84,16 @@ def test_conditions_of_robots_are_named_and_not_compared(tmp_path: Path) -> None
         "turtlebot-2: others use 60 % of the airtime on channel 6",
     ):
         assert reason in row["marks_reason"]
-    table = run_here(bad, "aggregate", "trials", "--format", "csv").out
+    table = run_here(marked_lab, "aggregate", "trials", "--format", "csv").out
     assert f"marks={names}" in table
-    assert run_here(bad, "report", "trials", "-o", "report.html").code == 0
-    page = (bad / "report.html").read_text(encoding="utf-8")
+    assert run_here(marked_lab, "report", "trials", "-o", "report.html").code == 0
+    page = (marked_lab / "report.html").read_text(encoding="utf-8")
     assert "1 valid repeat marked" in page
     assert "turtlebot-2: others use" in page
-    compared = run_here(tmp_path, "compare", "plain/trials", "bad/trials")
-    assert compared.code == 2
+    compare_run = run_here(tmp_path, "compare", "plain/trials", "bad/trials")
+    assert compare_run.code == 2
     for name in names.split(" and "):
-        assert f"marks, {name}: A has it in 0 of 1 repeats, B has it in 1 of 1" in compared.err
-    checked = run_here(bad, "clocks")
-    assert checked.code == 1
-    assert "the clocks of turtlebot-1 and turtlebot-2 differ by" in checked.out, "their true offset is 0"
+        assert f"marks, {name}: A has it in 0 of 1 repeats, B has it in 1 of 1" in compare_run.err
+    clocks_run = run_here(marked_lab, "clocks")
+    assert clocks_run.code == 1
+    assert "the clocks of turtlebot-1 and turtlebot-2 differ by" in clocks_run.out, "their true offset is 0"

@@ -1,4 +1,4 @@
-"""A slow control link costs a trial few round trips: independent work is parallel, and nothing is queried twice."""
+"""A trial takes few round trips on a slow control link: independent work is parallel, and no query is repeated."""
 
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,7 +21,7 @@ from tests.helpers import texts
 
 pytestmark = pytest.mark.emulated
 
-# Longer than threads wait for each other, so that parallel work is observable.
+# Longer than threads wait for each other, so that parallel work can be observed.
 ROUND_TRIP_S: Final = 0.3
 PER_REPEAT: Final = 12
 TO_OPEN: Final = 13
@@ -49,12 +49,12 @@ def test_connecting_and_each_repeat_take_few_sequential_round_trips(tmp_path: Pa
     plan = make_plan(request, backend="emulated", cast=cast, now=datetime.now(UTC))
     assert plan.procedure.protocols == (Protocol.TCP,)
     with slow_control(ROUND_TRIP_S) as slow:
-        passed: list[int] = []
+        trips_after_repeats: list[int] = []
 
         def sink(event: Event) -> None:
             if isinstance(event, RepeatEnded):
                 assert event.status is Status.VALID, event.reason
-                passed.append(slow.trips)
+                trips_after_repeats.append(slow.trips)
 
         robots = opened(
             backend, cast, session=plan.session, purpose=plan.trial, seed=1, sink=sink, operator=Unattended()
@@ -62,5 +62,5 @@ def test_connecting_and_each_repeat_take_few_sequential_round_trips(tmp_path: Pa
         with robots as testbed:
             assert slow.trips <= TO_OPEN
             run_trial(plan, testbed, tmp_path, sink)
-    first, second = passed
+    first, second = trips_after_repeats
     assert 0 < second - first <= PER_REPEAT

@@ -1,4 +1,4 @@
-"""Self-healing, end to end: `fieldkit trial selfheal`, real faults, and the resulting rows."""
+"""Trials with faults: `fieldkit trial selfheal`, other procedures, and the resulting rows."""
 
 import re
 from pathlib import Path
@@ -17,8 +17,8 @@ pytestmark = pytest.mark.emulated
 LONG_S = 300.0
 """Upper bound of recovery times on a busy machine."""
 
-# The killed ping never recovers; the sensors restart; the sender is rebooted while it records.
-NEVER = procedure(
+# The killed ping never recovers, and the sender is rebooted while it records.
+PERMANENT = procedure(
     "never",
     """\
 - fault:
@@ -39,7 +39,7 @@ NEVER = procedure(
 )
 
 CUT_S = 2.0
-# Flows of every kind: three with a rate, and a file. The topic starts slowly, on a busy machine up to 10 s late.
+# All kinds of flows: three with a rate, and a file. On a busy machine, the topic starts up to 10 s late.
 FLOWS = procedure(
     "flows",
     """\
@@ -75,19 +75,21 @@ FLOWS = procedure(
 """,
     more="expect: [up.transfer_stall_s < 300 ms]\n",
 )
-AGREES_S = 0.5
-"""Tolerance between the stall of a flow with a rate and the time its radio was out of range: a clock query over SSH,
-the duration of a command to the testbed on a busy machine, and two sending intervals of 50 ms.
+TOLERANCE_S = 0.5
+"""Tolerance between the stall of a flow with a rate and the time for which its radio was out of range.
+
+It covers a query of the clock over SSH, the duration of a command to the testbed on a busy machine, and two sending
+intervals of 50 ms.
 """
 
-HEALS = procedure(
+RESTARTING = procedure(
     "heals",
     """\
 - fault: {robot: receiver, kind: kill, process: sensors, after: 0.3s}
 """,
 )
 
-BROKEN = procedure(
+FAILING_RECORDER = procedure(
     "broken",
     """\
 - fault:
@@ -116,9 +118,9 @@ def test_a_link_and_a_robot_recover_and_the_rows_contain_the_times(
     assert row["link_down_recovered"] == row["reboot_recovered"] == "true"
     assert 2.0 <= float(row["link_down_outage_s"]) < LONG_S
     assert 0.0 <= float(row["link_down_recovery_s"]) < LONG_S
-    assert 2.0 <= float(row["reboot_outage_s"]) < LONG_S, "the boot time, and what its network takes"
+    assert 2.0 <= float(row["reboot_outage_s"]) < LONG_S, "the boot time and the time until the network works"
     assert row["reboot_recovery_s"] == row["reboot_outage_s"]
-    assert row["kill_recovered"] == row["kill_outage_s"] == "", "there was none"
+    assert row["kill_recovered"] == row["kill_outage_s"] == "", "no process was killed"
     assert 0.2 < float(row["rtt_loss"]) < 0.8, "the fault lasts 2 s of the 6 s of pings"
     assert summary(trial)["reboot_recovered"]["value"] == "1"
     evidence = {path.name for path in (trial / "repeats" / "tcp-01").iterdir()}
@@ -128,11 +130,11 @@ def test_a_link_and_a_robot_recover_and_the_rows_contain_the_times(
     untouched()
 
 
-def test_a_permanent_failure_has_no_times_and_a_failure_during_a_fault_is_a_result(tmp_path: Path) -> None:
-    began = Deadline.after(LONG_S)
-    run = run_procedure(tmp_path, NEVER)
+def test_a_permanent_failure_has_no_times_and_a_failure_during_a_fault_is_a_measurement(tmp_path: Path) -> None:
+    deadline = Deadline.after(LONG_S)
+    run = run_procedure(tmp_path, PERMANENT)
     assert run.code == 0, run.err + run.out
-    assert not began.expired, "the recording of 500 s ended with its robot"
+    assert not deadline.expired, "the recording of 500 s ended with its robot"
     assert "kill: did not recover" in run.out
     (row,) = rows(only_trial(tmp_path))
     assert row["status"] == "valid"
@@ -143,8 +145,8 @@ def test_a_permanent_failure_has_no_times_and_a_failure_during_a_fault_is_a_resu
     recovery = cells["kill_recovery_s"]
     assert recovery["is_lower_bound"] == "true", "the robot did not recover while it was watched"
     assert (recovery["n"], recovery["n_censored"]) == ("1", "1")
-    watched = (only_trial(tmp_path) / "repeats" / "tcp-01" / "fault-kill-watch.txt").read_text(encoding="ascii")
-    polls = [line.split() for line in watched.splitlines()[1:]]
+    polls_text = (only_trial(tmp_path) / "repeats" / "tcp-01" / "fault-kill-watch.txt").read_text(encoding="ascii")
+    polls = [line.split() for line in polls_text.splitlines()[1:]]
     last_up_s = max(float(poll[0]) for poll in polls if len(poll) > 1)
     assert float(recovery["value"]) == pytest.approx(float(polls[-1][0]) - last_up_s, abs=1e-6)
     assert recovery["low"] == recovery["high"] == ""
@@ -152,7 +154,7 @@ def test_a_permanent_failure_has_no_times_and_a_failure_during_a_fault_is_a_resu
 
 
 def test_flows_stall_for_the_time_out_of_range_and_tcp_longer(tmp_path: Path) -> None:
-    built_in_ros(tmp_path, radio="{mode: n0}")  # 6.5 Mbit/s: few packets last longer than the fault
+    built_in_ros(tmp_path, radio="{mode: n0}")  # at 6.5 Mbit/s, the transfer takes longer than the fault
     run = run_procedure(tmp_path, FLOWS)
     trial = only_trial(tmp_path)
     (row,) = rows(trial)
@@ -160,18 +162,18 @@ def test_flows_stall_for_the_time_out_of_range_and_tcp_longer(tmp_path: Path) ->
     assert run.code == 1, "the procedure demands stalls of at most 300 ms"
     assert row["out_of_range_recovered"] == "true"
     assert float(row["out_of_range_outage_s"]) >= CUT_S - 0.2
-    noted = (trial / "repeats" / "tcp-01" / "fault-out-of-range-times.txt").read_text(encoding="ascii")
-    began_ns, ended_ns = (int(noted.split(f"{name}_utc_ns ")[1].split()[0]) for name in ("began", "ended"))
-    cut_s = (ended_ns - began_ns) / 1e9
-    for paced in ("soak", "load.iperf3", "topic"):
-        stalled = {name: float(row[f"{paced}_{name}_s"]) for name in ("stall", "out_of_range_outage")}
-        assert abs(stalled["out_of_range_outage"] - cut_s) < AGREES_S, (paced, stalled, cut_s)
-        assert abs(stalled["stall"] - cut_s) < AGREES_S, (paced, stalled, cut_s)
-        assert 0 <= float(row[f"{paced}_out_of_range_recovery_s"]) < AGREES_S
-        assert int(row[f"{paced}_stalls"]) >= 1
-    # TCP waits for its retransmission timeout, which has grown during the outage: longer than the ping that measures
-    # it.
-    assert float(row["up.transfer_stall_s"]) >= cut_s - AGREES_S
+    fault_times = (trial / "repeats" / "tcp-01" / "fault-out-of-range-times.txt").read_text(encoding="ascii")
+    started_ns, ended_ns = (int(fault_times.split(f"{name}_utc_ns ")[1].split()[0]) for name in ("began", "ended"))
+    cut_s = (ended_ns - started_ns) / 1e9
+    for flow in ("soak", "load.iperf3", "topic"):
+        durations_s = {name: float(row[f"{flow}_{name}_s"]) for name in ("stall", "out_of_range_outage")}
+        assert abs(durations_s["out_of_range_outage"] - cut_s) < TOLERANCE_S, (flow, durations_s, cut_s)
+        assert abs(durations_s["stall"] - cut_s) < TOLERANCE_S, (flow, durations_s, cut_s)
+        assert 0 <= float(row[f"{flow}_out_of_range_recovery_s"]) < TOLERANCE_S
+        assert int(row[f"{flow}_stalls"]) >= 1
+    # TCP waits for its retransmission timeout, which has increased during the outage, so it recovers later than the
+    # ping.
+    assert float(row["up.transfer_stall_s"]) >= cut_s - TOLERANCE_S
     assert float(row["again.up.transfer_out_of_range_recovery_s"]) > 0
     assert float(row["load.iperf3_captured_jitter_mean_s"]) > 0
     assert "again: up: transfer recovery after out-of-range, median" in run.out
@@ -180,7 +182,7 @@ def test_flows_stall_for_the_time_out_of_range_and_tcp_longer(tmp_path: Path) ->
 
 def test_a_killed_service_restarts(tmp_path: Path) -> None:
     built_in_ros(tmp_path)
-    run = run_procedure(tmp_path, HEALS)
+    run = run_procedure(tmp_path, RESTARTING)
     assert run.code == 0, run.err + run.out
     (row,) = rows(only_trial(tmp_path))
     assert row["kill_recovered"] == "true"
@@ -191,9 +193,9 @@ def test_a_failure_before_the_fault_fails_the_attempt_without_a_fault(tmp_path: 
     built_in_ros(tmp_path)
     profile = locations.find("robots", "turtlebot3_burger").read_text(encoding="utf-8")
     (tmp_path / "robots").mkdir()
-    broken = re.sub(r"record: \[rosbag.*\]", 'record: ["false", "{topics}"]', profile)
-    (tmp_path / "robots" / "turtlebot3_burger.yaml").write_text(broken, encoding="utf-8")
-    run = run_procedure(tmp_path, BROKEN)
+    failing_profile = re.sub(r"record: \[rosbag.*\]", 'record: ["false", "{topics}"]', profile)
+    (tmp_path / "robots" / "turtlebot3_burger.yaml").write_text(failing_profile, encoding="utf-8")
+    run = run_procedure(tmp_path, FAILING_RECORDER)
     assert run.code == 4, run.err + run.out
     (row,) = rows(only_trial(tmp_path))
     assert row["status"] == "failed"
@@ -204,11 +206,11 @@ def test_a_failure_before_the_fault_fails_the_attempt_without_a_fault(tmp_path: 
 
 def test_a_fault_that_cannot_be_injected_fails_the_attempt(tmp_path: Path) -> None:
     built_in_ros(tmp_path)
-    began = Deadline.after(LONG_S)
+    deadline = Deadline.after(LONG_S)
     recording = "during: [{record: {robot: receiver, topics: [/pidrone/imu], duration: 500s}}]"
-    run = run_procedure(tmp_path, HEALS.replace("sensors, after: 0.3s", f"roscore, after: 0.3s, {recording}"))
+    run = run_procedure(tmp_path, RESTARTING.replace("sensors, after: 0.3s", f"roscore, after: 0.3s, {recording}"))
     assert run.code == 4, run.err + run.out
-    assert not began.expired, "the steps inside the block were ended"
+    assert not deadline.expired, "the steps inside the block were ended"
     (row,) = rows(only_trial(tmp_path))
     assert "no process named roscore runs" in row["reason"]
 

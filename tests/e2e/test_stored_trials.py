@@ -1,4 +1,4 @@
-"""Trials of an earlier version of fieldkit, whose outputs must stay as that version wrote them."""
+"""The outputs for trials of an earlier version of fieldkit must be those that the earlier version wrote."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,15 +16,15 @@ STORED = sorted(path.name for path in TRIALS.iterdir())
 
 @pytest.fixture
 def trials(tmp_path: Path) -> Iterator[list[Path]]:
-    with stored_trials.copied(tmp_path) as copies:
+    with stored_trials.copy_trials(tmp_path) as copies:
         yield copies
 
 
-def differing(trials: list[Path]) -> list[str]:
+def changed_outputs(trials: list[Path]) -> list[str]:
     """Return the outputs that differ from those of the version that ran the trials."""
-    written = dict(stored_trials.texts(trials))
-    assert written.keys() == {path.name for path in OUTPUTS.iterdir()}
-    return [name for name, text in written.items() if text != (OUTPUTS / name).read_text(encoding="utf-8")]
+    outputs = dict(stored_trials.texts(trials))
+    assert outputs.keys() == {path.name for path in OUTPUTS.iterdir()}
+    return [name for name, text in outputs.items() if text != (OUTPUTS / name).read_text(encoding="utf-8")]
 
 
 @pytest.mark.parametrize("name", STORED)
@@ -39,12 +39,14 @@ def test_rebuilt_tables_have_the_same_bytes(trials: list[Path], name: str) -> No
 def test_every_file_equals_its_checksum(trials: list[Path], name: str) -> None:
     command_output("verify", f"trials/{name}")
     stored_files = {path.relative_to(TRIALS / name) for path in (TRIALS / name).rglob("*") if path.is_file()}
-    listed = {Path(line.split("  ", 1)[1]) for line in (TRIALS / name / "MANIFEST.sha256").read_text().splitlines()}
-    assert listed - stored_files == set(), "a name that git ignores?"
+    listed_files = {
+        Path(line.split("  ", 1)[1]) for line in (TRIALS / name / "MANIFEST.sha256").read_text().splitlines()
+    }
+    assert listed_files - stored_files == set(), "git may ignore the name of a missing file"
 
 
 def test_every_output_is_unchanged(trials: list[Path]) -> None:
-    assert differing(trials) == []
+    assert changed_outputs(trials) == []
 
 
 def test_every_output_from_raw_evidence_is_the_same(trials: list[Path]) -> None:
@@ -53,7 +55,7 @@ def test_every_output_from_raw_evidence_is_the_same(trials: list[Path]) -> None:
 
 
 def test_changed_evidence_is_detected(trials: list[Path]) -> None:
-    """Check the check: one missing echo must change nearly all outputs."""
+    """One missing echo must change nearly all outputs, so the comparison of the other tests is effective."""
     (lossy,) = (trial for trial in trials if trial.name.startswith("20261122T013134"))
     ping = lossy / store.REPEATS / "udp-02" / "ping.txt"
     lines = ping.read_text(encoding="utf-8").splitlines(keepends=True)
@@ -62,4 +64,4 @@ def test_changed_evidence_is_detected(trials: list[Path]) -> None:
     assert main(["rebuild", str(lossy)]) == EvidenceError.exit_code, "its checksum no longer matches"
     (lossy / store.MANIFEST_FILE).unlink()
     assert "changed: trial.csv" in command_output("rebuild", str(lossy))
-    assert {"export.csv", "mcap.json", "report.txt", "figures.json"} <= set(differing(trials))
+    assert {"export.csv", "mcap.json", "report.txt", "figures.json"} <= set(changed_outputs(trials))

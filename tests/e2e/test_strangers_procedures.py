@@ -1,7 +1,8 @@
-"""Three procedures that a lab writes with the docs alone: their values are in every table, with label and unit.
+"""Three procedures that users can write from the documentation; every table has their values, labels and units.
 
-Two transfers of different sizes in opposite directions, while two other robots are busy; a robot without ROS that
-runs a vendor's tool with JSON output; a range walk that records the operator's observations.
+The first has two transfers of different sizes in opposite directions while two other robots are busy. The second
+runs a vendor's tool with JSON output on a robot without ROS. The third is a range walk that records the operator's
+observations.
 """
 
 import csv
@@ -89,7 +90,7 @@ printf 'words='
 printf '<%s>' "$@"
 printf '\\ncopies=%s\\n' "$(find ../.. -name probe.sh | wc -l)"
 """
-"""A program that a lab copies to a robot: it prints its arguments and the number of its copies there."""
+"""A program that a lab copies to a robot; it prints its arguments and the number of its copies on the robot."""
 DISTANCES = {"asymmetric": ["10m"], "vendor": ["10m", "20m"], "walk": ["5m", "15m"]}
 ANSWERS = "wet\n3.5\n2\n4\n0\ndry\n1\n-\n2 m/s\n1\n"
 
@@ -100,8 +101,9 @@ class LabResults:
 
     Attributes:
         trials: The trials, nearest first.
-        outputs: Outputs of its commands: `trial`, `aggregate` as CSV, `compare` of the first trial with the last.
-        page: The text of its report.
+        outputs: Outputs of commands by name: `trial`, `aggregate` as CSV, `compare` of the first trial with the last,
+            and `table` and `all` of `aggregate`.
+        page: The text of the report.
     """
 
     trials: tuple[Path, ...]
@@ -167,9 +169,9 @@ def test_both_transfers_are_measured_separately(lab_results: Mapping[str, LabRes
         for name, size_bytes in (("up", 5e6), ("down", 1e6)):
             completion_s = float(row[f"{name}.completion_s"])
             assert float(row[f"{name}.goodput_bit_s"]) == pytest.approx(8 * size_bytes / completion_s, rel=0.001)
-            # The receiving program closes the connection after the last frame, later on a busy machine.
+            # The receiving program closes the connection some time after the last frame.
             assert completion_s == pytest.approx(float(row[f"{name}.transfer_s"]), abs=0.25)
-        # The load shares the air with them: the sum is more than 2 Mbit/s of 65 Mbit/s, without preambles.
+        # The load uses the same channel, so the sum is more than 2 Mbit/s of 65 Mbit/s, without preambles.
         assert float(row["sender_busy_share"]) > 0.1
 
 
@@ -177,15 +179,15 @@ def test_the_output_of_a_vendors_tool_fills_columns(lab_results: Mapping[str, La
     results = lab_results["vendor"]
     outputs = [path for trial in results.trials for path in sorted(trial.glob("repeats/*/run.txt"))]
     for row, output in zip(results.rows(), outputs, strict=True):
-        (printed,) = json.loads(output.read_text(encoding="utf-8"))
-        assert (row["queue"], row["up"], row["driver"]) == (str(printed["txqlen"]), "true", "tun")
+        (link,) = json.loads(output.read_text(encoding="utf-8"))
+        assert (row["queue"], row["up"], row["driver"]) == (str(link["txqlen"]), "true", "tun")
 
 
 def test_a_program_of_the_lab_gets_the_distance_and_the_repeat(lab_results: Mapping[str, LabResults]) -> None:
     results = lab_results["vendor"]
     values = [(row["probe.words"], row["probe.copies"]) for row in results.rows()]
     expected = [f"<{at}><no {number}><{{repeat}}><${{distance}}>" for at in ("10m", "20m") for number in (1, 2)]
-    assert values == [(words, "1") for words in expected], "the copy of each attempt is deleted after it"
+    assert values == [(words, "1") for words in expected], "the copy is deleted after each attempt"
     assert not [path for trial in results.trials for path in trial.rglob("probe.sh")]
 
 
@@ -216,7 +218,7 @@ LABELS = {
         "rtt_median_s": ("s", "RTT", "RTT, 502-byte ping", "ms"),
     },
 }
-"""Figures by column: unit in files, label, label in the trial's table (empty if only --all shows it), unit."""
+"""By column: unit in files, label, label in the trial's table (empty if only --all shows it), and unit in tables."""
 
 
 @pytest.mark.parametrize("name", PROCEDURES)
@@ -226,7 +228,7 @@ def test_the_aggregate_contains_all_values(lab_results: Mapping[str, LabResults]
     expected = {quantity: unit for quantity, (unit, *_) in LABELS[name].items()}
     assert {cell["quantity"]: cell["unit"] for cell in cells}.items() >= expected.items()
     for cell in cells:
-        column, _, _ = cell["quantity"].partition("=")  # a text has a line per word
+        column, _, _ = cell["quantity"].partition("=")  # a text column has a line per value
         values = [row[column] for row in results.rows() if row["distance"] == cell["distance"]]
         assert int(cell["n"]) == sum(value != "" for value in values), cell
 
@@ -234,8 +236,8 @@ def test_the_aggregate_contains_all_values(lab_results: Mapping[str, LabResults]
 @pytest.mark.parametrize("name", PROCEDURES)
 def test_tables_have_labels_and_units(lab_results: Mapping[str, LabResults], name: str) -> None:
     results = lab_results[name]
-    for _, label, of_operator, unit in LABELS[name].values():
-        for table, row in (("trial", of_operator), ("compare", label)):
+    for _, label, trial_label, unit in LABELS[name].values():
+        for table, row in (("trial", trial_label), ("compare", label)):
             lines = [
                 line
                 for line in results.outputs[table].splitlines()
@@ -243,9 +245,9 @@ def test_tables_have_labels_and_units(lab_results: Mapping[str, LabResults], nam
             ]
             assert bool(lines) is bool(row), (table, label)
             assert all(unit in line for line in lines)
-        head = rf"^{of_operator if label == 'RTT' else label}{re.escape(f' ({unit})') if unit else ''}$"
-        assert re.search(head, results.outputs["all"], re.MULTILINE), head
-        # The page has a table for each named step.
+        title = rf"^{trial_label if label == 'RTT' else label}{re.escape(f' ({unit})') if unit else ''}$"
+        assert re.search(title, results.outputs["all"], re.MULTILINE), title
+        # The report has a table for each named step.
         assert re.search(rf"{label.rpartition(': ')[2]}\b.*? [0-9.]+ ?{unit}", results.page)
 
 
@@ -281,7 +283,7 @@ def test_each_transfer_has_a_separate_timeline(lab_results: Mapping[str, LabResu
     folder = results.trials[0].parents[1]
     page = (folder / "report.html").read_text(encoding="utf-8")
     spans = re.findall(r"((?:send|receive) \w+) from ([0-9.]+) to ([0-9.]+) s", page)
-    # In order of their start; of two that run together either may be first.
+    # The lanes are in the order of their start, which is random for two that run at the same time.
     assert sorted(lane for lane, _, _ in spans) == ["receive down", "receive up", "send down", "send up"]
     assert all(float(start_s) < float(stop_s) for _, start_s, stop_s in spans)
     assert [float(start_s) for _, start_s, _ in spans] == sorted(float(start_s) for _, start_s, _ in spans)

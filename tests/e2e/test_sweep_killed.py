@@ -1,4 +1,4 @@
-"""A sweep whose workers are killed at random ends with the same bytes as on one core, and repeats no finished run."""
+"""A sweep whose workers are killed has the same result as on one core, and repeats no completed run."""
 
 import json
 import random
@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from fieldkit.core.deadline import Deadline
-from tests.helpers.host import alive
+from tests.helpers.host import is_running
 from tests.helpers.nightly import mark_nightly
 from tests.helpers.runs import run_here
 from tests.helpers.sshd import wait_until
@@ -52,14 +52,14 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def one_core(lab: Path) -> Mapping[str, bytes]:
-    """The dataset of the sweep that one core ran without interruption."""
-    done = run_here(lab, "cosim", "sweep", *SWEEP, "--jobs", "1", "-o", "one")
-    assert (done.code, f"{RUNS} of {RUNS} runs are done" in done.out) == (0, True), done.err
+    """The dataset of the sweep, from one core without interruption."""
+    sweep_run = run_here(lab, "cosim", "sweep", *SWEEP, "--jobs", "1", "-o", "one")
+    assert (sweep_run.code, f"{RUNS} of {RUNS} runs are done" in sweep_run.out) == (0, True), sweep_run.err
     assert len(finished_runs(lab / "one")) == RUNS
     return dataset(lab / "one")
 
 
-def test_processes_that_are_killed(lab: Path, one_core: Mapping[str, bytes]) -> None:
+def test_a_sweep_is_completed_although_processes_are_killed(lab: Path, one_core: Mapping[str, bytes]) -> None:
     generator = random.Random(1)
     code, events, deaths = sweep_while_workers_die(
         [*SWEEP, "--jobs", "2", "-o", "local"],
@@ -72,7 +72,9 @@ def test_processes_that_are_killed(lab: Path, one_core: Mapping[str, bytes]) -> 
     assert dataset(lab / "local") == one_core
 
 
-def test_a_dask_cluster_whose_workers_are_killed(lab: Path, one_core: Mapping[str, bytes], tmp_path: Path) -> None:
+def test_a_sweep_is_completed_although_workers_of_dask_are_killed(
+    lab: Path, one_core: Mapping[str, bytes], tmp_path: Path
+) -> None:
     generator = random.Random(2)
     with dask_cluster(tmp_path, 2) as (scheduler, nannies):
 
@@ -88,7 +90,9 @@ def test_a_dask_cluster_whose_workers_are_killed(lab: Path, one_core: Mapping[st
 
 @pytest.mark.nightly
 @pytest.mark.skipif(shutil.which("slurmctld") is None, reason="needs slurm-wlm and munge of Debian")
-def test_slurm_jobs_that_are_cancelled(lab: Path, one_core: Mapping[str, bytes], tmp_path: Path) -> None:
+def test_a_sweep_is_completed_although_slurm_jobs_are_cancelled(
+    lab: Path, one_core: Mapping[str, bytes], tmp_path: Path
+) -> None:
     generator = random.Random(3)
     with slurm_node(tmp_path) as environment, dask_scheduler(tmp_path) as scheduler:
         worker = f"exec {sys.executable} -m distributed.cli.dask_worker --scheduler-file {scheduler} --nthreads 1"
@@ -107,34 +111,34 @@ def test_slurm_jobs_that_are_cancelled(lab: Path, one_core: Mapping[str, bytes],
     assert dataset(lab / "slurm") == one_core
 
 
-@pytest.mark.parametrize("how", mark_nightly([signal.SIGINT, signal.SIGKILL]))
-def test_a_stopped_sweep_continues_and_repeats_nothing(
-    how: signal.Signals, lab: Path, one_core: Mapping[str, bytes]
+@pytest.mark.parametrize("signal_number", mark_nightly([signal.SIGINT, signal.SIGKILL]))
+def test_a_stopped_sweep_can_be_continued_and_repeats_no_run(
+    signal_number: signal.Signals, lab: Path, one_core: Mapping[str, bytes]
 ) -> None:
-    out = f"stopped-{how.name}"
+    out = f"stopped-{signal_number.name}"
     command = [sys.executable, "-m", "fieldkit", "cosim", "sweep", *SWEEP, "--jobs", "2", "-o", out]
     with subprocess.Popen(command, cwd=lab, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True) as process:
         wait_until(lambda: len(finished_runs(lab / out)) >= 3, Deadline.after(120))
         workers = worker_processes(process.pid)
-        process.send_signal(how)
+        process.send_signal(signal_number)
         _, messages = process.communicate(timeout=60)
-    before = finished_runs(lab / out)
-    assert 3 <= len(before) < RUNS
-    wait_until(lambda: not any(map(alive, workers)), Deadline.after(60))
-    if how is signal.SIGINT:
+    previous_runs = finished_runs(lab / out)
+    assert 3 <= len(previous_runs) < RUNS
+    wait_until(lambda: not any(map(is_running, workers)), Deadline.after(60))
+    if signal_number is signal.SIGINT:
         assert process.returncode == 130
         assert f"to continue: fieldkit cosim sweep {' '.join(SWEEP[:-2])}" in messages
         assert "Traceback" not in messages
-    done = run_here(lab, "cosim", "sweep", *SWEEP, "--jobs", "1", "-o", out, "--json")
-    assert done.code == 0, done.err
-    planned = json.loads(done.out.splitlines()[0])
-    assert (planned["event"], planned["done"]) == ("sweep_planned", len(before))
-    assert {name: at for name, at in finished_runs(lab / out).items() if name in before} == before
+    sweep_run = run_here(lab, "cosim", "sweep", *SWEEP, "--jobs", "1", "-o", out, "--json")
+    assert sweep_run.code == 0, sweep_run.err
+    planned_event = json.loads(sweep_run.out.splitlines()[0])
+    assert (planned_event["event"], planned_event["done"]) == ("sweep_planned", len(previous_runs))
+    assert {name: at for name, at in finished_runs(lab / out).items() if name in previous_runs} == previous_runs
     assert dataset(lab / out) == one_core
 
 
-def test_only_one_process_runs_a_sweep(lab: Path, one_core: Mapping[str, bytes]) -> None:
+def test_a_completed_sweep_is_not_run_again(lab: Path, one_core: Mapping[str, bytes]) -> None:
     run = partial(run_here, lab, "cosim", "sweep", *SWEEP, "--jobs", "1", "-o", "one")
-    again = run()
-    assert (again.code, "32 are done" in again.out) == (0, True)
+    second_run = run()
+    assert (second_run.code, "32 are done" in second_run.out) == (0, True)
     assert dataset(lab / "one") == one_core

@@ -1,4 +1,4 @@
-"""Telemetry sources of a profile in a real trial: values and sources in row and table, failures as notes."""
+"""Telemetry sources of a profile in a trial: the row and table have values and sources, and notes report failures."""
 
 import gzip
 import re
@@ -75,7 +75,7 @@ def test_row_and_table_show_values_and_sources(lab: Path) -> None:
         "rx_rate_bit_s": "",
     }
     assert {name: row[f"sender_{name}"] for name in expected} == expected
-    assert int(row["sender_radio_tx_packets"]) > 0, "which no source gives: it is the testbed's"
+    assert int(row["sender_radio_tx_packets"]) > 0, "no source has this value, so it is from the testbed"
     assert float(row["receiver_signal_median_dbm"]) > -60, "the other robot has no sources"
     assert re.search(r"signal, sender, median +-97\.50 dBm", run.out)
     assert re.search(r"link source, sender +'lte \(command\)", run.out)

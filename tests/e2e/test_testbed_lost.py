@@ -1,4 +1,4 @@
-"""A testbed that dies during a trial stops it; no repeat fails because of that, and `resume` completes the trial."""
+"""A trial stops if its testbed is killed; no repeat counts as failed, and `resume` completes the trial."""
 
 import os
 import re
@@ -17,13 +17,13 @@ OPTIONS = ("--repeats", "2", "--protocol", "tcp", "--topology", "masterless", "-
 TRIAL = ("trial", *OPTIONS, "--json", "los", "30ft")
 
 
-def process_of(family: set[int], module: str) -> int:
-    """Return the process of a family that runs a module; for a robot's processes, the first of its namespace."""
+def find_process(process_ids: set[int], module: str) -> int:
+    """Return the process that runs a module; for a robot's processes, the first process of its namespace."""
 
-    def runs_it(pid: int) -> bool:
+    def runs_module(pid: int) -> bool:
         try:
             return module.encode() in Path(f"/proc/{pid}/cmdline").read_bytes()
-        except (FileNotFoundError, ProcessLookupError):  # it has ended after the family was listed
+        except (FileNotFoundError, ProcessLookupError):  # it has exited after the processes were listed
             return False
 
     def is_first(pid: int) -> bool:
@@ -31,31 +31,31 @@ def process_of(family: set[int], module: str) -> int:
             "^(?!NSpid).*\n", "", Path(f"/proc/{pid}/status").read_text(encoding="utf-8"), flags=re.MULTILINE
         )
 
-    running = sorted(filter(runs_it, family))
-    return next(filter(is_first, running), running[0])
+    module_pids = sorted(filter(runs_module, process_ids))
+    return next(filter(is_first, module_pids), module_pids[0])
 
 
 @pytest.mark.parametrize("victim", ["emulated.medium.process", "emulated.robot.init"])
-def test_a_part_that_dies_stops_the_trial_and_resume_completes_it(
+def test_a_trial_stops_if_a_part_of_the_testbed_is_killed_and_resume_completes_it(
     tmp_path: Path, untouched: NamespaceComparison, victim: str
 ) -> None:
     built_in_ros(tmp_path)
     process = start(tmp_path, *TRIAL)
     wait_for_line(process, '"transfer"')
-    family = descendants(process.pid)
-    os.kill(process_of(family, victim), signal.SIGKILL)
-    stopped = finish(process)
-    assert stopped.code == 3, stopped.err
-    assert "does not answer: it" in stopped.err
-    assert "fieldkit resume" in stopped.err
-    assert stopped.events("trial_stopped")
-    notes = [event["text"] for event in stopped.events("note")]
-    assert not any("stays" in note or "delete it" in note for note in notes), "nothing stays of emulated robots"
-    wait_for_end(family, within_s=60.0)
+    process_ids = descendants(process.pid)
+    os.kill(find_process(process_ids, victim), signal.SIGKILL)
+    stopped_run = finish(process)
+    assert stopped_run.code == 3, stopped_run.err
+    assert "does not answer: it" in stopped_run.err
+    assert "fieldkit resume" in stopped_run.err
+    assert stopped_run.events("trial_stopped")
+    notes = [event["text"] for event in stopped_run.events("note")]
+    assert not any("stays" in note or "delete it" in note for note in notes), "no files of emulated robots remain"
+    wait_for_end(process_ids, within_s=60.0)
     untouched()
     assert [row["status"] for row in rows(only_trial(tmp_path))] == ["void"]
-    resumed = run_here(tmp_path, "resume", str(only_trial(tmp_path)), "--json")
-    assert resumed.code == 0, resumed.err
+    resume_run = run_here(tmp_path, "resume", str(only_trial(tmp_path)), "--json")
+    assert resume_run.code == 0, resume_run.err
     table = rows(only_trial(tmp_path))
     assert [row["status"] for row in table] == ["void", "valid", "valid"]
     assert run_here(tmp_path, "verify", str(only_trial(tmp_path))).code == 0

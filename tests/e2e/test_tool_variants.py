@@ -1,4 +1,4 @@
-"""A trial on robots with each variant of their tools ends valid, or is rejected before its first repeat."""
+"""A trial on robots with any variant of their tools is valid, or is rejected before its first repeat."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +31,7 @@ MCAP: Final = (
     *("variant: ros1", "variant: ros2", "distribution: foxy", "distribution: jazzy"),
     *("/opt/ros/foxy", "/opt/ros/jazzy", "_0.db3", "_0.mcap"),
 )
-# Parts of the procedure that take time and have no variants.
+# These parts of the procedure take time and do not depend on the variant.
 SHORTER: Final = (
     *("count: 10", "count: 5", "interval: 200ms", "interval: 50ms"),
     *("topology: master", "topology: masterless"),
@@ -40,7 +40,7 @@ SHORTER: Final = (
 
 @dataclass(frozen=True)
 class Pair:
-    """Two robots: the tools of each in the site file, changes of the sender's profile, and ROS."""
+    """The tools of two robots in the site file, changes of the sender's profile, and the choice of ROS."""
 
     sender: str
     receiver: str
@@ -49,7 +49,7 @@ class Pair:
 
 
 def trial(lab: Path, pair: Pair, *words: str) -> Run:
-    """Run a short trial in a lab of two robots whose only netcat is `nc`, of any variant."""
+    """Run a short trial in a lab of two robots with any variant of netcat, whose command is `nc`."""
     for name, recorder in (("one", pair.recorder), ("two", ROSBAG)):
         changes = ("name: turtlebot3_burger", f"name: {name}", "netcat: nc.traditional", "netcat: nc", *recorder)
         copy_shipped(lab, "robots", "turtlebot3_burger", *changes, called=name)
@@ -74,17 +74,19 @@ def trial(lab: Path, pair: Pair, *words: str) -> Run:
     ],
     ids=lambda pair: f"{pair.sender} to {pair.receiver}",
 )
-def test_a_trial_ends_valid(tmp_path: Path, pair: Pair) -> None:
+def test_a_trial_is_valid(tmp_path: Path, pair: Pair) -> None:
     run = trial(tmp_path, pair)
     assert run.code == 0, run.out + run.err
-    assert "the link is lost" not in run.out + run.err, "no action of fieldkit may make a server hang up"
+    assert "the link is lost" not in run.out + run.err, (
+        "no action of fieldkit may cause a server to close its connection"
+    )
     table = rows(only_trial(tmp_path))
     assert [(row["protocol"], row["attempt"], row["status"]) for row in table] == [
         ("tcp", "1", "valid"),
         ("udp", "1", "valid"),
     ], run.out + run.err
     for row in table:
-        assert row["hash_match"] == "true", "nothing is lost on this radio"
+        assert row["hash_match"] == "true", "this radio loses no packets"
         assert int(row["bag_messages"]) > 0
         assert row["rtt_received"] == row["rtt_sent"] == "5"
 
@@ -111,4 +113,4 @@ def test_unsuitable_tools_are_rejected_before_repeat_1(tmp_path: Path, pair: Pai
     tool, package = words
     assert tool in run.err
     assert f"  apt-get install {package}" in run.err, "root needs no sudo"
-    assert rows(only_trial(tmp_path)) == [], "no repeat began"
+    assert rows(only_trial(tmp_path)) == [], "no repeat was started"

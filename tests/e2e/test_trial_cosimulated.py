@@ -1,4 +1,4 @@
-"""Campaigns, trials and labs on the co-simulation: their numbers, and real ROS at a wall; nothing remains."""
+"""Campaigns, trials and labs on the co-simulation: measured values, and a robot that real ROS drives to a wall."""
 
 import json
 import os
@@ -79,7 +79,7 @@ def test_a_campaign_on_the_built_in_network(tmp_path: Path, untouched: Namespace
 
 
 def test_a_trial_on_ns3(tmp_path: Path) -> None:
-    resolve(EmulatedOptions.model_validate({"network": "ns3"}))  # compiles it before the trial
+    resolve(EmulatedOptions.model_validate({"network": "ns3"}))  # this compiles ns-3 before the trial
     row = trial_row(tmp_path, "{network: ns3, ros: builtin}")
     assert float(row["delay_s"]) > float(row["delay_policy_s"]) > 0
     parts_s = [float(row[f"delay_{part}_s"]) for part in ("processing", "transmission", "propagation", "queuing")]
@@ -92,7 +92,7 @@ def test_a_trial_on_ns3(tmp_path: Path) -> None:
 
 
 def test_a_robot_that_real_ros_drives_stops_at_the_wall(tmp_path: Path) -> None:
-    """The wall of the lawn begins at 3.9 m east, and the robot has a radius of 0.113 m."""
+    """The wall of the lawn starts at 3.9 m east, and the robot has a radius of 0.113 m."""
     make_site(tmp_path, "{physics: kinematic, ros: debian, late_bound: 1us}")
     assert fieldkit(tmp_path, "lab", "up").code == 0
     try:
@@ -102,33 +102,33 @@ def test_a_robot_that_real_ros_drives_stops_at_the_wall(tmp_path: Path) -> None:
         assert fieldkit(tmp_path, "lab", "shell", "robot-1", f"{DRIVE} >/dev/null 2>&1 &").code == 0
 
         def east_m() -> float:
-            listed = json.loads(run_here(tmp_path, "lab", "ps", "--json").out)
-            return float(listed["robots"][0]["place_m"][0])
+            lab_state = json.loads(run_here(tmp_path, "lab", "ps", "--json").out)
+            return float(lab_state["robots"][0]["place_m"][0])
 
         wait_until(lambda: east_m() > 3.786, Deadline.after(90))
         assert east_m() == pytest.approx(3.787, abs=0.002)
         record = "timeout -s INT 60 rosbag record -q -l 5 -O wall.bag /odom /scan >/dev/null 2>&1; base64 wall.bag"
         (tmp_path / "wall.bag").write_bytes(b64decode(fieldkit(tmp_path, "lab", "shell", "robot-1", record).out))
         with AnyReader([tmp_path / "wall.bag"]) as bag:
-            last: dict[str, Any] = {
-                each.topic: bag.deserialize(data, each.msgtype) for each, _, data in bag.messages()
+            last_messages: dict[str, Any] = {
+                connection.topic: bag.deserialize(data, connection.msgtype) for connection, _, data in bag.messages()
             }
-        assert last["/odom"].pose.pose.position.x == pytest.approx(0.287, abs=0.003), "it began at 3.5 m"
-        assert last["/odom"].twist.twist.linear.x == 0.0
+        assert last_messages["/odom"].pose.pose.position.x == pytest.approx(0.287, abs=0.003), "it started at 3.5 m"
+        assert last_messages["/odom"].twist.twist.linear.x == 0.0
         beams_rad = np.radians(np.arange(50, 70))
-        wall_m = np.median(last["/scan"].ranges[50:70] * np.cos(beams_rad))
+        wall_m = np.median(last_messages["/scan"].ranges[50:70] * np.cos(beams_rad))
         assert wall_m == pytest.approx(3.9 - 3.787, abs=0.01)
-        listed = run_here(tmp_path, "lab", "ps")
-        late = re.search(r"late: .*windows at most [\d.]+ ms; \d{3,} windows", listed.out)
-        assert late is not None, listed.out
-        assert "windows later than 0.001 ms, so a trial would be void" in listed.err
+        ps_run = run_here(tmp_path, "lab", "ps")
+        lateness = re.search(r"late: .*windows at most [\d.]+ ms; \d{3,} windows", ps_run.out)
+        assert lateness is not None, ps_run.out
+        assert "windows later than 0.001 ms, so a trial would be void" in ps_run.err
         lab_pid = json.loads(run_here(tmp_path, "lab", "ps", "--json").out)["pid"]
         (cosim_pid,) = (pid for pid in descendants(lab_pid) if COSIM in Path(f"/proc/{pid}/cmdline").read_bytes())
         os.kill(cosim_pid, signal.SIGKILL)
         wait_until(lambda: run_here(tmp_path, "lab", "ps").code != 0, Deadline.after(60))
-        failed = run_here(tmp_path, "lab", "ps")
-        assert "does not answer: it was killed by SIGKILL" in failed.err
-        assert "fieldkit lab down" in failed.err
+        failed_run = run_here(tmp_path, "lab", "ps")
+        assert "does not answer: it was killed by SIGKILL" in failed_run.err
+        assert "fieldkit lab down" in failed_run.err
     finally:
         assert run_here(tmp_path, "lab", "down").code == 0
 
@@ -150,7 +150,7 @@ def test_a_robot_that_real_ros_drives_stops_at_the_wall(tmp_path: Path) -> None:
         ("{physics: kinematic, sync: {name: scheduled, window: 0.1ms}}", "shorter than the physics step"),
     ],
 )
-def test_a_combination_that_cannot_work_is_refused(emulated: str, reason: str, tmp_path: Path) -> None:
+def test_an_impossible_combination_is_rejected(emulated: str, reason: str, tmp_path: Path) -> None:
     make_site(tmp_path, emulated)
     if "gazebo" in emulated:
         site = (tmp_path / "fieldkit.yaml").read_text(encoding="utf-8")
@@ -179,8 +179,8 @@ def test_real_ros_drives_a_robot_in_gazebo(tmp_path: Path, monkeypatch: pytest.M
             assert fieldkit(tmp_path, "lab", "shell", "robot-1", f"{DRIVE} >/dev/null 2>&1 &").code == 0
 
             def place_m() -> list[float]:
-                listed = json.loads(run_here(tmp_path, "lab", "ps", "--json").out)
-                place: list[float] = listed["robots"][0]["place_m"]
+                lab_state = json.loads(run_here(tmp_path, "lab", "ps", "--json").out)
+                place: list[float] = lab_state["robots"][0]["place_m"]
                 return place
 
             wait_until(lambda: place_m()[0] > 10.3, Deadline.after(90))

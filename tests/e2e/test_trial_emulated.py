@@ -1,7 +1,6 @@
-"""The main use, end to end: `fieldkit trial` on emulated robots, and the use of its folder."""
+"""`fieldkit trial` on emulated robots, and commands that read its folder."""
 
 import csv
-import hashlib
 import math
 import shutil
 import signal
@@ -22,8 +21,8 @@ TRIAL = ("trial", "los", "30ft", "--repeats", "2", "--record", "2s")
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Run]:
-    """Return a lab whose trial ended without a void attempt, and its output; tests must not change it."""
+def lab_and_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Run]:
+    """A lab with a trial without void attempts, and the run of the trial; tests must not change the lab."""
     lab = tmp_path_factory.mktemp("lab")
     run = fieldkit(lab, *TRIAL)
     assert run.code == 0, run.err
@@ -32,24 +31,24 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Run]:
 
 
 @pytest.fixture
-def lab_copy(finished: tuple[Path, Run], tmp_path: Path) -> Path:
-    """Return a copy of that lab, which the test may change."""
-    return Path(shutil.copytree(finished[0], tmp_path / "copy"))
+def lab_copy(lab_and_run: tuple[Path, Run], tmp_path: Path) -> Path:
+    """A copy of the lab of `lab_and_run`, which the test may change."""
+    return Path(shutil.copytree(lab_and_run[0], tmp_path / "copy"))
 
 
-def test_the_trial_ends_valid_and_prints_its_table(finished: tuple[Path, Run]) -> None:
-    _, run = finished
+def test_the_trial_is_valid_and_prints_its_table(lab_and_run: tuple[Path, Run]) -> None:
+    _, run = lab_and_run
     assert "using emulated robots" in run.out
     assert "4/4" in run.out
     for label in ("2 valid", "radio loss", "RTT, 8192-byte ping, median", "goodput, median", "next: fieldkit report"):
         assert label in run.out
-    assert "\x1b" not in run.out, "no terminal codes off a terminal"
+    assert "\x1b" not in run.out, "the output has no terminal codes if it is not a terminal"
 
 
-def test_the_folder_contains_every_piece_of_evidence(finished: tuple[Path, Run]) -> None:
-    trial = only_trial(finished[0])
+def test_the_folder_contains_every_piece_of_evidence(lab_and_run: tuple[Path, Run]) -> None:
+    trial = only_trial(lab_and_run[0])
     assert trial.name.endswith("_los_30ft_master")
-    present = {path.name for path in trial.iterdir()}
+    names = {path.name for path in trial.iterdir()}
     files = {
         "trial.yaml",
         "journal.jsonl",
@@ -58,7 +57,7 @@ def test_the_folder_contains_every_piece_of_evidence(finished: tuple[Path, Run])
         "preflight.txt",
         "MANIFEST.sha256",
     }
-    assert present == files | {"repeats"}
+    assert names == files | {"repeats"}
     assert {path.name for path in (trial / "repeats").iterdir()} == {"tcp-01", "tcp-02", "udp-01", "udp-02"}
     evidence = {path.name for path in (trial / "repeats" / "udp-01").iterdir()}
     assert evidence >= {"scan.bag", "recv.bag", "sender.pcap", "receiver.pcap", "ping.txt"}
@@ -69,19 +68,19 @@ def test_aggregate_of_one_trial_from_raw_evidence_is_its_summary(lab_copy: Path)
     lab = lab_copy
     trial = only_trial(lab)
     (trial / "trial.csv").rename(lab / "trial.csv.away")
-    rebuilt = run_here(lab, "aggregate", "trials", "--rebuild", "--format", "csv")
+    rebuild_run = run_here(lab, "aggregate", "trials", "--rebuild", "--format", "csv")
     (lab / "trial.csv.away").rename(trial / "trial.csv")
-    for run in (rebuilt, run_here(lab, "aggregate", str(trial), "--format", "csv")):
+    for run in (rebuild_run, run_here(lab, "aggregate", str(trial), "--format", "csv")):
         assert run.out == (trial / "summary.csv").read_text(encoding="utf-8"), run.err
     assert run_here(lab, "verify", str(trial)).code == 0
 
 
-def test_the_rows_contain_the_results(finished: tuple[Path, Run]) -> None:
-    trial = only_trial(finished[0])
+def test_the_rows_contain_the_results(lab_and_run: tuple[Path, Run]) -> None:
+    trial = only_trial(lab_and_run[0])
     table = rows(trial)
-    declared = [column.name for column in (*trial_columns(), *robot_columns((Role.SENDER, Role.RECEIVER)))]
-    assert list(table[0])[: len(trial_columns())] == declared[: len(trial_columns())]
-    assert sorted(table[0]) == sorted(declared)
+    declared_names = [column.name for column in (*trial_columns(), *robot_columns((Role.SENDER, Role.RECEIVER)))]
+    assert list(table[0])[: len(trial_columns())] == declared_names[: len(trial_columns())]
+    assert sorted(table[0]) == sorted(declared_names)
     assert [(row["protocol"], row["repeat"], row["status"]) for row in table] == [
         ("tcp", "1", "valid"),
         ("udp", "1", "valid"),
@@ -90,17 +89,17 @@ def test_the_rows_contain_the_results(finished: tuple[Path, Run]) -> None:
     ]
     for row in table:
         folder = trial / "repeats" / f"{row['protocol']}-{int(row['repeat']):02d}"
-        sent, received = ((folder / name).read_bytes() for name in ("scan.bag", "recv.bag"))
-        assert int(row["sent_bytes"]) == len(sent)
-        assert int(row["received_bytes"]) == len(received)
-        assert row["hash_match"] == str(hashlib.sha256(sent).digest() == hashlib.sha256(received).digest()).lower()
+        sent_file, received_file = ((folder / name).read_bytes() for name in ("scan.bag", "recv.bag"))
+        assert int(row["sent_bytes"]) == len(sent_file)
+        assert int(row["received_bytes"]) == len(received_file)
+        assert row["hash_match"] == str(sent_file == received_file).lower()
         with Reader(folder / "scan.bag") as bag:
             messages = bag.message_count
         assert int(row["bag_messages"]) == messages
-        assert 0 < messages <= 11, "2 s of a 5 Hz laser, less what it takes to subscribe"
+        assert 0 < messages <= 11, "2 s of a 5 Hz laser, minus the time to subscribe"
         assert (row["sender"], row["receiver"], row["relay"]) == ("turtlebot-1", "turtlebot-2", "duckiedrone-1")
         assert float(row["distance_m"]) == pytest.approx(9.144)
-        assert 0 < int(row["rtt_received"]) <= int(row["rtt_sent"]) == 10, "echoes fade, too"
+        assert 0 < int(row["rtt_received"]) <= int(row["rtt_sent"]) == 10, "fading may lose echoes"
         assert float(row["paper_transfer_s"]) == pytest.approx(
             int(row["paper_packets"]) * float(row["paper_delay_s"]), rel=1e-6
         )
@@ -117,18 +116,18 @@ def test_a_simulation_of_the_same_trial_is_compared_without_options(lab_copy: Pa
     size_bytes = rows(trial)[0]["sent_bytes"]
     changes = ("trial.record=2s", *(f"traffic.{number}.size_bytes={size_bytes}" for number in (0, 2)))
     options = [word for change in changes for word in ("--set", change)]
-    simulated = run_here(lab_copy, "cosim", "run", "field_30ft", *options, "--out", "simulated")
-    assert simulated.code == 0, simulated.err
-    compared = run_here(lab_copy, "compare", "simulated", str(trial), "--format", "csv")
-    assert compared.code == 0, compared.err
-    assert "not comparable" not in compared.err
+    cosim_run = run_here(lab_copy, "cosim", "run", "field_30ft", *options, "--out", "simulated")
+    assert cosim_run.code == 0, cosim_run.err
+    compare_run = run_here(lab_copy, "compare", "simulated", str(trial), "--format", "csv")
+    assert compare_run.code == 0, compare_run.err
+    assert "not comparable" not in compare_run.err
     values = {
         (row["protocol"], row["quantity"]): (float(row["a"]), float(row["b"]))
-        for row in csv.DictReader(compared.out.splitlines())
+        for row in csv.DictReader(compare_run.out.splitlines())
         if row["a"] and row["b"]
     }
     for protocol in ("tcp", "udp"):
-        # The simulation has no processing time in programs and kernels.
+        # The simulation does not model the processing time of programs and kernels.
         assert values[protocol, "transfer_s"][0] < 1.2 * values[protocol, "transfer_s"][1]
         assert values[protocol, "rtt_median_s"][0] < values[protocol, "rtt_median_s"][1]
 
@@ -142,15 +141,15 @@ def test_verify_finds_one_flipped_byte_and_rebuild_gives_the_same_bytes(lab_copy
     (trial / "summary.csv").write_text("", encoding="utf-8")
     assert run_here(lab, "rebuild", str(trial)).code == 0
     assert before == {name: (trial / name).read_bytes() for name in before}
-    rebuilt = run_here(lab, "rebuild", str(trial))
-    assert "the same bytes as before" in rebuilt.out
+    rebuild_run = run_here(lab, "rebuild", str(trial))
+    assert "the same bytes as before" in rebuild_run.out
     pcap = trial / "repeats" / "tcp-02" / "receiver.pcap"
     content = bytearray(pcap.read_bytes())
     content[-1] ^= 0x10
     pcap.write_bytes(content)
-    broken = run_here(lab, "verify", str(trial))
-    assert broken.code == 4
-    assert "repeats/tcp-02/receiver.pcap: changed" in broken.err
+    verify_run = run_here(lab, "verify", str(trial))
+    assert verify_run.code == 4
+    assert "repeats/tcp-02/receiver.pcap: changed" in verify_run.err
 
 
 def test_a_masterless_trial_behind_the_wall_prints_one_json_object_per_line(tmp_path: Path) -> None:
@@ -165,15 +164,15 @@ def test_a_masterless_trial_behind_the_wall_prints_one_json_object_per_line(tmp_
         1,
         1,
     )
-    (ended,) = run.events("trial_ended")
-    assert Path(tmp_path / ended["folder"]) == only_trial(tmp_path)
+    (trial_ended,) = run.events("trial_ended")
+    assert Path(tmp_path / trial_ended["folder"]) == only_trial(tmp_path)
     assert {event["name"] for event in run.events("phase_started")} >= {"record", "transfer", "ping"}
     assert {
         (row["scenario"], row["topology"], row["relay"], row["receiver"]) for row in rows(only_trial(tmp_path))
     } == {("nlos", "masterless", "", "duckiedrone-1")}
 
 
-def test_a_dry_run_prints_every_command_and_starts_nothing(tmp_path: Path, untouched: NamespaceComparison) -> None:
+def test_a_dry_run_prints_every_command_and_starts_no_robot(tmp_path: Path, untouched: NamespaceComparison) -> None:
     run = fieldkit(tmp_path, "trial", "los", "30ft", "--dry-run")
     assert run.code == 0, run.err
     assert "## udp: turtlebot-1 (sender, 10.42.0.1)" in run.out
@@ -215,17 +214,17 @@ def test_a_missing_tool_stops_the_trial_before_repeat_1(tmp_path: Path) -> None:
     assert "remedy" in run.err
 
 
-def test_kill_9_leaves_only_finished_repeats(tmp_path: Path, untouched: NamespaceComparison) -> None:
+def test_after_kill_9_only_completed_repeats_remain(tmp_path: Path, untouched: NamespaceComparison) -> None:
     process = start(
         tmp_path, "trial", "los", "30ft", "--repeats", "5", "--record", "2s", "--protocol", "tcp", "--json"
     )
     wait_for_line(process, '"repeat_ended"')
     wait_for_line(process, '"transfer"')
-    family = descendants(process.pid)
-    assert len(family) > 10, "three robots with their programs, and the medium"
+    process_ids = descendants(process.pid)
+    assert len(process_ids) > 10, "three robots with their programs, and the medium"
     process.send_signal(signal.SIGKILL)
     process.wait(60)
-    wait_for_end(family, within_s=60.0)
+    wait_for_end(process_ids, within_s=60.0)
     untouched()
     trial = only_trial(tmp_path)
     (row,) = rows(trial)

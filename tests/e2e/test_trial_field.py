@@ -19,7 +19,7 @@ SHORT_TRIAL = ("--repeats", "1", "--record", "1s", "--yes", "--backend", "field"
 
 
 @pytest.mark.parametrize("topology", mark_nightly(Topology, in_ci=(Topology.MASTER,)))
-def test_a_trial_of_the_field_backend_ends_valid(tmp_path: Path, topology: Topology) -> None:
+def test_a_trial_of_the_field_backend_is_valid(tmp_path: Path, topology: Topology) -> None:
     with start_field_robots(tmp_path, topology=topology, site=DEFAULT_SITE) as field_robots:
         run = run_here(tmp_path, "trial", "los", "5m", "--topology", topology, *SHORT_TRIAL)
         assert run.code == 0, run.err
@@ -34,19 +34,19 @@ def test_robots_and_their_jobs_outlive_a_fieldkit_that_is_killed(tmp_path: Path)
             tmp_path, "trial", "los", "5m", "--topology", "masterless", "--record", "30s", "--yes", "--json"
         )
         wait_for_line(process, '"record"')
-        recording = wait_until_recording(field_robots)
+        recording_jobs = wait_until_recording(field_robots)
         process.kill()
         process.communicate(timeout=60)
         wait_for_end({process.pid}, within_s=60.0)
-        assert jobs_left(field_robots, Role.SENDER) == recording
+        assert running_jobs_of(field_robots, Role.SENDER) == recording_jobs
 
 
 def wait_until_recording(field_robots: FieldRobots) -> tuple[str, ...]:
     deadline = Deadline.after(60)
-    while not (running_jobs := jobs_left(field_robots, Role.SENDER)):
-        assert not deadline.expired, "it never began to record"
+    while not (running_jobs := running_jobs_of(field_robots, Role.SENDER)):
+        assert not deadline.expired, "the recording did not start"
     return running_jobs
 
 
-def jobs_left(field_robots: FieldRobots, role: Role) -> tuple[str, ...]:
+def running_jobs_of(field_robots: FieldRobots, role: Role) -> tuple[str, ...]:
     return jobs.list_running(field_robots.testbed.shells[role], Deadline.after(30))

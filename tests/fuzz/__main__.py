@@ -1,4 +1,4 @@
-"""Search for inputs that break a reader: `python -m tests.fuzz --minutes 60`; repeat one with `--replay FILE`."""
+"""Search for inputs that break a reader: `python -m tests.fuzz --minutes 60`. `--replay FILE` repeats an input."""
 
 import argparse
 import json
@@ -11,7 +11,7 @@ from tests.helpers.paths import ROOT
 
 
 def main(argv: list[str]) -> int:
-    """Run a search, or repeat an input that a search has kept; return 1 if a reader broke."""
+    """Run a search, or repeat an input of an earlier search; return 1 if a reader has a defect."""
     if argv[:1] == ["work"]:
         names, seed, start, stop, work_folder = argv[1:]
         harness.work(targets.select_targets(names), int(seed), range(int(start), int(stop)), Path(work_folder))
@@ -37,23 +37,23 @@ def main(argv: list[str]) -> int:
     options = parser.parse_args(argv)
     if options.replay is not None:
         (failure,) = harness.replay([options.replay])
-        print(failure or "nothing broke")
+        print(failure or "no defect")
         return int(failure is not None)
-    return _hunt(options)
+    return _search(options)
 
 
-def _hunt(options: argparse.Namespace) -> int:
-    start_s, defects, reported = time.monotonic(), 0, set[str]()
+def _search(options: argparse.Namespace) -> int:
+    start_s, defects, reported_keys = time.monotonic(), 0, set[str]()
     end_s = start_s + 60 * options.minutes
     options.keep.mkdir(exist_ok=True)
     print(f"seed {options.seed}", flush=True)
-    for result in harness.hunt(options.targets, options.seed, options.inputs, options.keep, end_s):
+    for result in harness.search(options.targets, options.seed, options.inputs, options.keep, end_s):
         if isinstance(result, int):
             print(f"{result} inputs, {(time.monotonic() - start_s) / 60:.1f} minutes, {defects} defects")
-        elif (defect_key := f"{result.target}: {result.failure.partition(': ')[0]}") in reported:
+        elif (defect_key := f"{result.target}: {result.failure.partition(': ')[0]}") in reported_keys:
             result.input.unlink()  # one input per defect is enough
         else:
-            reported.add(defect_key)
+            reported_keys.add(defect_key)
             defects += 1
             print(f"{result.target}: {result.failure}\n  {result.input}", flush=True)
     return int(defects > 0)

@@ -1,4 +1,4 @@
-"""Fuzz targets: the frames, datagrams and samples of external federates and of coordinators, which are untrusted."""
+"""Fuzz targets: readers of frames, datagrams and samples from external federates and coordinators."""
 
 import socket
 from collections.abc import Iterator
@@ -35,7 +35,7 @@ def _handle_datagram(data: bytes, _: Path) -> None:
         DatagramChannel(endpoint, 1, 2).handle(data)
 
 
-class _OneSample:
+class _OneSampleBus:
     """A bus with one sample."""
 
     def __init__(self, sample: bytes) -> None:
@@ -47,7 +47,7 @@ class _OneSample:
         return self._samples.pop()
 
     def write(self, sample: bytes, deadline_s: float | None) -> None:
-        raise ClosedError("nothing reads")
+        raise ClosedError("the bus has no reader")
 
     def has_peer(self) -> bool:
         return False
@@ -58,7 +58,7 @@ class _OneSample:
 
 def _accept_sample(data: bytes, _: Path) -> None:
     with suppress(ClosedError, MalformedFrameError):
-        SampleListener(_OneSample(data)).accept(None).receive(None)
+        SampleListener(_OneSampleBus(data)).accept(None).receive(None)
 
 
 def _read_ros_header(data: bytes, _: Path) -> None:

@@ -1,4 +1,4 @@
-"""Feed mutated outputs to readers, in a process that may crash, and keep each input that breaks a reader."""
+"""Give mutated outputs to readers in a process that may crash, and keep each input that breaks a reader."""
 
 import contextlib
 import hashlib
@@ -19,22 +19,22 @@ from pathlib import Path
 from typing import Any, Final
 
 from fieldkit.core.errors import FieldkitError
-from tests.fuzz.mutate import mutated
+from tests.fuzz.mutate import mutate
 from tests.helpers.paths import ROOT
 
 CPU_S: Final = 30.0
 MEMORY_BYTES: Final = 512 << 20
 """Limits of processor time and memory for an input of at most 1 MiB."""
 MAX_WAIT_S: Final = 200.0
-"""Maximum real time, for readers that wait without computing; a longer time is a defect as well."""
+"""Maximum real time, for readers that wait without computing; a longer time is also a defect."""
 
 _INPUTS_PER_WORKER: Final = 5_000
-"""Inputs per process, so that slow memory leaks of the process itself are not attributed to an input."""
+"""Inputs per process, so that slow memory leaks of the process are not attributed to an input."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """A reader of something that a robot or a colleague sends.
+    """A reader of data that a robot or another person sends.
 
     Attributes:
         name: Name of the target.
@@ -57,7 +57,7 @@ class Defect:
 
     Attributes:
         target: Name of the target.
-        failure: The exception and its location, or how the process ended.
+        failure: The exception and its location, or the signal or exit code of the process.
         input: The file with the input.
     """
 
@@ -67,16 +67,16 @@ class Defect:
 
 
 def work(targets: Sequence[Target], seed: int, inputs: range, folder: Path) -> None:
-    """Try the inputs with these numbers, each derived only from `seed` and its number; stop at the first that breaks.
+    """Try the inputs with these numbers; stop at the first input that breaks its reader.
 
-    Prints a line of JSON before each input, so that the parent process can identify the input that ended this
-    process.
+    An input depends only on `seed` and its number. A line of JSON is printed before each input, so that the parent
+    process can identify the input that terminated this process.
     """
     weights = [target.weight for target in targets]
     for number in inputs:
         rng = random.Random(f"{seed} {number}")
         target = rng.choices(targets, weights)[0]
-        data = mutated(rng.choice(target.seeds), target.seeds, rng)
+        data = mutate(rng.choice(target.seeds), target.seeds, rng)
         (folder / "input").write_bytes(data)
         _print_json({"number": number, "target": target.name})
         if failure := try_input(target, data, folder / "place"):
@@ -85,14 +85,15 @@ def work(targets: Sequence[Target], seed: int, inputs: range, folder: Path) -> N
 
 
 def try_input(target: Target, data: bytes, place: Path) -> str | None:
-    """Let a reader read an input; return a description of its exception, except for fieldkit's errors.
+    """Read an input with a reader; return a description of its exception, or None for no exception or fieldkit's
+    errors.
 
-    If a limit of time is exceeded, this process is ended by a signal.
+    If a time limit is exceeded, a signal terminates this process.
 
     Args:
         target: The reader.
         data: The input.
-        place: Folder that is created empty and is the current folder of the reader.
+        place: Folder that is created empty and is the working folder of the reader.
     """
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir()
@@ -115,8 +116,8 @@ def try_input(target: Target, data: bytes, place: Path) -> str | None:
     return None
 
 
-def hunt(targets: str, seed: int, inputs: int, folder: Path, end_s: float = math.inf) -> Iterator[Defect | int]:
-    """Yield each defect that mutated inputs cause, and finally the number of tried inputs.
+def search(targets: str, seed: int, inputs: int, folder: Path, end_s: float = math.inf) -> Iterator[Defect | int]:
+    """Yield each defect that mutated inputs reveal, and then the number of tried inputs.
 
     Args:
         targets: Names of targets, separated by commas; empty for all.
@@ -139,9 +140,9 @@ def hunt(targets: str, seed: int, inputs: int, folder: Path, end_s: float = math
     yield start
 
 
-def _run_worker(failure: Sequence[str], end_s: float) -> tuple[dict[str, Any], str | None]:
-    """Run a worker; return the last input that it started, and the defect, if any."""
-    command = (sys.executable, "-m", "tests.fuzz", *failure)
+def _run_worker(arguments: Sequence[str], end_s: float) -> tuple[dict[str, Any], str | None]:
+    """Run a worker; return the last input that it started, and the defect or None."""
+    command = (sys.executable, "-m", "tests.fuzz", *arguments)
     current: dict[str, Any] = {"number": -1, "target": ""}
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as worker:
         assert worker.stdout is not None
@@ -156,15 +157,15 @@ def _run_worker(failure: Sequence[str], end_s: float) -> tuple[dict[str, Any], s
         return current, None
     if not current["target"]:
         raise RuntimeError(f"the worker does not start: {command}")
-    return current, f"ended by {_ending(worker.returncode)}"
+    return current, f"ended by {_exit_reason(worker.returncode)}"
 
 
-def _ending(code: int) -> str:
+def _exit_reason(code: int) -> str:
     return signal.Signals(-code).name if code < 0 else f"exit code {code}"
 
 
-def _print_json(failure: dict[str, object]) -> None:
-    sys.stdout.write(json.dumps(failure) + "\n")
+def _print_json(value: dict[str, object]) -> None:
+    sys.stdout.write(json.dumps(value) + "\n")
     sys.stdout.flush()
 
 
@@ -179,7 +180,7 @@ def _describe(error: BaseException) -> str:
 
 
 def replay(inputs: Sequence[Path]) -> list[str | None]:
-    """Try kept inputs in one separate process, or several if an input ends it; return the defect of each, if any."""
+    """Try inputs in a separate process, or in several if inputs terminate it; return the defects, or None."""
     failures: list[str | None] = []
     while len(failures) < len(inputs):
         with tempfile.TemporaryDirectory() as place:
@@ -188,5 +189,5 @@ def replay(inputs: Sequence[Path]) -> list[str | None]:
             process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
         failures += map(json.loads, process.stdout.splitlines())
         if len(failures) < len(inputs):
-            failures.append(f"ended by {_ending(process.returncode)}")
+            failures.append(f"ended by {_exit_reason(process.returncode)}")
     return failures

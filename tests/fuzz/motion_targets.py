@@ -1,4 +1,4 @@
-"""Fuzz targets: readers of positions, drive logs and flight data, and of preflight queries."""
+"""Fuzz targets: readers of positions, drive logs, flight data and responses to preflight queries."""
 
 import json
 import math
@@ -100,13 +100,13 @@ def _read_answer(data: bytes, place: Path) -> None:
 
 @cache
 def _demanding_procedure() -> Procedure:
-    """Return a procedure whose steps have requirements of every kind."""
+    """Return a procedure whose steps have all kinds of requirements."""
     drone = next(role for role, robot in CAST.items() if mavlink_of(robot.profile) is not None)
     return schema.validate(schema.parse(_DEMANDING_PROCEDURE.replace("ROLE", drone), source="needy.yaml"), Procedure)
 
 
 def _judge_needs(data: bytes, _: Path) -> None:
-    """Judge every preflight query by the same input as its response."""
+    """Judge all preflight queries with the same response."""
     overrides = {"abilities": frozenset({"mavlink"}), "ros_master": CAST[Role.RELAY].address}
     demanding_cast = {role: robot.model_copy(update=overrides) for role, robot in CAST.items()}
     scene = replace(los_plan().scenes()[0], cast=demanding_cast)
@@ -118,24 +118,24 @@ def _judge_needs(data: bytes, _: Path) -> None:
     assert all(finding.detail.isprintable() and finding.remedy.isprintable() for finding in report.findings)
 
 
-def _accounts_text(sender: PositionSource, receiver: PositionSource) -> bytes:
+def _sources_text(sender: PositionSource, receiver: PositionSource) -> bytes:
     clocks = {Role.SENDER: Offset(0.2, 0.01), Role.RECEIVER: Offset(-0.2, 0.01)}
     return position_sources.text(PositionSources({Role.SENDER: sender, Role.RECEIVER: receiver}, clocks)).encode()
 
 
 @cache
 def _tracks() -> dict[str, bytes]:
-    """Return bags with a robot's positions, by the kind of message."""
+    """Return bags with the positions of a robot, by the kind of message."""
     messages_by_kind = {
         "odometry": [odometry(BEGAN_NS + n * S, float(n), 0.0, 0.1 * n) for n in range(9)],
         "fix": [fix(BEGAN_NS + n * S, 48 + n / 1e5, 11.0) for n in range(9)],
         "transform": [transform(BEGAN_NS + n * S, float(n), 0.0, "base") for n in range(9)],
     }
-    actual = {}
+    bags = {}
     for name, messages in messages_by_kind.items():
         with tempfile.TemporaryDirectory() as folder:
-            actual[name] = write_bag(Path(folder), messages).read_bytes()
-    return actual
+            bags[name] = write_bag(Path(folder), messages).read_bytes()
+    return bags
 
 
 def _check_samples(samples: Samples) -> None:
@@ -156,14 +156,14 @@ def _read_bag(data: bytes, place: Path) -> None:
                 _check_samples(position_files.to_placement_frame(samples, position_source))
 
 
-def _read_positions_file(ending: str, data: bytes, place: Path) -> None:
-    path = place / f"walk.{ending}"
+def _read_positions_file(suffix: str, data: bytes, place: Path) -> None:
+    path = place / f"walk.{suffix}"
     path.write_bytes(data)
     _check_samples(position_files.read_file(path))
 
 
 def _measure_positions(of_trial: bool, data: bytes, place: Path) -> None:
-    """Measure the distance of two robots with mutated position sources of an attempt, or of its trial."""
+    """Measure the distance of two robots with mutated position sources, of an attempt or of its trial."""
     attempt = place / "repeats" / "udp-01"
     attempt.mkdir(parents=True)
     (attempt / "track.bag").write_bytes(_tracks()["odometry"])
@@ -173,26 +173,26 @@ def _measure_positions(of_trial: bool, data: bytes, place: Path) -> None:
     (folder / position_sources.FILE).write_bytes(data)
     evidence = AttemptEvidence(attempt)
     times_ns = [BEGAN_NS + S, BEGAN_NS + 3 * S]
-    actual = position_columns.measure(evidence, ping.MOTION_COLUMNS, _ENDS, times_ns)
-    assert all(math.isfinite(float(value)) for value in actual.values.values())  # gates reject excessive distances
+    measured = position_columns.measure(evidence, ping.MOTION_COLUMNS, _ENDS, times_ns)
+    assert all(math.isfinite(float(value)) for value in measured.values.values())  # gates reject excessive distances
     position_columns.distances_m(evidence, _ENDS)
     recorded_positions.readable_samples(evidence)
-    output_text = position_sources.read(folder / position_sources.FILE)
-    (place / "again.json").write_text(position_sources.text(output_text), encoding="utf-8")
-    assert position_sources.read(place / "again.json") == output_text
+    sources = position_sources.read(folder / position_sources.FILE)
+    (place / "again.json").write_text(position_sources.text(sources), encoding="utf-8")
+    assert position_sources.read(place / "again.json") == sources
     recorded_positions.sources_text(evidence)
     assert math.isfinite(recorded_positions.clock_error_s(evidence) or 0.0)
 
 
 def _position_sources() -> tuple[bytes, ...]:
-    by_odometry = PositionSource(file="track.bag", topic="/where", heading_rad=0.0, began_utc_ns=BEGAN_NS + S)
-    at_rest = PositionSource(place=(0.0, 0.0, 0.2))
+    odometry_source = PositionSource(file="track.bag", topic="/where", heading_rad=0.0, began_utc_ns=BEGAN_NS + S)
+    stationary = PositionSource(place=(0.0, 0.0, 0.2))
     degrees = PositionSource(place=(48.1, 11.5, None), frame=WGS84)
     metres = PositionSource(place=(0.0, 0.0, 0.0), frame=LOCAL)
     return (
-        _accounts_text(at_rest, by_odometry),
-        _accounts_text(degrees, PositionSource(file="positions-receiver.gpx", offset_s=0.5)),
-        _accounts_text(metres, PositionSource(file="positions-receiver.csv")),
+        _sources_text(stationary, odometry_source),
+        _sources_text(degrees, PositionSource(file="positions-receiver.gpx", offset_s=0.5)),
+        _sources_text(metres, PositionSource(file="positions-receiver.csv")),
     )
 
 
@@ -204,7 +204,7 @@ def _recorded_bag() -> bytes:
 
 
 def _read_reception(data: bytes, place: Path) -> None:
-    """Measure when topics were received, with a mutated log and an intact bag."""
+    """Measure the reception of topics with a mutated log and an intact bag."""
     (place / "log").write_bytes(data)
     (place / "scan.bag").write_bytes(_recorded_bag())
     measured = recorded_topics.measure(recorded_topics.read(place, "log", "scan.bag", ["/scan"], 5.0))

@@ -1,4 +1,4 @@
-"""Changes to a stored output, as caused by cables, disks, people and attackers."""
+"""Changes of stored outputs, like those that faulty cables, faulty disks, people and attackers cause."""
 
 import random
 import re
@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 MAX_BYTES: Final = 1 << 20
-"""Maximum input size; longer inputs find nothing new."""
+"""Maximum input size; longer inputs reveal no other defects."""
 
 _NUMBER: Final = re.compile(rb"-?[0-9]+(?:\.[0-9]+)?")
 _NUMBERS: Final = (
@@ -70,8 +70,8 @@ _SIZES: Final = (0, 1, 2, 7, 8, 15, 16, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x1000
 _TIMES: Final = (2, 3, 10, 1000, 100_000)
 
 
-def mutated(seed: bytes, others: Sequence[bytes], rng: random.Random) -> bytes:
-    """Return `seed` with one to four changes, most often one; inserted pieces may come from `others`."""
+def mutate(seed: bytes, others: Sequence[bytes], rng: random.Random) -> bytes:
+    """Return `seed` with one to four changes, in most cases one; inserted data may be from `others`."""
     data = bytearray(seed)
     for _ in range(rng.choice((1, 1, 1, 2, 2, 3, 4))):
         rng.choice(_CHANGES)(data, others, rng)
@@ -154,8 +154,8 @@ def _write_size(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None
 def _splice(data: bytearray, others: Sequence[bytes], rng: random.Random) -> None:
     other = rng.choice(others)
     start, stop = _range(other, rng)
-    begin, end = _range(data, rng)
-    data[begin:end] = other[start:stop]
+    data_start, data_stop = _range(data, rng)
+    data[data_start:data_stop] = other[start:stop]
 
 
 def _copy(data: bytearray, _: Sequence[bytes], rng: random.Random) -> None:

@@ -1,4 +1,4 @@
-"""Fuzz targets: readers of radio and program outputs during a repeat, and of paths and expressions into them."""
+"""Fuzz targets: readers of the outputs of radios and programs during a repeat, and of paths and expressions."""
 
 import gzip
 import json
@@ -30,7 +30,10 @@ _PATHS: Final = (
     b"max_by(intervals, &sum.seconds).sum.bytes",
 )
 _EXPRESSIONS: Final = (b"rtt = ([0-9.]+) ms", b"^(\\S+) +dB$", b"(?i)(?:loss|lost)[: ]+([0-9]{1,3})%", b"(a+)+$")
-_PRINTED: Final = {"end": {"sum": {"bits_per_second": 5e6}}, "intervals": [{"sum": {"seconds": 1, "bytes": 12}}]}
+_PROGRAM_OUTPUT: Final = {
+    "end": {"sum": {"bits_per_second": 5e6}},
+    "intervals": [{"sum": {"seconds": 1, "bytes": 12}}],
+}
 
 
 def _measure(samples: list[LinkSample]) -> None:
@@ -48,7 +51,7 @@ def _read_testbed_samples(data: bytes, place: Path) -> None:
 
 
 def _read_robot_samples(name: str, data: bytes, place: Path) -> None:
-    """Read a robot's own link samples, with one mutated file and the others intact."""
+    """Read the link samples that a robot recorded, with one mutated file and the others intact."""
     (place / "sender-before.txt").write_text(_CLOCK, encoding="utf-8")
     if "link" not in name:
         (place / "sender-link.txt").write_text(_SAMPLES_TEXT, encoding="utf-8")
@@ -66,9 +69,9 @@ def _parse_iw(data: bytes, _: Path) -> None:
 
 
 def _evaluate_path(data: bytes, place: Path) -> None:
-    """Evaluate a path of any length, as given by the author of a procedure."""
+    """Evaluate a path of any length, as in a procedure."""
     path_text = data.decode(errors="replace")
-    (place / "run.txt").write_text(json.dumps(_PRINTED), encoding="ascii")
+    (place / "run.txt").write_text(json.dumps(_PROGRAM_OUTPUT), encoding="ascii")
     if program_output.path_error(path_text) is None:
         with suppress(EvidenceError):
             program_output.at_path(place / "run.txt", path_text)
@@ -82,7 +85,7 @@ def _match_expression(data: bytes, place: Path) -> None:
 
 
 def _measure_states(data: bytes, place: Path) -> None:
-    """Measure an attempt from a mutated snapshot; all values must be valid in the table."""
+    """Measure an attempt with mutated snapshots; all values must be valid in the table."""
     for when in ("before", "after"):
         (place / f"sender-sources-{when}.txt").write_bytes(data)
     evidence, names = AttemptEvidence(place), {Role.SENDER: "rover"}
@@ -93,7 +96,7 @@ def _measure_states(data: bytes, place: Path) -> None:
 
 
 def _snapshot(**paths: str) -> bytes:
-    """A snapshot with stored outputs, by name of the source with `_` for `-`."""
+    """A snapshot with stored outputs; the names are those of the sources, with `_` for `-`."""
     text = ""
     for name, path in paths.items():
         lines = (DATA / path).read_text(encoding="utf-8").split("\n")

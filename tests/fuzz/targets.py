@@ -1,4 +1,4 @@
-"""All fuzz targets: readers of everything that a robot or a colleague sends, with stored real outputs as seeds."""
+"""All fuzz targets: readers of data that a robot or another person sends, with stored real outputs as seeds."""
 
 import io
 import math
@@ -77,7 +77,7 @@ TRIALS: Final = DATA / "fieldkit" / "4" / "trials"
 LOS: Final = TRIALS / "20261122T013134.573068Z_los_30ft_master"
 SELFHEAL: Final = TRIALS / "20261122T011151.376739Z_selfheal_10ft_masterless"
 
-# Output of the job script about itself, its jobs and its locks (fieldkit/remote/*.sh).
+# Messages of the job script about its jobs and its locks (fieldkit/remote/*.sh).
 _SCRIPT_REPLIES: Final = (
     b"job.sh: held 12 3588 1795309788 jo@laptop 20261122T013134.573068Z_los_30ft_master\n",
     b"job.sh: aborted 1795309788 jo@laptop 20261122T013134.573068Z_los_30ft_master\n",
@@ -112,7 +112,7 @@ def _read_bag(path: Path) -> None:
 
 @cache
 def _ros2_files(storage: str) -> dict[str, bytes]:
-    """Return the files of a ROS 2 bag, written by rosbags: no bag of a real recorder is stored."""
+    """Return the files of a ROS 2 bag that rosbags writes, because no bag of a real recorder is stored."""
     with tempfile.TemporaryDirectory() as folder:
         path = write_ros2_bag(Path(folder, "scan"), storage, {"/scan": 40, "/odom": 3})
         return {file.name: file.read_bytes() for file in path.parent.iterdir()}
@@ -124,10 +124,10 @@ def _battery_bags() -> tuple[bytes, ...]:
         return (ros1(Path(folder), [0.5, 0.25]).read_bytes(), write_bag(Path(folder, "b"), {"/a": 9}).read_bytes())
 
 
-def _read_ros2_bag(storage: str, changed: str, data: bytes, place: Path) -> None:
+def _read_ros2_bag(storage: str, mutated_suffix: str, data: bytes, place: Path) -> None:
     files = _ros2_files(storage)
     for name, content in files.items():
-        (place / name).write_bytes(data if name.endswith(changed) else content)
+        (place / name).write_bytes(data if name.endswith(mutated_suffix) else content)
     _read_bag(place / f"scan_0.{storage}")
 
 
@@ -138,20 +138,20 @@ def _parse_capture(data: bytes, _: Path) -> None:
 def _measure_fault(data: bytes, place: Path) -> None:
     for kind in FaultKind:
         for name in (outage.note_file(kind), outage.observed_file(kind)):
-            stored = next(SELFHEAL.glob(f"repeats/*/{name}"), None)
-            (place / name).write_bytes(stored.read_bytes() if stored is not None else data)
+            stored_path = next(SELFHEAL.glob(f"repeats/*/{name}"), None)
+            (place / name).write_bytes(stored_path.read_bytes() if stored_path is not None else data)
         (place / outage.observed_file(kind)).write_bytes(data)
-        for which in (kind, None):
+        for has_evidence in (True, False):
             try:
-                outage.measure(kind, outage.read(place, kind) if which else None)
+                outage.measure(kind, outage.read(place, kind) if has_evidence else None)
             finally:
                 (place / outage.note_file(kind)).write_bytes(data)
 
 
 def _judge_sections(data: bytes, _: Path) -> None:
-    """Judge a robot by a mutated probe, and by sections that all have the same text."""
+    """Judge a robot with a mutated probe, and with sections that all have the same text."""
     text = data.decode(errors="replace")
-    the_plan, output_text = los_plan(), CommandResult(text.strip("\n"), 0)
+    trial_plan, output_text = los_plan(), CommandResult(text.strip("\n"), 0)
     names = ("wifi-info", "wifi-link", "wifi-stations", "wifi-power-save", "interface", "offloads", "control", "disk")
     for sections in (
         probe.parse(text),
@@ -160,8 +160,8 @@ def _judge_sections(data: bytes, _: Path) -> None:
         report = Report("robot")
         for role, robot in CAST.items():
             radio.judge(robot, sections, report)
-            system.judge(the_plan, role, sections, report)
-            software.judge(the_plan, role, sections, report)
+            system.judge(trial_plan, role, sections, report)
+            software.judge(trial_plan, role, sections, report)
         assert all(finding.detail.isprintable() for finding in report.findings)
 
 
@@ -202,18 +202,18 @@ def _tar_seeds() -> tuple[bytes, ...]:
     small = (path for path in sorted(folder.iterdir()) if path.stat().st_size < 9000)
     files = [(path.name.encode(), path.read_bytes()) for path in small if not laptop_files.is_reserved(path.name)]
     members = [entry(b"scan/scan.db3", b"x"), *(entry(name, content) for name, content in files)]
-    whole = b"".join(members) + bytes(1024)
-    names = [member.name for member in archive.members(io.BytesIO(whole), "robot")]
+    tar = b"".join(members) + bytes(1024)
+    names = [member.name for member in archive.members(io.BytesIO(tar), "robot")]
     assert len(names) == len(members)
-    return (whole,)
+    return (tar,)
 
 
 def _read_replies(data: bytes, place: Path) -> None:
     shells = [AnsweringRobot(place, data, code=code, stderr=data) for code in (0, 1, 28, 75, 76, 255)]
     for shell in shells:
-        for ask in (locks.read_lock, partial(jobs.list_running, deadline=Deadline.after(1)), _call_script):
+        for query in (locks.read_lock, partial(jobs.list_running, deadline=Deadline.after(1)), _call_script):
             with suppress(RobotError):
-                ask(shell)
+                query(shell)
     robot_clock.parse_date(data.decode("ascii", "replace"))
     printable(data)
 
@@ -233,8 +233,8 @@ def _read_journal(data: bytes, place: Path) -> None:
 
 
 def _measure_attempt(name: str, data: bytes, place: Path) -> None:
-    """Measure an attempt with one mutated file; errors that evidence has stored count as raised."""
-    the_plan, folders = _plan(), sorted((LOS / "repeats").glob("*-0?"))
+    """Measure an attempt with one mutated file; errors that the evidence stores are also raised."""
+    trial_plan, folders = _plan(), sorted((LOS / "repeats").glob("*-0?"))
     for folder in folders[:1] + folders[-1:]:
         attempt = place / folder.name
         shutil.copytree(folder, attempt, copy_function=lambda source, target: Path(target).symlink_to(source))
@@ -242,10 +242,10 @@ def _measure_attempt(name: str, data: bytes, place: Path) -> None:
         (attempt / name).write_bytes(data)
         result = AttemptEvidence(attempt)
         protocol, _, number = folder.name.partition("-")
-        scene = the_plan.scene(
-            RepeatId(next(candidate for candidate in the_plan.protocols if candidate == protocol), int(number)), ""
+        scene = trial_plan.scene(
+            RepeatId(next(candidate for candidate in trial_plan.protocols if candidate == protocol), int(number)), ""
         )
-        for placed in the_plan.procedure.walk():
+        for placed in trial_plan.procedure.walk():
             view = View(scene, result, placed.within)
             placed.step.measure(view)
             list(placed.step.check(view))
@@ -262,8 +262,8 @@ def _plan() -> plan.Plan:
 def _rebuild_trial(name: str, data: bytes, place: Path) -> None:
     folder = place / LOS.name
     shutil.copytree(LOS, folder, copy_function=lambda source, target: Path(target).symlink_to(source))
-    for replaced in (*folder.glob("*.csv"), folder / name):
-        replaced.unlink()
+    for path in (*folder.glob("*.csv"), folder / name):
+        path.unlink()
     (folder / name).write_bytes(data)
     rebuild.rebuild(folder)
 
@@ -322,7 +322,7 @@ def _measure_iperf3(path: Path) -> None:
 
 
 def _topic_logs() -> tuple[bytes, ...]:
-    """Return a log of each end of a topic, as written by the agent."""
+    """Return the logs of both ends of a topic, as the agent writes them."""
     start_ns = 1_700_000_000 * 10**9
     start_records = [(2, 0, 0, 0, 0, start_ns), (3, 0, 0, 0, 0, start_ns + 10**8)]
     samples = [
@@ -362,16 +362,19 @@ def _measure_topic_log(path: Path) -> None:
     sample_reads.measure(ReadPlan("used", 20.0, 0.5, 0.1), result, result, clocks, "no captures")
 
 
-def _read_printed(data: bytes, place: Path) -> None:
-    """Evaluate paths and expressions that have matches in any output of a program."""
+def _read_program_output(data: bytes, place: Path) -> None:
+    """Evaluate paths and expressions in a mutated output of a program."""
     path = place / "run.txt"
     path.write_bytes(data)
     readings = (
         *(
-            partial(program_output.at_path, path, where)
-            for where in ("[0].a[1].b", "end.sum.bytes", "@", "*", "[].a[]")
+            partial(program_output.at_path, path, path_text)
+            for path_text in ("[0].a[1].b", "end.sum.bytes", "@", "*", "[].a[]")
         ),
-        *(partial(program_output.by_expression, path, what) for what in (r"(a+)+$", r"= ([0-9]+)", r"(?s)(.*)")),
+        *(
+            partial(program_output.by_expression, path, expression)
+            for expression in (r"(a+)+$", r"= ([0-9]+)", r"(?s)(.*)")
+        ),
     )
     for reading in readings:
         for unit in ("V", "count", "ns", "share", "bool", "text"):
@@ -416,7 +419,9 @@ def _all_targets() -> Iterator[Target]:
     summary = b'{"frames": 203, "left_out": 0, "ended_us": 1795000010000000, "refused": {"32": 2}}\n'
     yield Target("tlog-summary", (summary,), partial(_read_evidence, tlog.read_summary))
     yield Target("topic-log", _topic_logs(), partial(_read_evidence, _measure_topic_log))
-    yield Target("printed", (b'[{"a": [1, {"b": "12.5"}]}, "x = 3"]', *_stored("iperf3/3.12/*.json")), _read_printed)
+    yield Target(
+        "printed", (b'[{"a": [1, {"b": "12.5"}]}, "x = 3"]', *_stored("iperf3/3.12/*.json")), _read_program_output
+    )
     yield Target("iw", (*_stored("iw/*.txt", "ip/*/*", "ethtool/*/*"), *_probe_seeds()), _judge_sections, 2)
     yield from radio_targets()
     yield from motion_targets()
@@ -493,7 +498,7 @@ def _targets_by_name() -> dict[str, Target]:
 
 
 def select_targets(names: str) -> Sequence[Target]:
-    """Return the targets with these names, separated by commas; all if it is empty."""
+    """Return the targets with these names, separated by commas; all targets if it is empty."""
     return [
         (_targets_by_name() | {PLANTED.name: PLANTED})[name]
         for name in (names.split(",") if names else _targets_by_name())
@@ -502,7 +507,8 @@ def select_targets(names: str) -> Sequence[Target]:
 
 NAMES: Final = tuple(_targets_by_name())
 
-# Like an earlier version of the `iw` reader: from each empty line the pattern continues through all that follow.
+# This pattern is like that of an earlier version of the `iw` reader. For each empty line, it also matches all
+# following empty lines.
 _SQUARE: Final = re.compile(r"^\s*type (.{1,30})$", re.MULTILINE)
 PLANTED: Final = Target("planted", [b"\n" * MAX_BYTES], partial(_parse_text, _SQUARE.search), cpu_s=0.5)
-"""A planted defect that a search must find; it is in no other target."""
+"""A target with a planted defect that a search must find; it is not in `NAMES`."""

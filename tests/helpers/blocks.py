@@ -58,7 +58,7 @@ def simple(frame: Frame, *, order: str = "<") -> bytes:
     return block(3, struct.pack(f"{order}I", _wire_bytes(frame)) + frame.data, order=order)
 
 
-def file_of(frames: Iterable[Frame], *, order: str = "<", link_type: int = 101) -> bytes:
+def file_bytes_of(frames: Iterable[Frame], *, order: str = "<", link_type: int = 101) -> bytes:
     """A section with one interface with nanosecond timestamps, and an enhanced packet block per frame."""
     blocks = [enhanced(frame, ticks=frame.time_ns, order=order) for frame in frames]
     return b"".join([section(order=order), interface(link_type, order=order, resolution=9), *blocks])

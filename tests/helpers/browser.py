@@ -14,8 +14,8 @@ _TIMEOUT_MS = 120_000
 
 
 @dataclass
-class Opened:
-    """An open page, its console messages, and its requests other than for its own file."""
+class OpenedPage:
+    """An open page, its console messages, and the URLs that it requested other than that of its file."""
 
     page: Page
     console_messages: list[str] = field(default_factory=list)
@@ -38,11 +38,11 @@ def chromium() -> Iterator[Browser]:
 @contextmanager
 def opened(
     browser: Browser, path: Path, *, width: int = LAPTOP, scheme: Literal["light", "dark"] = "light"
-) -> Iterator[Opened]:
+) -> Iterator[OpenedPage]:
     """Yield a page opened from a file; all other requests are rejected."""
     context = browser.new_context(viewport={"width": width, "height": 844}, color_scheme=scheme)
     context.set_default_timeout(_TIMEOUT_MS)
-    opened_page = Opened(context.new_page())
+    opened_page = OpenedPage(context.new_page())
 
     def filter_request(route: Route) -> None:
         if route.request.url == path.as_uri():

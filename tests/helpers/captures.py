@@ -1,4 +1,4 @@
-"""Captures for tests, built from bytes; the code under test is only used for the type of the result."""
+"""Captures for tests, built from bytes. The code under test is used only for the type of the result."""
 
 import struct
 from collections.abc import Iterable, Sequence
@@ -24,7 +24,7 @@ def transfer(protocol: Protocol) -> Transfer:
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame with its time."""
+    """A captured frame with its time."""
 
     time_ns: int
     data: bytes
@@ -35,9 +35,12 @@ def file_bytes(frames: Iterable[Frame], *, order: str = "<", nano: bool = True, 
     magic, tick_ns = (0xA1B23C4D, 1) if nano else (0xA1B2C3D4, 1000)
     parts = [struct.pack(f"{order}IHHiIII", magic, 2, 4, 0, 0, 128, link_type)]
     for frame in frames:
-        seconds, rest_ns = divmod(frame.time_ns, 1_000_000_000)
+        seconds, remainder_ns = divmod(frame.time_ns, 1_000_000_000)
         wire_bytes = len(frame.data) if frame.wire_bytes is None else frame.wire_bytes
-        parts += [struct.pack(f"{order}4I", seconds, rest_ns // tick_ns, len(frame.data), wire_bytes), frame.data]
+        parts += [
+            struct.pack(f"{order}4I", seconds, remainder_ns // tick_ns, len(frame.data), wire_bytes),
+            frame.data,
+        ]
     return b"".join(parts)
 
 
@@ -69,10 +72,10 @@ def ipv4(
 def datagram(ip_id: int, payload_bytes: int, *, mtu: int = 1500, port: int = PORT, sport: int = 40000) -> list[bytes]:
     """The IP packets of a UDP datagram as Linux fragments it, first fragment first."""
     datagram_bytes = payload_bytes + 8
-    step = (mtu - 20) // 8 * 8
+    fragment_bytes = (mtu - 20) // 8 * 8
     fragments: list[bytes] = []
-    for offset in range(0, datagram_bytes, step):
-        size = min(step, datagram_bytes - offset)
+    for offset in range(0, datagram_bytes, fragment_bytes):
+        size = min(fragment_bytes, datagram_bytes - offset)
         header = struct.pack(">HHHH", sport, port, datagram_bytes, 0) if offset == 0 else b""
         fragments.append(
             ipv4(header, protocol=17, size=size, ip_id=ip_id, offset=offset, more=offset + size < datagram_bytes)
@@ -92,7 +95,7 @@ def segment(
     ack: int = 0,
     back: bool = False,
 ) -> bytes:
-    """A TCP segment without its payload; `back` if it is from the receiver."""
+    """A TCP segment without its payload; `back` is True if the receiver sends it."""
     options = b"" if mss is None else struct.pack(">BBBBHBB", 1, 1, 2, 4, mss, 1, 0)
     header_words = 5 + len(options) // 4
     ports, ends = ((port, sport), (RECEIVER, SENDER)) if back else ((sport, port), (SENDER, RECEIVER))

@@ -45,12 +45,12 @@ steps:
 
 
 def los_plan(*, repeats: int = 2, protocols: tuple[Protocol, ...] = (), record_s: float | None = None) -> Plan:
-    """A trial of the shipped procedure `los`, which records a bag (`fieldkit.ros`)."""
+    """The plan of a trial of the shipped procedure `los`, which records a bag (`fieldkit.ros`)."""
     return _plan(load_procedure("los"), repeats, protocols, record_s)
 
 
 def plain_plan(*, repeats: int = 2, protocols: tuple[Protocol, ...] = ()) -> Plan:
-    """A trial like that of `los_plan` whose steps need neither `fieldkit.ros` nor `fieldkit.motion`."""
+    """A plan like that of `los_plan`, but its steps need neither `fieldkit.ros` nor `fieldkit.motion`."""
     return _plan(schema.validate(schema.parse(PLAIN, source="los.yaml"), Procedure), repeats, protocols)
 
 

@@ -26,7 +26,7 @@ _PCAP_HEADER_BYTES = 24
 _PCAP_RECORD = struct.Struct("<IIII")
 
 TESTBED_FILES = ("track.csv", "link.csv", "lateness.txt", "*medium.txt")
-"""Files written by the emulator; no second source exists to verify them."""
+"""Files that the emulator writes. No second source exists to verify them."""
 
 TOLERANCES: Mapping[str, float] = {
     # One reply may be 20 ms late (measure.checks.ping_checks). One packet may be 0.1 s early (steps.kinds.capture),
@@ -45,11 +45,11 @@ TOLERANCES: Mapping[str, float] = {
     "*stall_s": 0.11,
     "completion_s": 0.11,
     "*transfer_s": 0.11,
-    # Of rates, the change of the time in which the file arrives, in seconds.
+    # For rates, the tolerance is the change of the transfer time, in seconds.
     "throughput_bit_s": 0.11,
     "goodput_bit_s": 0.11,
 }
-"""Maximum undetected change of a column, by the pattern of its name without the step name."""
+"""Maximum change of a column that may stay undetected, by a pattern of its name without the step name."""
 
 
 @dataclass(frozen=True)
@@ -66,17 +66,17 @@ class StoredAttempt:
         names = sorted(path.name for path in self.folder.iterdir())
         return [name for name in names if not any(fnmatch(name, pattern) for pattern in TESTBED_FILES)]
 
-    def judge_changed(self, name: str, content: bytes | None, place: Path) -> EvidenceVerdict:
-        """The verdict with different content for one file; None removes the file."""
+    def judge_changed(self, name: str, content: bytes | None, folder: Path) -> EvidenceVerdict:
+        """The verdict if one file has different content; None removes the file."""
         for path in self.folder.iterdir():
-            (place / path.name).symlink_to(path)
-        (place / name).unlink(missing_ok=True)
+            (folder / path.name).symlink_to(path)
+        (folder / name).unlink(missing_ok=True)
         if content is not None:
-            (place / name).write_bytes(content)
-        return gates.judge(self.plan, self.repeat, AttemptEvidence(place))
+            (folder / name).write_bytes(content)
+        return gates.judge(self.plan, self.repeat, AttemptEvidence(folder))
 
-    def wrongly_changed(self, verdict: EvidenceVerdict) -> dict[str, tuple[Value | None, Value]]:
-        """Columns that changed although the attempt is still valid: the values before and after."""
+    def undetected_changes(self, verdict: EvidenceVerdict) -> dict[str, tuple[Value | None, Value]]:
+        """The values before and after the change, of columns that changed although the attempt is still valid."""
         if verdict.problems:
             return {}
         before = self.verdict.measured.values
@@ -107,7 +107,7 @@ def _within_tolerance(name: str, before: Mapping[str, Value], after: Mapping[str
         bits = 8 * float(before[f"{flow}.received_bytes" if flow else "received_bytes"])
         return abs(bits / float(old) - bits / float(new)) <= tolerance
     if short_name == "clock_offset_s" and abs(float(new)) > float(after[f"{name.removesuffix('_s')}_error_s"]):
-        return False  # the robots have one clock: the true offset is 0
+        return False  # the robots share one clock, so the true offset is 0
     return abs(float(old) - float(new)) <= tolerance
 
 
@@ -128,9 +128,9 @@ def changes(
 
 
 def _same_suffix_files(attempt: StoredAttempt, other: StoredAttempt, name: str) -> list[Path]:
-    ending = name.rpartition(".")[2]
+    extension = name.rpartition(".")[2]
     paths = (path for folder in (attempt.folder, other.folder) for path in sorted(folder.iterdir()))
-    return [path for path in paths if path.suffix == f".{ending}"]
+    return [path for path in paths if path.suffix == f".{extension}"]
 
 
 def with_wrong_time(capture: bytes, index: int, microseconds: int) -> bytes:

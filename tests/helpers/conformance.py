@@ -25,10 +25,10 @@ from fieldkit.remote.shell import Shell
 from tests.helpers.sshd import wait_until
 
 SOON_S = 60.0
-# Larger than all transport windows: that of paramiko has 2 MiB.
+# Larger than all transport windows; the window of paramiko has 2 MiB.
 LARGE_BYTES = 3_000_000
 LARGE_FILE_BYTES = fetching.PIECE_BYTES + 100
-"""Size of an evidence file that is fetched in two pieces."""
+"""Size of an evidence file that must be fetched in two pieces."""
 
 GAP_S = 3.0
 NOTICED_S = 40.0
@@ -44,7 +44,7 @@ class Subject:
 
     Attributes:
         shell: The Shell.
-        cut: Cuts the link to the robot silently, so that nothing arrives from it.
+        cut: Cuts the link to the robot without a reset, so that no packet arrives from the robot.
         restore: Restores the link.
         give_up_s: Time limit for restoring a lost link, including the last attempt; short, to save time.
     """
@@ -86,15 +86,15 @@ def endless_command(shell: Shell, *, first: str = ":") -> Iterator[tuple[str, ..
 
 @contextmanager
 def waiting_thread(shell: Shell) -> Iterator[Callable[[float], BaseException | None]]:
-    """Let a thread wait for an endless command while neither side sends data.
+    """Wait in a thread for an endless command while neither side sends data.
 
-    Yields a function that returns the thread's error, within a number of seconds.
+    Yields a function that waits up to a number of seconds for the thread, and returns its error.
     """
     with endless_command(shell, first="cat") as argv, ThreadPoolExecutor(1) as pool:
         session = shell.begin(argv, deadline=deadline_soon())
-        closing = pool.submit(session.end, deadline=Deadline.after(2 * SOON_S))
+        session_end = pool.submit(session.end, deadline=Deadline.after(2 * SOON_S))
         output_of(shell, "sh", "-c", "until [ -s endless ]; do sleep 0.05; done")
-        yield closing.exception
+        yield session_end.exception
 
 
 def is_responsive(shell: Shell) -> bool:
@@ -147,7 +147,7 @@ class ShellConformance:
         assert output_of(subject.shell, "echo", "meanwhile") == "meanwhile\n"
         assert session.end(deadline=deadline_soon()).exit_code == 0
 
-    def test_silence_does_not_affect_a_working_link(self, subject: Subject) -> None:
+    def test_expected_silence_does_not_affect_a_working_link(self, subject: Subject) -> None:
         with subject.shell.silence(SOON_S):
             assert output_of(subject.shell, "echo", "here") == "here\n"
         assert output_of(subject.shell, "echo", "again") == "again\n"
@@ -173,10 +173,10 @@ class ShellConformance:
 
     def test_an_endless_command_raises_a_link_error_at_the_deadline(self, subject: Subject) -> None:
         with endless_command(subject.shell) as argv:
-            began_s = time.monotonic()
+            started_s = time.monotonic()
             with pytest.raises(LinkError):
                 subject.shell.run(argv, deadline=Deadline.after(1.0))
-            assert 1.0 <= time.monotonic() - began_s < 1.0 + NOTICED_S
+            assert 1.0 <= time.monotonic() - started_s < 1.0 + NOTICED_S
         assert output_of(subject.shell, "echo", "on") == "on\n"
 
     def test_a_killed_command_raises_a_robot_error(self, subject: Subject) -> None:
@@ -281,9 +281,9 @@ class BackendConformance:
         after = oracle.delays(*flow)
         assert oracle.delays(*other_flow).packets == 0, "packets to another port belong to another flow"
         parts = ("processing_ns", "transmission_ns", "propagation_ns", "queuing_ns")
-        grown_ns = [getattr(after, name) - getattr(before, name) for name in parts]
-        assert min(grown_ns) >= 0
-        assert sum(grown_ns) > 0
+        increases_ns = [getattr(after, name) - getattr(before, name) for name in parts]
+        assert min(increases_ns) >= 0
+        assert sum(increases_ns) > 0
 
     def test_the_oracle_reports_the_position_of_each_robot(self, testbed: Testbed, cast: Cast) -> None:
         if testbed.oracle is None:

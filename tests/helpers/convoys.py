@@ -41,7 +41,7 @@ def positions_m(
     period_ms: int = 10,
     seconds: float,
 ) -> tuple[Floats, Floats]:
-    """Times, and positions of shape (times, robots, 3), of a convoy whose leader has an oscillating speed."""
+    """The times, and the positions of shape (times, robots, 3), of a convoy whose leader has an oscillating speed."""
     names = [f"v{number}" for number in range(followers + 1)]
     # The initial spacing is the equilibrium at the mean speed.
     spacing_m = STANDSTILL_M + headway_s * MEAN_M_S
@@ -61,11 +61,11 @@ def positions_m(
         ]
         parts += [Periodic(name, follower, period_ns=period_ms * MS) for follower in names[number + 1 : number + 2]]
         programs[name] = CombinedProgram(parts)
-    sampled = SampledBodies(bodies)
+    sampled_bodies = SampledBodies(bodies)
     network = Disc(1e6, round(delay_s * 1e9))
-    Coordinator(Agents(sampled, programs), network, policy, [*pairwise(names)]).advance(round(seconds * 1e9))
-    places = [[states[name].position_m for name in names] for states in sampled.samples]
-    return np.arange(len(places)) * SAMPLE_INTERVAL_NS / 1e9, np.array(places)
+    Coordinator(Agents(sampled_bodies, programs), network, policy, [*pairwise(names)]).advance(round(seconds * 1e9))
+    positions = [[states[name].position_m for name in names] for states in sampled_bodies.samples]
+    return np.arange(len(positions)) * SAMPLE_INTERVAL_NS / 1e9, np.array(positions)
 
 
 class SampledBodies:

@@ -1,4 +1,4 @@
-"""Two network namespaces on a co-simulated medium, and robots whose programs are the test."""
+"""Two network namespaces on a co-simulated medium; the test runs in place of the robots' programs."""
 
 import math
 import os
@@ -31,8 +31,8 @@ ADDRESSES = {"a": "10.9.0.1", "b": "10.9.0.2"}
 
 
 @dataclass
-class Driven:
-    """The files by which a robot is driven.
+class ControlFiles:
+    """The files through which a robot is controlled.
 
     Attributes:
         folder: Their folder.
@@ -43,19 +43,19 @@ class Driven:
     descriptors: Sequence[int]
 
     @classmethod
-    def make(cls, folder: Path, *inputs: str) -> "Driven":
-        """Return the files of a new robot, of which `inputs` are the last."""
+    def make(cls, folder: Path, *inputs: str) -> "ControlFiles":
+        """Create the files of a new robot; `inputs` are the names of its input files, by default `commanded`."""
         folder.mkdir()
         flags = os.O_RDWR | os.O_CREAT
         names = ("steered", "motion", *(inputs or ("commanded",)))
         return cls(folder, [os.open(folder / name, flags, 0o600) for name in names])
 
     def assign(self, place_m: Vector, facing_rad: float = 0.0) -> None:
-        """Assign the robot a place, as the lab does."""
+        """Assign a place to the robot, as the lab does."""
         append_path(self.folder / "motion", AssignedPath(time.monotonic_ns(), [place_m], 1.0, facing_rad))
 
     def motion(self) -> RecordedMotion | None:
-        """Return the motion that the physics recorded last."""
+        """Return the last motion that the physics recorded, or None if it recorded none."""
         record = MotionRecord.open(self.folder / "steered")
         try:
             return record.read()
@@ -82,12 +82,12 @@ class CosimBench:
     Attributes:
         medium: The medium.
         spaces: The namespaces of `a` and `b`.
-        driven: The files by which `a` is driven.
+        control_files: The files through which `a` is controlled.
     """
 
     medium: CosimulatedClient
     spaces: dict[str, Namespace]
-    driven: Driven
+    control_files: ControlFiles
 
     def ping(self, *options: str, count: int = 20, address: str = ADDRESSES["b"]) -> list[float]:
         """Return the round-trip times in ms of pings from a to b."""
@@ -108,10 +108,10 @@ def cosim_bench(
     radio: RadioOptions | None = None,
     world: World | None = None,
     places_m: dict[str, Vector] = PLACES,
-    driven: Driven | None = None,
+    control_files: ControlFiles | None = None,
     body: RobotBody = BODY,
 ) -> Iterator[CosimBench]:
-    """Yield two placed namespaces on a co-simulated medium; `a` faces east, with this body and these files."""
+    """Yield two placed namespaces on a co-simulated medium; `body` and `control_files` are those of `a`."""
     sync = sync or SyncOptions()
     with ExitStack() as stack:
         medium = stack.enter_context(
@@ -125,17 +125,17 @@ def cosim_bench(
             )
         )
         spaces = {name: stack.enter_context(Namespace()) for name in ADDRESSES}
-        driven = driven or Driven.make(folder / "a")
-        for fd in driven.descriptors:
+        control_files = control_files or ControlFiles.make(folder / "a")
+        for fd in control_files.descriptors:
             stack.callback(os.close, fd)
         for name, space in spaces.items():
             fd = space.tun("wlan0", f"{ADDRESSES[name]}/24")
-            fds = driven.descriptors if name == "a" else ()
+            fds = control_files.descriptors if name == "a" else ()
             medium.attach(name, f"{ADDRESSES[name]}/24", RADIO, fd, physics_fds=fds)
             os.close(fd)
-        driven.assign(places_m["a"])
+        control_files.assign(places_m["a"])
         medium.place(places_m)
-        yield CosimBench(medium, spaces, driven)
+        yield CosimBench(medium, spaces, control_files)
 
 
 def distance_m(motion: RecordedMotion, place_m: Vector) -> float:

@@ -1,4 +1,4 @@
-"""A trial on a disk whose power fails: at each sync, or repeatedly at random times."""
+"""A trial on a disk with simulated power cuts, at each sync or repeatedly at random times."""
 
 import hashlib
 import itertools
@@ -35,7 +35,7 @@ def robots_with_much_evidence() -> Iterator[None]:
     """Simulate robots with evidence that could be lost in different ways.
 
     The evidence contains an empty folder, a file too large for an inode of the file system, and a file in a separate
-    folder that is renamed after it was synced.
+    folder that is renamed after its sync.
     """
     with pytest.MonkeyPatch.context() as patch:
         robots_with_evidence(patch)
@@ -61,7 +61,7 @@ def robots_with_much_evidence() -> Iterator[None]:
 
 
 def run(out: Path, recorder: VersionRecorder) -> None:
-    """Start the trial in `out`, or resume it if a power cut left its plan; the witness receives the messages."""
+    """Start the trial in `out`, or resume it if its plan is on the disk; the recorder receives the events."""
     plans = list(out.glob(f"*/{PLAN_FILE}"))
     if plans:
         resume_trial(plans[0].parent, IdleTestbed(), recorder.on_event)
@@ -74,12 +74,12 @@ def run(out: Path, recorder: VersionRecorder) -> None:
 
 @contextmanager
 def at_every_sync(call: Callable[[str], bool]) -> Iterator[None]:
-    """Call a function before each sync of a file or folder, with the location in fieldkit that requests the sync.
+    """Call a function before each sync of a file or folder, with the source line in fieldkit that requests the sync.
 
     Syncs that are normally concurrent are serialized.
 
     Args:
-        call: Returns False to skip the sync.
+        call: Called with the source line; it returns False to skip the sync.
     """
     lock = threading.Lock()
 
@@ -94,7 +94,7 @@ def at_every_sync(call: Callable[[str], bool]) -> Iterator[None]:
 
 
 def _sync_location() -> str:
-    """Source location in fieldkit that requested the sync; for a folder, the caller of `sync_folder`."""
+    """The source line in fieldkit that requested the sync; for a folder, the line that calls `sync_folder`."""
     frames: list[FrameType] = []
     frame: FrameType | None = sys._getframe(2)
     while frame is not None:
@@ -109,18 +109,18 @@ def _sync_location() -> str:
 def cuts_at_every_sync(
     disk: Disk, place: Path, *, without: str = ""
 ) -> tuple[list[PowerCut], VersionRecorder, list[str]]:
-    """Run the trial on a disk and cut its power before each sync and at the end, in the worst case for durability.
+    """Run the trial on a disk and record the disk as a power cut before each sync and at the end would leave it.
 
-    Only synced data reaches the disk, so these are all disk states that a cut can leave. Each is combined with the
-    most that was reported to the user until then.
+    Only synced data reaches the disk, so these are all states of the disk that a cut can leave. Each state is
+    combined with all events that were reported to the user until then.
 
     Args:
         disk: The disk.
         place: A working folder.
-        without: Location in fieldkit whose sync is skipped.
+        without: The source line whose sync is skipped; none if empty.
 
     Returns:
-        The cuts, the witness of the trial, and the locations that requested a sync.
+        The cuts, the recorder of the trial, and the source lines that requested a sync.
     """
     cuts: list[PowerCut] = []
     locations: list[str] = []
@@ -145,7 +145,7 @@ def cuts_at_every_sync(
 
 @contextmanager
 def at_call(number: int, action: Callable[[], None]) -> Iterator[None]:
-    """Call a function after the body has made `number` function calls and returns.
+    """Call a function after `number` function calls and returns in the body.
 
     The count measures the progress of a trial reproducibly, unlike time.
     """
@@ -180,15 +180,15 @@ def calls_of_a_trial(place: Path) -> int:
     return min(counts)
 
 
-def cut_at_a_moment(disk: Disk, place: Path, file: Path, after_calls: int) -> tuple[PowerCut, VersionRecorder]:
-    """Run or resume the trial on a disk, and cut the power after a number of calls and returns, or at its end.
+def cut_after_calls(disk: Disk, place: Path, file: Path, after_calls: int) -> tuple[PowerCut, VersionRecorder]:
+    """Run or resume the trial on a disk, and cut the power after a number of calls and returns or at the trial's end.
 
     The trial continues while the disk is copied, so the effective cut may be slightly later.
 
     Args:
         disk: The disk.
         place: A working folder.
-        file: Path for the disk image after the cut.
+        file: Path of the new disk image.
         after_calls: Number of calls and returns before the cut.
     """
     with disk.mounted(place / "disk") as mounted, ThreadPoolExecutor() as pool:
@@ -207,7 +207,7 @@ def cut_at_a_moment(disk: Disk, place: Path, file: Path, after_calls: int) -> tu
             )
 
         def cut() -> None:
-            # The trial may hold any lock here, including one of the thread pool, so no thread is started.
+            # The trial may hold any lock at this time, including one of the thread pool, so no thread is started.
             states.append((dict(recorder.reported), recorder.is_over))
             cut_requested.set()
 
@@ -226,8 +226,8 @@ def cut_at_a_moment(disk: Disk, place: Path, file: Path, after_calls: int) -> tu
         return cut_result.result(), recorder
 
 
-def cuts_in_a_row(file_system: FileSystem, place: Path, draw: random.Random, *, calls: int, most: int) -> int:
-    """Run a trial with a power cut at a random time, resume it with the remaining data, and repeat until it ends.
+def lose_power_repeatedly(file_system: FileSystem, place: Path, draw: random.Random, *, calls: int, most: int) -> int:
+    """Run a trial with a power cut at a random time, and resume it with the remaining data until it is complete.
 
     Args:
         file_system: The file system of the disk.
@@ -244,11 +244,11 @@ def cuts_in_a_row(file_system: FileSystem, place: Path, draw: random.Random, *, 
     """
     disk, image = Disk.make(file_system, place / "disk.img"), place / "left.img"
     for number in range(1, most + 1):
-        cut, recorder = cut_at_a_moment(disk, place, image, draw.randrange(calls))
+        cut, recorder = cut_after_calls(disk, place, image, draw.randrange(calls))
         image.rename(disk.file)
         with disk.repair().mounted(place / "disk") as mounted:
-            lost = cut.lost(mounted / OUT, recorder)
-            assert not lost, lost
+            problems = cut.lost_files(mounted / OUT, recorder)
+            assert not problems, problems
             if cut.is_over or number == most:
                 run(mounted / OUT, recorder)
                 assert_resumable(mounted / OUT)

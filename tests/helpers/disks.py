@@ -1,7 +1,7 @@
 """Disks with simulated power cuts: file systems on loop files, and images of the data on disk at a given time.
 
 The device of a file system is a file. Data that was written but not synced is in the page cache and not in this file,
-so a copy of the file is the disk as a power cut at that time would leave it.
+so a copy of the file equals the disk after a power cut at that time.
 """
 
 import subprocess
@@ -22,7 +22,7 @@ class FileSystem:
     Attributes:
         name: Name in tests.
         kind: Type for `mount`.
-        make: Command that makes it, without the file.
+        make: Command that creates it, without the file.
         options: Mount options. The file system must not commit automatically during a test, so that only requested
             data reaches the disk: xfs writes its log every 30 s; by default ext4 commits every 5 s, btrfs every 30 s.
         repair: Command that must repair it after a cut, without the file; empty if mounting repairs it.
@@ -37,7 +37,7 @@ class FileSystem:
 
 FILE_SYSTEMS: Final = (
     FileSystem("ext4", "ext4", ("mkfs.ext4", "-q", "-F"), "loop,commit=300"),
-    # It only writes the synced file, whereas a journal also writes all earlier changes.
+    # A sync writes only the synced file; with a journal, it would also write all earlier changes.
     FileSystem(
         "ext4-without-journal",
         "ext4",
@@ -79,9 +79,9 @@ class Disk:
 
     @classmethod
     def make(cls, file_system: FileSystem, file: Path) -> "Disk":
-        """Make a disk in a new file."""
-        with file.open("xb") as created:
-            created.truncate(SIZE_BYTES)
+        """Create a disk in a new file."""
+        with file.open("xb") as disk_file:
+            disk_file.truncate(SIZE_BYTES)
         _run(*file_system.make, str(file))
         return cls(file_system, file)
 
@@ -104,9 +104,9 @@ class Disk:
             _run("umount", str(mount_point))
 
     def image(self, mounted: Path, file: Path) -> "Disk":
-        """A copy of the present state of a mounted disk, as a power cut would leave it.
+        """A copy of a mounted disk as a power cut now would leave it.
 
-        The kernel may write during the copy, so the copy is repeated until nothing was written in the meantime.
+        The kernel may write during the copy, so the copy is repeated until the kernel writes nothing during it.
         """
         for _ in range(_MAX_COPIES):
             before = _write_state(mounted)

@@ -36,7 +36,7 @@ def dissected(path: Path) -> list[Row]:
 
 
 def rows(packets: Packets) -> list[Row]:
-    """The rows of columns, with addresses as numbers; those that compute something from the packet are omitted."""
+    """The rows of packets, with addresses as numbers and without the columns that fieldkit computes."""
     columns = {name: getattr(packets, name) for name in Packets.__dataclass_fields__ if name not in _COMPUTED}
     for name in ("src", "dst"):
         columns[name] = [int(upper) << 64 | int(lower) for upper, lower in columns[name].tolist()]

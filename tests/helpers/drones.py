@@ -25,12 +25,12 @@ from tests.helpers.ground_station import LIMITS
 
 SYSTEM: Final = 7
 PEER: Final = ("gcs", 1)
-"""The peer that the drone attributes all received data to."""
+"""The name of the peer to which the drone attributes all received data."""
 START_US: Final = 1_795_000_000_000_000
 """A time in November 2026."""
 
 Damage = Callable[[bytes], Iterable[bytes]]
-"""Returns the data that is sent in place of a frame."""
+"""Takes a frame and returns the data that is sent in its place."""
 
 
 class Sender:
@@ -51,7 +51,7 @@ class Sender:
 
 
 def stamped(frames: Iterable[tuple[int, bytes]]) -> bytes:
-    """A telemetry log of frames, each with its time in us after `START_US`."""
+    """A telemetry log of frames with their times in us after `START_US`."""
     return b"".join(struct.pack(">Q", START_US + at_us) + frame for at_us, frame in frames)
 
 
@@ -101,7 +101,7 @@ def flying(
         with selectors.DefaultSelector() as selector:
             selector.register(descriptor, selectors.EVENT_READ)
             while not stop.is_set():
-                with suppress(OSError):  # no peer yet, or no longer
+                with suppress(OSError):  # there is no peer yet, or it has closed
                     received = receive(65_536) if selector.select(0.02) else b""
                     replies = list(autopilot.receive(received, PEER, time.monotonic_ns()))
                     for _, frame in (*replies, *autopilot.advance(time.monotonic_ns())):
@@ -149,7 +149,7 @@ def autopilot_at_udp(
 
 @contextmanager
 def at_terminal(damage: Damage = lambda frame: [frame]) -> Iterator[str]:
-    """Run a drone at a serial line whose output starts in the middle of a frame."""
+    """Run a drone at a serial line; its output starts in the middle of a frame."""
     master, terminal = os.openpty()
 
     def send(frame: bytes) -> None:
@@ -166,7 +166,8 @@ def at_terminal(damage: Damage = lambda frame: [frame]) -> Iterator[str]:
 
 
 class UsbSerial:
-    """A serial line at a USB port, whose device disappears when it is unplugged and appears again later.
+    """A serial line at a USB port; its device disappears when it is unplugged, and appears again when it is plugged
+    in.
 
     Args:
         path: Path of the device.
@@ -199,7 +200,7 @@ class UsbSerial:
         """Forward received data in both directions; without a device, the data is lost."""
         drone = self._drone.fileno()
         ready, _, _ = select.select([drone, *([self._master] if self._master >= 0 else [])], [], [], 0.01)
-        with self._changing, suppress(OSError):  # full, closed, or unplugged in the meantime
+        with self._changing, suppress(OSError):  # the line is full, closed or unplugged
             if drone in ready:
                 data = self._drone.recv(65_536)
                 if self._master >= 0:
@@ -216,7 +217,7 @@ def autopilot_at_usb(path: Path, firmware: Firmware = ARDUCOPTER) -> Iterator[tu
 
     def forward() -> None:
         while not stop.is_set():
-            with suppress(OSError):  # unplugged during the wait
+            with suppress(OSError):  # the line was unplugged during `select`
                 usb.forward()
 
     thread = threading.Thread(target=forward)
@@ -232,7 +233,7 @@ def autopilot_at_usb(path: Path, firmware: Firmware = ARDUCOPTER) -> Iterator[tu
 
 
 def damage_randomly(seed: int) -> Damage:
-    """A function that sends, with each frame, damaged frames and other bytes."""
+    """A function that adds damaged frames and random bytes to each frame."""
     random_source = random.Random(seed)
 
     def damaged(frame: bytes) -> Iterator[bytes]:

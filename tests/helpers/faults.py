@@ -1,4 +1,4 @@
-"""Faults of emulated robots whose duration the test controls, so that a slow machine does not matter."""
+"""Faults of emulated robots that last until the test ends them, so that they also work on a slow machine."""
 
 import time
 from collections.abc import Iterator
@@ -20,13 +20,13 @@ _TIMEOUT_S = 120.0
 
 @dataclass
 class _Clock:
-    """Replaces the clock of the testbed: `sleep` ends when the test releases the fault."""
+    """Replaces the clock of the testbed; `sleep` returns when the test releases the fault."""
 
-    began: Event = field(default_factory=Event)
+    started: Event = field(default_factory=Event)
     released: Event = field(default_factory=Event)
 
     def sleep(self, _duration_s: float) -> None:
-        self.began.set()
+        self.started.set()
         assert self.released.wait(_TIMEOUT_S)
 
     def monotonic(self) -> float:
@@ -35,14 +35,14 @@ class _Clock:
 
 @contextmanager
 def inject_until_exit(emulation: EmulatedTestbed, fault: Fault) -> Iterator[None]:
-    """Inject `fault` for the duration of the context, instead of its configured duration; it is active on entry."""
+    """Inject `fault` for the duration of the context instead of its configured duration; it is active in the body."""
     clock = _Clock()
     with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(1) as pool:
         patch.setattr(testbed, "time", clock)
-        injected = pool.submit(emulation.inject, fault)
+        injection = pool.submit(emulation.inject, fault)
         try:
-            wait_until(lambda: clock.began.is_set() or injected.done(), Deadline.after(_TIMEOUT_S))
+            wait_until(lambda: clock.started.is_set() or injection.done(), Deadline.after(_TIMEOUT_S))
             yield
         finally:
             clock.released.set()
-        injected.result()
+        injection.result()

@@ -1,8 +1,8 @@
 """Federates that have a fault after 200 ms of simulated time.
 
 `python -m tests.helpers.faulty_federates ROLE FAULT` serves one over its standard input and output. Without arguments
-it reads lines `ROLE FAULT ADDRESS RUNS DELAY`, serves each federate in a process that it forks, and prints the
-process id: the imports are done only once.
+it reads lines `ROLE FAULT ADDRESS RUNS DELAY`, serves each federate in a forked process, and prints the process id.
+The fork avoids that each process repeats the imports.
 """
 
 import os
@@ -47,22 +47,22 @@ def _fail(fault: str) -> None:
         raise ValueError("no wheels")
 
 
-def faulty(role: str, fault: str) -> Any:  # noqa: ANN401 (a class that is made here)
-    """Return the class of a federate."""
+def make_faulty_class(role: str, fault: str) -> Any:  # noqa: ANN401 (a class that is defined here)
+    """Return the class of a federate with a fault."""
 
     class Faulty(carts() if role == "physics" else _Net):  # type: ignore[misc]
-        def advance(self, to_ns: int, *rest: object) -> object:
+        def advance(self, to_ns: int, *arguments: object) -> object:
             if to_ns > FAULT_NS:
                 _fail(fault)
-            return super().advance(to_ns, *rest)
+            return super().advance(to_ns, *arguments)
 
-    if fault == "delayed":  # as a program that computes for long and has no thread for heartbeats
+    if fault == "delayed":  # like a program that computes for a long time and has no thread for heartbeats
         answering._Heartbeat.begin = lambda *_: None  # type: ignore[method-assign]
     return Faulty
 
 
 class Federates:
-    """Starts federates in processes that are forked by a process with all imports."""
+    """Starts federates as forks of a process that has done all imports."""
 
     def __init__(self, process: "subprocess.Popen[str]") -> None:
         self._process = process
@@ -86,7 +86,7 @@ class Federates:
 
 @contextmanager
 def forked_federates() -> Iterator[Federates]:
-    """Yield the means to start federates; all of them are killed at the end."""
+    """Yield an object that starts federates; all of them are killed at the end."""
     process = subprocess.Popen(
         (sys.executable, "-m", "tests.helpers.faulty_federates"),
         stdin=subprocess.PIPE,
@@ -105,7 +105,7 @@ def forked_federates() -> Iterator[Federates]:
 def main() -> None:
     """Serve one federate, or fork one for each line of the input."""
     if len(sys.argv) > 1:
-        serve(faulty(*sys.argv[1:]), name="faulty")
+        serve(make_faulty_class(*sys.argv[1:]), name="faulty")
         return
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel removes children that have exited
     for line in sys.stdin:
@@ -113,7 +113,7 @@ def main() -> None:
         pid = os.fork()
         if pid == 0:
             time.sleep(float(delay_s))
-            serve(faulty(role, fault), name="faulty", address=address, runs=int(runs))
+            serve(make_faulty_class(role, fault), name="faulty", address=address, runs=int(runs))
             os._exit(0)
         print(pid, flush=True)  # noqa: T201 (read by the test)
 

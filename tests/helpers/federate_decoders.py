@@ -1,4 +1,4 @@
-"""The decoder of each message with a body, by name, with the agents that the examples announce."""
+"""The decoder of each message that has a body, by the message's name; it uses the agents of the examples."""
 
 from collections.abc import Callable, Mapping
 from typing import Final

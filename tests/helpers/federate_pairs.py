@@ -1,4 +1,4 @@
-"""Federates served by a thread of the test, over a pair of sockets; the frames that they send can be changed."""
+"""Federates that a thread of the test serves over a pair of sockets; the test can change the frames they send."""
 
 import os
 import socket
@@ -52,32 +52,32 @@ HELLO = Hello(
 
 
 class AlteredChannel(StreamChannel):
-    """A channel that changes what a federate sends, or sends nothing."""
+    """A channel that changes or drops the frames that a federate sends."""
 
     alter: Alter | None = None
 
     def send(self, frame: bytes, deadline_s: float | None) -> None:
-        altered = frame if self.alter is None else self.alter(frame)
-        if altered is not None:
-            super().send(altered, deadline_s)
+        altered_frame = frame if self.alter is None else self.alter(frame)
+        if altered_frame is not None:
+            super().send(altered_frame, deadline_s)
 
 
 @dataclass
 class Pair:
-    """Opens sessions with a federate that a thread serves.
+    """Opens sessions with federates that threads serve.
 
     Attributes:
         service: The federate.
-        deadline_s: Longest wait for a frame after the handshake.
+        deadline_s: Longest time to wait for a frame after the handshake.
         alter: Changes its frames; None removes a frame.
         run_class: The class that answers requests.
-        stays: True if it does not close the connection at the end.
+        stays_open: True if it does not close the connection at its end.
     """
 
     service: FederateService
     deadline_s: float = 20.0
     alter: Alter | None = None
-    stays: bool = False
+    stays_open: bool = False
     run_class: type[_Run] = _Run
 
     def __call__(self, hello: Hello) -> tuple[FederateSession, Hello, Welcome]:
@@ -87,17 +87,17 @@ class Pair:
         threading.Thread(target=self._serve, args=(federate_end,), daemon=True).start()
         session = FederateSession(hello.role, "test", coordinator_end, deadline_s=20.0)
         welcome = session.welcome(hello)
-        session._deadline_s = self.deadline_s  # later, because a busy machine may need longer for the handshake
+        session._deadline_s = self.deadline_s  # set here, because a busy machine may need longer for the handshake
         return session, hello, welcome
 
     def _serve(self, channel: StreamChannel) -> None:
         self.run_class(self.service, channel, "").serve()
-        if self.stays:
+        if self.stays_open:
             threading.Event().wait(60)
         channel.close()
 
 
 def channel_of(side: socket.socket) -> AlteredChannel:
-    """Return a channel over a socket, which it owns."""
+    """Return a channel that owns a socket and transmits through it."""
     fd = side.detach()
     return AlteredChannel(fd, fd)

@@ -21,7 +21,7 @@ def free_port() -> int:
 
 
 def new_addresses(scheme: str) -> tuple[str, str]:
-    """Return an unused address of a transport, as of the federate that listens and as of the coordinator."""
+    """Return an unused address of a transport, once for the federate that listens and once for the coordinator."""
     if scheme in {"dds", "ros1"}:
         address = f"{scheme}:test_{secrets.token_hex(4)}"
         return address, address
@@ -31,7 +31,7 @@ def new_addresses(scheme: str) -> tuple[str, str]:
 
 @contextmanager
 def ros_master() -> Iterator[str]:
-    """Run a ROS master, let `ROS_MASTER_URI` name it, and yield its URI."""
+    """Run a ROS master, set `ROS_MASTER_URI` to its URI, and yield the URI."""
     port = free_port()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_MASTER_URI", f"http://127.0.0.1:{port}")

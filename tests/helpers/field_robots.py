@@ -1,4 +1,4 @@
-"""Emulated robots that outlive fieldkit: the test starts them, and the field backend connects to loopback ports."""
+"""Emulated robots that the test starts, so that they outlive fieldkit; the field backend reaches them by loopback."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -46,7 +46,7 @@ def start_field_robots(
     The robots stop at the latest when the calling thread ends, so the thread must live as long as the test.
 
     Args:
-        folder: Receives the site files and the key.
+        folder: The folder for the site files and the key.
         topology: The topology of the robots to start.
         site: Site file of the emulated testbed; if None, robots as in `built_in_ros` are used.
         distance: Distance between the robots, in line of sight; `testbed.place` changes it.

@@ -34,43 +34,43 @@ class _Flow:
         source: Socket that is read.
         sink: Socket that is written.
         queue: Received chunks with the time from which each may be sent; an empty chunk is the end of the stream.
-        finished: True if the source has reached its end.
-        ended: True if the end was forwarded.
+        source_closed: True if the source has sent its end of stream.
+        sink_closed: True if the end of stream was forwarded.
     """
 
     source: socket.socket
     sink: socket.socket
     queue: deque[tuple[float, bytes]] = field(default_factory=deque)
-    finished: bool = False
-    ended: bool = False
+    source_closed: bool = False
+    sink_closed: bool = False
 
     def due_in_s(self) -> float | None:
-        """Seconds until the next chunk may be sent, 0 for now; None if there is none."""
+        """Seconds until the next chunk may be sent, 0 if it may be sent now; None if there is no chunk."""
         return max(self.queue[0][0] - time.monotonic(), 0.0) if self.queue else None
 
     def can_read(self, delay_s: float) -> bool:
-        """True if it accepts more data; without a delay, only after the last chunk was sent."""
-        return not self.finished and (not self.queue or (delay_s > 0 and len(self.queue) < _MAX_CHUNKS))
+        """Return True if it accepts more data; without a delay, only after the last chunk was sent."""
+        return not self.source_closed and (not self.queue or (delay_s > 0 and len(self.queue) < _MAX_CHUNKS))
 
     def receive(self, delay_s: float) -> None:
         """Read the next chunk from the source."""
         chunk = self.source.recv(_CHUNK)
-        self.finished = not chunk
+        self.source_closed = not chunk
         self.queue.append((time.monotonic() + delay_s, chunk))
 
     def send(self) -> None:
         """Send as much of the next chunk as possible without blocking, or the end of the stream."""
         due_in_s, chunk = self.queue.popleft()
         if not chunk:
-            self.ended = True
+            self.sink_closed = True
             self.sink.shutdown(socket.SHUT_WR)
-        elif rest := chunk[self.sink.send(chunk) :]:
-            self.queue.appendleft((due_in_s, rest))
+        elif unsent := chunk[self.sink.send(chunk) :]:
+            self.queue.appendleft((due_in_s, unsent))
 
 
 @dataclass(eq=False)
 class _Link:
-    """A port and the streams through it."""
+    """A loopback port, and the streams that are forwarded from it."""
 
     connect: Connect
     listener: socket.socket
@@ -93,7 +93,7 @@ class _Link:
             end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.streams.append((_Flow(client, server), _Flow(server, client)))
 
-    def carry(self, readable: set[socket.socket], writable: set[socket.socket]) -> None:
+    def forward_ready(self, readable: set[socket.socket], writable: set[socket.socket]) -> None:
         for stream in list(self.streams):
             try:
                 for flow in stream:
@@ -102,14 +102,14 @@ class _Link:
                     if flow.due_in_s() == 0 and (flow.sink in writable or not flow.queue[0][1]):
                         flow.send()
             except OSError:
-                self.end(stream, _reset)
+                self.close_stream(stream, _reset)
             else:
-                if all(flow.ended for flow in stream):
-                    self.end(stream, socket.socket.close)
+                if all(flow.sink_closed for flow in stream):
+                    self.close_stream(stream, socket.socket.close)
         if self.listener in readable:
             self.accept()
 
-    def end(self, stream: tuple[_Flow, _Flow], close: Callable[[socket.socket], None]) -> None:
+    def close_stream(self, stream: tuple[_Flow, _Flow], close: Callable[[socket.socket], None]) -> None:
         self.streams.remove(stream)
         for flow in stream:
             close(flow.source)
@@ -121,11 +121,14 @@ class Forwarder(Generic[Key]):
     It has one thread and is a context manager.
 
     Args:
-        ways: For each key, a function that connects to the far side within a number of seconds, or raises OSError.
+        endpoints: For each key, a function that connects to the endpoint within a number of seconds, or raises
+        OSError.
     """
 
-    def __init__(self, ways: Mapping[Key, Connect]) -> None:
-        self._links = {key: _Link(connect, socket.create_server(("127.0.0.1", 0))) for key, connect in ways.items()}
+    def __init__(self, endpoints: Mapping[Key, Connect]) -> None:
+        self._links = {
+            key: _Link(connect, socket.create_server(("127.0.0.1", 0))) for key, connect in endpoints.items()
+        }
         self._lock = threading.Lock()
         self._wake, self._wake_receiver = socket.socketpair()
         self._stopping = False
@@ -151,7 +154,7 @@ class Forwarder(Generic[Key]):
         return port
 
     def reach(self, key: Key, timeout_s: float = _CONNECT_S) -> socket.socket:
-        """A stream through the port of `key`; raises OSError if it cannot be opened in time."""
+        """Open a stream through the port of `key`; raise OSError if it cannot be opened in time."""
         return socket.create_connection(("127.0.0.1", self.port(key)), timeout_s)
 
     def cut(self, key: Key) -> None:
@@ -174,7 +177,7 @@ class Forwarder(Generic[Key]):
         self._wake.send(b"x")
 
     def delay(self, key: Key, delay_s: float) -> None:
-        """Delay all data from now on by this time, in each direction."""
+        """Delay all data that is received from now on, in both directions."""
         with self._lock:
             self._links[key].delay_s = delay_s
         self._wake.send(b"x")
@@ -184,8 +187,8 @@ class Forwarder(Generic[Key]):
         link = self._links[key]
         with self._lock:
             for stream in list(link.streams):
-                link.end(stream, _reset)
-        # A socket is only reset when no `select` waits for it any more.
+                link.close_stream(stream, _reset)
+        # The kernel resets a socket only when no `select` waits for it any more.
         self._wake.send(b"x")
 
     def _run(self) -> None:
@@ -200,18 +203,18 @@ class Forwarder(Generic[Key]):
             with self._lock:
                 for link in self._links.values():
                     if not link.is_cut:
-                        link.carry({*readable}, {*writable})
+                        link.forward_ready({*readable}, {*writable})
 
     def _select_arguments(self) -> tuple[list[socket.socket], list[socket.socket], float | None]:
         """The arguments of `select`: sockets to read, sockets to write, and the timeout."""
         with self._lock:
-            alive = [link for link in self._links.values() if not link.is_cut]
-            flows = [(link.delay_s, flow) for link in alive for stream in link.streams for flow in stream]
+            intact_links = [link for link in self._links.values() if not link.is_cut]
+            flows = [(link.delay_s, flow) for link in intact_links for stream in link.streams for flow in stream]
             readers = [flow.source for delay_s, flow in flows if flow.can_read(delay_s)]
             flows_due = [(flow.due_in_s(), flow) for _, flow in flows]
             writers = [flow.sink for due_in_s, flow in flows_due if due_in_s == 0]
             waits_s = [due_in_s for due_in_s, _ in flows_due if due_in_s]
-            listeners = [link.listener for link in alive]
+            listeners = [link.listener for link in intact_links]
             return [self._wake_receiver, *listeners, *readers], writers, min(waits_s, default=None)
 
 

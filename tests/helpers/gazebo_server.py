@@ -1,4 +1,4 @@
-"""A server like Gazebo Fortress, on loopback: it is compiled against Debian 12's libraries of Gazebo."""
+"""A server like Gazebo Fortress on loopback, compiled against the Gazebo libraries of Debian 12."""
 
 import os
 import signal
@@ -31,7 +31,7 @@ SERVER: Final = CompiledProgram(
 
 
 def missing_libraries() -> str:
-    """Return the reason why the server cannot be compiled here; empty if it can."""
+    """Return the reason why the server cannot be compiled on this machine; empty if it can."""
     packages = (*SERVER.packages, "nlohmann_json")
     try:
         missing = [
@@ -47,7 +47,7 @@ class GazeboServer:
     """A running server.
 
     Attributes:
-        options: Options of the federate `gazebo` for it.
+        options: Options with which the federate `gazebo` connects to it.
         process: Its process.
     """
 
@@ -55,13 +55,13 @@ class GazeboServer:
     process: "subprocess.Popen[str]"
 
     def suspend(self) -> None:
-        """Suspend it; it is continued when it ends."""
+        """Suspend the server; the end of the context resumes it so that it can terminate."""
         os.kill(self.process.pid, signal.SIGSTOP)
 
 
 @contextmanager
 def gazebo_server(folder: Path, sdf: str, *arguments: str) -> Iterator[GazeboServer]:
-    """Yield a server of an SDF world, which only processes with the same partition on loopback can reach.
+    """Yield a server of an SDF world; only processes with the same partition on loopback can reach it.
 
     Args:
         folder: An empty folder.

@@ -1,4 +1,4 @@
-"""A small ground station without a network: it passes datagrams to an autopilot and reads the answers."""
+"""A small ground station without a network; it passes datagrams to an autopilot and reads the answers."""
 
 import math
 import struct
@@ -23,7 +23,7 @@ HOME_M: Final = (120.0, -40.0, 0.0)
 
 
 class GroundStation:
-    """Client of a new autopilot; its clock is a number.
+    """Client of a new autopilot, with a simulated clock.
 
     Args:
         is_lost: Returns True if the next datagram, in either direction, is lost.
@@ -94,7 +94,7 @@ class GroundStation:
             assert self.command(d.MAV_CMD_SET_MESSAGE_INTERVAL, kind, 1e6 / rate_hz) == d.MAV_RESULT_ACCEPTED
 
     def texts(self) -> list[tuple[int, str]]:
-        """Return severity and text of each STATUSTEXT so far."""
+        """Return the severity and text of each received STATUSTEXT."""
         return [(message.severity, message.text) for message in self.received if message.get_type() == "STATUSTEXT"]
 
     def set(self, name: str, value: float) -> None:
@@ -104,8 +104,8 @@ class GroundStation:
         bytewise = is_integer and not self._ardupilot
         packed = struct.unpack("<f", struct.pack("<i", round(value)))[0] if bytewise else value
         kind = d.MAV_PARAM_TYPE_INT32 if is_integer else d.MAV_PARAM_TYPE_REAL32
-        (now,) = self.send_message(d.MAVLink_param_set_message(SYSTEM, 1, name.encode(), packed, kind))
-        assert now.param_value == struct.unpack("<f", struct.pack("<f", packed))[0], name
+        (reply,) = self.send_message(d.MAVLink_param_set_message(SYSTEM, 1, name.encode(), packed, kind))
+        assert reply.param_value == struct.unpack("<f", struct.pack("<f", packed))[0], name
 
     def last(self, kind: str) -> Message:
         """Return the newest message of a kind."""

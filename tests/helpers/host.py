@@ -1,4 +1,4 @@
-"""Processes, interfaces and mounts of a test, and the error for leaks of these."""
+"""Processes, interfaces and mounts of a test, and the error for those that remain after the test."""
 
 import ctypes
 import os
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-ENDED = ("Z", "X")
+EXITED_STATES = ("Z", "X")
 """Process states in /proc that mean exited: zombie and dead."""
 
 # linux/sched.h
@@ -49,9 +49,9 @@ def host_state() -> HostState:
 
 @contextmanager
 def separate_namespaces() -> Iterator[None]:
-    """Give the calling thread and its children a separate network with only loopback, and separate mounts.
+    """Run the calling thread and its children with a separate network that has only loopback, and separate mounts.
 
-    No other process of the machine adds anything there, so everything that remains is a leak of the test.
+    No other process changes these namespaces, so everything that remains there is a leak of the test.
     """
     folder = os.open(".", os.O_PATH)
     original = {kind: os.open(f"/proc/thread-self/ns/{kind}", os.O_RDONLY) for kind in _NAMESPACES}
@@ -130,13 +130,13 @@ def owners(pids: set[int]) -> set[int]:
     return user_ids
 
 
-def alive(pid: int) -> bool:
+def is_running(pid: int) -> bool:
     """Return True if a process runs."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
     except OSError:
         return False
-    return state not in ENDED
+    return state not in EXITED_STATES
 
 
 def wait_for_end(pids: set[int], *, within_s: float) -> None:
@@ -147,7 +147,7 @@ def wait_for_end(pids: set[int], *, within_s: float) -> None:
     """
     deadline_s = time.monotonic() + within_s
     remaining = pids
-    while remaining := {pid for pid in remaining if alive(pid)}:
+    while remaining := {pid for pid in remaining if is_running(pid)}:
         if time.monotonic() >= deadline_s:
             raise LeakError(f"still running: {remaining}")
         time.sleep(0.02)

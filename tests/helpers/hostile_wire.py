@@ -1,7 +1,7 @@
 """A malicious host on the cable: `python -m tests.helpers.hostile_wire ATTACK ARGUMENT...`.
 
 `rtps COUNT` captures messages of other hosts and sends them again with changes. `heartbeat` sends one message in the
-name of the writer of a stream, which states that its oldest sample has a very high sequence number.
+name of the writer of a stream; it states that the oldest sample of the writer has a very high sequence number.
 `tcpros MASTER HOST:PORT...` connects to nodes and sends data that is not valid TCPROS, and registers publishers that
 do the same. The program prints `done` at its end.
 """
@@ -20,7 +20,7 @@ from xmlrpc.client import ServerProxy
 from xmlrpc.server import SimpleXMLRPCServer
 
 from fieldkit.agent.messaging.stream import MAGIC
-from tests.fuzz.mutate import mutated
+from tests.fuzz.mutate import mutate
 
 TOPIC: Final = "/stream"
 _ETH_P_ALL: Final = 0x0003
@@ -39,7 +39,7 @@ Datagram = tuple[tuple[str, int], bytes]
 
 
 def captured_messages() -> list[Datagram]:
-    """Captured RTPS messages of other hosts with their destination."""
+    """Capture RTPS messages of other hosts, and return each with its destination."""
     messages: list[Datagram] = []
     with socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, socket.htons(_ETH_P_ALL)) as capture:
         while len(messages) < _SEEDS:
@@ -61,7 +61,7 @@ def rtps(count: int) -> None:
         for number in range(count):
             target, payload = random_source.choice(messages)
             header_bytes = _HEADER_BYTES * (number % 2)
-            changed = payload[:header_bytes] + mutated(payload[header_bytes:], seeds, random_source)
+            changed = payload[:header_bytes] + mutate(payload[header_bytes:], seeds, random_source)
             with suppress(OSError):  # the send queue is full
                 sender.sendto(changed[:_MAX_BYTES], target)
 
@@ -113,7 +113,7 @@ def tcpros(master: str, nodes: Sequence[tuple[str, int]]) -> None:
     address = own_address(master)
     for number in range(_BAD_PUBLISHERS):
         data = socket.create_server((address, 0))
-        changed = mutated(reply, [reply, request], random_source)[:_MAX_BYTES]
+        changed = mutate(reply, [reply, request], random_source)[:_MAX_BYTES]
         threading.Thread(target=publish, args=(data, changed, connected), daemon=True).start()
         api = SimpleXMLRPCServer((address, 0), logRequests=False, allow_none=True)
         endpoint = ["TCPROS", address, data.getsockname()[1]]
@@ -127,7 +127,7 @@ def tcpros(master: str, nodes: Sequence[tuple[str, int]]) -> None:
     _report("connections accepted")
     for node, _ in itertools.product(nodes, range(_CONNECTIONS)):
         with socket.create_connection(node, timeout=5) as stream, suppress(OSError):
-            stream.sendall(mutated(request, [request, reply], random_source)[:_MAX_BYTES])
+            stream.sendall(mutate(request, [request, reply], random_source)[:_MAX_BYTES])
 
 
 def own_address(master: str) -> str:

@@ -1,4 +1,4 @@
-"""A testbed without real robots, for tests of the parts of a trial that do not need any."""
+"""A testbed without real robots, for tests of the parts of a trial that need no robot."""
 
 from collections.abc import Mapping
 from contextlib import AbstractContextManager

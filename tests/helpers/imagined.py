@@ -24,7 +24,7 @@ from tests.ros.bags.test_measure_bag import write_bag
 _START_NS = 1_700_000_000_000_000_000
 _HOP_NS = 2_000_000
 _SEQUENTIAL = 0
-"""Key of the clock of steps that do not run in parallel with other steps."""
+"""Key of the clock for steps that do not run in parallel with other steps."""
 _SNMP = "==> /proc/net/snmp <==\nIp: ReasmFails\nIp: 0\nUdp: RcvbufErrors\nUdp: {}\n"
 REFUSED = 3
 """Datagrams that were dropped because a socket buffer was full, for each robot in an attempt."""
@@ -53,8 +53,8 @@ class AttemptTruth:
     Attributes:
         transfers: The transfers.
         pings: Number of requests and number of replies.
-        loads: Number of data packets that iperf3 sent, and number that arrived.
-        cookies_bytes: Bytes before the data, in the same direction and never lost: the cookie of a TCP client.
+        loads: Number of data packets that iperf3 sent, and number that arrived_count.
+        cookies_bytes: Size of the cookie that a TCP client sends before the data; it is never lost.
         udp_to: Destination address of each UDP flow.
     """
 
@@ -100,7 +100,9 @@ class Attempt:
         return self.truth
 
     def _clock_of(self, placed: PlacedStep) -> int:
-        """Key of the clock of a step; a branch of a parallel block has a separate clock, started with the block."""
+        """Key of the clock of a step; each branch of a parallel block has a separate clock that starts with the
+        block.
+        """
         steps = (*placed.within, placed.step)
         parallel = [index for index, block in enumerate(placed.within) if block.parallel]
         if not parallel:
@@ -154,7 +156,7 @@ class Attempt:
         write_bag(self._path(f"{stem}.bag"), {"/scan": 60})
 
     def _cross(self, data: bytes, source: str, target: str, block_ids: tuple[int, ...], *, lost: bool = False) -> int:
-        """Transmit a packet, which arrives unless it is lost; return the time at which it was sent."""
+        """Transmit a packet; return the time at which it was sent."""
         at_ns = self._tick()
         received_frame = None if lost else Frame(at_ns + _HOP_NS, data, wire_bytes=65_555)
         self._crossings.append((Frame(at_ns, data, wire_bytes=65_555), received_frame, source, target, block_ids))
@@ -219,7 +221,7 @@ class Attempt:
         target, request_count, payload = argv[-1], int(argv[argv.index("-c") + 1]), int(argv[argv.index("-s") + 1])
         name, _, log = job.log.removesuffix(".log").rpartition(".")
         source = next(self._address(role) for role in FIXED_ROLES if log == f"{role}-ping")
-        answered, identifier = 0, struct.pack(">H", len(self.truth.pings))
+        reply_count, identifier = 0, struct.pack(">H", len(self.truth.pings))
         lines = [f"PING {target} ({target}) {payload}({payload + 28}) bytes of data."]
         for number in range(1, request_count + 1):
             lost = self.draw.random() < self.loss
@@ -231,9 +233,12 @@ class Attempt:
                 timestamp = f"[{at_ns // 10**9}.{at_ns % 10**9 // 1000:06d}]"
                 rtt_text = f" time={(reply_ns - request_ns) / 1e6:.2f} ms" if payload >= 16 else ""
                 lines.append(f"{timestamp} {payload + 8} bytes from {target}: icmp_seq={number} ttl=64{rtt_text}")
-                answered += 1
-        self.truth.pings[name] = (request_count, answered)
-        lines += [f"{request_count} packets transmitted, {answered} received, 0% packet loss, time 1ms", ""]
+                reply_count += 1
+                self.truth.pings[name] = (request_count, reply_count)
+                lines += [
+                    f"{request_count} packets transmitted, {reply_count} received, 0% packet loss, time 1ms",
+                    "",
+                ]
         self._path(job.stdout).write_text("\n".join(lines), encoding="ascii")
 
     def _echo(
@@ -272,10 +277,10 @@ class Attempt:
             self._cross(_segment(0x10, cookie_bytes, ports, ends, next(self._ip_ids), seq=1), *ends, block_ids)
         if "-R" in argv:
             ports, ends = ports[::-1], ends[::-1]
-        arrived = 0
+        arrived_count = 0
         for index in range(packet_count):
             lost = self.draw.random() < self.loss
-            arrived += not lost
+            arrived_count += not lost
             udp_header = struct.pack(">HHHH", *ports, 1408, 0)
             data = (
                 ipv4(udp_header, protocol=17, size=1408, ip_id=next(self._ip_ids), src=ends[0], dst=ends[1])
@@ -283,14 +288,14 @@ class Attempt:
                 else _segment(0x10, 1400, ports, ends, next(self._ip_ids), seq=1 + cookie_bytes + 1400 * index)
             )
             self._cross(data, *ends, block_ids, lost=lost)
-        self.truth.loads[name] = (packet_count, arrived)
+        self.truth.loads[name] = (packet_count, arrived_count)
         self.truth.cookies_bytes[name] = cookie_bytes
         self.truth.udp_to += [ends[1]] if udp else []
         duration_s = float(argv[argv.index("-t") + 1]) if "-t" in argv else 1.0
         for planned in (client, server):
             is_data_sender = self._address(planned.role) == ends[0]
             local_port, remote_port = ports if is_data_sender else ports[::-1]
-            total = {"seconds": duration_s, "bytes": 1400 * (packet_count if is_data_sender else arrived)}
+            total = {"seconds": duration_s, "bytes": 1400 * (packet_count if is_data_sender else arrived_count)}
             start = {"connected": [{"local_port": local_port, "remote_port": remote_port}]}
             output = {"start": start, "intervals": [{"sum": total}], "end": {}}
             self._path(planned.job.stdout).write_text(json.dumps(output), encoding="ascii")
@@ -302,10 +307,10 @@ class Attempt:
         elif job.log.endswith("-watch.txt"):
             self._path(job.log).write_text("1.0 up 7\n1.1\n4.0 up 8\n4.1 up 8\n", encoding="ascii")
         else:
-            answered = (*range(1, 11), *range(41, 51))
+            answered_numbers = (*range(1, 11), *range(41, 51))
             replies = [
                 f"[17000000{3 * (number > 40):02d}.{number:02d}0000] 64 bytes from 1.2.3.4: icmp_seq={number} ttl=64"
-                for number in answered
+                for number in answered_numbers
             ]
             lines = [
                 "PING 1.2.3.4 (1.2.3.4) 56(84) bytes of data.",

@@ -15,7 +15,7 @@ LOSSES_PERCENT = (0, 1, 10, 30)
 IN_CI, AT_NIGHT = 5, 20
 """Number of repeats of each trial."""
 REPEATS = [IN_CI, pytest.param(AT_NIGHT, marks=pytest.mark.nightly)]
-"""Parameters of a module fixture, so that each test that uses it runs with both numbers."""
+"""Parameters of a module fixture. Each test that uses the fixture runs with both numbers."""
 LOSSES_IN_CI = (0, 10, 30)
 """In few repeats, a loss of 1 % can hardly be distinguished from no loss."""
 EACH_LOSS = mark_nightly(LOSSES_PERCENT, in_ci=LOSSES_IN_CI)
@@ -25,10 +25,10 @@ Table = list[dict[str, str]]
 
 
 class LossyTables(dict[str, Table]):
-    """Rows by loss in percent; losses that CI does not test are measured when they are needed.
+    """Rows of trials by the loss in percent; a loss that CI does not test is measured when its rows are read.
 
     Args:
-        measure: Measures rows of some losses in parallel.
+        measure: Measures the rows of several losses in parallel.
     """
 
     def __init__(self, measure: Callable[[Sequence[int]], dict[str, Table]]) -> None:
@@ -70,12 +70,12 @@ def make_lab(lab: Path, radio: str, *, topic: str = "/scan", pings: int = 1, rep
 def measured(runs: dict[Path, Run]) -> dict[str, list[dict[str, str]]]:
     for run in runs.values():
         assert run.code == 0, run.err + run.out
-    # A packet during the exit of tcpdump correctly voids an attempt, and the repeat is then measured again.
+    # A packet that arrives while tcpdump exits makes an attempt void, and the repeat is then measured again.
     return {lab.name: [row for row in rows(only_trial(lab)) if row["status"] == "valid"] for lab in runs}
 
 
 def run_all(labs: list[Path], *arguments: str) -> dict[str, list[dict[str, str]]]:
-    """Run the same trial in all labs concurrently; they share only the machine."""
+    """Run the same trial in all labs concurrently; return the rows of valid repeats by the lab's name."""
     with ThreadPoolExecutor(len(labs)) as pool:
         runs = list(pool.map(lambda lab: fieldkit(lab, "trial", "quick", "5m", *arguments), labs))
     return measured(dict(zip(labs, runs, strict=True)))

@@ -1,4 +1,4 @@
-"""The folder of a lab: its procedures and profiles, most of them changed copies of shipped files."""
+"""The procedures and profiles in the folder of a lab; most of them are changed copies of shipped files."""
 
 from pathlib import Path
 
@@ -28,8 +28,10 @@ def replace_text(text: str, *changes: str) -> str:
 def built_in_ros(folder: Path, name: str = SITE_FILE, *, radio: str = "{}") -> Path:
     """Write a site file with the default robots but with the built-in ROS instead of Debian's; return its path.
 
-    For tests that do not depend on ROS: a short trial takes two thirds of the CPU time. A repeat is not void if a
-    busy machine delivers packets late, so these tests must not compare delays. `radio` has the radio's options.
+    Tests that do not depend on ROS use it, because a short trial then takes two thirds of the CPU time. A repeat is
+    not
+    void if a busy machine delivers packets late, so these tests must not compare delays. `radio` has the radio's
+    options.
     """
     site = folder / name
     site.write_text(

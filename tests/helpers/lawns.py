@@ -1,4 +1,4 @@
-"""Synthetic tables of repeats for reports: all conditions, with intervals, void repeats and failures."""
+"""Synthetic tables of repeats under all conditions, for reports; they also have void repeats."""
 
 from itertools import product
 
@@ -35,7 +35,7 @@ def row(number: int = 1, **changes: object) -> RepeatRow:
 
 
 def lawn(repeats: int = 4) -> list[RepeatRow]:
-    """Synthetic trials of the lawn: both scenarios, topologies, protocols and backends at three distances."""
+    """Synthetic repeats on the lawn, with both scenarios, topologies, protocols and backends at three distances."""
 
     random = np.random.default_rng(5)
     rows = []

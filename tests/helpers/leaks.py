@@ -1,7 +1,7 @@
-"""A pytest plugin that fails the run if tests leave processes behind, whatever the result of the tests.
+"""A pytest plugin that makes the run fail if processes of tests remain, even if all tests pass.
 
 The process watch is deliberately not a fixture. The teardown of a fixture belongs to the last test and is repeated
-with it, and in the repetition the leaked process would be among those that existed before.
+with it, and in the repetition the leaked process would count as one that existed before.
 """
 
 import ctypes
@@ -16,17 +16,17 @@ from typing import Any, Final
 
 import pytest
 
-from tests.helpers.host import NamespaceComparison, alive, descendants, separate_namespaces
+from tests.helpers.host import NamespaceComparison, descendants, is_running, separate_namespaces
 
 _PR_SET_CHILD_SUBREAPER: Final = 36  # linux/prctl.h: orphans become children of this process, not of init
 _KEY: Final = "processes left behind"
 
 
 class _ProcessWatch:
-    """Records the descendants of this process, and the test file after which each was first seen.
+    """Records the descendants of this process, and the test file after which each was first observed.
 
     Attributes:
-        leaks: One line per process that was left behind, of all workers.
+        leaks: One line per remaining process, from all workers.
     """
 
     def __init__(self, config: pytest.Config) -> None:
@@ -48,7 +48,7 @@ class _ProcessWatch:
 
     @pytest.hookimpl(trylast=True)
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
-        """Wait for all processes to exit, kill and report the others; fixtures are already torn down here."""
+        """Wait until all processes exit, and kill and report the others; fixtures are already torn down."""
         if self._config.getoption("dist", "no") == "no":
             self._end_processes()
         if hasattr(self._config, "workeroutput"):
@@ -79,7 +79,7 @@ class _ProcessWatch:
         for pid in pids:
             with suppress(ChildProcessError):
                 os.waitpid(pid, os.WNOHANG)
-        return [pid for pid in pids if alive(pid)]
+        return [pid for pid in pids if is_running(pid)]
 
     @pytest.hookimpl(optionalhook=True)
     def pytest_testnodedown(self, node: Any) -> None:  # noqa: ANN401 (xdist has no type hints)
@@ -88,7 +88,7 @@ class _ProcessWatch:
 
     @pytest.hookimpl(trylast=True)
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
-        """List the processes that were left behind, after all other sections, where they are most visible."""
+        """List the remaining processes after all other sections, where they are most visible."""
         if self.leaks:
             terminalreporter.section(_KEY, red=True)
             for leak in self.leaks:
@@ -113,7 +113,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture
 def untouched() -> Iterator[NamespaceComparison]:
-    """Run the test in separate network and mount namespaces; a call, and the end, check that they are unchanged."""
+    """Run the test in separate network and mount namespaces.
+
+    The yielded function checks that they are unchanged; it is also called at the end.
+    """
     with separate_namespaces():
         check = NamespaceComparison()
         yield check

@@ -1,4 +1,4 @@
-"""A link with known ground truth: the sent packets and the captures of both ends; each packet has a unique number.
+"""A simulated link, the captures at both ends, and the ground truth about them; each packet has a unique number.
 
 Nothing here uses the code under test. The headers are packed with struct, and copies are identified by the numbers.
 """
@@ -24,7 +24,7 @@ class Link:
     Attributes:
         seed: Seed of the random numbers.
         loss: Share of packets that are lost.
-        copied: Share of the arriving packets that arrive a second time 10 us later.
+        copied: Share of the arriving packets that arrive again 10 us later.
         late: Share of the arriving packets that are delayed by an additional `late_ns`.
         delay_ns: Delay of a packet.
         jitter_ns: Maximum of the additional random delay.
@@ -46,21 +46,21 @@ class Link:
 
     def arrivals(self, sent_ns: Sequence[int]) -> list[tuple[int, int]]:
         """Arrival times by the receiver's clock with the index of the packet, in order of arrival."""
-        arrived = []
+        arrivals = []
         for number, sent_at_ns in enumerate(sent_ns):
             if self.draw.random() < self.loss:
                 continue
             arrival_ns = sent_at_ns + self.clock_ns + self.delay_ns + self.draw.randint(0, self.jitter_ns)
             arrival_ns += self.late_ns * (self.draw.random() < self.late)
-            arrived.append((arrival_ns, number))
+            arrivals.append((arrival_ns, number))
             if self.draw.random() < self.copied:
-                arrived.append((arrival_ns + 10_000, number))
-        return sorted(arrived)
+                arrivals.append((arrival_ns + 10_000, number))
+        return sorted(arrivals)
 
 
 @dataclass(frozen=True)
 class PacketFates:
-    """The fate of the sent packets, known to the generator.
+    """The fates of the sent packets.
 
     Attributes:
         lost: Number of packets that never arrived.
@@ -92,7 +92,7 @@ def ip(
     """A packet with `size` payload bytes on the wire; an IPv6 packet if `ip_id` is None."""
     if ip_id is None:
         source, target = (ip_address(address).packed for address in ends or (SENDER_V6, RECEIVER_V6))
-        # The length field of a super-frame is too small for its length and is 0.
+        # The length field of a super-frame is 0 because its length does not fit into the field.
         return struct.pack(">IHBB", 6 << 28, size if size < 65_536 else 0, protocol, 64) + source + target + payload
     source, target = (ip_address(address).packed for address in ends or (SENDER, RECEIVER))
     total = size + 20 if size + 20 < 65_536 else 0
@@ -141,7 +141,7 @@ def tcp(
     ends: tuple[str, str] | None = None,
     sport: int = 40_000,
 ) -> TcpTruth:
-    """A TCP transfer; lost segments are sent again after 30 ms, and a share `again` of the others without need.
+    """A TCP transfer; lost segments are sent again after 30 ms, and a share `again` of the others is sent needlessly.
 
     A frame in the sender's capture has up to `offload` segments; in the receiver's capture, contiguous segments are
     coalesced in the same way.
@@ -255,12 +255,12 @@ def _segment_starts(frames: Sequence[Sequence[Segment]]) -> set[int]:
 
 
 def _reordered(joined: Sequence[tuple[int, list[tuple[int, Segment]]]], position: dict[tuple[int, int], int]) -> int:
-    arrived, latest, reordered = set[int](), -1, 0
+    arrived_packets, latest, reordered = set[int](), -1, 0
     for _, group in joined:
         for index, (number, segment) in enumerate(group):
             order = position[number, segment.start]
-            reordered += index == 0 and order not in arrived and order < latest
-            if order not in arrived:
+            reordered += index == 0 and order not in arrived_packets and order < latest
+            if order not in arrived_packets:
                 latest = max(latest, order)
-            arrived.add(order)
+            arrived_packets.add(order)
     return reordered

@@ -1,4 +1,4 @@
-"""SSH servers on loopback in separate namespaces, with an empty home folder; their processes exit with them."""
+"""SSH servers on loopback in separate namespaces, with an empty home folder; the namespaces end all processes."""
 
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
@@ -9,7 +9,7 @@ from fieldkit.core.deadline import Deadline
 from tests.helpers.sshd import UP_S, Server, free_port, is_ssh_server, make_key, wait_until
 
 Command = Callable[[Path, int], Sequence[str]]
-"""Command line of a server, from the file of its host key in OpenSSH format and its port."""
+"""Returns the command line of a server, from its port and the file of its host key in OpenSSH format."""
 
 _WITH_SEPARATE_HOME = """
 mount -t tmpfs -o mode=700 tmpfs /root && mkdir -m 700 /root/.ssh &&
@@ -28,9 +28,11 @@ def openssh(host_key: Path, port: int) -> Sequence[str]:
 
 
 def dropbear(host_key: Path, port: int) -> Sequence[str]:
-    converted = host_key.with_name("dropbear")
-    subprocess.run(("dropbearconvert", "openssh", "dropbear", host_key, converted), capture_output=True, check=True)
-    return ("/usr/sbin/dropbear", "-F", "-E", "-s", "-r", str(converted), "-p", f"127.0.0.1:{port}")
+    converted_key = host_key.with_name("dropbear")
+    subprocess.run(
+        ("dropbearconvert", "openssh", "dropbear", host_key, converted_key), capture_output=True, check=True
+    )
+    return ("/usr/sbin/dropbear", "-F", "-E", "-s", "-r", str(converted_key), "-p", f"127.0.0.1:{port}")
 
 
 @contextmanager

@@ -47,12 +47,12 @@ def message_id_hex(message_id: int) -> str:
 
 
 def wait_for_streams(log: Path) -> None:
-    """Wait until the log has a message of each stream; losses before the first one are not visible in it."""
+    """Wait until the log has a message of each stream; the log does not show losses before the first message."""
     deadline_s = time.monotonic() + STREAMS_WITHIN_S
-    # The id of a message is in bytes 7 to 9 of its MAVLink 2 frame, which begins with 0xfd.
+    # The id of a message is in bytes 7 to 9 of its MAVLink 2 frame, which starts with 0xfd.
     headers = [re.compile(rb"\xfd.{6}" + re.escape(kind.to_bytes(3, "little")), re.DOTALL) for kind in PERIODIC]
     while not all(header.search(log.read_bytes()) for header in headers):
-        assert time.monotonic() < deadline_s, "a stream did not begin"
+        assert time.monotonic() < deadline_s, "a stream did not start"
         time.sleep(0.01)
 
 
@@ -64,7 +64,7 @@ def counters() -> dict[str, int]:
 
 
 def other_station(port: int, stop: threading.Event) -> None:
-    """Send commands as another ground station, whose acknowledgements the router withholds from the recorder."""
+    """Send commands as another ground station; the router does not forward their acknowledgements to the recorder."""
     sender = drones.Sender(255, 190)
     request = d.MAVLink_command_long_message(
         *(drones.SYSTEM, 1, d.MAV_CMD_REQUEST_MESSAGE, 0, d.MAVLINK_MSG_ID_AUTOPILOT_VERSION, *(0,) * 6)

@@ -1,7 +1,7 @@
 """A MAVLink forwarder with the behaviour of mavlink-router, between an autopilot on UDP and its clients.
 
 The UDP server answers only the client from which it received last. The TCP server has several clients. A COMMAND_ACK
-is forwarded only to the endpoint from which frames of its target were received.
+is forwarded only to endpoints that have sent frames with the system and component of its target.
 """
 
 import selectors
@@ -23,18 +23,18 @@ class MavlinkRouter:
 
     Args:
         autopilot: UDP port of the autopilot on loopback.
-        most_clients: Maximum number of TCP connections; 1 corresponds to the port of an autopilot.
+        max_clients: Maximum number of TCP connections; 1 is like the port of an autopilot.
 
     Attributes:
         udp: Port of the UDP server.
         tcp: Port of the TCP server.
         accepted: Number of accepted TCP connections.
-        withheld: Number of COMMAND_ACKs that were not forwarded to an endpoint.
+        withheld: Number of times that a COMMAND_ACK was not forwarded to an endpoint.
     """
 
-    def __init__(self, autopilot: int, most_clients: int = 100) -> None:
+    def __init__(self, autopilot: int, max_clients: int = 100) -> None:
         self._autopilot = ("127.0.0.1", autopilot)
-        self._max_clients = most_clients
+        self._max_clients = max_clients
         self.accepted = self.withheld = 0
         self._stopping = threading.Event()
         self._is_down = threading.Event()
@@ -61,13 +61,13 @@ class MavlinkRouter:
             if end is not None:
                 end.close()
 
-    def restart(self, lasts_s: float) -> None:
-        """Close all TCP connections, refuse new ones for that time, and then accept them again.
+    def restart(self, duration_s: float) -> None:
+        """Close all TCP connections, and refuse new ones for a time.
 
         Returns when the connections are closed.
         """
         self._is_down.clear()
-        self._down_until_s = time.monotonic() + lasts_s
+        self._down_until_s = time.monotonic() + duration_s
         assert self._is_down.wait(_CLOSE_LIMIT_S), "the router did not close its connections"
 
     @property

@@ -1,8 +1,8 @@
 """A flight with MAVProxy, run as a program on a robot: `python -m tests.helpers.mavproxy_flight HOST PORT LOSS`.
 
-The program types each MAVProxy command at a terminal after the result of the previous command was received. The link
-loses the share LOSS of the datagrams in each direction. A second connection without losses shows the real state of
-the drone. The program prints one line of JSON.
+The program types each MAVProxy command at a terminal after it has received the result of the previous command. The
+link loses the share LOSS of the datagrams in each direction. A second connection without losses shows the real state
+of the drone. The program prints one line of JSON.
 """
 
 import json
@@ -23,18 +23,18 @@ from typing import Any, Final
 
 from pymavlink import mavutil
 
-from tests.helpers.mavsdk_flight import CORNERS_M, HEIGHT_M, M_PER_DEGREE, PATIENCE_S, forward_with_losses, until
+from tests.helpers.mavsdk_flight import CORNERS_M, HEIGHT_M, M_PER_DEGREE, TIMEOUT_S, forward_with_losses, until
 
 PROGRAM: Final = Path(sys.executable).with_name("mavproxy.py")
 LOADED: Final = b"Loaded 4 waypoints in "
 ARMED: Final = b"COMPONENT_ARM_DISARM: ACCEPTED"
 DISARMED: Final = b"DISARMED"
-"""Output of MAVProxy after the drone has answered, and when it no longer reports that it is armed."""
+"""Output of MAVProxy when the drone has confirmed the command, and when the drone reports that it is disarmed."""
 _WAYPOINT: Final = 16
 _RELATIVE: Final = 3
 _RETRY_S: Final = 3.0
 NEAR_M: Final = 0.3
-"""The distance from a corner at which a mission continues to the next item."""
+"""Distance from a corner within which the mission continues to the next item."""
 
 
 @dataclass
@@ -117,8 +117,10 @@ def fly(port: int, state: DroneState) -> dict[str, object]:
     with tempfile.TemporaryDirectory() as folder, mavproxy(port, folder) as (type_line, output):
 
         def type_until(line: str, is_done: Callable[[], bool]) -> None:
-            """Type a line repeatedly until it has taken effect; MAVProxy sends a command once, and it may be lost."""
-            end_s, next_s = time.monotonic() + PATIENCE_S, 0.0
+            """Type a line repeatedly until it has taken effect; MAVProxy sends a command only once, and it may be
+            lost.
+            """
+            end_s, next_s = time.monotonic() + TIMEOUT_S, 0.0
             while not is_done():
                 if time.monotonic() > end_s:
                     raise TimeoutError(f"{line}: {output[-2000:].decode(errors='replace')}")
@@ -129,7 +131,7 @@ def fly(port: int, state: DroneState) -> dict[str, object]:
 
         until(lambda: b"Detected vehicle" in output)
         Path(folder, "corners.txt").write_text(mission(state.home), encoding="ascii")
-        # The answers to these two may be lost, and both can be repeated; a take-off in the air would be rejected.
+        # The answers to the first two commands may be lost, and both commands can be repeated.
         type_until("wp load corners.txt", lambda: LOADED in output and state.items == 1 + len(CORNERS_M))
         type_until("arm throttle", lambda: ARMED in output and state.armed)
         type_until(f"takeoff {HEIGHT_M:g}", lambda: state.place_m[2] > HEIGHT_M - 0.15)

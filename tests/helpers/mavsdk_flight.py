@@ -25,8 +25,8 @@ HEIGHT_M: Final = 1.0
 CORNERS_M: Final = ((0.0, 2.0), (2.0, 2.0), (2.0, 0.0))
 """Distances north and east of the take-off position."""
 M_PER_DEGREE: Final = 111_319.5
-"""Metres per degree near the equator and the prime meridian, to 1 %."""
-PATIENCE_S: Final = 60.0
+"""Metres per degree near the equator and the prime meridian, with an error of at most 1 %."""
+TIMEOUT_S: Final = 60.0
 UPLOADS: Final = 5
 NAN: Final = float("nan")
 
@@ -47,8 +47,8 @@ def forward_with_losses(client_socket: socket.socket, drone: tuple[str, int], lo
 
 
 def until(condition: Callable[[], bool]) -> None:
-    """Wait until a condition is true, for at most `PATIENCE_S`."""
-    end_s = time.monotonic() + PATIENCE_S
+    """Wait until a condition is true, for at most `TIMEOUT_S`."""
+    end_s = time.monotonic() + TIMEOUT_S
     while not condition():
         if time.monotonic() > end_s:
             raise TimeoutError(condition)
@@ -76,7 +76,7 @@ def corner(latitude: float, longitude: float, north_m: float, east_m: float) -> 
 
 
 def upload(mission: Mission, plan: MissionPlan) -> None:
-    """Upload a mission, repeatedly if it fails: MAVSDK never receives a last MISSION_ACK that was lost."""
+    """Upload a mission, and repeat a failed upload: the upload fails if the last MISSION_ACK is lost."""
     for _ in range(UPLOADS - 1):
         with suppress(MissionError):
             mission.upload_mission(plan)
@@ -85,7 +85,7 @@ def upload(mission: Mission, plan: MissionPlan) -> None:
 
 
 def request_positions(telemetry: Telemetry) -> None:
-    """Request positions at 20 Hz, which PX4 otherwise sends at 1 Hz; repeat a lost request."""
+    """Request positions at 20 Hz because PX4 sends them at 1 Hz by default; repeat a lost request."""
     for _ in range(UPLOADS - 1):
         with suppress(TelemetryError):
             telemetry.set_rate_position_velocity_ned(20.0)
@@ -97,7 +97,7 @@ def fly(url: str) -> dict[str, object]:
     """Fly the mission; return the observations."""
     mavsdk = Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION))
     mavsdk.add_any_connection(url)
-    system = mavsdk.first_autopilot(PATIENCE_S)
+    system = mavsdk.first_autopilot(TIMEOUT_S)
     action, mission, telemetry = Action(system), Mission(system), Telemetry(system)
     until(telemetry.health_all_ok)
     request_positions(telemetry)
@@ -108,10 +108,10 @@ def fly(url: str) -> dict[str, object]:
     home = telemetry.home()
     items = [corner(home.latitude_deg, home.longitude_deg, *corner_m) for corner_m in CORNERS_M]
     upload(mission, MissionPlan(items))
-    downloaded = mission.download_mission().mission_items
+    downloaded_items = mission.download_mission().mission_items
     nearest_m = [float("inf")] * len(CORNERS_M)
 
-    def finished() -> bool:
+    def is_finished() -> bool:
         position = telemetry.position_velocity_ned().position
         for number, (north_m, east_m) in enumerate(CORNERS_M):
             distance_m = ((position.north_m - north_m) ** 2 + (position.east_m - east_m) ** 2) ** 0.5
@@ -119,11 +119,11 @@ def fly(url: str) -> dict[str, object]:
         return bool(mission.is_mission_finished())
 
     mission.start_mission()
-    until(finished)
+    until(is_finished)
     action.land()
     until(lambda: not telemetry.armed())
     battery = telemetry.battery().remaining_percent
-    return {"nearest_m": nearest_m, "items": len(downloaded), "battery": battery}
+    return {"nearest_m": nearest_m, "items": len(downloaded_items), "battery": battery}
 
 
 def main(host: str, port: str, loss: str) -> None:

@@ -1,4 +1,4 @@
-"""All figures of an attempt's folder, computed without a plan: transfer, ping, captures, faults and testbed."""
+"""All figures of an attempt's evidence, computed without a plan: transfer, ping, captures, faults and testbed."""
 
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ def all_columns(figures_by_column: Measures) -> dict[str, Any]:
 
 
 def measure(folder: Path, transfer: Transfer | None) -> Measures:
-    """All figures from the evidence in `folder`; each column occurs once, either with a value or as missing."""
+    """All figures from the evidence in `folder`; each column either has a value or is missing."""
     evidence = AttemptEvidence(folder)
     pings = evidence.read_or_none(ping.read, ping.FILE)
     positions = evidence.read_or_none(track.read, track.FILE)

@@ -1,7 +1,7 @@
-"""Cells of the fault matrix of moving robots, and the expected behaviour and time limits of each, derived from rules.
+"""Cells of the fault matrix of moving robots, and rules for their expected behaviour and time limits.
 
-A cell is a kind of robot, one or two parties, a fault and a phase. The limit is the time within which the fault must
-be detected, plus the time in which the robot brakes or lands after that; all these times are constants here.
+A cell is a kind of robot, one or more parties, a fault and a phase. The limit is the time within which the fault must
+be detected, plus the time in which the robot then brakes or lands; all these times are constants in this module.
 """
 
 from dataclasses import dataclass
@@ -73,35 +73,35 @@ DELAY_S: Final = 3.5
 DRIVE_LEASE_S: Final = 2.0
 FLIGHT_LEASE_S: Final = 3.0
 BASE_S: Final = 0.5
-"""The base of a ground robot stops the robot this long after the last Twist."""
+"""Time after the last Twist at which the base of a ground robot stops the robot."""
 PEER_S: Final = 1.0
-"""Within this time, the pilot and the guard of a drone detect that the other does not run."""
+"""Time within which the pilot and the guard of a drone detect that the other does not run."""
 SERVER_S: Final = 0.5
-"""Within this time, a client detects that the link server does not run."""
+"""Time within which a client detects that the link server does not run."""
 OPERATOR_S: Final = 1.0
-"""Within this time, a robot obeys Ctrl-C or `fieldkit stop`."""
+"""Time within which a robot obeys Ctrl-C or `fieldkit stop`."""
 
 RESCUE_S: Final = 1.0
-"""Within this time, fieldkit detects that neither the pilot nor the guard of a drone runs."""
+"""Time within which fieldkit detects that neither the pilot nor the guard of a drone runs."""
 RESCUE_STARTS_S: Final = 2.0
 """Time from the detection to the first command: Python starts on the robot and receives a heartbeat, sent at 1 Hz."""
 
 NO_HEARTBEAT_S: Final = 60.0
-"""Programs that land a drone exit this long after their start if they receive nothing from the autopilot."""
+"""Time after which programs that land a drone exit if they receive nothing from the autopilot."""
 ENDS_S: Final = 5.0
 """`fieldkit abort` reaches the robot and waits 2 s for its jobs; the link server exits 1 s after its last client."""
 
 ALARM_S: Final = 15.0
-"""Within this time, fieldkit prints an alarm if a drone may be in the air and no program of fieldkit lands it."""
+"""Time within which fieldkit prints an alarm if a drone may be in the air and no program of fieldkit lands it."""
 
 DRIVE_SPEED_M_S: Final = 0.6
 DRIVE_ACCELERATION_M_S2: Final = 2.0
 FLIGHT_HEIGHT_M: Final = 3.0
 LAND_M_S: Final = 0.5
-"""The lower landing speed of the two autopilots: LAND_SPEED of ArduCopter; MPC_LAND_SPEED of PX4 is 0.7 m/s."""
+"""The lower landing speed of the two autopilots, LAND_SPEED of ArduCopter; MPC_LAND_SPEED of PX4 is 0.7 m/s."""
 
 LOAD_S: Final = 0.5
-"""Allowance for load: the programs of the robot are processes of the machine that runs the matrix."""
+"""Additional time for load, because the programs of the robot run on the same machine as the matrix."""
 TURN_S: Final = 0.1
 """One loop iteration of a program on the robot, at 20 or 10 Hz, and one check of the stored commands."""
 MODE_S: Final = 1.0
@@ -119,9 +119,10 @@ class Expectation:
     Attributes:
         detected_by: The program that detects the fault.
         does: The behaviour of the robot.
-        begins_s: A ground robot is stationary, or a drone descends, at most this long after the fault; None if it may
+        begins_s: Time limit after the fault for a ground robot to be stationary or for a drone to descend; None if it
+        may
             continue.
-        ends_s: A drone is on the ground at most this long after the fault; None if it may continue.
+        ends_s: Time limit after the fault for a drone to be on the ground; None if it may continue.
         alarm: True if fieldkit prints an alarm in capitals, unless the drone has landed.
         alarm_s: Time limit for the alarm, even if the drone lands; None for no limit.
         programs_s: Time limit for all programs of fieldkit on the robot to exit; None for no limit.
@@ -167,7 +168,7 @@ class MotionCell:
 
     @property
     def cuts_link(self) -> bool:
-        """True if the programs must lose their link to the autopilot and the flight log can show it."""
+        """True if the programs must lose their link to the autopilot and the flight log can show the loss."""
         link_parties = {*self.parties} & {Party.ROUTER, Party.SERVER}
         is_logged = Party.SERVER in link_parties or Party.PILOT not in self.parties
         return (
@@ -201,7 +202,7 @@ def _parties(craft: Craft) -> tuple[Party, ...]:
 
 
 def _is_valid_pair(pair: tuple[Party, Party]) -> bool:
-    """Return True if the pair can occur: a laptop that is off also stops its fieldkit and its end of the link."""
+    """Return True if the pair can occur. A laptop that is off also stops its fieldkit and its end of the link."""
     return not (Party.LAPTOP in pair and _CONTROL & {*pair} - {Party.LAPTOP}) and Party.OPERATOR not in pair
 
 
@@ -225,12 +226,12 @@ def _all_cells() -> tuple[MotionCell, ...]:
             for fault, moment in product(_PAIR_FAULTS, moments):
                 if all(fault in _PARTY_FAULTS.get(party, _ALL_FAULTS) for party in pair):
                     cells.append(MotionCell(craft, pair, fault, moment))
-        if craft.flies:  # only fieldkit can detect these
+        if craft.flies:  # only fieldkit can detect these faults
             cells += [MotionCell(craft, flight_programs, InjectedFault.SUSPEND, moment) for moment in moments]
             drone_programs = (*flight_programs, Party.SERVER)
             cells += [
-                MotionCell(craft, drone_programs, *blow_and_moment)
-                for blow_and_moment in product((InjectedFault.KILL, InjectedFault.SUSPEND), moments)
+                MotionCell(craft, drone_programs, *fault_and_moment)
+                for fault_and_moment in product((InjectedFault.KILL, InjectedFault.SUSPEND), moments)
             ]
             # The router is killed, and then a person runs `fieldkit abort`.
             router_and_operator = (Party.ROUTER, Party.OPERATOR)
@@ -311,7 +312,7 @@ def _flight_expectation(cell: MotionCell) -> Expectation:
 
 
 def _lands(detected_by: str, within_s: float, *, alarm: bool = False, alarm_s: float | None = None) -> Expectation:
-    """The expectation of a drone that lands after the fault was detected within a time."""
+    """The expectation of a drone that lands; the fault is detected within `within_s`."""
     begins_s = within_s + MODE_S + TURN_S + LOAD_S
     ends_s = begins_s + FLIGHT_HEIGHT_M / LAND_M_S + REST_S
     return Expectation(detected_by, "descends, lands", begins_s, ends_s, alarm, alarm_s=alarm_s)

@@ -1,4 +1,4 @@
-"""An emulated lab with a rover and two drones that drive or fly; fieldkit uses them like real robots."""
+"""An emulated lab with a rover that drives and two drones that fly; fieldkit uses them like real robots."""
 
 import os
 import shutil
@@ -94,7 +94,7 @@ _DRIVEN_PATHS: Final = {Moment.THERE: (1, 14), Moment.BACK: (6, 11)}
 _FLOWN_PATHS: Final = {Moment.THERE: (2, 14), Moment.BACK: (12, 8)}
 
 
-def profiles(folder: Path) -> None:
+def write_profiles(folder: Path) -> None:
     """Write the robot profiles to a lab's folder: a fast rover, and two drones, each with and without a router."""
     (folder / "robots").mkdir()
     rover = rover_profile(
@@ -122,7 +122,7 @@ class MotionLab:
     _routers: dict[Craft, "subprocess.Popen[str]"] = field(default_factory=dict)
 
     def role(self, craft: Craft) -> Role:
-        """The role of a robot in the lab, the key of its shell and link."""
+        """The role of a robot in the lab, which is the key of its shell and its link."""
         return _ROLES[craft]
 
     def robot(self, craft: Craft) -> EmulatedRobot:
@@ -154,9 +154,9 @@ class MotionLab:
         field_robots, craft = self.field_robots, cell.craft
         shutil.copytree(field_robots.folder / "robots", folder / "robots")
         lines = (field_robots.folder / SITE_FILE).read_text(encoding="utf-8").splitlines()
-        other = field_robots.cast[_ROLES[Craft.ROVER if craft.flies else Craft.PX4]].name
+        other_robot = field_robots.cast[_ROLES[Craft.ROVER if craft.flies else Craft.PX4]].name
         name = field_robots.cast[_ROLES[craft]].name
-        roles = f"roles: {{masterless: {{sender: {other}, receiver: {name}}}}}"
+        roles = f"roles: {{masterless: {{sender: {other_robot}, receiver: {name}}}}}"
         lines = [line for line in lines if not line.startswith("roles:")] + [roles]
         text = "\n".join(lines) + "\n"
         if cell.routed:
@@ -206,7 +206,7 @@ class MotionLab:
             process.stdout.close()
 
     def restore_lab(self, craft: Craft, folder: Path) -> list[str]:
-        """Restore the lab after a trial, as an operator would; return descriptions of what was left behind.
+        """Restore the lab after a trial, as an operator would; return descriptions of the processes that still ran.
 
         Args:
             craft: The robot that moved.
@@ -249,11 +249,11 @@ class MotionLab:
 @contextmanager
 def motion_lab(folder: Path) -> Iterator[MotionLab]:
     """Yield the lab in an empty folder; it stops at the latest when the calling thread ends."""
-    profiles(folder)
+    write_profiles(folder)
     (folder / "lab.yaml").write_text(_SITE, encoding="utf-8")
     with ExitStack() as stack:
         with pytest.MonkeyPatch.context() as monkeypatch:
-            monkeypatch.chdir(folder)  # profiles are loaded from here
+            monkeypatch.chdir(folder)  # profiles are loaded from the working folder
             field_robots = stack.enter_context(
                 start_field_robots(folder, site=folder / "lab.yaml", topology=Topology.MASTER)
             )

@@ -1,4 +1,4 @@
-"""Outcome of a trial of the fault matrix, and its differences from the expectation of the cell."""
+"""The outcome of a trial of the fault matrix, and its differences from the expectation of its cell."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -82,7 +82,7 @@ def problems(cell: MotionCell, outcome: MotionOutcome) -> list[str]:
     if not expectation.judged:
         return [*result, *_alarm_problems(expectation, outcome), *_program_problems(expectation, outcome)]
     name, scheduling_s = "descends" if cell.craft.flies else "stops", outcome.scheduling_s
-    if Party.FIELDKIT in cell.parties:  # the lease, which it does not renew, stops the robot without the command
+    if Party.FIELDKIT in cell.parties:  # it does not renew the lease, so the robot stops even without the command
         scheduling_s = min(scheduling_s, (FLIGHT_LEASE_S if cell.craft.flies else DRIVE_LEASE_S) - OPERATOR_S)
     result += _time_problems(name, expectation.begins_s, outcome.begins_s, scheduling_s)
     result += _time_problems("on the ground", expectation.ends_s, outcome.ends_s, scheduling_s)
@@ -96,15 +96,15 @@ def problems(cell: MotionCell, outcome: MotionOutcome) -> list[str]:
 
 
 def _time_problems(name: str, bound_s: float | None, value_s: float | None, scheduling_s: float) -> list[str]:
-    """Problems with the time of an event, with the bound on a machine with a free processor."""
+    """Problems with the time of an event; `bound_s` is the bound on a machine with a free processor."""
     if bound_s is None:
         return []
     if value_s is None:
         return [f"{name}: never, bound {bound_s:.1f} s"]
     if value_s <= bound_s + scheduling_s:
         return []
-    waited = f" and {scheduling_s:.1f} s without a processor" if scheduling_s else ""
-    return [f"{name} after {value_s:.1f} s, bound {bound_s:.1f} s{waited}"]
+    scheduling_text = f" and {scheduling_s:.1f} s without a processor" if scheduling_s else ""
+    return [f"{name} after {value_s:.1f} s, bound {bound_s:.1f} s{scheduling_text}"]
 
 
 def _program_problems(expectation: Expectation, outcome: MotionOutcome) -> list[str]:

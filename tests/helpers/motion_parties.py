@@ -1,4 +1,4 @@
-"""Processes of the parties of a motion trial on emulated robots, and signals to them."""
+"""The processes of the parties of a motion trial with emulated robots, and signals to these processes."""
 
 import json
 import os
@@ -10,7 +10,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Final
 
-from tests.helpers.host import alive, descendants
+from tests.helpers.host import descendants, is_running
 
 SLOW_STOPPED_S: Final = 0.2
 SLOW_RUNS_S: Final = 0.2
@@ -42,7 +42,7 @@ def command_line(pid: int) -> list[str]:
 
 
 def agents_on(robot_pid: int) -> dict[int, list[str]]:
-    """The programs of fieldkit that run on a robot: command and arguments by process id.
+    """The command and arguments of each program of fieldkit that runs on a robot, by process id.
 
     Args:
         robot_pid: The outermost process of the robot, the ancestor of all its processes.
@@ -50,7 +50,7 @@ def agents_on(robot_pid: int) -> dict[int, list[str]]:
     agents = {}
     for pid in descendants(robot_pid):
         argv = command_line(pid)
-        if not argv or not argv[0].rpartition("/")[2].startswith("python") or not alive(pid):
+        if not argv or not argv[0].rpartition("/")[2].startswith("python") or not is_running(pid):
             continue
         index = next((number for number, argument in enumerate(argv[:3]) if _is_agent(argument)), None)
         if index is not None:

@@ -1,4 +1,4 @@
-"""Markdown tables of the fault matrix: one per kind of robot, one row per parties and fault, over all phases."""
+"""Markdown tables of the fault matrix, one per kind of robot, with a row for each fault of one or more parties."""
 
 import statistics
 from collections.abc import Iterator, Sequence
@@ -62,14 +62,14 @@ def _rows(craft: Craft, outcomes: Sequence[MotionOutcome]) -> Iterator[str]:
             groups.setdefault((cell.parties, cell.fault), []).append((cell, outcome))
     order = list(dict.fromkeys((cell.parties, cell.fault) for cell in CELLS if cell.craft is craft))
     for key in sorted(groups, key=order.index):
-        (parties, fault), members = key, groups[key]
-        expectation = expected(next((cell for cell, _ in members if cell.moment not in AT_REST), members[0][0]))
+        (parties, fault), trials = key, groups[key]
+        expectation = expected(next((cell for cell, _ in trials if cell.moment not in AT_REST), trials[0][0]))
         cells = [", ".join(parties), _fault(parties, fault), expectation.detected_by, expectation.does]
-        cells += _times(expectation.begins_s, [(cell, outcome.begins_s) for cell, outcome in members])
+        cells += _times(expectation.begins_s, [(cell, outcome.begins_s) for cell, outcome in trials])
         if craft.flies:
-            cells += _times(expectation.ends_s, [(cell, outcome.ends_s) for cell, outcome in members])
-        beyond = sum(bool(outcome.problems) for _, outcome in members)
-        yield "| " + " | ".join([*cells, str(len(members)), str(beyond)]) + " |"
+            cells += _times(expectation.ends_s, [(cell, outcome.ends_s) for cell, outcome in trials])
+        beyond = sum(bool(outcome.problems) for _, outcome in trials)
+        yield "| " + " | ".join([*cells, str(len(trials)), str(beyond)]) + " |"
 
 
 def _fault(parties: Sequence[Party], fault: InjectedFault) -> str:
@@ -85,22 +85,22 @@ def _fault(parties: Sequence[Party], fault: InjectedFault) -> str:
 def _times(bound_s: float | None, times: Sequence[tuple[MotionCell, float | None]]) -> list[str]:
     """Bound, median and maximum in seconds; the maximum is `never` if an event did not occur."""
     bound = "" if bound_s is None else f"{bound_s:.1f}"
-    known_times = [value for _, value in times if value is not None]
-    if not known_times:
+    event_times_s = [value for _, value in times if value is not None]
+    if not event_times_s:
         return [bound, "", "never"]
     slowest = max(times, key=lambda entry: float("inf") if entry[1] is None else entry[1])
     maximum = "never" if slowest[1] is None else f"{slowest[1]:.1f}"
-    return [bound, f"{statistics.median(known_times):.1f}", f"{maximum} ({slowest[0].moment})"]
+    return [bound, f"{statistics.median(event_times_s):.1f}", f"{maximum} ({slowest[0].moment})"]
 
 
 def write(page: Path, text: str) -> None:
-    """Write tables into a page, between the markers.
+    """Replace the text between the markers of a page by tables.
 
     Raises:
         ValueError: The page has no markers.
     """
-    before, begin_marker, rest = page.read_text(encoding="utf-8").partition(BEGIN)
-    _, end_marker, after = rest.partition(END)
+    before, begin_marker, remainder = page.read_text(encoding="utf-8").partition(BEGIN)
+    _, end_marker, after = remainder.partition(END)
     if not begin_marker or not end_marker:
         raise ValueError(f"{page} has no {BEGIN} and {END}")
     page.write_text(f"{before}{BEGIN}\n\n{text}\n{END}{after}", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""One trial of a cell of the fault matrix: start it, inject the fault in its phase, and observe the robot."""
+"""A trial of a cell of the fault matrix: it starts a motion, injects the fault, and observes the robot."""
 
 import json
 import os
@@ -35,13 +35,13 @@ from tests.helpers.sshd import wait_until
 REACHES_S: Final = 60.0
 """Time limit for a trial to reach the phase of its cell."""
 OBSERVED_S: Final = 5.0
-"""Time of observation after a robot has stopped, and after the last suspended process continues."""
+"""Time of observation after the robot has stopped."""
 ENDS_S: Final = 45.0
 """Maximum time of observation of a running fieldkit until it exits."""
 ARRIVES_S: Final = 40.0
 """Maximum time of observation of a robot that does not stop or is not on the ground."""
 LOST_HZ: Final = 2.0
-"""Positions at a lower rate indicate a lost link: 10 Hz are requested, and the rate is averaged over 1 s."""
+"""A lower rate of positions indicates a lost link; 10 Hz are requested, and the rate is averaged over 1 s."""
 _PHASES: Final = {
     Moment.OUT: ("out",),
     Moment.THERE: ("there",),
@@ -65,7 +65,7 @@ while (beat is None or beat.base_mode & 128) and time.monotonic() < until_s:
 raise SystemExit(beat is None or bool(beat.base_mode & 128))
 """
 _CAPITALS: Final = re.compile(r"\b(?:[A-Z][A-Z'-]+[ ,:;.!]+){2,}[A-Z]{2,}")
-"""At least three words in capitals in a row."""
+"""At least three consecutive words in capitals."""
 
 
 @dataclass
@@ -95,7 +95,7 @@ class MotionTrial:
 
     def run(self) -> MotionOutcome:
         """Run the trial, and restore the lab."""
-        cell, craft, began_s = self.cell, self.cell.craft, time.monotonic()
+        cell, craft, started_s = self.cell, self.cell.craft, time.monotonic()
         self.lab.prepare(cell, self.folder)
         if cell.routed:
             self.lab.start_router(craft)
@@ -110,11 +110,11 @@ class MotionTrial:
                 self._observe(sampler, at_s)
                 outcome = self._outcome(sampler, at_s)
             except AssertionError as error:
-                outcome = MotionOutcome(cell.name, self.seed, problems=(f"{error}; {self._printed()[-300:]}",))
+                outcome = MotionOutcome(cell.name, self.seed, problems=(f"{error}; {self._read_output()[-300:]}",))
             finally:
                 self._end()
         leftovers = self.lab.restore_lab(craft, self.folder)
-        duration_s = round(time.monotonic() - began_s, 1)
+        duration_s = round(time.monotonic() - started_s, 1)
         return replace(outcome, problems=(*outcome.problems, *leftovers), took_s=duration_s)
 
     @property
@@ -136,7 +136,7 @@ class MotionTrial:
             raise AssertionError(f"{self.cell.moment} was not reached: {error}") from error
 
     def _in_phase(self, sampler: MotionSampler) -> bool:
-        """Return True if the robot is in the phase, by its log and by its ground-truth motion."""
+        """Return True if both the log and the ground-truth motion of the robot show the phase."""
         sample, moment = sampler.newest, self.cell.moment
         if sample is None:
             return False
@@ -172,7 +172,7 @@ class MotionTrial:
         return isinstance(rate_hz, float) and rate_hz < LOST_HZ
 
     def _inject(self) -> None:
-        """Apply the fault to the parties; an operator acts last."""
+        """Apply the fault to the parties, to the operator last."""
         assert self._process is not None
         fault, parties = self.cell.fault, {*self.cell.parties}
         pids = {pid for party in parties & {*ON_ROBOT} for pid in self._pids_on_robot(party)}
@@ -222,33 +222,33 @@ class MotionTrial:
         (self.folder / "stop").write_text(completed.result().out + completed.result().err, encoding="utf-8")
 
     def _observe(self, sampler: MotionSampler, at_s: float) -> None:
-        """Observe the robot until some time after it has stopped or landed; end a pause in time."""
+        """Observe the robot until some time after it has stopped or landed; undo a pause after `PAUSE_S`."""
         paused_until_s = at_s + PAUSE_S if self.cell.fault is InjectedFault.PAUSE else None
         is_suspended = self.cell.fault in {InjectedFault.SUSPEND, InjectedFault.STOP} and {
             Party.FIELDKIT,
             Party.LAPTOP,
         } & {*self.cell.parties}
-        rest_at_s: float | None = None
+        stopped_at_s: float | None = None
         while True:
             time.sleep(0.05)
             now_s = time.monotonic()
             self._logs |= self.lab.logs(self.cell.craft) - self._previous_logs  # collected logs are deleted
             self._link_lost = self._link_lost or (self.cell.cuts_link and self._is_link_lost())
-            if self._alarm_s is None and _CAPITALS.search(self._printed()):
+            if self._alarm_s is None and _CAPITALS.search(self._read_output()):
                 self._alarm_s = now_s - at_s
             if paused_until_s is not None and now_s >= paused_until_s:
                 self._undo_fault()
                 paused_until_s = None
-                rest_at_s = None
-            if rest_at_s is None and self._rest_s(sampler, at_s) is not None:
-                rest_at_s = now_s
+                stopped_at_s = None
+            if stopped_at_s is None and self._stopped_s(sampler, at_s) is not None:
+                stopped_at_s = now_s
             if paused_until_s is not None or self._programs_run(at_s):
                 continue
             is_running = self._process is not None and self._process.poll() is None and not is_suspended
-            observed_s = now_s - (rest_at_s if rest_at_s is not None else now_s)
-            if rest_at_s is None and now_s - at_s > ARRIVES_S:
+            observed_s = now_s - (stopped_at_s if stopped_at_s is not None else now_s)
+            if stopped_at_s is None and now_s - at_s > ARRIVES_S:
                 return
-            if rest_at_s is not None and observed_s > OBSERVED_S and (not is_running or observed_s > ENDS_S):
+            if stopped_at_s is not None and observed_s > OBSERVED_S and (not is_running or observed_s > ENDS_S):
                 return
 
     def _programs_run(self, at_s: float) -> bool:
@@ -261,7 +261,7 @@ class MotionTrial:
         self._programs_s = now_s - at_s
         return False
 
-    def _rest_s(self, sampler: MotionSampler, at_s: float) -> float | None:
+    def _stopped_s(self, sampler: MotionSampler, at_s: float) -> float | None:
         """Time after the fault at which the robot was stationary, or a drone was on the ground."""
         samples = list(sampler.samples)
         return (grounded_s if self.cell.craft.flies else stopped_s)(samples, at_s, self._remains_s)
@@ -277,12 +277,14 @@ class MotionTrial:
 
     def _outcome(self, sampler: MotionSampler, at_s: float) -> MotionOutcome:
         cell, samples = self.cell, list(sampler.samples)
-        rest_s = self._rest_s(sampler, at_s)
-        ends_s = rest_s if cell.craft.flies else None
-        begins_s = descended_s(samples, at_s) if cell.craft.flies else rest_s
-        again_m = 0.0 if rest_s is None else moved_again_m(samples, at_s + rest_s + STOPPED_FOR_S / 2)
+        stopped_after_s = self._stopped_s(sampler, at_s)
+        ends_s = stopped_after_s if cell.craft.flies else None
+        begins_s = descended_s(samples, at_s) if cell.craft.flies else stopped_after_s
+        again_m = (
+            0.0 if stopped_after_s is None else moved_again_m(samples, at_s + stopped_after_s + STOPPED_FOR_S / 2)
+        )
         code = self._process.poll() if self._process is not None else None
-        printed = self._printed()
+        printed = self._read_output()
         outcome = MotionOutcome(
             cell=cell.name,
             seed=self.seed,
@@ -307,7 +309,7 @@ class MotionTrial:
         completed = shell.run((sys.executable, "-c", _DISARM_CHECK), deadline=Deadline.after(LONG_S), check=False)
         return completed.exit_code == 0
 
-    def _printed(self) -> str:
+    def _read_output(self) -> str:
         """All output of fieldkit: notices in its JSON, errors, and the output of `fieldkit stop`."""
         printed = ""
         for name in ("out", "err", "stop"):
@@ -330,7 +332,7 @@ class MotionTrial:
 def scheduling_delay_s(pid: int) -> float:
     """Return the time for which the main thread of a process waited for a processor (Linux, /proc/PID/schedstat).
 
-    It is 0 if the process has ended.
+    It is 0 if the process has exited.
     """
     try:
         _, waited_ns, _ = Path(f"/proc/{pid}/schedstat").read_text(encoding="ascii").split()

@@ -18,16 +18,16 @@ STATIONARY_M_S: Final = 0.02
 STATIONARY_RAD_S: Final = 0.02
 """A robot whose speed and rate of turn are below these limits is stationary."""
 STOPPED_FOR_S: Final = 0.4
-"""A robot has stopped once it is stationary for this time; a new attempt sets it in motion after one second."""
+"""A robot has stopped if it is stationary for this time; a new attempt would set it in motion after one second."""
 STATIONARY_FOR_S: Final = 5.0
-"""The same for a robot that was stationary before the fault, which may start to move late."""
+"""The same for a robot that was stationary before the fault, because it may start to move late."""
 DESCENDS_M_S: Final = 0.1
-"""A drone descends if its vertical speed is below the negative of this."""
+"""A drone descends if its downward speed is greater than this."""
 GROUND_M: Final = 0.02
 """A drone is on the ground if it is stationary and at most this high above its start position."""
 MOVED_AGAIN_M: Final = 0.05
 TURNED_AGAIN_RAD: Final = 0.1
-"""A stopped robot moves again if it travels or turns farther than this."""
+"""A stopped robot moves again if it moves or turns by more than this."""
 
 
 class MotionSample(NamedTuple):
@@ -140,7 +140,7 @@ class MotionSampler:
         self.samples: list[MotionSample] = []
         self._record = record
         self._start_m = start_m
-        self._begun_ns = time.monotonic_ns()
+        self._started_ns = time.monotonic_ns()
         self._heading_rad: float | None = None
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="motion sampler", daemon=True)
@@ -162,7 +162,7 @@ class MotionSampler:
         while not self._stopping.wait(PERIOD_S):
             now_ns = time.monotonic_ns()
             record = self._record()
-            if record is None or record.time_ns < self._begun_ns:  # from before a relocation
+            if record is None or record.time_ns < self._started_ns:  # the record is older than the last placement
                 self.samples.append(MotionSample(now_ns / 1e9, *([0.0] * 7)))
             else:
                 self.samples.append(self._sample(record.at(now_ns), now_ns))

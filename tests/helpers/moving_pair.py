@@ -18,16 +18,16 @@ RANGE_M = 4.0
 PERIOD_NS = 3_700_001
 DELAY_NS = 1_234_567
 STEP_NS = 10_000
-"""So short that the position at the last step is practically the present position."""
+"""The step is so short that the position at the last step is practically the present position."""
 ENTERS_NS, LEAVES_NS = 3_529_411_765, 8_235_294_118
-"""Times at which the moving robot enters and leaves the range: 4 m before and after 10 m, at 1.7 m/s."""
+"""Times at which the moving robot enters and leaves the range, at 6 m and 14 m with 1.7 m/s."""
 END_NS = 10_000_000_000
 PAIR_END_NS = 5_000_000_000
 WINDOW_S = 0.05
 
 
 def moving_agents(first_ns: int = 0, step_ns: int = STEP_NS) -> Agents:
-    """A robot that drives straight over another one 10 m ahead of it, and publishes from `first_ns` on."""
+    """A robot that drives through the position of another, 10 m ahead, and publishes from `first_ns`."""
     physics = Paths(
         [
             WayPoints("a", [(0.0, 0.0, 0.0), (100.0, 0.0, 0.0)], SPEED_M_S),
@@ -39,7 +39,7 @@ def moving_agents(first_ns: int = 0, step_ns: int = STEP_NS) -> Agents:
 
 
 def moving_pair(policy: SyncPolicy) -> Coordinator:
-    """The two robots on links with a hard range limit."""
+    """The two robots, with links that exist only within a fixed range."""
     return Coordinator(moving_agents(), Disc(RANGE_M, DELAY_NS, extrapolates=True), policy, [("a", "b")])
 
 
@@ -71,4 +71,4 @@ class MovingPair:
         ).advance(PAIR_END_NS)
 
     def close(self) -> None:
-        """Do nothing: there are no external federates."""
+        """Do nothing, because there are no external federates."""

@@ -1,4 +1,4 @@
-"""Selection of the values of a parametrized test, and of the number of examples of a property, that CI runs."""
+"""Selects which values of a parametrized test, and how many examples of a property test, CI runs."""
 
 from collections.abc import Collection, Iterable
 from typing import TypeVar
@@ -15,7 +15,7 @@ def mark_nightly(values: Iterable[T], *, in_ci: Collection[T] = ()) -> list[T | 
 
     Args:
         values: All values of the parameter.
-        in_ci: The values that CI runs as well; if empty, the first of `values`.
+        in_ci: The values that CI also runs; if empty, the first of `values`.
     """
     all_values = list(values)
     ci_values = in_ci or all_values[:1]
@@ -23,7 +23,7 @@ def mark_nightly(values: Iterable[T], *, in_ci: Collection[T] = ()) -> list[T | 
 
 
 def examples(count: int) -> int:
-    """Number of examples of a property for `settings`: `count`, but in CI at most as many as in its profile."""
+    """The `max_examples` of a property test: `count`, but in CI at most the number in the profile of CI."""
     if settings.get_current_profile_name() != "ci":
         return count
     return min(count, settings.get_profile("ci").max_examples)

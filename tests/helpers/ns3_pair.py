@@ -43,10 +43,10 @@ def run_pair(folder: Path, network: str, changes: Mapping[str, Any]) -> Run:
 
 
 def reasons(run: Run) -> Counter[str]:
-    """Return the number of packets that have not arrived, by reason."""
+    """Return the number of packets that did not arrive, by reason."""
     return Counter(fate.reason for fate in run.fates.values() if fate.arrived_ns is None)
 
 
 def arrived(run: Run) -> list[Fate]:
-    """Return the packets that have arrived."""
+    """Return the fates of the packets that arrived."""
     return [fate for fate in run.fates.values() if fate.arrived_ns is not None]

@@ -1,8 +1,8 @@
-"""An unprivileged user in a separate mount namespace, with an account that the machine does not need to have.
+"""An unprivileged user whose account exists only in a separate mount namespace.
 
 The module runs as `unshare --mount -- python -m tests.helpers.ordinary_user SCRIPT WORD...`. SCRIPT runs as root and
-changes the mounts and files of the namespace; then the user runs the WORDs in the home directory. When the namespace
-ends, the machine is unchanged.
+changes the mounts and files of the namespace; then the user runs the command WORD... in the home directory. The
+changes disappear with the namespace.
 """
 
 import os
@@ -36,7 +36,7 @@ def environment() -> dict[str, str]:
 
 
 def main() -> None:
-    """Prepare the mount namespace and switch to the user."""
+    """Prepare the mount namespace, and run the command as the user."""
     mounts.isolate()
     Path("/root").chmod(0o755)  # the Python interpreter may be in there
     accounts = Path("/etc/passwd").read_text(encoding="utf-8")

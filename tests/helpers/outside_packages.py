@@ -1,4 +1,4 @@
-"""Metadata of packages that are installed next to fieldkit, as pip writes it."""
+"""Metadata of installed packages that extend fieldkit, as pip writes it."""
 
 from pathlib import Path
 

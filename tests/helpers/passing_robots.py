@@ -1,4 +1,4 @@
-"""Two robots that pass each other and exchange packets: a deterministic run, also as a killable program."""
+"""A deterministic run of two robots that pass each other and exchange packets; also a program that can be killed."""
 
 import resource
 import sys
@@ -20,7 +20,7 @@ from sim_backends.physics.paths import Paths
 from sim_backends.world.motion import WayPoints
 
 MS = 1_000_000
-ABOUT = RunSettings("robots: two\n", "sliding_window", {"window_s": 0.0033}, 1)
+SETTINGS = RunSettings("robots: two\n", "sliding_window", {"window_s": 0.0033}, 1)
 
 
 def passing_robots(observer: WindowObserver | None = None, policy: SyncPolicy | None = None) -> Coordinator:
@@ -71,7 +71,7 @@ def main(arguments: Sequence[str]) -> None:
     """Record an endless run to a folder, optionally with a maximum file size in bytes."""
     if limit_bytes := [int(argument) for argument in arguments[1:]]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes[0], limit_bytes[0]))
-    with RunRecorder(Path(arguments[0]), ABOUT, part_every_s=0.01) as recorder:
+    with RunRecorder(Path(arguments[0]), SETTINGS, part_every_s=0.01) as recorder:
         passing_robots(ProgressRecorder(recorder)).advance(10**18)
 
 

@@ -1,4 +1,4 @@
-"""The files that fieldkit had reported to the user before a power cut, compared with the disk after the cut."""
+"""Compares the files that fieldkit had reported to the user before a power cut with the disk after the cut."""
 
 import hashlib
 from collections.abc import Iterator
@@ -21,7 +21,8 @@ _MANIFEST: Final = "MANIFEST.sha256"
 
 @dataclass
 class VersionRecorder:
-    """Records all versions of files with their final name, and the version of each at the last report to the user.
+    """Records all versions of the files with a final name, and the version of each file at the last report to the
+    user.
 
     Args:
         folder: Folder of the trials; must exist before the first `record_versions`.
@@ -34,7 +35,7 @@ class VersionRecorder:
 
     def record_versions(self) -> None:
         """Record the present versions of all files."""
-        for name, content in visible(self.folder).items():
+        for name, content in final_files(self.folder).items():
             versions = self.versions.setdefault(name, [])
             if not versions or versions[-1] != content:
                 versions.append(content)
@@ -55,35 +56,35 @@ class PowerCut:
         disk: The disk after the cut.
         reported: For each file, the version at the last report to the user.
         is_over: True if the end of the trial had been reported.
-        at: Description of the time of the cut.
+        description: Description of the time of the cut.
     """
 
     disk: Disk
     reported: dict[str, int]
     is_over: bool
-    at: str
+    description: str
 
-    def lost(self, folder: Path, recorder: VersionRecorder) -> list[str]:
-        """Descriptions of lost or partial files on the disk after the cut.
+    def lost_files(self, folder: Path, recorder: VersionRecorder) -> list[str]:
+        """Descriptions of the files that are missing, old or incomplete on the disk after the cut.
 
         Args:
             folder: Folder of the trials on the repaired and mounted disk.
-            witness: The witness of the interrupted trial.
+            recorder: The recorder of the interrupted trial.
         """
-        remaining = visible(folder)
-        lost = [
-            f"{self.at}: {name} is {'older than reported' if name in remaining else 'missing'}"
+        remaining = final_files(folder)
+        problems = [
+            f"{self.description}: {name} is {'older than reported' if name in remaining else 'missing'}"
             for name, number in self.reported.items()
             if not _is_current(
                 remaining.get(name), recorder.versions[name][number:], grows=name.endswith(JOURNAL_FILE)
             )
         ]
-        lost += [
-            f"{self.at}: {name} is incomplete"
+        problems += [
+            f"{self.description}: {name} is incomplete"
             for name, content in remaining.items()
             if not name.endswith(JOURNAL_FILE) and content not in recorder.versions.get(name, [])
         ]
-        return lost + [f"{self.at}: {problem}" for problem in _lost_evidence(folder, recorder)]
+        return problems + [f"{self.description}: {problem}" for problem in _lost_evidence(folder, recorder)]
 
 
 def read_tree(folder: Path) -> dict[str, bytes | None]:
@@ -92,14 +93,14 @@ def read_tree(folder: Path) -> dict[str, bytes | None]:
     return {name: path.read_bytes() if path.is_file() else None for name, path in paths.items()}
 
 
-def visible(folder: Path) -> dict[str, bytes]:
-    """The content of each file below a folder that has its final name."""
+def final_files(folder: Path) -> dict[str, bytes]:
+    """The content of each file below a folder, without temporary files."""
     entries = read_tree(folder).items()
     return {name: content for name, content in entries if "/." not in f"/{name}" and content is not None}
 
 
 def _is_current(content: bytes | None, versions: list[bytes], *, grows: bool) -> bool:
-    """Return True if the content is that of the reported version or of a later one; a journal may be longer."""
+    """Return True if the content is the reported version or a later one; a journal may also be longer."""
     if content is None:
         return False
     reported = versions[0]
@@ -107,8 +108,8 @@ def _is_current(content: bytes | None, versions: list[bytes], *, grows: bool) ->
 
 
 def _lost_evidence(folder: Path, recorder: VersionRecorder) -> Iterator[str]:
-    """Yield differences between the evidence of ended attempts and the journal or manifest."""
-    remaining = visible(folder)
+    """Yield differences between the evidence of completed attempts and the journal or the manifest."""
+    remaining = final_files(folder)
     for path in folder.glob(f"*/{JOURNAL_FILE}"):
         try:
             entries = journal.ended_attempts(journal.read(path.parent))
@@ -131,16 +132,16 @@ def _lost_evidence(folder: Path, recorder: VersionRecorder) -> Iterator[str]:
 
 
 def assert_resumable(out: Path) -> None:
-    """Resume a trial after a cut; it must end complete, with all attempts that had ended or were measured."""
+    """Resume a trial after a cut; it must be completed and keep all attempts that had ended or were measured."""
     folder = trial_of(out)
     entries = journal.read(folder) if (folder / JOURNAL_FILE).is_file() else []
-    before, evidence = journal.ended_attempts(entries), visible(folder / "repeats")
+    before, evidence = journal.ended_attempts(entries), final_files(folder / "repeats")
     measured = [attempt for attempt in journal.interrupted_attempts(entries) if attempt.status is Status.MEASURED]
     resume_trial(folder, IdleTestbed(), lambda _: None)
     assert_complete(out)
     after = journal.ended_attempts(journal.read(folder))
     assert after[: len(before)] == before
-    assert evidence.items() <= visible(folder / "repeats").items()
+    assert evidence.items() <= final_files(folder / "repeats").items()
     is_valid = {(attempt.repeat, attempt.number): attempt.status is Status.VALID for attempt in after}
     for attempt in measured:
         assert is_valid[attempt.repeat, attempt.number] == (

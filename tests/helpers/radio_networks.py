@@ -18,12 +18,12 @@ MS = 1_000_000
 IN_THE_OPEN = RadioOptions(fading=False, mode="g6")
 """Deterministic except for contention and bit errors; nearby stations have no bit errors."""
 ANTENNA = Antenna("802.11g", 15.0, -85.0)
-"""Has a range of about 70 m with a path loss exponent of 3."""
+"""An antenna with a range of about 70 m for a path loss exponent of 3."""
 
 
 @dataclass
 class Outcome:
-    """The fate of packets, by their identity."""
+    """The arrival time or drop reason of packets, by their identity."""
 
     arrived: dict[tuple[str, int], int] = field(default_factory=dict)
     dropped: dict[tuple[str, int], str] = field(default_factory=dict)
@@ -47,7 +47,7 @@ def standing(places_m: Mapping[str, Vector]) -> dict[str, State]:
 def packets(
     sends: Sequence[tuple[int, str, str, int]], *, protocol: str = "udp", flow: str | None = None
 ) -> list[Packet]:
-    """Packets from (time, source, destination, size), in order; each pair has a separate flow without `flow`."""
+    """Packets from tuples of time, source, destination and size; without `flow`, each pair has a separate flow."""
     result: list[Packet] = []
     numbers: dict[str, int] = {}
     for packet_id, (at_ns, source, destination, size_bytes) in enumerate(sends, start=1):
@@ -77,16 +77,16 @@ def carry(
     *,
     to_ns: int = 1000 * 10**9,
 ) -> Outcome:
-    """The fate of packets; a packet must not end twice."""
+    """Send packets over a network; return their outcome."""
     arrivals, drops = net.advance(to_ns, sent, states)
     return outcome(sent, arrivals, drops)
 
 
 def outcome(sent: Sequence[Packet], arrivals: Sequence[Arrival], drops: Sequence[Drop]) -> Outcome:
-    """Arrivals and drops by identity."""
+    """The outcome of sent packets; each must arrive or be dropped at most once."""
     by_id = {packet.packet_id: packet for packet in sent}
     packet_ids = [event.packet_id for event in arrivals] + [event.packet_id for event in drops]
-    assert len(packet_ids) == len(set(packet_ids)), "a packet ended twice"
+    assert len(packet_ids) == len(set(packet_ids)), "a packet arrived or was dropped twice"
     for arrival in arrivals:
         assert arrival.receiver == by_id[arrival.packet_id].destination
     assert [event.at_ns for event in arrivals] == sorted(event.at_ns for event in arrivals)

@@ -1,4 +1,4 @@
-"""A small hand-written trial on disk whose packets, replies and journal entries are all known."""
+"""A small synthetic trial on disk whose packets, replies and journal entries are known."""
 
 import struct
 from collections.abc import Callable, Sequence
@@ -40,7 +40,7 @@ def segment(number: int, payload_bytes: int) -> bytes:
 
 def make(out: Path, *, packets: int = PACKETS, lost: Sequence[int] = LOST) -> Path:
     """Write the folder of a trial with one repeat whose first attempt is void."""
-    from tests.ros.bags.test_measure_bag import write_bag  # noqa: PLC0415 (a copy without ROS lacks it)
+    from tests.ros.bags.test_measure_bag import write_bag  # noqa: PLC0415 (copies of the repository without ROS do not have this module)
 
     plan = los_plan(repeats=1, protocols=(Protocol.UDP,), record_s=2.0)
     return make_of(
@@ -49,7 +49,7 @@ def make(out: Path, *, packets: int = PACKETS, lost: Sequence[int] = LOST) -> Pa
 
 
 def make_plain(out: Path) -> Path:
-    """Write the folder of a trial like that of `make` that sends a generated file in place of a bag."""
+    """Write the folder of a trial like that of `make`, but it sends a generated file in place of a bag."""
     plan = plain_plan(repeats=1, protocols=(Protocol.UDP,))
     return make_of(plan, out, lambda folder: (folder / "send.bin").write_bytes(bytes(100_000)))
 
@@ -86,13 +86,17 @@ def write_evidence(folder: Path, start_ns: int, packets: int, lost: Sequence[int
     """Write the evidence of a repeat: the transfer starts after 2 s, the ping after 3 s; one packet arrives twice."""
     folder.mkdir()
     (folder / "recv.bag").touch()
-    sent = [Frame(start_ns + 2 * SECOND_NS + 1_000_000 * index, packet(index), 1042) for index in range(packets)]
-    received = [
-        Frame(frame.time_ns + AHEAD_NS, frame.data, 1042) for index, frame in enumerate(sent) if index not in lost
+    sent_frames = [
+        Frame(start_ns + 2 * SECOND_NS + 1_000_000 * index, packet(index), 1042) for index in range(packets)
     ]
-    received.append(Frame(received[-1].time_ns + 1_000_000, packet(REPEATED), 1042))
-    (folder / "sender.pcap").write_bytes(file_bytes(sent))
-    (folder / "receiver.pcap").write_bytes(file_bytes(received))
+    received_frames = [
+        Frame(frame.time_ns + AHEAD_NS, frame.data, 1042)
+        for index, frame in enumerate(sent_frames)
+        if index not in lost
+    ]
+    received_frames.append(Frame(received_frames[-1].time_ns + 1_000_000, packet(REPEATED), 1042))
+    (folder / "sender.pcap").write_bytes(file_bytes(sent_frames))
+    (folder / "receiver.pcap").write_bytes(file_bytes(received_frames))
     replies = [
         f"[{start_ns // SECOND_NS + 3}.{200_000 * (seq - 1):06}] 8200 bytes from {RECEIVER}: icmp_seq={seq} ttl=64 "
         f"time={rtt_ms:.3f} ms"

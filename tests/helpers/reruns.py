@@ -1,4 +1,4 @@
-"""A pytest plugin that repeats failed tests of real programs once, and fails a run with too many repetitions."""
+"""A pytest plugin that repeats failed tests of real programs once, and fails a run that has too many repetitions."""
 
 from collections.abc import Generator
 from pathlib import Path
@@ -9,7 +9,7 @@ import pytest
 from tests.helpers.host import LeakError
 
 ALLOWED: Final = 1
-"""Number of second tries that a run may have; find the cause of each."""
+"""Number of second tries that a run may have."""
 
 _FAILED: Final = pytest.StashKey[bool]()
 
@@ -18,7 +18,7 @@ class _Count:
     """Counts second tries in the process that collects all reports.
 
     Attributes:
-        tries: The tests that had a second try, in order; those of earlier parts of the run come first.
+        tries: The tests that had a second try, in order, starting with those of earlier parts of the run.
     """
 
     def __init__(self, log: Path | None) -> None:
@@ -39,7 +39,7 @@ class _Count:
 
     @pytest.hookimpl(trylast=True)
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
-        """Show why tests ran twice, and whether too many did."""
+        """Show why tests ran twice, and list them if they are too many."""
         for report in terminalreporter.stats.get("rerun", []):
             terminalreporter.section(f"first try of {report.nodeid}")
             terminalreporter.write_line(report.longreprtext)
@@ -67,7 +67,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Store whether the test failed, before its fixtures are torn down."""
+    """Store the result of the test before its fixtures are torn down."""
     report = yield
     if report.when != "teardown":
         item.stash[_FAILED] = report.failed
@@ -78,11 +78,11 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
 def pytest_runtest_teardown(item: pytest.Item) -> None:
     """Tear down the module fixtures of a failed test, so that its second try uses a new lab."""
     if item.stash.get(_FAILED, False):
-        item.session._setupstate.teardown_exact(item.session)  # type: ignore[arg-type]  # a session is a node with parents too
+        item.session._setupstate.teardown_exact(item.session)  # type: ignore[arg-type]  # a session is a node too
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Allow tests of real programs or of timing a second try, but not if a process or file was left behind."""
+    """Allow a second try of tests of real programs and of timing, except after a `LeakError`."""
     for item in items:
         if item.get_closest_marker("emulated") or item.get_closest_marker("quiet"):
             item.add_marker(pytest.mark.flaky(reruns=1, rerun_except=LeakError.__name__))

@@ -1,4 +1,4 @@
-"""A lab with a ground robot that drives, `rover-1`, and `box-1` next to it; fieldkit uses them like real robots."""
+"""A lab with a ground robot that drives, `rover-1`, and a computer, `box-1`; fieldkit uses them like real robots."""
 
 import math
 import subprocess
@@ -26,7 +26,7 @@ SPEED_M_S: Final = 0.6
 _SITE: Final = texts.site({"rover-1": "rover", "box-1": "box"}, emulated="ros: auto")
 _ROLES: Final = "roles: {masterless: {sender: rover-1, receiver: box-1}}"
 RECEIVER_SITE: Final = "receiver.yaml"
-"""Site file in which the rover is the receiver, whose position is the same for all distances."""
+"""Site file in which the rover is the receiver; the receiver has the same position at all distances."""
 _DRIVE: Final = """\
 name: drive
 summary: A robot drives away
@@ -105,7 +105,7 @@ class RoverLab:
         self.field_robots.testbed.place(Placement(Scenario.LOS, Topology.MASTERLESS, parse_distance(distance)))
 
     def wait_until_it_drives(self, process: "subprocess.Popen[str]") -> None:
-        """Wait until the rover drives in a started run, which must not end before."""
+        """Wait until the rover drives in a started run; raise AssertionError if the run ends earlier."""
         wait_during(process, lambda: self.drives, within_s=2 * LONG_S)
 
     def drive_forward(self, distance_m: float) -> None:
@@ -135,6 +135,6 @@ def rover_lab(folder: Path, *, fence_m: float = 30.0, lease_s: float = 2.0) -> I
     (folder / "lab.yaml").write_text(_SITE, encoding="utf-8")
     with chdir(folder), start_field_robots(folder, site=folder / "lab.yaml") as field_robots:
         site = (folder / SITE_FILE).read_text(encoding="utf-8")
-        swapped = replace_text(site, _ROLES, "roles: {masterless: {sender: box-1, receiver: rover-1}}")
-        (folder / RECEIVER_SITE).write_text(swapped, encoding="utf-8")
+        receiver_site = replace_text(site, _ROLES, "roles: {masterless: {sender: box-1, receiver: rover-1}}")
+        (folder / RECEIVER_SITE).write_text(receiver_site, encoding="utf-8")
         yield RoverLab(field_robots)

@@ -1,4 +1,4 @@
-"""Runs fieldkit like its users: as a command in a separate folder."""
+"""Runs fieldkit as users do, as a command in a separate folder."""
 
 import csv
 import json
@@ -68,7 +68,8 @@ def wait_during(process: "subprocess.Popen[str]", condition: Callable[[], bool],
     """Wait until a condition is true while a started run continues.
 
     Raises:
-        AssertionError: The run ended earlier, or the time is over; the message has its output, and the run is killed.
+        AssertionError: The run ended earlier, or the time limit expired. The message has the output, and the run is
+        killed.
     """
     deadline_s = time.monotonic() + within_s
     while not condition():
@@ -97,7 +98,7 @@ def fieldkit(lab: Path, *arguments: str) -> Run:
 def run_here(folder: Path, *arguments: str) -> Run:
     """Run `fieldkit` with `arguments` in a folder, in this process, which saves half a second of processor time.
 
-    For tests that need no separate process. Without `--jobs`, the command starts no workers, as on one processor.
+    Tests that need no separate process use it. Without `--jobs`, the command starts no workers, as on one processor.
     Only one thread may run commands, because the working folder and the standard streams belong to the process.
     """
     out, err = StringIO(), StringIO()
@@ -108,7 +109,7 @@ def run_here(folder: Path, *arguments: str) -> Run:
 
 
 def only_trial(lab: Path) -> Path:
-    """The only trial of a lab; fieldkit killed while it created a folder leaves one without a plan."""
+    """The only trial of a lab, without folders without a plan, which fieldkit leaves if it is killed early."""
     (plan,) = (lab / "trials").glob(f"*/{PLAN_FILE}")
     return plan.parent
 

@@ -1,4 +1,4 @@
-"""A wire for transport tests: a constant delay, a rate, and a script for the fate of each packet."""
+"""A wire for tests of transports, with a constant delay, a rate, and a script for the fate of each packet."""
 
 import heapq
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -17,8 +17,8 @@ normal delivery, `()` is a loss, and `(0, 5)` is a duplicate that arrives 5 ns l
 _SECOND_NS = 1_000_000_000
 
 
-def losing(numbers: Mapping[str, Collection[int]]) -> Script:
-    """A script that loses exactly the packets with the given indices, per source."""
+def lose_packets(numbers: Mapping[str, Collection[int]]) -> Script:
+    """A script that loses only the packets with the given indices of each source."""
     return lambda packet, _, number: () if number in numbers.get(packet.source, ()) else (0,)
 
 
@@ -29,7 +29,7 @@ class Transmitted:
     Attributes:
         at_ns: The time at which it was passed to the wire.
         packet: The packet.
-        arrived: True if at least one copy arrives.
+        arrives: True if at least one copy arrives.
     """
 
     at_ns: int

@@ -1,4 +1,4 @@
-"""Intervals of a single cell; the functions under test compute many at the same time."""
+"""Intervals of single cells; the functions under test compute the intervals of many cells at the same time."""
 
 import math
 

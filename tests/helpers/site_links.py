@@ -1,4 +1,4 @@
-"""Links of a built site: each target must be a file of the site, and each anchor must exist in it."""
+"""Checks the links of a built site: each target must be a file of the site, and each anchor must exist in it."""
 
 from dataclasses import dataclass, field
 from html.parser import HTMLParser
@@ -13,7 +13,7 @@ _LINK_ELEMENTS: Final = {"a"}
 
 @dataclass(frozen=True)
 class Page:
-    """The links of a page with their elements, and its anchors."""
+    """The links of a page, as pairs of element and target, and its anchors."""
 
     links: list[tuple[str, str]] = field(default_factory=list)
     anchors: set[str] = field(default_factory=set)
@@ -37,7 +37,7 @@ def read(path: Path) -> Page:
     return page
 
 
-def broken(site: Path) -> list[str]:
+def broken_links(site: Path) -> list[str]:
     """All broken links of a site, and all resources that a page loads from other sites."""
     pages = {path.resolve(): read(path) for path in site.rglob("*.html") if path.name != "404.html"}
     problems = []

@@ -1,7 +1,7 @@
 """Minimal runs of the benchmarks: `python -m tests.helpers.smallest NAME FOLDER` runs one in an empty folder.
 
-A run shows that the benchmark still works; its figures have no meaning. Replacing a constant that does not exist is
-an error.
+A run shows that the benchmark still works; its figures have no meaning. It is an error to replace a constant that
+does not exist.
 """
 
 import os
@@ -38,7 +38,7 @@ class MinimalRun:
     emulated: bool = False
 
 
-LONGEST_S: Final = 600.0
+TIMEOUT_S: Final = 600.0
 
 
 def run_module(*arguments: str) -> "subprocess.CompletedProcess[str]":
@@ -49,7 +49,7 @@ def run_module(*arguments: str) -> "subprocess.CompletedProcess[str]":
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
-        timeout=LONGEST_S,
+        timeout=TIMEOUT_S,
         check=False,
     )
 
@@ -62,7 +62,7 @@ def run_minimally(name: str, folder: Path) -> None:
     """
     completed = run_module("tests.helpers.smallest", name, str(folder))
     assert completed.returncode == 0, completed.stderr[-3000:]
-    assert any(character.isdigit() for character in completed.stdout), "a benchmark prints figures"
+    assert any(character.isdigit() for character in completed.stdout), "a benchmark must print figures"
 
 
 def replace(module: ModuleType, name: str, value: object) -> None:
@@ -115,8 +115,8 @@ def _two_bridge_paths(module: ModuleType, folder: Path) -> None:
 def _slow_iperf(module: ModuleType, folder: Path) -> None:
     """Limit the rate of iperf3, which would otherwise load all cores."""
     del folder
-    at_full_rate = module.iperf
-    replace(module, "iperf", lambda client, seconds, *options: at_full_rate(client, seconds, *options, "-b", "5M"))
+    unlimited_iperf = module.iperf
+    replace(module, "iperf", lambda client, seconds, *options: unlimited_iperf(client, seconds, *options, "-b", "5M"))
 
 
 def _small_swarm(module: ModuleType, folder: Path) -> None:
@@ -152,7 +152,7 @@ def _one_setting(module: ModuleType, folder: Path) -> None:
 
 
 def _one_trial(module: ModuleType, folder: Path) -> None:
-    """Reduce `field_shape` to one trial of one repeat for each protocol."""
+    """Reduce `field_shape` to one trial with one repeat of each protocol."""
     lab = folder / "lawn"
     shutil.copytree(module.LAB, lab)
     path = lab / "masterless-los.yaml"

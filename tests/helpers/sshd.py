@@ -1,4 +1,4 @@
-"""A real OpenSSH server on loopback with newly generated keys."""
+"""An OpenSSH server on loopback with newly generated keys."""
 
 import random
 import shutil
@@ -80,8 +80,8 @@ def sshd(folder: Path, *, within: Sequence[str] = (), **options: str) -> Iterato
     """Run sshd on loopback with its files in `folder`.
 
     Args:
-        folder: Receives the keys and the log.
-        within: Words before its command line.
+        folder: Folder for the keys and the log.
+        within: Words that precede its command line.
         options: Options of sshd_config in addition to the required ones.
     """
     host_key = make_key(folder / "host")

@@ -1,4 +1,4 @@
-"""Stations on one radio channel with manually set signal strengths, and saturated traffic between them."""
+"""Stations on one radio channel with given signal strengths, and saturated traffic between them."""
 
 from collections.abc import Sequence
 
@@ -16,7 +16,7 @@ HEADERS_BYTES = 28
 
 
 class FixedPowers(RadioChannel):
-    """A channel where all stations receive each other equally well, except the pairs in `deaf`."""
+    """A channel on which all stations receive each other equally well, except the pairs in `without_link`."""
 
     def __init__(self, names: Sequence[str], mode: WifiMode, *, without_link: Sequence[tuple[str, str]] = ()) -> None:
         self.names = tuple(names)
@@ -57,13 +57,13 @@ def saturate(
     wifi: Wifi[str] = Wifi(channel, seed)
     wifi.log_attempts(None if log is None else log.append)
     wifi.set_relay(relay)
-    arrived = dict.fromkeys(senders, 0)
+    arrived_packets = dict.fromkeys(senders, 0)
     for name in senders:
         for _ in range(queued):
             wifi.send(0, name, name, payload_bytes + HEADERS_BYTES, receiver)
     end_ns = round(seconds * 1e9)
     while (now_ns := wifi.next_event_ns()) is not None and now_ns < end_ns:
         for at_ns, _, name, _, _ in wifi.deliveries(now_ns):
-            arrived[name] += 1
+            arrived_packets[name] += 1
             wifi.send(at_ns, name, name, payload_bytes + HEADERS_BYTES, receiver)
-    return {name: count * payload_bytes * 8 / seconds for name, count in arrived.items()}
+    return {name: count * payload_bytes * 8 / seconds for name, count in arrived_packets.items()}

@@ -1,7 +1,7 @@
-"""All outputs of fieldkit for the stored trials as texts, for comparisons between versions of the code.
+"""All outputs of fieldkit for the stored trials as texts, for comparisons between versions of fieldkit.
 
-Run this file with the Python of the version to record: `python -P tests/helpers/stored_trials.py FOLDER` writes the
-texts to FOLDER. It imports no test modules, so any version can run it.
+`python -P tests/helpers/stored_trials.py FOLDER` writes the texts to FOLDER. Run it with the Python in whose
+environment the version to record is installed. It imports no test modules, so each version can run it.
 """
 
 import contextlib
@@ -31,11 +31,11 @@ TRIALS: Final = STORED / "trials"
 OUTPUTS: Final = STORED / "outputs"
 
 _SKIPPED_ELEMENTS: Final = frozenset(("style", "script", "svg"))
-"""Elements of the page whose text is not prose, such as the letters that matplotlib draws."""
+"""Elements of the page without prose, such as the letters that matplotlib draws."""
 
 
 @contextlib.contextmanager
-def copied(folder: Path) -> Iterator[list[Path]]:
+def copy_trials(folder: Path) -> Iterator[list[Path]]:
     """Copy the stored trials to `folder`/trials, change to `folder`, and yield their relative paths by time."""
     shutil.copytree(TRIALS, folder / "trials")
     with contextlib.chdir(folder):
@@ -43,7 +43,7 @@ def copied(folder: Path) -> Iterator[list[Path]]:
 
 
 def texts(trials: Sequence[Path]) -> Iterator[tuple[str, str]]:
-    """Yield the name and text of each output; the working folder is that of `copied`.
+    """Yield the name and text of each output; the working folder is that of `copy_trials`.
 
     `trials` contains the lossless run, the lossy run, and others, in the order in which they are stored.
     """
@@ -120,12 +120,12 @@ def _timeline(trial: Path) -> dict[str, Any]:
 
 
 def _float(text: str) -> float:
-    """A number with 12 digits: numpy sums in a different order on processors with wider vectors."""
+    """A number with 12 digits, because numpy sums in a different order on processors with wider vectors."""
     return float(f"{float(text):.12g}")
 
 
 class _Page(HTMLParser):
-    """Collects the texts, links and bar lengths of a page, one per line."""
+    """Collects the texts, links and bar lengths of a page as lines."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -174,8 +174,8 @@ def _figures(report_contents: contents.Contents) -> Iterator[dict[str, Any]]:
             }
 
 
-def _plain(value: Any) -> Any:  # noqa: ANN401 (whatever a chart is made of)
-    """Lists, texts and numbers with 9 digits, without field names, so that names and processors have no effect."""
+def _plain(value: Any) -> Any:  # noqa: ANN401 (any part of a chart)
+    """A value as lists, texts and numbers with 9 digits, so that field names and processors have no effect."""
 
     if dataclasses.is_dataclass(value):
         values = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
@@ -203,6 +203,6 @@ def _leaves(value: Any) -> Iterator[str | float | None]:  # noqa: ANN401 (what `
 if __name__ == "__main__":
     target = Path(sys.argv[1]).resolve()
     target.mkdir(exist_ok=True)
-    with tempfile.TemporaryDirectory() as place, copied(Path(place)) as found_trials:
-        for file_name, text in texts(found_trials):
+    with tempfile.TemporaryDirectory() as place, copy_trials(Path(place)) as copied_trials:
+        for file_name, text in texts(copied_trials):
             (target / file_name).write_text(text, encoding="utf-8")

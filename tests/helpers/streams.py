@@ -1,4 +1,4 @@
-"""Captures of one stream at both robots; scapy builds the packets, and the test decides which arrive."""
+"""Captures of one stream at both robots; scapy builds the packets, and the test selects which packets arrive."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -13,13 +13,13 @@ SECOND = 1_000_000_000
 MS = 1_000_000
 START = 1_700_000_000 * SECOND
 ISN = 2**32 - 1500
-"""Initial sequence number; sequence numbers wrap early in the stream."""
+"""Initial sequence number, so high that sequence numbers wrap early in the stream."""
 SEGMENT_BYTES = 1000
 
 
 @dataclass
 class Stream:
-    """Frames of both captures; times are in ns since the start, on one clock; packets arrive after a delay."""
+    """Frames of both captures. Times are in ns since the start, on one clock; packets arrive after a delay."""
 
     delay_ns: int = 2 * MS
     sport: int = 40000
@@ -50,8 +50,8 @@ class Stream:
         ip_header = IP(src=self.source, dst=self.destination, id=1 + len(self.sender) % 65535)
         self._add(ip_header / tcp_header / Raw(payload), at_ns, arrives=arrives)
 
-    def opens(self, at_ns: int = 0, *, lost: Sequence[int] = ()) -> None:
-        """Perform a TCP handshake; `lost` are the earlier times at which a lost SYN was sent."""
+    def handshake(self, at_ns: int = 0, *, lost: Sequence[int] = ()) -> None:
+        """Perform a TCP handshake; `lost` has the earlier times at which a lost SYN was sent."""
         for lost_ns in lost:
             self.forward(lost_ns, ISN, "S", arrives=False)
         self.forward(at_ns, ISN, "S")
@@ -71,7 +71,7 @@ class Stream:
         self._add(IP(src=self.destination, dst=self.source, id=number + 1) / ack, at_ns, arrives=True, is_reply=True)
 
     def datagram(self, number: int, at_ns: int, *, size: int = 1000, arrives: bool = True, mtu: int = 1500) -> None:
-        """Send a datagram, in fragments if it exceeds the MTU; of a lost datagram, only the last fragment is lost."""
+        """Send a datagram, in fragments if it exceeds the MTU; if it is lost, only its last fragment is lost."""
         payload = number.to_bytes(8, "big") * (size // 8)
         ip_header = IP(src=self.source, dst=self.destination, id=1 + number % 65535)
         packet = ip_header / UDP(sport=self.sport, dport=self.port) / Raw(payload)

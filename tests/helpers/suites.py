@@ -1,4 +1,4 @@
-"""Test suites in separate folders, run by the pytest command as their authors would."""
+"""Test suites in separate folders, run with the pytest command as their authors would run them."""
 
 import os
 import subprocess
@@ -76,13 +76,13 @@ def run(
         timeout=LIMIT_S,
         check=False,
     )
-    ended: dict[str, str] = {}
+    results: dict[str, str] = {}
     properties: dict[str, list[tuple[str, str]]] = {}
     for case in ET.parse(report).iter("testcase") if report.exists() else ():
         name = case.attrib["name"]
-        ended[name] = next(
+        results[name] = next(
             (element.tag for element in case if element.tag in {"failure", "error", "skipped"}), "passed"
         )
         properties[name] = [(element.attrib["name"], element.attrib["value"]) for element in case.iter("property")]
     report.unlink(missing_ok=True)
-    return SuiteRun(completed.returncode, completed.stdout, ended, properties)
+    return SuiteRun(completed.returncode, completed.stdout, results, properties)

@@ -1,4 +1,4 @@
-"""Trials that consist only of their tables, the input of `aggregate` and similar commands."""
+"""Tables of trials without the other files of a trial, as input of `aggregate` and similar commands."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ from fieldkit.trial.columns import trial_columns
 
 
 class RepeatRow(dict[str, Any]):
-    """A row of trial.csv, with columns also as attributes; a missing column has no key, and its attribute is None."""
+    """A row of trial.csv. Columns are also attributes; an empty column has no key, and its attribute is None."""
 
     def __init__(self, **values: object) -> None:
         super().__init__({name: value for name, value in values.items() if value is not None})
@@ -100,12 +100,12 @@ def bursty(row: RepeatRow, count: int, *, seed: int, loss: float = 0.1) -> list[
     ]
 
 
-def parsed(rows_of: Sequence[Mapping[str, Value]]) -> Repeats:
-    """Rows as parsed from the trial.csv that contains them."""
+def parsed(table: Sequence[Mapping[str, Value]]) -> Repeats:
+    """The rows as they would be parsed from a trial.csv."""
     numbers: dict[str, Numbers] = {}
     texts: dict[str, Texts] = {}
     for column in trial_columns():
-        cells = [cell(row.get(column.name)) for row in rows_of]
+        cells = [cell(row.get(column.name)) for row in table]
         if column.type is str:
             texts[column.name] = np.array(cells, dtype=np.object_)
         elif column.type is bool:
@@ -113,12 +113,12 @@ def parsed(rows_of: Sequence[Mapping[str, Value]]) -> Repeats:
         else:
             width = np.longdouble if column.unit == "ns" else np.float64
             numbers[column.name] = np.array([text or "nan" for text in cells], dtype=np.str_).astype(width)
-    return Repeats(numbers, {**texts, SOURCE: np.full(len(rows_of), "", np.object_)}, trial_columns())
+    return Repeats(numbers, {**texts, SOURCE: np.full(len(table), "", np.object_)}, trial_columns())
 
 
-def write(folder: Path, repeats_of: Sequence[RepeatRow], name: str = "trial.csv") -> Path:
+def write(folder: Path, table: Sequence[RepeatRow], name: str = "trial.csv") -> Path:
     """Write a table of repeats to a new folder; return the path of the table."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / name
-    path.write_text(rows.to_csv(repeats_of, trial_columns()), encoding="utf-8")
+    path.write_text(rows.to_csv(table, trial_columns()), encoding="utf-8")
     return path

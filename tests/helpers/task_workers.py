@@ -1,4 +1,4 @@
-"""Workers of tasks for tests: a Dask cluster and a SLURM node on loopback, and the end of workers at random."""
+"""Workers that run tasks: a Dask cluster and a SLURM node on loopback, and functions that kill random workers."""
 
 import json
 import os
@@ -37,7 +37,7 @@ traffic:
 
 
 def worker_processes(parent: int) -> list[int]:
-    """Return the processes below a parent that run tasks of `multiprocessing`, those of Dask's nannies included."""
+    """Return the descendants of a process that run tasks of `multiprocessing`, also those of Dask's nannies."""
     return [pid for pid in descendants(parent) if b"spawn_main" in _command_line(pid)]
 
 
@@ -49,7 +49,7 @@ def _command_line(pid: int) -> bytes:
 
 
 def kill_random(pids: Sequence[int], generator: random.Random) -> bool:
-    """Kill one of some processes, and return True if there was one."""
+    """Kill a random process of `pids`; return False if there is none."""
     if not pids:
         return False
     with suppress(ProcessLookupError):
@@ -60,26 +60,26 @@ def kill_random(pids: Sequence[int], generator: random.Random) -> bool:
 def sweep_while_workers_die(
     arguments: Sequence[str], folder: Path, end_worker: Callable[[int], bool], *, deaths: int, runs_between: int = 4
 ) -> tuple[int, list[dict[str, object]], int]:
-    """Run `fieldkit cosim sweep`; return its exit code, its events, and the number of workers that were ended.
+    """Run `fieldkit cosim sweep`; return its exit code, its events, and the number of terminated workers.
 
     Args:
         arguments: Arguments after `sweep`.
         folder: Working folder.
-        end_worker: Ends a worker of the process with this id; returns True if there was one.
-        deaths: Number of workers to end.
-        runs_between: Number of runs between two deaths.
+        end_worker: Terminates a worker of the process with this id; returns True if there was one.
+        deaths: Number of workers to terminate.
+        runs_between: Number of runs between two terminations.
     """
     command = [sys.executable, "-m", "fieldkit", "cosim", "sweep", *arguments, "--json"]
     events: list[dict[str, object]] = []
-    ended = 0
+    terminated_count = 0
     with subprocess.Popen(command, cwd=folder, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         for line in process.stdout:
             events.append(json.loads(line))
-            finished = sum(event["event"] == "sweep_run_ended" for event in events)
-            if ended < deaths and finished >= (ended + 1) * runs_between:
-                ended += end_worker(process.pid)
-    return process.returncode, events, ended
+            run_count = sum(event["event"] == "sweep_run_ended" for event in events)
+            if terminated_count < deaths and run_count >= (terminated_count + 1) * runs_between:
+                terminated_count += end_worker(process.pid)
+    return process.returncode, events, terminated_count
 
 
 @contextmanager
@@ -110,12 +110,12 @@ def _dask(folder: Path, *arguments: str) -> "Iterator[subprocess.Popen[bytes]]":
         try:
             yield process
         finally:
-            below = descendants(process.pid)
+            child_pids = descendants(process.pid)
             process.send_signal(signal.SIGINT)
             try:
                 process.wait(30)
             except subprocess.TimeoutExpired:
-                for pid in (*below, process.pid):
+                for pid in (*child_pids, process.pid):
                     with suppress(ProcessLookupError):
                         os.kill(pid, signal.SIGKILL)
 

@@ -1,4 +1,4 @@
-"""Tests of times from ground-truth motion, on courses with known times, and of the check against expectations."""
+"""Tests of times from ground-truth motion with known times, and of the comparison with expectations."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,7 +19,7 @@ FLYING = MotionCell(Craft.COPTER, (Party.PILOT,), InjectedFault.KILL, Moment.FLY
 def course(
     speed_m_s: Callable[[float], float], rises_m_s: Callable[[float], float] = lambda _: 0.0
 ) -> list[MotionSample]:
-    """20 s of motion to the east, starting 3 m above the ground, integrated in steps of 10 ms."""
+    """Samples of 20 s of motion to the east, starting 3 m above the ground, in steps of 10 ms."""
     samples, east_m, up_m = [], 0.0, 3.0
     for step in range(2000):
         at_s = step / 100
@@ -40,8 +40,8 @@ def test_a_robot_has_stopped_once_it_is_stationary_for_the_given_time() -> None:
 
 def test_a_robot_that_continues_to_drive_has_not_stopped() -> None:
     assert stopped_s(course(lambda _: 0.6), 4.0) is None
-    slow = course(lambda at_s: 0.6 if at_s < 5 else 0.1)
-    assert stopped_s(slow, 4.0) is None
+    slow_course = course(lambda at_s: 0.6 if at_s < 5 else 0.1)
+    assert stopped_s(slow_course, 4.0) is None
 
 
 def test_a_turn_on_the_spot_is_motion() -> None:
@@ -50,7 +50,7 @@ def test_a_turn_on_the_spot_is_motion() -> None:
     assert moved_again_m(turning, 19.0) == pytest.approx(0.25, abs=0.01)
 
 
-def test_a_drone_descends_and_is_on_the_ground() -> None:
+def test_the_times_of_a_descent_and_a_landing_are_measured() -> None:
     landing = course(lambda _: 0.0, lambda at_s: -0.5 if at_s >= 6 else 0.0)
     assert descended_s(landing, 4.0) == pytest.approx(2.0, abs=0.02)
     assert grounded_s(landing, 4.0) == pytest.approx(8.0, abs=0.05)
@@ -106,7 +106,7 @@ def test_the_cells_cover_each_party_and_each_pair() -> None:
     assert all(expected(cell).does for cell in CELLS)
 
 
-def test_cells_are_selected_by_name() -> None:
+def test_cells_are_selected_by_patterns_of_their_names() -> None:
     assert [cell.name for cell in select_cells("rover/agent/kill/*")] == [
         f"rover/agent/kill/{moment}" for moment in ("waiting", "out", "there", "back")
     ]

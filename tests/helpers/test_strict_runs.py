@@ -1,4 +1,4 @@
-"""Tests of the pytest plugins in a pytest subprocess: leaks and many second tries fail a run."""
+"""Tests of the pytest plugins that make a run fail after leaks or many second tries; they run pytest."""
 
 import os
 from pathlib import Path
@@ -77,7 +77,7 @@ WAIT_TIMES_OUT = """
             child.kill()
 """
 ORPHAN_OF_A_NAMESPACE = """
-    from tests.helpers.host import alive, descendants
+    from tests.helpers.host import descendants, is_running
     from tests.helpers.sshd import wait_until
     from fieldkit.core.deadline import Deadline
     def child_of(process):
@@ -91,7 +91,7 @@ ORPHAN_OF_A_NAMESPACE = """
         for process in (entered, robot):
             process.kill()
             process.wait()
-        wait_until(lambda: not alive(orphan), Deadline.after(30))
+        wait_until(lambda: not is_running(orphan), Deadline.after(30))
 """
 OTHER_PROCESS = """
     @pytest.fixture
@@ -145,7 +145,7 @@ def _unindent(text: str) -> str:
 
 @pytest.mark.parametrize("mode", [SEQUENTIAL, PARALLEL], ids=["sequential", "parallel"])
 @pytest.mark.parametrize("test", [LEAKS_A_PROCESS, DETACHES_A_PROCESS], ids=["child", "detached"])
-def test_a_process_left_by_a_first_try_fails_the_run(
+def test_a_process_that_a_first_try_leaves_running_fails_the_run(
     pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, test: str, mode: tuple[str, ...]
 ) -> None:
     result = run(pytester, monkeypatch, test, *mode)
@@ -156,7 +156,7 @@ def test_a_process_left_by_a_first_try_fails_the_run(
 
 
 @pytest.mark.emulated
-def test_an_orphan_in_an_ended_pid_namespace_is_not_left_behind(
+def test_an_orphan_in_a_terminated_pid_namespace_is_no_leak(
     pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     result = run(pytester, monkeypatch, ORPHAN_IN_A_PID_NAMESPACE, *SEQUENTIAL)
@@ -171,7 +171,7 @@ def test_a_first_try_that_leaves_network_state_always_fails(
 ) -> None:
     name = f"left-{os.getpid()}"
     result = run(pytester, monkeypatch, test.replace("{name}", name), *SEQUENTIAL)
-    Path("/run/netns", name).unlink(missing_ok=True)  # `ip` also keeps the name as a file
+    Path("/run/netns", name).unlink(missing_ok=True)  # the name of a namespace is a file
     assert result.ret == pytest.ExitCode.TESTS_FAILED
     result.assert_outcomes(passed=1, errors=1)
     result.stdout.fnmatch_lines(["*LeakError*left*"])
@@ -196,9 +196,7 @@ def test_a_process_that_does_not_exit_gets_no_second_try(
     result.stdout.fnmatch_lines(["*LeakError: still running*"])
 
 
-def test_a_second_try_shares_nothing_with_the_first(
-    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_second_try_uses_new_module_fixtures(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
     result = run(pytester, monkeypatch, SHARED_FIXTURE, *SEQUENTIAL, "-s")
     assert result.ret == pytest.ExitCode.OK
     result.stdout.fnmatch_lines(["*2 passed, 1 rerun*"])
@@ -237,7 +235,9 @@ def test_the_allowed_number_of_second_tries_does_not_fail_a_run(
     result.stdout.fnmatch_lines([f"*{ALLOWED} passed, {ALLOWED} rerun*"])
 
 
-def test_both_parts_of_a_run_count(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_second_tries_are_counted_over_all_parts_of_a_run(
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
     arguments = (*SEQUENTIAL, "--rerun-log", "reruns.txt")
     assert run(pytester, monkeypatch, MANY_RERUNS.format(tests=ALLOWED), *arguments).ret == pytest.ExitCode.OK
     second = run(pytester, monkeypatch, MANY_RERUNS.format(tests=ALLOWED + 1), *arguments)

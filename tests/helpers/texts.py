@@ -12,7 +12,8 @@ TURTLEBOTS_AND_DRONE: Final[Mapping[str, str]] = MappingProxyType({**TURTLEBOTS,
 
 
 def site(robots: Mapping[str, str] = TURTLEBOTS, *, emulated: str = "", backend: str = "emulated") -> str:
-    """A site file. Two robots are sender and receiver without a master; a third is the relay of topology `master`.
+    """A site file. With two robots, the topology is `masterless`; with three, it is `master`, and the third is the
+    relay.
 
     Args:
         robots: Profile by name of the robot, in the order sender, receiver, relay.
@@ -44,11 +45,11 @@ def procedure(
         topology: Its topology.
         protocols: Its protocols, separated by commas.
         repeats: Number of repeats.
-        attempts: Largest number of attempts at a repeat; None for the default.
+        attempts: Maximum number of attempts of a repeat; None for the default.
         more: Lines with other keys, in YAML.
     """
-    tries = "" if attempts is None else f"attempts: {attempts}\n"
+    attempts_line = "" if attempts is None else f"attempts: {attempts}\n"
     return (
         f"name: {name}\nsummary: A procedure of a test\nscenario: los\ntopology: {topology}\n"
-        f"protocols: [{protocols}]\nrepeats: {repeats}\n{tries}{more}steps:\n{indent(steps, '  ')}"
+        f"protocols: [{protocols}]\nrepeats: {repeats}\n{attempts_line}{more}steps:\n{indent(steps, '  ')}"
     )

@@ -1,4 +1,4 @@
-"""Synthetic evidence of a topic between two robots: the logs and captures of a valid attempt, for tests to change."""
+"""Synthetic evidence of a topic between two robots: logs and captures of a valid attempt, which tests change."""
 
 import struct
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ PLAN: Final = TopicPlan(
 TRAFFIC: Final = TopicTraffic(SENDER, RECEIVER, frozenset({PORT}), frozenset({17900}), deadline_s=0.2)
 
 Row = tuple[int, int, int, int, int]
-"""Kind, size, sequence number, send time, local time."""
+"""Kind, size in bytes, sequence number, send time in ns, and local time in ns."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ class TopicAttempt:
 
     Attributes:
         sent: Rows of the publisher's log, without the end record.
-        came: Rows of the subscriber's log, without the end record.
-        publisher_frames: Frames of the publisher's capture.
-        subscriber_frames: Frames of the subscriber's capture.
+        received: Rows of the subscriber's log, without the end record.
+        sender_frames: Frames of the publisher's capture.
+        receiver_frames: Frames of the subscriber's capture.
         plan: The requested topic.
     """
 
@@ -56,7 +56,7 @@ class TopicAttempt:
 
 
 def attempt(*, tcp: bool = False, lost: Sequence[int] = (), plan: TopicPlan = PLAN) -> TopicAttempt:
-    """A valid attempt; the samples in `lost` are missing in the subscriber's capture and log."""
+    """A valid attempt; the subscriber's capture and log do not contain the samples in `lost`."""
     start_ns, matched_ns = START - 2 * SECOND, START - 600 * MS
     size = plan.size_bytes + plan.envelope_bytes
     start_rows = [(records.DISCOVERY_STARTED, 0, 0, 0, start_ns), (records.MATCHED, 0, 0, 0, matched_ns)]
@@ -110,7 +110,7 @@ def _echo(number: int, *, is_request: bool) -> bytes:
 
 
 def _acknowledgement(number: int, plan: TopicPlan, *, tcp: bool) -> bytes:
-    """The packet that acknowledges a sample."""
+    """A packet that acknowledges a sample."""
     ip_fields = {"src": RECEIVER, "dst": SENDER, "ip_id": 30_000 + number}
     if not tcp:
         return ipv4(struct.pack(">HHHH", PORT, PORT, 8 + 64, 0) + bytes(64), protocol=17, **ip_fields)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Parser of topic logs that are still being written; independent of the reader under test."""
+"""Parser of topic logs that are still being written, independent of the reader under test."""
 
 from pathlib import Path
 
@@ -10,5 +10,5 @@ def rows(path: Path) -> list[tuple[int, ...]]:
     content = path.read_bytes()
     assert content.startswith(records.MAGIC)
     offsets = range(len(records.MAGIC), len(content) - records.RECORD.size + 1, records.RECORD.size)
-    records_found = (records.RECORD.unpack_from(content, offset) for offset in offsets)
-    return [record for record in records_found if record[-1]]
+    complete_records = (records.RECORD.unpack_from(content, offset) for offset in offsets)
+    return [record for record in complete_records if record[-1]]

@@ -1,4 +1,4 @@
-"""Two hosts on one cable: network namespaces with a veth pair, which end with the processes that hold them."""
+"""Two hosts on one cable: network namespaces with a veth pair; a namespace is removed when its process exits."""
 
 import subprocess
 from collections.abc import Iterator, Sequence
@@ -15,7 +15,7 @@ class TestHost:
 
     Attributes:
         address: Its address on the cable.
-        pid: The process that holds its namespace.
+        pid: The id of the process that keeps its namespace.
     """
 
     __test__ = False
@@ -49,7 +49,7 @@ def two_connected_hosts() -> Iterator[tuple[TestHost, TestHost]]:
 
 @contextmanager
 def _namespace() -> Iterator[int]:
-    """Yield the id of a process that holds a new network namespace."""
+    """Yield the id of a process that keeps a new network namespace."""
     holder = subprocess.Popen(
         ("unshare", "--net", "sh", "-c", "echo up; exec cat"), stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )

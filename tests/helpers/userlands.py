@@ -1,4 +1,4 @@
-"""Robots simulated on this machine without SSH: a folder is the home, and a userland comes first in PATH."""
+"""Robots simulated on this machine without SSH, with a folder as their home and a userland first in their PATH."""
 
 import os
 import shutil
@@ -14,13 +14,13 @@ from fieldkit.remote.shell import Completed
 from tests.helpers.nightly import mark_nightly
 
 USERLANDS = ("debian", "busybox", "bash")
-"""dash with coreutils and util-linux; BusyBox alone with its ash as sh; bash as sh."""
+"""The userlands: dash with coreutils and util-linux; BusyBox alone, with its ash as sh; bash as sh."""
 USERLANDS_OF_LONG_TESTS = mark_nightly(USERLANDS, in_ci=("debian", "busybox"))
-"""Parameters of a fixture of many tests; CI runs the script of jobs with bash in the tests of locks."""
+"""Parameters of a fixture of many tests. In CI, only the tests of locks run the script of jobs with bash."""
 
 
 def userland_path(userland: str, folder: Path) -> str:
-    """The PATH of a robot with the userland, whose programs are linked in `folder`."""
+    """Link the programs of a userland in `folder`; return the PATH of a robot that uses them."""
     folder.mkdir(exist_ok=True)
     if userland == "bash":
         link(folder, "sh", "bash")
@@ -39,13 +39,13 @@ def link(folder: Path, name: str, program: str) -> None:
 
 
 class LocalSession:
-    """A command that runs in the home folder of such a robot."""
+    """A command that runs in the home folder of a simulated robot."""
 
     def __init__(self, shell: "LocalShell", argv: Sequence[str], until: bytes | None = None) -> None:
         self.shell = shell
         self.argv = tuple(argv)
         environment = os.environ | {"HOME": str(shell.home), "PATH": shell.path}
-        # The robot's PATH is searched; Python would search the PATH of this process.
+        # Python would search the PATH of this process, not the robot's.
         program = shutil.which(argv[0], path=shell.path) or argv[0]
         pipe = subprocess.PIPE
         stdin = pipe if until is None else subprocess.DEVNULL
@@ -93,7 +93,7 @@ class LocalShell:
         return nullcontext()
 
     def close(self) -> None:
-        """Close the input of all commands, as a closed connection does; the report of a job waits for that."""
+        """Close the input of all commands, as a closed connection would, and wait until they exit."""
         while self.sessions:
             process = self.sessions.pop().process
             if process.stdin is not None:

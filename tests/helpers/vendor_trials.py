@@ -1,4 +1,4 @@
-"""Trials of different procedures, as plans and tables: named transfers and pings, and the meter of a vendor."""
+"""Plans and tables of trials with different procedures: named transfers and pings, and the meter of a vendor."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -40,7 +40,7 @@ def plan(name: str, *, distance: str, metres: float, columns: Sequence[Column]) 
 
 
 def write(folder: Path, plan: Plan, table: Sequence[Mapping[str, Value]], *, with_plan: bool = True) -> Path:
-    """Write a trial with these rows to a new folder with its name in `folder`; return the trial's folder."""
+    """Write a trial to a new folder in `folder`; return the new folder, which has the name of the trial."""
     trial = folder / plan.trial
     trial.mkdir(parents=True)
     (trial / "trial.csv").write_text(rows.to_csv(table, plan.table), encoding="utf-8")

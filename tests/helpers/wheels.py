@@ -12,13 +12,13 @@ _SOURCES = ("fieldkit", "sim_backends", "robots", "procedures", "docs", ".ci")
 _FILES = ("pyproject.toml", "README.md", "LICENSE")
 
 
-def installed(folder: Path) -> Path:
+def install_wheel(folder: Path) -> Path:
     """Build the wheel of fieldkit and install it; return the interpreter of the environment.
 
     All dependencies come from the environment of the tests, so no package registry is used. This takes about 5 s.
 
     Args:
-        folder: Receives the sources, the wheel and the environment.
+        folder: Folder for the sources, the wheel and the environment.
     """
     source, wheels, venv = (folder / name for name in ("source", "wheels", "venv"))
     for name in _SOURCES:

@@ -17,5 +17,5 @@ _DEFAULTS: Final[Mapping[str, Mapping[str, Any]]] = {
 
 def world(*obstacles: Mapping[str, Any]) -> World:
     """A world with obstacles in the format of a world file; missing values get defaults."""
-    completed = [{**_DEFAULTS[obstacle["kind"]], **obstacle} for obstacle in obstacles]
-    return World.model_validate({"name": "w", "summary": "s", "area_m": (20, 20), "obstacles": completed})
+    complete_obstacles = [{**_DEFAULTS[obstacle["kind"]], **obstacle} for obstacle in obstacles]
+    return World.model_validate({"name": "w", "summary": "s", "area_m": (20, 20), "obstacles": complete_obstacles})

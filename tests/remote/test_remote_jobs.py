@@ -25,7 +25,7 @@ from fieldkit.measure.evidence.endings import Cause
 from fieldkit.remote import evidence, fetching, jobs, script
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Completed
-from tests.helpers.host import ENDED
+from tests.helpers.host import EXITED_STATES
 from tests.helpers.paths import DATA
 from tests.helpers.sshd import free_port, wait_until
 from tests.helpers.userlands import USERLANDS_OF_LONG_TESTS, LocalSession, LocalShell, userland_path
@@ -82,7 +82,7 @@ def group_is_gone(pid: int) -> bool:
             state, _, group = path.read_text(encoding="utf-8").rpartition(")")[2].split()[:3]
         except OSError:
             continue
-        if int(group) == pid and state not in ENDED:
+        if int(group) == pid and state not in EXITED_STATES:
             return False
     return True
 

@@ -15,18 +15,18 @@ from tests.helpers.runs import only_trial, run_here
 pytestmark = pytest.mark.emulated
 
 A4 = 720
-"""Width of the page inside its margins, CSS pixels."""
+"""Width of the page inside its margins, in CSS pixels."""
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    with chromium() as launched:
-        yield launched
+    with chromium() as chromium_browser:
+        yield chromium_browser
 
 
 @pytest.fixture(scope="module")
 def lawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write the report of synthetic trials; return its path."""
+    """The path of a report of synthetic trials."""
     folder = tmp_path_factory.mktemp("lawn")
     tables.write(folder, [*lawns.lawn(), *rows_without_reply()], "all.csv")
     run = run_here(folder, "report", "all.csv")
@@ -35,7 +35,7 @@ def lawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def rows_without_reply() -> list[tables.RepeatRow]:
-    """Return repeats behind the wall in which nothing arrived."""
+    """Return repeats behind the wall in which no packet arrived."""
     lost = {"datagrams_received": 0, "datagram_loss": 1.0, "rtt_median_s": None, "transfer_s": None}
     place = {"scenario": "nlos", "procedure": "nlos", "distance": "60m", "distance_m": 60.0, "trial": "dead"}
     return [lawns.row(number, **place, **lost) for number in (1, 2, 3)]
@@ -73,7 +73,7 @@ def test_all_figures_are_visible_on_phone_and_laptop(
         assert opened_page.page.evaluate("document.documentElement.scrollWidth") == width
 
 
-def test_printed_tables_fit_the_page_and_charts_keep_their_size(browser: Browser, lawn: Path) -> None:
+def test_printed_tables_fit_the_page_and_charts_are_not_reduced(browser: Browser, lawn: Path) -> None:
     with opened(browser, lawn, width=A4) as opened_page:
         opened_page.page.emulate_media(media="print")
         for table in opened_page.page.locator(".scroll > table").all():
@@ -124,7 +124,7 @@ def test_report_of_an_emulated_trial_links_to_its_evidence(browser: Browser, tmp
         assert opened_page.page.locator("svg.raster").count() == 1
         boxes = [panel.bounding_box() for panel in opened_page.page.locator(".stacked > svg").all()]
         assert len(boxes) >= 3
-        assert len({(box["x"], box["width"]) for box in boxes if box}) == 1, "one time axis"
+        assert len({(box["x"], box["width"]) for box in boxes if box}) == 1, "all panels have the same time axis"
         links = [link.get_attribute("href") or "" for link in opened_page.page.locator("a.mark").all()]
     trial = only_trial(tmp_path).relative_to(tmp_path)
     assert links == [f"{trial}/repeats/udp-0{number}/" for number in (1, 2)]

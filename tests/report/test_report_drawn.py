@@ -1,4 +1,4 @@
-"""Content of figures: crosses where nothing arrived, dots for one distance, logarithmic axes, captions."""
+"""Content of figures: crosses for missing values, dots for one distance, logarithmic axes, and captions."""
 
 import dataclasses
 import math
@@ -30,7 +30,7 @@ from tests.helpers.tables import RepeatRow, parsed, replace
 LOST = {"datagrams_received": 0, "datagram_loss": 1.0, "rtt_loss": 1.0, "rtt_median_s": None, "transfer_s": None}
 
 
-def at(metres: float, repeats: int = 8, **changes: object) -> list[RepeatRow]:
+def rows_at(metres: float, repeats: int = 8, **changes: object) -> list[RepeatRow]:
     """Return repeats at one distance whose round-trip times differ by 1 %."""
     rows = [lawns.row(n, distance=f"{metres:g}m", distance_m=metres) for n in range(1, repeats + 1)]
     return [replace(row, **({"rtt_median_s": 0.010 + 1e-4 * n} | changes)) for n, row in enumerate(rows)]
@@ -53,8 +53,8 @@ def panel_of(charts: Sequence[Chart]) -> Panel:
     return panel
 
 
-def test_curve_has_a_cross_where_nothing_arrived() -> None:
-    (chart,) = curves(parsed([*at(10), *at(20), *at(60, 3, **LOST)]), "rtt_median_s")
+def test_curve_has_a_cross_at_a_distance_without_arrivals() -> None:
+    (chart,) = curves(parsed([*rows_at(10), *rows_at(20), *rows_at(60, 3, **LOST)]), "rtt_median_s")
     (panel,) = chart.panels
     (cross,) = panel.edges
     assert (cross.at, cross.text, cross.is_high) == (60.0, "nothing arrived: 3 of 3", True)
@@ -66,39 +66,44 @@ def test_curve_has_a_cross_where_nothing_arrived() -> None:
 
 
 def test_cross_of_a_missing_rate_is_at_the_bottom() -> None:
-    rows = [*at(10, goodput_bit_s=1e6), *at(20, goodput_bit_s=1e6), *at(60, 3, **LOST)]
+    rows = [*rows_at(10, goodput_bit_s=1e6), *rows_at(20, goodput_bit_s=1e6), *rows_at(60, 3, **LOST)]
     assert [edge.is_high for edge in panel_of(curves(parsed(rows), "goodput_bit_s")).edges] == [False]
 
 
 def test_cross_of_a_condition_without_valid_repeats_shows_the_status_counts() -> None:
-    rows = [*at(10), *at(20), *at(60, 2, status="failed", reason="no answer")]
+    rows = [*rows_at(10), *rows_at(20), *rows_at(60, 2, status="failed", reason="no answer")]
     assert [edge.text for edge in panel_of(curves(parsed(rows), "rtt_median_s")).edges] == [
         "no valid repeat: 2 failed"
     ]
 
 
 def test_point_shows_the_number_of_repeats_with_a_value() -> None:
-    some = [*at(20, 2), lawns.row(3, distance="20m", distance_m=20.0, **LOST)]
-    (chart,) = curves(parsed([*at(10), *some]), "rtt_median_s")
+    partial_rows = [*rows_at(20, 2), lawns.row(3, distance="20m", distance_m=20.0, **LOST)]
+    (chart,) = curves(parsed([*rows_at(10), *partial_rows]), "rtt_median_s")
     assert list(chart.panels[0].series[0].notes) == ["", "2 of 3"]
     assert "the number of valid repeats with a value" in chart.caption
 
 
 def test_line_is_broken_at_missing_values_and_very_wide_intervals() -> None:
-    measured_rows = [row for metres in (10, 20, 30, 40) for row in at(metres)]
+    measured_rows = [row for metres in (10, 20, 30, 40) for row in rows_at(metres)]
     (series,) = panel_of(curves(parsed(measured_rows), "rtt_median_s")).series
     assert (series.join, set(series.breaks)) == ("line", set())
-    lost = [*measured_rows, *at(25, 2, **LOST)]
-    (series,) = panel_of(curves(parsed(lost), "rtt_median_s")).series
+    lost_rows = [*measured_rows, *rows_at(25, 2, **LOST)]
+    (series,) = panel_of(curves(parsed(lost_rows), "rtt_median_s")).series
     assert set(series.breaks) == {1}
-    # The interval of two very different repeats spans the whole axis.
-    wide = [*measured_rows, *(replace(row, rtt_median_s=0.001 + 0.03 * n) for n, row in enumerate(at(25, 2)))]
-    (series,) = panel_of(curves(parsed(wide), "rtt_median_s")).series
+    # The interval of two very different repeats covers the whole axis.
+    wide_rows = [
+        *measured_rows,
+        *(replace(row, rtt_median_s=0.001 + 0.03 * n) for n, row in enumerate(rows_at(25, 2))),
+    ]
+    (series,) = panel_of(curves(parsed(wide_rows), "rtt_median_s")).series
     assert set(series.breaks) == {1, 2}
 
 
 @pytest.mark.parametrize("form", ["svg", "png"])
-def test_a_figure_is_equal_to_one_that_matplotlib_draws_twice(form: Format, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_figure_of_one_layout_equals_a_figure_that_matplotlib_lays_out_twice(
+    form: Format, monkeypatch: pytest.MonkeyPatch
+) -> None:
     x, y = [1.0, 2.0, 3.0], [0.5, 20.0, 3000.0]
     series = [Series("sent", Style("blue", "o"), x, y), Series("received", Style("red", "s"), x, y)]
     panel = Panel("a long title that needs several lines in a figure of one column", "distance", "ms", series, "")
@@ -118,7 +123,7 @@ def test_broken_line_is_drawn_in_segments() -> None:
 
 
 def test_quantities_of_one_distance_are_dots_not_curves() -> None:
-    repeats = parsed(at(10, 3, goodput_bit_s=2e6))
+    repeats = parsed(rows_at(10, 3, goodput_bit_s=2e6))
     report = build_contents(repeats, title="", repeat="", command=["fieldkit"])
     assert report.against_distance == []
     (chart,) = dot_charts(repeats)
@@ -138,19 +143,21 @@ def test_quantities_of_one_distance_are_dots_not_curves() -> None:
 
 
 def test_one_distance_per_topology_is_not_a_curve() -> None:
-    repeats = parsed([*at(10, 3), *at(20, 3, topology="masterless")])
+    repeats = parsed([*rows_at(10, 3), *rows_at(20, 3, topology="masterless")])
     assert curves(repeats, "rtt_median_s") == []
     (chart,) = dot_charts(repeats)
     assert {panel.title for panel in chart.panels} == {"UDP, master, 10m", "UDP, masterless, 20m"}
 
 
 def test_several_distances_are_curves_not_dots() -> None:
-    assert dot_charts(parsed([*at(10), *at(20)])) == []
+    assert dot_charts(parsed([*rows_at(10), *rows_at(20)])) == []
 
 
 def test_lane_of_a_condition_without_arrivals_has_a_cross() -> None:
-    lost = at(10, 2, scenario="nlos", procedure="nlos", **LOST)
-    times = next(panel for panel in dot_charts(parsed([*at(10), *lost]))[0].panels if "time" in panel.x_label)
+    lost_rows = rows_at(10, 2, scenario="nlos", procedure="nlos", **LOST)
+    times = next(
+        panel for panel in dot_charts(parsed([*rows_at(10), *lost_rows]))[0].panels if "time" in panel.x_label
+    )
     assert [edge.text for edge in times.edges] == ["nothing arrived: 2 of 2"] * 2
     assert [round(edge.at) for edge in times.edges] == [1, 0] or [round(edge.at) for edge in times.edges] == [0, 1]
 
@@ -166,7 +173,7 @@ def test_axis_is_logarithmic_over_more_than_1_5_decades(values: list[float]) -> 
 
 @pytest.mark.parametrize(("longest_s", "is_log"), [(0.02, False), (2.0, True)])
 def test_axis_of_a_distribution_is_logarithmic_for_a_wide_range(longest_s: float, is_log: bool) -> None:
-    rows = at(10, 4)
+    rows = rows_at(10, 4)
     rows[-1] = replace(rows[-1], rtt_median_s=longest_s)
     repeats = parsed(rows)
     cells = aggregate(repeats)
@@ -179,7 +186,7 @@ def test_axis_of_a_distribution_is_logarithmic_for_a_wide_range(longest_s: float
 def test_flag_is_drawn_as_a_share_of_repeats(tmp_path: Path) -> None:
     columns = trial_columns(outage_columns.fault_columns(FaultKind.REBOOT))
     name = fault_column_name(FaultKind.REBOOT, "recovered")
-    rows = [{**row, name: n > 1} for metres in (10, 20) for n, row in enumerate(at(metres, 4))]
+    rows = [{**row, name: n > 1} for metres in (10, 20) for n, row in enumerate(rows_at(metres, 4))]
     path = tmp_path / "trial.csv"
     path.write_text(to_csv(rows, columns), encoding="utf-8")
     (chart,) = curves(read([path], columns), name)
@@ -189,7 +196,7 @@ def test_flag_is_drawn_as_a_share_of_repeats(tmp_path: Path) -> None:
 
 
 def test_distances_have_the_labels_that_the_operator_typed() -> None:
-    rows = [*at(10), *(replace(row, distance="60ft") for row in at(18.288))]
+    rows = [*rows_at(10), *(replace(row, distance="60ft") for row in rows_at(18.288))]
     panel = panel_of(curves(parsed(rows), "rtt_median_s"))
     assert [label for _, label in panel.x_ticks] == ["10m", "60ft"]
     assert "at 60ft" in panel.words
@@ -213,7 +220,7 @@ def test_lower_bound_is_an_open_marker_that_breaks_the_line(tmp_path: Path) -> N
             "rtt_gap_at_least_s": 2.0 if metres == 40 and n else None,
         }
         for metres in (10, 20, 30, 40, 50)
-        for n, row in enumerate(at(metres, 6))
+        for n, row in enumerate(rows_at(metres, 6))
     ]
     path = tmp_path / "trial.csv"
     path.write_text(to_csv(rows, columns), encoding="utf-8")
@@ -226,11 +233,11 @@ def test_lower_bound_is_an_open_marker_that_breaks_the_line(tmp_path: Path) -> N
     assert {2, 3} <= set(series.breaks)
     assert "a lower bound" in chart.caption
     figure = figures.panel_svg(chart.panels[0])
-    closed = without_bounds(chart.panels[0])
-    assert figure.count("<path") > figures.panel_svg(closed).count("<path")
+    panel_without_bounds = without_bounds(chart.panels[0])
+    assert figure.count("<path") > figures.panel_svg(panel_without_bounds).count("<path")
 
 
 def without_bounds(panel: Panel) -> Panel:
-    """Return the panel with no value marked as a bound."""
+    """Return the panel without marks of lower bounds."""
     series = [dataclasses.replace(curve, bounds=()) for curve in panel.series]
     return dataclasses.replace(panel, series=series)

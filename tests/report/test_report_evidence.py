@@ -1,4 +1,4 @@
-"""Reports with raw evidence: a small synthetic trial whose packets and replies are all known."""
+"""Reports with raw evidence of a small synthetic trial whose packets and replies are known."""
 
 import math
 import os
@@ -40,14 +40,14 @@ def test_links_lead_to_existing_folders(trial: Path, monkeypatch: pytest.MonkeyP
     assert main(["report", "trials", "-o", "out/report.html"]) == 0
     elements = Elements((lab / "out" / "report.html").read_text(encoding="utf-8"))
     links = [value for name, value in elements.attributes if name == "href" and value.startswith("../")]
-    assert len(links) == 2 + 1 + 4  # attempts, trial, its files
+    assert len(links) == 2 + 1 + 4  # the attempts, the trial, and its files
     assert {link for link in links if not (lab / "out" / link).exists()} == {
         f"../trials/{trial.name}/MANIFEST.sha256"
     }
 
 
-def copied(trial: Path, name: str) -> Path:
-    """Copy a trial under another name."""
+def copy_trial(trial: Path, name: str) -> Path:
+    """Copy a trial to a folder with another name; return the folder."""
     copy = trial.with_name(name)
     shutil.copytree(trial, copy)
     for file in ("trial.csv", PLAN_FILE):
@@ -59,7 +59,7 @@ def copied(trial: Path, name: str) -> Path:
 def test_a_trial_that_the_filter_removes_is_not_opened(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lab = trial.parent.parent
     monkeypatch.chdir(lab)
-    os.mkfifo(copied(trial, "other") / store.REPEATS / "pipe")
+    os.mkfifo(copy_trial(trial, "other") / store.REPEATS / "pipe")
     pages = []
     for options in ((), ("--where", 'trial != "other"')):
         assert main(["report", "trials", "-o", "report.html", *options]) == 0
@@ -69,7 +69,7 @@ def test_a_trial_that_the_filter_removes_is_not_opened(trial: Path, monkeypatch:
 
 
 def test_the_evidence_of_many_trials_is_limited(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    copied(trial, "other")
+    copy_trial(trial, "other")
     monkeypatch.setattr(trial_folders, "MAX_TRIALS", 1)
     repeats = sources.find([trial.parent], print).read()
     for name in (trial.name, "other"):
@@ -119,20 +119,20 @@ def test_time_line_has_all_packets_and_replies(trial: Path) -> None:
         "round trip": len(recorded.RTT_MS),
         "no reply": 7,
     }
-    # The receiver's clock is an hour ahead, which cannot be seen in the captures.
+    # The receiver's clock is an hour ahead, which the captures do not show.
     assert max(packets.series[1].x) == pytest.approx(recorded.PACKETS)
 
 
 def test_time_line_shows_the_distance_between_moving_robots(trial: Path) -> None:
-    began_ns = recorded.START_NS + 10 * recorded.SECOND_NS
+    started_ns = recorded.START_NS + 10 * recorded.SECOND_NS
     places_m = {Role.SENDER: 1.0, Role.RECEIVER: 4.0}
     initial = [TrackPoint(0, role, (place_m, 0.0, 0.2)) for role, place_m in places_m.items()]
-    moved = [
-        TrackPoint(began_ns + 10**9, Role.SENDER, None),
-        TrackPoint(began_ns + 2 * 10**9, Role.SENDER, START_M),
+    moved_points = [
+        TrackPoint(started_ns + 10**9, Role.SENDER, None),
+        TrackPoint(started_ns + 2 * 10**9, Role.SENDER, START_M),
     ]
     file = trial / "repeats" / "udp-01" / "track.csv"
-    for moves, panels in (([], 2), (moved, 3)):
+    for moves, panels in (([], 2), (moved_points, 3)):
         file.write_text(track.text([*initial, *moves]), encoding="ascii")
         evidence = load_evidence(sources.find([trial], print).read())
         row = repeat_to_draw(aggregate(evidence.repeats), evidence, "")

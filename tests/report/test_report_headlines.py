@@ -1,4 +1,4 @@
-"""Headlines: missing data first, the worst condition before the best, expected quantities first."""
+"""Headlines: missing data is first, the worst condition precedes the best, and expected quantities precede others."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -33,14 +33,14 @@ def texts(headline: Headline) -> list[str]:
 
 def test_condition_without_arrivals_precedes_the_largest_loss() -> None:
     near_rows = [lawns.row(number) for number in (1, 2)]
-    middle = [lawns.row(n, distance="90m", distance_m=90.0, rtt_median_s=0.05) for n in (1, 2)]
-    lost = [lawns.row(number, **FAR, **LOST) for number in (1, 2, 3)]
-    by_subject = lines([*near_rows, *middle, *lost])
-    assert by_subject["Repeats"] == ["7 of 7 valid", "nothing arrived in 3 repeats UDP, NLOS, 60m (3 of 3)"]
-    assert by_subject["UDP datagram loss"][0].startswith("most 100 % [43.")
-    assert by_subject["UDP datagram loss"][0].endswith("NLOS, 60m")
-    assert by_subject["UDP datagram loss"][1] == "least 5.56 % LOS, 10ft; LOS, 90m"
-    assert by_subject["RTT with UDP"] == [
+    middle_rows = [lawns.row(n, distance="90m", distance_m=90.0, rtt_median_s=0.05) for n in (1, 2)]
+    lost_rows = [lawns.row(number, **FAR, **LOST) for number in (1, 2, 3)]
+    lines_by_subject = lines([*near_rows, *middle_rows, *lost_rows])
+    assert lines_by_subject["Repeats"] == ["7 of 7 valid", "nothing arrived in 3 repeats UDP, NLOS, 60m (3 of 3)"]
+    assert lines_by_subject["UDP datagram loss"][0].startswith("most 100 % [43.")
+    assert lines_by_subject["UDP datagram loss"][0].endswith("NLOS, 60m")
+    assert lines_by_subject["UDP datagram loss"][1] == "least 5.56 % LOS, 10ft; LOS, 90m"
+    assert lines_by_subject["RTT with UDP"] == [
         "nothing arrived NLOS, 60m (3 of 3)",
         "most 50.00 ms [50.00, 50.00]* LOS, 90m",
         "least 16.00 ms [16.00, 16.00]* LOS, 10ft",
@@ -50,23 +50,23 @@ def test_condition_without_arrivals_precedes_the_largest_loss() -> None:
 def test_condition_with_total_loss_in_some_repeats_shows_their_number() -> None:
     rows = [lawns.row(1), lawns.row(2, **LOST), lawns.row(3, **LOST)]
     rows += [lawns.row(number, distance="20ft", distance_m=6.096) for number in (1, 2)]
-    by_subject = lines(rows)
-    assert by_subject["RTT with UDP"] == ["nothing arrived 10ft (2 of 3)", "in all others 16.00 ms"]
-    assert by_subject["Repeats"][1:] == ["nothing arrived in 2 repeats UDP, 10ft (2 of 3)"]
+    lines_by_subject = lines(rows)
+    assert lines_by_subject["RTT with UDP"] == ["nothing arrived 10ft (2 of 3)", "in all others 16.00 ms"]
+    assert lines_by_subject["Repeats"][1:] == ["nothing arrived in 2 repeats UDP, 10ft (2 of 3)"]
 
 
 def test_void_failed_and_planned_conditions_are_counted() -> None:
     rows = [lawns.row(number) for number in (1, 2)]
     rows += [lawns.row(3, status="void", reason="no capture"), lawns.row(4, status="failed", reason="lost")]
     rows += [lawns.row(1, **FAR, status="failed", reason="no answer")]
-    by_subject = lines(rows, ["nlos 90m master"])
-    assert by_subject["Repeats"] == [
+    lines_by_subject = lines(rows, ["nlos 90m master"])
+    assert lines_by_subject["Repeats"] == [
         "2 of 5 valid",
         "2 repeats failed UDP, NLOS, 60m (1 of 1); UDP, LOS, 10ft (1 of 4)",
         "1 repeat void UDP, LOS, 10ft (1 of 4)",
         "1 condition not run nlos 90m master",
     ]
-    assert by_subject["RTT with UDP"][0] == "no valid repeat NLOS, 60m (1 failed)"
+    assert lines_by_subject["RTT with UDP"][0] == "no valid repeat NLOS, 60m (1 failed)"
 
 
 def test_void_attempt_of_a_repeated_repeat_is_not_missing() -> None:
@@ -80,15 +80,17 @@ def test_value_of_only_some_repeats_shows_their_number() -> None:
 
 
 def test_pings_of_different_sizes_have_separate_headlines() -> None:
-    small = [lawns.row(n, rtt_payload_bytes=56, rtt_median_s=0.001, distance="5m", distance_m=5.0) for n in (1, 2)]
-    large = [lawns.row(n, rtt_payload_bytes=8192) for n in (1, 2)]
-    by_subject = lines([*small, *large])
-    assert by_subject["RTT with UDP, 56 bytes"] == ["1.00 ms [1.00, 1.00]* 5m"]
-    assert by_subject["RTT with UDP, 8192 bytes"] == ["16.00 ms [16.00, 16.00]* 10ft"]
+    small_pings = [
+        lawns.row(n, rtt_payload_bytes=56, rtt_median_s=0.001, distance="5m", distance_m=5.0) for n in (1, 2)
+    ]
+    large_pings = [lawns.row(n, rtt_payload_bytes=8192) for n in (1, 2)]
+    lines_by_subject = lines([*small_pings, *large_pings])
+    assert lines_by_subject["RTT with UDP, 56 bytes"] == ["1.00 ms [1.00, 1.00]* 5m"]
+    assert lines_by_subject["RTT with UDP, 8192 bytes"] == ["16.00 ms [16.00, 16.00]* 10ft"]
 
 
 @pytest.mark.parametrize(
-    ("losses", "lost"),
+    ("losses", "lost_rows"),
     [
         ({"datagram_loss": 1.0, "rtt_loss": 1.0}, True),
         ({"datagram_loss": 1.0, "rtt_loss": 0.9}, False),
@@ -96,8 +98,8 @@ def test_pings_of_different_sizes_have_separate_headlines() -> None:
         ({"datagram_loss": None, "rtt_loss": None}, False),
     ],
 )
-def test_everything_lost_if_all_losses_are_total(losses: dict[str, float | None], lost: bool) -> None:
-    assert everything_lost(parsed([lawns.row(1, **losses)])).tolist() == [lost]
+def test_everything_lost_if_all_losses_are_total(losses: dict[str, float | None], lost_rows: bool) -> None:
+    assert everything_lost(parsed([lawns.row(1, **losses)])).tolist() == [lost_rows]
 
 
 def test_quantity_without_its_own_loss_uses_the_other_losses() -> None:
@@ -110,8 +112,10 @@ def evidence_with(folder: Path, *expected: str) -> Evidence:
     """Return the evidence of a synthetic trial with expectations."""
     trial = recorded.make_plain(folder)
     plan = plans.read_plan(trial)
-    changed = plan.procedure.model_copy(update={"expect": expected})
-    (trial / PLAN_FILE).write_text(schema.dump(plan.model_copy(update={"procedure": changed})), encoding="utf-8")
+    procedure_with_expectations = plan.procedure.model_copy(update={"expect": expected})
+    (trial / PLAN_FILE).write_text(
+        schema.dump(plan.model_copy(update={"procedure": procedure_with_expectations})), encoding="utf-8"
+    )
     return load_evidence(sources.find([trial], print).read())
 
 

@@ -1,4 +1,4 @@
-"""The page and its figures: reproducible bytes, and texts of the evidence are escaped."""
+"""The page and its figures: the bytes are reproducible, and texts of the evidence are escaped."""
 
 import re
 from html.parser import HTMLParser
@@ -31,16 +31,16 @@ class Elements(HTMLParser):
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Return the text of a report of synthetic trials."""
+    """The text of a report of synthetic trials."""
     folder = tmp_path_factory.mktemp("lawn")
-    written = folder / "report.html"
-    assert main(["report", str(tables.write(folder, lawns.lawn(2))), "-o", str(written)]) == 0
-    return written.read_text(encoding="utf-8")
+    report_path = folder / "report.html"
+    assert main(["report", str(tables.write(folder, lawns.lawn(2))), "-o", str(report_path)]) == 0
+    return report_path.read_text(encoding="utf-8")
 
 
 def test_two_runs_give_the_same_bytes(tmp_path: Path) -> None:
     rows = [
-        tables.replace(row, transfer_s=None)  # three figures instead of six
+        tables.replace(row, transfer_s=None)  # this leaves three figures of six
         for row in lawns.lawn(2)
         if (row.topology, row.backend, row.protocol) == ("master", "field", "udp") and row.distance != "55ft"
     ]
@@ -77,14 +77,16 @@ def test_texts_of_the_evidence_are_escaped(tmp_path: Path, monkeypatch: pytest.M
 def test_ids_are_unique_and_all_references_resolve(page: str) -> None:
     elements = Elements(page)
     assert len(elements.ids) == len(set(elements.ids))
-    named = {value[1:] for name, value in elements.attributes if name.endswith("href") and value.startswith("#")}
-    assert named | set(re.findall(r"url\(#([^)]*)\)", page)) <= set(elements.ids)
+    referenced_ids = {
+        value[1:] for name, value in elements.attributes if name.endswith("href") and value.startswith("#")
+    }
+    assert referenced_ids | set(re.findall(r"url\(#([^)]*)\)", page)) <= set(elements.ids)
 
 
 def test_page_has_no_external_references(page: str) -> None:
     elements = Elements(page)
-    outside = [value for name, value in elements.attributes if "//" in value and not name.startswith("xmlns")]
-    assert outside == []
+    external_values = [value for name, value in elements.attributes if "//" in value and not name.startswith("xmlns")]
+    assert external_values == []
     assert not {"script", "iframe", "object", "img"} & set(elements.tags)
 
 

@@ -1,4 +1,4 @@
-"""Parts of a report against independent results: packets, distributions, strips, summary, warnings."""
+"""Parts of a report compared with independent results: packets, distributions, strips, summary and warnings."""
 
 import re
 from pathlib import Path
@@ -41,15 +41,17 @@ def table(folder: Path, rows: list[RepeatRow]) -> Repeats:
     return read([tables.write(folder, rows)], trial_columns())
 
 
-def captured(folder: Path, protocol: Protocol, lost: set[int]) -> tuple[Transfer, list[int]]:
-    """Write the captures of a recorded transfer, with some packets removed at the receiver (counted from 0).
+def write_captures(folder: Path, protocol: Protocol, lost: set[int]) -> tuple[Transfer, list[int]]:
+    """Write the captures of a recorded transfer, without the `lost` packets (counted from 0) at the receiver.
 
     Returns:
         The transfer, and the indices of all missing packets, including those lost in the recording.
     """
-    sent = rdpcap(str(CAPTURES / f"{protocol}-sender.pcap"))
+    sent_packets = rdpcap(str(CAPTURES / f"{protocol}-sender.pcap"))
     first = next(
-        packet for packet in sent if packet.haslayer(IP) and packet[IP].proto == {"udp": 17, "tcp": 6}[protocol]
+        packet
+        for packet in sent_packets
+        if packet.haslayer(IP) and packet[IP].proto == {"udp": 17, "tcp": 6}[protocol]
     )
     transfer = Transfer(
         protocol,
@@ -62,18 +64,20 @@ def captured(folder: Path, protocol: Protocol, lost: set[int]) -> tuple[Transfer
         "recv.bag",
         captures=("sender.pcap", "receiver.pcap"),
     )
-    ids = [packet[IP].id * 65536 + packet[IP].frag for packet in sent if is_of_transfer(packet, transfer)]
-    removed = {ids[index] for index in lost}
-    received = rdpcap(str(CAPTURES / f"{protocol}-receiver.pcap"))
-    kept = [
+    ids = [packet[IP].id * 65536 + packet[IP].frag for packet in sent_packets if is_of_transfer(packet, transfer)]
+    removed_ids = {ids[index] for index in lost}
+    received_packets = rdpcap(str(CAPTURES / f"{protocol}-receiver.pcap"))
+    kept_packets = [
         packet
-        for packet in received
-        if not (is_of_transfer(packet, transfer) and packet[IP].id * 65536 + packet[IP].frag in removed)
+        for packet in received_packets
+        if not (is_of_transfer(packet, transfer) and packet[IP].id * 65536 + packet[IP].frag in removed_ids)
     ]
-    arrived = {packet[IP].id * 65536 + packet[IP].frag for packet in received if is_of_transfer(packet, transfer)}
+    arrived_ids = {
+        packet[IP].id * 65536 + packet[IP].frag for packet in received_packets if is_of_transfer(packet, transfer)
+    }
     (folder / "sender.pcap").write_bytes((CAPTURES / f"{protocol}-sender.pcap").read_bytes())
-    wrpcap(str(folder / "receiver.pcap"), kept)
-    return transfer, [index for index, packet_id in enumerate(ids) if packet_id not in arrived - removed]
+    wrpcap(str(folder / "receiver.pcap"), kept_packets)
+    return transfer, [index for index, packet_id in enumerate(ids) if packet_id not in arrived_ids - removed_ids]
 
 
 def is_of_transfer(packet: object, transfer: Transfer) -> bool:
@@ -84,7 +88,7 @@ def is_of_transfer(packet: object, transfer: Transfer) -> bool:
 
 
 def test_exactly_the_lost_packets_are_marked(tmp_path: Path) -> None:
-    transfer, missing = captured(tmp_path, Protocol.UDP, {2, 3, 7})
+    transfer, missing = write_captures(tmp_path, Protocol.UDP, {2, 3, 7})
     packet_fates = fates.read(AttemptEvidence(tmp_path), transfer)
     assert packet_fates is not None
     assert {2, 3, 7} <= set(missing)
@@ -95,7 +99,7 @@ def test_exactly_the_lost_packets_are_marked(tmp_path: Path) -> None:
 
 
 def test_marked_tcp_frames_equal_the_count_of_retransmissions(tmp_path: Path) -> None:
-    transfer, _ = captured(tmp_path, Protocol.TCP, set())
+    transfer, _ = write_captures(tmp_path, Protocol.TCP, set())
     packet_fates = fates.read(AttemptEvidence(tmp_path), transfer)
     assert packet_fates is not None
     sender, receiver = (pcap.read(tmp_path / name).packets for name in ("sender.pcap", "receiver.pcap"))
@@ -107,7 +111,7 @@ def test_marked_tcp_frames_equal_the_count_of_retransmissions(tmp_path: Path) ->
 
 
 def test_damaged_capture_is_not_read(tmp_path: Path) -> None:
-    transfer, _ = captured(tmp_path, Protocol.UDP, set())
+    transfer, _ = write_captures(tmp_path, Protocol.UDP, set())
     path = tmp_path / "receiver.pcap"
     path.write_bytes(path.read_bytes()[:-3])
     assert fates.read(AttemptEvidence(tmp_path), transfer) is None
@@ -117,12 +121,12 @@ def test_damaged_capture_is_not_read(tmp_path: Path) -> None:
 
 @given(st.lists(st.booleans(), max_size=50))
 def test_runs_cover_the_marked_packets(marked: list[bool]) -> None:
-    drawn = np.zeros(len(marked), dtype=np.bool_)
+    drawn_charts = np.zeros(len(marked), dtype=np.bool_)
     runs = packet_rasters._runs(np.array(marked, dtype=np.bool_))
     for start, length in runs:
-        assert not drawn[max(0, start - 1) : start + length].any()
-        drawn[start : start + length] = True
-    assert drawn.tolist() == marked
+        assert not drawn_charts[max(0, start - 1) : start + length].any()
+        drawn_charts[start : start + length] = True
+    assert drawn_charts.tolist() == marked
 
 
 @given(st.lists(st.floats(0, 10), min_size=1, max_size=distribution.MAX_STEPS))
@@ -148,7 +152,7 @@ def test_a_long_distribution_is_drawn_through_quantiles() -> None:
     assert np.abs(np.searchsorted(times, x, side="right") / len(times) - shares).max() <= 1 / 5000
 
 
-def test_strip_of_many_repeats_keeps_all_void_ones(tmp_path: Path) -> None:
+def test_strip_of_many_repeats_shows_all_void_repeats(tmp_path: Path) -> None:
     rows = [
         lawns.row(number, status="void", reason="no capture") if number % 50 == 0 else lawns.row(number)
         for number in range(1, 2401)
@@ -184,9 +188,11 @@ def test_strip_states_its_scale(tmp_path: Path, loss: float, expected: str) -> N
 
 def test_strip_shows_a_loss_that_its_repeats_have(tmp_path: Path) -> None:
     """Otherwise, a repeat with named steps would appear to have no loss."""
-    without = dict.fromkeys(("datagram_loss", "datagrams_sent", "datagrams_received"))
+    without_datagrams = dict.fromkeys(("datagram_loss", "datagrams_sent", "datagrams_received"))
     lost = {"ip_loss": 0.5, "ip_packets_sent": 8, "ip_packets_received": 4}
-    evidence = load_evidence(table(tmp_path, [lawns.row(1), lawns.row(2, topology="masterless", **without, **lost)]))
+    evidence = load_evidence(
+        table(tmp_path, [lawns.row(1), lawns.row(2, topology="masterless", **without_datagrams, **lost)])
+    )
     cells = aggregate(evidence.repeats)
     scales = {group.title: group.scale for group in strips.groups(cells, Identities(cells), evidence)}
     assert scales["UDP, masterless"] == "IP packet loss, full height 50.0 %"
@@ -218,15 +224,20 @@ def test_warnings_of_a_page(tmp_path: Path) -> None:
     ]
     evidence = load_evidence(table(tmp_path, rows))
     cells = aggregate(evidence.repeats)
-    listed = [(warning.text, list(map(plain_text, warning.reasons))) for warning in summary.warnings(cells, evidence)]
-    assert listed[0] == ("1 attempt void.", ["tcpdump dropped 3 packets (1)"])
-    assert listed[1] == ("1 attempt failed.", ["no answer (1)"])
-    assert listed[2] == ("No valid repeat in 1 condition.", ["UDP, 20ft"])
-    assert listed[3][0].startswith("* 95\N{NO-BREAK SPACE}% interval assuming a normal distribution")
-    assert "2 repeats give 50 %" in plain_text(listed[3][0])
-    assert listed[4] == ("One-way delay withheld, all or in part, in 1 valid repeat.", ["the clock drifts (1)"])
-    assert listed[5][0].startswith("Different versions of fieldkit")
-    assert len(listed) == 6
+    listed_warnings = [
+        (warning.text, list(map(plain_text, warning.reasons))) for warning in summary.warnings(cells, evidence)
+    ]
+    assert listed_warnings[0] == ("1 attempt void.", ["tcpdump dropped 3 packets (1)"])
+    assert listed_warnings[1] == ("1 attempt failed.", ["no answer (1)"])
+    assert listed_warnings[2] == ("No valid repeat in 1 condition.", ["UDP, 20ft"])
+    assert listed_warnings[3][0].startswith("* 95\N{NO-BREAK SPACE}% interval assuming a normal distribution")
+    assert "2 repeats give 50 %" in plain_text(listed_warnings[3][0])
+    assert listed_warnings[4] == (
+        "One-way delay withheld, all or in part, in 1 valid repeat.",
+        ["the clock drifts (1)"],
+    )
+    assert listed_warnings[5][0].startswith("Different versions of fieldkit")
+    assert len(listed_warnings) == 6
 
 
 def test_summary_paragraph_has_counts_and_conditions(tmp_path: Path) -> None:
@@ -278,23 +289,23 @@ def test_report_of_topics_has_their_headlines_and_charts(tmp_path: Path) -> None
     path.write_text(to_csv(rows, columns), encoding="utf-8")
     evidence = load_evidence(read([path], columns))
     cells = aggregate(evidence.repeats)
-    by_subject = {headline.subject: ends(headline) for headline in headlines.headlines(cells, evidence)}
-    assert by_subject == {
+    lines_by_subject = {headline.subject: ends(headline) for headline in headlines.headlines(cells, evidence)}
+    assert lines_by_subject == {
         "Repeats": ["4 of 4 valid"],
         "topic loss": ["in all conditions 10.00 %"],
         "topic delay": ["in all conditions 30.00 ms"],
     }
-    drawn = distance.charts(cells, Identities(cells), evidence, (*distance.LOSS, *distance.DELAY))
-    assert {"topic-loss", "topic-delay-median"} <= {chart.name for chart in drawn}
+    drawn_charts = distance.charts(cells, Identities(cells), evidence, (*distance.LOSS, *distance.DELAY))
+    assert {"topic-loss", "topic-delay-median"} <= {chart.name for chart in drawn_charts}
 
 
 def test_iperf3_results_are_separate_charts_against_distance(tmp_path: Path) -> None:
-    tested = {"iperf3_throughput_bit_s": 5e6, "iperf3_loss": 0.1, "iperf3_captured_loss": 0.12}
+    iperf3_values = {"iperf3_throughput_bit_s": 5e6, "iperf3_loss": 0.1, "iperf3_captured_loss": 0.12}
     counts = {"iperf3_datagrams_sent": 100, "iperf3_datagrams_received": 90}
     columns = trial_columns((*iperf3.COLUMNS, *iperf3_load.COLUMNS))
     path = tmp_path / "trial.csv"
     farther = {"distance": "20ft", "distance_m": 6.096}
-    rows = [{**lawns.row(number), **tested, **counts, **place} for place in ({}, farther) for number in (1, 2)]
+    rows = [{**lawns.row(number), **iperf3_values, **counts, **place} for place in ({}, farther) for number in (1, 2)]
     path.write_text(to_csv(rows, columns), encoding="utf-8")
     page = build_contents(read([path], columns), title="", repeat="", command=["fieldkit"])
     titles = {section.name: [chart.title for chart in section.charts] for section in page.against_distance}
@@ -321,8 +332,8 @@ def test_pings_of_different_sizes_have_separate_charts(tmp_path: Path) -> None:
     ]
     evidence = load_evidence(table(tmp_path, rows))
     cells = aggregate(evidence.repeats)
-    of_rtt = list(distance.charts(cells, Identities(cells), evidence, ["rtt_median_s"]))
-    assert [(chart.name, [panel.title for panel in chart.panels]) for chart in of_rtt] == [
+    rtt_charts = list(distance.charts(cells, Identities(cells), evidence, ["rtt_median_s"]))
+    assert [(chart.name, [panel.title for panel in chart.panels]) for chart in rtt_charts] == [
         ("rtt-median-502-bytes", ["TCP, master"]),
         ("rtt-median-8192-bytes", ["UDP, master"]),
     ]
@@ -370,14 +381,17 @@ def test_los_and_nlos_keep_their_style_among_other_procedures(tmp_path: Path, pr
     ]
     cells = aggregate(table(tmp_path, rows))
     identities = Identities(cells)
-    by_procedure = {str(cell.key["procedure"]): identities.of(cell) for cell in cells}
-    names_by_style = {(identity.style.colour, identity.style.marker): name for name, identity in by_procedure.items()}
+    identities_by_procedure = {str(cell.key["procedure"]): identities.of(cell) for cell in cells}
+    names_by_style = {
+        (identity.style.colour, identity.style.marker): name for name, identity in identities_by_procedure.items()
+    }
     assert len(names_by_style) == len(names)
     assert names_by_style.get(("blue", "o")) == next((name for name in ("los", "driveaway") if name in names), None)
     assert names_by_style.get(("red", "s")) == ("nlos" if "nlos" in names else None)
-    several = scenarios.count("los") > 1
-    assert {name: identity.label for name, identity in by_procedure.items()} == {
-        name: name.upper() if name in {"los", "nlos"} else f"LOS, {name}" if several else "LOS" for name in names
+    has_several_los = scenarios.count("los") > 1
+    assert {name: identity.label for name, identity in identities_by_procedure.items()} == {
+        name: name.upper() if name in {"los", "nlos"} else f"LOS, {name}" if has_several_los else "LOS"
+        for name in names
     }
 
 
@@ -389,5 +403,5 @@ def test_edited_table_cannot_refer_to_other_folders(tmp_path: Path) -> None:
 def test_a_title_names_few_procedures(tmp_path: Path) -> None:
     rows = [tables.replace(tables.COMPARABLE, procedure=f"run {number}") for number in range(6)]
     assert summary.title(aggregate(table(tmp_path, rows)), {}) == "Loss and delay: run 0, run 1 and 4 others"
-    three = aggregate(table(tmp_path / "three", rows[:3]))
-    assert summary.title(three, {}) == "Loss and delay: run 0, run 1 and run 2"
+    three_procedures = aggregate(table(tmp_path / "three", rows[:3]))
+    assert summary.title(three_procedures, {}) == "Loss and delay: run 0, run 1 and run 2"

@@ -1,4 +1,4 @@
-"""The repeat selected for the time line by default."""
+"""The repeat that the time line shows by default."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ FAR = replace(TCP, distance="55ft", distance_m=16.764)
 
 @dataclass(frozen=True, eq=False)
 class PartialEvidence(Evidence):
-    """A table with evidence for some of its rows."""
+    """Evidence that exists only for some rows of a table."""
 
     rows_with_evidence: frozenset[int] = frozenset()
 
@@ -31,10 +31,12 @@ class PartialEvidence(Evidence):
 
 
 def selected_row(rows: Sequence[RepeatRow], *missing: int) -> int | None:
-    """Return the row selected for the time line if evidence exists for all rows except some."""
+    """Return the row that is selected for the time line if all rows have evidence, except `missing`."""
     table = parsed([replace(row, repeat=1 + number) for number, row in enumerate(rows)])
-    remaining = frozenset(range(len(rows))).difference(missing)
-    return repeat_to_draw(aggregate(table), PartialEvidence(table, {}, (), frozenset(), frozenset(), remaining), "")
+    rows_with_evidence = frozenset(range(len(rows))).difference(missing)
+    return repeat_to_draw(
+        aggregate(table), PartialEvidence(table, {}, (), frozenset(), frozenset(), rows_with_evidence), ""
+    )
 
 
 def rows_with(row: RepeatRow, name: str, *values: float) -> list[RepeatRow]:
@@ -47,19 +49,23 @@ LOST = [*rows_with(TCP, "tcp_byte_loss", 0.3, 0.2, 0.1), *rows_with(FAR, "tcp_by
 @pytest.mark.parametrize(
     ("rows", "missing", "row"),
     [
-        (LOST, (), 6),  # condition of most loss, median of 0.6, 0.7 and 0.9; repeats without loss are excluded
-        (LOST, (5,), 3),  # the lower one of two
-        (LOST, (3, 5, 6), 1),  # no evidence of repeats with loss in that condition
+        (
+            LOST,
+            (),
+            6,
+        ),  # the condition of most loss, with the median of 0.6, 0.7 and 0.9; repeats without loss are excluded
+        (LOST, (5,), 3),  # the lower of two values
+        (LOST, (3, 5, 6), 1),  # the repeats with loss in this condition have no evidence
         (
             rows_with(TCP, "tcp_byte_loss", 0.0, 0.0) + rows_with(FAR, "rtt_loss", 0.1),
             (),
             None,
-        ),  # a share without its counts
+        ),  # a share without counts
         (
             rows_with(TCP, "transfer_s", 1.0, 3.0, 2.0) + rows_with(FAR, "transfer_s", 5.0, 4.0, 9.0),
             (),
             3,
-        ),  # nothing lost
+        ),  # no losses
         (rows_with(replace(TCP, tcp_byte_loss=0.0), "rtt_median_s", 0.3, 0.1, 0.2), (), 2),
         (LOST, range(len(LOST)), None),
         ([replace(LOST[0], status="void"), *LOST[1:3]], (), 2),

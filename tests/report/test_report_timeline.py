@@ -1,4 +1,4 @@
-"""Time line of one repeat: bars of steps, faults and moves, and flows, on one time axis."""
+"""The time line of a repeat: bars of steps, faults and moves, and panels of flows, on one time axis."""
 
 import json
 import struct
@@ -21,7 +21,7 @@ from fieldkit.trial.plan import PLAN_FILE
 from fieldkit.trial.stored import plans, sources
 from tests.helpers import recorded
 
-BEGAN_NS = recorded.START_NS + 10 * recorded.SECOND_NS
+STARTED_NS = recorded.START_NS + 10 * recorded.SECOND_NS
 """Start of the recording; the transfer starts 2 s later, the ping 3 s later."""
 BOOT_S = 100
 
@@ -32,14 +32,14 @@ def trial(tmp_path: Path) -> Path:
     return recorded.make(tmp_path / "trials")
 
 
-def jobs(trial: Path, **spans: tuple[float, float]) -> Path:
-    """Write when jobs ran on the sender, seconds since the attempt began; return the attempt's folder."""
+def write_jobs(trial: Path, **spans: tuple[float, float]) -> Path:
+    """Write the start and end times of jobs on the sender, in s since the attempt's start; return its folder."""
     folder = trial / "repeats" / "udp-01"
     lines = [
         f"{name.replace('__', '.').replace('_', '-')} itself 0 {round(100 * (BOOT_S + start))} {BOOT_S + stop:.2f}"
         for name, (start, stop) in spans.items()
     ]
-    clock = f"{BOOT_S}.00 {BEGAN_NS // recorded.SECOND_NS}.000000000 {BOOT_S}.00"
+    clock = f"{BOOT_S}.00 {STARTED_NS // recorded.SECOND_NS}.000000000 {BOOT_S}.00"
     text = "\n".join(["==> jobs <==", *lines, "==> clock <==", clock, "==> end <==", ""])
     (folder / host.after_file(Role.SENDER)).write_text(text, encoding="utf-8")
     return folder
@@ -55,12 +55,12 @@ def panels(trial: Path) -> list[Panel]:
 
 
 def bars(panel: Panel) -> dict[str, tuple[float, float]]:
-    """Return start and stop of the bar in each lane, rounded to 10 ms."""
+    """Return the start and end of the bar in each lane, rounded to 10 ms."""
     return {panel.lanes[span.lane]: (round(span.start, 2), round(span.stop, 2)) for span in panel.spans}
 
 
 def test_jobs_have_bars_and_panels_share_one_axis(trial: Path) -> None:
-    jobs(trial, capture=(1.0, 6.0), ping=(2.9, 5.0))
+    write_jobs(trial, capture=(1.0, 6.0), ping=(2.9, 5.0))
     all_panels = panels(trial)
     drawn_bars = bars(all_panels[0])
     assert drawn_bars["capture"][1] - drawn_bars["capture"][0] == pytest.approx(5.0, abs=0.02)
@@ -72,36 +72,37 @@ def test_jobs_have_bars_and_panels_share_one_axis(trial: Path) -> None:
 
 
 def test_fault_has_a_bar_for_its_cause_and_one_for_the_time_without_replies(trial: Path) -> None:
-    folder = jobs(trial, fault_link_down=(1.0, 9.0), fault_link_down_heals=(5.0, 8.0))
+    folder = write_jobs(trial, fault_link_down=(1.0, 9.0), fault_link_down_heals=(5.0, 8.0))
     (folder / "fault-link-down.txt").write_text("lasted_s 2.000\ninterval_s 0.1\n", encoding="ascii")
     replies = [
-        f"[{BEGAN_NS // recorded.SECOND_NS + at_s}.000000] 64 bytes from 10.0.0.2: icmp_seq={at_s} ttl=64 time=1 ms"
+        f"[{STARTED_NS // recorded.SECOND_NS + at_s}.000000] 64 bytes from 10.0.0.2: icmp_seq={at_s} ttl=64 time=1 ms"
         for at_s in (1, 2, 6, 7, 8)
     ]
     (folder / "fault-link-down-ping.txt").write_text(
         "\n".join(["PING 10.0.0.2 (10.0.0.2) 56(84) bytes of data.", *replies]), encoding="utf-8"
     )
     drawn_bars = bars(panels(trial)[0])
-    cause, silence = drawn_bars["fault link-down"], drawn_bars["no answer link-down"]
+    cause, no_answer = drawn_bars["fault link-down"], drawn_bars["no answer link-down"]
     assert cause[1] - cause[0] == pytest.approx(2.0, abs=0.02)
-    assert silence[1] - silence[0] == pytest.approx(4.0, abs=0.02)
-    assert cause[0] - silence[0] == pytest.approx(1.0, abs=0.02)
+    assert no_answer[1] - no_answer[0] == pytest.approx(4.0, abs=0.02)
+    assert cause[0] - no_answer[0] == pytest.approx(1.0, abs=0.02)
     assert "fault-link-down" not in drawn_bars
 
 
 def test_move_has_a_bar_from_its_first_to_its_last_position(trial: Path) -> None:
-    folder = jobs(trial, capture=(1.0, 9.0))
-    moved = [
-        TrackPoint(BEGAN_NS + 2 * 10**9 + round(n * 1e8), Role.RECEIVER, (10.0 + n / 10, 0.0, 0.2)) for n in range(21)
+    folder = write_jobs(trial, capture=(1.0, 9.0))
+    moved_points = [
+        TrackPoint(STARTED_NS + 2 * 10**9 + round(n * 1e8), Role.RECEIVER, (10.0 + n / 10, 0.0, 0.2))
+        for n in range(21)
     ]
     initial = [TrackPoint(1, Role.RECEIVER, (10.0, 0.0, 0.2)), TrackPoint(1, Role.SENDER, (0.0, 0.0, 0.2))]
-    (folder / track.FILE).write_text(track.text([*initial, *moved]), encoding="ascii")
+    (folder / track.FILE).write_text(track.text([*initial, *moved_points]), encoding="ascii")
     start, stop = bars(panels(trial)[0])["move receiver"]
     assert stop - start == pytest.approx(2.0, abs=0.02)
 
 
 def test_a_ping_without_any_reply_shows_all_its_losses(trial: Path) -> None:
-    folder = jobs(trial, ping=(3.0, 5.0))
+    folder = write_jobs(trial, ping=(3.0, 5.0))
     summary = "10 packets transmitted, 0 received, 100% packet loss, time 1800ms"
     (folder / "ping.txt").write_text(f"{recorded.PING_HEAD}\n{summary}\n", encoding="utf-8")
     trips = next(panel for panel in panels(trial) if panel.title == "round trips")
@@ -124,7 +125,7 @@ def add_step(trial: Path, text: str) -> None:
 
 def test_iperf3_has_a_panel_of_its_rate_per_second(trial: Path) -> None:
     add_step(trial, '{"iperf3": {"from": "sender", "to": "receiver", "duration": "3s"}}')
-    folder = jobs(trial, iperf3_client=(4.0, 7.0))
+    folder = write_jobs(trial, iperf3_client=(4.0, 7.0))
     intervals = [{"sum": {"seconds": 1.0, "bytes": size}} for size in (125_000, 250_000, 0)]
     test = {"start": {}, "intervals": intervals, "end": {}}
     (folder / "receiver-iperf3.json").write_text(json.dumps(test), encoding="utf-8")
@@ -138,20 +139,21 @@ def test_a_topic_has_a_panel_of_its_delays_and_losses(trial: Path) -> None:
     add_step(
         trial, '{"topics": {"from": "sender", "to": "receiver", "over": "dds", "rate": "10Hz", "bytes": "100B"}}'
     )
-    folder = jobs(trial, publish=(4.0, 7.0))
+    folder = write_jobs(trial, publish=(4.0, 7.0))
     after = folder / host.after_file(Role.SENDER)
     text = after.read_text(encoding="utf-8").replace("publish", "subscribe")
     (folder / host.after_file(Role.RECEIVER)).write_text(text, encoding="utf-8")
-    begin_ns = BEGAN_NS + 4 * 10**9
+    stream_start_ns = STARTED_NS + 4 * 10**9
 
     def record(kind: int, sequence: int, sent_ns: int, at_ns: int) -> bytes:
         return struct.pack("<HHIqqq", kind, 0, 100, sequence, sent_ns, at_ns)
 
     def log(name: str, numbers: tuple[int, ...], late_ns: int) -> None:
         samples = [
-            record(1, n, begin_ns + n * 10**8, begin_ns + n * 10**8 + late_ns + (n == 3) * 5 * 10**6) for n in numbers
+            record(1, n, stream_start_ns + n * 10**8, stream_start_ns + n * 10**8 + late_ns + (n == 3) * 5 * 10**6)
+            for n in numbers
         ]
-        content = topic_samples.LOG_MAGIC + b"".join(samples) + record(7, len(numbers), 0, begin_ns + 10**9)
+        content = topic_samples.LOG_MAGIC + b"".join(samples) + record(7, len(numbers), 0, stream_start_ns + 10**9)
         (folder / name).write_bytes(content)
 
     log("sender-topic.bin", (0, 1, 2, 3, 4), 0)

@@ -1,4 +1,4 @@
-"""Variables in arguments: only known names are replaced, and an argument stays one argument."""
+"""Variables in arguments: only known names are replaced, and an argument is not split."""
 
 import pytest
 from hypothesis import given
@@ -13,7 +13,7 @@ def fill_in(word: str) -> str:
     return arguments.fill_in(word, VALUES, lambda role: f"<{role}>")
 
 
-# Expected result of each piece of an argument, written by hand.
+# The expected results of parts of an argument, written by hand.
 PIECES = {
     "{distance}": "30ft",
     "{repeat}": "7",
@@ -75,13 +75,13 @@ def test_values_are_not_expanded_again(value: str) -> None:
         ("{adress.receiver}", "{address.receiver}"),
     ],
 )
-def test_misspelled_variable_is_refused_with_suggestion(word: str, suggested: str) -> None:
+def test_misspelled_variable_is_rejected_with_suggestion(word: str, suggested: str) -> None:
     reason = arguments.problem(f"--x={word}", has_program=True)
     assert reason is not None
     assert f"there is no variable {word}; did you mean '{suggested}'? write {{{word}}} for the text {word}" == reason
-    assert fill_in(f"{{{word}}}") == word, "the remedy works when it is typed"
+    assert fill_in(f"{{{word}}}") == word, "the remedy is effective"
 
 
-def test_put_without_copied_program_is_refused() -> None:
+def test_put_without_copied_program_is_rejected() -> None:
     assert "the step has no put:" in (arguments.problem("{put}", has_program=False) or "")
     assert arguments.problem("{{put}}", has_program=False) is None

@@ -1,4 +1,4 @@
-"""A real transfer between each pair of netcats: the file arrives, and both ends exit."""
+"""Transfers between all pairs of variants of netcat: the file arrives, and both ends exit."""
 
 import shutil
 import subprocess
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.emulated
 
 LIMIT_S = 60.0
 IDLE_S = 3
-"""How long a listener waits for the first datagram, and after the last."""
+"""Time in which a listener waits for the first datagram, and for a further datagram after the last."""
 # Larger than a pipe and both socket buffers, so that the sender must wait for the reader.
 TCP_BYTES = 24_000_000
 # Smaller than a socket buffer, because nothing limits the rate of UDP on loopback.
@@ -29,13 +29,13 @@ UDP = list(product(netcat.DATAGRAM_BYTES, repeat=2))
 
 @cache
 def version(kind: Netcat) -> str:
-    """Return the version text of a netcat of this machine; empty except for ncat, which alone prints one."""
+    """Return the version text of ncat on this machine; the other variants print none, so theirs is empty."""
     argv = ("ncat", "--version")
     return subprocess.run(argv, capture_output=True, text=True, check=True).stderr if kind is Netcat.NCAT else ""
 
 
 def program(kind: Netcat, folder: Path) -> str:
-    """Return the program of a variant under the name with which it is called."""
+    """Return the command of a variant."""
     if kind is Netcat.BUSYBOX:
         link = folder / "nc"
         if not link.is_symlink():
@@ -66,15 +66,15 @@ def transfer(sender: Netcat, receiver: Netcat, protocol: Protocol, content: byte
     ):
         try:
             wait_for_listener(protocol, port)
-            with subprocess.Popen(send, stdin=source, stdout=subprocess.DEVNULL, cwd=folder) as sending:
+            with subprocess.Popen(send, stdin=source, stdout=subprocess.DEVNULL, cwd=folder) as sender_process:
                 try:
-                    received, _ = listener.communicate(timeout=LIMIT_S)
-                    assert sending.wait(LIMIT_S) == 0
+                    received_data, _ = listener.communicate(timeout=LIMIT_S)
+                    assert sender_process.wait(LIMIT_S) == 0
                 finally:
-                    sending.kill()
+                    sender_process.kill()
         finally:
             listener.kill()
-    return received
+    return received_data
 
 
 @pytest.mark.parametrize(("sender", "receiver"), list(product(Netcat, repeat=2)))
@@ -85,12 +85,12 @@ def test_tcp_delivers_complete_file(sender: Netcat, receiver: Netcat, tmp_path: 
 
 
 @pytest.mark.parametrize(("sender", "receiver"), UDP)
-def test_udp_delivers_complete_file_or_pair_is_refused(sender: Netcat, receiver: Netcat, tmp_path: Path) -> None:
+def test_udp_delivers_complete_file_or_the_pair_is_refused(sender: Netcat, receiver: Netcat, tmp_path: Path) -> None:
     content = (bytes(range(256)) * (UDP_BYTES // 256 + 1))[:UDP_BYTES]
     is_complete = transfer(sender, receiver, Protocol.UDP, content, tmp_path) == content
     assert is_complete != netcat.truncates_datagrams(sender, receiver, version(receiver))
 
 
 def test_refused_pair_loses_half_of_the_file(tmp_path: Path) -> None:
-    received = transfer(Netcat.OPENBSD, Netcat.TRADITIONAL, Protocol.UDP, b"x" * 4 * 16384, tmp_path)
-    assert len(received) == 4 * 8192
+    received_data = transfer(Netcat.OPENBSD, Netcat.TRADITIONAL, Protocol.UDP, b"x" * 4 * 16384, tmp_path)
+    assert len(received_data) == 4 * 8192

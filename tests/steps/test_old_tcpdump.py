@@ -1,4 +1,4 @@
-"""A repeat with a tcpdump without immediate mode: the captures are complete."""
+"""A repeat with a tcpdump without immediate mode, whose captures must be complete."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,11 +21,11 @@ from tests.helpers.plans import problems
 pytestmark = pytest.mark.emulated
 
 
-def test_kernel_ring_is_drained(tmp_path: Path) -> None:
+def test_the_ring_buffer_of_the_kernel_is_drained(tmp_path: Path) -> None:
     plan = los_plan(record_s=0.5, protocols=(Protocol.TCP,))
-    old = replace(variants.expected(TURTLEBOT), immediate_mode=False)
+    old_tools = replace(variants.expected(TURTLEBOT), immediate_mode=False)
     folder = jobs.work_folder(plan.trial, "tcp-01-1")
-    scene = plan.scene(RepeatId(Protocol.TCP, 1), folder, dict.fromkeys(FIXED_ROLES, old))
+    scene = plan.scene(RepeatId(Protocol.TCP, 1), folder, dict.fromkeys(FIXED_ROLES, old_tools))
     cast, radio = EmulatedBackend(None, None).cast(Topology.MASTER), RadioOptions(fading=False)
     with testbed.bring_up(
         cast, options=EmulatedOptions(radio=radio), world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1

@@ -1,4 +1,4 @@
-"""Steps over one of several links: their commands, their errors, and the check of the route."""
+"""Steps that use one of several links: their commands, their errors, and the check of the route."""
 
 import pytest
 
@@ -36,7 +36,7 @@ LINKED = {
 SCENE = Scene(Protocol.TCP, LINKED, "f")
 
 
-def parsed(kind: type[Step], text: str) -> Step:
+def parse_step(kind: type[Step], text: str) -> Step:
     return schema.validate(schema.parse(f"{{{text}}}", source="x.yaml"), kind)
 
 
@@ -56,22 +56,22 @@ def commands(step: Step) -> list[str]:
     ],
 )
 def test_a_step_sends_to_the_address_on_its_link(kind: type[Step], keys: str, address: str) -> None:
-    assert any(f" {address}" in command for command in commands(parsed(kind, keys)))
+    assert any(f" {address}" in command for command in commands(parse_step(kind, keys)))
 
 
 def test_a_capture_and_a_fault_use_the_interface_of_their_link() -> None:
-    step = parsed(CaptureStep, "over: cell, during: [{ping: {from: sender, to: receiver, over: cell}}]")
+    step = parse_step(CaptureStep, "over: cell, during: [{ping: {from: sender, to: receiver, over: cell}}]")
     captures = commands(step)[:2]
     assert all(" -i wwan0 " in command for command in captures)
     assert all("host 100.64.0.1 and host 100.64.0.2" in command for command in captures)
-    fault = parsed(FaultStep, "robot: receiver, kind: link-down, link: cell, for: 5s")
+    fault = parse_step(FaultStep, "robot: receiver, kind: link-down, link: cell, for: 5s")
     assert isinstance(fault, FaultStep)
     assert fault.cause.link == "cell"
     assert commands(fault)[0].endswith("-I wwan0 -i 0.1 100.64.0.2")
 
 
 def test_a_capture_of_a_link_without_an_interface_is_on_all_interfaces() -> None:
-    step = parsed(CaptureStep, "over: either, during: [{ping: {from: sender, to: receiver, over: either}}]")
+    step = parse_step(CaptureStep, "over: either, during: [{ping: {from: sender, to: receiver, over: either}}]")
     assert all(" -i any " in command for command in commands(step)[:2])
     assert isinstance(step, CaptureStep)
     assert step.placement_error((), ()) is None
@@ -89,40 +89,40 @@ def test_a_capture_of_a_link_without_an_interface_is_on_all_interfaces() -> None
     ],
 )
 def test_duplicates_need_a_capture_of_the_link(keys: str, is_captured: bool, reason: str | None) -> None:
-    step = parsed(PingStep, f"from: sender, to: receiver, {keys}, duplicates: true")
-    around = parsed(CaptureStep, "over: either, during: [{wait: {duration: 1s}}]")
+    step = parse_step(PingStep, f"from: sender, to: receiver, {keys}, duplicates: true")
+    capture = parse_step(CaptureStep, "over: either, during: [{wait: {duration: 1s}}]")
     assert isinstance(step, PingStep)
-    assert isinstance(around, CaptureStep)
-    error = step.placement_error((), (around,) if is_captured else ())
+    assert isinstance(capture, CaptureStep)
+    error = step.placement_error((), (capture,) if is_captured else ())
     assert error is None if reason is None else reason in (error or "")
 
 
 @pytest.mark.parametrize(
     ("outer", "inner"), [("over: cell,", ""), ("", ", over: cell"), ("over: wifi,", ", over: cell")]
 )
-def test_a_capture_on_another_link_than_its_steps_is_refused(outer: str, inner: str) -> None:
-    step = parsed(CaptureStep, f"{outer} during: [{{ping: {{from: sender, to: receiver{inner}}}}}]")
+def test_a_capture_on_another_link_than_its_steps_is_rejected(outer: str, inner: str) -> None:
+    step = parse_step(CaptureStep, f"{outer} during: [{{ping: {{from: sender, to: receiver{inner}}}}}]")
     assert isinstance(step, CaptureStep)
     assert "see `over`" in (step.placement_error((), ()) or "")
 
 
-def test_a_link_that_a_robot_does_not_have_is_refused_with_the_nearest_name() -> None:
+def test_a_link_that_a_robot_does_not_have_is_rejected_with_the_nearest_name() -> None:
     with pytest.raises(ConfigurationError, match=r"turtlebot-2 \(receiver\) has no link 'cel'") as error:
-        commands(parsed(PingStep, "from: sender, to: receiver, over: cel"))
+        commands(parse_step(PingStep, "from: sender, to: receiver, over: cel"))
     assert "cell" in error.value.remedy
     with pytest.raises(ConfigurationError, match="a reboot does not allow link"):
-        parsed(FaultStep, "robot: receiver, kind: reboot, link: cell")
+        parse_step(FaultStep, "robot: receiver, kind: reboot, link: cell")
 
 
 def test_flows_and_route_checks_name_the_link() -> None:
-    step = parsed(PingStep, "from: sender, to: receiver, over: cell")
+    step = parse_step(PingStep, "from: sender, to: receiver, over: cell")
     assert isinstance(step, SendsTraffic)
     assert isinstance(step, HasNeeds)
     assert [flow.link for flow in step.flows(SCENE)] == ["cell"]
     (need,) = step.needs(SCENE)
     assert need.argv == ("ip", "-o", "route", "get", "100.64.0.2")
     for other in ("", ", over: wifi", ", over: either"):
-        radio = parsed(PingStep, f"from: sender, to: receiver{other}")
+        radio = parse_step(PingStep, f"from: sender, to: receiver{other}")
         assert isinstance(radio, HasNeeds)
         assert len(list(radio.needs(SCENE))) == (1 if "wifi" in other else 0)
 
@@ -136,14 +136,14 @@ def test_flows_and_route_checks_name_the_link() -> None:
         ("", 127, Verdict.FAIL),
     ],
 )
-def test_the_route_must_leave_by_the_interface_of_the_link(output: str, code: int, verdict: Verdict) -> None:
-    here, there = (LINKED[role].links["cell"] for role in (Role.SENDER, Role.RECEIVER))
-    actual, _, remedy = judge_route(here, there, CommandResult(output, code))
+def test_the_route_must_use_the_interface_of_the_link(output: str, code: int, verdict: Verdict) -> None:
+    sender_link, receiver_link = (LINKED[role].links["cell"] for role in (Role.SENDER, Role.RECEIVER))
+    actual, _, remedy = judge_route(sender_link, receiver_link, CommandResult(output, code))
     assert actual is verdict
     assert ("ip route replace 100.64.0.2 dev wwan0" in remedy) == (verdict is Verdict.FAIL)
 
 
-def test_two_links_with_one_interface_are_refused() -> None:
+def test_two_links_with_one_interface_are_rejected() -> None:
     data = TURTLEBOT.model_dump(mode="json", by_alias=True) | {"links": {"a": "wlan0", "b": "wlan0"}}
     with pytest.raises(schema.ValidationError, match="two links have the same interface"):
         RobotProfile.model_validate(data)

@@ -1,4 +1,4 @@
-"""Preflight check for routing protocols on robots that forward packets for each other."""
+"""The preflight check for routing protocols on robots that forward packets for each other."""
 
 import shlex
 import shutil
@@ -17,11 +17,11 @@ SCENE = Scene(Protocol.UDP, CAST, "f")
 
 
 def test_forwarded_ping_checks_all_robots_of_the_trial() -> None:
-    plain = {"from": "sender", "to": "receiver"}
-    step = PingStep.model_validate(plain | {"forwarded": True})
+    keys = {"from": "sender", "to": "receiver"}
+    step = PingStep.model_validate(keys | {"forwarded": True})
     assert [need.role for need in step.needs(SCENE)] == list(CAST)
     assert Role.RELAY in CAST.keys() - step.roles()
-    assert not [*PingStep.model_validate(plain).needs(SCENE)]
+    assert not [*PingStep.model_validate(keys).needs(SCENE)]
 
 
 @pytest.mark.emulated
@@ -35,11 +35,13 @@ def test_daemon_is_found_by_exact_name_in_each_shell(tmp_path: Path, shell: str,
         shutil.copy("/usr/bin/sleep", tmp_path / daemon)
         search = f"./{daemon} 60 & until grep -qx {daemon} /proc/$!/comm; do :; done; {search}"
     namespace = ("unshare", "--pid", "--fork", "--kill-child", "--mount", "--mount-proc")
-    done = subprocess.run((*namespace, "sh", "-c", search), cwd=tmp_path, capture_output=True, text=True, check=False)
-    names = done.stdout.split()
-    # Kernel modules are those of this machine, independent of the namespace.
+    completed = subprocess.run(
+        (*namespace, "sh", "-c", search), cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    names = completed.stdout.split()
+    # The kernel modules of this machine are visible in each namespace.
     assert [name for name in names if name != "batman-adv"] == ([daemon] if daemon in routing.DAEMONS else [])
-    assert (done.returncode, done.stderr) == (0, "")
+    assert (completed.returncode, completed.stderr) == (0, "")
 
 
 @pytest.mark.parametrize(
@@ -51,7 +53,7 @@ def test_daemon_is_found_by_exact_name_in_each_shell(tmp_path: Path, shell: str,
         (CommandResult("sh: not found", 127), Verdict.FAIL, "no routing protocol runs on it"),
     ],
 )
-def test_verdict_and_detail(result: CommandResult, verdict: Verdict, detail: str) -> None:
+def test_a_missing_routing_protocol_fails_with_a_remedy(result: CommandResult, verdict: Verdict, detail: str) -> None:
     actual, detail_text, remedy = routing.judge(result)
     assert actual is verdict
     assert detail_text.startswith(detail)

@@ -1,4 +1,4 @@
-"""Steps that last as long as the move around them (`along: true`): ping, wait, topics, iperf3."""
+"""Steps that take as long as the move around them (`along: true`): ping, wait, topics and iperf3."""
 
 import math
 from typing import Any
@@ -44,7 +44,7 @@ def resolved_step(kind: str, keys: str, distance: str = "2m") -> Any:  # noqa: A
 
 
 @pytest.mark.motion
-def test_each_kind_lasts_as_long_as_the_path() -> None:
+def test_each_kind_takes_as_long_as_the_path() -> None:
     ping = resolved_step("ping", f"{ENDS}, along: true, interval: 300ms")
     assert isinstance(ping, PingStep)
     assert (ping.count, ping.along) == (34, False), "10 s are more than 33 intervals"
@@ -64,24 +64,26 @@ def test_each_kind_lasts_as_long_as_the_path() -> None:
 @pytest.mark.motion
 def test_driving_robot_needs_time_for_turns() -> None:
     text = TEXT.replace("AWAY", "1m}, {left: 1m").replace("KIND: {KEYS}", "wait: {along: true}")
-    turning = schema.validate(schema.parse(text, source="x.yaml"), Procedure)
-    moved, driven = (list(turning.resolved(cast).walk())[-1].step for cast in (CAST, driving_cast(CAST)))
-    assert isinstance(moved, WaitStep)
-    assert isinstance(driven, WaitStep)
-    assert moved.duration == 10.0
-    # It needs a quarter of a turn at up to 1 rad/s, and brakes twice.
-    assert driven.duration == pytest.approx(10.0 + math.pi / 2 + 2.0, abs=1.0)
+    turning_procedure = schema.validate(schema.parse(text, source="x.yaml"), Procedure)
+    moved_wait, driven_wait = (
+        list(turning_procedure.resolved(cast).walk())[-1].step for cast in (CAST, driving_cast(CAST))
+    )
+    assert isinstance(moved_wait, WaitStep)
+    assert isinstance(driven_wait, WaitStep)
+    assert moved_wait.duration == 10.0
+    # The robot turns by 90 degrees at up to 1 rad/s and brakes twice.
+    assert driven_wait.duration == pytest.approx(10.0 + math.pi / 2 + 2.0, abs=1.0)
 
 
 @pytest.mark.motion
 def test_resolved_procedure_is_read_again() -> None:
     for kind, keys in (("ping", ENDS), ("wait", ""), ("topics", ENDS), ("iperf3", ENDS)):
-        written = procedure(kind, f"{keys}{', ' if keys else ''}along: true", "1.23m").resolved(CAST)
-        assert schema.validate(schema.parse(schema.dump(written), source="trial.yaml"), Procedure) == written
+        resolved = procedure(kind, f"{keys}{', ' if keys else ''}along: true", "1.23m").resolved(CAST)
+        assert schema.validate(schema.parse(schema.dump(resolved), source="trial.yaml"), Procedure) == resolved
 
 
 @pytest.mark.parametrize(
-    ("kind", "keys", "complaint"),
+    ("kind", "keys", "message"),
     [
         ("ping", f"{ENDS}, along: true, count: 3", "along and count exclude each other"),
         ("topics", f"{ENDS}, along: true, duration: 3s", "along and duration exclude each other"),
@@ -91,13 +93,13 @@ def test_resolved_procedure_is_read_again() -> None:
         ("wait", "along: true, duration: 3s", "leave one out"),
     ],
 )
-def test_second_duration_is_refused(kind: str, keys: str, complaint: str) -> None:
-    with pytest.raises(ConfigurationError, match=complaint) as caught:
+def test_a_second_duration_is_rejected(kind: str, keys: str, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message) as caught:
         procedure(kind, keys)
     assert caught.value.where == "x.yaml:13"
 
 
-def test_along_without_move_is_refused() -> None:
+def test_along_without_move_is_rejected() -> None:
     text = TEXT[: TEXT.index("  - move")] + f"  - ping: {{{ENDS}, along: true}}\n"
     with pytest.raises(ConfigurationError, match="needs a move around it") as caught:
         schema.validate(schema.parse(text, source="x.yaml"), Procedure)

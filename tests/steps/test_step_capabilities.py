@@ -1,4 +1,4 @@
-"""Capabilities of steps: found by the methods that a class defines, also without deriving from them."""
+"""Capabilities of steps, which a class has if it defines their methods, even if it does not derive from them."""
 
 import inspect
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ from tests.helpers.idle_testbed import IdleTestbed
 MAX_METHODS = 12
 
 
-class Outside(Step):
+class ExternalStep(Step):
     """A kind of another package that derives from no capability."""
 
     def needs(self, scene: Scene) -> Iterator[Need]:
@@ -56,22 +56,22 @@ def test_methods_of_capabilities_are_not_in_the_contract_and_in_one_capability()
 
 
 def test_step_that_defines_the_methods_has_the_capability() -> None:
-    step = Outside()
+    step = ExternalStep()
     assert isinstance(step, HasNeeds)
     assert not isinstance(step, Listens | Restarts | Records)
 
 
 def test_derived_kind_has_the_capabilities_of_its_base_only() -> None:
-    """A step class that derives from a capability is no capability."""
+    """A step class that derives from a capability is not a capability."""
     assert issubclass(SendStep, Listens | Prepares)
-    assert not issubclass(Outside, TransferStep)
+    assert not issubclass(ExternalStep, TransferStep)
     assert not issubclass(RecordStep, TransferStep)
 
 
-def test_kind_that_has_a_part_of_a_capability_lacks_its_other_methods() -> None:
+def test_the_missing_methods_of_a_partial_capability_are_named() -> None:
     assert capabilities.missing_methods(Partial) == ("records_on", "with_record")
     assert not isinstance(Partial(), Records)
-    assert not capabilities.missing_methods(Outside)
+    assert not capabilities.missing_methods(ExternalStep)
     for kind in step_types().values():
         assert capabilities.missing_methods(kind) == ()
 

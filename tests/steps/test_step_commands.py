@@ -1,4 +1,4 @@
-"""Golden command lines of the robots of each profile."""
+"""Expected command lines of the robots of each profile."""
 
 import pytest
 
@@ -19,7 +19,7 @@ FILTER = "'host 10.42.0.1 and host 10.42.0.2 and (port 1234 or icmp or ip[6:2] &
 CAPTURE = "tcpdump -i wlan0 -n -U --immediate-mode -s 128 -B 4096 -w"
 ROSBAG = """bash -c '. /opt/ros/noetic/setup.bash && exec "$@"' bash rosbag record --duration=15 -O scan /scan"""
 
-GOLDEN = {
+EXPECTED_COMMANDS = {
     Protocol.TCP: [
         (Role.SENDER, f"{ROSBAG} 2> sender-record.log"),
         (Role.SENDER, f"{CAPTURE} sender.pcap {FILTER} 2> sender-capture.log"),
@@ -46,11 +46,11 @@ GOLDEN = {
 
 
 @pytest.mark.parametrize("protocol", Protocol)
-def test_commands_of_the_paper_trial(protocol: Protocol) -> None:
+def test_the_trial_of_the_paper_has_the_expected_commands(protocol: Protocol) -> None:
     plan = los_plan()
     scene = plan.scene(RepeatId(protocol, 1), ".fieldkit/t/r")
     jobs_planned = [planned for entry in plan.procedure.steps for planned in entry.step.jobs(scene)]
-    assert [(planned.role, shell_line(planned.job)) for planned in jobs_planned] == GOLDEN[protocol]
+    assert [(planned.role, shell_line(planned.job)) for planned in jobs_planned] == EXPECTED_COMMANDS[protocol]
 
 
 def test_record_override_changes_only_the_duration() -> None:
@@ -68,7 +68,9 @@ def test_ros2_recording_ends_by_sigint_at_the_limit() -> None:
     (planned,) = record.jobs(Scene(Protocol.TCP, cast, "f"))
     assert planned.job.argv[-7:] == ("ros2", "bag", "record", "-o", "scan", "/scan", "/imu")
     assert planned.job.limit_s == 15.0
-    assert planned.job.ready == "log:Subscribed to topic", "the start does not count as recording time"
+    assert planned.job.ready == "log:Subscribed to topic", (
+        "the start of the recorder is not part of the recording time"
+    )
     assert record.bag(cast[Role.SENDER]) == "scan/scan_0.db3"
 
 
@@ -83,7 +85,7 @@ def test_capture_with_sudo_runs_the_job_as_root() -> None:
     assert jobs.command("start", first.job)[:4] == ("sudo", "-n", "sh", jobs.SCRIPT_PATH)
 
 
-def test_command_that_starts_a_job() -> None:
+def test_a_job_is_started_with_its_limit_port_and_files() -> None:
     scene = los_plan().scene(RepeatId(Protocol.UDP, 1), ".fieldkit/t/udp-01-1")
     jobs_planned = [planned for entry in los_plan().procedure.steps for planned in entry.step.jobs(scene)]
     listen = next(planned.job for planned in jobs_planned if planned.job.name == "listen")
@@ -124,6 +126,6 @@ def test_limit_of_capture_exceeds_those_of_steps_inside() -> None:
 )
 def test_capture_filter_follows_steps_inside(during: str, filter_text: str) -> None:
     step = schema.validate(schema.parse(f"during: [{{{during}}}]", source="x"), CaptureStep)
-    recorded = {Role.SENDER: (RecordedFile(Role.SENDER, "scan.bag", 1e6),)}
-    first = next(step.jobs(Scene(Protocol.TCP, CAST, "f", recorded)))
+    recordings = {Role.SENDER: (RecordedFile(Role.SENDER, "scan.bag", 1e6),)}
+    first = next(step.jobs(Scene(Protocol.TCP, CAST, "f", recordings)))
     assert first.job.argv[-1] == f"{filter_text} or ip[6:2] & 0x1fff != 0)"

@@ -1,4 +1,4 @@
-"""Conformance of every kind of step to the contract, with one example of each kind on emulated robots.
+"""Conformance of all kinds of steps to the contract, with an example of each kind on emulated robots.
 
 A new kind adds its example to `EXAMPLES`.
 """
@@ -59,19 +59,20 @@ class Example:
     """An example of a kind of step.
 
     Attributes:
-        steps: The step and the steps that it needs before it, as a YAML list.
-        spare: Files other than logs without which the evidence is still complete.
-        outlives: Jobs whose end at their limit is a measurement and not an error.
-        brief: Jobs that are too short to be killed, so that a second is added.
-        absent: The steps with a program that begins with `no-such`; empty if profiles name its programs.
+        steps: The step and the preceding steps that it needs, as a YAML list.
+        optional_files: Files other than logs without which the evidence is complete.
+        may_reach_limit: Jobs whose stop at their limit is a measurement and not an error.
+        short_jobs: Jobs that are too short to be killed, so that a second is added.
+        with_missing_program: The steps with a program that starts with `no-such`; empty if profiles name its
+        programs.
         unmeasured: True if its columns are empty in the lab of these tests, which has fixed links.
     """
 
     steps: str
-    spare: frozenset[str] = frozenset()
-    outlives: frozenset[str] = frozenset()
-    brief: frozenset[str] = frozenset()
-    absent: str = ""
+    optional_files: frozenset[str] = frozenset()
+    may_reach_limit: frozenset[str] = frozenset()
+    short_jobs: frozenset[str] = frozenset()
+    with_missing_program: str = ""
     unmeasured: bool = False
 
 
@@ -80,8 +81,8 @@ EXAMPLES: Mapping[str, Example] = {
     "capture": Example(f"[capture: {{during: [{SMALL}]}}]"),
     "transfer": Example(
         f"[{RECORD}, transfer: {{from: sender, to: receiver, limit: 20s}}]",
-        spare=frozenset({"medium.txt"}),
-        outlives=frozenset({"listen", "send"}),
+        optional_files=frozenset({"medium.txt"}),
+        may_reach_limit=frozenset({"listen", "send"}),
     ),
     "ping": Example(f"[{PING}]"),
     "fault": Example(f"[fault: {{robot: sender, kind: link-down, for: 1s, limit: 4s, during: [{PING}]}}]"),
@@ -91,7 +92,7 @@ EXAMPLES: Mapping[str, Example] = {
     "run": Example(
         "[run: {robot: sender, command: sh -c 'sleep 1; seq 8000; echo U=3', prints: 40kB, "
         "columns: [{name: battery, unit: V, regex: 'U=([0-9])'}]}]",
-        absent="[run: {robot: sender, command: no-such-tool}]",
+        with_missing_program="[run: {robot: sender, command: no-such-tool}]",
     ),
     "iperf3": Example("[iperf3: {from: sender, to: receiver, rate: 200kbit/s, duration: 1s, limit: 10s}]"),
     "soak": Example(
@@ -100,9 +101,9 @@ EXAMPLES: Mapping[str, Example] = {
     "roam": Example(f"[roam: {{robot: sender, during: [{PING}]}}]", unmeasured=True),
     "send": Example(
         f"[{SEND}]",
-        spare=frozenset({"medium.txt"}),
-        outlives=frozenset({"listen", "send"}),
-        brief=frozenset({"make"}),
+        optional_files=frozenset({"medium.txt"}),
+        may_reach_limit=frozenset({"listen", "send"}),
+        short_jobs=frozenset({"make"}),
     ),
     "topics": Example("[topics: {from: sender, to: receiver, rate: 50Hz, duration: 1s, patience: 5s}]"),
     "video": Example("[video: {from: sender, to: receiver, rate: 10Hz, size: 128x64, noise: 0 %, duration: 1s}]"),
@@ -113,7 +114,7 @@ EXAMPLES: Mapping[str, Example] = {
     ),
     "fly": Example(
         "[fly: {robot: sender, height: 50cm, then: land, during: [ping: {from: sender, to: receiver, count: 2}]}]",
-        spare=frozenset({"fly.orders", "guard.orders"}),
+        optional_files=frozenset({"fly.orders", "guard.orders"}),
     ),
     "together": Example(f"[together: {{during: [{SEND}, {PING}]}}]"),
 }
@@ -121,11 +122,12 @@ KINDS = sorted(EXAMPLES.keys() & kinds.shipped_names())
 TEXT_BYTES = 10_000
 
 SITE = site(emulated="ros: builtin, late_bound: 5s, radio: {loss: 0%, rate: 500kbit/s}")
-"""The rate is so low that the transfer of a bag takes more than a second and can be interrupted. A busy machine may
-deliver packets late, because no delay is measured.
+"""The rate is so low that the transfer of a bag takes more than a second and can be interrupted. Packets may be
+late on a busy machine, because these tests measure no delay.
 """
 
-# Kills the program of a job as soon as it runs: the last child of the job's leader; the first one enforces the limit.
+# Kills the program of a job as soon as it runs. The program is the last child of the leader of the job; the first
+# child enforces the limit.
 KILL = """
 until [ -s "$1/pid" ]; do sleep 0.02; done
 read -r leader _ <"$1/pid"
@@ -151,7 +153,7 @@ def procedure(kind: str, steps: str = "") -> Procedure:
 
 
 def of_kind(kind: str, plan: Plan) -> PlacedStep:
-    """Return the step of this kind."""
+    """Return the first step of this kind, with its place in the procedure."""
     return next(placed for placed in plan.procedure.walk() if placed.kind == kind)
 
 
@@ -161,7 +163,7 @@ def own_jobs(kind: str, plan: Plan) -> list[Planned]:
 
 @dataclass
 class Bench:
-    """Emulated robots that are shared by all tests, and trials on them."""
+    """The emulated robots that all tests share, and functions that run trials on them."""
 
     testbed: EmulatedTestbed
     backend: EmulatedBackend
@@ -181,7 +183,7 @@ class Bench:
         return make_plan(request, backend="emulated", cast=cast, now=now, lab_bytes=self.backend.lab_bytes)
 
     def run(self, plan: Plan, sink: Callable[[Event], None] = lambda event: None) -> tuple[str, str, Path]:
-        """Run a trial of one attempt; return its status, the reason, and the folder of its evidence."""
+        """Run a trial with one attempt; return its status, the reason, and the folder of its evidence."""
         self.testbed.place(plan.placement)
         with locks.locked_exclusively(
             self.testbed.shells, Holder(plan.session, runtime.user_at_host(), plan.trial), sink=sink
@@ -241,7 +243,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 
 @dataclass(frozen=True)
 class Valid:
-    """A valid attempt of a kind, its plan and its evidence."""
+    """A valid attempt at a trial with one kind of step: the kind, the plan, and the folder of the evidence."""
 
     kind: str
     plan: Plan
@@ -250,7 +252,7 @@ class Valid:
 
 @pytest.fixture(scope="module", params=KINDS)
 def valid(request: pytest.FixtureRequest, bench: Bench) -> Valid:
-    """Make one valid attempt of each kind for all tests."""
+    """Return a valid attempt for each kind of step; all tests share it."""
     plan = bench.plan(request.param)
     status, reason, evidence = bench.run(plan)
     assert (status, reason) == ("valid", "")
@@ -277,10 +279,10 @@ def test_dry_run_prints_every_job(
 def test_attempt_without_a_file_is_void(valid: Valid, tmp_path: Path) -> None:
     plan, evidence = valid.plan, valid.evidence
     step = of_kind(valid.kind, plan).step
-    spare = {step_prefixed(step.prefix, name) for name in EXAMPLES[valid.kind].spare}
+    optional_files = {step_prefixed(step.prefix, name) for name in EXAMPLES[valid.kind].optional_files}
     repeat = next(plan.repeats_in_order())
     for name in step.files():
-        if name.endswith(".log") or name in spare or not (evidence / name).exists():
+        if name.endswith(".log") or name in optional_files or not (evidence / name).exists():
             continue
         copy = tmp_path / name
         shutil.copytree(evidence, copy)
@@ -300,7 +302,7 @@ def test_every_column_has_a_value_or_a_reason(valid: Valid) -> None:
 
 
 def test_size_estimate_is_within_a_factor_of_two(valid: Valid) -> None:
-    """Small text files do not count."""
+    """The factor is not checked if the files are small."""
     step, scene = of_kind(valid.kind, valid.plan).step, valid.plan.scenes()[0]
     estimate = sum(step.stored_bytes(scene, role) for role in valid.plan.cast) if isinstance(step, UsesSpace) else 0.0
     actual = sum((valid.evidence / name).stat().st_size for name in step.files() if (valid.evidence / name).is_file())
@@ -314,7 +316,7 @@ def test_check_finds_missing_program(
 ) -> None:
     for module in (iperf3, soak):
         monkeypatch.setattr(module, "PROGRAM", "no-such-iperf3")
-    plan = bench.plan(kind, _without_tools, EXAMPLES[kind].absent)
+    plan = bench.plan(kind, _without_tools, EXAMPLES[kind].with_missing_program)
     findings = preflight.check(plan, bench.testbed.shells, tmp_path, all_checks=False).findings
     failed = {(finding.robot, finding.check) for finding in findings if finding.status is Verdict.FAIL}
     programs = {(planned.role, planned.program) for planned in own_jobs(kind, plan)}
@@ -337,10 +339,10 @@ def _without_tools(profile: RobotProfile) -> RobotProfile:
     return profile.model_copy(update={"tools": tools, "ros": profile.ros.model_copy(update={"variants": variants})})
 
 
-def change(monkeypatch: pytest.MonkeyPatch, name: str, changed: Callable[[Job], Job]) -> None:
-    """Replace the job of this name on the robots."""
+def change_job(monkeypatch: pytest.MonkeyPatch, name: str, change: Callable[[Job], Job]) -> None:
+    """Change the job of this name before the robots start it."""
     real = jobs.command
-    monkeypatch.setattr(jobs, "command", lambda verb, job: real(verb, changed(job) if job.name == name else job))
+    monkeypatch.setattr(jobs, "command", lambda verb, job: real(verb, change(job) if job.name == name else job))
 
 
 KILLED_ELSEWHERE = ("fly",)
@@ -365,9 +367,9 @@ def test_killed_later_tool_makes_attempt_void(kind: str, bench: Bench) -> None:
 def kill_tool(kind: str, role: Role, name: str, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     """Run a trial in which the program of a job is killed."""
     plan = bench.plan(kind)
-    if name in EXAMPLES[kind].brief:
-        slow = ("sh", "-c", 'sleep 1; exec "$@"', "sh")
-        change(monkeypatch, name, lambda original: replace(original, argv=(*slow, *original.argv)))
+    if name in EXAMPLES[kind].short_jobs:
+        delay = ("sh", "-c", 'sleep 1; exec "$@"', "sh")
+        change_job(monkeypatch, name, lambda original: replace(original, argv=(*delay, *original.argv)))
     folder = jobs.work_folder(plan.trial, f"{next(plan.repeats_in_order())}-1")
     shell = bench.testbed.shells[role]
     argv = ("sh", "-c", KILL, "sh", f"{folder}/.jobs/{name}")
@@ -400,10 +402,10 @@ def test_hanging_tool_is_stopped_at_its_limit(kind: str, bench: Bench, monkeypat
     plan = bench.plan(kind)
     if not (kind_jobs := own_jobs(kind, plan)):
         return  # this kind starts no program
-    hanging = kind_jobs[0].job.name
-    # A program that hangs is never ready.
-    change(monkeypatch, hanging, lambda original: replace(original, argv=("sleep", "600"), limit_s=1.0, ready_s=2))
+    name = kind_jobs[0].job.name
+    # The replacement runs on for longer than its limit, and never becomes ready.
+    change_job(monkeypatch, name, lambda original: replace(original, argv=("sleep", "600"), limit_s=1.0, ready_s=2))
     status, reason, _ = bench.run(plan)
-    if hanging not in EXAMPLES[kind].outlives:
+    if name not in EXAMPLES[kind].may_reach_limit:
         assert (status, bool(reason)) == ("failed", True)
     assert not bench.running_jobs()

@@ -24,24 +24,24 @@ Install = Callable[..., None]
 
 @pytest.fixture
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
-    """Return a function that installs a package with entry points: target by name."""
+    """A function that installs a package with entry points; each keyword is a name with the target as its value."""
 
-    def entries(**targets: str) -> None:
-        points = "".join(f"{name} = {target}\n" for name, target in targets.items())
-        write_package(tmp_path / "installed", "more-steps", f"[{plugins.STEPS}]\n{points}")
+    def install_package(**targets: str) -> None:
+        entry_points = "".join(f"{name} = {target}\n" for name, target in targets.items())
+        write_package(tmp_path / "installed", "more-steps", f"[{plugins.STEPS}]\n{entry_points}")
         monkeypatch.syspath_prepend(tmp_path / "installed")
 
     cached_functions = (step_types, installed_columns)
     for function in cached_functions:
         function.cache_clear()
-    yield entries
+    yield install_package
     for function in cached_functions:
         function.cache_clear()
 
 
 @pytest.mark.motion
 @pytest.mark.ros
-def test_builtin_kinds_are_in_order_and_in_modules_of_their_names(install: Install) -> None:
+def test_builtin_kinds_are_in_order_and_in_modules_with_their_names(install: Install) -> None:
     install()
     assert list(step_types()) == [*BUILTIN, *MOTION, *ROS]
     assert kinds.shipped_names() == {*BUILTIN, *MOTION, *ROS}
@@ -52,7 +52,7 @@ def test_builtin_kinds_are_in_order_and_in_modules_of_their_names(install: Insta
 
 @pytest.mark.motion
 @pytest.mark.ros
-def test_kinds_of_packages_follow_by_name(install: Install) -> None:
+def test_kinds_from_packages_are_sorted_by_name(install: Install) -> None:
     install(zoom="fieldkit.steps.kinds.ping:PingStep", load="fieldkit.steps.kinds.ping:PingStep")
     assert list(step_types()) == [*BUILTIN, "fly", "load", "mavlink", "move", *ROS, "zoom"]
     assert step_types()["load"] is PingStep
@@ -92,7 +92,7 @@ def test_a_kind_is_imported_when_it_is_used(install: Install) -> None:
 
 
 @pytest.mark.parametrize("target", ["os.path:join", "fieldkit.steps.base:View", "fieldkit.steps.kinds.ping"])
-def test_entry_point_without_step_class_is_refused(install: Install, target: str) -> None:
+def test_entry_point_without_step_class_is_rejected(install: Install, target: str) -> None:
     install(load=target)
     with pytest.raises(ConfigurationError, match="a kind of step must be a subclass of Step") as caught:
         step_types()["load"]
@@ -106,21 +106,21 @@ def test_builtin_kind_cannot_be_replaced(install: Install) -> None:
     assert caught.value.where == "entry point ping = no_such_package.steps:Ping of more-steps 1.0"
 
 
-def test_abstract_class_is_refused(install: Install) -> None:
+def test_abstract_class_is_rejected(install: Install) -> None:
     install(load="fieldkit.steps.program:ProgramStep")
     with pytest.raises(ConfigurationError, match="the kind of step lacks argv, parse"):
         step_types()["load"]
 
 
 @pytest.mark.ros
-def test_class_with_a_part_of_a_capability_is_refused(install: Install) -> None:
+def test_class_with_only_a_part_of_a_capability_is_rejected(install: Install) -> None:
     install(load="tests.steps.test_step_capabilities:Partial")
     with pytest.raises(ConfigurationError, match="only a part of a capability: it lacks records_on, with_record"):
         step_types()["load"]
 
 
 @pytest.mark.parametrize("name", ["rtt_sent", "status"])
-def test_column_name_that_is_already_used_is_refused(
+def test_column_name_that_is_already_used_is_rejected(
     install: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     (tmp_path / f"declares_{name}.py").write_text(

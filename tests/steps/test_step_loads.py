@@ -62,17 +62,17 @@ def test_command_lines_of_both_ends(keys: str, protocol: Protocol, options: str)
     assert server.job.ready == "tcp:1451", "its control connection uses TCP"
 
 
-def test_soak_runs_around_the_steps_inside() -> None:
-    inside = "ping: {from: sender, to: receiver}"
-    step = step_of(f"soak: {{from: receiver, to: sender, rate: 3Mbit/s, during: [{inside}]}}")
+def test_soak_runs_before_and_after_its_inner_steps() -> None:
+    inner_step = "ping: {from: sender, to: receiver}"
+    step = step_of(f"soak: {{from: receiver, to: sender, rate: 3Mbit/s, during: [{inner_step}]}}")
     server, client, ping = lines(step, Protocol.UDP)
     assert server == (Role.SENDER, "iperf3 -s -1 -p 5202 2> sender-soak.log")
     assert client[1].endswith(
         "sh wlan0 iperf3 -c 10.42.0.1 -p 5202 -u -l 1400 -b 3000000 -t 86400 2> receiver-soak.log"
     )
     assert "ping" in ping[1]
-    jobs_of = [planned.job for planned in step.jobs(Scene(Protocol.UDP, CAST, "f"))]
-    assert jobs_of[0].limit_s == jobs_of[1].limit_s > jobs_of[2].limit_s
+    all_jobs = [planned.job for planned in step.jobs(Scene(Protocol.UDP, CAST, "f"))]
+    assert all_jobs[0].limit_s == all_jobs[1].limit_s > all_jobs[2].limit_s
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_soak_runs_around_the_steps_inside() -> None:
         ),
     ],
 )
-def test_invalid_keys_are_refused_with_line(text: str, reason: str) -> None:
+def test_error_of_invalid_keys_names_the_line(text: str, reason: str) -> None:
     with pytest.raises(ConfigurationError, match=reason) as caught:
         procedure(text)
     assert caught.value.where == "x.yaml:8"
@@ -119,7 +119,7 @@ def test_number_of_frames_of_a_flow(keys: str, frames: float) -> None:
     assert flow.frames == pytest.approx(frames)
 
 
-def test_capture_around_it_uses_its_port() -> None:
+def test_capture_around_iperf3_uses_its_port() -> None:
     step = step_of("capture: {during: [{iperf3: {from: sender, to: receiver, port: 7000}}]}")
     first = next(step.jobs(Scene(Protocol.UDP, CAST, "f")))
     assert "port 7000" in first.job.argv[-1]
@@ -141,8 +141,8 @@ def test_values_are_from_reports_of_sending_and_receiving_end(tmp_path: Path) ->
     assert "captures" in measured.missing["iperf3_captured_bit_s"]
     assert isinstance(step, Summarizes)
     assert list(step.summary(measured.values)) == ["iperf3 loss 6.2 %", "iperf3 1.87 Mbit/s"]
-    declared = {column.name for column in step.output_columns()}
-    assert measured.values.keys() | measured.missing.keys() == declared
+    declared_columns = {column.name for column in step.output_columns()}
+    assert measured.values.keys() | measured.missing.keys() == declared_columns
 
 
 @pytest.mark.parametrize(
@@ -182,12 +182,12 @@ Calls = tuple[list[str], dict[str, int]]
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> Calls:
     """Replace the functions of `jobs`; return the list of their calls, and the exit codes to return by call."""
-    done: list[str] = []
+    made_calls: list[str] = []
     codes: dict[str, int] = {}
 
     def named(verb: str) -> Callable[..., int]:
         def act(shell: Shell, job: Job, *_: object, **__: object) -> int:
-            done.append(f"{verb} {job.name} {job.log.partition('-')[0]}")
+            made_calls.append(f"{verb} {job.name} {job.log.partition('-')[0]}")
             return codes.get(f"{verb} {job.name}", 0)
 
         return act
@@ -197,13 +197,13 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Calls:
             self.job = job
 
         def end(self, within_s: float) -> int:
-            done.append(f"wait {self.job.name} {self.job.log.partition('-')[0]}")
+            made_calls.append(f"wait {self.job.name} {self.job.log.partition('-')[0]}")
             return codes.get(f"wait {self.job.name}", 0)
 
     for verb in ("start", "run", "stop"):
         monkeypatch.setattr(jobs, verb, named(verb))
     monkeypatch.setattr(jobs, "begin_wait", Wait)
-    return done, codes
+    return made_calls, codes
 
 
 def run_step(step: Step, tmp_path: Path) -> None:
@@ -212,16 +212,16 @@ def run_step(step: Step, tmp_path: Path) -> None:
 
 
 def test_server_that_does_not_exit_is_stopped(calls: Calls, tmp_path: Path) -> None:
-    done, codes = calls
+    made_calls, codes = calls
     step = step_of("iperf3: {from: sender, to: receiver}")
     expected = ["start iperf3-server receiver", "run iperf3-client sender", "wait iperf3-server receiver"]
     run_step(step, tmp_path)
-    assert done == expected
-    done.clear()
+    assert made_calls == expected
+    made_calls.clear()
     codes["wait iperf3-server"] = jobs.STILL_RUNNING
     with pytest.raises(RobotError, match="turtlebot-2: iperf3-server did not exit"):
         run_step(step, tmp_path)
-    assert done == [*expected, "stop iperf3-server receiver"]
+    assert made_calls == [*expected, "stop iperf3-server receiver"]
 
 
 def test_failure_of_client_is_the_reason(calls: Calls, tmp_path: Path) -> None:
@@ -232,13 +232,13 @@ def test_failure_of_client_is_the_reason(calls: Calls, tmp_path: Path) -> None:
 
 
 def test_soak_stops_its_load_also_after_an_error_inside(calls: Calls, tmp_path: Path) -> None:
-    done, codes = calls
+    made_calls, codes = calls
     step = step_of("soak: {from: sender, to: receiver, during: [{ping: {from: sender, to: receiver}}]}")
     run_step(step, tmp_path)
     load = ["start soak receiver", "start soak sender", "run ping sender", "stop soak sender", "stop soak receiver"]
-    assert done == load
-    done.clear()
+    assert made_calls == load
+    made_calls.clear()
     codes["run ping"] = 2
     with pytest.raises(RobotError, match="ping ended with exit code 2"):
         run_step(step, tmp_path)
-    assert done == load
+    assert made_calls == load

@@ -180,7 +180,7 @@ def test_gates_and_rows_prefix_columns_reasons_and_summaries(tmp_path: Path) -> 
         ("robots: [sender]", "robots: [sender, sender]", "a robot is named twice"),
     ],
 )
-def test_ambiguous_steps_are_refused(old: str, new: str, message: str) -> None:
+def test_ambiguous_steps_are_rejected(old: str, new: str, message: str) -> None:
     assert old in STEPS
     with pytest.raises(ConfigurationError) as caught:
         load(STEPS.replace(old, new))

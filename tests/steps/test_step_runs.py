@@ -40,7 +40,7 @@ def ignore(name: str, expected_s: float | None) -> None:
 
 
 def set_exit_code(monkeypatch: pytest.MonkeyPatch, code: int) -> None:
-    """Let every job exit with this code."""
+    """Replace `jobs.run`, so that every job ends with this exit code."""
     monkeypatch.setattr(jobs, "run", lambda shell, job: code)
 
 
@@ -70,7 +70,7 @@ def test_exit_code_counts_only_for_recorder_with_duration(
 
 
 def replace_captures(monkeypatch: pytest.MonkeyPatch, code: int) -> list[str]:
-    """Let captures exit with this code; return the list of starts and stops."""
+    """Replace the start and the stop of jobs, with this exit code; return the list of their calls."""
     calls: list[str] = []
 
     def start(shell: Shell, job: Job) -> None:

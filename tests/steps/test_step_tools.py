@@ -1,4 +1,4 @@
-"""Golden command lines of each variant of a tool, and refusals before the first repeat."""
+"""Expected command lines for each variant of a tool, and refusals before the first repeat."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -44,7 +44,7 @@ PING = "-c 10 -i 0.2 -s 502 -W 2 10.42.0.2 > ping.txt 2> sender-ping.log"
 
 
 def lines(protocol: Protocol, detected: Mapping[Role, Variants], plan: Plan | None = None) -> dict[str, str]:
-    """Return the command of each job with these tools by name; for the captures, that of the receiver."""
+    """Return the command line of each job with these tools by job name; `capture` is the receiver's."""
     plan = plan or los_plan()
     scene = plan.scene(RepeatId(protocol, 1), "f", detected)
     jobs = [planned.job for entry in plan.procedure.steps for planned in entry.step.jobs(scene)]
@@ -52,15 +52,15 @@ def lines(protocol: Protocol, detected: Mapping[Role, Variants], plan: Plan | No
 
 
 def on_both(**changes: object) -> dict[Role, Variants]:
-    """Return these changed tools for sender and receiver."""
+    """Return the default tools with these changes, for sender and receiver."""
     return dict.fromkeys((Role.SENDER, Role.RECEIVER), replace(DEFAULT, **changes))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("netcat", "protocol"), LISTEN)
 def test_transfer_with_each_netcat(netcat: Netcat, protocol: Protocol) -> None:
-    text_of = lines(protocol, on_both(netcat=netcat))
-    assert text_of["listen"] == f"{LISTEN[netcat, protocol]} > recv.bag 2> receiver-listen.log"
-    assert text_of["send"] == f"{SEND[netcat, protocol]} < scan.bag 2> sender-send.log"
+    command_lines = lines(protocol, on_both(netcat=netcat))
+    assert command_lines["listen"] == f"{LISTEN[netcat, protocol]} > recv.bag 2> receiver-listen.log"
+    assert command_lines["send"] == f"{SEND[netcat, protocol]} < scan.bag 2> sender-send.log"
 
 
 def test_each_end_uses_options_of_its_netcat() -> None:
@@ -68,9 +68,9 @@ def test_each_end_uses_options_of_its_netcat() -> None:
         Role.SENDER: replace(DEFAULT, netcat=Netcat.NCAT),
         Role.RECEIVER: replace(DEFAULT, netcat=Netcat.OPENBSD),
     }
-    text_of = lines(Protocol.TCP, detected)
-    assert text_of["listen"].startswith(LISTEN[Netcat.OPENBSD, Protocol.TCP])
-    assert text_of["send"].startswith(SEND[Netcat.NCAT, Protocol.TCP])
+    command_lines = lines(Protocol.TCP, detected)
+    assert command_lines["listen"].startswith(LISTEN[Netcat.OPENBSD, Protocol.TCP])
+    assert command_lines["send"].startswith(SEND[Netcat.NCAT, Protocol.TCP])
 
 
 def test_ping_with_each_variant() -> None:

@@ -1,4 +1,4 @@
-"""The source `modemmanager` with Debian's mmcli, against a ModemManager that python-dbusmock provides."""
+"""The source `modemmanager` with Debian's mmcli and a ModemManager that python-dbusmock provides."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,13 +17,14 @@ SOURCE = schema.validate(
 
 @pytest.fixture
 def _modem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The system bus of mmcli, with one LTE modem."""
     with modem_bus(tmp_path) as address:
         monkeypatch.setenv("DBUS_SYSTEM_BUS_ADDRESS", address)
         yield
 
 
 @pytest.mark.usefixtures("_modem")
-def test_values_of_a_modem() -> None:
+def test_the_values_of_a_modem_are_read() -> None:
     readings = source_readings.parse(laptop_telemetry.query_once(SOURCE, {}), SOURCE)
     assert readings.values == (
         {

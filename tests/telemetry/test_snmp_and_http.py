@@ -1,4 +1,4 @@
-"""Telemetry sources against Debian's snmpd and an HTTP server on loopback, with correct, slow and hostile answers."""
+"""Telemetry sources with Debian's snmpd and an HTTP server on loopback, with correct, slow and hostile answers."""
 
 import socket
 import threading
@@ -24,6 +24,7 @@ def query(text: str, **environment: str) -> SourceReadings:
 
 @pytest.fixture
 def agent(tmp_path: Path) -> Iterator[int]:
+    """The port of Debian's snmpd, which runs on loopback with a community."""
     with snmp_agent(tmp_path, SECRET) as port:
         yield port
 
@@ -36,25 +37,25 @@ def snmp(port: int, credentials: str) -> str:
     )
 
 
-def test_a_real_agent(agent: int, tmp_path: Path) -> None:
+def test_the_values_of_an_snmp_agent_are_read(agent: int, tmp_path: Path) -> None:
     expected = {"signal_dbm": -71.0, "band": "B7", "noise_dbm": -98.5}
-    by_variable = snmp(agent, "{environment: AP_SNMP}")
-    assert query(by_variable, AP_SNMP=f"defCommunity {SECRET}").values == (expected,)
+    source_text = snmp(agent, "{environment: AP_SNMP}")
+    assert query(source_text, AP_SNMP=f"defCommunity {SECRET}").values == (expected,)
     folder = tmp_path / "ap"
     folder.mkdir(mode=0o700)
     (folder / "snmp.conf").write_text(f"defCommunity {SECRET}\n", encoding="ascii")
     assert query(snmp(agent, f"{{file: '{folder}/snmp.conf'}}")).values == (expected,)
-    wrong = query(by_variable, AP_SNMP="defCommunity other")
-    assert (wrong.values, wrong.reason) == ((), "snmpget failed with exit code 1")
+    wrong_community = query(source_text, AP_SNMP="defCommunity other")
+    assert (wrong_community.values, wrong_community.reason) == ((), "snmpget failed with exit code 1")
 
 
 Answer = Callable[[BaseHTTPRequestHandler], None]
 
 
 def answer_json(handler: BaseHTTPRequestHandler) -> None:
-    is_known = handler.headers.get("Authorization") == f"Bearer {SECRET}"
-    body = b'{"lte": {"rsrp": "-97 dBm", "sinr": 11.5, "band": "B3"}}' if is_known else b"denied"
-    handler.send_response(200 if is_known else 401)
+    is_authorized = handler.headers.get("Authorization") == f"Bearer {SECRET}"
+    body = b'{"lte": {"rsrp": "-97 dBm", "sinr": 11.5, "band": "B3"}}' if is_authorized else b"denied"
+    handler.send_response(200 if is_authorized else 401)
     handler.send_header("Content-Length", str(len(body)))
     handler.end_headers()
     handler.wfile.write(body)
@@ -116,15 +117,15 @@ class Handler(BaseHTTPRequestHandler):
 @pytest.fixture(scope="module")
 def server() -> Iterator[str]:
     STOPPED.clear()
-    running = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    running.daemon_threads = True
-    thread = threading.Thread(target=running.serve_forever)
+    http_server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    http_server.daemon_threads = True
+    thread = threading.Thread(target=http_server.serve_forever)
     thread.start()
-    yield f"http://127.0.0.1:{running.server_port}"
+    yield f"http://127.0.0.1:{http_server.server_port}"
     STOPPED.set()
-    running.shutdown()
+    http_server.shutdown()
     thread.join()
-    running.server_close()
+    http_server.server_close()
 
 
 def http(url: str, limit: str) -> str:
@@ -134,7 +135,7 @@ def http(url: str, limit: str) -> str:
     )
 
 
-def test_a_real_server(server: str) -> None:
+def test_the_values_of_an_http_server_are_read(server: str) -> None:
     config = f'header = "Authorization: Bearer {SECRET}"'
     readings = query(http(f"{server}/json", "60s"), ROUTER=config)
     assert readings.values == ({"signal_dbm": -97.0, "sinr_db": 11.5, "band": "B3"},)
@@ -158,6 +159,8 @@ def test_wrong_answers_give_no_value(server: str, path: str, limit: str, reasons
 
 
 def test_a_closed_port_gives_no_value() -> None:
-    with socket.socket() as unused:
-        unused.bind(("127.0.0.1", 0))
-        assert query(http(f"http://127.0.0.1:{unused.getsockname()[1]}/", "60s")).reason == "connection refused"
+    with socket.socket() as unused_socket:
+        unused_socket.bind(("127.0.0.1", 0))
+        assert (
+            query(http(f"http://127.0.0.1:{unused_socket.getsockname()[1]}/", "60s")).reason == "connection refused"
+        )

@@ -1,4 +1,4 @@
-"""Values in real outputs of mmcli, batctl and snmpget of several versions, and in wrong and hostile ones."""
+"""Values in real outputs of several versions of mmcli, batctl and snmpget, and in wrong and hostile outputs."""
 
 import json
 
@@ -26,14 +26,14 @@ SNMP_OUTPUT = """\
 .1.3.6.1.4.1.99999.9.0 No Such Object available on this agent at this OID
 .1.3.6.1.2.1.2.2.1.6.1 ""
 """
-"""Printed by snmpget 5.9.3 of Debian 12 from its snmpd with the objects of test_snmp_and_http.py."""
+"""The output of snmpget 5.9.3 of Debian 12 for the objects of test_snmp_and_http.py."""
 
 
 def source(text: str) -> TelemetrySource:
     return schema.validate(schema.parse(text, source="source.yaml"), TelemetrySource)
 
 
-def older(name: str) -> str:
+def older_output(name: str) -> str:
     return (DATA / "mmcli" / "1.14-1.18" / f"{name}.json").read_text(encoding="utf-8")
 
 
@@ -51,18 +51,18 @@ def older(name: str) -> str:
             },
         ),
         (SIGNAL + MODEM, {"signal_dbm": -97.0, "sinr_db": 12.4, "band": "lte"}),
-        (older("signal-get"), {"signal_dbm": -104.0, "sinr_db": 2.0}),
-        (older("signal-get") + MODEM.replace('["lte"]', '["hspa"]'), {"band": "hspa"}),
+        (older_output("signal-get"), {"signal_dbm": -104.0, "sinr_db": 2.0}),
+        (older_output("signal-get") + MODEM.replace('["lte"]', '["hspa"]'), {"band": "hspa"}),
         (
-            older("signal-get") + MODEM.replace('["lte"]', '["gprs", "edge"]'),
+            older_output("signal-get") + MODEM.replace('["lte"]', '["gprs", "edge"]'),
             {"signal_dbm": -69.0, "band": "gprs/edge"},
         ),
-        (older("signal-get-comma"), {}),
-        (older("signal-get-off"), {}),
+        (older_output("signal-get-comma"), {}),
+        (older_output("signal-get-off"), {}),
         (SIGNAL.replace("-97.00", "0.00"), {}),
     ],
 )
-def test_values_of_mmcli(output: str, expected: Values) -> None:
+def test_the_values_in_outputs_of_mmcli_are_read(output: str, expected: Values) -> None:
     assert source_outputs.values(source("modemmanager: {modem: any}"), output) == expected
 
 
@@ -77,12 +77,12 @@ def test_values_of_mmcli(output: str, expected: Values) -> None:
         ("2024.3/neighbors-iv.txt", 1),
     ],
 )
-def test_neighbours_of_batctl_were_heard_recently(file: str, neighbours: int) -> None:
+def test_only_recent_neighbours_of_batctl_are_counted(file: str, neighbours: int) -> None:
     text = (DATA / "batctl" / file).read_text(encoding="utf-8")
     assert source_outputs.values(source("batctl: {}"), f"{text}\n[]\n") == {"neighbours": neighbours}
 
 
-def test_a_mesh_without_neighbours_has_none_and_another_output_gives_no_number() -> None:
+def test_an_empty_list_is_a_count_of_zero_and_another_output_is_rejected() -> None:
     mesh = source("batctl: {}")
     assert source_outputs.values(mesh, "[]\n\n[]\n") == {"neighbours": 0}
     for output in ("", "Error - interface bat0 is not present", '{"neigh_address": 1}'):
@@ -90,7 +90,7 @@ def test_a_mesh_without_neighbours_has_none_and_another_output_gives_no_number()
             source_outputs.values(mesh, output)
 
 
-def test_objects_of_snmp() -> None:
+def test_the_values_of_snmp_objects_are_read() -> None:
     agent = source(
         "at: laptop\nsnmp: {address: 127.0.0.1}\nvalues:\n"
         "  signal_dbm: {oid: .1.3.6.1.4.1.99999.1.1.0}\n  band: {oid: 1.3.6.1.4.1.99999.1.2.0}\n"
@@ -138,9 +138,9 @@ def test_an_expression_of_a_command_takes_linear_time() -> None:
 @settings(max_examples=40)
 @given(st.text(max_size=60).map(lambda text: f'{{"modem": {text}}}') | st.binary(max_size=80).map(repr))
 def test_no_output_crashes_a_parser_or_gives_an_impossible_cell(text: str) -> None:
-    for origin in (source("modemmanager: {}"), source("batctl: {}"), HTTP):
+    for telemetry_source in (source("modemmanager: {}"), source("batctl: {}"), HTTP):
         try:
-            values = source_outputs.values(origin, text)
+            values = source_outputs.values(telemetry_source, text)
         except ValueError:
             continue
         assert all(isinstance(value, float | str) for value in values.values())

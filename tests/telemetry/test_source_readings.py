@@ -1,4 +1,4 @@
-"""The file that the sampler of a telemetry source writes: runs of real commands in each shell, and altered files."""
+"""The file that the sampler of a telemetry source writes, for real commands in each shell, and altered files."""
 
 import subprocess
 import time
@@ -12,7 +12,7 @@ from fieldkit.remote.script import SCRIPT
 from fieldkit.telemetry import source_readings
 from fieldkit.telemetry.source_readings import SourceReadings
 from fieldkit.telemetry.telemetry_section import TelemetrySource
-from tests.helpers.host import ENDED
+from tests.helpers.host import EXITED_STATES
 from tests.helpers.sshd import wait_until
 
 SHELLS = {"dash": ("dash",), "bash": ("bash", "--posix"), "busybox": ("busybox", "sh")}
@@ -31,15 +31,15 @@ def script(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, ...]:
 
 def run_once(script: tuple[str, ...], *argv: str, address: str = "-", tested: str = "-") -> SourceReadings:
     words = (*script, "poll", "/", "-", address, tested, "0", "1", *argv)
-    done = subprocess.run(words, cwd=Path(script[-1]).parent, capture_output=True, timeout=60, check=True)
+    completed = subprocess.run(words, cwd=Path(script[-1]).parent, capture_output=True, timeout=60, check=True)
     assert sorted(path.name for path in Path(script[-1]).parent.iterdir()) == ["job.sh"]
-    return source_readings.parse(done.stdout, COMMAND)
+    return source_readings.parse(completed.stdout, COMMAND)
 
 
-def has_ended(pid: int) -> bool:
-    """True if a process has ended; it may remain as a zombie if its parent has ended before."""
+def has_exited(pid: int) -> bool:
+    """Return True if a process has exited; it may remain as a zombie if its parent has exited earlier."""
     try:
-        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] in ENDED
+        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] in EXITED_STATES
     except OSError:
         return True
 
@@ -60,12 +60,12 @@ def test_runs_without_a_value_have_a_reason(script: tuple[str, ...]) -> None:
 
 
 def test_an_output_cannot_imitate_another_run(script: tuple[str, ...]) -> None:
-    forged = '==> 1.00 0 13 <==\n{"rsrp": -10}'
-    readings = run_once(script, "printf", "%s\n", forged)
+    forged_output = '==> 1.00 0 13 <==\n{"rsrp": -10}'
+    readings = run_once(script, "printf", "%s\n", forged_output)
     assert (readings.values, readings.runs) == ((), 1)
 
 
-def test_nothing_is_sent_over_the_interface_under_test(script: tuple[str, ...]) -> None:
+def test_no_query_is_sent_over_the_interface_under_test(script: tuple[str, ...]) -> None:
     marker = Path(script[-1]).parent.parent / "queried"
     readings = run_once(script, "touch", str(marker), address="127.0.0.1", tested="lo")
     assert (readings.values, readings.runs) == ((), 1)
@@ -80,8 +80,8 @@ def test_errors_of_a_query_with_an_address_are_not_stored(script: tuple[str, ...
     assert readings.reason == "x failed with exit code 3"
 
 
-def test_it_ends_immediately_with_its_command(script: tuple[str, ...], tmp_path: Path) -> None:
-    started = tmp_path / "started"
+def test_the_sampler_and_its_command_stop_immediately(script: tuple[str, ...], tmp_path: Path) -> None:
+    started_file = tmp_path / "started"
     words = (
         *script,
         "poll",
@@ -93,23 +93,31 @@ def test_it_ends_immediately_with_its_command(script: tuple[str, ...], tmp_path:
         "60",
         "sh",
         "-c",
-        f"echo $$ >'{started}'; trap '' TERM; sleep 300",
+        f"echo $$ >'{started_file}'; trap '' TERM; sleep 300",
     )
     with (tmp_path / "output").open("wb") as output:
         process = subprocess.Popen(words, cwd=Path(script[-1]).parent, stdout=output)
-    wait_until(lambda: started.exists() and started.read_text(encoding="ascii").strip() != "", Deadline.after(60))
-    pid = int(started.read_text(encoding="ascii"))
+    wait_until(
+        lambda: started_file.exists() and started_file.read_text(encoding="ascii").strip() != "", Deadline.after(60)
+    )
+    pid = int(started_file.read_text(encoding="ascii"))
     before_s = time.monotonic()
     process.terminate()
     assert process.wait(60) == 0
-    assert time.monotonic() - before_s < 30, "it waited for the command, which lasts 300 s"
-    wait_until(lambda: has_ended(pid), Deadline.after(60))
+    assert time.monotonic() - before_s < 30, "it does not wait for the command, which takes 300 s"
+    wait_until(lambda: has_exited(pid), Deadline.after(60))
 
 
-def test_incomplete_and_altered_files(tmp_path: Path) -> None:
+def test_incomplete_and_altered_files_have_no_values(tmp_path: Path) -> None:
     run = b'==> 1.00 0 14 <==\n{"rsrp": -80}\n\n'
     assert source_readings.parse(run * 2, COMMAND).runs == 2
     for length in range(len(run)):
         assert source_readings.parse(run[:length], COMMAND).runs == 0
-    for altered in (b"", b"\0" * 99, b"==> 1.00 0 99999 <==\n", b"==> 1.00 -1 0 <==\n\n", b"==> 1 0 0 <==\n\n"):
-        assert source_readings.parse(altered, COMMAND).values == ()
+    for altered_content in (
+        b"",
+        b"\0" * 99,
+        b"==> 1.00 0 99999 <==\n",
+        b"==> 1.00 -1 0 <==\n\n",
+        b"==> 1 0 0 <==\n\n",
+    ):
+        assert source_readings.parse(altered_content, COMMAND).values == ()

@@ -1,4 +1,4 @@
-"""The section `telemetry` of profiles: commands of its sources, and refused sources."""
+"""The section `telemetry` of profiles: the commands of its sources, and rejected sources."""
 
 import pytest
 
@@ -13,7 +13,7 @@ def source(text: str) -> TelemetrySource:
     return schema.validate(schema.parse(text, source="source.yaml"), TelemetrySource)
 
 
-def test_commands_of_sources() -> None:
+def test_a_source_has_the_command_of_its_program() -> None:
     snmp = source(f"snmp: {{address: 'fd00::1', version: '3'}}\nvalues: {{signal_dbm: {{oid: {OID}}}}}\n")
     assert snmp.argv()[-2:] == ("udp6:[fd00::1]:161", OID)
     assert snmp.argv("/x/snmp.conf")[:3] == ("env", "SNMPCONFPATH=/x", "snmpget")
@@ -23,8 +23,8 @@ def test_commands_of_sources() -> None:
     )
     assert http.poll_words("wlan0")[:4] == ("192.168.8.1", "wlan0", "2", "3")
     assert http.argv()[-4:] == ("--config", "/home/r/router", "--url", "http://192.168.8.1:80/api?a[]=1")
-    wired = http.model_copy(update={"wired": True})
-    assert wired.poll_words("eth0")[:2] == ("192.168.8.1", "-")
+    wired_http = http.model_copy(update={"wired": True})
+    assert wired_http.poll_words("eth0")[:2] == ("192.168.8.1", "-")
     assert source("batctl: {}").poll_words("bat0")[:2] == ("-", "bat0")
 
 
@@ -66,7 +66,7 @@ def test_commands_of_sources() -> None:
         ("modemmanager: {modem: '0; reboot'}", "modem"),
     ],
 )
-def test_wrong_sources_are_refused(text: str, message: str) -> None:
+def test_wrong_sources_are_rejected(text: str, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
         source(text)
 

@@ -1,4 +1,4 @@
-"""Random procedures on simulated evidence: each is measured correctly, or rejected when it is loaded."""
+"""Random procedures with simulated evidence: each is measured correctly, or rejected when it is loaded."""
 
 import json
 import random
@@ -48,7 +48,7 @@ RECORD = st.builds(
     _optional_keys(name=st.sampled_from(["scan", "lidar", "recv"])),
 )
 TRANSFER = st.builds(
-    lambda ends, more: {"transfer": {"from": ends[0], "to": ends[1], **more}},
+    lambda ends, options: {"transfer": {"from": ends[0], "to": ends[1], **options}},
     ENDS,
     _optional_keys(
         name=NAMES,
@@ -58,14 +58,14 @@ TRANSFER = st.builds(
     ),
 )
 PING = st.builds(
-    lambda ends, more: {"ping": {"from": ends[0], "to": ends[1], "count": 4, **more}},
+    lambda ends, options: {"ping": {"from": ends[0], "to": ends[1], "count": 4, **options}},
     ENDS,
     _optional_keys(name=NAMES, payload_bytes=st.sampled_from([{"tcp": 502, "udp": 8192}, {"tcp": 8, "udp": 100}])),
 )
 
 
 IPERF3 = st.builds(
-    lambda ends, more: {"iperf3": {"from": ends[0], "to": ends[1], "duration": "1s", **more}},
+    lambda ends, options: {"iperf3": {"from": ends[0], "to": ends[1], "duration": "1s", **options}},
     ENDS,
     _optional_keys(
         name=NAMES,
@@ -83,14 +83,14 @@ ROBOTS = st.sampled_from(
 
 def _capture(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
     keys = _optional_keys(name=NAMES, robots=ROBOTS, port=PORTS)
-    return st.builds(lambda more, steps: {"capture": {**more, "during": steps}}, keys, during)
+    return st.builds(lambda options, steps: {"capture": {**options, "during": steps}}, keys, during)
 
 
 def _move(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
     path_keys = {"path": [{"away": "5m"}], "speed": "0.1m/s"}
     keys = _optional_keys(name=NAMES)
     return st.builds(
-        lambda robot, more, steps: {"move": {"robot": robot, **path_keys, **more, "during": steps}},
+        lambda robot, options, steps: {"move": {"robot": robot, **path_keys, **options, "during": steps}},
         ROLES,
         keys,
         during,
@@ -100,7 +100,7 @@ def _move(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
 def _fault(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
     kinds = [{"kind": "link-down", "for": "1s"}, {"kind": "reboot"}, {"kind": "kill", "process": "nc"}]
     return st.builds(
-        lambda robot, kind, more, steps: {"fault": {"robot": robot, **kind, **more, "during": steps}},
+        lambda robot, kind, options, steps: {"fault": {"robot": robot, **kind, **options, "during": steps}},
         ROLES,
         st.sampled_from(kinds),
         _optional_keys(name=NAMES),
@@ -122,14 +122,14 @@ def _for(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
     return st.builds(lambda each, steps: {"for": {"each": {"n": each}, "during": steps}}, values, during)
 
 
-# Arbitrary procedures, most of which are rejected; and usual ones with random changes.
+# The tests use arbitrary procedures, of which most are rejected, and usual procedures with random changes.
 ANYTHING = st.lists(
     st.recursive(st.one_of(TRANSFER, PING, RECORD, IPERF3), _nests, max_leaves=4), min_size=1, max_size=3
 )
 
 
-def usual(seed: int) -> list[Any]:
-    """Return a usual procedure with random changes."""
+def usual_steps(seed: int) -> list[Any]:
+    """Return the steps of a usual procedure with random changes."""
     draw = random.Random(seed)
     source, target = draw.choice([("sender", "receiver")] * 4 + [("receiver", "sender"), ("sender", "relay")])
     name = draw.choice(["scan", "scan", "lidar"])
@@ -138,18 +138,18 @@ def usual(seed: int) -> list[Any]:
         [{}, {}, {}, {"into": "other.bag"}, {"into": f"{name}.bag"}, {"into": f"{target}-listen.log"}]
     )
     transfer |= draw.choice([{}, {}, {}, {"port": 2222}, {"file": f"{name}.bag"}, {"file": "none.bin"}])
-    inside: list[Any] = [{"transfer": transfer}]
+    inner_steps: list[Any] = [{"transfer": transfer}]
     if draw.random() < 0.7:
         options = draw.choice([{}, {"payload_bytes": {"tcp": 8, "udp": 100}}])
         ends = draw.choice([(source, target)] * 3 + [(target, source)])
-        inside.append({"ping": {"from": ends[0], "to": ends[1], "count": 4, **options}})
-    inside = _more(draw, inside, source, target)
+        inner_steps.append({"ping": {"from": ends[0], "to": ends[1], "count": 4, **options}})
+    inner_steps = _add_steps(draw, inner_steps, source, target)
     if draw.random() < 0.3:
         move = {"robot": draw.choice([source, "relay"]), "path": [{"away": "5m"}], "speed": "0.1m/s"}
-        inside = [{"move": {**move, "during": inside}}]
+        inner_steps = [{"move": {**move, "during": inner_steps}}]
     capture: dict[str, Any] = draw.choice([{}, {"robots": [source, target]}, {"robots": [source, target, "relay"]}])
     capture |= draw.choice([{}, {}, {"port": 1234}, {"port": 2222}, {"robots": [source]}])
-    steps: list[Any] = [{"capture": {**capture, "during": inside}}]
+    steps: list[Any] = [{"capture": {**capture, "during": inner_steps}}]
     if draw.random() < 0.2:
         fault = draw.choice(
             [{"kind": "link-down", "for": "1s"}, {"kind": "reboot"}, {"kind": "kill", "process": "nc"}]
@@ -159,29 +159,29 @@ def usual(seed: int) -> list[Any]:
     return [{"record": {"robot": recorder, "topics": ["/scan"], "duration": "2s", "name": name}}, *steps]
 
 
-def _more(draw: random.Random, inside: list[Any], source: str, target: str) -> list[Any]:
-    """Return the steps with further steps of the same kinds: in sequence, in parallel, or once for each value."""
+def _add_steps(draw: random.Random, inner_steps: list[Any], source: str, target: str) -> list[Any]:
+    """Return the steps, perhaps with more of the same kinds: in sequence, in parallel, or once for each value."""
     if draw.random() < 0.3:
         ping: dict[str, Any] = {"from": source, "to": target, "count": 3, "payload_bytes": "{bytes}"}
         ping |= draw.choice([{"name": "p{bytes}"}] * 4 + [{"name": "p"}, {"name": "p{byte}"}])
-        inside = [*inside, {"for": {"each": {"bytes": [100, 502, 8192]}, "during": [{"ping": ping}]}}]
+        inner_steps = [*inner_steps, {"for": {"each": {"bytes": [100, 502, 8192]}, "during": [{"ping": ping}]}}]
     if draw.random() < 0.4:
         ends = draw.choice([(source, target), (source, target), (target, source)])
         port = draw.choice([3333, 3333, 3333, 1234])
-        inside = [*inside, {"transfer": {"from": ends[0], "to": ends[1], "name": "more", "port": port}}]
+        inner_steps = [*inner_steps, {"transfer": {"from": ends[0], "to": ends[1], "name": "more", "port": port}}]
     for name in draw.choice([[]] * 5 + [["a"], ["a", "b"], ["a", "b", "c"]]):
         ends = draw.choice([(source, target), (target, source)])
         load: dict[str, Any] = {"from": ends[0], "to": ends[1], "name": name, "duration": "1s"}
         load |= {"protocol": draw.choice(["tcp", "udp"]), "reverse": draw.random() < 0.5}
-        inside = [*inside, {"iperf3": load | draw.choice([{}, {}, {"port": 5202}, {"port": 1234}])}]
-    if draw.random() < 0.5 and len(inside) > 1:
-        inside = [{"together": {"during": inside}}]
+        inner_steps = [*inner_steps, {"iperf3": load | draw.choice([{}, {}, {"port": 5202}, {"port": 1234}])}]
+    if draw.random() < 0.5 and len(inner_steps) > 1:
+        inner_steps = [{"together": {"during": inner_steps}}]
     if draw.random() < 0.2:
-        inside = [{"capture": {"name": "inner", "during": inside}}]
-    return inside
+        inner_steps = [{"capture": {"name": "inner", "during": inner_steps}}]
+    return inner_steps
 
 
-OTHER_STEPS = {
+RANDOM_CONDITIONS = {
     "protocol": st.sampled_from(list(Protocol)),
     "loss": st.sampled_from([0.0, 0.2]),
     "seed": st.integers(0, 99),
@@ -190,7 +190,7 @@ OTHER_STEPS = {
 OUTCOMES: Counter[str] = Counter()
 
 
-def loaded(steps: list[Any]) -> Procedure | ConfigurationError:
+def load(steps: list[Any]) -> Procedure | ConfigurationError:
     """Return the procedure, or the error with which it is rejected."""
     text = f"{HEAD}steps: {json.dumps(steps, indent=1)}\n"
     try:
@@ -200,7 +200,7 @@ def loaded(steps: list[Any]) -> Procedure | ConfigurationError:
 
 
 @pytest.mark.emulated  # needs tcpdump, which filters the captures
-@given(steps=ANYTHING, **OTHER_STEPS)
+@given(steps=ANYTHING, **RANDOM_CONDITIONS)
 def test_any_procedure_is_measured_correctly_or_rejected(
     steps: list[Any], protocol: Protocol, loss: float, seed: int
 ) -> None:
@@ -212,12 +212,12 @@ def test_any_procedure_is_measured_correctly_or_rejected(
 def test_usual_procedures_are_measured_correctly_or_rejected(block: int) -> None:
     for seed in range(100 * block, 100 * block + 100):
         draw = random.Random(seed)
-        judge(usual(seed), draw.choice(list(Protocol)), draw.choice([0.0, 0.2]), seed)
+        judge(usual_steps(seed), draw.choice(list(Protocol)), draw.choice([0.0, 0.2]), seed)
 
 
 def judge(steps: list[Any], protocol: Protocol, loss: float, seed: int) -> None:
     """Load a procedure; if it is valid, simulate it, measure it, and compare the result with the truth."""
-    procedure = loaded(steps)
+    procedure = load(steps)
     if isinstance(procedure, ConfigurationError):
         OUTCOMES["refused when loaded"] += 1
         assert int(procedure.where.removeprefix("any.yaml:")) > HEAD.count("\n"), "the line of a step"
@@ -244,43 +244,47 @@ def _compare(
     values: Mapping[str, Value],
     missing: Mapping[str, str],
 ) -> None:
-    declared = [
+    column_names = [
         step_prefixed(placed.step.prefix, column.name)
         for placed in procedure.walk()
         for column in placed.step.output_columns()
     ]
-    assert len(set(declared)) == len(declared)
-    assert set(declared) <= values.keys() | missing.keys()
-    assert all(missing.get(name, "for a reason") for name in declared)
-    for name, (requests, answered) in truth.pings.items():
+    assert len(set(column_names)) == len(column_names)
+    assert set(column_names) <= values.keys() | missing.keys()
+    assert all(missing.get(name, "for a reason") for name in column_names)
+    for name, (requests, replies) in truth.pings.items():
         assert (values[step_prefixed(name, "rtt_sent")], values[step_prefixed(name, "rtt_received")]) == (
             requests,
-            answered,
+            replies,
         )
-    for name, (sent, received) in truth.loads.items():
-        for end, packets in (("sent", sent), ("received", received)):
+    for name, (sent_packets, received_packets) in truth.loads.items():
+        for end, packets in (("sent", sent_packets), ("received", received_packets)):
             assert values[step_prefixed(name, f"iperf3_{end}_bytes")] == 1400 * packets
         loss, cookie_bytes = step_prefixed(name, "iperf3_captured_loss"), truth.cookies_bytes[name]
-        sent_bytes, came_bytes = (1400 * packets + cookie_bytes for packets in (sent, received))
-        assert loss in missing or values[loss] == 1 - came_bytes / sent_bytes
+        sent_bytes, received_bytes = (1400 * packets + cookie_bytes for packets in (sent_packets, received_packets))
+        assert loss in missing or values[loss] == 1 - received_bytes / sent_bytes
         OUTCOMES["valid, iperf3 captured"] += loss in values
     OUTCOMES["valid, two pings or more"] += len(truth.pings) > 1
     OUTCOMES["valid, two transfers or more"] += len(truth.transfers) > 1
     OUTCOMES["valid, at the same time"] += any(nest.parallel for placed in procedure.walk() for nest in placed.within)
     for placed in procedure.walk():
         if isinstance(placed.step, TransferStep):
-            sent_file = truth.transfers[placed.step.prefix]
-            _compare_transfer(placed, protocol, sent_file, values, missing)
-            refused = step_prefixed(placed.step.prefix, "receiver_udp_buffer_errors")
-            others = truth.udp_to.count(sent_file.target) - (protocol is Protocol.UDP)
-            assert "one counter for all datagrams" in missing[refused] if others else values[refused] == REFUSED
-            OUTCOMES["valid, UDP of several to one"] += bool(others)
+            transfer = truth.transfers[placed.step.prefix]
+            _compare_transfer(placed, protocol, transfer, values, missing)
+            buffer_errors = step_prefixed(placed.step.prefix, "receiver_udp_buffer_errors")
+            other_transfers = truth.udp_to.count(transfer.target) - (protocol is Protocol.UDP)
+            assert (
+                "one counter for all datagrams" in missing[buffer_errors]
+                if other_transfers
+                else values[buffer_errors] == REFUSED
+            )
+            OUTCOMES["valid, UDP of several to one"] += bool(other_transfers)
 
 
 def _compare_transfer(
     placed: PlacedStep,
     protocol: Protocol,
-    sent: TransferTruth,
+    transfer_truth: TransferTruth,
     values: Mapping[str, Value],
     missing: Mapping[str, str],
 ) -> None:
@@ -290,28 +294,34 @@ def _compare_transfer(
     def value(column: str) -> Value:
         return values[step_prefixed(step.prefix, column)]
 
-    assert (value("sent_bytes"), value("received_bytes")) == (sent.sent_bytes, sent.received_bytes)
-    assert value("file_loss") == 1 - sent.received_bytes / sent.sent_bytes
+    assert (value("sent_bytes"), value("received_bytes")) == (
+        transfer_truth.sent_bytes,
+        transfer_truth.received_bytes,
+    )
+    assert value("file_loss") == 1 - transfer_truth.received_bytes / transfer_truth.sent_bytes
     if (packets := step_prefixed(step.prefix, "paper_packets")) in values and protocol is Protocol.UDP:
-        assert values[packets] == -(-sent.sent_bytes // 8192)
-    captured = {role for nest in placed.within for role in nest.captures()}
-    if not {step.sender, step.receiver} <= captured:
+        assert values[packets] == -(-transfer_truth.sent_bytes // 8192)
+    capturing_roles = {role for nest in placed.within for role in nest.captures()}
+    if not {step.sender, step.receiver} <= capturing_roles:
         OUTCOMES["valid, transfer not captured at both ends"] += 1
         assert step_prefixed(step.prefix, "byte_loss") in missing
     elif protocol is Protocol.UDP:
         OUTCOMES["valid, UDP captured"] += 1
-        assert value("ip_packets_sent") == sent.packets_sent
-        assert value("ip_loss") == 1 - (sent.packets_sent - sent.packets_lost) / sent.packets_sent
+        assert value("ip_packets_sent") == transfer_truth.packets_sent
+        assert (
+            value("ip_loss")
+            == 1 - (transfer_truth.packets_sent - transfer_truth.packets_lost) / transfer_truth.packets_sent
+        )
     else:
         OUTCOMES["valid, TCP captured"] += 1
-        assert value("tcp_retransmitted_segments") == sent.retransmitted
+        assert value("tcp_retransmitted_segments") == transfer_truth.retransmitted
         assert value("byte_loss") == 0
 
 
 @pytest.mark.emulated
-def test_enough_procedures_of_each_kind_were_tried(record_property: Any) -> None:  # noqa: ANN401 (of pytest)
+def test_enough_random_procedures_of_each_kind_were_measured(record_property: Any) -> None:  # noqa: ANN401 (of pytest)
     if not OUTCOMES:
-        pytest.fail("this runs behind the test above, in one process")
+        pytest.fail("this test needs the results of the tests before it, in the same process")
     record_property("result", f"random procedures: {dict(sorted(OUTCOMES.items()))}")
     assert (
         min(OUTCOMES[outcome] for outcome in ("refused when loaded", "valid, UDP captured", "valid, TCP captured"))

@@ -1,4 +1,4 @@
-"""Estimates of durations: from a good and a dead link at first, then from finished repeats."""
+"""Estimates of durations: without finished repeats, from a good and a dead link; else from the finished repeats."""
 
 import pytest
 from hypothesis import given
@@ -17,12 +17,12 @@ LOS = los_plan()
 TCP, UDP = Protocol.TCP, Protocol.UDP
 
 
-def at(distance: str, topology: Topology = LOS.topology) -> Plan:
+def los_at(distance: str, topology: Topology = LOS.topology) -> Plan:
     parsed = parse_distance(distance)
     return LOS.model_copy(update={"distance_m": parsed.metres, "distance": distance, "topology": topology})
 
 
-def test_the_first_estimate_assumes_a_good_link_and_has_the_time_with_a_dead_link() -> None:
+def test_the_first_estimate_ranges_from_a_good_link_to_a_dead_link() -> None:
     estimate = estimate_repeats(LOS, TCP, 20, [])
     assert estimate.likely_s == pytest.approx(20 * LOS.procedure.expected_s(TCP))
     assert estimate.most_s == pytest.approx(estimate.likely_s + 20 * 120.0), "a transfer waits for its limit of 120 s"
@@ -33,20 +33,20 @@ def test_the_first_estimate_assumes_a_good_link_and_has_the_time_with_a_dead_lin
 
 
 def test_finished_repeats_of_the_same_trial_are_preferred() -> None:
-    condition, elsewhere = at("30ft"), at("10ft")
+    condition, other_distance = los_at("30ft"), los_at("10ft")
     finished = [
         FinishedRepeat(condition, TCP, 130.0),
         FinishedRepeat(condition, TCP, 150.0),
-        FinishedRepeat(elsewhere, TCP, 9.0),
+        FinishedRepeat(other_distance, TCP, 9.0),
         FinishedRepeat(condition, UDP, 8.0),
     ]
     assert estimate_repeats(condition, TCP, 3, finished) == TimeEstimate(3 * 140.0, 3 * 150.0)
     assert estimate_repeats(condition, UDP, 3, finished) == TimeEstimate(24.0, 24.0), (
-        "each protocol by its own repeats"
+        "each protocol is estimated from its own repeats"
     )
 
 
-def test_a_trial_reports_batteries_that_do_not_last_for_it() -> None:
+def test_notes_name_batteries_that_last_for_less_than_the_trial() -> None:
     short = LOS.model_copy(update={"repeats": 1})
     assert not list(estimates.battery_notes([short]))
     (note,) = estimates.battery_notes([LOS.model_copy(update={"repeats": 20})])
@@ -55,34 +55,34 @@ def test_a_trial_reports_batteries_that_do_not_last_for_it() -> None:
     )
 
 
-def test_a_larger_distance_than_any_before_may_have_a_dead_link() -> None:
-    finished = [FinishedRepeat(at("10m"), TCP, 9.0), FinishedRepeat(at("20m"), TCP, 12.0)]
-    farther = estimate_repeats(at("30m"), TCP, 1, finished)
-    assert farther.likely_s == 12.0, "as at the farthest place so far"
+def test_a_larger_distance_than_all_finished_ones_may_have_a_dead_link() -> None:
+    finished = [FinishedRepeat(los_at("10m"), TCP, 9.0), FinishedRepeat(los_at("20m"), TCP, 12.0)]
+    farther = estimate_repeats(los_at("30m"), TCP, 1, finished)
+    assert farther.likely_s == 12.0, "as long as at the largest distance with finished repeats"
     assert farther.most_s == estimates.dead_link_s(LOS.procedure, TCP)
-    assert estimate_repeats(at("15m"), TCP, 1, finished) == TimeEstimate(10.5, 12.0), (
-        "between two places, no longer than they took"
+    assert estimate_repeats(los_at("15m"), TCP, 1, finished) == TimeEstimate(10.5, 12.0), (
+        "between two distances with finished repeats: at most as long as these"
     )
-    assert estimate_repeats(at("5m"), TCP, 1, finished) == TimeEstimate(9.0, 12.0)
+    assert estimate_repeats(los_at("5m"), TCP, 1, finished) == TimeEstimate(9.0, 12.0)
 
 
 def test_another_topology_is_used_if_the_same_has_no_repeats() -> None:
     other = next(topology for topology in Topology if topology is not LOS.topology)
-    finished = [FinishedRepeat(at("10m", other), TCP, 50.0)]
-    assert estimate_repeats(at("10m"), TCP, 2, finished) == TimeEstimate(100.0, 100.0)
-    assert estimate_repeats(at("10m"), TCP, 2, [*finished, FinishedRepeat(at("10m"), TCP, 7.0)]) == TimeEstimate(
-        14.0, 14.0
-    )
+    finished = [FinishedRepeat(los_at("10m", other), TCP, 50.0)]
+    assert estimate_repeats(los_at("10m"), TCP, 2, finished) == TimeEstimate(100.0, 100.0)
+    assert estimate_repeats(
+        los_at("10m"), TCP, 2, [*finished, FinishedRepeat(los_at("10m"), TCP, 7.0)]
+    ) == TimeEstimate(14.0, 14.0)
 
 
 def test_finished_repeats_with_a_dead_link_are_used() -> None:
-    """A campaign estimated 4 min and took 19: after its first trial with dead links, the rest can be estimated."""
-    near_plan, far_plan = at("10m"), at("90m")
+    """A campaign that was estimated at 4 min took 19 min; trials with dead links must improve the next estimates."""
+    near_plan, far_plan = los_at("10m"), los_at("90m")
     before = estimate_trial(far_plan, [FinishedRepeat(near_plan, protocol, 8.0) for protocol in LOS.protocols])
     dead_s = sum(estimates.dead_link_s(LOS.procedure, protocol) for protocol in LOS.protocols) * LOS.repeats
     assert before.most_s == pytest.approx(dead_s)
     after = estimate_trial(
-        at("80m"),
+        los_at("80m"),
         [
             FinishedRepeat(near_plan, TCP, 8.0),
             FinishedRepeat(far_plan, TCP, 128.0),
@@ -124,15 +124,15 @@ TIMES = st.lists(
 
 
 @given(finished=TIMES, distance=st.sampled_from(["5m", "10m", "30m", "50m"]), count=st.integers(0, 50))
-def test_an_upper_end_is_never_below_what_is_expected(
+def test_the_largest_duration_is_never_below_the_expected_duration(
     finished: list[tuple[str, Protocol, float]], distance: str, count: int
 ) -> None:
     estimate = estimate_repeats(
-        at(distance),
+        los_at(distance),
         TCP,
         count,
         [
-            FinishedRepeat(at(trial_distance), trial_protocol, duration_s)
+            FinishedRepeat(los_at(trial_distance), trial_protocol, duration_s)
             for trial_distance, trial_protocol, duration_s in finished
         ],
     )

@@ -1,4 +1,4 @@
-"""A trial's folder from another person: links do not lead out of it, pipes do not block, errors are brief."""
+"""Folders of trials from other people: links out of them are not followed, pipes do not block, errors are short."""
 
 import json
 import os
@@ -36,7 +36,7 @@ def foreign_file(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A trial of one repeat, with its manifest; tests must not change it."""
+    """A trial of one repeat with a manifest; no test may change it."""
     folder = recorded.make(tmp_path_factory.mktemp("trials"))
     Ledger(plans.read_plan(folder), folder, Stop()).summarize()
     return folder
@@ -44,7 +44,7 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def trial(original: Path, tmp_path: Path) -> Path:
-    """A copy of that trial, which the test may change."""
+    """A copy of the original trial; a test may change it."""
     return Path(shutil.copytree(original, tmp_path / "trials" / original.name))
 
 
@@ -79,30 +79,32 @@ COMMANDS = [
 ]
 
 
-@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("name", PLACES)
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda words: words[0])
-def test_a_link_to_a_local_file_is_rejected_in_one_sentence(
-    trial: Path, foreign_file: Path, place: str, command: list[str], capsys: pytest.CaptureFixture[str]
+def test_a_link_to_a_local_file_is_rejected(
+    trial: Path, foreign_file: Path, name: str, command: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (trial / place).unlink(missing_ok=True)
-    (trial / place).symlink_to(foreign_file)
-    out = [str(trial.parent / "out.mcap") if word == "out.mcap" else word for word in command[1:]]
-    assert main([command[0], str(trial), *out]) == EvidenceError.exit_code
+    (trial / name).unlink(missing_ok=True)
+    (trial / name).symlink_to(foreign_file)
+    options = [str(trial.parent / "out.mcap") if word == "out.mcap" else word for word in command[1:]]
+    assert main([command[0], str(trial), *options]) == EvidenceError.exit_code
     output_text = capsys.readouterr().err
-    assert f"{place}: it is a symbolic link, not a regular file" in " ".join(output_text.split())
+    assert f"{name}: it is a symbolic link, not a regular file" in " ".join(output_text.split())
     assert "remedy: get a copy with plain files from" in " ".join(output_text.split())
     assert foreign_file.read_text(encoding="utf-8") == FOREIGN_TEXT
 
 
-@pytest.mark.parametrize("make", [pipe, unix_socket, lambda path: path.symlink_to("/dev/zero")])
-@pytest.mark.parametrize("place", ["trial.yaml", "journal.jsonl", "trial.csv", "repeats/udp-01/sender.pcap"])
-def test_files_that_could_block_a_reader_are_rejected(trial: Path, place: str, make: Callable[[Path], None]) -> None:
-    (trial / place).unlink()
-    make(trial / place)
+@pytest.mark.parametrize("make_file", [pipe, unix_socket, lambda path: path.symlink_to("/dev/zero")])
+@pytest.mark.parametrize("name", ["trial.yaml", "journal.jsonl", "trial.csv", "repeats/udp-01/sender.pcap"])
+def test_files_that_could_block_a_reader_are_rejected(
+    trial: Path, name: str, make_file: Callable[[Path], None]
+) -> None:
+    (trial / name).unlink()
+    make_file(trial / name)
     with pytest.raises(EvidenceError, match="not a regular file") as caught:
         rebuild(trial)
-    assert caught.value.where == str(trial / place)
-    assert any(line.startswith(f"{place}: it is a ") for line in verification.verify(trial))
+    assert caught.value.where == str(trial / name)
+    assert any(line.startswith(f"{name}: it is a ") for line in verification.verify(trial))
 
 
 def test_a_pipe_as_a_table_does_not_block(
@@ -129,14 +131,14 @@ def test_evidence_in_too_deep_folders_is_rejected(trial: Path) -> None:
 
 
 def test_a_journal_with_a_second_name_is_not_written(trial: Path, foreign_file: Path) -> None:
-    """A hard link to a backup or another local file: writing here would change it there."""
+    """A hard link shares its content with a backup or another local file, which a write would change."""
     (trial / "journal.jsonl").unlink()
     (trial / "journal.jsonl").hardlink_to(foreign_file)
     with (
         pytest.raises(ConfigurationError, match="hard link, and writing would change that file too"),
         journal.locked(trial),
     ):
-        raise AssertionError("claimed")
+        raise AssertionError("the journal was locked")
     with pytest.raises(OSError, match="hard link"):
         journal.append(trial, JournalEntry(1, Protocol.UDP, 1, 1, Status.RUNNING))
     assert foreign_file.read_text(encoding="utf-8") == FOREIGN_TEXT
@@ -151,7 +153,9 @@ def test_a_table_with_a_second_name_is_replaced_and_not_written(trial: Path, for
 
 
 @pytest.mark.parametrize("name", ["out.csv", ".out.csv.new"])
-def test_a_file_that_is_replaced_is_never_what_a_link_leads_to(tmp_path: Path, foreign_file: Path, name: str) -> None:
+def test_a_replacement_of_a_link_does_not_change_the_target_of_the_link(
+    tmp_path: Path, foreign_file: Path, name: str
+) -> None:
     (tmp_path / name).symlink_to(foreign_file)
     files.write(tmp_path / "out.csv", b"new")
     assert foreign_file.read_text(encoding="utf-8") == FOREIGN_TEXT
@@ -159,7 +163,7 @@ def test_a_file_that_is_replaced_is_never_what_a_link_leads_to(tmp_path: Path, f
     assert (tmp_path / "out.csv").read_bytes() == b"new"
 
 
-def test_names_that_are_not_text_are_written_as_by_sha256sum(trial: Path) -> None:
+def test_unusual_names_are_written_to_the_manifest_as_by_sha256sum(trial: Path) -> None:
     unusual_names = ["a\nb.txt", "back\\slash", "re\rturn"]
     for name in unusual_names:
         (trial / "repeats/udp-01" / name).write_text("x", encoding="utf-8")
@@ -222,7 +226,7 @@ def test_a_contradictory_journal_is_reported_with_its_line(
     ],
     ids=lambda line: line[:60],  # whole ids are sent between the processes of pytest-xdist
 )
-def test_an_invalid_line_is_one_error_with_its_line(trial: Path, line: str) -> None:
+def test_the_error_of_an_invalid_line_has_its_line_number(trial: Path, line: str) -> None:
     with (trial / journal.JOURNAL_FILE).open("a", encoding="utf-8") as file:
         file.write(f"{line}\n")
     with pytest.raises(EvidenceError, match="not a journal entry") as caught:
@@ -230,8 +234,8 @@ def test_an_invalid_line_is_one_error_with_its_line(trial: Path, line: str) -> N
     assert caught.value.where == f"{trial / journal.JOURNAL_FILE}:6"
 
 
-def test_a_reason_with_half_a_surrogate_pair_is_stored_with_a_mark(tmp_path: Path) -> None:
-    """Names of files that are not UTF-8 contain such halves, and errors contain names of files."""
+def test_half_a_surrogate_pair_in_a_reason_is_stored_as_a_question_mark(tmp_path: Path) -> None:
+    """Names of files that are not UTF-8 contain such characters, and reasons contain names of files."""
     plan = los_plan(repeats=1, protocols=(Protocol.UDP,))
     folder = store.create(tmp_path, plan)
     with journal.locked(folder):

@@ -1,7 +1,7 @@
-"""Power cuts of the laptop at every moment of a trial: nothing that was reported as done is lost.
+"""Power cuts of the laptop at any moment of a trial lose nothing that was reported as finished.
 
-On file systems that lose what was not synced, see `tests/helpers/disks.py`. `python -m tests.e2e.power_cuts` cuts as
-often as one likes.
+The file systems of these tests lose all data that was not synced; see `tests/helpers/disks.py`. Run
+`python -m tests.e2e.power_cuts` for a larger number of power cuts.
 """
 
 import os
@@ -19,7 +19,7 @@ from tests.helpers.cut_trials import (
     OUT,
     calls_of_a_trial,
     cuts_at_every_sync,
-    cuts_in_a_row,
+    lose_power_repeatedly,
     robots_with_much_evidence,
 )
 from tests.helpers.disks import FILE_SYSTEMS, STRICTEST, Disk, FileSystem, mount_workspace
@@ -31,9 +31,10 @@ from tests.helpers.sshd import wait_until
 
 pytestmark = pytest.mark.emulated  # mounts need root
 
-BROUGHT_ALONG = {"store.create: files.sync_folder(out)"}
-"""Sync of a folder that contains a new folder with a new file: the file systems here may write its name to disk with
-the file, which POSIX does not promise; see fsync(2)."""
+UNNECESSARY_SYNCS = {"store.create: files.sync_folder(out)"}
+"""Syncs that these file systems do not need. When a new file in a new folder is synced, they also write the name of
+the new folder to disk, which POSIX does not guarantee; see fsync(2).
+"""
 
 every_file_system = pytest.mark.parametrize("file_system", FILE_SYSTEMS, ids=lambda file_system: file_system.name)
 strictest_in_ci = pytest.mark.parametrize(
@@ -42,17 +43,17 @@ strictest_in_ci = pytest.mark.parametrize(
 
 
 @pytest.fixture
-def place(tmp_path: Path, untouched: NamespaceComparison) -> Iterator[Path]:
-    """A folder in memory, in separate mounts of the test."""
+def workspace(tmp_path: Path, untouched: NamespaceComparison) -> Iterator[Path]:
+    """A folder in memory, in mounts that only this test has."""
     with mount_workspace(tmp_path) as folder, robots_with_much_evidence():
         yield folder
 
 
 @every_file_system
-def test_a_cut_loses_what_was_not_synced(place: Path, file_system: FileSystem) -> None:
-    """Checks the method: the other tests here would also pass on disks that lose nothing."""
-    disk = Disk.make(file_system, place / "disk.img")
-    with disk.mounted(place / "disk") as mounted:
+def test_a_power_cut_loses_data_that_was_not_synced(workspace: Path, file_system: FileSystem) -> None:
+    """The other tests would pass without reason if these disks lost nothing."""
+    disk = Disk.make(file_system, workspace / "disk.img")
+    with disk.mounted(workspace / "disk") as mounted:
         (mounted / "changed").write_bytes(b"before")
         (mounted / "synced").write_bytes(b"synced" * 10_000)
         for name in ("changed", "synced", ""):
@@ -62,60 +63,60 @@ def test_a_cut_loses_what_was_not_synced(place: Path, file_system: FileSystem) -
         (mounted / "written").write_bytes(b"written" * 10_000)
         (mounted / "changed").write_bytes(b"after")
         (mounted / "synced").rename(mounted / "renamed")
-        image = disk.image(mounted, place / "cut.img")
+        image = disk.image(mounted, workspace / "cut.img")
         assert sorted(path.name for path in mounted.iterdir() if path.name != "lost+found") == [
             "changed",
             "renamed",
             "written",
         ]
-    with image.repair().mounted(place / "elsewhere") as mounted:
+    with image.repair().mounted(workspace / "elsewhere") as mounted:
         assert sorted(path.name for path in mounted.iterdir() if path.name != "lost+found") == ["changed", "synced"]
         assert (mounted / "changed").read_bytes() != b"after"
         assert (mounted / "synced").read_bytes() == b"synced" * 10_000
 
 
 @strictest_in_ci
-def test_a_power_cut_at_any_write_loses_nothing_that_was_reported(place: Path, file_system: FileSystem) -> None:
-    cuts, witness, _ = cuts_at_every_sync(Disk.make(file_system, place / "disk.img"), place)
+def test_a_power_cut_at_any_write_loses_nothing_that_was_reported(workspace: Path, file_system: FileSystem) -> None:
+    cuts, recorder, _ = cuts_at_every_sync(Disk.make(file_system, workspace / "disk.img"), workspace)
     assert len(cuts) > 30, "too few writes were interrupted"
     assert any(cut.reported for cut in cuts)
-    resumed = []
+    resumed_states = []
     for cut in cuts:
-        with cut.disk.repair().mounted(place / "elsewhere") as mounted:
-            assert cut.lost(mounted / OUT, witness) == []
-            left = read_tree(mounted / OUT)
+        with cut.disk.repair().mounted(workspace / "elsewhere") as mounted:
+            assert cut.lost_files(mounted / OUT, recorder) == []
+            remaining_files = read_tree(mounted / OUT)
             if not any((mounted / OUT).glob("*/trial.yaml")):
                 assert not cut.reported
-            elif left not in resumed:
-                resumed.append(left)
+            elif remaining_files not in resumed_states:
+                resumed_states.append(remaining_files)
                 assert_resumable(mounted / OUT)
 
 
-def test_removing_any_sync_is_detected(place: Path) -> None:
-    def lost(without: str) -> tuple[bool, set[str]]:
-        file = place / "disk.img"
-        cuts, witness, places = cuts_at_every_sync(Disk.make(STRICTEST, file), place, without=without)
+def test_removing_any_sync_is_detected(workspace: Path) -> None:
+    def run_without_sync(without: str) -> tuple[bool, set[str]]:
+        file = workspace / "disk.img"
+        cuts, recorder, places = cuts_at_every_sync(Disk.make(STRICTEST, file), workspace, without=without)
         file.unlink()
-        return any(_describe_losses(place, cut, witness) for cut in cuts), set(places)
+        return any(_describe_losses(workspace, cut, recorder) for cut in cuts), set(places)
 
-    _, places = lost("")
+    _, places = run_without_sync("")
     assert len(places) > 5
-    assert {sync for sync in places if not lost(sync)[0]} <= BROUGHT_ALONG
+    assert {sync for sync in places if not run_without_sync(sync)[0]} <= UNNECESSARY_SYNCS
 
 
 @strictest_in_ci
-def test_consecutive_cuts_at_random_moments_lose_nothing(place: Path, file_system: FileSystem) -> None:
-    draw, calls = random.Random(file_system.name), calls_of_a_trial(place)
-    assert sum(cuts_in_a_row(file_system, place, draw, calls=calls, most=4) for _ in range(3)) > 3
+def test_consecutive_cuts_at_random_moments_lose_nothing(workspace: Path, file_system: FileSystem) -> None:
+    draw, calls = random.Random(file_system.name), calls_of_a_trial(workspace)
+    assert sum(lose_power_repeatedly(file_system, workspace, draw, calls=calls, most=4) for _ in range(3)) > 3
 
 
-def _describe_losses(place: Path, cut: PowerCut, witness: VersionRecorder) -> list[str]:
-    with cut.disk.repair().mounted(place / "elsewhere") as mounted:
-        return cut.lost(mounted / OUT, witness)
+def _describe_losses(workspace: Path, cut: PowerCut, recorder: VersionRecorder) -> list[str]:
+    with cut.disk.repair().mounted(workspace / "elsewhere") as mounted:
+        return cut.lost_files(mounted / OUT, recorder)
 
 
 def test_a_killed_test_leaves_no_mounts(tmp_path: Path) -> None:
-    """Mounts and loop devices belong to the machine, so they must not need manual clean-up."""
+    """Otherwise, mounts and loop devices of the machine would have to be removed by hand."""
     with subprocess.Popen(
         (sys.executable, "-m", "tests.e2e.power_cuts"),
         cwd=ROOT,
@@ -125,13 +126,13 @@ def test_a_killed_test_leaves_no_mounts(tmp_path: Path) -> None:
     ) as process:
         assert process.stdout is not None
         folder = process.stdout.readline().split()[-1]
-        wait_until(lambda: _attached(folder), Deadline.after(60))
+        wait_until(lambda: _has_loop_device(folder), Deadline.after(60))
         process.kill()
-    wait_until(lambda: not _attached(folder), Deadline.after(60))
+    wait_until(lambda: not _has_loop_device(folder), Deadline.after(60))
     assert folder not in Path("/proc/self/mounts").read_text(encoding="utf-8")
 
 
-def _attached(folder: str) -> bool:
+def _has_loop_device(folder: str) -> bool:
     """Return True if a loop device of this machine uses a file in a folder."""
     for file in Path("/sys/block").glob("loop*/loop/backing_file"):
         with suppress(OSError):  # it may disappear meanwhile

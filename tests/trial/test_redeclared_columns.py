@@ -1,4 +1,4 @@
-"""A trial whose column declarations do not match its values: errors with a remedy, no traceback."""
+"""Commands with a trial whose declared columns do not match its values: errors with a remedy, no traceback."""
 
 import re
 import shutil
@@ -41,7 +41,7 @@ VALUES = {"V": "-3.25", "text": '"full"', "bool": "true", "count": "7", "ns": "1
 UNITS = (*VALUES, "share")
 
 
-def fetching(text: str) -> Callable[..., list[str]]:
+def fetch_text(text: str) -> Callable[..., list[str]]:
     def fetch(_self: Robots, _remote: str, into: Path, *, ended_normally: bool) -> list[str]:
         (into / "run.txt").write_text(text, encoding="utf-8")
         write_states(into)
@@ -52,39 +52,39 @@ def fetching(text: str) -> Callable[..., list[str]]:
 
 @pytest.fixture(scope="module")
 def trials(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A trial for each unit, with a value in it."""
+    """A trial for each unit, with a value in this unit."""
     folders = {}
     with pytest.MonkeyPatch.context() as patch:
         robots_with_evidence(patch)
         for unit, value in VALUES.items():
             text = f'{{"own": {value}}}'
-            patch.setattr(Robots, "fetch", fetching(text))
+            patch.setattr(Robots, "fetch", fetch_text(text))
             request = TrialRequest(validate(parse(PROCEDURE % unit, source="x"), Procedure), parse_distance("30ft"))
-            planned = make_plan(request, backend="field", cast=CAST, now=NOW)
-            outcome = run_trial(planned, IdleTestbed(), tmp_path_factory.mktemp(unit), lambda _: None)
+            trial_plan = make_plan(request, backend="field", cast=CAST, now=NOW)
+            outcome = run_trial(trial_plan, IdleTestbed(), tmp_path_factory.mktemp(unit), lambda _: None)
             assert outcome is not None
             assert outcome.valid == 3
             folders[unit] = outcome.folder
     return folders
 
 
-@pytest.mark.parametrize("now", UNITS)
-@pytest.mark.parametrize("was", mark_nightly(VALUES, in_ci=("V", "text")))
+@pytest.mark.parametrize("new_unit", UNITS)
+@pytest.mark.parametrize("old_unit", mark_nightly(VALUES, in_ci=("V", "text")))
 def test_every_command_prints_a_table_or_an_error(
     trials: dict[str, Path],
     tmp_path: Path,
-    was: str,
-    now: str,
+    old_unit: str,
+    new_unit: str,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     folder = tmp_path / "trial"
-    shutil.copytree(trials[was], folder)
+    shutil.copytree(trials[old_unit], folder)
     plan = folder / PLAN_FILE
-    written = plan.read_text(encoding="utf-8")
-    head, table, columns = written.partition("\ncolumns:\n")  # the procedure is unchanged
-    changed, count = re.subn(rf"(name: own\n\s*unit: ){was}\b", rf"\g<1>{now}", columns)
-    assert count == 1, written
-    plan.write_text(head + table + changed, encoding="utf-8")
+    plan_text = plan.read_text(encoding="utf-8")
+    head, table, columns = plan_text.partition("\ncolumns:\n")  # the text of the procedure before is unchanged
+    changed_columns, count = re.subn(rf"(name: own\n\s*unit: ){old_unit}\b", rf"\g<1>{new_unit}", columns)
+    assert count == 1, plan_text
+    plan.write_text(head + table + changed_columns, encoding="utf-8")
     (folder / store.MANIFEST_FILE).unlink()
     before = (folder / store.TRIAL_CSV).read_bytes()
     out = str(tmp_path / "out")
@@ -92,7 +92,7 @@ def test_every_command_prints_a_table_or_an_error(
         ("rebuild", str(folder)),
         ("aggregate", str(folder), "--rebuild"),
         ("aggregate", str(folder)),
-        ("aggregate", str(folder), str(trials[was])),
+        ("aggregate", str(folder), str(trials[old_unit])),
         ("export", str(folder), "--format", "csv", "-o", f"{out}.csv"),
         ("export", str(folder), "--format", "parquet", "-o", f"{out}.parquet"),
     ):

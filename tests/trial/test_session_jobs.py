@@ -1,4 +1,4 @@
-"""Jobs of a session that packages add by entry points."""
+"""Jobs of a session that installed packages add with entry points."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ def planned(cast, session):
 
 
 @pytest.fixture(autouse=True)
-def _installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _install_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "more_jobs.py").write_text(JOBS, encoding="utf-8")
     write_package(tmp_path, "more-jobs", f"[{plugins.SESSION_JOBS}]\nloggers = more_jobs:planned\n")
     monkeypatch.syspath_prepend(tmp_path)

@@ -1,4 +1,4 @@
-"""The columns of a trial: common columns, those of its steps, in its plan, and as read from its table."""
+"""The columns of a trial: common columns and columns of steps, in the plan and in the table."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -36,7 +36,7 @@ WORDS = st.text(st.characters(categories=("L", "N", "P", "S")), min_size=1, max_
 UNITS = (
     st.sampled_from(("text", "hash", "bool", "count", "B", "ns", "share", "s", "m", "bit/s", "ppm", "dBm")) | WORDS
 )
-EVERYWHERE = [column.name for column in trial_columns()]
+COMMON_NAMES = [column.name for column in trial_columns()]
 
 
 @st.composite
@@ -57,7 +57,7 @@ def declared_columns(draw: st.DrawFn) -> Column:
 def tables_of_columns(draw: st.DrawFn) -> tuple[list[Column], dict[str, Value]]:
     """Columns of one trial, and a value for each."""
     drawn_columns = draw(st.lists(declared_columns(), min_size=1, max_size=5, unique_by=lambda column: column.name))
-    columns = [column for column in drawn_columns if column.name not in EVERYWHERE]
+    columns = [column for column in drawn_columns if column.name not in COMMON_NAMES]
     return columns, {column.name: draw(values(column)) for column in columns}
 
 
@@ -85,20 +85,20 @@ def test_any_valid_column_is_read_back_from_plan_and_table(
     (folder / "trial.yaml").write_text(schema.dump(plan), encoding="utf-8")
     assert [*plans.read_columns(folder / "trial.yaml")] == columns
     assert plans.read_plan(folder).table == plan.table == (*trial_columns(), *columns)
-    read = repeats.parse(rows.to_csv([row], plan.table).encode(), plan.table)
-    # A cell has nine digits of a number; a bound may have more.
+    table_of_trials = repeats.parse(rows.to_csv([row], plan.table).encode(), plan.table)
+    # A cell of a table has nine digits of a number; a drawn value may have more, because it may be a bound.
     values = [float(f"{value:.9g}") if isinstance(value, float) else value for value in row.values()]
-    assert [read.column(name)[0] for name in row] == values
+    assert [table_of_trials.column(name)[0] for name in row] == values
 
 
 def test_common_columns_are_first_independently_of_their_rank() -> None:
-    beyond = [Column("probe.level", "dBm", "x", rank=1), Column("status", "count", "not this one")]
-    assert trial_columns(beyond) == (*trial_columns(), beyond[0])
+    more_columns = [Column("probe.level", "dBm", "x", rank=1), Column("status", "count", "not this one")]
+    assert trial_columns(more_columns) == (*trial_columns(), more_columns[0])
     assert trial_columns()[: len(IDENTITY)] == IDENTITY
     assert len({column.name for column in trial_columns()}) == len(trial_columns())
 
 
-def test_the_paper_s_procedure_freezes_only_the_columns_of_robots() -> None:
+def test_the_plan_of_the_paper_s_procedure_has_only_the_columns_of_robots() -> None:
     plan = los_plan()
     assert plan.columns == freeze(robot_columns(plan.procedure.roles()))
     assert names(plan.table) == names((*trial_columns(), *robot_columns(plan.procedure.roles())))
@@ -119,7 +119,7 @@ def test_a_named_column_has_named_figures_and_counts() -> None:
 
 
 @pytest.mark.parametrize(
-    ("column", "flaw"),
+    ("column", "expected_problem"),
     [
         (Column("Level", "dBm", "x"), "its name must consist of lower-case letters"),
         (Column("a..b", "dBm", "x"), "its name"),
@@ -142,15 +142,15 @@ def test_a_named_column_has_named_figures_and_counts() -> None:
         ),
     ],
 )
-def test_a_column_that_cannot_be_read_or_shown_is_rejected(column: Column, flaw: str) -> None:
+def test_a_column_that_cannot_be_read_or_shown_is_rejected(column: Column, expected_problem: str) -> None:
     problem = column.declaration_error()
     assert problem is not None
-    assert flaw in problem
+    assert expected_problem in problem
 
 
 def test_columns_of_every_trial_include_those_of_every_shipped_kind() -> None:
-    declared = {column for kind in kinds.shipped_names() for column in step_types()[kind].columns}
-    assert declared <= set(measured_columns())
+    columns_of_kinds = {column for kind in kinds.shipped_names() for column in step_types()[kind].columns}
+    assert columns_of_kinds <= set(measured_columns())
 
 
 # Steps.
@@ -158,20 +158,20 @@ def test_columns_of_every_trial_include_those_of_every_shipped_kind() -> None:
 
 @pytest.fixture
 def meters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """An installed package with `meter`."""
+    """Install a package with the kind of step `meter`."""
     write_package(tmp_path / "installed", "meters", f"[{plugins.STEPS}]\nmeter = {meter.TARGET}\n")
     monkeypatch.syspath_prepend(tmp_path / "installed")
-    for cached in (step_types, installed_columns):
-        cached.cache_clear()
+    for function in (step_types, installed_columns):
+        function.cache_clear()
     yield
-    for cached in (step_types, installed_columns):
-        cached.cache_clear()
+    for function in (step_types, installed_columns):
+        function.cache_clear()
 
 
 def procedure(*steps: str) -> Procedure:
-    listed = "".join(f"  - {step}\n" for step in steps)
+    step_lines = "".join(f"  - {step}\n" for step in steps)
     head = "name: x\nsummary: x\nscenario: los\ntopology: masterless\nprotocols: [tcp]\nrepeats: 1\nsteps:\n"
-    return schema.validate(schema.parse(head + listed, source="x.yaml"), Procedure)
+    return schema.validate(schema.parse(head + step_lines, source="x.yaml"), Procedure)
 
 
 def names(columns: Sequence[Column]) -> list[str]:
@@ -185,10 +185,10 @@ def test_columns_of_steps_follow_in_the_order_of_the_procedure() -> None:
     )
     columns = additional_columns(placed.step for placed in parsed_procedure.walk())
     assert names(columns) == ["b.meter_level", "b.x", "meter_level"]
-    filled = names(filled_columns(placed.step for placed in parsed_procedure.walk()))
-    assert filled[-3:] == names(columns)
-    assert {"status", "rtt_sent", "emulator_late_max_s"} <= set(filled)
-    assert not {"ip_loss", "file_loss"} & set(filled)
+    filled_names = names(filled_columns(placed.step for placed in parsed_procedure.walk()))
+    assert filled_names[-3:] == names(columns)
+    assert {"status", "rtt_sent", "emulator_late_max_s"} <= set(filled_names)
+    assert not {"ip_loss", "file_loss"} & set(filled_names)
     plan = los_plan().model_copy(update={"procedure": parsed_procedure, "columns": None})
     assert plan.table == (*trial_columns(), *columns), "a plan of an earlier version, without columns"
 
@@ -204,7 +204,9 @@ def test_columns_of_steps_follow_in_the_order_of_the_procedure() -> None:
     ],
 )
 @pytest.mark.usefixtures("meters")
-def test_clashing_names_are_rejected_with_the_line_of_their_step(steps: Sequence[str], message: str) -> None:
+def test_names_that_are_used_twice_are_rejected_with_the_line_of_their_step(
+    steps: Sequence[str], message: str
+) -> None:
     with pytest.raises(ConfigurationError, match=message) as caught:
         procedure(*steps)
     assert caught.value.where == f"x.yaml:{7 + len(steps)}"
@@ -218,7 +220,7 @@ def test_columns_of_other_packages_are_only_in_trials_that_use_them() -> None:
 
 # Tables.
 
-OF_TRIAL = [column for column in vendor_trials.VENDOR_COLUMNS if column.name.startswith("probe")]
+PROBE_COLUMNS = [column for column in vendor_trials.VENDOR_COLUMNS if column.name.startswith("probe")]
 
 
 def write_trial(folder: Path, name: str, columns: Sequence[Column], *, with_plan: bool = True) -> Path:
@@ -238,10 +240,13 @@ def test_a_table_is_read_by_its_plan_without_the_declaring_package(tmp_path: Pat
 
 
 def test_different_trials_share_their_common_columns(tmp_path: Path) -> None:
-    paths = [write_trial(tmp_path, "one", OF_TRIAL), write_trial(tmp_path, "two", vendor_trials.NAMED_STEP_COLUMNS)]
-    read = table_files.read(paths, tables.declared_columns(paths))
-    assert [value is None for value in read.column("probe.level")] == [False] * 4 + [True] * 4
-    assert [value is None for value in read.column("up.transfer_s")] == [True] * 4 + [False] * 4
+    paths = [
+        write_trial(tmp_path, "one", PROBE_COLUMNS),
+        write_trial(tmp_path, "two", vendor_trials.NAMED_STEP_COLUMNS),
+    ]
+    table_of_trials = table_files.read(paths, tables.declared_columns(paths))
+    assert [value is None for value in table_of_trials.column("probe.level")] == [False] * 4 + [True] * 4
+    assert [value is None for value in table_of_trials.column("up.transfer_s")] == [True] * 4 + [False] * 4
 
 
 def test_without_a_plan_prefixed_columns_are_known_and_others_are_text(tmp_path: Path) -> None:
@@ -257,8 +262,8 @@ def test_without_a_plan_prefixed_columns_are_known_and_others_are_text(tmp_path:
 
 def test_a_table_without_a_plan_is_read_by_the_plan_of_another_trial(tmp_path: Path) -> None:
     paths = [
-        write_trial(tmp_path / "a", "one", OF_TRIAL, with_plan=False),
-        write_trial(tmp_path / "b", "two", OF_TRIAL),
+        write_trial(tmp_path / "a", "one", PROBE_COLUMNS, with_plan=False),
+        write_trial(tmp_path / "b", "two", PROBE_COLUMNS),
     ]
     (level,) = (column for column in tables.declared_columns(paths) if column.name == "probe.level")
     assert level.unit == "dBm"
@@ -274,7 +279,7 @@ def test_a_table_without_a_plan_is_read_by_the_plan_of_another_trial(tmp_path: P
     ],
 )
 def test_plans_with_incompatible_columns_of_one_name_are_rejected(tmp_path: Path, other: Column) -> None:
-    paths = [write_trial(tmp_path, "one", OF_TRIAL), write_trial(tmp_path, "two", [other])]
+    paths = [write_trial(tmp_path, "one", PROBE_COLUMNS), write_trial(tmp_path, "two", [other])]
     with pytest.raises(ConfigurationError, match=r"probe\.level is a different column here") as caught:
         tables.declared_columns(paths)
     assert caught.value.where == str(paths[1].with_name("trial.yaml"))
@@ -307,7 +312,7 @@ HOSTILE = {
 
 @pytest.mark.parametrize("columns", HOSTILE.values(), ids=HOSTILE)
 def test_edited_columns_are_rejected_with_their_location(tmp_path: Path, columns: str) -> None:
-    table = write_trial(tmp_path, "one", OF_TRIAL)
+    table = write_trial(tmp_path, "one", PROBE_COLUMNS)
     path = table.with_name("trial.yaml")
     head, _, _ = path.read_text(encoding="utf-8").partition("columns:\n")
     path.write_text(f"{head}columns:\n{columns}\n", encoding="utf-8")

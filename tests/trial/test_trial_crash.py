@@ -1,4 +1,4 @@
-"""Fieldkit is killed at each of its writes and resumed: each planned repeat is valid exactly once."""
+"""Fieldkit is killed at each of its writes, and the trial resumed: each planned repeat is valid exactly once."""
 
 import os
 import shutil
@@ -61,21 +61,21 @@ PING 10.42.0.2 (10.42.0.2) 502(530) bytes of data.
 """
 
 STRIDES = mark_nightly([4, 1])
-"""Distances between the writes at which a test interrupts a trial: CI interrupts at every third one."""
+"""Numbers of writes between the interruptions of a test: CI interrupts a trial at every fourth write."""
 
 # Calls that write something to disk or remove it.
 WRITES = ("fsync", "write", "rename", "mkdir", "unlink", "truncate")
 
 
 def robots_with_evidence(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Replace the measurement on robots; everything after it is real."""
+    """Replace the measurement on robots by prepared evidence; fieldkit really does everything else."""
 
     def fetch(_self: Robots, remote: str, into: Path, *, ended_normally: bool) -> list[str]:
         (into / "ping.txt").write_text("" if remote.endswith(VOID_FIRST) else PING, encoding="utf-8")
         write_states(into)
         return []
 
-    def nothing(*_words: object, **_more: object) -> dict[str, object]:
+    def return_empty(*_args: object, **_options: object) -> dict[str, object]:
         return {}
 
     for verb in (
@@ -87,13 +87,13 @@ def robots_with_evidence(monkeypatch: pytest.MonkeyPatch) -> None:
         "close_connections",
         "delete_remote",
     ):
-        monkeypatch.setattr(Robots, verb, nothing)
+        monkeypatch.setattr(Robots, verb, return_empty)
     monkeypatch.setattr(Robots, "fetch", fetch)
-    monkeypatch.setattr(preflight, "check_before_trial", nothing)
-    # A short trial spends most of its time with the same YAML, the same code and the same installed packages.
-    # Processes that are forked later have the cached values of this one.
+    monkeypatch.setattr(preflight, "check_before_trial", return_empty)
+    # A short trial spends most of its time on reading YAML, hashing code, and listing packages, with the same
+    # results. Forked processes inherit these cached results.
     text, versions = schema.dump(plan()), plugins.versions()
-    monkeypatch.setattr(schema, "dump", lambda dumped: text if dumped == plan() else DUMP(dumped))
+    monkeypatch.setattr(schema, "dump", lambda model: text if model == plan() else DUMP(model))
     monkeypatch.setattr(schema, "read", read_once)
     monkeypatch.setattr(plugins, "versions", lambda: versions)
     for module in ("request", "running.resumption"):
@@ -101,46 +101,48 @@ def robots_with_evidence(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @cache
-def parsed_once(text: str, source: str) -> schema.Document:
+def parse_once(text: str, source: str) -> schema.Document:
     return parse(text, source=source)
 
 
 def read_once(path: Path) -> schema.Document:
     """Read a file, but parse equal content only once."""
-    return parsed_once(path.read_text(encoding="utf-8"), str(path))
+    return parse_once(path.read_text(encoding="utf-8"), str(path))
 
 
-def exit_after_kill(call: Callable[..., object], *words: object) -> None:
-    """Exit like after kill -9, with half of the data of a journal entry on disk."""
+def exit_after_kill(call: Callable[..., object], *args: object) -> None:
+    """Exit as if killed by SIGKILL; of an interrupted write, half of the data is on disk."""
     if call is WRITE:
-        descriptor, data = words
+        descriptor, data = args
         assert isinstance(descriptor, int)
         assert isinstance(data, bytes)
         WRITE(descriptor, data[: len(data) // 2])
     os._exit(KILLED)
 
 
-def receive_stop_signal(_call: Callable[..., object], *_words: object) -> None:
-    """Receive a request to stop immediately, as from a second Ctrl-C."""
+def receive_stop_signal(_call: Callable[..., object], *_args: object) -> None:
+    """Send SIGTERM to this process: a request to stop immediately, like a second Ctrl-C."""
     signal.raise_signal(signal.SIGTERM)
 
 
 def call_at_write(moment: int, event: Callable[..., None]) -> None:
-    """Let an event happen to this process at its `moment`-th write, for the rest of its life."""
+    """Call `event` at the `moment`-th write of this process. The patched functions of `os` are never restored."""
     count = 0
 
-    def watched(call: Callable[..., object]) -> Callable[..., object]:
-        def counted(*words: object, **options: object) -> object:
+    def counting(call: Callable[..., object]) -> Callable[..., object]:
+        def count_call(*args: object, **options: object) -> object:
             nonlocal count
             count += 1
             if count == moment:
-                event(call, *words)
-            return None if call is FSYNC else call(*words, **options)  # a kill of a process does not affect the disk
+                event(call, *args)
+            return (
+                None if call is FSYNC else call(*args, **options)
+            )  # a kill of a process loses nothing that it wrote
 
-        return counted
+        return count_call
 
     for name in WRITES:
-        setattr(os, name, watched(getattr(os, name)))
+        setattr(os, name, counting(getattr(os, name)))
 
 
 def run(out: Path, moment: int = 0, event: Callable[..., None] = exit_after_kill) -> bool:
@@ -178,7 +180,7 @@ def trial_of(out: Path) -> Path:
 
 
 def assert_consistent(folder: Path) -> None:
-    """Check that a trial's files are consistent."""
+    """Check that the files of a trial agree with each other."""
     assert verification.verify(folder) == []
     before = {name: (folder / name).read_bytes() for name in ("trial.csv", "summary.csv")}
     rebuild(folder)
@@ -186,7 +188,7 @@ def assert_consistent(folder: Path) -> None:
 
 
 def assert_complete(out: Path) -> None:
-    """Check the properties of every finished trial."""
+    """Check that a trial is finished, and that its files are complete."""
     folder = trial_of(out)
     entries = journal.ended_attempts(journal.read(folder))
     valid = Counter(

@@ -1,4 +1,4 @@
-"""Complete evidence passes every check; damaged in one place, it gives exactly one reason."""
+"""Complete evidence passes all checks; evidence with one damaged file fails with the reason."""
 
 import re
 from collections.abc import Callable
@@ -63,8 +63,8 @@ def test_packets_captured_before_the_filter_are_ignored(folder: Path) -> None:
 
 
 def test_a_tcpdump_without_a_match_count_is_accepted(folder: Path) -> None:
-    output_text = [line for line in log().splitlines(keepends=True) if "received by filter" not in line]
-    (folder / "sender-capture.log").write_text("".join(output_text), encoding="utf-8")
+    reason_text = [line for line in log().splitlines(keepends=True) if "received by filter" not in line]
+    (folder / "sender-capture.log").write_text("".join(reason_text), encoding="utf-8")
     assert problems(PLAN, Protocol.UDP, folder) == ()
 
 
@@ -87,7 +87,7 @@ def short_bag(folder: Path) -> None:
     write_bag(folder / "scan.bag", {"/scan": 1})
 
 
-def other_topic(folder: Path) -> None:
+def wrong_topic(folder: Path) -> None:
     (folder / "scan.bag").unlink()
     write_bag(folder / "scan.bag", {"/odom": 11})
 
@@ -106,7 +106,7 @@ def fewer_frames(folder: Path) -> None:
     [
         (without("scan.bag"), "scan.bag: there is no bag"),
         (text("scan.bag", ""), "scan.bag: the bag is empty"),
-        (other_topic, "scan.bag: no message of /scan"),
+        (wrong_topic, "scan.bag: no message of /scan"),
         (short_bag, "scan.bag: spans only 0.0 s of 4 s"),
         (without("recv.bag"), "recv.bag is missing"),
         (without("sender.pcap"), "sender capture: cannot be read: No such file or directory"),
@@ -139,13 +139,15 @@ def fewer_frames(folder: Path) -> None:
         (text("ping.txt", PING.format(sent=7)), "ping.txt: ping sent 7 of 10 requests"),
     ],
 )
-def test_one_damaged_file_gives_one_reason(folder: Path, damage: Callable[[Path], object], reason: str) -> None:
+def test_one_damaged_file_gives_at_most_two_reasons(
+    folder: Path, damage: Callable[[Path], object], reason: str
+) -> None:
     plan = los_plan(record_s=4.0) if damage is short_bag else PLAN
     damage(folder)
     reasons = problems(plan, Protocol.UDP, folder)
-    assert any(reason in other for other in reasons), reasons
+    assert any(reason in text_of_reason for text_of_reason in reasons), reasons
     assert len(reasons) <= 2, "one cause has at most two symptoms"
-    assert not [other for other in reasons if "cannot be measured" in other], "the damage is handled"
+    assert not [text_of_reason for text_of_reason in reasons if "cannot be measured" in text_of_reason]
 
 
 def test_an_exception_while_measuring_makes_the_attempt_failed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -153,11 +155,11 @@ def test_an_exception_while_measuring_makes_the_attempt_failed(folder: Path, mon
         raise OverflowError("int too large to convert to float")
 
     monkeypatch.setattr(PingStep, "measure", measure)
-    (output_text,) = problems(PLAN, Protocol.UDP, folder)
+    (reason_text,) = problems(PLAN, Protocol.UDP, folder)
     reason = "the evidence of the step ping cannot be measured: OverflowError: int too large to convert to float"
-    assert re.fullmatch(rf"{reason} \(test_trial_gates.py, line [0-9]+\)", output_text)
+    assert re.fullmatch(rf"{reason} \(test_trial_gates.py, line [0-9]+\)", reason_text)
     verdict = gates.judge(PLAN, next(PLAN.repeats_in_order()), AttemptEvidence(folder))
-    assert verdict.measured.missing["rtt_loss"] == output_text
+    assert verdict.measured.missing["rtt_loss"] == reason_text
     (traceback,) = verdict.step_errors
     assert "in measure" in traceback
     assert verdict.has_failed
@@ -167,7 +169,7 @@ def test_an_exception_while_measuring_makes_the_attempt_failed(folder: Path, mon
 def test_an_exception_of_a_reader_of_an_optional_file_is_logged(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without this, the file would count as missing."""
+    """The error must not make the file count as missing."""
 
     def read_lateness(path: Path) -> None:
         raise KeyError(path.name)
@@ -190,27 +192,27 @@ def test_an_exception_of_any_method_makes_the_attempt_failed(
 
     monkeypatch.setattr(PingStep, method, raise_error)
     verdict = gates.judge(PLAN, next(PLAN.repeats_in_order()), AttemptEvidence(folder))
-    *_, reason = verdict.problems  # the jobs of the capture around it raise too
+    *_, reason = verdict.problems  # the jobs of the capture that contains the ping raise too
     assert "the step ping cannot be " in reason
     assert "KeyError: 'wlan0' (test_trial_gates.py, line" in reason
     assert verdict.has_failed
     (folder / "scan.bag").unlink()
     assert not gates.judge(PLAN, next(PLAN.repeats_in_order()), AttemptEvidence(folder)).has_failed, (
-        "another attempt may help"
+        "another attempt may be valid"
     )
 
 
 def test_an_impossible_value_makes_the_attempt_void_and_is_missing(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A table with such a row could not be read again."""
+    """A table that contains the value could not be read again."""
     measured = PingStep.measure
 
-    def impossible(self: PingStep, view: View) -> Measured:
+    def measure_impossible_values(self: PingStep, view: View) -> Measured:
         result = measured(self, view)
         return Measured({**result.values, "rtt_loss": -38460.0, "rtt_min_s": float("nan")}, result.missing)
 
-    monkeypatch.setattr(PingStep, "measure", impossible)
+    monkeypatch.setattr(PingStep, "measure", measure_impossible_values)
     verdict = gates.judge(PLAN, next(PLAN.repeats_in_order()), AttemptEvidence(folder))
     assert verdict.problems == (
         "the evidence gives rtt_loss as -38460, not from 0 to 1",
@@ -224,33 +226,33 @@ def test_a_value_missing_without_a_reason_makes_the_attempt_void(
 ) -> None:
     measured = PingStep.measure
 
-    def forgetful(self: PingStep, view: View) -> Measured:
+    def measure_without_loss(self: PingStep, view: View) -> Measured:
         result = measured(self, view)
         return Measured({name: value for name, value in result.values.items() if name != "rtt_loss"}, result.missing)
 
-    monkeypatch.setattr(PingStep, "measure", forgetful)
+    monkeypatch.setattr(PingStep, "measure", measure_without_loss)
     assert problems(PLAN, Protocol.UDP, folder) == ("the step ping gives neither a value nor a reason for rtt_loss",)
 
 
 def test_evidence_disturbed_by_a_fault_may_be_incomplete(tmp_path: Path) -> None:
-    """The evidence of the fault must be complete; the ping inside left none."""
+    """The evidence of the faults must be complete, but there is none of the pings during them."""
     plan = los_plan().model_copy(update={"procedure": load_procedure("selfheal")})
     write_states(tmp_path)
     reasons = problems(plan, Protocol.TCP, tmp_path)
     assert [reason.partition(":")[0] for reason in reasons] == ["fault-link-down.txt", "fault-reboot.txt"]
 
 
-def test_times_are_withheld_if_the_clock_counts_instructions(folder: Path) -> None:
+def test_times_are_missing_if_the_clock_counts_instructions(folder: Path) -> None:
     def measured(simulators: dict[str, str]) -> Measured:
         plan = PLAN.model_copy(update={"simulators": simulators})
         (repeat, *_) = plan.repeats_in_order()
         return gates.judge(plan, repeat, AttemptEvidence(folder)).measured
 
-    plain, withheld = measured({}), measured({"wifi": "linux", "clock": "instructions"})
-    lost = plain.values.keys() - withheld.values.keys()
-    assert "bag_duration_s" in lost
-    assert all(name.endswith(("_s", "_ppm")) for name in lost)
-    assert {withheld.missing[name] for name in lost} == {
+    values_of_real_clock, withheld = measured({}), measured({"wifi": "linux", "clock": "instructions"})
+    missing_names = values_of_real_clock.values.keys() - withheld.values.keys()
+    assert "bag_duration_s" in missing_names
+    assert all(name.endswith(("_s", "_ppm")) for name in missing_names)
+    assert {withheld.missing[name] for name in missing_names} == {
         "its clock counts the instructions of a processor in software"
     }
-    assert withheld.values["file_loss"] == plain.values["file_loss"]
+    assert withheld.values["file_loss"] == values_of_real_clock.values["file_loss"]

@@ -23,19 +23,19 @@ entries = st.builds(
 
 
 @given(st.lists(entries, max_size=8), st.integers(min_value=0, max_value=200))
-def test_a_torn_journal_gives_every_complete_entry(
-    tmp_path_factory: pytest.TempPathFactory, written: list[JournalEntry], cut: int
+def test_all_complete_entries_of_a_torn_journal_are_read(
+    tmp_path_factory: pytest.TempPathFactory, written_entries: list[JournalEntry], lost_bytes: int
 ) -> None:
     folder = tmp_path_factory.mktemp("trial")
-    journal.append(folder, *written)
+    journal.append(folder, *written_entries)
     path = folder / journal.JOURNAL_FILE
     content = path.read_bytes()
-    truncated = content[: max(0, len(content) - cut)]
+    truncated = content[: max(0, len(content) - lost_bytes)]
     path.write_bytes(truncated)
-    complete = truncated.count(b"\n")
-    read = journal.read(folder)
+    complete_lines = truncated.count(b"\n")
+    read_entries = journal.read(folder)
     # A last line that lost only its line end is still complete.
-    assert read in (written[:complete], written[: complete + 1])
+    assert read_entries in (written_entries[:complete_lines], written_entries[: complete_lines + 1])
 
 
 def test_a_damaged_line_in_the_middle_is_an_error_with_its_number(tmp_path: Path) -> None:
@@ -49,12 +49,12 @@ def test_a_damaged_line_in_the_middle_is_an_error_with_its_number(tmp_path: Path
     assert caught.value.where == f"{path}:2"
 
 
-def test_no_journal_is_an_error(tmp_path: Path) -> None:
+def test_a_missing_journal_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="no journal"):
         journal.read(tmp_path)
 
 
-def test_ended_attempts_have_the_times_of_their_start(tmp_path: Path) -> None:
+def test_ended_attempts_have_their_start_times(tmp_path: Path) -> None:
     journal.append(
         tmp_path,
         JournalEntry(1, Protocol.UDP, 1, 0, Status.PLANNED),
@@ -72,14 +72,17 @@ def test_ended_attempts_have_the_times_of_their_start(tmp_path: Path) -> None:
 
 
 @given(st.lists(entries, max_size=6), st.integers(min_value=0, max_value=200), entries)
-def test_entries_after_a_repair_are_read_back(
-    tmp_path_factory: pytest.TempPathFactory, written: list[JournalEntry], cut: int, next_entry: JournalEntry
+def test_entries_that_are_appended_after_a_repair_are_read_back(
+    tmp_path_factory: pytest.TempPathFactory,
+    written_entries: list[JournalEntry],
+    lost_bytes: int,
+    next_entry: JournalEntry,
 ) -> None:
     folder = tmp_path_factory.mktemp("trial")
-    journal.append(folder, *written)
+    journal.append(folder, *written_entries)
     path = folder / journal.JOURNAL_FILE
     content = path.read_bytes()
-    path.write_bytes(content[: max(0, len(content) - cut)])
+    path.write_bytes(content[: max(0, len(content) - lost_bytes)])
     before = journal.read(folder)
     journal.remove_torn_line(folder)
     journal.append(folder, next_entry)
@@ -102,7 +105,7 @@ def test_an_attempt_without_an_end_was_interrupted(tmp_path: Path) -> None:
     ]
 
 
-def test_a_full_disk_leaves_the_journal_as_it_was(tmp_path: Path) -> None:
+def test_a_full_disk_does_not_change_the_journal(tmp_path: Path) -> None:
     journal.append(tmp_path, JournalEntry(1, Protocol.TCP, 1, 0, Status.PLANNED))
     before = (tmp_path / journal.JOURNAL_FILE).read_bytes()
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)

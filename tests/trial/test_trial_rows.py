@@ -1,4 +1,4 @@
-"""Rows that are measured again, by a later fieldkit than ran the trial."""
+"""Rows that a later version of fieldkit measures again from the evidence."""
 
 from pathlib import Path
 

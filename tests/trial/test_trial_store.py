@@ -21,9 +21,9 @@ def folder(tmp_path: Path) -> Path:
     (partial / "ping.txt").write_text("PING", encoding="utf-8")
     (partial / "scan").mkdir()
     (partial / "scan" / "scan_0.db3").write_bytes(b"SQLite format 3\0" * 9)
-    sums = manifest.Manifest(trial_folder)
-    sums.add(store.commit_attempt(partial, "udp-01"))
-    sums.write()
+    new_manifest = manifest.Manifest(trial_folder)
+    new_manifest.add(store.commit_attempt(partial, "udp-01"))
+    new_manifest.write()
     return trial_folder
 
 
@@ -33,7 +33,7 @@ def test_a_plan_is_written_and_read_back(folder: Path) -> None:
 
 
 @pytest.mark.ros
-def test_a_plan_contains_the_inputs_of_the_numbers() -> None:
+def test_a_plan_contains_all_inputs_of_a_trial() -> None:
     plan = los_plan(record_s=2.0)
     text = schema.dump(plan)
     assert "duration: 2s" in text
@@ -44,7 +44,7 @@ def test_a_plan_contains_the_inputs_of_the_numbers() -> None:
 
 @pytest.mark.parametrize("name", ["../..", ".", "a/b", "", "-rf"])
 def test_a_plan_with_an_invalid_folder_name_is_rejected(folder: Path, name: str) -> None:
-    """The folder of that name is removed on robots."""
+    """Robots remove the folder with this name."""
     path = folder / "trial.yaml"
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace(f"trial: {plain_plan().trial}", f"trial: '{name}'"), encoding="utf-8")
@@ -53,13 +53,13 @@ def test_a_plan_with_an_invalid_folder_name_is_rejected(folder: Path, name: str)
     assert caught.value.where.startswith(str(path))
 
 
-def test_an_untouched_trial_verifies_and_sha256sum_agrees(folder: Path) -> None:
+def test_verification_and_sha256sum_find_no_changes_in_an_unchanged_trial(folder: Path) -> None:
     assert verification.verify(folder) == []
     subprocess.run(("sha256sum", "--check", "--quiet", store.MANIFEST_FILE), cwd=folder, check=True)
 
 
 @pytest.mark.parametrize("name", ["trial.yaml", "repeats/udp-01/scan.bag", "repeats/udp-01/scan/scan_0.db3"])
-def test_one_flipped_byte_is_found(folder: Path, name: str) -> None:
+def test_one_changed_bit_is_found(folder: Path, name: str) -> None:
     content = bytearray((folder / name).read_bytes())
     content[len(content) // 2] ^= 1
     (folder / name).write_bytes(content)

@@ -111,12 +111,12 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
     @override
     def placement_error(self, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
         if not self.duplicates:
-            return None
+            return super().placement_error(earlier, within)
         if self.count > MAX_SEQUENCE_COUNT:
             return f"duplicates allows at most {MAX_SEQUENCE_COUNT} requests, because their numbers repeat"
         if not self.over or not all(capture_around(within, role) for role in (self.sender, self.receiver)):
             return "duplicates needs `over`, and a capture on both robots around the ping"
-        return None
+        return super().placement_error(earlier, within)
 
     @override
     def with_duration(self, seconds: float) -> Self:

@@ -14,7 +14,7 @@ from scapy.utils import PcapNgWriter, PcapReader, rdpcap
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.arrays import NO_TIME
-from tests.helpers.blocks import block, enhanced, file_of, interface, obsolete, option, section, simple
+from tests.helpers.blocks import block, enhanced, file_bytes_of, interface, obsolete, option, section, simple
 from tests.helpers.captures import TCPDUMP, Frame, file_bytes, segment, timed
 from tests.helpers.dissected import rows
 
@@ -213,7 +213,7 @@ def test_both_formats_give_the_same_columns(records: list[tuple[int, int, int]])
         for index, (time_ns, size, captured) in enumerate(records)
     ]
     for order in ("<", ">"):
-        classic, blocks = (make(frames, order=order) for make in (file_bytes, file_of))
+        classic, blocks = (make(frames, order=order) for make in (file_bytes, file_bytes_of))
         assert rows(pcap.parse(classic, where="x").packets) == rows(pcap.parse(blocks, where="x").packets)
 
 
@@ -232,4 +232,6 @@ def test_a_recorded_capture_rewritten_by_scapy_as_pcapng_gives_the_same_columns(
 
 def test_frames_are_timed_in_the_order_of_the_file() -> None:
     frames = timed([segment(index, 0) for index in range(9)])
-    assert pcap.parse(file_of(frames), where="x").packets.time_ns.tolist() == [frame.time_ns for frame in frames]
+    assert pcap.parse(file_bytes_of(frames), where="x").packets.time_ns.tolist() == [
+        frame.time_ns for frame in frames
+    ]

@@ -56,8 +56,8 @@ class Link:
             for name, content in (
                 ("scan.bag", sent),
                 ("recv.bag", received),
-                ("sender.pcap", file_of(self.sent)),
-                ("receiver.pcap", file_of(self.received)),
+                ("sender.pcap", file_bytes_of(self.sent)),
+                ("receiver.pcap", file_bytes_of(self.received)),
             ):
                 (folder / name).write_bytes(content)
             evidence = AttemptEvidence(folder)
@@ -65,7 +65,7 @@ class Link:
             return list(transfer_checks.find_contradictions(evidence, a_transfer, finished=finished))
 
 
-def file_of(frames: Iterable[Frame]) -> bytes:
+def file_bytes_of(frames: Iterable[Frame]) -> bytes:
     return file_bytes(sorted(frames, key=lambda frame: frame.time_ns))
 
 

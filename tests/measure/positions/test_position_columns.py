@@ -18,7 +18,7 @@ from fieldkit.measure.positions import position_columns, position_sources, recor
 from fieldkit.measure.positions.position_sources import PositionSource, PositionSources
 from fieldkit.measure.positions.samples import LOCAL, PLACED, WGS84
 from fieldkit.measure.robot_clock import Offset
-from tests.ros.bags.test_bag_positions import BEGAN_NS, S, odometry, stamped, write_bag
+from tests.ros.bags.test_bag_positions import BEGAN_NS, S, odometry, pose_stamped, write_bag
 
 SENDER, RECEIVER = Role.SENDER, Role.RECEIVER
 ENDS = (SENDER, RECEIVER)
@@ -156,7 +156,7 @@ def test_a_robot_without_a_source_has_no_distance(attempt: Path) -> None:
 
 
 def test_a_tracker_and_a_fixed_place_in_its_frame(attempt: Path) -> None:
-    write_bag(attempt, [stamped(BEGAN_NS + n * S, 3.0, float(n)) for n in range(5)])
+    write_bag(attempt, [pose_stamped(BEGAN_NS + n * S, 3.0, float(n)) for n in range(5)])
     tracker = PositionSource(file="track.bag", topic="/where")
     write_sources(attempt, {SENDER: PositionSource(place=(0.0, 2.0, 0.0), frame="frame map"), RECEIVER: tracker})
     assert mean_m(attempt, 2.0, 2.0) == pytest.approx(3)

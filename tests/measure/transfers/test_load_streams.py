@@ -35,7 +35,7 @@ def measured(load: LoadStreams, streams: Iterable[Stream]) -> dict[str, Any]:
 def control(**ends: Any) -> Stream:  # noqa: ANN401 (fields of Stream)
     """The control connection, which is opened first and idle during the test."""
     stream = Stream(**{"sport": 39000, **ends})
-    stream.opens(0)
+    stream.handshake(0)
     for number, at_ns in enumerate((10 * MS, 9 * SECOND)):
         stream.segment(number, at_ns)
         stream.answer(number + 1, at_ns + 5 * MS)
@@ -74,7 +74,7 @@ def test_a_test_longer_than_its_arrivals_has_a_lower_bound() -> None:
 def tcp_data(gap_ns: int) -> Stream:
     """A data connection: the client's cookie, segments, and a gap with retransmissions that are lost."""
     stream = Stream()
-    stream.opens(100 * MS)
+    stream.handshake(100 * MS)
     stream.forward(105 * MS, ISN + 1, "PA", b"c" * COOKIE_BYTES)
     shift = COOKIE_BYTES
     at_ns = SECOND
@@ -99,13 +99,13 @@ def test_retransmissions_that_are_lost_do_not_end_a_stall(gap_ms: int) -> None:
 
 def test_a_test_in_reverse_sends_from_the_servers_port() -> None:
     rebuilt = Stream(sport=PORT, port=40000)
-    rebuilt.opens(100 * MS)
+    rebuilt.handshake(100 * MS)
     for number in range(100):
         rebuilt.forward(
             SECOND + number * 10 * MS + 2 * SECOND * (number >= 50), ISN + 1 + number * 1000, "A", b"x" * 1000
         )
     first = Stream(sport=PORT, port=39000)
-    first.opens(0)
+    first.handshake(0)
     load = replace(TCP, source_listens=True, expected=FlowSchedule())
     assert measured(load, [first, rebuilt])["stall_s"] == pytest.approx(2.01, abs=1e-3)
 

@@ -39,7 +39,7 @@ def measured(deliveries: list[Delivery]) -> dict[str, Any]:
 def sends(count: int, *, every_ns: int = STEP_NS) -> Stream:
     """A connection that delivers a segment every 10 ms."""
     stream = Stream()
-    stream.opens()
+    stream.handshake()
     for number in range(count):
         stream.segment(number, 5 * MS + number * every_ns)
     return stream
@@ -55,7 +55,7 @@ def test_the_longest_stall_is_the_longest_gap_despite_retransmissions(
     gaps_ms: list[int], copies: int, offload: bool
 ) -> None:
     stream = Stream()
-    stream.opens()
+    stream.handshake()
     at_ns, arrived_ns, segments = 5 * MS, [], 3 if offload else 1
     for number, gap_ms in enumerate([0, *gaps_ms]):
         at_ns += gap_ms * MS
@@ -122,7 +122,7 @@ def test_a_file_that_is_complete_does_not_stall_until_its_listener_ends() -> Non
 
 def test_a_connection_that_was_set_up_late_has_stalled() -> None:
     stream = Stream()
-    stream.opens(3 * SECOND, lost=(0, SECOND))
+    stream.handshake(3 * SECOND, lost=(0, SECOND))
     for number in range(10):
         stream.segment(number, 3 * SECOND + 5 * MS + number * STEP_NS)
     result = measured(of_tcp(*captured([stream])))
@@ -197,7 +197,7 @@ def test_a_flow_shorter_than_its_schedule_has_stalled_until_the_end_of_it() -> N
 @pytest.mark.parametrize("ahead_ns", [-3600 * SECOND, 86_400 * SECOND])
 def test_an_offset_between_the_clocks_changes_nothing(ahead_ns: int) -> None:
     stream = Stream(ahead_ns=ahead_ns)
-    stream.opens(SECOND, lost=(0,))
+    stream.handshake(SECOND, lost=(0,))
     for number in range(20):
         stream.segment(number, SECOND + 5 * MS + number * STEP_NS)
     stream.segment(20, 2 * SECOND, arrives=False)
@@ -226,7 +226,7 @@ def test_extreme_times_do_not_overflow() -> None:
 
 def test_stalls_of_connections_are_counted_separately() -> None:
     steady, other = sends(100), Stream(sport=40001)
-    other.opens()
+    other.handshake()
     for number in range(10):
         other.segment(number, 5 * MS + number * 300 * MS)
     result = measured(of_tcp(*captured([steady, other])))

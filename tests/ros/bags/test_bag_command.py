@@ -1,4 +1,4 @@
-"""`fieldkit bag`: its output for complete and damaged bags, of ROS's recorders and truncated ones."""
+"""`fieldkit bag`: its output for complete, truncated and damaged bags, some of them from recorders of ROS."""
 
 import gzip
 import json
@@ -29,7 +29,7 @@ from fieldkit.ros.bags.worker import message_types
 from tests.helpers.paths import DATA
 
 KILLED = DATA / "rosbag/1.15.15/killed"
-BEGUN_NS = 1_795_000_000_000_000_000
+STARTED_NS = 1_795_000_000_000_000_000
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 Message = tuple[str, int, str]
 
@@ -37,44 +37,54 @@ Message = tuple[str, int, str]
 def expected(count: int) -> list[Message]:
     draw = random.Random(count)
     return [
-        (f"/t{number % 3}", BEGUN_NS + number * 10_000_000, "x" * draw.randrange(2000) + str(number))
+        (f"/t{number % 3}", STARTED_NS + number * 10_000_000, "x" * draw.randrange(2000) + str(number))
         for number in range(count)
     ]
 
 
 def write_bag(folder: Path, form: BagFormat, messages: Sequence[Message]) -> Path:
-    """Return a bag written by rosbags; for ROS 1 compressed, with about 20 messages per chunk."""
+    """Write a bag with rosbags; a ROS 1 bag is compressed and has about 20 messages per chunk."""
     if form is BagFormat.ROS1:
         types = get_typestore(Stores.ROS1_NOETIC)
         path = folder / "all.bag"
-        old = rosbag1.Writer(path)
-        old.set_compression(rosbag1.Writer.CompressionFormat.LZ4)
-        old.chunk_threshold = 20_000
-        with old:
+        ros1_writer = rosbag1.Writer(path)
+        ros1_writer.set_compression(rosbag1.Writer.CompressionFormat.LZ4)
+        ros1_writer.chunk_threshold = 20_000
+        with ros1_writer:
             channels = {
-                topic: old.add_connection(topic, "std_msgs/msg/String", typestore=types) for topic, *_ in messages[:3]
+                topic: ros1_writer.add_connection(topic, "std_msgs/msg/String", typestore=types)
+                for topic, *_ in messages[:3]
             }
             string = types.types["std_msgs/msg/String"]
             for topic, at_ns, text in messages:
-                old.write(channels[topic], at_ns, types.serialize_ros1(string(data=text), "std_msgs/msg/String"))
+                ros1_writer.write(
+                    channels[topic], at_ns, types.serialize_ros1(string(data=text), "std_msgs/msg/String")
+                )
         return path
     path = folder / "all"
     if form is BagFormat.MCAP and len(messages) > 100:
-        return in_chunks(path, messages)
+        return write_in_chunks(path, messages)
     plugin = rosbag2.StoragePlugin.MCAP if form is BagFormat.MCAP else rosbag2.StoragePlugin.SQLITE3
-    with rosbag2.Writer(path, version=9, storage_plugin=plugin) as new:
-        its = {topic: new.add_connection(topic, "std_msgs/msg/String", typestore=TYPES) for topic, *_ in messages[:3]}
+    with rosbag2.Writer(path, version=9, storage_plugin=plugin) as ros2_writer:
+        connections = {
+            topic: ros2_writer.add_connection(topic, "std_msgs/msg/String", typestore=TYPES)
+            for topic, *_ in messages[:3]
+        }
         string = TYPES.types["std_msgs/msg/String"]
         for topic, at_ns, text in messages:
-            new.write(its[topic], at_ns, TYPES.serialize_cdr(string(data=text), "std_msgs/msg/String"))
+            ros2_writer.write(
+                connections[topic], at_ns, TYPES.serialize_cdr(string(data=text), "std_msgs/msg/String")
+            )
     return path
 
 
-def in_chunks(path: Path, messages: Sequence[Message], compression: CompressionType = CompressionType.ZSTD) -> Path:
-    """Return an MCAP file with about 20 messages per chunk; rosbags writes one chunk."""
+def write_in_chunks(
+    path: Path, messages: Sequence[Message], compression: CompressionType = CompressionType.ZSTD
+) -> Path:
+    """Write an MCAP file with about 20 messages per chunk; rosbags would write one chunk."""
     path.mkdir()
-    with (path / "all.mcap").open("wb") as opened:
-        writer = McapWriter(opened, chunk_size=20_000, compression=compression)
+    with (path / "all.mcap").open("wb") as file_object:
+        writer = McapWriter(file_object, chunk_size=20_000, compression=compression)
         writer.start(profile="ros2")
         definition, _ = TYPES.generate_msgdef("std_msgs/msg/String", ros_version=2)
         schema = writer.register_schema("std_msgs/msg/String", "ros2msg", definition.encode())
@@ -99,12 +109,14 @@ def data_file(bag: Path) -> Path:
 
 
 @pytest.mark.parametrize("form", BagFormat)
-def test_info_and_check_of_a_whole_bag(tmp_path: Path, form: BagFormat, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_complete_bag_is_described_and_intact(
+    tmp_path: Path, form: BagFormat, capsys: pytest.CaptureFixture[str]
+) -> None:
     bag = write_bag(tmp_path, form, expected(31))
     assert main(["bag", "info", str(bag), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert (report["format"], report["messages"], report["problems"]) == (form.value, 31, [])
-    assert report["started_utc_ns"] == BEGUN_NS
+    assert report["started_utc_ns"] == STARTED_NS
     assert report["duration_s"] == pytest.approx(0.3)
     assert [topic["messages"] for topic in report["topics"]] == [11, 10, 10]
     assert main(["bag", "info", str(bag)]) == 0
@@ -115,40 +127,40 @@ def test_info_and_check_of_a_whole_bag(tmp_path: Path, form: BagFormat, capsys: 
 
 @pytest.mark.parametrize("form", BagFormat)
 @pytest.mark.parametrize("share", [0.35, 0.8, 0.97])
-def test_start_of_a_truncated_file_is_recovered(tmp_path: Path, form: BagFormat, share: float) -> None:
+def test_the_start_of_a_truncated_file_is_recovered(tmp_path: Path, form: BagFormat, share: float) -> None:
     messages = expected(300)
     bag = write_bag(tmp_path, form, messages)
     file = data_file(bag)
-    with file.open("r+b") as opened:
-        opened.truncate(int(share * file.stat().st_size))
+    with file.open("r+b") as file_object:
+        file_object.truncate(int(share * file.stat().st_size))
     assert main(["bag", "check", str(bag)]) == EvidenceError.exit_code
-    saved = tmp_path / ("saved.bag" if form is BagFormat.ROS1 else "saved")
+    repaired_bag = tmp_path / ("saved.bag" if form is BagFormat.ROS1 else "saved")
     if form is BagFormat.SQLITE:
-        # Its pages are a tree: a truncated database may contain no readable message.
-        assert main(["bag", "repair", str(bag), str(saved)]) in {0, EvidenceError.exit_code}
+        # The pages of a database are a tree, so a truncated database may contain no readable message.
+        assert main(["bag", "repair", str(bag), str(repaired_bag)]) in {0, EvidenceError.exit_code}
     else:
-        assert main(["bag", "repair", str(bag), str(saved)]) == 0
-    recovered = read(saved) if saved.exists() else []
+        assert main(["bag", "repair", str(bag), str(repaired_bag)]) == 0
+    recovered = read(repaired_bag) if repaired_bag.exists() else []
     assert recovered == messages[: len(recovered)]
     if form is not BagFormat.SQLITE:
         assert len(recovered) > (share - 0.25) * len(messages)
-    assert {path.name for path in tmp_path.iterdir()} <= {bag.name, saved.name}
+    assert {path.name for path in tmp_path.iterdir()} <= {bag.name, repaired_bag.name}
 
 
 @pytest.mark.parametrize(
-    ("name", "least"),
+    ("name", "count"),
     [("open.bag.active", 266), ("bz2.bag.active", 225), ("lz4.bag.active", 225)],
 )
-def test_as_many_messages_are_recovered_as_by_ros(
-    tmp_path: Path, name: str, least: int, capsys: pytest.CaptureFixture[str]
+def test_at_least_as_many_messages_are_recovered_as_by_ros(
+    tmp_path: Path, name: str, count: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """`rosbag reindex` 1.15.15 recovers 0, 225 and 225 messages of these."""
-    saved = tmp_path / "saved.bag"
+    """`rosbag reindex` 1.15.15 recovers 0, 225 and 225 messages of these bags."""
+    repaired_bag = tmp_path / "saved.bag"
     assert main(["bag", "check", str(KILLED / name)]) == EvidenceError.exit_code
-    assert f"{least} messages can be recovered: fieldkit bag repair" in capsys.readouterr().err
-    assert main(["bag", "repair", str(KILLED / name), str(saved)]) == 0
-    recovered = read(saved)
-    assert len(recovered) == least
+    assert f"{count} messages can be recovered: fieldkit bag repair" in capsys.readouterr().err
+    assert main(["bag", "repair", str(KILLED / name), str(repaired_bag)]) == 0
+    recovered = read(repaired_bag)
+    assert len(recovered) == count
     assert {(topic, text) for topic, _, text in recovered} == {("/chatter", "hello hello hello hello")}
     gaps_ns = sorted(after_ns - before_ns for (_, before_ns, _), (_, after_ns, _) in pairwise(recovered))
     assert gaps_ns[len(gaps_ns) // 2] == pytest.approx(20e6, rel=0.05), "50 Hz"
@@ -156,9 +168,11 @@ def test_as_many_messages_are_recovered_as_by_ros(
 
 @pytest.mark.emulated
 def test_ros_reads_a_repaired_bag(tmp_path: Path) -> None:
-    saved = tmp_path / "saved.bag"
-    contents.repair(KILLED / "open.bag.active", saved)
-    report = subprocess.run(("rosbag", "info", "-y", str(saved)), check=True, capture_output=True, text=True).stdout
+    repaired_bag = tmp_path / "saved.bag"
+    contents.repair(KILLED / "open.bag.active", repaired_bag)
+    report = subprocess.run(
+        ("rosbag", "info", "-y", str(repaired_bag)), check=True, capture_output=True, text=True
+    ).stdout
     assert "messages: 266" in report
     assert "indexed: True" in report
 
@@ -173,7 +187,7 @@ def test_write_ahead_log_of_a_killed_ros_2_recorder_is_recovered(tmp_path: Path)
         database.execute("PRAGMA wal_autocheckpoint=0")
         data = bytes(TYPES.serialize_cdr(TYPES.types["std_msgs/msg/String"](data="late"), "std_msgs/msg/String"))
         database.execute(
-            "INSERT INTO messages (topic_id, timestamp, data) VALUES (1, ?, ?)", (BEGUN_NS + 10**9, data)
+            "INSERT INTO messages (topic_id, timestamp, data) VALUES (1, ?, ?)", (STARTED_NS + 10**9, data)
         )
         database.commit()
         for path in bag.glob("*.db3*"):
@@ -186,12 +200,14 @@ def test_write_ahead_log_of_a_killed_ros_2_recorder_is_recovered(tmp_path: Path)
     assert report.recoverable_messages == 41
     contents.repair(remaining, tmp_path / "saved")
     assert [text for _, _, text in read(tmp_path / "saved")] == [*(text for _, _, text in messages), "late"]
-    assert {path.name: path.read_bytes() for path in remaining.iterdir()} == before, "it is not changed"
+    assert {path.name: path.read_bytes() for path in remaining.iterdir()} == before, (
+        "the original files are not changed"
+    )
 
 
 @pytest.mark.parametrize("form", BagFormat)
 @pytest.mark.parametrize("to", BagFormat)
-def test_conversion_keeps_all_messages(tmp_path: Path, form: BagFormat, to: BagFormat) -> None:
+def test_a_converted_bag_has_all_messages(tmp_path: Path, form: BagFormat, to: BagFormat) -> None:
     messages = expected(30)
     bag = write_bag(tmp_path, form, messages)
     new = tmp_path / ("new.bag" if to is BagFormat.ROS1 else "new")
@@ -203,7 +219,7 @@ def test_conversion_keeps_all_messages(tmp_path: Path, form: BagFormat, to: BagF
 
 
 def test_types_are_those_of_the_distribution(tmp_path: Path) -> None:
-    """The fields of CameraInfo have other names in ROS 2: D, K, R, P became d, k, r, p."""
+    """The fields D, K, R, P of CameraInfo are named d, k, r, p in ROS 2."""
     types = get_typestore(Stores.ROS1_NOETIC)
     bag = tmp_path / "camera.bag"
     with rosbag1.Writer(bag) as writer:
@@ -215,7 +231,7 @@ def test_types_are_those_of_the_distribution(tmp_path: Path) -> None:
         info = type_names["sensor_msgs/msg/CameraInfo"](
             header, 480, 640, "plumb_bob", numbers[:5], numbers[:9], numbers[:9], numbers, 0, 0, region
         )
-        writer.write(connection, BEGUN_NS, types.serialize_ros1(info, "sensor_msgs/msg/CameraInfo"))
+        writer.write(connection, STARTED_NS, types.serialize_ros1(info, "sensor_msgs/msg/CameraInfo"))
     contents.convert(bag, tmp_path / "camera", distribution="humble")
     with AnyReader([tmp_path / "camera"]) as reader:
         ((recorded, _, data),) = reader.messages()
@@ -281,19 +297,19 @@ def test_impossible_requests_are_reported(
 def test_single_mcap_file_is_a_bag(
     tmp_path: Path, compression: CompressionType, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its index is in the file: no other file is needed to check it and to read its contents."""
+    """The index is in the file, so no other file is needed to check it and to read its contents."""
     messages = expected(300)
-    alone = data_file(in_chunks(tmp_path / "all", messages, compression))
-    assert not (alone.parent / METADATA).exists()
-    for path in (alone, alone.parent):
+    mcap_file = data_file(write_in_chunks(tmp_path / "all", messages, compression))
+    assert not (mcap_file.parent / METADATA).exists()
+    for path in (mcap_file, mcap_file.parent):
         assert main(["bag", "check", str(path)]) == 0
         assert "intact, 300 messages" in capsys.readouterr().out
-    assert main(["bag", "convert", str(alone.parent), str(tmp_path / "new.bag")]) == 0
+    assert main(["bag", "convert", str(mcap_file.parent), str(tmp_path / "new.bag")]) == 0
     assert read(tmp_path / "new.bag") == messages
     capsys.readouterr()
-    with alone.open("r+b") as opened:
-        opened.truncate(alone.stat().st_size // 2)
-    assert main(["bag", "check", str(alone)]) == EvidenceError.exit_code
+    with mcap_file.open("r+b") as file_object:
+        file_object.truncate(mcap_file.stat().st_size // 2)
+    assert main(["bag", "check", str(mcap_file)]) == EvidenceError.exit_code
     output_text = capsys.readouterr().err
     assert "there is no metadata.yaml" in output_text
     assert "bytes before the end of a record" in output_text
@@ -302,24 +318,24 @@ def test_single_mcap_file_is_a_bag(
 
 def test_remedy_for_a_truncated_database(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     database = data_file(write_bag(tmp_path, BagFormat.SQLITE, expected(300)))
-    cut = tmp_path / "cut.db3"
-    cut.write_bytes(database.read_bytes()[:30_000])
-    assert main(["bag", "check", str(cut)]) == EvidenceError.exit_code
+    truncated_file = tmp_path / "cut.db3"
+    truncated_file.write_bytes(database.read_bytes()[:30_000])
+    assert main(["bag", "check", str(truncated_file)]) == EvidenceError.exit_code
     output_text = capsys.readouterr().err
     assert "there is no metadata.yaml" in output_text
-    assert f"{cut}: database disk image is malformed" in output_text
+    assert f"{truncated_file}: database disk image is malformed" in output_text
     assert (
         "no message can be recovered; SQLite may read more of it: sqlite3 OLD.db3 .recover | sqlite3 NEW.db3"
         in output_text
     )
-    assert main(["bag", "repair", str(cut), str(tmp_path / "new")]) == EvidenceError.exit_code
+    assert main(["bag", "repair", str(truncated_file), str(tmp_path / "new")]) == EvidenceError.exit_code
     assert "remedy: SQLite may read more of it" in capsys.readouterr().err
 
 
 def test_sparse_file_is_reported_in_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    bag = data_file(in_chunks(tmp_path / "all", expected(300)))
-    with bag.open("r+b") as opened:
-        opened.truncate(1 << 42)
+    bag = data_file(write_in_chunks(tmp_path / "all", expected(300)))
+    with bag.open("r+b") as file_object:
+        file_object.truncate(1 << 42)
     assert main(["bag", "check", str(bag)]) == EvidenceError.exit_code
     assert "can be recovered" in capsys.readouterr().err
 

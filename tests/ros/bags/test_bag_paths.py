@@ -1,4 +1,4 @@
-"""Bags can be read at any path, also with invalid characters, and written at any path with valid ones."""
+"""Bags can be read at any path, also with invalid characters, and written to any path with valid characters."""
 
 import os
 import shutil
@@ -47,7 +47,7 @@ def test_bag_is_read_at_any_path(
             shutil.copy(bags[form], bag_path)
         contents_of_bag = contents.inspect(bag_path, read_all=True)
         assert (contents_of_bag.problems, contents_of_bag.messages) == ((), COUNT)
-        assert bag.read(data_file(bag_path)).messages == COUNT, "as the evidence of a repeat"
+        assert bag.read(data_file(bag_path)).messages == COUNT, "the evidence of a repeat is read with this function"
     finally:
         shutil.rmtree(base)
 

@@ -1,4 +1,4 @@
-"""Positions in bags written by rosbags: every message type, frames, stamps, and the start of odometry."""
+"""Positions in bags that rosbags writes: all message types, frames, stamps, and the start of odometry."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -31,8 +31,8 @@ def header(at_ns: int, frame: str, number: int = 0) -> Any:  # noqa: ANN401 (of 
 
 def pose(x: float, y: float, yaw: float) -> Any:  # noqa: ANN401 (of rosbags)
     point = TYPES["geometry_msgs/msg/Point"](x, y, 0.0)
-    turned = TYPES["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
-    return TYPES["geometry_msgs/msg/Pose"](point, turned)
+    orientation = TYPES["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
+    return TYPES["geometry_msgs/msg/Pose"](point, orientation)
 
 
 def odometry(at_ns: int, x: float, y: float, yaw: float = 0.0) -> Any:  # noqa: ANN401 (of rosbags)
@@ -49,22 +49,22 @@ def fix(at_ns: int, latitude: float, longitude: float, status: int = 0) -> Any: 
 
 
 def transform(at_ns: int, x: float, y: float, child: str, frame: str = "map") -> Any:  # noqa: ANN401 (of rosbags)
-    at = TYPES["geometry_msgs/msg/Vector3"](x, y, 0.0)
-    pose_transform = TYPES["geometry_msgs/msg/Transform"](at, pose(0, 0, 0).orientation)
+    position = TYPES["geometry_msgs/msg/Vector3"](x, y, 0.0)
+    pose_transform = TYPES["geometry_msgs/msg/Transform"](position, pose(0, 0, 0).orientation)
     return TYPES["geometry_msgs/msg/TransformStamped"](header(at_ns, frame), child, pose_transform)
 
 
-def stamped(at_ns: int, x: float, y: float, frame: str = "map") -> Any:  # noqa: ANN401 (of rosbags)
+def pose_stamped(at_ns: int, x: float, y: float, frame: str = "map") -> Any:  # noqa: ANN401 (of rosbags)
     return TYPES["geometry_msgs/msg/PoseStamped"](header(at_ns, frame), pose(x, y, 0.0))
 
 
-def covered(at_ns: int, x: float, y: float) -> Any:  # noqa: ANN401 (of rosbags)
+def pose_with_covariance(at_ns: int, x: float, y: float) -> Any:  # noqa: ANN401 (of rosbags)
     with_covariance = TYPES["geometry_msgs/msg/PoseWithCovariance"](pose(x, y, 0.0), np.zeros(36))
     return TYPES["geometry_msgs/msg/PoseWithCovarianceStamped"](header(at_ns, "map"), with_covariance)
 
 
 def write_bag(folder: Path, messages: Iterable[Any], topic: str = "/where", late_ns: int = 1000) -> Path:
-    """Write a ROS 1 bag of messages that were received a little after their stamps."""
+    """Write a ROS 1 bag of messages that were received `late_ns` after their stamps."""
     path = folder / "track.bag"
     with rosbag1.Writer(path) as writer:
         connections: dict[str, Any] = {}
@@ -72,8 +72,8 @@ def write_bag(folder: Path, messages: Iterable[Any], topic: str = "/where", late
             kind = message.__msgtype__
             if kind not in connections:
                 connections[kind] = writer.add_connection(topic, kind, typestore=STORE)
-            at = BEGAN_NS + number * S + late_ns
-            writer.write(connections[kind], at, bytes(STORE.serialize_ros1(message, kind)))
+            position = BEGAN_NS + number * S + late_ns
+            writer.write(connections[kind], position, bytes(STORE.serialize_ros1(message, kind)))
     return path
 
 
@@ -81,10 +81,10 @@ def write_bag(folder: Path, messages: Iterable[Any], topic: str = "/where", late
     ("make_message", "frame", "places"),
     [
         (odometry, PLACED, [[0, 0, 0], [1, 2, 0]]),
-        (stamped, "frame map", [[0, 0, 0], [1, 2, 0]]),
-        (covered, "frame map", [[0, 0, 0], [1, 2, 0]]),
-        (lambda at, x, y: transform(at, x, y, "base"), "frame map", [[0, 0, 0], [1, 2, 0]]),
-        (lambda at, x, y: fix(at, 48 + x, 11 + y), WGS84, [[48, 11, 520], [49, 13, 520]]),
+        (pose_stamped, "frame map", [[0, 0, 0], [1, 2, 0]]),
+        (pose_with_covariance, "frame map", [[0, 0, 0], [1, 2, 0]]),
+        (lambda position, x, y: transform(position, x, y, "base"), "frame map", [[0, 0, 0], [1, 2, 0]]),
+        (lambda position, x, y: fix(position, 48 + x, 11 + y), WGS84, [[48, 11, 520], [49, 13, 520]]),
     ],
 )
 def test_every_message_type_has_positions(
@@ -106,12 +106,14 @@ def write_ros2_bag(folder: Path, message: Any, kind: str) -> Path:  # noqa: ANN4
 
 def transform2(x: float, y: float, frame: str, child: str) -> Any:  # noqa: ANN401 (of rosbags)
     types: Any = STORE2.types
-    head = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](*divmod(BEGAN_NS, S)), frame)
-    at, turned = (
+    message_header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](*divmod(BEGAN_NS, S)), frame)
+    position, orientation = (
         types["geometry_msgs/msg/Vector3"](x, y, 0.0),
         types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
     )
-    return types["geometry_msgs/msg/TransformStamped"](head, child, types["geometry_msgs/msg/Transform"](at, turned))
+    return types["geometry_msgs/msg/TransformStamped"](
+        message_header, child, types["geometry_msgs/msg/Transform"](position, orientation)
+    )
 
 
 def test_ros_2_bags_and_the_child_frame_of_a_transform_tree(tmp_path: Path) -> None:
@@ -128,14 +130,14 @@ def test_ros_2_bags_and_the_child_frame_of_a_transform_tree(tmp_path: Path) -> N
 
 
 def test_messages_without_a_fix_and_with_equal_times_are_ignored(tmp_path: Path) -> None:
-    lost, nan = fix(BEGAN_NS, 0.0, 0.0, status=-1), fix(BEGAN_NS + 2 * S, math.nan, 11.0)
-    path = write_bag(tmp_path, [lost, fix(BEGAN_NS + S, 48.0, 11.0), fix(BEGAN_NS + S, 49.0, 11.0), nan])
+    without_fix, nan = fix(BEGAN_NS, 0.0, 0.0, status=-1), fix(BEGAN_NS + 2 * S, math.nan, 11.0)
+    path = write_bag(tmp_path, [without_fix, fix(BEGAN_NS + S, 48.0, 11.0), fix(BEGAN_NS + S, 49.0, 11.0), nan])
     samples = bag_positions.read_bag(path, PositionSource(topic="/where"))
     assert (samples.times_ns.tolist(), samples.values.tolist()) == ([BEGAN_NS + S], [[48, 11, 520]])
 
 
-def test_stamps_of_another_clock_are_rejected_unless_times_are_the_recorders(tmp_path: Path) -> None:
-    path = write_bag(tmp_path, [stamped(7 * S, 1.0, 1.0)])
+def test_stamps_of_another_clock_are_rejected_unless_times_of_reception_are_used(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, [pose_stamped(7 * S, 1.0, 1.0)])
     with pytest.raises(EvidenceError, match="the stamps of /where differ by 1795348793 s from") as caught:
         bag_positions.read_bag(path, PositionSource(topic="/where"))
     assert caught.value.remedy == "write times: received, in the step"
@@ -146,9 +148,9 @@ def test_stamps_of_another_clock_are_rejected_unless_times_are_the_recorders(tmp
 @pytest.mark.parametrize(
     ("messages", "topic", "message"),
     [
-        ([stamped(BEGAN_NS, 0.0, 0.0)], "/other", "no position in /other"),
+        ([pose_stamped(BEGAN_NS, 0.0, 0.0)], "/other", "no position in /other"),
         ([TYPES["std_msgs/msg/String"]("here")], "/where", "contains no position"),
-        ([stamped(BEGAN_NS, 0.0, 0.0), stamped(BEGAN_NS, 0.0, 0.0, "odom")], "/where", "frames: map, odom"),
+        ([pose_stamped(BEGAN_NS, 0.0, 0.0), pose_stamped(BEGAN_NS, 0.0, 0.0, "odom")], "/where", "frames: map, odom"),
     ],
 )
 def test_topics_without_positions_are_rejected(tmp_path: Path, messages: list[Any], topic: str, message: str) -> None:
@@ -157,17 +159,17 @@ def test_topics_without_positions_are_rejected(tmp_path: Path, messages: list[An
 
 
 def test_odometry_is_transformed_to_the_robots_place_and_heading(tmp_path: Path) -> None:
-    # The robot was driven before the step: its odometry starts 5 m away, turned to the left.
-    began = (5.0, 5.0, math.pi / 2)
-    messages = [odometry(BEGAN_NS, *began), odometry(BEGAN_NS + S, 5.0, 7.0, math.pi / 2)]
+    # The robot was driven before the step, so its odometry starts 5 m away and turned to the left.
+    initial_pose = (5.0, 5.0, math.pi / 2)
+    messages = [odometry(BEGAN_NS, *initial_pose), odometry(BEGAN_NS + S, 5.0, 7.0, math.pi / 2)]
     odometry_samples = bag_positions.read_bag(write_bag(tmp_path, messages), PositionSource(topic="/where"))
     position_source = PositionSource(
         topic="/where", start=(10.0, 0.0, 0.0), heading_rad=math.pi, began_utc_ns=BEGAN_NS + S // 2
     )
     samples = position_files.to_placement_frame(odometry_samples, position_source)
     assert samples.values == pytest.approx(np.array([[10, 0, 0], [8, 0, 0]]), abs=1e-9), "2 m ahead, facing back"
-    late = PositionSource(topic="/where", heading_rad=0.0, began_utc_ns=BEGAN_NS - 3 * S)
+    late_source = PositionSource(topic="/where", heading_rad=0.0, began_utc_ns=BEGAN_NS - 3 * S)
     with pytest.raises(EvidenceError, match=r"/where begins 3\.0 s after the step started"):
-        position_files.to_placement_frame(odometry_samples, late)
+        position_files.to_placement_frame(odometry_samples, late_source)
     with pytest.raises(EvidenceError, match="the robot's initial heading is unknown"):
         position_files.to_placement_frame(odometry_samples, PositionSource(topic="/where", began_utc_ns=BEGAN_NS))

@@ -1,4 +1,4 @@
-"""Recovery of bags: hostile bytes cause messages and `DamagedError` only."""
+"""Recovery of bags: for hostile bytes, the only possible results are messages and `DamagedError`."""
 
 import random
 import sqlite3
@@ -28,7 +28,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[BagFormat, bytes]:
 @pytest.mark.parametrize("form", BagFormat)
 @given(seed=st.integers(0, 1 << 32), flips=st.integers(0, 8))
 @example(seed=290, flips=4)  # a record inside a chunk states an impossible length
-def test_changed_bytes(
+def test_changed_bytes_give_messages_or_an_error(
     tmp_path_factory: pytest.TempPathFactory, files: dict[BagFormat, bytes], form: BagFormat, seed: int, flips: int
 ) -> None:
     draw = random.Random(seed)
@@ -52,7 +52,7 @@ def test_a_table_of_topics_without_a_needed_column_is_damaged(tmp_path: Path) ->
 def test_a_record_longer_than_an_integer_of_the_platform_is_damaged(tmp_path: Path) -> None:
     bag = data_file(write_bag(tmp_path / "bag", BagFormat.MCAP, expected(3)))
     data = bytearray(bag.read_bytes())
-    data[9:17] = b"\xff" * 8  # the length of the first record, behind the magic and its opcode
+    data[9:17] = b"\xff" * 8  # the length of the first record, after the magic and the opcode
     bag.write_bytes(data)
     with pytest.raises(DamagedError):
         list(salvage.messages(BagFormat.MCAP, bag))
@@ -60,7 +60,7 @@ def test_a_record_longer_than_an_integer_of_the_platform_is_damaged(tmp_path: Pa
 
 @given(st.integers(13, len(COMPLETE_BAG)))
 def test_longer_file_recovers_no_less(tmp_path_factory: pytest.TempPathFactory, length: int) -> None:
-    def saved(data: bytes) -> int:
+    def count_recovered(data: bytes) -> int:
         file: Path = tmp_path_factory.getbasetemp() / "cut.bag"
         file.write_bytes(data)
         count = 0
@@ -71,4 +71,4 @@ def test_longer_file_recovers_no_less(tmp_path_factory: pytest.TempPathFactory, 
             return count
         return count
 
-    assert saved(COMPLETE_BAG[: length // 2]) <= saved(COMPLETE_BAG[:length]) <= 266
+    assert count_recovered(COMPLETE_BAG[: length // 2]) <= count_recovered(COMPLETE_BAG[:length]) <= 266

@@ -15,7 +15,7 @@ from fieldkit.ros.bags import bag
 
 
 def write_bag(path: Path, topics: dict[str, int], period_s: float = 0.2) -> Path:
-    """Write a real bag with this number of messages per topic."""
+    """Write a ROS 1 bag with the given number of messages per topic."""
     store = get_typestore(Stores.ROS1_NOETIC)
     message_type = "std_msgs/msg/String"
     message = store.types[message_type](data="x" * 100)
@@ -28,7 +28,7 @@ def write_bag(path: Path, topics: dict[str, int], period_s: float = 0.2) -> Path
     return path
 
 
-def test_contents_of_a_bag(tmp_path: Path) -> None:
+def test_the_contents_of_a_bag_are_counted(tmp_path: Path) -> None:
     contents = bag.read(write_bag(tmp_path / "scan.bag", {"/scan": 74, "/odom": 3}))
     assert contents.messages == 77
     assert dict(contents.messages_by_topic) == {"/scan": 74, "/odom": 3}
@@ -42,22 +42,24 @@ import sys
 from fieldkit.ros.bags import bag_reader
 print(bag_reader.answer({{"path": {str(path)!r}}})["messages"], {{"ruamel", "sqlite3"}} & set(sys.modules))
 """
-    done = subprocess.run((sys.executable, "-c", script), stdout=subprocess.PIPE, text=True, timeout=60, check=True)
-    assert done.stdout == "2 set()\n"
+    completed = subprocess.run(
+        (sys.executable, "-c", script), stdout=subprocess.PIPE, text=True, timeout=60, check=True
+    )
+    assert completed.stdout == "2 set()\n"
 
 
-def test_a_bag_truncated_at_any_byte_is_refused_with_a_remedy(tmp_path: Path) -> None:
+def test_a_bag_truncated_at_any_byte_is_rejected_with_a_remedy(tmp_path: Path) -> None:
     content = write_bag(tmp_path / "scan.bag", {"/scan": 5}).read_bytes()
-    cut = tmp_path / "cut.bag"
+    truncated_bag = tmp_path / "cut.bag"
     for size in range(0, len(content), 37):
-        cut.write_bytes(content[:size])
+        truncated_bag.write_bytes(content[:size])
         with pytest.raises(EvidenceError) as caught:
-            bag.read(cut)
+            bag.read(truncated_bag)
         assert caught.value.remedy
-        assert caught.value.where == str(cut)
+        assert caught.value.where == str(truncated_bag)
 
 
-def test_an_unindexed_bag_is_refused(tmp_path: Path) -> None:
+def test_an_unindexed_bag_is_rejected(tmp_path: Path) -> None:
     """A killed recorder leaves a header with index position 0."""
     path = write_bag(tmp_path / "scan.bag", {"/scan": 5})
     data = bytearray(path.read_bytes())
@@ -69,7 +71,7 @@ def test_an_unindexed_bag_is_refused(tmp_path: Path) -> None:
     assert "fieldkit bag repair" in caught.value.remedy
 
 
-def test_a_bag_without_messages_is_refused(tmp_path: Path) -> None:
+def test_a_bag_without_messages_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="contains no message"):
         bag.read(write_bag(tmp_path / "scan.bag", {"/scan": 0}))
 
@@ -81,18 +83,18 @@ def test_a_relative_path_uses_the_current_working_directory(tmp_path: Path, monk
         assert bag.read(write_bag(Path("scan.bag"), {"/scan": count})).messages == count
 
 
-def test_a_missing_bag_is_refused(tmp_path: Path) -> None:
+def test_a_missing_bag_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="there is no bag"):
         bag.read(tmp_path / "scan.bag")
 
 
-def test_flipped_bytes_are_refused_or_read_but_raise_nothing_else(tmp_path: Path) -> None:
+def test_flipped_bytes_are_rejected_or_read_without_other_exceptions(tmp_path: Path) -> None:
     content = write_bag(tmp_path / "scan.bag", {"/scan": 2}).read_bytes()
     path = tmp_path / "flipped.bag"
     random = np.random.default_rng(5)
-    # The index, which is read, is at the end; the padding of the header is omitted.
-    ends = [*range(120), *range(4100, len(content))]
-    for at in random.choice(ends, 400, replace=False):
+    # Only the header, without its padding, and the index at the end are read.
+    positions = [*range(120), *range(4100, len(content))]
+    for at in random.choice(positions, 400, replace=False):
         data = bytearray(content)
         data[at] ^= 1 << int(random.integers(8))
         path.write_bytes(data)
@@ -104,7 +106,7 @@ SUFFIXES = {"db3": rosbag2.StoragePlugin.SQLITE3, "mcap": rosbag2.StoragePlugin.
 
 
 def write_ros2_bag(folder: Path, suffix: str, topics: dict[str, int], period_s: float = 0.2) -> Path:
-    """Write a real ROS 2 bag with this number of messages per topic; return its data file, named as by ROS 2."""
+    """Write a ROS 2 bag with the given number of messages per topic; return its data file, named as in ROS 2."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     message_type = "std_msgs/msg/String"
     message = bytes(store.serialize_cdr(store.types[message_type](data="x" * 100), message_type))
@@ -137,14 +139,14 @@ def test_a_ros2_bag_of_a_killed_recorder_is_an_error(suffix: str, tmp_path: Path
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_ros2_bag_without_messages_is_refused(suffix: str, tmp_path: Path) -> None:
+def test_a_ros2_bag_without_messages_is_rejected(suffix: str, tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="contains no message") as caught:
         bag.read(write_ros2_bag(tmp_path / "scan", suffix, {"/scan": 0}))
     assert "ros2 topic hz" in caught.value.remedy
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_file_that_contradicts_its_metadata_is_refused(suffix: str, tmp_path: Path) -> None:
+def test_a_file_that_contradicts_its_metadata_is_rejected(suffix: str, tmp_path: Path) -> None:
     path = write_ros2_bag(tmp_path / "scan", suffix, {"/scan": 5})
     other = write_ros2_bag(tmp_path / "other" / "scan", suffix, {"/scan": 4})
     shutil.copy(other, path)
@@ -154,7 +156,7 @@ def test_a_file_that_contradicts_its_metadata_is_refused(suffix: str, tmp_path: 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 @pytest.mark.parametrize("damaged", ["file", "metadata"])
-def test_a_damaged_ros2_bag_is_refused_or_read_but_raises_nothing_else(
+def test_a_damaged_ros2_bag_is_rejected_or_read_without_other_exceptions(
     suffix: str, damaged: str, tmp_path: Path
 ) -> None:
     path = write_ros2_bag(tmp_path / "scan", suffix, {"/scan": 3, "/odom": 2})

@@ -20,9 +20,9 @@ TYPE = "sensor_msgs/msg/BatteryState"
 def message(store: Stores, percentage: float) -> object:
     types = get_typestore(store).types
     stamp = types["builtin_interfaces/msg/Time"](sec=1, nanosec=0)
-    counted = {"seq": 0} if store is Stores.ROS1_NOETIC else {}
+    sequence_field = {"seq": 0} if store is Stores.ROS1_NOETIC else {}
     return types[TYPE](
-        header=types["std_msgs/msg/Header"](stamp=stamp, frame_id="", **counted),
+        header=types["std_msgs/msg/Header"](stamp=stamp, frame_id="", **sequence_field),
         voltage=11.1,
         temperature=math.nan,
         current=math.nan,
@@ -70,7 +70,7 @@ def test_the_last_message_has_the_charge(tmp_path: Path, percentages: list[float
 
 
 @pytest.mark.parametrize("storage", StoragePlugin)
-def test_the_charge_in_a_ros_2_bag(tmp_path: Path, storage: StoragePlugin) -> None:
+def test_the_last_message_of_a_ros_2_bag_has_the_charge(tmp_path: Path, storage: StoragePlugin) -> None:
     assert battery_share(ros2(tmp_path, [0.9, 0.25], storage), TOPIC) == pytest.approx(0.25)
 
 

@@ -1,4 +1,4 @@
-"""Discovery time and gaps of recorded topics, from bags with known times and logs of real recorders."""
+"""Discovery times and gaps of recorded topics, from bags with known times and logs of real recorders."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,7 +17,7 @@ from tests.ros.bags.test_measure_bag import SUFFIXES
 
 BEGAN_NS = 1_795_208_123_219_164_628
 S = 10**9
-# Output of rosbag 1.15.15 with its colours; see tests/data/rosbag.
+# The output of rosbag 1.15.15 with its colours; see tests/data/rosbag.
 ROSBAG = "\x1b[0m[ INFO] [{s}.{ns:09d}]: Subscribing to {topic}\x1b[0m\n"
 RECORDING = "\x1b[0m[ INFO] [1795208130.000000000]: Recording to 'scan.bag'.\x1b[0m\n"
 ROS2 = (
@@ -27,19 +27,19 @@ ROS2 = (
 )
 
 
-def log(begun_ns: Mapping[str, int]) -> str:
-    lines = [ROSBAG.format(s=at // S, ns=at % S, topic=topic) for topic, at in begun_ns.items()]
+def log(subscribed_ns: Mapping[str, int]) -> str:
+    lines = [ROSBAG.format(s=at // S, ns=at % S, topic=topic) for topic, at in subscribed_ns.items()]
     return "".join(lines) + RECORDING
 
 
-def write(folder: Path, text: str, came_ns: Mapping[str, Sequence[int]]) -> None:
+def write(folder: Path, text: str, arrivals_ns: Mapping[str, Sequence[int]]) -> None:
     store = get_typestore(Stores.ROS1_NOETIC)
     kind = "std_msgs/msg/String"
     data = bytes(store.serialize_ros1(store.types[kind](data="x"), kind))
     (folder / "log").write_text(text, encoding="utf-8")
     (folder / "scan.bag").unlink(missing_ok=True)
     with Writer(folder / "scan.bag") as writer:
-        for topic, stamps_ns in came_ns.items():
+        for topic, stamps_ns in arrivals_ns.items():
             connection = writer.add_connection(topic, kind, typestore=store)
             for at_ns in stamps_ns:
                 writer.write(connection, at_ns, data)
@@ -49,7 +49,7 @@ def read(folder: Path, *topics: str, duration_s: float = 5.0) -> RecordingRecept
     return recorded_topics.read(folder, "log", "scan.bag", topics, duration_s)
 
 
-def test_discovery_is_of_the_slowest_topic_and_the_gap_of_any_topic(tmp_path: Path) -> None:
+def test_the_slowest_topic_determines_the_discovery_time_and_any_topic_the_gap(tmp_path: Path) -> None:
     arrived_ns = {
         "/scan": [BEGAN_NS + at for at in (S // 2, S, 5 * S)],
         "/imu": [BEGAN_NS + S + S // 4, BEGAN_NS + 4 * S],
@@ -70,7 +70,7 @@ def test_the_discovery_of_a_topic_starts_with_its_subscription(tmp_path: Path) -
 def test_silence_until_the_end_is_a_gap(tmp_path: Path) -> None:
     write(tmp_path, log({"/scan": BEGAN_NS}), {"/scan": [BEGAN_NS + S, BEGAN_NS + 2 * S]})
     assert read(tmp_path, "/scan", duration_s=9.0).gap_s == 7.0
-    assert read(tmp_path, "/scan", duration_s=1.0).gap_s == 1.0, "what comes after the duration makes none"
+    assert read(tmp_path, "/scan", duration_s=1.0).gap_s == 1.0, "messages after the duration do not affect the gap"
 
 
 def test_a_topic_without_a_message_is_not_discovered(tmp_path: Path) -> None:
@@ -83,12 +83,12 @@ def test_a_topic_without_a_message_is_not_discovered(tmp_path: Path) -> None:
     assert measured.missing.keys() == {"bag_discovery_s", "bag_gap_s"}
 
 
-def test_a_topic_of_a_longer_name_is_another_one(tmp_path: Path) -> None:
+def test_a_topic_with_a_longer_name_is_a_different_topic(tmp_path: Path) -> None:
     write(tmp_path, log({"/scan_2": BEGAN_NS, "/scan": BEGAN_NS + S}), {"/scan": [BEGAN_NS + 2 * S]})
     assert read(tmp_path, "/scan").discovery_s == 1.0
 
 
-def test_a_recorder_without_its_master_discovers_nothing(tmp_path: Path) -> None:
+def test_a_recorder_without_its_master_discovers_no_topic(tmp_path: Path) -> None:
     (tmp_path / "log").write_text("", encoding="utf-8")
     measured = recorded_topics.measure(read(tmp_path, "/scan"))
     assert dict(measured.values) == {"bag_discovered": False}
@@ -112,7 +112,7 @@ def test_without_a_log_the_columns_are_missing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_ros2_recorder_starts_discovery_of_all_topics_together(suffix: str, tmp_path: Path) -> None:
+def test_a_ros2_recorder_starts_the_discovery_of_all_topics_at_the_same_time(suffix: str, tmp_path: Path) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
     kind = "std_msgs/msg/String"
     data = bytes(store.serialize_cdr(store.types[kind](data="x"), kind))

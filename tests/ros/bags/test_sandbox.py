@@ -1,4 +1,4 @@
-"""Malicious bags: small files that would fill memory or disk, or never end, if a library trusts them."""
+"""Malicious bags: small files with which a library would fill the memory or the disk, or would run forever."""
 
 import bz2
 import os
@@ -36,8 +36,8 @@ def one_second(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def unpacking_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[sandbox.SandboxedReader]:
-    """Reader that unpacks 1 kB and is killed by the signals of the query, one per try, before it answers."""
-    (tmp_path / "unpacks.py").write_text(_UNPACKS, encoding="utf-8")
+    """A reader that unpacks 1 kB and is killed before its answer, in each try by the next signal of the query."""
+    (tmp_path / "unpacks.py").write_text(_UNPACKING_MODULE, encoding="utf-8")
     (tmp_path / "tmp").mkdir()
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
@@ -46,7 +46,7 @@ def unpacking_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterato
     reader.stop()
 
 
-_UNPACKS = """
+_UNPACKING_MODULE = """
 import os, tempfile
 from pathlib import Path
 from fieldkit.measure.evidence import sandbox_process
@@ -70,7 +70,7 @@ sandbox_process.serve(answer)
     ("signals", "reason"),
     [
         ([], None),
-        ([signal.SIGKILL], None),  # as the kernel if memory is short
+        ([signal.SIGKILL], None),  # the kernel sends this signal if the memory is full
         ([signal.SIGTERM], None),
         ([signal.SIGKILL, signal.SIGKILL], "another process or the kernel stopped its reader twice"),
         ([signal.SIGXCPU], "takes longer than 10 s"),
@@ -103,7 +103,7 @@ def test_a_reader_needs_no_disk_space_if_it_unpacks_nothing(tmp_path: Path, monk
     assert bag.read(path).messages == 3
 
 
-def test_sparse_and_large_files_have_limits_of_the_machine(tmp_path: Path) -> None:
+def test_the_limits_for_sparse_and_large_files_depend_on_the_machine(tmp_path: Path) -> None:
     path = tmp_path / "scan.bag"
     path.touch()
     os.truncate(path, 1 << 42)
@@ -127,7 +127,7 @@ def test_sparse_and_large_files_have_limits_of_the_machine(tmp_path: Path) -> No
         ("compression_mode: ", "compression_mode: 2026-13-45 #"),
     ],
 )
-def test_invalid_metadata_only_raises_that_the_bag_cannot_be_read(
+def test_for_invalid_metadata_the_only_error_is_that_the_bag_cannot_be_read(
     tmp_path: Path, one_second: None, old: str, new: str
 ) -> None:
     path = write_ros2_bag(tmp_path / "scan", "db3", {"/scan": 5})
@@ -139,15 +139,15 @@ def test_invalid_metadata_only_raises_that_the_bag_cannot_be_read(
         bag.read(path)
 
 
-def test_metadata_with_exponential_references_are_refused(tmp_path: Path, one_second: None) -> None:
+def test_metadata_with_exponential_references_is_rejected(tmp_path: Path, one_second: None) -> None:
     path = write_ros2_bag(tmp_path / "scan", "db3", {"/scan": 5})
-    merged = "".join(f"k{n}: &k{n} {{<<: [{', '.join([f'*k{n - 1}'] * 9)}]}}\n" for n in range(1, 30))
-    (path.parent / bag.METADATA).write_text(f"k0: &k0 {{a: 1}}\n{merged}", encoding="utf-8")
+    merged_keys = "".join(f"k{n}: &k{n} {{<<: [{', '.join([f'*k{n - 1}'] * 9)}]}}\n" for n in range(1, 30))
+    (path.parent / bag.METADATA).write_text(f"k0: &k0 {{a: 1}}\n{merged_keys}", encoding="utf-8")
     with pytest.raises(EvidenceError, match="cannot be read"):
         bag.read(path)
 
 
-def test_a_bag_that_exceeds_the_disk_limit_is_refused(tmp_path: Path) -> None:
+def test_a_bag_that_exceeds_the_disk_limit_is_rejected(tmp_path: Path) -> None:
     path = write_ros2_bag(tmp_path / "scan", "db3", {"/scan": 5})
     (path.parent / "zeros.zstd").write_bytes(zstd.compress(bytes(64 * MIB)))
     metadata = path.parent / bag.METADATA
@@ -159,7 +159,7 @@ def test_a_bag_that_exceeds_the_disk_limit_is_refused(tmp_path: Path) -> None:
         bag.read(path)
 
 
-def test_a_chunk_that_exceeds_the_memory_limit_is_refused(tmp_path: Path) -> None:
+def test_a_chunk_that_exceeds_the_memory_limit_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / "scan.bag"
     store = get_typestore(Stores.ROS1_NOETIC)
     writer = Writer(path)
@@ -175,7 +175,7 @@ def test_a_chunk_that_exceeds_the_memory_limit_is_refused(tmp_path: Path) -> Non
     assert bag.battery_share(ros1(Path(tempfile.mkdtemp(dir=tmp_path)), [0.5]), TOPIC) == 0.5
 
 
-def test_a_database_whose_schema_never_ends_is_refused(tmp_path: Path, one_second: None) -> None:
+def test_a_database_whose_schema_has_infinite_rows_is_rejected(tmp_path: Path, one_second: None) -> None:
     path = write_ros2_bag(tmp_path / "scan", "db3", {"/scan": 5})
     with closing(sqlite3.connect(path)) as database:
         database.executescript(

@@ -1,6 +1,6 @@
-"""A usual ROS 1 node, for Debian's Python: `ros1_end.py hear|say`.
+"""An ordinary ROS 1 node, for Debian's Python: `ros1_end.py hear|say`.
 
-`say` publishes scans with numbers from 1 until it is stopped; `hear` prints each received scan as JSON.
+`say` publishes numbered scans, starting with 1, until it is stopped; `hear` prints each received scan as JSON.
 """
 
 import json
@@ -22,8 +22,10 @@ def show(scan: LaserScan) -> None:
 
 # rospy's signal handler closes topics immediately, and deadlocks if the signal arrives during `publish`.
 rospy.init_node(verb, anonymous=True, disable_signals=True)
-for ends in (signal.SIGTERM, signal.SIGINT):
-    signal.signal(ends, lambda *_: threading.Thread(target=rospy.signal_shutdown, args=("asked to",)).start())
+for signal_number in (signal.SIGTERM, signal.SIGINT):
+    signal.signal(
+        signal_number, lambda *_: threading.Thread(target=rospy.signal_shutdown, args=("asked to",)).start()
+    )
 if verb == "hear":
     rospy.Subscriber("/scan", LaserScan, show, queue_size=100)
     rospy.spin()

@@ -1,4 +1,4 @@
-"""`fieldkit bridge` between a real ROS 1 on one host, and DDS or Zenoh on another."""
+"""`fieldkit bridge` between ROS 1 on one host, and DDS or Zenoh on another."""
 
 import json
 import os
@@ -30,24 +30,25 @@ from tests.helpers.two_hosts import TestHost, two_connected_hosts
 TYPE = "sensor_msgs/msg/LaserScan"
 SCAN = "/scan:sensor_msgs/LaserScan"
 DOMAIN = 5
-FOREIGN = 1000
-"""First number of the scans from the side without ROS 1."""
-ENDS = Path(__file__).parent
+FIRST_WIRE_NUMBER = 1000
+"""Number of the first scan from the side without ROS 1."""
+NODES = Path(__file__).parent
+"""Folder of the programs of the nodes."""
 LIMIT_S = 90
+"""Time limit of all nodes, so that the test of a bridge that forwards no samples fails."""
 ALL_TESTS_S = 1800
-"""The master runs during all tests of this file."""
-"""Time limit of all nodes: a bridge that forwards nothing fails its test by then."""
-ENOUGH = 30
+"""Time limit of the master, which runs during all tests of this file."""
+MIN_SAMPLES = 30
 OTHER_TYPE = ("rostopic", "pub", "-r", "10", "/scan", "std_msgs/String", "x")
 
 Process = subprocess.Popen[str]
 
 
 class Site:
-    """ROS 1 with its master on one host, and another host on the same cable.
+    """A host with ROS 1 and its master, and another host on the same cable.
 
     Attributes:
-        folder: Home and temporary files of all programs.
+        folder: Folder for the home and the temporary files of all programs.
     """
 
     def __init__(self, hosts: tuple[TestHost, TestHost], folder: Path) -> None:
@@ -61,8 +62,8 @@ class Site:
         }
 
     @contextmanager
-    def started(self, host: TestHost, *argv: str, limit_s: int = LIMIT_S) -> Iterator[Process]:
-        """Run a command on a host while the body runs."""
+    def run(self, host: TestHost, *argv: str, limit_s: int = LIMIT_S) -> Iterator[Process]:
+        """Run a command on a host for the duration of the context."""
         command = ("timeout", "-k", "10", str(limit_s), "nsenter", "-t", str(host.pid), "-n", *argv)
         pipe = subprocess.PIPE
         with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=self.environment) as process:
@@ -72,9 +73,9 @@ class Site:
                 process.terminate()
                 process.communicate()
 
-    def completed(self, *argv: str) -> subprocess.CompletedProcess[str]:
-        """Run a command on the host with ROS 1, and return its result."""
-        with self.started(self.ros1_host, *argv) as process:
+    def run_to_end(self, *argv: str) -> subprocess.CompletedProcess[str]:
+        """Run a command on the host with ROS 1 until it exits; return its result."""
+        with self.run(self.ros1_host, *argv) as process:
             output_text, errors = process.communicate()
         return subprocess.CompletedProcess(argv, process.returncode, output_text, errors)
 
@@ -94,8 +95,8 @@ class Site:
 
     @contextmanager
     def bridge(self, middleware_name: str, *words: str) -> Iterator[Process]:
-        """Run a bridge while the body runs; it is ready when the body starts."""
-        with self.started(self.ros1_host, *self.bridge_line(middleware_name, *words)) as process:
+        """Run a bridge for the duration of the context; it is ready when the body starts."""
+        with self.run(self.ros1_host, *self.bridge_line(middleware_name, *words)) as process:
             assert process.stderr is not None
             output_text = process.stderr.readline()
             assert output_text.startswith("note: the bridge is up"), output_text + process.stderr.read()
@@ -103,7 +104,7 @@ class Site:
 
     def ros1(self, verb: str) -> AbstractContextManager[Process]:
         """Run a ROS 1 node."""
-        return self.started(self.ros1_host, "/usr/bin/python3", str(ENDS / "ros1_end.py"), verb)
+        return self.run(self.ros1_host, "/usr/bin/python3", str(NODES / "ros1_end.py"), verb)
 
     def wire(self, verb: str, middleware_name: str, quality: str = "") -> AbstractContextManager[Process]:
         """Run a publisher or subscriber without ROS 1 on the other host."""
@@ -111,20 +112,22 @@ class Site:
         settings = {"listen/endpoints": f'["tcp/{self.wire_host.address}:0"]'} if middleware_name == "zenoh" else {}
         network = {"address": self.wire_host.address, "domain": DOMAIN, "node": verb, "settings": settings}
         samples = self.folder / "samples"
-        samples.write_text("\n".join(map(scan, range(FOREIGN, FOREIGN + 50 * LIMIT_S))), encoding="ascii")
+        samples.write_text(
+            "\n".join(map(scan, range(FIRST_WIRE_NUMBER, FIRST_WIRE_NUMBER + 50 * LIMIT_S))), encoding="ascii"
+        )
         words = (verb, middleware_name, json.dumps(network), json.dumps(topic), str(samples))
-        return self.started(self.wire_host, sys.executable, str(ENDS / "wire_end.py"), *words)
+        return self.run(self.wire_host, sys.executable, str(NODES / "wire_end.py"), *words)
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     with two_connected_hosts() as hosts:
-        samples = Site(hosts, tmp_path_factory.mktemp("bridge"))
-        with samples.started(hosts[0], "rosmaster", "--core", "-p", "11311", limit_s=ALL_TESTS_S):
-            # A node that starts before its master prints a warning among the received messages.
+        bridge_site = Site(hosts, tmp_path_factory.mktemp("bridge"))
+        with bridge_site.run(hosts[0], "rosmaster", "--core", "-p", "11311", limit_s=ALL_TESTS_S):
+            # A node that starts before its master would print a warning between the received messages.
             master = f"/dev/tcp/{hosts[0].address}/11311"
-            assert samples.completed("bash", "-c", f"until : <{master}; do sleep 0.1; done").returncode == 0
-            yield samples
+            assert bridge_site.run_to_end("bash", "-c", f"until : <{master}; do sleep 0.1; done").returncode == 0
+            yield bridge_site
 
 
 def scan(number: int) -> str:
@@ -136,18 +139,18 @@ def scan(number: int) -> str:
     return bytes(standard_types().ros2.serialize_cdr(message, TYPE)).hex()
 
 
-def received(subscriber: Process, number_of: Callable[[str], int]) -> list[tuple[int, str]]:
-    """Return the received samples with their numbers, until enough have arrived from both sides."""
+def receive(subscriber: Process, number_of: Callable[[str], int]) -> list[tuple[int, str]]:
+    """Return the received samples with their numbers; stop when enough samples have arrived from both sides."""
     assert subscriber.stdout is not None
     samples: list[tuple[int, str]] = []
-    missing = {True: ENOUGH, False: ENOUGH}
+    missing = {True: MIN_SAMPLES, False: MIN_SAMPLES}
     for line in subscriber.stdout:
         number = number_of(line)
         samples.append((number, line.strip()))
-        missing[number >= FOREIGN] -= 1
+        missing[number >= FIRST_WIRE_NUMBER] -= 1
         if max(missing.values()) <= 0:
             return samples
-    raise AssertionError(f"it ended: {subscriber.stderr and subscriber.stderr.read()}")
+    raise AssertionError(f"the subscriber exited: {subscriber.stderr and subscriber.stderr.read()}")
 
 
 def number_of_cdr(line: str) -> int:
@@ -161,8 +164,8 @@ def number_of_ros1(line: str) -> int:
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("middleware_name", ["dds", "zenoh"])
-def test_scans_are_forwarded_both_ways_once_and_unchanged(site: Site, middleware_name: str) -> None:
-    """Both sides publish and subscribe: a sample that loops would arrive twice."""
+def test_scans_are_forwarded_in_both_directions_once_and_unchanged(site: Site, middleware_name: str) -> None:
+    """Both sides publish and subscribe, so a sample in a loop would arrive twice."""
     with (
         site.wire("hear", middleware_name) as wire_subscriber,
         site.ros1("hear") as ros1_subscriber,
@@ -171,13 +174,13 @@ def test_scans_are_forwarded_both_ways_once_and_unchanged(site: Site, middleware
         site.wire("say", middleware_name),
     ):
         received_by_wire, received_by_ros1 = (
-            received(wire_subscriber, number_of_cdr),
-            received(ros1_subscriber, number_of_ros1),
+            receive(wire_subscriber, number_of_cdr),
+            receive(ros1_subscriber, number_of_ros1),
         )
         running.send_signal(signal.SIGINT)
         output_text, errors = running.communicate()
     assert [line for _, line in received_by_wire] == [scan(number) for number, _ in received_by_wire], (
-        "as serialized by rosbags"
+        "the samples are those that rosbags serializes"
     )
     for number, line in received_by_ros1:
         stamp, frame, ranges = json.loads(line)
@@ -193,7 +196,7 @@ def test_scans_are_forwarded_both_ways_once_and_unchanged(site: Site, middleware
         middleware_name: len(scan(1)) // 2,
     }
     for (source, _), counts in report.items():
-        assert counts["messages"] >= ENOUGH
+        assert counts["messages"] >= MIN_SAMPLES
         assert counts["bytes"] == counts["messages"] * size_bytes[source]
         assert (counts["topic"], counts["type"], counts["refused"], counts["unreadable"]) == ("/scan", TYPE, 0, 0)
         assert 0 < counts["delay_median_s"] <= counts["delay_p99_s"] < LIMIT_S
@@ -202,12 +205,12 @@ def test_scans_are_forwarded_both_ways_once_and_unchanged(site: Site, middleware
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("middleware_name", mark_nightly(["dds", "zenoh"]))
-def test_late_subscriber_receives_the_latched_message_of_ros_1(site: Site, middleware_name: str) -> None:
+def test_a_late_subscriber_receives_the_latched_message_of_ros_1(site: Site, middleware_name: str) -> None:
     latched = ("rostopic", "pub", "--latch", "/scan", "sensor_msgs/LaserScan", "{header: {frame_id: once}}")
-    late = "transient_local,depth=1"
-    with site.bridge(middleware_name, f"{SCAN}:{late}"), site.started(site.ros1_host, *latched):
+    quality = "transient_local,depth=1"
+    with site.bridge(middleware_name, f"{SCAN}:{quality}"), site.run(site.ros1_host, *latched):
         for _ in range(2):  # the second subscriber starts after the message was forwarded
-            with site.wire("hear", middleware_name, late) as subscriber:
+            with site.wire("hear", middleware_name, quality) as subscriber:
                 assert subscriber.stdout is not None
                 received: Any = standard_types().ros2.deserialize_cdr(
                     bytes.fromhex(subscriber.stdout.readline()), TYPE
@@ -216,62 +219,64 @@ def test_late_subscriber_receives_the_latched_message_of_ros_1(site: Site, middl
 
 
 @pytest.mark.emulated
-def test_stopped_bridge_leaves_no_process_and_file(site: Site) -> None:
+def test_a_stopped_bridge_leaves_no_process_and_no_file(site: Site) -> None:
     with site.bridge("dds", SCAN) as running:
-        assert " * /fieldkit_bridge " in site.completed("rostopic", "info", "/scan").stdout
+        assert " * /fieldkit_bridge " in site.run_to_end("rostopic", "info", "/scan").stdout
         running.send_signal(signal.SIGTERM)
         output_text, _ = running.communicate()
     assert running.returncode == 0
     assert "/scan" in output_text
     assert "ros1 to dds" in output_text
-    assert "/fieldkit_bridge" not in site.completed("rostopic", "info", "/scan").stdout
+    assert "/fieldkit_bridge" not in site.run_to_end("rostopic", "info", "/scan").stdout
     assert not list(site.folder.glob("fieldkit-*"))
     assert not list(site.folder.glob("ros/log/*bridge*"))
 
 
 @pytest.mark.emulated
-def test_topic_of_another_type_is_reported_and_not_forwarded(site: Site) -> None:
-    with site.bridge("dds", SCAN) as running, site.started(site.ros1_host, *OTHER_TYPE):
+def test_a_topic_of_another_type_is_reported_and_not_forwarded(site: Site) -> None:
+    with site.bridge("dds", SCAN) as running, site.run(site.ros1_host, *OTHER_TYPE):
         assert running.stderr is not None
-        late = running.stderr.readline()
-        at_once = site.completed(*site.bridge_line("dds", "--node", "second", SCAN))
+        late_message = running.stderr.readline()
+        second_bridge = site.run_to_end(*site.bridge_line("dds", "--node", "second", SCAN))
     sentence = "error: /scan is of type std_msgs/String in ros1, not sensor_msgs/msg/LaserScan\n"
-    assert late == sentence
-    assert (at_once.returncode, at_once.stderr.startswith(sentence)) == (2, True)
+    assert late_message == sentence
+    assert (second_bridge.returncode, second_bridge.stderr.startswith(sentence)) == (2, True)
 
 
 @pytest.mark.emulated
-def test_missing_master_is_reported(site: Site) -> None:
-    done = site.completed(*site.bridge_line("dds", "--master", "127.0.0.1:9", SCAN))
-    assert done.returncode == 3
-    assert done.stderr.startswith("error: the bridge does not start: no ROS master answers at http://127.0.0.1:9\n")
-    assert "roscore" in done.stderr
+def test_a_missing_master_is_reported(site: Site) -> None:
+    completed = site.run_to_end(*site.bridge_line("dds", "--master", "127.0.0.1:9", SCAN))
+    assert completed.returncode == 3
+    assert completed.stderr.startswith(
+        "error: the bridge does not start: no ROS master answers at http://127.0.0.1:9\n"
+    )
+    assert "roscore" in completed.stderr
 
 
 @pytest.mark.parametrize("middleware_name", ["dds", "zenoh"])
-def test_topic_of_another_type_is_detected_without_a_master(middleware_name: str) -> None:
-    def described(kind: str) -> Topic:
+def test_a_topic_of_another_type_is_detected_without_a_master(middleware_name: str) -> None:
+    def describe(kind: str) -> Topic:
         report = topics.describe(standard_types(), "/t", kind, PROFILES["default"], domain=DOMAIN, node="n")
         return Topic.from_json(report)
 
     settings = {"listen/endpoints": '["tcp/127.0.0.1:0"]'} if middleware_name == "zenoh" else {}
     network = Network("127.0.0.1", discovery="peers", domain=DOMAIN, settings=settings)
     running = middleware.adapter(middleware_name)(network)
-    publisher = running.publisher(described("std_msgs/String"))
-    assert running.other_types(described(TYPE)) == {"std_msgs::msg::dds_::String_"}
-    assert running.other_types(described("std_msgs/String")) == set()
+    publisher = running.publisher(describe("std_msgs/String"))
+    assert running.other_types(describe(TYPE)) == {"std_msgs::msg::dds_::String_"}
+    assert running.other_types(describe("std_msgs/String")) == set()
     assert publisher.matched() == 0
     running.close()
 
 
 class FakeMiddleware:
-    """A middleware whose other side is the test."""
+    """A middleware through which a test sends and receives samples."""
 
     version = "recorded"
 
     def __init__(self) -> None:
         self.written: list[bytes] = []
-        self.takes = True
+        self.accepts = True
         self.deliver: Deliver | None = None
 
     def publisher(self, _: Topic) -> "FakeMiddleware":
@@ -282,9 +287,9 @@ class FakeMiddleware:
         return lambda: 1
 
     def write(self, data: bytes) -> bool:
-        if self.takes:
+        if self.accepts:
             self.written.append(data)
-        return self.takes
+        return self.accepts
 
     def matched(self) -> int:
         return 1
@@ -306,22 +311,22 @@ def test_invalid_messages_are_dropped_and_counted(monkeypatch: pytest.MonkeyPatc
     )
     network = Network("127.0.0.1")
     sample = bytes.fromhex(scan(7))
-    of_ros1 = bytes(standard_types().ros2.cdr_to_ros1(sample, TYPE))
+    ros1_sample = bytes(standard_types().ros2.cdr_to_ros1(sample, TYPE))
     crossing = Crossing.parse(SCAN)
     with bridge.bridge_topics(Side("ros1", network), Side("dds", network), [crossing], standard_types()) as (
         carrier,
     ):
         assert source.deliver is not None
-        for data in (b"", of_ros1[:-1], of_ros1 + b"x", b"\xff" * 200, of_ros1):
+        for data in (b"", ros1_sample[:-1], ros1_sample + b"x", b"\xff" * 200, ros1_sample):
             source.deliver(data, time.time_ns())
-        target.takes = False
-        source.deliver(of_ros1, time.time_ns())
-        target.takes = True
-    source.deliver(of_ros1, time.time_ns())  # after the carrier was stopped
+        target.accepts = False
+        source.deliver(ros1_sample, time.time_ns())
+        target.accepts = True
+    source.deliver(ros1_sample, time.time_ns())  # the bridge has been stopped
     report = carrier.counts()
     assert target.written == [sample]
     assert (report.messages, report.unreadable, report.refused) == (1, 4, 1)
-    assert report.bytes == len(of_ros1)
+    assert report.bytes == len(ros1_sample)
 
 
 @pytest.mark.parametrize(
@@ -347,12 +352,12 @@ def test_invalid_messages_are_dropped_and_counted(monkeypatch: pytest.MonkeyPatc
         ),
     ],
 )
-def test_invalid_arguments_are_reported_before_anything_starts(
+def test_invalid_arguments_are_reported_before_the_bridge_starts(
     words: Sequence[str], output_text: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(["bridge", *words]) == 2
     assert output_text in capsys.readouterr().err.replace("\n", " ")
 
 
-def test_command_line_accepts_all_middlewares() -> None:
+def test_the_command_line_accepts_all_middlewares() -> None:
     assert {*MIDDLEWARES, "ros2"} == set(ADAPTERS)

@@ -1,4 +1,4 @@
-"""Bridges in profiles: the jobs on robots and their times, and a laser scan that is bridged from ROS 1 to DDS."""
+"""Bridges in profiles: the jobs on robots, and a laser scan that is bridged from ROS 1 to DDS."""
 
 import json
 import subprocess
@@ -47,15 +47,15 @@ BRIDGE: Final = RobotBridge(to="dds", topics=(SCAN,), back=(TWIST,), domain=7)
 OPTIONS: Final = EmulatedOptions(radio=RadioOptions(fading=False))
 
 
-def asking(bridge: RobotBridge = BRIDGE) -> RobotProfile:
+def profile_with_bridge(bridge: RobotBridge = BRIDGE) -> RobotProfile:
     profile = load_profile("turtlebot3_burger")
     return profile.model_copy(update={"ros": ros_of(profile).model_copy(update={"bridge": bridge})})
 
 
 def cast(bridge: RobotBridge = BRIDGE) -> Cast:
-    """Return a TurtleBot with a bridge, and a drone."""
+    """Return a cast of a TurtleBot with a bridge and a drone."""
     robots = EmulatedBackend(None, None).cast(Topology.MASTERLESS)
-    return {**robots, Role.SENDER: robots[Role.SENDER].model_copy(update={"profile": asking(bridge)})}
+    return {**robots, Role.SENDER: robots[Role.SENDER].model_copy(update={"profile": profile_with_bridge(bridge)})}
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ def soon() -> Deadline:
     return Deadline.after(LONG_S)
 
 
-def first_heard(pid: int, address: str) -> bytes:
+def receive_first_scan(pid: int, address: str) -> bytes:
     """Return the first scan that a DDS node receives in a robot's network."""
     network = json.dumps({"address": address, "node": "ears", "domain": BRIDGE.domain})
     kind, profile = "sensor_msgs/LaserScan", PROFILES["sensor_data"]
@@ -97,7 +97,7 @@ def test_dds_nodes_receive_ros_1_messages_during_the_session(emulation: Emulated
         (list_running,) = jobs.list_running(shell, soon())
         assert f"/{session_bridges.folder_of('s1')}/" in list_running
         scan: Any = standard_types().ros2.deserialize_cdr(
-            first_heard(drone.pid, drone.spec.ip), "sensor_msgs/msg/LaserScan"
+            receive_first_scan(drone.pid, drone.spec.ip), "sensor_msgs/msg/LaserScan"
         )
     assert (scan.header.frame_id, len(scan.ranges)) == ("base_scan", 360)
     assert jobs.list_running(shell, soon()) == ()
@@ -106,12 +106,12 @@ def test_dds_nodes_receive_ros_1_messages_during_the_session(emulation: Emulated
 
 @pytest.mark.emulated
 def test_a_bridge_that_does_not_start_is_reported_with_its_output(emulation: EmulatedTestbed) -> None:
-    wrong = cast(BRIDGE.model_copy(update={"topics": ("/scan:sensor_msgs/LasrScan",)}))
+    invalid_cast = cast(BRIDGE.model_copy(update={"topics": ("/scan:sensor_msgs/LasrScan",)}))
     with (
         pytest.raises(RobotError, match="LaserScan") as caught,
-        session_jobs.running(wrong, emulation.shells, "s2", sink=lambda _: None),
+        session_jobs.running(invalid_cast, emulation.shells, "s2", sink=lambda _: None),
     ):
-        raise AssertionError("it is not up")
+        raise AssertionError("the bridge must not start")
     assert "its bridge does not start" in str(caught.value)
     assert jobs.list_running(emulation.shells[Role.SENDER], soon()) == ()
 
@@ -123,8 +123,8 @@ def test_a_bridge_that_exits_early_is_reported(emulation: EmulatedTestbed) -> No
     emulation.shells[Role.SENDER].run(
         ("sh", "-c", "cat >short && chmod +x short"), stdin=short.encode(), deadline=soon()
     )
-    ends = cast(BRIDGE.model_copy(update={"program": "/root/short"}))
-    with session_jobs.running(ends, emulation.shells, "s3", sink=events.append):
+    exiting_cast = cast(BRIDGE.model_copy(update={"program": "/root/short"}))
+    with session_jobs.running(exiting_cast, emulation.shells, "s3", sink=events.append):
         wait_until(lambda: not jobs.list_running(emulation.shells[Role.SENDER], soon()), soon())
     (note,) = [event for event in events if isinstance(event, Note)]
     assert note.text == "the bridge on turtlebot-1 exited early, with exit code 3"
@@ -135,17 +135,17 @@ def test_in_an_interactive_lab_the_bridge_is_a_service_of_the_robot() -> None:
     members = {
         name: LabRobot(name, profile, address, ())
         for name, profile, address in (
-            ("turtlebot-1", asking(), "10.42.0.1"),
+            ("turtlebot-1", profile_with_bridge(), "10.42.0.1"),
             ("duckiedrone-1", load_profile("duckiedrone"), "10.42.0.2"),
         )
     }
     with running_robots(members, options=OPTIONS, world=load_world("lawn"), ros=RosChoice.DEBIAN, seed=1) as lab:
         lab.medium.place({"turtlebot-1": (0.0, 0.0, 0.2), "duckiedrone-1": (5.0, 0.0, 0.2)})
         drone = lab.robots["duckiedrone-1"]
-        assert first_heard(drone.pid, drone.spec.ip)
+        assert receive_first_scan(drone.pid, drone.spec.ip)
 
 
-def test_the_command_line_of_a_robot() -> None:
+def test_the_job_of_a_robot_has_the_command_line_of_its_bridge() -> None:
     jobs_by_role = bridge_jobs(cast())
     assert jobs_by_role.keys() == {Role.SENDER}
     assert jobs_by_role[Role.SENDER].argv == (
@@ -153,18 +153,19 @@ def test_the_command_line_of_a_robot() -> None:
         *("fieldkit", "bridge", "--from", "ros1", "--to", "dds", "--address", "10.42.0.1", "--domain", "7"),
         *("--patience", "5", "--back", TWIST, SCAN),
     )
-    routed = BRIDGE.model_copy(update={"to": "zenoh", "router": "10.42.0.3"})
-    assert routed.command("10.42.0.1", "10.42.0.9", 5)[-7:] == (
+    routed_bridge = BRIDGE.model_copy(update={"to": "zenoh", "router": "10.42.0.3"})
+    assert routed_bridge.command("10.42.0.1", "10.42.0.9", 5)[-7:] == (
         *("--master", "10.42.0.9", "--router", "10.42.0.3"),
         *("--back", TWIST, SCAN),
     )
 
 
-def test_of_robots_with_a_common_master_only_the_first_has_a_bridge() -> None:
+def test_only_the_first_of_robots_with_a_common_master_has_a_bridge() -> None:
     master = EmulatedBackend(None, None).cast(Topology.MASTER)
-    asking_both = {"profile": asking()}
+    bridge_changes = {"profile": profile_with_bridge()}
     robots = {
-        role: robot.model_copy(update=asking_both if role is not Role.RELAY else {}) for role, robot in master.items()
+        role: robot.model_copy(update=bridge_changes if role is not Role.RELAY else {})
+        for role, robot in master.items()
     }
     assert bridge_jobs(robots).keys() == {Role.SENDER, Role.RECEIVER}, "each robot has a separate master"
     shared = {role: robot.model_copy(update={"ros_master": "10.42.0.3"}) for role, robot in robots.items()}
@@ -203,7 +204,7 @@ def test_a_robot_with_ros_2_needs_no_bridge(tmp_path: Path) -> None:
         schema.load(file, RobotProfile)
 
 
-def test_an_emulated_lab_without_debian_s_ros_rejects_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_emulated_lab_without_debian_s_ros_rejects_a_bridge(monkeypatch: pytest.MonkeyPatch) -> None:
     text = f"{DEFAULT_SITE.read_text(encoding='utf-8')}\nemulated: {{ros: builtin}}\n"
     document = schema.parse(text, source="fieldkit.yaml")
     backend = EmulatedBackend(schema.validate(document, Site), document)
@@ -212,12 +213,12 @@ def test_an_emulated_lab_without_debian_s_ros_rejects_it(monkeypatch: pytest.Mon
         pytest.raises(ConfigurationError, match="has a bridge, which needs Debian's ROS"),
         backend.open(cast(), seed=1, sink=lambda _: None, operator=UNATTENDED),
     ):
-        raise AssertionError("it is open")
+        raise AssertionError("the lab must not open")
 
 
-def test_preflight_checks_the_program() -> None:
+def test_the_preflight_check_includes_the_program_of_the_bridge() -> None:
     plan = los_plan()
-    robot = plan.cast[Role.SENDER].model_copy(update={"profile": asking()})
+    robot = plan.cast[Role.SENDER].model_copy(update={"profile": profile_with_bridge()})
     plan = plan.model_copy(update={"cast": {**plan.cast, Role.SENDER: robot}})
     assert "program fieldkit" in software.commands(plan, Role.SENDER)
     assert "program fieldkit" not in software.commands(plan, Role.RECEIVER)

@@ -1,4 +1,4 @@
-"""Types that differ between ROS 1 and ROS 2 but can be bridged, compared with the serializers of rosbags."""
+"""Types that differ between ROS 1 and ROS 2 but can be bridged; their samples are compared with those of rosbags."""
 
 import time
 from typing import Any
@@ -15,7 +15,7 @@ from fieldkit.ros.interfaces.types import Distribution, MessageTypes, standard_t
 
 
 class FakeMiddleware:
-    """A middleware whose other side is the test; it records the requested topics."""
+    """A middleware through which a test sends and receives samples; it records the requested topics."""
 
     version = "test"
 
@@ -50,10 +50,10 @@ class FakeMiddleware:
         """Do nothing."""
 
 
-def carried(
+def bridge_sample(
     monkeypatch: pytest.MonkeyPatch, type_name: str, sample: bytes, types: MessageTypes, *, back: bool
 ) -> tuple[list[bytes], str, str]:
-    """Return the converted sample, and the announced MD5 sum in ROS 1 and name in DDS."""
+    """Return the converted samples, and the announced MD5 sum in ROS 1 and type name in DDS."""
     of_ros1, of_dds = FakeMiddleware(), FakeMiddleware()
     monkeypatch.setattr(
         "fieldkit.agent.messaging.middleware.adapter", lambda over: lambda _: of_ros1 if over == "ros1" else of_dds
@@ -68,7 +68,7 @@ def carried(
     return target.written, ros1_topic.md5, dds_topic.dds_types[dds_topic.type]
 
 
-# The MD5 sums are those of `rosmsg md5` in Noetic.
+# The MD5 sums are the output of `rosmsg md5` in Noetic.
 @pytest.mark.parametrize(
     ("name", "md5"),
     [("Time", "cd7166c74c552c311fbcc2fe5a7bc289"), ("Duration", "3e286caf4241d664e55f3ad380e2ae46")],
@@ -85,13 +85,13 @@ def test_time_types_are_bridged_under_their_names(
     kind = f"builtin_interfaces/msg/{name}"
     ros2 = bytes(types.ros2.serialize_cdr(types.ros2.types[kind](seconds, 999_999_999), kind))
     sample, expected = (ros2, ros1) if back else (ros1, ros2)
-    written, announced, dds_type = carried(monkeypatch, f"{package}/{name}", sample, types, back=back)
+    written, announced_md5, dds_type = bridge_sample(monkeypatch, f"{package}/{name}", sample, types, back=back)
     assert written == [expected]
-    assert (announced, dds_type) == (md5, f"builtin_interfaces::msg::dds_::{name}_")
+    assert (announced_md5, dds_type) == (md5, f"builtin_interfaces::msg::dds_::{name}_")
 
 
 def ranges(variance: float) -> tuple[bytes, bytes]:
-    """Return a range in the serialization of rosbags for Noetic and for Jazzy."""
+    """Return a range message, serialized by rosbags for Noetic and for Jazzy."""
     types = standard_types()
     messages = []
     for store, extra_fields in ((types.ros1, ()), (types.ros2, (variance,))):
@@ -105,26 +105,26 @@ def ranges(variance: float) -> tuple[bytes, bytes]:
 
 
 def test_range_has_variance_0_in_ros_2_and_none_in_ros_1(monkeypatch: pytest.MonkeyPatch) -> None:
-    of_noetic, of_jazzy = ranges(0.0)
-    written, md5, _ = carried(monkeypatch, "sensor_msgs/Range", of_noetic, standard_types(), back=False)
-    assert written == [of_jazzy]
+    noetic_range, jazzy_range = ranges(0.0)
+    written, md5, _ = bridge_sample(monkeypatch, "sensor_msgs/Range", noetic_range, standard_types(), back=False)
+    assert written == [jazzy_range]
     assert md5 == "c005c34273dc426c67a020a87bc24148"
-    _, measured = ranges(0.125)
-    assert measured != of_jazzy
-    written, _, _ = carried(monkeypatch, "sensor_msgs/Range", measured, standard_types(), back=True)
-    assert written == [of_noetic]
+    _, range_with_variance = ranges(0.125)
+    assert range_with_variance != jazzy_range
+    written, _, _ = bridge_sample(monkeypatch, "sensor_msgs/Range", range_with_variance, standard_types(), back=True)
+    assert written == [noetic_range]
 
 
 @pytest.mark.parametrize("cut", [1, 4, 5, 20])
 def test_range_with_a_wrong_length_is_invalid(cut: int) -> None:
     pair = counterparts.of_type(standard_types(), "sensor_msgs/Range")
     assert pair is not None
-    of_noetic, of_jazzy = ranges(0.0)
-    for data in (of_noetic[:-cut], of_noetic + bytes(cut)):
+    noetic_range, jazzy_range = ranges(0.0)
+    for data in (noetic_range[:-cut], noetic_range + bytes(cut)):
         with pytest.raises(SerdeError):
             pair.to_ros2(standard_types(), data)
     with pytest.raises(SerdeError):
-        pair.to_ros1(standard_types(), of_jazzy[:-cut])
+        pair.to_ros1(standard_types(), jazzy_range[:-cut])
 
 
 def test_additional_members_depend_on_the_distribution() -> None:

@@ -1,4 +1,4 @@
-"""The notation of topics of a bridge, and their counters."""
+"""The notation for the topics of a bridge, and their counters."""
 
 import math
 
@@ -14,7 +14,7 @@ from fieldkit.ros.interfaces.types import standard_types
 SCAN = Crossing.parse("/scan:sensor_msgs/LaserScan")
 
 
-def test_type_in_either_spelling_and_default_quality() -> None:
+def test_a_type_has_two_spellings_and_the_quality_has_a_default() -> None:
     assert Crossing.parse("/a/scan:sensor_msgs/msg/LaserScan") == Crossing(
         "/a/scan", "sensor_msgs/msg/LaserScan", PROFILES["default"]
     )
@@ -49,7 +49,7 @@ def test_invalid_topic_is_rejected(text: str) -> None:
 
 
 @given(st.lists(st.integers(1, 10**12), min_size=1, max_size=200))
-def test_quantiles_of_delays_are_exact_to_a_percent(delays_ns: list[int]) -> None:
+def test_quantiles_of_delays_have_an_error_below_one_percent(delays_ns: list[int]) -> None:
     tally = CrossingTally()
     for delay_ns in delays_ns:
         tally.count(10, 0, delay_ns)
@@ -88,7 +88,7 @@ def test_no_rate_and_no_delay_without_messages() -> None:
         ("nav_msgs/Odometry", True),
         ("tf2_msgs/TFMessage", True),
         ("std_msgs/Char", True),
-        # Types to which ROS 2 has added members.
+        # ROS 2 has added members to these types.
         ("sensor_msgs/Range", False),
         ("visualization_msgs/MarkerArray", False),
     ],

@@ -1,6 +1,6 @@
 """A publisher or subscriber of `/scan` over DDS or Zenoh: `wire_end.py hear|say OVER NETWORK TOPIC FILE`.
 
-NETWORK and TOPIC are JSON. `say` publishes the samples in the file, one hexadecimal line each, and prints `matched`
+NETWORK and TOPIC are JSON. `say` publishes the samples in the file, which are hexadecimal lines, and prints `matched`
 when a subscription matches; `hear` prints each received sample.
 """
 
@@ -13,9 +13,9 @@ from fieldkit.agent.messaging import middleware
 from fieldkit.agent.messaging.middleware import Network, Topic
 
 verb, middleware_name = sys.argv[1:3]
-network, described = map(json.loads, sys.argv[3:5])
+network, topic_description = map(json.loads, sys.argv[3:5])
 running = middleware.adapter(middleware_name)(Network(**network))
-topic = Topic.from_json(described)
+topic = Topic.from_json(topic_description)
 pause = threading.Event()
 
 

@@ -32,7 +32,8 @@ def test_profiles_have_the_values_of_rmw(name: str, values: tuple[object, ...]) 
         (PROFILES["system_default"], "::,:,:,:,,"),
         (QosProfile(depth=42), "::,:,:,:,,"),
         (QosProfile(durability=Durability.TRANSIENT_LOCAL, depth=1), ":1:,1:,:,:,,"),
-        # The example in liveliness_utils.hpp without the default values: deadline 5 s, lifespan 60 s and 3 us.
+        # This is the example in liveliness_utils.hpp without the default values: deadline 5 s, lifespan 60 s and 3
+        # us.
         (QosProfile(deadline_ns=5 * SECOND_NS, lifespan_ns=60 * SECOND_NS + 3000), "::,10:5,0:60,3000:,,"),
         (QosProfile(history=History.KEEP_ALL, liveliness=Liveliness.MANUAL_BY_TOPIC), "::2,10:,:,:3,,"),
     ],

@@ -12,9 +12,9 @@ from fieldkit.ros.interfaces.qos import PROFILES
 from fieldkit.ros.interfaces.types import Distribution, MessageField, MessageTypes, standard_types
 from tests.helpers.paths import DATA
 
-# Type hashes: std_msgs/String and its key expression from docs/design.md of ros2/rmw_zenoh; the others from key
-# expressions and generated code of public projects that speak to ROS 2 nodes (ros-z, rmw_zenoh users, roslibrust).
-# MD5 sums: `rosmsg md5` of ROS Noetic.
+# The type hash of std_msgs/String is from docs/design.md of ros2/rmw_zenoh. The others are from key expressions and
+# generated code of public projects that communicate with ROS 2 nodes (ros-z, users of rmw_zenoh, roslibrust). The MD5
+# sums are the output of `rosmsg md5` of ROS Noetic.
 PUBLISHED = {
     "std_msgs/msg/String": (
         "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
@@ -41,23 +41,23 @@ PUBLISHED = {
 
 @pytest.mark.parametrize(("name", "published"), PUBLISHED.items())
 @pytest.mark.parametrize("distribution", Distribution)
-def test_hashes_are_the_published_ones(name: str, published: tuple[str, str], distribution: Distribution) -> None:
+def test_hashes_equal_the_published_hashes(name: str, published: tuple[str, str], distribution: Distribution) -> None:
     message_type = standard_types(distribution).get(name)
     assert (message_type.rihs01, message_type.md5) == published
 
 
-def test_hashes_are_those_of_a_real_ros_2() -> None:
-    """The hashes that rosidl has written to the packages of ROS 2 Kilted."""
+def test_hashes_equal_those_of_a_ros_2_installation() -> None:
+    """The hashes are those that rosidl has written to the packages of ROS 2 Kilted."""
     published = json.loads((DATA / "ros2" / "kilted" / "type_hashes.json").read_text(encoding="utf-8"))
     assert len(published) > 100
     assert {name: standard_types().get(name).rihs01 for name in published} == published
 
 
-def test_either_spelling_names_a_type() -> None:
+def test_a_type_has_two_spellings() -> None:
     assert standard_types().get("sensor_msgs/LaserScan") == standard_types().get("sensor_msgs/msg/LaserScan")
 
 
-def test_custom_type() -> None:
+def test_a_custom_type_has_a_hash_and_its_fields() -> None:
     text = "std_msgs/Header header\nfloat32[4] level\nstring<=8 name\nuint8[] raw\nint16[<=3] few\n"
     types = MessageTypes(definitions={"lab_msgs/Radio": text})
     message_type = types.get("lab_msgs/Radio")
@@ -73,7 +73,7 @@ def test_custom_type() -> None:
 
 
 def test_md5_sum_is_independent_of_the_name() -> None:
-    """The MD5 sum of ROS 1 covers the members, not the name of the type."""
+    """The MD5 sum of ROS 1 includes the members but not the name of the type."""
     types = MessageTypes(definitions={"lab_msgs/Words": "string data\n"})
     assert types.get("lab_msgs/Words").md5 == PUBLISHED["std_msgs/msg/String"][1]
     assert types.get("lab_msgs/Words").rihs01 != PUBLISHED["std_msgs/msg/String"][0]
@@ -113,6 +113,6 @@ def test_hashes_are_announced_since_iron(name: str, *, hashes: bool) -> None:
     description = topics.describe(types, "/scan", "sensor_msgs/LaserScan", quality, domain=0, node="n")
     type_hash = types.get("sensor_msgs/LaserScan").rihs01
     assert description["user_data"] == (f"typehash={type_hash};" if hashes else "")
-    announced = type_hash if hashes else "TypeHashNotSupported"
-    assert description["key"] == f"0/scan/sensor_msgs::msg::dds_::LaserScan_/{announced}"
-    assert f"/{announced}/" in description["tokens"]["publisher"][1]
+    announced_hash = type_hash if hashes else "TypeHashNotSupported"
+    assert description["key"] == f"0/scan/sensor_msgs::msg::dds_::LaserScan_/{announced_hash}"
+    assert f"/{announced_hash}/" in description["tokens"]["publisher"][1]

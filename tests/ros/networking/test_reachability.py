@@ -17,7 +17,7 @@ ALL = {"unicast": 20, "multicast": 20, "fragmented": 20}
 
 
 @pytest.mark.parametrize(
-    ("counts", "bad"),
+    ("counts", "bad_checks"),
     [
         (ALL, {}),
         (ALL | {"multicast": 0}, {"multicast from a": Verdict.FAIL}),
@@ -27,14 +27,14 @@ ALL = {"unicast": 20, "multicast": 20, "fragmented": 20}
         ({}, {"UDP from a": Verdict.FAIL, "multicast from a": Verdict.FAIL}),
     ],
 )
-def test_missing_datagrams_are_reported(counts: Mapping[str, int], bad: Mapping[str, Verdict]) -> None:
+def test_missing_datagrams_are_reported(counts: Mapping[str, int], bad_checks: Mapping[str, Verdict]) -> None:
     report = Report("b")
     judge_arrivals(ros2_robot("a"), Arrivals(counts), robot_state(), 0, report, ros2=True)
     statuses = {check: status for check, (status, _) in findings(report).items() if status is not Verdict.OK}
-    assert statuses == bad
+    assert statuses == bad_checks
 
 
-def test_a_firewall_rule_is_the_evidence_and_peers_need_no_multicast() -> None:
+def test_a_firewall_rule_is_named_and_peers_need_no_multicast() -> None:
     report = Report("b")
     state = robot_state({"ROS_STATIC_PEERS": "10.0.0.1"}, drop_rules=("udp dport 7400-7649 drop",))
     judge_arrivals(ros2_robot("a"), Arrivals({}), state, 0, report, ros2=True)
@@ -43,7 +43,7 @@ def test_a_firewall_rule_is_the_evidence_and_peers_need_no_multicast() -> None:
     assert "7400:7649" in report.findings[0].remedy
 
 
-def test_an_exchange_that_failed_is_not_an_absence_of_datagrams() -> None:
+def test_a_failed_exchange_is_not_reported_as_an_absence_of_datagrams() -> None:
     report = Report("b")
     judge_arrivals(ros2_robot("a"), Arrivals({}, "a: no answer"), robot_state(), 0, report, ros2=True)
     assert findings(report) == {"datagrams from a": (Verdict.FAIL, "not tested: a: no answer")}

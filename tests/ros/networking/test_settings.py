@@ -1,4 +1,4 @@
-"""Findings of `fieldkit check --ros` on the settings of robots, one injected fault each."""
+"""Findings of `fieldkit check --ros` on the settings of robots, each with one fault."""
 
 from collections.abc import Mapping
 
@@ -46,7 +46,7 @@ def findings(report: Report) -> Findings:
     return {finding.check: (finding.status, finding.detail) for finding in report.findings}
 
 
-def judged(state: RosState) -> Findings:
+def judge_state(state: RosState) -> Findings:
     report = Report("r")
     settings.judge_robot(ros2_robot("r"), state, report)
     assert all(finding.remedy for finding in report.findings if finding.status is not Verdict.OK)
@@ -54,7 +54,7 @@ def judged(state: RosState) -> Findings:
 
 
 def test_a_robot_without_a_fault_is_ok() -> None:
-    assert {status for status, _ in judged(robot_state({"ROS_DISTRO": "humble"})).values()} == {Verdict.OK}
+    assert {status for status, _ in judge_state(robot_state({"ROS_DISTRO": "humble"})).values()} == {Verdict.OK}
 
 
 ZENOH = {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}
@@ -100,12 +100,12 @@ OTHER_DOMAIN = RosProgram("talker", {"ROS_DISTRO": "humble", "ROS_DOMAIN_ID": "5
     ],
 )
 def test_each_fault_is_reported(state: RosState, check: str, status: Verdict, text: str) -> None:
-    actual_status, detail = judged(state)[check]
+    actual_status, detail = judge_state(state)[check]
     assert actual_status is status
     assert text in detail
 
 
-def compared(first: RosState, second: RosState) -> Findings:
+def compare_states(first: RosState, second: RosState) -> Findings:
     cast: dict[Role, Robot] = {Role.SENDER: ros2_robot("a", "10.0.0.1"), Role.RECEIVER: ros2_robot("b", "10.0.0.2")}
     reports = {role: Report(robot.name) for role, robot in cast.items()}
     states = {Role.SENDER: first, Role.RECEIVER: second}
@@ -127,11 +127,13 @@ def compared(first: RosState, second: RosState) -> Findings:
         ({"ROS_DISCOVERY_SERVER": "10.0.0.9:11811"}, "discovery server", Verdict.OK),
     ],
 )
-def test_settings_that_differ_between_robots(variables: Mapping[str, str], check: str, status: Verdict) -> None:
-    assert compared(robot_state({"ROS_DISTRO": "humble"}), robot_state(variables))[check][0] is status
+def test_settings_that_differ_between_robots_are_reported(
+    variables: Mapping[str, str], check: str, status: Verdict
+) -> None:
+    assert compare_states(robot_state({"ROS_DISTRO": "humble"}), robot_state(variables))[check][0] is status
 
 
 def test_a_discovery_server_that_runs_is_ok() -> None:
     variables = {"ROS_DISCOVERY_SERVER": "10.0.0.1"}
     first = robot_state(variables, udp_ports=frozenset({11811}))
-    assert compared(first, robot_state(variables))["discovery server"][0] is Verdict.OK
+    assert compare_states(first, robot_state(variables))["discovery server"][0] is Verdict.OK

@@ -44,12 +44,12 @@ def output(**sections: str) -> str:
     return "".join(f"==> {name.replace('_', '-')}: 0 <==\n{text}\n" for name, text in sections.items())
 
 
-def parsed(**sections: str) -> state.RosState:
+def parse_sections(**sections: str) -> state.RosState:
     return state.parse(probe.parse(output(**sections)))
 
 
-def test_rules_that_drop_received_packets_are_listed_without_those_for_sent_ones() -> None:
-    assert parsed(nftables=NFTABLES, iptables=IPTABLES).drop_rules == (
+def test_only_rules_that_drop_received_packets_are_listed() -> None:
+    assert parse_sections(nftables=NFTABLES, iptables=IPTABLES).drop_rules == (
         "ct state invalid drop",
         "ip daddr 239.255.0.1 counter packets 12 bytes 4032 drop",
         'iifname "wlan0" udp dport 7410 reject',
@@ -61,11 +61,11 @@ def test_rules_that_drop_received_packets_are_listed_without_those_for_sent_ones
 def test_unreadable_rules_are_unknown_and_not_absent() -> None:
     text = "==> nftables: 1 <==\nOperation not permitted\n==> iptables: 127 <==\nnot found\n"
     assert state.parse(probe.parse(text)).drop_rules is None
-    assert parsed(nftables="").drop_rules == ()
+    assert parse_sections(nftables="").drop_rules == ()
 
 
-def test_environment_programs_and_sockets() -> None:
-    robot = parsed(
+def test_environment_programs_and_sockets_are_parsed() -> None:
+    robot = parse_sections(
         environment="ROS_DISTRO=jazzy\nROS_DOMAIN_ID=7",
         programs="program talker\nROS_DISTRO=jazzy\nROS_DOMAIN_ID=3\nprogram rviz2\nROS_DISTRO=jazzy",
         listeners=SOCKETS,
@@ -98,18 +98,18 @@ FAST_DDS = """
 """
 
 
-def test_interfaces_of_the_settings_of_the_rmw() -> None:
+def test_the_interfaces_in_the_settings_of_the_rmw_are_parsed() -> None:
     names = ("eth0", "10.0.0.1", "wlp2s0", "192.168.1.5", "wlan1")
-    assert parsed(cyclonedds=CYCLONEDDS, fastdds=FAST_DDS).rmw_interfaces == names
-    assert parsed(cyclonedds="<NetworkInterface autodetermine='true'/>", fastdds="").rmw_interfaces == ()
+    assert parse_sections(cyclonedds=CYCLONEDDS, fastdds=FAST_DDS).rmw_interfaces == names
+    assert parse_sections(cyclonedds="<NetworkInterface autodetermine='true'/>", fastdds="").rmw_interfaces == ()
     missing = state.parse(probe.parse("==> cyclonedds: 1 <==\nhead: cannot open 'x' for reading\n"))
     assert missing.unreadable_settings == "head: cannot open 'x' for reading"
 
 
 @given(st.text(max_size=2000))
-def test_any_output_is_read(text: str) -> None:
+def test_any_output_is_parsed(text: str) -> None:
     state.parse(probe.parse(text))
-    parsed(
+    parse_sections(
         cyclonedds=text,
         fastdds=text,
         programs=text,
@@ -122,7 +122,7 @@ def test_any_output_is_read(text: str) -> None:
 
 
 @pytest.mark.parametrize("shell", ["dash", "bash"])
-def test_script_reads_this_machine(shell: str) -> None:
+def test_the_script_reads_the_state_of_this_machine(shell: str) -> None:
     environment = {
         "PATH": "/usr/bin:/bin:/usr/sbin:/sbin",
         "ROS_DISTRO": "humble",

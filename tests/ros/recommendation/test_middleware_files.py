@@ -1,4 +1,4 @@
-"""Configuration files of middlewares: the real middleware reads each file, and applies the measured settings."""
+"""Configuration files of middlewares: the middleware reads its file and uses the settings in it."""
 
 import json
 import os
@@ -24,8 +24,8 @@ node = rclpy.create_node("x")
 ends = node.create_publisher(String, "x", 1), node.create_subscription(String, "x", print, 1)
 until_s = time.monotonic() + 30
 while time.monotonic() < until_s:
-    listed = subprocess.run(["ss", "-tulnpH"], capture_output=True, text=True).stdout.splitlines()
-    own = [line.split()[0] for line in listed if f"pid={os.getpid()}," in line]
+    lines = subprocess.run(["ss", "-tulnpH"], capture_output=True, text=True).stdout.splitlines()
+    own = [line.split()[0] for line in lines if f"pid={os.getpid()}," in line]
     if own.count("udp") >= 3 and own.count("tcp") == int(sys.argv[1]):
         break
     time.sleep(0.1)
@@ -47,8 +47,8 @@ def test_cyclonedds_reads_its_file(tmp_path: Path, settings: dict[str, str]) -> 
     completed = run(sys.executable, "-c", program, CYCLONEDDS_URI=f"file://{path}")
     is_known = "No/Such" not in settings
     assert (completed.returncode == 0) == is_known, completed.stderr
-    for path_, value in settings.items():
-        assert value in path.read_text(encoding="utf-8"), path_
+    for name, value in settings.items():
+        assert value in path.read_text(encoding="utf-8"), name
 
 
 @pytest.mark.parametrize("transport", ["tcp", "udp"])
@@ -58,11 +58,12 @@ def test_zenoh_reads_its_file(tmp_path: Path, transport: str) -> None:
     settings = tuning.recommended_settings("zenoh", transport)
     path.write_text(configurations.configuration_text("zenoh", transport, settings, COMMENT), encoding="utf-8")
     config = zenoh.Config.from_file(str(path))
-    for profile, text in settings.items():
-        read, expected = json.loads(config.get_json(profile)), json.loads(text)
-        pairs = zip(read, expected, strict=True) if isinstance(expected, list) else []
-        assert read == expected or all(
-            {key: printed["config"][key] for key in other["config"]} == other["config"] for printed, other in pairs
+    for name, text in settings.items():
+        actual, expected = json.loads(config.get_json(name)), json.loads(text)
+        pairs = zip(actual, expected, strict=True) if isinstance(expected, list) else []
+        assert actual == expected or all(
+            {key: actual_entry["config"][key] for key in entry["config"]} == entry["config"]
+            for actual_entry, entry in pairs
         )
     zenoh.open(config).close()
 
@@ -91,7 +92,7 @@ def test_fast_dds_reads_its_file(tmp_path: Path, transports: str, *, loads: bool
     assert completed.stdout.splitlines()[-1] == expected, completed.stdout
 
 
-def test_setting_that_a_file_cannot_contain_is_rejected() -> None:
+def test_a_setting_that_a_file_cannot_contain_is_rejected() -> None:
     with pytest.raises(ConfigurationError, match="cannot contain FASTDDS_X"):
         configurations.configuration_text("ros2", "tcp", {"FASTDDS_X": "1"}, [])
     with pytest.raises(ConfigurationError, match="cannot contain rmw_cyclonedds_cpp"):

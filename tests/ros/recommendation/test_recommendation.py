@@ -1,4 +1,4 @@
-"""The rule of `fieldkit middleware recommend`, on repeats with known results."""
+"""The rule of `fieldkit middleware recommend`, applied to repeats with known results."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -28,7 +28,7 @@ def cell(
     status: Sequence[str] = (),
     size_bytes: float = SIZE,
 ) -> LinkCell:
-    """Return repeats that lost the given numbers of 100 samples."""
+    """Return repeats that lost the given numbers of samples, by default of 100."""
     n = len(lost)
     delay = np.array([*delay_s] or [0.01] * n)
     numbers = {
@@ -66,11 +66,11 @@ def test_a_bound_is_compared_as_a_decimal() -> None:
 
 
 def test_one_bad_repeat_fails_although_the_mean_is_low() -> None:
-    # Bimodal: 1 of 200 repeats loses everything, 0.5 % on average.
+    # The loss is bimodal: 1 of 200 repeats loses all samples, so the mean loss is 0.5 %.
     assert judge(cell([100] + 199 * [0])).failures
 
 
-def test_samples_never_sent_are_lost() -> None:
+def test_samples_that_were_never_sent_count_as_lost() -> None:
     assert judge(cell(5 * [0], sent=99, never_sent=1)).passed
     assert judge(cell(5 * [0], sent=98, never_sent=2)).failures
 
@@ -85,7 +85,7 @@ def test_void_and_failed_repeats_do_not_count() -> None:
     measured_cell = cell(6 * [0], status=["valid", "void", "valid", "failed", "valid", "valid"])
     assert measured_cell.attempts == 6
     assert judge(measured_cell).missing_evidence == (f"{PLACE}, 1000 B: 4 of 5 valid repeats with samples; run more",)
-    # The loss of a void repeat proves nothing either.
+    # The loss of a void repeat is also ignored.
     assert judge(cell([0, 0, 0, 0, 0, 90], status=[*5 * ["valid"], "void"])).passed
 
 
@@ -93,7 +93,7 @@ def test_a_valid_repeat_without_a_loss_never_passes() -> None:
     assessment = judge(cell([*5 * [0], UNKNOWN]))
     assert not assessment.passed
     assert "1 of 6 repeats have no value" in assessment.missing_evidence[0]
-    # Nothing was sent: there was no subscription.
+    # No sample was sent because there was no subscription.
     assert judge(cell(5 * [0], sent=0)).missing_evidence
     assert not judge(cell(5 * [0], sent=0)).failures
 
@@ -119,24 +119,25 @@ def test_a_missing_delay_never_passes() -> None:
     assessment = judge(measured_cell, criterion=replace(ONE_PERCENT, max_delay_s=0.2))
     assert not assessment.failures
     assert "1 of 5 repeats have no value" in assessment.missing_evidence[0]
-    assert judge(measured_cell).passed  # without a delay limit it is not needed
+    assert judge(measured_cell).passed  # no delay is needed without a delay limit
 
 
 def test_a_censored_delay_never_passes() -> None:
-    # More than 5 % were lost, so that the delay of 95 % of those sent is censored.
+    # More than 5 % of the samples were lost, so the 95 % quantile of the delays of all sent samples is censored.
     lenient = LinkCriterion(0.5, 0.2)
     measured_cell = cell(5 * [10], delay_sent_s=[0.01, UNKNOWN, 0.01, 0.01, 0.01])
     assessment = judge(measured_cell, criterion=lenient)
     assert not assessment.failures
     assert "in 1 of 5 repeats the figure is infinite because of lost items" in assessment.missing_evidence[0]
-    # The received samples were already late, so it fails whatever the lost ones would have been.
+    # The received samples alone exceed the limit, so the lost samples cannot change the result.
     late = cell(5 * [10], delay_s=5 * [0.3], delay_sent_s=5 * [UNKNOWN])
     assert judge(late, criterion=lenient).failures
 
 
 @pytest.mark.parametrize(
     ("lost", "passed", "failed"),
-    # 95 %, one-sided (Clopper and Pearson 1934): of 29 all show 90 %, since 0.9^29 < 5 % < 0.9^28; of 46 all but one.
+    # One-sided confidence of 95 % (Clopper and Pearson 1934): a share of 90 % needs 29 of 29 repeats, because
+    # 0.9^29 < 5 % < 0.9^28, or 45 of 46 repeats.
     [
         (29 * [0], True, False),
         (28 * [0], False, False),
@@ -151,7 +152,7 @@ def test_a_share_of_repeats_needs_confidence(lost: list[float], passed: bool, fa
     assert bool(assessment.failures) == failed
 
 
-def test_every_cell_must_pass_and_none_may_be_missing() -> None:
+def test_every_cell_must_exist_and_pass() -> None:
     good, bad = cell(5 * [0]), cell(5 * [9], size_bytes=1e6)
     assert judge(good, bad).failures == (f"{PLACE}, 1e+06 B: loss <= 0.01 in 0 of 5 repeats, up to 0.09",)
     expected = {(PLACE, SIZE), (PLACE, 1e6)}
@@ -165,7 +166,7 @@ def test_the_rank_is_the_loss_of_the_worst_cell_and_then_the_delay() -> None:
     empty = cell([0, 0], status=["void", "void"])
     assert judge(fast).rank == (0, 0.01)
     assert judge(slow).rank == judge(fast, slow).rank == (0, 0.3)
-    assert judge(unknown).rank == (0, float("inf"))  # an unknown delay is not short
+    assert judge(unknown).rank == (0, float("inf"))  # an unknown delay ranks last
     assert judge(lossy).rank == judge(fast, lossy).rank == (3 / 500, 0.01)
     assert judge(fast, empty).rank == (float("inf"), float("inf"))
 

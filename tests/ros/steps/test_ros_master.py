@@ -1,4 +1,4 @@
-"""A shared ROS master: environment of robots, preflight check, and errors of the site file."""
+"""A shared ROS master: the environment of robots, the preflight check, and errors of the site file."""
 
 from datetime import UTC, datetime
 from pathlib import Path
@@ -43,7 +43,7 @@ def site(text: str) -> tuple[Site, schema.Document]:
     return schema.validate(document, Site), document
 
 
-def test_commands_have_address_of_master_and_own_radio_address() -> None:
+def test_commands_have_the_master_address_and_the_radio_address_of_the_robot() -> None:
     (record,) = steps_of(load_procedure("los"), RecordStep)
     (planned,) = record.jobs(Scene(Protocol.TCP, SHARED, "f"))
     assert shell_line(planned.job) == (
@@ -54,10 +54,10 @@ def test_commands_have_address_of_master_and_own_radio_address() -> None:
 
 def test_shared_master_overrides_variables_of_profile() -> None:
     assert TURTLEBOT.ros is not None
-    answer = {"ROS_HOSTNAME": "localhost", "ROS_NAMESPACE": "tb1"}
-    profile = TURTLEBOT.model_copy(update={"ros": TURTLEBOT.ros.model_copy(update={"environment": answer})})
+    response = {"ROS_HOSTNAME": "localhost", "ROS_NAMESPACE": "tb1"}
+    profile = TURTLEBOT.model_copy(update={"ros": TURTLEBOT.ros.model_copy(update={"environment": response})})
     robot = CAST[Role.SENDER].model_copy(update={"profile": profile})
-    assert robot.ros_environment == answer
+    assert robot.ros_environment == response
     shared = robot.model_copy(update={"ros_master": "10.42.0.3"}).ros_environment
     assert shared == {
         "ROS_HOSTNAME": "10.42.0.1",
@@ -69,19 +69,19 @@ def test_shared_master_overrides_variables_of_profile() -> None:
 def test_master_is_set_only_if_its_role_is_cast() -> None:
     robots = registry.cast_of(*site(SITE), Topology.MASTER, ADDRESSES)
     assert {robot.ros_master for robot in robots.values()} == {"10.0.0.3"}
-    alone = registry.cast_of(*site(SITE), Topology.MASTERLESS, ADDRESSES)
-    assert {robot.ros_master for robot in alone.values()} == {""}
+    masterless = registry.cast_of(*site(SITE), Topology.MASTERLESS, ADDRESSES)
+    assert {robot.ros_master for robot in masterless.values()} == {""}
 
 
 @pytest.mark.parametrize("role", ["drone", "rival"])
-def test_master_role_without_robot_is_refused(role: str) -> None:
+def test_master_role_without_robot_is_rejected(role: str) -> None:
     text = SITE.replace("ros_master: relay", f"ros_master: {role}")
     with pytest.raises(ConfigurationError, match="one of the assigned roles: sender, receiver, relay") as caught:
         site(text)
     assert caught.value.where == "fieldkit.yaml:9"
 
 
-def test_master_on_robot_without_ros_1_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_master_on_robot_without_ros_1_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "robots").mkdir()
     (tmp_path / "robots" / "box.yaml").write_text(BOX, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
@@ -99,12 +99,12 @@ def test_preflight_checks_only_shared_masters() -> None:
     )
     assert separate.keys() == {"ROS"}
     assert shared.keys() == {"ROS", "ROS master"}
-    assert shared["ROS master"].missing_program == "rosbag", "no recording is tried without a master"
+    assert shared["ROS master"].missing_program == "rosbag", "there is no test recording without a master"
     assert shared["ROS"].argv[-3:] == ("sh", "-c", 'echo "$ROS_DISTRO $ROS_MASTER_URI"')
 
 
 @pytest.mark.parametrize(
-    ("answer", "detail"),
+    ("response", "detail"),
     [
         (
             CommandResult(
@@ -117,8 +117,8 @@ def test_preflight_checks_only_shared_masters() -> None:
         (CommandResult("SSH-2.0-OpenSSH_9.2p1", 0), "SSH"),
     ],
 )
-def test_invalid_answer_of_master_fails_with_remedy(answer: CommandResult, detail: str) -> None:
-    verdict, detail_text, remedy = ros_master.judge(SHARED[Role.RELAY], answer)
+def test_invalid_answer_of_master_fails_with_remedy(response: CommandResult, detail: str) -> None:
+    verdict, detail_text, remedy = ros_master.judge(SHARED[Role.RELAY], response)
     assert verdict is Verdict.FAIL
     assert detail_text.startswith("no master answers at duckiedrone-1, 10.42.0.3:11311: ")
     assert detail in detail_text
@@ -136,11 +136,11 @@ def test_battery_topics_of_shared_master_are_ambiguous() -> None:
 def test_profiles_hash_depends_on_sharing_but_not_on_addresses() -> None:
     separate, shared = (plan_of(cast).profiles_sha256 for cast in (CAST, SHARED))
     assert separate != shared
-    moved = {
+    moved_cast = {
         role: robot.model_copy(update={"address": f"10.9.9.{number}", "ros_master": "10.9.9.2"})
         for number, (role, robot) in enumerate(SHARED.items())
     }
-    assert plan_of(moved).profiles_sha256 == shared
+    assert plan_of(moved_cast).profiles_sha256 == shared
 
 
 def plan_of(cast: Cast, procedure: str = "los") -> Plan:

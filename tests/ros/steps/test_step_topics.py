@@ -1,4 +1,4 @@
-"""The step topics: valid keys, arguments of the agents, and trials over radios that lose packets."""
+"""The step `topics`: valid keys, arguments of the agents, and trials over radios that lose packets."""
 
 import csv
 import json
@@ -54,23 +54,30 @@ def topics(keys: str = "over: dds") -> TopicsStep:
         ("topic: /a//b", "is not the name of a topic"),
     ],
 )
-def test_invalid_keys_are_refused_with_line(keys: str, message: str) -> None:
+def test_invalid_keys_are_rejected_with_their_line(keys: str, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message) as failed:
         topics(keys)
     assert failed.value.where.startswith("x.yaml:1") or "x.yaml:1" in str(failed.value)
 
 
-def test_equal_sender_and_receiver_are_refused() -> None:
+def test_equal_sender_and_receiver_are_rejected() -> None:
     with pytest.raises(ConfigurationError, match="cannot send to itself"):
         schema.validate(schema.parse("{from: sender, to: sender}", source="x.yaml"), TopicsStep)
 
 
-def test_arguments_of_subscriber_and_publisher() -> None:
+def test_subscriber_and_publisher_get_their_arguments() -> None:
     subscribe, publish = topics("name: a, bytes: 500B, rate: 20Hz, qos: {profile: sensor_data}").jobs(SCENE)
-    head = ("bash", "-c", '. /opt/ros/noetic/setup.bash && exec "$@"', "bash", "python3", agent.path_from_job())
+    command_start = (
+        "bash",
+        "-c",
+        '. /opt/ros/noetic/setup.bash && exec "$@"',
+        "bash",
+        "python3",
+        agent.path_from_job(),
+    )
     for planned, verb, role in ((subscribe, "subscribe", Role.RECEIVER), (publish, "publish", Role.SENDER)):
         assert (planned.role, planned.program, planned.job.name) == (role, "python3", f"a.{verb}")
-        assert planned.job.argv[:6] == head
+        assert planned.job.argv[:6] == command_start
         assert planned.job.argv[6] == verb
         assert planned.job.argv[8] == f"a.{role}-topic.bin"
         argument = json.loads(planned.job.argv[7])
@@ -103,8 +110,8 @@ def test_capture_filter_includes_multicast() -> None:
     )
 
 
-def test_ports_of_dds_follow_rtps() -> None:
-    """RTPS 2.5, table 9.8, for participants 0 and 1 of domain 1."""
+def test_the_ports_of_dds_are_those_of_rtps() -> None:
+    """The ports are those of RTPS 2.5, table 9.8, for participants 0 and 1 of domain 1."""
     dds_ports = ports.dds(1, multicast=True)
     assert {7650, 7660, 7662} <= dds_ports.discovery
     assert {7651, 7661, 7663} <= dds_ports.data
@@ -137,14 +144,14 @@ def settings(keys: str) -> dict[str, str]:
 
 @pytest.mark.parametrize("keys", ["over: dds", "over: zenoh", "over: zenoh, transport: udp", "over: ros1"])
 def test_tuned_settings_are_added_to_required_ones(keys: str) -> None:
-    plain, tuned = settings(keys), settings(f"{keys}, settings: tuned")
-    assert settings(f"{keys}, settings: default") == plain
-    assert plain.items() <= tuned.items()
-    assert plain != tuned
+    default_settings, tuned = settings(keys), settings(f"{keys}, settings: tuned")
+    assert settings(f"{keys}, settings: default") == default_settings
+    assert default_settings.items() <= tuned.items()
+    assert default_settings != tuned
 
 
 def test_tuned_datagram_fits_into_one_packet() -> None:
-    """A datagram with the headers of IP and UDP fits into 1,500 bytes, and a DDS fragment with its header into it."""
+    """A datagram with IP and UDP headers has at most 1,500 bytes, and contains a DDS fragment with its header."""
     max_bytes = 1500 - 20 - 8
     dds = {name: int(value.removesuffix(" B")) for name, value in settings("over: dds, settings: tuned").items()}
     assert dds["General/FragmentSize"] < dds["General/MaxMessageSize"] <= max_bytes
@@ -174,8 +181,8 @@ def test_ros_2_runs_with_environment_of_robot_and_settings() -> None:
     assert need.judge(CommandResult("rmw_b", 0)) == (Verdict.OK, "rclpy, rmw_b", "")
 
 
-def together(*several: str, within: str = "together") -> str:
-    steps = "".join(f"          - topics: {{name: s{number}, {keys}}}\n" for number, keys in enumerate(several))
+def together(*stream_keys: str, within: str = "together") -> str:
+    steps = "".join(f"          - topics: {{name: s{number}, {keys}}}\n" for number, keys in enumerate(stream_keys))
     return (
         "name: x\nsummary: x\nscenario: los\ntopology: master\nprotocols: [udp]\nrepeats: 1\n"
         f"steps:\n  - capture:\n      during:\n      - {within}:\n          during:\n{steps}"
@@ -184,7 +191,7 @@ def together(*several: str, within: str = "together") -> str:
 
 @pytest.mark.parametrize("middleware_name", ["zenoh", "zenoh, discovery: router", "ros1"])
 def test_simultaneous_streams_need_different_domains(middleware_name: str) -> None:
-    """In one domain they would listen on the same ports of the receiver, the router or the master."""
+    """In one domain, the streams would listen on the same ports of the receiver, the router or the master."""
     keys = (
         f"from: sender, to: receiver, over: {middleware_name}",
         f"from: relay, to: receiver, over: {middleware_name}, topic: /b",
@@ -259,10 +266,10 @@ def trial(
 ) -> Path:
     """Run a trial of one repeat; return its folder."""
     text = PROCEDURE.format(topology=topology, topics=f"{{from: sender, to: receiver, {keys}}}")
-    return trial_of(folder, monkeypatch, text + extra_keys, SITE.replace("LOSS", loss))
+    return run_procedure(folder, monkeypatch, text + extra_keys, SITE.replace("LOSS", loss))
 
 
-def trial_of(folder: Path, monkeypatch: pytest.MonkeyPatch, procedure: str, site: str) -> Path:
+def run_procedure(folder: Path, monkeypatch: pytest.MonkeyPatch, procedure: str, site: str) -> Path:
     """Run a trial of a procedure of one repeat; return its folder."""
     (folder / "procedures").mkdir()
     (folder / "procedures" / "lossy.yaml").write_text(procedure, encoding="utf-8")
@@ -280,7 +287,7 @@ def row(folder: Path) -> dict[str, str]:
 
 @pytest.mark.emulated
 def test_losses_equal_those_of_the_radio(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With best effort and one frame per sample, the missed samples are the packets lost on the radio."""
+    """With best effort and one frame per sample, the lost samples are the lost packets of the radio."""
     size = 600
     keys = f"rate: 200Hz, bytes: {size}B, duration: 2s, patience: 60s, qos: {{profile: sensor_data, depth: 1000}}"
     folder = trial(tmp_path, monkeypatch, keys, loss="20%")
@@ -293,12 +300,12 @@ def test_losses_equal_those_of_the_radio(tmp_path: Path, monkeypatch: pytest.Mon
     sent, received = counts
     assert (int(row_values["topic_sent"]), int(row_values["topic_received"])) == (sent, received)
     assert sent > received
-    # A subscriber may discover the publisher later than the reverse; then it accepts no earlier samples.
+    # If the subscriber discovers the publisher after the publisher has discovered it, it accepts no earlier samples.
     assert float(row_values["topic_loss"]) == pytest.approx(0.2, abs=0.15)
 
 
 @pytest.mark.emulated
-def test_repeat_without_discovery_is_valid_and_has_no_samples(
+def test_a_repeat_without_discovery_is_valid_and_has_no_samples(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     row_values = row(trial(tmp_path, monkeypatch, "duration: 1s, patience: 1s", loss="100%"))
@@ -308,10 +315,10 @@ def test_repeat_without_discovery_is_valid_and_has_no_samples(
 
 
 @pytest.mark.emulated
-def test_topics_with_router_and_master_and_several_publishers(
+def test_samples_arrive_with_a_router_a_master_and_several_publishers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Several robots publish simultaneously to one; over Zenoh and ROS 1 each stream has a separate domain there."""
+    """Several robots publish simultaneously to one robot; over Zenoh and ROS 1, each stream has a separate domain."""
     zenoh = "        - topics: {name: z, from: sender, to: receiver, over: zenoh, discovery: router, duration: 1s}\n"
     stream_keys = [
         f"{{name: {over}{number}, from: {role}, to: receiver, over: {over}, domain: {number}, server: receiver, "
@@ -330,8 +337,8 @@ def test_topics_with_router_and_master_and_several_publishers(
 
 
 @pytest.mark.emulated
-def test_robots_with_real_ros_2(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Over Fast DDS: one stream with discovery of the environment (multicast), and one by peers."""
+def test_samples_arrive_between_robots_with_ros_2(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two streams use Fast DDS: one with the discovery of the environment (multicast), and one with peers."""
     profile = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
     python = f"  ping: ping\n  python: {ROOT / '.ros2' / 'bin' / 'python'}"
     (tmp_path / "robots").mkdir()
@@ -339,16 +346,16 @@ def test_robots_with_real_ros_2(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         profile.replace("name: turtlebot3_burger", "name: real").replace("  ping: ping", python), encoding="utf-8"
     )
     keys = "from: sender, to: receiver, over: ros2, rate: 20Hz, duration: 1s, patience: 60s"
-    several = together(keys, f"{keys}, domain: 7, discovery: peers").replace("name: x", "name: lossy")
+    procedure = together(keys, f"{keys}, domain: 7, discovery: peers").replace("name: x", "name: lossy")
     site = SITE.replace("profile: turtlebot3_burger", "profile: real").replace("LOSS", "0%")
-    folder = trial_of(tmp_path, monkeypatch, several, site)
+    folder = run_procedure(tmp_path, monkeypatch, procedure, site)
     row_values = row(folder)
     assert row_values["status"] == "valid"
     packets = pcap.read(folder / "repeats" / "udp-01" / "sender.pcap").packets
     for name, domain, uses_multicast in (("s0", 42, True), ("s1", 7, False)):
         assert row_values[f"{name}.topic_sent"] == row_values[f"{name}.topic_received"] != "0"
         sent = int(row_values[f"{name}.topic_sent"])
-        # One packet per sample, and some for heartbeats and the participants of each node.
+        # There is one packet per sample, and there are some for heartbeats and for the participants of each node.
         assert sent <= int(row_values[f"{name}.topic_data_packets"]) < 200
         assert sent * 1_000 <= int(row_values[f"{name}.topic_data_bytes"]) < 2 * 20 * 1_000
         assert int(row_values[f"{name}.topic_discovery_packets"]) > 0

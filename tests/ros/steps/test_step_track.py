@@ -1,4 +1,4 @@
-"""The step track: valid keys, recordings of each robot, and stored sources of positions."""
+"""The step `track`: valid keys, recordings of each robot, and stored sources of positions."""
 
 import math
 from dataclasses import replace
@@ -46,7 +46,7 @@ def track(robots: str, during: str = PING) -> TrackStep:
         ("{sender: {at: {frame: map, x: 1, y: 2, lat: 1, lon: 2}}}", "not both"),
     ],
 )
-def test_invalid_keys_are_refused(robots: str, message: str) -> None:
+def test_invalid_keys_are_rejected(robots: str, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
         track(robots)
 
@@ -60,15 +60,15 @@ def test_invalid_keys_are_refused(robots: str, message: str) -> None:
         ("[{{together: {{during: [{TRACK}, {WAIT}]}}}}]", "put them into the track"),
     ],
 )
-def test_invalid_position_in_procedure_is_refused(steps: str, message: str) -> None:
-    inside = f"{{track: {{robots: {{sender: {{topic: /odom, facing: away}}}}, during: [{PING}]}}}}"
+def test_invalid_place_in_the_procedure_is_rejected(steps: str, message: str) -> None:
+    track_step = f"{{track: {{robots: {{sender: {{topic: /odom, facing: away}}}}, during: [{PING}]}}}}"
     text = "name: x\nsummary: x\nscenario: los\ntopology: masterless\nprotocols: [udp]\nrepeats: 1\nsteps: "
-    procedure = text + steps.format(TRACK=inside, WAIT="{wait: {duration: 1s}}")
+    procedure = text + steps.format(TRACK=track_step, WAIT="{wait: {duration: 1s}}")
     with pytest.raises(ConfigurationError, match=message):
         schema.validate(schema.parse(procedure, source="x.yaml"), Procedure)
 
 
-def test_each_robot_records_with_its_recorder_until_stopped() -> None:
+def test_each_robot_records_its_topics_until_the_step_ends() -> None:
     step = track("{sender: {topic: /odom, facing: away}, receiver: {at: {lat: 48.1, lon: 11.5}}}")
     recording, _ = step.jobs(SCENE)
     assert (recording.role, recording.program) == (Role.SENDER, "rosbag")
@@ -124,8 +124,8 @@ def test_stored_source_has_start_and_heading(role: Role, facing: str, heading_ra
 
 
 @pytest.mark.motion
-def test_moving_robot_without_source_has_no_position_and_fixed_one_is_stored() -> None:
+def test_a_moving_robot_without_a_source_has_no_position_and_a_fixed_position_is_stored() -> None:
     sources = sources_of(track("{receiver: {at: {lat: 48.1, lon: 11}}}", MOVE))
     assert sources == {Role.RECEIVER: PositionSource(place=(48.1, 11.0, None), frame=WGS84)}
-    fixed = track("{receiver: {at: {frame: map, x: 1, y: 2.5}}}")
-    assert sources_of(fixed)[Role.RECEIVER] == PositionSource(place=(1.0, 2.5, 0.0), frame="frame map")
+    fixed_track = track("{receiver: {at: {frame: map, x: 1, y: 2.5}}}")
+    assert sources_of(fixed_track)[Role.RECEIVER] == PositionSource(place=(1.0, 2.5, 0.0), frame="frame map")

@@ -29,7 +29,7 @@ from tests.trial.check.test_check_judges import (
 )
 
 
-def probed(sections: Sections) -> ProbeResult:
+def probe_result(sections: Sections) -> ProbeResult:
     return ProbeResult(sections, variants.expected(TURTLEBOT))
 
 
@@ -40,7 +40,7 @@ def test_a_robot_without_ros_needs_no_recorder_and_no_topic() -> None:
     sections = installed(plan)
     assert {finding.status for finding in judge_all(sections, plan)} == {OK}
     assert not any("ros" in " ".join(argv) for argv in software.commands(plan, Role.SENDER).values())
-    assert topic_check.can_record(plan, Role.SENDER, probed(sections))
+    assert topic_check.can_record(plan, Role.SENDER, probe_result(sections))
     assert topic_check.battery_of(robot) == ""
     assert topic_check.required_topics(plan, Role.SENDER) == ()
 
@@ -52,37 +52,39 @@ def test_a_recording_on_a_robot_without_ros_is_rejected() -> None:
         plan.scenes()
 
 
-def test_a_setup_file_that_is_missing_is_one_failure() -> None:
+def test_a_missing_setup_file_is_one_failure() -> None:
     missing = "bash: line 1: /opt/ros/noetic/setup.bash: No such file or directory"
     sections = installed() | {"ROS": CommandResult(missing, 1), "program rosbag": CommandResult(missing, 1)}
     (failed,) = [finding for finding in judge_all(sections) if finding.status is not OK]
     assert (failed.check, failed.detail) == ("ROS", missing)
-    assert not topic_check.can_record(PLAN, Role.SENDER, probed(sections))
-    assert topic_check.can_record(PLAN, Role.RECEIVER, probed({})), "without a recording nothing is needed"
+    assert not topic_check.can_record(PLAN, Role.SENDER, probe_result(sections))
+    assert topic_check.can_record(PLAN, Role.RECEIVER, probe_result({})), (
+        "a robot without recordings needs no recorder"
+    )
 
 
 def test_ros_1_without_a_master_is_a_warning() -> None:
-    (warned,) = [
+    (warning,) = [
         finding
         for finding in judge_all(installed() | {"ROS": CommandResult("noetic", 0)})
         if finding.status is not OK
     ]
-    assert "ROS_MASTER_URI" in warned.detail
+    assert "ROS_MASTER_URI" in warning.detail
 
 
-def required_topics(count: int, span_s: float) -> RecordingContents:
+def recorded_scans(count: int, span_s: float) -> RecordingContents:
     return RecordingContents(count, 0, span_s, MappingProxyType({"/scan": count}))
 
 
 @pytest.mark.parametrize(
     ("bag", "status"),
     [
-        (required_topics(10, 1.8), OK),
-        (required_topics(8, 1.5), OK),
-        (required_topics(2, 1.9), WARN),
-        (required_topics(30, 1.9), WARN),
-        (required_topics(1, 0.0), OK),
-        (required_topics(0, 0.0), FAIL),
+        (recorded_scans(10, 1.8), OK),
+        (recorded_scans(8, 1.5), OK),
+        (recorded_scans(2, 1.9), WARN),
+        (recorded_scans(30, 1.9), WARN),
+        (recorded_scans(1, 0.0), OK),
+        (recorded_scans(0, 0.0), FAIL),
         (None, FAIL),
     ],
 )
@@ -104,15 +106,15 @@ def test_a_check_records_long_enough_for_the_slowest_topic() -> None:
     assert topic_check.required_topics(PLAN, Role.SENDER) == ("/scan",)
     assert topic_check.required_topics(PLAN, Role.RELAY) == ()
     assert topic_check.recording(Role.SENDER, SENDER, ["/scan"]).duration == topic_check.RECORD_S
-    assert topic_check.recording(Role.RELAY, RELAY, ["/pidrone/battery"]).duration == 2.0, "two messages of 1 Hz"
+    assert topic_check.recording(Role.RELAY, RELAY, ["/pidrone/battery"]).duration == 2.0, "two messages at 1 Hz"
     topic = ros_of(RELAY.profile).topics[0].model_copy(update={"name": "/slow", "rate": 0.2})
     ros = ros_of(RELAY.profile).model_copy(update={"topics": (topic,)})
-    slow = RELAY.model_copy(update={"profile": RELAY.profile.model_copy(update={"ros": ros})})
-    assert topic_check.recording(Role.RELAY, slow, ["/slow"]).duration == 10.0
+    slow_robot = RELAY.model_copy(update={"profile": RELAY.profile.model_copy(update={"ros": ros})})
+    assert topic_check.recording(Role.RELAY, slow_robot, ["/slow"]).duration == 10.0
     profile = TURTLEBOT.model_copy(update={"ros": ros_of(TURTLEBOT).model_copy(update={"variant": "ros2"})})
     ros2 = SENDER.model_copy(update={"profile": profile})
     assert topic_check.recording(Role.SENDER, ros2, ["/scan"]).duration == 6.0, (
-        "a recorder that fieldkit ends loads for a while first"
+        "a recorder that fieldkit stops needs additional time to start"
     )
     assert topic_check.battery_of(RELAY) == "/pidrone/battery"
-    assert topic_check.battery_of(slow) == ""
+    assert topic_check.battery_of(slow_robot) == ""

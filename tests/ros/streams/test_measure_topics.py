@@ -38,16 +38,16 @@ def log(sequence: Sequence[int], at_ns: Sequence[int], **changes: int | None) ->
     return TopicLog(samples, is_complete=True, **{**times, **counts, **changes})  # type: ignore[arg-type]
 
 
-def published(count: int) -> TopicLog:
+def publisher_log(count: int) -> TopicLog:
     return log(range(count), [START + EVERY * number for number in range(count)])
 
 
-def arrived(sequence: Sequence[int], delay_ns: int = 2 * MS, ahead_ns: int = 0) -> TopicLog:
+def subscriber_log(sequence: Sequence[int], delay_ns: int = 2 * MS, ahead_ns: int = 0) -> TopicLog:
     return log(sequence, [START + EVERY * number + delay_ns + ahead_ns for number in sequence])
 
 
 def captures(ahead_ns: int = 0, one_way_ns: int = MS // 100) -> tuple[Packets, Packets]:
-    """Ten echoes and their replies; the receiver's clock is ahead by `ahead_ns`."""
+    """The captures of ten echo requests and their replies; the receiver's clock is ahead by `ahead_ns`."""
     publisher, subscriber = [], []
     for number in range(10):
         at_ns = START + number * EVERY
@@ -63,7 +63,7 @@ def captures(ahead_ns: int = 0, one_way_ns: int = MS // 100) -> tuple[Packets, P
     return packets(publisher), packets(subscriber)
 
 
-def measured(sent: TopicLog, received: TopicLog, *captured: Packets | None) -> dict[str, object]:
+def measure(sent: TopicLog, received: TopicLog, *captured: Packets | None) -> dict[str, object]:
     result = topic_columns.measure(FLOW, sent, received, *(captured or (None, None))) | topic_columns.withheld_mark(
         ""
     )
@@ -74,20 +74,20 @@ def measured(sent: TopicLog, received: TopicLog, *captured: Packets | None) -> d
 @given(st.sets(st.integers(0, 49)), st.lists(st.integers(0, 49), max_size=5))
 def test_losses_are_samples_that_never_arrived(lost: set[int], again: list[int]) -> None:
     arrived_numbers = [number for number in range(50) if number not in lost]
-    repeated = [number for number in again if number not in lost]
-    result = measured(published(50), arrived([*arrived_numbers, *repeated]))
+    repeated_numbers = [number for number in again if number not in lost]
+    result = measure(publisher_log(50), subscriber_log([*arrived_numbers, *repeated_numbers]))
     assert (result["topic_sent"], result["topic_received"]) == (50, 50 - len(lost))
     assert result["topic_loss"] == pytest.approx(len(lost) / 50)
-    assert result["topic_repeated"] == len(repeated)
+    assert result["topic_repeated"] == len(repeated_numbers)
 
 
 @pytest.mark.parametrize(
     ("lost", "median_s", "p95_s"), [(0, 2e-3, 2e-3), (2, 2e-3, 2e-3), (3, 2e-3, None), (25, None, None)]
 )
-def test_a_lost_sample_counts_as_latest_in_the_delays_of_all_sent(
+def test_a_lost_sample_counts_as_the_latest_in_the_delays_of_all_sent_samples(
     lost: int, median_s: float | None, p95_s: float | None
 ) -> None:
-    result = measured(published(50), arrived(range(lost, 50)), *captures())
+    result = measure(publisher_log(50), subscriber_log(range(lost, 50)), *captures())
     assert result["topic_delay_median_s"] == pytest.approx(2e-3, rel=1e-3)
     for name, expected in (("median", median_s), ("p95", p95_s)):
         value = result.get(f"topic_delay_{name}_sent_s")
@@ -95,12 +95,12 @@ def test_a_lost_sample_counts_as_latest_in_the_delays_of_all_sent(
 
 
 def test_discovery_is_timed_by_the_publishers_clock() -> None:
-    assert measured(published(3), arrived([0, 1, 2]))["topic_discovery_s"] == 0.5
+    assert measure(publisher_log(3), subscriber_log([0, 1, 2]))["topic_discovery_s"] == 0.5
 
 
 def test_failed_discovery_is_a_measurement() -> None:
-    nothing = replace(log([], []), matched_ns=None)
-    result = measured(nothing, log([], []))
+    unmatched_log = replace(log([], []), matched_ns=None)
+    result = measure(unmatched_log, log([], []))
     assert result == {
         "topic_sent": 0,
         "topic_received": 0,
@@ -114,42 +114,43 @@ def test_failed_discovery_is_a_measurement() -> None:
 
 @pytest.mark.parametrize("ahead_ns", [0, 5 * SECOND, -3600 * SECOND])
 def test_delays_are_corrected_for_the_clock_offset(ahead_ns: int) -> None:
-    result = measured(published(10), arrived(range(10), 2 * MS, ahead_ns), *captures(ahead_ns))
+    result = measure(publisher_log(10), subscriber_log(range(10), 2 * MS, ahead_ns), *captures(ahead_ns))
     assert result["topic_delay_median_s"] == pytest.approx(2e-3, abs=1e-5)
     assert result["topic_delay_max_s"] == pytest.approx(2e-3, abs=1e-5)
     assert result["topic_delay_error_s"] == pytest.approx(1.1e-5, rel=0.5)
     assert result["topic_delay_variation_p95_s"] == 0
     assert result["topic_jitter_s"] == 0
-    # With evenly spaced samples and a constant delay: half a period plus the delay; the peak is a whole period more.
+    # With evenly spaced samples and a constant delay, the mean age is half a period plus the delay, and the peak is a
+    # whole period plus the delay.
     assert result["topic_age_mean_s"] == pytest.approx(0.05 + 2e-3, abs=1e-5)
     assert result["topic_age_peak_s"] == pytest.approx(0.1 + 2e-3, abs=1e-5)
 
 
 def test_a_delay_below_the_clock_error_is_withheld() -> None:
-    result = measured(published(10), arrived(range(10), 2 * MS), *captures(one_way_ns=MS))
+    result = measure(publisher_log(10), subscriber_log(range(10), 2 * MS), *captures(one_way_ns=MS))
     assert "topic_delay_median_s" not in result
     assert result["topic_delay_error_s"] == pytest.approx(1e-3, rel=0.1)
     assert result["topic_age_mean_s"] == pytest.approx(0.052, abs=1e-3)
 
 
-def test_with_a_single_packet_back_there_is_no_delay() -> None:
+def test_with_a_single_packet_from_the_receiver_there_is_no_delay() -> None:
     """No other packet confirms its time, so the error of the clock offset is unlimited."""
     publisher, subscriber = captures()
     back = np.flatnonzero(publisher.are_from(FLOW.receiver_address))
     publisher = publisher.where(np.setdiff1d(np.arange(len(publisher)), back[1:]))
-    result = measured(published(10), arrived(range(10), 2 * MS), publisher, subscriber)
+    result = measure(publisher_log(10), subscriber_log(range(10), 2 * MS), publisher, subscriber)
     assert not {name for name in result if "delay_m" in name or "error" in name or "age" in name}
     assert result["topic_delay_variation_p95_s"] == 0
 
 
 def test_without_captures_there_is_no_delay() -> None:
-    result = measured(published(10), arrived(range(10)))
+    result = measure(publisher_log(10), subscriber_log(range(10)))
     assert not {name for name in result if "delay_m" in name or "age" in name}
     assert result["topic_jitter_s"] == 0
 
 
-def test_age_of_late_and_reordered_samples() -> None:
-    """Sent at 0, 1, 2 and 3 s; the third overtakes the second, which then does not reduce the age."""
+def test_late_and_reordered_samples_do_not_reduce_the_age() -> None:
+    """The samples are sent at 0, 1, 2 and 3 s. The third overtakes the second, which then does not reduce the age."""
     at_s, delay_s = np.array([0.5, 2.5, 2.75, 3.5]), np.array([0.5, 0.5, 1.75, 0.5])
     mean_s, peak_s = topic_columns.age_s(at_s, delay_s)
     # The age rises from 0.5 to 2.5 in 2 s, drops to 0.5 and rises to 1.5 in 1 s.
@@ -164,7 +165,7 @@ def test_the_mean_age_is_the_area_under_the_sawtooth(gaps: list[float], delays: 
     mean_s, _ = topic_columns.age_s(at_s, delay_s)
     if mean_s is None:
         return
-    # The age at times in between: time since the newest arrived sample was sent.
+    # The age at a time is the time since the newest arrived sample was sent.
     newest_s = np.maximum.accumulate(at_s - delay_s)
     fresh = np.concatenate(([True], newest_s[1:] > newest_s[:-1]))
     moments = np.linspace(at_s[0], at_s[fresh][-1], 20_001)[:-1] + (at_s[fresh][-1] - at_s[0]) / 40_000
@@ -181,38 +182,38 @@ def test_each_deadline_without_a_sample_is_missed(at_ms: list[int], missed: int)
 
 
 def test_traffic_is_identified_by_its_ports() -> None:
-    both = [datagram(1, 100, port=DATA), datagram(2, 100, port=DATA, sport=DISCOVERY), datagram(3, 3000, port=DATA)]
+    data = [datagram(1, 100, port=DATA), datagram(2, 100, port=DATA, sport=DISCOVERY), datagram(3, 3000, port=DATA)]
     discovery = [datagram(4, 60, port=DISCOVERY), datagram(5, 60, port=DISCOVERY, sport=DATA)]
     others = [datagram(6, 60), [ipv4(bytes(8), protocol=1, ip_id=7)], [ipv4(b"", protocol=1, size=99, offset=1480)]]
-    frames = [Frame(START, packet) for group in (*both, *discovery, *others) for packet in group]
-    result = measured(published(2), arrived([0, 1]), packets(frames), packets(frames))
-    # 3,008 bytes over UDP are three fragments.
+    frames = [Frame(START, packet) for group in (*data, *discovery, *others) for packet in group]
+    result = measure(publisher_log(2), subscriber_log([0, 1]), packets(frames), packets(frames))
+    # 3,008 bytes of UDP are three fragments.
     assert (result["topic_data_packets"], result["topic_discovery_packets"]) == (5, 2)
     sizes = sum(len(packet) for group in discovery for packet in group)
     assert result["topic_discovery_bytes"] == sizes
 
 
 def test_data_packets_missing_at_the_subscriber_are_lost() -> None:
-    """Each fragment separately; replies, discovery and TCP packets are not data packets of the topic."""
+    """Each fragment is counted separately; packets of replies and of the discovery are not data packets."""
     data = [packet for number in (1, 2) for packet in datagram(number, 3000, port=DATA)]
     others = [*datagram(3, 60, port=DISCOVERY), ipv4(bytes(8), protocol=17, ip_id=4, src=RECEIVER, dst=SENDER)]
     sent_frames = [Frame(START + number * MS, packet) for number, packet in enumerate((*data, *others))]
     lost = [1, 5, 6]
     received_frames = [frame for number, frame in enumerate(sent_frames) if number not in lost]
     assert len(data) == 6
-    result = measured(published(2), arrived([0]), packets(sent_frames), packets(received_frames))
+    result = measure(publisher_log(2), subscriber_log([0]), packets(sent_frames), packets(received_frames))
     assert result["topic_packet_loss"] == pytest.approx(2 / 6)
 
 
 def test_without_udp_packets_there_is_no_packet_loss() -> None:
-    assert "topic_packet_loss" not in measured(published(2), arrived([0]), *captures())
+    assert "topic_packet_loss" not in measure(publisher_log(2), subscriber_log([0]), *captures())
 
 
 @pytest.mark.parametrize("seed", range(12))
 def test_two_streams_of_one_pair_have_separate_fragments(seed: int) -> None:
-    """Datagrams fragmented by scapy; ids repeat in both streams, in replies, and in unfragmented packets."""
+    """scapy fragments the datagrams; ids repeat in both streams, in replies and in unfragmented packets."""
     draw = random.Random(seed)
-    cut: list[tuple[int, list[IP]]] = []
+    fragments_by_port: list[tuple[int, list[IP]]] = []
     for number in range(30):
         port, size = draw.choice([DATA, OTHER_DATA]), draw.choice([100, 3000, 9000])
         src, dst = (SENDER, RECEIVER) if draw.random() < 0.8 else (RECEIVER, SENDER)
@@ -221,13 +222,19 @@ def test_two_streams_of_one_pair_have_separate_fragments(seed: int) -> None:
             / UDP(sport=port, dport=port)
             / bytes(draw.randrange(256) for _ in range(size))
         )
-        cut.append((port, fragment(expected, 1480)))  # type: ignore[no-untyped-call]
-        if draw.random() < 0.3:  # between two fragments packet_port the last packet
-            alone = IP(src=SENDER, dst=RECEIVER, id=number % 3, flags="DF") / UDP(sport=OTHER_DATA, dport=OTHER_DATA)
-            cut[-1:] = [(port, cut[-1][1][:1]), (OTHER_DATA, [alone]), (port, cut[-1][1][1:])]
+        fragments_by_port.append((port, fragment(expected, 1480)))  # type: ignore[no-untyped-call]
+        if draw.random() < 0.3:  # this packet is between two fragments of the last datagram
+            unfragmented = IP(src=SENDER, dst=RECEIVER, id=number % 3, flags="DF") / UDP(
+                sport=OTHER_DATA, dport=OTHER_DATA
+            )
+            fragments_by_port[-1:] = [
+                (port, fragments_by_port[-1][1][:1]),
+                (OTHER_DATA, [unfragmented]),
+                (port, fragments_by_port[-1][1][1:]),
+            ]
     sent = [
         (START + MS * at, *packet)
-        for at, packet in enumerate((port, packet) for port, each in cut for packet in each)
+        for at, packet in enumerate((port, packet) for port, fragments in fragments_by_port for packet in fragments)
     ]
     received = [packet for packet in sent if draw.random() < 0.8]
     publisher, subscriber = (
@@ -247,12 +254,12 @@ def test_two_streams_of_one_pair_have_separate_fragments(seed: int) -> None:
 
 
 def test_only_columns_that_need_the_captures_are_withheld() -> None:
-    without = topic_columns.measure(FLOW, published(10), arrived(range(10)), None, None)
-    reasons = topic_columns.withheld_reasons(without, "packets were dropped")
-    assert set(reasons) == without.missing.keys() - {"topic_deadline_misses"}
+    without_captures = topic_columns.measure(FLOW, publisher_log(10), subscriber_log(range(10)), None, None)
+    reasons = topic_columns.withheld_reasons(without_captures, "packets were dropped")
+    assert set(reasons) == without_captures.missing.keys() - {"topic_deadline_misses"}
     assert set(reasons.values()) == {"packets were dropped"}
-    assert without.values.keys() >= {"topic_loss", "topic_jitter_s", "topic_delay_variation_p95_s"}
-    assert topic_columns.withheld_reasons(without, "") == {}
+    assert without_captures.values.keys() >= {"topic_loss", "topic_jitter_s", "topic_delay_variation_p95_s"}
+    assert topic_columns.withheld_reasons(without_captures, "") == {}
     assert topic_columns.withheld_mark("packets were dropped").values == {
         "topic_capture_withheld": "packets were dropped"
     }

@@ -1,4 +1,4 @@
-"""Logs of a topic compared with each other and with the captures: every change in one of them is noticed."""
+"""Logs of a topic are compared with each other and with the captures, which reveals every change in one of them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -36,13 +36,13 @@ def is_sample(row: Row) -> bool:
 
 
 def with_samples(rows: Sequence[Row], change: Callable[[int, Row], Row | None]) -> tuple[Row, ...]:
-    """Return rows in which each sample is replaced by `change(index, row)`, or removed if that is None."""
+    """Return rows in which each sample is replaced by `change(index, row)`, or removed if the result is None."""
     samples = [row for row in rows if is_sample(row)]
-    changed = [change(place, row) for place, row in enumerate(samples)]
-    return (*(row for row in rows if not is_sample(row)), *(row for row in changed if row is not None))
+    changed_samples = [change(index, row) for index, row in enumerate(samples)]
+    return (*(row for row in rows if not is_sample(row)), *(row for row in changed_samples if row is not None))
 
 
-def changed(attempt: TopicAttempt, end: str, rows: Sequence[Row]) -> TopicAttempt:
+def with_rows(attempt: TopicAttempt, end: str, rows: Sequence[Row]) -> TopicAttempt:
     return replace(attempt, sent=tuple(rows)) if end == "sent" else replace(attempt, received=tuple(rows))
 
 
@@ -50,8 +50,8 @@ def later(row: Row, by_ns: int) -> Row:
     return (*row[:4], row[4] + by_ns)
 
 
-def require_noticed(reasons: list[str], measured: Measured, before: Measured) -> None:
-    """Require that an attempt is void, or that every column is as before or withheld."""
+def assert_detected(reasons: list[str], measured: Measured, before: Measured) -> None:
+    """Assert that an attempt is void, or that every column has its previous value or is withheld."""
     if reasons:
         return
     for name, value in before.values.items():
@@ -69,7 +69,7 @@ def require_noticed(reasons: list[str], measured: Measured, before: Measured) ->
 def test_a_valid_attempt_has_no_contradiction(kind: str, signed: bool, tmp_path: Path) -> None:
     reasons, measured = topic_attempts.judge_attempt(KINDS[kind], tmp_path, signed=signed)
     assert reasons == []
-    # The fastest packet took 1 ms and its record 0.2 ms; the slowest took 84 us more.
+    # The fastest packet took 1 ms, its record 0.2 ms, and the slowest packet 84 us more.
     assert measured.values["topic_delay_median_s"] == pytest.approx(1.24e-3, abs=6e-5)
 
 
@@ -79,22 +79,22 @@ SHIFTS = (HOUR, -HOUR, 50 * MS, -50 * MS, 10 * MS, -2 * MS, SECOND)
 
 @pytest.mark.parametrize("shift_ns", SHIFTS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_log_with_shifted_arrivals_is_noticed(kind: str, shift_ns: int, tmp_path: Path) -> None:
+def test_a_log_with_shifted_arrivals_is_detected(kind: str, shift_ns: int, tmp_path: Path) -> None:
     attempt = KINDS[kind]
     received = with_samples(attempt.received, lambda _, row: later(row, shift_ns))
     reasons, _ = topic_attempts.judge_attempt(replace(attempt, received=received), tmp_path)
     assert reasons
-    which = "earlier than their packets" if shift_ns < 0 else "later than its capture for every sample"
-    which = "from before its start or after its end" if abs(shift_ns) == HOUR else which
-    assert which in reasons[0]
+    reason = "earlier than their packets" if shift_ns < 0 else "later than its capture for every sample"
+    reason = "from before its start or after its end" if abs(shift_ns) == HOUR else reason
+    assert reason in reasons[0]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_log_without_half_of_the_arrivals_is_noticed(kind: str, tmp_path: Path) -> None:
+def test_a_log_without_half_of_the_arrivals_is_detected(kind: str, tmp_path: Path) -> None:
     attempt = KINDS[kind]
     received = with_samples(attempt.received, lambda place, row: row if place % 2 else None)
     reasons, _ = topic_attempts.judge_attempt(replace(attempt, received=received), tmp_path)
-    if kind == "reliable with samples given up":  # nothing behind a gap need ever be handed over
+    if kind == "reliable with samples given up":  # samples after a gap need not be delivered to the program
         assert reasons
         return
     assert "arrived according to the subscriber's capture, but are not in the subscriber's log" in reasons[0]
@@ -121,7 +121,7 @@ def other_sending(place: int, row: Row) -> Row:
     ],
 )
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_subscribers_log_with_one_wrong_field_is_noticed(
+def test_a_wrong_field_in_the_subscribers_log_is_detected(
     kind: str, change: Callable[[int, Row], Row], expected_reason: str, tmp_path: Path
 ) -> None:
     attempt = replace(KINDS[kind], received=with_samples(KINDS[kind].received, change))
@@ -138,7 +138,7 @@ def test_a_subscribers_log_with_one_wrong_field_is_noticed(
         (lambda place, row: row if place < 30 else None, "accounts for 30 instead of 40 samples"),
     ],
 )
-def test_a_publishers_log_with_one_wrong_field_is_noticed(
+def test_a_wrong_field_in_the_publishers_log_is_detected(
     change: Callable[[int, Row], Row | None], expected_reason: str, tmp_path: Path
 ) -> None:
     attempt = KINDS["best effort with losses"]
@@ -146,16 +146,16 @@ def test_a_publishers_log_with_one_wrong_field_is_noticed(
     assert any(expected_reason in reason for reason in reasons)
 
 
-def test_the_same_change_in_both_logs_is_noticed_by_the_captures(tmp_path: Path) -> None:
+def test_the_captures_reveal_the_same_change_in_both_logs(tmp_path: Path) -> None:
     attempt = KINDS["reliable over UDP"]
 
     def earlier(_: int, row: Row) -> Row:
         return (*row[:3], row[3] - 30 * MS, row[4])
 
-    both = replace(
+    changed_attempt = replace(
         attempt, sent=with_samples(attempt.sent, earlier), received=with_samples(attempt.received, earlier)
     )
-    reasons, _ = topic_attempts.judge_attempt(both, tmp_path)
+    reasons, _ = topic_attempts.judge_attempt(changed_attempt, tmp_path)
     assert any("different times of sending" in reason for reason in reasons)
 
 
@@ -171,7 +171,7 @@ def test_the_publishers_log_is_not_accepted_as_the_subscribers(signed: bool, tmp
     assert ("the subscriber's log was written by the publisher of the topic" in reasons) is signed
 
 
-def test_the_log_of_another_topic_is_noticed(tmp_path: Path) -> None:
+def test_the_log_of_another_topic_is_detected(tmp_path: Path) -> None:
     topic_attempts.write(KINDS["over TCP"], tmp_path)
     sent, received = (topic_samples.read_log(tmp_path / f"{role}-topic.bin") for role in ("sender", "receiver"))
     (publisher, subscriber) = topic_checks.check_logs(replace(PLAN, topic="/other"), sent, received)
@@ -179,7 +179,7 @@ def test_the_log_of_another_topic_is_noticed(tmp_path: Path) -> None:
     assert "subscriber's log is of another topic" in subscriber
 
 
-def test_a_record_from_outside_the_attempt_is_noticed(tmp_path: Path) -> None:
+def test_a_record_from_before_or_after_the_attempt_is_detected(tmp_path: Path) -> None:
     topic_attempts.write(KINDS["over TCP"], tmp_path)
     log = topic_samples.read_log(tmp_path / "sender-topic.bin")
     role = Role.SENDER
@@ -193,19 +193,19 @@ def test_a_record_from_outside_the_attempt_is_noticed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_samples_in_the_log_that_never_arrived_are_noticed(kind: str, tmp_path: Path) -> None:
-    """The subscriber's capture lacks ten samples that are in its log."""
+def test_samples_in_the_log_that_never_arrived_are_detected(kind: str, tmp_path: Path) -> None:
+    """The subscriber's capture does not contain ten samples that are in its log."""
     attempt = KINDS[kind]
-    few = replace(
+    incomplete_attempt = replace(
         attempt,
         receiver_frames=tuple(frame for frame in attempt.receiver_frames if not is_data(frame) or frame.time_ns % 4),
     )
-    sent_again = [row for row in attempt.sent if is_sample(row)]
-    arrived = {row[2] for row in attempt.received if is_sample(row)}
-    extra = [later(row, topic_attempts.AHEAD + 2 * MS) for row in sent_again if row[2] not in arrived]
+    sent_samples = [row for row in attempt.sent if is_sample(row)]
+    arrived_numbers = {row[2] for row in attempt.received if is_sample(row)}
+    extra = [later(row, topic_attempts.AHEAD + 2 * MS) for row in sent_samples if row[2] not in arrived_numbers]
     received = tuple(sorted((*attempt.received, *extra), key=lambda row: row[4]))
     if extra:
-        reasons, _ = topic_attempts.judge_attempt(replace(few, received=received), tmp_path)
+        reasons, _ = topic_attempts.judge_attempt(replace(incomplete_attempt, received=received), tmp_path)
         assert any("are not in its capture" in reason for reason in reasons)
 
 
@@ -213,43 +213,46 @@ def is_data(frame: Frame) -> bool:
     return len(frame.data) > 200
 
 
-def test_an_overflowed_queue_is_no_contradiction(tmp_path: Path) -> None:
-    """The program stopped for 15 samples; its queue of 10 has the newest."""
+def test_an_overflowed_queue_is_not_a_contradiction(tmp_path: Path) -> None:
+    """The program was suspended for 15 samples; its queue of 10 has the newest."""
     attempt = KINDS["reliable over UDP"]
-    resumed = next(row for place, row in enumerate(filter(is_sample, attempt.received)) if place == 30)[4]
+    resumed_ns = next(row for place, row in enumerate(filter(is_sample, attempt.received)) if place == 30)[4]
 
-    def delayed(place: int, row: Row) -> Row | None:
+    def delay_sample(place: int, row: Row) -> Row | None:
         if not 15 <= place < 30:
             return row
-        return None if place < 20 else (*row[:4], resumed - MS)
+        return None if place < 20 else (*row[:4], resumed_ns - MS)
 
     reasons, measured = topic_attempts.judge_attempt(
-        replace(attempt, received=with_samples(attempt.received, delayed)), tmp_path
+        replace(attempt, received=with_samples(attempt.received, delay_sample)), tmp_path
     )
     assert reasons == []
     assert measured.values["topic_received"] == SAMPLES - 5
     assert "its program was delayed" in measured.missing["topic_delay_max_s"]
 
 
-def test_a_capture_without_heads_limits_the_number_of_arrivals(tmp_path: Path) -> None:
-    """As with the shorter snap length of older captures: Zenoh's heads were not captured."""
+def test_a_capture_without_sample_headers_limits_the_number_of_arrivals(tmp_path: Path) -> None:
+    """Older captures have a shorter snap length, so they do not contain the headers of samples over Zenoh."""
     attempt = KINDS["over TCP"]
-    cut = replace(
-        attempt, sender_frames=shorter(attempt.sender_frames), receiver_frames=shorter(attempt.receiver_frames)
+    truncated_attempt = replace(
+        attempt,
+        sender_frames=truncate_frames(attempt.sender_frames),
+        receiver_frames=truncate_frames(attempt.receiver_frames),
     )
-    assert topic_attempts.judge_attempt(cut, tmp_path)[0] == []
-    early = with_samples(attempt.received, lambda _, row: later(row, -20 * MS))
+    assert topic_attempts.judge_attempt(truncated_attempt, tmp_path)[0] == []
+    early_rows = with_samples(attempt.received, lambda _, row: later(row, -20 * MS))
     assert (
         "earlier than their bytes in its capture"
-        in topic_attempts.judge_attempt(replace(cut, received=early), tmp_path)[0][0]
+        in topic_attempts.judge_attempt(replace(truncated_attempt, received=early_rows), tmp_path)[0][0]
     )
-    few = with_samples(attempt.received, lambda place, row: row if place < 8 else None)
+    few_rows = with_samples(attempt.received, lambda place, row: row if place < 8 else None)
     assert (
-        "are not in the subscriber's log" in topic_attempts.judge_attempt(replace(cut, received=few), tmp_path)[0][0]
+        "are not in the subscriber's log"
+        in topic_attempts.judge_attempt(replace(truncated_attempt, received=few_rows), tmp_path)[0][0]
     )
 
 
-def shorter(frames: Sequence[Frame]) -> tuple[Frame, ...]:
+def truncate_frames(frames: Sequence[Frame]) -> tuple[Frame, ...]:
     return tuple(
         replace(frame, data=frame.data[:100], wire_bytes=frame.wire_bytes or len(frame.data)) for frame in frames
     )
@@ -266,7 +269,7 @@ def shorter(frames: Sequence[Frame]) -> tuple[Frame, ...]:
 )
 @example(kind="over TCP", end="received", field=4, some=(0, 5), by=35 * MS)
 @example(kind="reliable with samples given up", end="received", field=4, some=(15, 24), by=SECOND)
-def test_a_change_in_any_range_of_a_field_is_noticed(
+def test_a_change_in_any_range_of_a_field_is_detected(
     kind: str, end: str, field: int, some: tuple[int, int], by: int, *, folder: Path
 ) -> None:
     attempt, (first, count) = KINDS[kind], some
@@ -277,10 +280,10 @@ def test_a_change_in_any_range_of_a_field_is_noticed(
         row[field] = row[field] + by if field else by % 7 + 1
         rows[place] = (row[0], abs(row[1]) % 2**32, row[2], row[3], row[4])
     try:
-        reasons, measured = topic_attempts.judge_attempt(changed(attempt, end, rows), folder)
+        reasons, measured = topic_attempts.judge_attempt(with_rows(attempt, end, rows), folder)
     except EvidenceError:
         return
-    require_noticed(reasons, measured, before)
+    assert_detected(reasons, measured, before)
 
 
 @given(
@@ -289,7 +292,7 @@ def test_a_change_in_any_range_of_a_field_is_noticed(
     chosen=st.sets(st.integers(0, SAMPLES + 1), min_size=1),
     twice=st.booleans(),
 )
-def test_missing_or_duplicated_records_are_noticed(
+def test_missing_or_duplicated_records_are_detected(
     kind: str, end: str, chosen: set[int], twice: bool, folder: Path
 ) -> None:
     attempt = KINDS[kind]
@@ -301,14 +304,14 @@ def test_missing_or_duplicated_records_are_noticed(
     repeated_rows = tuple(row for row, count in zip(rows, times, strict=True) for _ in range(count))
     if not repeated_rows:
         return
-    reasons, measured = topic_attempts.judge_attempt(changed(attempt, end, repeated_rows), folder)
+    reasons, measured = topic_attempts.judge_attempt(with_rows(attempt, end, repeated_rows), folder)
     if kind == "reliable with samples given up" and end == "received" and not twice:
-        return  # behind a gap nothing shows whether the middleware handed a sample over
-    require_noticed(reasons, measured, before)
+        return  # after a gap, it is unknown if the middleware delivered a sample
+    assert_detected(reasons, measured, before)
 
 
 @given(end=st.sampled_from(["sender", "receiver"]), place=st.integers(0), bit=st.integers(0, 7))
-def test_a_flipped_bit_in_a_log_with_a_checksum_is_noticed(end: str, place: int, bit: int, folder: Path) -> None:
+def test_a_flipped_bit_in_a_log_with_a_checksum_is_detected(end: str, place: int, bit: int, folder: Path) -> None:
     attempt = KINDS["over TCP"]
     topic_attempts.write(attempt, folder)
     path = folder / f"{end}-topic.bin"
@@ -319,7 +322,7 @@ def test_a_flipped_bit_in_a_log_with_a_checksum_is_noticed(end: str, place: int,
         log = topic_samples.read_log(path)
     except EvidenceError:
         return
-    assert not log.is_complete, "a changed log passes for whole"
+    assert not log.is_complete, "a changed log is accepted as complete"
 
 
 def test_constants_equal_those_of_the_agent() -> None:
@@ -331,6 +334,6 @@ def test_constants_equal_those_of_the_agent() -> None:
 
 
 def test_every_time_of_a_topic_is_compared_with_the_capture() -> None:
-    """Columns added later are included."""
+    """The test includes columns that are added later."""
     times = {column.name for column in topic_columns.COLUMNS if column.name.endswith("_s")} - {"topic_discovery_s"}
     assert times | {"topic_deadline_misses"} == topic_captures.PROGRAM_DELAY_FIGURES.keys()

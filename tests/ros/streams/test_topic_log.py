@@ -1,4 +1,4 @@
-"""Logs of topics written by the agent, and damaged in each way that is possible on a robot."""
+"""Logs of topics that the agent writes, with all kinds of damage that are possible on a robot."""
 
 from pathlib import Path
 
@@ -37,7 +37,7 @@ def test_logs_of_the_agent_are_read(tmp_path: Path) -> None:
     assert parsed.samples.at_ns.tolist() == [105, 115, 125]
 
 
-def test_a_truncated_log_has_its_earlier_records_and_no_end(tmp_path: Path) -> None:
+def test_a_truncated_log_has_its_earlier_records_and_is_incomplete(tmp_path: Path) -> None:
     log = write_log(tmp_path / "log")
     for length in range(len(records.MAGIC), len(log)):
         (tmp_path / "cut").write_bytes(log[:length])
@@ -49,8 +49,8 @@ def test_a_truncated_log_has_its_earlier_records_and_no_end(tmp_path: Path) -> N
 def test_a_log_with_a_wrong_count_is_rejected(tmp_path: Path) -> None:
     log, size = write_log(tmp_path / "log"), topic_samples.RECORD_BYTES
     start = len(records.MAGIC) + 2 * size
-    for damaged in (log[:start] + log[start + size :], log + log[-size:]):
-        (tmp_path / "log").write_bytes(damaged)
+    for damaged_log in (log[:start] + log[start + size :], log + log[-size:]):
+        (tmp_path / "log").write_bytes(damaged_log)
         with pytest.raises(EvidenceError, match="does not have the number of samples"):
             topic_samples.read_log(tmp_path / "log")
 
@@ -59,7 +59,7 @@ def test_a_log_with_a_wrong_count_is_rejected(tmp_path: Path) -> None:
 def test_zeros_after_the_last_record_are_ignored(
     zeros: int, has_end: bool, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    """A killed writer leaves zeros: between two records, or between its last record and the end of the file."""
+    """A killed writer leaves zeros between two records, or between its last record and the end of the file."""
     log = tmp_path_factory.getbasetemp() / "zeros"
     content = write_log(log)
     log.write_bytes(content[: None if has_end else -topic_samples.RECORD_BYTES] + bytes(zeros))

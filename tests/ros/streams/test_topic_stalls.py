@@ -1,4 +1,4 @@
-"""Stalls of topics, from logs with known gaps."""
+"""Stalls of topics in logs with known gaps."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -13,13 +13,13 @@ from fieldkit.measure.transfers import stalls
 from fieldkit.measure.transfers.deliveries import FlowSchedule
 from fieldkit.ros.streams import topic_stalls
 from fieldkit.ros.streams.topic_samples import TopicLog
-from tests.ros.streams.test_measure_topics import FLOW, arrived, captures, log, published
+from tests.ros.streams.test_measure_topics import FLOW, captures, log, publisher_log, subscriber_log
 
 EXPECTED = FlowSchedule(interval_s=0.1, duration_s=9.9)
 SECOND = 1_000_000_000
 
 
-def measured(sent: TopicLog | None, received: TopicLog | None, **changes: Any) -> dict[str, Any]:  # noqa: ANN401
+def measure(sent: TopicLog | None, received: TopicLog | None, **changes: Any) -> dict[str, Any]:  # noqa: ANN401
     publisher, subscriber = captures()
     schedule = replace(EXPECTED, **changes)
     result = topic_stalls.measure(FLOW, (sent, received), (publisher, subscriber), schedule)
@@ -30,19 +30,19 @@ def measured(sent: TopicLog | None, received: TopicLog | None, **changes: Any) -
 @given(st.sets(st.integers(1, 98), max_size=95))
 def test_consecutive_lost_samples_are_overdue_by_one_interval_each(lost: set[int]) -> None:
     arrived_numbers = [number for number in range(100) if number not in lost]
-    result = measured(published(100), arrived(arrived_numbers))
+    result = measure(publisher_log(100), subscriber_log(arrived_numbers))
     overdue_s = [(later - earlier - 1) * 0.1 for earlier, later in pairwise(arrived_numbers)]
     assert result["stall_s"] == pytest.approx(max(overdue_s), abs=1e-6)
     assert result["stalls"] == sum(duration_s > 0.30001 for duration_s in overdue_s)
 
 
 def test_repeated_or_late_samples_are_counted_once() -> None:
-    assert measured(published(100), arrived([*range(100), *range(50)]))["stalls"] == 0
+    assert measure(publisher_log(100), subscriber_log([*range(100), *range(50)]))["stalls"] == 0
 
 
 @pytest.mark.parametrize(("last", "bound_s"), [(0, 9.8), (49, 4.9), (97, None), (99, None)])
 def test_a_topic_that_never_recovered_has_a_lower_bound(last: int, bound_s: float | None) -> None:
-    result = measured(published(100), arrived(list(range(last + 1))))
+    result = measure(publisher_log(100), subscriber_log(list(range(last + 1))))
     if bound_s is None:
         assert result == {"stall_s": pytest.approx(0.0), "stalls": 0}
     else:
@@ -50,34 +50,39 @@ def test_a_topic_that_never_recovered_has_a_lower_bound(last: int, bound_s: floa
 
 
 def test_a_publisher_that_stopped_writing_has_stalled() -> None:
-    result = measured(published(50), arrived(list(range(50))))
+    result = measure(publisher_log(50), subscriber_log(list(range(50))))
     assert result == {"stall_at_least_s": pytest.approx(4.9), "stalls": 1}
 
 
-def test_a_topic_of_which_nothing_arrived_has_a_lower_bound() -> None:
-    assert measured(published(100), log([], [])) == {"stall_at_least_s": pytest.approx(9.9), "stalls": 1}
+def test_a_topic_without_arrivals_has_a_lower_bound() -> None:
+    assert measure(publisher_log(100), log([], [])) == {"stall_at_least_s": pytest.approx(9.9), "stalls": 1}
 
 
-def test_a_subscription_that_received_nothing_at_first_has_stalled() -> None:
-    assert measured(published(100), arrived(list(range(30, 100)))) == {"stall_s": pytest.approx(3.0), "stalls": 1}
+def test_a_subscription_without_its_first_samples_has_stalled() -> None:
+    assert measure(publisher_log(100), subscriber_log(list(range(30, 100)))) == {
+        "stall_s": pytest.approx(3.0),
+        "stalls": 1,
+    }
 
 
 def test_a_clock_that_was_set_is_rejected() -> None:
-    received = arrived(list(range(100)))
+    received = subscriber_log(list(range(100)))
     at_ns = received.samples.at_ns + np.where(received.samples.sequence >= 50, -10 * SECOND, 0)
-    assert not measured(published(100), replace(received, samples=replace(received.samples, at_ns=at_ns)))
+    assert not measure(publisher_log(100), replace(received, samples=replace(received.samples, at_ns=at_ns)))
     publisher, subscriber = captures()
     forward = replace(
         subscriber,
         time_ns=subscriber.time_ns + 3600 * SECOND * (np.arange(len(subscriber)) > len(subscriber) // 2),
     )
-    result = topic_stalls.measure(FLOW, (published(100), arrived(list(range(100)))), (publisher, forward), EXPECTED)
+    result = topic_stalls.measure(
+        FLOW, (publisher_log(100), subscriber_log(list(range(100)))), (publisher, forward), EXPECTED
+    )
     assert not result.values
 
 
 def test_without_complete_logs_the_columns_are_empty() -> None:
-    assert not measured(None, arrived([1]))
-    assert not measured(published(0), log([], []))
+    assert not measure(None, subscriber_log([1]))
+    assert not measure(publisher_log(0), log([], []))
 
 
 def test_its_columns_equal_those_of_other_flows() -> None:

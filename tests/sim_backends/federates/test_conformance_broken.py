@@ -409,7 +409,7 @@ PHYSICS_CASES = [
         replace(physics(Carts, forks=False), alter=turn_errors_into(MessageKind.DONE)),
         "it must refuse fork",
     ),
-    BrokenFederate("bye", replace(physics(Carts), stays=True), "it has not closed the connection"),
+    BrokenFederate("bye", replace(physics(Carts), stays_open=True), "it has not closed the connection"),
     BrokenFederate("start", physics(StartsElsewhere), "ann starts 1 m away"),
     BrokenFederate(
         "remainders", replace(physics(Carts), alter=add_to_first_integer(MessageKind.STATES, 1)), "instead of 0 ns"
@@ -479,7 +479,7 @@ NETWORK_CASES = [
         replace(physics(DelayNetwork, forks=False), alter=turn_errors_into(MessageKind.DONE)),
         "it must refuse fork",
     ),
-    BrokenFederate("bye", replace(physics(DelayNetwork), stays=True), "it has not closed the connection"),
+    BrokenFederate("bye", replace(physics(DelayNetwork), stays_open=True), "it has not closed the connection"),
     BrokenFederate("first_request", physics(RefusesNegativeTimes), "ValueError: negative"),
     BrokenFederate(
         "exactly_once",

@@ -1,4 +1,4 @@
-"""The steps ask and wait: valid answers, number of prompts, and stored answers."""
+"""The steps `ask` and `wait`: valid answers, the number of prompts, and stored answers."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -78,7 +78,7 @@ def run_and_view(step: AskStep, folder: Path, operator: ScriptedOperator | None 
         (f"{WIND}, each: day", "'day' is not one of: repeat, trial"),
     ],
 )
-def test_invalid_question_is_refused(text: str, message: str) -> None:
+def test_invalid_question_is_rejected(text: str, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
         ask(text)
 
@@ -101,12 +101,12 @@ def test_invalid_question_is_refused(text: str, message: str) -> None:
         (GRASS, "we", None),
     ],
 )
-def test_reading_of_typed_answers(text: str, line: str, answer: str | None) -> None:
+def test_typed_answers_are_read_or_rejected(text: str, line: str, answer: str | None) -> None:
     assert ask(text)._full_question.read(line) == answer
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False, width=32), st.sampled_from(["", "m/s", "hPa", "e"]))
-def test_numbers_are_read_again(value: float, unit: str) -> None:
+def test_a_read_number_is_read_again_unchanged(value: float, unit: str) -> None:
     question = Question("how much", unit)
     answer = question.read(f"{value!r} {unit}")
     assert answer is not None
@@ -114,7 +114,7 @@ def test_numbers_are_read_again(value: float, unit: str) -> None:
     assert question.read(answer) == answer
 
 
-def test_number_becomes_a_column_with_its_unit(tmp_path: Path) -> None:
+def test_the_answer_to_a_number_question_is_in_a_column_with_its_unit(tmp_path: Path) -> None:
     step = ask(WIND)
     view = run_and_view(step, tmp_path / "a", ScriptedOperator("3.5"))
     (column,) = step.output_columns()
@@ -124,13 +124,13 @@ def test_number_becomes_a_column_with_its_unit(tmp_path: Path) -> None:
     assert not list(step.check(view))
 
 
-def test_word_becomes_a_text_column(tmp_path: Path) -> None:
+def test_the_answer_to_a_choice_question_is_in_a_text_column(tmp_path: Path) -> None:
     step = ask(GRASS)
     assert step.measure(run_and_view(step, tmp_path / "a", ScriptedOperator("2"))).values == {"grass": "wet"}
     assert step.output_columns()[0].unit == "text"
 
 
-def test_unknown_answer_leaves_column_empty_and_repeat_valid(tmp_path: Path) -> None:
+def test_with_an_unknown_answer_the_column_is_empty_and_the_repeat_valid(tmp_path: Path) -> None:
     for operator in (ScriptedOperator("-"), None):
         step = ask(WIND)
         view = run_and_view(step, tmp_path / str(operator is None), operator)
@@ -166,12 +166,12 @@ def wait(text: str) -> WaitStep:
 
 
 @pytest.mark.parametrize("text", ["", "duration: 1s, until: open the door", "duration: 0s", "until: ''"])
-def test_wait_needs_exactly_one_end(text: str) -> None:
+def test_wait_needs_either_a_duration_or_a_condition(text: str) -> None:
     with pytest.raises(ConfigurationError):
         wait(text)
 
 
-def test_wait_ends_after_its_time_or_by_operator() -> None:
+def test_wait_ends_after_its_duration_or_when_the_operator_confirms() -> None:
     operator, testbed = ScriptedOperator(""), IdleTestbed()
     testbed.operator = operator
     wait("until: open the door").run(SCENE, testbed, ignore)

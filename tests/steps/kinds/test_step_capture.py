@@ -1,4 +1,4 @@
-"""The step capture: simultaneous start of captures and first step, and clean-up if that step cannot start."""
+"""The step `capture`: captures start together with the first inner step, and are stopped if it cannot start."""
 
 import threading
 from collections.abc import Callable
@@ -25,9 +25,9 @@ TIMEOUT_S = 60.0
 
 
 def run(home: Path, patch: pytest.MonkeyPatch, prepare: Callable[[], None], barrier: threading.Barrier) -> list[str]:
-    """Run a capture around a step with this `prepare` function; return phases, stops and the error in order.
+    """Run a capture around a step with this `prepare` function; return the phases, the stops and the error in order.
 
-    The barrier makes sure that the starts of the captures and `prepare` run at the same time.
+    The barrier ensures that the starts of the captures and `prepare` run at the same time.
     """
     events: list[str] = []
 
@@ -38,14 +38,14 @@ def run(home: Path, patch: pytest.MonkeyPatch, prepare: Callable[[], None], barr
         events.append(f"end on {shell.robot}")
         return 0
 
-    def prepared(*_: object) -> Callable[[Announce], None]:
+    def prepare_step(*_: object) -> Callable[[Announce], None]:
         barrier.wait(TIMEOUT_S)
         prepare()
         return lambda announce: announce("inside", None)
 
     patch.setattr(jobs, "start", start)
     patch.setattr(jobs, "stop", stop)
-    patch.setattr(base, "prepare", prepared)
+    patch.setattr(base, "prepare", prepare_step)
     step = schema.validate(schema.parse(TEXT, source="x.yaml"), CaptureStep)
     shells = {role: LocalShell(home, robot=role) for role in step.robots}
     try:
@@ -62,7 +62,7 @@ def test_first_step_inside_is_prepared_while_captures_start(tmp_path: Path, monk
 
 
 def test_step_inside_waits_for_captures_with_sudo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """sudo may take longer than a UDP listener waits for its sender."""
+    """sudo may take longer than the time for which a UDP listener waits for its sender."""
     events: list[str] = []
     preparing = threading.Event()
 
@@ -70,19 +70,19 @@ def test_step_inside_waits_for_captures_with_sudo(tmp_path: Path, monkeypatch: p
         assert not preparing.wait(0.1)
         events.append(f"capture on {shell.robot}")
 
-    def prepared(*_: object) -> Callable[[Announce], None]:
+    def prepare_step(*_: object) -> Callable[[Announce], None]:
         preparing.set()
         return lambda _: events.append("inside")
 
     profile = CAST[Role.SENDER].profile
     tools = profile.tools.model_copy(update={"capture_right": "sudo"})
-    slow = CAST[Role.SENDER].model_copy(update={"profile": profile.model_copy(update={"tools": tools})})
+    robot_with_sudo = CAST[Role.SENDER].model_copy(update={"profile": profile.model_copy(update={"tools": tools})})
     monkeypatch.setattr(jobs, "start", start)
     monkeypatch.setattr(jobs, "stop", lambda *_, **__: 0)
-    monkeypatch.setattr(base, "prepare", prepared)
+    monkeypatch.setattr(base, "prepare", prepare_step)
     step = schema.validate(schema.parse(TEXT, source="x.yaml"), CaptureStep)
     shells = {role: LocalShell(tmp_path, robot=role) for role in step.robots}
-    step.run(Scene(Protocol.TCP, CAST | {Role.SENDER: slow}, "f"), IdleTestbed(shells), lambda *_: None)
+    step.run(Scene(Protocol.TCP, CAST | {Role.SENDER: robot_with_sudo}, "f"), IdleTestbed(shells), lambda *_: None)
     assert sorted(events[:2]) == ["capture on receiver", "capture on sender"]
     assert events[2:] == ["inside"]
 

@@ -1,4 +1,4 @@
-"""The step fault: valid keys, roles, and golden command lines."""
+"""The step `fault`: valid keys, roles, and expected command lines."""
 
 from dataclasses import replace
 from typing import cast
@@ -71,7 +71,7 @@ def lines(step: FaultStep, scene: Scene = SCENE) -> list[tuple[Role, str]]:
         ("robot: sender, kind: reboot, during: [{ping: {from: sender}}]", "'to' is missing"),
     ],
 )
-def test_invalid_keys_are_refused(text: str, message: str) -> None:
+def test_invalid_keys_are_rejected(text: str, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message) as caught:
         fault(text)
     assert caught.value.where == "x.yaml:1"
@@ -144,7 +144,7 @@ def test_steps_inside_a_fault_can_be_excluded() -> None:
     assert len(list(steps_of(procedure, PingStep, undisturbed=True))) == 1
 
 
-def test_two_faults_of_one_kind_are_refused() -> None:
+def test_two_faults_of_one_kind_are_rejected() -> None:
     nested_twice = NESTED + "  - fault: {robot: sender, kind: out-of-range, for: 1s}\n"
     with pytest.raises(ConfigurationError, match="a fault out-of-range is defined twice"):
         schema.validate(schema.parse(nested_twice, source="x"), Procedure)
@@ -156,8 +156,8 @@ def test_written_procedure_with_faults_is_read_unchanged() -> None:
     assert schema.validate(schema.parse(text, source="x"), Procedure) == procedure
 
 
-class MistakenStep(Step):
-    """A step that raises an exception which no code expects, after the fault has failed."""
+class RaisingStep(Step):
+    """A step that raises an unexpected exception after the fault has failed."""
 
     def roles(self) -> frozenset[Role]:
         return frozenset({Role.SENDER})
@@ -167,8 +167,10 @@ class MistakenStep(Step):
         raise KeyError("hops")
 
 
-def test_a_mistake_of_a_step_inside_is_not_hidden_by_the_error_of_the_fault(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Unreachable:
+def test_an_exception_of_an_inner_step_is_not_hidden_by_the_error_of_the_fault(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class UnreachableTestbed:
         shells = dict.fromkeys(FIXED_ROLES)
 
         def inject(self, fault: Fault) -> float:
@@ -176,10 +178,10 @@ def test_a_mistake_of_a_step_inside_is_not_hidden_by_the_error_of_the_fault(monk
 
     monkeypatch.setattr(jobs, "start", lambda *_: None)
     monkeypatch.setattr(kinds_fault, "end_inside", lambda *_: None)
-    entry = StepEntry("mistaken", MistakenStep())
+    entry = StepEntry("mistaken", RaisingStep())
     step = fault("robot: sender, kind: reboot, after: 0s").model_copy(update={"during": (entry,)})
     with pytest.raises(KeyError, match="hops") as caught:
-        step.run(SCENE, cast("Testbed", Unreachable()), lambda *_: None)
+        step.run(SCENE, cast("Testbed", UnreachableTestbed()), lambda *_: None)
     assert isinstance(caught.value.__cause__, LinkError)
 
 

@@ -1,4 +1,4 @@
-"""The step run: command lines, refusals, and values from the output."""
+"""The step `run`: command lines, invalid keys, and values from the output."""
 
 import signal
 from dataclasses import replace
@@ -60,7 +60,7 @@ def test_words_are_not_interpreted_by_a_shell() -> None:
     assert planned.job.argv[-4:] == ("echo", "$HOME; rm *", "{print}", "|")
 
 
-def test_variables_are_filled_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_variables_are_replaced_by_their_values(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "probe").write_text("x", encoding="utf-8")
     (tmp_path / "probe").chmod(0o755)
     monkeypatch.chdir(tmp_path)
@@ -108,7 +108,7 @@ def test_variables_are_filled_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         ("robot: sender\ncommand: a\nexpect: {code: []}", 3, "at least 1"),
     ],
 )
-def test_invalid_keys_are_refused_with_line(
+def test_invalid_keys_are_rejected_with_their_line(
     text: str, line: int, reason: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(ROOT)
@@ -117,7 +117,7 @@ def test_invalid_keys_are_refused_with_line(
     assert caught.value.where == f"run.yaml:{line}"
 
 
-def test_columns_are_those_of_the_procedure() -> None:
+def test_the_procedure_declares_the_columns() -> None:
     volts, mode = run_step(BATTERY).output_columns()
     assert (volts.name, volts.unit, volts.meaning) == ("volts", "V", "Of the battery.")
     assert (mode.unit, mode.type) == ("text", str)
@@ -132,7 +132,7 @@ def values_and_problems(folder: Path, output: str | None, *, after: str = "") ->
     return dict(step.measure(view).values), list(step.check(view))
 
 
-def test_values_and_summary(tmp_path: Path) -> None:
+def test_values_of_the_output_are_measured_and_summarized(tmp_path: Path) -> None:
     values, problems = values_and_problems(tmp_path, '{"cells": [{"V": 3.75}], "mode": "auto"}')
     assert (values, problems) == ({"volts": 3.75, "mode": "auto"}, [])
     assert list(run_step(BATTERY).summary(values)) == ["battery 3.75 V", "mode auto"]
@@ -196,7 +196,7 @@ def run_script(home: Path, userland: str, script: str) -> Completed:
         ("printf 'no line end'", 0, b"no line end", b""),
     ],
 )
-def test_output_and_exit_code_of_the_program(
+def test_output_and_exit_code_are_those_of_the_program(
     tmp_path: Path, userland: str, script: str, code: int, *, out: bytes, err: bytes
 ) -> None:
     result = run_script(tmp_path, userland, script)
@@ -212,5 +212,5 @@ def test_program_with_endless_output_is_stopped(tmp_path: Path, userland: str) -
 
 
 @pytest.mark.parametrize("userland", USERLANDS)
-def test_exit_code_of_killed_program(tmp_path: Path, userland: str) -> None:
+def test_the_exit_code_of_a_killed_program_contains_its_signal(tmp_path: Path, userland: str) -> None:
     assert run_script(tmp_path, userland, "kill -KILL $$").exit_code == 128 + signal.SIGKILL

@@ -1,4 +1,4 @@
-"""Simultaneous steps on robots of this machine: all start, and the first failure stops the others."""
+"""Simultaneous steps on robots of this machine: all steps start, and the first failure stops the others."""
 
 import threading
 from _thread import interrupt_main
@@ -108,16 +108,16 @@ def folder(robots: IdleTestbed, role: Role = Role.SENDER) -> Path:
     return shell.home / FOLDER
 
 
-def run(step: Step, robots: IdleTestbed, *recorded: str) -> list[str]:
-    announced: list[str] = []
+def run(step: Step, robots: IdleTestbed, *recorded_names: str) -> list[str]:
+    phases: list[str] = []
     cast = {role: robot.model_copy(update={"address": "127.0.0.1"}) for role, robot in CAST.items()}
-    files = {Role.SENDER: tuple(RecordedFile(Role.SENDER, name, 1e4, alias=name[:-4]) for name in recorded)}
+    files = {Role.SENDER: tuple(RecordedFile(Role.SENDER, name, 1e4, alias=name[:-4]) for name in recorded_names)}
     scene = Scene(Protocol.TCP, cast, FOLDER, files)
-    step.run(scene, robots, lambda name, expected_s: announced.append(name))
-    return announced
+    step.run(scene, robots, lambda name, expected_s: phases.append(name))
+    return phases
 
 
-def running(robots: IdleTestbed) -> Sequence[str]:
+def running_jobs(robots: IdleTestbed) -> Sequence[str]:
     return jobs.list_running(robots.shells[Role.SENDER], Deadline.after(30))
 
 
@@ -125,13 +125,13 @@ def running(robots: IdleTestbed) -> Sequence[str]:
 def test_steps_run_at_the_same_time(robots: IdleTestbed) -> None:
     """Each step waits for the files of the other two."""
     wait_for_all = "touch {0}; until [ -e a ] && [ -e b ] && [ -e c ]; do sleep 0.01; done"
-    announced = run(together(**{name: wait_for_all.format(name) for name in "abc"}), robots)
-    assert sorted(announced) == ["a", "b", "c"]
-    assert not running(robots)
+    phases = run(together(**{name: wait_for_all.format(name) for name in "abc"}), robots)
+    assert sorted(phases) == ["a", "b", "c"]
+    assert not running_jobs(robots)
 
 
 @pytest.mark.emulated
-def test_transfers_cross_at_the_same_time(robots: IdleTestbed) -> None:
+def test_transfers_run_at_the_same_time(robots: IdleTestbed) -> None:
     bags = {"a": b"a" * 20_000, "b": b"b" * 30_000}
     for name, content in bags.items():
         (folder(robots) / f"{name}.bag").write_bytes(content)
@@ -148,14 +148,14 @@ def test_first_failure_stops_the_others_and_is_reported(robots: IdleTestbed) -> 
     failing = "until [ -e a ] && [ -e b ]; do sleep 0.01; done; exit 7"
     with pytest.raises(RobotError, match="c ended with 7"):
         run(together(a=started.format("a"), b=started.format("b"), c=failing), robots)
-    assert not running(robots)
+    assert not running_jobs(robots)
     assert not list(folder(robots).glob("*.done"))
 
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("inside", [WAIT, {"together": {"during": [WAIT, WAIT]}}])
 def test_first_failure_interrupts_a_wait_and_the_steps_after_it(robots: IdleTestbed, inside: object) -> None:
-    """Without the interruption the wait would last an hour."""
+    """Without the interruption, the wait would take an hour."""
     steps = [
         StepEntry("quiet", SequenceStep.model_validate({"during": [inside, WAIT]})),
         StepEntry("says", CommandStep(name="c", command="exit 7")),
@@ -168,7 +168,7 @@ def test_first_failure_interrupts_a_wait_and_the_steps_after_it(robots: IdleTest
 
 @pytest.mark.emulated
 def test_started_listener_is_stopped_if_another_step_is_not_ready(robots: IdleTestbed) -> None:
-    """The listener of a transfer is running when the other step fails."""
+    """The listener of a transfer runs when the other step fails."""
     receiver = robots.shells[Role.RECEIVER]
 
     class Unready(CommandStep):
@@ -191,8 +191,8 @@ def test_interrupt_does_not_wait_for_steps(robots: IdleTestbed) -> None:
     is_over = threading.Event()
 
     def interrupt() -> None:
-        wait_until(lambda: is_over.is_set() or len(running(robots)) == 2, Deadline.after(60))
-        if not is_over.is_set():  # a later interrupt would end the process of the tests
+        wait_until(lambda: is_over.is_set() or len(running_jobs(robots)) == 2, Deadline.after(60))
+        if not is_over.is_set():  # a later interrupt would terminate the process of the tests
             interrupt_main()
 
     threads_before = set(threading.enumerate())
@@ -203,13 +203,13 @@ def test_interrupt_does_not_wait_for_steps(robots: IdleTestbed) -> None:
     finally:
         is_over.set()
     evidence.end_jobs(robots.shells[Role.SENDER], FOLDER)
-    assert not running(robots)
+    assert not running_jobs(robots)
     wait_until(lambda: set(threading.enumerate()) <= threads_before, Deadline.after(60))
 
 
 @pytest.mark.quiet
 @pytest.mark.emulated
-def test_interrupt_ends_waits_of_other_threads(robots: IdleTestbed) -> None:
+def test_interrupt_stops_waits_in_other_threads(robots: IdleTestbed) -> None:
     started = threading.Event()
 
     def interrupt() -> None:
@@ -228,7 +228,7 @@ def test_interrupt_ends_waits_of_other_threads(robots: IdleTestbed) -> None:
     wait_until(lambda: threading.active_count() == threads_before, Deadline.after(30))
 
 
-def test_expected_duration_and_dry_run_note() -> None:
+def test_the_expected_duration_is_that_of_the_longest_step() -> None:
     step = together(a="", long="", longest="")
     assert step.expected_s(Protocol.TCP) == len("longest")
     assert list(step.dry_run_notes(Scene(Protocol.TCP, CAST, FOLDER))) == [
@@ -259,36 +259,36 @@ MOVE_INSIDE = """\
             during:
               - move: {robot: sender, speed: 1m/s, path: [away: 1m], during: [ping: {FLOW, name: b}]}
 """
-RECORDED_BESIDE = """\
+SIMULTANEOUS_RECORDING = """\
   - together:
       during:
         - record: {robot: sender, topics: [/a], duration: 1s, name: a}
         - transfer: {FLOW, file: a}
 """
-TESTS = """\
+TWO_IPERF3 = """\
   - together:
       during:
         - iperf3: {FLOW, name: a, port: 5201}
         - iperf3: {FLOW, name: b, port: PORT}
 """
-SENDS = """\
+TWO_SENDS = """\
   - together:
       during:
         - send: {FLOW, name: a, size: 1kB}
         - send: {FLOW, name: b, size: 1kB, port: PORT}
 """
-SOAKED = """\
+IPERF3_IN_SOAK = """\
   - soak: {FLOW, during: [
       iperf3: {FLOW, port: PORT}]}
 """
-FROM_TWO = """\
+TWO_CLIENTS = """\
   - together:
       during:
         - iperf3: {FLOW, name: a}
         - iperf3: {from: relay, to: receiver, name: b}
 """
-CROSSED = FROM_TWO.replace("from: relay, to: receiver", "from: receiver, to: sender")
-BOTH_WAYS = """\
+OPPOSITE_CLIENTS = TWO_CLIENTS.replace("from: relay, to: receiver", "from: receiver, to: sender")
+BOTH_DIRECTIONS = """\
   - capture:
       during:
         - iperf3: {FLOW, name: a}
@@ -296,8 +296,8 @@ BOTH_WAYS = """\
         - iperf3: {from: receiver, to: sender, name: c}
         - iperf3: {from: relay, to: receiver, name: d}
 """
-SAME_WAY = BOTH_WAYS.replace("reverse: true", "streams: 2")
-BESIDE_A_TRANSFER = BOTH_WAYS.replace("iperf3: {FLOW, name: a}", "send: {FLOW, size: 1kB, port: 5201}")
+SAME_DIRECTION = BOTH_DIRECTIONS.replace("reverse: true", "streams: 2")
+WITH_A_TRANSFER = BOTH_DIRECTIONS.replace("iperf3: {FLOW, name: a}", "send: {FLOW, size: 1kB, port: 5201}")
 FOR_EACH = """\
   - capture:
       during:
@@ -306,7 +306,7 @@ FOR_EACH = """\
             during:
               - iperf3: {FLOW, name: "{n}"}
 """
-ONE_BY_ONE = """\
+SEQUENTIAL = """\
   - for:
       each: {n: [a, b]}
       during:
@@ -323,9 +323,14 @@ SWEEP = """\
 @pytest.mark.parametrize(
     "steps",
     [
-        *(TESTS.replace("PORT", "5202"), SENDS.replace("PORT", "1235"), SOAKED.replace("PORT", "5201"), ONE_BY_ONE),
-        *(CROSSED, BOTH_WAYS, FROM_TWO.replace("together", "capture")),
-        SOAKED.replace("iperf3: {FLOW, port: PORT}", "iperf3: {from: receiver, to: sender, port: 5202}"),
+        *(
+            TWO_IPERF3.replace("PORT", "5202"),
+            TWO_SENDS.replace("PORT", "1235"),
+            IPERF3_IN_SOAK.replace("PORT", "5201"),
+            SEQUENTIAL,
+        ),
+        *(OPPOSITE_CLIENTS, BOTH_DIRECTIONS, TWO_CLIENTS.replace("together", "capture")),
+        IPERF3_IN_SOAK.replace("iperf3: {FLOW, port: PORT}", "iperf3: {from: receiver, to: sender, port: 5202}"),
     ],
 )
 def test_distinguishable_loads_are_accepted(steps: str) -> None:
@@ -347,13 +352,13 @@ def load(steps: str) -> Procedure:
             "port 1234 is used twice in one capture, from sender to receiver; change the port of one of them",
             4,
         ),
-        (TESTS.replace("PORT", "5201"), "port 5201 is used twice at the same time", 4),
-        (SENDS.replace("PORT", "1234"), "port 1234 is used twice", 4),
+        (TWO_IPERF3.replace("PORT", "5201"), "port 5201 is used twice at the same time", 4),
+        (TWO_SENDS.replace("PORT", "1234"), "port 1234 is used twice", 4),
         (FOR_EACH, "port 5201 is used twice in one capture", 6),
-        (SOAKED.replace("PORT", "5202"), "port 5202 is used twice at the same time", 2),
-        (FROM_TWO, "port 5201 is used twice at the same time", 4),
-        (SAME_WAY, "port 5201 is used twice in one capture, from sender to receiver", 4),
-        (BESIDE_A_TRANSFER, "port 5201 is used twice in one capture", 4),
+        (IPERF3_IN_SOAK.replace("PORT", "5202"), "port 5202 is used twice at the same time", 2),
+        (TWO_CLIENTS, "port 5201 is used twice at the same time", 4),
+        (SAME_DIRECTION, "port 5201 is used twice in one capture, from sender to receiver", 4),
+        (WITH_A_TRANSFER, "port 5201 is used twice in one capture", 4),
         (FAULT_INSIDE, "fault may prompt the operator, so no step may run at the same time", 4),
         (
             FAULT_INSIDE.replace("fault: {robot: sender, kind: reboot}", "wait: {until: say so}"),
@@ -371,7 +376,7 @@ def load(steps: str) -> Procedure:
             6,
             marks=pytest.mark.motion,
         ),
-        (RECORDED_BESIDE, "sends a, but no recording of that name is made on sender before it", 4),
+        (SIMULTANEOUS_RECORDING, "sends a, but no recording of that name is made on sender before it", 4),
         (
             SWEEP.replace("VALUES", "[1, 2, 3, 4, 5, 6, 7, 8, 9]"),
             f"9 steps at the same time are more than {MAX_PARALLEL}",
@@ -379,7 +384,9 @@ def load(steps: str) -> Procedure:
         ),
     ],
 )
-def test_steps_that_cannot_run_simultaneously_are_refused_with_line(steps: str, message: str, line: int) -> None:
+def test_steps_that_cannot_run_simultaneously_are_rejected_with_their_line(
+    steps: str, message: str, line: int
+) -> None:
     with pytest.raises(ConfigurationError) as caught:
         load(steps)
     assert message in caught.value.what
@@ -391,7 +398,7 @@ def test_steps_that_cannot_run_simultaneously_are_refused_with_line(steps: str, 
     [
         SAME_PORT.replace("name: b", "name: b, port: 99"),
         IN_ONE_CAPTURE.replace("name: b", "name: b, port: 99"),
-        # In sequence, each in a separate capture.
+        # The transfers run in sequence, each in a separate capture.
         "  - for: {each: {a: [x, y]}, during: [capture: {name: '{a}', during: [transfer: {FLOW, name: '{a}'}]}]}",
         SWEEP.replace("VALUES", "[1, 2, 3]"),
     ],

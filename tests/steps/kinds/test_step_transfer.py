@@ -25,8 +25,8 @@ FOLDER = jobs.work_folder("trial", "udp-01-1")
 
 
 @dataclass(frozen=True)
-class Medium:
-    """An oracle that returns these delays in order."""
+class FakeOracle:
+    """An oracle that returns the given delays in order."""
 
     parts: Iterator[DelayParts]
 
@@ -55,14 +55,14 @@ class Medium:
         raise AssertionError(folder)
 
 
-class Robots(IdleTestbed):
+class TestbedWithOracle(IdleTestbed):
     """A testbed with an oracle, if delays are given."""
 
-    oracle: Medium | None
+    oracle: FakeOracle | None
 
     def __init__(self, shells: Mapping[Role, Shell], delays: Sequence[DelayParts], port: int) -> None:
         super().__init__(shells)
-        self.oracle = Medium(iter(delays), port) if delays else None
+        self.oracle = FakeOracle(iter(delays), port) if delays else None
 
 
 class LateShell(LocalShell):
@@ -97,7 +97,7 @@ def transfer(
     )
     bag = RecordedFile(Role.SENDER, "scan.bag", 20_000)
     scene = Scene(protocol, cast, FOLDER, {Role.SENDER: (bag,)}, laptop_folder=sender.home.parent)
-    robots = Robots({Role.SENDER: sender, Role.RECEIVER: receiver}, delays, port)
+    robots = TestbedWithOracle({Role.SENDER: sender, Role.RECEIVER: receiver}, delays, port)
     try:
         step.run(scene, robots, lambda name, expected_s: None)
     finally:
@@ -110,7 +110,7 @@ def test_file_arrives(tmp_path: Path, protocol: Protocol) -> None:
     receiver = LocalShell(tmp_path / "receiver")
     transfer(protocol, LocalShell(tmp_path / "sender"), receiver)
     assert (receiver.home / FOLDER / "recv.bag").read_bytes() == b"x" * 20_000
-    assert not (tmp_path / "medium.txt").exists(), "no oracle knows the delays"
+    assert not (tmp_path / "medium.txt").exists(), "there is no oracle, so there are no delays"
 
 
 def _parts(n: int) -> DelayParts:

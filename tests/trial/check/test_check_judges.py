@@ -1,4 +1,4 @@
-"""Checks of a robot: verbatim outputs of tools as input, findings as output."""
+"""Checks of a robot: findings for real outputs of tools."""
 
 import re
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ PLAN = los_plan()
 OK, WARN, FAIL = Verdict.OK, Verdict.WARN, Verdict.FAIL
 
 
-def output_text(name: str, code: int = 0) -> CommandResult:
+def read_result(name: str, code: int = 0) -> CommandResult:
     return CommandResult((DATA / name).read_text(encoding="utf-8").strip("\n"), code)
 
 
@@ -39,8 +39,8 @@ def only(findings: Sequence[Finding], check: str) -> Finding:
 
 
 def judge_radio(robot: Robot, **sections: CommandResult) -> list[Finding]:
-    """Judge the radio; an underscore in the name of a section is replaced by a hyphen."""
-    base = {"interface": output_text("ip/6.1.0/up.txt")}
+    """Judge the radio; each keyword is the name of a section, with underscores instead of hyphens."""
+    base = {"interface": read_result("ip/6.1.0/up.txt")}
     report = Report(robot.name)
     radio.judge(robot, base | {name.replace("_", "-"): text for name, text in sections.items()}, report)
     return report.findings
@@ -58,7 +58,7 @@ def judge_radio(robot: Robot, **sections: CommandResult) -> list[Finding]:
     ],
 )
 def test_an_interface_must_be_up_and_connected(file: str, code: int, status: Verdict, detail: str) -> None:
-    finding = only(judge_radio(SENDER, interface=output_text(file, code)), "interface wlan0")
+    finding = only(judge_radio(SENDER, interface=read_result(file, code)), "interface wlan0")
     assert finding.status is status
     assert detail in finding.detail
     assert bool(finding.remedy) == (status is FAIL)
@@ -69,8 +69,8 @@ def test_an_interface_with_another_address_is_a_failure() -> None:
     assert (finding.status, finding.detail) == (FAIL, "has 10.42.0.1/24, not 10.42.0.2")
 
 
-def test_offloads_are_for_the_record() -> None:
-    finding = only(judge_radio(SENDER, offloads=output_text("ethtool/6.1/tun.txt")), "offloads")
+def test_the_settings_of_offloads_are_always_ok() -> None:
+    finding = only(judge_radio(SENDER, offloads=read_result("ethtool/6.1/tun.txt")), "offloads")
     assert (finding.status, finding.detail) == (OK, "GSO on, TSO off, GRO on")
     assert only(judge_radio(SENDER), "offloads").status is OK
 
@@ -78,9 +78,9 @@ def test_offloads_are_for_the_record() -> None:
 def test_a_station_has_access_point_channel_signal_and_rate() -> None:
     findings = judge_radio(
         SENDER,
-        wifi_info=output_text("iw/info-station.txt"),
-        wifi_link=output_text("iw/link-station.txt"),
-        wifi_power_save=output_text("iw/power-save-off.txt"),
+        wifi_info=read_result("iw/info-station.txt"),
+        wifi_link=read_result("iw/link-station.txt"),
+        wifi_power_save=read_result("iw/power-save-off.txt"),
     )
     assert only(findings, "Wi-Fi").detail == (
         "managed 'knowhere', at f0:99:bf:0e:86:98, channel 11, -65 dBm, 65.0 MBit/s"
@@ -89,20 +89,20 @@ def test_a_station_has_access_point_channel_signal_and_rate() -> None:
 
 
 def test_a_signal_near_the_sensitivity_is_a_warning() -> None:
-    link = output_text("iw/link-station.txt")
+    link = read_result("iw/link-station.txt")
     # The TurtleBot's sensitivity is -82 dBm.
     for dbm, status in ((-72, OK), (-73, WARN)):
-        weak = CommandResult(link.text.replace("-65 dBm", f"{dbm} dBm"), 0)
-        findings = judge_radio(SENDER, wifi_info=output_text("iw/info-station.txt"), wifi_link=weak)
+        link_with_signal = CommandResult(link.text.replace("-65 dBm", f"{dbm} dBm"), 0)
+        findings = judge_radio(SENDER, wifi_info=read_result("iw/info-station.txt"), wifi_link=link_with_signal)
         assert only(findings, "Wi-Fi").status is status
 
 
 def test_power_save_is_a_warning_with_the_command_that_disables_it() -> None:
     findings = judge_radio(
         SENDER,
-        wifi_info=output_text("iw/info-station.txt"),
-        wifi_link=output_text("iw/link-station.txt"),
-        wifi_power_save=output_text("iw/power-save-on.txt"),
+        wifi_info=read_result("iw/info-station.txt"),
+        wifi_link=read_result("iw/link-station.txt"),
+        wifi_power_save=read_result("iw/power-save-on.txt"),
     )
     finding = only(findings, "power save")
     assert (finding.status, finding.remedy) == (WARN, "sudo iw dev wlan0 set power_save off")
@@ -110,22 +110,22 @@ def test_power_save_is_a_warning_with_the_command_that_disables_it() -> None:
 
 def test_a_station_without_a_network_fails() -> None:
     findings = judge_radio(
-        SENDER, wifi_info=output_text("iw/info-txpower.txt"), wifi_link=output_text("iw/link-none.txt")
+        SENDER, wifi_info=read_result("iw/info-txpower.txt"), wifi_link=read_result("iw/link-none.txt")
     )
     assert only(findings, "Wi-Fi").status is FAIL
 
 
 def test_an_access_point_counts_its_stations_and_needs_no_power_save() -> None:
     findings = judge_radio(
-        RELAY, wifi_info=output_text("iw/info-ap.txt"), wifi_stations=output_text("iw/stations-ap.txt")
+        RELAY, wifi_info=read_result("iw/info-ap.txt"), wifi_stations=read_result("iw/stations-ap.txt")
     )
     assert only(findings, "Wi-Fi").detail == "AP 'xx', channel 1, 1 stations, -57 dBm"
     assert "power save" not in {finding.check for finding in findings}
 
 
-def test_a_station_whose_profile_has_an_access_point_is_a_warning() -> None:
+def test_a_station_that_should_be_an_access_point_is_a_warning() -> None:
     findings = judge_radio(
-        RELAY, wifi_info=output_text("iw/info-station.txt"), wifi_link=output_text("iw/link-station.txt")
+        RELAY, wifi_info=read_result("iw/info-station.txt"), wifi_link=read_result("iw/link-station.txt")
     )
     finding = only(findings, "Wi-Fi")
     assert finding.status is WARN
@@ -133,45 +133,49 @@ def test_a_station_whose_profile_has_an_access_point_is_a_warning() -> None:
 
 
 def test_an_ad_hoc_cell_is_not_a_missing_network() -> None:
-    ibss = CommandResult(output_text("iw/info-station.txt").text.replace("managed", "IBSS"), 0)
-    findings = judge_radio(SENDER, wifi_info=ibss, wifi_link=output_text("iw/link-ibss.txt"))
+    ibss = CommandResult(read_result("iw/info-station.txt").text.replace("managed", "IBSS"), 0)
+    findings = judge_radio(SENDER, wifi_info=ibss, wifi_link=read_result("iw/link-ibss.txt"))
     assert only(findings, "Wi-Fi").detail == "IBSS 'knowhere', at 02:11:87:86:a3:0f, channel 11"
 
 
 def test_outputs_of_the_kernels_wifi_stack_are_read_in_every_mode() -> None:
     station = judge_radio(
-        SENDER, wifi_info=output_text("iw/info-hwsim-station-6.txt"), wifi_link=output_text("iw/link-hwsim-6.txt")
+        SENDER, wifi_info=read_result("iw/info-hwsim-station-6.txt"), wifi_link=read_result("iw/link-hwsim-6.txt")
     )
     assert only(station, "Wi-Fi").detail == "managed 'lawn', at 02:00:00:00:00:00, channel 6, -30 dBm, 1.0 MBit/s"
     relay = judge_radio(
         RELAY,
-        wifi_info=output_text("iw/info-hwsim-ap-6.txt"),
-        wifi_stations=output_text("iw/stations-hwsim-ap-6.txt"),
+        wifi_info=read_result("iw/info-hwsim-ap-6.txt"),
+        wifi_stations=read_result("iw/stations-hwsim-ap-6.txt"),
     )
     assert only(relay, "Wi-Fi").detail == "AP 'lawn', channel 6, 2 stations, -30 dBm"
     ibss = judge_radio(
-        SENDER, wifi_info=output_text("iw/info-hwsim-ibss-5.txt"), wifi_link=output_text("iw/link-hwsim-ibss-6.txt")
+        SENDER, wifi_info=read_result("iw/info-hwsim-ibss-5.txt"), wifi_link=read_result("iw/link-hwsim-ibss-6.txt")
     )
     assert only(ibss, "Wi-Fi").detail == "IBSS 'lawn', at 26:9f:2e:55:bf:8b, channel 6"
     down = judge_radio(
-        SENDER, wifi_info=output_text("iw/info-hwsim-down-5.txt"), wifi_link=output_text("iw/link-none.txt")
+        SENDER, wifi_info=read_result("iw/info-hwsim-down-5.txt"), wifi_link=read_result("iw/link-none.txt")
     )
     assert only(down, "Wi-Fi").detail == "not associated with a network"
 
 
 def test_an_interface_without_a_radio_has_no_wifi_findings() -> None:
-    findings = judge_radio(SENDER, wifi_info=output_text("iw/no-wifi.txt", 1))
+    findings = judge_radio(SENDER, wifi_info=read_result("iw/no-wifi.txt", 1))
     assert {finding.check for finding in findings} == {"interface wlan0", "control", "offloads"}
 
 
 def test_a_radio_without_iw_is_a_warning() -> None:
-    ether = CommandResult(output_text("ip/6.1.0/up.txt").text.replace("link/none", "link/ether b8:27:eb:94:14:9a"), 0)
-    findings = judge_radio(SENDER, interface=ether, wireless=CommandResult("/sys/class/net/wlan0/phy80211", 0))
+    ethernet_output = CommandResult(
+        read_result("ip/6.1.0/up.txt").text.replace("link/none", "link/ether b8:27:eb:94:14:9a"), 0
+    )
+    findings = judge_radio(
+        SENDER, interface=ethernet_output, wireless=CommandResult("/sys/class/net/wlan0/phy80211", 0)
+    )
     assert only(findings, "Wi-Fi").remedy == "sudo apt-get install iw"
 
 
-def probed(role: Role, **changes: CommandResult) -> list[Finding]:
-    """Judge the system of a robot that has everything except for `changes`."""
+def judge_system(role: Role, **changes: CommandResult) -> list[Finding]:
+    """Judge the system of a robot whose sections are all fine except for `changes`."""
     sections: dict[str, CommandResult] = {
         "system": CommandResult("Raspbian GNU/Linux 10 (buster), Linux 5.10.63-v7+ armv7l", 0),
         "disk": CommandResult(
@@ -199,17 +203,19 @@ def probed(role: Role, **changes: CommandResult) -> list[Finding]:
         (Role.SENDER, 1 << 20, FAIL),
     ],
 )
-def test_a_robot_s_disk_must_hold_an_attempt(role: Role, free_kib: int, status: Verdict) -> None:
+def test_a_robot_s_disk_must_have_space_for_an_attempt(role: Role, free_kib: int, status: Verdict) -> None:
     head = "Filesystem           1024-blocks    Used Available Capacity Mounted on\n"
-    finding = only(probed(role, disk=CommandResult(f"{head}/dev/root 14960428 3451724 {free_kib}  25% /", 0)), "disk")
+    finding = only(
+        judge_system(role, disk=CommandResult(f"{head}/dev/root 14960428 3451724 {free_kib}  25% /", 0)), "disk"
+    )
     assert finding.status is status
 
 
 def test_a_disk_with_unknown_space_fails() -> None:
-    assert only(probed(Role.SENDER, disk=CommandResult("df: .: Stale file handle", 1)), "disk").status is FAIL
+    assert only(judge_system(Role.SENDER, disk=CommandResult("df: .: Stale file handle", 1)), "disk").status is FAIL
 
 
-def test_the_laptop_must_hold_an_attempt_and_should_hold_the_trial() -> None:
+def test_the_laptop_must_have_space_for_an_attempt_and_should_have_space_for_the_trial() -> None:
     size_bytes = size.trial_bytes(PLAN)
     for free, status in (
         (size.RESERVE_BYTES + size_bytes, OK),
@@ -226,8 +232,8 @@ def test_evidence_that_takes_long_to_fetch_is_a_warning_with_size_and_rate(tmp_p
     system.judge_laptop(PLAN, tmp_path, report)
     assert "fetch" not in {finding.check for finding in report.findings}
     (entry, *others) = PLAN.procedure.steps
-    long = with_record(entry, 36_000.0)
-    procedure = PLAN.procedure.model_copy(update={"steps": (long, *others)})
+    long_record = with_record(entry, 36_000.0)
+    procedure = PLAN.procedure.model_copy(update={"steps": (long_record, *others)})
     system.judge_laptop(PLAN.model_copy(update={"procedure": procedure}), tmp_path, report)
     finding = only(report.findings, "fetch")
     assert finding.status is WARN
@@ -241,18 +247,20 @@ LISTENER = "   0: 00000000:04D2 00000000:0000 0A 00000000:00000000 00:00000000 0
 
 def test_a_port_in_use_fails_on_the_receiver_only() -> None:
     port_in_use = CommandResult(LISTENER, 0)
-    finding = only(probed(Role.RECEIVER, listeners=port_in_use), "port 1234")
+    finding = only(judge_system(Role.RECEIVER, listeners=port_in_use), "port 1234")
     assert finding.status is FAIL
     assert "1234" in finding.remedy
     assert (
-        only(probed(Role.RECEIVER, listeners=CommandResult(LISTENER.replace("04D2", "04D3"), 0)), "port 1234").status
+        only(
+            judge_system(Role.RECEIVER, listeners=CommandResult(LISTENER.replace("04D2", "04D3"), 0)), "port 1234"
+        ).status
         is OK
     )
-    assert "port 1234" not in {finding.check for finding in probed(Role.SENDER, listeners=port_in_use)}
+    assert "port 1234" not in {finding.check for finding in judge_system(Role.SENDER, listeners=port_in_use)}
 
 
 def test_a_low_battery_is_a_warning() -> None:
-    findings = probed(Role.SENDER, batteries=CommandResult("BAT0 81\nbq27000-0 19", 0))
+    findings = judge_system(Role.SENDER, batteries=CommandResult("BAT0 81\nbq27000-0 19", 0))
     assert [(finding.status, finding.detail) for finding in findings if finding.check == "battery"] == [
         (OK, "BAT0 at 81 %"),
         (WARN, "bq27000-0 at 19 %"),
@@ -303,7 +311,7 @@ def judge_all(sections: Sections, plan: Plan = PLAN) -> list[Finding]:
 
 
 def procedure_of(step: str) -> Procedure:
-    """A procedure with this step only."""
+    """Return a procedure that has only this step."""
     head = "name: x\nsummary: X\nscenario: los\ntopology: master\nprotocols: [tcp]\nrepeats: 1\nsteps:\n"
     return schema.validate(schema.parse(f"{head}- {step}\n", source="x.yaml"), Procedure)
 
@@ -317,9 +325,9 @@ def test_a_robot_that_has_everything_passes() -> None:
 
 def test_a_missing_program_is_one_failure_with_its_package() -> None:
     sections = installed() | {"program nc.traditional": CommandResult("", 1)}
-    (failed,) = [finding for finding in judge_all(sections) if finding.status is not OK]
-    assert failed.check == "nc.traditional"
-    assert failed.remedy == "sudo apt-get install netcat-traditional"
+    (failure,) = [finding for finding in judge_all(sections) if finding.status is not OK]
+    assert failure.check == "nc.traditional"
+    assert failure.remedy == "sudo apt-get install netcat-traditional"
 
 
 @pytest.mark.parametrize(
@@ -337,32 +345,32 @@ def test_a_missing_program_is_one_failure_with_its_package() -> None:
 def test_a_missing_program_of_a_step_is_reported_with_its_source(step: str, program: str, remedy: str) -> None:
     plan = PLAN.model_copy(update={"procedure": procedure_of(step)})
     sections = installed(plan) | {f"program {program}": CommandResult("", 127)}
-    (failed,) = [finding for finding in judge_all(sections, plan) if finding.status is not OK]
-    assert (failed.check, failed.remedy) == (program, remedy)
+    (failure,) = [finding for finding in judge_all(sections, plan) if finding.status is not OK]
+    assert (failure.check, failure.remedy) == (program, remedy)
 
 
 def test_a_missing_capture_permission_fails_with_the_command_that_grants_it() -> None:
     result = CommandResult("tcpdump: wlan0: You don't have permission to perform this capture on that device", 1)
-    (failed,) = [
+    (failure,) = [
         finding for finding in judge_all(installed() | {"right to capture": result}) if finding.status is not OK
     ]
-    assert failed.remedy == "sudo setcap cap_net_raw,cap_net_admin+eip $(command -v tcpdump)"
+    assert failure.remedy == "sudo setcap cap_net_raw,cap_net_admin+eip $(command -v tcpdump)"
 
 
 def test_a_missing_sudo_permission_fails_with_the_rule_that_grants_it() -> None:
     tools = TURTLEBOT.tools.model_copy(update={"capture_right": "sudo"})
     robot = SENDER.model_copy(update={"profile": TURTLEBOT.model_copy(update={"tools": tools})})
     plan = PLAN.model_copy(update={"cast": {**PLAN.cast, Role.SENDER: robot}})
-    for output_text, remedy in (
+    for result, remedy in (
         (CommandResult("sudo: a password is required", 1), "sudo tee /etc/sudoers.d/fieldkit"),
         (CommandResult("sh: 9: sudo: not found", CommandResult.MISSING), "capture_right: direct"),
     ):
-        (failed,) = [
+        (failure,) = [
             finding
-            for finding in judge_all(installed(plan) | {"right to capture": output_text}, plan)
+            for finding in judge_all(installed(plan) | {"right to capture": result}, plan)
             if finding.status is not OK
         ]
-        assert remedy in failed.remedy
+        assert remedy in failure.remedy
 
 
 @given(st.text())
@@ -371,12 +379,14 @@ def test_any_output_can_be_parsed(text: str) -> None:
 
 
 @given(st.text())
-def test_text_from_a_robot_cannot_garble_the_terminal(text: str) -> None:
+def test_findings_contain_only_printable_text(text: str) -> None:
     report = Report("turtlebot-1")
-    everything = {name: CommandResult(text, 0) for name in (*installed(), "system", "disk", "interface", "wifi-info")}
-    system.judge(PLAN, Role.SENDER, everything, report)
-    software.judge(PLAN, Role.SENDER, everything, report)
-    radio.judge(SENDER, everything, report)
+    all_sections = {
+        name: CommandResult(text, 0) for name in (*installed(), "system", "disk", "interface", "wifi-info")
+    }
+    system.judge(PLAN, Role.SENDER, all_sections, report)
+    software.judge(PLAN, Role.SENDER, all_sections, report)
+    radio.judge(SENDER, all_sections, report)
     for finding in report.findings:
         assert (finding.check + finding.detail + finding.remedy).isprintable()
 
@@ -402,14 +412,14 @@ def test_the_route_of_ssh_is_detected(connection: str, control: Control, status:
 @pytest.mark.parametrize("file", ["ip/6.1.0/nope.txt", "busybox/1.35.0/ip-nope.txt"])
 def test_a_missing_interface_hides_the_check_of_capture_permission(file: str) -> None:
     result = CommandResult("tcpdump: wlan0: No such device exists\n(SIOCGIFHWADDR: No such device)", 1)
-    sections = installed() | {"right to capture": result, "interface": output_text(file, 1)}
+    sections = installed() | {"right to capture": result, "interface": read_result(file, 1)}
     assert "right to capture" not in {finding.check for finding in judge_all(sections)}
-    findings = judge_all(sections | {"interface": output_text("ip/6.1.0/up.txt")})
+    findings = judge_all(sections | {"interface": read_result("ip/6.1.0/up.txt")})
     assert only(findings, "right to capture").status is FAIL
 
 
 @pytest.mark.parametrize(
-    ("user", "programs", "remedy", "typed"),
+    ("user", "programs", "remedy", "expected_remedy"),
     [
         ("1000", "sudo apt-get", "sudo apt-get install iw", "sudo apt-get install iw"),
         ("0", "apt-get", "sudo apt-get install iw", "apt-get install iw"),
@@ -422,13 +432,15 @@ def test_a_missing_interface_hides_the_check_of_capture_permission(file: str) ->
         ("1000", "sudo", "fieldkit abort", "fieldkit abort"),
     ],
 )
-def test_a_remedy_can_be_typed_on_this_robot(user: str, programs: str, remedy: str, typed: str) -> None:
+def test_a_remedy_uses_the_tools_and_permissions_of_the_robot(
+    user: str, programs: str, remedy: str, expected_remedy: str
+) -> None:
     report = Report("turtlebot-1")
     report.user_tools = system.user_tools(
         {"user": CommandResult(user, 0), "means": CommandResult("\n".join(programs.split()), 0)}
     )
     report.fail("iw", "not found", remedy)
-    assert only(report.findings, "iw").remedy == typed
+    assert only(report.findings, "iw").remedy == expected_remedy
 
 
 def test_the_remedy_for_a_port_uses_an_available_tool() -> None:
@@ -450,6 +462,6 @@ def test_the_remedy_for_a_clock_uses_an_available_tool() -> None:
         assert only(report.findings, "clock").remedy == f"{command} # on the laptop"
 
 
-def test_no_remedy_names_an_unknown_file() -> None:
+def test_the_remedy_for_the_control_route_names_the_site_file() -> None:
     finding = only(judge_radio(SENDER, control=CommandResult("10.42.0.254 51000 10.42.0.1 22", 0)), "control")
     assert finding.remedy == "write control: radio in the site file, or give host another network"

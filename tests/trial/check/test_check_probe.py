@@ -1,4 +1,4 @@
-"""The probe in the shells of robots."""
+"""The script of the probe in the shells that robots have."""
 
 import subprocess
 
@@ -7,22 +7,22 @@ import pytest
 from fieldkit.steps.scene import CommandResult
 from fieldkit.trial.check.probe import parse, script
 
-AWKWARD = 'it\'s $(touch x) `y` "z" \\ *'
+SPECIAL_CHARACTERS = 'it\'s $(touch x) `y` "z" \\ *'
 SHELLS = [("dash",), ("bash",), ("busybox", "ash")]
 
 
 @pytest.mark.parametrize("shell", SHELLS, ids=" ".join)
-def test_every_section_has_an_answer(shell: tuple[str, ...]) -> None:
+def test_every_command_has_a_section_with_its_output(shell: tuple[str, ...]) -> None:
     commands = {
-        "program it's": ("printf", "%s", AWKWARD),
+        "program it's": ("printf", "%s", SPECIAL_CHARACTERS),
         "no such": ("no-such-tool",),
         "reads": ("cat",),
         "fails": ("sh", "-c", "echo text; exit 3"),
     }
     argv = (*shell, "-s", "lo")
-    done = subprocess.run(argv, input=script(commands).encode(), capture_output=True, timeout=60, check=True)
-    sections = parse(done.stdout.decode())
-    assert sections["program it's"].text == AWKWARD
+    completed = subprocess.run(argv, input=script(commands).encode(), capture_output=True, timeout=60, check=True)
+    sections = parse(completed.stdout.decode())
+    assert sections["program it's"].text == SPECIAL_CHARACTERS
     assert sections["no such"].code == CommandResult.MISSING
     assert (sections["reads"].text, sections["reads"].code) == ("", 0), (
         "commands must not read the script from standard input"
@@ -34,4 +34,4 @@ def test_every_section_has_an_answer(shell: tuple[str, ...]) -> None:
     assert set(sections["means"].text.split()) <= {"sudo", "apt-get", "setcap", "ss", "netstat"}
     assert "Linux" in sections["system"].text
     assert {"offloads", "wifi-info", "wifi-link", "wifi-stations", "wifi-power-save"} < sections.keys()
-    assert done.stderr == b""
+    assert completed.stderr == b""

@@ -1,4 +1,4 @@
-"""Detection of a tool's variant from its output."""
+"""Detection of the variant of a tool from its output."""
 
 import contextlib
 import os
@@ -18,7 +18,7 @@ from tests.helpers.casts import TURTLEBOT, ros_of
 from tests.helpers.paths import DATA
 
 
-def about(name: str) -> bytes:
+def read_output(name: str) -> bytes:
     return (DATA / name).read_bytes()
 
 
@@ -30,7 +30,7 @@ USER = section("user", b"1000\n")
 
 
 def with_tools(**names: str) -> RobotProfile:
-    """The TurtleBot with programs under other names, and ROS in its PATH."""
+    """Return the profile of a TurtleBot with other names of programs, and with ROS in its PATH."""
     without_setup = ros_of(TURTLEBOT).command.model_copy(update={"setup": ()})
     ros = ros_of(TURTLEBOT).model_copy(update={"variants": {"ros1": without_setup}})
     return TURTLEBOT.model_copy(update={"tools": TURTLEBOT.tools.model_copy(update=names), "ros": ros})
@@ -51,15 +51,15 @@ def with_tools(**names: str) -> RobotProfile:
     ],
 )
 def test_each_netcat_is_identified_by_its_help(file: str, kind: Netcat, version: str) -> None:
-    detected = tools.parse(USER + section("netcat", about(file), 1), TURTLEBOT)
+    detected = tools.parse(USER + section("netcat", read_output(file), 1), TURTLEBOT)
     assert (detected.netcat, detected.versions) == (kind, {Tool.NETCAT: version})
 
 
 @pytest.mark.parametrize(
     ("text", "kind"),
     [
-        (about("ping/20221126/about.txt"), PingTool.IPUTILS),
-        (about("busybox/1.35.0/ping-about.txt"), PingTool.BUSYBOX),
+        (read_output("ping/20221126/about.txt"), PingTool.IPUTILS),
+        (read_output("busybox/1.35.0/ping-about.txt"), PingTool.BUSYBOX),
         (b"ping from iputils 20210722\n", PingTool.IPUTILS),
         (b"ping from iputils 20210202\n", PingTool.IPUTILS_OLD),
         (b"ping from iputils s20190709\n", PingTool.IPUTILS_OLD),
@@ -73,37 +73,39 @@ def test_each_ping_is_identified_by_its_version(text: bytes, kind: PingTool) -> 
 
 @pytest.mark.parametrize("tool", ["netcat", "ping", "capture"])
 def test_a_missing_or_unknown_tool_is_rejected_with_a_remedy(tool: str) -> None:
-    with pytest.raises(RobotError, match="there is no") as missing:
+    with pytest.raises(RobotError, match="there is no") as missing_error:
         tools.parse(USER + section(tool, b"sh: 4: nc: not found\n", 127), TURTLEBOT)
-    with pytest.raises(RobotError, match="of an unknown kind: GNU something") as unknown:
+    with pytest.raises(RobotError, match="of an unknown kind: GNU something") as unknown_error:
         tools.parse(USER + section(tool, b"GNU something 0.7.1\n"), TURTLEBOT)
-    assert "apt-get install" in missing.value.remedy
-    assert "apt-get install" in unknown.value.remedy
+    assert "apt-get install" in missing_error.value.remedy
+    assert "apt-get install" in unknown_error.value.remedy
 
 
 def test_a_killed_recorder_is_not_reported_as_missing() -> None:
-    with pytest.raises(RobotError, match="rosbag record --help did not exit in time") as slow:
+    with pytest.raises(RobotError, match="rosbag record --help did not exit in time") as timeout:
         tools.parse(USER + section("recorder", b"", 137), TURTLEBOT)
-    assert "the robot may be busy" in slow.value.remedy
+    assert "the robot may be busy" in timeout.value.remedy
 
 
 def test_a_ping_without_permission_is_rejected_with_a_remedy() -> None:
-    denied = section("echo", b"ping: permission denied (are you root?)\n", 1)
-    busybox = section("ping", about("busybox/1.35.0/ping-about.txt"))
+    denied_section = section("echo", b"ping: permission denied (are you root?)\n", 1)
+    busybox = section("ping", read_output("busybox/1.35.0/ping-about.txt"))
     with pytest.raises(RobotError, match=r"permission denied \(are you root\?\)") as caught:
-        tools.parse(USER + busybox + denied, TURTLEBOT)
+        tools.parse(USER + busybox + denied_section, TURTLEBOT)
     assert caught.value.remedy == "sudo apt-get install iputils-ping"
     with pytest.raises(RobotError) as caught:
-        tools.parse(USER + section("ping", about("ping/20221126/about.txt")) + denied, TURTLEBOT)
+        tools.parse(USER + section("ping", read_output("ping/20221126/about.txt")) + denied_section, TURTLEBOT)
     assert caught.value.remedy.startswith("sudo setcap cap_net_raw+ep")
 
 
 def test_immediate_mode_of_tcpdump_and_root_are_detected() -> None:
-    new = tools.parse(section("user", b"0\n") + section("capture", about("tcpdump/4.99.3/about.txt")), TURTLEBOT)
-    assert (new.immediate_mode, new.root) == (True, True)
-    old = tools.parse(USER + section("capture", about("tcpdump/4.5.1/about.txt"), 1), TURTLEBOT)
-    assert old.versions == {Tool.CAPTURE: "tcpdump version 4.5.1"}
-    assert (old.immediate_mode, old.root) == (False, False)
+    new_tcpdump = tools.parse(
+        section("user", b"0\n") + section("capture", read_output("tcpdump/4.99.3/about.txt")), TURTLEBOT
+    )
+    assert (new_tcpdump.immediate_mode, new_tcpdump.root) == (True, True)
+    old_tcpdump = tools.parse(USER + section("capture", read_output("tcpdump/4.5.1/about.txt"), 1), TURTLEBOT)
+    assert old_tcpdump.versions == {Tool.CAPTURE: "tcpdump version 4.5.1"}
+    assert (old_tcpdump.immediate_mode, old_tcpdump.root) == (False, False)
 
 
 def test_an_output_without_sections_is_rejected() -> None:
@@ -120,13 +122,13 @@ def test_tools_that_were_not_probed_have_the_expected_variant() -> None:
     assert variants.expected(profile).recorder is Recorder.ROSBAG
 
 
-words = st.sampled_from(
+output_parts = st.sampled_from(
     [b"==> ", b" <==\n", b"netcat", b"user", b"ping", b"exit ", b"0", b"\n", b"[v1.1", b"\xff", b"BusyBox v"]
 )
 
 
-@given(st.one_of(st.binary(), st.lists(words, max_size=40).map(b"".join)))
-def test_garbage_raises_nothing_but_a_robot_error(output: bytes) -> None:
+@given(st.one_of(st.binary(), st.lists(output_parts, max_size=40).map(b"".join)))
+def test_arbitrary_output_raises_no_other_error_than_a_robot_error(output: bytes) -> None:
     with contextlib.suppress(RobotError):
         assert all(text.isprintable() for text in tools.parse(output, TURTLEBOT).versions.values())
 
@@ -136,8 +138,10 @@ SHELLS = {"dash": ("dash",), "bash": ("bash",), "ash": ("busybox", "ash")}
 
 def run(profile: RobotProfile, shell: str = "dash") -> bytes:
     """Return the output of the probe on this machine."""
-    _, *rest = tools.probe(profile)
-    return subprocess.run((*SHELLS[shell], *rest), capture_output=True, check=False, timeout=tools.PROBE_S).stdout
+    _, *probe_args = tools.probe(profile)
+    return subprocess.run(
+        (*SHELLS[shell], *probe_args), capture_output=True, check=False, timeout=tools.PROBE_S
+    ).stdout
 
 
 @pytest.mark.emulated
@@ -164,9 +168,14 @@ def test_a_tool_that_does_not_exit_is_killed(tmp_path: Path) -> None:
     program.write_text("#!/bin/sh\necho $$ >>pid\nexec sleep 1000\n")
     program.chmod(0o755)
     profile = with_tools(netcat=str(program))
-    _, *rest = tools.probe(profile, [Tool.NETCAT])
+    _, *probe_args = tools.probe(profile, [Tool.NETCAT])
     output = subprocess.run(
-        ("sh", *rest), stdin=subprocess.PIPE, capture_output=True, check=False, timeout=tools.PROBE_S, cwd=tmp_path
+        ("sh", *probe_args),
+        stdin=subprocess.PIPE,
+        capture_output=True,
+        check=False,
+        timeout=tools.PROBE_S,
+        cwd=tmp_path,
     ).stdout
     with pytest.raises(RobotError, match="nc did not exit in time"):
         tools.parse(output, profile)

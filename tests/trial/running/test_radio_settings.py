@@ -1,4 +1,4 @@
-"""Settings of radios at the start of a trial: real outputs of `iw`, printed by a program of that name."""
+"""Settings of radios at the start of a trial, from real outputs that a fake `iw` prints."""
 
 from pathlib import Path
 
@@ -16,8 +16,8 @@ PLAN = los_plan()
 AT_START = {"channel": "6 (2437 MHz), width 20 MHz", "regulatory_domain": "HR"}
 
 
-def robot(folder: Path, info: str, domain: str = "reg-ath10k-ct") -> Shell:
-    """A robot whose `iw` prints two real outputs."""
+def robot_shell(folder: Path, info: str, domain: str = "reg-ath10k-ct") -> Shell:
+    """Return the shell of a robot with an `iw` that prints these two stored outputs."""
     folder.mkdir(exist_ok=True)
     program = folder / "iw"
     program.write_text(
@@ -31,9 +31,9 @@ def robot(folder: Path, info: str, domain: str = "reg-ath10k-ct") -> Shell:
 
 def test_settings_are_read_from_each_robot_that_has_iw(tmp_path: Path) -> None:
     shells = {
-        Role.SENDER: robot(tmp_path / "sender", "info-hwsim-station-6"),
+        Role.SENDER: robot_shell(tmp_path / "sender", "info-hwsim-station-6"),
         Role.RECEIVER: LocalShell(tmp_path, path="/usr/bin:/bin"),
-        Role.RELAY: robot(tmp_path / "relay", "no-wifi"),
+        Role.RELAY: robot_shell(tmp_path / "relay", "no-wifi"),
     }
     assert radio_settings.read(PLAN, shells) == {
         Role.SENDER: AT_START,
@@ -42,14 +42,14 @@ def test_settings_are_read_from_each_robot_that_has_iw(tmp_path: Path) -> None:
 
 
 def test_a_trial_is_not_resumed_on_another_channel(tmp_path: Path) -> None:
-    shells = {Role.SENDER: robot(tmp_path / "sender", "info-hwsim-station-6")}
+    shells = {Role.SENDER: robot_shell(tmp_path / "sender", "info-hwsim-station-6")}
     plan = PLAN.model_copy(update={"radios": {Role.SENDER: AT_START}})
     radio_settings.require_unchanged(plan, shells)
-    robot(tmp_path / "sender", "info-ap")
+    robot_shell(tmp_path / "sender", "info-ap")
     with pytest.raises(RobotError, match=r"channel 1 \(2412 MHz\), width 20 MHz, but 6 \(2437 MHz\), width 20 MHz"):
         radio_settings.require_unchanged(plan, shells)
-    robot(tmp_path / "sender", "info-hwsim-down-5")
+    robot_shell(tmp_path / "sender", "info-hwsim-down-5")
     radio_settings.require_unchanged(plan, shells)  # an unknown channel is not another channel
-    robot(tmp_path / "sender", "info-hwsim-station-6", "reg-balena")
+    robot_shell(tmp_path / "sender", "info-hwsim-station-6", "reg-balena")
     with pytest.raises(RobotError, match="regulatory domain 00, but HR at the start"):
         radio_settings.require_unchanged(plan, shells)

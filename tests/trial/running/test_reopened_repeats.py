@@ -1,4 +1,4 @@
-"""`resume --failed`: failed repeats are run again, their evidence is kept, and the tables are always consistent."""
+"""`resume --failed` runs failed repeats again and keeps their evidence; the tables are always consistent."""
 
 import os
 import shutil
@@ -29,13 +29,13 @@ from tests.trial.test_trial_crash import (
     robots_with_evidence,
 )
 
-TWO = plan().model_copy(update={"repeats": 2})
-FIRST = RepeatId(Protocol.TCP, 1)
+PLAN = plan().model_copy(update={"repeats": 2})
+FIRST_REPEAT = RepeatId(Protocol.TCP, 1)
 
 
 @pytest.fixture
-def incomplete(monkeypatch: pytest.MonkeyPatch) -> set[str]:
-    """Repeats whose evidence is incomplete."""
+def incomplete_repeats(monkeypatch: pytest.MonkeyPatch) -> set[str]:
+    """Names of repeats that get incomplete evidence; a test may change the set."""
     robots_with_evidence(monkeypatch)
     names: set[str] = set()
 
@@ -49,27 +49,29 @@ def incomplete(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     return names
 
 
-def with_a_failed_repeat(out: Path, incomplete: set[str]) -> Path:
-    incomplete.add(str(FIRST))
-    outcome = run_trial(TWO, IdleTestbed(), out, lambda _: None)
+def run_with_failed_repeat(out: Path, incomplete_repeats: set[str]) -> Path:
+    incomplete_repeats.add(str(FIRST_REPEAT))
+    outcome = run_trial(PLAN, IdleTestbed(), out, lambda _: None)
     assert outcome is not None
     assert (outcome.valid, outcome.failed) == (1, 1)
     return outcome.folder
 
 
-def resume_failed(folder: Path, received: list[Event] | None = None) -> Outcome:
-    events: list[Event] = [] if received is None else received
+def resume_failed(folder: Path, received_events: list[Event] | None = None) -> Outcome:
+    events: list[Event] = [] if received_events is None else received_events
     outcome = resume_trial(folder, IdleTestbed(), events.append, failed=True)
     assert outcome is not None
     return outcome
 
 
-def test_a_failed_repeat_is_repeated_and_its_attempts_become_void(tmp_path: Path, incomplete: set[str]) -> None:
-    folder = with_a_failed_repeat(tmp_path, incomplete)
-    incomplete.clear()
-    unasked = resume_trial(folder, IdleTestbed(), lambda _: None)
-    assert unasked is not None
-    assert unasked.failed == 1, "failed repeats are not repeated without the option"
+def test_a_failed_repeat_is_repeated_and_its_attempts_become_void(
+    tmp_path: Path, incomplete_repeats: set[str]
+) -> None:
+    folder = run_with_failed_repeat(tmp_path, incomplete_repeats)
+    incomplete_repeats.clear()
+    outcome_without_option = resume_trial(folder, IdleTestbed(), lambda _: None)
+    assert outcome_without_option is not None
+    assert outcome_without_option.failed == 1, "failed repeats are not repeated without the option"
     outcome = resume_failed(folder)
     assert (outcome.valid, outcome.failed) == (2, 0)
     table = rows(folder)
@@ -81,23 +83,25 @@ def test_a_failed_repeat_is_repeated_and_its_attempts_become_void(tmp_path: Path
     assert_consistent(folder)
 
 
-def test_a_reopened_repeat_has_all_attempts_again_and_may_fail_again(tmp_path: Path, incomplete: set[str]) -> None:
-    folder = with_a_failed_repeat(tmp_path, incomplete)
+def test_a_repeat_that_is_run_again_has_new_attempts_and_may_fail_again(
+    tmp_path: Path, incomplete_repeats: set[str]
+) -> None:
+    folder = run_with_failed_repeat(tmp_path, incomplete_repeats)
     assert resume_failed(folder).failed == 1
     assert [row["status"] for row in rows(folder) if row["repeat"] == "1"] == ["void"] * 5 + ["failed"]
     assert_consistent(folder)
-    incomplete.clear()
+    incomplete_repeats.clear()
     assert resume_failed(folder).failed == 0
     assert_consistent(folder)
-    received: list[Event] = []
-    assert resume_failed(folder, received).valid == 2
-    assert Note("no repeat of this trial failed") in received
+    received_events: list[Event] = []
+    assert resume_failed(folder, received_events).valid == 2
+    assert Note("no repeat of this trial failed") in received_events
 
 
-def moments(folder: Path, stride: int) -> Iterator[Path]:
-    """Yield the trial's folder after a kill at every `stride`-th write while a repeat is run again."""
-    moment, saved = 1 - stride, folder.with_name("kept")
-    shutil.copytree(folder, saved)
+def folders_after_kills(folder: Path, stride: int) -> Iterator[Path]:
+    """Resume the trial and kill fieldkit at every `stride`-th write; yield the folder after each kill."""
+    moment, copy = 1 - stride, folder.with_name("kept")
+    shutil.copytree(folder, copy)
     while True:
         moment += stride
         pid = os.fork()
@@ -108,35 +112,37 @@ def moments(folder: Path, stride: int) -> Iterator[Path]:
         code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
         yield folder
         shutil.rmtree(folder)
-        shutil.copytree(saved, folder)
+        shutil.copytree(copy, folder)
         if code == 0:
             return
         assert code == KILLED
 
 
 @pytest.mark.parametrize("stride", STRIDES)
-def test_a_kill_at_any_write_is_recovered(stride: int, tmp_path: Path, incomplete: set[str]) -> None:
-    folder = with_a_failed_repeat(tmp_path, incomplete)
-    incomplete.clear()
+def test_a_kill_at_any_write_is_recovered(stride: int, tmp_path: Path, incomplete_repeats: set[str]) -> None:
+    folder = run_with_failed_repeat(tmp_path, incomplete_repeats)
+    incomplete_repeats.clear()
     count = 0
-    for died in moments(folder, stride):
+    for killed_trial in folders_after_kills(folder, stride):
         count += stride
-        resume_failed(died)
-        assert Status.FAILED not in {attempt.status for attempt in journal.ended_attempts(journal.read(died))}
-        assert [row["repeat"] for row in rows(died) if row["status"] == "valid"].count("1") == 1
-        assert_consistent(died)
+        resume_failed(killed_trial)
+        assert Status.FAILED not in {attempt.status for attempt in journal.ended_attempts(journal.read(killed_trial))}
+        assert [row["repeat"] for row in rows(killed_trial) if row["status"] == "valid"].count("1") == 1
+        assert_consistent(killed_trial)
     assert count > 10, "too few writes were interrupted"
 
 
-def test_a_valid_repeat_is_not_planned_again(tmp_path: Path, incomplete: set[str]) -> None:
-    folder = with_a_failed_repeat(tmp_path, incomplete)
+def test_a_valid_repeat_is_not_planned_again(tmp_path: Path, incomplete_repeats: set[str]) -> None:
+    folder = run_with_failed_repeat(tmp_path, incomplete_repeats)
     journal.append(folder, JournalEntry(1, Protocol.TCP, 2, 0, Status.PLANNED))
     with pytest.raises(EvidenceError, match="tcp-02 is planned again, although it was valid"):
         resume_failed(folder)
 
 
-def test_altered_evidence_of_a_failed_attempt_is_not_measured_again(tmp_path: Path, incomplete: set[str]) -> None:
-    folder = with_a_failed_repeat(tmp_path, incomplete)
+def test_altered_evidence_of_a_failed_attempt_is_not_measured_again(
+    tmp_path: Path, incomplete_repeats: set[str]
+) -> None:
+    folder = run_with_failed_repeat(tmp_path, incomplete_repeats)
     (folder / store.REPEATS / "tcp-01.failed3" / "ping.txt").write_text(PING, encoding="utf-8")
     with pytest.raises(EvidenceError, match="evidence has changed since it was measured"):
         resume_failed(folder)

@@ -1,4 +1,4 @@
-"""Locks on robots: one holder at a time in any case, expiry, abort from another laptop."""
+"""Locks on robots: never two holders at the same time, expiry, and abort from another laptop."""
 
 import re
 import uuid
@@ -41,12 +41,12 @@ def fail_on_event(event: Event) -> None:
     raise AssertionError(event)
 
 
-def record(robot: LocalShell) -> list[str]:
+def record_words(robot: LocalShell) -> list[str]:
     (path,) = (robot.home / ".fieldkit").glob("lock.*")
     return path.read_text(encoding="ascii").split()
 
 
-def alter(robot: LocalShell, *changes: tuple[int, str]) -> None:
+def change_record(robot: LocalShell, *changes: tuple[int, str]) -> None:
     (path,) = (robot.home / ".fieldkit").glob("lock.*")
     words = path.read_text(encoding="ascii").split()
     for index, word in changes:
@@ -82,7 +82,7 @@ def test_the_holder_is_read_without_locking_the_robot(robot: LocalShell) -> None
         assert lock is not None
         assert lock.holder == ANNA
         assert 50 < lock.remaining_s <= 60
-        alter(robot, (4, "0"))
+        change_record(robot, (4, "0"))
         assert locks.read_lock(robot) is None, "it has expired"
     assert locks.read_lock(robot) is None
 
@@ -105,30 +105,31 @@ def test_only_one_of_many_simultaneous_laptops_locks_the_robot(robot: LocalShell
 
     for turn in range(3):
         with ThreadPoolExecutor(len(holders)) as pool:
-            won = [
+            winners = [
                 holder for holder, is_locked in zip(holders, pool.map(try_lock, holders), strict=True) if is_locked
             ]
-        (winner,) = won
-        assert record(robot)[:2] == ["held", winner.token]
-        alter(robot, (4, "1"), (5, "0"), (6, "1"))  # expired: in the next round, laptops compete to replace it
+        (winner,) = winners
+        assert record_words(robot)[:2] == ["held", winner.token]
+        # Let the lock expire, so that the laptops compete to replace it in the next round.
+        change_record(robot, (4, "1"), (5, "0"), (6, "1"))
         assert turn < 3
 
 
 def test_a_lock_number_that_was_used_and_removed_is_not_valid(robot: LocalShell) -> None:
-    """A laptop that read the lock before two others changed it finds its next number free again."""
+    """The next number may be free again for a laptop that read the lock before two other laptops changed it."""
     jobs.install(robot, Deadline.after(30))
     script = """set -- needs; . "$1"; base=.fieldkit; newest
     for words in "lock trial-b 60 bert x" "unlock trial-b" "lock trial-c 60 carl x"; do sh "$0" $words || exit; done
     record held trial-a 60 anna x && echo won; ls .fieldkit/lock.*"""
     script = script.replace('"$1"', jobs.SCRIPT_PATH)
-    done = robot.run(("sh", "-c", script, jobs.SCRIPT_PATH), deadline=Deadline.after(30), check=False)
-    assert done.stdout == b".fieldkit/lock.3\n", done.stderr
-    assert record(robot)[:2] == ["held", "trial-c"]
+    completed = robot.run(("sh", "-c", script, jobs.SCRIPT_PATH), deadline=Deadline.after(30), check=False)
+    assert completed.stdout == b".fieldkit/lock.3\n", completed.stderr
+    assert record_words(robot)[:2] == ["held", "trial-c"]
 
 
 def test_an_expired_lock_is_replaced_and_its_holder_is_notified(robot: LocalShell) -> None:
     with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
-        alter(robot, (4, "1"))
+        change_record(robot, (4, "1"))
         with locked({Role.SENDER: robot}, BERT, sink=fail_on_event):
             with pytest.raises(LockLostError, match=r"bert@two locked the robot at .* for trial-b") as caught:
                 begin(robot, ANNA)
@@ -138,34 +139,34 @@ def test_an_expired_lock_is_replaced_and_its_holder_is_notified(robot: LocalShel
 
 def test_a_lock_of_an_earlier_boot_expires_by_the_clock(robot: LocalShell) -> None:
     with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
-        alter(robot, (2, "another-boot"), (4, "1"))
+        change_record(robot, (2, "another-boot"), (4, "1"))
         with (
             pytest.raises(RobotError, match="anna@one locked it"),
             locked({Role.SENDER: robot}, BERT, sink=fail_on_event),
         ):
             raise AssertionError("taken twice")
-        alter(robot, (5, "99999999999"), (6, "99999999999"))  # the robot's clock is in the past: it has no battery
+        change_record(robot, (5, "99999999999"), (6, "99999999999"))  # the robot's clock has no battery and is behind
         with locked({Role.SENDER: robot}, BERT, sink=fail_on_event):
             begin(robot, BERT)
 
 
-def test_begin_renews_at_half_time_and_not_before(robot: LocalShell) -> None:
+def test_begin_renews_the_lock_only_after_half_of_its_time(robot: LocalShell) -> None:
     with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event, ttl_s=1000):
-        fresh = record(robot)
+        record_before = record_words(robot)
         begin(robot, ANNA)
-        assert record(robot) == fresh
-        alter(robot, (3, str(int(fresh[3]) - 600)), (4, str(int(fresh[4]) - 600)))
+        assert record_words(robot) == record_before
+        change_record(robot, (3, str(int(record_before[3]) - 600)), (4, str(int(record_before[4]) - 600)))
         begin(robot, ANNA)
-        renewed = record(robot)
-        assert int(renewed[4]) >= int(fresh[4])
-        assert renewed[7:] == fresh[7:]
+        record_after = record_words(robot)
+        assert int(record_after[4]) >= int(record_before[4])
+        assert record_after[7:] == record_before[7:]
 
 
 def test_an_expired_lock_without_a_new_holder_is_renewed(robot: LocalShell) -> None:
     with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
-        alter(robot, (4, "1"))
+        change_record(robot, (4, "1"))
         begin(robot, ANNA)
-        assert int(record(robot)[4]) > 1
+        assert int(record_words(robot)[4]) > 1
 
 
 def test_abort_ends_jobs_of_any_trial_and_notifies_the_holder(robot: LocalShell) -> None:
@@ -175,9 +176,9 @@ def test_abort_ends_jobs_of_any_trial_and_notifies_the_holder(robot: LocalShell)
         for folder in (FOLDER, jobs.work_folder("older", "udp-03-1")):
             argv = ("sh", "-c", "trap '' INT; echo up; while :; do sleep 0.05; done")
             jobs.start(robot, Job(folder=folder, name="capture", argv=argv, limit_s=60, log="log", ready="log:up"))
-        (aborted,) = locks.abort({"turtlebot-1": robot}, "bert@two").values()
-        assert aborted.error is None
-        assert [line.split()[0] for line in aborted.jobs] == [
+        (abort_result,) = locks.abort({"turtlebot-1": robot}, "bert@two").values()
+        assert abort_result.error is None
+        assert [line.split()[0] for line in abort_result.jobs] == [
             ".fieldkit/older/udp-03-1/capture",
             ".fieldkit/trial-a/tcp-01-1/capture",
         ]
@@ -221,8 +222,8 @@ def test_a_torn_record_does_not_block_for_long(robot: LocalShell) -> None:
             path.unlink()
 
 
-def test_an_empty_record_hides_no_lock(robot: LocalShell) -> None:
-    """An older fieldkit leaves such a record if the power fails just after it was written."""
+def test_an_empty_record_does_not_hide_a_lock(robot: LocalShell) -> None:
+    """Older versions of fieldkit leave such a record if the power fails just after they wrote it."""
     with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
         (robot.home / ".fieldkit" / "lock.9").touch()
         with (
@@ -231,7 +232,7 @@ def test_an_empty_record_hides_no_lock(robot: LocalShell) -> None:
         ):
             raise AssertionError("taken twice")
         begin(robot, ANNA)
-    assert record(robot)[0] == "free"
+    assert record_words(robot)[0] == "free"
 
 
 def test_a_robot_that_lost_its_records_is_locked_again(robot: LocalShell) -> None:
@@ -246,7 +247,7 @@ def test_a_robot_that_lost_its_records_is_locked_again(robot: LocalShell) -> Non
             raise AssertionError("taken twice")
 
 
-def test_a_record_is_on_the_disk_before_it_is_a_lock(robot: LocalShell, tmp_path: Path) -> None:
+def test_a_record_is_synced_before_it_becomes_a_lock(robot: LocalShell, tmp_path: Path) -> None:
     calls = tmp_path / "calls"
     for name in ("sync", "ln"):
         real = f"busybox {name}" if (tmp_path / "bin" / name).exists() else f"/bin/{name}"
@@ -258,29 +259,29 @@ def test_a_record_is_on_the_disk_before_it_is_a_lock(robot: LocalShell, tmp_path
         )
         (tmp_path / "bin" / name).chmod(0o755)
     with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
-        synced, linked, folder = calls.read_text(encoding="ascii").splitlines()
-        assert re.fullmatch(r"sync held new-lock\.\d+", synced)
-        assert linked.startswith("ln held new-lock.")
-        assert folder.startswith("sync ")
-        assert folder.endswith(" lock.1")
+        sync_call, link_call, sync_of_folder = calls.read_text(encoding="ascii").splitlines()
+        assert re.fullmatch(r"sync held new-lock\.\d+", sync_call)
+        assert link_call.startswith("ln held new-lock.")
+        assert sync_of_folder.startswith("sync ")
+        assert sync_of_folder.endswith(" lock.1")
 
 
-def test_a_lock_lasts_as_long_as_a_job_may(robot: LocalShell) -> None:
+def test_a_lock_is_extended_to_the_limit_of_a_job(robot: LocalShell) -> None:
     with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
         begin(robot, ANNA)
         jobs.run(robot, Job(folder=FOLDER, name="long", argv=("true",), limit_s=7200, log="log"))
         lock = locks.read_lock(robot)
         assert lock is not None
         assert lock.remaining_s > 7200
-        fresh = record(robot)
+        record_before = record_words(robot)
         jobs.run(robot, Job(folder=FOLDER, name="short", argv=("true",), limit_s=60, log="log"))
-        assert record(robot) == fresh
+        assert record_words(robot) == record_before
 
 
 def test_a_job_of_a_trial_that_lost_its_lock_does_not_start(robot: LocalShell) -> None:
     with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
         begin(robot, ANNA)
-        alter(robot, (4, "1"))
+        change_record(robot, (4, "1"))
         with locked({Role.SENDER: robot}, BERT, sink=fail_on_event):
             for call in (jobs.start, jobs.run):
                 job = Job(folder=FOLDER, name=call.__name__, argv=("touch", "started"), limit_s=5, log="log")
@@ -290,17 +291,18 @@ def test_a_job_of_a_trial_that_lost_its_lock_does_not_start(robot: LocalShell) -
 
 
 def test_no_job_starts_in_a_folder_created_during_an_abort(robot: LocalShell, tmp_path: Path) -> None:
-    called, go = robot.home / "called", robot.home / "go"
+    called_file, continue_file = robot.home / "called", robot.home / "go"
     with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event), ThreadPoolExecutor(1) as pool:
         real = "busybox df" if (tmp_path / "bin" / "df").exists() else "/bin/df"
         (tmp_path / "bin" / "df").unlink(missing_ok=True)
-        wrapper = f'#!/bin/sh\ntouch "{called}"; until [ -e "{go}" ]; do sleep 0.01; done; exec {real} "$@"\n'
+        wait = f'until [ -e "{continue_file}" ]; do sleep 0.01; done'
+        wrapper = f'#!/bin/sh\ntouch "{called_file}"; {wait}; exec {real} "$@"\n'
         (tmp_path / "bin" / "df").write_text(wrapper, encoding="ascii")  # called after the lock was checked
         (tmp_path / "bin" / "df").chmod(0o755)
         submitted = pool.submit(begin, robot, ANNA)
-        wait_until(called.exists, Deadline.after(30))
+        wait_until(called_file.exists, Deadline.after(30))
         assert locks.abort({"turtlebot-1": robot}, "bert@two")["turtlebot-1"].locked
-        go.touch()
+        continue_file.touch()
         submitted.result(30)
         with pytest.raises(LockLostError, match="the trial was aborted by bert@two"):
             jobs.run(robot, Job(folder=FOLDER, name="job", argv=("touch", "started"), limit_s=5, log="log"))
@@ -309,15 +311,15 @@ def test_no_job_starts_in_a_folder_created_during_an_abort(robot: LocalShell, tm
 
 def test_aborting_a_free_robot_reports_no_lock(robot: LocalShell) -> None:
     for _ in range(2):
-        (aborted,) = locks.abort({"turtlebot-1": robot}, "bert@two").values()
-        assert (aborted.locked, aborted.error) == (False, None)
+        (abort_result,) = locks.abort({"turtlebot-1": robot}, "bert@two").values()
+        assert (abort_result.locked, abort_result.error) == (False, None)
     with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
         pass
     assert not locks.abort({"turtlebot-1": robot}, "bert@two")["turtlebot-1"].locked
 
 
 def test_a_holder_that_lost_a_robot_is_notified(robot: LocalShell, tmp_path: Path) -> None:
-    """The holder is also notified if another robot does not answer."""
+    """It is notified even if another robot does not answer."""
     plan = plain_plan()
     anna = Holder(plan.session, "anna@one", plan.trial)
     shells = {Role.SENDER: robot, Role.RECEIVER: RobotOutOfRange(tmp_path, robot="abe")}
@@ -339,7 +341,7 @@ def test_fetched_evidence_is_deleted_after_a_broken_lock(robot: LocalShell) -> N
 
 
 class RobotOutOfRange(LocalShell):
-    """A robot that goes out of range after a number of commands."""
+    """A robot that does not answer after `calls_left` further commands."""
 
     calls_left = 0
 
@@ -360,11 +362,13 @@ def cast(tmp_path: Path) -> dict[Role, RobotOutOfRange]:
     return shells
 
 
-def test_all_robots_are_locked_or_none(cast: dict[Role, RobotOutOfRange]) -> None:
+def test_no_robot_stays_locked_if_one_cannot_be_locked(cast: dict[Role, RobotOutOfRange]) -> None:
     with locked({Role.SENDER: cast[Role.SENDER]}, BERT, sink=fail_on_event):
         with pytest.raises(RobotError, match="zoe: bert@two locked it"), locked(cast, ANNA, sink=fail_on_event):
             raise AssertionError("taken")
-        assert record(cast[Role.RECEIVER])[0] == "free", "locked first, in the order of names, and unlocked"
+        assert record_words(cast[Role.RECEIVER])[0] == "free", (
+            "it was locked first, because its name is first, and unlocked again"
+        )
 
 
 def test_a_robot_that_cannot_be_unlocked_is_reported(cast: dict[Role, RobotOutOfRange]) -> None:
@@ -374,7 +378,7 @@ def test_a_robot_that_cannot_be_unlocked_is_reported(cast: dict[Role, RobotOutOf
     (note,) = events
     assert isinstance(note, Note)
     assert note.text.startswith("zoe stays locked until its lock expires")
-    assert record(cast[Role.RECEIVER])[0] == "free"
+    assert record_words(cast[Role.RECEIVER])[0] == "free"
 
 
 def test_an_unreachable_robot_does_not_prevent_other_aborts(cast: dict[Role, RobotOutOfRange]) -> None:
@@ -388,10 +392,10 @@ def test_an_unreachable_robot_does_not_prevent_other_aborts(cast: dict[Role, Rob
         "eve": False,
         "zoe": True,
     }
-    assert record(cast[Role.SENDER])[:2] == ["aborted", "trial-a"]
+    assert record_words(cast[Role.SENDER])[:2] == ["aborted", "trial-a"]
 
 
-def test_the_user_of_this_machine_has_a_name() -> None:
+def test_the_user_and_this_machine_have_names() -> None:
     user, _, machine = runtime.user_at_host().partition("@")
     assert user
     assert machine
@@ -405,7 +409,7 @@ def test_a_second_process_with_the_token_does_not_unlock_the_robots(cast: dict[R
             pytest.raises(ConfigurationError, match="another fieldkit process runs this trial"),
             locked_exclusively(cast, anna, sink=fail_on_event),
         ):
-            raise AssertionError("two run it")
+            raise AssertionError("two processes run the trial")
         for shell in cast.values():
             begin(shell, anna)
     with locked_exclusively(cast, anna, sink=fail_on_event):
@@ -413,11 +417,11 @@ def test_a_second_process_with_the_token_does_not_unlock_the_robots(cast: dict[R
 
 
 def test_ctrl_c_closes_connections_before_the_robots_are_unlocked(cast: dict[Role, RobotOutOfRange]) -> None:
-    """The program must not wait again for a lost link."""
-    done: list[str] = []
+    """Unlocking must not wait again for a lost link."""
+    closed_robots: list[str] = []
     for shell in cast.values():
-        shell.close = lambda name=shell.robot: done.append(name)  # type: ignore[method-assign,misc]
+        shell.close = lambda name=shell.robot: closed_robots.append(name)  # type: ignore[method-assign,misc]
     with pytest.raises(KeyboardInterrupt), locked(cast, ANNA, sink=fail_on_event):
         raise KeyboardInterrupt
-    assert done == ["abe", "zoe"]
-    assert {record(shell)[0] for shell in cast.values()} == {"free"}
+    assert closed_robots == ["abe", "zoe"]
+    assert {record_words(shell)[0] for shell in cast.values()} == {"free"}

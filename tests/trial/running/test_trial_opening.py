@@ -1,4 +1,4 @@
-"""Opening the robots of a trial: the order of the steps, the clean-up, and the report of trials not started."""
+"""Opening the robots of a trial: the order of the steps, the clean-up, and the note about trials not started."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
@@ -28,7 +28,7 @@ TESTBED = IdleTestbed()
 
 
 class UnusedOperator:
-    """An operator that must not be asked."""
+    """An operator who must not be asked."""
 
     def ask(self, request: str, *, may_skip: bool = False) -> Any:  # noqa: ANN401 (never returns)
         raise AssertionError(request, may_skip)
@@ -38,10 +38,10 @@ class UnusedOperator:
 
 
 class Recorder:
-    """A backend that records the use of its testbed; it also replaces preflight checks, locks and runner.
+    """A backend that records the calls of itself, of the preflight checks, of the locks and of the runner.
 
     Args:
-        failing: What raises, by name.
+        failing: Errors to raise, by the name of the call.
     """
 
     by_hand = False
@@ -60,7 +60,7 @@ class Recorder:
             raise self.failing[event]
 
     @contextmanager
-    def around(self, event: str) -> Iterator[None]:
+    def record_both_ends(self, event: str) -> Iterator[None]:
         self.note(event)
         try:
             yield
@@ -74,7 +74,7 @@ class Recorder:
     @contextmanager
     def open(self, cast: Cast, *, seed: int, sink: Sink, operator: Operator) -> Iterator[Testbed]:
         assert (cast, seed) == (CAST, 7)
-        with self.around("open"):
+        with self.record_both_ends("open"):
             yield TESTBED
 
     def persistent_shells(self, *, sink: Sink) -> AbstractContextManager[Mapping[str, Shell | FieldkitError]]:
@@ -96,7 +96,7 @@ def recorder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Recorder]:
         def lock(shells: Shells, holder: Holder, *, sink: Sink) -> AbstractContextManager[None]:
             assert shells == TESTBED.shells
             recording.holder = holder
-            return recording.around("hold")
+            return recording.record_both_ends("hold")
 
         def run_trial(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop) -> Outcome:
             assert testbed is TESTBED

@@ -1,4 +1,4 @@
-"""A trial can only be resumed with the code, the backend and the robots with which it started."""
+"""A trial can only be resumed with the same code, the same backend and the same robots."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ TRIAL: Path = min(TRIALS.iterdir())
 PLAN = plans.read_plan(TRIAL)
 
 
-def test_rows_of_different_code_are_not_mixed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trial_is_not_resumed_with_different_code(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resumption, "code_hash", lambda: PLAN.code_sha256)
     assert resumption.resumable(TRIAL) == PLAN
     monkeypatch.setattr(resumption, "code_hash", lambda: "another")
@@ -37,10 +37,10 @@ def test_robots_of_another_backend_are_rejected() -> None:
 
 def test_other_simulators_are_rejected() -> None:
     resumption.require_simulators(PLAN, {}, TRIAL)
-    simulated = PLAN.model_copy(update={"simulators": {"physics": "mujoco", "network": "ns3"}})
-    resumption.require_simulators(simulated, {"network": "ns3", "physics": "mujoco"}, TRIAL)
+    simulated_plan = PLAN.model_copy(update={"simulators": {"physics": "mujoco", "network": "ns3"}})
+    resumption.require_simulators(simulated_plan, {"network": "ns3", "physics": "mujoco"}, TRIAL)
     with pytest.raises(ConfigurationError, match="was started on physics mujoco, network ns3, not on no simulators"):
-        resumption.require_simulators(simulated, {}, TRIAL)
+        resumption.require_simulators(simulated_plan, {}, TRIAL)
     with pytest.raises(ConfigurationError, match="was started on no simulators, not on network ns3"):
         resumption.require_simulators(PLAN, {"network": "ns3"}, TRIAL)
 
@@ -48,32 +48,32 @@ def test_other_simulators_are_rejected() -> None:
 @pytest.mark.parametrize("change", [{"name": "other"}, {"address": "10.42.0.99"}, None])
 def test_other_robots_are_rejected(change: dict[str, str] | None) -> None:
     resumption.require_cast(PLAN, PLAN.cast)
-    changed = dict(PLAN.cast)
-    sender = changed.pop(Role.SENDER)
+    changed_cast = dict(PLAN.cast)
+    sender = changed_cast.pop(Role.SENDER)
     if change is not None:
-        changed[Role.SENDER] = sender.model_copy(update=change)
+        changed_cast[Role.SENDER] = sender.model_copy(update=change)
     with pytest.raises(ConfigurationError, match=f"sender was {sender.name} ") as caught:
-        resumption.require_cast(PLAN, changed)
+        resumption.require_cast(PLAN, changed_cast)
     assert caught.value.where == PLAN.trial
 
 
 @pytest.mark.motion
 def test_a_self_moving_robot_needs_permission_again() -> None:
-    shipped = load_procedure("driveaway")
-    driving = {
+    driving_procedure = load_procedure("driveaway")
+    driving_cast = {
         role: robot.model_copy(update={"abilities": frozenset({"drive"})}) for role, robot in PLAN.cast.items()
     }
-    by_hand = {role: robot.model_copy(update={"abilities": frozenset()}) for role, robot in PLAN.cast.items()}
-    plan = PLAN.model_copy(update={"procedure": shipped, "cast": driving})
-    resumption.require_cast(plan, driving)
+    carried_cast = {role: robot.model_copy(update={"abilities": frozenset()}) for role, robot in PLAN.cast.items()}
+    plan = PLAN.model_copy(update={"procedure": driving_procedure, "cast": driving_cast})
+    resumption.require_cast(plan, driving_cast)
     with pytest.raises(
         ConfigurationError, match="moves without a person in this trial, which is not permitted now"
     ) as caught:
-        resumption.require_cast(plan, by_hand)
+        resumption.require_cast(plan, carried_cast)
     assert "--allow-motion" in caught.value.remedy
     # Permission to move does not matter if nothing moves the robot, or if a person does.
-    resumption.require_cast(PLAN.model_copy(update={"cast": driving}), by_hand)
-    resumption.require_cast(plan.model_copy(update={"cast": by_hand}), driving)
+    resumption.require_cast(PLAN.model_copy(update={"cast": driving_cast}), carried_cast)
+    resumption.require_cast(plan.model_copy(update={"cast": carried_cast}), driving_cast)
 
 
 def test_a_trial_with_a_changed_program_is_not_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""Ctrl-C during parallel operations on robots: nothing is written into an attempt's folder after it was stored."""
+"""Parallel operations on robots: fetching evidence, lost links, reboots, and Ctrl-C."""
 
 import os
 import signal
@@ -22,7 +22,7 @@ from tests.helpers.userlands import LocalShell
 
 
 class SlowRobot(LocalShell):
-    """A robot that sends its evidence until the connection is closed, and needs a moment to stop."""
+    """A robot whose evidence is only fetched completely when its connection is closed."""
 
     def __init__(self, home: Path, fetching: Callable[[], None]) -> None:
         super().__init__(home)
@@ -40,7 +40,7 @@ class SlowRobot(LocalShell):
 
 
 def slow_testbed(home: Path) -> IdleTestbed:
-    """Return a testbed of slow robots; the operator presses Ctrl-C while the last one is fetched."""
+    """Return a testbed of slow robots; the operator presses Ctrl-C while both are sending evidence."""
     barrier = threading.Barrier(2, action=lambda: os.kill(os.getpid(), signal.SIGINT))
     return IdleTestbed(
         {role: SlowRobot(home, lambda: (barrier.wait(60), None)[1]) for role in (Role.SENDER, Role.RECEIVER)}
@@ -48,28 +48,28 @@ def slow_testbed(home: Path) -> IdleTestbed:
 
 
 def test_ctrl_c_closes_connections_and_waits_for_writers_of_evidence(tmp_path: Path) -> None:
-    into = tmp_path / "into"
-    into.mkdir()
+    destination = tmp_path / "into"
+    destination.mkdir()
     robots = Robots(plain_plan(), slow_testbed(tmp_path))
     threads_before = set(threading.enumerate())
     with pytest.raises(KeyboardInterrupt):
-        robots.fetch("x", into, ended_normally=True)
+        robots.fetch("x", destination, ended_normally=True)
     robots.close_connections()
-    saved = into.rename(tmp_path / "kept")
+    stored_folder = destination.rename(tmp_path / "kept")
     wait_until(lambda: threads_before.issuperset(threading.enumerate()), Deadline.after(60))
-    assert list(saved.iterdir()) == [], "partially fetched files are removed before the attempt is stored"
-    assert not into.exists()
+    assert list(stored_folder.iterdir()) == [], "partially fetched files are removed before the attempt is stored"
+    assert not destination.exists()
 
 
 class UnreachableRobot(LocalShell):
-    """A robot whose link fails whenever it sends its evidence."""
+    """A robot whose link always fails while it sends evidence."""
 
     def fetch(self, argv: object, to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
         raise LinkError("the connection broke", where="turtlebot-1")
 
 
 @pytest.mark.emulated
-def test_unfetched_evidence_stays_on_its_robot(tmp_path: Path) -> None:
+def test_evidence_that_cannot_be_fetched_is_not_deleted_from_the_robot(tmp_path: Path) -> None:
     plan, shells = plain_plan(), {}
     attempts = {name: jobs.work_folder(plan.trial, name) for name in ("udp-01-1", "udp-01-2")}
     for role, kind in ((Role.SENDER, UnreachableRobot), (Role.RECEIVER, LocalShell)):
@@ -79,10 +79,12 @@ def test_unfetched_evidence_stays_on_its_robot(tmp_path: Path) -> None:
         for remote in attempts.values():
             evidence.begin(shells[role], remote, role, "lo", need_kib=0)
     robots = Robots(plan, IdleTestbed(shells))
-    into = tmp_path / "into"
-    into.mkdir()
-    assert robots.fetch(attempts["udp-01-1"], into, ended_normally=True) == ["turtlebot-1: the connection broke"]
-    assert {path.name for path in into.iterdir()} == {
+    destination = tmp_path / "into"
+    destination.mkdir()
+    assert robots.fetch(attempts["udp-01-1"], destination, ended_normally=True) == [
+        "turtlebot-1: the connection broke"
+    ]
+    assert {path.name for path in destination.iterdir()} == {
         "receiver-before.txt",
         "receiver-after.txt",
         "receiver-sources-before.txt",
@@ -97,7 +99,7 @@ def test_unfetched_evidence_stays_on_its_robot(tmp_path: Path) -> None:
 
 
 class RebootedRobot(LocalShell):
-    """A robot that lost power after the start of an attempt, with the data not yet written to its disk."""
+    """A robot that lost power after the start of an attempt, and with it all data of the attempt."""
 
     boots = 0
 
@@ -119,10 +121,10 @@ def test_a_void_attempt_reports_that_its_robot_rebooted(tmp_path: Path) -> None:
     output_text = robots.fetch("x", tmp_path, ended_normally=False)
     reasons = [f"{name}: the robot rebooted during the repeat" for name in ("turtlebot-2", "turtlebot-1")]
     assert sorted(output_text) == sorted(reasons)
-    listed = hosts.drop_effects_of_reboots(
+    remaining_reasons = hosts.drop_effects_of_reboots(
         ["turtlebot-1: no job in .jobs/capture", "scan.bag: there is no bag", *output_text]
     )
-    assert sorted(listed) == sorted(["scan.bag: there is no bag", *reasons])
+    assert sorted(remaining_reasons) == sorted(["scan.bag: there is no bag", *reasons])
 
 
 class InterruptedRobot(LocalShell):
@@ -134,11 +136,11 @@ class InterruptedRobot(LocalShell):
         self.pieces = 0
 
     def fetch(self, argv: Sequence[str], to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
-        done = super().fetch(argv, to, deadline=deadline, limit_bytes=limit_bytes)
+        completed = super().fetch(argv, to, deadline=deadline, limit_bytes=limit_bytes)
         if argv[2] == "piece":
             self.pieces += 1
             self.on_command()
-        return done
+        return completed
 
 
 @pytest.mark.emulated
@@ -153,14 +155,14 @@ def test_no_segment_is_requested_after_the_connection_was_closed(tmp_path: Path)
     (tmp_path / Role.SENDER / remote / "scan.bag").write_bytes(bytes(3 * fetching.PIECE_BYTES))
     robots = Robots(plan, IdleTestbed(shells))
     shells[Role.SENDER].on_command = robots.close_connections
-    into = tmp_path / "into"
-    into.mkdir()
-    assert robots.fetch(remote, into, ended_normally=True) == ["the fetch was cancelled"]
+    destination = tmp_path / "into"
+    destination.mkdir()
+    assert robots.fetch(remote, destination, ended_normally=True) == ["the fetch was cancelled"]
     assert shells[Role.SENDER].pieces == 1
     shells[Role.SENDER].on_command = lambda: None
-    for path in into.glob("*.txt"):
+    for path in destination.glob("*.txt"):
         path.unlink()
-    assert robots.fetch(remote, into, ended_normally=True) == []
+    assert robots.fetch(remote, destination, ended_normally=True) == []
     assert shells[Role.SENDER].pieces == 3, "fetching resumes at the same segment"
 
 
@@ -178,9 +180,9 @@ def test_completely_fetched_evidence_is_deleted_even_if_a_job_failed(tmp_path: P
     for name, text in {"leaves": "", "pid": "1 1 x", "exit": "3"}.items():
         (job / name).write_text(f"{text}\n", encoding="ascii")
     robots = Robots(plan, IdleTestbed(shells))
-    into = tmp_path / "into"
-    into.mkdir()
-    (output_text,) = robots.fetch(remote, into, ended_normally=True)
+    destination = tmp_path / "into"
+    destination.mkdir()
+    (output_text,) = robots.fetch(remote, destination, ended_normally=True)
     assert output_text.endswith("job capture ended with exit code 3")
     assert "exit code 1" not in output_text, "the message is from the robot"
     assert robots.unfetched.by_robot() == {}

@@ -1,4 +1,4 @@
-"""Events and files of a running trial without robots; everything else is real."""
+"""Events and files of a running trial; only the measurement on robots is replaced."""
 
 import errno
 import os
@@ -34,7 +34,7 @@ STEP_S = 100.0
 
 
 @pytest.fixture(autouse=True)
-def _no_robots(monkeypatch: pytest.MonkeyPatch) -> None:
+def _replace_measurement(monkeypatch: pytest.MonkeyPatch) -> None:
     robots_with_evidence(monkeypatch)
 
 
@@ -43,7 +43,7 @@ def events() -> list[Event]:
     return []
 
 
-def of_two() -> Plan:
+def plan_of_two_repeats() -> Plan:
     return plan().model_copy(update={"repeats": 2})
 
 
@@ -51,7 +51,7 @@ def repeat_ends(events: list[Event]) -> list[RepeatEnded]:
     return [event for event in events if isinstance(event, RepeatEnded)]
 
 
-def only(folder: Path) -> Path:
+def trial_in(folder: Path) -> Path:
     (plan_file,) = folder.glob("*/trial.yaml")
     return plan_file.parent
 
@@ -66,11 +66,16 @@ def test_the_remaining_time_is_estimated_from_finished_repeats(
 
     ticks = clock()
     monkeypatch.setattr("fieldkit.trial.running.runner.time.monotonic", lambda: next(ticks))
-    run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
-    void, first, second = repeat_ends(events)
-    assert (void.status, void.left_s) == (Status.VOID, 2 * of_two().procedure.expected_s(Protocol.TCP))
+    run_trial(plan_of_two_repeats(), IdleTestbed(), tmp_path, events.append)
+    void_attempt, first, second = repeat_ends(events)
+    assert (void_attempt.status, void_attempt.left_s) == (
+        Status.VOID,
+        2 * plan_of_two_repeats().procedure.expected_s(Protocol.TCP),
+    )
     assert first.status is Status.VALID
-    assert first.left_s == first.left_most_s >= STEP_S, "the duration of the finished repeat with its void attempts"
+    assert first.left_s == first.left_most_s >= STEP_S, (
+        "the duration of the finished repeat includes its void attempts"
+    )
     assert second.left_s == 0
 
 
@@ -79,20 +84,20 @@ def test_the_repeat_that_ctrl_c_lets_finish_is_reported(
 ) -> None:
     stop, fetch = Stop(), Robots.fetch
 
-    def recorded_fetch(self: Robots, remote: str, into: Path, *, ended_normally: bool) -> list[str]:
+    def fetch_and_stop(self: Robots, remote: str, into: Path, *, ended_normally: bool) -> list[str]:
         stop.after_repeat = not remote.endswith("tcp-01-1")
         return fetch(self, remote, into, ended_normally=ended_normally)
 
-    monkeypatch.setattr(Robots, "fetch", recorded_fetch)
+    monkeypatch.setattr(Robots, "fetch", fetch_and_stop)
     with pytest.raises(KeyboardInterrupt):
-        run_trial(of_two(), IdleTestbed(), tmp_path, events.append, stop)
+        run_trial(plan_of_two_repeats(), IdleTestbed(), tmp_path, events.append, stop)
     assert [event.status for event in repeat_ends(events)] == [Status.VOID, Status.VALID]
 
 
 def test_after_an_abort_by_another_user_fetched_folders_are_deleted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    removed: list[str | None] = []
+    removed_folders: list[str | None] = []
 
     def begin(_self: Robots, remote: str, *, old: str | None) -> Exchanges:
         if old is not None:
@@ -100,30 +105,30 @@ def test_after_an_abort_by_another_user_fetched_folders_are_deleted(
         return {}
 
     monkeypatch.setattr(Robots, "begin", begin)
-    monkeypatch.setattr(Robots, "delete_remote", lambda _, remote=None: removed.append(remote))
+    monkeypatch.setattr(Robots, "delete_remote", lambda _, remote=None: removed_folders.append(remote))
     with pytest.raises(LockLostError):
-        run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
-    assert removed == [f".fieldkit/{of_two().trial}/tcp-01-1"]
+        run_trial(plan_of_two_repeats(), IdleTestbed(), tmp_path, lambda _: None)
+    assert removed_folders == [f".fieldkit/{plan_of_two_repeats().trial}/tcp-01-1"]
 
 
 def test_an_aborted_attempt_does_not_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    removed: list[str | None] = []
+    removed_folders: list[str | None] = []
 
     def measure(*_: object) -> None:
         raise RobotError("ping ended with exit code 130", where="turtlebot-1")
 
-    def aborted(_self: Robots) -> None:
+    def raise_lock_lost(_self: Robots) -> None:
         raise LockLostError("the trial was aborted by anna@one at 12:00:00 UTC", where="turtlebot-1")
 
     monkeypatch.setattr(Robots, "measure", measure)
-    monkeypatch.setattr(Robots, "require_locks", aborted)
-    monkeypatch.setattr(Robots, "delete_remote", lambda _, remote=None: removed.append(remote))
+    monkeypatch.setattr(Robots, "require_locks", raise_lock_lost)
+    monkeypatch.setattr(Robots, "delete_remote", lambda _, remote=None: removed_folders.append(remote))
     with pytest.raises(LockLostError):
-        run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
-    (cut,) = journal.ended_attempts(journal.read(only(tmp_path)))
-    assert (cut.status, cut.excused) == (Status.VOID, True)
-    assert cut.reason == "turtlebot-1: the trial was aborted by anna@one at 12:00:00 UTC"
-    assert removed == [f".fieldkit/{of_two().trial}/tcp-01-1"]
+        run_trial(plan_of_two_repeats(), IdleTestbed(), tmp_path, lambda _: None)
+    (interrupted_attempt,) = journal.ended_attempts(journal.read(trial_in(tmp_path)))
+    assert (interrupted_attempt.status, interrupted_attempt.excused) == (Status.VOID, True)
+    assert interrupted_attempt.reason == "turtlebot-1: the trial was aborted by anna@one at 12:00:00 UTC"
+    assert removed_folders == [f".fieldkit/{plan_of_two_repeats().trial}/tcp-01-1"]
 
 
 def test_the_remedy_of_a_failed_step_is_reported(
@@ -136,7 +141,7 @@ def test_the_remedy_of_a_failed_step_is_reported(
             raise failure
 
     monkeypatch.setattr(Robots, "measure", measure)
-    run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
+    run_trial(plan_of_two_repeats(), IdleTestbed(), tmp_path, events.append)
     reasons_and_remedies = [(event.reason, event.remedy) for event in repeat_ends(events)]
     assert reasons_and_remedies[0] == ("sending began too late", "a larger `idle` leaves it more time")
     assert not any(remedy for _, remedy in reasons_and_remedies[1:])
@@ -150,14 +155,18 @@ def test_an_unexpected_exception_of_a_step_is_not_an_interruption(
 
     monkeypatch.setattr(Robots, "measure", measure)
     with pytest.raises(KeyError):
-        run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
-    (cut,) = journal.ended_attempts(journal.read(only(tmp_path)))
-    assert (cut.status, cut.excused, cut.reason) == (Status.VOID, True, "KeyError: 'load'")
+        run_trial(plan_of_two_repeats(), IdleTestbed(), tmp_path, lambda _: None)
+    (interrupted_attempt,) = journal.ended_attempts(journal.read(trial_in(tmp_path)))
+    assert (interrupted_attempt.status, interrupted_attempt.excused, interrupted_attempt.reason) == (
+        Status.VOID,
+        True,
+        "KeyError: 'load'",
+    )
 
 
 def test_evidence_missing_after_a_kill_is_explained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = store.create(tmp_path, of_two())
-    (repeat, _) = of_two().repeats_in_order()
+    folder = store.create(tmp_path, plan_of_two_repeats())
+    (repeat, _) = plan_of_two_repeats().repeats_in_order()
     journal.append(
         folder,
         JournalEntry(1, repeat.protocol, 1, 0, Status.PLANNED),
@@ -166,10 +175,10 @@ def test_evidence_missing_after_a_kill_is_explained(tmp_path: Path, monkeypatch:
     )
     fetch, message = Robots.fetch, "turtlebot-1: it has no folder .fieldkit/x/tcp-01-1 any more"
 
-    def gone_once(self: Robots, remote: str, into: Path, *, ended_normally: bool) -> list[str]:
+    def fail_first_fetch(self: Robots, remote: str, into: Path, *, ended_normally: bool) -> list[str]:
         return [message] if remote.endswith("tcp-01-1") else fetch(self, remote, into, ended_normally=ended_normally)
 
-    monkeypatch.setattr(Robots, "fetch", gone_once)
+    monkeypatch.setattr(Robots, "fetch", fail_first_fetch)
     resume_trial(folder, IdleTestbed(), lambda _: None)
     first = journal.ended_attempts(journal.read(folder))[0]
     assert (first.status, first.excused) == (Status.VOID, True)
@@ -184,16 +193,16 @@ def test_evidence_left_on_a_robot_is_also_reported_after_resuming(
 ) -> None:
     fetch = Robots.fetch
 
-    def leave_first(self: Robots, remote: str, into: Path, *, ended_normally: bool) -> list[str]:
+    def mark_first_unfetched(self: Robots, remote: str, into: Path, *, ended_normally: bool) -> list[str]:
         if remote.endswith("tcp-01-1"):
             self.unfetched.mark(Role.SENDER, remote, into, "the link broke \udcff")
             return ["the link broke"]
         raise LockLostError("aborted")
 
-    monkeypatch.setattr(Robots, "fetch", leave_first)
+    monkeypatch.setattr(Robots, "fetch", mark_first_unfetched)
     with pytest.raises(LockLostError):
-        run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
-    folder = only(tmp_path)
+        run_trial(plan_of_two_repeats(), IdleTestbed(), tmp_path, events.append)
+    folder = trial_in(tmp_path)
     note = Note(
         f"turtlebot-1: evidence that was not fetched stays on the robot; delete it if you do not need it: "
         f"~/.fieldkit/{folder.name}/tcp-01-1, ~/.fieldkit/{folder.name}/tcp-01-2"
@@ -213,18 +222,18 @@ def test_too_little_memory_makes_an_attempt_void_and_does_not_end_the_trial(
 ) -> None:
     judge, calls = gates.judge, 0
 
-    def exhausted(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVerdict:
+    def raise_memory_error_once(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVerdict:
         nonlocal calls
         calls += 1
         if calls == 2:
             raise MemoryError
         return judge(plan, repeat, evidence)
 
-    monkeypatch.setattr(gates, "judge", exhausted)
-    run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
-    void, exhausting, *valid = repeat_ends(events)
-    assert exhausting.reason == "this machine has too little memory to measure it"
-    assert [attempt.status for attempt in (void, exhausting, *valid)] == [
+    monkeypatch.setattr(gates, "judge", raise_memory_error_once)
+    run_trial(plan_of_two_repeats(), IdleTestbed(), tmp_path, events.append)
+    void_attempt, void_without_memory, *valid = repeat_ends(events)
+    assert void_without_memory.reason == "this machine has too little memory to measure it"
+    assert [attempt.status for attempt in (void_attempt, void_without_memory, *valid)] == [
         Status.VOID,
         Status.VOID,
         Status.VALID,
@@ -232,7 +241,7 @@ def test_too_little_memory_makes_an_attempt_void_and_does_not_end_the_trial(
     ]
 
 
-def interrupt(*_words: object, **_more: object) -> list[str]:
+def interrupt(*_args: object, **_options: object) -> list[str]:
     raise KeyboardInterrupt
 
 
@@ -242,9 +251,11 @@ def test_an_attempt_stopped_during_fetching_is_fetched_by_resume(
     with monkeypatch.context() as patched:
         patched.setattr(Robots, "fetch", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
-    folder = only(tmp_path)
-    assert [cut.status for cut in journal.interrupted_attempts(journal.read(folder))] == [Status.MEASURED]
+            run_trial(plan_of_two_repeats(), IdleTestbed(), tmp_path, lambda _: None)
+    folder = trial_in(tmp_path)
+    assert [
+        interrupted_attempt.status for interrupted_attempt in journal.interrupted_attempts(journal.read(folder))
+    ] == [Status.MEASURED]
     fetched: list[str] = []
 
     def fetch(_self: Robots, remote: str, into: Path, *, ended_normally: bool) -> list[str]:
@@ -266,10 +277,10 @@ def test_evidence_of_an_attempt_stopped_during_its_steps_stays_on_the_robots(
     with monkeypatch.context() as patched:
         patched.setattr(Robots, "measure", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
-    folder = only(tmp_path)
+            run_trial(plan_of_two_repeats(), IdleTestbed(), tmp_path, events.append)
+    folder = trial_in(tmp_path)
     remote = f"~/.fieldkit/{folder.name}/tcp-01-1"
-    for role in Robots(of_two(), IdleTestbed())._roles:
+    for role in Robots(plan_of_two_repeats(), IdleTestbed())._roles:
         unfetched = folder / "repeats/tcp-01.void1" / unfetched_file(role)
         assert unfetched.read_text(encoding="utf-8").startswith("interrupted\n")
     for _ in range(2):
@@ -280,40 +291,40 @@ def test_evidence_of_an_attempt_stopped_during_its_steps_stays_on_the_robots(
     assert verification.verify(folder) == []
 
 
-def failing(monkeypatch: pytest.MonkeyPatch, moment: int, error: OSError) -> list[str]:
-    """Make the `moment`-th writing call and all later ones fail; return the calls that failed."""
-    count, failed = 0, []
+def fail_from_write(monkeypatch: pytest.MonkeyPatch, moment: int, error: OSError) -> list[str]:
+    """Make the `moment`-th call that writes fail, and all later ones; return the list of failed calls."""
+    count, failed_calls = 0, []
 
-    def watched(name: str, call: Callable[..., object]) -> Callable[..., object]:
-        def counted(*words: object, **options: object) -> object:
+    def failing_call(name: str, call: Callable[..., object]) -> Callable[..., object]:
+        def count_call(*args: object, **options: object) -> object:
             nonlocal count
             count += 1
             if count >= moment:
-                failed.append(name)
+                failed_calls.append(name)
                 raise error
-            return None if name == "fsync" else call(*words, **options)
+            return None if name == "fsync" else call(*args, **options)
 
-        return counted
+        return count_call
 
     for name in ("fsync", "write", "rename", "mkdir"):
-        monkeypatch.setattr(os, name, watched(name, getattr(os, name)))
-    return failed
+        monkeypatch.setattr(os, name, failing_call(name, getattr(os, name)))
+    return failed_calls
 
 
 @pytest.mark.parametrize("stride", mark_nightly([3, 1]))
 def test_a_disk_may_be_full_at_any_write(stride: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    full, moment, is_over = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), 1 - stride, False
+    disk_full, moment, is_over = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), 1 - stride, False
     while not is_over:
         out = tmp_path / str(moment := moment + stride)
         with monkeypatch.context() as patched:
-            failed = failing(patched, moment, full)
+            failed_calls = fail_from_write(patched, moment, disk_full)
             try:
                 run_trial(plan(), IdleTestbed(), out, lambda _: None)
             except ConfigurationError as error:
-                assert error.what  # noqa: PT017 (it may also end)
-            is_over = not failed
+                assert error.what  # noqa: PT017 (the trial may also end without an error)
+            is_over = not failed_calls
         if any(out.glob("*/trial.yaml")):
-            folder = only(out)
+            folder = trial_in(out)
             resume_trial(folder, IdleTestbed(), lambda _: None)
             assert verification.verify(folder) == []
             assert rebuild(folder).changed == ()
@@ -329,15 +340,15 @@ def test_a_moved_folder_stops_the_trial_which_can_be_resumed_there(
 ) -> None:
     fetch = Robots.fetch
 
-    def moving(self: Robots, remote: str, into: Path, *, ended_normally: bool) -> list[str]:
+    def fetch_and_move_folder(self: Robots, remote: str, into: Path, *, ended_normally: bool) -> list[str]:
         output_text = fetch(self, remote, into, ended_normally=ended_normally)
         if remote.endswith("tcp-02-1"):
-            only(tmp_path).rename(tmp_path / "moved")
+            trial_in(tmp_path).rename(tmp_path / "moved")
         return output_text
 
-    monkeypatch.setattr(Robots, "fetch", moving)
+    monkeypatch.setattr(Robots, "fetch", fetch_and_move_folder)
     with pytest.raises(ConfigurationError, match="cannot be written: No such file or directory") as caught:
-        run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
+        run_trial(plan_of_two_repeats(), IdleTestbed(), tmp_path, lambda _: None)
     assert caught.value.remedy == "fieldkit resume FOLDER, with the current path of the folder"
     monkeypatch.setattr(Robots, "fetch", fetch)
     resume_trial(tmp_path / "moved", IdleTestbed(), lambda _: None)
@@ -350,17 +361,17 @@ def test_a_moved_folder_stops_the_trial_which_can_be_resumed_there(
 
 
 def test_a_running_trial_is_not_rebuilt(tmp_path: Path) -> None:
-    run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
+    run_trial(plan_of_two_repeats(), IdleTestbed(), tmp_path, lambda _: None)
     with (
-        journal.locked(only(tmp_path)),
+        journal.locked(trial_in(tmp_path)),
         pytest.raises(ConfigurationError, match="another fieldkit process runs this trial"),
     ):
-        rebuild(only(tmp_path))
+        rebuild(trial_in(tmp_path))
 
 
 def test_changed_evidence_is_reported_on_resume(tmp_path: Path, events: list[Event]) -> None:
-    run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
-    folder = only(tmp_path)
+    run_trial(plan_of_two_repeats(), IdleTestbed(), tmp_path, events.append)
+    folder = trial_in(tmp_path)
     (folder / "repeats/tcp-02/ping.txt").write_text(PING.replace("time=2", "time=9"), encoding="utf-8")
     resume_trial(folder, IdleTestbed(), events.append)
     assert Note("the evidence has changed since it was stored: repeats/tcp-02/ping.txt: changed") in events
@@ -370,7 +381,7 @@ def test_changed_evidence_is_reported_on_resume(tmp_path: Path, events: list[Eve
 def test_a_trial_started_with_another_version_of_a_step_package_is_not_resumed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    trial = of_two()
+    trial = plan_of_two_repeats()
     trial = trial.model_copy(update={"versions": {**trial.versions, "lab-steps": "1.0"}})
     folder = store.create(tmp_path, trial)
     monkeypatch.setattr(plugins, "versions", lambda: {"lab-steps": "1.0", "fieldkit": "stale"})
@@ -383,7 +394,9 @@ def test_a_trial_started_with_another_version_of_a_step_package_is_not_resumed(
 def test_each_expectation_is_judged_before_the_trial_ends(tmp_path: Path, events: list[Event]) -> None:
     expect = ("rtt_loss < 20 % of all packets", "udp rtt_loss < 1 %")
     procedure = plan().procedure.model_copy(update={"expect": expect})
-    outcome = run_trial(of_two().model_copy(update={"procedure": procedure}), IdleTestbed(), tmp_path, events.append)
+    outcome = run_trial(
+        plan_of_two_repeats().model_copy(update={"procedure": procedure}), IdleTestbed(), tmp_path, events.append
+    )
     assert outcome is not None
     *_, first, second, last = events
     assert isinstance(first, ExpectationJudged)

@@ -1,4 +1,4 @@
-"""The index of tables on a real file system that is full or read-only: a tmpfs in a mount namespace."""
+"""The index of tables on a file system that is full or read-only: a tmpfs in a separate mount namespace."""
 
 import shlex
 import subprocess
@@ -14,7 +14,7 @@ from tests.helpers.paths import ROOT
 pytestmark = pytest.mark.emulated
 
 
-def test_the_result_is_right_if_the_cache_is_full_or_read_only(tmp_path: Path) -> None:
+def test_the_result_is_correct_if_the_cache_is_full_or_read_only(tmp_path: Path) -> None:
     write_archive(tmp_path / "trials", indexed_tables.MIN_TABLES, 2)
     (tmp_path / "cache").mkdir()
     command = f"{shlex.quote(sys.executable)} -m fieldkit aggregate trials --format csv"
@@ -27,8 +27,10 @@ def test_the_result_is_right_if_the_cache_is_full_or_read_only(tmp_path: Path) -
     done"""  # tables that are younger than 2 s get no index
     namespace = ("unshare", "--mount", "--propagation", "private", "--", "sh", "-euc", script)
     environment = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    done = subprocess.run(namespace, cwd=tmp_path, env=environment, capture_output=True, timeout=600, check=False)
-    assert done.returncode == 0, done.stderr
+    completed = subprocess.run(
+        namespace, cwd=tmp_path, env=environment, capture_output=True, timeout=600, check=False
+    )
+    assert completed.returncode == 0, completed.stderr
     direct = (tmp_path / "direct.csv").read_bytes()
     assert direct.count(b"\n") > 1
     for options in ("size=16k", "size=16m,ro"):

@@ -1,4 +1,4 @@
-"""Positions added after a trial with the command: stored, summed, rejected, removed."""
+"""The command `positions`, which adds positions after a trial: stored files, checksums, errors, and removal."""
 
 import shutil
 from pathlib import Path
@@ -19,9 +19,9 @@ from tests.helpers.stored_trials import TRIALS
 
 @pytest.fixture
 def trial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a copy of a stored trial; its parent is the current folder."""
-    (stored,) = TRIALS.glob("*_driveaway_*")
-    shutil.copytree(stored, tmp_path / "trial")
+    """A copy of a stored trial in the working directory."""
+    (stored_trial,) = TRIALS.glob("*_driveaway_*")
+    shutil.copytree(stored_trial, tmp_path / "trial")
     monkeypatch.chdir(tmp_path)
     return Path("trial")
 
@@ -31,8 +31,8 @@ def replies_ns(trial: Path) -> list[int]:
     return [at_ns for file in files for reply in ping.read(file).answers if (at_ns := reply.at_utc_ns)]
 
 
-def walk(trial: Path, name: str = "walk.csv", *, late_ns: int = 0) -> list[int]:
-    """Write a walk at 1 m/s starting at 5 m during the whole trial; return the times of the replies."""
+def write_walk(trial: Path, name: str = "walk.csv", *, late_ns: int = 0) -> list[int]:
+    """Write positions of a walk at 1 m/s from 5 m away; return the times of the replies after its start in ns."""
     at_ns = replies_ns(trial)
     first_ns, last_ns = min(at_ns) - 60 * 10**9, max(at_ns) + 60 * 10**9
     lines = (f"{first_ns - late_ns},5,0", f"{last_ns - late_ns},{5 + (last_ns - first_ns) / 1e9},0")
@@ -40,7 +40,7 @@ def walk(trial: Path, name: str = "walk.csv", *, late_ns: int = 0) -> list[int]:
     return [time_ns - first_ns for time_ns in at_ns]
 
 
-def output_text(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
+def run_positions(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str]:
     code = main(["positions", "trial", *words])
     output = capsys.readouterr()
     return code, output.out + output.err
@@ -55,30 +55,32 @@ def test_added_positions_fill_columns_have_checksums_and_can_be_removed(
     trial: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = {path.name: path.read_bytes() for path in trial.iterdir() if path.is_file()}
-    elapsed_ns = walk(trial)
-    code, output = output_text(capsys, "receiver=walk.csv", "sender=0m,0m", "--gap", "1000min")
+    elapsed_ns = write_walk(trial)
+    code, output = run_positions(capsys, "receiver=walk.csv", "sender=0m,0m", "--gap", "1000min")
     assert code == 0, output
     assert output.startswith("changed: trial.csv")
     means = [float(metres) for metres in means_m(trial)]
     assert all(65 <= metres <= 5 + max(elapsed_ns) / 1e9 for metres in means)
     assert verification.verify(trial) == []
     assert {path.name for path in trial.glob("positions*")} == {"positions.json", "positions-receiver.csv"}
-    assert output_text(capsys)[1].count("sender 0, 0, 0 in metres, receiver positions-receiver.csv") == 2 * len(means)
+    assert run_positions(capsys)[1].count("sender 0, 0, 0 in metres, receiver positions-receiver.csv") == 2 * len(
+        means
+    )
 
-    walk(trial, "again.CSV", late_ns=2 * 10**9)
-    output_text(capsys, "receiver=again.CSV", "sender=0m,0m", "--gap", "1000min", "--offset", "-1s")
+    write_walk(trial, "again.CSV", late_ns=2 * 10**9)
+    run_positions(capsys, "receiver=again.CSV", "sender=0m,0m", "--gap", "1000min", "--offset", "-1s")
     assert [float(metres) for metres in means_m(trial)] == pytest.approx([metres + 3 for metres in means])
-    output_text(capsys, "receiver=again.CSV", "sender=0m,0m")
+    run_positions(capsys, "receiver=again.CSV", "sender=0m,0m")
     assert means_m(trial) == [""] * len(means)
-    assert "have a gap of" in output_text(capsys)[1]
+    assert "have a gap of" in run_positions(capsys)[1]
 
-    assert output_text(capsys, "--clear")[0] == 0
+    assert run_positions(capsys, "--clear")[0] == 0
     assert {path.name: path.read_bytes() for path in trial.iterdir() if path.is_file()} == before
 
 
 @pytest.mark.motion
 @pytest.mark.parametrize(
-    ("words", "code", "complaint"),
+    ("words", "code", "expected_message"),
     [
         (["walk.csv"], 2, "'walk.csv' is not ROLE=FILE"),
         (["Receiver=walk.csv"], 2, "is not ROLE=FILE"),
@@ -96,27 +98,27 @@ def test_added_positions_fill_columns_have_checksums_and_can_be_removed(
     ],
 )
 def test_invalid_positions_are_rejected_and_change_nothing(
-    trial: Path, capsys: pytest.CaptureFixture[str], words: list[str], code: int, complaint: str
+    trial: Path, capsys: pytest.CaptureFixture[str], words: list[str], code: int, expected_message: str
 ) -> None:
-    walk(trial)
+    write_walk(trial)
     shutil.copy("walk.csv", "walk.txt")
     Path("bad.csv").write_text("t,x_m,y_m\nnoon,1,2\n", encoding="ascii")
-    with Path("huge.gpx").open("wb") as huge:
-        huge.truncate(positions.MAX_BYTES + 1)
+    with Path("huge.gpx").open("wb") as huge_file:
+        huge_file.truncate(positions.MAX_BYTES + 1)
     before = {path: path.read_bytes() for path in trial.iterdir() if path.is_file()}
-    exit_code, output = output_text(capsys, *words)
-    assert (exit_code, complaint in output) == (code, True), output
+    exit_code, output = run_positions(capsys, *words)
+    assert (exit_code, expected_message in output) == (code, True), output
     assert {path: path.read_bytes() for path in trial.iterdir() if path.is_file()} == before
 
 
 @pytest.mark.motion
 def test_changed_or_running_trials_accept_no_positions(trial: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    walk(trial)
+    write_walk(trial)
     with journal.locked(trial):
-        assert output_text(capsys, "receiver=walk.csv")[0] == 2
+        assert run_positions(capsys, "receiver=walk.csv")[0] == 2
     file = next(trial.glob("repeats/*/ping.txt"))
     file.write_bytes(file.read_bytes() + b"\n")
-    code, output = output_text(capsys, "receiver=walk.csv")
+    code, output = run_positions(capsys, "receiver=walk.csv")
     assert (code, "the evidence has changed since it was measured" in output) == (4, True)
     assert not list(trial.glob("positions*"))
 
@@ -126,8 +128,8 @@ def test_changed_or_running_trials_accept_no_positions(trial: Path, capsys: pyte
 def test_changed_position_files_prevent_a_rebuild(
     trial: Path, capsys: pytest.CaptureFixture[str], change: str
 ) -> None:
-    walk(trial)
-    assert output_text(capsys, "receiver=walk.csv", "sender=0m,0m", "--gap", "1000min")[0] == 0
+    write_walk(trial)
+    assert run_positions(capsys, "receiver=walk.csv", "sender=0m,0m", "--gap", "1000min")[0] == 0
     positions_file = trial / "positions-receiver.csv"
     if change == "changed":
         positions_file.write_bytes(positions_file.read_bytes() + b"\n")
@@ -137,7 +139,7 @@ def test_changed_position_files_prevent_a_rebuild(
         shutil.copy(positions_file, trial / "positions-sender.csv")
     assert main(["rebuild", "trial"]) == 4
     assert "positions-" in capsys.readouterr().err
-    assert output_text(capsys, "--clear")[0] == 0
+    assert run_positions(capsys, "--clear")[0] == 0
     assert main(["rebuild", "trial"]) == 0
 
 
@@ -155,7 +157,7 @@ def test_changed_position_files_prevent_a_rebuild(
         ("sender=a=b.gpx", Path("a=b.gpx")),
     ],
 )
-def test_a_place_is_distinguished_from_a_file(text: str, expected: object) -> None:
+def test_coordinates_are_distinguished_from_a_file(text: str, expected: object) -> None:
     assert positions.parse_source(text) == (Role.SENDER, expected)
 
 

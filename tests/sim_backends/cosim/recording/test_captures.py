@@ -35,7 +35,7 @@ from sim_backends.physics.paths import Paths
 from sim_backends.radio.fixed_links import UniformLinks
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.motion import State, WayPoints
-from tests.helpers.passing_robots import ABOUT, MS
+from tests.helpers.passing_robots import MS, SETTINGS
 
 NAMES = ("alpha", "bravo", "carol")
 ADDRESSES = {name: f"10.0.0.{number}" for number, name in enumerate(NAMES, start=1)}
@@ -70,7 +70,7 @@ def recorded_run(tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
     }
     pairs = [("alpha", "bravo"), ("bravo", "carol"), ("carol", "alpha")]
     log: list[tuple[int, str, Fragment]] = []
-    with RunRecorder(folder, ABOUT, snap_bytes=65535, part_every_s=0.02) as recorder:
+    with RunRecorder(folder, SETTINGS, snap_bytes=65535, part_every_s=0.02) as recorder:
 
         def log_and_record(at_ns: int, host: str, fragment: Fragment) -> None:
             log.append((at_ns, host, fragment))
@@ -174,7 +174,7 @@ def test_tcpdump_reports_every_checksum_as_correct(recorded_run: RecordedRun) ->
 
 def test_the_robots_of_a_scenario_capture_the_packets_of_their_network(tmp_path: Path) -> None:
     scenario = load_scenario("baylands")
-    with RunRecorder(tmp_path / "run", ABOUT) as recorder:
+    with RunRecorder(tmp_path / "run", SETTINGS) as recorder:
         run = build(scenario, policy="scheduled", recorder=recorder).run(2000 * MS)
     assert read_recording(tmp_path / "run").run == run
     packet_counts = {
@@ -198,7 +198,7 @@ class EveryThirdPacketLost(Disc):
 
 def test_packets_of_another_network_are_captured_as_datagrams_at_both_ends(tmp_path: Path) -> None:
     scenario = load_scenario("baylands", {"duration": "2s"})
-    with RunRecorder(tmp_path / "run", ABOUT) as recorder:
+    with RunRecorder(tmp_path / "run", SETTINGS) as recorder:
         run = build(scenario, policy="scheduled", recorder=recorder, network=EveryThirdPacketLost(1e6, 3 * MS)).run()
     assert read_recording(tmp_path / "run").run == run
     assert any(fate.reason for fate in run.fates.values())

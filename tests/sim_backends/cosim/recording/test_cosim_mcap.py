@@ -18,7 +18,7 @@ from sim_backends.cosim.recording.recorder import RunRecorder
 from sim_backends.cosim.recording.replay import Recording, read_recording
 from sim_backends.cosim.run_record import Run
 from sim_backends.world.motion import State
-from tests.helpers.passing_robots import ABOUT, MS, passing_robots
+from tests.helpers.passing_robots import MS, SETTINGS, passing_robots
 
 Messages = list[tuple[str, int, Any]]
 
@@ -26,7 +26,7 @@ Messages = list[tuple[str, int, Any]]
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     folder = tmp_path_factory.mktemp("mcap") / "run"
-    with RunRecorder(folder, ABOUT) as recorder:
+    with RunRecorder(folder, SETTINGS) as recorder:
         passing_robots(recorder, TimeStepped(0.005)).advance(1_001 * MS)
     return read_recording(folder)
 
@@ -108,7 +108,7 @@ def test_the_file_has_metadata_and_is_reproducible(recording: Recording) -> None
     (metadata,) = make_reader(BytesIO(first.getvalue())).iter_metadata()
     assert metadata.metadata["digest"] == recording.run.digest
     assert metadata.metadata["policy"] == "sliding_window"
-    assert json.loads(metadata.metadata["parameters"]) == ABOUT.parameters
+    assert json.loads(metadata.metadata["parameters"]) == SETTINGS.parameters
 
 
 def test_the_file_can_be_read_from_the_middle(recording: Recording, tmp_path: Path) -> None:

@@ -39,7 +39,7 @@ from sim_backends.cosim.run_record import Run
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.loading import load_scenario
 from tests.helpers.nightly import mark_nightly
-from tests.helpers.passing_robots import ABOUT, MS, passing_robots
+from tests.helpers.passing_robots import MS, SETTINGS, passing_robots
 from tests.helpers.paths import ROOT
 
 END_NS = 4_000 * MS
@@ -48,7 +48,7 @@ EXIT_S = 300.0
 
 
 def record(folder: Path, policy: SyncPolicy | None = None, part_every_s: float = 0.01, end_ns: int = END_NS) -> Run:
-    with RunRecorder(folder, ABOUT, part_every_s=part_every_s) as recorder:
+    with RunRecorder(folder, SETTINGS, part_every_s=part_every_s) as recorder:
         return passing_robots(recorder, policy).advance(end_ns)
 
 
@@ -65,7 +65,7 @@ def test_a_recording_reproduces_every_number(tmp_path: Path, policy: SyncPolicy)
     )
     assert list(recording.run.fates) == list(live_run.fates), "in the same order, which affects the rounding of means"
     assert recording.manifest.ending is RunEnding.COMPLETE
-    assert recording.manifest.about == ABOUT
+    assert recording.manifest.about == SETTINGS
     # States are recorded at 10 Hz, each at the first end of a window after its due time. Robot a drives at 1 m/s, in
     # steps of 1 ms.
     states_of_a = [(at_ns, state) for at_ns, agent, state in recording.states if agent == "a"]
@@ -221,7 +221,7 @@ def test_the_recording_states_the_error_of_a_failed_policy(tmp_path: Path) -> No
 
     with (
         pytest.raises(FederateError, match="policy event_driven failed") as error_info,
-        RunRecorder(tmp_path / "run", ABOUT) as recorder,
+        RunRecorder(tmp_path / "run", SETTINGS) as recorder,
     ):
         passing_robots(recorder, FailingPolicy()).advance(MS * 200)
     recording = read_recording(tmp_path / "run")
@@ -236,7 +236,7 @@ def test_the_recording_states_the_error_of_a_failed_policy(tmp_path: Path) -> No
 def test_a_scenario_that_is_refused_leaves_no_files(tmp_path: Path) -> None:
     with (
         pytest.raises(ConfigurationError, match="no sync policy"),
-        RunRecorder(tmp_path / "run", ABOUT) as recorder,
+        RunRecorder(tmp_path / "run", SETTINGS) as recorder,
     ):
         build(load_scenario("convoy"), policy="none", recorder=recorder)
     assert not list(tmp_path.iterdir())
@@ -313,7 +313,7 @@ def test_a_recording_that_was_truncated_or_damaged_anywhere_is_refused(
 @pytest.fixture(scope="module")
 def recorded_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recorded") / "run"
-    with RunRecorder(folder, ABOUT, part_every_s=0.02) as recorder:
+    with RunRecorder(folder, SETTINGS, part_every_s=0.02) as recorder:
         passing_robots(recorder).advance(1_000 * MS)
     return folder
 
@@ -355,7 +355,7 @@ def test_a_manifest_that_was_changed_afterwards_is_refused(
     with pytest.raises(EvidenceError, match="the record was changed after the run"):
         read_recording(tmp_path / "run")
     path.write_text(json.dumps(json.loads(text)), encoding="utf-8")
-    assert read_recording(tmp_path / "run").manifest.about == ABOUT, "the formatting does not matter"
+    assert read_recording(tmp_path / "run").manifest.about == SETTINGS, "the formatting does not matter"
 
 
 def test_a_scenario_that_was_changed_afterwards_is_refused(tmp_path: Path, recorded_folder: Path) -> None:

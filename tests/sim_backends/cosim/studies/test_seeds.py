@@ -15,7 +15,7 @@ from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.executors import Workers
 from sim_backends.cosim.studies.seeds import Task, run_many
 from sim_backends.radio.random_streams import RandomStream
-from tests.helpers.host import alive
+from tests.helpers.host import is_running
 from tests.helpers.paths import ROOT
 from tests.helpers.sshd import wait_until
 
@@ -107,4 +107,6 @@ def test_workers_exit_when_their_parent_exits(stop_signal: signal.Signals, tmp_p
         _, stderr = process.communicate(timeout=EXIT_S)
     assert process.returncode == -stop_signal
     assert (b"KeyboardInterrupt" in stderr) == (stop_signal == signal.SIGINT)
-    wait_until(lambda: not any(alive(int(path.name)) for path in started_folder.iterdir()), Deadline.after(EXIT_S))
+    wait_until(
+        lambda: not any(is_running(int(path.name)) for path in started_folder.iterdir()), Deadline.after(EXIT_S)
+    )

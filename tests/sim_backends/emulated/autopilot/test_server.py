@@ -13,7 +13,7 @@ from typing import Final
 
 from pymavlink.dialects.v20 import common as d
 
-from tests.fuzz.mutate import mutated
+from tests.fuzz.mutate import mutate
 from tests.helpers.drones import Sender
 
 SYSTEM: Final = 7
@@ -88,7 +88,7 @@ def test_the_process_survives_any_datagrams_without_output(tmp_path: Path) -> No
             clients = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(4)]
             for number in range(DATAGRAMS):
                 datagram = (
-                    mutated(rng.choice(valid_frames), valid_frames, rng)[:60_000]
+                    mutate(rng.choice(valid_frames), valid_frames, rng)[:60_000]
                     if number % 3
                     else frame_with_any_values(rng)
                 )

@@ -152,13 +152,13 @@ def test_a_robot_stops_at_the_wall_and_can_be_placed_elsewhere(physics: str, tmp
     """The wall of the lawn begins at 3.9 m; the chassis of MuJoCo is shorter than the cylinder that contains it."""
     places_m: dict[str, Vector] = {**PLACES, "a": (3.6, 18.0, ANTENNA_M)}
     with cosim_bench(tmp_path, physics=physics, world=load_world("lawn"), places_m=places_m) as bench:
-        motion_at_wall = bench.driven.drive(0.2, 3.0)
+        motion_at_wall = bench.control_files.drive(0.2, 3.0)
         assert 3.9 - BODY.limits.radius_m - 0.02 < motion_at_wall.position_m[0] < 3.9
         assert not math.hypot(*motion_at_wall.velocity_m_s) > 0.02
         places_m["a"] = PLACES["a"]
-        bench.driven.assign(places_m["a"], facing_rad=math.pi / 2)
+        bench.control_files.assign(places_m["a"], facing_rad=math.pi / 2)
         bench.medium.place(places_m)
-        later_motion = bench.driven.drive(0.2, 1.0)
+        later_motion = bench.control_files.drive(0.2, 1.0)
         assert later_motion.position_m[0] == pytest.approx(PLACES["a"][0], abs=0.02)
         assert later_motion.position_m[1] == pytest.approx(PLACES["a"][1] + 0.2, abs=0.1)
         assert bench.ping(count=3)
@@ -169,34 +169,36 @@ def test_a_robot_stops_if_its_physics_is_suspended_or_killed(physics: str, tmp_p
     """Its sensors and the lab extrapolate the last record for `SILENT_NS`; afterwards it is at rest."""
     with cosim_bench(tmp_path, physics=physics) as bench:
         pid = bench.medium.pid
-        bench.driven.drive(0.2, 1.0)
+        bench.control_files.drive(0.2, 1.0)
         os.kill(pid, signal.SIGSTOP)
-        last_motion = bench.driven.drive(0.2, SILENT_NS / 1e9)
+        last_motion = bench.control_files.drive(0.2, SILENT_NS / 1e9)
         assert last_motion.is_moving
         motion_at_rest = last_motion.at(time.monotonic_ns() + SILENT_NS)
         assert not motion_at_rest.is_moving
         assert distance_m(motion_at_rest, last_motion.position_m) <= 0.2 * SILENT_NS / 1e9 + 0.01
         os.kill(pid, signal.SIGCONT)
-        wait_until(lambda: (motion := bench.driven.motion()) is not None and not motion.is_moving, Deadline.after(60))
-        wait_until(lambda: bench.driven.drive(0.2, 0.5).is_moving, Deadline.after(60))
+        wait_until(
+            lambda: (motion := bench.control_files.motion()) is not None and not motion.is_moving, Deadline.after(60)
+        )
+        wait_until(lambda: bench.control_files.drive(0.2, 0.5).is_moving, Deadline.after(60))
         os.kill(pid, signal.SIGKILL)
         with pytest.raises(TestbedLostError, match="killed by SIGKILL"):
             bench.medium.place(PLACES)
-        motion = bench.driven.drive(0.2, SILENT_NS / 1e9)
+        motion = bench.control_files.drive(0.2, SILENT_NS / 1e9)
         assert not motion.at(time.monotonic_ns() + SILENT_NS).is_moving
 
 
 def test_a_robot_cannot_be_placed_within_the_wall(tmp_path: Path) -> None:
     with cosim_bench(tmp_path, world=load_world("lawn")) as bench:
         wall_place_m = 4.0, 18.0, ANTENNA_M
-        bench.driven.assign(wall_place_m)
+        bench.control_files.assign(wall_place_m)
         with pytest.raises(RobotError, match="a would be within wall, at 4, 18"):
             bench.medium.place({**PLACES, "a": wall_place_m})
 
 
 def test_a_driven_robot_stops_without_commands_and_at_its_next_place(tmp_path: Path) -> None:
     with cosim_bench(tmp_path) as bench:
-        later_motion = bench.driven.drive(0.2, 1.0)
+        later_motion = bench.control_files.drive(0.2, 1.0)
         assert distance_m(later_motion, PLACES["a"]) == pytest.approx(0.2, abs=0.1)
         assert later_motion.heading_rad == pytest.approx(0)
         assert later_motion.odometry[0] == pytest.approx(distance_m(later_motion, PLACES["a"]))

@@ -39,7 +39,7 @@ def server(tmp_path: Path) -> Iterator[GazeboServer]:
 
 def drive_and_check(bench: CosimBench) -> bool:
     """Drive, and raise if the co-simulation has stopped; return False."""
-    bench.driven.drive(0.2, 0.1)
+    bench.control_files.drive(0.2, 0.1)
     bench.medium.check_alive()
     return False
 
@@ -56,20 +56,22 @@ def test_gazebo_places_robots_and_stops_them_at_the_wall_until_it_is_killed(
         world=LAWN,
         places_m={**PLACES, "a": NEAR_WALL_M},
     ) as bench:
-        wait_until(lambda: bench.driven.drive(0.2, 2.0).position_m[0] > 3.75, Deadline.after(60))
-        wait_until(lambda: not bench.driven.drive(0.2, 0.5).is_moving, Deadline.after(60))
-        motion_at_wall = bench.driven.drive(0.2, 0.5)
+        wait_until(lambda: bench.control_files.drive(0.2, 2.0).position_m[0] > 3.75, Deadline.after(60))
+        wait_until(lambda: not bench.control_files.drive(0.2, 0.5).is_moving, Deadline.after(60))
+        motion_at_wall = bench.control_files.drive(0.2, 0.5)
         assert motion_at_wall.position_m[:2] == pytest.approx((3.831, 18.0), abs=0.02), (
             "the chassis extends 69 mm ahead"
         )
-        bench.driven.assign(PLACES["a"])
+        bench.control_files.assign(PLACES["a"])
         bench.medium.place(PLACES)
-        wait_until(lambda: bench.driven.drive(0.2, 0.5).position_m[0] > PLACES["a"][0] + 0.1, Deadline.after(60))
-        later_motion = bench.driven.drive(0.2, 0.1)
+        wait_until(
+            lambda: bench.control_files.drive(0.2, 0.5).position_m[0] > PLACES["a"][0] + 0.1, Deadline.after(60)
+        )
+        later_motion = bench.control_files.drive(0.2, 0.1)
         assert later_motion.position_m[0] < motion_at_wall.position_m[0]
         assert later_motion.position_m[1] == pytest.approx(PLACES["a"][1], abs=0.02)
         assert bench.ping(count=3)
         os.kill(server.process.pid, signal.SIGKILL)
         with pytest.raises(TestbedLostError, match="Gazebo"):
             wait_until(lambda: drive_and_check(bench), Deadline.after(60))
-        assert not bench.driven.drive(0.2, 0.1).at(time.monotonic_ns() + SILENT_NS).is_moving
+        assert not bench.control_files.drive(0.2, 0.1).at(time.monotonic_ns() + SILENT_NS).is_moving

@@ -26,7 +26,7 @@ from sim_backends.physics.ground import Ground
 from sim_backends.physics.robot_limits import DUCKIEDRONE
 from sim_backends.world.motion import GRAVITY_M_S2
 from sim_backends.world.world import load_world
-from tests.helpers.cosim_benches import PLACES, CosimBench, Driven, cosim_bench
+from tests.helpers.cosim_benches import PLACES, ControlFiles, CosimBench, cosim_bench
 from tests.helpers.ground_station import LIMITS
 
 pytestmark = pytest.mark.emulated
@@ -73,7 +73,7 @@ class Drone:
 
     def flight(self) -> FlightMotion:
         """Return the motion that the physics recorded last."""
-        record = FlightRecord.open(self.bench.driven.folder / "flown")
+        record = FlightRecord.open(self.bench.control_files.folder / "flown")
         try:
             flight = record.read()
         finally:
@@ -96,13 +96,13 @@ class Drone:
 def drone(folder: Path, physics: str) -> Iterator[Drone]:
     place_m = (*START_M[:2], ANTENNA_M)
     places_m: dict[str, Vector] = {**PLACES, "a": place_m}
-    driven = Driven.make(folder / "a", "flight_command", "flown")
+    control_files = ControlFiles.make(folder / "a", "flight_command", "flown")
     with cosim_bench(
-        folder, physics=physics, world=load_world("lawn"), places_m=places_m, driven=driven, body=DRONE
+        folder, physics=physics, world=load_world("lawn"), places_m=places_m, control_files=control_files, body=DRONE
     ) as bench:
         now_ns = time.monotonic_ns()
-        motion = MotionReporter(driven.folder / "motion", driven.folder / "steered", now_ns)
-        files = PhysicsFiles(driven.folder / "flight_command", driven.folder / "flown")
+        motion = MotionReporter(control_files.folder / "motion", control_files.folder / "steered", now_ns)
+        files = PhysicsFiles(control_files.folder / "flight_command", control_files.folder / "flown")
         autopilot = Autopilot(
             firmware=PX4,
             system=1,
@@ -146,7 +146,7 @@ def test_a_wall_stops_the_drone_and_without_its_autopilot_the_drone_falls(physic
         assert max(-flight.velocity_m_s[2] for flight in flights) == pytest.approx(GRAVITY_M_S2 * fall_s, rel=0.15)
         assert flights[-1].place_m[2] == pytest.approx(0.0, abs=0.005)
 
-        simulated_drone.bench.driven.assign((*START_M[:2], ANTENNA_M))
+        simulated_drone.bench.control_files.assign((*START_M[:2], ANTENNA_M))
         simulated_drone.bench.medium.place({**PLACES, "a": (*START_M[:2], ANTENNA_M)})
         simulated_drone.fly(lambda: not vehicle.is_armed)
         assert vehicle.body.place_m == START_M

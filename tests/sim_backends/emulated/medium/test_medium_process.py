@@ -25,7 +25,7 @@ from sim_backends.emulated.robot.network import open_tun
 from sim_backends.radio.antennas import antenna_of
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.world_channel import WorldChannel
-from tests.helpers.host import alive
+from tests.helpers.host import is_running
 from tests.helpers.paths import ROOT
 from tests.helpers.sshd import wait_until
 
@@ -375,7 +375,7 @@ def test_close_stops_the_medium_and_may_be_repeated() -> None:
     medium.stats()
     medium.close()
     medium.close()
-    assert not alive(medium.pid)
+    assert not is_running(medium.pid)
 
 
 def test_a_killed_medium_raises_an_error() -> None:
@@ -407,7 +407,7 @@ def test_the_medium_exits_if_its_owner_is_killed() -> None:
     pid = int(owner.stdout.readline())
     owner.kill()
     owner.communicate()
-    wait_for(lambda: not alive(pid), "the medium exits")
+    wait_for(lambda: not is_running(pid), "the medium exits")
 
 
 def test_the_medium_exits_if_its_control_socket_is_closed() -> None:

@@ -24,7 +24,7 @@ from sim_backends.emulated.ros.robot_motion import Odometer
 from sim_backends.emulated.ros.sensor_specs import Sensor
 from sim_backends.emulated.ros.sensors import Publication
 from sim_backends.ros1 import framing
-from tests.fuzz.mutate import mutated
+from tests.fuzz.mutate import mutate
 
 GOOD: Final = "/good"
 HOSTILE: Final = 80
@@ -111,7 +111,7 @@ class Publishers:
 def test_a_recorder_survives_hostile_publishers(ros: str, tmp_path: Path) -> None:
     rng, valid_streams = random.Random(7), [stream_of(GOOD, 3), stream_of("/other", 3), b"\xff" * 40]
     topics = {
-        f"/bad{number}": mutated(rng.choice(valid_streams), valid_streams, rng)[:100_000] for number in range(HOSTILE)
+        f"/bad{number}": mutate(rng.choice(valid_streams), valid_streams, rng)[:100_000] for number in range(HOSTILE)
     }
     # Damaged only in the messages, or only in the headers.
     topics |= {f"/torn{number}": stream_of(f"/torn{number}", 2) + rng.randbytes(40) for number in range(10)}
@@ -152,7 +152,7 @@ def test_a_publisher_survives_hostile_subscribers(tmp_path: Path, monkeypatch: p
         stream.connect(str(tcpros.socket_path(SENSOR.topic)))
         stream.setblocking(False)
         with suppress(BlockingIOError):
-            stream.send(request if number == HOSTILE else mutated(request, [request], rng)[:50_000])
+            stream.send(request if number == HOSTILE else mutate(request, [request], rng)[:50_000])
         if number % 3 == 1:
             stream.close()
         streams.append(stream)

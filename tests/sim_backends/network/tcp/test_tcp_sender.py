@@ -16,7 +16,7 @@ from sim_backends.network.tcp.connection import Tcp, TcpSample
 from sim_backends.network.tcp.segments import Segment
 from sim_backends.network.tcp.tcp_options import Congestion, TcpOptions
 from sim_backends.network.wire import IpPacket
-from tests.helpers.scripted_wire import Script, ScriptedWire, losing
+from tests.helpers.scripted_wire import Script, ScriptedWire, lose_packets
 
 MS = 1_000_000
 SECOND = 1000 * MS
@@ -290,7 +290,7 @@ def test_the_window_does_not_grow_if_the_program_does_not_use_it() -> None:
 
 @pytest.mark.parametrize(("lost_syns", "window"), [(1, 10), (2, 1)])
 def test_more_than_one_lost_syn_reduces_the_initial_window_to_one_segment(lost_syns: int, window: int) -> None:
-    transfer = Transfer(50, TcpOptions(), script=losing({"a": range(lost_syns)}))
+    transfer = Transfer(50, TcpOptions(), script=lose_packets({"a": range(lost_syns)}))
     assert (
         Counter(at_ns for at_ns, _ in transfer.transmissions())[(2**lost_syns - 1) * SECOND + ROUND_TRIP_NS] == window
     )

@@ -14,7 +14,7 @@ from sim_backends.network.tcp.connection import Tcp
 from sim_backends.network.tcp.tcp_options import Congestion, TcpOptions
 from sim_backends.network.wire import IpPacket
 from tests.helpers.nightly import examples
-from tests.helpers.scripted_wire import Script, ScriptedWire, losing
+from tests.helpers.scripted_wire import Script, ScriptedWire, lose_packets
 
 MS = 1_000_000
 SECOND = 1000 * MS
@@ -57,14 +57,14 @@ def test_packets_have_the_sizes_of_linux() -> None:
 
 @pytest.mark.parametrize(("lost_syns", "arrives_s"), [(1, 1), (2, 3), (3, 7), (6, 63)])
 def test_a_syn_is_retransmitted_after_1_3_7_seconds(lost_syns: int, arrives_s: int) -> None:
-    wire = ScriptedWire(DELAY_NS, script=losing({"a": range(lost_syns)}))
+    wire = ScriptedWire(DELAY_NS, script=lose_packets({"a": range(lost_syns)}))
     send_messages(wire, [message(0)])
     wire.run()
     assert wire.delivered == {0: arrives_s * SECOND + 3 * DELAY_NS}
 
 
 def test_a_connection_that_never_opens_drops_its_messages_and_the_next_one_opens_another() -> None:
-    wire = ScriptedWire(DELAY_NS, script=losing({"a": range(7)}))
+    wire = ScriptedWire(DELAY_NS, script=lose_packets({"a": range(7)}))
     send_messages(wire, [message(0), message(1)])
     wire.run()
     assert wire.now_ns == 127 * SECOND  # 1 + 2 + 4 + ... + 64: Linux's tcp_syn_retries of 6
@@ -76,7 +76,7 @@ def test_a_connection_that_never_opens_drops_its_messages_and_the_next_one_opens
 
 def test_a_connection_fails_after_15_timeouts() -> None:
     # SYN, ACK and one message arrive; all later packets of the sender are lost.
-    wire = ScriptedWire(DELAY_NS, script=losing({"a": range(3, 1000)}))
+    wire = ScriptedWire(DELAY_NS, script=lose_packets({"a": range(3, 1000)}))
     send_messages(wire, [message(0)])
     wire.run(SECOND)
     send_messages(wire, [message(1)])
@@ -88,7 +88,7 @@ def test_a_connection_fails_after_15_timeouts() -> None:
 
 
 def test_delivered_messages_are_not_dropped_if_only_acks_are_lost() -> None:
-    wire = ScriptedWire(DELAY_NS, script=losing({"b": range(1, 1000)}))
+    wire = ScriptedWire(DELAY_NS, script=lose_packets({"b": range(1, 1000)}))
     send_messages(wire, [message(0)], TcpOptions(retries=2))
     wire.run()
     assert wire.delivered == {0: 3 * DELAY_NS}
@@ -171,7 +171,7 @@ def test_an_invalid_message_is_rejected(invalid_message: Packet) -> None:
 
 
 def test_every_packet_has_separate_draws() -> None:
-    wire = ScriptedWire(DELAY_NS, rate_bit_s=10_000_000, script=losing({"a": {0, 9, 30, 31}, "b": {0, 5}}))
+    wire = ScriptedWire(DELAY_NS, rate_bit_s=10_000_000, script=lose_packets({"a": {0, 9, 30, 31}, "b": {0, 5}}))
     send_messages(wire, [message(number, size_bytes=1 + 977 * number) for number in range(40)])
     wire.run()
     assert len(wire.delivered) == 40
@@ -184,7 +184,7 @@ def test_equal_packets_in_two_runs_have_equal_draws() -> None:
     packets = [message(number, size_bytes=5000) for number in range(20)]
     base_wire = ScriptedWire(DELAY_NS)
     send_messages(base_wire, packets)
-    changed_wire = ScriptedWire(DELAY_NS, script=losing({"a": {4, 5, 40}}))
+    changed_wire = ScriptedWire(DELAY_NS, script=lose_packets({"a": {4, 5, 40}}))
     send_messages(changed_wire, [*packets, message(20)])
 
     def sent_identities(wire: ScriptedWire) -> dict[int, tuple[str, int]]:

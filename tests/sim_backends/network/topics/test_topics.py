@@ -25,7 +25,7 @@ from sim_backends.network.topics.rtps import (
 from sim_backends.network.topics.rtps_transport import Topics
 from sim_backends.network.wire import IpPacket
 from sim_backends.radio.random_streams import PacketDraws
-from tests.helpers.scripted_wire import Script, ScriptedWire, losing
+from tests.helpers.scripted_wire import Script, ScriptedWire, lose_packets
 
 BEST_EFFORT = Qos("best_effort")
 KEEP_LAST = Qos()
@@ -121,7 +121,7 @@ def test_a_stream_is_acknowledged_at_its_start_and_end() -> None:
 
 
 def test_a_lost_sample_is_requested_after_the_next_heartbeat() -> None:
-    wire = publish_samples(KEEP_LAST, 4, script=losing({"a": {1}}), size_bytes=100)
+    wire = publish_samples(KEEP_LAST, 4, script=lose_packets({"a": {1}}), size_bytes=100)
     reported_ns = 2 * PERIOD_NS + DELAY_NS
     assert [entry for entry in messages(wire) if reported_ns <= entry[0] < 3 * PERIOD_NS] == [
         (reported_ns, "b", (AckNack(2, (2,), 2),)),
@@ -145,7 +145,7 @@ def test_a_duplicate_request_is_ignored() -> None:
 
 
 def test_a_large_sample_is_repaired_first_by_one_fragment_then_by_the_missing_ones() -> None:
-    wire = publish_samples(KEEP_LAST, 3, script=losing({"a": {1}}))
+    wire = publish_samples(KEEP_LAST, 3, script=lose_packets({"a": {1}}))
     submessage_types = [
         [type(submessage) for submessage in message] for at_ns, _, message in messages(wire) if at_ns > 2 * PERIOD_NS
     ]
@@ -167,7 +167,7 @@ EVICTED = "evicted from the writer's history before it was acknowledged"
 
 def test_samples_evicted_from_the_history_are_lost() -> None:
     """The second to the fourth of eight samples and the request for the fourth are lost; the history keeps two."""
-    wire = publish_samples(Qos(depth=2), 8, script=losing({"a": {1, 2, 3}, "b": {1}}), size_bytes=100)
+    wire = publish_samples(Qos(depth=2), 8, script=lose_packets({"a": {1, 2, 3}, "b": {1}}), size_bytes=100)
     assert wire.dropped == dict.fromkeys((1, 2, 3), EVICTED)
     assert list(wire.delivered) == [0, 4, 5, 6, 7]
     # The fifth sample waits until the sixth one's heartbeat reports that the fourth is no longer available.
@@ -239,7 +239,7 @@ def test_a_blocked_writer_drops_samples_after_max_blocking_time() -> None:
 
 def test_samples_of_many_datagrams_arrive_complete() -> None:
     """A camera image takes 75 messages of 10 fragments, more fragments than a bitmap of 256 can contain."""
-    wire = publish_samples(KEEP_LAST, 1, script=losing({"a": {*range(50), 80, 81}}), size_bytes=1_000_000)
+    wire = publish_samples(KEEP_LAST, 1, script=lose_packets({"a": {*range(50), 80, 81}}), size_bytes=1_000_000)
     assert list(wire.delivered) == [0]
     requests = [
         submessage for _, _, message in messages(wire) for submessage in message if isinstance(submessage, NackFrag)
