@@ -21,8 +21,8 @@ def robot_shell(folder: Path, info: str, domain: str = "reg-ath10k-ct") -> Shell
     folder.mkdir(exist_ok=True)
     program = folder / "iw"
     program.write_text(
-        f'#!/bin/sh\ncase "$*" in "dev wlan0 info") exec cat {DATA / "iw" / info}.txt ;; '
-        f'"reg get") exec cat {DATA / "iw" / domain}.txt ;; *) exit 1 ;; esac\n',
+        f'#!/bin/sh\ncase "$*" in "dev wlan0 info") exec cat "{DATA}/iw/{info}.txt" ;; '
+        f'"reg get") exec cat "{DATA}/iw/{domain}.txt" ;; *) exit 1 ;; esac\n',
         encoding="utf-8",
     )
     program.chmod(0o755)
