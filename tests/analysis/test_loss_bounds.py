@@ -1,4 +1,4 @@
-"""One-sided bounds compared with scipy, and coverage of the bound of bursty losses."""
+"""One-sided bounds compared with scipy, and the coverage of the loss bound with bursty losses."""
 
 import numpy as np
 import pytest
@@ -11,12 +11,12 @@ from tests.analysis.test_coverage import lost_in_bursts
 
 
 @given(st.integers(0, 200), st.integers(1, 200))
-def test_shares_of_repeats_equal_clopper_and_pearson(successes: int, n: int) -> None:
-    assume(successes <= n)
-    low = 0.0 if successes == 0 else scipy.stats.beta.ppf(0.05, successes, n - successes + 1)
-    high = 1.0 if successes == n else scipy.stats.beta.ppf(0.95, successes + 1, n - successes)
-    assert one_sided_bounds.share_low(successes, n) == pytest.approx(low, abs=1e-9)
-    assert one_sided_bounds.share_high(successes, n) == pytest.approx(high, abs=1e-9)
+def test_bounds_of_a_share_equal_those_of_clopper_and_pearson(successes: int, repeats: int) -> None:
+    assume(successes <= repeats)
+    low = 0.0 if successes == 0 else scipy.stats.beta.ppf(0.05, successes, repeats - successes + 1)
+    high = 1.0 if successes == repeats else scipy.stats.beta.ppf(0.95, successes + 1, repeats - successes)
+    assert one_sided_bounds.share_low(successes, repeats) == pytest.approx(low, abs=1e-9)
+    assert one_sided_bounds.share_high(successes, repeats) == pytest.approx(high, abs=1e-9)
 
 
 @given(st.floats(0.001, 0.9999))
@@ -32,21 +32,21 @@ def test_29_repeats_are_needed_for_90_percent() -> None:
 
 
 @given(st.lists(st.integers(0, 300), min_size=1, max_size=20))
-def test_the_loss_is_garwoods_bound_with_the_worst_repeat_as_burst_length(lost: list[int]) -> None:
+def test_the_loss_bound_is_garwoods_with_the_worst_repeat_as_burst_length(lost: list[int]) -> None:
     burst, total = max([*lost, one_sided_bounds.SHORTEST_BURST]), 1000 * len(lost)
     expected = burst * scipy.stats.gamma.ppf(0.95, sum(lost) / burst + 1) / total
     assert one_sided_bounds.loss_high(lost, [1000] * len(lost)) == pytest.approx(min(expected, 1), rel=1e-9)
 
 
 @given(st.lists(st.tuples(st.integers(0, 500), st.integers(0, 500)), min_size=1, max_size=20), st.integers(500, 5000))
-def test_fewer_losses_never_make_the_bound_larger(pairs: list[tuple[int, int]], sent: int) -> None:
-    fewer, more = ([pick(pair) for pair in pairs] for pick in (min, max))
-    sizes = [sent] * len(pairs)
+def test_fewer_losses_never_make_the_bound_larger(lost_pairs: list[tuple[int, int]], sent: int) -> None:
+    fewer, more = ([pick(pair) for pair in lost_pairs] for pick in (min, max))
+    sizes = [sent] * len(lost_pairs)
     assert one_sided_bounds.loss_high(fewer, sizes) <= one_sided_bounds.loss_high(more, sizes) * (1 + 1e-12)
-    assert one_sided_bounds.loss_high([0] * len(pairs), sizes) <= one_sided_bounds.loss_high(fewer, sizes)
+    assert one_sided_bounds.loss_high([0] * len(lost_pairs), sizes) <= one_sided_bounds.loss_high(fewer, sizes)
 
 
-def test_duplicates_are_no_negative_losses() -> None:
+def test_duplicates_do_not_count_as_negative_losses() -> None:
     assert one_sided_bounds.loss_high([-50, 0], [1000, 1000]) == one_sided_bounds.loss_high([0, 0], [1000, 1000])
     assert one_sided_bounds.loss_high([0], [0]) == 1
 

@@ -1,4 +1,4 @@
-"""Filters of rows: against an interpreter of three-valued logic, and their errors."""
+"""Filters of rows, compared with an interpreter of three-valued logic, and their errors."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -52,7 +52,7 @@ def negated(value: bool | None) -> bool | None:
     return None if value is None else not value
 
 
-def joined(kind: str, values: list[bool | None]) -> bool | None:
+def combined(kind: str, values: list[bool | None]) -> bool | None:
     decisive = kind == "or"
     if decisive in values:
         return decisive
@@ -66,7 +66,7 @@ CONDITIONS = st.recursive(
         st.tuples(st.sampled_from(["and", "or"]), st.lists(children, min_size=2, max_size=3)).map(
             lambda pair: (
                 f" {pair[0]} ".join(f"({text})" for text, _ in pair[1]),
-                lambda row: joined(pair[0], [decide(row) for _, decide in pair[1]]),
+                lambda row: combined(pair[0], [decide(row) for _, decide in pair[1]]),
             )
         ),
     ),
@@ -103,7 +103,7 @@ def test_any_text_is_a_condition_or_a_configuration_error(text: str) -> None:
         ("(" * 500 + "distance_m < 1" + ")" * 500, "is not an expression", "write for example"),
     ],
 )
-def test_a_wrong_expression_is_refused(text: str, message: str, remedy: str) -> None:
+def test_an_invalid_expression_is_refused(text: str, message: str, remedy: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         parse_filter(text, COLUMNS)
     assert message in caught.value.what
@@ -115,11 +115,11 @@ def test_commands_use_only_the_chosen_rows(tmp_path: Path) -> None:
         replace(COMPARABLE, repeat=number, distance=f"{5 * number}m", distance_m=5.0 * number) for number in (1, 2, 3)
     ]
     write(tmp_path / "trial", rows)
-    chosen = run_here(
+    filtered = run_here(
         tmp_path, "aggregate", "trial", "--where", "distance_m > 5", "--format", "csv", "--by", "distance"
     )
-    assert chosen.code == 0, chosen.err
-    assert {line.split(",")[0] for line in chosen.out.splitlines()[1:]} == {"10m", "15m"}
-    none = run_here(tmp_path, "aggregate", "trial", "--where", "distance_m > 50")
-    assert none.code == 4
-    assert "none of 3 attempts satisfies --where distance_m > 50" in none.err
+    assert filtered.code == 0, filtered.err
+    assert {line.split(",")[0] for line in filtered.out.splitlines()[1:]} == {"10m", "15m"}
+    no_rows = run_here(tmp_path, "aggregate", "trial", "--where", "distance_m > 50")
+    assert no_rows.code == 4
+    assert "none of 3 attempts satisfies --where distance_m > 50" in no_rows.err
