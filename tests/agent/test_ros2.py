@@ -148,8 +148,8 @@ try:
     ros2.message_type("lab_msgs/msg/Radio")
 except MiddlewareError as error:
     errors = str(error)
-settings = {discovery: ros2.environment(Network("10.0.0.1", discovery=discovery, peers=("10.0.0.2", "10.0.0.3"), domain=7))
-        for discovery in ("environment", "multicast", "peers")}
+settings = {name: ros2.environment(Network("10.0.0.1", discovery=name, peers=("10.0.0.2", "10.0.0.3"), domain=7))
+        for name in ("environment", "multicast", "peers")}
 print(json.dumps([policies, profile.deadline.nanoseconds, profile.lifespan.nanoseconds, errors, settings]))
 """
 

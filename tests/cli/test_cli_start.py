@@ -54,7 +54,7 @@ def imported_packages(lab: Path, command_line: str, variables: Mapping[str, str]
 
 DRY_RUN, EMULATED = "--dry-run", "--repeats 1 --record 1s --yes"
 MAX_LINES = {DRY_RUN: (18_400, 3_100), EMULATED: (27_000, 10_000)}
-"""Maximum number of imported lines of `fieldkit` and `sim_backends` in a trial of the paper's procedure, by options."""
+"""Maximum number of lines of `fieldkit` and `sim_backends` that a trial of `los` imports, by options."""
 
 MOTION = {"fieldkit.motion", "fieldkit.motion.permissions", "fieldkit.motion.profile_sections"}
 

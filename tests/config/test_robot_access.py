@@ -1,4 +1,4 @@
-"""Robot access as read by `fieldkit stop`: it equals that of the full site file, and tolerates other errors in the file."""
+"""Robot access as read by `fieldkit stop` equals that of the full site file; other errors are tolerated."""
 
 from pathlib import Path
 

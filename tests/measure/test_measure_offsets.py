@@ -14,7 +14,7 @@ DELAYS_NS = st.lists(st.tuples(st.integers(0, 2 * S), st.integers(0, 2 * S)), mi
 
 def test_the_fastest_exchange_gives_midpoint_and_half_its_round_trip() -> None:
     slow = Exchange(request_ns=0, robot_ns=3 * S, response_ns=2 * S)
-    # The request was sent at 10 s, and the response received at 10.4 s. The midpoint is 10.2 s; the robot's clock showed 15 s.
+    # The request was sent at 10 s and answered at 10.4 s; at the midpoint, 10.2 s, the robot's clock showed 15 s.
     fast = Exchange(request_ns=10 * S, robot_ns=15 * S, response_ns=10 * S + 4 * S // 10)
     estimate = offset([slow, fast])
     assert estimate.offset_s == pytest.approx(4.8)

@@ -98,7 +98,7 @@ def test_arbitrary_records_raise_no_error(data: bytes) -> None:
 
 
 def test_a_real_capture_of_the_papers_file_over_udp() -> None:
-    # From field notes: 293,797 bytes through nc.traditional -u are 36 datagrams of at most 8,192 bytes in 215 fragments.
+    # Field notes: 293,797 bytes through nc.traditional -u are 36 datagrams of at most 8,192 bytes in 215 fragments.
     packets = pcap.read(TCPDUMP / "nc-udp.pcap").packets
     assert len(packets) == 215
     assert (packets.dport == 1234).sum() == 36

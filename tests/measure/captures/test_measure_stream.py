@@ -33,7 +33,7 @@ FILES = {
 @pytest.mark.parametrize("step", mark_nightly([5, 1]))
 @pytest.mark.parametrize("name", FILES)
 def test_chunks_of_every_size_equal_the_whole_file(tmp_path: Path, name: str, step: int) -> None:
-    """CI uses every fifth size, because 5 has no common divisor with the sizes of headers and the alignment of blocks."""
+    """CI uses every fifth size; 5 has no common divisor with the sizes of headers and the alignment of blocks."""
     path = tmp_path / "x"
     path.write_bytes(FILES[name])
     whole_capture = pcap.parse(FILES[name], where=str(path))

@@ -20,7 +20,7 @@ def _address(text: str) -> int:
 
 
 def _read_tshark_output(path: Path) -> list[tuple[int, ...]]:
-    """Return rows of time, length, addresses, IP id, offset, ports, TCP numbers, flags, MSS, payload and UDP length."""
+    """Return rows: time, length, addresses, IP id, offset, ports, TCP numbers, flags, MSS, payload, UDP length."""
     printed_rows: list[tuple[int, ...]] = []
     for line in path.read_text().splitlines():
         cells = line.split(",")

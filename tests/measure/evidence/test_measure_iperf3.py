@@ -36,7 +36,7 @@ def test_the_counts_of_a_udp_test_agree_in_all_versions(version: str, test: str)
     values = measured(version, test)
     assert values["iperf3_received_bytes"] == PAYLOAD_BYTES * values["iperf3_datagrams_received"]
     assert values["iperf3_datagrams_sent"] == pytest.approx(values["iperf3_sent_bytes"] / PAYLOAD_BYTES, rel=0.02)
-    assert 0.01 < values["iperf3_loss"] < 0.1, "of 5 % on the radio"
+    assert 0.01 < values["iperf3_loss"] < 0.1, "the radio loses 5 %"
     assert values["iperf3_loss"] == 1 - values["iperf3_datagrams_received"] / values["iperf3_datagrams_sent"]
     assert values["iperf3_throughput_bit_s"] == pytest.approx(2e6 * (1 - values["iperf3_loss"]), rel=0.06)
     assert values["iperf3_interval_min_bit_s"] <= values["iperf3_interval_median_bit_s"]
@@ -46,7 +46,7 @@ def test_the_counts_of_a_udp_test_agree_in_all_versions(version: str, test: str)
 
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("test", ["udp", "udp-reverse"])
-def test_its_figures_equal_the_totals_of_the_receiver(version: str, test: str) -> None:
+def test_figures_equal_the_totals_of_the_receiver(version: str, test: str) -> None:
     """The totals are in the output of the client, where all versions report the receiver correctly."""
     end = json.loads(output(version, test, "client"))["end"]
     values = measured(version, test)
@@ -68,7 +68,7 @@ def test_the_counts_of_a_tcp_test_with_two_streams_agree(version: str) -> None:
     assert not {"iperf3_loss", "iperf3_datagrams_sent", "iperf3_jitter_s"} & values.keys()
     ports = [iperf3.parse(output(version, "tcp", end_name)).ports for end_name in ("client", "server")]
     assert len(ports[0]) == 2
-    assert ports[0] == tuple((own_port, other) for other, own_port in ports[1])
+    assert ports[0] == tuple((client_port, server_port) for server_port, client_port in ports[1])
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -108,7 +108,7 @@ def test_omitted_intervals_are_not_counted() -> None:
     assert iperf3.parse(json.dumps(data)).intervals == intervals[1:]
 
 
-def test_with_one_end_only_its_columns_have_values() -> None:
+def test_the_output_of_one_end_gives_only_its_columns() -> None:
     sender = iperf3.parse(output("3.12", "udp", "client"))
     result = iperf3.measure(Protocol.UDP, sender, None)
     assert set(result.values) == {"iperf3_sent_bytes"}
@@ -137,7 +137,7 @@ VALUES = st.recursive(
     connected=VALUES,
     protocol=st.sampled_from(Protocol),
 )
-def test_no_output_gives_an_impossible_value(
+def test_any_output_gives_only_possible_values(
     intervals: object, end: object, connected: object, protocol: Protocol
 ) -> None:
     text = json.dumps({"start": {"connected": connected}, "intervals": intervals, "end": end})
