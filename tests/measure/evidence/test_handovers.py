@@ -19,9 +19,8 @@ def output(count: int, interval_ns: int, unanswered: set[int]) -> ping.Ping:
     for number in range(count):
         if number not in unanswered:
             seconds, fraction_ns = divmod(START_NS + number * interval_ns + RTT_NS, 10**9)
-            lines.append(
-                f"[{seconds}.{fraction_ns // 1000:06}] 64 bytes from 10.0.0.1: icmp_seq={number + 1} ttl=64 time=3.00 ms"
-            )
+            stamp = f"{seconds}.{fraction_ns // 1000:06}"
+            lines.append(f"[{stamp}] 64 bytes from 10.0.0.1: icmp_seq={number + 1} ttl=64 time=3.00 ms")
     lines += ["", "--- 10.0.0.1 ping statistics ---"]
     lines.append(f"{count} packets transmitted, {count - len(unanswered)} received, 9% packet loss, time 9ms")
     return ping.parse("\n".join(lines) + "\n")
