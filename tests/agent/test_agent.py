@@ -69,10 +69,12 @@ class Cable:
 
     @contextmanager
     def running(
-        self, host: TestHost, verb: str, arguments: dict[str, Any], *words: str
+        self, host: TestHost, verb: str, arguments: dict[str, Any], *additional_arguments: str
     ) -> Iterator[subprocess.Popen[bytes]]:
         """Run the agent on a host; it is ready when the body starts, and is stopped after it."""
-        with host.start((sys.executable, str(self.program), verb, json.dumps(arguments), *words)) as process:
+        with host.start(
+            (sys.executable, str(self.program), verb, json.dumps(arguments), *additional_arguments)
+        ) as process:
             assert process.stderr is not None
             output_text = process.stderr.readline()
             assert output_text.startswith(b"up, "), output_text + process.stderr.read()
@@ -222,9 +224,9 @@ def test_missing_middleware_is_reported(tmp_path: Path) -> None:
     assert completed.stderr.startswith(b"error: zenoh is not installed here: ")
 
 
-def send_hostile_packets(host: TestHost, *words: str) -> None:
+def send_hostile_packets(host: TestHost, *arguments: str) -> None:
     """Let a host send hostile packets, and wait until it has finished."""
-    argv = ("env", f"PYTHONPATH={ROOT}", sys.executable, "-m", "tests.helpers.hostile_wire", *words)
+    argv = ("env", f"PYTHONPATH={ROOT}", sys.executable, "-m", "tests.helpers.hostile_wire", *arguments)
     with host.start(argv) as process:
         _, output_text = process.communicate(timeout=120)
     assert output_text.endswith(b"done\n"), output_text.decode()

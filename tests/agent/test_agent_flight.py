@@ -142,9 +142,9 @@ def plan(legs: list[tuple[float, float, float]]) -> FlightPlan:
 
 
 def test_acknowledgements_for_others_and_in_progress_are_ignored() -> None:
-    companion, other = (245, 191), (255, 190)
+    companion, other_station = (245, 191), (255, 190)
     state, _ = state_from(
-        d.MAVLink_command_ack_message(400, d.MAV_RESULT_DENIED, 0, 0, *other),
+        d.MAVLink_command_ack_message(400, d.MAV_RESULT_DENIED, 0, 0, *other_station),
         d.MAVLink_command_ack_message(22, d.MAV_RESULT_IN_PROGRESS, 40, 0, *companion),
         d.MAVLink_command_ack_message(176, d.MAV_RESULT_ACCEPTED, 0, 0, *companion),
         d.MAVLink_command_ack_message(21, d.MAV_RESULT_FAILED),

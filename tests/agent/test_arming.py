@@ -51,11 +51,11 @@ READY_MESSAGES: Mapping[str, Any] = {
 }
 
 
-def faults(needs: FlightNeeds = NEEDS, first: Any = None, **replacements: Any) -> list[str]:  # noqa: ANN401
+def faults(needs: FlightNeeds = NEEDS, first_heartbeat: Any = None, **replacements: Any) -> list[str]:  # noqa: ANN401
     """Return the faults if an autopilot sends the messages of a ready autopilot with replacements."""
     link, writer = MemoryLink(), d.MAVLink(None, srcSystem=7, srcComponent=1)
     autopilot = AutopilotState(link)
-    link.incoming_frames = [(first or heartbeat(d.MAV_AUTOPILOT_ARDUPILOTMEGA)).pack(writer)]
+    link.incoming_frames = [(first_heartbeat or heartbeat(d.MAV_AUTOPILOT_ARDUPILOTMEGA)).pack(writer)]
     autopilot.receive()
     check = ArmingCheck(autopilot, needs)
     messages = [item for item in {**READY_MESSAGES, **replacements}.values() if item is not None]
@@ -75,8 +75,14 @@ def test_no_faults_for_a_ready_autopilot() -> None:
 @pytest.mark.parametrize(
     ("replacements", "fault"),
     [
-        ({"first": heartbeat(d.MAV_AUTOPILOT_GENERIC)}, "its autopilot is neither PX4 nor ArduCopter (0, 2)"),
-        ({"first": heartbeat(d.MAV_AUTOPILOT_PX4, base=d.MAV_MODE_FLAG_SAFETY_ARMED)}, "its motors are running"),
+        (
+            {"first_heartbeat": heartbeat(d.MAV_AUTOPILOT_GENERIC)},
+            "its autopilot is neither PX4 nor ArduCopter (0, 2)",
+        ),
+        (
+            {"first_heartbeat": heartbeat(d.MAV_AUTOPILOT_PX4, base=d.MAV_MODE_FLAG_SAFETY_ARMED)},
+            "its motors are running",
+        ),
         ({"position": None}, "it does not report its position"),
         (
             {"estimate": d.MAVLink_ekf_status_report_message(0xA7, 1, 1, 1, 1, 1)},

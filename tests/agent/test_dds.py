@@ -33,9 +33,9 @@ def test_serialized_scan_equals_that_of_rosbags() -> None:
     written = bytes(store.serialize_cdr(message, "sensor_msgs/msg/LaserScan"))
 
     scan = dds.struct_type(topic("sensor_msgs/LaserScan"))
-    read = scan.deserialize(written)  # type: ignore[attr-defined]
-    assert read.header.frame_id == "base"
-    assert read.serialize(use_version_2=False) == written
+    parsed_message = scan.deserialize(written)  # type: ignore[attr-defined]
+    assert parsed_message.header.frame_id == "base"
+    assert parsed_message.serialize(use_version_2=False) == written
 
 
 @pytest.mark.parametrize(
@@ -47,8 +47,8 @@ def test_all_types_of_robots_can_be_built(name: str) -> None:
     topic_description = topic(name)
     struct = dds.struct_type(topic_description)
     empty = bytes((0, 1, 0, 0)) + bytes(2000)
-    read = struct.deserialize(empty)  # type: ignore[attr-defined]
-    written = read.serialize(use_version_2=False)
+    parsed_message = struct.deserialize(empty)  # type: ignore[attr-defined]
+    written = parsed_message.serialize(use_version_2=False)
     store = standard_types().ros2
     converted = store.serialize_cdr(store.deserialize_cdr(written, topic_description.type), topic_description.type)
     assert bytes(converted) == written
@@ -62,9 +62,14 @@ def test_custom_type_can_be_built() -> None:
         level, "x", raw, np.array([1], np.int16), good=True, one=7, wide=0.5, big=np.array([1, 2], np.int64)
     )
     written = bytes(types.ros2.serialize_cdr(message, "lab_msgs/msg/Radio"))
-    read = dds.struct_type(topic("lab_msgs/Radio", types)).deserialize(written)  # type: ignore[attr-defined]
-    assert (read.name, read.few, read.good, read.wide) == ("x", [1], True, 0.5)
-    assert read.serialize(use_version_2=False) == written
+    parsed_message = dds.struct_type(topic("lab_msgs/Radio", types)).deserialize(written)  # type: ignore[attr-defined]
+    assert (parsed_message.name, parsed_message.few, parsed_message.good, parsed_message.wide) == (
+        "x",
+        [1],
+        True,
+        0.5,
+    )
+    assert parsed_message.serialize(use_version_2=False) == written
 
 
 def test_types_have_the_dds_names_of_ros_2() -> None:

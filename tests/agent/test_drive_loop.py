@@ -57,8 +57,10 @@ def odometry(pose: OdometryPose, *, cdr: bool, frame: str = "odom", child_frame:
 @pytest.mark.parametrize("frame_names", [("odom", "base_footprint"), ("", ""), ("o", "abcdefghi")])
 def test_messages_equal_those_of_rosbags(frame_names: tuple[str, str], cdr: bool) -> None:
     pose = OdometryPose(3.5, -2.25, 1.25)
-    read = drive.read_odometry(odometry(pose, cdr=cdr, frame=frame_names[0], child_frame=frame_names[1]), cdr=cdr)
-    assert read == pytest.approx(pose)
+    parsed_pose = drive.read_odometry(
+        odometry(pose, cdr=cdr, frame=frame_names[0], child_frame=frame_names[1]), cdr=cdr
+    )
+    assert parsed_pose == pytest.approx(pose)
     kinds = STORES[cdr].types
     vector = kinds["geometry_msgs/msg/Vector3"]
     expected = kinds["geometry_msgs/msg/Twist"](vector(0.25, 0.0, 0.0), vector(0.0, 0.0, -0.5))
@@ -77,8 +79,10 @@ def test_invalid_odometry_is_none(data: bytes, cdr: bool) -> None:
 
 def test_odometry_with_nan_is_none() -> None:
     sample = odometry(OdometryPose(1.0, 2.0, 0.5), cdr=False)
-    at = sample.index(struct.pack("<d", 1.0))
-    assert drive.read_odometry(sample[:at] + struct.pack("<d", math.nan) + sample[at + 8 :], cdr=False) is None
+    offset = sample.index(struct.pack("<d", 1.0))
+    assert (
+        drive.read_odometry(sample[:offset] + struct.pack("<d", math.nan) + sample[offset + 8 :], cdr=False) is None
+    )
 
 
 class World:

@@ -64,7 +64,7 @@ def running(
         yield process
 
 
-def read(path: Path, kind: int) -> list[tuple[int, ...]]:
+def read_records(path: Path, kind: int) -> list[tuple[int, ...]]:
     rows = records.RECORD.iter_unpack(path.read_bytes()[len(records.MAGIC) :])
     return [row[2:5] for row in rows if row[0] == kind]
 
@@ -87,7 +87,9 @@ def exchange(program: Path, folder: Path) -> bool:
         output += [subscriber.communicate(timeout=TIMEOUT_S)[1] for subscriber in subscribers]
     assert [process.returncode for process in (*publishers, *subscribers)] == [0] * 4, output
     return all(
-        read(folder / f"{topic}.{verb}", records.MATCHED) for topic in SIZES for verb in ("publish", "subscribe")
+        read_records(folder / f"{topic}.{verb}", records.MATCHED)
+        for topic in SIZES
+        for verb in ("publish", "subscribe")
     )
 
 
@@ -98,9 +100,11 @@ def test_fast_dds_and_cyclonedds_exchange_samples_through_the_agent(program: Pat
     # On a busy machine CycloneDDS sometimes does not discover an endpoint of Fast DDS that has discovered it.
     assert any(exchange(program, tmp_path) for _ in range(MAX_EXCHANGES))
     for topic in SIZES:
-        sent, received = (read(tmp_path / f"{topic}.{verb}", records.SAMPLE) for verb in ("publish", "subscribe"))
-        assert sent
-        assert [row[1:] for row in received] == [row[1:] for row in sent]
+        sent_samples, received_samples = (
+            read_records(tmp_path / f"{topic}.{verb}", records.SAMPLE) for verb in ("publish", "subscribe")
+        )
+        assert sent_samples
+        assert [row[1:] for row in received_samples] == [row[1:] for row in sent_samples]
 
 
 @pytest.mark.emulated

@@ -87,19 +87,19 @@ def test_robot_drives_out_and_back_to_its_pose(
 ) -> None:
     task = replace(TASK, legs=legs, fence_m=50.0, limit_s=500.0)
     driver, robot = Driver(task, 0.0), Robot(start, noise_m, seed)
-    out = list(run(driver, robot))
+    out_velocities = list(run(driver, robot))
     assert (driver.phase, driver.stop_reason) == ("there", "")
     cos, sin = math.cos(start.yaw_rad), math.sin(start.yaw_rad)
     ahead, left = map(sum, zip(*legs, strict=True))
     goal = start.x_m + cos * ahead - sin * left, start.y_m + sin * ahead + cos * left
     assert math.dist(robot.pose[:2], goal) < 0.05 + 5 * noise_m + 3 * noise_m * len(legs)
-    back = list(run(driver, robot, now_s=len(out) * TICK_S, command=BACK))
+    return_velocities = list(run(driver, robot, now_s=len(out_velocities) * TICK_S, command=BACK))
     assert (driver.phase, driver.stop_reason) == ("home", "")
     assert math.dist(robot.pose[:2], start[:2]) < 0.05 + 10 * noise_m
     assert abs(math.remainder(robot.pose.yaw_rad - start.yaw_rad, math.tau)) < 0.1 + 5 * noise_m
-    assert out[-1] == back[-1] == ZERO_VELOCITY
-    assert is_within_limits(task, out)
-    assert is_within_limits(task, back)
+    assert out_velocities[-1] == return_velocities[-1] == ZERO_VELOCITY
+    assert is_within_limits(task, out_velocities)
+    assert is_within_limits(task, return_velocities)
 
 
 @given(
@@ -238,7 +238,7 @@ def test_constant_odometry_stops_the_robot(inputs: tuple[float, float]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("start", "last", "reason"),
+    ("start", "last_pose", "reason"),
     [
         ((6.0, 0.0, 0.0), None, "it is 6.00 m from its origin, outside its fence of 5 m"),
         ((0.5, 0.0, 0.0), None, "it is 0.50 m and 0.00 rad from its origin"),
@@ -247,9 +247,9 @@ def test_constant_odometry_stops_the_robot(inputs: tuple[float, float]) -> None:
     ],
 )
 def test_robot_that_is_not_at_its_place_does_not_start(
-    start: tuple[float, float, float], last: tuple[float, float, float] | None, reason: str
+    start: tuple[float, float, float], last_pose: tuple[float, float, float] | None, reason: str
 ) -> None:
-    driver = Driver(replace(TASK, origin=(0.0, 0.0, 0.0), last=last), 0.0)
+    driver = Driver(replace(TASK, origin=(0.0, 0.0, 0.0), last=last_pose), 0.0)
     assert set(run(driver, Robot(OdometryPose(*start)))) == {ZERO_VELOCITY}
     assert (driver.stop_reason, driver.refused) == (reason, True)
 

@@ -94,11 +94,11 @@ class FakeMiddleware:
 
 def read_log_rows(path: Path) -> list[tuple[int, int, int, int]]:
     """Return kind, size, sequence number and send time of each record. The last row is without its checksum."""
-    *rows, end = topic_logs.rows(path)
-    assert (end[0], end[4]) == (records.END, records.CHECKED)
+    *rows, last_row = topic_logs.rows(path)
+    assert (last_row[0], last_row[4]) == (records.END, records.CHECKED)
     return [
         *((kind, size, sequence, sent_ns) for kind, _, size, sequence, sent_ns, _ in rows),
-        (end[0], 0, end[3], 0),
+        (last_row[0], 0, last_row[3], 0),
     ]
 
 
@@ -114,9 +114,9 @@ def publish_and_read_log(
 def test_number_of_samples_is_rate_times_duration(tmp_path: Path) -> None:
     middleware = FakeMiddleware()
     rows = publish_and_read_log(tmp_path, middleware)
-    skipped = sum(row[2] for row in rows if row[0] == records.SKIPPED)
+    n_skipped = sum(row[2] for row in rows if row[0] == records.SKIPPED)
     codec = [row for row in rows if row[0] == records.SAMPLE]
-    assert len(codec) + skipped == 20
+    assert len(codec) + n_skipped == 20
     assert [row[2] for row in codec] == list(range(len(codec)))
     assert [SampleCodec(stream_of()).decode(data) for data in middleware.written] == [row[2:] for row in codec]
     assert rows[0][0] == records.MATCHED
@@ -152,10 +152,10 @@ def test_samples_during_a_blocked_write_are_skipped(tmp_path: Path) -> None:
     """A write that blocks for 5 periods; the skipped samples are not sent later."""
     unset_event = threading.Event()
     rows = publish_and_read_log(tmp_path, FakeMiddleware(accepts=lambda: not unset_event.wait(0.025)))
-    skipped = sum(row[2] for row in rows if row[0] == records.SKIPPED)
-    sent = sum(row[0] == records.SAMPLE for row in rows)
-    assert skipped >= 4 * (sent - 1)
-    assert sent <= 5, "the stream has 20 periods, and each write takes 5"
+    n_skipped = sum(row[2] for row in rows if row[0] == records.SKIPPED)
+    n_sent = sum(row[0] == records.SAMPLE for row in rows)
+    assert n_skipped >= 4 * (n_sent - 1)
+    assert n_sent <= 5, "the stream has 20 periods, and each write takes 5"
 
 
 def test_subscription_logs_arriving_samples(tmp_path: Path) -> None:

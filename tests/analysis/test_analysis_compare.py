@@ -56,8 +56,8 @@ def test_a_known_shift_is_detected() -> None:
 
 def test_a_share_without_its_counts_is_not_in_the_effect_size() -> None:
     rows = bursty(COMPARABLE, 10, seed=1)
-    lost = replace(rows[0], repeat=11, ip_packets_sent=None, ip_packets_received=None, ip_loss=1.0)
-    result = difference_of(compare_rows(rows, [*rows, lost]), "ip_loss")
+    lost_row = replace(rows[0], repeat=11, ip_packets_sent=None, ip_packets_received=None, ip_loss=1.0)
+    result = difference_of(compare_rows(rows, [*rows, lost_row]), "ip_loss")
     assert (result.b and result.b.n, result.value, result.cliffs_delta) == (10, 0.0, 0.0)
 
 
@@ -106,14 +106,14 @@ def test_a_single_repeat_has_a_difference_and_no_interval() -> None:
 
 
 @pytest.mark.parametrize(
-    ("limit_s", "repeats", "within"),
+    ("limit_s", "repeats", "is_within"),
     [(0.1, 20, True), (1e-6, 20, False), (0.1, 1, False)],
     ids=["wide", "narrow", "no interval"],
 )
-def test_the_whole_interval_must_be_within_a_threshold(limit_s: float, repeats: int, *, within: bool) -> None:
+def test_the_whole_interval_must_be_within_a_threshold(limit_s: float, repeats: int, *, is_within: bool) -> None:
     result = compare_rows(UDP, UDP[:repeats], thresholds={"rtt_median_s": limit_s})
-    assert difference_of(result, "rtt_median_s").within is within
-    assert result.exceeds_threshold is not within
+    assert difference_of(result, "rtt_median_s").within is is_within
+    assert result.exceeds_threshold is not is_within
 
 
 def test_a_point_within_a_threshold_is_not_enough() -> None:
@@ -186,7 +186,7 @@ def test_attempts_in_both_runs_are_reported() -> None:
 
 
 @pytest.mark.parametrize(
-    ("frames", "messages_text", "refused"),
+    ("frames", "messages_text", "is_refused"),
     [
         (0, [], False),
         (7, ["segmentation offload: A has off, B has on (los, master, 9.144 m, udp)"], True),
@@ -194,7 +194,7 @@ def test_attempts_in_both_runs_are_reported() -> None:
     ],
 )
 def test_offload_in_one_of_two_runs_is_refused(
-    frames: int | None, messages_text: list[str], *, refused: bool
+    frames: int | None, messages_text: list[str], *, is_refused: bool
 ) -> None:
     without_rtt = with_changes(UDP, tcp_superframes=0)
     result = compare_rows(
@@ -202,16 +202,16 @@ def test_offload_in_one_of_two_runs_is_refused(
         [*with_changes(UDP[:1], tcp_superframes=frames), *with_changes(UDP[1:], tcp_superframes=frames and 0)],
     )
     assert [str(concern) for concern in result.concerns] == messages_text
-    assert bool(result.refusals) is refused
+    assert bool(result.refusals) is is_refused
 
 
 @pytest.mark.parametrize(("messages", "comparable"), [(5, True), (8, False)])
 def test_a_short_recording_may_be_some_messages_longer(messages: int, *, comparable: bool) -> None:
-    short = with_changes(UDP, sent_bytes=19_560, bag_messages=4, datagrams_sent=3)
+    short_recordings = with_changes(UDP, sent_bytes=19_560, bag_messages=4, datagrams_sent=3)
     longer = with_changes(
-        short, sent_bytes=19_560 + 1_500 * (messages - 4) + 10_000 * (messages > 5), bag_messages=messages
+        short_recordings, sent_bytes=19_560 + 1_500 * (messages - 4) + 10_000 * (messages > 5), bag_messages=messages
     )
-    assert (not compare_rows(short, longer).refusals) is comparable
+    assert (not compare_rows(short_recordings, longer).refusals) is comparable
 
 
 def test_runs_without_hashes_are_refused() -> None:
@@ -238,12 +238,15 @@ def test_swapping_the_runs_changes_all_signs(seed: int, n: int, m: int) -> None:
         compare_rows(*runs, thresholds={"ip_loss": 0.1, "rtt_median_s": 0.002}) for runs in ((a, b), (b, a))
     )
     assert forward.exceeds_threshold == reverse.exceeds_threshold
-    for difference, other in zip(forward.differences, reverse.differences, strict=True):
-        assert difference.value == -(other.value or 0)
-        assert difference.cliffs_delta == -(other.cliffs_delta or 0)
-        assert difference.p_holm == other.p_holm
-        if difference.interval is not None and other.interval is not None:
-            assert (difference.interval.low, difference.interval.high) == (-other.interval.high, -other.interval.low)
+    for difference, reversed_difference in zip(forward.differences, reverse.differences, strict=True):
+        assert difference.value == -(reversed_difference.value or 0)
+        assert difference.cliffs_delta == -(reversed_difference.cliffs_delta or 0)
+        assert difference.p_holm == reversed_difference.p_holm
+        if difference.interval is not None and reversed_difference.interval is not None:
+            assert (difference.interval.low, difference.interval.high) == (
+                -reversed_difference.interval.high,
+                -reversed_difference.interval.low,
+            )
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -175,10 +175,10 @@ def test_a_table_truncated_in_its_last_line_is_refused_or_lacks_that_line(tmp_pa
     """A truncated last cell can be another valid number: 15336791.6 truncated to 1533679."""
     path = write(tmp_path / "a", repeats(ROW, 2))
     content = path.read_bytes()
-    last = content.rindex(b"\n", 0, -1) + 1
-    for end in range(last, len(content)):
+    last_line_start = content.rindex(b"\n", 0, -1) + 1
+    for end in range(last_line_start, len(content)):
         path.write_bytes(content[:end])
-        if end == last:
+        if end == last_line_start:
             assert len(read([path], trial_columns())) == 1
             continue
         with pytest.raises(

@@ -11,7 +11,7 @@ from fieldkit.core.model import Interval
 from tests.helpers.single import mean, mean_share, median, share, wilson
 
 counts = st.integers(1, 10**6).flatmap(lambda trials: st.tuples(st.integers(0, trials), st.just(trials)))
-lost_and_sent = st.integers(1, 300).flatmap(lambda sent: st.tuples(st.integers(0, sent), st.just(sent)))
+lost_and_sent = st.integers(1, 300).flatmap(lambda n_sent: st.tuples(st.integers(0, n_sent), st.just(n_sent)))
 repeats = st.lists(lost_and_sent, min_size=2, max_size=30)
 values = st.lists(st.floats(-1e6, 1e6).map(lambda value: round(value, 6)), min_size=2, max_size=30)
 
@@ -53,13 +53,13 @@ def test_student_equals_scipy() -> None:
     assert student(np.array([1, 2])) == pytest.approx(scipy.stats.t.ppf(0.975, [1, 2]), rel=1e-12)
 
 
-@pytest.mark.parametrize("sent", [np.full(20, 36), np.arange(33, 53)], ids=["equal", "unequal"])
-def test_the_interval_of_a_share_contains_the_values_that_a_score_test_accepts(sent: np.ndarray) -> None:
+@pytest.mark.parametrize("n_sent", [np.full(20, 36), np.arange(33, 53)], ids=["equal", "unequal"])
+def test_the_interval_of_a_share_contains_the_values_that_a_score_test_accepts(n_sent: np.ndarray) -> None:
     """The bounds solve |share - p| = t sqrt(p (1 - p) / trials), found here by bisection."""
-    interval = not_none(share(BURSTY, sent))
-    rate = BURSTY.sum() / sent.sum()
-    deviations = BURSTY - rate * sent
-    variance = np.var(deviations, ddof=1) * len(sent) / sent.sum() ** 2
+    interval = not_none(share(BURSTY, n_sent))
+    rate = BURSTY.sum() / n_sent.sum()
+    deviations = BURSTY - rate * n_sent
+    variance = np.var(deviations, ddof=1) * len(n_sent) / n_sent.sum() ** 2
     trials = rate * (1 - rate) / variance
     t = scipy.stats.t.ppf(0.975, 2 * (deviations**2).sum() ** 2 / (deviations**4).sum())
 
@@ -79,8 +79,8 @@ def test_bursts_make_the_interval_wider_than_wilsons() -> None:
 
 def test_repeats_that_agree_give_nearly_wilsons_interval() -> None:
     """The intervals differ only by the squared ratio of the t quantile to the normal quantile."""
-    lost = np.random.default_rng(1).binomial(1000, 0.1, size=5000)
-    interval, reference = not_none(share(lost, [1000] * 5000)), wilson(int(lost.sum()), 5_000_000)
+    n_lost = np.random.default_rng(1).binomial(1000, 0.1, size=5000)
+    interval, reference = not_none(share(n_lost, [1000] * 5000)), wilson(int(n_lost.sum()), 5_000_000)
     assert (interval.low, interval.high) == pytest.approx((reference.low, reference.high), rel=1e-3)
 
 
@@ -98,9 +98,9 @@ def test_one_repeat_that_lost_everything_gives_a_wide_interval() -> None:
     assert 0.3 < interval.high < 0.7
 
 
-@pytest.mark.parametrize(("lost", "sent"), [(1, 36), (7, 157)])  # the second share is not exact in binary
-def test_two_equal_repeats_have_a_wide_interval(lost: int, sent: int) -> None:
-    interval = not_none(share([lost, lost], [sent, sent]))
+@pytest.mark.parametrize(("n_lost", "n_sent"), [(1, 36), (7, 157)])  # the second share is not exact in binary
+def test_two_equal_repeats_have_a_wide_interval(n_lost: int, n_sent: int) -> None:
+    interval = not_none(share([n_lost, n_lost], [n_sent, n_sent]))
     assert interval.low < interval.value / 5
     assert interval.high > 5 * interval.value
 
@@ -114,17 +114,17 @@ def test_many_small_repeats_and_a_large_one_count_as_few_trials() -> None:
 
 @given(repeats)
 def test_the_interval_of_a_share_contains_it(samples: list[tuple[int, int]]) -> None:
-    lost, sent = np.array(samples).T
-    interval = not_none(share(lost, sent))
+    n_lost, n_sent = np.array(samples).T
+    interval = not_none(share(n_lost, n_sent))
     assert 0 <= interval.low <= interval.value <= interval.high <= 1
-    complement = not_none(share(sent - lost, sent))
+    complement = not_none(share(n_sent - n_lost, n_sent))
     assert (1 - complement.high, 1 - complement.low) == pytest.approx((interval.low, interval.high), abs=1e-9)
 
 
-@pytest.mark.parametrize("lost", [7, 15])
-def test_equal_repeats_are_not_distinguished_by_rounding(lost: int) -> None:
+@pytest.mark.parametrize("n_lost", [7, 15])
+def test_equal_repeats_are_not_distinguished_by_rounding(n_lost: int) -> None:
     """22 times a share of 15/22 is not exactly 15; the losses are then assumed to be independent."""
-    interval = not_none(share([lost] * 2, [22] * 2))
+    interval = not_none(share([n_lost] * 2, [22] * 2))
     assert interval.high - interval.low > 0.5
 
 
@@ -156,11 +156,11 @@ def test_a_mean_has_the_bootstrap_t_interval() -> None:
 
 @given(values, st.floats(-100, 100), st.floats(0.01, 100))
 def test_a_mean_is_shifted_and_scaled_with_its_values(samples: list[float], shift: float, factor: float) -> None:
-    original, moved = not_none(mean(samples)), not_none(mean(shift + factor * np.array(samples)))
+    original, transformed = not_none(mean(samples)), not_none(mean(shift + factor * np.array(samples)))
     assert original.low <= original.value <= original.high
     size = factor * (np.abs(samples).max() + abs(shift) + 1)
-    ends = (shift + factor * original.low, shift + factor * original.high)
-    assert (moved.low, moved.high) == pytest.approx(ends, rel=1e-3, abs=1e-3 * size)
+    expected_bounds = (shift + factor * original.low, shift + factor * original.high)
+    assert (transformed.low, transformed.high) == pytest.approx(expected_bounds, rel=1e-3, abs=1e-3 * size)
 
 
 def test_the_mean_of_tiny_values_has_a_tiny_interval() -> None:
@@ -201,10 +201,10 @@ def test_the_interval_of_a_median_contains_it(samples: list[float]) -> None:
 
 def test_vectorized_cells_equal_single_cells() -> None:
     random = np.random.default_rng(8)
-    lost, sent = random.integers(0, 5, (7, 20)), random.integers(5, 40, (7, 20))
+    n_lost, n_sent = random.integers(0, 5, (7, 20)), random.integers(5, 40, (7, 20))
     times = random.lognormal(size=(7, 20))
     for batch, single_cells in (
-        (shares(lost, sent), [share(*cell) for cell in zip(lost, sent, strict=True)]),
+        (shares(n_lost, n_sent), [share(*cell) for cell in zip(n_lost, n_sent, strict=True)]),
         (means(times), [mean(cell) for cell in times]),
         (medians(times), [median(cell) for cell in times]),
     ):

@@ -29,7 +29,7 @@ Floats = NDArray[np.float64]
 Draw = Callable[[np.random.Generator, tuple[int, int]], Floats]
 
 
-def lost_in_bursts(
+def burst_losses(
     random: np.random.Generator, rate: float, burst: int, shape: tuple[int, int], packets: int
 ) -> NDArray[np.int64]:
     """Return the number of lost packets per repeat on a Gilbert-Elliott link, whose bad state loses all packets."""
@@ -38,12 +38,12 @@ def lost_in_bursts(
     recovery_probability = 1 / burst
     failure_probability = recovery_probability * rate / (1 - rate)
     bad = random.random(shape) < rate
-    lost = bad.astype(np.int64)
+    n_lost = bad.astype(np.int64)
     for _ in range(packets - 1):
         uniform = random.random(shape, dtype=np.float32)
         bad = np.where(bad, uniform >= recovery_probability, uniform < failure_probability)
-        lost += bad
-    return lost
+        n_lost += bad
+    return n_lost
 
 
 def coverage_percent(intervals: Intervals, truth: float) -> float:
@@ -67,10 +67,10 @@ def test_intervals_of_shares_cover_for_any_burst_length(
     random = np.random.default_rng(11)
     coverages, wilson_coverages = [], []
     for burst in BURSTS:
-        lost = lost_in_bursts(random, rate, burst, (CELLS, REPEATS), packets)
-        sent = np.full(lost.shape, packets)
-        coverages.append(coverage_percent(shares(lost, sent), rate))
-        wilson_coverages.append(coverage_percent(wilsons(lost.sum(axis=1), sent.sum(axis=1)), rate))
+        n_lost = burst_losses(random, rate, burst, (CELLS, REPEATS), packets)
+        n_sent = np.full(n_lost.shape, packets)
+        coverages.append(coverage_percent(shares(n_lost, n_sent), rate))
+        wilson_coverages.append(coverage_percent(wilsons(n_lost.sum(axis=1), n_sent.sum(axis=1)), rate))
     record_property(
         "result", f"share, 20 repeats of {packets}, {rate:.0%} lost, bursts {BURSTS}: {rounded(coverages)}"
     )
@@ -91,7 +91,7 @@ def test_intervals_of_shares_of_few_repeats_have_nearly_the_same_coverage(
     random = np.random.default_rng(12)
     coverages = [
         coverage_percent(
-            shares(lost_in_bursts(random, rate, burst, (CELLS, n), 36), np.full((CELLS, n), 36)),
+            shares(burst_losses(random, rate, burst, (CELLS, n), 36), np.full((CELLS, n), 36)),
             rate,
         )
         for rate in RATES
@@ -106,9 +106,9 @@ def test_intervals_of_shares_cover_if_repeats_send_different_numbers(
     burst: int, record_property: Callable[[str, object], None]
 ) -> None:
     random = np.random.default_rng(13)
-    sent = np.concatenate([np.full((CELLS, 10), size) for size in (36, 215)], axis=1)
-    lost = np.concatenate([lost_in_bursts(random, 0.05, burst, (CELLS, 10), size) for size in (36, 215)], axis=1)
-    coverages = coverage_percent(shares(lost, sent), 0.05)
+    n_sent = np.concatenate([np.full((CELLS, 10), size) for size in (36, 215)], axis=1)
+    n_lost = np.concatenate([burst_losses(random, 0.05, burst, (CELLS, 10), size) for size in (36, 215)], axis=1)
+    coverages = coverage_percent(shares(n_lost, n_sent), 0.05)
     record_property(
         "result", f"share, 10 repeats of 36 and 10 of 215, 5 % lost, bursts of {burst}: {coverages:.1f} %"
     )
@@ -124,9 +124,9 @@ def test_shares_cover_less_if_repeats_differ_strongly(
     random, prior = np.random.default_rng(17), 1 / 0.3 - 1
     coverages = []
     for n in (5, 10, 20, 40):
-        sent = np.broadcast_to(np.where(np.arange(n) % 2, largest, 36), (CELLS, n))
-        lost = random.binomial(sent, random.beta(prior * rate, prior * (1 - rate), sent.shape))
-        coverages.append(coverage_percent(shares(lost, sent), rate))
+        n_sent = np.broadcast_to(np.where(np.arange(n) % 2, largest, 36), (CELLS, n))
+        n_lost = random.binomial(n_sent, random.beta(prior * rate, prior * (1 - rate), n_sent.shape))
+        coverages.append(coverage_percent(shares(n_lost, n_sent), rate))
     label = f"{rate:.0%} lost, ".replace("%", " %") + (
         "all of 36" if largest == 36 else f"half of 36, half of {largest}"
     )
@@ -176,8 +176,8 @@ def test_means_and_medians_cover_skewed_repeats(name: str, record_property: Call
 def test_means_and_medians_cover_bursty_shares(burst: int, record_property: Callable[[str, object], None]) -> None:
     random = np.random.default_rng(15)
     packets, rate = 215, 0.35
-    true_median = float(np.median(lost_in_bursts(random, rate, burst, (1, 100_000), packets))) / packets
-    shares = [lost_in_bursts(random, rate, burst, (CELLS, n), packets) / packets for n in (5, 10, REPEATS)]
+    true_median = float(np.median(burst_losses(random, rate, burst, (1, 100_000), packets))) / packets
+    shares = [burst_losses(random, rate, burst, (CELLS, n), packets) / packets for n in (5, 10, REPEATS)]
     mean_coverages = [coverage_percent(mean_shares(values), rate) for values in shares]
     median_coverages = [coverage_percent(medians(values), true_median) for values in shares]
     bootstrap_coverage = coverage_percent(percentile_bootstrap(random, shares[-1]), rate)

@@ -28,8 +28,8 @@ def bursts(loss: float, length: float) -> Draw:
 
     def draw(random: np.random.Generator, shape: tuple[int, int]) -> Floats:
         count = random.poisson(PACKETS * loss / length, shape)
-        lost = count + random.negative_binomial(np.maximum(count, 1), 1 / length)
-        return np.minimum(PACKETS, np.where(count > 0, lost, 0)).astype(float)
+        n_lost = count + random.negative_binomial(np.maximum(count, 1), 1 / length)
+        return np.minimum(PACKETS, np.where(count > 0, n_lost, 0)).astype(float)
 
     return draw
 
@@ -47,7 +47,7 @@ def loss_intervals(values: Floats) -> Intervals:
 
 
 def differences(a: Intervals, b: Intervals) -> list[Interval]:
-    sides = [[Interval(*ends) for ends in zip(side.value, side.low, side.high, strict=True)] for side in (a, b)]
+    sides = [[Interval(*bounds) for bounds in zip(side.value, side.low, side.high, strict=True)] for side in (a, b)]
     return [between(first, second) for first, second in zip(*sides, strict=True)]
 
 

@@ -81,9 +81,9 @@ def test_the_text_of_an_expectation_is_parsed(
     ],
 )
 def test_an_invalid_text_is_an_error_with_a_remedy(text: str, message: str) -> None:
-    with pytest.raises(ConfigurationError, match=message) as caught:
+    with pytest.raises(ConfigurationError, match=message) as error_info:
         expectations.parse(text, QUANTITIES)
-    assert caught.value.remedy
+    assert error_info.value.remedy
 
 
 @pytest.mark.parametrize(
@@ -134,11 +134,13 @@ def test_the_scope_of_an_expectation(text: str, scope: Scope, is_inclusive: bool
     assert (result.scope, result.is_inclusive, result.share) == (scope, is_inclusive, share)
 
 
-def losses(*lost: int, sent: int = 1250) -> Cell:
+def losses(*lost_counts: int, n_sent: int = 1250) -> Cell:
     """Return the cell of UDP repeats, each of which lost one of these numbers of packets of `sent`."""
     rows = [
-        replace(ROW, repeat=number, ip_packets_sent=sent, ip_packets_received=sent - n_lost, ip_loss=n_lost / sent)
-        for number, n_lost in enumerate(lost, 1)
+        replace(
+            ROW, repeat=number, ip_packets_sent=n_sent, ip_packets_received=n_sent - n_lost, ip_loss=n_lost / n_sent
+        )
+        for number, n_lost in enumerate(lost_counts, 1)
     ]
     (cell,) = aggregate(parsed(rows), ("protocol",), quantities=[PACKETS])
     return cell
@@ -158,7 +160,7 @@ def test_a_perfect_link_meets_an_expectation_of_all_packets() -> None:
     assert ruling(text, losses(25, 25, 25, 25, 25, 25)) is Ruling.FAILS
     assert ruling("ip_loss <= 2 % of all packets", losses(25, 25, 25, 25, 25, 25)) is Ruling.OPEN
     assert ruling("ip_loss < 2 %", losses(0, 0, 0, 0, 0, 0)) is Ruling.OPEN, "a statement on other repeats"
-    (judgement_of_few,) = judgements.judge([expectations.parse(text, QUANTITIES)], [losses(0, 0, sent=100)])
+    (judgement_of_few,) = judgements.judge([expectations.parse(text, QUANTITIES)], [losses(0, 0, n_sent=100)])
     assert judgement_texts(judgement_of_few)[2:] == (
         "0.00 %", "14.98 % or less", "undecided: 200 packets were sent, but at least 1498 are needed",
     )  # fmt: skip
@@ -177,7 +179,7 @@ def test_fewer_losses_never_make_a_ruling_worse(pairs: list[tuple[int, int]], te
 
 
 @pytest.mark.parametrize(
-    ("lost", "every", "share"),
+    ("lost_counts", "every", "share"),
     [
         ([0] * 29, Ruling.HOLDS, Ruling.HOLDS),
         ([0] * 28, Ruling.HOLDS, Ruling.OPEN),
@@ -187,9 +189,11 @@ def test_fewer_losses_never_make_a_ruling_worse(pairs: list[tuple[int, int]], te
         ([25] * 29, Ruling.FAILS, Ruling.FAILS),
     ],
 )
-def test_rulings_on_every_repeat_and_on_a_share_of_repeats(lost: list[int], every: Ruling, share: Ruling) -> None:
-    assert ruling("every ip_loss < 2 %", losses(*lost)) is every
-    assert ruling("90 % of ip_loss < 2 %", losses(*lost)) is share
+def test_rulings_on_every_repeat_and_on_a_share_of_repeats(
+    lost_counts: list[int], every: Ruling, share: Ruling
+) -> None:
+    assert ruling("every ip_loss < 2 %", losses(*lost_counts)) is every
+    assert ruling("90 % of ip_loss < 2 %", losses(*lost_counts)) is share
 
 
 def test_the_measured_value_is_shown_for_each_scope() -> None:

@@ -65,19 +65,19 @@ def test_the_error_of_an_impossible_value_names_its_place(tmp_path: Path, name: 
         writer = csv.DictWriter(file, lines[0], lineterminator="\n")
         writer.writeheader()
         writer.writerows(lines)
-    with pytest.raises(EvidenceError) as caught:
+    with pytest.raises(EvidenceError) as error_info:
         read([path], trial_columns())
-    assert caught.value.where == f"{path}:4"
-    assert caught.value.what.startswith(f"{name} is '{text[:40]}")
-    assert caught.value.what.endswith(f", {reason}")
-    assert "fieldkit rebuild TRIAL" in caught.value.remedy
+    assert error_info.value.where == f"{path}:4"
+    assert error_info.value.what.startswith(f"{name} is '{text[:40]}")
+    assert error_info.value.what.endswith(f", {reason}")
+    assert "fieldkit rebuild TRIAL" in error_info.value.remedy
 
 
 def test_a_share_that_its_counts_contradict_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path, [*repeats(ROW, 2), replace(ROW, repeat=3, ip_loss=0.5)])
-    with pytest.raises(EvidenceError, match=r"ip_loss is 0\.5, but ip_packets_received is 206 of 216") as caught:
+    with pytest.raises(EvidenceError, match=r"ip_loss is 0\.5, but ip_packets_received is 206 of 216") as error_info:
         read([path], trial_columns())
-    assert caught.value.where == f"{path}:4"
+    assert error_info.value.where == f"{path}:4"
 
 
 @pytest.mark.parametrize(
@@ -117,9 +117,9 @@ def test_the_error_of_a_shortened_time_has_a_remedy(tmp_path: Path) -> None:
     path = tmp_path / "saved.csv"
     table = as_csv([replace(ROW, started_utc_ns=1_795_309_790_492_337_123)])
     path.write_text(table.replace("1795309790492337123", "1.79531E+18"), encoding="utf-8")
-    with pytest.raises(EvidenceError, match="not a whole number") as caught:
+    with pytest.raises(EvidenceError, match="not a whole number") as error_info:
         read([path], trial_columns())
-    assert "a spreadsheet has removed digits" in caught.value.remedy
+    assert "a spreadsheet has removed digits" in error_info.value.remedy
 
 
 def test_a_time_keeps_its_nanoseconds_next_to_a_missing_value(tmp_path: Path) -> None:

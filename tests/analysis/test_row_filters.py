@@ -104,10 +104,10 @@ def test_any_text_is_a_condition_or_a_configuration_error(text: str) -> None:
     ],
 )
 def test_an_invalid_expression_is_refused(text: str, message: str, remedy: str) -> None:
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(ConfigurationError) as error_info:
         parse_filter(text, COLUMNS)
-    assert message in caught.value.what
-    assert remedy in caught.value.remedy
+    assert message in error_info.value.what
+    assert remedy in error_info.value.remedy
 
 
 def test_commands_use_only_the_chosen_rows(tmp_path: Path) -> None:

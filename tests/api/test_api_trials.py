@@ -134,7 +134,7 @@ def test_each_packet_has_the_times_at_which_it_was_captured(recorded_trial: Path
     assert packets["received_ns"] == [
         None if number in LOST else sent_ns + AHEAD_NS for number, sent_ns in enumerate(packets["sent_ns"])
     ]
-    assert [number for number, lost in enumerate(packets["lost"]) if lost] == list(LOST)
+    assert [number for number, is_lost in enumerate(packets["lost"]) if is_lost] == list(LOST)
     assert set(packets["wire_bytes"]) == {1042}
     assert set(packets["payload_bytes"]) == {1008}
     assert set(packets["delay_s"]) == {None}, "without packets in the other direction the clock offset is unknown"
@@ -271,9 +271,9 @@ def test_notes_of_commands_are_warnings(tmp_path: Path) -> None:
 
 
 def test_rebuild_measures_the_evidence_again(recorded_trial: Path) -> None:
-    stored = fieldkit.load(recorded_trial).repeats
+    stored_repeats = fieldkit.load(recorded_trial).repeats
     (recorded_trial / store.TRIAL_CSV).unlink()
-    assert fieldkit.load(recorded_trial, rebuild=True).repeats.equals(stored)
+    assert fieldkit.load(recorded_trial, rebuild=True).repeats.equals(stored_repeats)
 
 
 def test_the_package_imports_its_readers_lazily() -> None:

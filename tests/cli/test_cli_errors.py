@@ -161,9 +161,9 @@ def test_a_topology_without_roles_names_the_line_of_the_roles(
 
 
 def test_a_question_without_a_terminal_suggests_an_option() -> None:
-    with pytest.raises(ConfigurationError, match="a person must put a and b 5m apart") as caught:
+    with pytest.raises(ConfigurationError, match="a person must put a and b 5m apart") as error_info:
         Terminal(lambda event: None).ask("put a and b 5m apart")
-    assert "--yes" in caught.value.remedy
+    assert "--yes" in error_info.value.remedy
 
 
 def test_version_option_prints_the_version() -> None:

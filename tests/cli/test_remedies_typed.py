@@ -63,14 +63,14 @@ def parser_of(command_line: str, top_parser: Parser) -> tuple[Parser, list[str]]
 def test_commands_in_remedies_exist_and_accept_their_options() -> None:
     parser = cli.parser()
     invalid_commands = []
-    for place, text in remedies():
+    for location, text in remedies():
         for match in COMMAND.finditer(text):
             command, _ = parser_of(match[1], parser)
             if command is parser and match[1].split()[0] not in {"is", "runs", "itself", "reads", "with"}:
-                invalid_commands.append((place, match[0], "no such command"))
+                invalid_commands.append((location, match[0], "no such command"))
             accepted_options = set(re.findall(r"--[a-z][a-z-]+", command.format_help()))
             invalid_commands += [
-                (place, match[0], option) for option in OPTION.findall(match[2]) if option not in accepted_options
+                (location, match[0], option) for option in OPTION.findall(match[2]) if option not in accepted_options
             ]
     assert invalid_commands == []
 

@@ -17,7 +17,7 @@ SCRIPT = b"#!/bin/sh\necho 1\n"
 
 
 class Holder(Strict):
-    load_program: NamedProgram | None = None
+    put: NamedProgram | None = None
 
 
 @pytest.fixture(autouse=True)

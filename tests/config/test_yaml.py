@@ -19,10 +19,10 @@ from sim_backends.world.world import World
 from tests.helpers.paths import DATA, ROOT
 
 
-@pytest.mark.parametrize("first", ["ip_loss < 2 %", "[a, b]", "x: 1", "'a'"])
-def test_an_item_that_is_indented_too_far_is_refused_with_its_line(first: str) -> None:
+@pytest.mark.parametrize("first_item", ["ip_loss < 2 %", "[a, b]", "x: 1", "'a'"])
+def test_an_item_that_is_indented_too_far_is_refused_with_its_line(first_item: str) -> None:
     with pytest.raises(ConfigurationError) as error_info:
-        documents.parse(f"expect:\n  - {first}\n   - rtt_loss < 5 %\n", source="p.yaml")
+        documents.parse(f"expect:\n  - {first_item}\n   - rtt_loss < 5 %\n", source="p.yaml")
     assert error_info.value.where == "p.yaml:3"
     assert "indent" in error_info.value.remedy
 

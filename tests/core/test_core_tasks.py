@@ -65,9 +65,9 @@ def use_executor(monkeypatch: pytest.MonkeyPatch, executor: ScriptedWorkers) -> 
 
 def test_many_tasks_are_submitted_a_few_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     executor, notes = ScriptedWorkers(), list[str]()
-    ends = list(completed(abs, range(4_000), use_executor(monkeypatch, executor), notes.append))
-    assert sorted(end.number for end in ends) == list(range(4_000))
-    assert all(end.result == end.number for end in ends)
+    task_ends = list(completed(abs, range(4_000), use_executor(monkeypatch, executor), notes.append))
+    assert sorted(task_end.number for task_end in task_ends) == list(range(4_000))
+    assert all(task_end.result == task_end.number for task_end in task_ends)
     assert executor.max_submitted == 4
     assert notes == ["no worker is connected to tcp://scripted:1 yet; waiting for one"]
     assert executor.capacities == [-1], "the executor is stopped"
@@ -90,8 +90,12 @@ def kill_process_once(path: Path) -> str:
 def test_a_task_whose_process_died_is_run_again(tmp_path: Path) -> None:
     notes: list[str] = []
     tasks = [tmp_path / "stays", tmp_path / "dies", tmp_path / "stays"]
-    ends = list(completed(kill_process_once, tasks, Workers(2), notes.append))
-    assert sorted((end.number, end.result) for end in ends) == [(0, "stays"), (1, "dies"), (2, "stays")]
+    task_ends = list(completed(kill_process_once, tasks, Workers(2), notes.append))
+    assert sorted((task_end.number, task_end.result) for task_end in task_ends) == [
+        (0, "stays"),
+        (1, "dies"),
+        (2, "stays"),
+    ]
     assert any("a worker died" in note for note in notes)
     assert MAX_DEATHS > 1
 

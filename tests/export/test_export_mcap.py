@@ -125,13 +125,18 @@ def test_the_log_has_the_entries_of_the_journal(read_messages: list[ReadMessage]
 
 
 def test_each_packet_has_the_time_of_its_robot_and_its_fate(read_messages: list[ReadMessage]) -> None:
-    sent, received = messages_of(read_messages, "/sender/packets"), messages_of(read_messages, "/receiver/packets")
+    sent_messages, received_messages = (
+        messages_of(read_messages, "/sender/packets"),
+        messages_of(read_messages, "/receiver/packets"),
+    )
     first_ns = BEGIN_NS + 2 * SECOND_NS
-    assert [message.time_ns for message in sent] == [first_ns + 1_000_000 * index for index in range(PACKETS)]
-    assert received[0].time_ns == first_ns + AHEAD_NS
-    assert [index for index, message in enumerate(sent) if message.content["lost"]] == list(LOST)
-    assert [message.content["copy"] for message in received] == [False] * (PACKETS - len(LOST)) + [True]
-    assert sent[REPEATED].content == {
+    assert [message.time_ns for message in sent_messages] == [
+        first_ns + 1_000_000 * index for index in range(PACKETS)
+    ]
+    assert received_messages[0].time_ns == first_ns + AHEAD_NS
+    assert [index for index, message in enumerate(sent_messages) if message.content["lost"]] == list(LOST)
+    assert [message.content["copy"] for message in received_messages] == [False] * (PACKETS - len(LOST)) + [True]
+    assert sent_messages[REPEATED].content == {
         "timestamp": {"sec": first_ns // SECOND_NS, "nsec": 1_000_000 * REPEATED},
         "repeat": "udp-01",
         "protocol": 17,
@@ -212,8 +217,8 @@ def test_many_packets_are_stored_in_several_compressed_chunks(tmp_path: Path) ->
     assert summary
     assert len(summary.chunk_indexes) > 2
     assert {chunk.compression for chunk in summary.chunk_indexes} == {"zstd"}
-    lost = [message.content["lost"] for message in messages(content) if message.topic == "/sender/packets"]
-    assert (len(lost), sum(lost)) == (10_000, 1_000)
+    lost_flags = [message.content["lost"] for message in messages(content) if message.topic == "/sender/packets"]
+    assert (len(lost_flags), sum(lost_flags)) == (10_000, 1_000)
 
 
 def test_a_damaged_capture_gives_the_packets_before_the_damage_without_fates(trial: Path) -> None:
@@ -239,24 +244,24 @@ def test_frames_of_offload_have_no_fates(trial: Path, payload_bytes: int, has_fa
     path = trial / journal.JOURNAL_FILE
     path.write_text(path.read_text(encoding="utf-8").replace('"udp"', '"tcp"'), encoding="utf-8")
     folder = (trial / "repeats" / "udp-01").rename(trial / "repeats" / "tcp-01")
-    sent = [recorded.segment(number, payload_bytes) for number in range(10)]
-    (folder / "sender.pcap").write_bytes(file_bytes(timed(sent)))
-    (folder / "receiver.pcap").write_bytes(file_bytes(timed(sent[1:])))
-    lost = [message.content.get("lost") for message in messages_of(messages(export(trial)), "/sender/packets")]
-    assert lost == ([True] + [False] * 9 if has_fates else [None] * 10)
+    sent_packets = [recorded.segment(number, payload_bytes) for number in range(10)]
+    (folder / "sender.pcap").write_bytes(file_bytes(timed(sent_packets)))
+    (folder / "receiver.pcap").write_bytes(file_bytes(timed(sent_packets[1:])))
+    lost_flags = [message.content.get("lost") for message in messages_of(messages(export(trial)), "/sender/packets")]
+    assert lost_flags == ([True] + [False] * 9 if has_fates else [None] * 10)
 
 
 @pytest.mark.parametrize(("ip_id", "receiver_address"), [(0, recorded.RECEIVER), (1, "10.42.0.9")])
 def test_packets_that_cannot_be_matched_have_no_fates(trial: Path, ip_id: int, receiver_address: str) -> None:
     """The packets are equal except for their times, or the receiver has another address."""
     folder = trial / "repeats" / "udp-01"
-    sent = timed([recorded.packet(number * ip_id) for number in range(10)])
-    received = [
+    sent_frames = timed([recorded.packet(number * ip_id) for number in range(10)])
+    received_frames = [
         replace(message, data=message.data[:16] + IPv4Address(receiver_address).packed + message.data[20:])
-        for message in sent[1:]
+        for message in sent_frames[1:]
     ]
-    (folder / "sender.pcap").write_bytes(file_bytes(sent))
-    (folder / "receiver.pcap").write_bytes(file_bytes(received))
+    (folder / "sender.pcap").write_bytes(file_bytes(sent_frames))
+    (folder / "receiver.pcap").write_bytes(file_bytes(received_frames))
     read_messages = messages(export(trial))
     assert (
         len(messages_of(read_messages, "/sender/packets")),
@@ -299,8 +304,8 @@ def test_a_track_replaces_the_planned_places(trial: Path) -> None:
     ]
     (folder / "track.csv").write_text(track.text(track_points), encoding="ascii")
     read_messages = messages(export(trial, "tracked.mcap"))
-    places = [message.content["transforms"][0]["translation"] for message in messages_of(read_messages, "/tf")]
-    assert places == [{"x": 1.0, "y": 2.0, "z": 0.2}, {"x": 1.5, "y": 2.0, "z": 0.2}]
+    positions = [message.content["transforms"][0]["translation"] for message in messages_of(read_messages, "/tf")]
+    assert positions == [{"x": 1.0, "y": 2.0, "z": 0.2}, {"x": 1.5, "y": 2.0, "z": 0.2}]
     assert all(
         message.content["transforms"][0]["child_frame_id"] == "turtlebot-1"
         for message in messages_of(read_messages, "/tf")

@@ -56,7 +56,7 @@ def test_undeclared_columns_are_kept_as_text(trial: Path, tmp_path: Path, capsys
     path, extra_cells = trial / store.TRIAL_CSV, ("soil_moisture,,note", "0.300,,wet", ",,")
     lines = path.read_text(encoding="utf-8").splitlines()
     path.write_text(
-        "".join(f"{line},{end}\n" for line, end in zip(lines, extra_cells, strict=True)), encoding="utf-8"
+        "".join(f"{line},{extra}\n" for line, extra in zip(lines, extra_cells, strict=True)), encoding="utf-8"
     )
     old = tmp_path / "old.csv"
     old.write_text("".join(f"{line}\n" for line in lines).replace(trial.name, "older"), encoding="utf-8")

@@ -33,20 +33,24 @@ COUNTERS = "{0} packets captured\n{0} packets received by filter\n{1} packets dr
 BAG = bytes(range(256)) * 40
 
 
-def _ping(payload_bytes: int, times_ms: list[float], sent: int) -> str:
+def _ping(payload_bytes: int, times_ms: list[float], n_sent: int) -> str:
     lines = [f"PING 10.9.0.2 (10.9.0.2) {payload_bytes}({payload_bytes + 28}) bytes of data."]
     lines += [f"64 bytes from 10.9.0.2: icmp_seq={n} ttl=64 time={time} ms" for n, time in enumerate(times_ms, 1)]
-    return "\n".join([*lines, f"{sent} packets transmitted, {len(times_ms)} received, 0% packet loss, time 1ms"])
+    return "\n".join([*lines, f"{n_sent} packets transmitted, {len(times_ms)} received, 0% packet loss, time 1ms"])
 
 
-def _write_repeat(folder: Path, sent: list[Frame], received: list[Frame], ping: str, bag: bytes = BAG) -> Path:
+def _write_repeat(
+    folder: Path, sent_frames: list[Frame], received_frames: list[Frame], ping: str, bag: bytes = BAG
+) -> Path:
     """Write the evidence of a repeat to a folder, and return the folder. The sent file is not a bag."""
     (folder / "scan.bag").write_bytes(BAG)
     (folder / "recv.bag").write_bytes(bag)
-    (folder / "sender.pcap").write_bytes(file_bytes(sent))
-    (folder / "receiver.pcap").write_bytes(file_bytes(received))
-    (folder / "sender-capture.log").write_text(LISTENING + COUNTERS.format(len(sent), 0), encoding="utf-8")
-    (folder / "receiver-capture.log").write_text(LISTENING + COUNTERS.format(len(received), 2), encoding="utf-8")
+    (folder / "sender.pcap").write_bytes(file_bytes(sent_frames))
+    (folder / "receiver.pcap").write_bytes(file_bytes(received_frames))
+    (folder / "sender-capture.log").write_text(LISTENING + COUNTERS.format(len(sent_frames), 0), encoding="utf-8")
+    (folder / "receiver-capture.log").write_text(
+        LISTENING + COUNTERS.format(len(received_frames), 2), encoding="utf-8"
+    )
     (folder / "ping.txt").write_text(ping, encoding="utf-8")
     (folder / "receiver-before.txt").write_text(SNMP.format(1, 5), encoding="utf-8")
     (folder / "receiver-after.txt").write_text(SNMP.format(2, 9), encoding="utf-8")
@@ -55,10 +59,10 @@ def _write_repeat(folder: Path, sent: list[Frame], received: list[Frame], ping: 
 
 def _write_udp_repeat(folder: Path) -> Path:
     """36 datagrams of six fragments; the receiver lacks the first fragment of one and the last of another."""
-    sent = timed([packet for number in range(36) for packet in datagram(number, 8192)])
-    received = [frame for index, frame in enumerate(sent) if index not in {6, 17}]
+    sent_frames = timed([packet for number in range(36) for packet in datagram(number, 8192)])
+    received_frames = [frame for index, frame in enumerate(sent_frames) if index not in {6, 17}]
     times_ms = [14.0, 15.0, 16.0, 17.0, 18.0]
-    return _write_repeat(folder, sent, received, _ping(8192, times_ms, sent=10), bag=BAG[:-2560])
+    return _write_repeat(folder, sent_frames, received_frames, _ping(8192, times_ms, n_sent=10), bag=BAG[:-2560])
 
 
 def test_a_udp_repeat(tmp_path: Path) -> None:
@@ -117,11 +121,13 @@ def test_a_udp_repeat(tmp_path: Path) -> None:
 
 def test_a_tcp_repeat(tmp_path: Path) -> None:
     isn = 2**32 - 2000
-    sent = timed(
+    sent_frames = timed(
         [segment(isn, 0, flags=2, mss=900), *(segment(isn + 1 + offset, 1000) for offset in (0, 1000, 2000, 1000))]
     )
-    received = [frame for index, frame in enumerate(sent) if index != 2]
-    measures = measure(_write_repeat(tmp_path, sent, received, _ping(502, [5.0], sent=1)), transfer(Protocol.TCP))
+    received_frames = [frame for index, frame in enumerate(sent_frames) if index != 2]
+    measures = measure(
+        _write_repeat(tmp_path, sent_frames, received_frames, _ping(502, [5.0], n_sent=1)), transfer(Protocol.TCP)
+    )
     assert measures.hash_match is True
     assert (measures.ip_packets_sent, measures.ip_packets_received) == (5, 4)
     assert (measures.tcp_sent_bytes, measures.tcp_unique_bytes, measures.tcp_received_bytes) == (4000, 3000, 3000)
@@ -141,7 +147,7 @@ def test_a_tcp_repeat(tmp_path: Path) -> None:
 
 
 def test_the_papers_delay_needs_the_papers_payload(tmp_path: Path) -> None:
-    folder = _write_repeat(tmp_path, [], [], _ping(56, [5.0], sent=1))
+    folder = _write_repeat(tmp_path, [], [], _ping(56, [5.0], n_sent=1))
     measures = measure(folder, transfer(Protocol.TCP))
     assert (measures.rtt_mean_s, measures.paper_delay_s, measures.paper_transfer_s) == (0.005, None, None)
 
@@ -280,28 +286,34 @@ def test_real_captures_of_the_papers_file_without_loss(tmp_path: Path) -> None:
 
 def test_a_forged_capture_empties_only_the_columns_of_the_transfer(tmp_path: Path) -> None:
     forged = timed([segment(index, 60_000 * (index > 0), flags=0x02 * (index == 0)) for index in range(3000)])
-    measures = measure(_write_repeat(tmp_path, forged, forged[:1], _ping(502, [5.0], sent=1)), transfer(Protocol.TCP))
+    measures = measure(
+        _write_repeat(tmp_path, forged, forged[:1], _ping(502, [5.0], n_sent=1)), transfer(Protocol.TCP)
+    )
     assert (measures.tcp_sent_bytes, measures.ip_packets_sent) == (None, None)
     assert (measures.rtt_received, measures.sender_captured) == (1, 3000)
 
 
 def test_a_clock_that_was_set_empties_all_times(tmp_path: Path) -> None:
     """The receiver's clock is set forward by an hour during the transfer: 30 ms would appear as 3600 s."""
-    sent = timed([segment(0, 0, flags=2), *(segment(1 + 1000 * index, 1000, ip_id=index) for index in range(20))])
+    sent_frames = timed(
+        [segment(0, 0, flags=2), *(segment(1 + 1000 * index, 1000, ip_id=index) for index in range(20))]
+    )
     ack = struct.pack(">HHIIBBHHH", PORT, 40000, 1, 1, 5 << 4, 0x10, 502, 0, 0)
     answers = [
         Frame(frame.time_ns + 500_000, ipv4(ack, protocol=6, ip_id=number, src=RECEIVER, dst=SENDER))
-        for number, frame in enumerate(sent)
+        for number, frame in enumerate(sent_frames)
     ]
-    frames = sorted([*sent, *answers], key=lambda frame: frame.time_ns)
+    frames = sorted([*sent_frames, *answers], key=lambda frame: frame.time_ns)
     hour_ns = 3600 * 10**9
-    received = [replace(frame, time_ns=frame.time_ns + hour_ns * (index > 20)) for index, frame in enumerate(frames)]
+    received_frames = [
+        replace(frame, time_ns=frame.time_ns + hour_ns * (index > 20)) for index, frame in enumerate(frames)
+    ]
     measures_of_steady_clock = measure(
-        _write_repeat(tmp_path, frames, frames, _ping(502, [5.0], sent=1)), transfer(Protocol.TCP)
+        _write_repeat(tmp_path, frames, frames, _ping(502, [5.0], n_sent=1)), transfer(Protocol.TCP)
     )
     assert measures_of_steady_clock.transfer_s == pytest.approx(0.02)
     measures_of_set_clock = measure(
-        _write_repeat(tmp_path, frames, received, _ping(502, [5.0], sent=1)), transfer(Protocol.TCP)
+        _write_repeat(tmp_path, frames, received_frames, _ping(502, [5.0], n_sent=1)), transfer(Protocol.TCP)
     )
     assert measures_of_set_clock.one_way_withheld == delay.UNSTEADY
     assert (

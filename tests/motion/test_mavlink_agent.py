@@ -53,24 +53,24 @@ FRAMES = real_frames()
 
 
 @given(st.lists(st.sampled_from(FRAMES), max_size=8), st.lists(st.integers(0, 400), max_size=5))
-def test_frames_are_complete_for_any_division_of_the_stream(sent: list[bytes], cuts: list[int]) -> None:
-    stream = b"".join(sent)
+def test_frames_are_complete_for_any_division_of_the_stream(sent_frames: list[bytes], cuts: list[int]) -> None:
+    stream = b"".join(sent_frames)
     edges = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
-    buffer, received = bytearray(), list[bytes]()
+    buffer, received_frames = bytearray(), list[bytes]()
     for start, end in pairwise(edges):
         buffer += stream[start:end]
-        received += mavlink_frames.frames(buffer)
-    assert received == sent
+        received_frames += mavlink_frames.frames(buffer)
+    assert received_frames == sent_frames
     assert not buffer
 
 
 @given(st.binary(max_size=700))
 def test_frames_in_any_bytes_are_parts_of_these_bytes_in_order(data: bytes) -> None:
-    at = 0
+    offset = 0
     for frame in mavlink_frames.frames(bytearray(data)):
         assert mavlink_frames.frame_bytes(frame) == len(frame)
         mavlink_frames.parse_frame(frame)
-        at = data.index(frame, at) + len(frame)
+        offset = data.index(frame, offset) + len(frame)
 
 
 def test_frames_are_received_after_an_incomplete_frame() -> None:
@@ -232,11 +232,11 @@ def test_log_is_read_by_pymavlink(connection_kind: ConnectionKind, program: Path
         wait_until_size(result.log, 15_000)  # a PX4 sends ATTITUDE without a request until it is switched off
     assert result.code == 0
     types = message_types(result.log)
-    read = tlog.read(result.log, 0, result.summary["ended_us"])
-    assert result.summary["frames"] == read.frames == len(types)
+    log_content = tlog.read(result.log, 0, result.summary["ended_us"])
+    assert result.summary["frames"] == log_content.frames == len(types)
     assert (result.summary["refused"], result.summary["left_out"]) == ({}, 0)
-    assert read.kinds == {kind: types.count(kind) for kind in set(types) - {"BAD_DATA"}}
-    assert read.values["mavlink_loss"] == 0
+    assert log_content.kinds == {kind: types.count(kind) for kind in set(types) - {"BAD_DATA"}}
+    assert log_content.values["mavlink_loss"] == 0
     assert types.count("LOCAL_POSITION_NED") > 3 * types.count("ATTITUDE")
 
 
@@ -395,7 +395,7 @@ def test_hostile_bytes_do_not_stop_the_recorder_or_damage_the_log(
         with recording(program, tmp_path / "x.tlog", connection, intervals_us=REQUESTED) as result:
             wait_until_size(result.log, 12_000)
     assert result.code == 0
-    read = tlog.read(result.log, drones.SYSTEM, result.summary["ended_us"])
-    assert read.frames == result.summary["frames"]
-    assert int(read.values["mavlink_damaged"]) > 10
-    assert read.kinds["LOCAL_POSITION_NED"] > 5
+    log_content = tlog.read(result.log, drones.SYSTEM, result.summary["ended_us"])
+    assert log_content.frames == result.summary["frames"]
+    assert int(log_content.values["mavlink_damaged"]) > 10
+    assert log_content.kinds["LOCAL_POSITION_NED"] > 5

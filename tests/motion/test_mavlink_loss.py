@@ -38,8 +38,8 @@ def test_loss_behind_a_router_equals_that_of_the_kernel(percent: int, tmp_path: 
     assert counters["periodic"] > 200
     assert counters["withheld"] > 10, "sequence numbers have gaps that are not losses"
     values = tlog.measure(tlog.read(log, drones.SYSTEM, counters["ended_us"], REQUESTED), 0.0).values
-    received, sent = int(values["mavlink_periodic"]), int(values["mavlink_periodic_sent"])
-    assert abs(sent - received - counters["dropped"]) <= MAX_DIFFERENCE
-    assert received >= counters["periodic"] - counters["dropped"]
-    assert float(values["mavlink_loss"]) == pytest.approx(1 - received / sent)
+    n_received, n_sent = int(values["mavlink_periodic"]), int(values["mavlink_periodic_sent"])
+    assert abs(n_sent - n_received - counters["dropped"]) <= MAX_DIFFERENCE
+    assert n_received >= counters["periodic"] - counters["dropped"]
+    assert float(values["mavlink_loss"]) == pytest.approx(1 - n_received / n_sent)
     assert float(values["mavlink_loss_most"]) > float(values["mavlink_loss"])

@@ -104,8 +104,8 @@ def test_start_returns_when_the_log_contains_the_text(shell: LocalShell) -> None
 
 
 def test_start_has_no_output(shell: LocalShell) -> None:
-    done = shell.run(jobs.command("start", job("sh", "-c", "exit 0")), deadline=Deadline.after(30))
-    assert (done.stdout, done.stderr) == (b"", b"")
+    completed = shell.run(jobs.command("start", job("sh", "-c", "exit 0")), deadline=Deadline.after(30))
+    assert (completed.stdout, completed.stderr) == (b"", b"")
 
 
 @pytest.mark.parametrize("protocol", Protocol)

@@ -65,13 +65,13 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> DeadlineClock:
 class HaltingServer(paramiko.ServerInterface):
     """An SSH server that stops at a request and reports it, or refuses logins."""
 
-    def __init__(self, at: str, on_request: Callable[[], None]) -> None:
-        self.at = at
+    def __init__(self, halt_point: str, on_request: Callable[[], None]) -> None:
+        self.halt_point = halt_point
         self.on_request = on_request
         self.go = threading.Event()
 
-    def halt(self, at: str) -> None:
-        if self.at == at:
+    def halt(self, halt_point: str) -> None:
+        if self.halt_point == halt_point:
             self.on_request()
             self.go.wait(SOON)
 
@@ -80,7 +80,7 @@ class HaltingServer(paramiko.ServerInterface):
 
     def check_auth_publickey(self, username: str, key: paramiko.PKey) -> int:
         self.halt("auth")
-        return AUTH_FAILED if self.at == "refuse" else AUTH_SUCCESSFUL
+        return AUTH_FAILED if self.halt_point == "refuse" else AUTH_SUCCESSFUL
 
     def check_channel_request(self, kind: str, chanid: int) -> int:
         self.halt("channel")
@@ -88,7 +88,7 @@ class HaltingServer(paramiko.ServerInterface):
 
     def check_channel_exec_request(self, channel: paramiko.Channel, command: bytes) -> bool:
         self.halt("exec")
-        if self.at == "command":
+        if self.halt_point == "command":
             self.on_request()
         return True  # no command is run
 
@@ -113,11 +113,14 @@ class FakeServer:
 
 
 def ssh_server(
-    stream: socket.socket, key: paramiko.PKey, at: str = "never", on_request: Callable[[], None] = lambda: None
+    stream: socket.socket,
+    key: paramiko.PKey,
+    halt_point: str = "never",
+    on_request: Callable[[], None] = lambda: None,
 ) -> paramiko.Transport:
     transport = paramiko.Transport(stream)
     transport.add_server_key(key)
-    transport.start_server(event=threading.Event(), server=HaltingServer(at, on_request))
+    transport.start_server(event=threading.Event(), server=HaltingServer(halt_point, on_request))
     return transport
 
 
@@ -144,7 +147,7 @@ def start_fake_server() -> Iterator[Callable[[Callable[[socket.socket], object]]
 
 
 @pytest.mark.parametrize(
-    ("at", "message"),
+    ("halt_point", "message"),
     [
         ("banner", "robot did not send its SSH banner in time"),
         ("keys", "robot did not agree on keys in time"),
@@ -160,16 +163,16 @@ def test_any_hang_of_a_server_is_reported(
     start_fake_server: Callable[..., FakeServer],
     clock: DeadlineClock,
     *,
-    at: str,
+    halt_point: str,
     message: str,
 ) -> None:
     def serve(stream: socket.socket) -> object:
-        if at in {"banner", "keys"}:
-            if at == "keys":
+        if halt_point in {"banner", "keys"}:
+            if halt_point == "keys":
                 stream.sendall(b"SSH-2.0-halting\r\n")
             clock.start()
             return None
-        return ssh_server(stream, rsa, at, clock.start)
+        return ssh_server(stream, rsa, halt_point, clock.start)
 
     shell = server.shell(connect=start_fake_server(serve).connect, host_key=pinned_key(rsa), timing=QUICK)
     with pytest.raises(LinkError, match=message) as error_info:
@@ -179,7 +182,7 @@ def test_any_hang_of_a_server_is_reported(
     shell.close()
 
 
-def serve_flood(stream: socket.socket, key: paramiko.PKey, sent: list[int]) -> paramiko.Transport:
+def serve_flood(stream: socket.socket, key: paramiko.PKey, sent_sizes: list[int]) -> paramiko.Transport:
     """Serve a channel. After a command is requested, send data beyond the window of the channel without end."""
 
     def flood() -> None:
@@ -188,9 +191,9 @@ def serve_flood(stream: socket.socket, key: paramiko.PKey, sent: list[int]) -> p
         packet.add_int(transport._channels.values()[0].remote_chanid)  # type: ignore[attr-defined]
         packet.add_string(bytes(1 << 15))
         with contextlib.suppress(EOFError, OSError):
-            while transport.is_active() and len(sent) < FLOOD_PACKETS:
+            while transport.is_active() and len(sent_sizes) < FLOOD_PACKETS:
                 transport._send_message(packet)  # type: ignore[attr-defined]
-                sent.append(1 << 15)
+                sent_sizes.append(1 << 15)
 
     transport = ssh_server(stream, key, "command", lambda: threading.Thread(target=flood, daemon=True).start())
     return transport
@@ -203,8 +206,8 @@ FLOOD_PACKETS = 2000
 def test_flooding_server_fills_no_memory_while_nothing_is_read(
     server: Server, rsa: paramiko.RSAKey, start_fake_server: Callable[..., FakeServer]
 ) -> None:
-    sent: list[int] = []
-    fake_server = start_fake_server(lambda stream: serve_flood(stream, rsa, sent))
+    sent_sizes: list[int] = []
+    fake_server = start_fake_server(lambda stream: serve_flood(stream, rsa, sent_sizes))
     shell = server.shell(connect=fake_server.connect, host_key=pinned_key(rsa), timing=QUICK, host="turtle.example")
 
     def run() -> None:
@@ -217,7 +220,7 @@ def test_flooding_server_fills_no_memory_while_nothing_is_read(
     ) as error_info:
         run()
     assert "turtle.example" in error_info.value.remedy
-    assert len(sent) < FLOOD_PACKETS, "the connection was closed"
+    assert len(sent_sizes) < FLOOD_PACKETS, "the connection was closed"
     shell.close()
 
 

@@ -386,7 +386,7 @@ NONCE: Final = b"0123456789abcdef"
 OUTPUTS = st.lists(st.one_of(st.binary(), st.integers(1, 15).map(lambda n: NONCE[:n]))).map(b"".join)
 
 
-def split(data: bytes, positions: Sequence[int]) -> list[bytes]:
+def split_at(data: bytes, positions: Sequence[int]) -> list[bytes]:
     edges = [0, *sorted(n % (len(data) + 1) for n in positions), len(data)]
     return [data[start:end_marker] for start, end_marker in pairwise(edges) if end_marker > start]
 
@@ -401,8 +401,8 @@ def test_output_and_exit_code_are_separated_for_any_pieces(
     end_marker = NONCE + f" {code}\n".encode()
     start_marker = stray_output + NONCE + b"\n"
     channel = ReceivedChannel(
-        split(start_marker + out[0] + end_marker + stray_output, out[1]),
-        split(start_marker + err[0] + end_marker, err[1]),
+        split_at(start_marker + out[0] + end_marker + stray_output, out[1]),
+        split_at(start_marker + err[0] + end_marker, err[1]),
     )
     lock = threading.Lock()
     lock.acquire()

@@ -42,8 +42,8 @@ def test_output_streams_and_exit_code_are_returned(shell: SshShell) -> None:
 
 def test_begin_returns_after_the_expected_output(shell: SshShell, tmp_path: Path) -> None:
     go = tmp_path / "go"
-    words = 'cat; sleep 0.2; echo up; until [ -e "$0" ]; do sleep 0.02; done; echo over; exit 4'
-    session = shell.begin(("sh", "-c", words, str(go)), deadline=soon(), until=b"up\n")
+    script = 'cat; sleep 0.2; echo up; until [ -e "$0" ]; do sleep 0.02; done; echo over; exit 4'
+    session = shell.begin(("sh", "-c", script, str(go)), deadline=soon(), until=b"up\n")
     assert session.is_ready
     go.touch()
     completed = session.end(deadline=soon(), check=False)
@@ -69,9 +69,9 @@ class CountingDeadline(Deadline):
 
 def test_wait_for_output_does_not_poll_because_of_standard_error(shell: SshShell, tmp_path: Path) -> None:
     go = tmp_path / "go"
-    words = 'echo why >&2; until [ -e "$0" ]; do sleep 0.02; done; echo up'
+    script = 'echo why >&2; until [ -e "$0" ]; do sleep 0.02; done; echo up'
     threading.Timer(0.5, go.touch).start()
-    session = shell.begin(("sh", "-c", words, str(go)), deadline=CountingDeadline.after(SOON), until=b"up\n")
+    session = shell.begin(("sh", "-c", script, str(go)), deadline=CountingDeadline.after(SOON), until=b"up\n")
     assert session.end(deadline=soon()).stderr == b"why\n"
     assert CountingDeadline.count < SOON
 
@@ -136,8 +136,8 @@ def test_wait_continues_after_this_process_was_suspended(shell: SshShell, monkey
     monotonic, wait = time.monotonic, select.select
     stopped_s: list[float] = []
 
-    def stop_once(read: list[int], write: list[int], other: list[int], wait_s: float) -> object:
-        ready = wait(read, write, other, wait_s)
+    def stop_once(read: list[int], write: list[int], exceptional: list[int], wait_s: float) -> object:
+        ready = wait(read, write, exceptional, wait_s)
         if not stopped_s:
             stopped_s.append(1000.0)
         return ready

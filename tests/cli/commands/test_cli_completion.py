@@ -54,7 +54,7 @@ def completions(lab: Path, line: str) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("line", "words"),
+    ("line", "expected"),
     [
         ("fieldkit re", ["resume", "report", "rebuild"]),
         ("fieldkit lab s", ["shell", "sdf", "ssh-config"]),
@@ -76,8 +76,8 @@ def completions(lab: Path, line: str) -> list[str]:
         ("fieldkit campaign n", ["notes.txt"]),
     ],
 )
-def test_values_of_arguments_are_completed(lab: Path, line: str, words: list[str]) -> None:
-    assert completions(lab, line) == words
+def test_values_of_arguments_are_completed(lab: Path, line: str, expected: list[str]) -> None:
+    assert completions(lab, line) == expected
 
 
 def test_a_damaged_site_file_completes_nothing(lab: Path) -> None:

@@ -166,9 +166,9 @@ def test_frames_without_a_readable_ip_packet_are_counted_as_others(
 
 
 def test_a_later_80211_fragment_is_not_an_ip_packet(tmp_path: Path) -> None:
-    first, later = _dot11(TO_DS | MORE) / PAYLOAD, _dot11(TO_DS) / PAYLOAD
-    later.SC = 1
-    write(tmp_path / "x.pcap", [first, later], 105)
+    first_fragment, later_fragment = _dot11(TO_DS | MORE) / PAYLOAD, _dot11(TO_DS) / PAYLOAD
+    later_fragment.SC = 1
+    write(tmp_path / "x.pcap", [first_fragment, later_fragment], 105)
     capture = pcap.read(tmp_path / "x.pcap")
     assert capture.frames - len(capture.packets) == 1
 
@@ -216,8 +216,8 @@ def test_payload_length_is_taken_from_the_ip_header() -> None:
     assert _parse_frame(
         ethernet + segment(5, 1448), link_type=1, wire_bytes=14 + 1488
     ).tcp_payload_bytes.tolist() == [1448]
-    short = ethernet + ipv4(bytes(12), protocol=17, size=9) + bytes(20)
-    assert _parse_frame(short, link_type=1).ip_payload_bytes.tolist() == [9]
+    short_frame = ethernet + ipv4(bytes(12), protocol=17, size=9) + bytes(20)
+    assert _parse_frame(short_frame, link_type=1).ip_payload_bytes.tolist() == [9]
 
 
 def test_padding_is_not_decoded_as_a_transport_header() -> None:

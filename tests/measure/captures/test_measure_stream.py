@@ -56,9 +56,9 @@ def test_concatenated_chunks_equal_the_whole_file(monkeypatch: pytest.MonkeyPatc
     whole_capture = pcap.parse(FILES[name], where="x")
     for chunk_bytes in (1, 100, 200, 1000):
         monkeypatch.setattr(pcap, "CHUNK_BYTES", chunk_bytes)
-        joined = pcap.parse(FILES[name], where="x")
-        assert rows(joined.packets) == rows(whole_capture.packets)
-        assert (joined.frames, joined.damage) == (whole_capture.frames, whole_capture.damage)
+        joined_capture = pcap.parse(FILES[name], where="x")
+        assert rows(joined_capture.packets) == rows(whole_capture.packets)
+        assert (joined_capture.frames, joined_capture.damage) == (whole_capture.frames, whole_capture.damage)
 
 
 @pytest.mark.parametrize("name", ["nc-udp", "nc-tcp"])

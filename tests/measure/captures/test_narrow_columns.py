@@ -36,6 +36,6 @@ def test_sums_of_columns_do_not_overflow() -> None:
 
 
 def test_concatenated_packets_have_the_rows_of_all_parts() -> None:
-    joined = Packets.concatenated([PACKETS, PACKETS.where(slice(1, 3))])
-    assert joined.sport.tolist() == [*PACKETS.sport.tolist(), *PACKETS.sport.tolist()[1:3]]
-    assert joined.echo.tolist() == [*PACKETS.echo.tolist(), *PACKETS.echo.tolist()[1:3]]
+    all_packets = Packets.concatenated([PACKETS, PACKETS.where(slice(1, 3))])
+    assert all_packets.sport.tolist() == [*PACKETS.sport.tolist(), *PACKETS.sport.tolist()[1:3]]
+    assert all_packets.echo.tolist() == [*PACKETS.echo.tolist(), *PACKETS.echo.tolist()[1:3]]

@@ -27,9 +27,9 @@ SHARES = st.sampled_from((0.0, 0.05, 0.3, 0.9))
 class Link:
     """A link that loses, copies and delays packets, with captures at both ends."""
 
-    def __init__(self, seed: int, lost: float, copied: float, delayed: float) -> None:
+    def __init__(self, seed: int, lost_share: float, copied_share: float, delayed_share: float) -> None:
         self.random_generator = random.Random(seed)
-        self.shares = lost, copied, delayed
+        self.shares = lost_share, copied_share, delayed_share
         self.ahead_ns = self.random_generator.randrange(-(10**15), 10**15)
         self.now_ns = 1_700_000_000_000_000_000
         self.sent: list[Frame] = []
@@ -41,21 +41,21 @@ class Link:
         ahead_ns = (self.ahead_ns, 0) if reverse else (0, self.ahead_ns)
         self.now_ns += 1_000_000
         from_frames.append(Frame(self.now_ns + ahead_ns[0], data))
-        lost, copied, delayed = (self.random_generator.random() < share for share in self.shares)
-        copies = 0 if lost else 2 if copied else 1
+        is_lost, is_copied, is_delayed = (self.random_generator.random() < share for share in self.shares)
+        copies = 0 if is_lost else 2 if is_copied else 1
         for _ in range(copies):
-            delay_ns = self.random_generator.randrange(50_000_000 if delayed else 1_000_000)
+            delay_ns = self.random_generator.randrange(50_000_000 if is_delayed else 1_000_000)
             to_frames.append(Frame(self.now_ns + delay_ns + ahead_ns[1], data))
         return copies
 
     def contradictions(
-        self, protocol: Protocol, sent: bytes, received: bytes, *, finished: bool, captured: bool = True
+        self, protocol: Protocol, sent_file: bytes, received_file: bytes, *, finished: bool, captured: bool = True
     ) -> list[str]:
         with tempfile.TemporaryDirectory() as temporary_folder:
             folder = Path(temporary_folder)
             for name, content in (
-                ("scan.bag", sent),
-                ("recv.bag", received),
+                ("scan.bag", sent_file),
+                ("recv.bag", received_file),
                 ("sender.pcap", file_of(self.sent)),
                 ("receiver.pcap", file_of(self.received)),
             ):
@@ -78,25 +78,25 @@ def frame(seq: int, ack: int, flags: int, payload_bytes: int = 0, *, reverse: bo
 
 @given(SEEDS, SHARES, SHARES, SHARES, st.integers(1, 30))
 def test_a_udp_transfer_over_any_link_has_no_contradiction(
-    seed: int, lost: float, copied: float, delayed: float, datagrams: int
+    seed: int, lost_share: float, copied_share: float, delayed_share: float, datagrams: int
 ) -> None:
-    link = Link(seed, lost, copied, delayed)
+    link = Link(seed, lost_share, copied_share, delayed_share)
     random_generator = random.Random(seed)
     parts = [random_generator.randbytes(random_generator.randrange(1, 9_000)) for _ in range(datagrams)]
-    received: list[bytes] = []
+    received_datagrams: list[bytes] = []
     for number, part in enumerate(parts):
         copies = min([link.carry(packet) for packet in datagram(number, len(part))])
         # The buffer of the socket may be full.
-        received += [part] * random_generator.randrange(copies + 1)
-    random_generator.shuffle(received)
-    assert link.contradictions(Protocol.UDP, b"".join(parts), b"".join(received), finished=True) == []
+        received_datagrams += [part] * random_generator.randrange(copies + 1)
+    random_generator.shuffle(received_datagrams)
+    assert link.contradictions(Protocol.UDP, b"".join(parts), b"".join(received_datagrams), finished=True) == []
 
 
 @given(SEEDS, SHARES, SHARES, SHARES, st.integers(0, 40))
 def test_a_tcp_transfer_over_any_link_has_no_contradiction(
-    seed: int, lost: float, copied: float, delayed: float, segments: int
+    seed: int, lost_share: float, copied_share: float, delayed_share: float, segments: int
 ) -> None:
-    link = Link(seed, lost, copied, delayed)
+    link = Link(seed, lost_share, copied_share, delayed_share)
     random_generator = random.Random(seed)
     isn = random_generator.choice((0, 2**32 - 5_000, random_generator.randrange(2**32)))
     sizes = [random_generator.randrange(1, 3_000) for _ in range(segments)]
@@ -106,11 +106,11 @@ def test_a_tcp_transfer_over_any_link_has_no_contradiction(
     tries_left = random_generator.randrange(1, 500)
     arrived_segments, is_finished = set[int](), False
 
-    def send(at: int, flags: int, size: int = 0) -> bool:
+    def send(offset: int, flags: int, size: int = 0) -> bool:
         nonlocal tries_left
         while tries_left > 0:
             tries_left -= 1
-            if link.carry(frame(isn + at, 0, flags, size)):
+            if link.carry(frame(isn + offset, 0, flags, size)):
                 return True
         return False
 
@@ -130,10 +130,10 @@ def test_a_tcp_transfer_over_any_link_has_no_contradiction(
             is_finished = True
             acknowledge(2 + len(data))
     n_contiguous = next((number for number in range(segments) if number not in arrived_segments), segments)
-    received = data[: sum(sizes[:n_contiguous])]
+    received_file = data[: sum(sizes[:n_contiguous])]
     if not is_finished:  # the listener was stopped at its time limit, so it may not have read everything
-        received = received[: random_generator.randrange(len(received) + 1)]
-    assert link.contradictions(Protocol.TCP, data, received, finished=is_finished) == []
+        received_file = received_file[: random_generator.randrange(len(received_file) + 1)]
+    assert link.contradictions(Protocol.TCP, data, received_file, finished=is_finished) == []
 
 
 def test_a_datagram_that_was_not_captured_at_the_sender_is_a_contradiction() -> None:
@@ -202,7 +202,7 @@ def test_a_fragment_of_another_program_is_not_part_of_the_transfer() -> None:
         for packet in datagram(number, 3000, port=port):
             link.carry(packet)
     lost_index = next(
-        at for at, packet in enumerate(link.received) if packet.data in datagram(1, 3000, port=7400)[1:]
+        index for index, packet in enumerate(link.received) if packet.data in datagram(1, 3000, port=7400)[1:]
     )
     del link.received[lost_index]
     assert link.contradictions(Protocol.UDP, bytes(6000), bytes(6000), finished=True) == []

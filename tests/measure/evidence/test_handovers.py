@@ -94,7 +94,8 @@ def test_samples_after_the_ping_do_not_count() -> None:
 
 def test_a_return_to_the_previous_access_point_within_the_limit_is_a_ping_pong() -> None:
     handover_list = [
-        Handover(*pair, at * 10**9, at * 10**9) for pair, at in ((("a", "b"), 0), (("b", "a"), 10), (("a", "b"), 21))
+        Handover(*pair, second * 10**9, second * 10**9)
+        for pair, second in ((("a", "b"), 0), (("b", "a"), 10), (("a", "b"), 21))
     ]
     assert handovers.count_ping_pongs(handover_list, 10.0) == 1
     assert handovers.count_ping_pongs(handover_list, 11.0) == 2

@@ -93,10 +93,10 @@ def test_valid_powers_of_proc_net_wireless_are_parsed() -> None:
 
 
 @given(st.sampled_from([*STATIONS, "link-station", "survey-mt7996-6"]), st.integers(0), st.binary(max_size=20))
-def test_a_changed_output_raises_no_error(name: str, at: int, replacement: bytes) -> None:
+def test_a_changed_output_raises_no_error(name: str, offset: int, replacement: bytes) -> None:
     complete = output(name).encode()
-    at %= len(complete)
-    text = (complete[:at] + replacement + complete[at + len(replacement) :]).decode(errors="replace")
+    offset %= len(complete)
+    text = (complete[:offset] + replacement + complete[offset + len(replacement) :]).decode(errors="replace")
     for peer in robot_link_samples.parse_stations(text):
         assert peer.signal_dbm is None or -1000 < peer.signal_dbm < 0
     robot_link_samples.parse_cell(text)

@@ -16,7 +16,8 @@ SAMPLE = StationSample("aa", -50.0, 65e6, 58.5e6, 10, 100, 1, 0, 0)
 
 def samples(*stations: StationSample, cell: str | None = None) -> list[LinkSample]:
     return [
-        LinkSample(at * S, (station,), cell, -95.0 + at, 1000 * at, 250 * at) for at, station in enumerate(stations)
+        LinkSample(second * S, (station,), cell, -95.0 + second, 1000 * second, 250 * second)
+        for second, station in enumerate(stations)
     ]
 
 
@@ -88,11 +89,11 @@ def test_any_values_of_a_driver_give_valid_cells_or_are_missing(link_samples: li
 
 
 def test_the_link_of_an_access_point_is_that_of_the_station_with_the_most_packets() -> None:
-    other = replace(SAMPLE, station="bb", signal_dbm=-80.0, tx_packets=0, rx_packets=10**6)
+    other_station = replace(SAMPLE, station="bb", signal_dbm=-80.0, tx_packets=0, rx_packets=10**6)
     link_samples = [
-        LinkSample(0, (other, SAMPLE)),
-        LinkSample(S, (other, replace(SAMPLE, tx_packets=60, signal_dbm=-52.0))),
-        LinkSample(2 * S, (replace(other, tx_packets=40), StationSample("", -51.0))),
+        LinkSample(0, (other_station, SAMPLE)),
+        LinkSample(S, (other_station, replace(SAMPLE, tx_packets=60, signal_dbm=-52.0))),
+        LinkSample(2 * S, (replace(other_station, tx_packets=40), StationSample("", -51.0))),
     ]
     assert measured(link_samples)["radio_tx_packets"] == 50
     assert measured(link_samples)["signal_min_dbm"] == -52.0

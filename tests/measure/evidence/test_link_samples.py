@@ -112,10 +112,10 @@ def test_a_robots_file_is_read_with_its_clock_and_host_states(tmp_path: Path, co
 
 
 @given(st.integers(0, len(SAMPLER_OUTPUT)))
-def test_a_truncated_file_of_a_sampler_has_the_earlier_samples(at: int) -> None:
+def test_a_truncated_file_of_a_sampler_has_the_earlier_samples(end: int) -> None:
     complete_samples, truncated = (
         robot_link_samples.parse(SAMPLER_OUTPUT),
-        robot_link_samples.parse(SAMPLER_OUTPUT[:at]),
+        robot_link_samples.parse(SAMPLER_OUTPUT[:end]),
     )
     assert [item.utc_ns for item in truncated] == [item.utc_ns for item in complete_samples][: len(truncated)]
     for item, complete_sample in zip(truncated, complete_samples, strict=False):

@@ -50,8 +50,8 @@ def test_figures_equal_the_totals_of_the_receiver(version: str, test: str) -> No
     """The totals are in the output of the client, where all versions report the receiver correctly."""
     end = json.loads(output(version, test, "client"))["end"]
     values = measured(version, test)
-    lost = values["iperf3_datagrams_sent"] - values["iperf3_datagrams_received"]
-    assert lost == end["sum"]["lost_packets"]
+    n_lost = values["iperf3_datagrams_sent"] - values["iperf3_datagrams_received"]
+    assert n_lost == end["sum"]["lost_packets"]
     if "sum_received" in end:
         assert values["iperf3_received_bytes"] == pytest.approx(end["sum_received"]["bytes"], rel=0.07)
     assert values["iperf3_jitter_s"] == pytest.approx(end["sum"]["jitter_ms"] / 1e3, rel=1e-3)

@@ -56,21 +56,24 @@ def test_invalid_contents_are_refused(tmp_path: Path, content: str) -> None:
     assert measure(tmp_path, None) == Measures()
 
 
-@given(before=COUNTS, received=COUNTS, bound_ns=st.integers(1, 10**12))
+@given(earlier_packets=COUNTS, new_packets=COUNTS, bound_ns=st.integers(1, 10**12))
 def test_packets_between_two_readings_are_written_and_read(
-    tmp_path_factory: pytest.TempPathFactory, before: dict[int, int], received: dict[int, int], bound_ns: int
+    tmp_path_factory: pytest.TempPathFactory,
+    earlier_packets: dict[int, int],
+    new_packets: dict[int, int],
+    bound_ns: int,
 ) -> None:
-    first = Lateness(bound_ns=bound_ns, packets=before)
-    second = Lateness(bound_ns=bound_ns, packets=Counter(before) + Counter(received))
+    first = Lateness(bound_ns=bound_ns, packets=earlier_packets)
+    second = Lateness(bound_ns=bound_ns, packets=Counter(earlier_packets) + Counter(new_packets))
     path = write_file(tmp_path_factory.getbasetemp(), oracle_delays.lateness_text(first, second).encode())
-    assert oracle_delays.read_lateness(path) == Lateness(bound_ns=bound_ns, packets=received)
+    assert oracle_delays.read_lateness(path) == Lateness(bound_ns=bound_ns, packets=new_packets)
 
 
 @given(st.integers(0, 10**6))
-def test_a_truncated_file_is_refused(tmp_path_factory: pytest.TempPathFactory, at: int) -> None:
+def test_a_truncated_file_is_refused(tmp_path_factory: pytest.TempPathFactory, end: int) -> None:
     lateness = Lateness(bound_ns=5000, packets={1000: 98, 6000: 1, 8000: 1})
     content = oracle_delays.lateness_text(Lateness(bound_ns=5000, packets={}), lateness).encode()
-    path = write_file(tmp_path_factory.getbasetemp(), content[: at % len(content)])
+    path = write_file(tmp_path_factory.getbasetemp(), content[: end % len(content)])
     with pytest.raises(EvidenceError):
         oracle_delays.read_lateness(path)
 

@@ -170,15 +170,15 @@ def test_other_lines_in_a_real_output_do_not_change_the_result(data: st.DataObje
     text = (OUTPUTS / "duplicates.txt").read_text(encoding="utf-8")
     lines = text.split("\n")
     noise = st.text(st.characters(exclude_characters="\n"), min_size=1).filter(lambda line: "e" not in line)
-    at = data.draw(st.integers(0, len(lines)))
-    result = ping.parse("\n".join([*lines[:at], data.draw(noise), *lines[at:]]))
+    index = data.draw(st.integers(0, len(lines)))
+    result = ping.parse("\n".join([*lines[:index], data.draw(noise), *lines[index:]]))
     assert (result.replies, result.transmitted) == (ping.parse(text).replies, 3)
 
 
-def ping_with_answers(*seqs_ms: tuple[int, int], sent: int) -> Ping:
+def ping_with_answers(*seqs_ms: tuple[int, int], n_sent: int) -> Ping:
     """Return a ping of `sent` requests with the times of its answers in ms."""
     replies = tuple(Reply(seq, 1e-3, at_ms * 1_000_000, duplicate=False, damaged=False) for seq, at_ms in seqs_ms)
-    return Ping(56, replies, (), sent, len(replies), ())
+    return Ping(56, replies, (), n_sent, len(replies), ())
 
 
 INTERVAL_S = 0.1
@@ -186,54 +186,58 @@ INTERVAL_S = 0.1
 
 def test_the_longest_gap_has_the_number_of_lost_requests() -> None:
     gap = ping_gaps.longest_gap(
-        ping_with_answers((1, 100), (2, 201), (6, 640), (7, 700), (9, 900), sent=10), INTERVAL_S
+        ping_with_answers((1, 100), (2, 201), (6, 640), (7, 700), (9, 900), n_sent=10), INTERVAL_S
     )
     assert gap == AnswerGap(0.439, 3, is_open=False)
-    assert ping_gaps.longest_gap(ping_with_answers((1, 100), (2, 200), (3, 350), sent=3), INTERVAL_S) == AnswerGap(
+    assert ping_gaps.longest_gap(ping_with_answers((1, 100), (2, 200), (3, 350), n_sent=3), INTERVAL_S) == AnswerGap(
         0.15, 0, is_open=False
     )
     # A late answer creates no additional gap: the answer to 2 arrived after that to 3.
-    assert ping_gaps.longest_gap(ping_with_answers((1, 100), (3, 300), (2, 310), sent=3), INTERVAL_S) == AnswerGap(
+    assert ping_gaps.longest_gap(ping_with_answers((1, 100), (3, 300), (2, 310), n_sent=3), INTERVAL_S) == AnswerGap(
         0.21, 0, is_open=False
     )
 
 
 @pytest.mark.parametrize(
-    ("ping_", "duration_s", "lost", "is_open"),
+    ("ping_", "duration_s", "n_lost", "is_open"),
     [
-        pytest.param(ping_with_answers((1, 100), (3, 300), sent=5), 0.2, 2, True, id="as long at the end as within"),
-        pytest.param(ping_with_answers((1, 100), (4, 400), sent=5), 0.3, 2, False, id="a lost echo at the end"),
-        pytest.param(ping_with_answers((1, 100), (2, 200), (3, 300), sent=26), 2.3, 23, True, id="down at the end"),
-        pytest.param(ping_with_answers((24, 100), (25, 200), sent=25), 2.3, 23, True, id="down at the start"),
-        pytest.param(ping_with_answers(sent=30), 3.0, 30, True, id="no answer at all"),
-        pytest.param(ping_with_answers((1, 100), sent=12), 1.1, 11, True, id="a single answer"),
         pytest.param(
-            ping_with_answers((1, 100), (31, 3100), sent=42), 3.0, 29, True, id="1 s down at the end, longer within"
+            ping_with_answers((1, 100), (3, 300), n_sent=5), 0.2, 2, True, id="as long at the end as within"
+        ),
+        pytest.param(ping_with_answers((1, 100), (4, 400), n_sent=5), 0.3, 2, False, id="a lost echo at the end"),
+        pytest.param(ping_with_answers((1, 100), (2, 200), (3, 300), n_sent=26), 2.3, 23, True, id="down at the end"),
+        pytest.param(ping_with_answers((24, 100), (25, 200), n_sent=25), 2.3, 23, True, id="down at the start"),
+        pytest.param(ping_with_answers(n_sent=30), 3.0, 30, True, id="no answer at all"),
+        pytest.param(ping_with_answers((1, 100), n_sent=12), 1.1, 11, True, id="a single answer"),
+        pytest.param(
+            ping_with_answers((1, 100), (31, 3100), n_sent=42), 3.0, 29, True, id="1 s down at the end, longer within"
         ),
         pytest.param(
-            ping_with_answers((65535, 100), (0, 200), (1, 300), sent=65537), 6553.4, 65534, True, id="16 bits"
+            ping_with_answers((65535, 100), (0, 200), (1, 300), n_sent=65537), 6553.4, 65534, True, id="16 bits"
         ),
     ],
 )
-def test_a_gap_at_the_start_or_end_is_a_lower_bound(ping_: Ping, duration_s: float, lost: int, is_open: bool) -> None:
+def test_a_gap_at_the_start_or_end_is_a_lower_bound(
+    ping_: Ping, duration_s: float, n_lost: int, is_open: bool
+) -> None:
     result = ping_gaps.longest_gap(ping_, INTERVAL_S)
-    assert result == AnswerGap(pytest.approx(duration_s), lost, is_open)  # type: ignore[arg-type]
+    assert result == AnswerGap(pytest.approx(duration_s), n_lost, is_open)  # type: ignore[arg-type]
     values = ping_gaps.measure_gap(ping_, INTERVAL_S).values
     suffix = ("_at_least_s", "_lost_at_least") if is_open else ("_s", "_lost")
     assert values == {
-        f"rtt_gap{name}": pytest.approx(value) for name, value in zip(suffix, (duration_s, lost), strict=True)
+        f"rtt_gap{name}": pytest.approx(value) for name, value in zip(suffix, (duration_s, n_lost), strict=True)
     }
 
 
 def test_sequence_numbers_of_a_long_ping_may_wrap() -> None:
     answers = [(seq & 0xFFFF, 100 * seq) for seq in range(1, 70_001) if not 66_000 < seq <= 66_010]
-    assert ping_gaps.longest_gap(ping_with_answers(*answers, sent=70_000), INTERVAL_S) == AnswerGap(
+    assert ping_gaps.longest_gap(ping_with_answers(*answers, n_sent=70_000), INTERVAL_S) == AnswerGap(
         1.1, 10, is_open=False
     )
 
 
 def test_without_time_stamps_there_is_no_gap() -> None:
-    assert ping_gaps.longest_gap(ping_with_answers((1, 100), sent=1), INTERVAL_S) is None
+    assert ping_gaps.longest_gap(ping_with_answers((1, 100), n_sent=1), INTERVAL_S) is None
     assert ping_gaps.longest_gap(ping.read(DATA / "busybox/1.35.0/ping-duplicates.txt"), INTERVAL_S) is None
     columns = {column.name for column in (*ping_gaps.GAP_COLUMNS, *ping_gaps.OPEN_GAP_COLUMNS)}
     assert ping_gaps.measure_gap(None, INTERVAL_S).missing.keys() == columns
@@ -242,29 +246,29 @@ def test_without_time_stamps_there_is_no_gap() -> None:
 @given(st.lists(st.booleans(), min_size=1, max_size=60))
 def test_every_ping_has_either_a_gap_or_its_lower_bound(replies: list[bool]) -> None:
     result = ping_with_answers(
-        *((seq, 100 * seq) for seq, arrived in enumerate(replies, 1) if arrived), sent=len(replies)
+        *((seq, 100 * seq) for seq, is_answered in enumerate(replies, 1) if is_answered), n_sent=len(replies)
     )
     measured = ping_gaps.measure_gap(result, INTERVAL_S)
-    longest_run = max((len(list(run)) for arrived, run in groupby(replies) if not arrived), default=0)
+    longest_run = max((len(list(run)) for is_answered, run in groupby(replies) if not is_answered), default=0)
     if len(replies) == 1 and replies[0]:
         assert not measured.values
     else:
-        (lost,) = (value for name, value in measured.values.items() if "lost" in name)
+        (n_lost,) = (value for name, value in measured.values.items() if "lost" in name)
         assert len(measured.values) == 2
-        assert lost == longest_run
+        assert n_lost == longest_run
 
 
 @given(st.lists(st.floats(0, 1, width=32), max_size=30), st.integers(0, 30))
-def test_the_median_of_all_requests_counts_a_lost_request_as_infinitely_late(rtt_s: list[float], lost: int) -> None:
-    padded = sorted([*rtt_s, *[math.inf] * lost])
+def test_the_median_of_all_requests_counts_a_lost_request_as_infinitely_late(rtt_s: list[float], n_lost: int) -> None:
+    padded = sorted([*rtt_s, *[math.inf] * n_lost])
     middle_values = padded[(len(padded) - 1) // 2 : len(padded) // 2 + 1]
     expected = fmean(middle_values) if middle_values and math.inf not in middle_values else None
     assert quantile_of_sent(rtt_s, len(padded), 0.5) == (expected if expected is None else pytest.approx(expected))
 
 
 def test_a_ping_with_half_of_its_echoes_lost_has_no_median_of_all_requests() -> None:
-    def measured(sent: int) -> Measured:
-        return ping.measure(ping_with_answers((1, 100), (2, 200), (3, 300), sent=sent))
+    def measured(n_sent: int) -> Measured:
+        return ping.measure(ping_with_answers((1, 100), (2, 200), (3, 300), n_sent=n_sent))
 
     assert measured(3).values["rtt_median_sent_s"] == measured(3).values["rtt_median_s"]
     assert measured(5).values["rtt_median_sent_s"] == 1e-3

@@ -16,17 +16,17 @@ HEADER = "PING 10.42.0.1 (10.42.0.1) 56(84) bytes of data."
 FIRST_S = 1_795_218_000
 
 
-def pings(answered: list[int], sent: int, *, stamps: bool = True, interval_s: float = 0.1) -> str:
+def pings(answered_numbers: list[int], n_sent: int, *, stamps: bool = True, interval_s: float = 0.1) -> str:
     """Return output of ping for `sent` requests. Only the requests in `answered` have an answer."""
     lines = [HEADER]
-    for number in answered:
+    for number in answered_numbers:
         stamp = f"[{FIRST_S + number * interval_s:.6f}] " if stamps else ""
         lines.append(f"{stamp}64 bytes from 10.42.0.1: icmp_seq={number} ttl=64 time=0.6 ms")
-    return "\n".join([*lines, "", "--- 10.42.0.1 ping statistics ---", summary(sent, len(answered))])
+    return "\n".join([*lines, "", "--- 10.42.0.1 ping statistics ---", summary(n_sent, len(answered_numbers))])
 
 
-def summary(sent: int, received: int) -> str:
-    return f"{sent} packets transmitted, {received} received, 1% packet loss, time 6066ms"
+def summary(n_sent: int, n_received: int) -> str:
+    return f"{n_sent} packets transmitted, {n_received} received, 1% packet loss, time 6066ms"
 
 
 def watch_output(*polls: tuple[float, str]) -> str:
@@ -79,13 +79,13 @@ def test_a_fault_of_unknown_duration_has_an_outage_and_no_recovery_time(tmp_path
     assert result == Recovery(pytest.approx(2.6), None, recovered=True)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("sent", [20, 600])
-def test_a_robot_that_does_not_recover_has_no_times(tmp_path: Path, sent: int) -> None:
-    text = pings(list(range(1, 11)), sent)
+@pytest.mark.parametrize("n_sent", [20, 600])
+def test_a_robot_that_does_not_recover_has_no_times(tmp_path: Path, n_sent: int) -> None:
+    text = pings(list(range(1, 11)), n_sent)
     kind = FaultKind.LINK_DOWN
     result = outage.read(write_fault(tmp_path, kind, text), kind)
     fault_s = 2.0
-    bound_s = max(0.0, (sent - 10) * 0.1 - fault_s)
+    bound_s = max(0.0, (n_sent - 10) * 0.1 - fault_s)
     assert result == Recovery(None, None, recovered=False, recovery_at_least_s=pytest.approx(bound_s))  # type: ignore[arg-type]
     values = outage.measure(kind, result).values
     assert values.keys() == {"link_down_recovered", "link_down_recovery_at_least_s"}
@@ -168,22 +168,24 @@ def test_each_kind_has_separate_columns_and_no_transfer_is_needed(tmp_path: Path
     gap_length=st.integers(31, 400),
     before=st.integers(1, 50),
     after=st.integers(1, 50),
-    lost=st.sets(st.integers(1, 1000), max_size=20),
+    lost_numbers=st.sets(st.integers(1, 1000), max_size=20),
 )
 def test_the_longest_gap_is_detected_at_any_position(
-    tmp_path_factory: pytest.TempPathFactory, gap_length: int, before: int, after: int, lost: set[int]
+    tmp_path_factory: pytest.TempPathFactory, gap_length: int, before: int, after: int, lost_numbers: set[int]
 ) -> None:
     """The oracle is a loop over all requests; `gap_length` exceeds all other losses."""
     path = tmp_path_factory.mktemp("fault")
-    answered = [number for number in range(1, before + 1) if number not in lost or number == before]
+    answered_numbers = [number for number in range(1, before + 1) if number not in lost_numbers or number == before]
     gap_end = before + gap_length
-    answered += [number for number in range(gap_end, gap_end + after) if number not in lost or number == gap_end]
-    sent = answered[-1]
+    answered_numbers += [
+        number for number in range(gap_end, gap_end + after) if number not in lost_numbers or number == gap_end
+    ]
+    n_sent = answered_numbers[-1]
     run_length = longest = 0
-    for number in range(answered[0], sent + 1):
-        run_length = 0 if number in set(answered) else run_length + 1
+    for number in range(answered_numbers[0], n_sent + 1):
+        run_length = 0 if number in set(answered_numbers) else run_length + 1
         longest = max(longest, run_length)
-    result = outage.read(write_fault(path, FaultKind.LINK_DOWN, pings(answered, sent)), FaultKind.LINK_DOWN)
+    result = outage.read(write_fault(path, FaultKind.LINK_DOWN, pings(answered_numbers, n_sent)), FaultKind.LINK_DOWN)
     assert result.outage_s == pytest.approx((longest + 1) / 10, abs=1e-5)
 
 

@@ -10,11 +10,11 @@ from fieldkit.measure.evidence import reading
 
 
 @pytest.mark.parametrize(("change", "is_equal"), [(b"", True), (b"x", False)])
-@pytest.mark.parametrize("at", [0, 1 << 20, (3 << 20) - 1])
-def test_files_are_compared_byte_for_byte(tmp_path: Path, at: int, change: bytes, is_equal: bool) -> None:
+@pytest.mark.parametrize("offset", [0, 1 << 20, (3 << 20) - 1])
+def test_files_are_compared_byte_for_byte(tmp_path: Path, offset: int, change: bytes, is_equal: bool) -> None:
     content = bytearray(3 << 20)
     (tmp_path / "a").write_bytes(content)
-    content[at : at + len(change)] = change
+    content[offset : offset + len(change)] = change
     (tmp_path / "b").write_bytes(content)
     assert reading.size(tmp_path / "a") == reading.size(tmp_path / "b") == 3 << 20
     assert reading.have_equal_bytes(tmp_path, "a", "b") is is_equal

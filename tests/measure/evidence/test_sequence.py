@@ -36,7 +36,7 @@ def test_late_messages_are_not_lost_and_duplicates_count_once(order: list[int], 
     arrivals = sent_messages(40, first)
     arrivals[10:14] = [arrivals[10 + index] for index in order]
     arrivals.insert(20, arrivals[19])
-    counts = count_messages([(at * PERIOD_US, number) for at, (_, number) in enumerate(arrivals)], 0)
+    counts = count_messages([(index * PERIOD_US, number) for index, (_, number) in enumerate(arrivals)], 0)
     assert (counts.messages, counts.lost, counts.repeated) == (40, 0, 1)
 
 

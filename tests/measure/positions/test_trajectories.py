@@ -90,8 +90,8 @@ TIMES = st.lists(st.integers(0, 10_000), min_size=2, max_size=8, unique=True).ma
 @st.composite
 def any_trajectory(draw: st.DrawFn) -> Trajectory:
     times_ms = draw(TIMES)
-    places = [(draw(COORDINATES), draw(COORDINATES), draw(COORDINATES)) for _ in times_ms]
-    return Trajectory(np.array([EPOCH_NS + 10**6 * time_ms for time_ms in times_ms]), np.array(places), 2**62)
+    positions_m = [(draw(COORDINATES), draw(COORDINATES), draw(COORDINATES)) for _ in times_ms]
+    return Trajectory(np.array([EPOCH_NS + 10**6 * time_ms for time_ms in times_ms]), np.array(positions_m), 2**62)
 
 
 @given(any_trajectory(), any_trajectory(), st.data())

@@ -26,19 +26,19 @@ TRANSLATED = "a router on the path translates an address or a port"
 CHANGED = "they were changed on the path, or the sender's capture is incomplete"
 
 
-def _with_field(at: int, form: str, value: int) -> Change:
+def _with_field(offset: int, form: str, value: int) -> Change:
     def change(packet: bytes) -> bytes:
         changed = bytearray(packet)
-        struct.pack_into(form, changed, at, value)
+        struct.pack_into(form, changed, offset, value)
         return bytes(changed)
 
     return change
 
 
-def _with_increment(at: int, form: str, increment: int) -> Change:
+def _with_increment(offset: int, form: str, increment: int) -> Change:
     def change(packet: bytes) -> bytes:
-        (old_value,) = struct.unpack_from(form, packet, at)
-        return _with_field(at, form, (old_value + increment) % 256 ** struct.calcsize(form))(packet)
+        (old_value,) = struct.unpack_from(form, packet, offset)
+        return _with_field(offset, form, (old_value + increment) % 256 ** struct.calcsize(form))(packet)
 
     return change
 
@@ -61,9 +61,11 @@ TRANSLATIONS: dict[str, tuple[Change, str]] = {
 def _udp(change: Change, *, lost_one_of: int = 10, ip_id: int | None = None) -> tuple[list[Frame], list[Frame]]:
     """Return captures of 36 datagrams of six fragments. One in `lost_one_of` packets is lost."""
     cut_packets = [packet for number in range(36) for packet in datagram(number if ip_id is None else ip_id, 8192)]
-    sent = timed(cut_packets)
-    return sent, [
-        Frame(frame.time_ns, change(frame.data), 2000) for at, frame in enumerate(sent) if at % lost_one_of != 3
+    sent_frames = timed(cut_packets)
+    return sent_frames, [
+        Frame(frame.time_ns, change(frame.data), 2000)
+        for index, frame in enumerate(sent_frames)
+        if index % lost_one_of != 3
     ]
 
 
@@ -107,28 +109,32 @@ def test_changed_ids_are_reported() -> None:
 
 def test_a_port_that_changes_during_the_transfer_is_reported() -> None:
     """As if a router lost its state for the flow: half of the packets arrive unchanged."""
-    sent, received = _udp(lambda packet: packet)
-    half = len(received) // 2
-    later = [Frame(frame.time_ns, _change_port(frame.data), 2000) for frame in received[half:]]
-    reason = _reason((sent, [*received[:half], *later]), Protocol.UDP)
+    sent_frames, received_frames = _udp(lambda packet: packet)
+    half = len(received_frames) // 2
+    translated = [Frame(frame.time_ns, _change_port(frame.data), 2000) for frame in received_frames[half:]]
+    reason = _reason((sent_frames, [*received_frames[:half], *translated]), Protocol.UDP)
     assert reason
     assert reason.endswith(TRANSLATED)
 
 
 def test_packets_missing_in_the_senders_capture_are_reported() -> None:
-    sent, received = _udp(lambda packet: packet)
-    assert str(_reason((sent[60:], received), Protocol.UDP)).endswith(CHANGED)
+    sent_frames, received_frames = _udp(lambda packet: packet)
+    assert str(_reason((sent_frames[60:], received_frames), Protocol.UDP)).endswith(CHANGED)
 
 
 @pytest.mark.parametrize("protocol", Protocol)
 def test_packets_captured_on_two_interfaces_are_reported(protocol: Protocol) -> None:
     """As with `-i any` if packets pass a bridge or a VLAN: they would appear as lost or retransmitted."""
-    sent, received = _udp(lambda packet: packet) if protocol is Protocol.UDP else _tcp(lambda packet: packet)
-    duplicated = [packet for frame in sent for packet in (frame, replace(frame, time_ns=frame.time_ns + 5000))]
-    reason = _reason((duplicated, received), protocol)
+    sent_frames, received_frames = (
+        _udp(lambda packet: packet) if protocol is Protocol.UDP else _tcp(lambda packet: packet)
+    )
+    duplicated = [packet for frame in sent_frames for packet in (frame, replace(frame, time_ns=frame.time_ns + 5000))]
+    reason = _reason((duplicated, received_frames), protocol)
     assert reason
     assert "in the sender's capture occur twice" in reason
-    assert _reason((sent, [*received, *received]), protocol) is None, "a link may duplicate packets"
+    assert _reason((sent_frames, [*received_frames, *received_frames]), protocol) is None, (
+        "a link may duplicate packets"
+    )
 
 
 @pytest.mark.parametrize("end", ["sender", "receiver"])
@@ -139,29 +145,37 @@ def test_a_snap_length_within_the_headers_does_not_appear_as_loss(
     protocol: Protocol, snap_length: int, end: str
 ) -> None:
     """Without ports all packets would appear lost or never sent; without sequence numbers TCP has no payload."""
-    sent, received = _udp(lambda packet: packet) if protocol is Protocol.UDP else _tcp(lambda packet: packet)
+    sent_frames, received_frames = (
+        _udp(lambda packet: packet) if protocol is Protocol.UDP else _tcp(lambda packet: packet)
+    )
     cut_packets = [
-        replace(packet, data=packet.data[: 20 + snap_length]) for packet in (sent if end == "sender" else received)
+        replace(packet, data=packet.data[: 20 + snap_length])
+        for packet in (sent_frames if end == "sender" else received_frames)
     ]
-    reason = _reason((cut_packets, received) if end == "sender" else (sent, cut_packets), protocol)
+    reason = _reason((cut_packets, received_frames) if end == "sender" else (sent_frames, cut_packets), protocol)
     assert reason
     assert f"in the {end}'s capture were truncated in their TCP or UDP header" in reason
 
 
 def test_similar_traffic_is_not_mistaken_for_a_translation() -> None:
-    sent, received = _udp(lambda packet: packet)
+    sent_frames, received_frames = _udp(lambda packet: packet)
     other_stream = timed([packet for number in range(36) for packet in datagram(900 + number, 700, sport=9)])
     packets_of_another_robot = [Frame(frame.time_ns, _change_source(frame.data), 2000) for frame in other_stream]
-    packets_translated_at_receiver = [Frame(frame.time_ns, _change_target(frame.data), 2000) for frame in received]
+    packets_translated_at_receiver = [
+        Frame(frame.time_ns, _change_target(frame.data), 2000) for frame in received_frames
+    ]
     for name, captures in {
-        "nothing": (sent, received),
-        "all packets were lost": (sent, []),
-        "another robot sends to the port": (sent, [*received, *packets_of_another_robot]),
-        "another robot sends, and all packets were lost": (sent, packets_of_another_robot),
-        "the receiver translates, and captures both packets": (sent, [*received, *packets_translated_at_receiver]),
-        "a packet of earlier traffic": (sent, [*received, *timed(datagram(999, 10))]),
-        "a packet of earlier traffic, and all packets were lost": (sent, timed(datagram(999, 10, sport=9))),
-        "the transfer was not captured": ([], received),
+        "nothing": (sent_frames, received_frames),
+        "all packets were lost": (sent_frames, []),
+        "another robot sends to the port": (sent_frames, [*received_frames, *packets_of_another_robot]),
+        "another robot sends, and all packets were lost": (sent_frames, packets_of_another_robot),
+        "the receiver translates, and captures both packets": (
+            sent_frames,
+            [*received_frames, *packets_translated_at_receiver],
+        ),
+        "a packet of earlier traffic": (sent_frames, [*received_frames, *timed(datagram(999, 10))]),
+        "a packet of earlier traffic, and all packets were lost": (sent_frames, timed(datagram(999, 10, sport=9))),
+        "the transfer was not captured": ([], received_frames),
     }.items():
         assert _reason(captures, Protocol.UDP) is None, name
 
@@ -182,9 +196,9 @@ def test_captures_that_cannot_be_compared_give_no_counts(
     tmp_path: Path, translation: str, protocol: Protocol
 ) -> None:
     change, _ = TRANSLATIONS[translation]
-    sent, received = _udp(change) if protocol is Protocol.UDP else _tcp(change)
-    (tmp_path / "sender.pcap").write_bytes(file_bytes(sent))
-    (tmp_path / "receiver.pcap").write_bytes(file_bytes(received))
+    sent_frames, received_frames = _udp(change) if protocol is Protocol.UDP else _tcp(change)
+    (tmp_path / "sender.pcap").write_bytes(file_bytes(sent_frames))
+    (tmp_path / "receiver.pcap").write_bytes(file_bytes(received_frames))
     measures = measure(tmp_path, transfer(protocol))
     assert TRANSLATED in measures.one_way_withheld
     layers = ("ip_", "datagram", "byte_", "tcp_", "paper_received", "paper_loss", "jitter", "transfer_s")
@@ -201,11 +215,11 @@ def _with_planned_addresses(packet: bytes) -> bytes:
 
 def test_a_repeat_with_translated_addresses_is_void(tmp_path: Path) -> None:
     plan = los_plan(protocols=(Protocol.UDP,))
-    sent, received = _udp(lambda packet: _change_source(_with_planned_addresses(packet)))
+    sent_frames, received_frames = _udp(lambda packet: _change_source(_with_planned_addresses(packet)))
     (tmp_path / "sender.pcap").write_bytes(
-        file_bytes([Frame(frame.time_ns, _with_planned_addresses(frame.data)) for frame in sent])
+        file_bytes([Frame(frame.time_ns, _with_planned_addresses(frame.data)) for frame in sent_frames])
     )
-    (tmp_path / "receiver.pcap").write_bytes(file_bytes(received))
+    (tmp_path / "receiver.pcap").write_bytes(file_bytes(received_frames))
     (tmp_path / "recv.bag").write_bytes(b"x")
     reasons = problems(plan, Protocol.UDP, tmp_path)
     assert [reason for reason in reasons if "left as 10.42.0.1:40000 > 10.42.0.2:1234" in reason], reasons

@@ -35,7 +35,7 @@ class Flow:
     arrived_packets: int = 0
     sent_datagrams: int = 0
     complete_datagrams: int = 0
-    received: bytearray = field(default_factory=bytearray)
+    received_bytes: bytearray = field(default_factory=bytearray)
 
     @property
     def content(self) -> bytes:
@@ -86,8 +86,8 @@ def send_all(folder: Path, flows: list[Flow], random_generator: random.Random, l
         index = random_generator.choice([index for index, remaining in enumerate(waiting) if remaining])
         flow, fragments = flows[index], waiting[index].pop(0)
         start = flow.sent_datagrams * 8192
-        lost = [random_generator.random() < loss for _ in fragments]
-        for data, is_lost in zip(fragments, lost, strict=True):
+        lost_flags = [random_generator.random() < loss for _ in fragments]
+        for data, is_lost in zip(fragments, lost_flags, strict=True):
             now_ns += 100_000
             (at_receiver if flow.is_reverse else at_sender).append(Frame(now_ns, data, wire_bytes=1500))
             if not is_lost:
@@ -95,13 +95,13 @@ def send_all(folder: Path, flows: list[Flow], random_generator: random.Random, l
                     Frame(now_ns + 2_000_000, data, wire_bytes=1500)
                 )
         flow.sent_packets += len(fragments)
-        flow.arrived_packets += len(fragments) - sum(lost)
+        flow.arrived_packets += len(fragments) - sum(lost_flags)
         flow.sent_datagrams += 1
-        flow.complete_datagrams += not any(lost)
-        flow.received += b"" if any(lost) else flow.content[start : start + 8192]
+        flow.complete_datagrams += not any(lost_flags)
+        flow.received_bytes += b"" if any(lost_flags) else flow.content[start : start + 8192]
     for flow in flows:
         (folder / f"{flow.name}.bag").write_bytes(flow.content)
-        (folder / f"{flow.name}.recv.bag").write_bytes(flow.received)
+        (folder / f"{flow.name}.recv.bag").write_bytes(flow.received_bytes)
     for name, frames in (("sender.pcap", at_sender), ("receiver.pcap", at_receiver)):
         (folder / name).write_bytes(file_bytes(sorted(frames, key=lambda frame: frame.time_ns)))
 
@@ -136,5 +136,5 @@ def test_each_transfer_counts_its_own_packets_even_with_equal_ids(
                 flow.sent_datagrams,
                 flow.complete_datagrams,
             ]
-            assert values["file_loss"] == 1 - len(flow.received) / flow.size_bytes
+            assert values["file_loss"] == 1 - len(flow.received_bytes) / flow.size_bytes
             assert values["paper_packets"] == flow.sent_datagrams

@@ -42,10 +42,10 @@ def control(**ends: Any) -> Stream:  # noqa: ANN401 (the fields of Stream)
     return stream
 
 
-def data(sport: int = 40000, lost: range = range(*LOST)) -> Stream:
+def data(sport: int = 40000, lost_numbers: range = range(*LOST)) -> Stream:
     stream = Stream(sport=sport)
     for number in range(400):
-        stream.datagram(number, SECOND + number * 10 * MS, arrives=number not in lost)
+        stream.datagram(number, SECOND + number * 10 * MS, arrives=number not in lost_numbers)
     return stream
 
 

@@ -42,22 +42,22 @@ def _udp(
     link: Link, contents: list[bytes], *, ids: list[int | None], step_ns: int = MS
 ) -> tuple[udp.UdpCounts, PacketFates]:
     """Send datagrams in sequence; return the measured counts and the true fates."""
-    sent = [
+    sent_frames = [
         Frame(10**18 + number * step_ns, links.udp(content, ip_id=ip_id), 2000)
         for number, (content, ip_id) in enumerate(zip(contents, ids, strict=True))
     ]
-    arrivals = link.arrivals([frame.time_ns for frame in sent])
-    received = [Frame(at, sent[index].data, 2000) for at, index in arrivals]
+    arrivals = link.arrivals([frame.time_ns for frame in sent_frames])
+    received_frames = [Frame(time_ns, sent_frames[index].data, 2000) for time_ns, index in arrivals]
     transfer_filter = _transfer_over(Protocol.UDP, ipv6=ids[0] is None)
-    counts = udp.count(udp.match_transfer(packets(sent), packets(received), transfer_filter))
-    return counts, PacketFates.of(len(sent), [index for _, index in arrivals])
+    counts = udp.count(udp.match_transfer(packets(sent_frames), packets(received_frames), transfer_filter))
+    return counts, PacketFates.of(len(sent_frames), [index for _, index in arrivals])
 
 
 def _fates_of(counts: udp.UdpCounts) -> PacketFates:
     assert counts.packets_reordered is not None
     assert counts.loss_bursts is not None
-    lost = counts.packets_sent - counts.packets_received
-    return PacketFates(lost, counts.packets_duplicated, counts.packets_reordered, counts.loss_bursts)
+    n_lost = counts.packets_sent - counts.packets_received
+    return PacketFates(n_lost, counts.packets_duplicated, counts.packets_reordered, counts.loss_bursts)
 
 
 @given(lossy_links, same_ids)
@@ -90,19 +90,19 @@ def test_as_many_copies_as_losses_do_not_hide_the_losses() -> None:
 
 def test_a_late_copy_does_not_hide_a_loss() -> None:
     """Ten equal packets 1 ms apart; the sixth is lost, and a copy of the third arrives 2.4 ms after it."""
-    sent = [Frame(10**18 + at * MS, links.udp(bytes(40), ip_id=0)) for at in range(10)]
-    late_ns = [*(at * MS for at in range(10) if at != 5), 2 * MS + 2_400_000]
-    received = [Frame(10**18 + 7 * MS + at, sent[0].data) for at in sorted(late_ns)]
-    counts = udp.count(udp.match_transfer(packets(sent), packets(received), transfer(Protocol.UDP)))
+    sent_frames = [Frame(10**18 + number * MS, links.udp(bytes(40), ip_id=0)) for number in range(10)]
+    late_ns = [*(number * MS for number in range(10) if number != 5), 2 * MS + 2_400_000]
+    received_frames = [Frame(10**18 + 7 * MS + number, sent_frames[0].data) for number in sorted(late_ns)]
+    counts = udp.count(udp.match_transfer(packets(sent_frames), packets(received_frames), transfer(Protocol.UDP)))
     assert (counts.packets_ambiguous, counts.possible_copies) == (10, 10)
 
 
 def test_the_arrival_of_a_single_repeated_segment_is_ambiguous() -> None:
     """The segment is sent twice, 210 ms apart, without time stamps or other packets that give the clock offset."""
     syn, data = segment(0, 0, flags=2), segment(1, 700)
-    sent = [Frame(10**18 + at * MS, packet) for at, packet in ((0, syn), (10, data), (220, data))]
-    received = [Frame(10**18 + at * MS, packet) for at, packet in ((3, syn), (223, data))]
-    counts = tcp.count(tcp.match_transfer(packets(sent), packets(received), transfer(Protocol.TCP)))
+    sent_frames = [Frame(10**18 + time_ms * MS, packet) for time_ms, packet in ((0, syn), (10, data), (220, data))]
+    received_frames = [Frame(10**18 + time_ms * MS, packet) for time_ms, packet in ((3, syn), (223, data))]
+    counts = tcp.count(tcp.match_transfer(packets(sent_frames), packets(received_frames), transfer(Protocol.TCP)))
     assert (counts.ambiguous_frames, counts.possible_copies, counts.received_bytes) == (2, 0, 700)
     assert counts.spurious_frames is counts.reordered_frames is None
 
@@ -110,9 +110,11 @@ def test_the_arrival_of_a_single_repeated_segment_is_ambiguous() -> None:
 def test_arrivals_of_joined_segments_repeated_immediately_are_ambiguous() -> None:
     """A frame of three segments is sent again 1 ms later. A router splits both frames."""
     syn = segment(0, 0, flags=2, ip_id=9, mss=700)
-    sent = timed([syn, segment(1, 2100, ip_id=10), segment(1, 2100, ip_id=13)])
-    cut = [segment(1 + 700 * (number % 3), 700, ip_id=10 + number) for number in range(6)]
-    counts = tcp.count(tcp.match_transfer(packets(sent), packets(timed([syn, *cut])), transfer(Protocol.TCP)))
+    sent_frames = timed([syn, segment(1, 2100, ip_id=10), segment(1, 2100, ip_id=13)])
+    split_segments = [segment(1 + 700 * (number % 3), 700, ip_id=10 + number) for number in range(6)]
+    counts = tcp.count(
+        tcp.match_transfer(packets(sent_frames), packets(timed([syn, *split_segments])), transfer(Protocol.TCP))
+    )
     assert (counts.ambiguous_frames, counts.lost_bytes, counts.received_bytes) == (2, 0, 4200)
     assert counts.spurious_frames is counts.reordered_frames is None
 
@@ -120,10 +122,12 @@ def test_arrivals_of_joined_segments_repeated_immediately_are_ambiguous() -> Non
 def test_a_repeat_has_no_loss_if_copies_may_hide_losses(tmp_path: Path) -> None:
     """33 of 500 equal packets are lost and 29 copied: sent packets are counted, but arrivals are not."""
     link = Link(3, loss=0.06, copied=0.06, jitter_ns=30_000)
-    sent = [Frame(10**18 + at * MS, links.udp(bytes(100), ip_id=0), 128) for at in range(500)]
-    arrivals = link.arrivals([frame.time_ns for frame in sent])
-    (tmp_path / "sender.pcap").write_bytes(file_bytes(sent))
-    (tmp_path / "receiver.pcap").write_bytes(file_bytes(Frame(at, sent[index].data, 128) for at, index in arrivals))
+    sent_frames = [Frame(10**18 + time * MS, links.udp(bytes(100), ip_id=0), 128) for time in range(500)]
+    arrivals = link.arrivals([frame.time_ns for frame in sent_frames])
+    (tmp_path / "sender.pcap").write_bytes(file_bytes(sent_frames))
+    (tmp_path / "receiver.pcap").write_bytes(
+        file_bytes(Frame(time, sent_frames[index].data, 128) for time, index in arrivals)
+    )
     measures = measure(tmp_path, transfer(Protocol.UDP))
     assert (measures.ip_packets_sent, measures.ip_packets_doubtful, measures.datagrams_sent) == (500, 500, 500)
     assert measures.one_way_withheld == "the packets of the transfer cannot be distinguished"
@@ -137,18 +141,21 @@ def test_ids_that_repeat_after_65536_datagrams_are_matched_correctly(has_content
     """Packets around the wrap of the ids are lost and copied, and others are lost or reordered."""
     count, draw = 70_000, random.Random(5)
     contents = [draw.randbytes(32) if has_content else bytes(32) for _ in range(count)]
-    sent = [
+    sent_frames = [
         Frame(10**18 + number * 20_000, links.udp(content, ip_id=number % 65_536), 2000)
         for number, content in enumerate(contents)
     ]
-    times_ns = [frame.time_ns + 5 * 10**9 + draw.randint(MS, MS + 30_000) for frame in sent]
-    lost, copied = {100, 65_536 + 200, *range(30_000, 30_010)}, [65_536 + 100, 200]
-    arrived = [number for number in range(count) if number not in lost]
+    times_ns = [frame.time_ns + 5 * 10**9 + draw.randint(MS, MS + 30_000) for frame in sent_frames]
+    lost_indices, copied = {100, 65_536 + 200, *range(30_000, 30_010)}, [65_536 + 100, 200]
+    arrived_indices = [number for number in range(count) if number not in lost_indices]
     arrivals = sorted(
-        [(times_ns[index], index) for index in arrived] + [(times_ns[index] + 10_000, index) for index in copied]
+        [(times_ns[index], index) for index in arrived_indices]
+        + [(times_ns[index] + 10_000, index) for index in copied]
     )
-    received = [Frame(at, sent[index].data, 2000) for at, index in arrivals]
-    counts = udp.count(udp.match_transfer(packets(sent), packets(received), _transfer_over(Protocol.UDP, ipv6=False)))
+    received_frames = [Frame(time_ns, sent_frames[index].data, 2000) for time_ns, index in arrivals]
+    counts = udp.count(
+        udp.match_transfer(packets(sent_frames), packets(received_frames), _transfer_over(Protocol.UDP, ipv6=False))
+    )
     truth = PacketFates.of(count, [index for _, index in arrivals])
     assert _fates_of(counts) == truth
     assert (truth.lost, truth.duplicated, truth.bursts) == (12, 2, 3)
@@ -204,16 +211,18 @@ def test_order_without_time_stamps_is_correct_or_missing(
 def test_content_truncated_in_one_capture_is_not_used() -> None:
     """The snap length includes content or time stamps at one end only."""
     link = Link(8, loss=0.1, copied=0.1)
-    sent = [Frame(10**18 + at * MS, links.udp(link.draw.randbytes(40), ip_id=0), 68) for at in range(200)]
-    arrivals = link.arrivals([frame.time_ns for frame in sent])
-    received = [Frame(at, sent[index].data[:58], 68) for at, index in arrivals]
-    counts = udp.count(udp.match_transfer(packets(sent), packets(received), _transfer_over(Protocol.UDP, ipv6=False)))
+    sent_frames = [Frame(10**18 + time * MS, links.udp(link.draw.randbytes(40), ip_id=0), 68) for time in range(200)]
+    arrivals = link.arrivals([frame.time_ns for frame in sent_frames])
+    received_frames = [Frame(time, sent_frames[index].data[:58], 68) for time, index in arrivals]
+    counts = udp.count(
+        udp.match_transfer(packets(sent_frames), packets(received_frames), _transfer_over(Protocol.UDP, ipv6=False))
+    )
     assert (counts.packets_sent, counts.packets_ambiguous) == (200, 200)
     assert counts.possible_copies
     truth = links.tcp(Link(8, loss=0.1), 100, ids=False, again=0.2)
-    short = [Frame(frame.time_ns, frame.data[:44], frame.wire_bytes) for frame in truth.receiver]
+    truncated_frames = [Frame(frame.time_ns, frame.data[:44], frame.wire_bytes) for frame in truth.receiver]
     short_counts = tcp.count(
-        tcp.match_transfer(packets(truth.sender), packets(short), _transfer_over(Protocol.TCP, ipv6=False))
+        tcp.match_transfer(packets(truth.sender), packets(truncated_frames), _transfer_over(Protocol.TCP, ipv6=False))
     )
     _assert_unambiguous_counts(short_counts, truth)
     assert short_counts.ambiguous_frames
@@ -225,20 +234,24 @@ def test_captures_of_different_link_types_match(protocol: Protocol) -> None:
     """One end has VLAN tags, the other cooked frames; padding after short packets is not content."""
     if protocol is Protocol.UDP:
         link = Link(2, loss=0.1, copied=0.1, late=0.1)
-        sent = [Frame(10**18 + at * MS, links.udp(link.draw.randbytes(5), ip_id=0)) for at in range(200)]
-        received = [Frame(at, sent[index].data) for at, index in link.arrivals([frame.time_ns for frame in sent])]
+        sent_frames = [Frame(10**18 + time * MS, links.udp(link.draw.randbytes(5), ip_id=0)) for time in range(200)]
+        received_frames = [
+            Frame(time, sent_frames[index].data)
+            for time, index in link.arrivals([frame.time_ns for frame in sent_frames])
+        ]
     else:
         truth = links.tcp(Link(2, loss=0.1, copied=0.1, late=0.1), 100, ids=False, again=0.1)
-        sent, received = truth.sender, truth.receiver
+        sent_frames, received_frames = truth.sender, truth.receiver
     vlan, cooked = bytes(12) + b"\x81\x00\x00\x07\x08\x00", bytes(14) + b"\x08\x00"
     vlan_frames = [
         Frame(frame.time_ns, vlan + frame.data + bytes(20), frame.wire_bytes and frame.wire_bytes + 18)
-        for frame in sent
+        for frame in sent_frames
     ]
     cooked_frames = [
-        Frame(frame.time_ns, cooked + frame.data, frame.wire_bytes and frame.wire_bytes + 16) for frame in received
+        Frame(frame.time_ns, cooked + frame.data, frame.wire_bytes and frame.wire_bytes + 16)
+        for frame in received_frames
     ]
-    plain = packets(sent), packets(received)
+    plain = packets(sent_frames), packets(received_frames)
     framed = (
         pcap.parse(file_bytes(vlan_frames, link_type=1), where="test").packets,
         pcap.parse(file_bytes(cooked_frames, link_type=113), where="test").packets,

@@ -91,9 +91,9 @@ def test_the_error_equals_that_of_linear_programs_without_one_packet(
     middle_ns, base_ns = clocks.middle_ns, clocks.base_ns
 
     rows = [
-        (sign * np.array([1.0, (int(when) - middle_ns) / 1e9]), sign * (int(ahead) - base_ns) / 1e9 + STAMP_S)
+        (sign * np.array([1.0, (int(time_ns) - middle_ns) / 1e9]), sign * (int(offset_ns) - base_ns) / 1e9 + STAMP_S)
         for sign, delays in ((1, forward), (-1, reverse))
-        for when, ahead in zip(delays.receiver_ns, delays.receiver_ns - delays.sender_ns, strict=True)
+        for time_ns, offset_ns in zip(delays.receiver_ns, delays.receiver_ns - delays.sender_ns, strict=True)
     ]
     x = (int(at_ns[0]) - middle_ns) / 1e9
     line_offsets_s = [

@@ -38,12 +38,12 @@ CLOCKS: list[ClockError] = [
 ]
 
 
-def _measured(sender: Packets, receiver: Packets, transfer_filter: Transfer, sent: int | None = None) -> Measures:
+def _measured(sender: Packets, receiver: Packets, transfer_filter: Transfer, n_sent: int | None = None) -> Measures:
     if transfer_filter.protocol is Protocol.UDP:
         pairs = delay.udp_packets(udp.match_transfer(sender, receiver, transfer_filter))
     else:
         pairs = delay.tcp_frames(tcp.match_transfer(sender, receiver, transfer_filter))
-    columns = delay.measure(pairs, sender, receiver, transfer_filter, sent=len(pairs) if sent is None else sent)
+    columns = delay.measure(pairs, sender, receiver, transfer_filter, sent=len(pairs) if n_sent is None else n_sent)
     assert not columns.values.keys() & columns.missing.keys(), "no column has both a value and a reason"
     assert columns.values.keys() | columns.missing.keys() == {
         column.name for column in (*delay.COLUMNS, *delay.SENT_COLUMNS)
@@ -71,8 +71,8 @@ def _real_delays_s(protocol: Protocol) -> list[float]:
                 continue
             times_s[ip.id, ip.frag] = float(frame.time)
         times_by_capture.append(times_s)
-    sent, received = times_by_capture
-    return [received[key] - sent[key] for key in sent if key in received]
+    send_times_s, receive_times_s = times_by_capture
+    return [receive_times_s[key] - send_times_s[key] for key in send_times_s if key in receive_times_s]
 
 
 def _measure_real_transfer(protocol: Protocol, offset_s: float = 0.0, drift: float = 0.0) -> Measures:
@@ -202,7 +202,9 @@ def test_results_on_two_clocks_equal_closed_forms() -> None:
 
 def test_a_lost_packet_counts_as_infinitely_late_in_the_median_of_all_sent_packets() -> None:
     sender, receiver = _captures_with_pings([50.0 * n for n in range(101)], [100.0 + n for n in range(101)], (0, 0))
-    measures = {sent: _measured(sender, receiver, transfer(Protocol.UDP), sent) for sent in (101, 151, 202, 203)}
+    measures = {
+        n_sent: _measured(sender, receiver, transfer(Protocol.UDP), n_sent) for n_sent in (101, 151, 202, 203)
+    }
     assert all(delays.one_way_median_s == pytest.approx(0.150, abs=1e-5) for delays in measures.values())
     assert measures[101].one_way_median_sent_s == measures[101].one_way_median_s
     assert measures[151].one_way_median_sent_s == pytest.approx(0.175, abs=1e-5)
@@ -212,13 +214,13 @@ def test_a_lost_packet_counts_as_infinitely_late_in_the_median_of_all_sent_packe
 def test_reordered_packets_count_and_packets_of_another_transfer_do_not() -> None:
     """The second of four packets arrives last: delays in the order of arrival are 100, 100, 100, 300 ms."""
     sender, receiver = _captures_with_pings([0.0, 10.0, 20.0, 30.0], [100.0, 300.0, 100.0, 100.0], (5.0, 0))
-    other = [
+    other_transfer = [
         Frame(START_NS + n * MILLISECOND_NS, packet) for n in range(9) for packet in datagram(900 + n, 3000, port=9)
     ]
-    later = [replace(frame, time_ns=frame.time_ns + 5_000_000_000) for frame in other]
+    other_arrivals = [replace(frame, time_ns=frame.time_ns + 5_000_000_000) for frame in other_transfer]
     sender, receiver = (
-        Packets.concatenated((sender, packets(other))),
-        Packets.concatenated((receiver, packets(later))),
+        Packets.concatenated((sender, packets(other_transfer))),
+        Packets.concatenated((receiver, packets(other_arrivals))),
     )
     measures = _measured(sender, receiver, transfer(Protocol.UDP))
     assert measures.jitter_s == pytest.approx(0.2 / 16)
@@ -240,10 +242,10 @@ def test_a_wrong_time_of_a_frame_joined_by_offload_does_not_shift_the_offset() -
     """Three segments from the receiver arrive as one frame, whose time is 3.9 ms early; all others take 2 ms."""
     forward = [(5.0 * n, segment(1, 0, ack=n)) for n in range(6)]
     backward = [(5.0 * n, segment(1000 * n + 1, 1000, back=True)) for n in range(3)]
-    joined = [(20 + 0.1 * n, segment(3001 + 1000 * n, 1000, back=True)) for n in range(3)]
+    joined_by_offload = [(20 + 0.1 * n, segment(3001 + 1000 * n, 1000, back=True)) for n in range(3)]
     sides = (
         [*forward, *((ms + 2, data) for ms, data in backward), (18.3, segment(3001, 3000, back=True))],
-        [*((ms + 2, data) for ms, data in forward), *backward, *joined],
+        [*((ms + 2, data) for ms, data in forward), *backward, *joined_by_offload],
     )
     sender, receiver = (
         packets(Frame(START_NS + round(ms * MILLISECOND_NS), data) for ms, data in sorted(frames)) for frames in sides
@@ -259,17 +261,17 @@ def test_a_wrong_time_of_a_frame_joined_by_offload_does_not_shift_the_offset() -
 def test_a_tcp_frame_with_offload_arrives_with_its_last_byte() -> None:
     """The segments of a superframe arrive separately; a segment that was sent twice is ambiguous."""
     isn = 2**32 - 1500
-    sent = [(0, segment(isn, 0, flags=2)), (10, segment(isn + 1, 3000)), (20, segment(isn + 3001, 1000))]
-    sent += [(60, segment(isn + 3001, 1000)), (70, segment(isn + 4001, 500))]
-    back = segment(8, 0, back=True)
-    arrivals = [(1, sent[0][1]), *((110 + 5 * n, segment(isn + 1 + 1000 * n, 1000)) for n in range(3))]
-    arrivals += [(150, segment(isn + 3001, 1000)), (200, sent[-1][1])]
+    sent_frames = [(0, segment(isn, 0, flags=2)), (10, segment(isn + 1, 3000)), (20, segment(isn + 3001, 1000))]
+    sent_frames += [(60, segment(isn + 3001, 1000)), (70, segment(isn + 4001, 500))]
+    reverse = segment(8, 0, back=True)
+    arrivals = [(1, sent_frames[0][1]), *((110 + 5 * n, segment(isn + 1 + 1000 * n, 1000)) for n in range(3))]
+    arrivals += [(150, segment(isn + 3001, 1000)), (200, sent_frames[-1][1])]
     ack = segment(isn + 1, 0)
     sender, receiver = (
         packets(Frame(START_NS + ms * MILLISECOND_NS, data) for ms, data in frames)
         for frames in (
-            [*sent, (3, back), (4, ack), (6, segment(9, 0, back=True))],
-            [*arrivals, (2, back), (5, ack), (5, segment(9, 0, back=True))],
+            [*sent_frames, (3, reverse), (4, ack), (6, segment(9, 0, back=True))],
+            [*arrivals, (2, reverse), (5, ack), (5, segment(9, 0, back=True))],
         )
     )
     measures = _measured(sender, receiver, transfer(Protocol.TCP))
@@ -280,11 +282,17 @@ def test_a_tcp_frame_with_offload_arrives_with_its_last_byte() -> None:
 
 def test_a_lost_tcp_frame_does_not_match_a_retransmission_in_a_larger_frame() -> None:
     """Two segments are lost and sent again as one superframe; they arrive separately 10 ms later."""
-    sent = [(0, segment(0, 0, flags=2)), (10, segment(1, 1000)), (12, segment(1001, 1000)), (14, segment(2001, 1000))]
-    arrivals = [(10, sent[0][1]), (24, sent[3][1]), (310, sent[1][1]), (310, sent[2][1])]
-    sent += [(300, segment(1, 2000))]
+    sent_frames = [
+        (0, segment(0, 0, flags=2)),
+        (10, segment(1, 1000)),
+        (12, segment(1001, 1000)),
+        (14, segment(2001, 1000)),
+    ]
+    arrivals = [(10, sent_frames[0][1]), (24, sent_frames[3][1]), (310, sent_frames[1][1]), (310, sent_frames[2][1])]
+    sent_frames += [(300, segment(1, 2000))]
     sender, receiver = (
-        packets(Frame(START_NS + ms * MILLISECOND_NS, data) for ms, data in frames) for frames in (sent, arrivals)
+        packets(Frame(START_NS + ms * MILLISECOND_NS, data) for ms, data in frames)
+        for frames in (sent_frames, arrivals)
     )
     frames = delay.tcp_frames(tcp.match_transfer(sender, receiver, transfer(Protocol.TCP)))
     assert ((frames.receiver_ns - frames.sender_ns) / MILLISECOND_NS).tolist() == [10, 10]
@@ -293,23 +301,26 @@ def test_a_lost_tcp_frame_does_not_match_a_retransmission_in_a_larger_frame() ->
 Change = Callable[[Packets, Packets], tuple[Packets, Packets]]
 
 WITHHELD: dict[str, Change] = {
-    "no packet of the transfer is in both captures": lambda sent, received: (sent, received.where(slice(0, 0))),
-    "no packet from receiver to sender is in both captures": lambda sent, received: (
-        sent.where(sent.are_from(SENDER)),
-        received,
+    "no packet of the transfer is in both captures": lambda sender, receiver: (sender, receiver.where(slice(0, 0))),
+    "no packet from receiver to sender is in both captures": lambda sender, receiver: (
+        sender.where(sender.are_from(SENDER)),
+        receiver,
     ),
-    "a capture lacks times": lambda sent, received: (replace(sent, time_ns=np.full(len(sent), NO_TIME)), received),
-    delay.UNSTEADY: lambda sent, received: (
-        sent,
+    "a capture lacks times": lambda sender, receiver: (
+        replace(sender, time_ns=np.full(len(sender), NO_TIME)),
+        receiver,
+    ),
+    delay.UNSTEADY: lambda sender, receiver: (
+        sender,
         replace(
-            received, time_ns=received.time_ns + np.where(np.arange(len(received)) < len(received) - 6, 0, -(10**9))
+            receiver, time_ns=receiver.time_ns + np.where(np.arange(len(receiver)) < len(receiver) - 6, 0, -(10**9))
         ),
     ),
-    delay.SINGLE_PACKET: lambda sent, received: (
-        sent.where(sent.are_from(SENDER) | (np.arange(len(sent)) == len(sent) - 1)),
-        received,
+    delay.SINGLE_PACKET: lambda sender, receiver: (
+        sender.where(sender.are_from(SENDER) | (np.arange(len(sender)) == len(sender) - 1)),
+        receiver,
     ),
-    "the error is above a tenth of: min, median, mean, p95": lambda sent, received: (sent, received),
+    "the error is above a tenth of: min, median, mean, p95": lambda sender, receiver: (sender, receiver),
 }
 
 

@@ -37,8 +37,8 @@ def tcp_frames(count: int, *, repeated: tuple[int, ...] = ()) -> list[Frame]:
     return frames + [Frame(START + index * PERIOD_NS + 1_000_000, segments[index]) for index in repeated]
 
 
-def measured(flow: LoadFlow, sent: list[Frame], received: list[Frame]) -> dict[str, object]:
-    result = iperf3_load.measure_totals(flow, packets(sent), packets(received))
+def measured(flow: LoadFlow, sent_frames: list[Frame], received_frames: list[Frame]) -> dict[str, object]:
+    result = iperf3_load.measure_totals(flow, packets(sent_frames), packets(received_frames))
     assert result.values.keys() | result.missing.keys() == {column.name for column in iperf3_load.COLUMNS}
     return dict(result.values)
 
@@ -50,19 +50,19 @@ def test_the_rate_includes_the_datagrams_in_the_measured_seconds() -> None:
 
 
 @given(st.sets(st.integers(0, 399), max_size=399))
-def test_losses_of_the_radio_are_counted(lost: set[int]) -> None:
-    sent = udp_frames(400)
-    received = [frame for index, frame in enumerate(sent) if index - 1 not in lost]
-    result = measured(UDP, sent, received)
-    assert result["iperf3_captured_loss"] == pytest.approx(len(lost) / 400)
-    first = min(set(range(400)) - lost)
-    n_received = sum(index not in lost for index in range(first + 100, min(first + 300, 400)))
+def test_losses_of_the_radio_are_counted(lost_indices: set[int]) -> None:
+    sent_frames = udp_frames(400)
+    received_frames = [frame for index, frame in enumerate(sent_frames) if index - 1 not in lost_indices]
+    result = measured(UDP, sent_frames, received_frames)
+    assert result["iperf3_captured_loss"] == pytest.approx(len(lost_indices) / 400)
+    first = min(set(range(400)) - lost_indices)
+    n_received = sum(index not in lost_indices for index in range(first + 100, min(first + 300, 400)))
     assert result["iperf3_captured_bit_s"] == pytest.approx(8 * PAYLOAD_BYTES * n_received / 2.0)
 
 
 def test_retransmitted_bytes_count_once_in_the_rate() -> None:
-    sent = tcp_frames(400, repeated=tuple(range(0, 400, 10)))
-    result = measured(TCP, sent, sent)
+    sent_frames = tcp_frames(400, repeated=tuple(range(0, 400, 10)))
+    result = measured(TCP, sent_frames, sent_frames)
     assert result == {"iperf3_captured_bit_s": RATE, "iperf3_captured_loss": 0.0}
 
 

@@ -83,12 +83,12 @@ def test_offload_at_one_end_does_not_change_counts(tmp_path: Path) -> None:
     assert (counts.retransmitted_frames > 0) == (counts.sent_bytes > FILE_BYTES) == (kernel_retransmissions > 0)
     assert counts.sent_bytes - FILE_BYTES <= kernel_retransmissions * max_received_payload
     assert counts.superframes == int((sender.tcp_payload_bytes > 1460).sum()) > 0
-    sent = TRANSFER.forward(sender)
-    matches = match(sent, TRANSFER.forward(receiver))
+    sent_packets = TRANSFER.forward(sender)
+    matches = match(sent_packets, TRANSFER.forward(receiver))
     assert matches.arrived.all()
     assert not matches.duplicates.any()
     # Joined segments that TCP retransmits within one millisecond have equal time stamps, and the router splits both.
-    assert set(np.flatnonzero(matches.ambiguous)) <= frames_with_repeated_bytes(sent)
+    assert set(np.flatnonzero(matches.ambiguous)) <= frames_with_repeated_bytes(sent_packets)
     assert (counts.ambiguous_frames > 0) == matches.ambiguous.any()
     if counts.ambiguous_frames:
         assert counts.spurious_frames is counts.reordered_frames is None
@@ -98,11 +98,11 @@ def test_offload_at_one_end_does_not_change_counts(tmp_path: Path) -> None:
         assert (counts.reordered_frames > 0) >= (kernel_out_of_order > 0)
 
 
-def frames_with_repeated_bytes(sent: Packets) -> set[int]:
+def frames_with_repeated_bytes(sent_packets: Packets) -> set[int]:
     """Return the frames that share a byte with another frame of the same time stamp."""
-    payload_frames = np.flatnonzero(sent.tcp_payload_bytes)
-    first, stamp = sent.tcp_seq[payload_frames], sent.tcp_stamp[payload_frames]
-    end = first + sent.tcp_payload_bytes[payload_frames]
+    payload_frames = np.flatnonzero(sent_packets.tcp_payload_bytes)
+    first, stamp = sent_packets.tcp_seq[payload_frames], sent_packets.tcp_stamp[payload_frames]
+    end = first + sent_packets.tcp_payload_bytes[payload_frames]
     overlaps = (stamp == stamp[:, None]) & (first < end[:, None]) & (first[:, None] < end)
     return set(payload_frames[overlaps.sum(axis=1) > 1])
 

@@ -149,25 +149,25 @@ def test_data_that_never_arrives_has_a_lower_bound() -> None:
 
 @given(st.sets(st.integers(1, 98), max_size=90), st.integers(0, 1))
 @settings(max_examples=40, deadline=None)
-def test_lost_datagrams_are_a_gap_with_and_without_fragmentation(lost: set[int], fragments: int) -> None:
+def test_lost_datagrams_are_a_gap_with_and_without_fragmentation(lost_numbers: set[int], fragments: int) -> None:
     stream = Stream()
     size = 1000 if not fragments else 4000
     for number in range(100):
-        stream.datagram(number, number * STEP_NS, size=size, arrives=number not in lost)
+        stream.datagram(number, number * STEP_NS, size=size, arrives=number not in lost_numbers)
     result = measured(udp_deliveries(*captured([stream])))
-    arrived = sorted(set(range(100)) - lost)
-    gaps_s = [(later - earlier) * 0.01 for earlier, later in pairwise(arrived)]
+    arrived_numbers = sorted(set(range(100)) - lost_numbers)
+    gaps_s = [(later - earlier) * 0.01 for earlier, later in pairwise(arrived_numbers)]
     assert result["stall_s"] == pytest.approx(max(gaps_s), abs=1e-5)
     assert result["stalls"] == sum(gap_s > 0.2001 for gap_s in gaps_s)
 
 
-@pytest.mark.parametrize("last", [60, 95])
-def test_the_end_of_a_flow_counts_if_it_is_longer_than_the_minimum_stall(last: int) -> None:
+@pytest.mark.parametrize("last_arrived", [60, 95])
+def test_the_end_of_a_flow_counts_if_it_is_longer_than_the_minimum_stall(last_arrived: int) -> None:
     stream = Stream()
     for number in range(100):
-        stream.datagram(number, number * STEP_NS, arrives=number <= last)
+        stream.datagram(number, number * STEP_NS, arrives=number <= last_arrived)
     result = measured(udp_deliveries(*captured([stream])))
-    if last == 95:
+    if last_arrived == 95:
         assert result == {"stall_s": pytest.approx(0.01), "stalls": 0}, (
             "four lost datagrams are a loss, but not a stall"
         )

@@ -60,11 +60,11 @@ def test_an_unchanged_log_has_no_contradiction(numbered: bool, tmp_path: Path) -
     assert drive_log.measure(drive_log.read(path)).values["drive_farthest_m"] == pytest.approx(2.0)
 
 
-@given(cut=st.integers(1, 2000))
-def test_a_truncated_log_is_detected(cut: int, tmp_path_factory: pytest.TempPathFactory) -> None:
+@given(n_removed_bytes=st.integers(1, 2000))
+def test_a_truncated_log_is_detected(n_removed_bytes: int, tmp_path_factory: pytest.TempPathFactory) -> None:
     path = write_log(tmp_path_factory.mktemp("drive"), drive_lines())
     content = path.read_bytes()
-    path.write_bytes(content[: max(len(content) - cut, 1)])
+    path.write_bytes(content[: max(len(content) - n_removed_bytes, 1)])
     try:
         assert reasons(path)
     except EvidenceError:

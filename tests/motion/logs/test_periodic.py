@@ -21,13 +21,18 @@ def test_each_lost_message_is_counted_once_even_if_the_sender_has_a_loop_period(
     """An autopilot whose loop takes 20 ms sends 20 messages a second at intervals of 40 and 60 ms."""
     random_generator = random.Random(7)
     times_ms = list(accumulate(islice(cycle(steps_ms), SENT - 1), initial=0))
-    arrived = [number for number in range(SENT) if number in {0, SENT - 1} or random_generator.random() >= share]
-    numbers = [(times_ms[number] * 1000, number % 256) for number in arrived]
-    stream = [StreamMessage(times_ms[number] * 1000, times_ms[number], index) for index, number in enumerate(arrived)]
+    arrived_numbers = [
+        number for number in range(SENT) if number in {0, SENT - 1} or random_generator.random() >= share
+    ]
+    numbers = [(times_ms[number] * 1000, number % 256) for number in arrived_numbers]
+    stream = [
+        StreamMessage(times_ms[number] * 1000, times_ms[number], index)
+        for index, number in enumerate(arrived_numbers)
+    ]
     ended_us = times_ms[-1] * 1000
     assert periodic.count_messages(numbers, {"ATTITUDE": stream}, ended_us, REQUESTED) == (
-        len(arrived),
-        SENT - len(arrived),
+        len(arrived_numbers),
+        SENT - len(arrived_numbers),
     )
 
 
@@ -73,8 +78,8 @@ def late_messages(
 def test_late_messages_and_withheld_answers_are_not_counted_as_lost(share: float, rate_hz: int) -> None:
     for seed in range(20):
         numbers, streams, true_losses = late_messages(share, seed, rate_hz)
-        received, n_lost = periodic.count_messages(numbers, streams, 0, REQUESTED if rate_hz == 20 else None)
-        assert received == len(numbers)
+        n_received, n_lost = periodic.count_messages(numbers, streams, 0, REQUESTED if rate_hz == 20 else None)
+        assert n_received == len(numbers)
         assert abs(n_lost - true_losses) <= 1 + 0.02 * true_losses, seed
 
 

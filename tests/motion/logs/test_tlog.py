@@ -267,14 +267,16 @@ def test_repeated_frames_are_detected(tmp_path: Path) -> None:
 def test_random_loss_is_measured_even_if_a_router_filters_messages(share: float, seed: int) -> None:
     random_generator = random.Random(seed)
     numbers, streams, n_lost = list[tuple[int, int]](), dict[str, list[StreamMessage]](), 0
-    sent = 0
+    n_sent = 0
     for slot in range(400):
         for name in ("ATTITUDE", "LOCAL_POSITION_NED"):
-            sent += 1 + (random_generator.random() < 0.02)  # an answer to another station also has a sequence number
+            n_sent += 1 + (
+                random_generator.random() < 0.02
+            )  # an answer to another station also has a sequence number
             if 0 < slot < 399 and random_generator.random() < share:
                 n_lost += 1
                 continue
-            numbers.append((100_000 * slot, sent % 256))
+            numbers.append((100_000 * slot, n_sent % 256))
             streams.setdefault(name, []).append(StreamMessage(100_000 * slot, 100 * slot, len(numbers) - 1))
-    arrived, counted_losses = periodic.count_messages(numbers, streams, 0)
-    assert (arrived, counted_losses) == (len(numbers), n_lost)
+    n_arrived, counted_losses = periodic.count_messages(numbers, streams, 0)
+    assert (n_arrived, counted_losses) == (len(numbers), n_lost)

@@ -65,7 +65,7 @@ def test_order_is_renewed_over_interrupted_link_until_context_is_left() -> None:
     assert orders[:5] == ("stay",) * 5
     assert orders[-1] == "go"
     assert set(seconds) == {"0.05"}
-    assert {tuple(words[-3::2]) for words in shell.commands} == {("f/up.fly.orders", "f/log")}
+    assert {tuple(command[-3::2]) for command in shell.commands} == {("f/up.fly.orders", "f/log")}
     assert orders_file("up.fly") == "up.fly.orders"
 
 

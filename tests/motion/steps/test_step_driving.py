@@ -59,9 +59,9 @@ def test_size_of_log_grows_with_drive_and_is_on_driving_robot_only() -> None:
 
 
 def test_argument_of_driver_has_legs_limits_and_topics() -> None:
-    first, *_ = STEP.jobs(SCENE)
-    assert (first.role, first.job.name, first.job.log) == (Role.RECEIVER, "out.drive", "out.drive.log")
-    argv = list(first.job.argv)
+    driver_job, *_ = STEP.jobs(SCENE)
+    assert (driver_job.role, driver_job.job.name, driver_job.job.log) == (Role.RECEIVER, "out.drive", "out.drive.log")
+    argv = list(driver_job.job.argv)
     assert argv[0] == "bash"
     assert shlex.split(argv[2])[:2] == [".", "/opt/ros/noetic/setup.bash"]
     assert argv[-3:-2] + argv[-1:] == ["drive", "out.drive.jsonl"]
@@ -75,7 +75,7 @@ def test_argument_of_driver_has_legs_limits_and_topics() -> None:
     assert list(task.legs) == [(2.0, 0.0), (-1.0, -1.0)]
     assert (task.speed_m_s, task.turn_rad_s, task.fence_m, task.lease_s) == (0.2, 1.0, 30, 2.0)
     assert task.limit_s > 3.4 / 0.2
-    assert first.job.limit_s > 2 * task.limit_s
+    assert driver_job.job.limit_s > 2 * task.limit_s
     assert set(STEP.files()) >= {"out.drive.jsonl", "out.drive.log", "out.drive.orders", "out.drive.status"}
     (need, *_) = STEP.needs(SCENE)
     assert need.name == "ros1 for Python"
@@ -121,9 +121,9 @@ def argument_with_ros_2(**environment: str) -> Any:  # noqa: ANN401 (any JSON)
     robots = {**DRIVES, Role.RECEIVER: DRIVES[Role.RECEIVER].model_copy(update={"profile": profile})}
     scene = replace(SCENE, cast=robots)
     assert not list(STEP.refusals(scene))
-    first, *_ = STEP.jobs(scene)
+    driver_job, *_ = STEP.jobs(scene)
     (need, *_) = STEP.needs(scene)
-    argument = json.loads(first.job.argv[-2])
+    argument = json.loads(driver_job.job.argv[-2])
     assert need.name == f"{argument['over']} for Python"
     return argument
 
@@ -292,8 +292,8 @@ def quick_scene() -> Scene:
 
 def drive(testbed: DrivingTestbed, body: Any) -> None:  # noqa: ANN401
     scene = quick_scene()
-    first, *_ = STEP.jobs(scene)
-    with driving.drive_robot(scene, testbed, first, STEP.motion, "out.{}"):
+    driver_job, *_ = STEP.jobs(scene)
+    with driving.drive_robot(scene, testbed, driver_job, STEP.motion, "out.{}"):
         body()
 
 
