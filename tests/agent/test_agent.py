@@ -154,8 +154,8 @@ def test_killed_subscriber_leaves_received_samples(cable: Cable, tmp_path: Path)
         with cable.running(first_host, "publish", cable.arguments("dds", first_host), str(sent_log)) as publisher:
             assert publisher.wait(timeout=60) == 0
         subscriber.kill()
-    received_rows = [row[3] for row in topic_logs.rows(received_log) if row[0] == records.SAMPLE]
-    assert received_rows == [row[3] for row in topic_logs.rows(sent_log) if row[0] == records.SAMPLE]
+    received_sequences = [row[3] for row in topic_logs.rows(received_log) if row[0] == records.SAMPLE]
+    assert received_sequences == [row[3] for row in topic_logs.rows(sent_log) if row[0] == records.SAMPLE]
     assert topic_logs.rows(received_log)[-1][0] == records.SAMPLE
 
 
@@ -167,9 +167,8 @@ def test_publisher_stops_without_acknowledgements(cable: Cable, tmp_path: Path) 
         second_host, "subscribe", cable.arguments("dds", second_host), str(received_log)
     ) as subscriber:
         publisher_arguments = cable.arguments("dds", first_host)
-        publisher_arguments["stream"]["duration_s"] = (
-            3.0  # the subscriber is suspended before it has received all samples
-        )
+        # The subscriber is suspended before it has received all samples.
+        publisher_arguments["stream"]["duration_s"] = 3.0
         with cable.running(first_host, "publish", publisher_arguments, str(sent_log)) as publisher:
             wait_until(lambda: any(row[0] == records.SAMPLE for row in topic_logs.rows(sent_log)), Deadline.after(60))
             subscriber.send_signal(signal.SIGSTOP)

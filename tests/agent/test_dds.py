@@ -19,8 +19,8 @@ CUSTOM_TYPE = (
 )
 
 
-def topic(name: str, message_types_or_none: MessageTypes | None = None) -> Topic:
-    message_types = message_types_or_none or standard_types()
+def topic(name: str, message_types: MessageTypes | None = None) -> Topic:
+    message_types = message_types or standard_types()
     return Topic.from_json(topics.describe(message_types, "/t", name, PROFILES["default"], domain=0, node="n"))
 
 

@@ -89,7 +89,7 @@ def test_lost_fragments_do_not_count_and_copied_fragments_do(sizes: list[int], d
 
 
 def stream(total: int, *, segments_per_frame: int = 1, repeated_frames: Sequence[int] = ()) -> list[bytes]:
-    """Return frames of `segments_per_frame` segments. Frames with the indices `repeated_frames` are repeated at the end."""
+    """Return frames of `segments_per_frame` segments; the frames `repeated_frames` are sent again at the end."""
     starts = list(range(0, total, segments_per_frame * SEGMENT))
     starts += [starts[index] for index in repeated_frames]
     data = [segment(ISN + 1 + offset, min(segments_per_frame * SEGMENT, total - offset)) for offset in starts]
