@@ -10,7 +10,8 @@ from fieldkit.measure.evidence import handovers, iperf3, ping_gaps
 from fieldkit.measure.transfers import iperf3_load, recoveries, stalls
 from fieldkit.motion.logs import drive_log, fly_log, tlog
 from fieldkit.ros.bags import recorded_topics
-from fieldkit.ros.streams import topic_columns, topic_stalls
+from fieldkit.ros.streams import sample_reads, topic_columns, topic_stalls
+from fieldkit.ros.video import video_columns
 from fieldkit.telemetry import telemetry_columns
 from fieldkit.trial.columns import installed_columns
 
@@ -20,6 +21,8 @@ STEP_COLUMNS: Final[Mapping[str, tuple[Column, ...]]] = {
     "`iperf3`": (*iperf3.COLUMNS, *iperf3_load.COLUMNS, *iperf3_load.JITTER),
     "`iperf3`, `soak`": stalls.declare_columns("FLOW", "FLOW", 0),
     "`topics`": (*topic_columns.COLUMNS, *topic_stalls.COLUMNS),
+    "`topics` with `reads`": sample_reads.declare_columns("used", "topic_sent"),
+    "`video`; `topics` with `reads` and `image`: `seen_*`": video_columns.COLUMNS,
     "`record` with `reception: true`": recorded_topics.COLUMNS,
     "a flow inside `fault`": recoveries.declare_columns("FLOW", FaultKind.REBOOT),
     "`mavlink`": tlog.COLUMNS,

@@ -23,7 +23,7 @@ from fieldkit.agent.messaging.records import Log, LogError
 from fieldkit.agent.messaging.stream import Stream
 
 _USAGE = (
-    "usage: agent.pyz publish|subscribe|mavlink|drive JSON LOG, "
+    "usage: agent.pyz publish|subscribe|send-video|receive-video|mavlink|drive JSON LOG, "
     "or agent.pyz route|fly|arming|survey|link|datagrams JSON"
 )
 
@@ -175,6 +175,19 @@ def _stream(arguments: Arguments, stop_event: threading.Event, path: str, *, pub
     return 0
 
 
+def _stream_video(arguments: Arguments, stop_event: threading.Event, path: str, *, sends: bool) -> int:
+    """Send a video over RTP, or receive it."""
+    from fieldkit.agent.messaging import rtp_stream  # noqa: PLC0415 (loaded only if needed)
+
+    log = Log(path)
+    log.origin(time.time_ns(), records.PUBLISHER if sends else records.SUBSCRIBER, rtp_stream.NAME)
+    log.note(records.DISCOVERY_STARTED, time.time_ns())
+    transfer = rtp_stream.send if sends else rtp_stream.receive
+    transfer(rtp_stream.Video(**arguments), log, stop_event)
+    log.end(time.time_ns())
+    return 0
+
+
 def _report(text: str) -> None:
     sys.stderr.write(f"{text}\n")
     sys.stderr.flush()
@@ -183,6 +196,8 @@ def _report(text: str) -> None:
 _TASKS_WITH_LOG: Mapping[str, Callable[..., int]] = {
     "publish": partial(_stream, publishes=True),
     "subscribe": partial(_stream, publishes=False),
+    "send-video": partial(_stream_video, sends=True),
+    "receive-video": partial(_stream_video, sends=False),
     "mavlink": _record,
     "drive": _drive,
 }

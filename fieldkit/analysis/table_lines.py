@@ -17,12 +17,15 @@ _OPERATOR: Final = (
     "file_loss",
     *_RADIO,
     "topic_loss",
+    "video_loss",
     "iperf3_loss",
     "mavlink_loss",
     "rtt_loss",
     "rtt_median_s",
     "topic_discovered",
     "topic_delay_median_s",
+    "used_age_p95_s",
+    "seen_age_p95_s",
     "goodput_bit_s",
     "iperf3_throughput_bit_s",
     "sender_signal_median_dbm",
@@ -36,6 +39,7 @@ _SENT: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {
         "packets sent": ("ip_loss", "paper_loss"),
         "topic samples sent": ("topic_loss",),
+        "frames sent": ("video_loss",),
         "iperf3 datagrams sent": ("iperf3_loss",),
     }
 )

@@ -11,7 +11,7 @@ from fieldkit.remote import evidence, fetching, jobs
 from fieldkit.remote.command import quote
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.scene import PutProgram
-from fieldkit.trial.plan import Plan
+from fieldkit.trial.plan import Plan, telemetry_cast
 
 
 def print_commands(plan: Plan) -> None:
@@ -49,7 +49,7 @@ def _remarks(plan: Plan) -> Iterator[str]:
         yield f"if {name} has the tools of its profile, this will be refused: {refusal.what}; {refusal.remedy}"
     for line in plan.dry_run_notes(plan.scene(RepeatId(plan.protocols[0], 1), "")):
         yield f"while steps run: {line}"
-    if cast := plan.telemetry_cast():
+    if cast := telemetry_cast(plan):
         from fieldkit.telemetry import telemetry_queries  # noqa: PLC0415 (few profiles have sources)
 
         for line in telemetry_queries.dry_run_notes(cast):
@@ -86,7 +86,7 @@ def _commands(plan: Plan) -> Iterator[CommandPlanned]:
 
 def _telemetry_sources(plan: Plan, role: Role) -> Sequence[Sequence[str]]:
     """Return the telemetry sources that a robot queries during an attempt."""
-    cast = plan.telemetry_cast()
+    cast = telemetry_cast(plan)
     if not cast:
         return ()
     from fieldkit.telemetry import telemetry_queries  # noqa: PLC0415 (few profiles have sources)

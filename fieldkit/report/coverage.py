@@ -20,6 +20,9 @@ Rows = NDArray[np.bool_]
 _LOSSES: Final = {
     "rtt": ("rtt_loss",),
     "topic": ("topic_loss",),
+    "used": ("topic_loss",),
+    "seen": ("topic_loss", "video_loss"),
+    "video": ("video_loss",),
     "iperf3": ("iperf3_loss", "iperf3_captured_loss"),
 }
 """Losses that belong to a quantity, by the first part of its column's name."""

@@ -15,8 +15,24 @@ from fieldkit.report.headlines import Ranking
 from fieldkit.report.series import Identities, Identity, Point, axis_limits, panels, point
 from fieldkit.report.trial_folders import Evidence
 
-LOSS: Final = ("datagram_loss", "ip_loss", "tcp_byte_loss", "topic_loss", "iperf3_loss", "iperf3_captured_loss")
-DELAY: Final = ("rtt_median_s", "one_way_median_s", "delay_s", "transfer_s", "topic_delay_median_s")
+LOSS: Final = (
+    "datagram_loss",
+    "ip_loss",
+    "tcp_byte_loss",
+    "topic_loss",
+    "iperf3_loss",
+    "iperf3_captured_loss",
+    "video_loss",
+)
+DELAY: Final = (
+    "rtt_median_s",
+    "one_way_median_s",
+    "delay_s",
+    "transfer_s",
+    "topic_delay_median_s",
+    "used_age_p95_s",
+    "seen_age_p95_s",
+)
 RATE: Final = ("goodput_bit_s", "throughput_bit_s", "iperf3_throughput_bit_s")
 
 _DODGE: Final = 0.026

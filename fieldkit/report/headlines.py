@@ -18,7 +18,7 @@ from fieldkit.trial.plan import Plan
 _LAB_KINDS: Final = frozenset(("ask", "run"))
 """Kinds of step whose columns a lab declares."""
 _MORE_IS_BETTER: Final = frozenset(("bit/s", "dBm", "dB"))
-_LOSSES: Final = frozenset((*LOSSES, "topic_loss", "iperf3_loss", "iperf3_captured_loss"))
+_LOSSES: Final = frozenset((*LOSSES, "topic_loss", "video_loss", "iperf3_loss", "iperf3_captured_loss"))
 
 
 class Ranking:
@@ -63,8 +63,8 @@ def _lab_columns(plan: Plan) -> Iterator[str]:
 
 
 _PROTOCOL_QUANTITIES: Final = {"udp": ("datagram_loss", "rtt_median_s"), "tcp": ("tcp_byte_loss", "rtt_median_s")}
-_TOPIC_QUANTITIES: Final = ("topic_loss", "topic_delay_median_s")
-"""Quantities of trials that stream topics, in which pings and transfers only provide clock offset and load."""
+_TOPIC_QUANTITIES: Final = ("topic_loss", "topic_delay_median_s", "video_loss", "used_age_p95_s", "seen_age_p95_s")
+"""Quantities of trials that stream topics or video, in which pings and transfers only give clock offset and load."""
 _MAX_FIRST: Final = 6
 """Maximum number of headlines of expected quantities and of a lab's quantities."""
 _MAX_PLACES: Final = 3
@@ -129,7 +129,11 @@ def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[st
         yield from writer.quantity_headlines(quantity.label, [quantity], group_cells)
     for protocol, names in _PROTOCOL_QUANTITIES.items():
         protocol_cells = [cell for cell in cells if cell.key["protocol"] == protocol]
-        topic_cells = [cell for cell in protocol_cells if with_plain_name(measured([cell]), _TOPIC_QUANTITIES[0])]
+        topic_cells = [
+            cell
+            for cell in protocol_cells
+            if any(with_plain_name(measured([cell]), name) for name in _TOPIC_QUANTITIES)
+        ]
         other_cells = [cell for cell in protocol_cells if cell not in topic_cells]
         for group_cells, quantity_names in ((topic_cells, _TOPIC_QUANTITIES), (other_cells, names)):
             for quantities_of_name in _existing_quantities(measured(group_cells), quantity_names):

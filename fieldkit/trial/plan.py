@@ -127,11 +127,6 @@ class Plan(Strict):
                 planned_jobs = tuple(entry.step.jobs(scene))
             yield from planned_jobs
 
-    def telemetry_cast(self) -> dict[Role, Robot]:
-        """Return the robots of the procedure whose profiles have telemetry sources."""
-        roles = sorted(self.procedure.roles() & self.cast.keys())
-        return {role: self.cast[role] for role in roles if TELEMETRY in self.cast[role].profile.sections}
-
     def program_copies(self) -> tuple[PutProgram, ...]:
         """Return the programs of the lab that are copied to robots in every attempt."""
         planned_jobs = (job for scene in self.scenes() for job in self.jobs(scene))
@@ -147,7 +142,7 @@ class Plan(Strict):
         return tuple(dict.fromkeys((*step_refusals, *section_refusals, *self._telemetry_refusals())))
 
     def _telemetry_refusals(self) -> Iterable[Refusal]:
-        cast = self.telemetry_cast()
+        cast = telemetry_cast(self)
         if not cast:
             return ()
         from fieldkit.telemetry import telemetry_queries  # noqa: PLC0415 (few profiles have sources)
@@ -168,3 +163,9 @@ class Plan(Strict):
         section_notes = (line for section in self._sections() for line in section.abort_notes(self))
         steps = (placed.step for placed in self.procedure.walk() if isinstance(placed.step, Moves))
         return (*section_notes, *(line for step in steps for line in step.abort_notes(scene)))
+
+
+def telemetry_cast(plan: Plan) -> dict[Role, Robot]:
+    """Return the robots of the procedure whose profiles have telemetry sources."""
+    roles = sorted(plan.procedure.roles() & plan.cast.keys())
+    return {role: plan.cast[role] for role in roles if TELEMETRY in plan.cast[role].profile.sections}

@@ -30,6 +30,7 @@ LOSSES: Final = frozenset(
         "tcp_byte_loss",
         "rtt_loss",
         "topic_loss",
+        "video_loss",
         "iperf3_loss",
         "mavlink_loss",
     )

@@ -5,7 +5,7 @@ The queue of events in virtual time also contains the start times of stations th
 
 import heapq
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from sim_backends.radio.modes import CW_MAX, CW_MIN, SLOT_NS
 
@@ -13,8 +13,45 @@ CCA_TIME_NS: Final = 4_000
 """Stations that start within this time of each other do not sense each other and collide: aCCATime, table 17-21."""
 
 
+class ChannelAccess(Protocol):
+    """Carrier sense and backoff of a station, for one queue (`Contention`) or several (`AccessCategories`)."""
+
+    @property
+    def busy_until_ns(self) -> int:
+        """End of the last frame or reservation that the station has sensed or sent."""
+
+    @property
+    def ifs_ns(self) -> int:
+        """Inter-frame space before the backoff; 0 if each queue adds its own."""
+
+    def earliest_start_ns(self, now_ns: int) -> int:
+        """Return the earliest start time of a station with a frame to send at `now_ns`, if the channel stays idle."""
+
+    def on_busy(self, now_ns: int, until_ns: int) -> None:
+        """Record that the channel is busy from `now_ns` to `until_ns`, for a station that has nothing to send."""
+
+    def postpone(self, now_ns: int, until_ns: int) -> int:
+        """Record that the channel is busy from `now_ns` to `until_ns`, for a station that waits to send.
+
+        Returns:
+            The time at which it may start if the channel then stays idle.
+        """
+
+    def defer_until(self, until_ns: int) -> None:
+        """Suspend the countdown until `until_ns`: EIFS, the time of the ACK, after a frame that was not decoded."""
+
+    def set_busy_until(self, until_ns: int) -> None:
+        """Record that the channel is busy until `until_ns`."""
+
+    def on_success(self) -> None:
+        """Reset the contention window and draw a backoff, after a frame that was delivered or given up."""
+
+    def on_failure(self) -> None:
+        """Double the contention window and draw a backoff, after a frame that was not acknowledged."""
+
+
 class Contention:
-    """Carrier sense and backoff of one station.
+    """Carrier sense and backoff of a station with one queue; see `ChannelAccess` for its methods.
 
     Backoff slots count down only after the channel has been idle for an inter-frame space; the remaining slots
     wait for the next idle period. A new backoff is drawn after every frame, so that no station keeps the channel.

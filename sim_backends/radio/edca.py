@@ -13,7 +13,7 @@ from typing import Final, Generic
 from typing_extensions import override
 
 from fieldkit.config.wifi_phy import DscpMapping
-from sim_backends.radio.contention import Contention
+from sim_backends.radio.contention import ChannelAccess, Contention
 from sim_backends.radio.frames import Frame
 from sim_backends.radio.links import Payload
 from sim_backends.radio.modes import CW_MAX, CW_MIN, SLOT_NS, Band
@@ -134,8 +134,8 @@ class CategoryQueue(Generic[Payload]):
         )
 
 
-class AccessCategories(Generic[Payload]):
-    """The access categories of one station, with the methods of `Contention` for all of them together.
+class AccessCategories(ChannelAccess, Generic[Payload]):
+    """The access categories of one station, with the methods of `ChannelAccess` for all of them together.
 
     Args:
         mapping: Mapping of DSCPs.
@@ -144,10 +144,7 @@ class AccessCategories(Generic[Payload]):
 
     Attributes:
         active: The category of the current or last exchange.
-        ifs_ns: 0; each category adds its own inter-frame space.
     """
-
-    ifs_ns: Final = 0
 
     def __init__(self, mapping: DscpMapping, band: Band, draw: Callable[[deque[Frame[Payload]]], float]) -> None:
         self.mapping: Final = mapping
@@ -163,8 +160,13 @@ class AccessCategories(Generic[Payload]):
         return [queue.frames for queue in self._queues]
 
     @property
+    @override
+    def ifs_ns(self) -> int:
+        return 0
+
+    @property
+    @override
     def busy_until_ns(self) -> int:
-        """End of the last frame or reservation that the station has sensed or sent."""
         return self.active.contention.busy_until_ns
 
     def queue_of(self, frame: Frame[Payload]) -> deque[Frame[Payload]]:
@@ -182,25 +184,25 @@ class AccessCategories(Generic[Payload]):
         if in_exchange:
             contention.require_backoff()
 
+    @override
     def earliest_start_ns(self, now_ns: int) -> int:
-        """Return the earliest start time of a category with frames, if the channel stays idle."""
         return min(queue.contention.earliest_start_ns(now_ns) for queue in self._queues if queue.frames)
 
+    @override
     def on_busy(self, now_ns: int, until_ns: int) -> None:
-        """Implement `Contention.on_busy` for a station that is not scheduled to send."""
         for queue in self._queues:
             if queue.frames:
                 queue.contention.postpone(now_ns, until_ns)
             else:
                 queue.contention.on_busy(now_ns, until_ns)
 
+    @override
     def postpone(self, now_ns: int, until_ns: int) -> int:
-        """Implement `Contention.postpone`."""
         self.on_busy(now_ns, until_ns)
         return self.earliest_start_ns(now_ns)
 
+    @override
     def defer_until(self, until_ns: int) -> None:
-        """Implement `Contention.defer_until`; each category adds its inter-frame space."""
         for queue in self._queues:
             queue.contention.defer_until(until_ns + queue.contention.ifs_ns)
 
@@ -209,18 +211,18 @@ class AccessCategories(Generic[Payload]):
         for queue in self._queues:
             queue.contention.defer_until(now_ns)
 
+    @override
     def set_busy_until(self, until_ns: int) -> None:
-        """Implement `Contention.set_busy_until`."""
         for queue in self._queues:
             queue.contention.set_busy_until(until_ns)
 
+    @override
     def on_success(self) -> None:
-        """Implement `Contention.on_success` for the active category."""
         self.active.contention.on_success()
 
+    @override
     def on_failure(self) -> None:
-        """Implement `Contention.on_failure` for the active category, and end its transmission opportunity."""
-        self._txop_end_ns = 0
+        self._txop_end_ns = 0  # a failure ends the transmission opportunity
         self.active.contention.on_failure()
 
     def select(self, now_ns: int) -> deque[Frame[Payload]]:

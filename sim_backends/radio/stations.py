@@ -8,7 +8,7 @@ from typing_extensions import override
 
 from fieldkit.config.wifi_phy import DscpMapping
 from sim_backends.radio.aggregation import Aggregate, BlockAckSession
-from sim_backends.radio.contention import Contention
+from sim_backends.radio.contention import ChannelAccess, Contention
 from sim_backends.radio.edca import AccessCategories
 from sim_backends.radio.frames import Frame, Transmission
 from sim_backends.radio.links import LinkCounters, Payload
@@ -61,9 +61,7 @@ class Station(Generic[Payload]):
         self._redraws_of: tuple[PacketIdentity, int] | None = None
         self._redraws = 0
         self.queue: deque[Frame[Payload]] = deque()
-        self.contention: Contention | AccessCategories[Payload] = Contention(
-            partial(self._backoff, self.queue), ifs_ns
-        )
+        self.contention: ChannelAccess = Contention(partial(self._backoff, self.queue), ifs_ns)
         self.categories: AccessCategories[Payload] | None = None
         self.receiving: Transmission | None = None
         self.aggregate: Aggregate[Payload] | None = None

@@ -1,4 +1,4 @@
-"""The driver of a ground robot: it keeps the limits for all inputs, drives out and back, and stops in time."""
+"""The driver of a ground robot: its velocities are within the limits for all inputs, and it stops in time."""
 
 import math
 from collections.abc import Iterator

@@ -132,7 +132,7 @@ def test_a_condition_of_only_one_run_is_not_within_the_threshold() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "messages_text"),
+    ("changes", "message"),
     [
         ({"profiles_sha256": "ffff"}, "profiles_sha256: A has aaaa, B has ffff (los, master, 9.144 m, udp)"),
         ({"procedure_sha256": "ffff"}, "procedure_sha256: A has bbbb, B has ffff (los, master, 9.144 m, udp)"),
@@ -149,9 +149,9 @@ def test_a_condition_of_only_one_run_is_not_within_the_threshold() -> None:
         ),
     ],
 )
-def test_incomparable_runs_have_a_reason(changes: dict[str, Any], messages_text: str) -> None:
+def test_incomparable_runs_have_a_reason(changes: dict[str, Any], message: str) -> None:
     result = compare_rows(UDP, with_changes(UDP, **changes))
-    assert [str(concern) for concern in result.refusals] == [messages_text]
+    assert [str(concern) for concern in result.refusals] == [message]
 
 
 def test_runs_with_different_congestion_controls_are_not_comparable() -> None:
@@ -165,7 +165,7 @@ def test_runs_with_different_congestion_controls_are_not_comparable() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "messages_text"),
+    ("changes", "message"),
     [
         ({"code_sha256": "ffff"}, "code_sha256: A has cccc, B has ffff"),
         ({"sent_bytes": 235_000}, None),
@@ -173,10 +173,10 @@ def test_runs_with_different_congestion_controls_are_not_comparable() -> None:
         ({"rtt_payload_bytes": None}, "rtt_payload_bytes: A has 8192, B has unknown (los, master, 9.144 m, udp)"),
     ],
 )
-def test_a_possible_difference_is_only_a_note(changes: dict[str, Any], messages_text: str | None) -> None:
+def test_a_possible_difference_is_only_a_note(changes: dict[str, Any], message: str | None) -> None:
     result = compare_rows(UDP, with_changes(UDP, **changes))
     assert result.refusals == ()
-    assert [str(concern) for concern in result.concerns][:1] == ([messages_text] if messages_text else [])
+    assert [str(concern) for concern in result.concerns][:1] == ([message] if message else [])
 
 
 def test_attempts_in_both_runs_are_reported() -> None:
@@ -186,22 +186,20 @@ def test_attempts_in_both_runs_are_reported() -> None:
 
 
 @pytest.mark.parametrize(
-    ("frames", "messages_text", "is_refused"),
+    ("frames", "messages", "is_refused"),
     [
         (0, [], False),
         (7, ["segmentation offload: A has off, B has on (los, master, 9.144 m, udp)"], True),
         (None, ["segmentation offload: A has off, B has unknown (los, master, 9.144 m, udp)"], False),
     ],
 )
-def test_offload_in_one_of_two_runs_is_refused(
-    frames: int | None, messages_text: list[str], *, is_refused: bool
-) -> None:
+def test_offload_in_one_of_two_runs_is_refused(frames: int | None, messages: list[str], *, is_refused: bool) -> None:
     without_rtt = with_changes(UDP, tcp_superframes=0)
     result = compare_rows(
         without_rtt,
         [*with_changes(UDP[:1], tcp_superframes=frames), *with_changes(UDP[1:], tcp_superframes=frames and 0)],
     )
-    assert [str(concern) for concern in result.concerns] == messages_text
+    assert [str(concern) for concern in result.concerns] == messages
     assert bool(result.refusals) is is_refused
 
 

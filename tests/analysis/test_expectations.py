@@ -135,7 +135,7 @@ def test_the_scope_of_an_expectation(text: str, scope: Scope, is_inclusive: bool
 
 
 def losses(*lost_counts: int, n_sent: int = 1250) -> Cell:
-    """Return the cell of UDP repeats, each of which lost one of these numbers of packets of `sent`."""
+    """Return the cell of UDP repeats with these numbers of lost packets, of `n_sent` sent packets each."""
     rows = [
         replace(
             ROW, repeat=number, ip_packets_sent=n_sent, ip_packets_received=n_sent - n_lost, ip_loss=n_lost / n_sent

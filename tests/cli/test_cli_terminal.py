@@ -71,7 +71,7 @@ class Operator:
 
 @contextmanager
 def run_at_terminal(*arguments: str, lab: Path | None = None) -> Iterator[tuple[Operator, "subprocess.Popen[bytes]"]]:
-    """Run `ASK_PROGRAM`, or Python with `words` in the folder `lab`, at a pseudo-terminal."""
+    """Run `ASK_PROGRAM`, or Python with `arguments` in the folder `lab`, at a pseudo-terminal."""
     controller, terminal = pty.openpty()
     process = subprocess.Popen(
         (sys.executable, *(arguments or ("-c", ASK_PROGRAM))),

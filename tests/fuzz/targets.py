@@ -11,6 +11,8 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from fieldkit.agent.messaging import records
 from fieldkit.analysis import duplicates, table_files
 from fieldkit.campaign.plan import load_campaign
@@ -39,14 +41,18 @@ from fieldkit.measure.evidence import (
 )
 from fieldkit.measure.evidence.sandbox import ReaderError
 from fieldkit.measure.positions.position_sources import PositionSource
+from fieldkit.measure.transfers.clock_offset import Clocks
 from fieldkit.motion.logs import tlog, tlog_positions
 from fieldkit.remote import archive, fetching, jobs, script
 from fieldkit.remote.command import printable
 from fieldkit.ros.bags import bag, recorded_topics
-from fieldkit.ros.streams import topic_captures, topic_checks, topic_columns, topic_samples
+from fieldkit.ros.streams import read_checks, sample_reads, topic_captures, topic_checks, topic_columns, topic_samples
+from fieldkit.ros.streams.sample_reads import ReadPlan
 from fieldkit.ros.streams.topic_captures import CapturedTopic
 from fieldkit.ros.streams.topic_checks import TopicPlan
 from fieldkit.ros.streams.topic_columns import TopicTraffic
+from fieldkit.ros.video import video_checks, video_columns
+from fieldkit.ros.video.rtp_packets import RtpPackets
 from fieldkit.steps.scene import CommandResult
 from fieldkit.steps.view import View
 from fieldkit.trial import columns, journal, plan
@@ -322,9 +328,11 @@ def _topic_logs() -> tuple[bytes, ...]:
     samples = [
         (1, 0, 220, number, start_ns + number * 10**8, start_ns + number * 10**8 + 10**6) for number in range(20)
     ]
+    reads = [(9, 0, 0, number, start_ns + number * 10**8, start_ns + number * 10**8 + 10**7) for number in range(20)]
+    unreadable = (10, 0, 220, 0, 0, start_ns)
     logs = (
         [*start_records, *samples, (5, 0, 0, 3, 0, start_ns), (7, 0, 0, 20, 0, start_ns)],
-        [*start_records, *samples[::2]],
+        [*start_records, *samples[::2], *reads[::2], unreadable],
     )
     complete, killed = (records.MAGIC + b"".join(records.RECORD.pack(*record) for record in log) for log in logs)
     return complete, killed + bytes(500)
@@ -346,6 +354,12 @@ def _measure_topic_log(path: Path) -> None:
     list(topic_checks.check_logs(plan, result, result))
     list(topic_captures.check_captures(plan, result, result, CapturedTopic(None, None, complete=False)))
     topic_columns.measure(flow, result, result, None, None)
+    list(read_checks.check_reads(result))
+    packets = RtpPackets(*(np.arange(20) for _ in range(4)))
+    list(video_checks.check_captures(result, result, packets, packets))
+    video_columns.measure_packets(packets, packets, result, 0.1)
+    clocks = Clocks(0, 0, 0.0, 0.0, *(np.zeros(1) for _ in range(3)))
+    sample_reads.measure(ReadPlan("used", 20.0, 0.5, 0.1), result, result, clocks, "no captures")
 
 
 def _read_printed(data: bytes, place: Path) -> None:

@@ -105,6 +105,7 @@ EXAMPLES: Mapping[str, Example] = {
         brief=frozenset({"make"}),
     ),
     "topics": Example("[topics: {from: sender, to: receiver, rate: 50Hz, duration: 1s, patience: 5s}]"),
+    "video": Example("[video: {from: sender, to: receiver, rate: 10Hz, size: 128x64, noise: 0 %, duration: 1s}]"),
     "track": Example(f"[track: {{robots: {{sender: {{topic: /odom, facing: away}}}}, during: [{PING}]}}]"),
     "mavlink": Example(
         f"[mavlink: {{robot: sender, at: receiver, rates: {{SYS_STATUS: 5Hz}}, positions: local, facing: away, "

@@ -17,7 +17,7 @@ from tests.helpers.outside_packages import write_package
 
 BUILTIN = ["capture", "transfer", "ping", "fault", "wait", "ask", "together", "run", "iperf3", "soak", "send", "roam"]
 MOTION = ["fly", "mavlink", "move"]
-ROS = ["record", "topics", "track"]
+ROS = ["record", "topics", "track", "video"]
 
 Install = Callable[..., None]
 

@@ -47,6 +47,11 @@ ORIGIN = 8
 """The role of the program that writes the log: `sequence` is `PUBLISHER` or `SUBSCRIBER`, `size` is the CRC-32 of the
 topic's name."""
 
+READ = 9
+"""The subscriber's program reads the newest sample, at the local time; `sequence` is -1 if none has arrived."""
+UNREADABLE = 10
+"""A received frame whose pixels do not contain a number and a time."""
+
 PUBLISHER, SUBSCRIBER = 1, 2
 CHECKED = 1
 

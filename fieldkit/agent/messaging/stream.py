@@ -1,7 +1,8 @@
 """Stream samples with sequence numbers and times from one robot to another, and log them at both.
 
 A sample is a `std_msgs/UInt8MultiArray` with an empty layout, which all ROS tools can read. Its data start with a
-magic number, the sequence number and the time. Random bytes follow, so that compression does not change its size.
+magic number, the sequence number and the time. Random bytes follow, so that compression does not change its size. Or
+it is a `sensor_msgs/Image` of a synthetic camera, with number and time in its pixels.
 """
 
 from __future__ import annotations
@@ -11,10 +12,13 @@ import struct
 import threading
 import time
 from dataclasses import dataclass
+from typing import Iterator
 
 from fieldkit.agent.messaging import records
 from fieldkit.agent.messaging.middleware import Middleware, Topic
+from fieldkit.agent.messaging.newest import NewestSample, logged_reads
 from fieldkit.agent.messaging.records import Log, LogError
+from fieldkit.agent.video.image_message import ImageCodec
 
 HEAD = struct.Struct("<8sqq")
 """Magic number, sequence number, time in nanoseconds since 1970 UTC."""
@@ -45,6 +49,9 @@ class Stream:
         rate_hz: Samples per second.
         duration_s: Duration.
         patience_s: Time for which the publisher waits for a subscription.
+        reads_hz: Rate at which the subscriber's program reads the newest sample; 0 if it only logs arrivals.
+        width: Pixels per row, if the samples are images; `size_bytes` is width times height.
+        height: Rows of pixels; 0 if the samples are not images.
     """
 
     over: str
@@ -52,6 +59,9 @@ class Stream:
     rate_hz: float
     duration_s: float
     patience_s: float
+    reads_hz: float = 0.0
+    width: int = 0
+    height: int = 0
 
 
 class SampleCodec:
@@ -67,13 +77,19 @@ class SampleCodec:
         self._random_bytes = random.Random(size).getrandbits(8 * (size - HEAD.size) or 1).to_bytes(size, "little")  # noqa: S311
         self._random_bytes = self._random_bytes[: size - HEAD.size]
         self._size = len(self._envelope) + size
+        self._image = ImageCodec(stream.width, stream.height, ros1=stream.over == "ros1") if stream.height else None
 
     def encode(self, sequence: int, at_ns: int) -> bytes:
         """Return a serialized sample."""
-        return self._envelope + HEAD.pack(MAGIC, sequence, at_ns) + self._random_bytes
+        head = HEAD.pack(MAGIC, sequence, at_ns)
+        return (
+            self._image.encode(sequence, at_ns, head) if self._image else self._envelope + head + self._random_bytes
+        )
 
     def decode(self, data: bytes) -> tuple[int, int] | None:
         """Return the sequence number and the time of a sample, or None if it does not belong to this stream."""
+        if self._image:
+            return self._image.decode(data)
         start = len(self._envelope)
         # Some implementations pad CDR to a multiple of 4 bytes and do not indicate this in the header.
         if not 0 <= len(data) - self._size < 4 or data[start : start + len(MAGIC)] != MAGIC:
@@ -84,8 +100,6 @@ class SampleCodec:
 
 def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, stop_event: threading.Event) -> None:
     """Wait for a subscription, publish samples at their scheduled times, and log each of them.
-
-    A sample is skipped if its time has passed while the previous one was written. Timers of robots do the same.
 
     Args:
         middleware: The started middleware.
@@ -105,35 +119,51 @@ def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, stop
             return
     log.note(records.MATCHED, time.time_ns())
     stop_event.wait(SETTLING_S)
-    start_s, sequence, tick, tick_count = time.monotonic(), 0, 0, round(stream.duration_s * stream.rate_hz)
-    while tick < tick_count:
-        wait_s = start_s + tick / stream.rate_hz - time.monotonic()
-        if stop_event.wait(wait_s) if wait_s > 0 else stop_event.is_set():
-            return
+    for sequence in scheduled(stream.rate_hz, stream.duration_s, log, stop_event):
         sent_ns = time.time_ns()
         data = codec.encode(sequence, sent_ns)
         kind = records.SAMPLE if publisher.write(data) else records.REFUSED
         log.note(kind, time.time_ns(), size=len(data), sequence=sequence, sent_ns=sent_ns)
-        sequence += 1
-        due_tick = min(int((time.monotonic() - start_s) * stream.rate_hz), tick_count)
-        if due_tick > tick + 1:
-            log.note(records.SKIPPED, time.time_ns(), sequence=due_tick - tick - 1)
-        tick = max(tick + 1, due_tick)
+    if stop_event.is_set():
+        return
     publisher.drain(_DRAIN_TIMEOUT_S)
     stop_event.wait(SETTLING_S)
 
 
+def scheduled(rate_hz: float, duration_s: float, log: Log, stop_event: threading.Event) -> Iterator[int]:
+    """Yield the number of each sample when it is due, until `stop_event` is set; log how many are skipped.
+
+    A sample whose time has passed before the next value is requested is skipped, as timers of robots do.
+
+    Raises:
+        LogError: As `Log.note`.
+    """
+    start_s, sequence, tick, ticks = time.monotonic(), 0, 0, round(duration_s * rate_hz)
+    while tick < ticks:
+        wait_s = start_s + tick / rate_hz - time.monotonic()
+        if stop_event.wait(wait_s) if wait_s > 0 else stop_event.is_set():
+            return
+        yield sequence
+        sequence += 1
+        due_tick = min(int((time.monotonic() - start_s) * rate_hz), ticks)
+        if due_tick > tick + 1:
+            log.note(records.SKIPPED, time.time_ns(), sequence=due_tick - tick - 1)
+        tick = max(tick + 1, due_tick)
+
+
 def subscribe(middleware: Middleware, topic: Topic, stream: Stream, log: Log, stop_event: threading.Event) -> None:
-    """Log each received sample until `stop_event` is set; arguments as for `publish`.
+    """Log each received sample, and each read of the newest, until `stop_event` is set; arguments as for `publish`.
 
     Raises:
         LogError: As `Log.note`; `stop_event` is set then.
     """
-    codec = SampleCodec(stream)
+    codec, newest = SampleCodec(stream), NewestSample()
     errors: list[LogError] = []
 
     def on_sample(data: bytes, at_ns: int) -> None:
         header = codec.decode(data)
+        if header is not None:
+            newest.offer(*header)
         try:
             if header is None:
                 log.note(records.FOREIGN, at_ns, size=len(data))
@@ -146,9 +176,10 @@ def subscribe(middleware: Middleware, topic: Topic, stream: Stream, log: Log, st
 
     count_publishers = middleware.subscribe(topic, on_sample)
     is_matched = False
-    while not stop_event.wait(_POLL_S if not is_matched else WAIT_S):
-        if not is_matched and count_publishers() != 0:
-            is_matched = True
-            log.note(records.MATCHED, time.time_ns())
+    with logged_reads(newest, stream.reads_hz, log, stop_event):
+        while not stop_event.wait(_POLL_S if not is_matched else WAIT_S):
+            if not is_matched and count_publishers() != 0:
+                is_matched = True
+                log.note(records.MATCHED, time.time_ns())
     if errors:
         raise errors[0]

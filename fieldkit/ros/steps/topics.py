@@ -16,7 +16,7 @@ from fieldkit.remote import agent, jobs
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.jobs import Job
 from fieldkit.ros.middlewares.middleware import Discovery, MiddlewareName
-from fieldkit.ros.streams import topic_checks
+from fieldkit.ros.streams import read_checks, topic_checks
 from fieldkit.ros.streams.stream_options import LONGEST_S, StreamOptions
 from fieldkit.steps import agent_commands
 from fieldkit.steps.along import AlongStep
@@ -73,7 +73,12 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
     directions. Writes `ROLE-topic.bin` and `ROLE-topic.log`, and `ROLE-serve.log` of a router or a master.
     """
 
-    cross_checks = (*topic_checks.CROSS_CHECKS, *stalls.cross_checks("topic"))
+    cross_checks = (
+        *topic_checks.CROSS_CHECKS,
+        *stalls.cross_checks("topic"),
+        *read_checks.cross_checks("seen", "topic"),
+        *read_checks.cross_checks("used", "topic"),
+    )
     kept_bytes = KEPT_BYTES
     capture_buffer_kib = BUFFER_KIB
     needs_complete_capture = False
@@ -195,7 +200,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
 
     @override
     def exclusive_resources(self) -> tuple[str, ...]:
-        return ("topics",)
+        return ("topics", read_checks.SEEN) if self.reads and self.image else ("topics",)
 
     @override
     def files(self) -> tuple[str, ...]:
@@ -210,7 +215,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
 
     @override
     def flows(self, scene: Scene) -> Iterator[Flow]:
-        frames = 2 * self._samples * fragments(round(self.bytes) + _ENVELOPE_BYTES)
+        frames = 2 * self._samples * fragments(self.size_bytes + _ENVELOPE_BYTES)
         ends = (self.sender, self.receiver)
         server = self.server_role
         pairs = [ends, *((end, server) for end in ends if server and end != server)]
@@ -225,14 +230,16 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
 
     @override
     def stored_bytes(self, scene: Scene, role: Role) -> float:
-        return _RECORD_BYTES * self._samples if role in {self.sender, self.receiver} else 0.0
+        reads = self.reads.rate * self.duration if self.reads and role == self.receiver else 0.0
+        return _RECORD_BYTES * (self._samples + reads) if role in {self.sender, self.receiver} else 0.0
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
         """Return the columns of topics, which only trials with this step have."""
-        from fieldkit.ros.streams import topic_columns, topic_stalls  # noqa: PLC0415 (needed only by this step)
+        from fieldkit.ros.streams import sample_reads, topic_columns, topic_stalls  # noqa: PLC0415 (only this step)
 
-        return (*topic_columns.COLUMNS, *topic_stalls.COLUMNS)
+        of_reads = sample_reads.declare_columns(self._reads_prefix, "topic_sent") if self.reads else ()
+        return (*topic_columns.COLUMNS, *topic_stalls.COLUMNS, *of_reads)
 
     @override
     def check(self, view: View) -> Iterator[str]:
@@ -260,7 +267,31 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
             topic_columns.withheld_reasons(measured, topic_evidence.dropped_reason(self, view))
         )
         measured = topic_evidence.without_contradicted_times(self, view, logs, measured)
-        return measured | topic_columns.withheld_mark(topic_evidence.dropped_reason(self, view))
+        return (
+            measured
+            | topic_columns.withheld_mark(topic_evidence.dropped_reason(self, view))
+            | self._measure_reads(view, ends, packets)
+        )
+
+    def _measure_reads(
+        self,
+        view: View,
+        ends: "tuple[TopicLog | None, TopicLog | None]",
+        packets: "tuple[Packets | None, Packets | None]",
+    ) -> Measured:
+        """Return the columns of the reads of the newest sample."""
+        if self.reads is None:
+            return Measured()
+        from fieldkit.ros.streams import sample_reads  # noqa: PLC0415 (as above)
+
+        addresses = (view.scene.robot(role).address for role in (self.sender, self.receiver))
+        plan = sample_reads.ReadPlan(self._reads_prefix, self.reads.rate, self.reads.limit, 1 / self.rate)
+        return sample_reads.measure(plan, *ends, *sample_reads.read_clocks(*packets, *addresses))
+
+    @property
+    def _reads_prefix(self) -> str:
+        """Prefix of the columns of reads."""
+        return "seen" if self.image else "used"
 
     def deliveries(self, view: View) -> "Sequence[Delivery]":
         """Return the deliveries of the stream; see `SendsFlow.deliveries`."""
@@ -319,3 +350,6 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
             yield f"topic loss {100 * loss:.1f} %"
         if isinstance(delay_s := values.get("topic_delay_median_s"), float):
             yield f"topic delay {1e3 * delay_s:.1f} ms"
+        for name, text in (("seen_age_p95_s", "age of what is seen"), ("used_age_p95_s", "age of what is used")):
+            if isinstance(age_s := values.get(name), float):
+                yield f"{text} {1e3 * age_s:.1f} ms"

@@ -1,5 +1,6 @@
 """Streams of samples over a middleware: their YAML keys, and the arguments of the agents on the robots."""
 
+import math
 from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -20,6 +21,7 @@ from fieldkit.ros.middlewares.middleware import (
     judge_binding,
 )
 from fieldkit.ros.middlewares.ports import MiddlewarePorts
+from fieldkit.ros.streams.read_options import ImageSize, Reads, dimensions
 from fieldkit.steps import agent_commands
 from fieldkit.steps.scene import Need, Scene
 
@@ -27,8 +29,10 @@ if TYPE_CHECKING:
     from fieldkit.ros.interfaces.qos import QosProfile
 
 MESSAGE: Final = "std_msgs/msg/UInt8MultiArray"
+IMAGE_MESSAGE: Final = "sensor_msgs/msg/Image"
 MIN_BYTES: Final = 24
 MAX_BYTES: Final = 16e6
+_DEFAULT_BYTES: Final = 1000.0
 LONGEST_S: Final = 3600.0
 
 
@@ -113,6 +117,9 @@ class StreamOptions(Strict):
             `Discovery/SPDPInterval: 500 ms` of CycloneDDS, `Internal/SocketReceiveBufferSize@min: 10 MB` for an
             attribute, `transport/link/tx/batch_size: "1400"` of Zenoh, `tcp_nodelay: "1"` of ROS 1, and for `ros2`
             environment variables: `RMW_IMPLEMENTATION: rmw_cyclonedds_cpp`.
+        reads: A program of the receiver that reads the newest sample, with [the age at its reads](teleop.md).
+        image: Size in pixels of grey images, `320x240`, which are the samples instead of `bytes`: `sensor_msgs/Image`
+            of [a synthetic camera](teleop.md).
     """
 
     sender: Role = Field(alias="from")
@@ -120,7 +127,7 @@ class StreamOptions(Strict):
     over: MiddlewareName = MiddlewareName.DDS
     topic: TopicName = "/fieldkit/stream"
     rate: Annotated[Hertz, Field(gt=0, le=100_000)] = 10.0
-    bytes: Annotated[Bytes, Field(ge=MIN_BYTES, le=MAX_BYTES)] = 1000.0
+    bytes: Annotated[Bytes, Field(ge=MIN_BYTES, le=MAX_BYTES)] = _DEFAULT_BYTES
     qos: StreamQos = StreamQos.defaults()
     discovery: Discovery | None = None
     server: Role = Role.RELAY
@@ -129,6 +136,8 @@ class StreamOptions(Strict):
     domain: Annotated[Int, Field(ge=0, le=ports.MAX_DOMAIN)] = 42
     transport: Annotated[str, Field(pattern="^(tcp|udp)$")] = "tcp"
     settings: Annotated[Settings | str, AfterValidator(_validate_settings)] = "default"
+    reads: Reads | None = Field(default=None, exclude_if=schema.is_empty)
+    image: ImageSize | None = Field(default=None, exclude_if=schema.is_empty)
 
     @schema.model_validator(mode="after")
     def _is_consistent(self) -> "StreamOptions":
@@ -150,10 +159,27 @@ class StreamOptions(Strict):
             raise schema.validation_error(
                 "it ends before its second sample; write a longer duration or a higher rate", "duration"
             )
+        if self.image is not None and self.bytes != _DEFAULT_BYTES:
+            raise schema.validation_error("the size of an image is width x height; leave bytes out", "bytes")
         for name in self.middleware_settings if self.over is MiddlewareName.ROS2 else ():
             if reason := invalid_setting_reason(name):
                 raise schema.validation_error(reason, "settings")
         return self
+
+    @property
+    def size_bytes(self) -> int:
+        """Data bytes of a sample."""
+        return math.prod(dimensions(self.image)) if self.image else round(self.bytes)
+
+    @property
+    def width(self) -> int:
+        """Pixels per row of the images; 0 if the samples are not images."""
+        return dimensions(self.image)[0] if self.image else 0
+
+    @property
+    def message(self) -> str:
+        """Type of the messages."""
+        return IMAGE_MESSAGE if self.image else MESSAGE
 
     @property
     def discovery_method(self) -> Discovery:
@@ -229,15 +255,24 @@ class StreamOptions(Strict):
 
         network = self.network(scene, role)
         topic_description = topics.describe(
-            types.standard_types(), self.topic, MESSAGE, self.qos.resolved(), domain=self.domain, node=network["node"]
+            types.standard_types(),
+            self.topic,
+            self.message,
+            self.qos.resolved(),
+            domain=self.domain,
+            node=network["node"],
         )
-        stream = {
+        stream: dict[str, Any] = {
             "over": self.over.value,
-            "size_bytes": round(self.bytes),
+            "size_bytes": self.size_bytes,
             "rate_hz": self.rate,
             "duration_s": self.duration,
             "patience_s": self.patience,
         }
+        if self.reads:
+            stream["reads_hz"] = self.reads.rate
+        if self.image:
+            stream["width"], stream["height"] = dimensions(self.image)
         return agent_commands.compact({"network": network, "topic": topic_description, "stream": stream})
 
 

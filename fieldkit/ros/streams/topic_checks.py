@@ -109,7 +109,7 @@ def _end_contradictions(plan: TopicPlan, log: TopicLog, role: int) -> Iterator[s
         log.kinds.get(topic_samples.MATCHED, 0) <= 1,
     )
     unexpected_kinds = (
-        (topic_samples.FOREIGN,)
+        (topic_samples.FOREIGN, topic_samples.READ, topic_samples.UNREADABLE)
         if role == topic_samples.PUBLISHER
         else (topic_samples.REFUSED, topic_samples.SKIPPED)
     )

@@ -1,6 +1,7 @@
 """Evidence of a topic: the logs of publisher and subscriber, the captures, and contradictions between them."""
 
 from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import Final
 
 from fieldkit.core.columns import Measured
@@ -9,7 +10,7 @@ from fieldkit.core.model import Role
 from fieldkit.core.units import format_count
 from fieldkit.ros.interfaces.qos import History, Reliability
 from fieldkit.ros.middlewares.middleware import MiddlewareName
-from fieldkit.ros.streams import topic_captures, topic_checks, topic_samples
+from fieldkit.ros.streams import read_checks, topic_captures, topic_checks, topic_samples
 from fieldkit.ros.streams.stream_options import StreamOptions
 from fieldkit.ros.streams.topic_captures import CapturedTopic
 from fieldkit.ros.streams.topic_checks import TopicPlan
@@ -17,8 +18,11 @@ from fieldkit.ros.streams.topic_columns import first_arrivals
 from fieldkit.ros.streams.topic_samples import SampleFlow, TopicLog
 from fieldkit.steps.view import View, capture_around
 
-_ENVELOPE_BYTES: Final = 12
-_CDR_BYTES: Final = 16
+_ENVELOPE_BYTES: Final = MappingProxyType(
+    {(False, True): 12, (False, False): 16, (True, True): 48, (True, False): 52}
+)
+"""Bytes that serialization adds to the data: by whether the samples are images, and whether it is ROS 1's, else CDR.
+"""
 _ROS1_QUEUE: Final = 1000
 """Queue size in samples that the agent sets in ROS 1 for the history `keep_all` (`fieldkit.agent.messaging.ros1`)."""
 _LATE_S: Final = 0.1
@@ -33,8 +37,8 @@ def plan(step: StreamOptions) -> TopicPlan:
     return TopicPlan(
         topic=step.topic,
         samples=round(step.duration * step.rate),
-        size_bytes=round(step.bytes),
-        envelope_bytes=_ENVELOPE_BYTES if step.over is MiddlewareName.ROS1 else _CDR_BYTES,
+        size_bytes=step.size_bytes,
+        envelope_bytes=_ENVELOPE_BYTES[bool(step.image), step.over is MiddlewareName.ROS1],
         reliable=step.over in {MiddlewareName.ROS1, MiddlewareName.ZENOH}
         or quality.reliability is not Reliability.BEST_EFFORT,
         # Zenoh passes samples to the callback without a queue.
@@ -56,7 +60,7 @@ def problems(step: StreamOptions, view: View, logs: Mapping[Role, TopicLog]) -> 
     if {step.sender, step.receiver} <= logs.keys():
         ends = logs[step.sender], logs[step.receiver]
         topic_plan = plan(step)
-        reasons = list(topic_checks.check_logs(topic_plan, *ends))
+        reasons = [*topic_checks.check_logs(topic_plan, *ends), *read_checks.check_reads(ends[1])]
         yield from reasons
         # The same cause would also lead to contradictions with the captures.
         if not reasons:
@@ -86,15 +90,16 @@ def _flow(step: StreamOptions, view: View, role: Role) -> SampleFlow | None:
     capture = view.capture(role)
     if name is None or capture is None:
         return None
-    heads = view.evidence.read(topic_samples.find_heads, name, round(step.bytes))
+    heads = view.evidence.read(topic_samples.find_heads, name, step.size_bytes, step.width)
     address = view.scene.robot(role).address
     publishes = role == step.sender
     return topic_samples.sample_flow(
         capture.packets,
         heads,
         step.wire_ports.data,
-        round(step.bytes),
+        step.size_bytes,
         lambda packets: packets.are_from(address) if publishes else ~packets.are_from(address),
+        width=step.width,
     )
 
 
@@ -120,6 +125,16 @@ def without_contradicted_times(
 
 
 def read(step: StreamOptions, view: View, files: Mapping[Role, str]) -> tuple[dict[Role, TopicLog], list[str]]:
+    """Return the complete logs by role, and an error message for each other log and for samples of other programs."""
+    logs, errors = read_logs(view, files)
+    for name in files.values():
+        log = view.evidence.read_or_none(topic_samples.read_log, name)
+        if log is not None and log.foreign:
+            errors.append(f"{name}: another program also publishes {step.topic}: use another topic or domain")
+    return logs, errors
+
+
+def read_logs(view: View, files: Mapping[Role, str]) -> tuple[dict[Role, TopicLog], list[str]]:
     """Return the complete logs by role, and an error message for each other log."""
     logs, errors = dict[Role, TopicLog](), list[str]()
     for role, name in files.items():
@@ -132,6 +147,4 @@ def read(step: StreamOptions, view: View, files: Mapping[Role, str]) -> tuple[di
             errors.append(f"{name} is incomplete: the agent was stopped")
         else:
             logs[role] = log
-        if log.foreign:
-            errors.append(f"{name}: another program also publishes {step.topic}: use another topic or domain")
     return logs, errors

@@ -6,7 +6,7 @@ killed, the log ends with zeros, because the file grows by blocks.
 The agent starts each sample with the empty layout of `std_msgs/UInt8MultiArray` and the length of its data, followed
 by the head (`fieldkit.agent.messaging.stream`): magic number, sequence number and time of sending. The head is in a
 capture if that part of the packet was captured. This is always true for the first sample of a packet, but TCP or a
-middleware may put further samples behind it.
+middleware may put further samples behind it. An image has the same head in its first pixels.
 """
 
 import struct
@@ -34,8 +34,8 @@ _RECORD: Final = np.dtype(
 )
 RECORD_BYTES: Final = _RECORD.itemsize
 
-_KINDS: Final = range(1, 9)
-_SAMPLE, DISCOVERY_STARTED, MATCHED, REFUSED, SKIPPED, FOREIGN, _END, _ORIGIN = _KINDS
+_KINDS: Final = range(1, 11)
+_SAMPLE, DISCOVERY_STARTED, MATCHED, REFUSED, SKIPPED, FOREIGN, _END, _ORIGIN, READ, UNREADABLE = _KINDS
 PUBLISHER: Final = 1
 SUBSCRIBER: Final = 2
 _HAS_CHECKSUM: Final = 1
@@ -60,6 +60,26 @@ class TopicSamples(Table):
     at_ns: Ints
 
 
+@dataclass(frozen=True, eq=False)
+class SampleReads(Table):
+    """Reads of the newest sample by the subscriber's program, in order.
+
+    Attributes:
+        sequence: Number of the newest sample that had arrived; -1 if none had.
+        sent_ns: Its time of sending by the sender's clock, nanoseconds since 1970 UTC.
+        at_ns: Time of the read by the subscriber's clock.
+    """
+
+    sequence: Ints
+    sent_ns: Ints
+    at_ns: Ints
+
+
+def no_reads() -> SampleReads:
+    """Return an empty table."""
+    return SampleReads(*(np.empty(0, dtype=np.int64) for _ in range(3)))
+
+
 @dataclass(frozen=True)
 class TopicLog:
     """Log of one end of a topic.
@@ -77,6 +97,8 @@ class TopicLog:
         numbers: Sequence number of each sample that was passed to the middleware or arrived, including refused ones.
         role: `PUBLISHER` or `SUBSCRIBER`; None in a log of a version without origin records.
         topic_sum: CRC-32 of the topic's name; None in a log of a version without origin records.
+        reads: Reads of the newest sample by the subscriber's program.
+        unreadable: Number of received frames of a camera whose pixels have no number and time.
     """
 
     samples: TopicSamples
@@ -91,6 +113,8 @@ class TopicLog:
     numbers: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     role: int | None = None
     topic_sum: int | None = None
+    reads: SampleReads = field(default_factory=no_reads)
+    unreadable: int = 0
 
 
 def read_log(path: Path) -> TopicLog:
@@ -133,6 +157,8 @@ def read_log(path: Path) -> TopicLog:
         numbers=offered_records["sequence"].astype(np.int64),
         role=int(origin_records["sequence"][0]) if len(origin_records) else None,
         topic_sum=int(origin_records["size"][0]) if len(origin_records) else None,
+        reads=SampleReads(*(by_kind[READ][name].astype(np.int64) for name in ("sequence", "sent_ns", "at_ns"))),
+        unreadable=len(by_kind[UNREADABLE]),
     )
 
 
@@ -211,7 +237,6 @@ def _positions(data: Buffer, frames: Frames, pattern: bytes) -> Ints:
 
 MAGIC: Final = b"fieldkit"
 HEAD_BYTES: Final = 24
-_LAYOUT: Final = struct.Struct("<III")
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,9 +302,20 @@ class SampleFlow:
         )
 
 
-def find_heads(path: Path, size_bytes: int) -> Occurrences:
-    """Return the heads of samples with `size_bytes` of data in a capture; raises the errors of `find_bytes`."""
-    return find_bytes(path, _LAYOUT.pack(0, 0, size_bytes) + MAGIC)
+def find_heads(path: Path, size_bytes: int, width: int = 0) -> Occurrences:
+    """Return the heads of samples in a capture; raises the errors of `find_bytes`.
+
+    Args:
+        path: The capture.
+        size_bytes: Data bytes of a sample.
+        width: Pixels per row of images; 0 if the samples are not images.
+    """
+    return find_bytes(path, _before_head(size_bytes, width) + MAGIC)
+
+
+def _before_head(size_bytes: int, width: int) -> bytes:
+    """Return the last fields of a message before its data: an empty layout, or an image's bytes per row, and size."""
+    return struct.pack("<II", width, size_bytes) if width else struct.pack("<III", 0, 0, size_bytes)
 
 
 def sample_flow(
@@ -288,6 +324,8 @@ def sample_flow(
     ports: frozenset[int],
     size_bytes: int,
     is_forward: Callable[[Packets], Mask],
+    *,
+    width: int = 0,
 ) -> SampleFlow:
     """Return the packets of a topic in a capture.
 
@@ -297,6 +335,7 @@ def sample_flow(
         ports: Ports of the topic's data.
         size_bytes: Data bytes of a sample.
         is_forward: Returns a mask of the packets from publisher to subscriber.
+        width: Pixels per row of images; 0 if the samples are not images.
     """
     packets_with_ports = with_ports(packets)
     data = np.isin(packets_with_ports.dport, list(ports)) | np.isin(packets_with_ports.sport, list(ports))
@@ -305,7 +344,8 @@ def sample_flow(
     carrier = packets.where(occurrences.packet)
     tcp_header_bytes = carrier.ip_payload_bytes - carrier.tcp_payload_bytes
     is_tcp = carrier.protocol == TCP
-    starts = occurrences.offset + _LAYOUT.size - np.where(is_tcp, tcp_header_bytes, UDP_HEADER_BYTES)
+    before_bytes = len(_before_head(size_bytes, width))
+    starts = occurrences.offset + before_bytes - np.where(is_tcp, tcp_header_bytes, UDP_HEADER_BYTES)
     ends = starts + size_bytes
     heads = SampleHeads(
         sequence=occurrences.first,

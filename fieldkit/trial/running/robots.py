@@ -27,7 +27,7 @@ from fieldkit.remote.fetching import FetchProgress, LateJobError, NoFolderError
 from fieldkit.steps.scene import Announce, Scene, Shells
 from fieldkit.trial import hosts, size, step_errors
 from fieldkit.trial.owners import FileOwners
-from fieldkit.trial.plan import Plan
+from fieldkit.trial.plan import Plan, telemetry_cast
 from fieldkit.trial.running import locks
 from fieldkit.trial.running.unfetched import UnfetchedEvidence
 
@@ -106,7 +106,7 @@ class Robots:
 
     def _telemetry_sources(self) -> Mapping[Role, Sequence[Sequence[str]]]:
         """Return the telemetry sources that each robot queries during an attempt."""
-        cast = self._plan.telemetry_cast()
+        cast = telemetry_cast(self._plan)
         if not cast:
             return {}
         from fieldkit.telemetry import telemetry_queries  # noqa: PLC0415 (few profiles have sources)
@@ -136,7 +136,7 @@ class Robots:
 
     def _run_steps(self, scene: Scene, announce: Announce) -> None:
         with self._monitored_processes(), ExitStack() as stack:
-            if (cast := self._plan.telemetry_cast()) and scene.laptop_folder is not None:
+            if (cast := telemetry_cast(self._plan)) and scene.laptop_folder is not None:
                 from fieldkit.telemetry import laptop_telemetry  # noqa: PLC0415 (few profiles have sources)
 
                 stack.enter_context(laptop_telemetry.querying(cast, scene.laptop_folder))

@@ -176,7 +176,7 @@ def test_other_lines_in_a_real_output_do_not_change_the_result(data: st.DataObje
 
 
 def ping_with_answers(*seqs_ms: tuple[int, int], n_sent: int) -> Ping:
-    """Return a ping of `sent` requests with the times of its answers in ms."""
+    """Return a ping of `n_sent` requests with the times of its answers in ms."""
     replies = tuple(Reply(seq, 1e-3, at_ms * 1_000_000, duplicate=False, damaged=False) for seq, at_ms in seqs_ms)
     return Ping(56, replies, (), n_sent, len(replies), ())
 

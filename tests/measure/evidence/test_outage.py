@@ -17,7 +17,7 @@ FIRST_S = 1_795_218_000
 
 
 def pings(answered_numbers: list[int], n_sent: int, *, stamps: bool = True, interval_s: float = 0.1) -> str:
-    """Return output of ping for `sent` requests. Only the requests in `answered` have an answer."""
+    """Return output of ping for `n_sent` requests. Only the requests in `answered_numbers` have an answer."""
     lines = [HEADER]
     for number in answered_numbers:
         stamp = f"[{FIRST_S + number * interval_s:.6f}] " if stamps else ""

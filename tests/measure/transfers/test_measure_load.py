@@ -30,7 +30,7 @@ def udp_frames(count: int) -> list[Frame]:
 
 
 def tcp_frames(count: int, *, repeated: tuple[int, ...] = ()) -> list[Frame]:
-    """Return a connection with SYN, cookie and segments, of which those at the indices `again` are sent twice."""
+    """Return a connection with SYN, cookie and segments, of which those at the indices `repeated` are sent twice."""
     header_frames = [segment(0, 0, flags=SYN), segment(1, COOKIE)]
     segments = [segment(1 + COOKIE + index * PAYLOAD_BYTES, PAYLOAD_BYTES) for index in range(count)]
     frames = [*timed(header_frames, start_ns=START - 10**9), *timed(segments, start_ns=START, step_ns=PERIOD_NS)]

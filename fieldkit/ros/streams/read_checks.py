@@ -1,0 +1,76 @@
+"""Contradictions between the reads of the newest sample and the arrivals of samples in the same log."""
+
+from collections.abc import Iterator
+from typing import Final
+
+import numpy as np
+
+from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
+from fieldkit.core.units import format_count
+from fieldkit.measure.captures.arrays import Ints
+from fieldkit.ros.streams.topic_checks import MAX_SLEW_NS
+from fieldkit.ros.streams.topic_samples import TopicLog
+
+SEEN: Final = "frames that are seen"
+"""Exclusive resource of steps with the columns of frames that are seen."""
+_HANDOVER_NS: Final = 200_000_000
+"""On a busy robot, this much time may pass between the time of arrival of a sample and its first possible read."""
+
+
+def check_reads(received: TopicLog) -> Iterator[str]:
+    """Yield each contradiction between reads and arrivals in a subscriber's log as a sentence."""
+    samples, reads = received.samples, received.reads
+    order = np.argsort(samples.at_ns, kind="stable")
+    arrival_ns = samples.at_ns[order]
+    newest = np.append(-1, np.maximum.accumulate(samples.sequence[order]))
+
+    def newest_at(at_ns: Ints) -> Ints:
+        number: Ints = newest[np.searchsorted(arrival_ns, at_ns, side="right")]
+        return number
+
+    if early := int((reads.sequence > newest_at(reads.at_ns + MAX_SLEW_NS)).sum()):
+        yield f"{format_count(early, 'read')} in the subscriber's log returned a sample before it arrived"
+    if stale := int((reads.sequence < newest_at(reads.at_ns - _HANDOVER_NS)).sum()):
+        yield f"{format_count(stale, 'read')} in the subscriber's log did not return the newest sample"
+    numbers, first = np.unique(samples.sequence, return_index=True)
+    _, read_index, sample_index = np.intersect1d(reads.sequence, numbers, return_indices=True)
+    if (reads.sent_ns[read_index] != samples.sent_ns[first][sample_index]).any():
+        yield "a read in the subscriber's log has another time of sending than the sample"
+
+
+def cross_checks(prefix: str, stream: str) -> tuple[CrossCheck, ...]:
+    """Return the sources of the columns of reads, and the checks between them.
+
+    Args:
+        prefix: Prefix of the columns.
+        stream: `topic`, or `video` for a stream over RTP.
+    """
+    columns = tuple(
+        f"{prefix}_{name}" for name in ("age_*", "withheld", "blank", "repeated", "distinct", "never", "gap*")
+    )
+    log = f"`ROLE-{stream}.bin` of the subscriber"
+    return (
+        CrossCheck(
+            f"newest {'frame' if prefix == 'seen' else 'sample'} at each read of a {stream}",
+            columns,
+            f"{log}: reads",
+            (f"{log}: arrivals", "the log of the publisher: times of sending"),
+            "a sample may arrive up to 0.2 s before its first read on a busy robot; no read is before the arrival",
+        ),
+        CrossCheck(
+            f"clocks of the age at a read of a {stream}",
+            (f"{prefix}_age_*", f"{prefix}_late"),
+            f"{log}: reads and times of sending",
+            ("the captures: packets in both directions, which limit the clock offset",),
+            "the clock error is at most a tenth of the age",
+            CheckOutcome.WITHHELD,
+        ),
+        CrossCheck(
+            f"number of reads of a {stream}",
+            (f"{prefix}_reads", f"{prefix}_age_*", f"{prefix}_gap*", f"{prefix}_repeated", f"{prefix}_blank"),
+            f"{log}: reads",
+            ("the rate of reads in the procedure",),
+            "at least 90 %: a busy robot misses single ticks",
+            CheckOutcome.WITHHELD,
+        ),
+    )
