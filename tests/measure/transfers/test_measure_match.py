@@ -170,7 +170,7 @@ frames = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 15), st.integers(
 def test_each_byte_has_as_many_matches_as_copies_sent_and_received(
     isn: int, sent_ranges: list[tuple[int, int, int]], received_ranges: list[tuple[int, int, int]], other_ids: int
 ) -> None:
-    """The oracle are lists of single bytes. If equal frames exist, fewer bytes may match."""
+    """The oracle is a list of single bytes for each end. If equal frames exist, fewer bytes may match."""
     ends = [
         packets(
             timed(

@@ -97,7 +97,7 @@ def stream(total: int, *, segments_per_frame: int = 1, repeated_frames: Sequence
 
 
 def with_fin(received_frames: list[Frame], after_ns: int, acknowledged: int) -> list[Frame]:
-    """Add the receiver's FIN `after_ns` after the last frame. It acknowledges `acknowledged` bytes and the sender's FIN."""
+    """Add the receiver's FIN after `after_ns`. It acknowledges `acknowledged` bytes and the sender's FIN."""
     at_ns = received_frames[-1].time_ns + after_ns
     return [*received_frames, Frame(at_ns, segment(77, 0, flags=FIN_ACK, ack=ISN + 1 + acknowledged + 1, back=True))]
 
