@@ -255,7 +255,7 @@ def streaming_during_attack(cable: Cable, tmp_path: Path, middleware_name: str, 
 
 @pytest.mark.emulated
 def test_changed_rtps_messages_stop_neither_program(cable: Cable, tmp_path: Path) -> None:
-    """Their messages may be lost permanently, because RTPS trusts packets in the name of another participant."""
+    """Their messages may be lost permanently, because RTPS accepts packets in the name of another participant."""
     with streaming_during_attack(cable, tmp_path, "dds"):
         send_hostile_packets(cable.hosts[1], "rtps", "1000")
 

@@ -172,8 +172,8 @@ def test_legs_ahead_and_left_follow_the_heading() -> None:
     _, ahead, left = plan([(4.0, 0.0, 0.0), (0.0, 2.0, 1.0)]).corners_m(
         FlightOrigin("local", "", 0.0, 0.0, math.pi / 2), 0.0
     )
-    assert ahead == pytest.approx((0.0, 4.0, -3.0)), "east"
-    assert left == pytest.approx((2.0, 4.0, -4.0)), "north of it, and up"
+    assert ahead == pytest.approx((0.0, 4.0, -3.0)), "the first leg is to the east"
+    assert left == pytest.approx((2.0, 4.0, -4.0)), "the second leg is to the north and up"
 
 
 @given(legs, st.floats(0, 400), st.floats(0, 400))

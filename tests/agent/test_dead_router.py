@@ -75,7 +75,7 @@ def test_all_programs_stop_in_time_after_a_signal(tmp_path: Path) -> None:
                 duration_s = time.monotonic() - start_s
                 wait_until(lambda: not alive(server), Deadline.after(60))
         assert duration_s >= NO_HEARTBEAT_S
-        assert autopilot.vehicle.is_armed, "it received no command"
+        assert autopilot.vehicle.is_armed, "the autopilot received no command"
     for log in logs:
         texts = log_texts(log)
         assert texts[-1] == f"error: no heartbeat of the autopilot for {NO_HEARTBEAT_S:g} s"

@@ -55,7 +55,7 @@ def test_px4_modes_equal_those_of_pymavlink() -> None:
 
 def test_mode_names_are_those_of_pymavlink() -> None:
     px4_modes = {name: PX4.mode_name(main << 16 | sub << 24) for name, (_, main, sub) in mavutil.px4_map.items()}
-    del px4_modes["RTGS"], px4_modes["FOLLOWME"]  # not in px4_custom_mode.h any more, which has FOLLOW_TARGET
+    del px4_modes["RTGS"], px4_modes["FOLLOWME"]  # px4_custom_mode.h has FOLLOW_TARGET in their place
     assert {name: full_name.rpartition(".")[2] for name, full_name in px4_modes.items()} == {
         name: name for name in px4_modes
     }

@@ -158,7 +158,7 @@ def test_runs_with_different_congestion_controls_are_not_comparable() -> None:
     cubic, bbr = (with_changes(UDP, tcp_congestion_control=name) for name in ("cubic", "bbr"))
     (refusal,) = compare_rows(cubic, bbr).refusals
     assert str(refusal) == "tcp_congestion_control: A has cubic, B has bbr (los, master, 9.144 m, udp)"
-    assert not compare_rows(cubic, UDP).refusals, "it is unknown in trials of earlier versions"
+    assert not compare_rows(cubic, UDP).refusals, "trials of earlier versions do not record the congestion control"
     simulated = compare_rows(cubic, with_changes(bbr, backend="cosim"))
     assert not simulated.refusals, "a simulation has its own TCP"
     assert str(refusal) in map(str, simulated.concerns)

@@ -159,7 +159,7 @@ def test_a_perfect_link_meets_an_expectation_of_all_packets() -> None:
     assert ruling(text, losses(0, 0, 37, 0, 0, 0)) is Ruling.OPEN, "0.5 % in one burst"
     assert ruling(text, losses(25, 25, 25, 25, 25, 25)) is Ruling.FAILS
     assert ruling("ip_loss <= 2 % of all packets", losses(25, 25, 25, 25, 25, 25)) is Ruling.OPEN
-    assert ruling("ip_loss < 2 %", losses(0, 0, 0, 0, 0, 0)) is Ruling.OPEN, "a statement on other repeats"
+    assert ruling("ip_loss < 2 %", losses(0, 0, 0, 0, 0, 0)) is Ruling.OPEN, "this is a statement about other repeats"
     (judgement_of_few,) = judgements.judge([expectations.parse(text, QUANTITIES)], [losses(0, 0, n_sent=100)])
     assert judgement_texts(judgement_of_few)[2:] == (
         "0.00 %", "14.98 % or less", "undecided: 200 packets were sent, but at least 1498 are needed",

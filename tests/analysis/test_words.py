@@ -99,7 +99,7 @@ def test_words_of_two_runs_are_listed_but_not_compared() -> None:
     a, b = table(["wet", "wet", "dry"]), table(["dry", "dry", ""])
     result = compare(a, b)
     without_words = compare(table(["", "", ""]), table(["", "", ""]))
-    assert result.n_compared == without_words.n_compared, "words are not in the number of comparisons"
+    assert result.n_compared == without_words.n_compared, "words do not count as comparisons"
     rows = {row.quantity: row for _, row in comparison_results.difference_rows(result) if row.estimate == Kind.WORDS}
     assert set(rows) == {"grass=wet", "grass=dry"}
     wet = rows["grass=wet"]

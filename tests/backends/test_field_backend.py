@@ -108,7 +108,7 @@ def test_unreadable_key_file_is_named(tmp_path: Path, robot_keys: str) -> None:
         pytest.raises(ConfigurationError, match="/no/such/key cannot be read"),
         field_backend.open(robots_by_role, seed=1, sink=lambda event: None, operator=Unattended()),
     ):
-        raise AssertionError("opened")
+        raise AssertionError("the testbed was opened")
 
 
 def test_robots_drive_automatically_only_if_allowed(tmp_path: Path, robot_keys: str) -> None:

@@ -85,12 +85,12 @@ def test_no_order_in_blocks_is_shorter_than_the_shortest(planned: set[PlannedTri
 def test_the_walk_counts_every_carried_robot() -> None:
     los, master, masterless = Scenario.LOS, Topology.MASTER, Topology.MASTERLESS
     outward_and_back = [trial(10, los, master), trial(30, los, master), trial(20, los, master)]
-    assert order.walk_m(outward_and_back) == pytest.approx(2 * (10 + 20 + 10) * 0.3048), "two stations"
+    assert order.walk_m(outward_and_back) == pytest.approx(2 * (10 + 20 + 10) * 0.3048), "two stations are carried"
     assert order.walk_m([trial(10, los, masterless), trial(30, los, masterless)]) == pytest.approx(30 * 0.3048)
     assert order.walk_m([trial(30, los, master), trial(30, los, masterless)]) == pytest.approx((60 + 30) * 0.3048)
     assert order.walk_m([trial(9, los, master, procedure) for procedure in ("a", "b")]) == pytest.approx(
         18 * 0.3048
-    ), "one way"
+    ), "the stations are carried one way"
 
 
 def first_trials(factor: float) -> Iterator[PlannedTrial]:

@@ -200,7 +200,7 @@ def test_a_disk_too_small_for_the_evidence_is_reported_before_robots_are_placed(
     with pytest.raises(ConfigurationError, match="GB are free"):
         campaign.run(Unattended(), Stop())
     assert [type(event) for event in events] == [CampaignEnded], "no robot was started"
-    assert journal.folder.is_dir(), "the order is unchanged"
+    assert journal.folder.is_dir(), "the order is stored"
 
 
 def test_trials_with_failed_repeats_are_planned_again_with_option_failed(lawn: Path) -> None:

@@ -90,7 +90,9 @@ def test_a_trial_imports_only_the_kinds_of_step_that_it_uses(tmp_path: Path, opt
     assert {name for name in names if name.startswith("fieldkit.ros.steps.")} <= {
         f"fieldkit.ros.steps.{name}" for name in ("record", "ros_master", "topic_check")
     }
-    assert {name for name in names if name.startswith("fieldkit.motion")} == MOTION, "sections of the profiles"
+    assert {name for name in names if name.startswith("fieldkit.motion")} == MOTION, (
+        "only the sections of the profiles are imported"
+    )
     for package, limit in zip(("fieldkit", "sim_backends"), MAX_LINES[options], strict=True):
         assert sum(count for name, count in lines.items() if name.partition(".")[0] == package) <= limit, package
 

@@ -61,7 +61,7 @@ class Operator:
         """Return the next output, empty after a timeout."""
         if not select.select([self._terminal], [], [], within_s)[0]:
             return ""
-        new_output = self._decode(os.output(self._terminal, 4096))
+        new_output = self._decode(os.read(self._terminal, 4096))
         self.output += new_output
         return new_output
 

@@ -272,7 +272,7 @@ class Text(schema.Strict):
 @example("on")
 @example("a\N{NEXT LINE}0")
 @example("a\N{LINE SEPARATOR}0\r")
-def test_text_round_trips_even_if_it_looks_like_another_type(text: str) -> None:
+def test_text_round_trips_even_if_it_resembles_another_type(text: str) -> None:
     model = Text(text=text)
     assert schema.validate(schema.parse(schema.dump(model), source="x"), Text) == model
 

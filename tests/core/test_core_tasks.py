@@ -87,7 +87,7 @@ def kill_process_once(path: Path) -> str:
     return ""
 
 
-def test_a_task_whose_process_died_is_run_again(tmp_path: Path) -> None:
+def test_a_task_whose_process_was_killed_is_run_again(tmp_path: Path) -> None:
     notes: list[str] = []
     tasks = [tmp_path / "stays", tmp_path / "dies", tmp_path / "stays"]
     task_ends = list(completed(kill_process_once, tasks, Workers(2), notes.append))

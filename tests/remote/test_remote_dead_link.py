@@ -86,7 +86,7 @@ def silent_job(script: str) -> Job:
 
 
 @pytest.mark.quiet
-def test_silent_link_that_dies_is_detected_within_10_s() -> None:
+def test_loss_of_a_silent_link_is_detected_within_10_s() -> None:
     with robot(patience_s=0.0) as emulated, ThreadPoolExecutor(1) as pool:
         # Standard input has ended and is acknowledged, so neither side sends anything afterwards.
         argv = ("sh", "-c", f"cat; touch {FOLDER}/up; sleep 60")

@@ -16,7 +16,7 @@ SOON = 60.0
 
 
 @pytest.mark.quiet
-def test_link_that_died_while_idle_is_detected_within_10_s(server: Server) -> None:
+def test_loss_of_an_idle_link_is_detected_within_10_s(server: Server) -> None:
     notices: list[str] = []
     with Forwarder({"robot": server.connect}) as links, ThreadPoolExecutor(1) as pool:
         shell = server.shell(connect=lambda within_s: links.reach("robot", within_s), notice=notices.append)

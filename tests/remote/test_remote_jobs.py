@@ -373,7 +373,7 @@ def test_job_that_starts_during_an_abort_does_not_run(
     assert not (shell.home / FOLDER / "started").exists()
 
 
-def test_lost_caller_that_requested_the_end_is_not_awaited_forever(shell: LocalShell) -> None:
+def test_wait_for_a_lost_caller_has_a_timeout(shell: LocalShell) -> None:
     """The link was cut while the job ran: the SSH server has not detected it, and keeps standard input open."""
     query_log = shell.home / "queries"
     replace_program(shell, "timeout", f'echo "$1" >>"{query_log}"; shift; exec {{program}} 1 "$@"')

@@ -46,7 +46,7 @@ def test_the_associated_access_point_is_parsed() -> None:
     assert robot_link_samples.parse_cell(output("link-rtl8812au")) == StationSample("xx:xx", -45.0, 216.7e6)
     raspberry_pi = robot_link_samples.parse_cell(output("link-station"))
     assert raspberry_pi == StationSample("f0:99:bf:0e:86:98", -65.0, 65e6, None, 1263, 25943), (
-        "a Raspberry Pi's brcmfmac"
+        "the driver brcmfmac of a Raspberry Pi"
     )
     assert (
         robot_link_samples.parse_cell(output("link-none"))

@@ -44,7 +44,7 @@ def test_synchronized_clocks_give_columns_and_no_mark(tmp_path: Path) -> None:
     measured = measure(tmp_path, clock_offset_s=0.0004, clock_offset_error_s=0.0005)
     assert measured.values["marks"] == "none"
     assert measured.values["sender_time_source"] == "chrony 10.9.0.2"
-    assert measured.values["sender_time_offset_s"] == -0.0003, "the larger offset of before and after"
+    assert measured.values["sender_time_offset_s"] == -0.0003, "the larger of the offsets before and after"
     assert measured.values["sender_time_error_s"] == pytest.approx(0.0003)
     assert measured.values["receiver_time_offset_s"] == 2.537e-6
     assert measured.values["receiver_laptop_offset_s"] == pytest.approx(0.0, abs=0.005)

@@ -66,7 +66,7 @@ def test_a_place_is_new_if_the_last_origin_belongs_to_another_place(tmp_path: Pa
     assert open_origins(tmp_path, FAR).is_new_place(Role.SENDER)
     assert not open_origins(tmp_path, FAR).is_new_place(Role.RECEIVER), "the receiver is not moved"
     MotionJournal(tmp_path / MOTION_FILE).add(MotionEvent.CONFIRMED, "rover-2")
-    assert open_origins(tmp_path, FAR).is_new_place(Role.SENDER), "confirmed at the former place"
+    assert open_origins(tmp_path, FAR).is_new_place(Role.SENDER), "the confirmation was for the former place"
     open_origins(tmp_path, FAR).record(Role.SENDER, ORIGIN)
     assert open_origins(tmp_path, NEAR).is_new_place(Role.SENDER), "no person confirmed the return to the first place"
 
@@ -81,7 +81,7 @@ def test_only_a_confirmation_lets_robots_move_after_a_fault(tmp_path: Path, at_p
         raise ValueError("fault")
     for role in ROBOTS:
         with pytest.raises(MotionHeldError, match="rover-1"), open_origins(tmp_path).moving(role):
-            pytest.fail("it moved")
+            pytest.fail("the robot moved")
     journal = MotionJournal(tmp_path / MOTION_FILE)
     journal.confirm("how", at_place=at_place)
     reopened = open_origins(tmp_path)
@@ -128,7 +128,7 @@ def test_logs_and_robots_have_the_same_maximum_start_distance() -> None:
 
 
 class BrakingBase:
-    """A base that decelerates with `DECELERATION_M_S2` instead of immediately, with exact odometry."""
+    """A base that decelerates with `DECELERATION_M_S2`, and has exact odometry."""
 
     def __init__(self) -> None:
         self.pose = OdometryPose(0.0, 0.0, 0.0)

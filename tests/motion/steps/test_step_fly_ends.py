@@ -51,7 +51,7 @@ NEAR_M = 0.6
 class Shell(LocalShell):
     """A robot with a link that can be interrupted."""
 
-    is_cut = False
+    is_interrupted = False
 
     def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
         if self.is_interrupted:
@@ -195,7 +195,7 @@ def test_flight_continues_after_restart_of_its_router(shell: Shell) -> None:
         assert autopilot.vehicle.body.on_ground
         assert not autopilot.vehicle.is_armed
         assert restarts
-        assert router.accepted == 2, "the connection of the link server, and the one after the restart"
+        assert router.accepted == 2, "the link server connected before and after the restart"
     assert silent_lines(shell) >= 3, "no positions arrived during the interruption"
     assert [text for _, text in log_lines(shell, "fly")][-1] == "landed"
 

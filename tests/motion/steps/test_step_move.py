@@ -237,7 +237,9 @@ def test_path_is_shortened_at_the_fence(path: list[Leg], fence_m: float) -> None
     end = math.hypot(sum(leg.away_m for leg in shortened), sum(leg.left_m for leg in shortened))
     assert end == pytest.approx(fence_m, abs=1e-6)
     last_leg, leg = shortened[n_complete], path[n_complete]
-    assert last_leg.away_m * leg.left_m == pytest.approx(last_leg.left_m * leg.away_m, abs=1e-6), "the same direction"
+    assert last_leg.away_m * leg.left_m == pytest.approx(last_leg.left_m * leg.away_m, abs=1e-6), (
+        "the last leg has the direction of the planned leg"
+    )
     assert math.hypot(last_leg.away_m, last_leg.left_m) <= math.hypot(leg.away_m, leg.left_m) + 1e-6
 
 
