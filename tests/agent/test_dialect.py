@@ -53,9 +53,9 @@ def test_px4_modes_equal_those_of_pymavlink() -> None:
     assert guided == ["OFFBOARD"]
 
 
-def test_mode_names_are_those_of_pymavlink() -> None:
+def test_mode_names_equal_those_of_pymavlink() -> None:
     px4_modes = {name: PX4.mode_name(main << 16 | sub << 24) for name, (_, main, sub) in mavutil.px4_map.items()}
-    del px4_modes["RTGS"], px4_modes["FOLLOWME"]  # px4_custom_mode.h has FOLLOW_TARGET in their place
+    del px4_modes["RTGS"], px4_modes["FOLLOWME"]  # no longer in px4_custom_mode.h, which has FOLLOW_TARGET
     assert {name: full_name.rpartition(".")[2] for name, full_name in px4_modes.items()} == {
         name: name for name in px4_modes
     }
