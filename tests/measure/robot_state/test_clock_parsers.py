@@ -165,7 +165,7 @@ def test_a_source_cannot_print_the_output_of_another(tmp_path: Path) -> None:
 
 def test_the_script_has_a_command_for_each_parser() -> None:
     script = (Path(snapshots.__file__).parents[2] / "remote" / "snapshot.sh").read_text(encoding="ascii")
-    names = set(re.findall(r"source_of ([a-z-]+) ", script))
+    names = set(re.findall(r"start_source ([a-z-]+) ", script))
     assert names == attempt_states.CLOCK_SOURCES | attempt_states.RADIO_SOURCES | {health.NAME, health.THROTTLED_NAME}
 
 
