@@ -10,7 +10,7 @@ from fieldkit.config.schema import Bool, Document, Duration, Field, Length, Stri
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.emulated.linux_wifi.linux_wifi_options import LinuxWifiOptions
 from sim_backends.emulated.robot.spec import HELLO_S, NETCATS, Netcat, Ping, SshServer, Userland
-from sim_backends.radio.radio_options import RadioOptions
+from sim_backends.radio.radio_options import INFRASTRUCTURE, RadioOptions
 
 BOOT_S: Final = 2.0
 LATE_BOUND_S: Final = 0.1
@@ -206,6 +206,21 @@ class EmulatedOptions(Strict):
             )
         if self.links and self.is_cosimulated:
             raise schema.validation_error("a co-simulation has one network; remove `links`", "links")
+        return self
+
+    @schema.model_validator(mode="after")
+    def _network_supports_options(self) -> "EmulatedOptions":
+        if self.network in {None, "builtin"}:
+            return self
+        for key, is_used, what in (
+            ("radio", self.radio.is_fixed, "fixed links (`loss`, `delay`, `rate` or `jitter`)"),
+            ("radio", self.radio.has_infrastructure, ", ".join(f"`{name}`" for name in INFRASTRUCTURE)),
+            ("record_air", self.record_air, "`record_air`"),
+            ("mesh", self.mesh is not None, "`mesh`"),
+        ):
+            if is_used:
+                cause = f"the network {self.network} does not support {what}; remove it, or write `network: builtin`"
+                raise schema.validation_error(cause, key)
         return self
 
     def with_wifi(self, kind: str) -> "EmulatedOptions":

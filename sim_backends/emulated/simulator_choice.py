@@ -24,7 +24,6 @@ from sim_backends.federates.named import (
     named_federate,
 )
 from sim_backends.physics.robot_limits import BODIES, TURTLEBOT3_BURGER, DriveLimits, quadrotor
-from sim_backends.radio.radio_options import INFRASTRUCTURE
 
 _EXTERNAL_NETWORK = SyncOptions.model_validate({"name": "sliding_window", "window": "2ms"})
 """Default for a network in another process, because an exchange at each of its events would take too long for real
@@ -97,17 +96,6 @@ def _network(options: EmulatedOptions) -> str:
     name = options.network or BUILTIN
     if name == BUILTIN:
         return name
-    for is_set, key in (
-        (options.radio.is_fixed, "fixed links under radio"),
-        (options.radio.has_infrastructure, f"{', '.join(INFRASTRUCTURE)} under radio"),
-        (options.record_air, "record_air"),
-        (options.mesh is not None, "mesh"),
-    ):
-        if is_set:
-            raise ConfigurationError(
-                f"the network {name} does not support emulated: {key}",
-                remedy=f"remove it, or write network: {BUILTIN}",
-            )
     return command_line(name, NETWORK)
 
 

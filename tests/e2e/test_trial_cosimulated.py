@@ -137,8 +137,14 @@ def test_a_robot_that_real_ros_drives_stops_at_the_wall(tmp_path: Path) -> None:
     ("emulated", "reason"),
     [
         ("{physics: gazebo, ros: builtin}", "fieldkit.yaml:7: an autopilot cannot fly the drone robot-2 in Gazebo"),
-        ("{network: ns3, record_air: true}", "does not support record_air"),
-        ("{network: ns3, radio: {loss: 5%}}", "does not support fixed links"),
+        (
+            "{network: ns3, record_air: true}",
+            "fieldkit.yaml:7: in emulated: the network ns3 does not support `record_air`",
+        ),
+        (
+            "{network: ns3, radio: {loss: 5%}}",
+            "fieldkit.yaml:7: in emulated: the network ns3 does not support fixed links",
+        ),
         ("{physics: kinematic, sync: slidding_window}", "there is no sync policy 'slidding_window'"),
         ("{sync: sliding_window}", "`sync` needs a co-simulation"),
         ("{physics: kinematic, sync: {name: scheduled, window: 0.1ms}}", "shorter than the step of the physics"),
