@@ -72,9 +72,9 @@ def test_intervals_of_shares_cover_for_any_burst_length(
         coverages.append(coverage_percent(shares(n_lost, n_sent), rate))
         wilson_coverages.append(coverage_percent(wilsons(n_lost.sum(axis=1), n_sent.sum(axis=1)), rate))
     record_property(
-        "result", f"share, 20 repeats of {packets}, {rate:.0%} lost, bursts {BURSTS}: {rounded(coverages)}"
+        "result", f"share, 20 repeats of {packets}, {rate:.0%} lost, bursts {BURSTS}: {as_text(coverages)}"
     )
-    record_property("result", f"the same by Wilson: {rounded(wilson_coverages)}")
+    record_property("result", f"the same by Wilson: {as_text(wilson_coverages)}")
     low, high = (96.0, 99.5) if (packets, rate) in RARE else BAND
     assert all(low <= percentage <= high for percentage in coverages)
     assert BAND[0] <= wilson_coverages[0] <= BAND[1], "Wilson interval, independent losses"
@@ -130,7 +130,7 @@ def test_shares_cover_less_if_repeats_differ_strongly(
     label = f"{rate:.0%} lost, ".replace("%", " %") + (
         "all of 36" if largest == 36 else f"half of 36, half of {largest}"
     )
-    record_property("result", f"share, repeats that differ by far, {label}: {rounded(coverages)}")
+    record_property("result", f"share, repeats that differ by far, {label}: {as_text(coverages)}")
     assert table_row(label) == pytest.approx(coverages, abs=0.8)
 
 
@@ -163,9 +163,9 @@ def test_means_and_medians_cover_skewed_repeats(name: str, record_property: Call
     bootstrap_coverage = coverage_percent(percentile_bootstrap(random, samples[-1]), mean)
     record_property(
         "result",
-        f"mean, {name}, 5, 10, 20 repeats: {rounded(mean_coverages)}, percentile bootstrap {bootstrap_coverage:.1f}",
+        f"mean, {name}, 5, 10, 20 repeats: {as_text(mean_coverages)}, percentile bootstrap {bootstrap_coverage:.1f}",
     )
-    record_property("result", f"median, {name}, 5, 10, 20 repeats: {rounded(median_coverages)}")
+    record_property("result", f"median, {name}, 5, 10, 20 repeats: {as_text(median_coverages)}")
     assert BAND[0] <= mean_coverages[-1] <= BAND[1]
     assert all(BAND[0] <= percentage <= MAX_MEDIAN_COVERAGE for percentage in median_coverages)
     assert abs(mean_coverages[-1] - 95) < abs(bootstrap_coverage - 95)
@@ -183,7 +183,7 @@ def test_means_and_medians_cover_bursty_shares(burst: int, record_property: Call
     bootstrap_coverage = coverage_percent(percentile_bootstrap(random, shares[-1]), rate)
     record_property(
         "result",
-        f"shares lost, bursts of {burst}: mean {rounded(mean_coverages)}, median {rounded(median_coverages)}",
+        f"shares lost, bursts of {burst}: mean {as_text(mean_coverages)}, median {as_text(median_coverages)}",
     )
     assert all(BAND[0] <= percentage <= BAND[1] for percentage in mean_coverages)
     assert all(BAND[0] <= percentage <= MAX_MEDIAN_COVERAGE for percentage in median_coverages)
@@ -220,10 +220,10 @@ def test_medians_have_the_assured_coverage_for_any_distribution(
     random = np.random.default_rng(16)
     draw, true_median = SHAPES[name]
     coverages = {n: coverage_percent(medians(draw(random, (CELLS, n))), true_median) for n in REPEAT_NUMBERS}
-    record_property("result", f"median, {name}, of {REPEAT_NUMBERS}: {rounded(list(coverages.values()))}")
+    record_property("result", f"median, {name}, of {REPEAT_NUMBERS}: {as_text(list(coverages.values()))}")
     assert all(percentage >= 100 * assured(n) - 1 for n, percentage in coverages.items())
     assert table_row(f"median, {name}") == pytest.approx(list(coverages.values()), abs=0.8)
 
 
-def rounded(coverages: list[float]) -> str:
+def as_text(coverages: list[float]) -> str:
     return ", ".join(f"{percentage:.1f}" for percentage in coverages)

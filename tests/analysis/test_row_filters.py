@@ -48,11 +48,11 @@ LEAVES: dict[str, Any] = {
 }
 
 
-def negated(value: bool | None) -> bool | None:
+def negate(value: bool | None) -> bool | None:
     return None if value is None else not value
 
 
-def combined(kind: str, values: list[bool | None]) -> bool | None:
+def combine(kind: str, values: list[bool | None]) -> bool | None:
     decisive = kind == "or"
     if decisive in values:
         return decisive
@@ -62,11 +62,11 @@ def combined(kind: str, values: list[bool | None]) -> bool | None:
 CONDITIONS = st.recursive(
     st.sampled_from(sorted(LEAVES)).map(lambda text: (text, LEAVES[text])),
     lambda children: st.one_of(
-        children.map(lambda child: (f"not ({child[0]})", lambda row: negated(child[1](row)))),
+        children.map(lambda child: (f"not ({child[0]})", lambda row: negate(child[1](row)))),
         st.tuples(st.sampled_from(["and", "or"]), st.lists(children, min_size=2, max_size=3)).map(
             lambda pair: (
                 f" {pair[0]} ".join(f"({text})" for text, _ in pair[1]),
-                lambda row: combined(pair[0], [decide(row) for _, decide in pair[1]]),
+                lambda row: combine(pair[0], [decide(row) for _, decide in pair[1]]),
             )
         ),
     ),

@@ -144,11 +144,11 @@ def test_a_campaign_continues_with_a_truncated_journal(
     path = journal.folder / JOURNAL_FILE
     content = path.read_bytes()
     path.write_bytes(content[: max(0, len(content) - n_removed_bytes)])
-    reopened = CampaignJournal(journal.folder)
-    n_complete = len(reopened.end_entries())
+    reopened_journal = CampaignJournal(journal.folder)
+    n_complete = len(reopened_journal.end_entries())
     assert n_complete >= path.read_bytes().count(b"\n")
-    with reopened.locked(campaign_plan):
-        reopened.add(trials[-1], TrialProgress.ENDED, valid=1)
+    with reopened_journal.locked(campaign_plan):
+        reopened_journal.add(trials[-1], TrialProgress.ENDED, valid=1)
     assert list(CampaignJournal(journal.folder).end_entries()) == [*map(str, trials[:n_complete]), str(trials[-1])]
 
 
@@ -223,6 +223,6 @@ def test_trials_with_failed_repeats_are_planned_again_with_option_failed(lawn: P
         campaign._restart_failed()
     (journal.folder / "2").mkdir()
     (journal.folder / "2" / "trial.yaml").touch()
-    for reopened in (journal, CampaignJournal(journal.folder)):
-        assert set(reopened.end_entries()) == {str(complete)}
-        assert reopened.interrupted_folder(failed) == journal.folder / "2"
+    for current_journal in (journal, CampaignJournal(journal.folder)):
+        assert set(current_journal.end_entries()) == {str(complete)}
+        assert current_journal.interrupted_folder(failed) == journal.folder / "2"

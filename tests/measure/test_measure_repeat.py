@@ -285,9 +285,10 @@ def test_real_captures_of_the_papers_file_without_loss(tmp_path: Path) -> None:
 
 
 def test_a_forged_capture_empties_only_the_columns_of_the_transfer(tmp_path: Path) -> None:
-    forged = timed([segment(index, 60_000 * (index > 0), flags=0x02 * (index == 0)) for index in range(3000)])
+    forged_packets = timed([segment(index, 60_000 * (index > 0), flags=0x02 * (index == 0)) for index in range(3000)])
     measures = measure(
-        _write_repeat(tmp_path, forged, forged[:1], _ping(502, [5.0], n_sent=1)), transfer(Protocol.TCP)
+        _write_repeat(tmp_path, forged_packets, forged_packets[:1], _ping(502, [5.0], n_sent=1)),
+        transfer(Protocol.TCP),
     )
     assert (measures.tcp_sent_bytes, measures.ip_packets_sent) == (None, None)
     assert (measures.rtt_received, measures.sender_captured) == (1, 3000)

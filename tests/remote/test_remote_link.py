@@ -203,7 +203,7 @@ FLOOD_PACKETS = 2000
 """Number of packets in a flood of 64 MB."""
 
 
-def test_flooding_server_fills_no_memory_while_nothing_is_read(
+def test_flooding_server_does_not_fill_the_memory_while_nothing_is_read(
     server: Server, rsa: paramiko.RSAKey, start_fake_server: Callable[..., FakeServer]
 ) -> None:
     sent_sizes: list[int] = []

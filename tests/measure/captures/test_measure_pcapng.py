@@ -127,7 +127,7 @@ def test_a_truncated_file_gives_the_packets_before_the_cut() -> None:
         assert capture.damage == (None if size == start else damage)
 
 
-def _damaged(index: int, offset: int, value: bytes) -> bytes:
+def _damage_block(index: int, offset: int, value: bytes) -> bytes:
     start = ENDS[index] - len(BLOCKS[index])
     return VALID[: start + offset] + value + VALID[start + offset + len(value) :]
 
@@ -151,7 +151,7 @@ def _damaged(index: int, offset: int, value: bytes) -> bytes:
 def test_packets_before_a_broken_block_are_read_and_the_damage_is_reported(
     index: int, offset: int, value: bytes, damage: str
 ) -> None:
-    capture = pcap.parse(_damaged(index, offset, value), where="x")
+    capture = pcap.parse(_damage_block(index, offset, value), where="x")
     start = ENDS[index] - len(BLOCKS[index])
     n_before = sum(end <= start for end in PACKET_ENDS)
     assert capture.packets.tcp_seq.tolist() == list(range(n_before))

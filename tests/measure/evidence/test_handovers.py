@@ -18,9 +18,10 @@ def output(count: int, interval_ns: int, unanswered: set[int]) -> ping.Ping:
     lines = ["PING 10.0.0.1 (10.0.0.1) 56(84) bytes of data."]
     for number in range(count):
         if number not in unanswered:
-            seconds, fraction_ns = divmod(START_NS + number * interval_ns + RTT_NS, 10**9)
-            stamp = f"{seconds}.{fraction_ns // 1000:06}"
-            lines.append(f"[{stamp}] 64 bytes from 10.0.0.1: icmp_seq={number + 1} ttl=64 time=3.00 ms")
+            seconds, rest_ns = divmod(START_NS + number * interval_ns + RTT_NS, 10**9)
+            lines.append(
+                f"[{seconds}.{rest_ns // 1000:06}] 64 bytes from 10.0.0.1: icmp_seq={number + 1} ttl=64 time=3.00 ms"
+            )
     lines += ["", "--- 10.0.0.1 ping statistics ---"]
     lines.append(f"{count} packets transmitted, {count - len(unanswered)} received, 9% packet loss, time 9ms")
     return ping.parse("\n".join(lines) + "\n")
@@ -30,7 +31,7 @@ def samples(cells: list[str | None], period_ns: int) -> list[LinkSample]:
     return [LinkSample(START_NS + number * period_ns, cell=cell) for number, cell in enumerate(cells)]
 
 
-def measured(recorded: list[LinkSample], result: ping.Ping, interval_ns: int) -> Measured:
+def measure_handovers(recorded: list[LinkSample], result: ping.Ping, interval_ns: int) -> Measured:
     return handovers.measure(recorded, result, interval_ns / 1e9, ping_pong_s=10.0)
 
 
@@ -53,7 +54,7 @@ def test_gap_and_loss_of_an_outage_equal_the_closed_form(
         "a" if at_ms < outage_start_ms else None if at_ms < outage_end_ms else "b"
         for at_ms in range(0, count * interval_ms, sample_ms)
     ]
-    result = measured(
+    result = measure_handovers(
         samples([*cells], sample_ms * 1_000_000),
         output(count, interval_ns, {*range(first_lost, lost_end)}),
         interval_ns,
@@ -67,20 +68,22 @@ def test_gap_and_loss_of_an_outage_equal_the_closed_form(
 
 def test_losses_away_from_the_handover_do_not_count() -> None:
     cells = ["a"] * 20 + ["b"] * 20
-    result = measured(samples([*cells], 200_000_000), output(80, 100_000_000, {5, 6, 7, 40, 60, 61}), 100_000_000)
+    result = measure_handovers(
+        samples([*cells], 200_000_000), output(80, 100_000_000, {5, 6, 7, 40, 60, 61}), 100_000_000
+    )
     assert result.values["roam_lost"] == 1
     assert result.values["roam_gap_s"] == pytest.approx(0.2)
 
 
 def test_requests_in_a_gap_of_two_handovers_count_once() -> None:
     cells = ["a"] * 10 + ["b", "c"] + ["c"] * 10
-    result = measured(samples([*cells], 200_000_000), output(40, 100_000_000, {*range(18, 24)}), 100_000_000)
+    result = measure_handovers(samples([*cells], 200_000_000), output(40, 100_000_000, {*range(18, 24)}), 100_000_000)
     assert (result.values["roam_handovers"], result.values["roam_lost"]) == (2, 6)
 
 
 def test_a_gap_that_is_open_at_the_end_of_the_ping_is_a_lower_bound() -> None:
     cells = ["a"] * 10 + ["b"] * 10
-    result = measured(samples([*cells], 200_000_000), output(40, 100_000_000, {*range(19, 40)}), 100_000_000)
+    result = measure_handovers(samples([*cells], 200_000_000), output(40, 100_000_000, {*range(19, 40)}), 100_000_000)
     assert "roam_gap_s" in result.missing
     assert result.values["roam_gap_at_least_s"] == pytest.approx(2.1)
     assert result.values["roam_lost"] == 21
@@ -88,7 +91,7 @@ def test_a_gap_that_is_open_at_the_end_of_the_ping_is_a_lower_bound() -> None:
 
 def test_samples_after_the_ping_do_not_count() -> None:
     cells = ["a"] * 10 + ["b"] * 20 + ["a"] * 20
-    result = measured(samples([*cells], 200_000_000), output(40, 100_000_000, set()), 100_000_000)
+    result = measure_handovers(samples([*cells], 200_000_000), output(40, 100_000_000, set()), 100_000_000)
     assert (result.values["roam_ap_after"], result.values["roam_handovers"]) == ("b", 1)
 
 
@@ -115,7 +118,7 @@ def test_each_column_has_a_value_or_a_reason() -> None:
         for ping_result in pings:
             result = handovers.measure(samples([*cells], 200_000_000), ping_result, 0.1, ping_pong_s=10.0)
             assert names == {*result.values, *result.missing}
-    result = measured(samples([None] * 9, 200_000_000), output(40, 100_000_000, set()), 100_000_000)
+    result = measure_handovers(samples([None] * 9, 200_000_000), output(40, 100_000_000, set()), 100_000_000)
     assert "no access point" in result.missing["roam_ap_before"]
 
 

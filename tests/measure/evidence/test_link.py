@@ -21,7 +21,7 @@ def samples(*stations: StationSample, cell: str | None = None) -> list[LinkSampl
     ]
 
 
-def measured(link_samples: list[LinkSample]) -> dict[str, object]:
+def measure_values(link_samples: list[LinkSample]) -> dict[str, object]:
     return {
         name.removeprefix("sender_"): value for name, value in link.measure(Role.SENDER, link_samples).values.items()
     }
@@ -35,7 +35,7 @@ def test_each_column_has_the_expected_value() -> None:
             SAMPLE, signal_dbm=-55.0, tx_packets=30, rx_packets=130, tx_retries=9, tx_failures=2, beacon_losses=1
         ),
     )
-    assert measured(link_samples) == {
+    assert measure_values(link_samples) == {
         "signal_median_dbm": -55.0,
         "signal_min_dbm": -70.0,
         "signal_last_dbm": -55.0,
@@ -58,7 +58,7 @@ def test_each_column_has_a_value_or_a_reason() -> None:
         measured_link = [link.measure(role, link_samples) for role in link.ROLES]
         assert names == {name for item in measured_link for name in (*item.values, *item.missing)}
     assert "no Wi-Fi or no iw" in link.measure(Role.SENDER, []).missing["sender_signal_min_dbm"]
-    assert "tx_retries" not in measured(samples(SAMPLE)), "an increment needs two samples"
+    assert "tx_retries" not in measure_values(samples(SAMPLE)), "an increment needs two samples"
 
 
 COUNTS = st.none() | st.integers(0, 10**18)
@@ -95,12 +95,12 @@ def test_the_link_of_an_access_point_is_that_of_the_station_with_the_most_packet
         LinkSample(S, (other_station, replace(SAMPLE, tx_packets=60, signal_dbm=-52.0))),
         LinkSample(2 * S, (replace(other_station, tx_packets=40), StationSample("", -51.0))),
     ]
-    assert measured(link_samples)["radio_tx_packets"] == 50
-    assert measured(link_samples)["signal_min_dbm"] == -52.0
-    assert measured(link_samples)["signal_last_dbm"] == -51.0, (
+    assert measure_values(link_samples)["radio_tx_packets"] == 50
+    assert measure_values(link_samples)["signal_min_dbm"] == -52.0
+    assert measure_values(link_samples)["signal_last_dbm"] == -51.0, (
         "the sample of /proc/net/wireless, because iw was not called"
     )
-    assert "roams" not in measured(link_samples)
+    assert "roams" not in measure_values(link_samples)
 
 
 def test_counters_continue_when_a_station_roams() -> None:
@@ -111,8 +111,8 @@ def test_counters_continue_when_a_station_roams() -> None:
         LinkSample(3 * S, (replace(second_cell, tx_packets=9),)),
         LinkSample(4 * S, (), "aa"),
     ]
-    assert measured(link_samples)["roams"] == 2
-    assert measured(link_samples)["radio_tx_packets"] == 5 + 4 + 5
+    assert measure_values(link_samples)["roams"] == 2
+    assert measure_values(link_samples)["radio_tx_packets"] == 5 + 4 + 5
 
 
 def test_counters_of_a_new_link_start_from_zero() -> None:
@@ -124,10 +124,10 @@ def test_counters_of_a_new_link_start_from_zero() -> None:
         LinkSample(S, (replace(first_cell, tx_packets=21, rx_packets=1530),), first_cell.station),
         LinkSample(2 * S, (second_cell,)),
     ]
-    assert measured(link_samples)["roams"] == 1, "only the station dump shows the new access point"
-    assert measured(link_samples)["radio_tx_packets"] == 10 + 139
-    assert measured(link_samples)["radio_rx_packets"] == 8 + 1775
-    assert measured(link_samples)["beacon_losses"] == 0
+    assert measure_values(link_samples)["roams"] == 1, "only the station dump shows the new access point"
+    assert measure_values(link_samples)["radio_tx_packets"] == 10 + 139
+    assert measure_values(link_samples)["radio_rx_packets"] == 8 + 1775
+    assert measure_values(link_samples)["beacon_losses"] == 0
 
 
 def test_counts_after_the_last_sample_of_a_replaced_link_are_unknown() -> None:
@@ -148,8 +148,8 @@ def test_the_link_of_a_station_with_several_peers_is_that_of_its_access_point() 
         LinkSample(S, (replace(SAMPLE, tx_packets=12),), "aa"),
         LinkSample(2 * S, (replace(SAMPLE, tx_packets=17), peer)),
     ]
-    assert measured(link_samples)["radio_tx_packets"] == 7
-    assert measured(link_samples)["roams"] == 0
+    assert measure_values(link_samples)["radio_tx_packets"] == 7
+    assert measure_values(link_samples)["roams"] == 0
 
 
 @pytest.mark.parametrize("busy", [[0, 500, 100], [900, 1400, 1500]])

@@ -22,7 +22,7 @@ def output(version: str, test: str, end: str) -> str:
     return (DATA / "iperf3" / version / f"{test}-{end}.json").read_text(encoding="utf-8")
 
 
-def measured(version: str, test: str) -> dict[str, Any]:
+def measure_values(version: str, test: str) -> dict[str, Any]:
     sends, receives = ("server", "client") if test.endswith("reverse") else ("client", "server")
     sender, receiver = (iperf3.parse(output(version, test, end)) for end in (sends, receives))
     result = iperf3.measure(Protocol(test[:3]), sender, receiver)
@@ -33,7 +33,7 @@ def measured(version: str, test: str) -> dict[str, Any]:
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("test", ["udp", "udp-reverse"])
 def test_the_counts_of_a_udp_test_agree_in_all_versions(version: str, test: str) -> None:
-    values = measured(version, test)
+    values = measure_values(version, test)
     assert values["iperf3_received_bytes"] == PAYLOAD_BYTES * values["iperf3_datagrams_received"]
     assert values["iperf3_datagrams_sent"] == pytest.approx(values["iperf3_sent_bytes"] / PAYLOAD_BYTES, rel=0.02)
     assert 0.01 < values["iperf3_loss"] < 0.1, "the radio loses 5 %"
@@ -49,7 +49,7 @@ def test_the_counts_of_a_udp_test_agree_in_all_versions(version: str, test: str)
 def test_figures_equal_the_totals_of_the_receiver(version: str, test: str) -> None:
     """The totals are in the output of the client, where all versions report the receiver correctly."""
     end = json.loads(output(version, test, "client"))["end"]
-    values = measured(version, test)
+    values = measure_values(version, test)
     n_lost = values["iperf3_datagrams_sent"] - values["iperf3_datagrams_received"]
     assert n_lost == end["sum"]["lost_packets"]
     if "sum_received" in end:
@@ -59,7 +59,7 @@ def test_figures_equal_the_totals_of_the_receiver(version: str, test: str) -> No
 
 @pytest.mark.parametrize("version", VERSIONS)
 def test_the_counts_of_a_tcp_test_with_two_streams_agree(version: str) -> None:
-    values = measured(version, "tcp")
+    values = measure_values(version, "tcp")
     end = json.loads(output(version, "tcp", "client"))["end"]
     assert values["iperf3_sent_bytes"] == end["sum_sent"]["bytes"]
     assert values["iperf3_retransmits"] == end["sum_sent"]["retransmits"]

@@ -267,9 +267,9 @@ def test_the_median_of_all_requests_counts_a_lost_request_as_infinitely_late(rtt
 
 
 def test_a_ping_with_half_of_its_echoes_lost_has_no_median_of_all_requests() -> None:
-    def measured(n_sent: int) -> Measured:
+    def measure_values(n_sent: int) -> Measured:
         return ping.measure(ping_with_answers((1, 100), (2, 200), (3, 300), n_sent=n_sent))
 
-    assert measured(3).values["rtt_median_sent_s"] == measured(3).values["rtt_median_s"]
-    assert measured(5).values["rtt_median_sent_s"] == 1e-3
-    assert "rtt_median_sent_s" in measured(6).missing
+    assert measure_values(3).values["rtt_median_sent_s"] == measure_values(3).values["rtt_median_s"]
+    assert measure_values(5).values["rtt_median_sent_s"] == 1e-3
+    assert "rtt_median_sent_s" in measure_values(6).missing

@@ -27,14 +27,14 @@ BUSYBOX = """\
 """
 
 
-def parsed(text: str) -> Clock:
+def parse_clock(text: str) -> Clock:
     bounds = clock.parse(text.splitlines())
     assert bounds is not None
     return bounds
 
 
 def test_two_readings_of_one_boot_agree_to_a_few_milliseconds() -> None:
-    before, after = parsed(COREUTILS), parsed(BUSYBOX)
+    before, after = parse_clock(COREUTILS), parse_clock(BUSYBOX)
     step = clock.clock_step(before, after)
     assert abs(step.step_s) <= step.error_s < 0.01
     assert clock.step_description(before, after) is None
@@ -42,26 +42,26 @@ def test_two_readings_of_one_boot_agree_to_a_few_milliseconds() -> None:
 
 def test_the_step_of_a_changed_reading_has_sign_and_uncertainty() -> None:
     earlier_readings = BUSYBOX.replace(" 1795320484.0", " 1795320483.9").replace(" 1795320484.1", " 1795320484.0")
-    problem = clock.step_description(parsed(COREUTILS), parsed(earlier_readings))
+    problem = clock.step_description(parse_clock(COREUTILS), parse_clock(earlier_readings))
     assert problem is not None
     assert problem.startswith("its clock was set back by 0.099 s (uncertainty 0.006 s)")
     later_readings = BUSYBOX.replace(" 1795320484", " 1795324084")
-    assert (clock.step_description(parsed(COREUTILS), parsed(later_readings)) or "").startswith(
+    assert (clock.step_description(parse_clock(COREUTILS), parse_clock(later_readings)) or "").startswith(
         "its clock was set ahead by 3600.0"
     )
 
 
 def test_a_clock_in_whole_seconds_shows_larger_steps() -> None:
     seconds = "100.00 1000 100.01\n100.01 1000 100.02\n"
-    assert clock.step_description(parsed(seconds), parsed("200.00 1100 200.01\n")) is None
+    assert clock.step_description(parse_clock(seconds), parse_clock("200.00 1100 200.01\n")) is None
     assert "set ahead by 3.005 s (uncertainty 1.015 s)" in (
-        clock.step_description(parsed(seconds), parsed("200.00 1103 200.01\n")) or ""
+        clock.step_description(parse_clock(seconds), parse_clock("200.00 1103 200.01\n")) or ""
     )
 
 
 def test_a_clock_set_during_the_reading_is_detected() -> None:
-    inconsistent_clock = parsed("1.00 50.000000000 1.00\n1.00 70.000000000 1.00\n")
-    assert clock.step_description(inconsistent_clock, parsed(BUSYBOX)) == "its clock was set while it was read"
+    inconsistent_clock = parse_clock("1.00 50.000000000 1.00\n1.00 70.000000000 1.00\n")
+    assert clock.step_description(inconsistent_clock, parse_clock(BUSYBOX)) == "its clock was set while it was read"
 
 
 @pytest.mark.parametrize("text", ["", "1.0 2 3.0", "nothing", "1.00 1795320484.07 1.00", "12611.27  12611.27"])
@@ -96,7 +96,7 @@ class Moment:
                 f"{wall_ns // 10**9}.{wall_ns % 10**9:09d}" if robot.has_nanoseconds else str(wall_ns // 10**9)
             )
             lines.append(f"{uptime_texts[0]} {wall_text} {uptime_texts[1]}")
-        return parsed("\n".join(lines))
+        return parse_clock("\n".join(lines))
 
 
 ROBOTS = st.builds(Robot, st.integers(10**18, 2 * 10**18), st.floats(0.9, 1.1), st.booleans())

@@ -24,7 +24,7 @@ TCP = replace(UDP, protocol=Protocol.TCP, expected=FlowSchedule(head_bytes=COOKI
 LOST = (100, 150)
 
 
-def measured(load: LoadStreams, streams: Iterable[Stream]) -> dict[str, Any]:
+def measure_values(load: LoadStreams, streams: Iterable[Stream]) -> dict[str, Any]:
     result = iperf3_load.measure_stalls("iperf3", load, *captured(streams))
     assert result.values.keys() | result.missing.keys() == {
         column.name for column in stalls.declare_columns("iperf3", "iperf3", 0)
@@ -50,25 +50,25 @@ def data(sport: int = 40000, lost_numbers: range = range(*LOST)) -> Stream:
 
 
 def test_consecutive_lost_datagrams_are_a_stall() -> None:
-    result = measured(UDP, [control(), data()])
+    result = measure_values(UDP, [control(), data()])
     assert result == {"stall_s": pytest.approx(0.5), "stalls": 1}
 
 
 def test_stalls_of_parallel_streams_are_counted_separately() -> None:
     packets = [control(), data(), data(40001, range(200, 300))]
     two_streams = replace(UDP, count=2)
-    assert measured(two_streams, packets) == {"stall_s": pytest.approx(1.0), "stalls": 2}
+    assert measure_values(two_streams, packets) == {"stall_s": pytest.approx(1.0), "stalls": 2}
     named_stream = replace(UDP, ports=((40000, PORT),))
-    assert measured(named_stream, packets) == {"stall_s": pytest.approx(0.5), "stalls": 1}
+    assert measure_values(named_stream, packets) == {"stall_s": pytest.approx(0.5), "stalls": 1}
 
 
 def test_streams_that_cannot_be_distinguished_have_no_stall() -> None:
-    assert not measured(UDP, [control(), data(), data(40001)])
+    assert not measure_values(UDP, [control(), data(), data(40001)])
 
 
 def test_a_test_longer_than_its_arrivals_has_a_lower_bound() -> None:
     with_duration = replace(UDP, expected=replace(SCHEDULE, duration_s=10.0))
-    assert measured(with_duration, [control(), data()]) == {"stall_at_least_s": pytest.approx(6.0), "stalls": 2}
+    assert measure_values(with_duration, [control(), data()]) == {"stall_at_least_s": pytest.approx(6.0), "stalls": 2}
 
 
 def tcp_data(gap_ns: int) -> Stream:
@@ -93,7 +93,7 @@ def tcp_data(gap_ns: int) -> Stream:
 @given(st.integers(300, 4000))
 @settings(max_examples=15, deadline=None)
 def test_retransmissions_that_are_lost_do_not_end_a_stall(gap_ms: int) -> None:
-    result = measured(TCP, [control(), tcp_data(gap_ms * MS)])
+    result = measure_values(TCP, [control(), tcp_data(gap_ms * MS)])
     # The setup is included: 0.9 s from SYN to the first data.
     assert result["stall_s"] == pytest.approx(max(gap_ms / 1e3 + 0.01, 0.9), abs=1e-3)
     assert result["stalls"] == 2
@@ -109,7 +109,7 @@ def test_a_reverse_test_sends_from_the_port_of_the_server() -> None:
     control_stream = Stream(sport=PORT, port=39000)
     control_stream.opens(0)
     load = replace(TCP, source_listens=True, expected=FlowSchedule())
-    assert measured(load, [control_stream, data_stream])["stall_s"] == pytest.approx(2.01, abs=1e-3)
+    assert measure_values(load, [control_stream, data_stream])["stall_s"] == pytest.approx(2.01, abs=1e-3)
 
 
 @pytest.mark.parametrize("end", ["sender", "receiver"])
@@ -121,13 +121,13 @@ def test_a_clock_that_is_set_forward_is_not_a_stall(end: str) -> None:
             Frame(frame.time_ns + 3600 * SECOND * (frame.time_ns > START + 3 * SECOND), frame.data)
             for frame in frames
         ]
-    assert not measured(UDP, streams)
+    assert not measure_values(UDP, streams)
 
 
 def test_without_captures_or_packets_the_columns_are_empty() -> None:
     assert not iperf3_load.measure_stalls("iperf3", UDP, None, captured([data()])[1]).values
-    assert not measured(UDP, [])
-    assert not measured(TCP, [control()])
+    assert not measure_values(UDP, [])
+    assert not measure_values(TCP, [control()])
 
 
 def rfc_3550(transit_s: Sequence[float]) -> float:

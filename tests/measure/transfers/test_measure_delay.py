@@ -38,7 +38,9 @@ CLOCKS: list[ClockError] = [
 ]
 
 
-def _measured(sender: Packets, receiver: Packets, transfer_filter: Transfer, n_sent: int | None = None) -> Measures:
+def _measure_delays(
+    sender: Packets, receiver: Packets, transfer_filter: Transfer, n_sent: int | None = None
+) -> Measures:
     if transfer_filter.protocol is Protocol.UDP:
         pairs = delay.udp_packets(udp.match_transfer(sender, receiver, transfer_filter))
     else:
@@ -80,7 +82,7 @@ def _measure_real_transfer(protocol: Protocol, offset_s: float = 0.0, drift: flo
     start_ns = int(sender.time_ns.min()) - START_NS
     sender, receiver = (replace(capture, time_ns=capture.time_ns - start_ns) for capture in (sender, receiver))
     transfer_filter = replace(transfer(protocol), sender_address="10.42.0.1", receiver_address="10.42.0.2", port=1234)
-    return _measured(sender, _on_another_clock(receiver, offset_s, drift), transfer_filter)
+    return _measure_delays(sender, _on_another_clock(receiver, offset_s, drift), transfer_filter)
 
 
 @pytest.mark.parametrize(("offset_s", "drift"), CLOCKS)
@@ -162,7 +164,7 @@ def test_values_are_correct_within_their_error_or_withheld(
     sender, receiver = _captures_with_pings(
         [20.0 * n for n in range(len(delay_ms))], delay_ms, clock_error, ping_delay_ms=ping_delay_ms
     )
-    measures = _measured(sender, receiver, transfer(Protocol.UDP))
+    measures = _measure_delays(sender, receiver, transfer(Protocol.UDP))
     error_s = measures.one_way_error_s
     assert error_s is not None
     delay_s = np.array(delay_ms) / 1e3
@@ -186,7 +188,7 @@ def test_results_on_two_clocks_equal_closed_forms() -> None:
     """Delays are 100, 110, 100, 110 ... ms, and pings take 1 ms in each direction."""
     delay_ms = [100.0 + 10 * (n % 2) for n in range(101)]
     sender, receiver = _captures_with_pings([50.0 * n for n in range(101)], delay_ms, (-3600, 0))
-    measures = _measured(sender, receiver, transfer(Protocol.UDP))
+    measures = _measure_delays(sender, receiver, transfer(Protocol.UDP))
     assert measures.one_way_withheld is None
     assert measures.one_way_min_s == pytest.approx(0.100, abs=1e-5)
     assert measures.one_way_median_s == pytest.approx(0.100, abs=1e-5)
@@ -203,7 +205,7 @@ def test_results_on_two_clocks_equal_closed_forms() -> None:
 def test_a_lost_packet_counts_as_infinitely_late_in_the_median_of_all_sent_packets() -> None:
     sender, receiver = _captures_with_pings([50.0 * n for n in range(101)], [100.0 + n for n in range(101)], (0, 0))
     measures = {
-        n_sent: _measured(sender, receiver, transfer(Protocol.UDP), n_sent) for n_sent in (101, 151, 202, 203)
+        n_sent: _measure_delays(sender, receiver, transfer(Protocol.UDP), n_sent) for n_sent in (101, 151, 202, 203)
     }
     assert all(delays.one_way_median_s == pytest.approx(0.150, abs=1e-5) for delays in measures.values())
     assert measures[101].one_way_median_sent_s == measures[101].one_way_median_s
@@ -222,7 +224,7 @@ def test_reordered_packets_count_and_packets_of_another_transfer_do_not() -> Non
         Packets.concatenated((sender, packets(other_transfer))),
         Packets.concatenated((receiver, packets(other_arrivals))),
     )
-    measures = _measured(sender, receiver, transfer(Protocol.UDP))
+    measures = _measure_delays(sender, receiver, transfer(Protocol.UDP))
     assert measures.jitter_s == pytest.approx(0.2 / 16)
     assert measures.delay_variation_p95_s == pytest.approx(0.2 * 0.85), "packets of the other transfer are 5 s late"
     assert measures.one_way_mean_s == pytest.approx(0.150, abs=1e-5)
@@ -274,7 +276,7 @@ def test_a_tcp_frame_with_offload_arrives_with_its_last_byte() -> None:
             [*arrivals, (2, reverse), (5, ack), (5, segment(9, 0, back=True))],
         )
     )
-    measures = _measured(sender, receiver, transfer(Protocol.TCP))
+    measures = _measure_delays(sender, receiver, transfer(Protocol.TCP))
     assert measures.one_way_error_s == pytest.approx(0.001, abs=0.2e-3)
     assert measures.one_way_min_s == pytest.approx(0.110, abs=1e-5), "the delay of the last byte of the superframe"
     assert measures.one_way_mean_s == pytest.approx((0.110 + 0.130) / 2, abs=1e-5)
@@ -327,7 +329,7 @@ WITHHELD: dict[str, Change] = {
 @pytest.mark.parametrize("reason", WITHHELD)
 def test_unknown_values_are_missing_with_a_reason(reason: str) -> None:
     sender, receiver = _captures_with_pings([0.0, 1.0, 2.0], [1.0, 1.0, 1.5], (12.0, 0))
-    measures = _measured(*WITHHELD[reason](sender, receiver), transfer(Protocol.UDP))
+    measures = _measure_delays(*WITHHELD[reason](sender, receiver), transfer(Protocol.UDP))
     assert measures.one_way_withheld == reason
     assert (
         measures.one_way_min_s

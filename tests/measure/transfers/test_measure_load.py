@@ -37,7 +37,7 @@ def tcp_frames(count: int, *, repeated: tuple[int, ...] = ()) -> list[Frame]:
     return frames + [Frame(START + index * PERIOD_NS + 1_000_000, segments[index]) for index in repeated]
 
 
-def measured(flow: LoadFlow, sent_frames: list[Frame], received_frames: list[Frame]) -> dict[str, object]:
+def measure_values(flow: LoadFlow, sent_frames: list[Frame], received_frames: list[Frame]) -> dict[str, object]:
     result = iperf3_load.measure_totals(flow, packets(sent_frames), packets(received_frames))
     assert result.values.keys() | result.missing.keys() == {column.name for column in iperf3_load.COLUMNS}
     return dict(result.values)
@@ -45,7 +45,7 @@ def measured(flow: LoadFlow, sent_frames: list[Frame], received_frames: list[Fra
 
 def test_the_rate_includes_the_datagrams_in_the_measured_seconds() -> None:
     frames = udp_frames(400)
-    result = measured(UDP, frames, frames)
+    result = measure_values(UDP, frames, frames)
     assert result == {"iperf3_captured_bit_s": RATE, "iperf3_captured_loss": 0.0}
 
 
@@ -53,7 +53,7 @@ def test_the_rate_includes_the_datagrams_in_the_measured_seconds() -> None:
 def test_losses_of_the_radio_are_counted(lost_indices: set[int]) -> None:
     sent_frames = udp_frames(400)
     received_frames = [frame for index, frame in enumerate(sent_frames) if index - 1 not in lost_indices]
-    result = measured(UDP, sent_frames, received_frames)
+    result = measure_values(UDP, sent_frames, received_frames)
     assert result["iperf3_captured_loss"] == pytest.approx(len(lost_indices) / 400)
     first = min(set(range(400)) - lost_indices)
     n_received = sum(index not in lost_indices for index in range(first + 100, min(first + 300, 400)))
@@ -62,13 +62,13 @@ def test_losses_of_the_radio_are_counted(lost_indices: set[int]) -> None:
 
 def test_retransmitted_bytes_count_once_in_the_rate() -> None:
     sent_frames = tcp_frames(400, repeated=tuple(range(0, 400, 10)))
-    result = measured(TCP, sent_frames, sent_frames)
+    result = measure_values(TCP, sent_frames, sent_frames)
     assert result == {"iperf3_captured_bit_s": RATE, "iperf3_captured_loss": 0.0}
 
 
 def test_retransmissions_count_in_the_loss() -> None:
     repeated = tuple(range(0, 400, 10))
-    result = measured(TCP, tcp_frames(400, repeated=repeated), tcp_frames(400))
+    result = measure_values(TCP, tcp_frames(400, repeated=repeated), tcp_frames(400))
     sent_bytes = 440 * PAYLOAD_BYTES + COOKIE
     assert result["iperf3_captured_loss"] == pytest.approx(40 * PAYLOAD_BYTES / sent_bytes)
     assert result["iperf3_captured_bit_s"] == RATE
@@ -81,14 +81,14 @@ def test_streams_are_summed() -> None:
     ]
     all_frames = udp_frames(400) + second
     flow = replace(UDP, ports=((40000, PORT), (50000, PORT)))
-    assert measured(flow, all_frames, all_frames)["iperf3_captured_bit_s"] == 2 * RATE
+    assert measure_values(flow, all_frames, all_frames)["iperf3_captured_bit_s"] == 2 * RATE
 
 
 def test_fragmented_datagrams_have_no_loss() -> None:
     flow = replace(UDP, payload_bytes=3000)
     data = [piece for index in range(400) for piece in datagram(index, 3000)]
     frames = timed(data, start_ns=START, step_ns=PERIOD_NS // 3)
-    result = measured(flow, frames, frames)
+    result = measure_values(flow, frames, frames)
     assert "iperf3_captured_loss" not in result
 
 
@@ -98,12 +98,12 @@ def test_fragmented_datagrams_have_no_loss() -> None:
 )
 def test_without_packets_of_the_test_the_columns_are_empty(flow: LoadFlow) -> None:
     frames = udp_frames(400)
-    assert "iperf3_captured_bit_s" not in measured(flow, frames, frames)
+    assert "iperf3_captured_bit_s" not in measure_values(flow, frames, frames)
 
 
 def test_a_connection_without_a_captured_syn_has_no_rate() -> None:
     frames = tcp_frames(400)
-    assert "iperf3_captured_bit_s" not in measured(TCP, frames, frames[1:])
+    assert "iperf3_captured_bit_s" not in measure_values(TCP, frames, frames[1:])
 
 
 def test_without_both_captures_the_columns_are_empty() -> None:

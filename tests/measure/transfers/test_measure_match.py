@@ -209,8 +209,8 @@ def test_empty_captures_have_no_matches() -> None:
 
 def test_many_overlapping_forged_frames_are_refused() -> None:
     """3,000 superframes that start one byte after each other have 9 million pieces."""
-    forged = packets(timed([segment(1 + index, 60_000, ip_id=index) for index in range(3000)]))
+    forged_packets = packets(timed([segment(1 + index, 60_000, ip_id=index) for index in range(3000)]))
     with pytest.raises(EvidenceError, match="3000 TCP frames overlap"):
-        match_payload(forged, packets([]))
-    few_frames = match_payload(forged.where(slice(0, 500)), packets([]))
+        match_payload(forged_packets, packets([]))
+    few_frames = match_payload(forged_packets.where(slice(0, 500)), packets([]))
     assert few_frames.sent.size_bytes.sum() == 500 * 60_000

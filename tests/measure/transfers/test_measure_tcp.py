@@ -34,7 +34,7 @@ def _bytes(byte_ranges: Iterable[Range]) -> Counter[int]:
     return Counter(byte for start, size in byte_ranges for byte in range(start, start + size))
 
 
-def _retransmitted(sent_ranges: Iterable[Range]) -> int:
+def _count_retransmissions(sent_ranges: Iterable[Range]) -> int:
     sent_before: set[int] = set()
     repeated = 0
     for start, size in sent_ranges:
@@ -62,7 +62,7 @@ def test_ranges_equal_a_model_of_single_bytes(
     assert counts.unique_bytes == len(sent_bytes)
     assert counts.received_bytes == (sent_bytes & received_bytes).total()
     assert counts.lost_bytes == len(set(sent_bytes) - set(received_bytes))
-    assert counts.retransmitted_frames == _retransmitted(sent_ranges)
+    assert counts.retransmitted_frames == _count_retransmissions(sent_ranges)
     assert (counts.frames_sent, counts.frames_received) == (1 + len(sent_ranges), syn + len(received_ranges))
 
 

@@ -36,7 +36,7 @@ def times(began_ms: int, ended_ms: int | None, ahead_s: float = 0.0, error_s: fl
     return FaultTimes(began_ns, ended_ns, {ROBOT: Offset(ahead_s, error_s)})
 
 
-def measured(fault_times: FaultTimes | None, *streams: Delivery) -> dict[str, Any]:
+def measure_values(fault_times: FaultTimes | None, *streams: Delivery) -> dict[str, Any]:
     result = recoveries.measure("transfer", KIND, lambda: streams, fault_times, ROBOT)
     recovery_names = {column.name for column in recoveries.declare_columns("transfer", KIND)}
     assert result.values.keys() | result.missing.keys() == recovery_names
@@ -53,42 +53,42 @@ def test_recovery_starts_at_the_end_of_the_fault_for_any_clock_offset(
     before_ms: list[int], recovery_ms: int, ahead_s: int
 ) -> None:
     stream = delivery(*sorted(before_ms), 3000 + recovery_ms, 3000 + recovery_ms + 10)
-    result = measured(times(1000, 3000, float(ahead_s)), stream)
+    result = measure_values(times(1000, 3000, float(ahead_s)), stream)
     assert result["recovery_s"] == pytest.approx(recovery_ms / 1e3, abs=1e-6)
     assert result["outage_s"] == pytest.approx((3000 + recovery_ms - max(before_ms)) / 1e3, abs=1e-6)
 
 
 def test_an_unaffected_flow_recovers_with_its_next_payload() -> None:
-    result = measured(times(1000, 3000), delivery(*range(0, 5000, 20)))
+    result = measure_values(times(1000, 3000), delivery(*range(0, 5000, 20)))
     assert result == {"recovery_s": pytest.approx(0.02), "outage_s": pytest.approx(0.02)}
 
 
 def test_a_flow_that_does_not_recover_has_lower_bounds() -> None:
-    result = measured(times(1000, 3000), delivery(0, 500, 900, end_ms=9000))
+    result = measure_values(times(1000, 3000), delivery(0, 500, 900, end_ms=9000))
     assert result == {"recovery_at_least_s": pytest.approx(6.0), "outage_at_least_s": pytest.approx(8.1)}
 
 
 def test_a_flow_that_ended_during_the_fault_has_only_an_outage() -> None:
-    result = measured(times(1000, 3000), delivery(0, 900, end_ms=2000))
+    result = measure_values(times(1000, 3000), delivery(0, 900, end_ms=2000))
     assert result == {"outage_at_least_s": pytest.approx(1.1)}
 
 
 def test_the_last_of_several_streams_to_recover_counts() -> None:
     recovered, unrecovered = delivery(0, 900, 3100), delivery(0, 900, end_ms=5000)
-    assert measured(times(1000, 3000), recovered, delivery(0, 950, 3900))["recovery_s"] == pytest.approx(0.9)
-    assert measured(times(1000, 3000), recovered, unrecovered) == {
+    assert measure_values(times(1000, 3000), recovered, delivery(0, 950, 3900))["recovery_s"] == pytest.approx(0.9)
+    assert measure_values(times(1000, 3000), recovered, unrecovered) == {
         "recovery_at_least_s": pytest.approx(2.0),
         "outage_at_least_s": pytest.approx(4.1),
     }
 
 
 def test_a_flow_that_was_being_set_up_has_an_outage_from_its_start() -> None:
-    result = measured(times(1000, 3000), delivery(4000, 4010, begin_ms=500))
+    result = measure_values(times(1000, 3000), delivery(4000, 4010, begin_ms=500))
     assert result == {"recovery_s": pytest.approx(1.0), "outage_s": pytest.approx(3.5)}
 
 
 def test_a_fault_with_an_unknown_end_has_only_an_outage() -> None:
-    result = measured(times(1000, None), delivery(0, 990, 4000, 4010))
+    result = measure_values(times(1000, None), delivery(0, 990, 4000, 4010))
     assert result == {"outage_s": pytest.approx(3.01)}
 
 
@@ -108,7 +108,7 @@ def test_a_fault_with_an_unknown_end_has_only_an_outage() -> None:
 def test_flows_outside_the_fault_or_without_times_have_no_recovery(
     fault_times: FaultTimes | None, stream: Delivery
 ) -> None:
-    assert not measured(fault_times, stream)
+    assert not measure_values(fault_times, stream)
 
 
 @given(

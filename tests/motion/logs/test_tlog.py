@@ -24,14 +24,14 @@ def write_log(tmp_path: Path, data: bytes) -> Path:
     return path
 
 
-def measured(tmp_path: Path, data: bytes, ended_us: int = 0) -> dict[str, object]:
+def measure_values(tmp_path: Path, data: bytes, ended_us: int = 0) -> dict[str, object]:
     measured_log = tlog.measure(tlog.read(write_log(tmp_path, data), 0, ended_us))
     assert measured_log.values.keys() | measured_log.missing.keys() == {column.name for column in tlog.COLUMNS}
     return dict(measured_log.values)
 
 
 def test_the_columns_of_a_flight_are_correct(tmp_path: Path) -> None:
-    values = measured(tmp_path, flight(10, 1.5))
+    values = measure_values(tmp_path, flight(10, 1.5))
     assert values["mavlink_messages"] == values["mavlink_sent"] == 1 + 2 * 101
     assert values["mavlink_loss"] == values["mavlink_damaged"] == 0
     assert values["mavlink_armed"] is True
@@ -57,7 +57,7 @@ def test_battery_position_and_radio_link_are_measured(tmp_path: Path) -> None:
         sender.frame(d.MAVLink_sys_status_message(*sensors, 11_100, 100, 42, 250, 0, 0, 0, 0, 0)),
         sender.frame(d.MAVLink_sys_status_message(*sensors, 65_535, 100, -1, 0, 0, 0, 0, 0, 0)),
     ]
-    values = measured(tmp_path, stamped([(number, message) for number, message in enumerate(messages)]))
+    values = measure_values(tmp_path, stamped([(number, message) for number, message in enumerate(messages)]))
     assert (values["mavlink_battery_begin"], values["mavlink_battery_end"]) == (0.9, 0.42)
     assert (values["mavlink_battery_begin_v"], values["mavlink_battery_end_v"]) == (12.6, 11.1)
     assert (values["mavlink_lat_begin_deg"], values["mavlink_lon_end_deg"]) == (48.1374, 11.5755)
@@ -69,7 +69,7 @@ def test_battery_position_and_radio_link_are_measured(tmp_path: Path) -> None:
 
 
 def test_the_loss_is_a_share_of_the_sent_messages(tmp_path: Path) -> None:
-    values = measured(tmp_path, flight(10, lost=lambda number: number % 10 == 5))
+    values = measure_values(tmp_path, flight(10, lost=lambda number: number % 10 == 5))
     assert (values["mavlink_messages"], values["mavlink_sent"]) == (183, 203)
     assert values["mavlink_loss_most"] == pytest.approx(20 / 203)
     assert (values["mavlink_periodic"], values["mavlink_periodic_sent"]) == (182, 202)
@@ -83,14 +83,14 @@ def test_sequence_numbers_filtered_by_a_router_count_only_in_the_upper_bound(tmp
         frames.append((100_000 * number, sender.frame(d.MAVLink_attitude_message(100 * number, 0, 0, 0, 0, 0, 0))))
         if number % 20 == 10:
             sender.frame(d.MAVLink_command_ack_message(511, 0))  # to another station
-    values = measured(tmp_path, stamped(frames))
+    values = measure_values(tmp_path, stamped(frames))
     assert values["mavlink_loss"] == 0
     assert values["mavlink_loss_most"] == pytest.approx(10 / 211)
 
 
 def test_a_log_without_a_periodic_stream_has_only_the_upper_bound(tmp_path: Path) -> None:
     sender = Sender()
-    values = measured(tmp_path, stamped([(1_000_000 * number, sender.frame(beat())) for number in range(20)]))
+    values = measure_values(tmp_path, stamped([(1_000_000 * number, sender.frame(beat())) for number in range(20)]))
     assert values["mavlink_loss_most"] == 0
     assert "mavlink_loss" not in values
 
@@ -98,7 +98,7 @@ def test_a_log_without_a_periodic_stream_has_only_the_upper_bound(tmp_path: Path
 def test_a_damaged_frame_is_counted_and_lost(tmp_path: Path) -> None:
     data = bytearray(flight(1))
     data[60] ^= 1
-    values = measured(tmp_path, bytes(data))
+    values = measure_values(tmp_path, bytes(data))
     assert (values["mavlink_damaged"], values["mavlink_sent"]) == (1, 23)
     assert values["mavlink_messages"] == 22
 
@@ -110,7 +110,7 @@ def test_impossible_values_are_missing(tmp_path: Path) -> None:
         d.MAVLink_local_position_ned_message(0, float("nan"), 1e30, float("inf"), 1e20, 0, float("nan")),
         d.MAVLink_attitude_message(0, 1e30, float("nan"), 0, 0, 0, 0),
     ]
-    values = measured(tmp_path, stamped([(0, sender.frame(message)) for message in messages]))
+    values = measure_values(tmp_path, stamped([(0, sender.frame(message)) for message in messages]))
     assert not {message for message in values if message.endswith(("_m", "_m_s", "_deg"))}
 
 
@@ -125,7 +125,7 @@ def test_logs_of_mavlink_1_and_of_signed_frames_are_read(version: str, tmp_path:
         frames.append((number, bytes(message.pack(sender.link, force_mavlink1=version == "old"))))
         sender.link.seq = number + 1
     assert {message[0] for _, message in frames} == {0xFE if version == "old" else 0xFD}
-    values = measured(tmp_path, stamped(frames))
+    values = measure_values(tmp_path, stamped(frames))
     assert (values["mavlink_messages"], values["mavlink_sent"], values["mavlink_damaged"]) == (6, 6, 0)
     assert values["mavlink_roll_max_deg"] == pytest.approx(28.65, abs=0.01)
 

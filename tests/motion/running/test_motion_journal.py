@@ -84,9 +84,9 @@ def test_only_a_confirmation_lets_robots_move_after_a_fault(tmp_path: Path, at_p
             pytest.fail("the robot moved")
     journal = MotionJournal(tmp_path / MOTION_FILE)
     journal.confirm("how", at_place=at_place)
-    reopened = open_origins(tmp_path)
-    reopened.require()
-    assert reopened.get(Role.RECEIVER) == (None if at_place else ORIGIN)
+    reopened_origins = open_origins(tmp_path)
+    reopened_origins.require()
+    assert reopened_origins.get(Role.RECEIVER) == (None if at_place else ORIGIN)
 
 
 def test_a_stop_by_the_operator_holds_the_robots_of_a_campaign(tmp_path: Path) -> None:
