@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 from unittest.mock import patch
 
-from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.agent_setup import make_bodies
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.external import make_hello
 from sim_backends.cosim.scenario.loading import load_scenario
@@ -99,7 +99,7 @@ def run_coupled(scenario: CosimScenario, requests: Path | None = None) -> Figure
     with build(scenario) as simulation:
         if requests is not None:
             world = load_world(scenario.world)
-            hello = make_hello(scenario, world, bodies(scenario, world), simulation.seed, NETWORK)
+            hello = make_hello(scenario, world, make_bodies(scenario, world), simulation.seed, NETWORK)
             requests.write_bytes(encode(MessageKind.HELLO, 1, 0, hello.encode()))
             assert isinstance(simulation.network, RemoteNetwork)
             simulation.network.session.observer = _recorder(requests)

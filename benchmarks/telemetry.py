@@ -14,17 +14,22 @@ within its share of the processor.
 import argparse
 import json
 import os
+import re
 import resource
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
+from fieldkit.config import schema
 from fieldkit.remote.script import SCRIPT
+from fieldkit.telemetry.telemetry_section import TelemetrySource
+from tests.helpers.telemetry_devices import ENTERPRISE, json_server, modem_bus, snmp_agent
 
 SHELLS: Final = {"bash": ("bash",), "dash": ("dash",), "busybox ash": ("busybox", "sh")}
 SLOWER: Final = (1, 4, 8)
@@ -62,10 +67,38 @@ done
 
 # A telemetry source of a profile at its default interval; the cost of its program is added.
 _POLL: Final = ("poll", ".began", "-", "-", "-", "2", "2", "echo", "signal:")
+_ANSWER: Final = r"==> [0-9.]+ 0 [0-9]+ <=="
+_COMMUNITY: Final = "benchmark"
+_SOURCES: Final = {
+    "command": "command: [echo, '{\"rsrp\": -97.5}']\nvalues: {signal_dbm: {json: rsrp}}",
+    "http": "http: {url: 'http://127.0.0.1:HTTP/'}\nvalues: {signal_dbm: {json: rsrp}}",
+    "snmp": (
+        "snmp: {address: 127.0.0.1, port: SNMP, credentials: {file: FOLDER/snmp.conf}}\n"
+        f"values: {{signal_dbm: {{oid: {ENTERPRISE}.1.0}}, noise_dbm: {{oid: {ENTERPRISE}.3.0}}}}"
+    ),
+    "modemmanager": "modemmanager: {modem: any}",
+    "batctl": "batctl: {interface: bat0}",
+}
 
 
-def measure(shell: Sequence[str], text: str, words: Sequence[str], seconds: float) -> tuple[float, int]:
-    """Run a script in a folder like that of an attempt; return processor time in ms per second, and sample count."""
+Row = dict[str, float | str | int]
+
+
+def measure(
+    shell: Sequence[str], text: str, words: Sequence[str], seconds: float, sample: str = "signal:"
+) -> tuple[float, int]:
+    """Run a script in a folder like an attempt's for some seconds.
+
+    Args:
+        shell: The shell and its arguments.
+        text: The script.
+        words: Its arguments.
+        seconds: Duration of the run.
+        sample: Regular expression of a sample in its output.
+
+    Returns:
+        Processor time in ms per second, and the number of samples.
+    """
     with tempfile.TemporaryDirectory() as folder:
         jobs = Path(folder, ".jobs", "link")
         jobs.mkdir(parents=True)
@@ -84,12 +117,33 @@ def measure(shell: Sequence[str], text: str, words: Sequence[str], seconds: floa
             running.terminate()
             running.wait()
         used_s, lasted_s = _children_s() - before, time.monotonic() - started_s
-        return 1e3 * used_s / lasted_s, output.read_bytes().count(b"signal:")
+        return 1e3 * used_s / lasted_s, len(re.findall(sample.encode(), output.read_bytes()))
 
 
 def _children_s() -> float:
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     return usage.ru_utime + usage.ru_stime
+
+
+def measure_sources(seconds: float) -> Iterator[Row]:
+    """Yield a row for each kind of telemetry source whose program is installed."""
+    with ExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory())
+        values = {"FOLDER": folder, "HTTP": stack.enter_context(json_server(b'{"rsrp": -97.5}')), "SNMP": 161}
+        Path(folder, "snmp.conf").write_text(f"defCommunity {_COMMUNITY}\n", encoding="ascii")
+        if shutil.which("snmpget") is not None:
+            values["SNMP"] = stack.enter_context(snmp_agent(Path(folder), _COMMUNITY))
+        if shutil.which("mmcli") is not None:
+            os.environ["DBUS_SYSTEM_BUS_ADDRESS"] = stack.enter_context(modem_bus(Path(folder)))
+        for kind, template in _SOURCES.items():
+            text = re.sub("|".join(values), lambda match: str(values[match[0]]), template)
+            source = schema.validate(schema.parse(text, source=kind), TelemetrySource)
+            if shutil.which(source.program) is None:
+                print(f"there is no {source.program}", file=sys.stderr)
+                continue
+            words = ("poll", ".began", "-", *source.poll_words("wlan0"))
+            ms_per_s, answers = measure(("sh",), SCRIPT.decode(), words, seconds, _ANSWER)
+            yield {"shell": "sh", "what": kind, "slower": 1, "ms_per_s": ms_per_s, "samples": answers}
 
 
 def main() -> int:
@@ -101,7 +155,7 @@ def main() -> int:
     if shutil.which("iw", path=f"{os.environ['PATH']}:/usr/sbin:/sbin") is None:
         print("there is no iw: apt-get install iw", file=sys.stderr)
         return 2
-    rows: list[dict[str, float | str | int]] = []
+    rows: list[Row] = [*measure_sources(options.seconds)]
     for name, shell in SHELLS.items():
         if shutil.which(shell[0]) is None:
             continue

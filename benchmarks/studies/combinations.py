@@ -20,12 +20,12 @@ import numpy as np
 from fieldkit.core.executors import Workers
 from fieldkit.core.text import print_text
 from sim_backends.cosim import build, load_scenario
-from sim_backends.cosim.comparison import errors, lost_share
+from sim_backends.cosim.comparison import compare_runs, lost_share
 from sim_backends.cosim.policies.registry import BUILTIN
 from sim_backends.cosim.scenario.build import Simulation
 from sim_backends.cosim.scenario.federate_choice import BUILT_IN
 from sim_backends.cosim.studies.intervals import mean
-from sim_backends.cosim.studies.shootout import Outcomes, RunOutcome, delay_s, mean_separation_m, outcomes
+from sim_backends.cosim.studies.shootout import Outcomes, RunOutcome, delay_s, mean_separation_m, run_outcomes
 
 REFERENCE: Final = "event_driven"
 NETWORK_OPTIONS: Final = {"ns3": {"topics": "udp"}}
@@ -94,7 +94,7 @@ def study_rows(physics: str, network: str, results: Outcomes) -> Iterator[StudyR
 
 
 def _row(run: StudyRow, reference: RunOutcome, outcome: RunOutcome) -> StudyRow:
-    differences = errors(reference.run, outcome.run, outcome.tracks.distances_m(reference.tracks))
+    differences = compare_runs(reference.run, outcome.run, outcome.tracks.distances_m(reference.tracks))
     return run._replace(
         loss=lost_share(outcome.run),
         delay_s=delay_s(outcome),
@@ -144,7 +144,7 @@ def run(arguments: argparse.Namespace) -> None:
             "network.federate": network,
             "network.options": NETWORK_OPTIONS.get(network),
         }
-        results = outcomes(
+        results = run_outcomes(
             partial(make, arguments.scenario, changes),
             arguments.policy,
             range(1, arguments.seeds + 1),

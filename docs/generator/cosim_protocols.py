@@ -30,8 +30,8 @@ def cosim_protocols() -> str:
     )
     return page(
         "Classes of the co-simulation",
-        "Members of the classes that a [sync policy, physics or network of your own](../cosim-api.md) implements or "
-        "receives. Times are nanoseconds of simulated time.",
+        "Members of the classes that a [sync policy, physics or network simulator of your own](../cosim-api.md) "
+        "implements or receives. Times are nanoseconds of simulated time.",
         *sections,
     )
 

@@ -53,7 +53,7 @@ or equals that of ping are omitted. The values are those of a run `demo` of 2 s 
 `{}` and token `s3cret`.
 
 - The agent `ugv` (`husky`, antenna at 0.5 m, limit 3 m/s^2) starts at (1, 2, 0.5) with heading 0.25.
-- The physics `carts`, `carts 1.0`, is deterministic and supports both commands.
+- The physics federate `carts`, version `carts 1.0`, is deterministic and supports both commands.
 - From 10 to 11.1 ms `ugv` drives at 0.5 m/s and turns at -0.125 rad/s, and agent 1 flies at (1, 0, 0.25) m/s.
 - Agent 1, `uav`, appears in the states at (-1.5, 0, 10) with the velocity (0, 0.5, -0.25).
 - Packet 9, number 4 of `pose`, has 300 bytes, is sent at 10 ms and enters the network at 10.5 ms.

@@ -121,7 +121,7 @@ def index() -> str:
         ("[Tables of a recording](recording-tables.md)", "packets, states and windows of a co-simulation"),
         (
             "[Classes of the co-simulation](cosim-protocols.md)",
-            "for your own sync policy, physics or network",
+            "for your own sync policy, physics or network simulator",
         ),
         ("[JSON events](events.md)", "output of `--json`"),
         ("[Rules and layouts of the federate protocol](federate-protocol.md)", "messages of external federates"),
@@ -286,11 +286,12 @@ def columns() -> str:
     blocks = [
         (
             "`fieldkit columns` prints this list; `fieldkit columns PROCEDURE` prints those that a procedure fills. "
-            "A missing value is empty, never 0. See also [trial folder](../trial-folder.md#columns)."
+            "A missing value is empty, never 0. *Estimate* is the [estimate over several repeats]"
+            "(../method-intervals.md#intervals). See also [trial folder](../trial-folder.md#columns)."
         ),
     ]
     for name, file_columns in files.items():
-        blocks += [f"## {name}", table(("column", "unit", "repeats give", "meaning"), _column_rows(file_columns))]
+        blocks += [f"## {name}", table(("column", "unit", "estimate", "meaning"), _column_rows(file_columns))]
     blocks += ["## trial.csv with certain steps", "FLOW is the kind of step.", step_columns()]
     packets = ((f"`{column.name}`", column.unit, column.meaning) for column in PACKET_COLUMNS)
     blocks += [

@@ -33,7 +33,8 @@ def simulator_options() -> str:
         "Options of simulators",
         "Keys of `physics.options` or `network.options` in a [scenario file](scenario-file.md) whose `federate` is "
         "the name of an installed simulator. On the command line: `--set physics.options.KEY=VALUE`. fieldkit checks "
-        "them before anything starts. The program of a [command or an address](../federates.md) checks its options.",
+        "them before anything starts. If `federate` is a [command or an address](../federates.md), its "
+        "program checks the options.",
         *blocks,
     )
 

@@ -6,6 +6,7 @@ from typing import Final
 from docs.generator.markdown import page, table
 from fieldkit.core.columns import Column
 from fieldkit.core.model import FaultKind
+from fieldkit.measure.checks import ping_duplicates
 from fieldkit.measure.evidence import handovers, iperf3, ping_gaps
 from fieldkit.measure.transfers import iperf3_load, recoveries, stalls
 from fieldkit.motion.logs import drive_log, fly_log, tlog
@@ -17,6 +18,7 @@ from fieldkit.trial.columns import installed_columns
 
 STEP_COLUMNS: Final[Mapping[str, tuple[Column, ...]]] = {
     "`ping` with `gap: true`": (*ping_gaps.GAP_COLUMNS, *ping_gaps.OPEN_GAP_COLUMNS),
+    "`ping` with `duplicates: true`": ping_duplicates.COLUMNS,
     "`roam`": handovers.COLUMNS,
     "`iperf3`": (*iperf3.COLUMNS, *iperf3_load.COLUMNS, *iperf3_load.JITTER),
     "`iperf3`, `soak`": stalls.declare_columns("FLOW", "FLOW", 0),
@@ -51,7 +53,7 @@ def step_columns() -> str:
         for step, columns in STEP_COLUMNS.items()
         for column in columns
     )
-    return table(("column", "unit", "repeats give", "step", "meaning"), lines)
+    return table(("column", "unit", "estimate", "step", "meaning"), lines)
 
 
 def table_rows() -> str:

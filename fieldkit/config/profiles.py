@@ -34,7 +34,7 @@ class PublishedTopic(Strict):
         points: For a laser scan, beams per turn; for a point cloud, points of 16 bytes.
         width: For an image, width in pixels of 3 bytes.
         height: For an image, height in pixels.
-        size: For any other type, size of the first list of numbers in each message, `100kB`.
+        size: For any other type, size of the first array of numbers in each message, `100kB`.
         definition: Message definition, as `rosmsg show -r` prints it; needed for types that ROS does not have.
     """
 
@@ -314,7 +314,7 @@ class RobotProfile(catalog.Named, Sectioned):
     `sensor_msgs/LaserScan` (needs `points`), `Imu`, `BatteryState`, `Range`, `NavSatFix`, `MagneticField`,
     `FluidPressure`, `Temperature`, `nav_msgs/Odometry`, `tf2_msgs/TFMessage` and `geometry_msgs/PoseStamped` the
     values are the measurements of such a sensor on [the moving robot](add-a-robot.md#messages-of-an-emulated-robot).
-    In messages of other types, strings are empty, numbers are 0, quaternions are the identity, and the first list of
+    In messages of other types, strings are empty, numbers are 0, quaternions are the identity, and the first array of
     numbers is noise of the size in the profile. Types with a `definition` need ROS 1.
 
     Attributes:

@@ -76,7 +76,7 @@ class HostKeyError(RobotError):
 
 
 class LinkError(FieldkitError):
-    """A robot did not answer, or the connection to it broke or ran out of time."""
+    """A robot did not answer, or its connection was lost or timed out."""
 
     exit_code = 3
 

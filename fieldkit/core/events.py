@@ -115,7 +115,7 @@ class PhaseStarted(Event):
     Attributes:
         name: Name of the phase, for example `record`, `transfer`, `start robots`.
         repeat: The repeat to which it belongs, or empty.
-        expected_s: Expected duration; None if unknown.
+        expected_s: Expected duration; None (`null` in JSON) if unknown.
     """
 
     name: str
@@ -132,7 +132,7 @@ class Progress(Event):
         done: Finished amount.
         total: Total amount, above 0.
         unit: Unit of both amounts: `s` of simulated time, `runs`.
-        left_s: Estimated remaining time; None if unknown.
+        left_s: Estimated remaining time; None (`null` in JSON) if unknown.
     """
 
     what: str

@@ -29,6 +29,8 @@ from fieldkit.measure.evidence.recordings import RecordingContents
 from fieldkit.measure.transfers import altered_packets
 from fieldkit.measure.transfers.match import Match, match
 from fieldkit.measure.transfers.transfer_spec import Transfer
+from fieldkit.telemetry import telemetry_samples
+from fieldkit.telemetry.telemetry_samples import TelemetrySample
 from fieldkit.trial import planned_evidence
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
@@ -166,6 +168,7 @@ class AttemptRecord:
         pings: Outputs of ping by file.
         bags: Contents of the recorded bags by role.
         links: Samples of the radios' links by role.
+        telemetry: Values of the telemetry sources that robots queried, by role.
     """
 
     plan: Plan
@@ -174,6 +177,7 @@ class AttemptRecord:
     pings: Mapping[str, ping.Ping]
     bags: Mapping[Role, RecordingContents]
     links: Mapping[Role, Sequence[LinkSample]]
+    telemetry: Mapping[Role, Sequence[TelemetrySample]]
 
     @property
     def transfers(self) -> tuple[Transfer, ...]:
@@ -195,6 +199,7 @@ def read(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> AttemptReco
         pings={name: output for name, output in pings.items() if output},
         bags={role: content for role, content in bags.items() if content},
         links={role: evidence.links(role) for role in plan.cast},
+        telemetry={role: telemetry_samples.read(evidence, role, robot.profile) for role, robot in plan.cast.items()},
     )
 
 
@@ -226,7 +231,12 @@ def messages(record: AttemptRecord) -> Iterator[Message]:
             channel = _channel(record, role, topic, schemas.PACKET, meaning)
             streams.append(packet_messages(channel, record.attempt.folder, packets_by_file[file]))
     for role in record.plan.cast:
-        robot_stream = [*_phases(record, role), *_links(record, role), *_rtts(record, role)]
+        robot_stream = [
+            *_phases(record, role),
+            *_links(record, role),
+            *_telemetry(record, role),
+            *_rtts(record, role),
+        ]
         streams.append(iter(sorted(robot_stream, key=attrgetter("time_ns"))))
     return heapq.merge(*streams, key=attrgetter("time_ns"))
 
@@ -273,6 +283,14 @@ def _links(record: AttemptRecord, role: Role) -> Iterator[Message]:
     channel = _channel(record, role, "link", schemas.LINK, "State of the radio's links, five times per second.")
     for sample in record.links[role]:
         yield Message(channel, sample.utc_ns, schemas.link(record.attempt.folder, sample))
+
+
+def _telemetry(record: AttemptRecord, role: Role) -> Iterator[Message]:
+    """Yield the values of the telemetry sources that a robot queried; each source has a channel."""
+    for sample in record.telemetry[role]:
+        meaning = "Values of a telemetry source of the robot's profile."
+        channel = _channel(record, role, f"telemetry/{sample.source}", schemas.TELEMETRY, meaning)
+        yield Message(channel, sample.utc_ns, schemas.telemetry(record.attempt.folder, sample))
 
 
 def _phases(record: AttemptRecord, role: Role) -> Iterator[Message]:

@@ -15,6 +15,7 @@ from fieldkit.core.columns import Column
 from fieldkit.core.model import LinkSample, Vector
 from fieldkit.export.mcap import Json
 from fieldkit.measure.evidence.ping import Reply
+from fieldkit.telemetry.telemetry_samples import TelemetrySample
 from fieldkit.trial.columns import IDENTITY, Row
 
 
@@ -67,6 +68,11 @@ def link(repeat: str, sample: LinkSample) -> Json:
     }
     stations = [_present(asdict(station)) for station in sample.stations]
     return {"timestamp": time(sample.utc_ns), "repeat": repeat, **_present(radio), "stations": stations}
+
+
+def telemetry(repeat: str, sample: TelemetrySample) -> Json:
+    """Return a message of `TELEMETRY` for the values of a source in the repeat whose folder is `repeat`."""
+    return {"timestamp": time(sample.utc_ns), "repeat": repeat, **sample.values}
 
 
 def _present(values: Mapping[str, Any]) -> Json:
@@ -225,6 +231,21 @@ LINK: Final = _object(
         },
     },
     optional=tuple(_CHANNEL),
+)
+
+
+_QUANTITIES: Final = {
+    "signal_dbm": _typed("number", "Received signal strength, in dBm."),
+    "sinr_db": _typed("number", "Ratio of signal to interference and noise, in dB."),
+    "noise_dbm": _typed("number", "Noise, in dBm."),
+    "band": _typed("string", "Access technology, band or channel."),
+    "cell": _typed("string", "Cell or access point."),
+    "tx_rate_bit_s": _typed("number", "Rate of transmission, in bit/s."),
+    "rx_rate_bit_s": _typed("number", "Rate of reception, in bit/s."),
+    "neighbours": _typed("number", "Number of other cells, stations or mesh nodes that the radio received."),
+}
+TELEMETRY: Final = _object(
+    "fieldkit.Telemetry", {"timestamp": _TIME, "repeat": _REPEAT, **_QUANTITIES}, optional=tuple(_QUANTITIES)
 )
 
 

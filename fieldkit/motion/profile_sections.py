@@ -16,6 +16,12 @@ MAVLINK: Final = "mavlink"
 MIN_CHARGE: Final = 0.2
 """Default minimum charge for the start of a flight. Battery manufacturers recommend a reserve of 20 %."""
 
+TWIST: Final = "geometry_msgs/Twist"
+TWIST_STAMPED: Final = "geometry_msgs/TwistStamped"
+
+BASE_FRAME: Final = "base_link"
+"""Frame of a mobile base (REP 105)."""
+
 _CONNECTION: Final = r"^((udpout|udpin|tcp):[0-9A-Za-z.-]+:[0-9]{1,5}|/dev/[0-9A-Za-z/_.-]+:[0-9]{3,7})$"
 
 
@@ -61,7 +67,10 @@ class Drive(ProfileSection):
     """Settings for [driving](motion.md) a ground robot automatically; without them, a person moves the robot.
 
     Attributes:
-        topic: Topic of velocities (`geometry_msgs/Twist`) that its base subscribes to.
+        topic: Topic of velocities that its base subscribes to.
+        type: Type of this topic: `geometry_msgs/Twist`, or `geometry_msgs/TwistStamped`, the default of the
+            controllers of ROS 2 Jazzy. Stamps are from the robot's clock.
+        frame: Frame id of stamped velocities.
         odometry: Topic of its odometry (`nav_msgs/Odometry`).
         turn_rad_s: Maximum turn rate, in radians per second.
         acceleration_m_s2: Maximum acceleration, in m/s^2.
@@ -72,6 +81,12 @@ class Drive(ProfileSection):
     placement = "let {robot} face away from {other} with a clear path: it drives automatically"
 
     topic: TopicName = "/cmd_vel"
+    type: Annotated[str, Field(pattern=f"^({TWIST}|{TWIST_STAMPED})$", exclude_if=lambda name: name == TWIST)] = TWIST
+    frame: Annotated[
+        str,
+        pattern_field("^[A-Za-z0-9_/-]{1,100}$", "the name of a frame, such as base_link"),
+        Field(exclude_if=lambda name: name == BASE_FRAME),
+    ] = BASE_FRAME
     odometry: TopicName = "/odom"
     turn_rad_s: Annotated[Number | Int, Field(gt=0, le=10)] = 1.0
     acceleration_m_s2: Annotated[Number | Int, Field(gt=0, le=10)] = 0.5

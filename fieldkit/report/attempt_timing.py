@@ -26,6 +26,7 @@ from fieldkit.measure.transfers.fates import Fates
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.report.charts import Panel, Series
 from fieldkit.report.theme import Colour, Style
+from fieldkit.telemetry import telemetry_samples
 from fieldkit.trial import planned_evidence
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import PlacedStep
@@ -65,6 +66,7 @@ class AttemptTimes:
         clock_offset_ns: Clock offset of each role relative to the first sending robot; 0 if unknown.
         clock_note: A sentence about the source of the clock offset.
         links: Samples of the radio link at each end.
+        telemetry: Values from telemetry sources at each end by quantity (`telemetry_samples.series`).
         distances_m: Distances between the ends, with the start time of each; empty if unknown.
         ends: Roles of the first transfer's sender and receiver.
         jobs: Start and end of each job on a robot, by role and name.
@@ -77,6 +79,7 @@ class AttemptTimes:
     clock_offset_ns: Mapping[Role, int]
     clock_note: str
     links: Mapping[Role, Sequence[tuple[int, StationSample]]]
+    telemetry: Mapping[Role, Mapping[str, Sequence[tuple[int, float]]]]
     distances_m: Sequence[tuple[int, float | None]]
     ends: tuple[Role, Role]
     jobs: Mapping[tuple[Role, str], tuple[int, int]]
@@ -116,6 +119,14 @@ def read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> A
         links={
             role: [(at_ns - clock_offset_ns[role], sample) for at_ns, sample in history]
             for role, history in links.items()
+        },
+        telemetry={
+            role: {
+                quantity: [(at_ns - clock_offset_ns[role], value) for at_ns, value in values]
+                for quantity, values in telemetry_samples.series(evidence, role, plan.cast[role].profile).items()
+            }
+            for role in ends
+            if role in plan.cast
         },
         ends=ends,
         distances_m=position_columns.distances_m(evidence, ends),

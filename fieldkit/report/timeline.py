@@ -218,16 +218,22 @@ def estimate_send_times(
 
 
 def _links(times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
-    """Yield the signal and the PHY rate of both radios over time."""
-    signals = {
-        role: [(at_ns, sample.signal_dbm) for at_ns, sample in history] for role, history in times.links.items()
-    }
-    rates = {
-        role: [(at_ns, sample.tx_rate_bit_s and sample.tx_rate_bit_s / 1e6) for at_ns, sample in history]
-        for role, history in times.links.items()
-    }
+    """Yield the signal, the PHY rate and the SINR of both radios over time.
+
+    Values of telemetry sources replace those of `iw`, as in the columns (`telemetry_columns`).
+    """
+    signals: dict[Role, Sequence[tuple[int, float | None]]] = {}
+    rates: dict[Role, Sequence[tuple[int, float | None]]] = {}
+    ratios: dict[Role, Sequence[tuple[int, float | None]]] = {}
+    for role, history in times.links.items():
+        telemetry = times.telemetry.get(role, {})
+        signals[role] = telemetry.get("signal_dbm", [(at_ns, sample.signal_dbm) for at_ns, sample in history])
+        rates_bit_s = telemetry.get("tx_rate_bit_s", [(at_ns, sample.tx_rate_bit_s) for at_ns, sample in history])
+        rates[role] = [(at_ns, rate_bit_s and rate_bit_s / 1e6) for at_ns, rate_bit_s in rates_bit_s]
+        ratios[role] = telemetry.get("sinr_db", ())
     yield from _radio_panel("signal", "[dBm]", signals, zero_ns, bottom=None)
     yield from _radio_panel("PHY rate", "[Mbit/s]", rates, zero_ns, bottom=0.0)
+    yield from _radio_panel("SINR", "[dB]", ratios, zero_ns, bottom=None)
 
 
 def _radio_panel(

@@ -15,6 +15,9 @@ from fieldkit.steps.scene import CommandResult, Need, Scene
 LOOPBACK: Final = "lo"
 """Interface of a link whose address is reached over any link of the robot that its routes select."""
 
+ANY: Final = "any"
+"""tcpdump's name of all interfaces."""
+
 _DEVICE: Final = re.compile(r"\bdev (?P<interface>\S{1,30})", re.ASCII)
 
 
@@ -27,6 +30,11 @@ class OverLink(Strict):
     """
 
     over: LinkName = Field(default="", exclude_if=schema.is_empty)
+
+    def capture_interface(self, scene: Scene, role: Role) -> str:
+        """Return the interface on which a capture of the link runs; `any` for a link that uses any interface."""
+        interface = scene.link(role, self.over).interface
+        return ANY if interface == LOOPBACK else interface
 
     def route_need(self, scene: Scene, source: Role, destination: Role) -> Iterator[Need]:
         """Yield the check that the route from a robot to another uses this link.

@@ -20,7 +20,8 @@ from fieldkit.telemetry import source_outputs
 from fieldkit.telemetry.source_outputs import Values
 from fieldkit.telemetry.telemetry_section import MAX_OUTPUT_BYTES, TelemetrySource
 
-_HEAD: Final = re.compile(rb"==> ([0-9]{1,10}\.[0-9]{2}) ([0-9]{1,3}|large|interface) ([0-9]{1,5}) <==\n")
+_HEAD: Final = re.compile(rb"==> ([0-9]{1,10})\.([0-9]{2}) ([0-9]{1,3}|large|interface) ([0-9]{1,5}) <==\n")
+_HUNDREDTH_NS: Final = 10_000_000
 _TOO_LONG: Final = f"its output was longer than {MAX_OUTPUT_BYTES >> 10} KiB"
 _CURL: Final = {
     "7": "connection refused",
@@ -47,11 +48,13 @@ class SourceReadings:
         values: Values of each run with at least one value, in order of time.
         runs: Number of runs.
         reasons: Number of the other runs by the reason why they have no value.
+        since_boot_ns: Start of each run in `values`, in nanoseconds since the boot of the computer that ran it.
     """
 
     values: tuple[Values, ...]
     runs: int
     reasons: Counter[str]
+    since_boot_ns: tuple[int, ...] = ()
 
     @property
     def reason(self) -> str:
@@ -80,22 +83,24 @@ def _content(path: Path) -> bytes:
 def parse(content: bytes, source: TelemetrySource) -> SourceReadings:
     """Return the readings in a file; an incomplete last run, which was being written at the end, is omitted."""
     run_values: list[Values] = []
+    since_boot_ns: list[int] = []
     reasons: Counter[str] = Counter()
     runs = position = 0
     while (head := _HEAD.match(content, position)) is not None:
-        output = content[head.end() : head.end() + int(head[3])]
-        position = head.end() + int(head[3]) + 1
+        output = content[head.end() : head.end() + int(head[4])]
+        position = head.end() + int(head[4]) + 1
         if position > len(content):
             break
         runs += 1
-        reason = _failure_reason(head[2].decode(), output, source)
+        reason = _failure_reason(head[3].decode(), output, source)
         if not reason:
             reason, values = _parse_values(source, output.decode(errors="replace"))
             if values:
                 run_values.append(values)
+                since_boot_ns.append(int(head[1]) * 10**9 + int(head[2]) * _HUNDREDTH_NS)
                 continue
         reasons[reason] += 1
-    return SourceReadings(tuple(run_values), runs, reasons)
+    return SourceReadings(tuple(run_values), runs, reasons, tuple(since_boot_ns))
 
 
 def _failure_reason(code: str, output: bytes, source: TelemetrySource) -> str:

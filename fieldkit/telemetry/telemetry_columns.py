@@ -31,8 +31,8 @@ def _role_columns(role: Role) -> tuple[Column, ...]:
             f"{role}_link_source",
             "text",
             (
-                f"Telemetry sources of the {role}'s profile that gave values: NAME (KIND): VALUES. Other columns of "
-                "its radio are from `others`: iw, or the testbed."
+                f"Telemetry sources of the {role}'s profile that gave values: NAME (KIND): VALUES. `others` "
+                "names the source of the other columns of its radio: iw, or the emulator."
             ),
             Figure(f"link source, {role}", Kind.WORDS, rank=BACKGROUND),
         ),

@@ -79,7 +79,7 @@ ATTEMPT_CHECKS: Final = (
         ("emulator_*", "sender_*", "receiver_*"),
         "`lateness.txt`, `link.csv`; `ROLE-link.txt` of a robot",
         (),
-        "only the testbed or the radio's driver measures them",
+        "only the emulator or the radio's driver measures them",
         CheckOutcome.UNCHECKED,
     ),
 )

@@ -1,4 +1,4 @@
-"""The agents of a co-simulation: the bodies that the physics moves, and the programs that run on them."""
+"""The agents of a co-simulation: bodies that the physics federate moves, and the programs that run on them."""
 
 import heapq
 from collections.abc import Iterable, Iterator, KeysView, Mapping, Sequence
@@ -79,8 +79,9 @@ _CHANGE: Final = ""
 class Agents:
     """Advances bodies and programs together, so that programs always read the current state of their bodies.
 
-    An agent is absent outside of its lifetime. If the attribute `agents_disappear` of the physics is True, an agent
-    is also absent while the physics returns no state for it. The program of an absent agent does not wake.
+    An agent is absent outside of its lifetime. If the attribute `agents_disappear` of the physics federate is True,
+    an agent is also absent while the physics federate returns no state for it. The program of an absent agent does
+    not wake.
 
     Args:
         physics: Moves the bodies.
@@ -92,10 +93,10 @@ class Agents:
         FederateError: A program failed.
 
     Attributes:
-        physics: The physics.
+        physics: The physics federate.
         programs: The programs by agent name, sorted.
         absent: The agents that are absent now.
-        has_changed: True if an agent has ever been absent, or was added by the physics.
+        has_changed: True if an agent has ever been absent, or was added by the physics federate.
     """
 
     def __init__(
@@ -130,11 +131,11 @@ class Agents:
         self._schedule_change()
 
     def states(self, now_ns: int) -> Mapping[str, State]:
-        """Return the states of the present agents at the last physics step that is not after `now_ns`.
+        """Return the states of the agents that are present at the last physics step that is not after `now_ns`.
 
         Raises:
-            FederateError: The physics failed, did not answer in time, or returned no state for an agent that must be
-                present.
+            FederateError: The physics federate failed, did not answer in time, or returned no state for an agent that
+                must be present.
         """
         if self._changes_ns:
             self._read_states_at_changes(now_ns)
@@ -173,7 +174,7 @@ class Agents:
             self.states(change_ns)
 
     def _states_within_lifetime(self, states: Mapping[str, State], now_ns: int) -> Mapping[str, State]:
-        """Return the states of the agents that are within their lifetimes; the physics may also move other agents."""
+        """Return the states of the agents that are within their lifetimes. The physics may also move other agents."""
         if self._changes_ns and self._changes_ns[-1] <= now_ns:
             while self._changes_ns and self._changes_ns[-1] <= now_ns:
                 self._changes_ns.pop()
@@ -188,7 +189,7 @@ class Agents:
         )
 
     def _update_names(self, states: Mapping[str, State], now_ns: int) -> None:
-        """Update the names of the present agents.
+        """Update the names of the agents that are present.
 
         Raises:
             FederateError: An agent has disappeared within its lifetime, but this physics may not remove agents.

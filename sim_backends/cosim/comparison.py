@@ -1,4 +1,4 @@
-"""Errors of a run against the exact reference of the same scenario, packet by packet (the coupled errors)."""
+"""Compares a run with the exact reference of the same scenario, packet by packet (the coupled errors)."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -68,7 +68,7 @@ class Errors:
     real_time_factor: float
 
 
-def errors(reference: Run, run: Run, path_errors_m: Floats | None = None) -> Errors:
+def compare_runs(reference: Run, run: Run, path_errors_m: Floats | None = None) -> Errors:
     """Return the errors of a run relative to the exact reference.
 
     Args:

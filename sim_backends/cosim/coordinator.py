@@ -61,9 +61,9 @@ class Coordinator:
         is_interrupted: True if `KeyboardInterrupt` must be raised as soon as `is_committing` is False.
 
     Raises:
-        ConfigurationError: The physics does not move an agent that may send or receive, or the physics lacks a member
+        ConfigurationError: The physics federate does not move an agent that may send or receive, or it lacks a member
             of a physics federate.
-        FederateError: The physics failed, or does not move an agent that runs a program.
+        FederateError: The physics federate failed, or does not move an agent that runs a program.
     """
 
     def __init__(
@@ -120,8 +120,8 @@ class Coordinator:
         unmoved_agents = self._active - self.situation.states.keys() - agents.absent.keys()
         if unmoved_agents:
             raise ConfigurationError(
-                f"{', '.join(sorted(unmoved_agents))} may send, receive or interfere, but the physics does not move "
-                "this agent"
+                f"{', '.join(sorted(unmoved_agents))} may send, receive or interfere, but the "
+                "physics federate does not move this agent"
             )
         self._select_present()
         if observer is not None:
@@ -148,7 +148,7 @@ class Coordinator:
         return self.run
 
     def fork(self) -> "Coordinator":
-        """Return an independent copy of this co-simulation in its present state, without an observer."""
+        """Return an independent copy of this co-simulation in its current state, without an observer."""
         return copy.deepcopy(self, {id(self._observer): None})
 
     def _next_wake_ns(self) -> int | None:
@@ -338,7 +338,7 @@ class Coordinator:
         self._select_present()
 
     def _select_present(self) -> None:
-        """Limit the pairs and the other agents of the situation to present agents."""
+        """Limit the pairs and the other agents of the situation to agents that are present."""
         if not self._agents.has_changed:
             return
         situation = self.situation

@@ -50,13 +50,13 @@ def check_physics(physics: object) -> None:
         problem = "no method advance(to_ns, commands)"
     if problem:
         raise ConfigurationError(
-            f"the physics {type(physics).__name__} has {problem}",
+            f"the physics federate {type(physics).__name__} has {problem}",
             remedy="see what a physics class needs: fieldkit docs cosim-api",
         )
 
 
 def check_states(states: Mapping[str, object]) -> None:
-    """Check the states that a physics returns for time 0.
+    """Check the states that a physics federate returns for time 0.
 
     Raises:
         ConfigurationError: A value is not a `State`; the message names it.
@@ -64,7 +64,7 @@ def check_states(states: Mapping[str, object]) -> None:
     for name, state in states.items():
         if not isinstance(state, State):
             raise ConfigurationError(
-                f"the physics returned {state!r} for {name}, which is not a State",
+                f"the physics federate returned {state!r} for {name}, which is not a State",
                 remedy="see what a physics class needs: fieldkit docs cosim-api",
             )
 
@@ -94,7 +94,7 @@ class Program(Protocol):
 
         Args:
             now_ns: The current time.
-            own_state: State of its agent at the last step of the physics.
+            own_state: State of its agent at the last physics step.
             received_datagrams: Datagrams that have arrived since the previous call.
         """
         ...

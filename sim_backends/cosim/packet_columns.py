@@ -1,4 +1,4 @@
-"""The packets of a run as arrays: one array per column, named as in the recorded Parquet file."""
+"""Converts the packets of a run to arrays: one per column, named as in the recorded Parquet file."""
 
 from collections.abc import Callable
 from typing import Any, Final

@@ -1,4 +1,4 @@
-"""Contents and layout of plots: curves, outlines of obstacles, directions of travel, and positions of labels."""
+"""Content and layout of plots: curves, outlines of obstacles, directions of travel, and positions of labels."""
 
 import math
 from collections.abc import Iterator, Sequence

@@ -72,11 +72,11 @@ class Pace:
         Args:
             simulation: The simulation at time 0.
             lateness: The lateness of each window is added to it.
-            progress: As for `Simulation.run`.
+            progress: Reports the progress at most every 0.2 s of wall time, or None.
 
         Raises:
             RealTimeError: A window was later than the bound.
-            FieldkitError: As for `Simulation.run`.
+            FieldkitError: The policy, a federate or a program failed.
         """
         coordinator, end_ns = simulation.coordinator, simulation.scenario.duration_ns
         bound_ns = round(self.late_bound_s * 1e9)

@@ -1,4 +1,4 @@
-"""The record of a run: the fate of every packet, the windows, the hash over all events; and its observers."""
+"""The record of a run (the fate of every packet, the windows, the hash over all events), and its observers."""
 
 import hashlib
 import struct

@@ -1,4 +1,4 @@
-"""Wall time of a run by part, reports of its progress, and the fault `stalled-federate`: a federate answers late."""
+"""Measures the wall time of a run by part, reports its progress, and delays the answer of a federate as a fault."""
 
 import time
 from collections.abc import Callable, Iterable, Sequence

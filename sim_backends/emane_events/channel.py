@@ -1,4 +1,4 @@
-"""Sockets of EMANE's event channel: UDP multicast on one interface."""
+"""Sockets for EMANE's event channel, which is UDP multicast on one interface."""
 
 import select
 import socket

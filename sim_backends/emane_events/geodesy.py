@@ -49,9 +49,9 @@ class LocalFrame:
         height_m = across_m * cos + z * sin - _A_M * math.sqrt(1 - _E2 * sin * sin)
         return math.degrees(latitude), math.degrees(math.atan2(y, x)), height_m
 
-    def position_m(self, place: Geodetic) -> Vector:
+    def position_m(self, position: Geodetic) -> Vector:
         """Return the position east, north, up of a geodetic position."""
-        ecef_m = _ecef_m(math.radians(place[0]), math.radians(place[1]), place[2])
+        ecef_m = _ecef_m(math.radians(position[0]), math.radians(position[1]), position[2])
         offset_m = [metres - origin_m for metres, origin_m in zip(ecef_m, self._origin_m, strict=True)]
         east_m, north_m, up_m = (
             sum(metres * component for metres, component in zip(offset_m, axis, strict=True)) for axis in self._axes

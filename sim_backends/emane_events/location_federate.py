@@ -1,4 +1,4 @@
-"""The physics federate `emane`: agents with the locations and path losses in EMANE's events, in real time."""
+"""The physics federate `emane`, which takes agent locations and path losses from EMANE events, in real time."""
 
 import math
 import time
@@ -29,20 +29,22 @@ from sim_backends.world.motion import STILL, State
 
 
 class EmaneLocations:
-    """A physics in which each agent has the position in the last location event for its NEM.
+    """A physics federate that places each agent at the position of the last location event for its NEM.
+
+    A NEM (network emulation module) is a radio interface in EMANE; the option `nems` assigns one to each agent.
 
     From the first request on, simulated time passes as fast as wall time. The motion of the scenario's agents is not
     simulated.
 
     Args:
-        hello: The run; its configuration has the options of `EmaneOptions`.
+        hello: First message of the run; its configuration contains the options of `EmaneOptions`.
 
     Attributes:
-        step_ns: See `PhysicsFederate`.
-        limits_m_s2: See `PhysicsFederate`; infinite, because events may contain any location.
+        step_ns: The time step that the first message requests.
+        limits_m_s2: Acceleration limit of each agent: infinite, because events may contain any location.
         waited_s: Total time that it has waited, in seconds of wall time.
-        path_losses_db: See `PhysicsFederate`. Like EMANE's receivers, it uses the forward loss in the events for a
-            NEM, which is the path loss from the other NEM to this NEM, and ignores the reverse loss.
+        path_losses_db: Path loss by transmitter and receiver. As in EMANE's receivers, this is the forward loss in
+            the events for a NEM, which is the path loss from the other NEM to this NEM. The reverse loss is ignored.
 
     Raises:
         ValueError: An option is invalid.
@@ -63,7 +65,7 @@ class EmaneLocations:
         self.path_losses_db: dict[tuple[str, str], float] = {}
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "EmaneLocations":
-        raise FederateError("the physics emane cannot be copied: it follows events in real time")
+        raise FederateError("the emane physics federate cannot be copied, because it follows events in real time")
 
     def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
         """Implement `PhysicsFederate.advance`: wait until this time, and return the last locations.
@@ -74,7 +76,7 @@ class EmaneLocations:
         """
         if commands:
             raise FederateError(
-                f"the physics emane does not move robots, and {', '.join(commands)} has a command",
+                f"the emane physics federate does not move robots, and {', '.join(commands)} has a command",
                 remedy="remove the motion of the agents from the scenario",
             )
         start_s = time.monotonic()
@@ -98,7 +100,7 @@ class EmaneLocations:
                     f"{name} (NEM {nem})" for nem, name in self._agents.items() if name not in self._states
                 )
                 raise UnansweredError(
-                    f"physics emane: no location of {missing} has arrived on {self._options.channel} within "
+                    f"emane physics federate: no location of {missing} has arrived on {self._options.channel} within "
                     f"{self._options.wait:g} s",
                     remedy="start the publisher of the events, or set channel, device or nems",
                 )
@@ -115,9 +117,9 @@ class EmaneLocations:
     def _apply_locations(self, locations: Sequence[NemLocation]) -> None:
         for location in locations:
             if (name := self._agents.get(location.nem)) is not None:
-                place = (location.latitude_deg, location.longitude_deg, location.altitude_m)
+                geodetic_position = (location.latitude_deg, location.longitude_deg, location.altitude_m)
                 velocity = STILL if location.velocity is None else velocity_m_s(location.velocity)
-                self._states[name] = State(self._frame.position_m(place), velocity)
+                self._states[name] = State(self._frame.position_m(geodetic_position), velocity)
 
     def _apply_losses(self, nem: int, losses: Sequence[NemPathloss]) -> None:
         receivers = self._agents.values() if nem == ALL_NEMS else filter(None, [self._agents.get(nem)])

@@ -40,7 +40,7 @@ class EmaneOptions(SimulatorOptions):
     Attributes:
         channel: Multicast group and port of the events.
         device: Network interface; if omitted, the interface of the route to the group.
-        nems: NEM identifiers of agents; if empty, 1, 2, ... in the order of the agents.
+        nems: EMANE's identifiers (NEM, one per radio) of agents; if empty, 1, 2, ... in the order of the agents.
         reference: Latitude and longitude in degrees, and height above the ellipsoid in metres, of the world's origin.
         interval: Smallest time between two events of a run, in simulated time.
         pathloss: Publish the mean path loss between all agents, with obstacles, for `precomputed` propagation; or, if

@@ -116,12 +116,12 @@ class EmulatedBackend:
 
     @property
     def must_relocate(self) -> bool:
-        """Implement `Relocating.must_relocate`: the Wi-Fi of Linux needs radios of hwsim in this kernel."""
+        """Implement `Relocating.must_relocate`: Linux Wi-Fi needs hwsim radios in this kernel."""
         if not self._options.has_linux_wifi:
             return False
         from sim_backends.emulated.linux_wifi import radios  # noqa: PLC0415 (other labs need none of it)
 
-        return not radios.runs_here()
+        return not radios.can_use_radios()
 
     def run_elsewhere(self, argv: Sequence[str], results: Path) -> int:
         """Implement `Relocating.run_elsewhere`: the command runs in a virtual machine."""
@@ -254,7 +254,7 @@ class EmulatedBackend:
         return interactive_lab.overview(members, placement.square_m(members, self._world), self._options, self._world)
 
     def gazebo_world(self, version: str) -> str:
-        """Implement `GazeboWorlds.gazebo_world`; the robots are at the places of an interactive lab."""
+        """Implement `GazeboWorlds.gazebo_world`; the robots are at their positions in an interactive lab."""
         from sim_backends.emulated import placement, simulator_choice  # noqa: PLC0415 (as in `open`)
         from sim_backends.gazebo.sdf import SdfRobot, world_sdf  # noqa: PLC0415 (as above)
 
@@ -338,7 +338,7 @@ def _check_ros(robot: "Robot | LabRobot", options: EmulatedOptions) -> None:
         )
     if ros.variant == "ros2" and any(topic.definition for topic in ros.topics):
         raise ConfigurationError(
-            f"profile {robot.profile.name} runs ros2, whose emulated recorder supports only ROS's own types",
+            f"profile {robot.profile.name} runs ros2, whose emulated recorder supports only standard types",
             where=robot.name,
             remedy="remove the topics that have a definition from a copy of the profile",
         )

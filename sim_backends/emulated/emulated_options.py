@@ -109,9 +109,9 @@ class SyncOptions(Strict):
 
     Attributes:
         name: Its name. `event_driven` adds no delay to a packet.
-        window: Length of a window, or the w of the velocity-aware policies.
+        window: Length of a window, or the parameter w of the velocity-aware policies.
         longest: Longest window of policies with variable windows.
-        bound: Largest error of the network's relative position of two robots, for `error_bounded`.
+        bound: For `error_bounded`: largest error of the relative position of two robots in the network.
         step: Time step of the physics.
     """
 
@@ -134,7 +134,7 @@ class SyncOptions(Strict):
 
     @property
     def step_ns(self) -> int:
-        """Time step of the physics in nanoseconds."""
+        """Time step of the physics simulator in nanoseconds."""
         return round(self.step * 1e9)
 
 
@@ -155,21 +155,22 @@ class EmulatedOptions(Strict):
             fixes the links.
         links: The medium of each [further link](links.md) of the profiles, by the link's name, with the keys of
             `radio`: `{cell: {rate: 20Mbit/s, delay: 40ms, loss: 1%}}`.
-        late_bound: Maximum additional delay of a packet by the emulator, before and after the radio model in total.
+        late_bound: Maximum delay that the emulator may add to a packet, before and after the radio model in total.
             If it is exceeded, the repeat is void.
         record_air: True to write every transmission attempt and ACK to `air.pcap` and `air.csv` of each repeat;
             fixed links have none.
         boot: Time for which a robot that reboots is off before its programs start.
         mesh: Robots forward packets for each other, and a routing daemon on each finds the routes: [a mesh](mesh.md).
-        physics: The robots move [on the co-simulation](lab-cosim.md), moved by this physics: `kinematic`, `mujoco` or
-            `gazebo`. If only `network` is given, `kinematic`. `gazebo` refuses drones with an autopilot.
-        network: The network of the co-simulation: `builtin` or `ns3`. If only `physics` is given, `builtin`.
+        physics: Physics simulator of [the co-simulation](lab-cosim.md) that moves the robots: `kinematic`, `mujoco`
+            or `gazebo`. The default is `kinematic` if `network` is given. `gazebo` refuses drones with an autopilot.
+        network: The network of the co-simulation: `builtin` or `ns3`. The default is `builtin` if `physics`
+            is given.
         sync: The sync policy between physics and network: its name, or name and parameters. The default is
             `event_driven`, which adds no delay; with `ns3` it is `{name: sliding_window, window: 2ms}`, because an
             exchange at every event of ns-3 takes too long for real time.
-        wifi: `model`: the Wi-Fi of fieldkit's radio. `linux`: [the Wi-Fi of Linux](linux-wifi.md), over the same
-            radio, in a virtual machine if this kernel has no mac80211_hwsim.
-        linux_wifi: Settings of the Wi-Fi of Linux.
+        wifi: `model`: the Wi-Fi of fieldkit's radio. `linux`: [Linux Wi-Fi](linux-wifi.md), over the same radio,
+            in a virtual machine if this kernel has no mac80211_hwsim.
+        linux_wifi: Settings of Linux Wi-Fi.
     """
 
     ros: RosChoice = RosChoice.AUTO
@@ -190,7 +191,7 @@ class EmulatedOptions(Strict):
 
     @property
     def has_linux_wifi(self) -> bool:
-        """True if the robots have the Wi-Fi of Linux."""
+        """True if the robots have Linux Wi-Fi."""
         return self.wifi == "linux"
 
     @property

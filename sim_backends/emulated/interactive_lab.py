@@ -1,4 +1,4 @@
-"""Interactive lab: all robots of a site file run, without roles, and communicate directly."""
+"""The interactive lab, in which all robots of a site file run, without roles, and communicate directly."""
 
 import socket
 import threading
@@ -24,7 +24,7 @@ from sim_backends.emulated.mobility import WATCH_S, MotionThread, self_steered_m
 from sim_backends.emulated.motion_sections import mavlink_of
 from sim_backends.emulated.nodes import RunningRobots, running_robots
 from sim_backends.emulated.robot.spec import USER
-from sim_backends.emulated.ros.own_motion import AssignedPath
+from sim_backends.emulated.ros.robot_motion import AssignedPath
 from sim_backends.radio.antennas import antenna_of
 from sim_backends.radio.world_channel import WorldChannel
 from sim_backends.world.motion import State
@@ -50,16 +50,16 @@ class EmulatedLab:
         self._running = running
         self._options = options
         self._world = world
-        self._places_m = placement.square_m(members, world)
+        self._positions_m = placement.square_m(members, world)
         self._path_starts_ns: dict[str, int] = {}
         self._states: dict[str, State] = {}
         self._watch: MotionThread | None = None
-        # A separate thread updates the places of robots that steer themselves.
+        # A separate thread updates the positions of robots that steer themselves.
         self._lock = threading.RLock()
         for name in members:
-            self._assign_place(name, self._places_m[name])
-        running.media.place(self._places_m)
-        running.places.write(self._places_m)
+            self._assign_position(name, self._positions_m[name])
+        running.media.place(self._positions_m)
+        running.positions_writer.write(self._positions_m)
         self._first_stats = running.medium.stats() if options.is_cosimulated else None
         self.members = members
         self.login = Login(USER, running.private_key, running.host_keys)
@@ -78,38 +78,39 @@ class EmulatedLab:
         if self._watch is not None:
             self._watch.check()
         with self._lock:
-            return self._places_m[name]
+            return self._positions_m[name]
 
     def move(self, name: str, to: Destination) -> Vector:
         """Implement `Lab.move`."""
         with self._lock:
-            place_m = placement.destination_m(self._places_m[name], to, self._world)
-            places_m = self._places_m | {name: place_m}
-            # As in a trial, the robot is updated before the medium, whose physics refuses a place in an obstacle.
-            self._assign_place(name, place_m)
+            position_m = placement.destination_m(self._positions_m[name], to, self._world)
+            positions_m = self._positions_m | {name: position_m}
+            # As in a trial, the robot is updated before the medium, whose physics simulator refuses a position in an
+            # obstacle.
+            self._assign_position(name, position_m)
             try:
-                self._running.media.place(places_m)
+                self._running.media.place(positions_m)
             except RobotError:
-                self._assign_place(name, self._places_m[name])
+                self._assign_position(name, self._positions_m[name])
                 raise
-            self._running.places.write(places_m)
-            self._places_m = places_m
-            return place_m
+            self._running.positions_writer.write(positions_m)
+            self._positions_m = positions_m
+            return position_m
 
-    def _assign_place(self, name: str, place_m: Vector) -> None:
-        """Send a robot its new place; it faces east there."""
+    def _assign_position(self, name: str, position_m: Vector) -> None:
+        """Send a robot its new position; it faces east there."""
         self._path_starts_ns[name] = start_ns = time.monotonic_ns()
-        self._running.robots[name].move(AssignedPath(start_ns, [place_m], speed_m_s=1.0, facing_rad=0.0))
+        self._running.robots[name].move(AssignedPath(start_ns, [position_m], speed_m_s=1.0, facing_rad=0.0))
 
     def watching(self) -> AbstractContextManager[object]:
         """Return a context that keeps the medium up to date with robots that steer themselves."""
         if not any(robot.spec.steers for robot in self._running.robots.values()):
             return nullcontext()
-        self._watch = MotionThread(self._update_places, "watch")
+        self._watch = MotionThread(self._update_positions, "watch")
         return self._watch
 
-    def _update_places(self) -> float:
-        """Update the places of robots that steer themselves; return the seconds until the next update."""
+    def _update_positions(self) -> float:
+        """Update the positions of robots that steer themselves; return the seconds until the next update."""
         with self._lock:
             states = {
                 name: motion.state
@@ -119,10 +120,10 @@ class EmulatedLab:
             }
             if states != self._states:
                 self._states = states
-                self._places_m = self._places_m | {name: state.position_m for name, state in states.items()}
+                self._positions_m = self._positions_m | {name: state.position_m for name, state in states.items()}
                 velocities_m_s = {name: state.velocity_m_s for name, state in states.items()}
-                self._running.media.place(self._places_m, velocities_m_s=velocities_m_s)
-                self._running.places.write(self._places_m)
+                self._running.media.place(self._positions_m, velocities_m_s=velocities_m_s)
+                self._running.positions_writer.write(self._positions_m)
         return WATCH_S
 
     def lateness(self) -> LabLateness | None:
@@ -143,7 +144,7 @@ class EmulatedLab:
 
     def overview(self) -> Overview:
         """Implement `Lab.overview`."""
-        return overview(self.members, self._places_m, self._options, self._world)
+        return overview(self.members, self._positions_m, self._options, self._world)
 
 
 @contextmanager
@@ -181,17 +182,17 @@ def members_of(site: Site, document: Document | None, addresses: Mapping[str, st
 
 
 def overview(
-    members: Mapping[str, LabRobot], places_m: Mapping[str, Vector], options: EmulatedOptions, world: World
+    members: Mapping[str, LabRobot], positions_m: Mapping[str, Vector], options: EmulatedOptions, world: World
 ) -> Overview:
     """Return the map of the lab, computed without shadowing, which depends on the seed."""
     antennas = {name: antenna_of(member.profile.radio) for name, member in members.items()}
     channel = WorldChannel(
         0, antennas, options.radio.model_copy(update={"shadowing_db": 0.0, "fading": False}), world
     )
-    channel.move(0, places_m)
+    channel.move(0, positions_m)
     names = list(members)
     pairs = [] if options.radio.is_fixed else list(combinations(range(len(names)), 2))
-    first, second = (np.array([places_m[names[pair[end]]] for pair in pairs]).reshape(-1, 3) for end in (0, 1))
+    first, second = (np.array([positions_m[names[pair[end]]] for pair in pairs]).reshape(-1, 3) for end in (0, 1))
     links = [
         LabLink(
             (names[first_index], names[second_index]),
@@ -203,7 +204,7 @@ def overview(
     ]
     parts = sorted(world.parts, key=lambda part: part.shape.top_m)
     outlines = [Outline(part.material, part.shape.corners_m()) for part in parts]
-    robots = {name: place_m[:2] for name, place_m in places_m.items()}
+    robots = {name: position_m[:2] for name, position_m in positions_m.items()}
     return Overview(world.name, world.area_m, outlines, robots, links)
 
 

@@ -1,4 +1,4 @@
-"""Mobility of robots in an emulated lab: places and velocities over time, as the medium receives them."""
+"""Mobility of robots in an emulated lab: positions and velocities over time, as the medium receives them."""
 
 import math
 import threading
@@ -12,7 +12,7 @@ from fieldkit.backends.protocols import Cast
 from fieldkit.core import geometry
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Move, Placement, Role, TrackPoint, Vector
-from sim_backends.emulated import placement as places
+from sim_backends.emulated import placement as positions
 from sim_backends.emulated.motion_sections import mavlink_of
 from sim_backends.emulated.nodes import EmulatedRobot, Laptop
 from sim_backends.emulated.provisioning import RobotKey
@@ -38,7 +38,8 @@ class MotionThread:
     """Thread that reports a motion step by step; use it as a context manager, which stops the thread on leaving.
 
     Args:
-        step: Reports the present places of the robots; returns the seconds until its next call, or None at the end.
+        step: Reports the current positions of the robots; returns the seconds until its next call, or None at the
+            end.
         name: Name of the thread.
 
     Raises:
@@ -104,7 +105,7 @@ class PlacesRobots(Protocol):
         relay: str | None = None,
         velocities_m_s: Mapping[str, Vector] = ...,
     ) -> None:
-        """Place the robots; see `MediumClient.place`."""
+        """Place the robots. The arguments are those of `MediumClient.place`."""
 
 
 class Mobility:
@@ -147,7 +148,7 @@ class Mobility:
         self._lock = threading.RLock()
 
     def place(self, placement: Placement) -> None:
-        """Put all robots in place, immediately.
+        """Move all robots to their positions, immediately.
 
         Raises:
             LinkError: The medium ended or did not answer.
@@ -160,7 +161,7 @@ class Mobility:
             self._update_medium()
 
     def return_to_place(self, role: Role) -> None:
-        """Put one robot back in its place, immediately. Raises the errors of `set_out_of_range`."""
+        """Move one robot back to its position, immediately. Raises the errors of `set_out_of_range`."""
         with self._lock:
             self._send_path(Move(role, (), speed_m_s=1.0), time.monotonic_ns())
             self._update_medium()
@@ -172,7 +173,7 @@ class Mobility:
 
         Raises:
             LinkError: The medium ended or did not answer.
-            RobotError: The robots have no places yet.
+            RobotError: The robots have not been placed yet.
         """
         with self._lock:
             self._require_placement()
@@ -181,13 +182,13 @@ class Mobility:
 
     @contextmanager
     def moving(self, move: Move) -> Iterator[None]:
-        """Move a robot while the body runs; afterwards, also after an error, put it back at its place immediately.
+        """Move a robot while the body runs; then move it back to its position, also after an error.
 
         Raises:
             LinkError: The medium ended or did not answer.
-            RobotError: The robots have no places yet.
+            RobotError: The robots have not been placed yet.
         """
-        motion = places.motion(self._cast, self._require_placement(), move, self._world)
+        motion = positions.motion(self._cast, self._require_placement(), move, self._world)
         entry = time.monotonic_ns(), motion
         with self._lock:
             self._motions.append(entry)
@@ -229,15 +230,15 @@ class Mobility:
             return tuple(self._track)
 
     def _send_path(self, move: Move, start_ns: int) -> None:
-        """Send a robot the path of a move, if the placement has a place for it."""
+        """Send a robot the path of a move, if the placement includes its role."""
         placement = self._require_placement()
         if move.role in self._robots and move.role in geometry.positions_m(placement):
             self._path_starts_ns[move.role] = start_ns
-            self._robots[move.role].move(places.assigned_path(placement, move, self._world, start_ns))
+            self._robots[move.role].move(positions.assigned_path(placement, move, self._world, start_ns))
 
     def _require_placement(self) -> Placement:
         if self._placement is None:
-            raise RobotError("the robots have no places yet", remedy="place them first")
+            raise RobotError("the robots have not been placed yet", remedy="place them first")
         return self._placement
 
     def _update_medium(self) -> float | None:
@@ -246,17 +247,17 @@ class Mobility:
             placement = self._require_placement()
             # The track gets the time of the positions, because the medium's answer may take long on a busy machine.
             now_ns, utc_ns = time.monotonic_ns(), time.time_ns()
-            positions_m = places.positions_m(self._cast, placement, self._world)
-            states = {name: State(place_m) for name, place_m in positions_m.items()}
+            positions_m = positions.positions_m(self._cast, placement, self._world)
+            states = {name: State(position_m) for name, position_m in positions_m.items()}
             for start_ns, motion in self._motions:
                 states |= motion.at(now_ns - start_ns)
             states |= {
                 self._cast[role].name: self._self_steered_state(role, motion)
                 for role, motion in self._self_steered_motions().items()
             }
-            relay = places.relay(self._cast, placement)
+            relay = positions.relay(self._cast, placement)
             if self._laptop is not None:
-                states[self._laptop.name] = State(places.laptop_m(self._cast, placement, self._world))
+                states[self._laptop.name] = State(positions.laptop_m(self._cast, placement, self._world))
             hidden = None if self._out_of_range_role is None else self._cast[self._out_of_range_role].name
             self._write_positions({name: state.position_m for name, state in states.items() if name != hidden})
             if hidden is not None:
@@ -282,7 +283,7 @@ class Mobility:
     def _self_steered_state(self, role: Role, motion: RecordedMotion) -> State:
         """Return the state of a robot that steers itself; a ground robot is at the height of the ground."""
         flies = mavlink_of(self._cast[role].profile) is not None
-        return motion.state if flies else places.on_ground(motion.state, self._world)
+        return motion.state if flies else positions.on_ground(motion.state, self._world)
 
     def _next_update_s(self, now_ns: int, states: Mapping[str, State]) -> float | None:
         remaining_ns = [

@@ -17,6 +17,7 @@ class DriveSection(Protocol):
     """The base of a ground robot, driven by velocities on a topic; keys: docs/reference/robot-profile.md."""
 
     topic: str
+    type: str
     turn_rad_s: float
     acceleration_m_s2: float
 

@@ -1,4 +1,4 @@
-"""Nodes of an emulated lab, robots and the operator's laptop: their handles, and their startup."""
+"""Handles and startup of the nodes of an emulated lab: robots and the operator's laptop."""
 
 import os
 import socket
@@ -26,9 +26,9 @@ from sim_backends.emulated.provisioning import LAPTOP_NAME, KeyPair, RobotKey, r
 from sim_backends.emulated.robot.init import START_S
 from sim_backends.emulated.robot.spec import HOME, RobotSpec, WifiSpec
 from sim_backends.emulated.robot.ssh_server import SSH_PORT
-from sim_backends.emulated.ros.laser import PlacesWriter
+from sim_backends.emulated.ros.laser import PositionsWriter
 from sim_backends.emulated.ros.motion_record import MotionRecord, RecordedMotion
-from sim_backends.emulated.ros.own_motion import AssignedPath
+from sim_backends.emulated.ros.robot_motion import AssignedPath
 from sim_backends.radio.antennas import antenna_of, fixed_mode
 from sim_backends.world.world import World
 
@@ -151,31 +151,32 @@ class EmulatedRobot(Node):
 
     Args:
         spec: Specification of the robot.
-        places_fd: Descriptor of the memory with the places of all robots (`laser.PlacesWriter`), which must stay
-            open until `build` has returned; None for a robot without neighbours.
+        positions_fd: Descriptor of the shared memory that holds the positions of all robots
+            (`laser.PositionsWriter`). It must stay open until `build` has returned; None for a robot without
+            neighbours.
 
     Attributes:
         spec: Specification of the robot.
-        physics_fds: Descriptors for a physics that moves it, after `build`: the record of its motion, the file of its
-            assigned paths, and the record of its commanded velocity, or of its autopilot's commands and of its
-            flight; empty if no such physics moves it.
+        physics_fds: Descriptors for a physics simulator that moves the robot, set by `build`: its motion record, its
+            file of assigned paths, and either its record of commanded velocities or, for a robot with an autopilot,
+            its records of commands and of flight. Empty if no simulator moves the robot.
         link_fds: Descriptor of the TUN device of each further link, by its name, after `open_links`.
 
     Raises:
-        ConfigurationError: See `Node`.
+        ConfigurationError: A program of util-linux is missing.
     """
 
-    def __init__(self, spec: RobotSpec, places_fd: int | None = None) -> None:
+    def __init__(self, spec: RobotSpec, positions_fd: int | None = None) -> None:
         super().__init__(spec.name, interface=spec.interface, address=spec.address)
         self.spec = spec
-        self._places_fd = places_fd
+        self._positions_fd = positions_fd
         self._record: MotionRecord | None = None
         self.physics_fds: Sequence[int] = ()
         self.link_fds: dict[str, int] = {}
 
     def build(self) -> None:
         """Give the robot its host name and its file system. Raises the errors of `open_radio`."""
-        shared_fds = () if self._places_fd is None else (self._places_fd,)
+        shared_fds = () if self._positions_fd is None else (self._positions_fd,)
         _, (fd, *others) = self._worker.request({"do": "build", "robot": asdict(self.spec)}, descriptors=shared_fds)
         self._record = MotionRecord(fd)
         self.physics_fds = (fd, *others) if others else ()
@@ -183,7 +184,7 @@ class EmulatedRobot(Node):
     def open_wifi(self, device: str) -> None:
         """Bring up the Wi-Fi interface `device`, which was moved to the robot. Raises the errors of `open_radio`."""
         if self.spec.wifi is None:
-            raise RobotError("it has no Wi-Fi of Linux", where=self.name)
+            raise RobotError("it has no Linux Wi-Fi", where=self.name)
         link = {"device": device, "interface": self.interface, "address": self.address}
         self._worker.request({"do": "open wifi", "wifi": asdict(self.spec.wifi), **link})
 
@@ -266,7 +267,7 @@ class Laptop(Node):
         address: Its address with the prefix length.
 
     Raises:
-        ConfigurationError: See `Node`.
+        ConfigurationError: A program of util-linux is missing.
     """
 
     def __init__(self, address: str) -> None:
@@ -283,13 +284,13 @@ _MAX_PARALLEL_STARTS: Final = 16
 
 @dataclass(frozen=True)
 class RunningRobots(Generic[RobotKey]):
-    """Running robots on their media; they have no places yet.
+    """Running robots, attached to their media but not placed yet.
 
     Attributes:
         robots: The robots.
         medium: The medium of the radio under test.
         media: This medium and those of further links.
-        places: Writer of the robots' places, for the lasers of the other robots.
+        positions_writer: Writer of the robots' positions, for the lasers of the other robots.
         host_keys: Public host key of each robot.
         private_key: Private key that logs in on all robots, OpenSSH PEM.
     """
@@ -297,7 +298,7 @@ class RunningRobots(Generic[RobotKey]):
     robots: Mapping[RobotKey, EmulatedRobot]
     medium: MediumClient
     media: Media
-    places: PlacesWriter
+    positions_writer: PositionsWriter
     host_keys: Mapping[RobotKey, str]
     private_key: str = field(repr=False)
 
@@ -313,7 +314,7 @@ def running_robots(
 ) -> Iterator[RunningRobots[RobotKey]]:
     """Yield robots whose programs are ready; leaving the context stops all their processes.
 
-    Arguments are those of `testbed.bring_up`. Robots that share a ROS master or a Zenoh router start 1 m apart,
+    The arguments are those of `testbed.bring_up`. Robots that share a ROS master or a Zenoh router start 1 m apart,
     and connect to it over the radio.
 
     Raises:
@@ -343,7 +344,7 @@ def running_robots(
             if name in used_links
         }
         media = Media(medium, links)
-        places = stack.enter_context(closing(PlacesWriter([robot.name for robot in robots.values()])))
+        positions_writer = stack.enter_context(closing(PositionsWriter([robot.name for robot in robots.values()])))
         # The pool is shut down after the robots have exited, because a request that waits for a robot ends only then.
         pool = stack.enter_context(ThreadPoolExecutor(min(len(robots), _MAX_PARALLEL_STARTS)))
         running: dict[RobotKey, EmulatedRobot] = {}
@@ -352,7 +353,7 @@ def running_robots(
                 robots, key, ros=ros, login=login, host_key=host_keys[key], options=options, world=world
             )
             spec = replace(spec, wifi=wifi.get(key))
-            running[key] = stack.enter_context(EmulatedRobot(spec, places.fd))
+            running[key] = stack.enter_context(EmulatedRobot(spec, positions_writer.fd))
         list(pool.map(partial(_build, radios=radios), running.values()))
         # Robots with a ROS master start first, because the other robots wait for it.
         startups = pool.map(
@@ -368,7 +369,12 @@ def running_robots(
             media.place(placement.side_by_side_m(names))
         list(startups)
         yield RunningRobots(
-            running, medium, media, places, {key: pair.public for key, pair in host_keys.items()}, login.private
+            running,
+            medium,
+            media,
+            positions_writer,
+            {key: pair.public for key, pair in host_keys.items()},
+            login.private,
         )
         for robot in running.values():
             robot.request_exit()

@@ -1,4 +1,4 @@
-"""Places of robots in the emulated world."""
+"""Positions and paths of robots in the emulated world."""
 
 import math
 from collections.abc import Collection, Iterable
@@ -10,7 +10,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Move, Placement, Role, Topology, Vector
 from fieldkit.lab.robots import Destination
 from sim_backends.emulated.robot.spec import ANTENNA_M
-from sim_backends.emulated.ros.own_motion import AssignedPath
+from sim_backends.emulated.ros.robot_motion import AssignedPath
 from sim_backends.world.motion import Motion, OnGround, State, WayPoints
 from sim_backends.world.world import Line, World
 
@@ -42,19 +42,19 @@ def motion(cast: Cast, placement: Placement, move: Move, world: World) -> Motion
     """Return the motion of a ground robot in a trial. Raises the errors of `positions_m`."""
     corners = [(*corner, 0.0) for corner in _corners_m(placement, move, world)]
     path = WayPoints(cast[move.role].name, corners, move.speed_m_s)
-    return OnGround(path, lambda place_m: antenna_m(world, place_m)[2])
+    return OnGround(path, lambda position_m: antenna_m(world, position_m)[2])
 
 
 def assigned_path(placement: Placement, move: Move, world: World, start_ns: int) -> AssignedPath:
-    """Return the path of a move in the form that the robot receives; raises the errors of `positions_m`.
+    """Return the path of a move in the form that the robot receives. Raises the errors of `positions_m`.
 
-    At its place the robot faces away from the other end of its link.
+    The robot first faces away from the other end of its link.
 
     Args:
-        placement: Places of the robots.
-        move: The move; without legs the robot stays at its place.
+        placement: The scenario, the topology and the distance of the robots.
+        move: The move; without legs the robot stays where it is.
         world: The world around the robots.
-        start_ns: Start of the move, by the monotonic clock.
+        start_ns: Start of the move, as a time of the monotonic clock.
     """
     line, (along_m, left_m) = _line(placement, world), _along_line_m(placement)[move.role]
     ahead_m = math.cos(geometry.heading_rad(move.role, "away"))
@@ -75,22 +75,22 @@ def _line(placement: Placement, world: World) -> Line:
     line = world.lines.get(placement.scenario)
     if line is None:
         raise ConfigurationError(
-            f"the world {world.name} has no line for the places of robots in the scenario {placement.scenario}",
+            f"the world {world.name} has no line for the positions of robots in the scenario {placement.scenario}",
             remedy=f"add lines: {{{placement.scenario}: {{from_m: [0, 0], bearing_deg: 90}}}} to it",
         )
     return line
 
 
 def _along_line_m(placement: Placement) -> dict[Role, tuple[float, float]]:
-    """Return the place of each role: metres from the sender along the line, and metres to the left of the line."""
-    places_m = geometry.positions_m(placement)
-    sender_m = places_m[Role.SENDER][0]
-    return {role: (east_m - sender_m, north_m) for role, (east_m, north_m, _) in places_m.items()}
+    """Return the position of each role: metres from the sender along the line, and metres to the left of the line."""
+    world_positions_m = geometry.positions_m(placement)
+    sender_m = world_positions_m[Role.SENDER][0]
+    return {role: (east_m - sender_m, north_m) for role, (east_m, north_m, _) in world_positions_m.items()}
 
 
-def antenna_m(world: World, place_m: tuple[float, float]) -> Vector:
+def antenna_m(world: World, point_m: tuple[float, float]) -> Vector:
     """Return the position of a ground robot's antenna above a point on the ground, metres east and north."""
-    return (*place_m, world.ground_m(place_m) + ANTENNA_M)
+    return (*point_m, world.ground_m(point_m) + ANTENNA_M)
 
 
 def below_antenna_m(antenna_m: Vector) -> Vector:
@@ -120,30 +120,30 @@ def square_m(names: Collection[str], world: World) -> dict[str, Vector]:
     }
 
 
-def destination_m(place_m: Vector, to: Destination, world: World) -> Vector:
+def destination_m(start_m: Vector, to: Destination, world: World) -> Vector:
     """Return the position of an antenna after a move.
 
     Args:
-        place_m: Its position before the move.
+        start_m: Its position before the move.
         to: The destination.
         world: The world around the robot.
 
     Raises:
         ConfigurationError: The destination is outside the world, below its ground, or above 100 km.
     """
-    start_m = place_m[:2] if to.relative else (0.0, 0.0)
-    end_m = start_m[0] + to.east_m, start_m[1] + to.north_m
+    origin_m = start_m[:2] if to.relative else (0.0, 0.0)
+    end_m = origin_m[0] + to.east_m, origin_m[1] + to.north_m
     width_m, depth_m = world.area_m
     if not (0 <= end_m[0] <= width_m and 0 <= end_m[1] <= depth_m):
         raise ConfigurationError(
             f"{end_m[0]:g} m east, {end_m[1]:g} m north is outside of the world {world.name}, which is "
             f"{width_m:g} m by {depth_m:g} m",
-            remedy="choose a place inside it, or select a larger world with emulated.world in the site file; see: "
+            remedy="choose a position inside it, or select a larger world with emulated.world in the site file; see: "
             "fieldkit docs world-file",
         )
     ground_m = world.ground_m(end_m)
     if to.relative:
-        above_ground_m = place_m[2] - world.ground_m(place_m[:2]) + (to.up_m or 0.0)
+        above_ground_m = start_m[2] - world.ground_m(start_m[:2]) + (to.up_m or 0.0)
     else:
         above_ground_m = ANTENNA_M if to.up_m is None else to.up_m - ground_m
     up_m = ground_m + above_ground_m
@@ -157,7 +157,7 @@ def destination_m(place_m: Vector, to: Destination, world: World) -> Vector:
 
 
 def laptop_m(cast: Cast, placement: Placement, world: World) -> Vector:
-    """Return the position of the laptop: 2 m beside the robot that stays in its place.
+    """Return the position of the laptop: 2 m beside the robot that does not move.
 
     With a master this is the relay, because operators are near the access point. Without a master it is the receiver,
     because a person carries the sender, possibly behind a wall, and the laptop is never behind a wall.

@@ -237,7 +237,9 @@ def _base(profile: RobotProfile, *, is_simulated: bool) -> Base | None:
     if drive is None:
         return None
     limits = profile.limits
-    return Base(drive.topic, limits.max_speed_m_s, drive.acceleration_m_s2, drive.turn_rad_s, is_simulated)
+    return Base(
+        drive.topic, drive.type, limits.max_speed_m_s, drive.acceleration_m_s2, drive.turn_rad_s, is_simulated
+    )
 
 
 def _ros2_spec(

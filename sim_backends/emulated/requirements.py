@@ -74,10 +74,10 @@ def check(programs: Iterable[str] = (), *, needs_tun: bool = True) -> None:
 
 def _check_files() -> None:
     """Raise ConfigurationError if a file that each robot replaces by a mount is missing; only root can create it."""
-    missing = [path for path in rootfs.OWN_FILES if not Path(path).exists()]
+    missing = [path for path in rootfs.ROBOT_FILES if not Path(path).exists()]
     if missing:
         raise ConfigurationError(
-            f"this machine has no {', '.join(missing)}; each robot mounts its own file there",
+            f"this machine has no {', '.join(missing)}; each robot mounts a separate file there",
             remedy=f"sudo touch {' '.join(missing)}",
         )
 

@@ -54,7 +54,7 @@ def resolve(options: EmulatedOptions) -> Simulators:
     policy = make_policy(sync.name, **sync.parameters)
     if isinstance(policy, FixedWindow) and sync.window < sync.step:
         raise ConfigurationError(
-            f"emulated.sync has a window of {sync.window:g} s, which is shorter than the step of the physics, "
+            f"emulated.sync has a window of {sync.window:g} s, which is shorter than the physics step, "
             f"{sync.step:g} s",
             remedy=f"write window: {sync.step * 1e3:g}ms, or a shorter step",
         )
@@ -120,7 +120,7 @@ def _body(profile: RobotProfile) -> RobotBody:
 
 
 def summary(options: EmulatedOptions) -> Mapping[str, str]:
-    """Return texts for `physics`, `network`, `sync` (the policy) and `step` (of the physics) of a lab."""
+    """Return texts for `physics`, `network`, `sync` (the policy) and `step` (of the physics simulator) of a lab."""
     sync = sync_of(options)
     policy = make_policy(sync.name, **sync.parameters)
     defaults = {name: parameter.default for name, parameter in inspect.signature(type(policy)).parameters.items()}

@@ -1,4 +1,4 @@
-"""Testbed of the emulated robots of one cast."""
+"""The testbed of the emulated robots of one cast."""
 
 import socket
 import time
@@ -27,7 +27,7 @@ from fieldkit.core.model import (
 from fieldkit.core.prompts import DONE, UNATTENDED, Answer, Operator
 from fieldkit.remote.shell import Shell
 from fieldkit.remote.ssh import PATIENCE_S, SshShell
-from sim_backends.emulated import placement as places
+from sim_backends.emulated import placement as positions
 from sim_backends.emulated.emulated_options import EmulatedOptions, MeshOptions, RosChoice
 from sim_backends.emulated.medium.media import Media
 from sim_backends.emulated.mobility import Mobility
@@ -40,7 +40,7 @@ _IP_PROTOCOL: Final = {Protocol.TCP: socket.IPPROTO_TCP, Protocol.UDP: socket.IP
 
 
 class EmulatedOracle:
-    """Ground truth of the medium: delays and lateness of packets, places of robots, link samples.
+    """Ground truth of the medium: delays and lateness of packets, positions of robots, link samples.
 
     Args:
         names: Name of each robot.
@@ -59,7 +59,7 @@ class EmulatedOracle:
         self._has_windows = options.is_cosimulated
 
     def track(self, since_utc_ns: int) -> tuple[TrackPoint, ...]:
-        """Implement `Oracle.track` from the places that the medium received."""
+        """Implement `Oracle.track` from the positions that the medium received."""
         return self._mobility.track(since_utc_ns)
 
     def delays(self, source: Role, destination: Role, protocol: Protocol, port: int, *, link: str = "") -> DelayParts:
@@ -118,7 +118,7 @@ class EmulatedTestbed:
         self._shells = shells
         self._boot_s = options.boot
         self._mobility = Mobility(
-            cast, running.media, world, laptop, running.robots, write_positions=running.places.write
+            cast, running.media, world, laptop, running.robots, write_positions=running.positions_writer.write
         )
         names = {role: robot.name for role, robot in running.robots.items()}
         self._oracle = EmulatedOracle(names, running.media, self._mobility, options)
@@ -162,7 +162,7 @@ class EmulatedTestbed:
         return 0.0
 
     def bring_back(self, role: Role, *, has_returned: bool) -> None:  # noqa: ARG002 (all repeats must start in the same way)
-        """Implement `Testbed.bring_back`; the robot is exactly at its place, independently of its odometry."""
+        """Implement `Testbed.bring_back`; the robot returns exactly, independently of its odometry."""
         self._mobility.return_to_place(role)
 
     def watching(self) -> AbstractContextManager[object]:
@@ -170,14 +170,14 @@ class EmulatedTestbed:
         return self._mobility.watching()
 
     def moving(self, move: Move) -> AbstractContextManager[None]:
-        """Implement `Testbed.moving`; the robot returns to its place immediately."""
+        """Implement `Testbed.moving`; the robot returns to its position immediately."""
         return self._mobility.moving(move)
 
 
 class LinuxWifiTestbed(EmulatedTestbed):
-    """Robots with the Wi-Fi of Linux, whose radio is measured as on real robots.
+    """Robots with Linux Wi-Fi, whose radio is measured as on real robots.
 
-    Arguments are those of the base class.
+    The arguments are those of the base class.
     """
 
     @property
@@ -229,9 +229,9 @@ def bring_up(
     with ExitStack() as stack:
         running = stack.enter_context(running_robots(cast, options=options, world=world, ros=ros, seed=seed))
         laptop = stack.enter_context(laptop_on_air(running, options.mesh)) if control is Control.RADIO else None
-        if laptop is not None:  # it connects to the robots before they have places
+        if laptop is not None:  # it connects to the robots before they are placed
             running.media.place(
-                places.side_by_side_m([*(robot.name for robot in running.robots.values()), laptop.name])
+                positions.side_by_side_m([*(robot.name for robot in running.robots.values()), laptop.name])
             )
         shells: dict[Role, Shell] = {}
         for role in running.robots:
@@ -245,7 +245,7 @@ def bring_up(
 
 @contextmanager
 def laptop_on_air(running: RunningRobots[RobotKey], mesh: MeshOptions | None) -> Iterator[Laptop]:
-    """Yield the laptop, attached to the medium without a place.
+    """Yield the laptop, attached to the medium but not placed.
 
     In a mesh it uses the routes of the robots, and forwards no packets.
     """

@@ -1,4 +1,7 @@
-"""Serves a named federate that is a Python class: `python -m sim_backends.federates physics mujoco [ADDRESS]`."""
+"""Serves a named federate that is a Python class.
+
+The command is, for example, `python -m sim_backends.federates physics mujoco [ADDRESS]`.
+"""
 
 import sys
 
@@ -13,7 +16,7 @@ def main(role_name: str, name: str, address: str | None = None) -> None:
     Args:
         role_name: `physics` or `network`.
         name: Its name.
-        address: As for `serve`.
+        address: Address of a transport; None for standard input and output.
 
     Raises:
         SystemExit: There is no such federate.

@@ -1,7 +1,8 @@
 """Agents by index, and their states, in the layout of the wire protocol.
 
-Every exchange contains the states of all agents, so they are packed and checked together. A received state is
-unpacked only when it is requested.
+A state consists of the index of the agent, a reserved field, its position, velocity and heading, and the limit of its
+acceleration. Every exchange contains the states of all agents, so they are packed and checked together. A received
+state is unpacked only when it is requested.
 """
 
 import math
@@ -30,13 +31,13 @@ class _Layouts(NamedTuple):
         indices: The index and the reserved field as one number, which equals the index if the reserved field is 0.
         positions: Positions and velocities.
         headings: The headings.
-        limits: The limits.
+        acceleration_limits: The acceleration limits.
     """
 
     indices: struct.Struct
     positions: struct.Struct
     headings: struct.Struct
-    limits: struct.Struct
+    acceleration_limits: struct.Struct
 
 
 @lru_cache(maxsize=32)
@@ -56,8 +57,8 @@ class AgentTable:
         indices: Their indices by name. An addition replaces the mapping, so that received states can keep the
             previous one.
         all_indices: All indices.
-        valid_limits: The limits in the last received states. They seldom change, and equal limits are not checked
-            again.
+        valid_limits: The acceleration limits in the last received states. They seldom change, and equal limits are
+            not checked again.
     """
 
     def __init__(self, names: Iterable[str] = ()) -> None:
@@ -139,7 +140,7 @@ class ReceivedStates(Mapping[str, State]):
     Args:
         rows: Row of each agent's state in `data`.
         data: The bytes of the states.
-        limits: The limits of the agents, in the order of the rows.
+        limits: Acceleration limits of the agents, in m/s^2, in the order of the rows.
     """
 
     def __init__(self, rows: Mapping[str, int], data: bytes, limits: tuple[float, ...]) -> None:
@@ -172,16 +173,19 @@ class ReceivedStates(Mapping[str, State]):
         return len(self._rows)
 
     def has_indices(self, agents: AgentTable) -> bool:
-        """Return True if the states have the same agents with the same indices as a table."""
+        """Return True if the states have the same agents with the same indices as the table."""
         return self._rows is agents.indices or self._rows == agents.indices
 
     def has_limits_of(self, other: Mapping[str, State]) -> bool:
-        """Return True if other states have the same agents and limits; it may also return False for equal limits."""
+        """Return True if other states have the same agents and acceleration limits.
+
+        The result may be False although they are the same.
+        """
         return isinstance(other, ReceivedStates) and self._rows is other._rows and self._limits == other._limits  # noqa: SLF001 (of the same class)
 
     @property
     def limits_m_s2(self) -> dict[str, float]:
-        """The limits of the agents."""
+        """The acceleration limits of the agents."""
         return dict(zip(self._rows, self._limits, strict=True))
 
 
@@ -191,7 +195,7 @@ def states_bytes(states: Mapping[str, State], agents: AgentTable, limits_m_s2: M
     Args:
         states: The states.
         agents: The agents.
-        limits_m_s2: Limits of their accelerations; None if the message has no limits.
+        limits_m_s2: Acceleration limits of the agents; None if the message contains no limits.
     """
     count = len(states)
     if limits_m_s2 is None and isinstance(states, ReceivedStates) and states.has_indices(agents):
@@ -219,15 +223,18 @@ def read_states(reader: FrameReader, agents: AgentTable) -> ReceivedStates:
 
 
 def unpack_states(data: bytes, begin: int, agents: AgentTable) -> ReceivedStates:
-    """Return states of agents; arguments and errors as for `read_states`.
+    """Return states of agents, by name.
 
     Args:
         data: The bytes of the states.
-        begin: Position of the first one in the frame.
+        begin: Position of the first state in the frame.
         agents: The agents.
+
+    Raises:
+        MalformedFrameError: A state is invalid, or an agent has two states.
     """
     layouts = _layouts(len(data) // STATE.size)
-    indices, limits = layouts.indices.unpack(data), layouts.limits.unpack(data)
+    indices, limits = layouts.indices.unpack(data), layouts.acceleration_limits.unpack(data)
     headings = layouts.headings.unpack(data)
     # The sum of finite numbers may overflow; then each number is checked.
     if not (

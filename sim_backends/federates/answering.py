@@ -1,4 +1,4 @@
-"""Answers of a federate to the requests of a coordinator."""
+"""Answers the requests of a coordinator on behalf of a federate."""
 
 import copy
 import sys
@@ -48,11 +48,11 @@ class FederateService:
     """A federate and its properties.
 
     Attributes:
-        make: Returns a physics or a network for a run.
+        make: Returns a physics or network federate for a run.
         name: Its name in messages.
         software: Name and version of its software.
         is_deterministic: True if equal requests give equal answers.
-        forks: True if `copy.deepcopy` copies it in its present state.
+        forks: True if `copy.deepcopy` copies it in its current state.
         agents_appear: True if agents may appear during a run.
         agents_disappear: True if agents may disappear.
         commands: Types of commands that it supports.
@@ -69,7 +69,7 @@ class FederateService:
     commands: Sequence[int] = COMMAND_TYPES
     transports: Sequence[str] = ()
 
-    def welcome(self, federate: Any, hello: Hello) -> Welcome:  # noqa: ANN401 (a physics or a network)
+    def welcome(self, federate: Any, hello: Hello) -> Welcome:  # noqa: ANN401 (a physics or network federate)
         """Return the answer to a hello.
 
         Raises:
@@ -102,7 +102,7 @@ class FederateService:
         )
 
 
-def _next_event_ns(federate: Any) -> int:  # noqa: ANN401 (a physics or a network)
+def _next_event_ns(federate: Any) -> int:  # noqa: ANN401 (a physics or network federate)
     if not hasattr(federate, "next_event_ns"):
         return NO_EVENT
     at_ns = federate.next_event_ns()

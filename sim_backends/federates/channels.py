@@ -39,7 +39,7 @@ class FrameChannel(Protocol):
         """Return the next frame.
 
         Args:
-            deadline_s: As for `send`.
+            deadline_s: Time of `time.monotonic` until which to wait; None for no deadline.
             max_bytes: Largest allowed size of a body.
 
         Raises:
@@ -122,7 +122,7 @@ class StreamChannel:
         """Return the next bytes, at least one.
 
         Args:
-            deadline_s: As for `receive`.
+            deadline_s: Time of `time.monotonic` until which to wait; None for no deadline.
             bytes_before: Number of bytes of the same frame that were read before, for the error.
         """
         if not self._fds:

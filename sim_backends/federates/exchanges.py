@@ -15,7 +15,7 @@ next index in the first message that mentions it, for this copy and its copies.
   world file](reference/world-file.md)), `robots` (limits of each agent's body, and its radio) and `options`. A simple
   federate ignores it and uses the agents of hello. A network declared with `writes_captures` gets `captures` if the
   run has an output folder: the `folder` for one `AGENT.pcap` each, of raw IP; `addresses` by agent; and `flows` by
-  name: `port` of the destination (0: its own), `ping` (identifier of ICMP echo; 0: none), `reply`.
+  name: `port` of the destination (0: the network chooses it), `ping` (identifier of ICMP echo; 0: none), `reply`.
 - **Physics: states.** `at_ns` is `to_ns` rounded down to a multiple of the `step_ns` in welcome; the states are valid
   at this time. Positions are of the antenna. `heading_rad` is from east towards north, NaN if undefined. `limit_m_s2`
   is the largest change of velocity per second after this time, infinity if unknown; in requests to a network it has
@@ -32,7 +32,8 @@ next index in the first message that mentions it, for this copy and its copies.
 - **Dead reckoning.** If `reckoning_ns` is above 0, which needs the capability *extrapolates*, the position at t is
   `position_m` + n `reckoning_ns` `velocity_m_s`, where n is (t - `since_ns`) / `reckoning_ns`, rounded down.
   Otherwise agents stay at their positions until the next request.
-- **Absent agents** have no state. A physics with the capability 32 omits agents that it has removed; they may return.
+- **Absent agents** have no state. A physics federate with the capability 32 omits agents that it has removed;
+  they may return.
   With the scenario's keys `appears` and `disappears` the coordinator ignores states of absent agents, sends them no
   commands, and drops their packets as `agent absent`; the network still reports the fates of those that it already
   carries. A network without the capability 32 receives the last states of absent agents, or their start states.
@@ -77,17 +78,17 @@ from sim_backends.world.motion import State
 _TIME: Final = struct.Struct("<q")
 _TWO_TIMES: Final = struct.Struct("<qq")
 _NO_COMMANDS: Final = struct.Struct("<qqI")
-"""A request to a physics in which the count of commands is 0."""
+"""A request to a physics federate in which the count of commands is 0."""
 _NO_OUTCOMES: Final = struct.Struct("<qqQ")
 """An answer of a network in which both counts are 0."""
 _THREE_TIMES: Final = struct.Struct("<qqq")
 _U32: Final = struct.Struct("<I")
 _STATES_HEAD: Final = struct.Struct("<qII")
-"""An answer of a physics without new agents: time, 0, number of states."""
+"""An answer of a physics federate without new agents: time, 0, number of states."""
 
 
 def encode_advance_physics(to_ns: int, from_ns: int, commands: Mapping[str, Any], agents: AgentTable) -> bytes:
-    """Return the body of a request to a physics; errors as for `commands_bytes`.
+    """Return the body of a request to a physics federate. Raises the errors of `commands_bytes`.
 
     Args:
         to_ns: Time to advance to.
@@ -101,7 +102,7 @@ def encode_advance_physics(to_ns: int, from_ns: int, commands: Mapping[str, Any]
 
 
 def decode_advance_physics(body: bytes, agents: AgentTable) -> tuple[int, int, dict[str, Twist | Velocity]]:
-    """Return the two times and the commands of a request to a physics.
+    """Return the two times and the commands of a request to a physics federate.
 
     Raises:
         MalformedFrameError: It is malformed.
@@ -120,12 +121,12 @@ def decode_advance_physics(body: bytes, agents: AgentTable) -> tuple[int, int, d
 def encode_states(
     at_ns: int, states: Mapping[str, State], agents: AgentTable, limits_m_s2: Mapping[str, float]
 ) -> bytes:
-    """Return the body of a physics' answer."""
+    """Return the body of a physics federate's answer."""
     return _TIME.pack(at_ns) + announcements_bytes(states, agents) + states_bytes(states, agents, limits_m_s2)
 
 
 def decode_states(body: bytes, agents: AgentTable) -> tuple[int, ReceivedStates]:
-    """Return time and states of a physics' answer; the states include the limits.
+    """Return time and states of a physics federate's answer; the states include the acceleration limits.
 
     Raises:
         MalformedFrameError: It is malformed.

@@ -231,7 +231,7 @@ class FrameReader:
         return int(count)
 
     def short_count(self, item_bytes: int) -> int:
-        """Return the next count of two bytes; arguments and errors as for `count`."""
+        """Return the next count of items, stored in two bytes. Arguments and errors are those of `count`."""
         return self.count(item_bytes, _LENGTH)
 
     def end(self) -> None:

@@ -44,7 +44,7 @@ class FederateCapability(IntFlag):
 
     Attributes:
         DETERMINISTIC: Equal requests give equal answers.
-        FORK: It can be copied in its present state.
+        FORK: It can be copied in its current state.
         NEXT_EVENT: Before `next_event_ns`, no packet arrives or is dropped and no position is used, unless a new
             packet enters. The time may be earlier than the event; -1: there is no event.
         EXTRAPOLATES: It moves agents by dead reckoning.

@@ -1,4 +1,4 @@
-"""The IP packets of the built-in transports, carried by a network federate."""
+"""The radio for built-in transports whose IP packets a network federate carries."""
 
 from collections.abc import Callable, Mapping, Sequence, Set
 
@@ -54,12 +54,12 @@ class IpRadio:
     def place(
         self,
         now_ns: int,  # noqa: ARG002 (see RadioModel)
-        places_m: Mapping[str, Vector],
+        positions_m: Mapping[str, Vector],
         relay: str | None,  # noqa: ARG002
         velocities_m_s: Mapping[str, Vector] | None = None,  # noqa: ARG002
     ) -> None:
         """Implement `RadioModel.place`."""
-        self._states = {name: State(place_m) for name, place_m in places_m.items()}
+        self._states = {name: State(position_m) for name, position_m in positions_m.items()}
 
     def send(
         self,
@@ -120,7 +120,7 @@ class IpRadio:
         return {}
 
     def use_meter(self) -> None:
-        """Implement `RadioModel.use_meter`; the federate has its own counters."""
+        """Implement `RadioModel.use_meter`; the federate counts itself."""
 
     def sample(self, now_ns: int, utc_ns: int) -> dict[str, LinkSample]:  # noqa: ARG002 (see RadioModel)
         """Implement `RadioModel.sample`; samples are requested directly from the federate."""

@@ -1,4 +1,4 @@
-"""Samples of the links of radios, in the answer of a network."""
+"""Encoding of the link samples of radios in the answer of a network federate."""
 
 import math
 import struct

@@ -50,7 +50,7 @@ class PythonFederate:
         load: Imports the simulator, and returns the class with its properties. It raises `ConfigurationError` if
             required software is not installed; the remedy is the command that installs it.
         summary: Description in one line.
-        options: As for `ProgramFederate`.
+        options: Model of its options in a scenario; None if it has any options, which are not validated.
     """
 
     role: int
@@ -98,7 +98,7 @@ def default_options(endpoint: str, role: int) -> dict[str, Any]:
     """Return the default options of the federate with a name; empty if `endpoint` is a command or an address.
 
     Raises:
-        ConfigurationError: As for `named_federate`.
+        ConfigurationError: The package of the federate cannot be loaded, or the federate has another role.
     """
     federate = named_federate(endpoint, role)
     return {} if federate is None or federate.options is None else federate.options().to_json()
@@ -117,7 +117,7 @@ def is_single_threaded(endpoint: str, role: int) -> bool:
     """Return True if `endpoint` is the name of a program that declares one thread; False for a command or an address.
 
     Raises:
-        ConfigurationError: As for `named_federate`.
+        ConfigurationError: The package of the federate cannot be loaded, or the federate has another role.
     """
     federate = named_federate(endpoint, role)
     return isinstance(federate, ProgramFederate) and federate.is_single_threaded

@@ -1,4 +1,4 @@
-"""Records inside messages: commands, packets, arrivals and drops."""
+"""Encoding of records inside messages: commands, packets, arrivals and drops."""
 
 import math
 import struct

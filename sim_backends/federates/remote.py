@@ -1,4 +1,4 @@
-"""Physics and network in other processes, as the coordinator uses them."""
+"""Proxies of physics and network federates that run in other processes."""
 
 import copy
 import time
@@ -48,7 +48,7 @@ class _RemoteFederate:
         self.session.close()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Any:  # noqa: ANN401 (of the subclass)
-        """Copy the federate in its process, in its present state, and return the object that represents the copy.
+        """Copy the federate in its process, in its current state, and return the object that represents the copy.
 
         Raises:
             FederateError: The federate does not support copies, or failed.
@@ -75,7 +75,7 @@ class _RemoteFederate:
 
 
 class RemotePhysics(_RemoteFederate):
-    """A physics in another process.
+    """A physics federate in another process.
 
     A request that changes nothing is not sent: the states between two steps are the states at the first of them.
 
@@ -85,9 +85,9 @@ class RemotePhysics(_RemoteFederate):
         welcome: Its answer.
 
     Attributes:
-        step_ns: See `PhysicsFederate`.
-        limits_m_s2: See `PhysicsFederate`.
-        agents_disappear: See `PhysicsFederate`.
+        step_ns: Time step, as reported in the federate's answer.
+        limits_m_s2: Acceleration limit of each agent, as last reported by the federate.
+        agents_disappear: True if agents may disappear during a run.
     """
 
     def __init__(self, session: FederateSession, hello: Hello, welcome: Welcome) -> None:
@@ -132,7 +132,7 @@ class RemotePhysics(_RemoteFederate):
 
 
 class RemoteNetwork(_RemoteFederate):
-    """A network in another process.
+    """A network federate in another process.
 
     A network that does not support absent agents receives their last states, or their start states.
 
@@ -142,9 +142,9 @@ class RemoteNetwork(_RemoteFederate):
         welcome: Its answer.
 
     Attributes:
-        extrapolates: See `NetworkFederate`.
-        transmitters: See `NetworkFederate`.
-        fixed_emitters_m: See `NetworkFederate`.
+        extrapolates: True if the network evaluates dead-reckoned states at the time of each event.
+        transmitters: Names of the agents that forward packets or interfere.
+        fixed_emitters_m: Positions of interfering objects that are not agents.
     """
 
     def __init__(self, session: FederateSession, hello: Hello, welcome: Welcome) -> None:
@@ -234,10 +234,16 @@ class RemoteNetwork(_RemoteFederate):
 
 
 def open_physics(endpoint: str, hello: Hello, deadline_s: float | None) -> RemotePhysics:
-    """Start or connect to a physics; arguments and errors as for `open_session`."""
+    """Start or connect to a physics federate.
+
+    The arguments and the errors are those of `open_session`.
+    """
     return RemotePhysics(*open_session(PHYSICS, endpoint, hello, deadline_s))
 
 
 def open_network(endpoint: str, hello: Hello, deadline_s: float | None) -> RemoteNetwork:
-    """Start or connect to a network; arguments and errors as for `open_session`."""
+    """Start or connect to a network federate.
+
+    The arguments and the errors are those of `open_session`.
+    """
     return RemoteNetwork(*open_session(NETWORK, endpoint, hello, deadline_s))

@@ -1,4 +1,4 @@
-"""The federate's side of the protocol: `serve(MyPhysics)` serves a physics or network class to a coordinator."""
+"""Serves a physics or network class to a coordinator: the federate's side of the protocol."""
 
 import os
 import time
@@ -17,7 +17,7 @@ _HELLO_S: Final = 10.0
 
 
 def serve(make: Make, *, address: str | None = None, runs: int | None = None, **properties: Any) -> None:  # noqa: ANN401 (of `FederateService`)
-    """Serve a physics or a network class.
+    """Serve a physics or network class.
 
     Args:
         make: Called with the `Hello` of each run; returns the federate, for example its class.
@@ -35,7 +35,10 @@ def serve(make: Make, *, address: str | None = None, runs: int | None = None, **
 
 
 def serve_service(service: FederateService, *, address: str | None = None, runs: int | None = None) -> None:
-    """Serve a federate and its properties; arguments and errors as for `serve`."""
+    """Serve a federate that is declared with its properties.
+
+    Arguments and errors are those of `serve`.
+    """
     transport_address = None if address is None else parse_address(address)
     if address is not None and transport_address is None:
         raise ValueError(f"{address!r} is not one of {', '.join(FORMS)}")

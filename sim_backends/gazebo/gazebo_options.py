@@ -18,7 +18,7 @@ Position = tuple[Coordinate, Coordinate, Coordinate]
 
 
 class GazeboOptions(SimulatorOptions):
-    """Options of the physics [Gazebo](gazebo.md).
+    """Options of the physics simulator [Gazebo](gazebo.md).
 
     In names of services and topics, `{world}` and `{model}` are replaced by the names of the world and of the agent's
     model.

@@ -88,7 +88,7 @@ def world_sdf(
         world: The world.
         robots: Its robots by name; the model of a robot has the same name.
         step_ns: Physics step.
-        version: Names of the plugins.
+        version: Version of Gazebo, which determines the names of the plugins.
     """
     root = Element("sdf", version="1.9")
     element = SubElement(root, "world", name=world.name)

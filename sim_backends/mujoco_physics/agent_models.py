@@ -1,4 +1,4 @@
-"""Limits of agents, and their models at the start of a run."""
+"""Limits and models of agents in MuJoCo at the start of a run."""
 
 import math
 from collections.abc import Mapping

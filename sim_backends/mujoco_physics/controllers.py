@@ -1,4 +1,4 @@
-"""The controllers on board: wheel speeds of a robot on wheels, attitude and thrust of a quadrotor.
+"""The controllers of robots in MuJoCo: wheel speeds of a robot on wheels, attitude and thrust of a quadrotor.
 
 They run at `TICK_NS`, as on real robots; motors and attitude control run in MuJoCo at every step.
 """
@@ -147,7 +147,7 @@ class FlightController:
         )
         targets, first = registers.mocap_quat, 4 * mocap
         if not self._is_powered:
-            # If the target is the present attitude, the attitude control applies no torque except damping.
+            # If the target is the current attitude, the attitude control applies no torque except damping.
             registers.ctrl[motor] = 0.0
             for index in range(4):
                 targets[first + index] = registers.xquat[4 * body + index]

@@ -32,7 +32,7 @@ _GRIP_SLIP: Final = "0.3 1"
 the friction were stiffer, the wheels of a robot that turns would hop (documentation of MuJoCo, "Computation", convex
 relaxation)."""
 _BODY_FRICTION: Final = 0.3
-"""Friction of a robot that has fallen over; our estimate."""
+"""Friction of a robot that has fallen over; an estimate without a source."""
 _IMPEDANCE_RATIO: Final = 10_000.0
 """Ratio of softness across and along a contact. It limits the sliding of a robot at rest down a slope of 20 degrees
 to 0.02 mm/s."""

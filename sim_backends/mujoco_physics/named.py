@@ -19,14 +19,14 @@ def load() -> FederateService:
         from sim_backends.mujoco_physics.physics import SERVICE  # noqa: PLC0415 (it is not always installed)
     except ImportError as error:
         raise ConfigurationError(
-            f"the physics mujoco needs the Python package mujoco: {error}",
+            f"the mujoco physics federate needs the Python package mujoco: {error}",
             remedy=f"{sys.executable} -m pip install 'fieldkit[mujoco]'",
         ) from error
     return SERVICE
 
 
 class MujocoOptions(SimulatorOptions):
-    """The physics [MuJoCo](mujoco.md) has no options."""
+    """The physics simulator [MuJoCo](mujoco.md) has no options."""
 
 
 MUJOCO = PythonFederate(PHYSICS, load, "MuJoCo: robots with wheels and rotors, ground and contacts", MujocoOptions)

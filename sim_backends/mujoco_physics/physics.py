@@ -92,7 +92,7 @@ class MujocoPhysics:
         step_ns: Time step; MuJoCo divides it if it is longer than 1 ms.
         limits_m_s2: Infinity for each agent, because a contact may change a velocity within a step.
         model: The model, for example for MuJoCo's viewer.
-        data: Its present state.
+        data: Its current state.
 
     Raises:
         ConfigurationError: The step is not positive, or a robot's body is invalid.
@@ -177,7 +177,7 @@ class MujocoPhysics:
         data.qvel[model.body_rootid[model.dof_bodyid] == body.id] = 0.0
 
     def _change_presence(self) -> None:
-        """Place the agents that appear at the present step, and park those that disappear."""
+        """Place the agents that appear at the current step, and park those that disappear."""
         while self._changes and self._changes[-1].step <= self._step:
             _, row, appears = self._changes.pop()
             self._place(row, is_parked=not appears)
@@ -191,7 +191,7 @@ class MujocoPhysics:
         mujoco.mj_step1(self.model, self.data)
 
     def put(self, name: str, place_m: Vector, heading_rad: float) -> None:
-        """Put an agent at a place, at rest and without a command. Whether it overlaps something is not checked.
+        """Put an agent at a position, at rest and without a command. Whether it overlaps something is not checked.
 
         Args:
             name: The agent.
@@ -242,7 +242,7 @@ class MujocoPhysics:
         return False
 
     def run_controllers(self) -> None:
-        """Run the controllers that are due at the present step; they set their motors."""
+        """Run the controllers that are due at the current step; they set their motors."""
         step = self._step
         rows = self._due if step % self._tick_steps else self._active
         if not rows:

@@ -14,8 +14,8 @@ class Disc:
     Args:
         range_m: Maximum range; it is compared with the distance at the time when the packet enters the network.
         delay_ns: Delay of every packet.
-        extrapolates: See `NetworkFederate.advance`; if False, agents stay at their positions at the start of a
-            window.
+        extrapolates: True to evaluate dead-reckoned states when a packet enters; False if agents stay at their
+            positions at the start of a window.
     """
 
     def __init__(self, range_m: float, delay_ns: int, *, extrapolates: bool = False) -> None:

@@ -48,7 +48,7 @@ class Jammer:
         power_dbm: Transmit power within the channel's 20 MHz.
         begin_ns: Start time.
         end_ns: End time; None for the end of the run.
-        place_m: Its position, metres east, north, up; None if an agent carries it.
+        position_m: Its position, metres east, north, up; None if an agent carries it.
         agent: The agent that carries it; empty if it has a fixed position.
 
     Raises:
@@ -58,11 +58,11 @@ class Jammer:
     power_dbm: float
     begin_ns: int
     end_ns: int | None = None
-    place_m: Vector | None = None
+    position_m: Vector | None = None
     agent: str = ""
 
     def __post_init__(self) -> None:
-        if (self.place_m is None) == (not self.agent):
+        if (self.position_m is None) == (not self.agent):
             raise ValueError("a jammer needs either a position or an agent that carries it")
 
 

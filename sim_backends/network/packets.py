@@ -60,7 +60,7 @@ class Arrival(NamedTuple):
     Attributes:
         packet_id: Its number.
         receiver: Name of the receiver.
-        at_ns: Arrival time by the network's clock.
+        at_ns: Arrival time in the network.
     """
 
     packet_id: int

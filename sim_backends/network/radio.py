@@ -53,8 +53,8 @@ class RadioNetwork:
         relay: Station whose access point relays between the others; None for direct links.
 
     Attributes:
-        now_ns: See `Wire`.
-        extrapolates: See `NetworkFederate.advance`.
+        now_ns: Current simulated time.
+        extrapolates: True, because dead-reckoned states are evaluated at the time of each event.
         transmitters: Stations that send independently of the traffic: the relay, and agents that carry a jammer.
         fixed_emitters_m: Positions of the jammers that no agent carries.
 
@@ -80,11 +80,11 @@ class RadioNetwork:
         self._check_names()
         jammers = [disturbance for disturbance in disturbances if isinstance(disturbance, Jammer)]
         self.transmitters = frozenset({relay or "", *(jammer.agent for jammer in jammers)} - {""})
-        self.fixed_emitters_m = tuple(jammer.place_m for jammer in jammers if jammer.place_m is not None)
+        self.fixed_emitters_m = tuple(jammer.position_m for jammer in jammers if jammer.position_m is not None)
         self._changes_ns = changes_ns(disturbances)[::-1]
         self._stations_off: set[str] = set()
         self._absent_stations: frozenset[str] = frozenset()
-        self._places_m: dict[str, Vector] = {}
+        self._positions_m: dict[str, Vector] = {}
         self._jammers: dict[str, Jammer] = {}
         self._states: Mapping[str, State] = {}
         self._placed_states: Mapping[str, State] | None = None
@@ -226,12 +226,12 @@ class RadioNetwork:
         self._placed_states = states
         absent_stations: frozenset[str] = frozenset()
         try:
-            self._places_m = {name: states[name].position_m for name in self._names}
+            self._positions_m = {name: states[name].position_m for name in self._names}
         except KeyError:
             absent_stations = frozenset(name for name in self._names if name not in states)
             present_m = {name: states[name].position_m for name in self._names if name not in absent_stations}
-            self._places_m = dict.fromkeys(self._names, STILL) | self._places_m | present_m
-        self._radio.place(self.now_ns, self._places_m, self._relay)
+            self._positions_m = dict.fromkeys(self._names, STILL) | self._positions_m | present_m
+        self._radio.place(self.now_ns, self._positions_m, self._relay)
         if absent_stations != self._absent_stations:
             self._absent_stations = absent_stations
             if self._current_stations_off() != self._stations_off:
@@ -274,7 +274,7 @@ class RadioNetwork:
         } | self._absent_stations
 
     def _disturb(self, resume_ns: int) -> None:
-        """Apply the present disturbances; called when one starts or ends, and when the absent stations change.
+        """Apply the current disturbances; called when one starts or ends, and when the absent stations change.
 
         Args:
             resume_ns: Time from which the suspended timers of hosts that are on again fire.
@@ -296,13 +296,14 @@ class RadioNetwork:
 
     def _jam(self) -> None:
         states = self._states if self._placed_states is None else self._placed_states
-        places_m = {
-            name: states[jammer.agent].position_m if jammer.place_m is None else jammer.place_m
+        positions_m = {
+            name: states[jammer.agent].position_m if jammer.position_m is None else jammer.position_m
             for name, jammer in self._jammers.items()
-            if jammer.place_m is not None or jammer.agent in states
+            if jammer.position_m is not None or jammer.agent in states
         }
         self._radio.jam(
-            self.now_ns, [Emitter(name, place_m, self._jammers[name].power_dbm) for name, place_m in places_m.items()]
+            self.now_ns,
+            [Emitter(name, position_m, self._jammers[name].power_dbm) for name, position_m in positions_m.items()],
         )
 
     def _transport(self, name: str) -> Transport:

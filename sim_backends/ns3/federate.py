@@ -1,4 +1,4 @@
-"""The federate `ns3`: its program and its command line."""
+"""The network federate `ns3`: its program and its command line."""
 
 import re
 import shlex

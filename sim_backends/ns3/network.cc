@@ -164,7 +164,7 @@ class Network
         return request.to_ns;
     }
 
-    // Samples of all radios, and of their links to the stations to which they send frames, at the present time.
+    // Samples of all radios, and of their links to the stations to which they send frames, at the current time.
     std::string SampleLinks()
     {
         std::vector<protocol::RadioSample> radios;

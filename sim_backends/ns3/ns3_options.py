@@ -15,7 +15,7 @@ from sim_backends.world.world import World
 
 
 class Ns3Options(SimulatorOptions):
-    """Options of the network [ns-3](ns3.md).
+    """Options of the network simulator [ns-3](ns3.md).
 
     Attributes:
         standard: Standard of all radios; if omitted, 802.11n if all radios have it, otherwise 802.11g.

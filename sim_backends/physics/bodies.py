@@ -1,4 +1,4 @@
-"""The physics federate of bodies in a world: each follows its course, and stops at a contact.
+"""The built-in physics federate: bodies in a world follow their courses, and stop at a contact.
 
 Bodies move in time steps. A command takes effect at the first step at or after the time of the command,
 and the motion does not depend on how the time is divided into calls. Two measures make this fast. A course is
@@ -125,7 +125,7 @@ class Bodies:
         return self._states
 
     def put(self, name: str, place_m: Vector, heading_rad: float) -> None:
-        """Put a body at a place, at rest and without a command; it may overlap something.
+        """Put a body at a position, at rest and without a command; it may overlap something.
 
         Args:
             name: The body.
@@ -235,7 +235,7 @@ class Bodies:
         return first_step <= self._step and not has_disappeared
 
     def _update_present(self) -> None:
-        """Add the bodies that appear at the present step, and remove those that disappear.
+        """Add the bodies that appear at the current step, and remove those that disappear.
 
         Raises:
             ConfigurationError: A body that appears overlaps another one.

@@ -1,4 +1,4 @@
-"""Protocols of a body moved by the physics, its commands, its pose, and its track.
+"""Protocols of a body that the built-in physics federate moves: its commands, pose and track.
 
 A body has no mutable state: from a pose and a command it derives a course, which gives the pose at every later step
 and is evaluated on request. The result therefore does not depend on when it is requested, and a body at rest costs
@@ -107,7 +107,7 @@ class Body(Protocol[PoseT]):
         ...
 
     def pose_at(self, place_m: Vector, heading_rad: float) -> PoseT:
-        """Return its pose at rest at a place; see `place_m`."""
+        """Return its pose at rest at a position, which is defined as for `place_m`."""
         ...
 
     def on_surface(self, pose: PoseT, surface: Surface) -> PoseT:

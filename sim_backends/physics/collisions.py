@@ -98,7 +98,7 @@ class Extent(Protocol):
     Attributes:
         radius_m: Its radius.
         height_m: Its height.
-        flies: See `Body.flies`.
+        flies: True if its height is independent of the ground.
     """
 
     radius_m: float

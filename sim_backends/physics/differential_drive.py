@@ -73,7 +73,7 @@ class Arc:
         turn_rad_s: Initial yaw rate, equal to the yaw rate of the initial pose except for rounding.
         acceleration_m_s2: Change of the speed per second.
         turn_acceleration_rad_s2: Change of the yaw rate per second.
-        steps: See `Course.steps`.
+        steps: Number of steps for which it is valid; None for no limit.
         step_s: Length of a step.
     """
 

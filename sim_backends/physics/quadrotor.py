@@ -62,8 +62,8 @@ class FlightStatus(NamedTuple):
 
     Attributes:
         place_m: Position of its lowest point, metres east, north, up.
-        roll_rad: See `FlightPose`.
-        pitch_rad: See `FlightPose`.
+        roll_rad: Roll, positive with the left side up.
+        pitch_rad: Pitch, positive with the nose down.
         is_supported: True if it rests on something.
     """
 

@@ -1,4 +1,4 @@
-"""Limits and sizes of the robots that the physics supports, and the robots by the name of their profile."""
+"""Limits and sizes of the robots that the physics federate supports, and the robots by the name of their profile."""
 
 import math
 from dataclasses import dataclass
@@ -36,8 +36,8 @@ turn from `husky_control/config/control.yaml` (github.com/husky/husky)."""
 
 TURTLEBOT3_BURGER: Final = DriveLimits(0.22, 2.5, 2.84, 3.2, radius_m=0.113, height_m=0.192)
 """ROBOTIS TurtleBot3 Burger: 0.22 m/s, 2.84 rad/s, 138 mm x 178 mm x 192 mm (e-Manual, specifications); accelerations
-from `turtlebot3_navigation2/param/burger.yaml` (github.com/ROBOTIS-GIT/turtlebot3); friction of rubber on dry ground,
-our estimate.
+from `turtlebot3_navigation2/param/burger.yaml` (github.com/ROBOTIS-GIT/turtlebot3); friction of rubber on dry ground
+is an estimate.
 """
 
 
@@ -121,9 +121,9 @@ IRIS: Final = QuadrotorLimits(
 5.84e-6 N/(rad/s)^2 up to 1100 rad/s, so 28.27 N; rotor drag 1.75e-4 N/(rad/s)/(m/s) at the 794 rad/s of hovering;
 0.47 m x 0.47 m x 0.11 m, rotors of 0.128 m around (0.13, 0.22) m. Limits and gains are PX4's defaults (parameter
 reference: MPC_TILTMAX_AIR, MC_ROLLRATE_MAX, MC_YAWRATE_MAX, 1 / MC_ROLL_P, MPC_XY_VEL_MAX, MPC_Z_VEL_MAX_DN and UP,
-MPC_ACC_HOR_MAX, MPC_ACC_DOWN_MAX and UP, MPC_XY_VEL_P_ACC, MPC_Z_VEL_P_ACC). The minimum thrust of a tenth is our
-choice, and the drag of the body is the drag of a cube with a face of 0.47 m x 0.11 m: 1.225 kg/m^3 x 1.05 x 0.052 m^2
-/ 2.
+MPC_ACC_HOR_MAX, MPC_ACC_DOWN_MAX and UP, MPC_XY_VEL_P_ACC, MPC_Z_VEL_P_ACC). The minimum thrust of a tenth is an
+assumption, and the drag of the body is the drag of a cube with a face of 0.47 m x 0.11 m: 1.225 kg/m^3 x 1.05 x 0.052
+m^2 / 2.
 """
 
 DUCKIEDRONE: Final = QuadrotorLimits(
@@ -143,8 +143,8 @@ DUCKIEDRONE: Final = QuadrotorLimits(
     radius_m=0.2,
     height_m=0.12,
 )
-"""Duckietown Duckiedrone: a frame of the 250 mm class. No data sheet describes its flight; all values are our
-estimates, from the mass of its parts and a thrust of twice its weight. Its speeds are low, because it flies indoors
+"""Duckietown Duckiedrone: a frame of the 250 mm class. No data sheet describes its flight; all values are
+estimates from the mass of its parts and a thrust of twice its weight. Its speeds are low, because it flies indoors
 and uses a camera for control.
 """
 

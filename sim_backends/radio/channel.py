@@ -77,10 +77,10 @@ class Emitter:
 
     Attributes:
         name: Its name, which does not change while it sends without a pause.
-        place_m: Current position, metres east, north, up.
+        position_m: Current position, metres east, north, up.
         power_dbm: Transmit power.
     """
 
     name: str
-    place_m: Vector
+    position_m: Vector
     power_dbm: float

@@ -22,7 +22,7 @@ class ChannelAccess(Protocol):
 
     @property
     def ifs_ns(self) -> int:
-        """Inter-frame space before the backoff; 0 if each queue adds its own."""
+        """Inter-frame space before the backoff; 0 if each queue adds an inter-frame space."""
 
     def earliest_start_ns(self, now_ns: int) -> int:
         """Return the earliest start time of a station with a frame to send at `now_ns`, if the channel stays idle."""

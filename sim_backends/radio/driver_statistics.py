@@ -1,4 +1,4 @@
-"""Counters of the radio drivers, as real drivers report them."""
+"""Counters as real radio drivers report them."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -140,7 +140,7 @@ class AccessCategories(ChannelAccess, Generic[Payload]):
     Args:
         mapping: Mapping of DSCPs.
         band: Band of the station.
-        draw: See `CategoryQueue`.
+        draw: Returns the next random draw for the backoff of the first frame in a queue.
 
     Attributes:
         active: The category of the current or last exchange.

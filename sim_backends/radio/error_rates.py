@@ -1,4 +1,4 @@
-"""Packet errors by noise: bit errors of the modulation, and the convolutional code.
+"""Packet errors due to noise: bit errors of the modulation, and the convolutional code.
 
 The model is from Pei and Henderson, "Validation of OFDM error rate model in ns-3" (2010), which follows Miller,
 "Validation of 802.11a/UWB coexistence simulation" (NIST, 2003). It assumes hard decisions on a channel with additive

@@ -369,15 +369,15 @@ class UniformLinks(FixedLinks[Payload]):
     def place(
         self,
         now_ns: int,  # noqa: ARG002 (see RadioModel)
-        places_m: Mapping[str, Vector],
+        positions_m: Mapping[str, Vector],
         relay: str | None,
         velocities_m_s: Mapping[str, Vector] | None = None,  # noqa: ARG002
     ) -> None:
         """Implement `RadioModel.place`; only the set of stations matters."""
-        stations = frozenset(places_m), relay
+        stations = frozenset(positions_m), relay
         if stations != self._stations:
             self._stations = stations
-            self.connect(mesh(self._options, places_m), relay)
+            self.connect(mesh(self._options, positions_m), relay)
 
     def jam(self, now_ns: int, emitters: Sequence[Emitter]) -> None:  # noqa: ARG002 (see RadioModel)
         """Implement `RadioModel.jam`; fixed links support no jammers."""

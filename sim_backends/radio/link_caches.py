@@ -1,4 +1,4 @@
-"""Computed properties of the links of a channel, each with the time or the positions for which it is valid."""
+"""Caches of computed properties of links, each with the time or the positions for which it is valid."""
 
 import numpy as np
 from numpy.typing import NDArray

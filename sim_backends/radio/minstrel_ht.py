@@ -3,7 +3,7 @@
 The algorithm is from `net/mac80211/rc80211_minstrel_ht.c` in Linux 5.14 and later. Modes form groups with equal
 width, guard interval and number of streams. Each mode has a smoothed share of acknowledged frames, updated
 every 50 ms. Three modes form the chain of a frame: the two with the highest expected throughput, and a robust one. At
-most every 20 ms a frame tries another mode once before the second mode of the chain.
+most every 20 ms a frame is tried once in another mode before the second mode of the chain.
 
 The model differs from Linux in four ways. It does not use the rates of 802.11a/b/g. It applies the same rules to
 groups of 802.11ax, which Linux does not have. After its chain, a frame is tried in the robust mode up to the retry
@@ -96,7 +96,7 @@ class MinstrelHt(RateControl):
         draws: Random draws that order the sampled modes.
 
     Attributes:
-        is_probing: True if the frame of the last first attempt is a sample; drivers do not aggregate it.
+        is_probing: True if the most recent new frame is a sample of another mode; drivers do not aggregate it.
     """
 
     def __init__(self, groups: Sequence[Sequence[WifiMode]], draws: PacketDraws) -> None:
@@ -113,7 +113,7 @@ class MinstrelHt(RateControl):
         self._samples: list[list[WifiMode]] = [[], [], []]
         self._sample_types = cycle(_SAMPLE_ORDER)
         self._last_group = [0, 0, 0]
-        self._columns = [0] * len(self._groups)
+        self._order_counts = [0] * len(self._groups)  # random orders drawn for each group
         self._orders: list[list[WifiMode]] = [[] for _ in self._groups]
         self._best = self._second = self._robust = self._groups[0][0]
         self._fallback: list[WifiMode] = []
@@ -316,8 +316,8 @@ class MinstrelHt(RateControl):
         while True:
             order = self._orders[group]
             if not order:
-                column = self._columns[group] = self._columns[group] + 1
-                draws = [self._draws.draw((f"order {group}", column * len(modes) + n)) for n in range(len(modes))]
+                count = self._order_counts[group] = self._order_counts[group] + 1
+                draws = [self._draws.draw((f"order {group}", count * len(modes) + n)) for n in range(len(modes))]
                 order.extend(mode for _, mode in sorted(zip(draws, modes, strict=True), key=lambda pair: pair[0]))
             mode = order.pop()
             if self._statistics[mode].duration_ns < limit_ns:

@@ -32,7 +32,7 @@ class RadioModel(Protocol[Payload]):
     def place(
         self,
         now_ns: int,
-        places_m: Mapping[str, Vector],
+        positions_m: Mapping[str, Vector],
         relay: str | None,
         velocities_m_s: Mapping[str, Vector] | None = None,
     ) -> None:
@@ -40,7 +40,7 @@ class RadioModel(Protocol[Payload]):
 
         Args:
             now_ns: Current time.
-            places_m: Positions in metres east, north, up.
+            positions_m: Positions in metres east, north, up.
             relay: Station whose access point relays between the others; None for direct links.
             velocities_m_s: Velocities; None if all stations are at rest.
         """
@@ -164,7 +164,7 @@ class WifiInWorld(Wifi[Payload]):
     def place(
         self,
         now_ns: int,
-        places_m: Mapping[str, Vector],
+        positions_m: Mapping[str, Vector],
         relay: str | None,
         velocities_m_s: Mapping[str, Vector] | None = None,
     ) -> None:
@@ -173,9 +173,9 @@ class WifiInWorld(Wifi[Payload]):
         if self._path_losses_db is not None:
             self._world_channel.use_path_losses(self._path_losses_db())
         infrastructure = self._infrastructure
-        if infrastructure is not None and infrastructure.places_m:
-            places_m = {**places_m, **infrastructure.places_m}
-        self._world_channel.move(now_ns, places_m, velocities_m_s)
+        if infrastructure is not None and infrastructure.positions_m:
+            positions_m = {**positions_m, **infrastructure.positions_m}
+        self._world_channel.move(now_ns, positions_m, velocities_m_s)
         self.set_relay(relay)
         if infrastructure is not None and infrastructure.roaming is not None:
             infrastructure.roaming.start(now_ns)
@@ -213,5 +213,8 @@ class WifiInWorld(Wifi[Payload]):
         received_mw = self._world_channel.received_mw
         self.set_emissions(
             now_ns,
-            {emitter.name: Emission(now_ns, received_mw(emitter.place_m, emitter.power_dbm)) for emitter in emitters},
+            {
+                emitter.name: Emission(now_ns, received_mw(emitter.position_m, emitter.power_dbm))
+                for emitter in emitters
+            },
         )

@@ -257,6 +257,6 @@ class Shadowing:
         loss_db: Floats = self._sigma_db * (self._field(start_m) + self._field(end_m)) / math.sqrt(2)
         return loss_db
 
-    def _field(self, places_m: Floats) -> Floats:
-        field: Floats = np.cos(places_m[:, :2] @ self._waves + self._phases).sum(axis=1) * math.sqrt(2 / _WAVES)
+    def _field(self, positions_m: Floats) -> Floats:
+        field: Floats = np.cos(positions_m[:, :2] @ self._waves + self._phases).sum(axis=1) * math.sqrt(2 / _WAVES)
         return field

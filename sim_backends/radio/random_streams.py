@@ -88,8 +88,8 @@ class PacketDraws:
     """Draws for packets, for one purpose at one station or on one link.
 
     Args:
-        seed: See `RandomStream`.
-        name: See `RandomStream`.
+        seed: Seed of all random draws.
+        name: Words that name the purpose and the station or link.
     """
 
     def __init__(self, seed: int, *name: str) -> None:

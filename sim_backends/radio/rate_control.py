@@ -1,4 +1,4 @@
-"""Rate control: the mode of a station's next frame, fixed or adapted to acknowledgements like Linux's minstrel."""
+"""Rate control: selects the mode of the next frame, fixed or adapted to acknowledgements like Linux's minstrel."""
 
 from collections.abc import Sequence
 from typing import Final, Protocol
@@ -13,7 +13,7 @@ class RateControl(Protocol):
     """Selects the mode of each attempt on one directed link.
 
     Attributes:
-        is_probing: True if the frame of the last first attempt must not be aggregated, because it tries a mode.
+        is_probing: True if the most recent new frame is a sample of another mode, which must not be aggregated.
     """
 
     is_probing: bool = False
@@ -68,12 +68,13 @@ class Minstrel(RateControl):
 
     Each mode has an exponentially weighted mean of the share of acknowledged attempts: weight 75 % for the old value,
     updated every 100 ms. A frame is sent first in the mode with the highest throughput, then in the second best, then
-    in the most robust (the fastest with at least 95 % success), and finally in the slowest; each as often as fits
-    into 6 ms, at most twice if its success share is above 95 % or below 10 %, and in total at most up to the
-    standard's retry limit. A tenth of the frames are samples: a mode that is faster than the best, or was not used
-    for 20 updates, is tried before the best, at most four times per update if its share is above 95 % or below 10 %.
-    If there is no such mode, a slower mode replaces the second best, which costs nothing while the best succeeds.
-    This follows Linux's rc80211_minstrel.c (kernels 2.6.28 to 5.11) and the documentation of mac80211's minstrel.
+    in the most robust (the fastest with at least 95 % success), and finally in the slowest. Each mode is tried as
+    often as fits into 6 ms, but at most twice if its success share is above 95 % or below 10 %. All attempts together
+    do not exceed the retry limit of the standard. A tenth of the frames are samples: a mode that is faster than the
+    best, or was not used for 20 updates, is tried before the best, at most four times per update if its share is
+    above 95 % or below 10 %. If there is no such mode, a slower mode replaces the second best, which costs nothing
+    while the best succeeds. This follows Linux's rc80211_minstrel.c (kernels 2.6.28 to 5.11) and the documentation of
+    mac80211's minstrel.
 
     The model differs in three ways. The initial shares are computed from the signal-to-noise ratio, as in drivers
     that start from RSSI. A random draw per frame, and not a counter, selects sampling frames and their modes, so that
@@ -84,7 +85,7 @@ class Minstrel(RateControl):
         modes: The available modes, two or more, slowest first.
         snr_db: Mean signal-to-noise ratio at the receiver, with the noise of 20 MHz.
         draws: Random draws for sampling.
-        frames_per_exchange: Number of frames that share the times between frames, the preamble and the response.
+        frames_per_exchange: Number of frames that share one preamble, one response and the interframe spaces.
     """
 
     def __init__(

@@ -24,7 +24,7 @@ class Station(Generic[Payload]):
         index: Its index in the channel's list of stations.
         draws: Random draws of its backoff.
         ifs_ns: Inter-frame space before its backoff.
-        rts_threshold_bytes: See the attribute.
+        rts_threshold_bytes: Size of the largest frame or aggregate that it sends without RTS.
 
     Attributes:
         contention: Its carrier sense and backoff.

@@ -91,19 +91,19 @@ class WorldChannel(RadioChannel):
             wavelength_m=SPEED_OF_LIGHT_M_S / self.band.carrier_hz,
             stir_m_s=options.stir_m_s,
         )
-        self._places: list[Vector | None] = [None] * count
+        self._positions: list[Vector | None] = [None] * count
         self._velocities: list[Vector] = [STILL] * count
         self._in_motion = False
         self._cut = np.zeros((count, count), dtype=bool)
         self._specified_db: Floats | None = None
         self._present = np.zeros(count, dtype=bool)
-        self._places_m, self._velocities_m_s = np.zeros((2, count, 3))
+        self._positions_m, self._velocities_m_s = np.zeros((2, count, 3))
         self._moved_ns, self._gain_valid_ns = 0, self._compute_gain_valid_ns()
         self._revision = 0
         self.use_losses(np.full((count, count), np.inf))
 
     def move(
-        self, now_ns: int, places_m: Mapping[str, Vector], velocities_m_s: Mapping[str, Vector] | None = None
+        self, now_ns: int, positions_m: Mapping[str, Vector], velocities_m_s: Mapping[str, Vector] | None = None
     ) -> None:
         """Set the current positions and velocities of the stations.
 
@@ -111,8 +111,8 @@ class WorldChannel(RadioChannel):
         only fading, which changes within a wavelength, extrapolates with the velocities.
         """
         velocities_by_name = velocities_m_s or {}
-        places = list(map(places_m.get, self.names))
-        has_moved = np.array(list(map(ne, places, self._places)), dtype=bool)
+        positions = list(map(positions_m.get, self.names))
+        has_moved = np.array(list(map(ne, positions, self._positions)), dtype=bool)
         velocities = self._velocities
         if velocities_by_name or self._in_motion:
             velocities = [velocities_by_name.get(name, STILL) for name in self.names]
@@ -123,9 +123,9 @@ class WorldChannel(RadioChannel):
             self._velocities_m_s = np.array(velocities, dtype=np.float64).reshape(-1, 3)
             self._in_motion = bool(self._velocities_m_s.any())
             self._gain_valid_ns = self._compute_gain_valid_ns()
-        self._places, self._velocities = places, velocities
-        self._present = np.array([place is not None for place in places])
-        self._places_m = np.array([place or STILL for place in places], dtype=np.float64).reshape(-1, 3)
+        self._positions, self._velocities = positions, velocities
+        self._present = np.array([position is not None for position in positions])
+        self._positions_m = np.array([position or STILL for position in positions], dtype=np.float64).reshape(-1, 3)
         # If no station moves, the result must not depend on the time, not even by rounding.
         self._moved_ns = now_ns if self._in_motion else 0
         self._revision += 1
@@ -166,10 +166,10 @@ class WorldChannel(RadioChannel):
         self._revision += 1
         self._stale |= ~(is_unchanged & is_unchanged.T)[tuple(self._ends)]
 
-    def received_mw(self, place_m: Vector, power_dbm: float) -> list[float]:
+    def received_mw(self, position_m: Vector, power_dbm: float) -> list[float]:
         """Return the mean power, by index, that each station receives from another transmitter at a position."""
-        to_m = self._places_m
-        loss_db = self.loss_db(np.broadcast_to(place_m, to_m.shape), to_m)
+        to_m = self._positions_m
+        loss_db = self.loss_db(np.broadcast_to(position_m, to_m.shape), to_m)
         loss_db[~self._present] = np.inf
         received_mw: list[float] = _milliwatts(power_dbm - loss_db).tolist()
         return received_mw
@@ -203,7 +203,7 @@ class WorldChannel(RadioChannel):
         cache, own_links = self._gain_cache(station), self._own_links[station]
         if cache.fades is None or cache.revision != self._revision:
             first, second = cache.ends
-            start_m, end_m = self._places_m[first], self._places_m[second]
+            start_m, end_m = self._positions_m[first], self._positions_m[second]
             velocities_m_s = (self._velocities_m_s[first], self._velocities_m_s[second]) if self._in_motion else None
             cache.fades = cache.echoes.fades(start_m, end_m, velocities_m_s, self._k[first, second], self._moved_ns)
             cache.revision, cache.slot = self._revision, -1
@@ -236,7 +236,7 @@ class WorldChannel(RadioChannel):
         if np.count_nonzero(self._stale) <= _BATCH_LINKS:
             stale = np.flatnonzero(self._stale)
         first, second = self._ends[:, stale]
-        start, end = self._places_m[first], self._places_m[second]
+        start, end = self._positions_m[first], self._positions_m[second]
         obstacles_db = self._obstacles_db(start, end)
         loss_db = reverse_db = self._open_db(start, end) + obstacles_db
         if self._specified_db is not None:
@@ -296,7 +296,7 @@ class WorldChannel(RadioChannel):
 
     @override
     def delay_ns(self, transmitter: int, receiver: int) -> int:
-        first, second = self._places[transmitter], self._places[receiver]
+        first, second = self._positions[transmitter], self._positions[receiver]
         return round(math.dist(first or STILL, second or STILL) / SPEED_OF_LIGHT_M_S * 1e9)
 
     @override

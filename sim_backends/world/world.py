@@ -41,7 +41,7 @@ class Line(Strict):
 
     Attributes:
         from_m: The sender's position, metres east and north.
-        bearing_deg: Direction of the others, clockwise from north.
+        bearing_deg: Direction of the line, clockwise from north.
     """
 
     from_m: Place

@@ -14,9 +14,11 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
 from fieldkit.agent.driving import drive
+from fieldkit.agent.driving.drive_messages import VelocityEncoder, read_odometry
 from fieldkit.agent.driving.steering import DriveVelocity, OdometryPose
 from fieldkit.agent.messaging.middleware import Deliver, MiddlewareError, Topic
 
+STAMPED = "geometry_msgs/msg/TwistStamped"
 STORES = {False: get_typestore(Stores.ROS1_NOETIC), True: get_typestore(Stores.ROS2_HUMBLE)}
 TASK = {
     "legs": [[0.5, 0.0]],
@@ -57,32 +59,47 @@ def odometry(pose: OdometryPose, *, cdr: bool, frame: str = "odom", child_frame:
 @pytest.mark.parametrize("frame_names", [("odom", "base_footprint"), ("", ""), ("o", "abcdefghi")])
 def test_messages_equal_those_of_rosbags(frame_names: tuple[str, str], cdr: bool) -> None:
     pose = OdometryPose(3.5, -2.25, 1.25)
-    parsed_pose = drive.read_odometry(
-        odometry(pose, cdr=cdr, frame=frame_names[0], child_frame=frame_names[1]), cdr=cdr
-    )
+    parsed_pose = read_odometry(odometry(pose, cdr=cdr, frame=frame_names[0], child_frame=frame_names[1]), cdr=cdr)
     assert parsed_pose == pytest.approx(pose)
     kinds = STORES[cdr].types
     vector = kinds["geometry_msgs/msg/Vector3"]
     expected = kinds["geometry_msgs/msg/Twist"](vector(0.25, 0.0, 0.0), vector(0.0, 0.0, -0.5))
     serialize = STORES[cdr].serialize_cdr if cdr else STORES[cdr].serialize_ros1
-    twist = drive.twist(DriveVelocity(0.25, -0.5), cdr=cdr)
+    twist = VelocityEncoder("geometry_msgs/msg/Twist", "", cdr=cdr).encode(DriveVelocity(0.25, -0.5), 7)
     assert twist == bytes(serialize(expected, "geometry_msgs/msg/Twist"))
+
+
+@given(
+    st.text(st.characters(codec="ascii", categories=["L", "N"]), max_size=20),
+    st.integers(0, (1 << 31) * 10**9 - 1),
+    st.booleans(),
+)
+def test_stamped_velocities_equal_those_of_rosbags(frame: str, at_ns: int, cdr: bool) -> None:
+    store, kind = STORES[cdr], "geometry_msgs/msg/TwistStamped"
+    encoder = VelocityEncoder(kind, frame, cdr=cdr)
+    for sequence in (1, 2):
+        data = encoder.encode(DriveVelocity(0.25, -0.5), at_ns)
+        message: Any = store.deserialize_cdr(data, kind) if cdr else store.deserialize_ros1(data, kind)
+        assert (message.header.stamp.sec, message.header.stamp.nanosec) == divmod(at_ns, 10**9)
+        assert message.header.frame_id == frame
+        assert cdr or message.header.seq == sequence
+        linear, angular = message.twist.linear, message.twist.angular
+        assert (linear.x, linear.y, linear.z, angular.x, angular.y, angular.z) == (0.25, 0.0, 0.0, 0.0, 0.0, -0.5)
+        assert data == bytes(store.serialize_cdr(message, kind) if cdr else store.serialize_ros1(message, kind))
 
 
 @given(st.binary(max_size=300), st.booleans())
 def test_invalid_odometry_is_none(data: bytes, cdr: bool) -> None:
-    pose = drive.read_odometry(data, cdr=cdr)
+    pose = read_odometry(data, cdr=cdr)
     assert pose is None or all(map(math.isfinite, pose))
     sample = odometry(OdometryPose(1.0, 2.0, 0.5), cdr=cdr)
-    assert drive.read_odometry(sample[: min(len(data), 80)], cdr=cdr) is None
+    assert read_odometry(sample[: min(len(data), 80)], cdr=cdr) is None
 
 
 def test_odometry_with_nan_is_none() -> None:
     sample = odometry(OdometryPose(1.0, 2.0, 0.5), cdr=False)
     offset = sample.index(struct.pack("<d", 1.0))
-    assert (
-        drive.read_odometry(sample[:offset] + struct.pack("<d", math.nan) + sample[offset + 8 :], cdr=False) is None
-    )
+    assert read_odometry(sample[:offset] + struct.pack("<d", math.nan) + sample[offset + 8 :], cdr=False) is None
 
 
 class World:
@@ -95,6 +112,9 @@ class World:
         self.orders, self.orders_end_s = orders, orders_end_s
         self.pose = OdometryPose(1.0, 1.0, 0.3)
         self.sent: list[DriveVelocity] = []
+        self.stamps_ns: list[int] = []
+        self.frames: set[str] = set()
+        self.types: set[str] = set()
         self.count_subscribers: Callable[[], int] = lambda: 1
         self.deliver: Deliver | None = None
         self.is_stopped = False
@@ -130,7 +150,11 @@ class World:
     # The methods of a middleware.
     def publisher(self, topic: Topic) -> Any:  # noqa: ANN401
         def write(data: bytes) -> bool:
-            values = struct.unpack("<6d", data)
+            if topic.type == STAMPED:
+                message: Any = STORES[False].deserialize_ros1(data, STAMPED)
+                self.stamps_ns.append(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
+                self.frames.add(message.header.frame_id)
+            values = struct.unpack("<6d", data[-48:])
             self.sent.append(DriveVelocity(values[0], values[5]))
             return True
 
@@ -140,16 +164,20 @@ class World:
         self.deliver = deliver
         return lambda: 1
 
+    def other_types(self, topic: Topic) -> set[str]:
+        return self.types - {topic.type}
+
 
 def run(
-    world: World, monkeypatch: pytest.MonkeyPatch, folder: Path
+    world: World, monkeypatch: pytest.MonkeyPatch, folder: Path, *, kind: str = "geometry_msgs/msg/Twist"
 ) -> tuple[str, list[dict[str, Any]], dict[str, Any]]:
     """Drive; return the reason for the stop, the log and the last status."""
     monkeypatch.setattr(drive, "time", world)
     monkeypatch.setattr(drive, "now_s", world.monotonic)
     arguments: Mapping[str, Any] = {
         "cdr": False,
-        "command": {"name": "/cmd_vel", "type": "geometry_msgs/msg/Twist"},
+        "command": {"name": "/cmd_vel", "type": kind},
+        **({"frame": "base"} if kind == STAMPED else {}),
         "odometry": {"name": "/odom", "type": "nav_msgs/msg/Odometry"},
         "task": TASK,
         "orders": str(world.orders),
@@ -174,9 +202,21 @@ def test_robot_drives_out_and_back_and_ends_with_zero_velocity(
     assert {line["phase"] for line in log} >= {"out", "there", "back", "home"}
 
 
-def test_lost_laptop_stops_the_robot(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_stamped_velocities_have_the_time_of_the_robot_and_the_frame_of_its_profile(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    world = World(tmp_path / "orders")
+    stop_reason, log, status = run(world, monkeypatch, tmp_path, kind=STAMPED)
+    assert (stop_reason, status["ended"], world.frames) == ("", "home", {"base"})
+    assert world.stamps_ns == sorted(set(world.stamps_ns))
+    assert log[0]["utc_ns"] in world.stamps_ns
+    assert world.sent[-8:] == [DriveVelocity()] * 8
+
+
+@pytest.mark.parametrize("kind", ["geometry_msgs/msg/Twist", STAMPED])
+def test_lost_laptop_stops_the_robot(kind: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     world = World(tmp_path / "orders", orders_end_s=100.9)
-    stop_reason, log, status = run(world, monkeypatch, tmp_path)
+    stop_reason, log, status = run(world, monkeypatch, tmp_path, kind=kind)
     assert stop_reason == status["ended"] == "no order from the laptop for 2 s"
     assert log[-1]["utc_ns"] / 1e9 < 100.9 + 2.0 + 0.7
     assert world.sent[-8:] == [DriveVelocity()] * 8
@@ -194,7 +234,12 @@ def test_signal_stops_the_robot(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
 def test_missing_subscription_and_odometry_are_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     world = World(tmp_path / "orders")
     world.count_subscribers = lambda: 0
-    with pytest.raises(MiddlewareError, match="/cmd_vel has no subscription"):
+    with pytest.raises(MiddlewareError, match=r"/cmd_vel has no subscription of geometry_msgs/msg/Twist$"):
+        run(world, monkeypatch, tmp_path)
+    world.types = {STAMPED}
+    with pytest.raises(
+        MiddlewareError, match=f"of geometry_msgs/msg/Twist, but endpoints of {STAMPED}: correct type"
+    ):
         run(world, monkeypatch, tmp_path)
     world = World(tmp_path / "orders")
     monkeypatch.setattr(World, "subscribe", lambda *_: lambda: 1)

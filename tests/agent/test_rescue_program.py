@@ -72,7 +72,7 @@ def fly_up(autopilot: Autopilot, firmware: Firmware) -> None:
     vehicle = autopilot.vehicle
     wait_until(lambda: not vehicle.arming_errors, Deadline.after(60))
     if firmware is PX4:
-        vehicle.accept_set_point(SetPoint((0.0, 0.0, HEIGHT_M), is_place=True))
+        vehicle.accept_set_point(SetPoint((0.0, 0.0, HEIGHT_M), is_position=True))
     vehicle.change_mode(Mode.OFFBOARD)
     vehicle.arm()
     if firmware is PX4:
@@ -83,7 +83,7 @@ def fly_up(autopilot: Autopilot, firmware: Firmware) -> None:
 
 
 def send_set_point(autopilot: Autopilot) -> float:
-    autopilot.vehicle.accept_set_point(SetPoint((0.0, 0.0, HEIGHT_M), is_place=True))
+    autopilot.vehicle.accept_set_point(SetPoint((0.0, 0.0, HEIGHT_M), is_position=True))
     return height_m(autopilot)
 
 

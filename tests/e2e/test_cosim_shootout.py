@@ -60,7 +60,7 @@ def test_the_table_explains_its_columns_within_100_characters(lab: Path) -> None
     run = cosim(lab, "shootout", "pass.yaml", "--duration", "100ms", "--window", "10ms,20ms")
     assert run.code == 0, run.err
     assert max(map(len, run.out.splitlines())) <= 100
-    for head in ("time (ms)", "p95", "max", "fate (%)", "late", "added", "place (mm)", "per s", "speed"):
+    for head in ("time (ms)", "p95", "max", "fate (%)", "late", "added", "position (mm)", "per s", "speed"):
         assert head in run.out
         assert f"{head.partition(' (')[0]}: " in " ".join(run.out.split()), "the column is explained"
 

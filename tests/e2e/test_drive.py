@@ -32,6 +32,7 @@ from tests.helpers.field_robots import FieldRobots, start_field_robots
 from tests.helpers.host import descendants, wait_for_end
 from tests.helpers.labs import replace_text
 from tests.helpers.nightly import mark_nightly
+from tests.helpers.paths import ROOT
 from tests.helpers.rovers import rover_profile
 from tests.helpers.runs import finish, only_trial, rows, run_here, start, wait_during, wait_for_line
 from tests.helpers.sshd import wait_until
@@ -50,10 +51,14 @@ emulated: {ros: auto}
 """
 LAB = """\
 backend: emulated
-robots: {robot-1: {profile: turtlebot3_burger}}
+robots: {robot-1: {profile: rover}}
 roles: {}
 emulated: {ros: debian}
 """
+ROSTOPIC_MESSAGES = {
+    "geometry_msgs/Twist": "{linear: {x: 0.2}}",
+    "geometry_msgs/TwistStamped": "{twist: {linear: {x: 0.2}}}",
+}
 PLACEMENT = Placement(Scenario.LOS, Topology.MASTER, parse_distance("5m"))
 SPEED_M_S = 0.6
 LEASE_S = 2.0
@@ -111,6 +116,7 @@ def rovers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FieldRobots]:
     (folder / "robots" / "rover_two.yaml").write_text(ros2, encoding="utf-8")
     zenoh = ros2.replace("name: rover_two", "name: rover_three").replace("distribution: foxy", "distribution: jazzy")
     zenoh = zenoh.replace("\nlimits:", "\n  environment: {RMW_IMPLEMENTATION: rmw_zenoh_cpp}\nlimits:")
+    zenoh = replace_text(zenoh, "topic: /cmd_vel", "topic: /cmd_vel, type: geometry_msgs/TwistStamped, frame: base")
     (folder / "robots" / "rover_three.yaml").write_text(zenoh, encoding="utf-8")
     (folder / "lab.yaml").write_text(SITE, encoding="utf-8")
     with chdir(folder), start_field_robots(folder, site=folder / "lab.yaml", topology=Topology.MASTER) as robots:
@@ -155,7 +161,8 @@ def test_robots_drive_there_and_back_and_the_true_track_equals_their_odometry(fi
     trial = only_trial(field_robots.folder)
     (repeat,) = (trial / "repeats").iterdir()
     (row,) = rows(trial)
-    # Over ROS 1, with positions relative to the sender; over ROS 2 with DDS, facing the other way; over Zenoh.
+    # Over ROS 1, with positions relative to the sender; over ROS 2 with DDS, facing the other way; over Zenoh, with
+    # stamped velocities.
     for role, name, sign, way_m in (
         (Role.RECEIVER, "", 1, (0.4, 0.0)),
         (Role.SENDER, "outer.", -1, (0.3, 0.3)),
@@ -189,7 +196,15 @@ def test_robots_drive_there_and_back_and_the_true_track_equals_their_odometry(fi
         assert float(row[f"{name}drive_speed_max_m_s"]) == pytest.approx(max(speeds), abs=0.25)
 
 
-def test_a_robot_of_an_interactive_lab_can_be_driven(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", mark_nightly(ROSTOPIC_MESSAGES))
+def test_a_robot_of_an_interactive_lab_can_be_driven(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "robots").mkdir()
+    profile = (ROOT / "robots/turtlebot3_burger.yaml").read_text(encoding="utf-8")
+    profile = replace_text(profile, "name: turtlebot3_burger", "name: rover", "topic:", f"type: {kind}, topic:")
+    (tmp_path / "robots/rover.yaml").write_text(profile, encoding="utf-8")
     (tmp_path / "fieldkit.yaml").write_text(LAB, encoding="utf-8")
     backend = EmulatedBackend(*load_site(tmp_path / "fieldkit.yaml"))
     with backend.open_lab(seed=1, sink=lambda _: None) as lab:
@@ -202,7 +217,7 @@ def test_a_robot_of_an_interactive_lab_can_be_driven(tmp_path: Path) -> None:
             private_key=lab.login.private_key,
         )
         with closing(shell):
-            topic = ("rostopic", "pub", "-r", "10", "/cmd_vel", "geometry_msgs/Twist", "{linear: {x: 0.2}}")
+            topic = ("rostopic", "pub", "-r", "10", "/cmd_vel", kind, ROSTOPIC_MESSAGES[kind])
             # Until its input ends.
             driver = ("sh", "-c", '"$@" & cat >/dev/null; kill $!', "sh", *with_environment(topic, setup=SETUP))
             session = shell.begin(driver, deadline=Deadline.after(30))

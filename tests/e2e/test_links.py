@@ -40,14 +40,26 @@ steps:
         - ping: {name: cell, over: cell, from: sender, to: receiver, count: 3, payload_bytes: 56}
   - ping: {name: wifi, over: wifi, from: sender, to: receiver, count: 3, payload_bytes: 56}
   - wait: {duration: 8s}
-  - fault:
-      robot: receiver
-      kind: link-down
-      link: wifi
-      for: 8s
-      after: 2s
+  - capture:
+      name: any
+      over: either
       during:
-        - ping: {over: either, from: sender, to: receiver, count: 110, interval: 100ms, payload_bytes: 56, gap: true}
+        - fault:
+            robot: receiver
+            kind: link-down
+            link: wifi
+            for: 8s
+            after: 2s
+            during:
+              - ping:
+                  over: either
+                  from: sender
+                  to: receiver
+                  count: 110
+                  interval: 100ms
+                  payload_bytes: 56
+                  gap: true
+                  duplicates: true
 """
 
 
@@ -70,3 +82,6 @@ def test_each_step_uses_its_link_and_packets_move_to_another_one(tmp_path: Path)
     assert 0.5 < float(row["rtt_gap_s"]) < 7.5
     assert float(row["rtt_min_s"]) < 0.1
     assert float(row["rtt_max_s"]) >= 0.2
+    # babeld sends each packet over one link. The captures contain the packets of both.
+    assert row["rtt_duplicates"] == "0"
+    assert int(row["any.sender_captured"]) >= 110

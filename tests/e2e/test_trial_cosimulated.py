@@ -147,7 +147,7 @@ def test_a_robot_that_real_ros_drives_stops_at_the_wall(tmp_path: Path) -> None:
         ),
         ("{physics: kinematic, sync: slidding_window}", "there is no sync policy 'slidding_window'"),
         ("{sync: sliding_window}", "`sync` needs a co-simulation"),
-        ("{physics: kinematic, sync: {name: scheduled, window: 0.1ms}}", "shorter than the step of the physics"),
+        ("{physics: kinematic, sync: {name: scheduled, window: 0.1ms}}", "shorter than the physics step"),
     ],
 )
 def test_a_combination_that_cannot_work_is_refused(emulated: str, reason: str, tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from sim_backends.emulated.emulated_options import SyncOptions
 from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.emulated.robot.velocity_command import VelocityCommand, VelocityCommandRecord
 from sim_backends.emulated.ros.motion_record import MotionRecord, RecordedMotion
-from sim_backends.emulated.ros.own_motion import AssignedPath, append_path
+from sim_backends.emulated.ros.robot_motion import AssignedPath, append_path
 from sim_backends.physics.robot_limits import TURTLEBOT3_BURGER
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import World
@@ -139,5 +139,5 @@ def cosim_bench(
 
 
 def distance_m(motion: RecordedMotion, place_m: Vector) -> float:
-    """Return the horizontal distance of a motion from a place."""
-    return math.dist(motion.place_m[:2], place_m[:2])
+    """Return the horizontal distance of a motion from a position."""
+    return math.dist(motion.position_m[:2], place_m[:2])

@@ -7,6 +7,7 @@ from pathlib import Path
 from scapy.config import conf
 from scapy.layers.inet import ICMP, IP, TCP, UDP
 from scapy.layers.inet6 import IPv6, IPv6ExtHdrFragment, IPv46
+from scapy.layers.l2 import CookedLinuxV2
 from scapy.layers.sctp import SCTP
 from scapy.packet import Packet
 from scapy.utils import PcapReader, PcapWriter
@@ -92,4 +93,5 @@ def _row(frame: Packet, addresses: Sequence[int], ip_fields: Row, upper: Packet)
         udp.len if udp else 0,
         icmp.id + 65_536 * (icmp.type == 0) if icmp else -1,
         icmp.seq if icmp else -1,
+        frame.ifindex if isinstance(frame, CookedLinuxV2) else -1,
     )

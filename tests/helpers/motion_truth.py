@@ -171,7 +171,7 @@ class MotionSampler:
         if self._heading_rad is None:
             self._heading_rad = motion.heading_rad
         east_m, north_m, up_m = (
-            newest - origin_m for newest, origin_m in zip(motion.place_m, self._start_m, strict=True)
+            newest - origin_m for newest, origin_m in zip(motion.position_m, self._start_m, strict=True)
         )
         return MotionSample(
             now_ns / 1e9,

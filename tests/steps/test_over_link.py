@@ -70,6 +70,33 @@ def test_a_capture_and_a_fault_use_the_interface_of_their_link() -> None:
     assert commands(fault)[0].endswith("-I wwan0 -i 0.1 100.64.0.2")
 
 
+def test_a_capture_of_a_link_without_an_interface_is_on_all_interfaces() -> None:
+    step = parsed(CaptureStep, "over: either, during: [{ping: {from: sender, to: receiver, over: either}}]")
+    assert all(" -i any " in command for command in commands(step)[:2])
+    assert isinstance(step, CaptureStep)
+    assert step.placement_error((), ()) is None
+    assert all(need.argv[-2:] == ("-i", "any") for need in step.needs(SCENE))
+    assert "host 10.99.0.1 and host 10.99.0.2" in commands(step)[0]
+
+
+@pytest.mark.parametrize(
+    ("keys", "is_captured", "reason"),
+    [
+        ("over: either", True, None),
+        ("over: either", False, "a capture on both robots"),
+        ("count: 10", True, "needs `over`"),
+        ("over: either, count: 65536", True, "at most 65535 requests"),
+    ],
+)
+def test_duplicates_need_a_capture_of_the_link(keys: str, is_captured: bool, reason: str | None) -> None:
+    step = parsed(PingStep, f"from: sender, to: receiver, {keys}, duplicates: true")
+    around = parsed(CaptureStep, "over: either, during: [{wait: {duration: 1s}}]")
+    assert isinstance(step, PingStep)
+    assert isinstance(around, CaptureStep)
+    error = step.placement_error((), (around,) if is_captured else ())
+    assert error is None if reason is None else reason in (error or "")
+
+
 @pytest.mark.parametrize(
     ("outer", "inner"), [("over: cell,", ""), ("", ", over: cell"), ("over: wifi,", ", over: cell")]
 )

@@ -1,8 +1,6 @@
 """Telemetry sources against Debian's snmpd and an HTTP server on loopback, with correct, slow and hostile answers."""
 
-import shutil
 import socket
-import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -11,19 +9,12 @@ from pathlib import Path
 import pytest
 
 from fieldkit.config import schema
-from fieldkit.core.deadline import Deadline
 from fieldkit.telemetry import laptop_telemetry, source_readings
 from fieldkit.telemetry.source_readings import SourceReadings
 from fieldkit.telemetry.telemetry_section import TelemetrySource
-from tests.helpers.sshd import free_port, wait_until
+from tests.helpers.telemetry_devices import ENTERPRISE, snmp_agent
 
 SECRET = "fk-secret-27"
-ENTERPRISE = "1.3.6.1.4.1.99999.1"
-OBJECTS = f"""\
-override .{ENTERPRISE}.1.0 integer -71
-override .{ENTERPRISE}.2.0 octet_str "B7"
-override .{ENTERPRISE}.3.0 octet_str "-98.5 dBm"
-"""
 
 
 def query(text: str, **environment: str) -> SourceReadings:
@@ -33,22 +24,8 @@ def query(text: str, **environment: str) -> SourceReadings:
 
 @pytest.fixture
 def agent(tmp_path: Path) -> Iterator[int]:
-    """Debian's snmpd on loopback with a community; yields its port."""
-    program = shutil.which("snmpd", path="/usr/sbin:/usr/bin")
-    assert program is not None, "install snmpd: .ci/install --dev"
-    port = free_port()
-    config = tmp_path / "snmpd.conf"
-    config.write_text(f"agentAddress udp:127.0.0.1:{port}\nrocommunity {SECRET}\n{OBJECTS}", encoding="utf-8")
-    # -C: only this file; its state is in the folder of the test.
-    words = (program, "-f", "-Lf", str(tmp_path / "log"), "-C", "-c", str(config), "-I", "-smux")
-    process = subprocess.Popen(words, env={"SNMP_PERSISTENT_DIR": str(tmp_path), "PATH": "/usr/bin:/usr/sbin"})
-    try:
-        bound = f":{port:04X} "
-        wait_until(lambda: bound in Path("/proc/net/udp").read_text(encoding="ascii"), Deadline.after(60))
+    with snmp_agent(tmp_path, SECRET) as port:
         yield port
-    finally:
-        process.kill()
-        process.wait()
 
 
 def snmp(port: int, credentials: str) -> str:

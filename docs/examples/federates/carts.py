@@ -12,7 +12,7 @@ from sim_backends.world.motion import State
 
 
 class Carts:
-    """A physics: `advance` moves the robots, one step at a time."""
+    """A physics simulator: `advance` moves the robots, one step at a time."""
 
     def __init__(self, hello):
         self.step_ns = hello.step_ns

@@ -1,15 +1,14 @@
 """Drive a ground robot along its path by its velocity topic, in a closed loop on its odometry.
 
 The laptop renews its order repeatedly (`orders`). If no order arrives within the lease of the task, the laptop or the
-link to it is lost, and the robot stops. Twists are published `RATE_HZ` times per second; the base of a robot
-stops when no more Twists arrive.
+link to it is lost, and the robot stops. Velocities are published `RATE_HZ` times per second; the base of a robot
+stops when no more velocities arrive.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import struct
 import threading
 import time
 from contextlib import suppress
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import Any, Callable, Mapping
 
 from fieldkit.agent.boot_clock import boot_id, now_s
+from fieldkit.agent.driving.drive_messages import VelocityEncoder, read_odometry
 from fieldkit.agent.driving.drive_plan import ORDERS, DriveTask
 from fieldkit.agent.driving.standstill import Standstill
 from fieldkit.agent.driving.steering import ZERO_VELOCITY, Driver, DriveVelocity, OdometryPose
@@ -26,18 +26,12 @@ from fieldkit.agent.orders import Orders
 
 RATE_HZ = 20.0
 _MIN_STOP_S = 0.5
-"""Minimum time for which zero Twists are published at the end, because one may be lost."""
+"""Minimum time for which zero velocities are published at the end, because one may be lost."""
 _MAX_STOP_S = 1.5
-"""Maximum time for which zero Twists are published while odometry shows that the robot still moves."""
+"""Maximum time for which zero velocities are published while odometry shows that the robot still moves."""
 _TIMEOUT_S = 15.0
 """Timeout for a subscription to the velocity topic, and for the first odometry."""
 _LOG_INTERVAL_S = 0.1
-
-_CDR_HEADER = b"\0\1\0\0"
-_TWIST = struct.Struct("<6d")
-_POSE = struct.Struct("<7d")
-_LENGTH = struct.Struct("<I")
-_MAX_STRING_BYTES = 1 << 16
 
 
 def drive(middleware: Middleware, arguments: Mapping[str, Any], log: Path, stop_event: threading.Event) -> str:
@@ -45,10 +39,10 @@ def drive(middleware: Middleware, arguments: Mapping[str, Any], log: Path, stop_
 
     Args:
         middleware: The started middleware.
-        arguments: `command` and `odometry`, the topics; `task`, the `DriveTask`; `orders`, the file that the laptop
-            writes; `status`, the file with the progress, which the laptop reads; `stationary`, a file that is
-            created when the robot is stationary at the end (optional); `cdr`, True if messages are encoded in CDR as
-            in ROS 2, False for ROS 1.
+        arguments: `command` and `odometry`, the topics; `frame`, the frame of stamped velocities (needed only for
+            them); `task`, the `DriveTask`; `orders`, the file that the laptop writes; `status`, the file with the
+            progress, which the laptop reads; `stationary`, a file that is created when the robot is stationary at
+            the end (optional); `cdr`, True if messages are encoded in CDR as in ROS 2, False for ROS 1.
         log: The log file: a line of JSON ten times per second.
         stop_event: Set when the drive must end.
 
@@ -60,7 +54,10 @@ def drive(middleware: Middleware, arguments: Mapping[str, Any], log: Path, stop_
         OSError: The log cannot be written; the robot was stopped.
     """
     cdr = bool(arguments["cdr"])
-    publisher = middleware.publisher(Topic.from_json(arguments["command"]))
+    command = Topic.from_json(arguments["command"])
+    publisher = _VelocityPublisher(
+        middleware.publisher(command), VelocityEncoder(command.type, arguments.get("frame", ""), cdr=cdr)
+    )
     poses: list[tuple[float, OdometryPose]] = []
 
     def on_odometry(data: bytes, _at_ns: int) -> None:
@@ -69,8 +66,9 @@ def drive(middleware: Middleware, arguments: Mapping[str, Any], log: Path, stop_
             poses.append((now_s(), pose))
 
     middleware.subscribe(Topic.from_json(arguments["odometry"]), on_odometry)
-    _wait_until(arguments["command"]["name"] + " has no subscription", lambda: publisher.matched() > 0, stop_event)
-    _wait_until("no odometry arrives on " + arguments["odometry"]["name"], lambda: bool(poses), stop_event)
+    _wait_for_subscription(middleware, publisher, command, stop_event)
+    if not _wait_until(lambda: bool(poses), stop_event):
+        raise MiddlewareError("no odometry arrives on " + arguments["odometry"]["name"])
     task = DriveTask.from_json(arguments["task"])
     driver = Driver(task, now_s())
     orders, status = Orders(arguments["orders"], ORDERS, task.lease_s), Path(arguments["status"])
@@ -92,77 +90,72 @@ def drive(middleware: Middleware, arguments: Mapping[str, Any], log: Path, stop_
                 velocity = driver.tick(iteration_s)
                 if stop_event.is_set():  # the signal may have arrived while this process was suspended
                     velocity = ZERO_VELOCITY
-                publisher.write(twist(velocity, cdr=cdr))
+                publisher.write(velocity)
                 if iteration_s - logged_s >= _LOG_INTERVAL_S:
                     logged_s = iteration_s
                     _report(driver, velocity, lines, status)
                 stop_event.wait(1 / RATE_HZ)
         finally:
-            _stop_robot(publisher, poses, arguments.get("stationary", ""), cdr=cdr)
+            _stop_robot(publisher, poses, arguments.get("stationary", ""))
         stop_reason = driver.stop_reason or ("" if driver.phase == "home" else "ordered to stop")
         _report(driver, ZERO_VELOCITY, lines, status, end_reason=stop_reason or "home")
     return stop_reason
 
 
-def twist(velocity: DriveVelocity, *, cdr: bool) -> bytes:
-    """Return a serialized `geometry_msgs/Twist`: linear x, y, z, then angular x, y, z."""
-    payload = _TWIST.pack(velocity.forward_m_s, 0.0, 0.0, 0.0, 0.0, velocity.turn_rad_s)
-    return (_CDR_HEADER if cdr else b"") + payload
+class _VelocityPublisher:
+    """Publishes velocities with the time of the robot's clock."""
+
+    def __init__(self, publisher: Publisher, encoder: VelocityEncoder) -> None:
+        self.matched = publisher.matched
+        self._publisher = publisher
+        self._encoder = encoder
+
+    def write(self, velocity: DriveVelocity) -> None:
+        self._publisher.write(self._encoder.encode(velocity, time.time_ns()))
 
 
-def read_odometry(data: bytes, *, cdr: bool) -> OdometryPose | None:
-    """Return the pose in a serialized `nav_msgs/Odometry`, or None if the data are invalid.
+def _wait_for_subscription(
+    middleware: Middleware, publisher: _VelocityPublisher, command: Topic, stop_event: threading.Event
+) -> None:
+    """Wait until the base of the robot has subscribed to the velocity topic.
 
-    The pose follows a header (in ROS 1 with a sequence number before the time), the frame id of the header and the
-    child frame id. Strings follow their length; in CDR they end with a zero byte, and doubles are aligned to 8 bytes.
+    Raises:
+        MiddlewareError: It has not; the text contains the types of other endpoints of the topic.
     """
-    if cdr and data[:4] != _CDR_HEADER:
-        return None
-    payload = data[4:] if cdr else data
-    offset = 8 if cdr else 12
-    try:
-        for _ in range(2):
-            offset += -offset % 4 if cdr else 0
-            (length,) = _LENGTH.unpack_from(payload, offset)
-            if length > _MAX_STRING_BYTES:
-                return None
-            offset += 4 + length
-        x_m, y_m, _, x, y, z, w = _POSE.unpack_from(payload, offset + (-offset % 8 if cdr else 0))
-    except struct.error:
-        return None
-    if not all(map(math.isfinite, (x_m, y_m, x, y, z, w))):
-        return None
-    return OdometryPose(x_m, y_m, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+    if _wait_until(lambda: publisher.matched() > 0, stop_event):
+        return
+    other_types = set() if stop_event.is_set() else middleware.other_types(command)
+    hint = f", but endpoints of {', '.join(sorted(other_types))}: correct type of drive in its profile"
+    raise MiddlewareError(f"{command.name} has no subscription of {command.type}{hint if other_types else ''}")
 
 
-def _wait_until(message: str, condition: Callable[[], bool], stop_event: threading.Event) -> None:
+def _wait_until(condition: Callable[[], bool], stop_event: threading.Event) -> bool:
+    """Return True when the condition is true, False after `_TIMEOUT_S` or a signal."""
     deadline_s = time.monotonic() + _TIMEOUT_S
     while not condition():
         if stop_event.wait(0.02) or time.monotonic() > deadline_s:
-            raise MiddlewareError(message)
+            return False
+    return True
 
 
-def _stop_robot(
-    publisher: Publisher, poses: list[tuple[float, OdometryPose]], stationary_file: str, *, cdr: bool
-) -> None:
+def _stop_robot(publisher: _VelocityPublisher, poses: list[tuple[float, OdometryPose]], stationary_file: str) -> None:
     """Publish zero velocities until the robot is stationary, for at least `_MIN_STOP_S` and at most `_MAX_STOP_S`.
 
     Args:
         publisher: The publisher of the velocity topic.
         poses: Poses of the odometry, which other threads append.
         stationary_file: A file that is created when the robot is stationary; empty to create none.
-        cdr: Whether messages are encoded in CDR.
     """
     start_s, standstill, is_confirmed = time.monotonic(), Standstill(), False
-    poses.clear()  # these poses are older than the first zero Twist
+    poses.clear()  # these poses are older than the first zero velocity
     while True:
-        publisher.write(twist(ZERO_VELOCITY, cdr=cdr))
+        publisher.write(ZERO_VELOCITY)
         while poses:
             standstill.add_pose(*poses.pop(0))
         if standstill.stationary and not is_confirmed:
             is_confirmed = True
             if stationary_file:
-                with suppress(OSError):  # zero Twists must be published even if the disk is full
+                with suppress(OSError):  # zero velocities must be published even if the disk is full
                     Path(stationary_file).touch()
         elapsed_s = time.monotonic() - start_s
         if elapsed_s >= _MAX_STOP_S or (is_confirmed and elapsed_s >= _MIN_STOP_S):

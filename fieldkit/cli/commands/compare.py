@@ -15,7 +15,7 @@ delta (Cliff's) shows how much the repeats of A and B overlap: among all pairs o
 A and a repeat of B, the share of pairs with the larger value in B minus the share with the
 smaller value in B. +1 or -1: no overlap; 0: both shares are equal. `cliffs_delta` in CSV, JSON.
 
-exit codes with --threshold: 0 if, in every cell in which A or B has the quantity,
+exit codes with --threshold: 0 if, in every condition in which A or B has the quantity,
 the whole 95 % interval of B - A is within the threshold; 1 if it is not, or if A or
 B has no such cell, no value of the quantity or no interval. Without --threshold: 0.
 

@@ -31,7 +31,7 @@ def add(parser: Parser) -> None:
         "--repeat",
         default="",
         metavar="NAME",
-        help="repeat for the time line: udp-07, or TRIAL/udp-07 (default: the median one of the worst condition)",
+        help="repeat for the time line: udp-07, or TRIAL/udp-07 (default: the median repeat of the worst condition)",
     )
     parser.add_argument(
         "--quantity",

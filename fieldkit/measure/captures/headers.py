@@ -14,6 +14,12 @@ from fieldkit.measure.captures.arrays import BIG, Fields, Frames, Integers, Ints
 NO_HEADER: Final = -1
 """Position for a frame without an IP header."""
 
+NO_INTERFACE: Final = -1
+"""Index of an interface that a capture does not contain."""
+
+COOKED_V2: Final = 276
+"""Link type of captures on all interfaces by tcpdump 4.99 and later (LINKTYPE_LINUX_SLL2)."""
+
 RAW_LINKS: Final = frozenset((12, 14, 101, 228, 229))
 """Link types whose frames are IP packets: DLT_RAW of most systems, DLT_RAW of OpenBSD, LINKTYPE_RAW, IPv4, IPv6.
 
@@ -52,6 +58,14 @@ def network(integers: Integers, frames: Frames) -> Ints:
         if link_type in LINKS:
             header_at[rows] = LINKS[link_type](integers, frames.where(rows))
     return header_at
+
+
+def interfaces(integers: Integers, frames: Frames) -> Ints:
+    """Return the index of each frame's interface; `NO_INTERFACE` if its link-layer header does not contain one."""
+    cooked = frames.link_type == COOKED_V2
+    if not cooked.any():
+        return np.full(len(frames), NO_INTERFACE)
+    return np.where(cooked, integers.u32(np.where(cooked, frames.start + 4, 0)), NO_INTERFACE)
 
 
 ICMP: Final = 1

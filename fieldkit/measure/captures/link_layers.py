@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from fieldkit.measure.captures.arrays import LITTLE, Frames, Integers, Ints, Mask
-from fieldkit.measure.captures.headers import NO_HEADER
+from fieldkit.measure.captures.headers import COOKED_V2, NO_HEADER
 
 HeaderFinder = Callable[[Integers, Frames], Ints]
 
@@ -123,7 +123,7 @@ LINKS: Final[Mapping[int, HeaderFinder]] = MappingProxyType(
         108: _null,  # OpenBSD loopback
         113: _cooked,
         127: _radiotap,
-        276: _cooked_v2,
+        COOKED_V2: _cooked_v2,
     }
 )
 """Function that finds the IP headers, by link type number. The types of `headers.RAW_LINKS` need no function."""

@@ -22,7 +22,17 @@ from fieldkit.measure.captures.arrays import (
     layout,
     row_hashes,
 )
-from fieldkit.measure.captures.headers import ICMP, SCTP, TCP, UDP, Addresses, address, ip_headers, network
+from fieldkit.measure.captures.headers import (
+    ICMP,
+    SCTP,
+    TCP,
+    UDP,
+    Addresses,
+    address,
+    interfaces,
+    ip_headers,
+    network,
+)
 
 FIN: Final = 0x01
 SYN: Final = 0x02
@@ -98,6 +108,7 @@ class Packets(Table):
         content: Hash of the first `CONTENT_BYTES` after the TCP or UDP header or, without one, after the IP header.
             The transport checksum is excluded, because with offload it is computed after the capture. `NOT_CAPTURED`
             if one of these bytes is missing.
+        interface: Index of the interface in captures on all interfaces; `headers.NO_INTERFACE` in other captures.
     """
 
     time_ns: Ints
@@ -123,6 +134,7 @@ class Packets(Table):
     echo: Ints
     echo_seq: Ints
     content: Ints
+    interface: Ints
 
     def are_from(self, text: str) -> Mask:
         """Return a mask of the packets with this IPv4 or IPv6 source address."""
@@ -143,7 +155,7 @@ _STORAGE_TYPES: Final[Mapping[str, type[np.integer[Any]]]] = MappingProxyType(
         **dict.fromkeys(("fragment_offset", "tcp_mss", "udp_bytes"), np.uint16),
         **dict.fromkeys(("wire_bytes", "ip_id", "ip_header_bytes", "ip_payload_bytes"), np.uint32),
         **dict.fromkeys(("tcp_seq", "tcp_ack", "tcp_payload_bytes"), np.uint32),
-        **dict.fromkeys(("sport", "dport", "echo", "echo_seq"), np.int32),
+        **dict.fromkeys(("sport", "dport", "echo", "echo_seq", "interface"), np.int32),
     }
 )
 """Columns stored in fewer than eight bytes. Each type can store the header field and the negative special values."""
@@ -199,6 +211,7 @@ def decode(integers: Integers, frames: Frames) -> Packets:
         content=_content_hashes(
             integers, transport + transport_bytes, captured - transport_bytes, payload - transport_bytes
         ),
+        interface=interfaces(integers, frames),
     )
 
 

@@ -137,6 +137,13 @@ CROSS_CHECKS: Final = (
         ("the procedure", "each capture: size of echoes"),
         "none",
     ),
+    CrossCheck(
+        "copies over several links",
+        ("rtt_duplicates",),
+        "captures on all interfaces: interface of each echo",
+        ("`ping.txt`: replies with `(DUP!)`", "receiver's capture: at most one reply per received request"),
+        "a copy in the last 0.1 s of ping, or later than one interval after the last request; fragmented requests",
+    ),
 )
 
 

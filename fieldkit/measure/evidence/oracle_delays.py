@@ -170,7 +170,7 @@ AIR_DELAY_COLUMNS: Final = columns(
         "s",
         (
             "Mean one-way delay of the transfer's packets: the sum of the four components of the paper's eq. 2. "
-            "Empty if the testbed cannot measure it, for example with real radios."
+            "Empty if the backend cannot measure it, for example with real radios."
         ),
         Figure("air delay", Kind.MEDIAN, rank=34),
     ),

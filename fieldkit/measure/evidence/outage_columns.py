@@ -20,8 +20,9 @@ def _observer(kind: FaultKind) -> str:
 
 def fault_columns(kind: FaultKind) -> tuple[Column, ...]:
     """Return the columns of a kind of fault."""
+    outage_column = fault_column_name(kind, "outage_s")
     outage_meaning = f"Longest time without a reply around the fault {kind}; empty if the robot did not recover."
-    recovery_meaning = f"Part of this outage after the end of the fault's cause ({kind}); empty if that is unknown."
+    recovery_meaning = f"Part of {outage_column} after the end of the cause of {kind}; empty if that end is unknown."
     recovered_meaning = f"True if the robot recovered from the fault {kind} within the time limit."
     bound_meaning = f"Lower bound of the recovery time if the robot did not recover from {kind}; otherwise empty."
     index, bound = list(FaultKind).index(kind), fault_column_name(kind, "recovery_at_least_s")
@@ -29,7 +30,7 @@ def fault_columns(kind: FaultKind) -> tuple[Column, ...]:
     recovery = Figure(f"{_observer(kind)} recovery after {kind}", Kind.MEDIAN, rank=80 + index, at_least=bound)
     times = columns(
         90,
-        (fault_column_name(kind, "outage_s"), "s", outage_meaning),
+        (outage_column, "s", outage_meaning),
         (fault_column_name(kind, "recovery_s"), "s", recovery_meaning, recovery),
         (fault_column_name(kind, "recovered"), "bool", recovered_meaning, recovered),
     )

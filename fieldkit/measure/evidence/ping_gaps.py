@@ -15,7 +15,7 @@ GAP_COLUMNS: Final = columns(
         "s",
         (
             "Longest time between consecutive replies; empty if ping printed no time stamps, or if the time without "
-            "replies at its start or end was longer than this, or at least 1 s."
+            "replies at its start or end was longer than this time, or at least 1 s."
         ),
         Figure("longest gap between answers", Kind.MEDIAN, at_least="rtt_gap_at_least_s"),
     ),

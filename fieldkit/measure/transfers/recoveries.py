@@ -132,8 +132,8 @@ def declare_columns(flow: str, kind: FaultKind) -> tuple[Column, ...]:
             f"{outage}_s",
             "s",
             (
-                f"Longest time without new payload of the {flow} that overlaps the fault {kind}; empty if it had not "
-                f"ended when the {flow} did."
+                f"Longest time without new payload of the {flow} that overlaps the fault {kind}; empty if the "
+                f"outage had not ended when the {flow} ended."
             ),
             Figure(f"{flow} outage around {kind}", Kind.MEDIAN, rank=80 + index, at_least=f"{outage}_at_least_s"),
         ),

@@ -14,7 +14,7 @@ from fieldkit.core.errors import FieldkitError, LinkError, MotionHeldError, Robo
 from fieldkit.core.model import Move
 from fieldkit.motion.logs import drive_log
 from fieldkit.motion.origins import RobotMotion, origins_of
-from fieldkit.motion.profile_sections import Drive, drive_of
+from fieldkit.motion.profile_sections import TWIST_STAMPED, Drive, drive_of
 from fieldkit.motion.steps import lease
 from fieldkit.motion.steps.drive_lease import START_S, STATUS, DriveLease
 from fieldkit.motion.steps.lease import orders_file
@@ -189,7 +189,8 @@ def _driver_arguments(scene: Scene, move: Move, name: str) -> str:
         "over": middleware.value,
         "network": network,
         "cdr": middleware is not MiddlewareName.ROS1,
-        "command": topic(drive.topic, "geometry_msgs/msg/Twist", "default", 1),
+        "command": topic(drive.topic, drive.type, "default", 1),
+        **({"frame": drive.frame} if drive.type == TWIST_STAMPED else {}),
         "odometry": topic(drive.odometry, "nav_msgs/msg/Odometry", "sensor_data", 2),
         "task": {**_task(robot, move), **_origin(scene, move)},
         "orders": orders_file(name.format("drive")),

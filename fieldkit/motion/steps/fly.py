@@ -93,8 +93,8 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
     its nose away from the robot at the other end of its link. Real drones need `--allow-motion`. A flight beyond
     `limits` of the profile is refused, and so is a robot whose profile has no `mavlink`. Before the trial and before
     each take-off its autopilot, PX4 or ArduCopter, must report [that it can be
-    armed](mavlink.md#checks-before-a-take-off). A `fault` or a `together` may be inside a flight, but not a
-    flight inside them. Adds columns of the flight (`fly_height_median_m` and others,
+    armed](mavlink.md#checks-before-a-take-off). A `fault` or a `together` may be inside a flight; a
+    flight must not be inside a `fault` or a `together`. Adds columns of the flight (`fly_height_median_m` and others,
     [MAVLink](mavlink.md#evidence-of-a-flight)). Writes `fly.jsonl`, `fly.log` and `fly.orders`.
 
     Attributes:

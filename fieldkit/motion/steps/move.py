@@ -60,8 +60,8 @@ class MoveStep(
     lab move on the ground of their world, and return instantly; in the field the operator is asked to start the
     motion and to bring the robot back. Ground robots that [fieldkit drives](motion.md) move and return automatically,
     with `--allow-motion`, and write `drive.jsonl`. `--dry-run` describes the path. A move may be inside a move of
-    another robot; one of the two needs a `name`, because each may write such a file. A `fault` may be inside a move,
-    but not a move inside a fault.
+    another robot; one of the two needs a `name`, because each may write such a file. A `fault` may be inside a move;
+    a move must not be inside a fault.
 
     Attributes:
         robot: Role that moves.

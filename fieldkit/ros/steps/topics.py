@@ -68,9 +68,10 @@ _ENVELOPE_BYTES: Final = 100
 class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listens, SendsTraffic, Summarizes):
     """Streams samples of a topic from one robot to another over a middleware.
 
-    The program is part of fieldkit; both robots need the middleware for Python. [Topics](topics.md) describes the
-    columns, too. Inside a `capture` its traffic is counted, and delays are measured if there are packets in both
-    directions. Writes `ROLE-topic.bin` and `ROLE-topic.log`, and `ROLE-serve.log` of a router or a master.
+    The programs that publish and subscribe are part of fieldkit; both robots need the middleware for Python.
+    [Topics](topics.md) also describes the columns. Inside a `capture` its traffic is counted, and delays are measured
+    if there are packets in both directions. Writes `ROLE-topic.bin` and `ROLE-topic.log`, and `ROLE-serve.log` of a
+    router or a master.
     """
 
     cross_checks = (

@@ -83,12 +83,12 @@ def declare_columns(prefix: str, sent: str) -> tuple[Column, ...]:
         ),
         (f"{prefix}_age_error_s", "s", "Maximum error of each age that is caused by the clocks."),
         (f"{prefix}_withheld", "text", "Reason why ages are empty; empty if all of them have a value."),
-        (f"{prefix}_reads", "count", "Reads while the stream was expected."),
-        (f"{prefix}_blank", "share", f"Share of these reads before the first {item}."),
+        (f"{prefix}_reads", "count", f"Number of reads while {item}s were expected."),
+        (f"{prefix}_blank", "share", f"Share of {prefix}_reads before the first {item}."),
         (
             f"{prefix}_repeated",
             "share",
-            f"Share of these reads that read the same {item} as the previous read.",
+            f"Share of {prefix}_reads that returned the same {item} as the previous read.",
             Figure(f"{item}s repeated", Kind.MEAN, rank=94),
         ),
         (f"{prefix}_distinct", "count", f"{item.capitalize()}s that at least one read returned."),
@@ -110,10 +110,14 @@ def declare_columns(prefix: str, sent: str) -> tuple[Column, ...]:
         (
             f"{prefix}_gap_s",
             "s",
-            f"Longest time without a newer {item} at the reads while the stream was expected.",
+            f"Longest time in which reads returned no newer {item} although {item}s were expected.",
             Figure(f"longest time without a new {item}", Kind.MEDIAN, rank=92),
         ),
-        (f"{prefix}_gaps", "count", "Number of such times that were longer than the limit of the step."),
+        (
+            f"{prefix}_gaps",
+            "count",
+            f"Number of times without a newer {item} that were longer than the limit of the step.",
+        ),
     )
 
 

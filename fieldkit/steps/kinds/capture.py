@@ -67,10 +67,13 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
     steps (a port filter matches only first fragments). The columns on losses and delays of a transfer are empty
     unless the transfer is inside a capture on both of its robots. With a `ping` inside, after the transfer, the
     captures give the offset between the two clocks, which [one-way delay](method-delay.md#one-way-delay) needs: a UDP
-    transfer has no answer, and the offset needs packets in both directions. Writes `ROLE.pcap` and
-    `ROLE-capture.log`.
+    transfer has no answer, and the offset needs packets in both directions. On a link with the interface `lo`, whose
+    packets use any interface, it captures on all interfaces; a bridge or bond shows each packet twice.
+    Writes `ROLE.pcap` and `ROLE-capture.log`.
 
     Attributes:
+        over: Link to capture, by its name in [the profiles of the robots](links.md); without it, the radio under
+            test.
         robots: Roles that capture.
         port: A port to capture in addition to the ports of the steps inside.
         during: Steps to capture.
@@ -140,7 +143,7 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
                 *(
                     profile.tools.capture,
                     "-i",
-                    scene.link(role, self.over).interface,
+                    self.capture_interface(scene, role),
                     *options,
                     "-w",
                     self._file(role),
@@ -197,7 +200,7 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
             # A capture with sudo runs the job script as root, so that the script can signal its children.
             prefix = ("sudo", "-n", "sh", "-c", 'exec "$@"', "sh") if names.capture_right == "sudo" else ()
             # The list of link types needs the same permission as a capture, because it opens the interface.
-            argv = (*prefix, names.capture, "-L", "-i", scene.link(role, self.over).interface)
+            argv = (*prefix, names.capture, "-L", "-i", self.capture_interface(scene, role))
             name = f"right to capture{f' on {self.over}' if self.over else ''}"
             yield Need(role, name, argv, partial(_judge, profile), required_program=names.capture)
 

@@ -49,8 +49,8 @@ _LASTING: Final = frozenset({FaultKind.LINK_DOWN, FaultKind.OUT_OF_RANGE})
 class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     """Causes a fault of a robot while the steps in `during` run; their losses are a result, not an error.
 
-    A backend that can cause the fault does so; on a lab's robots the fault is real. In the field the operator is
-    asked to cause it; with `--yes` no operator is asked, and the attempts are void.
+    The emulated backend causes the fault. In the field the operator is asked to cause it; with `--yes` no operator is
+    asked, and the attempts are void.
 
     - `link-down`: the interface of the radio, or of `link`, is down for `for`, then up again.
     - `out-of-range`: no other robot receives packets of the robot for `for`. If it is the relay, no robot receives
@@ -59,10 +59,10 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     - `kill`: every process named `process` ends at the same moment.
 
     An observer records when the robot answers. It starts before the fault, and ends when the robot has answered again
-    for a second. It sends a ping every 100 ms from the other end of the pair (200 ms if an old iputils requires it),
-    or for `kill` polls the robot's processes. Writes `fault-KIND-ping.txt` or `fault-kill-watch.txt`,
-    `fault-KIND.txt` (duration of the cause and its interval) and `fault-KIND-times.txt` (its start and end, see
-    [recovery](method-delay.md#recovery)).
+    for a second. It sends a ping every 100 ms (200 ms if an old iputils requires it) from the robot at the other end
+    of the link, or for `kill` polls the robot's processes. Writes `fault-KIND-ping.txt` or `fault-kill-watch.txt`,
+    `fault-KIND.txt` (duration of the fault, and interval of the pings or polls), and `fault-KIND-times.txt` (start
+    and end of the fault, see [recovery](method-delay.md#recovery)).
 
     Attributes:
         robot: Role of the robot with the fault.
@@ -73,7 +73,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
         link: Link that is down, by its name in [the profile](links.md); only for `link-down`. Without it, the radio
             under test.
         after: Time for which the steps inside run before the fault.
-        limit: Maximum time between the end of the cause and the recovery of the robot.
+        limit: Maximum time between the end of the fault and the recovery of the robot.
         during: Steps during which the fault occurs.
     """
 

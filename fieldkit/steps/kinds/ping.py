@@ -1,8 +1,8 @@
 """Measure round-trip times with ping."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Annotated, Final, Self
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Final, Self
 
 import numpy as np
 from typing_extensions import override
@@ -24,13 +24,19 @@ from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import routing
 from fieldkit.steps.along import AlongStep
-from fieldkit.steps.capabilities import HasNeeds, HasRefusals, Pings, SendsTraffic, Summarizes
+from fieldkit.steps.capabilities import ChecksPlacement, HasNeeds, HasRefusals, Pings, SendsTraffic, Summarizes
 from fieldkit.steps.over_link import OverLink
 from fieldkit.steps.scene import Announce, Flow, Need, PingSource, Planned, Refusal, Scene, fragments
+from fieldkit.steps.surroundings import EarlierStep, EnclosingStep
 from fieldkit.steps.variants import PingTool, Tool
-from fieldkit.steps.view import View
+from fieldkit.steps.view import View, capture_around
+
+if TYPE_CHECKING:
+    from fieldkit.measure.checks.ping_duplicates import PingEchoes
 
 LAST_REPLY_S: Final = 2
+MAX_SEQUENCE_COUNT: Final = 0xFFFF
+"""Number of requests after which sequence numbers repeat."""
 _HEADER_BYTES: Final = 8
 OLD_INTERVAL_S: Final = 0.2
 MAX_COUNT: Final = 1_000_000
@@ -64,7 +70,7 @@ class Payloads(Strict):
         return {"tcp": data, "udp": data} if isinstance(data, int) and not isinstance(data, bool) else data
 
 
-class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes):
+class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes):
     """Measures round-trip times with ping. Writes `ping.txt`.
 
     Attributes:
@@ -76,6 +82,9 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
         gap: Whether columns report the longest time without an answer, `rtt_gap_s`, and the requests lost in it,
             `rtt_gap_lost`. If the ping started or ended in the gap, the columns have lower bounds
             (`rtt_gap_at_least_s`).
+        duplicates: Whether a column reports the requests and replies that arrived again over another link,
+            `rtt_duplicates`. It needs `over` with a link whose interface is `lo`, and a `capture` over this link on
+            both robots around the ping.
         forwarded: Whether robots forward packets for each other; the checks then require a routing daemon on each.
     """
 
@@ -90,6 +99,7 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
     interval: Annotated[Duration, Field(ge=0.002)] = 0.2
     payload_bytes: Payloads = Payloads.defaults()
     gap: Bool = Field(default=False, exclude_if=schema.is_empty)
+    duplicates: Bool = Field(default=False, exclude_if=schema.is_empty)
     forwarded: Bool = Field(default=False, exclude_if=schema.is_empty)
 
     @schema.model_validator(mode="after")
@@ -97,6 +107,16 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
         if self.sender == self.receiver:
             raise schema.validation_error(f"{self.sender} cannot ping itself; name another robot", "to")
         return self
+
+    @override
+    def placement_error(self, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
+        if not self.duplicates:
+            return None
+        if self.count > MAX_SEQUENCE_COUNT:
+            return f"duplicates allows at most {MAX_SEQUENCE_COUNT} requests, because their numbers repeat"
+        if not self.over or not all(capture_around(within, role) for role in (self.sender, self.receiver)):
+            return "duplicates needs `over`, and a capture on both robots around the ping"
+        return None
 
     @override
     def with_duration(self, seconds: float) -> Self:
@@ -189,6 +209,11 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
             f"{self._file}: {reason}"
             for reason in ping_checks.check_output(result, self.count, payload_bytes, window)
         )
+        if self.duplicates:
+            from fieldkit.measure.checks import ping_duplicates  # noqa: PLC0415 (only with `duplicates: true`)
+
+            reasons = ping_duplicates.contradictions(result, self.interval, *self._captured_echoes(view))
+            yield from (f"{self._file}: {reason}" for reason in reasons)
         if result.received is not None and result.received != len(result.answers):
             yield f"{self._file}: ping counted {result.received} answers and printed {len(result.answers)}"
         # iputils reports 0 for a negative time, and "time of day goes back" in its log.
@@ -227,6 +252,15 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
                 for candidate in candidates
             ]
             yield from (f"{self._file}: {reason}" for reason in min(reasons, key=len, default=[]))
+
+    def _captured_echoes(self, view: View) -> "tuple[PingEchoes | None, ...]":
+        """Return the echoes in the captures of sender and receiver; None if one is missing or incomplete."""
+        from fieldkit.measure.checks.ping_duplicates import captured_echoes  # noqa: PLC0415 (only if needed)
+
+        source, destination = (view.scene.link(end, self.over).address for end in (self.sender, self.receiver))
+        size_bytes = self.payload_of(view.scene.protocol) + _HEADER_BYTES
+        captures = (view.capture(role) for role in (self.sender, self.receiver))
+        return tuple(captured_echoes(capture, source, destination, size_bytes) for capture in captures)
 
     def _packets_missing_in_capture(self, result: Ping, role: Role, view: View) -> Iterator[str]:
         """Yield a reason if ping printed more answers, or more answered requests, than a capture contains.
@@ -275,11 +309,16 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
-        if not self.gap:
-            return self.columns
-        from fieldkit.measure.evidence import ping_gaps  # noqa: PLC0415 (only with `gap: true`)
+        chosen: list[Column] = []
+        if self.gap:
+            from fieldkit.measure.evidence import ping_gaps  # noqa: PLC0415 (only with `gap: true`)
 
-        return (*self.columns, *ping_gaps.GAP_COLUMNS, *ping_gaps.OPEN_GAP_COLUMNS)
+            chosen += [*ping_gaps.GAP_COLUMNS, *ping_gaps.OPEN_GAP_COLUMNS]
+        if self.duplicates:
+            from fieldkit.measure.checks import ping_duplicates  # noqa: PLC0415 (only with `duplicates: true`)
+
+            chosen += ping_duplicates.COLUMNS
+        return (*self.columns, *chosen)
 
     @override
     def measure(self, view: View) -> Measured:
@@ -291,9 +330,15 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
             from fieldkit.measure.evidence import ping_gaps  # noqa: PLC0415 (only with `gap: true`)
 
             gap = ping_gaps.measure_gap(result, self.interval)
+        duplicates = Measured()
+        if self.duplicates:
+            from fieldkit.measure.checks import ping_duplicates  # noqa: PLC0415 (only with `duplicates: true`)
+
+            duplicates = ping_duplicates.measure(*self._captured_echoes(view))
         return (
             ping.measure(result)
             | gap
+            | duplicates
             | position_columns.measure(view.evidence, ping.MOTION_COLUMNS, ends, reply_times_ns)
         )
 
@@ -304,6 +349,8 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
             yield f"ping loss {100 * loss:.1f} %{no_reply_text}"
         if isinstance(gap_s := values.get("rtt_gap_s"), float):
             yield f"longest gap {gap_s:.1f} s with {values['rtt_gap_lost']} lost"
+        if duplicates := values.get("rtt_duplicates"):
+            yield f"{format_count(int(duplicates), 'packet')} received over both links"
         if isinstance(open_s := values.get("rtt_gap_at_least_s"), float):
             yield f"longest gap >= {open_s:.1f} s with {values['rtt_gap_lost_at_least']} lost"
         if isinstance(median_s := values.get("rtt_median_s"), float):

@@ -149,15 +149,15 @@ def _add_table(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "table",
         help="regenerate a table of the paper",
-        description="Run the simulations of a table of the paper. Print each number of the paper next to ours, with "
-        "the interval of our number and the result of the comparison.",
+        description="Run the simulations of a table of the paper. Print each number of the paper next to the "
+        "simulated number, with its interval and the result of the comparison.",
         epilog="example: fieldkit cosim table 1 --format markdown",
     )
     parser.add_choice(
         "which",
         _TABLES,
         metavar="TABLE",
-        help="1, 2 or 3: tables of its simulations; emane: its emulation; claims: its claims",
+        help="1, 2 or 3: tables of the paper's simulations; emane: its emulation; claims: its claims",
     )
     seeds = parser.add_mutually_exclusive_group()
     _add_seed(seeds, "the seeds of --seeds")
@@ -203,7 +203,7 @@ def _add_plot(commands: Commands) -> None:
         "plot",
         help="draw a recording, or the table of a shootout",
         description="Draw a recording: the paths of its agents from above, and delay, loss and distance over time. "
-        "Or draw the table of a shootout in CSV: errors against cost.",
+        "Or draw the CSV table of `fieldkit cosim shootout`: errors against cost.",
         epilog="example: fieldkit cosim plot runs/baylands --out baylands.pdf",
     )
     _add_recording(parser)
@@ -229,8 +229,8 @@ def _add_conform(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "conform",
         help="check an external federate",
-        description="Start an external physics or network, check that it follows the protocol, and print each "
-        "failure with the request and the answer. Exit code 1 if a check failed.",
+        description="Start an external physics or network simulator, check that it follows the protocol, and print "
+        "each failure with the request and the answer. Exit code 1 if a check failed.",
         epilog="example: fieldkit cosim conform 'python3 carts.py'",
     )
     parser.add_argument(
@@ -243,11 +243,15 @@ def _add_conform(commands: Commands) -> None:
         "--role", ("physics", "network"), help="role of the federate (default: the first that it accepts)"
     )
     parser.add_argument(
-        "--scenario", default="convoy", metavar="SCENARIO", help="scenario that it receives (default convoy)"
+        "--scenario", default="convoy", metavar="SCENARIO", help="scenario for the checks (default convoy)"
     )
     _add_changes(parser)
     parser.add_argument(
-        "--windows", type=natural, default=2000, metavar="N", help="windows of the check for drift (default 2000)"
+        "--windows",
+        type=natural,
+        default=2000,
+        metavar="N",
+        help="number of windows in the check for drift (default 2000)",
     )
     parser.add_argument("--deadline", metavar="TIME", help="longest wait for an answer, in wall time (default 30s)")
     parser.add_choice("--format", ("table", "json"), default="table", help="output format (default table)")

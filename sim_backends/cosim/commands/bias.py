@@ -1,4 +1,4 @@
-"""`fieldkit cosim shootout SCENARIO --bias`: the bias of each sync policy, over seeds."""
+"""The command `fieldkit cosim shootout --bias`, which computes the bias of each sync policy over seeds."""
 
 import argparse
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from sim_backends.cosim.policies.window_policies import EventDriven
 from sim_backends.cosim.scenario.build import Simulation, build
 from sim_backends.cosim.scenario.external import without_federates
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.studies.shootout import Bias, biases, outcomes
+from sim_backends.cosim.studies.shootout import Bias, compute_biases, run_outcomes
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -23,26 +23,26 @@ def run(arguments: argparse.Namespace) -> int:
     Raises:
         ConfigurationError: There is only one seed.
     """
-    scenario = settings.scenario(arguments)
-    policies = settings.policies(arguments)
-    seeds = settings.seeds(arguments, scenario)
+    scenario = settings.read_scenario(arguments)
+    policies = settings.read_policies(arguments)
+    seeds = settings.read_seeds(arguments, scenario)
     if len(seeds) < 2:
         raise ConfigurationError("--bias: one seed has no distribution", remedy="add --seeds 20")
     if arguments.windows:
-        scenario = settings.with_window(scenario, settings.windows_s(arguments, scenario)[0])
-    draw = None if arguments.figure is None else settings.figure(arguments.figure, "--figure")
+        scenario = settings.with_window(scenario, settings.read_windows_s(arguments, scenario)[0])
+    draw = None if arguments.figure is None else settings.open_figure(arguments.figure, "--figure")
     build(without_federates(scenario))  # raises before any run if the scenario is invalid
     settings.note_commensurate_events(scenario, policies, [scenario.policy.window], len(seeds))
     with showing_progress() as sink:
         runs = len({*policies, EventDriven.name}) * len(seeds)
-        all_outcomes = outcomes(
+        all_outcomes = run_outcomes(
             partial(_build, scenario),
             policies,
             seeds,
-            workers=settings.workers(arguments, scenario.packets * runs),
+            workers=settings.read_workers(arguments, scenario.packets * runs),
             progress=partial(progress_reporter(sink), "bias", runs),
         )
-    by_policy = {name: measures for name, measures in biases(all_outcomes).items() if name in policies}
+    by_policy = {name: measures for name, measures in compute_biases(all_outcomes).items() if name in policies}
     title = f"{scenario.name}, {scenario.topology}, {len(seeds)} seeds"
     _sheet(title, by_policy, arguments.format).show(arguments.format)
     for name, failure in all_outcomes.failures.items():

@@ -1,4 +1,4 @@
-"""`fieldkit cosim shootout SCENARIO --bound`: the exchanges that `error_bounded` and fixed windows need."""
+"""The command `fieldkit cosim shootout --bound`, which compares exchanges of fixed windows and `error_bounded`."""
 
 import argparse
 import math
@@ -30,7 +30,7 @@ _COLUMNS: Final = (
     SheetColumn("all_window_s", "all (ms)", "longest fixed window that keeps the bound in all runs, by search", 1e3),
     SheetColumn("all_exchanges", "its exchanges", ""),
     SheetColumn("all_factor", "factor", "ratio of its exchanges to those of error_bounded"),
-    SheetColumn("found_window_s", "own (ms)", "longest fixed window that keeps the bound in this run", 1e3),
+    SheetColumn("found_window_s", "this (ms)", "longest fixed window that keeps the bound in this run", 1e3),
     SheetColumn("found_exchanges", "its exchanges", ""),
     SheetColumn("found_factor", "factor", ""),
 )
@@ -47,16 +47,16 @@ def run(arguments: argparse.Namespace) -> int:
             "--bound compares error_bounded with fixed windows, and has no figure",
             remedy="remove --figure, --policy and --window; change the bound by --set policy.bound=1cm",
         )
-    scenario = settings.scenario(arguments)
+    scenario = settings.read_scenario(arguments)
     if scenario.policy.bound_db is not None:
         raise ConfigurationError(
             "--bound compares position errors, and policy.bound_db limits the error of path loss",
             remedy="remove policy.bound_db; change the bound by --set policy.bound=1cm",
         )
-    seeds = settings.seeds(arguments, scenario)
+    seeds = settings.read_seeds(arguments, scenario)
     build(without_federates(scenario))  # raises before any run if the scenario is invalid
     tasks = [Task(ErrorBounded.name, seed) for seed in seeds]
-    workers = settings.workers(arguments)
+    workers = settings.read_workers(arguments)
     with showing_progress() as sink:
         report = partial(progress_reporter(sink, "seeds"), "bound", len(seeds))
         report(0)

@@ -1,4 +1,4 @@
-"""`fieldkit cosim conform COMMAND...`: checks that an external federate follows the protocol."""
+"""The command `fieldkit cosim conform`, which checks that an external federate follows the protocol."""
 
 import argparse
 import shlex
@@ -9,7 +9,7 @@ from fieldkit.cli.display import show_note
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.text import json_text, print_text
 from sim_backends.cosim.commands import settings
-from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.agent_setup import make_bodies
 from sim_backends.cosim.scenario.external import make_hello
 from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -33,8 +33,8 @@ def run(arguments: argparse.Namespace) -> int:
         FieldkitError: The federate cannot be started or connected.
     """
     endpoint = arguments.federate[0] if len(arguments.federate) == 1 else shlex.join(arguments.federate)
-    deadline_s = settings.deadline_s(arguments.deadline)
-    changes = settings.changes(arguments)
+    deadline_s = settings.parse_deadline_s(arguments.deadline)
+    changes = settings.read_changes(arguments)
     if _is_federate_with_role(endpoint, NETWORK):
         changes |= {"traffic": _udp_traffic(load_scenario(arguments.scenario, changes))}
     scenario = load_scenario(arguments.scenario, changes | _federate_change(endpoint))
@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _hello(scenario: CosimScenario, role: int) -> Hello:
     world = load_world(scenario.world)
-    return make_hello(scenario, world, bodies(scenario, world), scenario.seeds[0], role)
+    return make_hello(scenario, world, make_bodies(scenario, world), scenario.seeds[0], role)
 
 
 def _role(endpoint: str, scenario: CosimScenario, requested_role: str | None, deadline_s: float) -> tuple[int, str]:

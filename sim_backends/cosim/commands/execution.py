@@ -1,4 +1,4 @@
-"""Runs of a scenario, one per seed, with progress reports; SIGINT stops a run between two windows."""
+"""Runs a scenario once per seed and reports the progress; SIGINT stops a run between two windows."""
 
 import signal
 import threading
@@ -73,8 +73,8 @@ def simulate(
         policy: Name of the sync policy.
         seed: The seed.
         folder: The folder for recording and rows, or None.
-        progress: As for `Simulation.run`.
-        deadline_s: As for `build`.
+        progress: Called with the simulated nanoseconds so far and the elapsed wall time in seconds, or None.
+        deadline_s: Longest wait for an answer of a federate, in seconds of wall time; None for no deadline.
         pace: Pace of a run in real time; None to run as fast as possible.
     """
     recorder = None
@@ -145,8 +145,8 @@ def simulate_all(
         seeds: The seeds.
         folder: The folder for all recordings and rows, or None.
         sink: Receives progress reports.
-        deadline_s: As for `build`.
-        pace: As for `simulate`; the runs are then not parallel.
+        deadline_s: Longest wait for an answer of a federate, in seconds of wall time; None for no deadline.
+        pace: Pace of runs in real time, which are not parallel; None to run as fast as possible.
         workers: The workers that execute the runs of several seeds.
     """
     if len(seeds) == 1:

@@ -1,4 +1,4 @@
-"""`fieldkit cosim list` and `fieldkit cosim schema`."""
+"""The commands `fieldkit cosim list` and `fieldkit cosim schema`."""
 
 import argparse
 from typing import Final

@@ -1,4 +1,4 @@
-"""`fieldkit cosim shootout SCENARIO --orders`: local errors against the window, and the order of each sync policy."""
+"""The command `fieldkit cosim shootout --orders`, which computes local errors and the order of each sync policy."""
 
 import argparse
 from collections.abc import Mapping, Sequence
@@ -41,11 +41,13 @@ _COLUMNS: Final = (
     SheetColumn(
         "delivery_s",
         "time (ms)",
-        "mean magnitude of the difference between the delivery time and the reference's",
+        "mean absolute difference from the delivery time in the reference",
         1e3,
     ),
-    SheetColumn("late_s", "late (ms)", "mean time by which the receiver was already past an arrival", 1e3),
-    SheetColumn("position_m", "place (mm)", "mean error of the relative position of two agents in the network", 1e3),
+    SheetColumn("late_s", "late (ms)", "mean time by which an arrival was in the receiver's past", 1e3),
+    SheetColumn(
+        "position_m", "position (mm)", "mean error of the relative position of two agents in the network", 1e3
+    ),
     SheetColumn("fates", "fate (%)", "packets with another fate", 100),
     SheetColumn("path_m", "path (mm)", "mean position error of agents at the end of a window", 1e3),
 )
@@ -56,17 +58,17 @@ _HEADS: Final[Mapping[str, str]] = MappingProxyType(
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure local errors, print them with their orders, and draw them on request."""
-    scenario = settings.scenario(arguments)
-    seeds = settings.seeds(arguments, scenario)
-    windows_s = settings.windows_s(arguments, scenario) if arguments.windows else list(WINDOWS_S)
+    scenario = settings.read_scenario(arguments)
+    seeds = settings.read_seeds(arguments, scenario)
+    windows_s = settings.read_windows_s(arguments, scenario) if arguments.windows else list(WINDOWS_S)
     policies = [
-        name for name in settings.policies(arguments) if not getattr(registry.policies()[name], "exact", False)
+        name for name in settings.read_policies(arguments) if not getattr(registry.policies()[name], "exact", False)
     ]
-    draw = None if arguments.figure is None else settings.figure(arguments.figure, "--figure")
+    draw = None if arguments.figure is None else settings.open_figure(arguments.figure, "--figure")
     build(without_federates(scenario))  # raises before any run if the scenario is invalid
     with showing_progress() as sink:
         runs = len(policies) * len(seeds) * len(windows_s)
-        workers = settings.workers(arguments, scenario.packets * runs)
+        workers = settings.read_workers(arguments, scenario.packets * runs)
         by_policy, failures = _measure(scenario, policies, seeds, windows_s, workers=workers, sink=sink)
     title = f"{scenario.name}, {scenario.topology}, {format_count(len(seeds), 'seed')}"
     _error_sheet(title, by_policy).show(arguments.format)

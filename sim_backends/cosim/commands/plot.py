@@ -1,4 +1,4 @@
-"""`fieldkit cosim plot`, and the figures of studies."""
+"""The command `fieldkit cosim plot`, and the figures of studies."""
 
 import argparse
 import csv
@@ -15,7 +15,7 @@ from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.report.theme import Format
 from sim_backends.cosim import plots
 from sim_backends.cosim.commands import settings
-from sim_backends.cosim.commands.replay import recording_at, scenario_of, title
+from sim_backends.cosim.commands.replay import recording_at, scenario_of, title_of
 from sim_backends.cosim.commands.result_texts import BIAS_LABELS, order_text
 from sim_backends.cosim.plot_layout import Curve, FlowTrace, LogPanel, ObstacleOutline, outlines
 from sim_backends.cosim.plots import run_figure
@@ -161,13 +161,13 @@ _REMEDY: Final = "write one with fieldkit cosim shootout SCENARIO --format csv >
 
 def run(arguments: argparse.Namespace) -> int:
     """Draw a recording, or the table of a shootout."""
-    draw = settings.figure(arguments.out, "--out")
+    draw = settings.open_figure(arguments.out, "--out")
     if arguments.recording.suffix == ".csv":
         draw(error_against_cost(_points(arguments.recording)))
         return 0
     recording = recording_at(arguments.recording)
     obstacles = _obstacles(recording)
-    draw(lambda form: run_figure(title(recording), _paths_m(recording), _traces(recording), form, obstacles))
+    draw(lambda form: run_figure(title_of(recording), _paths_m(recording), _traces(recording), form, obstacles))
     return 0
 
 

@@ -1,4 +1,4 @@
-"""`fieldkit cosim replay RECORDING`: prints the numbers of a run again, from its recording."""
+"""The command `fieldkit cosim replay`, which prints the numbers of a run again, from its recording."""
 
 import argparse
 import io
@@ -20,7 +20,7 @@ def run(arguments: argparse.Namespace) -> int:
     recording = recording_at(arguments.recording)
     scenario = scenario_of(recording)
     result = seed_result(scenario, recording.manifest.about.seed, recording.run, recording.states)
-    show_results(arguments.format, title(recording), scenario, [result])
+    show_results(arguments.format, title_of(recording), scenario, [result])
     if recording.manifest.ending is not RunEnding.COMPLETE:
         reason_text = f": {recording.manifest.why}" if recording.manifest.why else ""
         show_note(f"the run did not complete ({recording.manifest.ending}){reason_text}")
@@ -73,7 +73,7 @@ def scenario_of(recording: Recording) -> CosimScenario:
         raise EvidenceError(f"its scenario cannot be read: {error.located}", remedy=remedy) from error
 
 
-def title(recording: Recording) -> str:
+def title_of(recording: Recording) -> str:
     """Return a title of the recorded run: scenario, policy and seed.
 
     Raises:

@@ -12,9 +12,9 @@ from fieldkit.trial.simulated import PlannedExchange, SimulatedRepeat, Simulated
 from sim_backends.cosim.commands.flow_rows import BACKEND, motion_columns
 from sim_backends.cosim.commands.results import FlowResult, FlowRoundTrips, SeedResult
 from sim_backends.cosim.programs.senders import REPLY
-from sim_backends.cosim.recording.captures import addresses, first_tcp_packet_ns, packets_between
+from sim_backends.cosim.recording.captures import assign_addresses, first_tcp_packet_ns, packets_between
 from sim_backends.cosim.recording.recorder import CAPTURES
-from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.agent_setup import make_bodies
 from sim_backends.cosim.scenario.external import writes_captures
 from sim_backends.cosim.scenario.reproduced_trial import ReproducedRepeat, ReproducedTrial
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -47,7 +47,7 @@ class ReproducedRows:
         self._agents = {Role.SENDER: first_repeat.transfer.source, Role.RECEIVER: first_repeat.transfer.to[0]}
         if scenario.topology is Topology.MASTER and scenario.relay is not None:
             self._agents[Role.RELAY] = scenario.relay
-        self._addresses = {name: str(address) for name, address in addresses(sorted(scenario.agents)).items()}
+        self._addresses = {name: str(address) for name, address in assign_addresses(sorted(scenario.agents)).items()}
         self._trial = SimulatedTrial(
             trial.procedure,
             robots={
@@ -65,7 +65,7 @@ class ReproducedRows:
 
     def _distance(self) -> Distance:
         """Return the horizontal distance from the sender to the relay, or to the receiver if there is no relay."""
-        starts = bodies(self._scenario, load_world(self._scenario.world))
+        starts = make_bodies(self._scenario, load_world(self._scenario.world))
         peer = self._agents.get(Role.RELAY, self._agents[Role.RECEIVER])
         points_m = [starts[name].place_m[:2] for name in (self._agents[Role.SENDER], peer)]
         metres = round(math.dist(*points_m), 3)

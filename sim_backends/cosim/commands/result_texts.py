@@ -1,4 +1,4 @@
-"""Labels and texts of the results of studies that tables and figures share."""
+"""Labels and texts for study results, shared by tables and figures."""
 
 import math
 from collections.abc import Mapping
@@ -8,13 +8,17 @@ from typing import Final
 from sim_backends.cosim.studies.local_errors import LocalErrors
 
 BIAS_LABELS: Final[Mapping[str, tuple[str, float]]] = MappingProxyType(
-    {"loss": ("packets lost (%)", 100.0), "delay_s": ("delay (ms)", 1e3), "apart_m": ("agents apart (m)", 1.0)}
+    {
+        "loss": ("packets lost (%)", 100.0),
+        "delay_s": ("delay (ms)", 1e3),
+        "apart_m": ("agent distance (m)", 1.0),
+    }
 )
 """For each measure of a bias: its label, and the factor from SI units to the label's unit."""
 
 
 def order_text(errors: LocalErrors, measure: str) -> str:
-    """Return the order of an error with its interval: `1.00 [0.98, 1.03]`; empty if there was no error."""
+    """Return the order of convergence of an error with its interval, `1.00 [0.98, 1.03]`; empty without an error."""
     order = errors.order(measure)
     if math.isnan(order.value):
         return ""

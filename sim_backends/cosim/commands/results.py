@@ -1,4 +1,4 @@
-"""The result of a run, as the numbers of tables: flows, recoveries after faults, positions of followers."""
+"""Computes the results of a run: flows, recoveries after faults, and position errors of followers."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from sim_backends.cosim.real_time import WindowLateness
 from sim_backends.cosim.run_record import Fate, Run
 from sim_backends.cosim.scenario.faults import Fault, JammerFault, LinkCutFault, NodeLossFault, StalledFederateFault
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.studies.formation import Formation, formation, tracks_of
+from sim_backends.cosim.studies.formation import Formation, compute_formation, tracks_of
 from sim_backends.world.motion import State
 
 
@@ -369,7 +369,7 @@ def seed_result(
         starts_m={agent: state.position_m for _, agent, state in reversed(states)}
         | {agent: state.position_m for agent, state in (starts or {}).items()},
         recoveries=recoveries(scenario, run),
-        formation=formation(scenario, tracks_of(states)),
+        formation=compute_formation(scenario, tracks_of(states)),
         stop_reason="" if ended_by is None else stop_reason,
         error=error,
         lateness=lateness,

@@ -1,4 +1,4 @@
-"""`fieldkit cosim run SCENARIO`: runs it with one sync policy, and one seed or several."""
+"""The command `fieldkit cosim run`, which runs a scenario with one sync policy and one or several seeds."""
 
 import argparse
 import hashlib
@@ -45,12 +45,12 @@ def run(arguments: argparse.Namespace) -> int:
     Raises:
         FieldkitError: A run failed; its results until the failure are printed and written.
     """
-    scenario = settings.scenario(arguments)
-    policy = settings.policy(arguments, scenario)
-    seeds = settings.seeds(arguments, scenario)
+    scenario = settings.read_scenario(arguments)
+    policy = settings.read_policy(arguments, scenario)
+    seeds = settings.read_seeds(arguments, scenario)
     if scenario.emane is not None and len(seeds) > 1:
         raise ConfigurationError("only one run can publish events of EMANE", remedy="add --seed 1")
-    pace = settings.pace(arguments)
+    pace = settings.read_pace(arguments)
     text = settings.policy_text(policy, scenario)
     build(
         without_federates(scenario), policy=policy
@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
             seeds,
             folder,
             sink=sink,
-            deadline_s=settings.deadline_s(arguments.deadline),
+            deadline_s=settings.parse_deadline_s(arguments.deadline),
             pace=pace,
             workers=Workers(arguments.jobs),
         )

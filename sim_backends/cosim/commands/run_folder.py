@@ -1,4 +1,4 @@
-"""The folder of runs: recordings, each with a trial.csv in the format of trials."""
+"""Writes the folder of the runs of a scenario: recordings, each with a trial.csv in the format of trials."""
 
 from collections.abc import Sequence
 from pathlib import Path

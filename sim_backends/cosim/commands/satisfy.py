@@ -1,4 +1,4 @@
-"""`fieldkit cosim satisfy SCENARIO`: the paper's loop that repeats a run until the loss is satisfactory."""
+"""The command `fieldkit cosim satisfy`, the paper's loop that repeats a run until the loss is satisfactory."""
 
 import argparse
 from functools import partial
@@ -27,14 +27,14 @@ _COLUMNS: Final = (
     SheetColumn("window_s", "w (ms)", "initial window", 1e3),
     SheetColumn("median_window_s", "median (ms)", "median of the windows that the rule computed", 1e3),
     SheetColumn("loss", "lost (%)", "share of packets whose fate is decided", 100),
-    SheetColumn("fate_disagreement", "fate (%)", "lost here or in the reference, but not in both", 100),
+    SheetColumn("fate_disagreement", "fate (%)", "lost in this run or in the reference, but not in both", 100),
     SheetColumn(
         "delivery_error_mean_s",
         "time (ms)",
-        "mean magnitude of the difference between the delivery time and the reference's",
+        "mean absolute difference from the delivery time in the reference",
         1e3,
     ),
-    SheetColumn("position_error_mean_m", "place (mm)", "mean error of relative positions in the network", 1e3),
+    SheetColumn("position_error_mean_m", "position (mm)", "mean error of relative positions in the network", 1e3),
     SheetColumn("exchanges", "exchanges", "cost of the round"),
 )
 
@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     Raises:
         ConfigurationError: The threshold is above 100 %.
     """
-    scenario = settings.scenario(arguments)
+    scenario = settings.read_scenario(arguments)
     threshold = parse_quantity(arguments.threshold, {"%": 0.01}, "threshold")
     if threshold > 1:
         raise ConfigurationError(

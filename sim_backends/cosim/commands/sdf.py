@@ -1,4 +1,4 @@
-"""`fieldkit cosim sdf SCENARIO`: the world of a scenario for Gazebo."""
+"""The command `fieldkit cosim sdf`, which prints the world of a scenario for Gazebo."""
 
 import argparse
 
@@ -9,5 +9,5 @@ from sim_backends.cosim.scenario.sdf_world import scenario_sdf
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the world with its robots as SDF."""
-    print_text(scenario_sdf(settings.scenario(arguments), arguments.gazebo).rstrip("\n"))
+    print_text(scenario_sdf(settings.read_scenario(arguments), arguments.gazebo).rstrip("\n"))
     return 0

@@ -1,4 +1,4 @@
-"""Applies the options of a command to a scenario, and reports the progress of its runs."""
+"""Reads the options of a command, applies them to a scenario, and reports the progress of runs."""
 
 import argparse
 import inspect
@@ -50,13 +50,14 @@ ENOUGH_SEEDS: Final = 20
 """Each seed draws one phase; the mean over 20 phases has a standard error of 7 % of a window."""
 
 
-def scenario(arguments: argparse.Namespace) -> CosimScenario:
+def read_scenario(arguments: argparse.Namespace) -> CosimScenario:
     """Return the scenario that the arguments name, with the changes of other arguments.
 
     Raises:
-        ConfigurationError: It does not exist, or a change is invalid; the message states the key and its place.
+        ConfigurationError: It does not exist, or a change is invalid; the message states the key and its line in the
+            file.
     """
-    return load_scenario(arguments.scenario, changes(arguments))
+    return load_scenario(arguments.scenario, read_changes(arguments))
 
 
 _KEYS: Final = (
@@ -70,7 +71,7 @@ _KEYS: Final = (
 """Options that change values of a scenario."""
 
 
-def changes(arguments: argparse.Namespace) -> dict[str, Any]:
+def read_changes(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the values that options change, by their keys in the scenario's file."""
     values = dict(map(_change, arguments.set))
     for option, key in _KEYS:
@@ -79,14 +80,14 @@ def changes(arguments: argparse.Namespace) -> dict[str, Any]:
     return values
 
 
-def seeds(arguments: argparse.Namespace, cosim_scenario: CosimScenario) -> tuple[int, ...]:
+def read_seeds(arguments: argparse.Namespace, scenario: CosimScenario) -> tuple[int, ...]:
     """Return the seeds from the options; without such options, the seeds of the scenario."""
     if arguments.seeds is not None:
         return tuple(range(1, arguments.seeds + 1))
-    return cosim_scenario.seeds if arguments.seed is None else (arguments.seed,)
+    return scenario.seeds if arguments.seed is None else (arguments.seed,)
 
 
-def workers(arguments: argparse.Namespace, packets: float = math.inf) -> Workers:
+def read_workers(arguments: argparse.Namespace, packets: float = math.inf) -> Workers:
     """Return the workers from the options; without such options, only this process if there are few packets.
 
     Args:
@@ -96,7 +97,7 @@ def workers(arguments: argparse.Namespace, packets: float = math.inf) -> Workers
     return workers_for(packets, Workers(arguments.jobs, arguments.cluster))
 
 
-def policies(arguments: argparse.Namespace) -> list[str]:
+def read_policies(arguments: argparse.Namespace) -> list[str]:
     """Return the names of the sync policies without repetitions, in the order of `registry.policies`.
 
     Raises:
@@ -107,14 +108,14 @@ def policies(arguments: argparse.Namespace) -> list[str]:
     return [name for name in registry.policies() if not arguments.policy or name in arguments.policy]
 
 
-def windows_s(arguments: argparse.Namespace, cosim_scenario: CosimScenario) -> list[float]:
+def read_windows_s(arguments: argparse.Namespace, scenario: CosimScenario) -> list[float]:
     """Return the windows of a comparison in seconds, in ascending order.
 
     Raises:
         ConfigurationError: One of them is not a duration above 0.
     """
     if not arguments.windows:
-        return [cosim_scenario.policy.window]
+        return [scenario.policy.window]
     windows = sorted({parse_duration_s(text, "--window") for text in arguments.windows.split(",")})
     if windows[0] <= 0:
         raise ConfigurationError(
@@ -124,9 +125,9 @@ def windows_s(arguments: argparse.Namespace, cosim_scenario: CosimScenario) -> l
     return windows
 
 
-def with_window(cosim_scenario: CosimScenario, window_s: float) -> CosimScenario:
+def with_window(scenario: CosimScenario, window_s: float) -> CosimScenario:
     """Return a scenario with another window."""
-    return cosim_scenario.model_copy(update={"policy": cosim_scenario.policy.model_copy(update={"window": window_s})})
+    return scenario.model_copy(update={"policy": scenario.policy.model_copy(update={"window": window_s})})
 
 
 def has_window(name: str) -> bool:
@@ -134,7 +135,7 @@ def has_window(name: str) -> bool:
     return "window_s" in inspect.signature(registry.policies()[name]).parameters
 
 
-def figure(path: Path, option: str) -> Callable[[Callable[[Format], bytes]], None]:
+def open_figure(path: Path, option: str) -> Callable[[Callable[[Format], bytes]], None]:
     """Return a function that writes a figure; its argument is the function that draws it.
 
     Args:
@@ -163,7 +164,7 @@ def figure(path: Path, option: str) -> Callable[[Callable[[Format], bytes]], Non
     return write
 
 
-def deadline_s(text: str | None) -> float:
+def parse_deadline_s(text: str | None) -> float:
     """Return the longest wait for the answer of a federate, in seconds of wall time.
 
     Raises:
@@ -177,7 +178,7 @@ def deadline_s(text: str | None) -> float:
     return seconds
 
 
-def pace(arguments: argparse.Namespace) -> Pace | None:
+def read_pace(arguments: argparse.Namespace) -> Pace | None:
     """Return the pace of runs in real time, or None if they run as fast as possible.
 
     Raises:
@@ -204,24 +205,24 @@ def pace(arguments: argparse.Namespace) -> Pace | None:
     return Pace(factor, bound_s)
 
 
-def policy(arguments: argparse.Namespace, cosim_scenario: CosimScenario) -> str:
+def read_policy(arguments: argparse.Namespace, scenario: CosimScenario) -> str:
     """Return the name of the sync policy.
 
     Raises:
         ConfigurationError: There is no policy with this name, or a parameter is invalid.
     """
-    name = cosim_scenario.policy.name if arguments.policy is None else arguments.policy
-    make_policy(name, **cosim_scenario.policy.parameters)
+    name = scenario.policy.name if arguments.policy is None else arguments.policy
+    make_policy(name, **scenario.policy.parameters)
     return str(name)
 
 
 def note_commensurate_events(
-    cosim_scenario: CosimScenario, policies: Sequence[str], windows_s: Sequence[float], seeds: int
+    scenario: CosimScenario, policies: Sequence[str], windows_s: Sequence[float], seeds: int
 ) -> None:
     """Print a note on each window that is commensurate with a period of the scenario; suggest a better window.
 
     Args:
-        cosim_scenario: The scenario.
+        scenario: The scenario.
         policies: Names of the sync policies that run it.
         windows_s: Windows of the policies that have one.
         seeds: Number of seeds; each seed draws different phases.
@@ -230,14 +231,14 @@ def note_commensurate_events(
         return
     used_s = [window_s for window_s in windows_s if any(map(has_window, policies))]
     for window_s in used_s:
-        commensurate = commensurate_events(cosim_scenario, [window_s])
+        commensurate = commensurate_events(scenario, [window_s])
         if not commensurate:
             continue
         periods = ", ".join(
             f"{item.event.name} (every {item.event.period_s * 1e3:.6g} ms: {format_count(item.phases, 'phase')})"
             for item in commensurate
         )
-        other_s = incommensurate_window_s(cosim_scenario, window_s)
+        other_s = incommensurate_window_s(scenario, window_s)
         instead = f"--seeds {ENOUGH_SEEDS}" if other_s is None else f"--window {other_s * 1e3:.6g}ms"
         show_note(
             f"the window of {window_s * 1e3:.6g} ms is commensurate with the period of {periods}; errors and added "
@@ -246,14 +247,14 @@ def note_commensurate_events(
         )
 
 
-def policy_text(name: str, cosim_scenario: CosimScenario) -> str:
+def policy_text(name: str, scenario: CosimScenario) -> str:
     """Return the name of a sync policy and the parameter that determines its windows: `sliding_window 10 ms`."""
     if has_window(name):
-        return f"{name} {cosim_scenario.policy.window * 1e3:g} ms"
+        return f"{name} {scenario.policy.window * 1e3:g} ms"
     if "bound_m" not in inspect.signature(registry.policies()[name]).parameters:
         return name
-    bound_db = cosim_scenario.policy.bound_db
-    return f"{name} {cosim_scenario.policy.bound:g} m" if bound_db is None else f"{name} {bound_db:g} dB"
+    bound_db = scenario.policy.bound_db
+    return f"{name} {scenario.policy.bound:g} m" if bound_db is None else f"{name} {bound_db:g} dB"
 
 
 def _change(text: str) -> tuple[str, Any]:

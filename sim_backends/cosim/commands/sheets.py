@@ -1,4 +1,4 @@
-"""Tables of results: columns with a unit and a meaning, printed in four formats."""
+"""Tables of results, whose columns have a unit and a meaning, printed in four formats."""
 
 import math
 import re

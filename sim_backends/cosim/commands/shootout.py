@@ -1,4 +1,4 @@
-"""`fieldkit cosim shootout SCENARIO`: the error and the cost of each sync policy."""
+"""The command `fieldkit cosim shootout`, which prints the error and the cost of each sync policy."""
 
 import argparse
 import math
@@ -20,8 +20,8 @@ from sim_backends.cosim.policies.window_policies import EventDriven
 from sim_backends.cosim.scenario.build import Simulation, build
 from sim_backends.cosim.scenario.external import without_federates
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.studies.formation import formation, has_followers
-from sim_backends.cosim.studies.shootout import Row, outcomes, rows
+from sim_backends.cosim.studies.formation import compute_formation, has_followers
+from sim_backends.cosim.studies.shootout import Row, rows, run_outcomes
 
 COLUMNS: Final = (
     SheetColumn("policy", "policy", ""),
@@ -30,7 +30,7 @@ COLUMNS: Final = (
     SheetColumn(
         "delivery_error_mean_s",
         "time (ms)",
-        "mean magnitude of the difference between the delivery time and the reference's",
+        "mean absolute difference from the delivery time in the reference",
         1e3,
     ),
     SheetColumn("delivery_error_p95_s", "p95", "its 95th percentile", 1e3),
@@ -38,7 +38,7 @@ COLUMNS: Final = (
     SheetColumn("delay_added_s", "added", "mean delay that the policy added, in ms", 1e3),
     SheetColumn("fate_disagreement", "fate (%)", "packets lost here or in the reference, but not in both", 100),
     SheetColumn("causality_violations", "late", "arrivals at a time that the receiver was already past, per run"),
-    SheetColumn("position_error_mean_m", "place (mm)", "mean error of relative positions in the network", 1e3),
+    SheetColumn("position_error_mean_m", "position (mm)", "mean error of relative positions in the network", 1e3),
     SheetColumn("position_error_p95_m", "p95", "its 95th percentile", 1e3),
     SheetColumn("position_error_max_m", "max", "its maximum", 1e3),
     SheetColumn(
@@ -71,15 +71,15 @@ def run(arguments: argparse.Namespace) -> int:
         return bias.run(arguments)
     if arguments.bound:
         return bound.run(arguments)
-    scenario = settings.scenario(arguments)
-    policies = settings.policies(arguments)
-    seeds = settings.seeds(arguments, scenario)
-    windows_s = settings.windows_s(arguments, scenario)
-    draw = None if arguments.figure is None else settings.figure(arguments.figure, "--figure")
+    scenario = settings.read_scenario(arguments)
+    policies = settings.read_policies(arguments)
+    seeds = settings.read_seeds(arguments, scenario)
+    windows_s = settings.read_windows_s(arguments, scenario)
+    draw = None if arguments.figure is None else settings.open_figure(arguments.figure, "--figure")
     build(without_federates(scenario))  # raises before any run if the scenario is invalid
     settings.note_commensurate_events(scenario, policies, windows_s, len(seeds))
     with showing_progress() as sink:
-        workers = settings.workers(arguments, scenario.packets * (len(policies) + 1) * len(seeds))
+        workers = settings.read_workers(arguments, scenario.packets * (len(policies) + 1) * len(seeds))
         all_rows = _all_rows(scenario, policies, seeds, windows_s, workers=workers, sink=sink)
     _sheet(scenario, all_rows, seeds).show(arguments.format)
     for window_s, row in all_rows:
@@ -117,8 +117,8 @@ def _all_rows(
         runs = len({*policies_to_run, EventDriven.name}) * len(seeds)
         progress = partial(report, f"window {window_s * 1e3:g} ms", runs)
         progress(0)
-        window_outcomes = outcomes(make, policies_to_run, seeds, workers=workers, progress=progress)
-        window_rows = rows(window_outcomes, partial(formation, scenario))
+        window_outcomes = run_outcomes(make, policies_to_run, seeds, workers=workers, progress=progress)
+        window_rows = rows(window_outcomes, partial(compute_formation, scenario))
         all_rows += [(window_s, row) for row in window_rows if row.policy in policies_to_run]
     return sorted(all_rows, key=lambda window_and_row: policies.index(window_and_row[1].policy))
 
@@ -133,7 +133,8 @@ def _exceeded_bound(scenario: CosimScenario, row: Row) -> str | None:
         return None
     return (
         f"{row.policy} had a position error of {largest_m * 1e3:.3g} mm, more than its bound of "
-        f"{chosen_policy.bound * 1e3:.3g} mm: agents changed their velocity by more than limits_m_s2 of the physics"
+        f"{chosen_policy.bound * 1e3:.3g} mm: agents changed their velocity "
+        "by more than limits_m_s2 of the physics federate"
     )
 
 

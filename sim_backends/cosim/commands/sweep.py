@@ -1,4 +1,4 @@
-"""`fieldkit cosim sweep SCENARIO`: all combinations of settings and seeds, in parallel."""
+"""The command `fieldkit cosim sweep`, which runs all combinations of settings and seeds in parallel."""
 
 import argparse
 from collections.abc import Sequence
@@ -39,10 +39,10 @@ def run(arguments: argparse.Namespace) -> int:
             code of the first failed run.
     """
     factors = parse_factors(arguments.over)
-    scenario = settings.scenario(arguments)
-    seeds = settings.seeds(arguments, scenario)
-    plan = plan_sweep(arguments.scenario, factors, seeds, settings.changes(arguments))
-    workers = _workers(plan, settings.workers(arguments))
+    scenario = settings.read_scenario(arguments)
+    seeds = settings.read_seeds(arguments, scenario)
+    plan = plan_sweep(arguments.scenario, factors, seeds, settings.read_changes(arguments))
+    workers = _workers(plan, settings.read_workers(arguments))
     for setting in plan.settings:
         build(without_federates(setting.scenario))  # raises before any run if a scenario is invalid
     command = _command(arguments)

@@ -1,4 +1,4 @@
-"""`fieldkit cosim table TABLE`: the paper's numbers next to ours, and their agreement."""
+"""The command `fieldkit cosim table`, which compares the numbers of the paper with those of simulations."""
 
 import argparse
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.settings import progress_reporter
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value, wrapped
-from sim_backends.cosim.studies.paper_claims import Claim, claim_setups, claims
+from sim_backends.cosim.studies.paper_claims import Claim, claim_setups, compute_claims
 from sim_backends.cosim.studies.paper_setups import flow_samples
 from sim_backends.cosim.studies.paper_tables import Agreement, PaperCell, PaperRow, paper_table
 
@@ -33,18 +33,18 @@ _REASON: Final = SheetColumn("loss_reason", "main reason", "most frequent reason
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the simulations of a table or of the claims of the paper; print the paper's numbers next to ours."""
-    which, changes = arguments.which, settings.changes(arguments)
+    """Run the simulations of a table or of the claims of the paper; print the numbers of both."""
+    which, changes = arguments.which, settings.read_changes(arguments)
     seeds = range(1, arguments.seeds + 1) if arguments.seed is None else (arguments.seed,)
     table = None if which == "claims" else paper_table(which, changes)
     setups = claim_setups(changes) if table is None else table.setups
     with showing_progress() as sink:
         progress = partial(progress_reporter(sink), f"table {which}", len(setups) * len(seeds))
         progress(0)
-        samples = flow_samples(setups, seeds, workers=settings.workers(arguments), progress=progress)
+        samples = flow_samples(setups, seeds, workers=settings.read_workers(arguments), progress=progress)
     title = f"{_TITLES[which]}, {format_count(len(seeds), 'seed')}"
     if table is None:
-        claim_sheet(title, claims(setups, samples)).show(arguments.format)
+        claim_sheet(title, compute_claims(setups, samples)).show(arguments.format)
         return 0
     rows = table.rows(samples)
     paper_sheet(title, rows, is_ping=which == "emane").show(arguments.format)
@@ -86,26 +86,26 @@ def _columns(name: str, factor: float) -> list[SheetColumn]:
     suffix = "" if name == "loss" else "_s"
     return [
         SheetColumn(f"{name}_paper{suffix}", "paper", "as printed", factor, digits=6),
-        SheetColumn(f"{name}{suffix}", "ours", "mean over seeds", factor),
+        SheetColumn(f"{name}{suffix}", "simulated", "mean over seeds", factor),
         SheetColumn(f"{name}_low{suffix}", "from", "lower end of its 95 % interval", factor),
         SheetColumn(f"{name}_high{suffix}", "to", "upper end", factor),
         SheetColumn(f"{name}_seeds", "seeds", "number of seeds for which packets arrived" if name == "delay" else ""),
         SheetColumn(
             f"{name}_agreement",
             "verdict",
-            "agrees if the printed value, with its precision, is within the interval, or equals our mean",
+            "agrees if the printed value, with its precision, is within the interval, or equals the simulated mean",
         ),
-        SheetColumn(f"{name}_off{suffix}", "off", "our value minus the paper's", factor),
+        SheetColumn(f"{name}_off{suffix}", "off", "simulated value minus the printed one", factor),
     ]
 
 
 def _values(cell: PaperCell) -> tuple[Value, ...]:
-    our_value = cell.ours
+    measured = cell.measured
     return (
         cell.printed.value,
-        our_value.value,
-        our_value.low,
-        our_value.high,
+        measured.value,
+        measured.low,
+        measured.high,
         cell.seeds,
         str(cell.agreement),
         cell.difference,
@@ -118,8 +118,8 @@ def summary(rows: Sequence[PaperRow]) -> str:
     agreeing_cells = [cell for cell in cells if cell.agreement is Agreement.AGREES]
     by_mean = sum(cell.agrees_by_mean for cell in agreeing_cells)
     return (
-        f"{len(agreeing_cells)} of {format_count(len(cells), 'cell')} agree: {by_mean} by our mean, "
-        f"{len(agreeing_cells) - by_mean} only because our interval is wide. "
+        f"{len(agreeing_cells)} of {format_count(len(cells), 'cell')} agree: {by_mean} by the simulated mean, "
+        f"{len(agreeing_cells) - by_mean} only because the simulated interval is wide. "
         "Assumptions for values that the paper does not state: fieldkit docs paper"
     )
 
@@ -139,7 +139,7 @@ def claim_sheet(title: str, claims: Sequence[Claim]) -> Sheet:
         SheetColumn("tables", "tables", "from its tables 1 and 3", 100),
         SheetColumn(
             "ours",
-            "ours",
+            "simulated",
             "relative change of the delay of a packet, or change of the loss in percentage points",
             100,
         ),
@@ -151,11 +151,11 @@ def claim_sheet(title: str, claims: Sequence[Claim]) -> Sheet:
     rows = [
         (
             claim.compared_system,
-            claim.lines,
+            claim.sight_group,
             claim.quantity,
             None if claim.claimed_change is None else claim.claimed_change.value,
-            claim.tabled_change,
-            *(claim.ours.value, claim.ours.low, claim.ours.high),
+            claim.change_in_tables,
+            *(claim.measured_change.value, claim.measured_change.low, claim.measured_change.high),
             claim.rows,
             str(claim.agreement or ""),
         )

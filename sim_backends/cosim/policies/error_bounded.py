@@ -1,26 +1,28 @@
-"""`error_bounded` (ours): the longest window in which no position error of the network exceeds a bound.
+"""The sync policy `error_bounded`, whose windows are as long as a bound on position errors of the network allows.
+
+The paper has no such policy.
 
 The network extrapolates the agents at the velocities that they had at the beginning of the window, as simulators of
 many vehicles do between updates (dead reckoning, IEEE Std 1278.1, annex E). Physics and programs advance ahead of the
 network: arrivals count from the end of the window, so nothing that physics and programs do in the window depends on
 the network. At the time that physics and programs have reached, a pair of agents has an error x: the distance between
-its true relative position and its relative position in the network. This error grows at a speed v, which changes by
-at most the acceleration limit a: after a time t, the error is at most x + v t + a t^2 / 2. Before the error can reach
-the bound, the policy evaluates the errors again; if less than one step of the physics remains, the window ends. The
-bound is therefore kept for any motion, and the windows are not shortened for motions that were possible but did not
-occur ("send on delta": Miskowicz, Sensors 6, 49, 2006).
+the true relative position of the two agents and their relative position in the network. This error grows at a speed
+v, which changes by at most the acceleration limit a: after a time t, the error is at most x + v t + a t^2 / 2. Before
+the error can reach the bound, the policy evaluates the errors again; if less than one physics step remains, the
+window ends. The bound is therefore kept for any motion, and the windows are not shortened for motions that were
+possible but did not occur ("send on delta": Miskowicz, Sensors 6, 49, 2006).
 
 The policy examines the pairs of all agents that send, receive, forward or interfere. A bound in metres adds the pairs
 of each agent and a fixed point on the ground, so that the bound also applies to the absolute position of the agent. A
 bound in dB adds the pairs of each agent and a fixed source of interference.
 
 The network extrapolates in steps, but the trajectory is continuous: with an assumed relative speed u and a step q,
-the error grows by u q between two steps. The step is the step of the physics if u q is at most an eighth of the
+the error grows by u q between two steps. The step is the physics step if u q is at most an eighth of the
 bound; otherwise it is shorter.
 
 While no program sends and the network has no events, positions are not used, and the window extends to the last step
 before the next event. If a network cannot extrapolate, it assumes that agents do not move, and x is the distance that
-they have moved; if one step of the physics moves them farther than the bound, the bound cannot be kept, and the
+they have moved; if one physics step moves them farther than the bound, the bound cannot be kept, and the
 policy raises an error.
 
 The bound may be given in dB of path loss. By the log-distance law, 10 n log10(d), if a pair has the assumed distance
@@ -146,11 +148,11 @@ class ErrorBounded:
             return
         worst_pair = int(np.argmax(errors_m - pairs.bounds_m))
         raise PolicyError(
-            f"this network does not extrapolate, and in one step of the physics, {step_s:g} s, the position error of "
+            f"this network does not extrapolate, and in one physics step, {step_s:g} s, the position error of "
             f"{pairs.name(worst_pair)} may reach {errors_m[worst_pair]:.3g} m; the bound is "
             f"{pairs.bounds_m[worst_pair]:.3g} m",
             where=f"{self.name} at {situation.now_ns / 1e9:g} s",
-            remedy="use a larger bound, a shorter step of the physics, or a network that extrapolates",
+            remedy="use a larger bound, a shorter physics step, or a network that extrapolates",
         )
 
     def _pairs(self, situation: Situation) -> "_Pairs":
@@ -160,9 +162,9 @@ class ErrorBounded:
         assumed_states = [State(state.position_m) for state in states]
         if situation.assumed_states is not None:
             assumed_states = [situation.assumed_states[name] for name in names]
-        places_m, velocities_m_s = _arrays(states, fixed_m)
+        positions_m, velocities_m_s = _arrays(states, fixed_m)
         assumed_m, assumed_m_s = _arrays(assumed_states, fixed_m)
-        # The physics may have no limit for an agent that appeared during the run.
+        # The physics federate may have no limit for an agent that appeared during the run.
         limits_m_s2 = np.array(
             [*(situation.limits_m_s2.get(name, math.inf) for name in names), *(0.0 for _ in fixed_m)]
         )
@@ -175,7 +177,7 @@ class ErrorBounded:
             names,
             first,
             second,
-            errors_m=_norms((places_m - assumed_m)[first] - (places_m - assumed_m)[second]),
+            errors_m=_norms((positions_m - assumed_m)[first] - (positions_m - assumed_m)[second]),
             error_rates_m_s=error_rates_m_s,
             assumed_m_s=speeds_m_s,
             limits_m_s2=limits_m_s2[first] + limits_m_s2[second],
@@ -190,9 +192,9 @@ class _Pairs:
 
     Attributes:
         names: The agents.
-        first: Row of the first of a pair.
-        second: Row of the second; a row beyond `names` is a fixed point.
-        errors_m: Present error of the assumed relative position.
+        first: Row of the first agent of each pair.
+        second: Row of the second agent of each pair; a row beyond `names` is a fixed point.
+        errors_m: Current error of the assumed relative position.
         error_rates_m_s: Speed at which that error grows.
         assumed_m_s: Assumed relative speed.
         limits_m_s2: Largest change of their relative velocity per second.
@@ -243,9 +245,9 @@ def _pair_rows(
 
 def _arrays(states: Sequence[State], fixed_m: Sequence[Vector]) -> tuple[Floats, Floats]:
     """Return positions and velocities of agents and fixed points, each of shape (agents and fixed points, 3)."""
-    places_m = np.array([*(state.position_m for state in states), *fixed_m], np.float64).reshape(-1, 3)
+    positions_m = np.array([*(state.position_m for state in states), *fixed_m], np.float64).reshape(-1, 3)
     velocities_m_s = np.array([*(state.velocity_m_s for state in states), *(STILL for _ in fixed_m)], np.float64)
-    return places_m, velocities_m_s.reshape(-1, 3)
+    return positions_m, velocities_m_s.reshape(-1, 3)
 
 
 def _norms(vectors: Floats) -> Floats:

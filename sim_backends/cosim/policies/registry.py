@@ -1,4 +1,4 @@
-"""The sync policies by name, built in or from entry points, and their parameters."""
+"""Finds and creates sync policies by name; they are built in or come from entry points of packages."""
 
 import inspect
 from collections.abc import Callable, Mapping

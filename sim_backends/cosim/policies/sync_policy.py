@@ -1,4 +1,4 @@
-"""Protocol of a sync policy, and its input."""
+"""The interface of a sync policy, and the data on which it decides."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -10,7 +10,7 @@ from fieldkit.core.model import Vector
 from sim_backends.world.motion import State
 
 Pair = tuple[str, str]
-"""Publisher and subscriber."""
+"""Names of a publisher and a subscriber."""
 
 
 @dataclass(slots=True)
@@ -21,9 +21,9 @@ class Situation:
         now_ns: Time that physics and network have reached.
         states: States of the agents now.
         pairs: Sender and receiver of each possible transmission.
-        next_wake_ns: Returns the next time at which a program's timer wakes it, or None.
+        next_wake_ns: Returns the next time at which a timer of a program fires, or None.
         next_event_ns: Returns the time of the next event in the network, or None.
-        physics_step_ns: The step of the physics.
+        physics_step_ns: Time step of the physics simulator.
         limits_m_s2: Largest change of each agent's velocity per second.
         next_send_ns: Time before which no program sends, or None; only set for policies that look ahead.
         assumed_states: States of the agents that the network assumes now, and from which it extrapolates; only set
@@ -62,7 +62,8 @@ class SyncPolicy(Protocol):
 
     The constructor may have the parameters `window_s`, `longest_s`, `bound_m`, `bound_db` and `exponent`: the values
     of `policy` in a scenario. A policy may have a text `decided_by` that describes what determined the last window;
-    recordings contain it. A policy with the method `extended_end_ns` is a `LookingAhead` policy.
+    recordings contain it. A policy with the methods of `LookingAhead` (in the same module) looks ahead: physics and
+    programs advance before the network does.
 
     Attributes:
         name: Its name in scenarios and tables.
@@ -102,7 +103,8 @@ class LookingAhead(SyncPolicy, Protocol):
         """Return the step of the network's dead reckoning in the window that begins now.
 
         Args:
-            situation: The present situation; `assumed_states` has the velocities that the network will extrapolate.
+            situation: The current situation; `assumed_states` has the velocities with which the network will
+                extrapolate.
         """
         ...
 
@@ -110,7 +112,7 @@ class LookingAhead(SyncPolicy, Protocol):
         """Return the time to which the current window can be extended; the agents have reached `situation.now_ns`.
 
         Args:
-            situation: The present situation, except for the network, which is still at the beginning of the window:
+            situation: The current situation, except for the network, which is still at the beginning of the window:
                 its next event is the next one after that time. If a program has sent in the window, the network may
                 need positions immediately.
 

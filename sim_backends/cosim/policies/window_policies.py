@@ -1,4 +1,4 @@
-"""The sync policies other than `error_bounded`, and ends of windows without accumulated rounding errors."""
+"""The sync policies other than `error_bounded`, and the computation of ends of windows without accumulated errors."""
 
 import math
 from collections.abc import Sequence
@@ -58,11 +58,11 @@ class FixedWindow:
         """Return the end of the next window.
 
         Raises:
-            PolicyError: The window is shorter than the step of the physics.
+            PolicyError: The window is shorter than the physics step.
         """
         if self._window_ns < situation.physics_step_ns:
             raise PolicyError(
-                f"a window of {self._window_ns:g} ns is shorter than the step of the physics, "
+                f"a window of {self._window_ns:g} ns is shorter than the physics step, "
                 f"{situation.physics_step_ns} ns, so that no state changes in it",
                 where=self.name,
                 remedy="use a longer window, or physics with a shorter step",
@@ -89,7 +89,7 @@ class Scheduled(FixedWindow):
 
 
 class SlidingWindow(FixedWindow):
-    """The network is one window behind the physics."""
+    """The network is simulated one window later than the physics."""
 
     name = "sliding_window"
     defers_sends = False
@@ -112,7 +112,7 @@ class EventDriven:
 
 
 class VariableStepped:
-    """A window lasts until the next step of the physics or the next event, whichever is first."""
+    """A window lasts until the next physics step or the next event, whichever is first."""
 
     name = "variable_stepped"
     exact = True
@@ -189,7 +189,7 @@ class VelocityAwareRaw:
 
 
 class VelocityAware:
-    """The smallest window `w + |Vp - Vs| / 1000` of any pair, at least a step of the physics.
+    """The smallest window `w + |Vp - Vs| / 1000` of any pair, at least a physics step.
 
     Args:
         window_s: w, in seconds.

@@ -1,7 +1,7 @@
 """Programs that follow other agents, using only the states that the network delivers.
 
 The age of a received state is its transmission delay, which follows from its time stamp. The state is extrapolated
-to the present time with its velocity. Every delay, and every error of a delivery time, therefore becomes a position
+to the current time with its velocity. Every delay, and every error of a delivery time, therefore becomes a position
 error: after a time d, a leader with the acceleration a is a d^2 / 2 away from its extrapolated position. A follower
 stops if it receives no state for longer than a timeout.
 

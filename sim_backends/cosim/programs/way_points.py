@@ -229,7 +229,7 @@ class ProfileLeg:
 
 
 class VelocityProfile(NeverSends):
-    """Sends the command of each leg in order, and then stops.
+    """Gives the body the command of each leg in order, and then stops it.
 
     Args:
         legs: The legs.
@@ -254,7 +254,7 @@ class VelocityProfile(NeverSends):
         return self._times_ns[self._next_index] if self._next_index < len(self._times_ns) else None
 
     def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
-        """Send the command of the leg that has begun, if any."""
+        """Return the command of the leg that has begun, if any."""
         due = bisect_right(self._times_ns, now_ns)
         if due == self._next_index:
             return Action()
@@ -288,7 +288,7 @@ class SpeedOscillation(NeverSends):
         return self._timer.next_ns
 
     def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
-        """Send the present speed if a command is due."""
+        """Return the command for the current speed if it is due."""
         if not self._timer.fire_if_due(now_ns):
             return Action()
         return Action(command=Twist(self._mean_m_s + self._amplitude_m_s * math.sin(self._rate_rad_s * now_ns / 1e9)))

@@ -11,7 +11,7 @@ from sim_backends.world.motion import State
 
 
 class CombinedProgram:
-    """Combines programs of one agent: each wakes at its own times, and every program receives all datagrams.
+    """Combines programs of one agent. Each program wakes at the times that it requests, and receives all datagrams.
 
     Args:
         programs: The programs; if several steer at the same time, the command of the last one applies.

@@ -1,4 +1,4 @@
-"""A pcap file per robot, with the internet headers of its packets.
+"""Writes a pcap file per robot, with the internet headers of its packets.
 
 A network in another process reports no IP packets. `PacketObserver` therefore creates them from the packets of
 programs.
@@ -34,7 +34,7 @@ _FIRST_PORT: Final = 40_000
 _FIRST_EPHEMERAL_PORT: Final = 50_000
 """Source port of the first flow: a dynamic port (RFC 6335, section 6), not 49152, which tcpdump decodes specially."""
 _PORTS: Final = 9_000
-"""Number of ports after which they are reused."""
+"""Number of ports that flows use before the first port is used again."""
 
 _IP: Final = struct.Struct(">BBHHHBBH4s4s")
 _UDP_HEADER: Final = struct.Struct(">HHHH")
@@ -70,7 +70,7 @@ _DEFAULT: Final = CapturedFlow()
 NO_FLOWS: Final[Mapping[str, CapturedFlow]] = MappingProxyType({})
 
 
-def addresses(names: Sequence[str]) -> dict[str, IPv4Address]:
+def assign_addresses(names: Sequence[str]) -> dict[str, IPv4Address]:
     """Return the addresses of robots in captures: the first is 10.0.0.1, each further robot has the next address.
 
     Args:
@@ -83,12 +83,12 @@ class IpEncoder:
     """Encodes fragments as the bytes of IP packets.
 
     Args:
-        names: The hosts, see `addresses`.
+        names: The hosts, in the order of `assign_addresses`.
         flows: Flows with special headers, by name.
     """
 
     def __init__(self, names: Sequence[str], flows: Mapping[str, CapturedFlow] = NO_FLOWS) -> None:
-        self.addresses = addresses(names)
+        self.addresses = assign_addresses(names)
         self._special_flows = flows
         self._packed: dict[str | None, bytes] = {name: address.packed for name, address in self.addresses.items()}
         self._packed[None] = _MULTICAST
@@ -217,7 +217,7 @@ _RECORD_HEADER: Final = struct.Struct("<IIII")
 
 
 class Captures:
-    """One pcap file per robot that sent or received packets, with these packets.
+    """Writes the packets of each robot to a pcap file; robots without packets have no file.
 
     Files grow by whole packets, so they are readable even if the run is killed.
 

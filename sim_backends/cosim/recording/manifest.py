@@ -1,4 +1,4 @@
-"""`run.json` of a recording: the scenario and its settings, the software versions, and the end of the run."""
+"""The file `run.json` of a recording: the scenario, its settings, the software versions, and the end of the run."""
 
 import fcntl
 import hashlib
@@ -67,7 +67,7 @@ class RunManifest:
         scenario_hash: SHA-256 of the scenario's text.
         schema_version: Schema version of the recording.
         versions: Versions of fieldkit, Python and the libraries that affect the numbers of a run.
-        ending: The end of the run.
+        ending: Status of the run.
         why: The error that ended the run; empty without an error.
         digest: Hash over all events (`EventDigest`); empty during the run.
         parts: BLAKE2b of each file of a table, by its path in the folder; empty during the run.
@@ -86,7 +86,7 @@ class RunManifest:
 _CODEC: Final = Codec(RunManifest)
 
 
-def versions() -> dict[str, str]:
+def software_versions() -> dict[str, str]:
     """Return the versions of the running software for `RunManifest.versions`."""
     return {"python": platform.python_version()} | {name: version(name) for name in ("fieldkit", "numpy")}
 

@@ -1,4 +1,4 @@
-"""The tables of a recording: each is a folder of Parquet files, and each file is readable without the others.
+"""Writes and reads the tables of a recording. Each is a folder of Parquet files that are readable independently.
 
 The only module of `sim_backends` that imports pyarrow. `RecordingState` is the state of a recording between parts.
 """
@@ -32,14 +32,14 @@ def _field(name: str, kind: pa.DataType, unit: str, meaning: str) -> pa.Field:
 
 def _end_fields(prefix: str, meaning: str) -> list[pa.Field]:
     kinds = (
-        ("m", _VECTOR, "m", "position, east, north, up"),
-        ("m_s", _VECTOR, "m/s", "velocity, east, north, up"),
-        ("heading_rad", pa.float64(), "rad", "heading from east towards north, empty if there is none"),
+        ("m", _VECTOR, "m", "position (east, north, up)", ""),
+        ("m_s", _VECTOR, "m/s", "velocity (east, north, up)", ""),
+        ("heading_rad", pa.float64(), "rad", "heading (from east towards north)", "; empty if there is none"),
     )
     return [
-        _field(f"{prefix}_{end}_{quantity}", kind, unit, f"{meaning} {end}, {name}")
-        for end in ("source", "destination")
-        for quantity, kind, unit, name in kinds
+        _field(f"{prefix}_{end}_{quantity}", kind, unit, f"{name} of the {agent} {meaning}{note}")
+        for end, agent in (("source", "sending agent"), ("destination", "receiving agent"))
+        for quantity, kind, unit, name, note in kinds
     ]
 
 
@@ -60,10 +60,14 @@ SCHEMAS: Final[Mapping[str, pa.Schema]] = {
                 "arrived_ns",
                 pa.int64(),
                 "ns",
-                "time of arrival by the network's clock; empty if the packet never arrived",
+                "time of arrival in the network; empty if the packet never arrived",
             ),
             _field(
-                "counted_ns", pa.int64(), "ns", "time of arrival by the policy; empty if the packet never arrived"
+                "counted_ns",
+                pa.int64(),
+                "ns",
+                "time from which the sync policy counts the packet as arrived: `arrived_ns`, or the end of the "
+                "window if the policy defers arrivals; empty if the packet never arrived",
             ),
             _field(
                 "late_ns",
@@ -78,8 +82,8 @@ SCHEMAS: Final[Mapping[str, pa.Schema]] = {
                 "reason why the packet never arrived; empty if it did, or was under way at the end",
             ),
             _field("ended_window", pa.int64(), "", "number of the window in which the packet arrived or was dropped"),
-            *_end_fields("known", "as the network assumed it when the packet entered:"),
-            *_end_fields("true", "true value when the packet was sent:"),
+            *_end_fields("known", "that the network assumed when the packet entered it"),
+            *_end_fields("true", "when the packet was sent (true value)"),
         ]
     ),
     "states": pa.schema(
@@ -141,7 +145,7 @@ def write_part(folder: Path, table: str, number: int, rows: Sequence[Row]) -> st
     return hashlib.blake2b(content, digest_size=16).hexdigest()
 
 
-def checksum(path: Path) -> str:
+def file_checksum(path: Path) -> str:
     """Return the BLAKE2b of a file, computed as by `write_part`.
 
     Raises:

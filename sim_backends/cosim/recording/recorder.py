@@ -18,7 +18,7 @@ from sim_backends.cosim.recording.manifest import (
     RunManifest,
     RunSettings,
     recording_lock,
-    versions,
+    software_versions,
     write_manifest,
 )
 from sim_backends.cosim.recording.packet_tables import RecordingState, state_rows
@@ -137,7 +137,7 @@ class RunRecorder:
         self._windows: list[Window] = []
         self._state = RecordingState()
         self._last_write_s = time.perf_counter()
-        self._manifest = RunManifest(about, about.scenario_hash, versions=versions())
+        self._manifest = RunManifest(about, about.scenario_hash, versions=software_versions())
         self._lock = ExitStack()
         self._has_begun = False
         self._has_failed = False
@@ -165,7 +165,7 @@ class RunRecorder:
         self._has_begun = True
 
     def log_ip(self, at_ns: int, name: str, fragment: Fragment) -> None:
-        """Add an IP packet that a robot sent or that arrived at it; see `RadioNetwork.log_ip`."""
+        """Add an IP packet that a robot sent or that arrived at it; called by the network."""
         if self._captures is None:
             names = sorted({*self._first_states, *self._agents})
             self._captures = Captures(self._folder / CAPTURES, names, self._snap_bytes, self._flows)

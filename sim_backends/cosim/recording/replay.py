@@ -1,4 +1,4 @@
-"""Reads a recording back as a run; a recording that was changed or truncated is an error."""
+"""Reads the record of a run from a recording; a recording that was changed or truncated is an error."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -67,7 +67,7 @@ def read_recording(folder: Path) -> Recording:
 def _check_parts(folder: Path, manifest: RunManifest) -> None:
     for path, checksum in manifest.parts.items():
         try:
-            is_same = packet_tables.checksum(folder / path) == checksum
+            is_same = packet_tables.file_checksum(folder / path) == checksum
         except OSError as error:
             raise EvidenceError(
                 f"the recording was truncated: this part cannot be read: {error.strerror}",

@@ -1,4 +1,4 @@
-"""The motions and the traffic of agents in a scenario file."""
+"""The schema of the motions and the traffic of agents in a scenario file."""
 
 from abc import ABC, abstractmethod
 from typing import Annotated, Literal

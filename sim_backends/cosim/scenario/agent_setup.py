@@ -1,4 +1,4 @@
-"""The agents of a scenario: their bodies and radios, and the programs that steer them and send their traffic."""
+"""Creates the agents of a scenario: bodies, radios, and the programs that steer them and send their traffic."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -44,12 +44,12 @@ from sim_backends.radio.random_streams import RandomStream
 from sim_backends.world.world import World
 
 
-def robots() -> list[str]:
+def list_robots() -> list[str]:
     """Return all valid values of an agent's `robot`: kinds of bodies, and names of robot profiles."""
     return sorted({*BODIES, *names("robots")})
 
 
-def limits(robot: str) -> DriveLimits | QuadrotorLimits:
+def limits_of(robot: str) -> DriveLimits | QuadrotorLimits:
     """Return the limits of a robot's body.
 
     For the name of a robot profile, these are the limits of the paper's ground robot or quadrotor, with the top speed
@@ -62,13 +62,13 @@ def limits(robot: str) -> DriveLimits | QuadrotorLimits:
     return replace(reference_limits, speed_m_s=float(profile.limits.max_speed_m_s))
 
 
-def bodies(scenario: CosimScenario, world: World) -> dict[str, Body[Any]]:
+def make_bodies(scenario: CosimScenario, world: World) -> dict[str, Body[Any]]:
     """Return the bodies of all agents, at their start positions."""
     return {name: _body(plan, scenario, world) for name, plan in scenario.agents.items()}
 
 
 def _body(plan: AgentPlan, scenario: CosimScenario, world: World) -> Body[Any]:
-    heading_rad, body_limits = math.radians(plan.heading_deg), limits(plan.robot)
+    heading_rad, body_limits = math.radians(plan.heading_deg), limits_of(plan.robot)
     east_m, north_m, up_m = _start_m(plan, scenario, world)
     if isinstance(body_limits, QuadrotorLimits):
         return Quadrotor(body_limits, (east_m, north_m, up_m), heading_rad)
@@ -77,14 +77,14 @@ def _body(plan: AgentPlan, scenario: CosimScenario, world: World) -> Body[Any]:
 
 def _start_m(plan: AgentPlan, scenario: CosimScenario, world: World) -> Vector:
     """Return the start position of an agent: metres east, north, up."""
-    place_m = plan.at_m
-    if place_m is None:
+    point_m = plan.at_m
+    if point_m is None:
         assert plan.along is not None
-        place_m = world.lines[scenario.line].at(plan.along, plan.aside_m)
-    return *place_m, world.ground_m(place_m) + plan.height
+        point_m = world.lines[scenario.line].at(plan.along, plan.aside_m)
+    return *point_m, world.ground_m(point_m) + plan.height
 
 
-def antennas(scenario: CosimScenario) -> dict[str, Antenna]:
+def antennas_of(scenario: CosimScenario) -> dict[str, Antenna]:
     """Return the antennas of the agents that have a radio, from their plan or from their robot profile."""
     profile_names = names("robots")
     used_profiles = {
@@ -109,7 +109,7 @@ def stop_commands(bodies: Mapping[str, Body[Any]]) -> dict[str, Twist | Velocity
     return {name: Velocity() if body.flies else Twist() for name, body in bodies.items()}
 
 
-def controllers(scenario: CosimScenario, bodies: Mapping[str, Body[Any]], seed: int) -> dict[str, Program]:
+def make_controllers(scenario: CosimScenario, bodies: Mapping[str, Body[Any]], seed: int) -> dict[str, Program]:
     """Return the controllers of the agents that move, by the name of the agent.
 
     Args:
@@ -192,7 +192,7 @@ START_INTERVAL_S: Final = 0.1
 `policy.longest`, the longest window."""
 
 
-def programs(
+def make_programs(
     scenario: CosimScenario, seed: int, controllers: Mapping[str, Program], stops: Mapping[str, Any]
 ) -> dict[str, Program]:
     """Return the programs of all agents with traffic or a controller, by the name of the agent.

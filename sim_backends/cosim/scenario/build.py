@@ -1,4 +1,4 @@
-"""Builds a scenario: agents, network and coordinator.
+"""Builds the simulation of a scenario: agents, network and coordinator.
 
 The network consists of antennas, a radio model and transports, with the faults of radios.
 """
@@ -17,10 +17,16 @@ from sim_backends.cosim.federates import NetworkFederate, PhysicsFederate
 from sim_backends.cosim.policies.registry import make_policy
 from sim_backends.cosim.policies.sync_policy import SyncPolicy
 from sim_backends.cosim.programs.senders import REPLY
-from sim_backends.cosim.recording.captures import CapturedFlow, PacketObserver, addresses
+from sim_backends.cosim.recording.captures import CapturedFlow, PacketObserver, assign_addresses
 from sim_backends.cosim.run_record import IpObserver, Run, WindowObserver
 from sim_backends.cosim.scenario.agent_plans import FileTraffic, PingTraffic, QosOptions, Traffic
-from sim_backends.cosim.scenario.agent_setup import antennas, bodies, controllers, programs, stop_commands
+from sim_backends.cosim.scenario.agent_setup import (
+    antennas_of,
+    make_bodies,
+    make_controllers,
+    make_programs,
+    stop_commands,
+)
 from sim_backends.cosim.scenario.checks import check
 from sim_backends.cosim.scenario.external import carried_radio, open_network, open_physics, writes_captures
 from sim_backends.cosim.scenario.faults import JammerFault, LinkCutFault, NodeLossFault, StalledFederateFault
@@ -64,10 +70,11 @@ def radio_network(
         world: Its world.
         seed: Seed of all random draws.
         observer: Receives all IP packets if it has `log_ip`.
-        path_losses_db: As for `WifiInWorld`; fixed links ignore them.
+        path_losses_db: Returns the mean losses that replace losses in the world, by transmitter and receiver; None if
+            there are none. Fixed links ignore them.
         carrier: Network that carries its IP packets instead of the built-in radio, or None.
     """
-    stations = antennas(scenario)
+    stations = antennas_of(scenario)
     radio: RadioModel[Fragment]
     if carrier is not None:
         radio = carried_radio(carrier, tuple(stations))
@@ -109,7 +116,7 @@ def _captures(scenario: CosimScenario, folder: Path) -> dict[str, Any] | None:
     pings = list(dict.fromkeys(flow.ping for flow in flows.values() if flow.ping))
     return {
         "folder": str(folder.absolute()),
-        "addresses": {name: str(address) for name, address in addresses(sorted(scenario.agents)).items()},
+        "addresses": {name: str(address) for name, address in assign_addresses(sorted(scenario.agents)).items()},
         "flows": {
             name: {
                 "port": flow.port or 0,
@@ -157,7 +164,7 @@ def _qos(traffic: Traffic) -> Qos:
 
 def _disturbances(scenario: CosimScenario, world: World) -> Iterator[Disturbance]:
     """Yield the disturbances that are caused by faults, and those that switch off the radios of absent agents."""
-    stations = antennas(scenario)
+    stations = antennas_of(scenario)
     for name, lifetime in scenario.lifetimes.items():
         if name not in stations:
             continue
@@ -172,8 +179,8 @@ def _disturbances(scenario: CosimScenario, world: World) -> Iterator[Disturbance
             case LinkCutFault():
                 yield LinkCut(*fault.between, fault.begin_ns, fault.end_ns)
             case JammerFault():
-                place_m = None if fault.at_m is None else (*fault.at_m, world.ground_m(fault.at_m) + fault.height)
-                yield Jammer(float(fault.power_dbm), fault.begin_ns, fault.end_ns, place_m, fault.agent or "")
+                position_m = None if fault.at_m is None else (*fault.at_m, world.ground_m(fault.at_m) + fault.height)
+                yield Jammer(float(fault.power_dbm), fault.begin_ns, fault.end_ns, position_m, fault.agent or "")
 
 
 def _nothing_to_close() -> None:
@@ -217,7 +224,7 @@ class Simulation:
 
         Args:
             until_ns: End time in nanoseconds of simulated time, or None.
-            progress: As for `Coordinator.advance`.
+            progress: Called at most every 0.2 s of wall time, or None.
 
         Raises:
             PolicyError: The policy has no window. After any error, `Coordinator.run` has the record so far.
@@ -249,7 +256,7 @@ def build(
         deadline_s: Longest wait for an answer of a federate, in seconds of wall time; None for no deadline.
         physics: Replaces the scenario's physics, and receives the commands to bodies.
         network: Replaces the scenario's network; it must then also apply the faults of the radio.
-        measures_all: As for `Coordinator`.
+        measures_all: True to include all agents in the position error of every packet, as comparisons need.
         captures: Folder of captures for a network that writes them itself; the recorder then receives no IP packets.
 
     Raises:
@@ -262,7 +269,7 @@ def build(
     world = load_world(scenario.world)
     check(scenario, world, lambda location: f"scenario {scenario.name}: {'.'.join(map(str, location))}")
     with ExitStack() as federates:
-        scenario_bodies = bodies(scenario, world)
+        scenario_bodies = make_bodies(scenario, world)
         federate_arguments = scenario, world, scenario_bodies, seed, deadline_s
         if physics is None and (physics := open_physics(*federate_arguments)) is not None:
             federates.callback(getattr(physics, "close", _nothing_to_close))
@@ -285,8 +292,8 @@ def build(
                     physics = with_stall(physics, stall)
                 else:
                     network = with_stall(network, stall)
-        scenario_programs = programs(
-            scenario, seed, controllers(scenario, scenario_bodies, seed), stop_commands(scenario_bodies)
+        scenario_programs = make_programs(
+            scenario, seed, make_controllers(scenario, scenario_bodies, seed), stop_commands(scenario_bodies)
         )
         lifetimes = scenario.lifetimes
         starts = Bodies(scenario_bodies, world, lifetimes=lifetimes).start_states() if lifetimes else {}

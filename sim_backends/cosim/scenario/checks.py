@@ -17,7 +17,7 @@ from sim_backends.cosim.scenario.agent_plans import (
     VelocityProfilePlan,
     WayPointsPlan,
 )
-from sim_backends.cosim.scenario.agent_setup import antennas, bodies, limits, path_points_m, robots
+from sim_backends.cosim.scenario.agent_setup import antennas_of, limits_of, list_robots, make_bodies, path_points_m
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.robot_limits import DriveLimits, QuadrotorLimits
@@ -160,10 +160,10 @@ def check(scenario: CosimScenario, world: World, where: Callable[[Location], str
     Args:
         scenario: The scenario.
         world: Its world.
-        where: Returns the place of keys in the scenario's file, for the message.
+        where: Returns the line of keys in the scenario's file, for the message.
 
     Raises:
-        ConfigurationError: It cannot be run; the message has the first reason and its place.
+        ConfigurationError: It cannot be run; the message has the first reason and its line in the file.
     """
     for problem in problems(scenario, world):
         raise ConfigurationError(problem.message, where=where(problem.location), remedy=problem.remedy)
@@ -180,7 +180,7 @@ def _lines(scenario: CosimScenario, world: World) -> Iterator[ScenarioProblem]:
 
 
 def _robots(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
-    robot_names = robots()
+    robot_names = list_robots()
     for name, plan in scenario.agents.items():
         if plan.robot not in robot_names:
             yield ScenarioProblem(
@@ -191,7 +191,7 @@ def _robots(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
 
 
 def _radios(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
-    stations = antennas(scenario)
+    stations = antennas_of(scenario)
     agents_without_radio = ({name for pair in scenario.pairs for name in pair} | {scenario.relay}) - stations.keys()
     for name, plan in scenario.agents.items():
         if name in agents_without_radio:
@@ -210,7 +210,7 @@ def _infrastructure(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
     from sim_backends.radio.infrastructure import infrastructure  # noqa: PLC0415 (other scenarios need none of it)
 
     has_relay = scenario.topology is Topology.MASTER
-    if problem := infrastructure.conflict(radio, antennas(scenario), has_relay=has_relay):
+    if problem := infrastructure.conflict(radio, antennas_of(scenario), has_relay=has_relay):
         yield ScenarioProblem(("radio",), problem, "change radio or the agents of the scenario")
     if scenario.network.federate is not None:
         key = next(key for key in INFRASTRUCTURE if getattr(radio, key))
@@ -221,7 +221,7 @@ def _infrastructure(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
 
 def _starts(scenario: CosimScenario, world: World) -> Iterator[ScenarioProblem]:
     for name, plan in scenario.agents.items():
-        if isinstance(limits(plan.robot), QuadrotorLimits):
+        if isinstance(limits_of(plan.robot), QuadrotorLimits):
             continue
         if plan.height:
             yield ScenarioProblem(
@@ -240,17 +240,17 @@ def _starts(scenario: CosimScenario, world: World) -> Iterator[ScenarioProblem]:
                 f"choose one of {', '.join(plan.motion.leader)}",
             )
     try:
-        Bodies(bodies(scenario, world), world, lifetimes=scenario.lifetimes)
+        Bodies(make_bodies(scenario, world), world, lifetimes=scenario.lifetimes)
     except ConfigurationError as error:
         agent = error.what.partition(" ")[0]  # the message begins with the name of the agent
         yield ScenarioProblem(("agents", agent), error.what, error.remedy)
 
 
 def _speeds(scenario: CosimScenario, world: World) -> Iterator[ScenarioProblem]:
-    bodies_at_start = bodies(scenario, world)
+    bodies_at_start = make_bodies(scenario, world)
     for name, plan in scenario.agents.items():
         start_m = bodies_at_start[name].place_m
-        for excess in excesses(plan.motion, start_m, limits(plan.robot)):
+        for excess in excesses(plan.motion, start_m, limits_of(plan.robot)):
             yield ScenarioProblem(
                 ("agents", name, "motion", *excess.location),
                 f"{name} has {excess.quantity} of {excess.value:.6g} {excess.unit}, but {plan.robot} reaches at most "

@@ -13,7 +13,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.cosim.recording.recorder import Sampling
 from sim_backends.cosim.run_record import IpObserver, Window, WindowObserver
-from sim_backends.cosim.scenario.agent_setup import antennas
+from sim_backends.cosim.scenario.agent_setup import antennas_of
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.emane_events.channel import EventPublisher
 from sim_backends.emane_events.events import (
@@ -142,13 +142,13 @@ def emane_observer(scenario: CosimScenario, seed: int, observer: WindowObserver 
 
 
 def _losses(scenario: CosimScenario, seed: int) -> Losses:
-    channel = WorldChannel(seed, antennas(scenario), scenario.radio, load_world(scenario.world))
+    channel = WorldChannel(seed, antennas_of(scenario), scenario.radio, load_world(scenario.world))
 
-    def losses_db(places_m: Sequence[Vector]) -> dict[tuple[int, int], float]:
-        pairs = list(combinations(range(len(places_m)), 2))
+    def losses_db(positions_m: Sequence[Vector]) -> dict[tuple[int, int], float]:
+        pairs = list(combinations(range(len(positions_m)), 2))
         if not pairs:
             return {}
-        ends_m = np.array([[places_m[first], places_m[second]] for first, second in pairs])
+        ends_m = np.array([[positions_m[first], positions_m[second]] for first, second in pairs])
         return dict(zip(pairs, channel.loss_db(ends_m[:, 0], ends_m[:, 1]).tolist(), strict=True))
 
     return losses_db

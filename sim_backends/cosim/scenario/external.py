@@ -1,4 +1,4 @@
-"""External federates of a scenario; only this module of the co-simulation starts, connects to or creates them."""
+"""Starts, connects to or creates the external federates of a scenario; no other module of the co-simulation does."""
 
 import dataclasses
 import json
@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.cosim.scenario.agent_setup import antennas, limits
+from sim_backends.cosim.scenario.agent_setup import antennas_of, limits_of
 from sim_backends.cosim.scenario.federate_choice import BUILT_IN
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.federates import remote
@@ -89,14 +89,14 @@ def make_hello(scenario: CosimScenario, world: World, bodies: Mapping[str, Body[
 
 def _configuration(scenario: CosimScenario, world: World, role: int) -> bytes:
     """Return the configuration as JSON; agents are in the order of the scenario, because results may depend on it."""
-    radios = antennas(scenario)
+    radios = antennas_of(scenario)
     options = (scenario.physics if role == PHYSICS else scenario.network).options
     configuration = {
         "scenario": without_federates(scenario).model_dump(mode="json", by_alias=True, exclude_none=True),
         "world": world.model_dump(mode="json", by_alias=True, exclude_none=True),
         "robots": {
             name: {
-                "body": dataclasses.asdict(limits(plan.robot)),
+                "body": dataclasses.asdict(limits_of(plan.robot)),
                 "radio": dataclasses.asdict(radios[name]) if name in radios else None,
             }
             for name, plan in scenario.agents.items()
@@ -109,7 +109,7 @@ def _configuration(scenario: CosimScenario, world: World, role: int) -> bytes:
 
 
 class SimulatorName(NamedTuple):
-    """A physics or a network that has a name.
+    """A physics or network federate that has a name.
 
     Attributes:
         name: Its name.
@@ -136,7 +136,14 @@ def simulators() -> list[SimulatorName]:
 def open_physics(
     scenario: CosimScenario, world: World, bodies: Mapping[str, Body[Any]], seed: int, deadline_s: float | None
 ) -> PhysicsFederate | None:
-    """Start, connect to or create the scenario's external physics, if it has one; arguments as for `make_hello`.
+    """Start, connect to or create the scenario's external physics federate; return None if it has none.
+
+    Args:
+        scenario: The scenario.
+        world: Its world.
+        bodies: The body of each agent.
+        seed: Seed of all random draws.
+        deadline_s: Longest wait for an answer, in seconds of wall time; None for no deadline.
 
     Raises:
         ConfigurationError: The name, the command or the address cannot be used.
@@ -162,15 +169,20 @@ def open_network(
     *,
     captures: Mapping[str, Any] | None = None,
 ) -> NetworkFederate | None:
-    """Start, connect to or create the scenario's external network, if it has one; errors as for `open_physics`.
+    """Start, connect to or create the scenario's external network federate; return None if it has none.
 
     Args:
         scenario: The scenario.
-        world: The world.
-        bodies: The bodies.
-        seed: The seed.
-        deadline_s: The deadline.
+        world: Its world.
+        bodies: The body of each agent.
+        seed: Seed of all random draws.
+        deadline_s: Longest wait for an answer, in seconds of wall time; None for no deadline.
         captures: Settings of the captures for a network with `writes_captures`; None if it writes no captures.
+
+    Raises:
+        ConfigurationError: The name, the command or the address cannot be used, or the network lacks a transport or a
+            capability that the scenario needs.
+        FederateError: The federate failed, or has not connected or answered in time.
     """
     endpoint = scenario.network.federate
     if endpoint is None:
@@ -209,11 +221,11 @@ def open_network(
 
 
 def carried_radio(network: NetworkFederate, names: Sequence[str]) -> RadioModel[Fragment]:
-    """Return the radio for built-in transports that uses an external network to carry IP packets."""
+    """Return the radio for built-in transports whose IP packets an external network carries."""
     return IpRadio(network, names)
 
 
-def _make_federate(federate: PythonFederate, name: str, hello: Hello) -> Any:  # noqa: ANN401 (a physics or a network)
+def _make_federate(federate: PythonFederate, name: str, hello: Hello) -> Any:  # noqa: ANN401 (either role)
     """Return a federate in this process.
 
     Raises:

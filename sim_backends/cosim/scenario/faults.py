@@ -1,4 +1,4 @@
-"""The faults in a scenario file."""
+"""The schema of the faults in a scenario file."""
 
 from typing import Annotated, Literal
 
@@ -111,7 +111,7 @@ class JammerFault(_TimedFault):
     agent: Name | None = None
 
     @schema.model_validator(mode="after")
-    def _one_place(self) -> "JammerFault":
+    def _one_position(self) -> "JammerFault":
         if (self.at_m is None) == (self.agent is None):
             raise schema.validation_error(
                 "a jammer needs either at_m: [EAST, NORTH], or an agent: NAME that carries it"

@@ -1,4 +1,4 @@
-"""The federate of a scenario's physics or network, and its options, which the named simulator defines."""
+"""The section of a scenario file that selects the federate for the physics or the network, and its options."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, Final
@@ -52,7 +52,7 @@ _VALIDATED_DEFAULT: Final = Field(validate_default=True)
 PhysicsFederateOptions = Annotated[
     Options, PlainValidator(_options_of(PHYSICS)), _SERIALIZER, _JSON_SCHEMA, _VALIDATED_DEFAULT
 ]
-"""Options of the physics that `federate` names in the same mapping."""
+"""Options of the physics federate that `federate` names in the same mapping."""
 NetworkFederateOptions = Annotated[
     Options, PlainValidator(_options_of(NETWORK)), _SERIALIZER, _JSON_SCHEMA, _VALIDATED_DEFAULT
 ]

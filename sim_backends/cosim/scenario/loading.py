@@ -1,4 +1,4 @@
-"""Scenarios by name or by the path of a file, and the JSON schema of scenario files for editors."""
+"""Loads scenarios by name or by the path of a file, and creates the JSON schema of scenario files for editors."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -62,7 +62,7 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
             "agents.husky-2.along": "40m"}`.
 
     Raises:
-        ConfigurationError: It does not exist, or is invalid; the message states the place.
+        ConfigurationError: It does not exist, or is invalid; the message states the line in the file.
     """
     path = _path(str(name_or_path))
     document = schema.read(path)

@@ -1,4 +1,4 @@
-"""Periods that are commensurate with a window, so that a run samples only a few phases of the window.
+"""Finds periods that are commensurate with a window, so that a run samples only a few phases of the window.
 
 The error of a policy depends on the phase of the window at which a packet is sent. If b periods are a whole number of
 windows, packets are sent at b phases only, the same ones in every window, and the measured error is the error at

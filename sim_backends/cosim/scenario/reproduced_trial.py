@@ -1,4 +1,4 @@
-"""Section of a scenario file: the trial of robots that the scenario reproduces, so that both can be compared."""
+"""The section of a scenario file that names the trial of robots that the scenario reproduces, to compare both."""
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise

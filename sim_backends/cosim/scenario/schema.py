@@ -40,13 +40,15 @@ def _list_policies(json_schema: dict[str, Any]) -> None:
 
 
 class PolicyChoice(Strict):
-    """The sync policy of a scenario. Its parameters apply to every policy that has them, also in a shootout.
+    """The sync policy of a scenario.
+
+    Its parameters apply to every policy that has them, also in `fieldkit cosim shootout`.
 
     Attributes:
         name: The default policy of a run.
         window: Length of a window, or the parameter w of the velocity-aware policies.
         longest: Longest window of policies with variable windows.
-        bound: For `error_bounded`: largest error of the relative position in the network of two agents that transmit.
+        bound: For `error_bounded`: largest error of the relative position of two transmitting agents in the network.
         bound_db: Instead of `bound`: largest error of the path loss between them in free line of sight, in dB.
         exponent: Exponent of the log-distance law for `bound_db`.
     """
@@ -139,7 +141,8 @@ class AgentPlan(Strict):
     Attributes:
         robot: A kind of body, or a robot profile, which also has a radio.
         at_m: Start position, metres east and north.
-        along: Instead of `at_m`: start position along the world's line, as a distance from its beginning.
+        along: Instead of `at_m`: start position on the line of the world file, as a distance from the beginning of
+            the line.
         aside_m: Distance of the start from that line, to the left.
         height: Height of the start above the ground, for agents that fly.
         heading_deg: Initial heading, from east towards north.
@@ -181,7 +184,7 @@ class AgentPlan(Strict):
     def _one_start(self) -> "AgentPlan":
         if (self.at_m is None) == (self.along is None):
             raise schema.validation_error(
-                "it needs either at_m: [EAST, NORTH], or along: 20m, a distance on the world's line"
+                "it needs either at_m: [EAST, NORTH], or along: 20m, a distance on the line of the world file"
             )
         return self
 
@@ -202,28 +205,29 @@ class CosimScenario(Named):
     `fieldkit cosim schema` prints its JSON schema, with which an editor completes and checks it, see [the Python
     API](cosim-api.md#scenario-files). `robot` is the name of a robot profile, which has a radio. Bodies of `husky`,
     `iris`, `turtlebot3_burger` and `duckiedrone` are built in; another robot has the body of the TurtleBot, or of the
-    Duckiedrone, with its own top speed. `radio` has the same keys as `emulated.radio` in the [site
+    Duckiedrone, with the top speed of its profile. `radio` has the same keys as `emulated.radio` in the [site
     file](reference/site-file.md).
 
     Attributes:
         name: The file's name without `.yaml`.
         summary: Description in one line.
         world: Surroundings of the agents: a file of the lab's folder `worlds/`, or a shipped one.
-        line: The line of the world along which agents start.
-        duration: Its duration, in simulated time.
+        line: The line of the world file along which agents start: `los` (line of sight) or `nlos` (no line of sight).
+        duration: Duration of a run, in simulated time.
         seeds: Seeds of the random draws, one for each run.
-        physics: The physics.
-        network: The network.
-        radio: The radio.
+        physics: The physics simulator.
+        network: The network simulator.
+        radio: The radio model.
         tcp: The TCP of all agents, also for ROS 1 topics.
-        topology: `masterless`, or `master`: all packets pass the relay, which is also the host of a ROS 1 master.
+        topology: `masterless`, or `master`: all packets go through the relay, which also runs
+            the ROS 1 master, if any.
         relay: The agent whose access point relays packets.
-        policy: The sync policy.
+        policy: The [sync policy](method-cosim.md#sync-policies).
         emane: If given, a run publishes its positions to the network emulator EMANE.
         agents: The agents by name.
-        traffic: The traffic between them.
-        faults: The faults.
-        trial: The trial of robots that it reproduces.
+        traffic: The traffic between the agents.
+        faults: Faults during a run.
+        trial: The trial of robots that the scenario reproduces.
     """
 
     world: str
@@ -377,7 +381,7 @@ class CosimScenario(Named):
     def _window_is_at_least_a_step(self) -> "CosimScenario":
         if self.policy.window < self.physics.step:
             raise schema.validation_error(
-                f"a window of {self.policy.window:.12g} s is shorter than the step of the physics, "
+                f"a window of {self.policy.window:.12g} s is shorter than the physics step, "
                 f"{self.physics.step:.12g} s, so that no state changes in it",
                 "policy",
                 "window",

@@ -1,6 +1,6 @@
-"""The world of a scenario as SDF, for Gazebo."""
+"""Converts the world and the robots of a scenario to SDF, for Gazebo."""
 
-from sim_backends.cosim.scenario.agent_setup import bodies, limits
+from sim_backends.cosim.scenario.agent_setup import limits_of, make_bodies
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.gazebo.sdf import SdfRobot, Version, world_sdf
 from sim_backends.physics.bodies import Bodies
@@ -12,17 +12,17 @@ def scenario_sdf(scenario: CosimScenario, version: Version = "fortress") -> str:
 
     Args:
         scenario: The scenario.
-        version: As for `world_sdf`.
+        version: Version of Gazebo, which determines the names of the plugins.
 
     Raises:
         ConfigurationError: The world does not exist, or a robot starts within an obstacle.
     """
     world = load_world(scenario.world)
-    scenario_bodies = bodies(scenario, world)
+    scenario_bodies = make_bodies(scenario, world)
     states = Bodies(scenario_bodies, world, lifetimes=scenario.lifetimes).start_states()
     robots = {}
     for name, plan in scenario.agents.items():
         east_m, north_m, up_m = states[name].position_m
         place_m = (east_m, north_m, up_m - scenario_bodies[name].antenna_m)
-        robots[name] = SdfRobot(limits(plan.robot), place_m, states[name].heading_rad or 0.0)
+        robots[name] = SdfRobot(limits_of(plan.robot), place_m, states[name].heading_rad or 0.0)
     return world_sdf(world, robots, step_ns=scenario.physics.step_ns, version=version)

@@ -1,6 +1,7 @@
-"""The built-in physics and network as external federates: `python -m sim_backends.cosim.scenario.served physics`.
+"""Serves the built-in physics or network as an external federate.
 
-A second argument is an address as for `serve`; without it, standard input and output are used.
+The command is `python -m sim_backends.cosim.scenario.served physics [ADDRESS]`, or `network` instead of `physics`.
+ADDRESS is the address of a transport; without it, standard input and output are used.
 """
 
 import json
@@ -8,7 +9,7 @@ import sys
 from functools import partial
 from typing import Any
 
-from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.agent_setup import make_bodies
 from sim_backends.cosim.scenario.build import radio_network
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.federates.frames import NETWORK, PHYSICS, ROLES
@@ -18,7 +19,7 @@ from sim_backends.physics.bodies import Bodies
 from sim_backends.world.world import World
 
 
-def make_federate(role: int, hello: Hello) -> Any:  # noqa: ANN401 (a physics or a network)
+def make_federate(role: int, hello: Hello) -> Any:  # noqa: ANN401 (a physics or network federate)
     """Return the built-in federate of a run.
 
     Args:
@@ -32,7 +33,7 @@ def make_federate(role: int, hello: Hello) -> Any:  # noqa: ANN401 (a physics or
     scenario = CosimScenario.model_validate(configuration["scenario"])
     world = World.model_validate(configuration["world"])
     if role == PHYSICS:
-        return Bodies(bodies(scenario, world), world, step_ns=hello.step_ns, lifetimes=scenario.lifetimes)
+        return Bodies(make_bodies(scenario, world), world, step_ns=hello.step_ns, lifetimes=scenario.lifetimes)
     return radio_network(scenario, world, hello.seed)
 
 

@@ -1,4 +1,4 @@
-"""The number of exchanges needed to keep a bound, with `error_bounded` and the longest sufficient fixed window."""
+"""Counts the exchanges needed to keep a bound, with `error_bounded` and with the longest sufficient fixed window."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -65,7 +65,7 @@ def bound_cost(
     Args:
         run: Runs the same scenario and seed with a policy.
         bound_m: Largest allowed error of the network's relative position of two agents.
-        step_s: The step of the physics, which is the shortest window.
+        step_s: The physics step, which is the shortest window.
         longest_s: The longest window.
     """
     bounded_run = run(ErrorBounded(bound_m, longest_s))
@@ -76,7 +76,12 @@ def bound_cost(
 
 
 def fixed_cost(run: Callable[[SyncPolicy], Run], window_s: float) -> FixedCost:
-    """Return the cost of a fixed window in a scenario with one seed; `run` is as for `bound_cost`."""
+    """Return the cost of a fixed window in a scenario with one seed.
+
+    Args:
+        run: Runs the same scenario and seed with a policy.
+        window_s: The window.
+    """
     result = run(Scheduled(window_s))
     return FixedCost(largest_m(result), len(result.windows_ns))
 
@@ -86,8 +91,8 @@ def longest_sufficient_window(
 ) -> tuple[float, Sequence[FixedCost]]:
     """Return the longest fixed window that keeps a bound in all runs, and its cost in each run.
 
-    The tolerance is 2 %. It is the window that a user would choose for further runs. If there is none, the result is
-    nan and an empty sequence.
+    This is the window that a user would choose for further runs; it is determined within 2 %. If there is no such
+    window, the result is nan and an empty sequence.
 
     Args:
         longest_s: The longest window that keeps the bound in each run.

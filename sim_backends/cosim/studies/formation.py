@@ -1,4 +1,4 @@
-"""Position errors of followers, and the string stability of convoys."""
+"""Computes the position errors of followers, and the string stability of convoys."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -9,7 +9,7 @@ import numpy as np
 
 from sim_backends.cosim.federates import PhysicsFederate
 from sim_backends.cosim.scenario.agent_plans import FollowPlan
-from sim_backends.cosim.scenario.agent_setup import limits
+from sim_backends.cosim.scenario.agent_setup import limits_of
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.intervals import Floats
 from sim_backends.physics.robot_limits import QuadrotorLimits
@@ -23,17 +23,19 @@ class Tracks:
     Attributes:
         names: The agents.
         times_s: Times, shape (times,).
-        places_m: Positions in metres east, north, up, shape (times, agents, 3).
+        positions_m: Positions in metres east, north, up, shape (times, agents, 3).
     """
 
     names: Sequence[str]
     times_s: Floats
-    places_m: Floats
+    positions_m: Floats
 
     def distances_m(self, other: "Tracks") -> Floats:
         """Return the distance of each agent from its position in another run, shape (common times, agents)."""
         common_count = min(len(self.times_s), len(other.times_s))
-        distances_m: Floats = np.linalg.norm(self.places_m[:common_count] - other.places_m[:common_count], axis=2)
+        distances_m: Floats = np.linalg.norm(
+            self.positions_m[:common_count] - other.positions_m[:common_count], axis=2
+        )
         return distances_m
 
 
@@ -51,18 +53,18 @@ def tracks_of(states: Iterable[tuple[int, str, State]]) -> Tracks:
 
 def _tracks(times_s: Floats, samples: Sequence[Mapping[str, State]]) -> Tracks:
     names = tuple(dict.fromkeys(name for states in samples for name in states))
-    places_m = [
+    positions_m = [
         [states[name].position_m if name in states else (math.nan,) * 3 for name in names] for states in samples
     ]
-    return Tracks(names, times_s, np.array(places_m, dtype=np.float64).reshape(len(samples), len(names), 3))
+    return Tracks(names, times_s, np.array(positions_m, dtype=np.float64).reshape(len(samples), len(names), 3))
 
 
 class SampledPhysics:
     """Physics whose states are sampled at equal intervals; sampling does not change the motion.
 
     Args:
-        physics: The physics.
-        interval_ns: Sampling interval; it is rounded up to whole steps of the physics.
+        physics: The physics federate.
+        interval_ns: Sampling interval; it is rounded up to whole physics steps.
     """
 
     def __init__(self, physics: PhysicsFederate, interval_ns: int) -> None:
@@ -75,7 +77,7 @@ class SampledPhysics:
         self.agents_disappear = getattr(physics, "agents_disappear", False)
 
     def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
-        """Advance the physics, and store the samples that are due."""
+        """Advance the physics federate, and store the samples that are due."""
         while self._next_ns <= to_ns:
             self._samples.append(self._physics.advance(self._next_ns, commands))
             self._next_ns += self._interval_ns
@@ -89,49 +91,49 @@ class SampledPhysics:
         return _tracks(times_s, self._samples)
 
 
-def speeds_m_s(times_s: Floats, places_m: Floats) -> Floats:
+def speeds_m_s(times_s: Floats, positions_m: Floats) -> Floats:
     """Return the speeds of vehicles, by central differences.
 
     Args:
         times_s: Times, shape (times,).
-        places_m: Positions in metres east, north, up, shape (times, vehicles, 3).
+        positions_m: Positions in metres east, north, up, shape (times, vehicles, 3).
 
     Returns:
         Shape (times, vehicles).
     """
-    speeds: Floats = np.linalg.norm(np.gradient(places_m, times_s, axis=0), axis=-1)
+    speeds: Floats = np.linalg.norm(np.gradient(positions_m, times_s, axis=0), axis=-1)
     return speeds
 
 
-def spacing_errors_m(times_s: Floats, places_m: Floats, standstill_m: float, headway_s: float) -> Floats:
+def spacing_errors_m(times_s: Floats, positions_m: Floats, standstill_m: float, headway_s: float) -> Floats:
     """Return the gap in front of each follower minus the desired gap, which is `standstill_m + headway_s v`.
 
     Args:
         times_s: Times, shape (times,).
-        places_m: Positions of the vehicles in their order in the row, shape (times, vehicles, 3).
+        positions_m: Positions of the vehicles in their order in the row, shape (times, vehicles, 3).
         standstill_m: Desired gap at standstill.
         headway_s: Time headway.
 
     Returns:
         Shape (times, vehicles - 1).
     """
-    gaps_m = np.linalg.norm(np.diff(places_m, axis=1), axis=-1)
-    errors: Floats = gaps_m - standstill_m - headway_s * speeds_m_s(times_s, places_m)[:, 1:]
+    gaps_m = np.linalg.norm(np.diff(positions_m, axis=1), axis=-1)
+    errors: Floats = gaps_m - standstill_m - headway_s * speeds_m_s(times_s, positions_m)[:, 1:]
     return errors
 
 
-def station_errors_m(places_m: Floats, station_m: Floats, above_m: float) -> Floats:
+def station_errors_m(positions_m: Floats, station_m: Floats, above_m: float) -> Floats:
     """Return the distance of a drone from its station, which is `above_m` above the centre of the vehicles.
 
     Args:
-        places_m: Positions of the vehicles, shape (times, vehicles, 3).
+        positions_m: Positions of the vehicles, shape (times, vehicles, 3).
         station_m: Positions of the drone, shape (times, 3).
         above_m: Height of its station above them.
 
     Returns:
         Shape (times,).
     """
-    errors: Floats = np.linalg.norm(station_m - places_m.mean(axis=1) - (0.0, 0.0, above_m), axis=-1)
+    errors: Floats = np.linalg.norm(station_m - positions_m.mean(axis=1) - (0.0, 0.0, above_m), axis=-1)
     return errors
 
 
@@ -207,7 +209,7 @@ def has_followers(scenario: CosimScenario) -> bool:
     return any(isinstance(plan.motion, FollowPlan) for plan in scenario.agents.values())
 
 
-def formation(scenario: CosimScenario, tracks: Tracks) -> Formation:
+def compute_formation(scenario: CosimScenario, tracks: Tracks) -> Formation:
     """Return the position errors of followers; `NO_FORMATION` if there are fewer than two samples.
 
     Args:
@@ -222,12 +224,12 @@ def formation(scenario: CosimScenario, tracks: Tracks) -> Formation:
     for name, plan in scenario.agents.items():
         if not isinstance(plan.motion, FollowPlan) or not {name, *plan.motion.leader} <= {*tracks.names}:
             continue
-        row_m = _places_m(tracks, [*plan.motion.leader, name])
+        row_m = _positions_m(tracks, [*plan.motion.leader, name])
         is_present = ~np.isnan(row_m).any(axis=(1, 2))
         if np.count_nonzero(is_present) < _MIN_SAMPLES:
             continue
         times_s, leaders, follower = tracks.times_s[is_present], row_m[is_present, :-1], row_m[is_present, -1:]
-        if isinstance(limits(plan.robot), QuadrotorLimits):
+        if isinstance(limits_of(plan.robot), QuadrotorLimits):
             station_errors.append(station_errors_m(leaders, follower[:, 0], plan.motion.distance))
         else:
             row_m = row_m[is_present]
@@ -252,8 +254,8 @@ def mean_formation(formations: Sequence[Formation]) -> Formation:
     )
 
 
-def _places_m(tracks: Tracks, names: Sequence[str]) -> Floats:
-    return tracks.places_m[:, [tracks.names.index(name) for name in names]]
+def _positions_m(tracks: Tracks, names: Sequence[str]) -> Floats:
+    return tracks.positions_m[:, [tracks.names.index(name) for name in names]]
 
 
 def _ratios(times_s: Floats, row_m: Floats) -> Iterator[float]:

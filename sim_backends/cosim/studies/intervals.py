@@ -1,4 +1,4 @@
-"""95 % intervals over independent repeats, in closed form: without resampling, no result depends on a seed."""
+"""Computes 95 % intervals over independent repeats in closed form, so that no result depends on a seed."""
 
 import math
 from dataclasses import dataclass

@@ -26,7 +26,7 @@ from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.world.motion import State
 
 MEASURES: Final = ("delivery_s", "late_s", "position_m", "fates", "path_m")
-"""Error of the delivery time; time by which the receiver was already past an arrival; error of the relative position
+"""Error of the delivery time; time by which an arrival was in the receiver's past; error of the relative position
 of sender and receiver in the network; share of packets with another fate; position error of agents at the end of the
 window."""
 
@@ -97,7 +97,7 @@ def local_errors(
         policies: Functions that return a policy for a parameter: the length of a window in seconds, or its
             equivalent.
         parameters: The parameters.
-        starts_ns: Start times of windows, ascending; whole steps of the physics.
+        starts_ns: Start times of windows, ascending; whole physics steps.
         tail_ns: Time for which forks continue after the window; packets whose fate is undecided then are ignored.
 
     Raises:

@@ -1,7 +1,9 @@
-"""The paper's claims about its middleware: an adaptive window against a fixed one, masterless against master-based.
+"""Measured changes for the claims of the paper about its middleware.
 
-Both claims are measured in the rows of its tables 1 and 3, with the same seeds. The measures are the change of the
-mean delay of packets that arrive, and the change of the share of packets that do not arrive.
+The paper claims that an adaptive window is better than a fixed one, and that masterless communication is better than
+communication through a ROS master. Both claims are measured in the rows of the paper's tables 1 and 3, with the same
+seeds. The measures are the change of the mean delay of packets that arrive, and the change of the share of packets
+that do not arrive.
 """
 
 import math
@@ -22,17 +24,20 @@ from sim_backends.cosim.studies.paper_tables import (
     PRINTED,
     Agreement,
     Printed,
-    agreement,
+    compare,
 )
 
 ADAPTIVE: Final = "adaptive"
-"""The paper's own system, which is compared with `FIXED` and `MASTER`."""
+"""The system of the paper, with a window that adapts; it is compared with `FIXED` and `MASTER`."""
 
-ROWS: Final = tuple((line, distance_m) for line in Sight for distance_m in DISTANCES_M)
-"""The lines and distances at which each system is run."""
+ROWS: Final = tuple((sight, distance_m) for sight in Sight for distance_m in DISTANCES_M)
+"""The sight conditions (with or without line of sight) and the distances at which each system is run."""
 
-LINES: Final[Mapping[str, tuple[Sight, ...]]] = {"all": tuple(Sight), **{str(line): (line,) for line in Sight}}
-"""The lines to which a claim applies, by name."""
+SIGHT_GROUPS: Final[Mapping[str, tuple[Sight, ...]]] = {
+    "all": tuple(Sight),
+    **{str(sight): (sight,) for sight in Sight},
+}
+"""The sight conditions that a claim covers, by name of the group."""
 
 
 class Claim(NamedTuple):
@@ -40,46 +45,48 @@ class Claim(NamedTuple):
 
     Attributes:
         compared_system: The system with which the paper's system is compared.
-        lines: One of `LINES`.
+        sight_group: The sight conditions that the claim covers, as a key of `SIGHT_GROUPS`.
         quantity: `delay`, with a relative change, or `loss`, with a difference.
         claimed_change: The change that the paper states; None if it states none.
-        tabled_change: The change according to the paper's own tables; nan if the tables do not contain it.
-        ours: The measured change, with its 95 % interval.
-        rows: Number of rows that it is based on: for a delay, packets must have arrived in both systems.
+        change_in_tables: The change according to the tables of the paper; nan if the tables do not contain it.
+        measured_change: The change in the simulations of this program, with its 95 % interval.
+        rows: Number of rows that the change is based on. For a delay, packets must have arrived in both systems.
     """
 
     compared_system: str
-    lines: str
+    sight_group: str
     quantity: str
     claimed_change: Printed | None
-    tabled_change: float
-    ours: IntervalEstimate
+    change_in_tables: float
+    measured_change: IntervalEstimate
     rows: int
 
     @property
     def agreement(self) -> Agreement | None:
-        """The relation of our change to the stated one; None if the paper states none."""
-        return None if self.claimed_change is None else agreement(self.claimed_change, self.ours)
+        """The relation of the measured change to the stated one; None if the paper states none."""
+        return None if self.claimed_change is None else compare(self.claimed_change, self.measured_change)
 
 
 def claim_setups(changes: Changes) -> dict[str, Setup]:
     """Return the setups to run for the claims, by name.
 
     Args:
-        changes: Changes of the scenario's file, as for `load_scenario`.
+        changes: Values by dotted key of the scenario file, which replace those of the file.
 
     Raises:
         ConfigurationError: The changes are invalid.
     """
     setups: dict[str, Setup] = {}
-    for line, distance_m in ROWS:
-        adaptive = setups[_name(ADAPTIVE, line, distance_m)] = masterless(line, distance_m, changes)
-        setups[_name(FIXED, line, distance_m)] = Setup(adaptive.scenario, SlidingWindow.name)
-        setups[_name(MASTER, line, distance_m)] = master_based(line, distance_m, "ros1", changes)
+    for sight, distance_m in ROWS:
+        adaptive = setups[_name(ADAPTIVE, sight, distance_m)] = masterless(sight, distance_m, changes)
+        setups[_name(FIXED, sight, distance_m)] = Setup(adaptive.scenario, SlidingWindow.name)
+        setups[_name(MASTER, sight, distance_m)] = master_based(sight, distance_m, "ros1", changes)
     return setups
 
 
-def claims(setups: Mapping[str, Setup], samples: Mapping[str, Sequence[Mapping[str, FlowSample]]]) -> list[Claim]:
+def compute_claims(
+    setups: Mapping[str, Setup], samples: Mapping[str, Sequence[Mapping[str, FlowSample]]]
+) -> list[Claim]:
     """Return all claims.
 
     Args:
@@ -91,46 +98,50 @@ def claims(setups: Mapping[str, Setup], samples: Mapping[str, Sequence[Mapping[s
     }
     all_claims: list[Claim] = []
     for compared_system in (FIXED, MASTER):
-        for lines, claim_lines in LINES.items():
-            rows = [row for row in ROWS if row[0] in claim_lines]
-            our_flows, other_system_flows = (
+        for sight_group, sights in SIGHT_GROUPS.items():
+            rows = [row for row in ROWS if row[0] in sights]
+            adaptive_flows, other_system_flows = (
                 [flows[_name(system, *row)] for row in rows] for system in (ADAPTIVE, compared_system)
             )
-            claimed_changes = CLAIMS.get((compared_system, lines), (None, None))
-            tabled_changes = (
-                _changes_in_paper_tables(claim_lines) if compared_system == MASTER else (math.nan, math.nan)
+            claimed_changes = CLAIMS.get((compared_system, sight_group), (None, None))
+            changes_in_tables = (
+                _changes_in_paper_tables(sights) if compared_system == MASTER else (math.nan, math.nan)
             )
-            delay, row_count = delay_change(_delays_s(our_flows), _delays_s(other_system_flows))
-            loss = mean((_losses(our_flows) - _losses(other_system_flows)).mean(axis=0))
+            delay, delay_rows = delay_change(_delays_s(adaptive_flows), _delays_s(other_system_flows))
+            loss = mean((_losses(adaptive_flows) - _losses(other_system_flows)).mean(axis=0))
             all_claims.append(
-                Claim(compared_system, lines, "delay", claimed_changes[0], tabled_changes[0], delay, row_count)
+                Claim(
+                    compared_system, sight_group, "delay", claimed_changes[0], changes_in_tables[0], delay, delay_rows
+                )
             )
             all_claims.append(
-                Claim(compared_system, lines, "loss", claimed_changes[1], tabled_changes[1], loss, len(rows))
+                Claim(compared_system, sight_group, "loss", claimed_changes[1], changes_in_tables[1], loss, len(rows))
             )
     return all_claims
 
 
-def delay_change(ours_s: Floats, other_s: Floats) -> tuple[IntervalEstimate, int]:
+def delay_change(adaptive_s: Floats, other_s: Floats) -> tuple[IntervalEstimate, int]:
     """Return the relative change of delays, and the number of rows that it is based on.
 
-    In each row, it compares the means over the seeds with which packets arrived in both systems; at least two such
-    seeds are needed. The total is the geometric mean over the rows, so that each has the same weight. The interval is
-    computed for the logarithm of the change.
+    Each row compares the mean delays of the two systems over those seeds for which packets arrived in both. A row is
+    omitted if there are fewer than two such seeds. The total change is the geometric mean over the rows, so that each
+    row has the same weight. The interval is computed for the logarithm of the change.
 
     Args:
-        ours_s: Mean delay of a packet in the paper's system, shape (rows, seeds); nan if none arrived.
-        other_s: The same for the other system.
+        adaptive_s: Mean delay of a packet in the paper's system, shape (rows, seeds); nan if none arrived.
+        other_s: Mean delay of a packet in the compared system, with the same shape.
     """
-    arrived_in_both = np.isfinite(ours_s) & np.isfinite(other_s)
-    seeds = ours_s.shape[1]
+    arrived_in_both = np.isfinite(adaptive_s) & np.isfinite(other_s)
+    seeds = adaptive_s.shape[1]
     used_rows = arrived_in_both.sum(axis=1) >= min(2, seeds)
     if not used_rows.any():
         return IntervalEstimate(math.nan, math.nan, math.nan), 0
-    ours_s, other_s = (np.where(arrived_in_both, values_s, np.nan)[used_rows] for values_s in (ours_s, other_s))
+    adaptive_s, other_s = (
+        np.where(arrived_in_both, values_s, np.nan)[used_rows] for values_s in (adaptive_s, other_s)
+    )
 
     def log_change(columns: Sequence[int]) -> float:
-        ratios = np.nanmean(ours_s[:, columns], axis=1) / np.nanmean(other_s[:, columns], axis=1)
+        ratios = np.nanmean(adaptive_s[:, columns], axis=1) / np.nanmean(other_s[:, columns], axis=1)
         return float(np.log(ratios).mean())
 
     all_seeds = range(seeds)
@@ -142,16 +153,18 @@ def delay_change(ours_s: Floats, other_s: Floats) -> tuple[IntervalEstimate, int
     return change, int(used_rows.sum())
 
 
-def _changes_in_paper_tables(lines: Sequence[Sight]) -> tuple[float, float]:
+def _changes_in_paper_tables(sights: Sequence[Sight]) -> tuple[float, float]:
     """Return the changes of delay and loss from the paper's table 3, with TCP, to its table 1."""
-    our_columns, other_columns = (
-        [PRINTED["1"][line, "topic"] for line in lines],
-        [PRINTED["3"][line, "ros1"] for line in lines],
+    adaptive_columns, other_columns = (
+        [PRINTED["1"][sight, "topic"] for sight in sights],
+        [PRINTED["3"][sight, "ros1"] for sight in sights],
     )
     delay, _ = delay_change(
-        *(_printed_numbers([columns.delays_s for columns in system]) for system in (our_columns, other_columns))
+        *(_printed_numbers([columns.delays_s for columns in system]) for system in (adaptive_columns, other_columns))
     )
-    losses = (_printed_numbers([columns.losses for columns in system]) for system in (our_columns, other_columns))
+    losses = (
+        _printed_numbers([columns.losses for columns in system]) for system in (adaptive_columns, other_columns)
+    )
     return delay.value, float(np.subtract(*losses).mean())
 
 
@@ -168,5 +181,5 @@ def _losses(rows: Sequence[Sequence[FlowSample]]) -> Floats:
     return np.array([[sample.loss for sample in row] for row in rows], np.float64)
 
 
-def _name(system: str, line: Sight, distance_m: int) -> str:
-    return f"{system}, {line} {distance_m} m"
+def _name(system: str, sight: Sight, distance_m: int) -> str:
+    return f"{system}, {sight} {distance_m} m"

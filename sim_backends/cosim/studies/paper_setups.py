@@ -76,8 +76,8 @@ def flow_samples(
     Args:
         setups: The setups by name.
         seeds: Seeds of the random draws.
-        workers: As for `run_many`.
-        progress: As for `run_many`.
+        workers: The workers that run the simulations.
+        progress: Called with the number of finished runs.
 
     Raises:
         FieldkitError: A run failed.
@@ -122,7 +122,7 @@ def _flow_sample(sent_packets: int, delays_s: Sequence[float], fates: Sequence[F
 
 
 Changes = Mapping[str, Any]
-"""Changes of a scenario's file, as for `load_scenario`."""
+"""Values by dotted key of a scenario file, which replace those of the file."""
 
 RADIOS: Final[Mapping[str, Changes]] = MappingProxyType(
     {"wifi": MappingProxyType({}), "1 Mbit/s": MappingProxyType({"radio": {"rate": "1Mbit/s"}})}
@@ -133,26 +133,26 @@ _DURATION: Final = "20s"
 """The run ends 9 s after the last packet of a bag; packets that are still under way then count as lost."""
 
 
-def masterless(line: Sight, distance_m: float, changes: Changes, *, flying: bool = False) -> Setup:
+def masterless(sight: Sight, distance_m: float, changes: Changes, *, flying: bool = False) -> Setup:
     """Return the setup of a row of tables 1 and 2: a topic from one agent to another.
 
     Args:
-        line: With line of sight or without.
-        distance_m: Distance between the two agents along that line.
+        sight: Line of sight, or no line of sight.
+        distance_m: Distance between the two agents, along the world's line for this sight condition.
         changes: Changes that apply to all rows.
         flying: True if the drone sends, instead of a ground robot.
     """
     source, destination, moved_agent = ("iris", "husky-1", "iris") if flying else ("husky-1", "husky-2", "husky-2")
-    places = {f"agents.{moved_agent}.along": f"{distance_m}m"}
-    return Setup(_baylands(line, places | _bag(source, destination, "topic"), changes), VelocityAware.name)
+    placements = {f"agents.{moved_agent}.along": f"{distance_m}m"}
+    return Setup(_baylands(sight, placements | _bag(source, destination, "topic"), changes), VelocityAware.name)
 
 
-def master_based(line: Sight, distance_m: float, protocol: str, changes: Changes) -> Setup:
+def master_based(sight: Sight, distance_m: float, protocol: str, changes: Changes) -> Setup:
     """Return the setup of a row of table 3: all packets pass the drone, which hovers halfway.
 
     Args:
-        line: With line of sight or without.
-        distance_m: Distance between the two ground robots along that line.
+        sight: Line of sight, or no line of sight.
+        distance_m: Distance between the two ground robots, along the world's line for this sight condition.
         protocol: `ros1` (TCP) or `ros1-udp`.
         changes: Changes that apply to all rows.
     """
@@ -163,7 +163,7 @@ def master_based(line: Sight, distance_m: float, protocol: str, changes: Changes
         "agents.iris.along": f"{distance_m / 2}m",
         "agents.iris.motion": {"kind": "station-keeping"},
     }
-    return Setup(_baylands(line, master | _bag("husky-1", "husky-2", protocol), changes), SlidingWindow.name)
+    return Setup(_baylands(sight, master | _bag("husky-1", "husky-2", protocol), changes), SlidingWindow.name)
 
 
 def mesh(radio: Changes, changes: Changes) -> Setup:
@@ -187,5 +187,5 @@ def _bag(source: str, destination: str, protocol: str) -> dict[str, Any]:
     return {"traffic": [{"kind": "bag", "from": source, "to": destination, "protocol": protocol, "start": "500ms"}]}
 
 
-def _baylands(line: Sight, row_changes: Changes, changes: Changes) -> CosimScenario:
-    return load_scenario("baylands", {"line": str(line), "duration": _DURATION, **row_changes, **changes})
+def _baylands(sight: Sight, row_changes: Changes, changes: Changes) -> CosimScenario:
+    return load_scenario("baylands", {"line": str(sight), "duration": _DURATION, **row_changes, **changes})

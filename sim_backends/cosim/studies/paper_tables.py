@@ -1,4 +1,4 @@
-"""The tables of the paper: its printed values, and their agreement with our runs."""
+"""The tables of the paper: the printed values, and their agreement with the simulations of this program."""
 
 import math
 from collections import Counter
@@ -62,18 +62,18 @@ class Printed:
         return float(low / self.per_si), float(high / self.per_si)
 
 
-def agreement(printed: Printed, ours: IntervalEstimate) -> Agreement:
+def compare(printed: Printed, measured: IntervalEstimate) -> Agreement:
     """Return the relation of an estimate to a printed number, both in SI units.
 
     They agree if the printed number, at its precision, is within the interval of the estimate, or if the value of the
     estimate rounds to it.
     """
-    if math.isnan(ours.value):
+    if math.isnan(measured.value):
         return Agreement.NO_VALUE
     low, high = printed.bounds
-    if max(ours.value, _or_value(ours.high, ours.value)) < low:
+    if max(measured.value, _or_value(measured.high, measured.value)) < low:
         return Agreement.BELOW
-    if min(ours.value, _or_value(ours.low, ours.value)) > high:
+    if min(measured.value, _or_value(measured.low, measured.value)) > high:
         return Agreement.ABOVE
     return Agreement.AGREES
 
@@ -142,7 +142,7 @@ EMANE: Final[Mapping[str, tuple[Printed, Printed]]] = MappingProxyType(
 """Section "Discussion": mean round trip and share of lost requests of 100 pings, before and after node 10 moved."""
 
 FIXED: Final = "fixed window"
-"""The paper's own system with a window that does not adapt."""
+"""The system of the paper with a window that does not adapt."""
 MASTER: Final = "master-based"
 """ROS 1 with TCP."""
 
@@ -157,7 +157,7 @@ CLAIMS: Final[Mapping[tuple[str, str], tuple[Printed, Printed]]] = MappingProxyT
         (MASTER, Sight.NLOS): (Printed("-40", per_si=100), Printed("-20", per_si=100)),
     }
 )
-"""Relative change of delay, and change of loss in percentage points, by compared system and lines."""
+"""Relative change of delay, and change of loss in percentage points, by compared system and sight group."""
 
 
 TABLES: Final = (*PRINTED, "emane")
@@ -176,29 +176,29 @@ class PaperCell:
 
     Attributes:
         printed: The paper's number.
-        ours: Mean over seeds with its 95 % interval, in SI units.
+        measured: The result of the simulations: mean over seeds with its 95 % interval, in SI units.
         seeds: Number of seeds that had a value.
     """
 
     printed: Printed
-    ours: IntervalEstimate
+    measured: IntervalEstimate
     seeds: int
 
     @property
     def agreement(self) -> Agreement:
-        """The relation of our number to the printed one."""
-        return agreement(self.printed, self.ours)
+        """The relation of the measured number to the printed one."""
+        return compare(self.printed, self.measured)
 
     @property
     def agrees_by_mean(self) -> bool:
         """True if the mean rounds to the printed number; False if only another value in its interval does."""
-        mean_only = IntervalEstimate(self.ours.value, np.nan, np.nan)
-        return agreement(self.printed, mean_only) is Agreement.AGREES
+        mean_only = IntervalEstimate(self.measured.value, np.nan, np.nan)
+        return compare(self.printed, mean_only) is Agreement.AGREES
 
     @property
     def difference(self) -> float:
-        """Difference of our number from the printed one; nan if our number is unknown."""
-        return self.ours.value - self.printed.value
+        """Measured number minus the printed one; nan if the measured number is unknown."""
+        return self.measured.value - self.printed.value
 
 
 @dataclass(frozen=True)
@@ -275,7 +275,7 @@ def paper_table(table: str, changes: Mapping[str, Any]) -> PaperTable:
 
     Args:
         table: One of `TABLES`.
-        changes: Changes of the scenario's file, as for `load_scenario`.
+        changes: Values by dotted key of the scenario file, which replace those of the file.
 
     Raises:
         ConfigurationError: The changes are invalid.
@@ -286,23 +286,23 @@ def paper_table(table: str, changes: Mapping[str, Any]) -> PaperTable:
 def _cell(printed: Printed, values: Sequence[float], highest: float) -> PaperCell:
     """Return a cell for the values of all seeds, nan if unknown; its interval is clipped to [0, `highest`]."""
     finite = np.array([value for value in values if np.isfinite(value)])
-    ours = mean(finite)
-    low, high = np.clip((ours.low, ours.high), 0, highest).tolist()
-    return PaperCell(printed, IntervalEstimate(ours.value, low, high), len(finite))
+    estimate = mean(finite)
+    low, high = np.clip((estimate.low, estimate.high), 0, highest).tolist()
+    return PaperCell(printed, IntervalEstimate(estimate.value, low, high), len(finite))
 
 
 def _transmissions(table: str, changes: Mapping[str, Any]) -> PaperTable:
     """Return one of tables 1 to 3."""
     setups: dict[str, Setup] = {}
     sources: list[RowSource] = []
-    for (line, protocol), columns in PRINTED[table].items():
+    for (sight, protocol), columns in PRINTED[table].items():
         for distance_m, *printed in zip(DISTANCES_M, columns.delays_s, columns.losses, strict=True):
-            name = f"{line} {distance_m} m {protocol}"
+            name = f"{sight} {distance_m} m {protocol}"
             if table == "3":
-                setups[name] = master_based(line, distance_m, protocol, changes)
+                setups[name] = master_based(sight, distance_m, protocol, changes)
             else:
-                setups[name] = masterless(line, distance_m, changes, flying=table == "2")
-            labels: Labels = {"line": str(line), "distance_m": distance_m, "protocol": _LABELS[protocol]}
+                setups[name] = masterless(sight, distance_m, changes, flying=table == "2")
+            labels: Labels = {"line": str(sight), "distance_m": distance_m, "protocol": _LABELS[protocol]}
             sources.append(RowSource(labels, name, only_flow(setups[name]), (printed[0], printed[1])))
     return PaperTable(setups, sources, lambda sample: sample.delay_sum_s)
 

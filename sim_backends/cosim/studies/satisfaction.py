@@ -1,7 +1,7 @@
 """The paper's satisfaction loop: a round is repeated with another window until its loss is accepted.
 
-The paper (section III, below algorithm 1): the network's loss is compared with a threshold. While the loss is above
-the threshold, algorithm 1 changes the window, and the same round is run again, until a result "is deemed to be
+In the paper (section III, below algorithm 1), the network's loss is compared with a threshold. While the loss is
+above the threshold, algorithm 1 changes the window, and the same round is run again, until a result "is deemed to be
 satisfactory". The window of a round is the result of the rule in the previous round.
 
 A sync policy does not change the losses of the radio. Each round is therefore compared with the exact reference of
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_backends.cosim.comparison import Errors, errors, lost_share
+from sim_backends.cosim.comparison import Errors, compare_runs, lost_share
 from sim_backends.cosim.policies.sync_policy import PolicyError, SyncPolicy
 from sim_backends.cosim.policies.window_policies import EventDriven
 from sim_backends.cosim.run_record import Run
@@ -75,7 +75,7 @@ def satisfy(
 
     Args:
         run: Runs the same scenario and seed with a policy.
-        rule: Returns the policy of a round for its w: `VelocityAwareRaw`, or `VelocityAware`.
+        rule: Returns the policy of a round for its parameter w.
         threshold: Accepted loss.
         window_s: w of the first round.
         max_rounds: Largest number of rounds.
@@ -91,7 +91,7 @@ def satisfy(
             break
         median_s = float(np.median(np.diff(result.windows_ns, prepend=0))) / 1e9
         loss = lost_share(result)
-        rounds.append(Round(window_s, median_s, loss, errors(reference, result), len(result.windows_ns)))
+        rounds.append(Round(window_s, median_s, loss, compare_runs(reference, result), len(result.windows_ns)))
         if loss <= threshold:
             reason = ""
             break

@@ -1,4 +1,4 @@
-"""Many runs in parallel; results do not depend on the number of workers."""
+"""Executes many runs in parallel, with results that do not depend on the number of workers."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -57,7 +57,7 @@ def run_many(
     After the first error, and after Ctrl-C, all tasks are stopped.
 
     Args:
-        work: As for `tasks.completed`.
+        work: Executes a task; it must be picklable.
         tasks: The tasks.
         workers: The workers that run the tasks.
         progress: Called with the number of finished tasks.
@@ -77,7 +77,10 @@ def run_many(
 def as_completed_tasks(
     work: Callable[[Task], Result], tasks: Sequence[Task], *, workers: Workers = ALL_PROCESSORS
 ) -> Iterator[tuple[int, Result]]:
-    """Yield the number and the result of each task when it has finished; arguments, errors as for `run_many`."""
+    """Yield the number and the result of each task when it has finished.
+
+    The arguments and the errors are those of `run_many`.
+    """
     for end in completed(partial(_run_task, work), tasks, workers):
         if isinstance(end.error, WorkerDiedError):
             end.error.where = str(tasks[end.number])

@@ -1,4 +1,4 @@
-"""The cost and the errors of each sync policy: with one seed, and the bias over seeds."""
+"""Compares sync policies: cost and errors with one seed, and bias over seeds."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -11,7 +11,7 @@ import numpy as np
 
 from fieldkit.core.executors import Workers
 from sim_backends.cosim.agents import Agents
-from sim_backends.cosim.comparison import Errors, errors, lost_share, mean_errors
+from sim_backends.cosim.comparison import Errors, compare_runs, lost_share, mean_errors
 from sim_backends.cosim.policies.sync_policy import PolicyError
 from sim_backends.cosim.policies.window_policies import EventDriven
 from sim_backends.cosim.run_record import Run
@@ -73,10 +73,10 @@ class Outcomes:
     def errors(self, policy: str, seed: int) -> Errors:
         """Return the errors of one run relative to the reference with the same seed."""
         reference, outcome = self.reference[seed], self.runs[policy][seed]
-        return errors(reference.run, outcome.run, outcome.tracks.distances_m(reference.tracks))
+        return compare_runs(reference.run, outcome.run, outcome.tracks.distances_m(reference.tracks))
 
 
-def outcomes(
+def run_outcomes(
     make: Make,
     policies: Sequence[str],
     seeds: Sequence[int],
@@ -90,8 +90,8 @@ def outcomes(
         make: Builds the scenario; it must be picklable.
         policies: Names of policies.
         seeds: The seeds.
-        workers: As for `run_many`.
-        progress: As for `run_many`.
+        workers: The workers that run the simulations.
+        progress: Called with the number of finished runs.
 
     Raises:
         FieldkitError: A run failed with an error other than `PolicyError`.
@@ -130,11 +130,11 @@ def delay_s(outcome: RunOutcome) -> float:
 
 def mean_separation_m(outcome: RunOutcome) -> float:
     """Return the mean distance between agents over time and all pairs; nan for a single agent."""
-    places_m = outcome.tracks.places_m
-    first, second = np.triu_indices(places_m.shape[1], k=1)
+    positions_m = outcome.tracks.positions_m
+    first, second = np.triu_indices(positions_m.shape[1], k=1)
     if not len(first):
         return math.nan
-    return float(np.nanmean(np.linalg.norm(places_m[:, first] - places_m[:, second], axis=2)))
+    return float(np.nanmean(np.linalg.norm(positions_m[:, first] - positions_m[:, second], axis=2)))
 
 
 MEASURES: Final[Mapping[str, Callable[[RunOutcome], float]]] = {
@@ -164,7 +164,7 @@ class Bias:
     seeds_needed: int | None
 
 
-def biases(outcomes: Outcomes) -> dict[str, dict[str, Bias]]:
+def compute_biases(outcomes: Outcomes) -> dict[str, dict[str, Bias]]:
     """Return the bias of each measure for each policy that could be run with all seeds."""
     complete_policies = [name for name, runs in outcomes.runs.items() if len(runs) == len(outcomes.seeds)]
     return {

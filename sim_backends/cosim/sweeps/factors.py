@@ -25,7 +25,10 @@ from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.cosim.scenario.schema import CosimScenario
 
 DISTANCE: Final = "distance"
-"""The factor that moves agents along the world's line."""
+"""The factor that sets the distance between agents whose position is given with `along`.
+
+`along` is the position on the line that the world file defines for the scenario's `line`.
+"""
 
 _SHORT_NAMES: Final = {
     "policy": "policy.name",
@@ -50,11 +53,15 @@ _QUANTITIES: Final = (
     ("_dbm", "dBm", {"dBm": 1.0}),
     ("_value", "1", FRACTION_PER_UNIT),
 )
-"""For each kind of quantity: suffix and unit of its column of numbers, and the factors of all its units."""
+"""Suffix and unit of the column of numbers of each kind of quantity, and the factors of all its units."""
 
 
-def _in_unit(text: str, unit: str, factors: dict[str, float]) -> float:
-    """Return a quantity in a unit; only levels in dB or dBm may be negative. Errors are as for `parse_quantity`."""
+def _parse_in_unit(text: str, unit: str, factors: dict[str, float]) -> float:
+    """Parse a quantity and convert it to `unit`. Only levels in dB or dBm may be negative.
+
+    Raises:
+        ConfigurationError: It is not a quantity of this kind.
+    """
     magnitude = text.removeprefix("-") if unit in {"dB", "dBm"} else text
     value = parse_quantity(magnitude, factors, "value")
     return value if magnitude == text else -value
@@ -65,8 +72,8 @@ class Factor:
     """A setting with its values.
 
     Attributes:
-        name: Its name in the command.
-        values: Its values as in the command, at least one.
+        name: Its name on the command line.
+        values: Its values as given on the command line, at least one.
     """
 
     name: str
@@ -79,7 +86,7 @@ class Factor:
 
     @property
     def column(self) -> str:
-        """Name of the column with the values as in the command."""
+        """Name of the column with the values as given on the command line."""
         return re.sub(r"[^a-z0-9_]", "_", self.name.lower())
 
     @property
@@ -94,7 +101,11 @@ class Factor:
             return f"{self.column}_value", "1", tuple(map(float, self.values))
         for suffix, unit, factors in _QUANTITIES:
             with suppress(ConfigurationError):
-                return self.column + suffix, unit, tuple(_in_unit(value, unit, factors) for value in self.values)
+                return (
+                    self.column + suffix,
+                    unit,
+                    tuple(_parse_in_unit(value, unit, factors) for value in self.values),
+                )
         return None
 
 
@@ -121,15 +132,15 @@ def parse_factors(words: Sequence[str]) -> tuple[Factor, ...]:
     return tuple(factors.values())
 
 
-def settings_of(
+def load_combinations(
     name_or_path: str, factors: Sequence[Factor], changes: Mapping[str, Any]
 ) -> Iterator[tuple[tuple[str, ...], CosimScenario]]:
-    """Yield the values of each combination, in the order of the command, and its scenario.
+    """Yield each combination of values, in the order of the command line, and the scenario with these values.
 
     Args:
-        name_or_path: As for `load_scenario`.
+        name_or_path: Name or path of the scenario.
         factors: The factors.
-        changes: Changes of all scenarios, as for `load_scenario`.
+        changes: Values by dotted key of the scenario file, which replace those of the file in all combinations.
 
     Raises:
         ConfigurationError: There is no such factor, or a combination is invalid.
@@ -146,12 +157,12 @@ def settings_of(
         }
         if DISTANCE in values_by_name:
             scenario_with_values = load_scenario(name_or_path, all_changes)
-            all_changes |= _placements(scenario_with_values, parse_distance(values_by_name[DISTANCE]).metres)
+            all_changes |= _placement_changes(scenario_with_values, parse_distance(values_by_name[DISTANCE]).metres)
         yield values, load_scenario(name_or_path, all_changes)
 
 
 def _parse_value(name: str, text: str) -> Any:  # noqa: ANN401 (any YAML value)
-    """Return a value as in the scenario's file."""
+    """Return a value of `--over`, parsed like a value in the scenario's file."""
     return schema.parse(f"value: {text}", source=f"--over {name}").data["value"]
 
 
@@ -194,13 +205,14 @@ def _leaves(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:  # noqa:
             yield name, item
 
 
-def _placements(scenario: CosimScenario, distance_m: float) -> dict[str, str]:
-    """Return the changes that set the distance of the ends of the first flow or, with a relay, of sender and relay.
+def _placement_changes(scenario: CosimScenario, distance_m: float) -> dict[str, str]:
+    """Return the changes of `along` that result in a distance between two agents.
 
-    The distances of all agents on the world's line from the sender change by the same factor.
+    The two agents are the ends of the first flow or, with a relay, the sender and the relay. The distance from the
+    sender to every agent on the line is scaled by the same ratio.
 
     Raises:
-        ConfigurationError: The scenario does not place these agents on the world's line.
+        ConfigurationError: The positions of the two agents are not given with `along`, or are equal.
     """
     along_m = {name: plan.along for name, plan in scenario.agents.items() if plan.along is not None}
     if scenario.traffic:

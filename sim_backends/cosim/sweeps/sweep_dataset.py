@@ -1,4 +1,4 @@
-"""The results of a sweep as a dataset of Parquet files, partitioned by its factors (Hive style).
+"""Writes the results of a sweep as a dataset of Parquet files, partitioned by its factors (Hive style).
 
 Equal results give equal bytes: rows are in the order of the plan, not in the order in which the runs ended.
 """
@@ -95,13 +95,16 @@ def _schema(rows: Iterable[Mapping[str, Value]], factors: Sequence[Factor]) -> p
     declarations = dict(_SWEEP_COLUMNS)
     group_columns, partitions = [], {}
     for factor in factors:
-        meaning = f"Value of the setting {factor.name}, as in the command."
+        meaning = f"Value of the setting {factor.name}, as given on the command line."
         partitions[factor.column] = meaning
         if (number_column := factor.numbers) is None:
             group_columns.append(factor.column)
         else:
             name, unit, _ = number_column
-            declarations[name] = {"unit": unit, "meaning": meaning.replace("as in the command", "as a number")}
+            declarations[name] = {
+                "unit": unit,
+                "meaning": meaning.replace("as given on the command line", "as a number"),
+            }
             group_columns.append(name)
     fields = [
         pa.field(name, _arrow_type(column_type), metadata=declarations.get(name))

@@ -1,4 +1,4 @@
-"""The state of a sweep on disk: a file per finished run, a file per failed run, and a file with the plan.
+"""Stores the state of a sweep on disk: a file per finished run, a file per failed run, and a file with the plan.
 
 A file is written under a temporary name, synced and renamed, so that it is complete or does not exist.
 """
@@ -144,7 +144,7 @@ class SweepFolder:
         return RunFailure(**{name: content[name] for name in RunFailure.__dataclass_fields__ if name in content})
 
     def write_failure(self, run: SweepRun, failure: RunFailure) -> None:
-        """Write the failure of a run; errors as for `write_result`."""
+        """Write the failure of a run. Raises the errors of `write_result`."""
         self._write(self.path / _FAILED / f"{run.name}.json", _identity(run) | vars(failure))
 
     @contextmanager

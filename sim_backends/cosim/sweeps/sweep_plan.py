@@ -1,4 +1,7 @@
-"""The runs of a sweep. The name of a run is the hash of scenario, settings, seed and version of fieldkit."""
+"""The plan of a sweep: all its settings and runs.
+
+The name of a run is the hash of scenario, settings, seed and version of fieldkit.
+"""
 
 import hashlib
 import json
@@ -14,7 +17,7 @@ from fieldkit.config.locations import names
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.sweeps.factors import Factor, settings_of
+from sim_backends.cosim.sweeps.factors import Factor, load_combinations
 from sim_backends.physics.robot_limits import BODIES
 from sim_backends.world.world import world_files
 
@@ -27,7 +30,7 @@ class SweepSetting:
     """A scenario with a combination of values.
 
     Attributes:
-        values: The values by the name of their factor, as in the command.
+        values: The values by the name of their factor, as given on the command line.
         scenario: The scenario with these values.
         digest: Hash of the scenario, of the files that it names, and of the version of fieldkit.
     """
@@ -68,7 +71,7 @@ class SweepPlan:
     Attributes:
         scenario: The scenario without its factors.
         factors: The factors.
-        settings: All combinations of their values, in the order of the command.
+        settings: All combinations of their values, in the order of the command line.
         seeds: Seeds of each combination.
     """
 
@@ -89,16 +92,16 @@ def plan_sweep(
     """Return the plan of a sweep.
 
     Args:
-        name_or_path: As for `load_scenario`.
+        name_or_path: Name or path of the scenario.
         factors: The factors.
-        seeds: The seeds.
-        changes: Changes of all scenarios, as for `load_scenario`.
+        seeds: Seeds of each combination of values.
+        changes: Values by dotted key of the scenario file, which replace those of the file in all settings.
 
     Raises:
         ConfigurationError: A factor or a value is invalid, or two values are the same.
     """
     settings: dict[str, SweepSetting] = {}
-    for values, scenario in settings_of(name_or_path, factors, changes):
+    for values, scenario in load_combinations(name_or_path, factors, changes):
         values_by_name = dict(zip((factor.name for factor in factors), values, strict=True))
         setting = SweepSetting(values_by_name, scenario, digest(scenario))
         if (existing_setting := settings.setdefault(setting.digest, setting)) is not setting:

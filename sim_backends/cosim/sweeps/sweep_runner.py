@@ -101,7 +101,7 @@ def _settings_text(run: SweepRun) -> str:
 
 
 def _sweep_columns(run: SweepRun, flow: FlowResult, result: SeedResult) -> dict[str, Value]:
-    """Return the columns that only sweeps have; a distance is written as in the command."""
+    """Return the columns that only sweeps have; a distance is written as on the command line."""
     columns: dict[str, Value] = {"flow": flow.name}
     if DISTANCE in run.setting.values:
         columns["distance"] = run.setting.values[DISTANCE]

@@ -1,4 +1,4 @@
-"""ArduCopter 4.6, as far as it is emulated."""
+"""The behaviour of ArduCopter 4.6 that the emulated autopilot implements."""
 
 from typing import Final
 

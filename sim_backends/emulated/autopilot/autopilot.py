@@ -1,4 +1,4 @@
-"""The autopilot: its answers to messages, and its periodic messages. It uses neither socket nor clock."""
+"""The emulated autopilot, which answers messages and sends periodic ones. It uses neither socket nor clock."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -44,7 +44,7 @@ class Autopilot:
         obstacles: Obstacles in the world, including the floor.
         now_ns: Time of power-on.
         boot_s: Time from power-on until its position estimate has an origin.
-        make_airframe: See `VehicleBase`.
+        make_airframe: Creates the airframe; None for an airframe that the autopilot itself moves.
     """
 
     def __init__(
@@ -219,9 +219,9 @@ class Autopilot:
         """Accept a position or a velocity; if a message has both, the velocity is used."""
         if message.get_type() == "SET_POSITION_TARGET_GLOBAL_INT":
             args = message.coordinate_frame, message.lat_int, message.lon_int, message.alt
-            place = goal_m(*args, self.vehicle.home_m)
+            position_m = goal_m(*args, self.vehicle.home_m)
         elif message.coordinate_frame == dialect.MAV_FRAME_LOCAL_NED:
-            place = self.vehicle.from_local((message.y, message.x, -message.z))
+            position_m = self.vehicle.from_local((message.y, message.x, -message.z))
         else:
             return
         has_yaw = not message.type_mask & _YAW_IGNORED and math.isfinite(message.yaw)
@@ -229,9 +229,9 @@ class Autopilot:
         velocity = (message.vy, message.vx, -message.vz)
         if not message.type_mask & _VELOCITY_IGNORED:
             if all(map(math.isfinite, velocity)):
-                self.vehicle.accept_set_point(SetPoint(velocity, is_place=False, yaw_rad=yaw_rad))
-        elif not message.type_mask & _POSITION_IGNORED and place and all(map(math.isfinite, place)):
-            self.vehicle.accept_set_point(SetPoint(place, is_place=True, yaw_rad=yaw_rad))
+                self.vehicle.accept_set_point(SetPoint(velocity, is_position=False, yaw_rad=yaw_rad))
+        elif not message.type_mask & _POSITION_IGNORED and position_m and all(map(math.isfinite, position_m)):
+            self.vehicle.accept_set_point(SetPoint(position_m, is_position=True, yaw_rad=yaw_rad))
 
 
 _MESSAGE_QUERIES: Final = frozenset({dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAV_CMD_GET_MESSAGE_INTERVAL})

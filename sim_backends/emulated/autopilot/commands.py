@@ -1,4 +1,4 @@
-"""Commands to the vehicle: execution of COMMAND_LONG and COMMAND_INT, and their MAV_RESULT."""
+"""Executes the commands COMMAND_LONG and COMMAND_INT to the vehicle, and returns their MAV_RESULT."""
 
 import math
 from collections.abc import Callable

@@ -309,13 +309,13 @@ class Fence:
         """Maximum distance from home, horizontal and vertical."""
         return self._parameters["GF_MAX_HOR_DIST"], self._parameters["GF_MAX_VER_DIST"]
 
-    def contains(self, place_m: Vector) -> bool:
+    def contains(self, position_m: Vector) -> bool:
         """Return True if the vehicle may fly to a position."""
-        return is_within(place_m, self.limits_m)
+        return is_within(position_m, self.limits_m)
 
-    def nearest_inside(self, place_m: Vector) -> Vector:
+    def nearest_inside(self, position_m: Vector) -> Vector:
         """Return the position itself, or the point where the line from home to it crosses the fence."""
-        (east, north, up), (radius_m, height_m) = place_m, self.limits_m
+        (east, north, up), (radius_m, height_m) = position_m, self.limits_m
         share = radius_m / max(math.hypot(east, north), radius_m)
         return share * east, share * north, min(up, height_m)
 
@@ -331,12 +331,12 @@ class Fence:
         return stop_distance_m > max(radius_m, math.hypot(*here_m[:2])) or stop_m[2] > max(height_m, here_m[2])
 
     def reset(self) -> None:
-        """Treat the vehicle as inside the fence, after it was armed or carried to another place."""
+        """Treat the vehicle as inside the fence, after it was armed or carried to another position."""
         self._is_breached = False
 
-    def advance(self, state: VehicleState, place_m: Vector) -> Reaction | None:
+    def advance(self, state: VehicleState, position_m: Vector) -> Reaction | None:
         """Return ArduCopter's reaction to a new breach in flight, or None."""
-        (east, north, up), (radius_m, height_m) = place_m, self.limits_m
+        (east, north, up), (radius_m, height_m) = position_m, self.limits_m
         fences = ["Max Alt"] * (up > height_m) + ["Circle"] * (math.hypot(east, north) > radius_m)
         is_new, self._is_breached = bool(fences) and not self._is_breached, bool(fences)
         if not is_new or not state.is_armed or state.has_landed:
@@ -346,6 +346,6 @@ class Fence:
         return Reaction(text, dialect.MAV_SEVERITY_NOTICE, mode)
 
 
-def is_within(place_m: Vector, limits_m: tuple[float, float]) -> bool:
+def is_within(position_m: Vector, limits_m: tuple[float, float]) -> bool:
     """Return True if a position relative to home is inside a cylinder, given by radius and height."""
-    return math.hypot(*place_m[:2]) <= limits_m[0] and 0 <= place_m[2] <= limits_m[1]
+    return math.hypot(*position_m[:2]) <= limits_m[0] and 0 <= position_m[2] <= limits_m[1]

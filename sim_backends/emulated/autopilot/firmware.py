@@ -1,4 +1,4 @@
-"""Differences between firmware families: modes, parameters, messages, refusals."""
+"""Differences between the emulated firmware families: modes, parameters, messages, refusals."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,7 @@
-"""Flight of the emulated drone: the quadrotor of the physics federate among obstacles, and its guidance to a goal.
+"""Flight of the emulated drone among obstacles, and its guidance to a goal.
 
-Time is in integer nanoseconds and advances in steps of equal length, so a flight does not depend on how often its
-state is read.
+The drone is the quadrotor of the built-in physics. Time is in integer nanoseconds and advances in steps of equal
+length, so a flight does not depend on how often its state is read.
 """
 
 import math
@@ -148,7 +148,7 @@ class Airframe:
 
 
 MakeAirframe = Callable[[Vector, float, int], Airframe]
-"""Creates a drone at a place; arguments: position of its lowest point in the world, heading, time."""
+"""Creates a drone; arguments: position of its lowest point in the world, heading, time."""
 
 
 def limits_within(limits: QuadrotorLimits, parameters: Parameters) -> QuadrotorLimits:
@@ -204,12 +204,12 @@ class SetPoint(NamedTuple):
 
     Attributes:
         vector: Position relative to home in m, or velocity in m/s: east, north, up.
-        is_place: True if it is a position.
+        is_position: True if it is a position.
         yaw_rad: Heading from east towards north; None if it has none.
     """
 
     vector: Vector
-    is_place: bool
+    is_position: bool
     yaw_rad: float | None = None
 
 
@@ -235,7 +235,7 @@ class Guidance:
     def hold(self, place_m: Vector) -> None:
         """Make a position both the goal and the set-point, so that the drone holds it in every mode."""
         self.goal_m = place_m
-        self.set_point = SetPoint(place_m, is_place=True)
+        self.set_point = SetPoint(place_m, is_position=True)
 
     def has_recent_set_point(self, now_ns: int) -> bool:
         """Return True if the last set-point is recent enough."""
@@ -255,8 +255,8 @@ class Guidance:
             ceiling_m: Height of the fence.
         """
         if mode is Mode.OFFBOARD:
-            vector, is_place, _ = self.set_point
-            return velocity_to(vector, body, limits) if is_place else vector
+            vector, is_position, _ = self.set_point
+            return velocity_to(vector, body, limits) if is_position else vector
         if mode is Mode.RTL:
             return self._return_m_s(body, limits, ceiling_m)
         if mode in LANDING or (mode is Mode.MISSION and self.goal_m[2] < 0):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fieldkit.core.model import Vector
 from sim_backends.emulated.ros.flight_records import FlightCommandRecord, FlightRecord
-from sim_backends.emulated.ros.own_motion import MotionReporter
+from sim_backends.emulated.ros.robot_motion import MotionReporter
 
 if TYPE_CHECKING:
     from sim_backends.emulated.autopilot.autopilot import Autopilot
@@ -27,7 +27,7 @@ _BURST: Final = 64
 
 
 class PhysicsFiles(NamedTuple):
-    """The files between an autopilot and the physics that flies its drone.
+    """The files between an autopilot and the physics simulator that flies its drone.
 
     Attributes:
         commands: File of `FlightCommandRecord`.
@@ -53,7 +53,7 @@ class Drone:
         antenna_m: Height of the antenna, whose position the lab uses, above the lowest point of the drone.
         world: World that it flies in, as JSON.
         boot_s: Time from power-on until its position estimate has an origin.
-        physics: Its files for the physics that flies it; None if the autopilot moves it itself.
+        physics: Its files for the physics simulator that flies it; None if the autopilot moves it itself.
     """
 
     system: int
@@ -74,8 +74,8 @@ def serve(drone: Drone, *, assigned_paths: Path, motion_record: Path, ready: Pat
 
     Args:
         drone: Settings of the drone.
-        assigned_paths: The file of the paths that the lab assigns (`own_motion.append_path`).
-        motion_record: The file in which the robot records its motion (`own_motion.MotionReporter`).
+        assigned_paths: The file of the paths that the lab assigns (`robot_motion.append_path`).
+        motion_record: The file in which the robot records its motion (`robot_motion.MotionReporter`).
         ready: File that is created when the port is open.
 
     Raises:
@@ -129,7 +129,7 @@ def _load(
 
 
 def simulated_airframe(profile: str, files: PhysicsFiles, reporter: MotionReporter) -> "MakeAirframe":
-    """Return the function that creates a drone at a place; a physics moves this drone."""
+    """Return the function that creates a drone at a position; a physics simulator moves this drone."""
     from sim_backends.emulated.autopilot.simulated_airframe import SimulatedAirframe  # noqa: PLC0415 (as above)
     from sim_backends.physics.robot_limits import quadrotor  # noqa: PLC0415
 
@@ -167,10 +167,10 @@ class DroneMotionReporter:
         self._was_flying = False
 
     def read_placement(self, now_ns: int) -> None:
-        """Restart the drone at its new place if the lab has moved it."""
+        """Restart the drone at its new position if the lab has moved it."""
         placement = self._reporter.poll_placement(now_ns)
         if placement is not None:
-            east_m, north_m, up_m = placement.place_m
+            east_m, north_m, up_m = placement.position_m
             self._vehicle.place((east_m, north_m, up_m - self._antenna_m), placement.heading_rad, now_ns)
             self._was_flying = False
 

@@ -1,4 +1,4 @@
-"""MAVLink microservices of the autopilot: parameters, time, ping, logs, file transfer, message intervals, missions.
+"""MAVLink microservices of the emulated autopilot: parameters, time, ping, logs, files, message intervals, missions.
 
 Sources: https://mavlink.io/en/services/, https://mavlink.io/en/services/mission.html. The receiver of a mission
 requests each item, and repeats the request if the item does not arrive: the autopilot for an upload, the ground
@@ -287,7 +287,7 @@ class MissionTransfer:
         upload = self._upload
         if upload is None or upload.client != client:
             if self._last_upload is not None and self._last_upload[:2] == (client, message.seq):
-                # The client repeats the last item, because our answer was lost.
+                # The client repeats the last item, because the answer was lost.
                 yield _ack(client, self._last_upload[2])
             return
         if message.seq != len(upload.items):

@@ -1,4 +1,4 @@
-"""Mission of a vehicle: the uploaded items, the current item, and the goal of this item."""
+"""The mission of an emulated drone: the uploaded items, the current item, and the goal of this item."""
 
 import math
 from collections.abc import Iterator

@@ -107,14 +107,14 @@ class PositionEstimate:
         """Return a position in the world relative to the origin; None before there is an origin."""
         if self.origin_m is None:
             return None
-        east, north, up = (place - origin for place, origin in zip(world_m, self.origin_m, strict=True))
+        east, north, up = (world - origin for world, origin in zip(world_m, self.origin_m, strict=True))
         return east, north, up
 
     def to_world(self, local_m: Vector) -> Vector | None:
         """Return the position in the world of a point of the local frame; None before there is an origin."""
         if self.origin_m is None:
             return None
-        east, north, up = (place + origin for place, origin in zip(local_m, self.origin_m, strict=True))
+        east, north, up = (local + origin for local, origin in zip(local_m, self.origin_m, strict=True))
         return east, north, up
 
 
@@ -147,7 +147,7 @@ class LandDetector:
         self.grounded_ns = self.armed_ns = now_ns
 
     def advance(self, now_ns: int, *, on_ground: bool) -> None:
-        """Update the state with the present contact with the ground."""
+        """Update the state with the current contact with the ground."""
         if not on_ground:
             self.has_flown, self.has_landed, self.grounded_ns = True, False, now_ns
         elif now_ns - self.grounded_ns >= self._landed_s * 1e9:

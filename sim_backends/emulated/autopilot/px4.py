@@ -1,4 +1,4 @@
-"""PX4 1.16, as far as it is emulated."""
+"""The behaviour of PX4 1.16 that the emulated autopilot implements."""
 
 from typing import Final
 

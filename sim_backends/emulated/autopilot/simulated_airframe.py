@@ -1,4 +1,4 @@
-"""The drone of an autopilot on the co-simulation: a physics moves it, and the autopilot records its commands."""
+"""The airframe of an emulated drone that a physics simulator moves; the autopilot only records its commands."""
 
 from typing import Final
 
@@ -12,14 +12,14 @@ from sim_backends.physics.quadrotor import FlightPose, Quadrotor
 from sim_backends.physics.robot_limits import QuadrotorLimits
 
 _MAX_EXTRAPOLATION_NS: Final = 100_000_000
-"""Longest extrapolation of a state of the physics, which records one every 10 ms."""
+"""Longest extrapolation of a state of the physics simulator, which records one every 10 ms."""
 
 
 class SimulatedAirframe(Airframe):
-    """An `Airframe` that a physics moves.
+    """An `Airframe` that a physics simulator moves.
 
-    On the ground its rotors turn without thrust until it climbs. Until its first flight it stays at the place where
-    the lab has put it.
+    On the ground its rotors turn without thrust until it climbs. Until its first flight it stays at the position at
+    which the lab has placed it.
 
     Args:
         limits: Limits of the airframe.
@@ -27,8 +27,8 @@ class SimulatedAirframe(Airframe):
         facing_rad: Heading.
         now_ns: Time of this state.
         commands: Record of the autopilot's commands.
-        flight_record: Record of the flight by the physics.
-        path_start_ns: Start of the assigned path that put it at its place.
+        flight_record: Record in which the physics simulator stores the flight.
+        path_start_ns: Start time of the path with which the lab last placed it.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class SimulatedAirframe(Airframe):
         )
 
     def _sense(self) -> None:
-        """Read the state of the physics, if there is one already, and extrapolate it to the present."""
+        """Read the last state from the physics simulator, if there is one, and extrapolate it to the current time."""
         flight = self._flight_record.read()
         if flight is None or flight.path_start_ns != self._path_start_ns:
             return

@@ -1,4 +1,4 @@
-"""Telemetry: messages with the state of the vehicle."""
+"""Telemetry of the emulated autopilot: messages with the state of the vehicle."""
 
 import math
 from collections.abc import Callable, Mapping

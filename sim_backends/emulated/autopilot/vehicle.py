@@ -1,4 +1,4 @@
-"""The vehicle: arming, flight mode, and the motion that follows from them.
+"""The emulated drone as a vehicle: arming, flight mode, and the motion that follows from them.
 
 It has neither clock nor socket: `advance` receives the time.
 """
@@ -117,7 +117,7 @@ class Vehicle(VehicleBase):
             raise self._refusal("Reposition denied: not in the air")
         if self.firmware.is_ardupilot:
             self.change_mode(Mode.OFFBOARD)
-            self.accept_set_point(SetPoint(goal_m, is_place=True))
+            self.accept_set_point(SetPoint(goal_m, is_position=True))
         else:
             self._fly_to(Mode.LOITER, goal_m)
             self.failsafes.on_mode_change(self.body.now_ns)
@@ -131,7 +131,7 @@ class Vehicle(VehicleBase):
         if self.firmware.is_ardupilot:
             if self.mode not in {Mode.OFFBOARD, Mode.TAKEOFF} or self.body.on_ground:
                 return
-            if set_point.is_place and not self.fence.contains(set_point.vector):
+            if set_point.is_position and not self.fence.contains(set_point.vector):
                 return
             self.mode = Mode.OFFBOARD
         self.guidance.set_point, self.guidance.set_point_ns = set_point, self.body.now_ns
@@ -268,8 +268,8 @@ class Vehicle(VehicleBase):
         """React to missing set-points, and to set-points that lead outside PX4's fence."""
         has_recent_set_point = self.guidance.has_recent_set_point(self.body.now_ns)
         if self.firmware.is_ardupilot:
-            if not self.guidance.set_point.is_place and not has_recent_set_point:
-                self.guidance.set_point = SetPoint(self._stop_m(), is_place=True)
+            if not self.guidance.set_point.is_position and not has_recent_set_point:
+                self.guidance.set_point = SetPoint(self._stop_m(), is_position=True)
         elif not has_recent_set_point:
             self.report(_CRITICAL, "Failsafe activated")
             self._switch_automatically(_OFFBOARD_LOST.get(int(self._parameters["COM_OBL_RC_ACT"]), Mode.LOITER))

@@ -1,4 +1,4 @@
-"""Base class of the vehicle: its airframe, estimates, fence, failsafes and mission; its home and its local frame."""
+"""Base class of the emulated drone, which combines its airframe, estimates, fence, failsafes and mission."""
 
 import math
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ class VehicleBase:
         obstacles: Obstacles in the world, including the floor.
         now_ns: Time of power-on.
         boot_s: Time from power-on until its position estimate has an origin.
-        make_airframe: Creates the airframe at a place; None for an airframe that the autopilot itself moves.
+        make_airframe: Creates the airframe at a position; None for an airframe that the autopilot itself moves.
 
     Attributes:
         body: Position and motion, relative to home.
@@ -44,7 +44,7 @@ class VehicleBase:
         estimate: Its position estimate.
         fence: Its fence.
         guidance: Its goal and set-points.
-        home_m: Home in the world, metres east, north, up: the place where it was armed last, or where it booted.
+        home_m: Home in the world, metres east, north, up: the point where it was armed last, or where it booted.
         failsafes: Its failsafes.
         status_texts: Texts that are not sent yet; the reader clears the list.
     """
@@ -86,7 +86,7 @@ class VehicleBase:
         self.failsafes = self.firmware.failsafes(self._parameters)
 
     def place(self, place_m: Vector, facing_rad: float, now_ns: int) -> None:
-        """Put it on the ground at another place in the world, as if a person carried it. It keeps its mode."""
+        """Put it on the ground at another position in the world, as if a person carried it. It keeps its mode."""
         self.body = self._make_airframe(place_m, facing_rad, now_ns)
         if self.estimate.origin_m is None:
             self.home_m = place_m
@@ -107,7 +107,7 @@ class VehicleBase:
         world_m = self.estimate.to_world(place_m)
         if world_m is None:
             return None
-        east, north, up = (place - home for place, home in zip(world_m, self.home_m, strict=True))
+        east, north, up = (world - home for world, home in zip(world_m, self.home_m, strict=True))
         return east, north, up
 
     @property

@@ -1,13 +1,13 @@
-"""The medium of a co-simulation: a physics moves emulated robots, and a network carries their packets.
+"""The medium of a co-simulation: a physics simulator moves emulated robots, and a network carries their packets.
 
 | module | purpose | imports |
 | --- | --- | --- |
-| `client` | the lab's client: starts the process, and passes it bodies, devices and places | medium client |
+| `client` | the lab's client: starts the process, and passes it bodies, devices and positions | medium client |
 | `cosim_process` | the process: requests of the lab, reading and delivery of packets | medium server, all below |
 | `cosim_session` | one run of the coordinator, with its physics and network | cosim, all below |
 | `clock` | simulated time as real time | nothing |
 | `real_agents` | the agents of the coordinator: packets read from devices, in windows that end in real time | cosim |
-| `lab_physics` | the physics, with robots that the lab has put at a place | steering, federates |
+| `lab_physics` | the physics simulator, with robots that the lab has placed | steering, federates |
 | `steering` | commanded velocities of one robot, and the record of its motion | records in the robot |
 | `simulators` | builds the physics and the network | cosim, network, radio, physics |
 

@@ -1,4 +1,4 @@
-"""The lab's client of a co-simulated medium."""
+"""The lab's client of a co-simulated medium, which starts the process of the medium."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,7 +14,7 @@ from sim_backends.world.world import World
 
 
 class CosimulatedClient(MediumClient):
-    """Starts the process of a co-simulated medium. Other arguments and errors are those of `MediumClient`.
+    """Starts the process of a co-simulated medium. The other arguments and the errors are those of `MediumClient`.
 
     Args:
         bodies: Body of each robot; other nodes have none.

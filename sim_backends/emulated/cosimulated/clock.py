@@ -1,4 +1,4 @@
-"""Simulated time as real time."""
+"""Converts between the simulated time of a session and the monotonic clock."""
 
 import time
 
@@ -14,7 +14,7 @@ class RealTime:
         self.epoch_ns = time.monotonic_ns()
 
     def now_ns(self) -> int:
-        """Return the present simulated time."""
+        """Return the current simulated time."""
         return time.monotonic_ns() - self.epoch_ns
 
     def monotonic_ns(self, simulated_ns: int) -> int:

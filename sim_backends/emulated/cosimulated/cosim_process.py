@@ -1,4 +1,4 @@
-"""The process of a co-simulated medium: a network carries packets between devices, and a physics moves the robots.
+"""The process of a co-simulated medium, which runs a network for packets and a physics simulator for robots.
 
 `client` runs it as `python -m sim_backends.emulated.cosimulated.cosim_process FD SEED FRAMING`. It answers the same
 requests as the process of a radio model, and two more: `simulate`, with simulators and policy, and `body`, with the
@@ -52,7 +52,7 @@ _MAX_LAG_NS: Final = 1_000_000_000
 Packets that wait during the lag are delivered late, so their repeat is void."""
 
 _START_NS: Final = 5_000_000
-"""A request to place robots that takes longer has started a simulator."""
+"""If a request to place robots takes longer, it has started a simulator."""
 
 
 class _NewSession(BaseException):
@@ -62,7 +62,8 @@ class _NewSession(BaseException):
 class CosimulatedMedium(MediumServer):
     """Moves packets between ports through the coordinator of a co-simulation.
 
-    It implements the coordinator's observer and the devices of its agents. Arguments are those of `MediumServer`.
+    It implements the coordinator's observer and the devices of its agents. The arguments are those of
+    `MediumServer`.
     """
 
     def __init__(self, seed: int, framing: Framing, channel: socket.socket) -> None:
@@ -303,8 +304,8 @@ class CosimulatedMedium(MediumServer):
             self._log_attempts(None if self._air_log is None else self._air_log.write)
         velocities_m_s = self._layout.velocities_m_s
         states = {
-            name: State(place_m, velocities_m_s.get(name, STILL))
-            for name, place_m in self._layout.positions_m.items()
+            name: State(position_m, velocities_m_s.get(name, STILL))
+            for name, position_m in self._layout.positions_m.items()
         }
         session.physics.place(states, frozenset(positions_m))
         self._session = session

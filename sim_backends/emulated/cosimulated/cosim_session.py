@@ -1,4 +1,4 @@
-"""One run of the coordinator in a lab on the co-simulation."""
+"""A session of a lab on the co-simulation: one run of the coordinator."""
 
 import time
 from collections.abc import Mapping
@@ -47,7 +47,7 @@ class CosimSession:
         settings: Simulators and their settings.
         steerings: Steering of each robot that programs can drive.
         policy: Name and parameters of the sync policy.
-        clock: Simulated time as real time.
+        clock: Converts between simulated time and the monotonic clock.
 
     Raises:
         ConfigurationError: A simulator cannot be used with these settings.
@@ -130,7 +130,7 @@ class CosimSession:
         log(replace(attempt, start_ns=start_ns, end_ns=end_ns, payload=content))
 
     def sample_links(self) -> Mapping[str, LinkSample]:
-        """Return a sample of the links of all radios at their present positions; empty if the network has none."""
+        """Return a sample of the links of all radios at their current positions; empty if the network has none."""
         if isinstance(self.network, RemoteNetwork):
             return self.network.sample_links()
         assert self.builtin is not None

@@ -1,4 +1,7 @@
-"""The physics of a lab: moves the robots that programs drive; other robots stay where the lab has put them."""
+"""The physics simulator of a lab, which moves the robots that programs drive.
+
+Other robots stay where the lab has placed them.
+"""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -27,10 +30,13 @@ _MOVED_M: Final = 1e-6
 
 @runtime_checkable
 class Placing(PhysicsFederate, Protocol):
-    """A physics that can put a robot at a place during a run. A physics without this method is restarted instead."""
+    """A physics simulator that can place a robot during a run.
+
+    A physics simulator without this method is restarted instead.
+    """
 
     def put(self, name: str, place_m: Vector, heading_rad: float) -> None:
-        """Put a robot at a place, at rest.
+        """Place a robot at a position, at rest.
 
         Args:
             name: The robot.
@@ -42,35 +48,35 @@ class Placing(PhysicsFederate, Protocol):
 
 @runtime_checkable
 class Flying(PhysicsFederate, Protocol):
-    """A physics that moves drones according to the commands of their autopilots."""
+    """A physics simulator that moves drones according to the commands of their autopilots."""
 
     def flight_status(self, name: str) -> FlightStatus:
-        """Return attitude and support of a drone at its present state."""
+        """Return attitude and support of a drone in its current state."""
         ...
 
 
 StartPhysics = Callable[[Mapping[str, State]], PhysicsFederate]
-"""Starts a physics with the robots at these states of their antennas; its time starts at 0."""
+"""Starts a physics simulator with the robots at these states of their antennas; its time starts at 0."""
 
 
 class LabPhysics:
-    """The physics of a session of the co-simulation; implements `PhysicsFederate`.
+    """The physics simulator of a session of the co-simulation.
 
     It starts when the lab has placed all robots that can be driven. It moves a robot after the robot's first command.
     Before that command, and after the lab has placed the robot again, the robot stays where the lab has put it. A
     station without a body, such as the laptop, always stays there.
 
     Args:
-        start: Starts the physics.
+        start: Starts the physics simulator.
         steerings: Steering of each robot that programs can drive.
         bodies: Names of the robots, which have a body.
         stations: Names of all stations.
-        step_ns: Step of the physics.
-        clock: Simulated time as real time.
+        step_ns: Time step of the physics simulator.
+        clock: Converts between simulated time and the monotonic clock.
 
     Attributes:
-        step_ns: See `PhysicsFederate`.
-        limits_m_s2: See `PhysicsFederate`.
+        step_ns: Time step of the physics simulator.
+        limits_m_s2: Acceleration limit of each station; 0 if no program drives it.
     """
 
     def __init__(
@@ -97,33 +103,33 @@ class LabPhysics:
         self._active_commands: dict[str, Command] = {}
         self._assigned_states = dict.fromkeys(stations, State(OFF_AIR_M))
         self._hidden_stations: frozenset[str] = frozenset()
-        self._places_in_physics: dict[str, tuple[Vector, float]] = {}
+        self._poses_in_physics: dict[str, tuple[Vector, float]] = {}
         self._physics_states: Mapping[str, State] = {}
         self._states: Mapping[str, State] = self._assigned_states
         self._has_changed = True
         self._polled_ns = 0
 
-    def place(self, states: Mapping[str, State], present: frozenset[str]) -> None:
-        """Put stations at places. Robots that are driven by their programs are not moved.
+    def place(self, states: Mapping[str, State], stations_on_air: frozenset[str]) -> None:
+        """Place stations. Robots that are driven by their programs are not moved.
 
         Args:
-            states: State of the antenna of each station that has a place.
-            present: Stations that are on the air; the network assumes that others are out of range.
+            states: State of the antenna of each station that has a position.
+            stations_on_air: Stations that are on the air; the network assumes that others are out of range.
 
         Raises:
             ConfigurationError: A robot would be placed within an obstacle or another robot.
-            FederateError: The physics failed.
+            FederateError: The physics simulator failed.
         """
         self._poll_placements(self._clock.now_ns())
         self._assigned_states |= states
-        self._hidden_stations = frozenset(self._assigned_states) - present
+        self._hidden_stations = frozenset(self._assigned_states) - stations_on_air
         self._has_changed = True
         if self._steerings and all(steering.is_placed for steering in self._steerings.values()):
             self._place_bodies()
 
     @property
     def states(self) -> Mapping[str, State]:
-        """The present states, including changes by the lab since the last call of `advance`."""
+        """The current states, including changes by the lab since the last call of `advance`."""
         return self._combine_states()
 
     def limit_m_s2(self, name: str) -> float:
@@ -149,7 +155,7 @@ class LabPhysics:
         return self._states
 
     def close(self) -> None:
-        """Stop the physics."""
+        """Stop the physics simulator."""
         if close := getattr(self._physics, "close", None):
             close()
 
@@ -168,7 +174,7 @@ class LabPhysics:
         self._pending_commands[name] = command
 
     def _advance(self, to_ns: int) -> None:
-        """Advance the physics; its time does not advance while nothing moves in it."""
+        """Advance the physics simulator; its time does not advance while nothing moves in it."""
         physics = self._physics
         assert physics is not None
         if not self._pending_commands and all(steering.is_at_rest for steering in self._steerings.values()):
@@ -212,8 +218,8 @@ class LabPhysics:
                     self._pending_commands[name] = steering.idle
 
     def _place_bodies(self) -> None:
-        """Put the robots that the lab has moved at their places in the physics."""
-        places = {
+        """Put the robots that the lab has moved at their positions in the physics simulator."""
+        poses = {
             name: (
                 self._assigned_states[name].position_m,
                 self._steerings[name].heading_rad if name in self._steerings else 0.0,
@@ -221,17 +227,15 @@ class LabPhysics:
             for name in self._bodies
             if name not in self._steerings or not self._steerings[name].is_driven
         }
-        new_places = {
-            name: place for name, place in places.items() if _differs(place, self._places_in_physics.get(name))
-        }
-        if self._physics is not None and not new_places:
+        new_poses = {name: pose for name, pose in poses.items() if _differs(pose, self._poses_in_physics.get(name))}
+        if self._physics is not None and not new_poses:
             return
-        self._places_in_physics |= new_places
+        self._poses_in_physics |= new_poses
         if isinstance(self._physics, Placing):
-            for name, ((east_m, north_m, up_m), heading_rad) in new_places.items():
+            for name, ((east_m, north_m, up_m), heading_rad) in new_poses.items():
                 self._active_commands.pop(name, None)
                 self._physics.put(name, (east_m, north_m, up_m - ANTENNA_M), heading_rad)
-            self._check_overlaps(new_places)
+            self._check_overlaps(new_poses)
             self._physics_states = self._physics.advance(max(self._now_ns - self._started_ns, 0), {})
         else:
             self._restart()
@@ -245,16 +249,16 @@ class LabPhysics:
             if state.velocity_m_s == STILL and (other := self._physics.overlap(name)):
                 raise ConfigurationError(
                     f"{name} would be within {other}, at {coordinates_text(state.position_m)} m",
-                    remedy="put it at a free place, or choose another world or distance",
+                    remedy="place it at a free position, or choose another world or distance",
                 )
 
     def _restart(self) -> None:
-        """Start the physics with all robots at their present places; moving robots are at rest afterwards."""
+        """Start the physics simulator with all robots at rest at their current positions."""
         self.close()
         self._physics = None
         self._active_commands.clear()
         states = {name: self._body_state(name) for name in self._bodies}
-        self._places_in_physics = {
+        self._poses_in_physics = {
             name: (state.position_m, state.heading_rad or 0.0) for name, state in states.items()
         }
         self._started_ns = self._now_ns - self._now_ns % self.step_ns
@@ -272,8 +276,8 @@ class LabPhysics:
         )
 
 
-def _differs(place: tuple[Vector, float], other: tuple[Vector, float] | None) -> bool:
-    return other is None or math.dist(place[0], other[0]) > _MOVED_M or place[1] != other[1]
+def _differs(pose: tuple[Vector, float], other: tuple[Vector, float] | None) -> bool:
+    return other is None or math.dist(pose[0], other[0]) > _MOVED_M or pose[1] != other[1]
 
 
 class _Limits(Mapping[str, float]):

@@ -64,7 +64,7 @@ class RealAgents(Agents):
     """Robots with real programs. A window ends when its end is reached in real time.
 
     The next event of a program is unknown until it happens. Policies that need its time wait for the event for at
-    most one step of the physics. If there is no event, they get the time of that step.
+    most one physics step. If there is no event, they get the time of that step.
 
     Args:
         physics: Moves the robots, and receives the commands of their programs.

@@ -1,4 +1,4 @@
-"""Builds the physics and the network of a session."""
+"""Builds the physics simulator and the network of a session of the co-simulation."""
 
 import dataclasses
 import json
@@ -45,7 +45,7 @@ class Simulators(NamedTuple):
     Attributes:
         physics: `kinematic`, or a name or command of a physics federate.
         network: `builtin`, or a command of a network federate.
-        step_ns: Step of the physics.
+        step_ns: Step of the physics simulator.
         network_options: Options of the network federate; None if it has none.
         physics_options: Options of the physics federate; None if it has none.
     """
@@ -111,7 +111,7 @@ class LabSettings:
 
 
 def start_physics(settings: LabSettings, states: Mapping[str, State]) -> PhysicsFederate:
-    """Start the physics with robots at rest.
+    """Start the physics simulator with robots at rest.
 
     Args:
         settings: The session.

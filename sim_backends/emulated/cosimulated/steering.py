@@ -12,13 +12,13 @@ from typing_extensions import override
 from sim_backends.emulated.robot.base_controller import TIMEOUT_NS, odometry
 from sim_backends.emulated.robot.velocity_command import VelocityCommandRecord
 from sim_backends.emulated.ros.flight_records import FlightCommandRecord, FlightMotion, FlightRecord
-from sim_backends.emulated.ros.own_motion import AT_REST, MotionReporter, OwnMotion
+from sim_backends.emulated.ros.robot_motion import AT_REST, MotionReporter, RobotMotion
 from sim_backends.physics.body import Twist, Velocity
 from sim_backends.physics.quadrotor import ROTORS_OFF, FlightStatus, FlightTarget
 from sim_backends.world.motion import STILL, State
 
 _REPORT_NS: Final = 10_000_000
-"""Interval of the records while a robot moves; the robot's own base controller uses 20 ms."""
+"""Interval of the records while a robot moves; the base controller in a robot uses 20 ms."""
 
 _PENDING_COMMANDS: Final = 1000
 """Maximum number of commands that are kept while the simulation lags (at most 1 s); older ones are dropped."""
@@ -30,7 +30,7 @@ class TimedCommand(NamedTuple):
     """A command.
 
     Attributes:
-        time_ns: Its time, by the monotonic clock.
+        time_ns: Its time, from the monotonic clock.
         command: The command.
         is_idle: True if it need not be repeated, because a robot without commands is in the state that it causes.
     """
@@ -46,12 +46,12 @@ class Steering(ABC):
     Args:
         motion_record: Descriptor of the record of the robot's motion.
         paths: Descriptor of the file of its assigned paths.
-        now_ns: The present time.
+        now_ns: The current time.
 
     Attributes:
         idle: The command that is applied if the last command has not been repeated for `TIMEOUT_NS`.
-        is_driven: True if the robot has received a command since the lab put it at its place.
-        is_placed: True if the lab has put it at a place.
+        is_driven: True if the robot has received a command since the lab last placed it.
+        is_placed: True if the lab has placed it.
         is_at_rest: True if it is at rest, no command is active, and this is recorded.
     """
 
@@ -62,7 +62,7 @@ class Steering(ABC):
         self._pending: deque[TimedCommand] = deque(maxlen=_PENDING_COMMANDS)
         self._reporter = MotionReporter(_path(paths), _path(motion_record), now_ns)
         self.is_driven = False
-        self._start: OwnMotion = AT_REST
+        self._start: RobotMotion = AT_REST
         self.is_placed = False
         self._stop_due_ns: int | None = None
         self._last_report: tuple[int, float] | None = None
@@ -72,8 +72,8 @@ class Steering(ABC):
     def _read_command(self) -> TimedCommand | None:
         """Return the last command of the robot's programs, or None if there is none."""
 
-    def poll_placement(self, now_ns: int) -> OwnMotion | None:
-        """Return the place at which the lab has put the robot since the last call, or None if it has not moved it.
+    def poll_placement(self, now_ns: int) -> RobotMotion | None:
+        """Return the motion at the position where the lab has placed the robot since the last call, or None.
 
         The robot is at rest there, and earlier commands are dropped.
         """
@@ -87,7 +87,7 @@ class Steering(ABC):
 
     @property
     def heading_rad(self) -> float:
-        """Heading at the place at which the lab put the robot."""
+        """Heading of the robot when the lab last placed it."""
         return self._start.heading_rad
 
     def commands(self, until_ns: int) -> Iterator[tuple[int, Command]]:
@@ -167,7 +167,7 @@ class GroundSteering(Steering):
     Args:
         descriptors: Descriptors (`EmulatedRobot.physics_fds`) of the record of its motion, the file of its assigned
             paths, and the record of its velocity commands.
-        now_ns: The present time.
+        now_ns: The current time.
     """
 
     idle = Twist()
@@ -189,7 +189,7 @@ class FlightSteering(Steering):
     Args:
         descriptors: Descriptors (`EmulatedRobot.physics_fds`) of the record of its motion, the file of its assigned
             paths, the record of the autopilot's commands, and the record of its flight.
-        now_ns: The present time.
+        now_ns: The current time.
     """
 
     idle = ROTORS_OFF

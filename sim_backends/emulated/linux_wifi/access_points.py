@@ -34,7 +34,7 @@ table netdev fieldkit {{
     }}
 }}
 """
-"""The rules of robots (`wireless`), but for frames that the bridge forwards, which do not pass the hook `output`."""
+"""nftables rules for frames that the bridge forwards, which do not pass the hook `output` of the robots' rules."""
 _BEACON_INTERVALS_TU: Final = (100, 101, 103, 107, 109, 113)
 """They differ because hwsim derives the times of beacons from one clock: beacons of equal intervals would always
 collide."""

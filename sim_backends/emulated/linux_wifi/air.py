@@ -161,9 +161,9 @@ class _Channel:
         self.frames: dict[PacketIdentity, FrameOnAir] = {}
         self.events = AirEvents()
 
-    def place(self, now_ns: int, places_m: Mapping[str, Vector], velocities_m_s: Mapping[str, Vector]) -> None:
+    def place(self, now_ns: int, positions_m: Mapping[str, Vector], velocities_m_s: Mapping[str, Vector]) -> None:
         self._wifi.advance(now_ns)
-        self._gains.move(now_ns, places_m, velocities_m_s)
+        self._gains.move(now_ns, positions_m, velocities_m_s)
 
     def transmit(self, now_ns: int, frame: FrameOnAir) -> None:
         number = self._numbers[frame.source]
@@ -234,14 +234,14 @@ class Air:
         self._channel_arguments = seed, options, antennas, world
         self._channels: dict[int, _Channel] = {}
         self._tuned_mhz: dict[str, int] = {}
-        self._places_m: Mapping[str, Vector] = {}
+        self._positions_m: Mapping[str, Vector] = {}
         self._velocities_m_s: Mapping[str, Vector] = {}
 
     def place(
-        self, now_ns: int, places_m: Mapping[str, Vector], velocities_m_s: Mapping[str, Vector] | None = None
+        self, now_ns: int, positions_m: Mapping[str, Vector], velocities_m_s: Mapping[str, Vector] | None = None
     ) -> None:
         """Set the positions of the radios, metres east, north, up; radios without a position are out of range."""
-        self._places_m, self._velocities_m_s = dict(places_m), dict(velocities_m_s or {})
+        self._positions_m, self._velocities_m_s = dict(positions_m), dict(velocities_m_s or {})
         for frequency_mhz in self._channels:
             self._place(now_ns, frequency_mhz)
 
@@ -289,10 +289,10 @@ class Air:
 
     def _place(self, now_ns: int, frequency_mhz: int) -> None:
         """Place the radios that are on a channel, or may be on it."""
-        places_m = {
-            name: place_m
-            for name, place_m in self._places_m.items()
+        positions_m = {
+            name: position_m
+            for name, position_m in self._positions_m.items()
             if self._tuned_mhz.get(name, frequency_mhz) == frequency_mhz
         }
-        velocities_m_s = {name: velocity for name, velocity in self._velocities_m_s.items() if name in places_m}
-        self._channels[frequency_mhz].place(now_ns, places_m, velocities_m_s)
+        velocities_m_s = {name: velocity for name, velocity in self._velocities_m_s.items() if name in positions_m}
+        self._channels[frequency_mhz].place(now_ns, positions_m, velocities_m_s)

@@ -1,4 +1,4 @@
-"""Commands of fieldkit in the virtual machine: the same command line, with its results in a folder of the host."""
+"""Runs commands of fieldkit in the virtual machine, with their results in a folder of the host."""
 
 import os
 import shlex

@@ -157,7 +157,7 @@ def bring_up(
         site: Content of its site file.
         seed: Seed of all random numbers of the lab.
         radios: Number of radios.
-        draw: See `GuestLab`.
+        draw: Returns the plan view for the positions of the robots.
 
     Raises:
         ConfigurationError: A program, or the kernel of the machine, is not installed.

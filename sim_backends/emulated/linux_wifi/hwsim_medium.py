@@ -1,4 +1,4 @@
-"""The medium of mac80211_hwsim: frames from the kernel to the air, and results to the kernel.
+"""The medium of mac80211_hwsim, which passes frames from the kernel to the air, and results to the kernel.
 
 `HwsimMedium` has no socket: it maps messages to messages, so tests can use recorded messages. `medium_program` runs
 it.

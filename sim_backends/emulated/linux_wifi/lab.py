@@ -1,4 +1,4 @@
-"""Wi-Fi of Linux in an emulated lab: the Wi-Fi settings of each robot, its radio, and the medium of all radios."""
+"""Linux Wi-Fi in an emulated lab: the Wi-Fi settings of each robot, its radio, and the medium of all radios."""
 
 import secrets
 from collections.abc import Iterable, Mapping
@@ -41,7 +41,7 @@ def wifi_specs(
 
 
 def radios_of(robots: Iterable[Robot | LabRobot], options: RadioOptions) -> dict[str, HwsimRadio]:
-    """Return the radio of each robot and access point by its name; raises the errors of `require_radios`."""
+    """Return the radio of each robot and access point by its name. Raises the errors of `require_radios`."""
     names = [*(robot.name for robot in robots), *options.access_points]
     return dict(zip(names, require_radios(len(names)), strict=True))
 
@@ -49,5 +49,5 @@ def radios_of(robots: Iterable[Robot | LabRobot], options: RadioOptions) -> dict
 def medium(
     options: RadioOptions, world: World, seed: int, radios: Mapping[str, HwsimRadio], wifi: Iterable[WifiSpec]
 ) -> WifiClient:
-    """Return the medium of the radios, for robots with these settings; raises the errors of `WifiClient`."""
+    """Return the medium of the radios, for robots with these settings. Raises the errors of `WifiClient`."""
     return WifiClient(options, world, seed=seed, radios=radios, station=next(iter(wifi)))

@@ -1,4 +1,6 @@
-"""The medium as a process: `python -m sim_backends.emulated.linux_wifi.medium_program [CHANNEL] [--fd FD]`, as root.
+"""Program that runs the medium of mac80211_hwsim as a process.
+
+The command is `python -m sim_backends.emulated.linux_wifi.medium_program [CHANNEL] [--fd FD]`; it needs root.
 
 It registers as the medium of all radios of mac80211_hwsim in its network namespace. It reads requests from the socket
 with the descriptor CHANNEL, or from standard input, and writes the replies to that socket or to standard output.
@@ -9,7 +11,7 @@ Requests and replies are JSON objects, one per line. The first request is `Mediu
 
 It exits when the requests end. When the last descriptor of the registered socket is closed, hwsim again delivers all
 frames without loss. A supervisor therefore opens the socket with `hwsim_socket.open_registered`, keeps it open, and
-passes its descriptor with `--fd`. If the medium is then killed, no frame is delivered until a new medium continues.
+passes its descriptor with `--fd`. If the medium is then killed, no frame is delivered until a new medium takes over.
 """
 
 import argparse
@@ -112,7 +114,7 @@ class KernelSocket(Protocol):
 
 
 class RequestLines:
-    """Lines of a descriptor.
+    """Reads lines from a descriptor.
 
     Args:
         fd: The descriptor.
@@ -195,7 +197,7 @@ def _answer(
             return MediumSetup.model_validate(request).medium(), {}
         match request["do"]:
             case "place":
-                positions_m = {str(name): _vector(place_m) for name, place_m in request["positions"].items()}
+                positions_m = {str(name): _vector(position_m) for name, position_m in request["positions"].items()}
                 velocities_m_s = {str(name): _vector(value) for name, value in request["velocities"].items()}
                 medium.air.place(time.monotonic_ns(), positions_m, velocities_m_s)
                 return medium, {}

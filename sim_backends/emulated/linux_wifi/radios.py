@@ -1,4 +1,4 @@
-"""The radios of mac80211_hwsim in this kernel, and their move into the network namespaces of robots."""
+"""Finds the radios of mac80211_hwsim in this kernel, and moves them into the network namespaces of robots."""
 
 import os
 import shutil
@@ -78,7 +78,7 @@ def find_radios(folder: Path = _FOLDER) -> list[HwsimRadio]:
     return radios
 
 
-def runs_here() -> bool:
+def can_use_radios() -> bool:
     """Return True if this process can use radios of hwsim: it is root, and the kernel has the module."""
     return os.geteuid() == 0 and _MODULE.exists()
 

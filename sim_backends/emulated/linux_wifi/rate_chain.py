@@ -1,4 +1,4 @@
-"""Rate chains of mac80211: the mode of each try, and the tries that were made in each stage.
+"""Rate chains of mac80211: the mode of each try of a frame, and the number of tries in each stage.
 
 The radio model has 802.11g and the modes of 802.11n with one stream in 20 MHz. Stages in other modes are mapped:
 

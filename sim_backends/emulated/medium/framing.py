@@ -12,7 +12,7 @@ from typing import Final
 NO_ROBOT: Final = ""
 
 Routes = Mapping[bytes, str | None]
-"""Robot per destination address, None for broadcast; empty for a robot without a place."""
+"""Robot per destination address, None for broadcast; empty for a robot that is not placed."""
 
 _ETHERNET_BYTES: Final = 14
 _IPV4_TYPE: Final = b"\x08\x00"

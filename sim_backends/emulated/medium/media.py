@@ -38,7 +38,7 @@ class Media:
         """
         self.radio.place(positions_m, relay=relay, velocities_m_s=velocities_m_s)
         for medium in self.links.values():
-            attached_m = {name: place_m for name, place_m in positions_m.items() if name in medium.robot_names}
+            attached_m = {name: position_m for name, position_m in positions_m.items() if name in medium.robot_names}
             medium.place(
                 attached_m,
                 velocities_m_s={name: velocities_m_s[name] for name in attached_m if name in velocities_m_s},

@@ -1,4 +1,4 @@
-"""The lab's client of the medium process."""
+"""The lab's client of the medium, which starts the process of the medium and sends requests to it."""
 
 from collections.abc import Mapping, Sequence, Set
 from contextlib import ExitStack
@@ -20,7 +20,7 @@ from sim_backends.world.world import World
 
 
 class MediumClient:
-    """Starts the medium and sends it the robots' TUN or TAP devices and places; use as a context manager.
+    """Starts the medium and sends it the robots' TUN or TAP devices and positions; use as a context manager.
 
     The process starts when the object is created, and the first request waits until the process is ready. The kernel
     kills the process when the thread that created the object ends, so create it in a thread that exists as long as
@@ -86,7 +86,7 @@ class MediumClient:
             fd: Descriptor of its device, or of a packet socket: each read returns one framed packet, and each write
                 accepts one. The medium gets a copy; the caller closes this descriptor. None for a radio of the
                 kernel, which has no device.
-            physics_fds: `EmulatedRobot.physics_fds`, for a medium with a physics; other media ignore them.
+            physics_fds: `EmulatedRobot.physics_fds`, for a medium with a physics simulator; other media ignore them.
 
         Raises:
             LinkError: The medium ended or did not answer.
@@ -106,9 +106,10 @@ class MediumClient:
         relay: str | None = None,
         velocities_m_s: Mapping[str, Vector] = MappingProxyType({}),
     ) -> None:
-        """Place the robots; later packets cross the obstacles between these places.
+        """Place the robots; later packets cross the obstacles between these positions.
 
-        Places are valid until the next call. A velocity moves no robot; it only sets the speed of the fading.
+        Positions are valid until the next call. A velocity does not move a robot; it only sets the speed of the
+        fading.
 
         Args:
             positions_m: Position of each antenna, metres east, north, up. Robots that are not named are off the air.
@@ -116,13 +117,13 @@ class MediumClient:
             velocities_m_s: Velocities, metres per second east, north, up; 0 for robots that are not named.
 
         Raises:
-            ConfigurationError: A named robot is not attached, or the relay has no place.
+            ConfigurationError: A named robot is not attached, or the relay has no position.
             LinkError: The medium ended or did not answer.
         """
-        unknown = (positions_m.keys() - self._robots) | ({relay} - {None} - positions_m.keys())
-        if unknown:
+        invalid_names = (positions_m.keys() - self._robots) | ({relay} - {None} - positions_m.keys())
+        if invalid_names:
             raise ConfigurationError(
-                f"robots without a radio or a place: {', '.join(sorted(map(str, unknown)))}",
+                f"robots without a radio or a position: {', '.join(sorted(map(str, invalid_names)))}",
                 remedy="attach every robot, and give the relay a position",
             )
         if not self._is_configured:
@@ -136,7 +137,7 @@ class MediumClient:
         self._worker.request({"do": "use", "options": self._options.model_dump(mode="json"), "world": world})
 
     def record(self, folder: Path | None) -> None:
-        """Record later transmissions in files in `folder` (see `air_log`), or stop recording with None.
+        """Record later transmissions in files in `folder` (`air_log`), or stop recording if it is None.
 
         Raises:
             LinkError: The medium ended or did not answer.

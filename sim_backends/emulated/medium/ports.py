@@ -1,4 +1,4 @@
-"""Ports of the medium, and their statistics: packets sent and delivered, lateness and delays, also per flow."""
+"""Ports of the medium, and their statistics: packets sent and delivered, lateness, delays, and delays per flow."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
@@ -107,7 +107,7 @@ class MediumStats:
     Attributes:
         scheduling: `fifo 1`, or the reason why the process has no real-time priority.
         packet_lateness_counts: Number of packets per lateness in ns, rounded by `round_up`. Lateness is the longest
-            time that the packet can have waited to be read, plus the time from its arrival by the model until it was
+            time that the packet can have waited to be read, plus the time from its arrival in the model until it was
             written.
         links: Counters per directed link.
         ports: Counters per robot.
@@ -187,7 +187,7 @@ class Port:
         self.refused_packets = 0
         self.unroutable_packets = 0
         self.other_packets = 0
-        # Number of the next packets that may have waited in the device since `backlog_since_ns`.
+        # Number of packets in the device that may have waited since `backlog_since_ns`.
         self.backlog = 0
         self.backlog_since_ns = 0
         # Delays of the written packets, by the robot that sent them. `refused_packets` counts packets that were not

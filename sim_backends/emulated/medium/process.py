@@ -35,7 +35,7 @@ _MAX_SLEEP_NS: Final = 10_000_000
 
 
 class Medium(MediumServer):
-    """Moves packets between ports through a radio model. Arguments are those of `MediumServer`."""
+    """Moves packets between ports through a radio model. The arguments are those of `MediumServer`."""
 
     def __init__(self, seed: int, framing: Framing, channel: socket.socket) -> None:
         super().__init__(seed, framing, channel)

@@ -1,4 +1,4 @@
-"""Common part of media: devices of robots, requests of the lab, interfaces, link samples and recordings of the air.
+"""Base class of media: devices of robots, requests of the lab, interfaces, link samples, recordings of the air.
 
 A medium is a process that carries the packets of the robots' TUN or TAP devices. `process` contains the medium of a
 radio model, and `sim_backends.emulated.cosimulated` contains the medium of a co-simulation.
@@ -39,7 +39,7 @@ INTERFACE_POLL_NS: Final = 1_000_000
 """Polling interval of the robots' interfaces; a poll takes 0.6 us for three robots."""
 
 _OWNER_TIMEOUT_S: Final = 5.0
-# The sampling interval of a robot's own link sampler.
+# The link sampler of a robot has the same sampling interval.
 _SAMPLE_NS: Final = 200_000_000
 _MAX_SAMPLES: Final = 10_000
 """Maximum number of samples that are kept per robot: half an hour."""
@@ -49,7 +49,7 @@ AttemptLog = Callable[[TransmissionAttempt], None]
 
 @dataclass(frozen=True)
 class Layout:
-    """Places of the robots in the last request of the lab.
+    """Positions of the robots in the last request of the lab.
 
     Attributes:
         positions_m: Position of each robot, metres east, north, up; empty before the first request.
@@ -64,7 +64,7 @@ class Layout:
     @classmethod
     def from_message(cls, message: Message) -> Self:
         """Return the layout from a request to place the robots."""
-        positions_m = {name: tuple(place_m) for name, place_m in message["positions"].items()}
+        positions_m = {name: tuple(position_m) for name, position_m in message["positions"].items()}
         velocities_m_s = {name: tuple(velocity) for name, velocity in message["velocities"].items()}
         return cls(positions_m, velocities_m_s, message["relay"])
 
@@ -86,7 +86,7 @@ class MediumServer(ABC):
         self._world: World | None = None
         self._antennas: dict[str, Antenna] = {}
         self._air_log: AirLog | None = None
-        # Time of the next link sample, None if links are not sampled; and the samples since the last request.
+        # Time of the next link sample, or None if links are not sampled.
         self._sample_ns: int | None = None
         self._samples: deque[Mapping[str, LinkSample]] = deque(maxlen=_MAX_SAMPLES)
         self._layout = Layout()
@@ -184,9 +184,9 @@ class MediumServer(ABC):
             self._place()
 
     def _place(self) -> None:
-        """Place the robots that are on the air; if the access point is off the air, no station has a place."""
+        """Place the robots that are on the air; if the access point is off the air, no station is placed."""
         positions_m = {
-            name: place_m for name, place_m in self._layout.positions_m.items() if name in self._on_air_robots
+            name: position_m for name, position_m in self._layout.positions_m.items() if name in self._on_air_robots
         }
         relay = self._layout.relay
         if relay is not None and relay not in positions_m:

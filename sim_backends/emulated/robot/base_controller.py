@@ -9,7 +9,7 @@ from typing import Final
 
 from fieldkit.core.model import Vector
 from sim_backends.emulated.robot.spec import Base
-from sim_backends.emulated.ros.own_motion import AT_REST, OwnMotion
+from sim_backends.emulated.ros.robot_motion import AT_REST, RobotMotion
 from sim_backends.physics.body import Twist
 from sim_backends.physics.differential_drive import DifferentialDrive, DrivePose
 from sim_backends.physics.robot_limits import DriveLimits
@@ -23,15 +23,15 @@ _TURN_RISE_S: Final = 0.5
 """Time in which the turn rate rises from 0 to its limit."""
 
 
-def odometry(start: OwnMotion, place_m: Vector, heading_rad: float) -> Vector:
+def odometry(start: RobotMotion, position_m: Vector, heading_rad: float) -> Vector:
     """Return the odometry of a robot after a motion; see `RecordedMotion.odometry`.
 
     Args:
         start: State of motion of the robot at the start of the motion.
-        place_m: Its position, metres east, north, up.
+        position_m: Its position, metres east, north, up.
         heading_rad: Its heading, continuous over full turns.
     """
-    x_m, y_m = place_m[0] - start.place_m[0], place_m[1] - start.place_m[1]
+    x_m, y_m = position_m[0] - start.position_m[0], position_m[1] - start.position_m[1]
     rotation_rad = start.yaw_rad - start.heading_rad
     cos, sin = math.cos(rotation_rad), math.sin(rotation_rad)
     yaw_rad = start.yaw_rad + heading_rad - start.heading_rad
@@ -76,10 +76,10 @@ class BaseController:
         """Odometry; see `RecordedMotion.odometry`."""
         return odometry(self._start, self._pose.place_m, self._pose.heading_rad)
 
-    def reset(self, motion: OwnMotion) -> None:
-        """Start again at the place where the lab put the robot; it is at rest, and earlier velocities are dropped."""
+    def reset(self, motion: RobotMotion) -> None:
+        """Start again at rest where the lab has placed the robot; earlier velocities are dropped."""
         self._start = motion
-        self._pose = DrivePose(motion.place_m, motion.heading_rad)
+        self._pose = DrivePose(motion.position_m, motion.heading_rad)
         self._commanded_ns = None
 
     def set_velocity(self, now_ns: int, ahead_m_s: float, turn_rad_s: float) -> None:

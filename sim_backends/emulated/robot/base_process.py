@@ -1,6 +1,6 @@
 """Process of the base of an emulated ground robot: receives velocities at a socket and drives the robot.
 
-The velocities are datagrams of six doubles, as in ROS's `Twist`. Relays that run under Debian's Python import this
+The velocities are datagrams of six doubles, those of ROS's `Twist`. Relays that run under Debian's Python import this
 module, so it imports only the standard library and modules that do the same.
 """
 
@@ -11,11 +11,11 @@ import socket
 import struct
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NoReturn
+from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from sim_backends.emulated.robot.spec import STATE, Base
 from sim_backends.emulated.robot.velocity_command import VELOCITY_COMMAND, VelocityCommand, VelocityCommandRecord
-from sim_backends.emulated.ros.own_motion import MotionReporter
+from sim_backends.emulated.ros.robot_motion import MotionReporter
 
 if TYPE_CHECKING:
     from sim_backends.emulated.robot.base_controller import BaseController
@@ -28,8 +28,8 @@ def serve(base: Base, *, assigned_paths: Path, motion_record: Path, ready: Path)
 
     Args:
         base: Settings of the robot's base.
-        assigned_paths: The file of the paths that the lab assigns (`own_motion.append_path`).
-        motion_record: The file in which the robot records its motion (`own_motion.MotionReporter`).
+        assigned_paths: The file of the paths that the lab assigns (`robot_motion.append_path`).
+        motion_record: The file in which the robot records its motion (`robot_motion.MotionReporter`).
         ready: File that is created when the base accepts velocities.
 
     Raises:
@@ -60,7 +60,7 @@ def serve(base: Base, *, assigned_paths: Path, motion_record: Path, ready: Path)
 
 
 def _record_velocities(channel: socket.socket) -> NoReturn:
-    """Record each velocity for the physics, which limits it and stops the robot after the last one."""
+    """Record each velocity for the physics simulator, which limits it and stops the robot after the last one."""
     record = VelocityCommandRecord.open(VELOCITY_COMMAND)
     while True:
         velocity = unpack(channel.recv(BYTES + 1))
@@ -95,9 +95,25 @@ _TWIST: Final = struct.Struct("<6d")
 BYTES: Final = _TWIST.size
 
 
-def pack(*values: float) -> bytes:
-    """Return the datagram for metres per second along x, y, z, and radians per second about them."""
-    return _TWIST.pack(*values)
+STAMPED: Final = "geometry_msgs/TwistStamped"
+"""Type of velocities with a header."""
+
+_MAX_AGE_NS: Final = 500_000_000
+"""ROS's default `cmd_vel_timeout`."""
+
+
+def is_outdated(stamp_ns: int, now_ns: int) -> bool:
+    """Return True if a stamped velocity is too old for a base, by the rule of ROS 2's `diff_drive_controller`.
+
+    A stamp of 0 means the time of arrival (`DiffDriveController::on_configure`).
+    """
+    return stamp_ns != 0 and now_ns - stamp_ns >= _MAX_AGE_NS
+
+
+def pack(twist: Any) -> bytes:  # noqa: ANN401 (a `geometry_msgs/Twist` of rospy or of rosbags)
+    """Return the datagram of a velocity: metres per second along x, y, z, and radians per second about them."""
+    linear, angular = twist.linear, twist.angular
+    return _TWIST.pack(linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
 
 
 def unpack(datagram: bytes) -> tuple[float, float] | None:

@@ -25,9 +25,9 @@ from sim_backends.emulated.robot import mounts, network, rootfs, services, wirel
 from sim_backends.emulated.robot.services import Service
 from sim_backends.emulated.robot.spec import HOME, LOOPBACK_INTERFACE, STATE, RobotSpec, WifiSpec
 from sim_backends.emulated.robot.velocity_command import VELOCITY_COMMAND
-from sim_backends.emulated.ros import own_motion
+from sim_backends.emulated.ros import robot_motion
 from sim_backends.emulated.ros.laser import Neighbourhood
-from sim_backends.emulated.ros.own_motion import AssignedPath
+from sim_backends.emulated.ros.robot_motion import AssignedPath
 
 RESTART_S: Final = 0.1
 """Delay before a service that exited is restarted; the default of systemd's RestartSec."""
@@ -133,7 +133,7 @@ START_S: Final = 30.0
 
 _MESSAGE_S: Final = 10.0
 
-VOLATILE: Final = ("/tmp", "/run", "/dev/shm")  # noqa: S108 (the robot's own)
+VOLATILE: Final = ("/tmp", "/run", "/dev/shm")  # noqa: S108 (in the robot)
 """Folders whose content is in the robot's memory, and is lost without power; other folders are on its SD card."""
 
 
@@ -203,7 +203,7 @@ class Init:
             case "open wifi" | "switch off" | "switch on" | "switch link on":
                 self._change_radio(request)
             case "move":
-                own_motion.append_path(services.ASSIGNED_PATHS, AssignedPath(**request["path"]))
+                robot_motion.append_path(services.ASSIGNED_PATHS, AssignedPath(**request["path"]))
             case "kill":
                 kill_processes(request["process"])
             case "halt":
@@ -283,7 +283,7 @@ def _build(spec: RobotSpec) -> None:
 
 
 def _motion_files(spec: RobotSpec) -> list[int]:
-    """Return descriptors of the record of the robot's motion, and of the inputs of a simulated physics, if any."""
+    """Return descriptors of the robot's motion record, and of the files of a physics simulator that moves it."""
     inputs: list[tuple[Path, int]] = []
     if spec.simulated_flight:
         inputs = [(services.FLIGHT_COMMAND, os.O_RDONLY), (services.FLIGHT, os.O_RDWR)]

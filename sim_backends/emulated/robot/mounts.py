@@ -1,4 +1,4 @@
-"""File system of an emulated robot: the host's files, read-only, and separate folders that a robot can change."""
+"""Builds the file system of an emulated robot: read-only files of the host, and folders that the robot can change."""
 
 import contextlib
 import ctypes
@@ -24,22 +24,22 @@ _SYS_MOUNT_SETATTR: Final = 442
 _AT_FDCWD: Final = -100
 _AT_RECURSIVE: Final = 0x8000
 
-OWN_FOLDERS: Final = {
+ROBOT_FOLDERS: Final = {
     "/root": "0700",
     "/home": "0755",
     "/opt": "0755",
     "/run": "0755",
-    "/tmp": "1777",  # noqa: S108 (the robot's own, fresh)
+    "/tmp": "1777",  # noqa: S108 (in the robot, initially empty)
     "/var/log": "0755",
-    "/var/tmp": "1777",  # noqa: S108 (the robot's own, fresh)
-    "/dev/shm": "1777",  # noqa: S108 (the robot's own, fresh)
+    "/var/tmp": "1777",  # noqa: S108 (in the robot, initially empty)
+    "/dev/shm": "1777",  # noqa: S108 (in the robot, initially empty)
     "/sys/class/power_supply": "0755",  # hides the battery of the host
 }
 """Folders that each robot has separately, with their modes; their content is lost when the robot stops."""
 
 
 def isolate(*, replaced_files: Iterable[str] = ()) -> None:
-    """Mount the robot's own folders in this process's mount namespace, and make everything of the host read-only.
+    """Mount the robot's folders in this process's mount namespace, and make everything of the host read-only.
 
     All that the robot needs from the host remains visible: this Python, this package, and everything in `/opt`.
 
@@ -60,7 +60,7 @@ def isolate(*, replaced_files: Iterable[str] = ()) -> None:
     replaced_in_opt = {Path(path).parts[2] for path in replaced_files if path.startswith("/opt/")}
     visible = [*_python_folders(), *(child for child in Path("/opt").glob("*") if child.name not in replaced_in_opt)]
     open_fds = {path: _open_path(path) for path in _outermost(visible) if path.exists()}
-    for folder, mode in {**OWN_FOLDERS, **dict.fromkeys(missing, "0755")}.items():
+    for folder, mode in {**ROBOT_FOLDERS, **dict.fromkeys(missing, "0755")}.items():
         if Path(folder).is_dir():
             _mount("tmpfs", folder, "tmpfs", _MS_NOSUID | _MS_NODEV, f"mode={mode}")
     for path, fd in open_fds.items():
@@ -179,8 +179,8 @@ def _python_folders() -> list[Path]:
 
 
 def _outermost(paths: Iterable[Path]) -> list[Path]:
-    """Return the paths that the robot's own folders hide; a path inside another of these paths is omitted."""
-    hidden = {path for path in paths if any(Path(folder) in path.parents for folder in OWN_FOLDERS)}
+    """Return the paths that the robot's folders hide; a path inside another of these paths is omitted."""
+    hidden = {path for path in paths if any(Path(folder) in path.parents for folder in ROBOT_FOLDERS)}
     return [path for path in hidden if not any(parent in hidden for parent in path.parents)]
 
 

@@ -26,7 +26,7 @@ _LONG_TERM_STATE: Final = f"{STATE}/babel-state"
 
 
 def command(interface: str, address: str, hello_s: float, links: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the command of a robot's routing daemon. Settings that are not in it have babeld's defaults.
+    """Return the command of a robot's routing daemon. Other settings have babeld's defaults.
 
     Args:
         interface: The radio interface. It is declared wireless, because a TAP device has no wireless extensions.
@@ -50,7 +50,7 @@ def command(interface: str, address: str, hello_s: float, links: Mapping[str, st
 def guest_command(interface: str, address: str, hello_s: float) -> tuple[str, ...]:
     """Return the command of a node that uses the robots' routes, and announces only the route to itself.
 
-    The daemon writes no files. Arguments are those of `command`.
+    The daemon writes no files. The arguments are those of `command`.
     """
     filters = (f"out ip {IPv4Interface(address).ip}/32 allow", "out deny")
     return (*_program("", ""), *_settings(interface, address, hello_s, *filters), interface)
@@ -199,7 +199,7 @@ def add_link(interface: str, address: str, *, mesh: bool = False) -> int:
     Args:
         interface: Name of the interface.
         address: Its address with the prefix length.
-        mesh: See `bring_up`.
+        mesh: True if robots forward packets for each other.
 
     Returns:
         The device's descriptor, for the medium of the link.
@@ -253,7 +253,7 @@ def _routes(interface: str) -> tuple[str, ...]:
 
 
 def run_ip(*commands: str) -> None:
-    """Run commands of `ip`.
+    """Run `ip` commands.
 
     Raises:
         RobotError: `ip` rejected a setting.
@@ -261,7 +261,7 @@ def run_ip(*commands: str) -> None:
     for command in commands:
         # Each command runs separately, because busybox's ip, which a robot may have, has no batch mode.
         result = subprocess.run(
-            ["ip", *command.split()],  # noqa: S607 (found on the robot's own PATH)
+            ["ip", *command.split()],  # noqa: S607 (found on the robot's PATH)
             capture_output=True,
             text=True,
             timeout=_TIMEOUT_S,

@@ -36,7 +36,7 @@ _GROUPS: Final = "root:x:0:\ntty:x:5:\nnogroup:x:65534:\ntcpdump:x:101:\n"
 # `*` matches no password; keys still log in. `!` would lock the account, which sshd without PAM refuses.
 _PASSWORDS: Final = "root:*:20000:0:99999:7:::\n"
 
-OWN_FILES: Final = tuple(f"/etc/{name}" for name in ("passwd", "group", "shadow", "hostname", "hosts"))
+ROBOT_FILES: Final = tuple(f"/etc/{name}" for name in ("passwd", "group", "shadow", "hostname", "hosts"))
 """System files that each robot has separately."""
 
 # On a real robot `python3` is Debian's, which searches this folder after PYTHONPATH. The folder is appended, so that
@@ -98,7 +98,7 @@ def write_files(spec: RobotSpec) -> None:
     # The files are mounted separately, because a user namespace may not mount over a folder that contains mounts, as
     # `/etc` does in Docker. If this machine lacks one of the files (a minimal Debian has no `hosts`), an overlay of
     # the folder adds them.
-    if all(Path(path).exists() for path in OWN_FILES):
+    if all(Path(path).exists() for path in ROBOT_FILES):
         for name in files:
             mounts.bind(state / "etc" / name, Path("/etc", name))
     else:

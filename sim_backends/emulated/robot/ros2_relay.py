@@ -1,9 +1,9 @@
 """Publishes an emulated robot's sensors over DDS or Zenoh, as nodes of ROS 2 do; or runs a Zenoh router.
 
 Arguments: `route` and the robot's address; or `relay`, the address, the node's name, the topic of velocities for the
-base (may be empty), and as JSON the ROS 2 settings (`Ros2Spec`) and the type of each topic. The sensors process
-creates each message. The relay converts it to CDR as the robot's distribution defines the type, and publishes it
-while the topic has subscribers anywhere on the radio. It always publishes `/tf_static`, for late subscribers.
+base and its type (may be empty), and as JSON the ROS 2 settings (`Ros2Spec`) and the type of each topic. The sensors
+process creates each message. The relay converts it to CDR as the robot's distribution defines the type, and publishes
+it while the topic has subscribers anywhere on the radio. It always publishes `/tf_static`, for late subscribers.
 Velocities go in the other direction. The node logs on `/rosout`.
 """
 
@@ -30,7 +30,7 @@ from sim_backends.emulated.ros import offered_qos, static_frames
 from sim_backends.emulated.ros.tcpros import Listener
 
 _POLL_S: Final = 0.1
-"""Polling interval for subscribers; ROS 2's own recorder polls for new publishers as often."""
+"""Polling interval for subscribers; the recorder of ROS 2 polls for new publishers as often."""
 
 
 _LOG: Final = "rcl_interfaces/msg/Log"
@@ -90,16 +90,28 @@ class Ros2Relay:
             migrate_bytes(types.ros1, types.ros2, kind, kind, defaults, data, src_is2=False, dst_is2=True)
         )
 
-    def relay_velocities(self, topic: str) -> None:
-        """Send each `geometry_msgs/Twist` of a topic to the base; messages are dropped while the base restarts."""
-        kind, channel = "geometry_msgs/msg/Twist", socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        types = self._types
+    def relay_velocities(self, topic: str, kind: str) -> None:
+        """Send each velocity of a topic to the base; messages are dropped while the base restarts.
 
-        def send(data: bytes, _: int) -> None:
-            with contextlib.suppress(OSError, SerdeError):  # no process receives it, or it is not a Twist
-                channel.sendto(bytes(types.ros2.cdr_to_ros1(data, kind)), str(base_process.CHANNEL))
+        Args:
+            topic: Name of the topic.
+            kind: Its type, `geometry_msgs/Twist` or `geometry_msgs/TwistStamped`.
+        """
+        channel = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        description = self._topic(topic, kind, PROFILES["default"])
+        types = self._types.ros2
 
-        self._middleware.subscribe(self._topic(topic, kind, PROFILES["default"]), send)
+        def send(data: bytes, at_ns: int) -> None:
+            with contextlib.suppress(OSError, SerdeError):  # no process receives it, or it has another type
+                message: Any = types.deserialize_cdr(data, description.type)
+                if kind == base_process.STAMPED:
+                    stamp = message.header.stamp
+                    if base_process.is_outdated(stamp.sec * 10**9 + stamp.nanosec, at_ns):
+                        return
+                    message = message.twist
+                channel.sendto(base_process.pack(message), str(base_process.CHANNEL))
+
+        self._middleware.subscribe(description, send)
 
     def run(self) -> None:
         """Relay messages until a signal stops the process."""
@@ -160,13 +172,15 @@ def _run_router(address: str) -> None:
     router.close()
 
 
-def _run_relay(address: str, node: str, velocities: str, ros2_json: str, types_json: str) -> None:
+def _run_relay(  # noqa: PLR0917 (the words of the command line)
+    address: str, node: str, velocities: str, velocity_type: str, ros2_json: str, types_json: str
+) -> None:
     services.name_process(services.ROS2_RELAY)
     types = json.loads(types_json)
     spec = Ros2Spec.from_json(json.loads(ros2_json))
     relay = Ros2Relay(_network(address, node, spec), spec.middleware, Distribution.of(spec.distribution), types)
     if velocities:
-        relay.relay_velocities(velocities)
+        relay.relay_velocities(velocities, velocity_type)
     relay.log(f"publishing {', '.join(types)}" + (f"; driven by {velocities}" if velocities else ""))
     services.ready_file(services.ROS2_RELAY).touch()
     relay.run()

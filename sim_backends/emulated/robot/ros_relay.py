@@ -1,8 +1,8 @@
 """Publishes an emulated robot's sensors to its ROS master; runs under Debian's Python, which has rospy.
 
-Arguments: the node's name, the topic of velocities for the base (may be empty), and the topics to publish. The master
-may run on another robot, over the radio. The sensors process creates and serializes each message; the relay publishes
-it unchanged while the topic has subscribers. It also sends received velocities to the base.
+Arguments: the node's name, the topic of velocities for the base and its type (may be empty), and the topics to
+publish. The master may run on another robot, over the radio. The sensors process creates and serializes each message;
+the relay publishes it unchanged while the topic has subscribers. It also sends received velocities to the base.
 """
 
 import contextlib
@@ -41,7 +41,7 @@ class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no type
         super().__init__()
         self._topic = topic
         self._stream: socket.socket | None = None
-        # rospy calls `peer_subscribe` in its own threads, possibly before the publisher has been assigned.
+        # rospy calls `peer_subscribe` in other threads, possibly before the publisher has been assigned.
         self._lock = threading.Lock()
         stream, packets = _subscribe(topic)
         with stream:
@@ -94,17 +94,24 @@ class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no type
                 self._publisher.publish(message)
 
 
-def _relay_velocities(topic: str) -> None:
-    """Send each `geometry_msgs/Twist` to the base; messages are dropped while the base restarts."""
+def _relay_velocities(topic: str, kind: str) -> None:
+    """Send each velocity to the base; messages are dropped while the base restarts.
+
+    Args:
+        topic: Name of the topic.
+        kind: Its type, `geometry_msgs/Twist` or `geometry_msgs/TwistStamped`.
+    """
     channel = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
 
     def send(message: Any) -> None:  # noqa: ANN401 (rospy has no types)
-        linear, angular = message.linear, message.angular
-        datagram = base_process.pack(linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
+        if kind == base_process.STAMPED:
+            if base_process.is_outdated(message.header.stamp.to_nsec(), time.time_ns()):
+                return
+            message = message.twist
         with contextlib.suppress(OSError):
-            channel.sendto(datagram, str(base_process.CHANNEL))
+            channel.sendto(base_process.pack(message), str(base_process.CHANNEL))
 
-    rospy.Subscriber(topic, roslib.message.get_message_class("geometry_msgs/Twist"), send, queue_size=1)
+    rospy.Subscriber(topic, roslib.message.get_message_class(kind), send, queue_size=1)
 
 
 def _subscribe(topic: str) -> tuple[socket.socket, framing.PacketSplitter]:
@@ -146,7 +153,7 @@ def _next_packet(stream: socket.socket, packets: framing.PacketSplitter) -> byte
 def _message_class(header: dict[str, str]) -> Any:  # noqa: ANN401 (rospy has no types)
     """Return a message class whose content stays serialized.
 
-    If ROS's own class of that type is installed, its definition is announced, with comments, as on a real robot.
+    If the class of ROS for that type is installed, its definition is announced, with comments, as on a real robot.
     """
     installed_class = roslib.message.get_message_class(header["type"])
     attributes = {
@@ -176,13 +183,13 @@ def master_answers() -> bool:
 def main() -> None:
     """Relay the robot's topics; does not return."""
     services.name_process("ros_relay")
-    node, velocities, *topics = sys.argv[1:]
+    node, velocities, velocity_type, *topics = sys.argv[1:]
     _wait("the sensors do not publish", services.ready_file("sensors").exists)
     _wait("the ROS master does not answer", master_answers)
     rospy.init_node(node, disable_signals=True)
     relays = [Relay(topic) for topic in topics]
     if velocities:
-        _relay_velocities(velocities)
+        _relay_velocities(velocities, velocity_type)
     services.ready_file("ros_relay").touch()
     rospy.spin()
     del relays

@@ -30,10 +30,10 @@ MOTION_RECORD: Final = Path(STATE, "steered")
 """The file in which a robot that steers itself records its motion."""
 
 FLIGHT_COMMAND: Final = Path(STATE, "flight_command")
-"""The file in which an autopilot records its command for a physics that flies the drone."""
+"""The file in which an autopilot records its command for a physics simulator that flies the drone."""
 
 FLIGHT: Final = Path(STATE, "flown")
-"""The file in which that physics records the flight."""
+"""The file in which this physics simulator records the flight."""
 
 READY_FOLDER: Final = f"{STATE}/ready"
 
@@ -157,7 +157,7 @@ def services(spec: RobotSpec, neighbourhood: Neighbourhood | None = None) -> lis
         types = {sensor.topic: sensor.type for sensor in spec.sensors}
         if frames:
             types[static_frames.TOPIC] = static_frames.TYPE
-        words = (spec.ip, ros_node(spec), _velocity_topic(spec), json.dumps(asdict(spec.ros2)), json.dumps(types))
+        words = (spec.ip, ros_node(spec), *_velocity_topic(spec), json.dumps(asdict(spec.ros2)), json.dumps(types))
         result.append(_ros2_program(ROS2_RELAY, "relay", *words))
     return result
 
@@ -166,7 +166,7 @@ def _network_services(spec: RobotSpec) -> Iterator[Service]:
     """Yield the programs of the robot's radio: hostapd or wpa_supplicant, and the routing daemon of a mesh."""
     wifi = spec.wifi
     if wifi is not None and wifi.mode in wireless.PROGRAMS:
-        argv = wireless.command(spec.interface, wifi)
+        argv = wireless.prepare_command(spec.interface, wifi)
         yield _program(wireless.PROGRAMS[wifi.mode], argv, {}, partial(wireless.is_connected, wifi))
     if spec.mesh_hello_s is not None:
         argv = network.command(spec.interface, spec.address, spec.mesh_hello_s, dict(spec.links.values()))
@@ -186,13 +186,13 @@ def _debian_ros(spec: RobotSpec, topics: Sequence[str]) -> Iterator[Service]:
     variables = spec.ros1_environment | {"PYTHONPATH": str(worker.PROJECT)}
     if spec.runs_master:
         yield _master(spec, variables)
-    relay = ("/usr/bin/python3", "-s", str(_RELAY), ros_node(spec), _velocity_topic(spec), *topics)
+    relay = ("/usr/bin/python3", "-s", str(_RELAY), ros_node(spec), *_velocity_topic(spec), *topics)
     yield _program("ros_relay", relay, variables, ready_file("ros_relay").exists)
 
 
-def _velocity_topic(spec: RobotSpec) -> str:
-    """Return the topic of velocities that the robot's base subscribes to; empty if it has no base."""
-    return spec.base.topic if spec.base else ""
+def _velocity_topic(spec: RobotSpec) -> tuple[str, str]:
+    """Return the topic of velocities that the robot's base subscribes to, and its type; empty if it has no base."""
+    return (spec.base.topic, spec.base.type) if spec.base else ("", "")
 
 
 def _drone(spec: RobotSpec, port: int) -> autopilot.Drone:

@@ -47,13 +47,16 @@ class Base:
 
     Attributes:
         topic: ROS topic of velocities that it subscribes to.
+        type: Type of this topic, `geometry_msgs/Twist` or `geometry_msgs/TwistStamped`.
         speed_m_s: Maximum speed.
         acceleration_m_s2: Maximum acceleration.
         turn_rad_s: Maximum turn rate.
-        is_simulated: True if the physics of a co-simulation moves the robot: the base only records the velocities.
+        is_simulated: True if the physics simulator of a co-simulation moves the robot: the base only records the
+            velocities.
     """
 
     topic: str
+    type: str
     speed_m_s: float
     acceleration_m_s2: float
     turn_rad_s: float
@@ -88,7 +91,7 @@ class Ros2Spec:
 
 @dataclass(frozen=True)
 class WifiSpec:
-    """The Wi-Fi of Linux on a robot.
+    """Settings of Linux Wi-Fi on a robot.
 
     Attributes:
         mode: `ad hoc`, `mesh point`, `access point` or `station`.
@@ -127,7 +130,8 @@ class RobotSpec:
         registered_topics: Published topics that it registers at that master.
         definitions: Definitions of the message types of its sensors.
         mavlink_port: UDP port of its autopilot; None without an autopilot.
-        simulated_flight: True if the physics of a co-simulation flies it: the autopilot records its commands only.
+        simulated_flight: True if the physics simulator of a co-simulation flies it: the autopilot only records its
+            commands.
         autopilot: Firmware that the autopilot emulates, `px4` or `ardupilot`.
         system: MAVLink system id of that autopilot.
         boot_s: Boot time of that autopilot.
@@ -148,7 +152,7 @@ class RobotSpec:
         mesh_hello_s: Hello interval of its routing daemon; None for a robot that does not forward.
         ros2: Its ROS 2 over the radio; None if it has none.
         routes_zenoh: True if it runs the Zenoh router.
-        wifi: Its Wi-Fi of Linux; None for a robot whose radio is a TUN or TAP device.
+        wifi: Settings of its Linux Wi-Fi; None for a robot whose radio is a TUN or TAP device.
         links: Interface and address with the prefix length of each further link, by its name.
         bridge: Command that bridges its topics from ROS 1 to another middleware; empty if none runs automatically.
     """

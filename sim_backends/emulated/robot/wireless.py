@@ -1,4 +1,4 @@
-"""Wi-Fi of Linux on an emulated robot.
+"""Linux Wi-Fi on an emulated robot.
 
 The robot joins an ad hoc cell or an 802.11s mesh, runs an access point (hostapd), or is a station (wpa_supplicant).
 """
@@ -34,10 +34,10 @@ table inet fieldkit {
     }
 }
 """
-"""Sends all packets in access category VO.
+"""nftables rules that assign all sent packets to access category VO.
 
-The other categories would use block-ACK sessions, in which mac80211 ignores the tries that hwsim reports. hwsim has
-no queues per category, so this changes nothing else.
+The other categories would use block-ACK sessions, in which mac80211 ignores the attempts that hwsim reports. hwsim
+has no queues per category, so this changes nothing else.
 """
 
 _ACCESS_POINT: Final = """\
@@ -67,7 +67,10 @@ _PROTECTION: Final = {"wpa2": 0, "wpa3": 2}
 """Protected management frames, 802.11w: none, or required as in WPA3."""
 
 MONITOR: Final = "mon0"
-"""Name of the monitor interface, which captures all frames that the radio sends, with their tries, or receives."""
+"""Name of the monitor interface, which captures all frames that the radio receives or sends.
+
+Sent frames contain the number of their transmission attempts.
+"""
 _INTERFACE_TYPES: Final = {"ad hoc": "ibss", "mesh point": "mp"}
 
 _CONFIGURATION: Final = Path(STATE, "wifi.conf")
@@ -80,7 +83,7 @@ def bring_up(device: str, interface: str, address: str, wifi: WifiSpec) -> None:
     """Bring up loopback and a Wi-Fi interface in this process's network namespace.
 
     Args:
-        device: Present name of the interface.
+        device: Current name of the interface.
         interface: Its new name.
         address: Its address with the prefix length.
         wifi: Mode of the robot in the Wi-Fi network; the program of this mode is started later.
@@ -111,7 +114,7 @@ def rejoin(interface: str, wifi: WifiSpec) -> None:
         _run("iw", "dev", interface, *_JOIN[wifi.mode])
 
 
-def command(interface: str, wifi: WifiSpec) -> tuple[str, ...]:
+def prepare_command(interface: str, wifi: WifiSpec) -> tuple[str, ...]:
     """Write the configuration of the robot's hostapd or wpa_supplicant, and return its command line."""
     _CONFIGURATION.touch(mode=0o600)
     _CONFIGURATION.write_text(configuration(interface, wifi), encoding="ascii")

@@ -1,4 +1,4 @@
-"""Records between the autopilot of a drone and the physics that flies it: commands, and the resulting flight."""
+"""Records that the autopilot and the physics simulator of a drone exchange: commands, and the resulting flight."""
 
 import math
 from typing import Final, NamedTuple
@@ -14,7 +14,7 @@ class FlightCommand(NamedTuple):
     """A command of an autopilot.
 
     Attributes:
-        time_ns: Its time, by the monotonic clock.
+        time_ns: Its time, from the monotonic clock.
         path_start_ns: Start of the assigned path (`AssignedPath.start_ns`) that put the drone at the start of this
             flight. If the lab has assigned another path since, the command is invalid.
         powered: False if the rotors are off.
@@ -77,11 +77,11 @@ class FlightCommandRecord(Record):
 
 
 class FlightMotion(NamedTuple):
-    """Motion of a drone that a physics flies, for its autopilot.
+    """Motion of a drone that a physics simulator flies, for its autopilot.
 
     Attributes:
-        time_ns: Its time, by the monotonic clock.
-        path_start_ns: See `FlightCommand`.
+        time_ns: Its time, from the monotonic clock.
+        path_start_ns: Start time of the path with which the lab last placed the drone.
         is_supported: True if the drone rests on the ground or on an obstacle.
         place_m: Position of its lowest point, metres east, north, up.
         velocity_m_s: Velocity, east, north, up.

@@ -24,20 +24,20 @@ _SLACK_BEAMS: Final = 1e-9
 
 
 def ranges_m(
-    targets: Iterable[LaserTarget], place_m: Vector, heading_rad: float, beams: int, reach_m: float
+    targets: Iterable[LaserTarget], position_m: Vector, heading_rad: float, beams: int, reach_m: float
 ) -> list[float]:
     """Return the distance to the first surface along each beam, infinite beyond `reach_m`.
 
     Args:
         targets: Solids in the world.
-        place_m: Position of the scanner, metres east, north, up.
+        position_m: Position of the scanner, metres east, north, up.
         heading_rad: Direction of beam 0, from east towards north; the others follow counter-clockwise.
         beams: Number of beams.
         reach_m: Maximum range.
     """
-    scan = _Scan(place_m, heading_rad, beams, reach_m)
+    scan = _Scan(position_m, heading_rad, beams, reach_m)
     for target in targets:
-        if not target.base_m <= place_m[2] <= target.top_m:
+        if not target.base_m <= position_m[2] <= target.top_m:
             continue
         if target.radius_m:
             scan.add_circle(target.outline_m[0], target.radius_m)
@@ -48,11 +48,11 @@ def ranges_m(
 
 
 class _Scan:
-    """Distance to the nearest added surface, per beam. Arguments are those of `ranges_m`."""
+    """Distance to the nearest added surface, per beam. The arguments are those of `ranges_m`."""
 
-    def __init__(self, place_m: Vector, heading_rad: float, beams: int, reach_m: float) -> None:
+    def __init__(self, position_m: Vector, heading_rad: float, beams: int, reach_m: float) -> None:
         self.ranges_m = [math.inf] * beams
-        self._east_m, self._north_m, _ = place_m
+        self._east_m, self._north_m, _ = position_m
         self._heading_rad = heading_rad
         self._step_rad = 2 * math.pi / beams
         self._reach_m = reach_m
@@ -111,12 +111,12 @@ class _Slots:
     """Layout of the two slots for a number of robots."""
 
     def __init__(self, robots: int) -> None:
-        self.places = struct.Struct(f"<{_AXES * robots}d")
-        self.body_bytes = _NUMBER.size + self.places.size
+        self.positions = struct.Struct(f"<{_AXES * robots}d")
+        self.body_bytes = _NUMBER.size + self.positions.size
         self.slot_bytes = self.body_bytes + _CRC.size
 
 
-class PlacesWriter:
+class PositionsWriter:
     """Writes the positions to the memory, in the lab. Call `close` when every robot has stopped.
 
     Args:
@@ -130,18 +130,18 @@ class PlacesWriter:
         self._names = tuple(names)
         self._slots = _Slots(len(self._names))
         self._number = 0
-        self.fd = os.memfd_create("places")
+        self.fd = os.memfd_create("positions")
         os.ftruncate(self.fd, 2 * self._slots.slot_bytes)
 
     def write(self, positions_m: Mapping[str, Vector]) -> None:
-        """Write the position of each antenna, metres east, north, up; robots that are not named have no place.
+        """Write the position of each antenna, metres east, north, up; robots that are not named have no position.
 
         Raises:
             OSError: The memory cannot be written.
         """
         self._number += 1
         values = [axis for name in self._names for axis in positions_m.get(name, _ABSENT)]
-        body = _NUMBER.pack(self._number) + self._slots.places.pack(*values)
+        body = _NUMBER.pack(self._number) + self._slots.positions.pack(*values)
         os.pwrite(self.fd, body + _CRC.pack(zlib.crc32(body)), self._number % 2 * self._slots.slot_bytes)
 
     def close(self) -> None:
@@ -165,14 +165,14 @@ class Neighbourhood:
         self._slots = _Slots(robots)
         self._memory = mmap.mmap(fd, 2 * self._slots.slot_bytes, access=mmap.ACCESS_READ)
         self._number = 0
-        self._places_m = [_ABSENT] * robots
+        self._positions_m = [_ABSENT] * robots
 
     def targets(self, neighbours: Sequence[Neighbour]) -> list[LaserTarget]:
-        """Return the laser targets of other robots at their current positions; those without a place are omitted."""
+        """Return the other robots with a position, as laser targets at these positions."""
         self._read()
         targets = []
         for body in neighbours:
-            east_m, north_m, up_m = self._places_m[body.number]
+            east_m, north_m, up_m = self._positions_m[body.number]
             if not math.isnan(up_m):
                 outline_m = ((east_m, north_m),)
                 targets.append(LaserTarget(outline_m, body.radius_m, up_m - body.below_m, up_m + body.above_m))
@@ -186,5 +186,5 @@ class Neighbourhood:
             (number,) = _NUMBER.unpack_from(body)
             if number > self._number and _CRC.unpack(crc)[0] == zlib.crc32(body):
                 self._number = number
-                axes = iter(self._slots.places.unpack_from(body, _NUMBER.size))
-                self._places_m = list(zip(axes, axes, axes, strict=True))
+                axes = iter(self._slots.positions.unpack_from(body, _NUMBER.size))
+                self._positions_m = list(zip(axes, axes, axes, strict=True))

@@ -4,7 +4,7 @@ ROS 1 serializes a message's fields in order without padding, little-endian; a s
 bytes before it (wiki.ros.org/msg). Each generator packs the fields of its type with the standard library alone,
 because the libraries that support all types would cost each robot 20 MB of memory.
 
-The motion of the robot comes from `own_motion`. Frames and units follow REP 103 and REP 105: metres, radians, x
+The motion of the robot comes from `robot_motion`. Frames and units follow REP 103 and REP 105: metres, radians, x
 ahead, y to the left. In frames that are fixed to the world, x is east and y is north, as in the orientation of an IMU
 (REP 145). Covariances are the values that drivers of such robots report. The laser ranges are computed from the
 world. Numbers that vary in a real sensor contain noise, so that they compress no better than real data.
@@ -19,7 +19,7 @@ from random import Random
 from typing import Final
 
 from sim_backends.emulated.ros.laser import ranges_m
-from sim_backends.emulated.ros.own_motion import AT_REST, OwnMotion
+from sim_backends.emulated.ros.robot_motion import AT_REST, RobotMotion
 from sim_backends.emulated.ros.sensor_specs import LASER_SCAN, LaserTarget, Sensor, Template, check, packed_string
 from sim_backends.world.motion import GRAVITY_M_S2
 
@@ -50,7 +50,7 @@ _FLOATS_BYTES: Final = 16  # the size of a point, so that the fields of points s
 _ONE_TRANSFORM: Final = struct.pack("<I", 1)
 
 
-Generator = Callable[[Sensor, Random, OwnMotion], bytes]
+Generator = Callable[[Sensor, Random, RobotMotion], bytes]
 """Returns the serialized fields that follow the header."""
 
 
@@ -82,7 +82,7 @@ class Source:
         # The seed is the topic, so that equal robots publish equal values, independently of their start time.
         self._noise = Random(sensor.topic)  # noqa: S311 (no secret)
 
-    def message(self, number: int, stamp_ns: int, motion: OwnMotion = AT_REST) -> bytes:
+    def message(self, number: int, stamp_ns: int, motion: RobotMotion = AT_REST) -> bytes:
         """Return message `number`, serialized, for a motion and a time stamp in nanoseconds since the epoch."""
         if not self._has_header:
             return self._generate(self._sensor, self._noise, motion)
@@ -100,7 +100,7 @@ def _template_generator(template: Template) -> Generator:
     head, tail, size_bytes = bytes.fromhex(template.head), bytes.fromhex(template.tail), template.size_bytes
     pool = b""
 
-    def generate(_: Sensor, noise: Random, __: OwnMotion) -> bytes:
+    def generate(_: Sensor, noise: Random, __: RobotMotion) -> bytes:
         nonlocal pool
         if not template.floats:
             return head + noise.randbytes(size_bytes) + tail
@@ -148,14 +148,14 @@ def _reported_range_m(value_m: float, low_m: float, high_m: float) -> float:
 def _laser_scan(
     sensor: Sensor,
     noise: Random,
-    motion: OwnMotion,
+    motion: RobotMotion,
     targets: Sequence[LaserTarget] = (),
     moving_targets: Callable[[], Sequence[LaserTarget]] = tuple,
 ) -> bytes:
     points = sensor.points or 0
     step = 2 * math.pi / points
     low_m, high_m = LASER_RANGE_M
-    true_ranges_m = ranges_m(chain(targets, moving_targets()), motion.place_m, motion.heading_rad, points, high_m)
+    true_ranges_m = ranges_m(chain(targets, moving_targets()), motion.position_m, motion.heading_rad, points, high_m)
     turn_s = 1 / sensor.rate_hz
     angles = (0.0, step * (points - 1), step)
     scalars = struct.pack("<7f", *angles, turn_s / points, turn_s, low_m, high_m)
@@ -165,7 +165,7 @@ def _laser_scan(
     return scalars + _float32s(ranges) + _float32s(echoes)
 
 
-def _imu(_: Sensor, noise: Random, motion: OwnMotion) -> bytes:
+def _imu(_: Sensor, noise: Random, motion: RobotMotion) -> bytes:
     # On an assigned path the robot turns and accelerates in zero time, which gyroscope and accelerometer cannot show.
     orientation_covariance, angular_covariance, acceleration_covariance = (
         _diagonal(*[variance] * 3) for variance in IMU_VARIANCES
@@ -180,7 +180,7 @@ def _child_frame(sensor: Sensor) -> bytes:
     return packed_string(sensor.child_frame or "base_link")
 
 
-def _odometry(sensor: Sensor, noise: Random, motion: OwnMotion) -> bytes:
+def _odometry(sensor: Sensor, noise: Random, motion: RobotMotion) -> bytes:
     covariance = _diagonal(*ODOMETRY_VARIANCES)
     angular = (0.0, 0.0, noise.gauss(motion.turn_rad_s, 1e-3))
     pose = _float64s((motion.x_m, motion.y_m, 0.0), _heading_quaternion(motion.yaw_rad), covariance)
@@ -188,58 +188,58 @@ def _odometry(sensor: Sensor, noise: Random, motion: OwnMotion) -> bytes:
     return _child_frame(sensor) + pose + twist
 
 
-def _transforms(sensor: Sensor, _: Random, motion: OwnMotion) -> bytes:
+def _transforms(sensor: Sensor, _: Random, motion: RobotMotion) -> bytes:
     """Return one transform, from the odometry frame to the robot's frame: the robot's pose in odometry (REP 105)."""
     return _child_frame(sensor) + _float64s((motion.x_m, motion.y_m, 0.0), _heading_quaternion(motion.yaw_rad))
 
 
-def _battery_state(_: Sensor, noise: Random, _motion: OwnMotion) -> bytes:
+def _battery_state(_: Sensor, noise: Random, _motion: RobotMotion) -> bytes:
     voltage, design_capacity, percentage = noise.gauss(11.1, 0.01), 1.8, 0.8
     unknown = math.nan  # sensor_msgs/BatteryState: "if unmeasured NaN"
     discharging, good, polymer, present = 2, 1, 3, True  # POWER_SUPPLY_STATUS, _HEALTH, _TECHNOLOGY
     measured_fields = struct.pack("<7f", voltage, *[unknown] * 4, design_capacity, percentage)
     state = struct.pack("<3B?", discharging, good, polymer, present)
     no_cells = _float32s(()) * 2  # voltages and temperatures of the cells
-    return measured_fields + state + no_cells + packed_string("") * 2  # place and serial number of the battery
+    return measured_fields + state + no_cells + packed_string("") * 2  # location and serial number of the battery
 
 
-def _range(_: Sensor, noise: Random, motion: OwnMotion) -> bytes:
+def _range(_: Sensor, noise: Random, motion: RobotMotion) -> bytes:
     infrared = 1  # sensor_msgs/Range.INFRARED
     low_m, high_m = 0.02, 4.0
-    down_m = max(STANDING_M, motion.place_m[2]) + abs(noise.gauss(0.0, 0.005))
+    down_m = max(STANDING_M, motion.position_m[2]) + abs(noise.gauss(0.0, 0.005))
     return struct.pack("<B4f", infrared, math.radians(25.0), low_m, high_m, _reported_range_m(down_m, low_m, high_m))
 
 
-def _nav_sat_fix(_: Sensor, noise: Random, motion: OwnMotion) -> bytes:
+def _nav_sat_fix(_: Sensor, noise: Random, motion: RobotMotion) -> bytes:
     fix, gps, diagonal_known = 0, 1, 2  # NavSatStatus.STATUS_FIX, .SERVICE_GPS; COVARIANCE_TYPE_DIAGONAL_KNOWN
-    east_m, north_m, up_m = motion.place_m
+    east_m, north_m, up_m = motion.position_m
     latitude, longitude = math.degrees(north_m / NORTH_RADIUS_M), math.degrees(east_m / EAST_RADIUS_M)
     across, up = FIX_NOISE_M
     across_deg = math.degrees(across / EAST_RADIUS_M)
-    place = (*_gaussian(noise, across_deg, latitude, longitude), noise.gauss(up_m, up))
+    fix_position = (*_gaussian(noise, across_deg, latitude, longitude), noise.gauss(up_m, up))
     covariance = _diagonal(across**2, across**2, up**2)
-    return struct.pack("<bH", fix, gps) + _float64s(place, covariance) + struct.pack("<B", diagonal_known)
+    return struct.pack("<bH", fix, gps) + _float64s(fix_position, covariance) + struct.pack("<B", diagonal_known)
 
 
-def _magnetic_field(_: Sensor, noise: Random, motion: OwnMotion) -> bytes:
+def _magnetic_field(_: Sensor, noise: Random, motion: RobotMotion) -> bytes:
     north_t, up_t = FIELD_T
     ahead_t, left_t = north_t * math.sin(motion.heading_rad), north_t * math.cos(motion.heading_rad)
     return _float64s(_gaussian(noise, 1e-7, ahead_t, left_t, up_t), _diagonal(*[1e-14] * 3))
 
 
-def _fluid_pressure(_: Sensor, noise: Random, motion: OwnMotion) -> bytes:
+def _fluid_pressure(_: Sensor, noise: Random, motion: RobotMotion) -> bytes:
     # Standard atmosphere, ISO 2533, at a height above the sea; then the variance.
-    pressure_pa = 101_325.0 * (1 - 0.0065 * motion.place_m[2] / 288.15) ** 5.25588
+    pressure_pa = 101_325.0 * (1 - 0.0065 * motion.position_m[2] / 288.15) ** 5.25588
     return _float64s((noise.gauss(pressure_pa, 3.0), 9.0))
 
 
-def _temperature(_: Sensor, noise: Random, _motion: OwnMotion) -> bytes:
+def _temperature(_: Sensor, noise: Random, _motion: RobotMotion) -> bytes:
     return _float64s((noise.gauss(20.0, 0.1), 0.01))  # then the variance
 
 
-def _pose_stamped(_: Sensor, __: Random, motion: OwnMotion) -> bytes:
+def _pose_stamped(_: Sensor, __: Random, motion: RobotMotion) -> bytes:
     return _float64s(
-        motion.place_m, _heading_quaternion(motion.heading_rad)
+        motion.position_m, _heading_quaternion(motion.heading_rad)
     )  # in the world's frame, `map` of REP 105
 
 

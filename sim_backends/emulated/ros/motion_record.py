@@ -21,20 +21,20 @@ class RecordedMotion(NamedTuple):
     """Motion of a robot that steers itself, at one time.
 
     Attributes:
-        time_ns: The time, by the monotonic clock.
-        path_start_ns: Start of the assigned path (`AssignedPath.start_ns`) that put the robot at the start of this
-            motion; 0 if there was none. If the lab has assigned another path since, the record is invalid.
-        place_m: Position, metres east, north, up.
+        time_ns: The time, from the monotonic clock.
+        path_start_ns: Start time of the path (`AssignedPath.start_ns`) with which the lab placed the robot before
+            this motion; 0 if there was none. If the lab has assigned another path since, the record is invalid.
+        position_m: Position, metres east, north, up.
         velocity_m_s: Velocity, east, north, up.
         heading_rad: Heading, from east towards north.
         turn_rad_s: Turn rate to the left.
-        odometry: Metres ahead of the place where the robot was switched on, metres to the left of its heading at that
+        odometry: Metres ahead of the point where the robot was switched on, metres to the left of its heading at that
             time, and the angle to the left of that heading in radians.
     """
 
     time_ns: int
     path_start_ns: int
-    place_m: Vector
+    position_m: Vector
     velocity_m_s: Vector = STILL
     heading_rad: float = 0.0
     turn_rad_s: float = 0.0
@@ -49,7 +49,7 @@ class RecordedMotion(NamedTuple):
     @property
     def state(self) -> State:
         """Position, velocity and heading as the lab uses them."""
-        return State(self.place_m, self.velocity_m_s, self.heading_rad)
+        return State(self.position_m, self.velocity_m_s, self.heading_rad)
 
     @property
     def is_moving(self) -> bool:
@@ -64,7 +64,7 @@ class RecordedMotion(NamedTuple):
         ahead_m = self.speed_m_s * elapsed_s
         later = self._replace(
             time_ns=max(now_ns, self.time_ns),
-            place_m=_extrapolate(self.place_m, self.velocity_m_s, elapsed_s),
+            position_m=_extrapolate(self.position_m, self.velocity_m_s, elapsed_s),
             heading_rad=self.heading_rad + self.turn_rad_s * elapsed_s,
             odometry=(
                 x_m + ahead_m * math.cos(yaw_rad),
@@ -94,7 +94,7 @@ class MotionRecord(Record):
         self._slots.write(
             motion.time_ns,
             motion.path_start_ns,
-            *motion.place_m,
+            *motion.position_m,
             *motion.velocity_m_s,
             motion.heading_rad,
             motion.turn_rad_s,
@@ -114,13 +114,13 @@ class MotionRecord(Record):
 
 
 def _to_motion(time_ns: int, path_start_ns: int, *values: float) -> RecordedMotion:
-    place, velocity, odometry = (_vector(values[index : index + 3]) for index in (0, 3, 8))
+    position_m, velocity_m_s, odometry = (_vector(values[index : index + 3]) for index in (0, 3, 8))
     heading_rad, turn_rad_s = values[6:8]
-    return RecordedMotion(time_ns, path_start_ns, place, velocity, heading_rad, turn_rad_s, odometry)
+    return RecordedMotion(time_ns, path_start_ns, position_m, velocity_m_s, heading_rad, turn_rad_s, odometry)
 
 
-def _extrapolate(place_m: Vector, velocity_m_s: Vector, for_s: float) -> Vector:
-    (east, north, up), (e, n, u) = place_m, velocity_m_s
+def _extrapolate(position_m: Vector, velocity_m_s: Vector, for_s: float) -> Vector:
+    (east, north, up), (e, n, u) = position_m, velocity_m_s
     return east + e * for_s, north + n * for_s, up + u * for_s
 
 

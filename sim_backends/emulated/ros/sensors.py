@@ -15,7 +15,7 @@ from typing import Final
 
 from sim_backends.emulated.ros import static_frames, tcpros
 from sim_backends.emulated.ros.messages import Source
-from sim_backends.emulated.ros.own_motion import Odometer
+from sim_backends.emulated.ros.robot_motion import Odometer
 from sim_backends.emulated.ros.sensor_specs import Definition, LaserTarget, Sensor
 from sim_backends.ros1 import framing
 
@@ -207,8 +207,9 @@ def publish(
         frames: Links in `/tf_static`, which is published once and latched; empty for a robot without it.
         targets: Laser targets in the robot's world.
         moving_targets: Returns the laser targets that move: the other robots at their current positions.
-        assigned_paths: The file of the paths that the lab assigns (`own_motion.append_path`).
-        motion_record: The file in which a robot that steers itself records its motion (`own_motion.MotionReporter`).
+        assigned_paths: The file of the paths that the lab assigns (`robot_motion.append_path`).
+        motion_record: The file in which a robot that steers itself records its motion
+            (`robot_motion.MotionReporter`).
         ready: File that is created when every topic can be subscribed to.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Checks of both roles: handshake, ping, rejected requests, the end of a session, forks that are not declared."""
+"""Conformance checks of both roles: handshake, ping, rejected requests, end of a session, undeclared forks."""
 
 from sim_backends.federates.conformance.probe import CheckError, NotDeclaredError, Target
 from sim_backends.federates.exchanges import encode_fork

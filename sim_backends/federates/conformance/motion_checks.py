@@ -1,4 +1,4 @@
-"""Checks of a physics: signs, axes and units of its motion.
+"""Conformance checks of the motion of a physics federate: signs, axes and units.
 
 Agents accelerate within limits, and wheels slip: the tolerances accept half of the commanded motion.
 """
@@ -55,13 +55,13 @@ def _suitable_agents(probe: FederateProbe, command: int) -> list[str]:
 def _states_under_commands(
     probe: FederateProbe, commands: Mapping[str, Any], seconds: float, window_s: float = _LONG_WINDOW_S
 ) -> Iterator[Mapping[str, State]]:
-    """Yield the present states, and the states at the ends of windows after the commands were sent."""
+    """Yield the current states, and the states at the ends of windows after the commands were sent."""
     step_ns = probe.welcome.step_ns
     window_ns = max(round(window_s * 1e9 / step_ns), 1) * step_ns
     begin_ns = probe.last_ns
-    yield probe.physics(begin_ns).states
+    yield probe.advance_physics(begin_ns).states
     for window in range(1, math.ceil(seconds * 1e9 / window_ns) + 1):
-        yield probe.physics(begin_ns + window * window_ns, commands if window == 1 else None).states
+        yield probe.advance_physics(begin_ns + window * window_ns, commands if window == 1 else None).states
 
 
 def _displacement_m(before: State, after: State) -> tuple[float, float, float]:

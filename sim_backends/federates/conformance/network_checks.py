@@ -1,4 +1,4 @@
-"""Checks of a network: times, fates of packets, window borders, reasons, determinism, forks."""
+"""Conformance checks of a network federate: times, fates of packets, window borders, reasons, determinism, forks."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -70,7 +70,7 @@ class _FateAccount:
     ) -> NetworkOutcomes:
         """Advance the network, and check its answer."""
         from_ns = self._probe.last_ns
-        outcomes = self._probe.network(to_ns, states, packets, copy=copy)
+        outcomes = self._probe.advance_network(to_ns, states, packets, copy=copy)
         self._packets |= {packet.packet_id: packet for packet in packets}
         if outcomes.at_ns != to_ns:
             raise CheckError(f"it was requested to advance to {to_ns} ns, but advanced to {outcomes.at_ns} ns")
@@ -147,7 +147,7 @@ def _run(probe: FederateProbe, window_ns: int, until_ns: int = _END_NS) -> _Fate
 def check_first_request(target: Target) -> None:
     """A first request for time -1, which a window of length 0 causes, is answered."""
     probe = target.open()
-    outcomes = probe.network(-1, _states(probe))
+    outcomes = probe.advance_network(-1, _states(probe))
     if outcomes.at_ns != -1 or outcomes.arrivals or outcomes.drops:
         raise CheckError("the first request for -1 ns was not answered with this time and without packets")
 
@@ -343,7 +343,7 @@ def check_dead_reckoning(target: Target) -> None:
         probe.require(FederateCapability.EXTRAPOLATES)
         states = _states(probe)
         outcomes = [
-            probe.network(to_ns, states, packets, reckoning_ns=reckoning_ns)
+            probe.advance_network(to_ns, states, packets, reckoning_ns=reckoning_ns)
             for to_ns, packets in ((10 * _MS, _packets(probe, [5 * _MS])), (_END_NS, []))
         ]
         arrivals.append([outcome.arrivals for outcome in outcomes])
@@ -357,11 +357,11 @@ def check_fork(target: Target) -> None:
     probe.require(FederateCapability.FORK)
     states = _states(probe)
     packets = _packets(probe, [number * _MS for number in range(5)])
-    probe.network(_MS, states, packets[:2])
+    probe.advance_network(_MS, states, packets[:2])
     probe.fork(1)
     requests = (5 * _MS, packets[2:]), (_END_NS, packets[:0])
     copy_outcomes, original_outcomes = (
-        [probe.network(to_ns, states, entering_packets, copy=copy) for to_ns, entering_packets in requests]
+        [probe.advance_network(to_ns, states, entering_packets, copy=copy) for to_ns, entering_packets in requests]
         for copy in (1, 0)
     )
     if copy_outcomes != original_outcomes:

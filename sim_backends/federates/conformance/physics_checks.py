@@ -1,4 +1,4 @@
-"""Checks of a physics: times, commands, motion, determinism, forks."""
+"""Conformance checks of a physics federate: times, commands, motion, determinism, forks."""
 
 import json
 import math
@@ -70,7 +70,7 @@ def _check_time(probe: FederateProbe, to_ns: int, answer: PhysicsAnswer) -> None
 def check_start(target: Target) -> None:
     """At time 0 each agent has a state near its requested start."""
     probe = target.open()
-    answer = probe.physics(0)
+    answer = probe.advance_physics(0)
     _check_time(probe, 0, answer)
     for agent in target.hello.agents:
         if agent.name not in answer.states:  # the agent is absent; the probe checks that the federate declares this
@@ -87,7 +87,7 @@ def check_remainders(target: Target) -> None:
     window_ns = step_ns + max(step_ns // 10, 1)
     for window in range(200):
         to_ns = window * window_ns
-        _check_time(probe, to_ns, probe.physics(to_ns))
+        _check_time(probe, to_ns, probe.advance_physics(to_ns))
 
 
 def check_drift(target: Target) -> None:
@@ -96,26 +96,26 @@ def check_drift(target: Target) -> None:
     step_ns = probe.welcome.step_ns
     window_ns = step_ns + max(step_ns // 10, 1)
     commands = _commands(probe)
-    answer = probe.physics(0)
+    answer = probe.advance_physics(0)
     for window in range(1, target.windows + 1):
         to_ns = window * window_ns
-        answer = probe.physics(to_ns, commands if window == 1 else None)
+        answer = probe.advance_physics(to_ns, commands if window == 1 else None)
         _check_time(probe, to_ns, answer)
     if not probe.has(FederateCapability.DETERMINISTIC):
         raise NotDeclaredError("it does not declare DETERMINISTIC; only the times were compared")
     single_window_probe = target.open()
-    single_window_probe.physics(0)
-    single_window_answer = single_window_probe.physics(target.windows * window_ns, commands)
+    single_window_probe.advance_physics(0)
+    single_window_answer = single_window_probe.advance_physics(target.windows * window_ns, commands)
     _check_same(answer.states, single_window_answer.states, f"{target.windows} windows instead of one")
 
 
 def check_repeated_time(target: Target) -> None:
     """A second request for the same time gives the same states."""
     probe = target.open()
-    probe.physics(0)
+    probe.advance_physics(0)
     to_ns = 20 * probe.welcome.step_ns
-    first = probe.physics(to_ns, _commands(probe))
-    second = probe.physics(to_ns)
+    first = probe.advance_physics(to_ns, _commands(probe))
+    second = probe.advance_physics(to_ns)
     if first.states != second.states:
         raise CheckError(f"a second request for {to_ns} ns gave other states")
 
@@ -123,10 +123,10 @@ def check_repeated_time(target: Target) -> None:
 def check_motion(target: Target) -> None:
     """Commanded agents move, without jumps, and continue without a new command."""
     probe = target.open()
-    before = start = probe.physics(0).states
+    before = start = probe.advance_physics(0).states
     step_ns, commands = probe.welcome.step_ns, _commands(probe)
     for step in range(1, _COMMANDED_STEPS + 1):
-        answer = probe.physics(step * step_ns, commands if step == 1 else None)
+        answer = probe.advance_physics(step * step_ns, commands if step == 1 else None)
         for name, state in answer.states.items():
             moved_m = math.dist(state.position_m, before[name].position_m)
             speed_m_s = max(math.hypot(*state.velocity_m_s), math.hypot(*before[name].velocity_m_s))
@@ -142,13 +142,13 @@ def check_motion(target: Target) -> None:
 def check_limits(target: Target) -> None:
     """The error of an extrapolation at the velocity is at most a t^2 / 2, where a is the returned limit."""
     probe = target.open()
-    before = probe.physics(0)
+    before = probe.advance_physics(0)
     step_ns, commands = probe.welcome.step_ns, _commands(probe)
     window_s = _LIMIT_STEPS * step_ns / 1e9
     # The error is larger by one step for a simulator that moves bodies at the velocity at the end of a step.
     per_limit_s2 = window_s**2 / 2 + window_s * step_ns / 1e9
     for window in range(1, 40):
-        answer = probe.physics(window * _LIMIT_STEPS * step_ns, commands if window == 1 else None)
+        answer = probe.advance_physics(window * _LIMIT_STEPS * step_ns, commands if window == 1 else None)
         for name, state in before.states.items():
             expected = extrapolate(state, window_s).position_m
             error_m = math.dist(answer.states[name].position_m, expected)
@@ -166,14 +166,14 @@ def check_command_time(target: Target) -> None:
     exact_probe.require(FederateCapability.DETERMINISTIC)
     step_ns, commands = exact_probe.welcome.step_ns, _commands(exact_probe)
     middle_ns, end_ns = 100 * step_ns, 300 * step_ns
-    exact_probe.physics(0)
-    exact_probe.physics(middle_ns)
-    expected = exact_probe.physics(end_ns, commands)
+    exact_probe.advance_physics(0)
+    exact_probe.advance_physics(middle_ns)
+    expected = exact_probe.advance_physics(end_ns, commands)
     late_probe = target.open()
-    late_probe.physics(0)
+    late_probe.advance_physics(0)
     _check_same(
         expected.states,
-        late_probe.physics(end_ns, commands, from_ns=middle_ns).states,
+        late_probe.advance_physics(end_ns, commands, from_ns=middle_ns).states,
         f"a command that applies from {middle_ns} ns",
     )
 
@@ -181,7 +181,7 @@ def check_command_time(target: Target) -> None:
 def check_unknown_command(target: Target) -> None:
     """A command of an unknown type is refused with an error."""
     probe = target.open()
-    probe.physics(0)
+    probe.advance_physics(0)
     body = (
         encode_number(probe.welcome.step_ns) + encode_number(0) + b"\1\0\0\0" + b"\0\0\0\0\xff\x7f\x08\0" + bytes(8)
     )
@@ -196,7 +196,10 @@ def check_determinism(target: Target) -> None:
         probe.require(FederateCapability.DETERMINISTIC)
         window_ns, commands = 7 * probe.welcome.step_ns, _commands(probe)
         answers.append(
-            [probe.physics(number * window_ns, commands if number == 3 else None).body for number in range(100)]
+            [
+                probe.advance_physics(number * window_ns, commands if number == 3 else None).body
+                for number in range(100)
+            ]
         )
     for number, (first, second) in enumerate(zip(*answers, strict=True)):
         if first != second:
@@ -218,10 +221,10 @@ def check_lifetimes(target: Target) -> None:
     probe.require(FederateCapability.AGENTS_DISAPPEAR)
     if probe.welcome.step_ns != step_ns:
         raise NotDeclaredError(f"its step of {probe.welcome.step_ns} ns is not that of the scenario")
-    if name in probe.physics(0).states:
+    if name in probe.advance_physics(0).states:
         raise NotDeclaredError("it moves agents before they appear, and the coordinator ignores their states")
     for step in (appears_steps - 1, appears_steps, disappears_steps - 1, disappears_steps, 2 * disappears_steps):
-        states = probe.physics(step * step_ns).states
+        states = probe.advance_physics(step * step_ns).states
         if (name in states) != (appears_steps <= step < disappears_steps):
             raise CheckError(
                 f"{name}, which appears at {appears_steps * step_ns} ns and disappears at "
@@ -241,11 +244,13 @@ def check_fork(target: Target) -> None:
     probe = target.open()
     probe.require(FederateCapability.FORK)
     step_ns, commands = probe.welcome.step_ns, _commands(probe)
-    probe.physics(0)
+    probe.advance_physics(0)
     middle_ns, end_ns = 100 * step_ns, 400 * step_ns
-    answer_at_fork = probe.physics(middle_ns, commands)
+    answer_at_fork = probe.advance_physics(middle_ns, commands)
     probe.fork(1)
-    copy_answer = probe.physics(end_ns, from_ns=middle_ns, copy=1)
-    repeated_answer = probe.physics(middle_ns, from_ns=middle_ns)
+    copy_answer = probe.advance_physics(end_ns, from_ns=middle_ns, copy=1)
+    repeated_answer = probe.advance_physics(middle_ns, from_ns=middle_ns)
     _check_same(answer_at_fork.states, repeated_answer.states, "the original, after its copy has advanced")
-    _check_same(copy_answer.states, probe.physics(end_ns, from_ns=middle_ns).states, "the original and its copy")
+    _check_same(
+        copy_answer.states, probe.advance_physics(end_ns, from_ns=middle_ns).states, "the original and its copy"
+    )

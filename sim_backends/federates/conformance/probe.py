@@ -1,4 +1,4 @@
-"""Helpers of the checks: connections to newly started federates, and the last request and answer of each."""
+"""Helpers of the conformance checks: connections to new federates, and the last request and answer of each."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -46,12 +46,12 @@ class Opener(Protocol):
 
 @dataclass(frozen=True)
 class PhysicsAnswer:
-    """The answer of a physics.
+    """The answer of a physics federate.
 
     Attributes:
         at_ns: Time of the states.
         states: The states.
-        limits_m_s2: The limits.
+        limits_m_s2: Acceleration limit of each agent.
         body: The bytes of the answer.
     """
 
@@ -111,32 +111,32 @@ class FederateProbe:
     def request(
         self, kind: MessageKind, body: bytes, answer: MessageKind, decode: Callable[[bytes], Any], *, copy: int = 0
     ) -> Any:  # noqa: ANN401 (of `decode`)
-        """Send a request, and return the decoded answer; errors as for `FederateSession.request`."""
+        """Send a request, and return the decoded answer. Raises the errors of `FederateSession.request`."""
         request_name = kind.name.lower().replace("_", " ")
         return self._session.request(kind, copy, body, answer, decode=decode, describe=lambda: request_name)
 
-    def physics(
+    def advance_physics(
         self, to_ns: int, commands: Mapping[str, Any] | None = None, *, from_ns: int | None = None, copy: int = 0
     ) -> PhysicsAnswer:
-        """Advance a physics; the commands apply from the time of the last call, or from `from_ns`."""
+        """Advance a physics federate; the commands apply from the time of the last call, or from `from_ns`."""
         begin_ns = self.last_ns if from_ns is None else from_ns
         body = encode_advance_physics(to_ns, begin_ns, commands or {}, self.agents)
         names_before = set(self.agents.names)
         decode = partial(_decode_physics_answer, agents=self.agents)
-        answer_: PhysicsAnswer = self.request(
+        states_answer: PhysicsAnswer = self.request(
             MessageKind.ADVANCE_PHYSICS, body, MessageKind.STATES, decode, copy=copy
         )
         self.last_ns = to_ns
         if set(self.agents.names) - names_before and not self.has(FederateCapability.AGENTS_APPEAR):
             raise CheckError(f"the agent {self.agents.names[-1]} appeared, but it does not declare AGENTS_APPEAR")
-        missing_names = names_before - answer_.states.keys()
+        missing_names = names_before - states_answer.states.keys()
         if missing_names and not self.has(FederateCapability.AGENTS_DISAPPEAR):
             raise CheckError(
                 f"there is no state of {', '.join(sorted(missing_names))}, but it does not declare AGENTS_DISAPPEAR"
             )
-        return answer_
+        return states_answer
 
-    def network(
+    def advance_network(
         self,
         to_ns: int,
         states: Mapping[str, State],
@@ -155,7 +155,7 @@ class FederateProbe:
         return outcomes
 
     def fork(self, copy: int) -> None:
-        """Request a copy of the federate in its present state."""
+        """Request a copy of the federate in its current state."""
         self.request(MessageKind.FORK, encode_fork(copy), MessageKind.DONE, bytes)
 
     def ping(self, value: int) -> int:
@@ -223,7 +223,7 @@ class Target:
 
     @property
     def is_physics(self) -> bool:
-        """True if a physics is tested."""
+        """True if a physics federate is tested."""
         return self.hello.role == PHYSICS
 
     def open(self, hello: Hello | None = None) -> FederateProbe:

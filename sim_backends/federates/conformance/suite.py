@@ -1,4 +1,4 @@
-"""The suite: all checks of a role, and their results."""
+"""The conformance suite of external federates: all checks of a role, and their results."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

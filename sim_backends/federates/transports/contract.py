@@ -1,4 +1,4 @@
-"""Interface of a transport: an address that can connect or listen, and a listener that accepts with a deadline."""
+"""The interface of a transport between coordinator and federate: an address that can connect or listen."""
 
 import hmac
 import ipaddress
@@ -118,7 +118,7 @@ class HostAndPort:
         scheme: Its scheme, without `-listen`.
         host: Host name or IP address.
         port: Port.
-        listens: See `TransportAddress`.
+        listens: True if this side listens; False if it connects.
     """
 
     scheme: str

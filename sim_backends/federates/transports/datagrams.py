@@ -1,4 +1,4 @@
-"""Datagrams of the UDP transport: frames are a byte stream, in numbered datagrams that are acknowledged and resent.
+"""The datagrams of the UDP transport: a byte stream in numbered datagrams that are acknowledged and resent.
 
 A datagram has at most 1,200 bytes: a header of 40 bytes, `FKUD`, `version` u8 (1), `kind` u8, `reserved` u16,
 `connection` u64, `cookie` u64, `number` u64, `expected` u64, then, in data (kind 3), a part of the stream.
@@ -126,8 +126,8 @@ class DatagramChannel:
 
     Args:
         endpoint: The socket; the channel closes it.
-        connection: See `DatagramHeader`.
-        cookie: See `DatagramHeader`.
+        connection: Number that the connecting side has drawn.
+        cookie: Number that the listening side has drawn for this connection and the address of the connecting side.
     """
 
     def __init__(self, endpoint: socket.socket, connection: int, cookie: int) -> None:

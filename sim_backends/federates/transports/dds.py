@@ -1,4 +1,4 @@
-"""DDS with CycloneDDS: two reliable topics that keep all samples. There is no master.
+"""The transport over DDS, with CycloneDDS: two reliable topics that keep all samples. There is no master.
 
 The two sides discover each other at different times. A writer may thus send the first sample before the reader has
 discovered it; a volatile reader never receives this sample. The topics are therefore transient local: a reader
@@ -151,7 +151,7 @@ class DdsAddress:
         name: Its name.
         domain: DDS domain.
         interface: IPv4 address of the network interface to use.
-        listens: See `TransportAddress`.
+        listens: None: the federate listens and the coordinator connects, with the same address on both sides.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""The first message of a federate that connects: a coordinator that listens accepts it by its token."""
+"""The first message of a federate that connects, with the token by which a listening coordinator accepts it."""
 
 import time
 from typing import Final

@@ -1,4 +1,4 @@
-"""ROS 1: messages `std_msgs/UInt8MultiArray` on two topics, whose nodes find each other through a ROS master.
+"""The transport over ROS 1: two topics with `std_msgs/UInt8MultiArray`, whose nodes connect through a ROS master.
 
 The topics are `/fieldkit/NAME/requests` and `/fieldkit/NAME/answers`. The environment variables of ROS apply:
 `ROS_MASTER_URI` (http://localhost:11311) and `ROS_IP` or `ROS_HOSTNAME`, the address of this machine for other nodes.
@@ -106,7 +106,7 @@ class Ros1Address:
         name: Its name.
         master: URI of the master.
         host: Address of this machine for other nodes; empty for the local address of connections to the master.
-        listens: See `TransportAddress`.
+        listens: None: the federate listens and the coordinator connects, with the same address on both sides.
     """
 
     name: str

@@ -1,12 +1,12 @@
-"""Channels over a bus of samples, a pair of topics of DDS or ROS 1.
+"""Channels over a sample bus: a pair of DDS or ROS 1 topics.
 
 The coordinator writes `requests` and reads `answers`; the federate does the reverse. A sample consists of the `run`,
 a u64 that the coordinator draws, and one frame. The first is `hello`; a sample without a frame ends the run.
 
 DDS: topics `fieldkit/NAME/requests` and `fieldkit/NAME/answers`, final type
 `fieldkit::Frame { sequence<octet> data; }` in plain CDR, reliable, keep all, transient local; the durability service
-of a writer keeps the last two samples. A volatile writer does not match. A volatile reader does, but misses `hello`
-if it discovers the writer too late.
+of a writer keeps the last two samples. A volatile writer does not match. A volatile reader matches, but misses
+`hello` if it discovers the writer too late.
 
 ROS 1: topics `/fieldkit/NAME/requests` and `/fieldkit/NAME/answers`, type `std_msgs/UInt8MultiArray` without
 dimensions.

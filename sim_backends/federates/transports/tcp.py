@@ -1,4 +1,4 @@
-"""TCP: the frames follow each other in the byte stream of a connection."""
+"""The transport over TCP: the frames follow each other in the byte stream of a connection."""
 
 import socket
 import time

@@ -1,4 +1,4 @@
-"""The table of transports. `--physics`, `--network`, `serve` and the documentation page read it."""
+"""The table of all transports. `--physics`, `--network`, `serve` and the documentation page read it."""
 
 from collections.abc import Sequence
 from typing import Final

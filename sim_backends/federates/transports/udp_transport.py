@@ -1,4 +1,4 @@
-"""UDP: numbered datagrams that are acknowledged and resent (`datagrams`).
+"""The transport over UDP: numbered datagrams that are acknowledged and resent (`datagrams`).
 
 The listening side keeps no state until a program has returned the cookie that was sent to its address, so that a
 program with a forged address cannot open a connection, as in RFC 6347, section 4.2.1.

@@ -28,7 +28,7 @@ class TcpStreams:
         options: Options of TCP.
 
     Attributes:
-        now_ns: See `Wire`.
+        now_ns: Current simulated time.
     """
 
     def __init__(self, wire: Wire, transport: str, options: TcpOptions) -> None:

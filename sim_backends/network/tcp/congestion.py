@@ -130,7 +130,7 @@ class Cubic(NewReno):
     """The window of RFC 9438; slow start as in RFC 5681, without HyStart++ (RFC 9406).
 
     Args:
-        options: As for `NewReno`.
+        options: Segment size, initial window and growth of the window.
     """
 
     def __init__(self, options: TcpOptions) -> None:

@@ -33,7 +33,8 @@ class LinuxCubic(NewReno):
         options: Segment size, initial window and growth of the window.
 
     Attributes:
-        reduces_in_recovery: See `NewReno`; False for Linux (`tcp_enter_loss`).
+        reduces_in_recovery: False: as in Linux (`tcp_enter_loss`), a timeout within a recovery does not lower the
+            threshold again.
     """
 
     reduces_in_recovery: ClassVar[bool] = False

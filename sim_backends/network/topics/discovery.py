@@ -1,4 +1,4 @@
-"""Discovery of publish-subscribe: participants by SPDP, their endpoints by SEDP (DDSI-RTPS 2.5, clause 8.5).
+"""Discovery in publish-subscribe: participants by SPDP, their endpoints by SEDP (DDSI-RTPS 2.5, clause 8.5).
 
 No master is needed. A participant announces itself by multicast. A participant that receives an announcement for the
 first time responds by unicast, and sends its publications and subscriptions over reliable built-in topics. CycloneDDS

@@ -1,4 +1,4 @@
-"""A flow of publish-subscribe: a writer, its reader, and the record of the result of each sample.
+"""A publish-subscribe flow: a writer, its reader, and the record of the result of each sample.
 
 The two ends exchange information only by messages. The record uses the state of both ends: a sample will never arrive
 if its writer has given it up, no message with a part of it is in flight, and its reader has not stored all of it.

@@ -1,4 +1,4 @@
-"""The used messages of RTPS, and their sizes (OMG DDSI-RTPS 2.5, clause 9.4).
+"""Sizes and contents of the RTPS messages that are used (OMG DDSI-RTPS 2.5, clause 9.4).
 
 A message consists of a header and submessages. Message sizes include the headers of IP and UDP.
 """

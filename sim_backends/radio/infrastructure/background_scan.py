@@ -1,4 +1,4 @@
-"""Decisions of a station when to scan and whether to roam: `bgscan="simple"` of wpa_supplicant.
+"""Decides when a station scans and whether it roams, as `bgscan="simple"` of wpa_supplicant.
 
 The model follows bgscan_simple.c and events.c of wpa_supplicant 2.10, and the signal events of mac80211 (mlme.c).
 """

@@ -1,4 +1,4 @@
-"""Access points, neighbouring networks and microwave ovens around robots, in one object."""
+"""The infrastructure around robots: access points, neighbouring networks and microwave ovens."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -55,7 +55,7 @@ class Infrastructure:
 
     Attributes:
         antennas: All stations: robots, access points, neighbours.
-        places_m: Positions of the stations that are not robots.
+        positions_m: Positions of the stations that are not robots.
         robots: Indices of the robots.
         roaming: The association of the robots; None without access points.
 
@@ -79,7 +79,9 @@ class Infrastructure:
             name: replace(first, tx_power_dbm=float(station.tx_power_dbm), phy=phy)
             for name, station in stations.items()
         }
-        self.places_m = {name: self._place_m(station.at_m, station.height) for name, station in stations.items()}
+        self.positions_m = {
+            name: self._position_m(station.at_m, station.height) for name, station in stations.items()
+        }
         self.robots: Sequence[int] = range(len(robots))
         self.roaming: Roaming | None = None
         self._access_points: Sequence[int] = ()
@@ -109,7 +111,7 @@ class Infrastructure:
             self._ovens = [
                 MicrowaveOven(
                     self._seed,
-                    Emitter(_OVEN + name, self._place_m(oven.at_m, oven.height), float(oven.power_dbm)),
+                    Emitter(_OVEN + name, self._position_m(oven.at_m, oven.height), float(oven.power_dbm)),
                     float(oven.mains_hz),
                     exchange.events,
                     self._on_oven,
@@ -144,7 +146,7 @@ class Infrastructure:
         self._set_emissions(now_ns)
         meter = self._exchange.meter
         if meter is not None and until_ns is not None:
-            powers_mw = self._channel.received_mw(oven.emitter.place_m, oven.emitter.power_dbm)
+            powers_mw = self._channel.received_mw(oven.emitter.position_m, oven.emitter.power_dbm)
             threshold_mw = milliwatt(ENERGY_DETECTION_DBM)
             meter.on_busy(now_ns, until_ns, [index for index in self.robots if powers_mw[index] >= threshold_mw])
 
@@ -156,7 +158,7 @@ class Infrastructure:
                 self._exchange.retry_when_idle(now_ns, station)
 
     def _emission(self, now_ns: int, emitter: Emitter) -> Emission:
-        return Emission(now_ns, self._channel.received_mw(emitter.place_m, emitter.power_dbm))
+        return Emission(now_ns, self._channel.received_mw(emitter.position_m, emitter.power_dbm))
 
-    def _place_m(self, at_m: Place, height_m: float) -> Vector:
+    def _position_m(self, at_m: Place, height_m: float) -> Vector:
         return station_place_m(at_m, height_m, self._world)

@@ -1,4 +1,4 @@
-"""Packets of robots that are stations of access points, and management frames of all stations.
+"""Delivers packets of robots that are stations of access points, and management frames of all stations.
 
 The access points share an ideal wired network: it takes no time and has no losses. A packet goes from a robot to its
 access point, over the wired network to the access point of its destination, and to the destination. The wired network
@@ -46,7 +46,7 @@ class ManagementHandler(Protocol):
 
 
 class ManagedDelivery(PacketDelivery[Payload]):
-    """Packets of robots that may be stations of access points. Arguments are those of the base class.
+    """Packets of robots that may be stations of access points. The arguments are those of the base class.
 
     Attributes:
         robots: Indices of the robots; other stations are access points and neighbours.

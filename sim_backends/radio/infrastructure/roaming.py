@@ -1,4 +1,4 @@
-"""Access points, and the robots that roam between them: beacons, scans, association and its loss.
+"""Association of robots with access points between which they roam: beacons, scans, association and its loss.
 
 All access points and robots share one channel here; a robot that scans another channel neither sends nor receives.
 Probe frames would be on the other channels, so they are omitted. A scan finds each access point whose signal reaches
@@ -20,7 +20,7 @@ from sim_backends.radio.power_save import BEACON_INTERVAL_NS
 BEACON: Final = "beacon"
 
 _BEACON_BYTES: Final = 250
-"""Size of a beacon of hostapd with 802.11n and WPA2. Our estimate from its elements."""
+"""Size of a beacon of hostapd with 802.11n and WPA2, estimated from its elements."""
 
 # Kind, size with MAC header and FCS, and True if the robot sends it. 802.11-2020: 9.3.3.6 to 9.3.3.12 with the
 # elements of 802.11n and WPA2; 12.7.6 (an EAPOL-Key frame has 99 bytes and key data, and 8 bytes of LLC and SNAP).

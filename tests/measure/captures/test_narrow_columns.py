@@ -7,7 +7,7 @@ from fieldkit.measure.captures.packets import NO_ECHO, Packets
 from tests.helpers.captures import file_bytes, segment, timed
 
 PACKETS = pcap.parse(file_bytes(timed([segment(index, 100) for index in range(5)])), where="x").packets
-BYTES_PER_PACKET = 111
+BYTES_PER_PACKET = 115
 EIGHT_BYTES = {"time_ns", "src", "dst", "tcp_stamp", "content"}
 """Columns that need eight bytes: nanoseconds, halves of addresses, 32-bit values with a special value, and a hash."""
 WIDE_TYPES = [np.dtype(kind) for kind in (np.int64, np.uint64, np.bool_)]

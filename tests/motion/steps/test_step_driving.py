@@ -2,7 +2,7 @@
 
 import json
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -114,10 +114,12 @@ def test_robots_that_share_a_velocity_topic_are_refused() -> None:
     )
 
 
-def argument_with_ros_2(**environment: str) -> Any:  # noqa: ANN401 (any JSON)
-    """Return the argument of the driver of a robot with ROS 2."""
+def argument_with_ros_2(*, drive: Mapping[str, Any] | None = None, **environment: str) -> Any:  # noqa: ANN401 (any JSON)
+    """Return the argument of the driver of a robot with ROS 2; `drive` has keys of this section of its profile."""
     ros2 = ros_of(TURTLEBOT).model_copy(update={"variant": "ros2", "environment": environment})
-    profile = TURTLEBOT.model_copy(update={"ros": ros2})
+    data = TURTLEBOT.model_copy(update={"ros": ros2}).model_dump(mode="json", by_alias=True)
+    data["drive"] |= drive or {}
+    profile = schema.validate(schema.parse(json.dumps(data), source="robots/x.yaml"), RobotProfile)
     robots = {**DRIVES, Role.RECEIVER: DRIVES[Role.RECEIVER].model_copy(update={"profile": profile})}
     scene = replace(SCENE, cast=robots)
     assert not list(STEP.refusals(scene))
@@ -126,6 +128,24 @@ def argument_with_ros_2(**environment: str) -> Any:  # noqa: ANN401 (any JSON)
     argument = json.loads(driver_job.job.argv[-2])
     assert need.name == f"{argument['over']} for Python"
     return argument
+
+
+def test_driver_publishes_stamped_velocities_in_the_frame_of_the_profile() -> None:
+    assert "frame" not in argument_with_ros_2()
+    argument = argument_with_ros_2(drive={"type": "geometry_msgs/TwistStamped"})
+    assert (argument["command"]["type"], argument["frame"]) == ("geometry_msgs/msg/TwistStamped", "base_link")
+    assert argument["command"]["dds_types"][argument["command"]["type"]] == "geometry_msgs::msg::dds_::TwistStamped_"
+    argument_with_frame = argument_with_ros_2(drive={"type": "geometry_msgs/TwistStamped", "frame": "base_footprint"})
+    assert argument_with_frame["frame"] == "base_footprint"
+
+
+@pytest.mark.parametrize(
+    "drive", [{"type": "geometry_msgs/Vector3"}, {"type": "geometry_msgs/msg/Twist"}, {"frame": "a b"}, {"frame": ""}]
+)
+def test_other_types_and_frames_of_velocities_are_refused(drive: Mapping[str, str]) -> None:
+    (key,) = drive
+    with pytest.raises(ConfigurationError, match=rf"drive\.{key}"):
+        argument_with_ros_2(drive=drive)
 
 
 def test_driver_uses_zenoh_router_of_its_robot() -> None:

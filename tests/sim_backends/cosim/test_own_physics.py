@@ -7,10 +7,10 @@ import pytest
 
 from fieldkit.core.errors import FieldkitError
 from sim_backends.cosim import build, load_scenario
-from sim_backends.cosim.comparison import errors
+from sim_backends.cosim.comparison import compare_runs
 from sim_backends.cosim.policies.registry import BUILTIN
 from sim_backends.cosim.policies.window_policies import Scheduled
-from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.agent_setup import make_bodies
 from sim_backends.cosim.scenario.external import make_hello
 from sim_backends.cosim.studies.local_errors import local_errors
 from sim_backends.federates.frames import PHYSICS
@@ -29,7 +29,7 @@ def carts() -> Any:  # noqa: ANN401 (a class of an example)
 
 
 def physics(carts: Any) -> Any:  # noqa: ANN401 (as above)
-    return carts(make_hello(SCENARIO, WORLD, bodies(SCENARIO, WORLD), 1, PHYSICS))
+    return carts(make_hello(SCENARIO, WORLD, make_bodies(SCENARIO, WORLD), 1, PHYSICS))
 
 
 # The paper's rule as printed stops if a subscriber is faster, as the drone is immediately.
@@ -40,7 +40,7 @@ def test_the_class_of_the_page_runs_with_every_policy(policy: str, carts: Any) -
     assert run.fates
     exact = build(SCENARIO, physics=physics(carts)).run(400 * MS)
     if policy in {"event_driven", "variable_stepped"}:
-        assert errors(exact, run).delivery_error_s.largest == 0
+        assert compare_runs(exact, run).delivery_error_s.largest == 0
 
 
 def test_the_class_receives_commands_and_forks_do_not_change_it(carts: Any) -> None:  # noqa: ANN401 (as above)

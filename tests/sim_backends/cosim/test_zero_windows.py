@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sim_backends.cosim.agents import Agents
-from sim_backends.cosim.comparison import errors
+from sim_backends.cosim.comparison import compare_runs
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.federates import Action
 from sim_backends.cosim.policies.sync_policy import PolicyError, Situation
@@ -64,7 +64,7 @@ def test_events_at_one_instant_are_simulated_at_it_and_time_advances() -> None:
     assert run.windows_ns[-1] == 100 * MS
     # One window until then, and one for each further return, which follows an arrival.
     assert Counter(run.windows_ns)[BEGINS_NS] >= 40
-    assert errors(run, run).delivery_error_s.largest == 0
+    assert compare_runs(run, run).delivery_error_s.largest == 0
 
 
 def test_a_recording_of_empty_windows_equals_the_run(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from fieldkit.cli import main
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim import build, load_scenario
-from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.agent_setup import make_bodies
 from sim_backends.cosim.scenario.external import make_hello
 from sim_backends.emane_events.channel import EventListener, EventPublisher
 from sim_backends.emane_events.events import (
@@ -388,7 +388,7 @@ def test_given_path_losses_have_a_direction() -> None:
 def test_the_physics_emane_passes_the_conformance_suite(network: None) -> None:
     scenario = load_scenario("convoy", {"physics.options": {"device": "lo", "reference": list(TURIN)}})
     world = load_world(scenario.world)
-    hello = make_hello(scenario, world, bodies(scenario, world), 1, PHYSICS)
+    hello = make_hello(scenario, world, make_bodies(scenario, world), 1, PHYSICS)
     starts = [agent.start.position_m for agent in hello.agents]
     with publishing(*starts):
         results = list(run_checks(Target(Pair(_load()), hello, windows=100)))
@@ -401,7 +401,7 @@ def test_the_physics_emane_passes_the_conformance_suite(network: None) -> None:
 def test_what_the_physics_emane_cannot_do_is_refused(network: None) -> None:
     scenario = load_scenario("convoy", {"physics.options": {"device": "lo"}})
     world = load_world(scenario.world)
-    hello = make_hello(scenario, world, bodies(scenario, world), 1, PHYSICS)
+    hello = make_hello(scenario, world, make_bodies(scenario, world), 1, PHYSICS)
     physics = EmaneLocations(hello)
     with pytest.raises(FederateError, match="does not move robots, and leader has a command"):
         physics.advance(0, {"leader": Twist()})

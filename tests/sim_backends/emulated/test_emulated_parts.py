@@ -146,7 +146,7 @@ class TestBackend:
             (("sensor_msgs/Imu", "sensor_msgs/Imi"), r"cannot publish sensor_msgs/Imi(.|\n)*'sensor_msgs/Imu'\?"),
             (
                 ("variant: ros1", "variant: ros2", "points: 360}", 'points: 360, definition: "int8 x"}'),
-                "runs ros2, whose emulated recorder supports only ROS's own types",
+                "runs ros2, whose emulated recorder supports only standard types",
             ),
             (("/opt/ros/noetic/setup.bash", "/proc/ros/setup.bash"), "cannot have the setup file /proc/ros"),
             (("/opt/ros/noetic/setup.bash", "/setup.bash"), "cannot have the setup file /setup.bash"),
@@ -189,7 +189,7 @@ class TestPlacement:
 
     def test_a_world_without_a_line_for_the_scenario_is_refused(self) -> None:
         without_lines = self.LAWN.model_copy(update={"lines": {}})
-        with pytest.raises(ConfigurationError, match="no line for the places of robots in the scenario los"):
+        with pytest.raises(ConfigurationError, match="no line for the positions of robots in the scenario los"):
             placement.positions_m(cast_for(Topology.MASTER), placed(Scenario.LOS, Topology.MASTER), without_lines)
 
 

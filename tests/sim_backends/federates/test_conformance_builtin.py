@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 
 from sim_backends.cosim import load_scenario
-from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.agent_setup import make_bodies
 from sim_backends.cosim.scenario.external import make_hello
 from sim_backends.cosim.scenario.served import make_federate
 from sim_backends.federates.answering import FederateService
@@ -18,7 +18,7 @@ from tests.helpers.federate_pairs import Pair
 
 SCENARIO = load_scenario("convoy")
 WORLD = load_world(SCENARIO.world)
-HELLO = make_hello(SCENARIO, WORLD, bodies(SCENARIO, WORLD), 1, PHYSICS)
+HELLO = make_hello(SCENARIO, WORLD, make_bodies(SCENARIO, WORLD), 1, PHYSICS)
 CASES = [(role, name) for role in (PHYSICS, NETWORK) for name in checks(is_physics=role == PHYSICS)]
 
 

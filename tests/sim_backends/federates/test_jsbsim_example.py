@@ -10,7 +10,7 @@ from fieldkit.cli import main
 from fieldkit.core import plugins
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim import build, load_scenario
-from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.agent_setup import make_bodies
 from sim_backends.cosim.scenario.external import make_hello
 from sim_backends.federates.conformance.probe import Target
 from sim_backends.federates.conformance.suite import checks, run_check
@@ -54,7 +54,7 @@ def test_the_module_is_short() -> None:
 def test_it_conforms(name: str) -> None:
     scenario = load_scenario(SCENARIO)
     world = load_world(scenario.world)
-    hello = make_hello(scenario, world, bodies(scenario, world), 1, PHYSICS)
+    hello = make_hello(scenario, world, make_bodies(scenario, world), 1, PHYSICS)
     result = run_check(Target(Pair(federate().load()), hello, windows=200), name, checks(is_physics=True)[name])
     assert not result.failure, result
     assert bool(result.skipped) == (name in {"fork", "drive_axes", "lifetimes", "turn"})

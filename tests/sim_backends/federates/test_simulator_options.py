@@ -7,7 +7,7 @@ import pytest
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim import load_scenario
-from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.agent_setup import make_bodies
 from sim_backends.cosim.scenario.external import make_hello
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.emane_events.options import EmaneOptions
@@ -42,7 +42,7 @@ def loaded(
 
 def options_sent(scenario: CosimScenario, role: int) -> dict[str, object]:
     world = load_world(scenario.world)
-    hello = make_hello(scenario, world, bodies(scenario, world), 1, role)
+    hello = make_hello(scenario, world, make_bodies(scenario, world), 1, role)
     options: dict[str, object] = json.loads(hello.configuration)["options"]
     return options
 

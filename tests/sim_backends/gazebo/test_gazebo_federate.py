@@ -15,7 +15,7 @@ import pytest
 
 from fieldkit.cli import main
 from sim_backends.cosim import load_scenario
-from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.agent_setup import make_bodies
 from sim_backends.cosim.scenario.external import make_hello
 from sim_backends.cosim.scenario.sdf_world import scenario_sdf
 from sim_backends.federates.conformance.probe import Target
@@ -52,7 +52,7 @@ def hello(running: GazeboServer, options: Mapping[str, object], changes: Mapping
     federate = {"physics.federate": "gazebo", "physics.options": {**running.options, **options}}
     scenario = load_scenario("convoy", {**federate, **changes})
     world = load_world(scenario.world)
-    return make_hello(scenario, world, bodies(scenario, world), 1, PHYSICS)
+    return make_hello(scenario, world, make_bodies(scenario, world), 1, PHYSICS)
 
 
 @contextmanager

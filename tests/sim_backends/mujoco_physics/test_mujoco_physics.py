@@ -9,7 +9,7 @@ import pytest
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim import load_scenario
-from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.agent_setup import make_bodies
 from sim_backends.cosim.scenario.external import make_hello
 from sim_backends.federates.conformance.probe import Target
 from sim_backends.federates.conformance.suite import checks, run_check
@@ -29,7 +29,7 @@ from tests.helpers.federate_pairs import HELLO, Pair
 COMMANDS = {"ann": Twist(0.5, 0.4), "bob": Twist(-0.3), "cy": Velocity((1.0, 0.5, 0.2), 0.5)}
 CONVOY = load_scenario("convoy")
 WORLD = load_world(CONVOY.world)
-CONVOY_HELLO = make_hello(CONVOY, WORLD, bodies(CONVOY, WORLD), 1, PHYSICS)
+CONVOY_HELLO = make_hello(CONVOY, WORLD, make_bodies(CONVOY, WORLD), 1, PHYSICS)
 
 
 @pytest.mark.parametrize("name", checks(is_physics=True))

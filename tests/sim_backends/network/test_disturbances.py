@@ -110,11 +110,11 @@ def test_the_noise_of_a_jammer_follows_from_the_path_loss() -> None:
     ratio_db, n, size_bytes = 3.98, 150, 1400
     signal_dbm = ANTENNA.tx_power_dbm - loss_db(20)
     noise_mw = 10 ** ((signal_dbm - ratio_db) / 10) - 10 ** (IN_THE_OPEN.noise_floor_dbm / 10)
-    jammer = Jammer(10 * math.log10(noise_mw) + loss_db(100), 0, place_m=(120.0, 0.0, 1.0))
+    jammer = Jammer(10 * math.log10(noise_mw) + loss_db(100), 0, position_m=(120.0, 0.0, 1.0))
     sent = packets([(number * 100 * MS, "a", "b", size_bytes) for number in range(n)])
     # Below 4 dB no preamble is detected; above, bits have the error rate of their SNR.
     assert run_jammed(sent, jammer).dropped == {packet.identity: RETRIES_EXHAUSTED for packet in sent}
-    weaker = Jammer(jammer.power_dbm - 0.1, 0, place_m=(120.0, 0.0, 1.0))
+    weaker = Jammer(jammer.power_dbm - 0.1, 0, position_m=(120.0, 0.0, 1.0))
     result = run_jammed(sent, weaker)
     attempt_error = packet_error(G6, ratio_db + 0.1, size_bytes + 28 + HEADER_BYTES)
     assert 0.05 < attempt_error < 0.7
@@ -147,7 +147,7 @@ def test_the_noise_of_a_jammer_follows_from_the_path_loss() -> None:
 def test_noise_corrupts_only_overlapping_frames(begin_ns: int, end_ns: int, corrupted: bool) -> None:
     """The noise is far stronger at the receiver than the frame, but too weak to prevent the sender from sending."""
     at_receiver_dbm = ANTENNA.tx_power_dbm - loss_db(20) + 20
-    jammer = Jammer(at_receiver_dbm + loss_db(2), begin_ns, end_ns, place_m=(22.0, 0.0, 1.0))
+    jammer = Jammer(at_receiver_dbm + loss_db(2), begin_ns, end_ns, position_m=(22.0, 0.0, 1.0))
     assert jammer.power_dbm - loss_db(22) < ENERGY_DETECTION_DBM
     (at_ns,) = run_jammed(packets([(0, "a", "b", 1000)]), jammer).arrived.values()
     wave_ns = round(20 / SPEED_OF_LIGHT_M_S * 1e9)
@@ -158,7 +158,7 @@ def test_noise_corrupts_only_overlapping_frames(begin_ns: int, end_ns: int, corr
 def test_energy_above_the_threshold_prevents_sending_until_it_ends(excess_db: float, waits: bool) -> None:
     """The jammer is near the sender and far from the receiver, which receives the frame much more strongly."""
     end_ns = 33_333_333
-    jammer = Jammer(ENERGY_DETECTION_DBM + excess_db + loss_db(1), 0, end_ns, place_m=(-1.0, 0.0, 1.0))
+    jammer = Jammer(ENERGY_DETECTION_DBM + excess_db + loss_db(1), 0, end_ns, position_m=(-1.0, 0.0, 1.0))
     (at_ns,) = run_jammed(packets([(5 * MS, "a", "b", 1000)]), jammer).arrived.values()
     frame_ns = FRAME_NS + round(20 / SPEED_OF_LIGHT_M_S * 1e9)
     if waits:
@@ -185,7 +185,7 @@ def test_a_carried_jammer_has_the_position_of_its_agent() -> None:
 
 
 def test_fixed_links_reject_a_jammer() -> None:
-    net = network(fixed(), "ab", disturbances=[Jammer(20.0, 0, place_m=(0.0, 0.0, 0.0))])
+    net = network(fixed(), "ab", disturbances=[Jammer(20.0, 0, position_m=(0.0, 0.0, 0.0))])
     with pytest.raises(ConfigurationError, match="do not support jammers") as attempt_error:
         carry(net, AT_ORIGIN, [])
     assert attempt_error.value.remedy

@@ -17,7 +17,7 @@ from scapy.utils import PcapReader
 from fieldkit.cli import main
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim import build, load_scenario
-from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.agent_setup import make_bodies
 from sim_backends.cosim.scenario.build import Simulation
 from sim_backends.cosim.scenario.external import make_hello
 from sim_backends.federates.conformance.probe import Target
@@ -61,7 +61,7 @@ def simulated(tmp_path: Path) -> Any:  # noqa: ANN401 (an iterator of a function
 def test_it_conforms(name: str, program: str) -> None:
     scenario = load_scenario("convoy", {"network.federate": "ns3", "network.options.topics": "udp"})
     world = load_world(scenario.world)
-    hello = make_hello(scenario, world, bodies(scenario, world), 1, NETWORK)
+    hello = make_hello(scenario, world, make_bodies(scenario, world), 1, NETWORK)
     target = Target(lambda hello: open_session(NETWORK, program, hello, 20.0), replace(hello, role=NETWORK))
     result = run_check(target, name, checks(is_physics=False)[name])
     assert not result.failure, result

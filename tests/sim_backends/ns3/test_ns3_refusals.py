@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from sim_backends.cosim import load_scenario
-from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.agent_setup import make_bodies
 from sim_backends.cosim.scenario.external import make_hello
 from sim_backends.federates.agent_states import AgentTable
 from sim_backends.federates.exchanges import AdvanceNetwork
@@ -34,7 +34,7 @@ def hello(tmp_path_factory: pytest.TempPathFactory) -> Hello:
     path.write_text(SCENARIO, encoding="utf-8")
     scenario = load_scenario(path, {"network.federate": "ns3"})
     world = load_world(scenario.world)
-    return make_hello(scenario, world, bodies(scenario, world), 1, NETWORK)
+    return make_hello(scenario, world, make_bodies(scenario, world), 1, NETWORK)
 
 
 def hello_frame(hello: Hello, changes: Mapping[str, object] = MappingProxyType({})) -> bytes:

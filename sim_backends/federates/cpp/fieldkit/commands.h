@@ -1,4 +1,4 @@
-// Requests to a physics: the commands of robots.
+// Requests to a physics federate: the commands of robots.
 
 #ifndef FIELDKIT_FEDERATES_COMMANDS_H
 #define FIELDKIT_FEDERATES_COMMANDS_H

@@ -69,7 +69,7 @@ ReadNewAgents(Reader& reader)
     return agents;
 }
 
-// Body of the answer to a request to a physics.
+// Body of the answer to a request to a physics federate.
 inline std::string
 StatesBody(int64_t at_ns, const std::vector<State>& states, const std::vector<NewAgent>& new_agents = {})
 {

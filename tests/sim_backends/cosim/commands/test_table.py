@@ -43,7 +43,7 @@ def test_tables_have_labels_that_differ_between_rows_and_printed_digits(capsys: 
 
 def test_cells_that_agree_only_by_a_wide_interval_are_counted_separately() -> None:
     text = table.summary(ROWS)
-    assert "3 of 4 cells agree: 2 by our mean, 1 only because our interval is wide" in text
+    assert "3 of 4 cells agree: 2 by the simulated mean, 1 only because the simulated interval is wide" in text
 
 
 def test_claims_are_next_to_the_papers_statements_and_tables(capsys: pytest.CaptureFixture[str]) -> None:

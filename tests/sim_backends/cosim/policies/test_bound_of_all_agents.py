@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from fieldkit.core.model import Vector
 from sim_backends.cosim import build, load_scenario
 from sim_backends.cosim.agents import Agents
-from sim_backends.cosim.comparison import errors
+from sim_backends.cosim.comparison import compare_runs
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.packet_ledger import position_error_m
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
@@ -145,7 +145,7 @@ def test_agents_that_forward_or_interfere_count_in_the_bound_and_in_the_errors(r
     }
     assert max(position_error_m(fate) for fate in runs["bounded"].fates.values()) <= 0.01
     assert len(runs["bounded"].windows_ns) > 60, "the drone accelerates"
-    assert errors(runs["bounded"], runs["scheduled"]).position_error_m.largest > 0.1
+    assert compare_runs(runs["bounded"], runs["scheduled"]).position_error_m.largest > 0.1
 
 
 def test_a_jammer_at_a_fixed_position_counts_if_two_robots_move_side_by_side() -> None:

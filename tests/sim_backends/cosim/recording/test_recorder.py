@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from scapy.utils import RawPcapReader
 
 from fieldkit.core.errors import ConfigurationError, EvidenceError
-from sim_backends.cosim.comparison import errors
+from sim_backends.cosim.comparison import compare_runs
 from sim_backends.cosim.federates import FederateError
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.policies.sync_policy import Situation, SyncPolicy
@@ -60,7 +60,9 @@ def test_a_recording_reproduces_every_number(tmp_path: Path, policy: SyncPolicy)
     live = record(tmp_path / "run", policy)
     recording = read_recording(tmp_path / "run")
     assert recording.run == live
-    assert repr(errors(reference, recording.run)) == repr(errors(reference, live)), "also if values are nan"
+    assert repr(compare_runs(reference, recording.run)) == repr(compare_runs(reference, live)), (
+        "also if values are nan"
+    )
     assert list(recording.run.fates) == list(live.fates), "in the same order, which affects the rounding of means"
     assert recording.manifest.ending is RunEnding.COMPLETE
     assert recording.manifest.about == ABOUT
@@ -258,7 +260,7 @@ def damage(folder: Path, column: str, *, forge: bool) -> None:
     pq.write_table(table.set_column(place, field, pa.array(values, field.type)), path)
     if forge:
         manifest = read_manifest(folder)
-        parts = {**manifest.parts, str(path.relative_to(folder)): packet_tables.checksum(path)}
+        parts = {**manifest.parts, str(path.relative_to(folder)): packet_tables.file_checksum(path)}
         write_manifest(folder, replace(manifest, parts=parts))
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from sim_backends.cosim import build, load_scenario
-from sim_backends.cosim.comparison import errors
+from sim_backends.cosim.comparison import compare_runs
 from sim_backends.cosim.scenario.loading import scenario_files
 from tests.helpers.nightly import mark_nightly
 
@@ -26,7 +26,7 @@ def test_errors_are_at_most_a_few_windows_of_any_length(case: tuple[str, int]) -
     scenario = load_scenario(name, window)
     exact = build(scenario).run(UNTIL_NS)
     for policy, late in LATE_WINDOWS.items():
-        run_errors = errors(exact, build(scenario, policy=policy).run(UNTIL_NS))
+        run_errors = compare_runs(exact, build(scenario, policy=policy).run(UNTIL_NS))
         assert run_errors.packets > 0
         assert run_errors.fate_disagreement == 0, policy
         assert run_errors.delivery_error_s.largest <= (2 * late + (late == 0)) * window_s, policy

@@ -10,7 +10,7 @@ from sim_backends.cosim.studies.formation import (
     NO_FORMATION,
     Formation,
     Tracks,
-    formation,
+    compute_formation,
     has_followers,
     mean_formation,
     tracks_of,
@@ -33,22 +33,24 @@ def tracks(gap_m: float, above_m: float) -> Tracks:
 def test_the_shipped_convoy_is_measured_with_the_distances_of_its_file() -> None:
     """2 m and 1 s behind, 8 m above: at 1 m/s the follower is 3 m behind; its oscillation is half as large."""
     scenario = load_scenario("convoy")
-    measured = formation(scenario, tracks(gap_m=3.0, above_m=8.5))
+    measured = compute_formation(scenario, tracks(gap_m=3.0, above_m=8.5))
     assert (measured.station_mean_m, measured.station_max_m) == pytest.approx((0.5, 0.5))
     assert measured.amplification == pytest.approx(0.5, rel=0.01)
     # 0.1 sin wt of the gap less 1 s times 0.1 w cos wt of the speed: the amplitude is 0.1 sqrt(1 + w^2).
     amplitude_m = 0.1 * math.hypot(1, math.tau / 10)
     assert measured.spacing_max_m == pytest.approx(amplitude_m, rel=0.02)
     assert measured.spacing_mean_m == pytest.approx(amplitude_m * 2 / math.pi, rel=0.02)
-    assert formation(scenario, tracks(gap_m=4.0, above_m=8.0)).spacing_mean_m == pytest.approx(1, rel=0.02)
+    assert compute_formation(scenario, tracks(gap_m=4.0, above_m=8.0)).spacing_mean_m == pytest.approx(1, rel=0.02)
 
 
 def test_a_scenario_without_followers_has_no_formation() -> None:
     scenario = load_scenario("baylands")
     assert not has_followers(scenario)
     assert has_followers(load_scenario("convoy"))
-    assert all(math.isnan(value) for value in vars(formation(scenario, tracks(3.0, 8.0))).values())
-    assert formation(load_scenario("convoy"), tracks_of([(0, "leader", State((0.0, 0.0, 0.0)))])) is NO_FORMATION
+    assert all(math.isnan(value) for value in vars(compute_formation(scenario, tracks(3.0, 8.0))).values())
+    assert (
+        compute_formation(load_scenario("convoy"), tracks_of([(0, "leader", State((0.0, 0.0, 0.0)))])) is NO_FORMATION
+    )
 
 
 def test_the_mean_of_several_runs_has_means_and_the_largest_maxima() -> None:
@@ -60,5 +62,5 @@ def test_tracks_of_a_recording_have_every_agent_at_every_time() -> None:
     rows = [(0, "b", 0.0), (0, "a", 5.0), (10**8, "b", 1.0), (10**8, "a", 5.0)]
     recorded = tracks_of((at_ns, name, State((east_m, 0.0, 0.0))) for at_ns, name, east_m in rows)
     assert (recorded.names, recorded.times_s.tolist()) == (("b", "a"), [0.0, 0.1])
-    assert recorded.places_m[:, :, 0].tolist() == [[0.0, 5.0], [1.0, 5.0]]
-    assert tracks_of([]).places_m.shape == (0, 0, 3)
+    assert recorded.positions_m[:, :, 0].tolist() == [[0.0, 5.0], [1.0, 5.0]]
+    assert tracks_of([]).positions_m.shape == (0, 0, 3)

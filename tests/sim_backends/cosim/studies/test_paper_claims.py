@@ -8,7 +8,7 @@ import pytest
 
 from fieldkit.core.model import Scenario as Sight
 from sim_backends.cosim.studies.intervals import t_quantile
-from sim_backends.cosim.studies.paper_claims import Claim, claim_setups, claims, delay_change
+from sim_backends.cosim.studies.paper_claims import Claim, claim_setups, compute_claims, delay_change
 from sim_backends.cosim.studies.paper_setups import FlowSample, Setup, only_flow
 from sim_backends.cosim.studies.paper_tables import Agreement
 
@@ -30,7 +30,10 @@ def claims_of(delays_s: dict[str, list[float]], arrived: dict[str, list[int]]) -
             {flow: FlowSample(100, count, count * delay_s if count else NAN, {})}
             for delay_s, count in zip(delays_s[system], arrived[system], strict=True)
         ]
-    return {(claim.compared_system, claim.lines, claim.quantity): claim for claim in claims(setups(), samples)}
+    return {
+        (claim.compared_system, claim.sight_group, claim.quantity): claim
+        for claim in compute_claims(setups(), samples)
+    }
 
 
 def test_a_change_compares_means_and_every_row_has_the_same_weight() -> None:
@@ -64,17 +67,17 @@ def test_claims_by_hand() -> None:
     )
     assert len(by_key) == 12
     fixed, loss = by_key["fixed window", "all", "delay"], by_key["fixed window", "all", "loss"]
-    assert fixed.ours.value == pytest.approx(-0.12)
+    assert fixed.measured_change.value == pytest.approx(-0.12)
     assert fixed.agreement is Agreement.AGREES
-    assert loss.ours.value == pytest.approx(-0.10)
+    assert loss.measured_change.value == pytest.approx(-0.10)
     assert loss.agreement is Agreement.AGREES
     assert (fixed.rows, loss.rows) == (10, 10)
-    assert math.isnan(fixed.tabled_change), "no table of the paper has it"
+    assert math.isnan(fixed.change_in_tables), "no table of the paper has it"
     master = by_key["master-based", "nlos", "delay"]
-    assert master.ours.value == pytest.approx(1.0)
+    assert master.measured_change.value == pytest.approx(1.0)
     assert master.agreement is Agreement.ABOVE
     # The arrivals differ by 50 and by 10 points with the two seeds.
-    assert by_key["master-based", "nlos", "loss"].ours.value == pytest.approx(-0.3)
+    assert by_key["master-based", "nlos", "loss"].measured_change.value == pytest.approx(-0.3)
     assert by_key["fixed window", "los", "delay"].agreement is None, "the paper states none"
 
 
@@ -82,11 +85,11 @@ def test_the_papers_own_tables_contradict_its_statements() -> None:
     systems = "adaptive", "fixed window", "master-based"
     by_key = claims_of({system: [1.0, 1.0] for system in systems}, {system: [1, 1] for system in systems})
     los, nlos = (by_key["master-based", line, "loss"] for line in Sight)
-    assert los.tabled_change == pytest.approx((20 - 40) / 5 / 100), "0 0 0 10 10 instead of 0 0 10 10 20"
-    assert nlos.tabled_change == pytest.approx((70 - 140) / 5 / 100)
+    assert los.change_in_tables == pytest.approx((20 - 40) / 5 / 100), "0 0 0 10 10 instead of 0 0 10 10 20"
+    assert nlos.change_in_tables == pytest.approx((70 - 140) / 5 / 100)
     delay = by_key["master-based", "los", "delay"]
     expected = (0.01 * 0.1 * 0.4 * 0.4 * 0.6) / (0.01 * 0.1 * 0.48 * 0.6 * 0.8)
-    assert delay.tabled_change == pytest.approx(expected ** (1 / 5) - 1)
+    assert delay.change_in_tables == pytest.approx(expected ** (1 / 5) - 1)
 
 
 def test_adaptive_and_fixed_window_differ_only_by_their_policy() -> None:

@@ -23,7 +23,7 @@ from sim_backends.cosim.studies.paper_setups import (
     mesh,
     only_flow,
 )
-from sim_backends.cosim.studies.paper_tables import DISTANCES_M, TABLES, Agreement, Printed, agreement, paper_table
+from sim_backends.cosim.studies.paper_tables import DISTANCES_M, TABLES, Agreement, Printed, compare, paper_table
 
 NAN = math.nan
 
@@ -52,7 +52,7 @@ NAN = math.nan
     ],
 )
 def test_cases_by_hand(printed: Printed, ours: IntervalEstimate, expected: Agreement) -> None:
-    assert agreement(printed, ours) is expected
+    assert compare(printed, ours) is expected
 
 
 @given(
@@ -63,7 +63,7 @@ def test_cases_by_hand(printed: Printed, ours: IntervalEstimate, expected: Agree
 def test_a_rounded_number_agrees_with_its_original(value: Decimal, places: int, per_si: int) -> None:
     text = str(value.quantize(Decimal(1).scaleb(-places), ROUND_HALF_UP))
     ours = float(value / per_si)
-    assert agreement(Printed(text, per_si), IntervalEstimate(ours, NAN, NAN)) is Agreement.AGREES
+    assert compare(Printed(text, per_si), IntervalEstimate(ours, NAN, NAN)) is Agreement.AGREES
 
 
 @given(
@@ -78,9 +78,9 @@ def test_a_number_more_than_half_a_step_away_disagrees(
     printed = Printed(str(number), step=step)
     ours = printed.value + deviation * float(step) * (1 if above else -1)
     expected = Agreement.ABOVE if above else Agreement.BELOW
-    assert agreement(printed, IntervalEstimate(ours, NAN, NAN)) is expected
+    assert compare(printed, IntervalEstimate(ours, NAN, NAN)) is expected
     ends = printed.value, ours
-    assert agreement(printed, IntervalEstimate(ours, min(ends), max(ends))) is Agreement.AGREES
+    assert compare(printed, IntervalEstimate(ours, min(ends), max(ends))) is Agreement.AGREES
 
 
 SHORT = {"duration": "1200ms"}
@@ -156,15 +156,15 @@ def test_a_row_has_the_mean_over_seeds_and_the_printed_number() -> None:
     row = study.rows(samples)[1]
     assert row.labels == {"line": "los", "distance_m": 40, "protocol": "topic"}
     assert row.delay.seeds == 2
-    assert row.delay.ours.value == pytest.approx(0.2), "of the seeds with arrivals"
+    assert row.delay.measured.value == pytest.approx(0.2), "of the seeds with arrivals"
     # Student's t with one degree of freedom is 12.706, and the standard error is 0.1 s; a delay is at least 0.
-    assert row.delay.ours.low == 0
-    assert row.delay.ours.high == pytest.approx(0.2 + 12.706 * 0.1, rel=1e-4)
+    assert row.delay.measured.low == 0
+    assert row.delay.measured.high == pytest.approx(0.2 + 12.706 * 0.1, rel=1e-4)
     assert row.delay.agreement is Agreement.AGREES
     assert not row.delay.agrees_by_mean
     assert row.delay.difference == pytest.approx(0.1)
-    assert row.loss.ours.value == pytest.approx((0.02 + 0.02 + 1) / 3)
-    assert row.loss.ours.high == 1, "Student's interval would end at 1.75"
+    assert row.loss.measured.value == pytest.approx((0.02 + 0.02 + 1) / 3)
+    assert row.loss.measured.high == 1, "Student's interval would end at 1.75"
     assert row.reason == "not matched yet"
     assert flow == study.sources[1].flow
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from fieldkit.core.executors import Workers
-from sim_backends.cosim.comparison import Errors, Spread, errors, mean_errors
+from sim_backends.cosim.comparison import Errors, Spread, compare_runs, mean_errors
 from sim_backends.cosim.policies.window_policies import EventDriven, Scheduled
-from sim_backends.cosim.studies.shootout import Outcomes, biases, outcomes, rows
+from sim_backends.cosim.studies.shootout import Outcomes, compute_biases, rows, run_outcomes
 from tests.helpers.moving_pair import DELAY_NS, PAIR_END_NS, PERIOD_NS, SPEED_M_S, WINDOW_S, MovingPair, moving_run
 
 POLICIES = ["scheduled", "velocity_aware_raw", "event_driven", "variable_stepped", "time_stepped"]
@@ -17,7 +17,7 @@ SEEDS = [4, 1, 7]
 
 @pytest.fixture(scope="module")
 def all_outcomes() -> Outcomes:
-    return outcomes(MovingPair, POLICIES, SEEDS, workers=Workers(2))
+    return run_outcomes(MovingPair, POLICIES, SEEDS, workers=Workers(2))
 
 
 def reproducible_text(run_errors: Errors) -> str:
@@ -55,7 +55,7 @@ def test_the_reference_is_first_and_a_policy_that_cannot_run_has_a_reason(all_ou
 
 
 def test_one_worker_and_other_orders_give_the_same_table(all_outcomes: Outcomes) -> None:
-    reordered = outcomes(MovingPair, POLICIES[::-1], SEEDS[::-1], workers=Workers(1))
+    reordered = run_outcomes(MovingPair, POLICIES[::-1], SEEDS[::-1], workers=Workers(1))
     for row in rows(all_outcomes):
         for seed, run_errors in zip(SEEDS, row.by_seed, strict=False):
             assert reproducible_text(reordered.errors(row.policy, seed)) == reproducible_text(run_errors)
@@ -78,17 +78,17 @@ def test_the_mean_over_seeds_has_means_and_the_largest_maximum(all_outcomes: Out
 
 def test_the_first_disagreement_has_its_time_and_is_nan_without_one() -> None:
     reference = moving_run(EventDriven())
-    late = errors(reference, moving_run(Scheduled(0.25)))
+    late = compare_runs(reference, moving_run(Scheduled(0.25)))
     # A window begins at 3.5 s, and the range limit is reached at 3.529 s.
     assert late.first_disagreement == ("a", -(-3_529_411_765 // PERIOD_NS))
     assert late.first_disagreement_s == pytest.approx(3.529, abs=0.005)
-    none = mean_errors([errors(reference, reference)])
+    none = mean_errors([compare_runs(reference, reference)])
     assert none.first_disagreement is None
     assert math.isnan(none.first_disagreement_s)
 
 
 def test_a_bias_is_relative_to_the_reference_and_has_the_needed_seeds(all_outcomes: Outcomes) -> None:
-    by_policy = biases(all_outcomes)
+    by_policy = compute_biases(all_outcomes)
     assert set(by_policy) == {"event_driven", "scheduled", "variable_stepped", "time_stepped"}
     for measure in ("loss", "delay_s", "apart_m"):
         exact = by_policy["variable_stepped"][measure]

@@ -3,7 +3,7 @@
 import pytest
 
 from sim_backends.cosim.agents import Agents
-from sim_backends.cosim.comparison import Spread, errors, lost_share
+from sim_backends.cosim.comparison import Spread, compare_runs, lost_share
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.policies.sync_policy import PolicyError, SyncPolicy
 from sim_backends.cosim.policies.window_policies import EventDriven, Scheduled, VariableStepped, VelocityAwareRaw
@@ -39,12 +39,14 @@ def three_robots(policy: SyncPolicy) -> Coordinator:
 def test_exact_policies_agree_on_the_radio_and_a_fixed_window_does_not() -> None:
     reference = three_robots(EventDriven()).advance(600 * MS)
     assert lost_share(reference) > 0.03, "losses that could differ"
-    merged = errors(reference, three_robots(VariableStepped()).advance(600 * MS))
+    merged = compare_runs(reference, three_robots(VariableStepped()).advance(600 * MS))
     assert merged.packets == len(reference.fates) - sum(not fate.is_decided for fate in reference.fates.values())
     assert merged.delivery_error_s == merged.late_s == Spread(0, 0, 0)
-    assert merged.position_error_m == errors(reference, reference).position_error_m, "states are held for equal steps"
+    assert merged.position_error_m == compare_runs(reference, reference).position_error_m, (
+        "states are held for equal steps"
+    )
     assert (merged.fate_disagreement, merged.causality_violations) == (0, 0)
-    windowed = errors(reference, three_robots(Scheduled(0.02)).advance(600 * MS))
+    windowed = compare_runs(reference, three_robots(Scheduled(0.02)).advance(600 * MS))
     assert windowed.delivery_error_s.mean > 0.005
     assert windowed.fate_disagreement > 0
 

@@ -16,7 +16,7 @@ from fieldkit.core.errors import ConfigurationError, EvidenceError, LinkError
 from sim_backends.cosim.commands.execution import simulate
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.sweeps import sweep_runner
-from sim_backends.cosim.sweeps.factors import parse_factors, settings_of
+from sim_backends.cosim.sweeps.factors import load_combinations, parse_factors
 from tests.helpers.runs import run_here
 from tests.helpers.task_workers import PAIR
 
@@ -70,7 +70,7 @@ def placed(scenario: str, *overrides: str) -> list[Mapping[str, float | None]]:
     def along_m(setting: CosimScenario) -> dict[str, float | None]:
         return {name: plan.along for name, plan in setting.agents.items()}
 
-    return [along_m(setting) for _, setting in settings_of(scenario, parse_factors(overrides), {})]
+    return [along_m(setting) for _, setting in load_combinations(scenario, parse_factors(overrides), {})]
 
 
 def test_a_distance_moves_the_agents_on_the_line() -> None:

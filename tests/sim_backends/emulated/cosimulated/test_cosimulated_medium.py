@@ -153,14 +153,14 @@ def test_a_robot_hits_the_wall_and_is_put_elsewhere(physics: str, tmp_path: Path
     places_m: dict[str, Vector] = {**PLACES, "a": (3.6, 18.0, ANTENNA_M)}
     with cosim_bench(tmp_path, physics=physics, world=load_world("lawn"), places_m=places_m) as bench:
         stopped = bench.driven.drive(0.2, 3.0)
-        assert 3.9 - BODY.limits.radius_m - 0.02 < stopped.place_m[0] < 3.9
+        assert 3.9 - BODY.limits.radius_m - 0.02 < stopped.position_m[0] < 3.9
         assert not math.hypot(*stopped.velocity_m_s) > 0.02
         places_m["a"] = PLACES["a"]
         bench.driven.assign(places_m["a"], facing_rad=math.pi / 2)
         bench.medium.place(places_m)
         moved = bench.driven.drive(0.2, 1.0)
-        assert moved.place_m[0] == pytest.approx(PLACES["a"][0], abs=0.02)
-        assert moved.place_m[1] == pytest.approx(PLACES["a"][1] + 0.2, abs=0.1)
+        assert moved.position_m[0] == pytest.approx(PLACES["a"][0], abs=0.02)
+        assert moved.position_m[1] == pytest.approx(PLACES["a"][1] + 0.2, abs=0.1)
         assert bench.ping(count=3)
 
 
@@ -175,7 +175,7 @@ def test_a_robot_stops_if_its_physics_is_suspended_or_killed(physics: str, tmp_p
         assert last.is_moving
         at_rest = last.at(time.monotonic_ns() + SILENT_NS)
         assert not at_rest.is_moving
-        assert distance_m(at_rest, last.place_m) <= 0.2 * SILENT_NS / 1e9 + 0.01
+        assert distance_m(at_rest, last.position_m) <= 0.2 * SILENT_NS / 1e9 + 0.01
         os.kill(pid, signal.SIGCONT)
         wait_until(lambda: (motion := bench.driven.motion()) is not None and not motion.is_moving, Deadline.after(60))
         wait_until(lambda: bench.driven.drive(0.2, 0.5).is_moving, Deadline.after(60))

@@ -54,16 +54,16 @@ def test_it_puts_robots_at_places_and_drives_them_into_the_wall(server: GazeboSe
         world=LAWN,
         places_m={**PLACES, "a": NEAR_WALL_M},
     ) as bench:
-        wait_until(lambda: bench.driven.drive(0.2, 2.0).place_m[0] > 3.75, Deadline.after(60))
+        wait_until(lambda: bench.driven.drive(0.2, 2.0).position_m[0] > 3.75, Deadline.after(60))
         wait_until(lambda: not bench.driven.drive(0.2, 0.5).is_moving, Deadline.after(60))
         stopped = bench.driven.drive(0.2, 0.5)
-        assert stopped.place_m[:2] == pytest.approx((3.831, 18.0), abs=0.02), "the chassis has 69 mm in front"
+        assert stopped.position_m[:2] == pytest.approx((3.831, 18.0), abs=0.02), "the chassis has 69 mm in front"
         bench.driven.assign(PLACES["a"])
         bench.medium.place(PLACES)
-        wait_until(lambda: bench.driven.drive(0.2, 0.5).place_m[0] > PLACES["a"][0] + 0.1, Deadline.after(60))
+        wait_until(lambda: bench.driven.drive(0.2, 0.5).position_m[0] > PLACES["a"][0] + 0.1, Deadline.after(60))
         moved = bench.driven.drive(0.2, 0.1)
-        assert moved.place_m[0] < stopped.place_m[0]
-        assert moved.place_m[1] == pytest.approx(PLACES["a"][1], abs=0.02)
+        assert moved.position_m[0] < stopped.position_m[0]
+        assert moved.position_m[1] == pytest.approx(PLACES["a"][1], abs=0.02)
         assert bench.ping(count=3)
         os.kill(server.process.pid, signal.SIGKILL)
         with pytest.raises(TestbedLostError, match="Gazebo"):

@@ -21,7 +21,7 @@ from sim_backends.emulated.cosimulated.simulators import RobotBody
 from sim_backends.emulated.robot.base_controller import TIMEOUT_NS
 from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.emulated.ros.flight_records import FlightMotion, FlightRecord
-from sim_backends.emulated.ros.own_motion import MotionReporter
+from sim_backends.emulated.ros.robot_motion import MotionReporter
 from sim_backends.physics.ground import Ground
 from sim_backends.physics.robot_limits import DUCKIEDRONE
 from sim_backends.world.motion import GRAVITY_M_S2
@@ -125,7 +125,7 @@ def test_a_wall_stops_it_and_without_its_autopilot_it_falls(physics: str, tmp_pa
         nearest_m = WALL_M - DUCKIEDRONE.radius_m
 
         def push() -> bool:
-            vehicle.accept_set_point(SetPoint((1.0, 0.0, 0.0), is_place=False))
+            vehicle.accept_set_point(SetPoint((1.0, 0.0, 0.0), is_position=False))
             return vehicle.body.place_m[0] > nearest_m - 0.03
 
         push()

@@ -5,16 +5,17 @@ import math
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
 
 from sim_backends.emulated.robot import base_process
 from sim_backends.emulated.robot.base_controller import STEP_NS, TIMEOUT_NS, BaseController
 from sim_backends.emulated.robot.spec import Base
-from sim_backends.emulated.ros.own_motion import OwnMotion
+from sim_backends.emulated.ros.robot_motion import RobotMotion
 
 S = 10**9
-BASE = Base("/cmd_vel", 0.5, 1.0, 2.0)
+BASE = Base("/cmd_vel", "geometry_msgs/Twist", 0.5, 1.0, 2.0)
 ANY = st.floats(allow_nan=True, allow_infinity=True)
-START = OwnMotion(x_m=1.0, y_m=2.0, yaw_rad=0.5, place_m=(30.0, 40.0, 0.2), heading_rad=-1.0)
+START = RobotMotion(x_m=1.0, y_m=2.0, yaw_rad=0.5, position_m=(30.0, 40.0, 0.2), heading_rad=-1.0)
 
 
 @given(st.lists(st.tuples(st.integers(0, S), st.one_of(st.floats(-2, 2), ANY), st.one_of(st.floats(-9, 9), ANY))))
@@ -61,8 +62,8 @@ def test_it_drives_while_velocities_arrive_and_then_stops() -> None:
     assert controller.pose.place_m == stopped_m
     # Deceleration takes as long as acceleration.
     far_m = 0.4 * (1.9 + TIMEOUT_NS / S)
-    assert math.dist(stopped_m, START.place_m) == pytest.approx(far_m, abs=0.02)
-    along = math.atan2(stopped_m[1] - START.place_m[1], stopped_m[0] - START.place_m[0])
+    assert math.dist(stopped_m, START.position_m) == pytest.approx(far_m, abs=0.02)
+    along = math.atan2(stopped_m[1] - START.position_m[1], stopped_m[0] - START.position_m[0])
     assert along == pytest.approx(START.heading_rad)
     x_m, y_m, _ = controller.odometry
     assert math.atan2(y_m - START.y_m, x_m - START.x_m) == pytest.approx(START.yaw_rad)
@@ -75,10 +76,21 @@ def test_a_reset_robot_is_at_rest_at_the_new_place() -> None:
     assert not controller.is_idle
     controller.reset(START)
     assert controller.is_idle
-    assert (controller.pose.place_m, controller.odometry) == (START.place_m, (START.x_m, START.y_m, START.yaw_rad))
+    assert (controller.pose.place_m, controller.odometry) == (START.position_m, (START.x_m, START.y_m, START.yaw_rad))
 
 
 def test_velocities_are_packed_exactly_and_other_datagrams_are_ignored() -> None:
-    assert base_process.unpack(base_process.pack(0.25, 1.0, 2.0, 3.0, 4.0, -0.5)) == (0.25, -0.5)
+    kinds = get_typestore(Stores.ROS1_NOETIC).types
+    vector = kinds["geometry_msgs/msg/Vector3"]
+    twist = kinds["geometry_msgs/msg/Twist"](vector(0.25, 1.0, 2.0), vector(3.0, 4.0, -0.5))
+    assert base_process.unpack(base_process.pack(twist)) == (0.25, -0.5)
     assert base_process.unpack(b"") is None
     assert base_process.unpack(bytes(base_process.BYTES + 1)) is None
+
+
+@pytest.mark.parametrize(
+    ("stamp_ns", "is_outdated"),
+    [(0, False), (9 * S, True), (int(9.5 * S), True), (int(9.5 * S) + 1, False), (11 * S, False)],
+)
+def test_a_stamped_velocity_is_outdated_half_a_second_after_its_stamp(stamp_ns: int, is_outdated: bool) -> None:
+    assert base_process.is_outdated(stamp_ns, 10 * S) is is_outdated

@@ -20,7 +20,7 @@ from rosbags.highlevel import AnyReader
 
 from sim_backends.emulated.provisioning import definition
 from sim_backends.emulated.ros import tcpros
-from sim_backends.emulated.ros.own_motion import Odometer
+from sim_backends.emulated.ros.robot_motion import Odometer
 from sim_backends.emulated.ros.sensor_specs import Sensor
 from sim_backends.emulated.ros.sensors import Publication
 from sim_backends.ros1 import framing

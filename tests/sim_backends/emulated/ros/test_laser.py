@@ -16,9 +16,9 @@ from fieldkit.core.model import Vector
 from fieldkit.ros.interfaces.types import standard_types
 from sim_backends.emulated.provisioning import laser_targets, neighbour
 from sim_backends.emulated.robot.spec import ANTENNA_M
-from sim_backends.emulated.ros.laser import Neighbourhood, PlacesWriter, ranges_m
+from sim_backends.emulated.ros.laser import Neighbourhood, PositionsWriter, ranges_m
 from sim_backends.emulated.ros.messages import LASER_NOISE_M, Source
-from sim_backends.emulated.ros.own_motion import OwnMotion
+from sim_backends.emulated.ros.robot_motion import RobotMotion
 from sim_backends.emulated.ros.sensor_specs import LASER_SCAN, LaserTarget, Neighbour, Sensor
 from sim_backends.world.shapes import Box, Cylinder, Solids
 from sim_backends.world.world import World, load_world
@@ -123,9 +123,9 @@ BURGER_RADIUS_M = 0.113
 
 
 @pytest.fixture
-def writer() -> Iterator[PlacesWriter]:
-    with closing(PlacesWriter(NAMES)) as places:
-        yield places
+def writer() -> Iterator[PositionsWriter]:
+    with closing(PositionsWriter(NAMES)) as positions_writer:
+        yield positions_writer
 
 
 def expected(places_m: dict[str, Vector]) -> list[LaserTarget]:
@@ -135,7 +135,7 @@ def expected(places_m: dict[str, Vector]) -> list[LaserTarget]:
 
 @given(st.lists(PLACES, max_size=4))
 def test_a_reader_gets_the_places_written_last(written: list[dict[str, Vector]]) -> None:
-    with closing(PlacesWriter(NAMES)) as writer:
+    with closing(PositionsWriter(NAMES)) as writer:
         reader = Neighbourhood(writer.fd, len(NAMES))
         assert reader.targets(BODIES) == []
         for places_m in written:
@@ -145,7 +145,7 @@ def test_a_reader_gets_the_places_written_last(written: list[dict[str, Vector]])
         assert late.targets(BODIES) == (expected(written[-1]) if written else [])
 
 
-def test_a_partly_written_slot_is_ignored(writer: PlacesWriter) -> None:
+def test_a_partly_written_slot_is_ignored(writer: PositionsWriter) -> None:
     first: dict[str, Vector] = {"other": (1.0, 2.0, 3.0)}
     writer.write(first)
     before = os.pread(writer.fd, 1 << 10, 0)
@@ -157,26 +157,26 @@ def test_a_partly_written_slot_is_ignored(writer: PlacesWriter) -> None:
         assert Neighbourhood(writer.fd, len(NAMES)).targets(BODIES) == expected(first)
 
 
-def test_memory_for_fewer_robots_is_refused(writer: PlacesWriter) -> None:
+def test_memory_for_fewer_robots_is_refused(writer: PositionsWriter) -> None:
     with pytest.raises(ValueError, match="greater than file size"):
         Neighbourhood(writer.fd, 200)
 
 
-def test_the_range_to_a_robot_is_its_distance_less_its_radius(writer: PlacesWriter) -> None:
+def test_the_range_to_a_robot_is_its_distance_less_its_radius(writer: PositionsWriter) -> None:
     neighbourhood = Neighbourhood(writer.fd, len(NAMES))
     bodies = [neighbour(1, load_profile("turtlebot3_burger"))]
     scanner = Sensor("/scan", LASER_SCAN, 5.0, "base_scan", 360)
     source = Source(scanner, (), lambda: neighbourhood.targets(bodies))
-    own_motion = OwnMotion(place_m=(10.0, 20.0, 5.0 + ANTENNA_M), heading_rad=math.pi / 2)
+    robot_motion = RobotMotion(position_m=(10.0, 20.0, 5.0 + ANTENNA_M), heading_rad=math.pi / 2)
 
     def scan(**places_m: Vector) -> np.ndarray:
         writer.write(places_m)
-        data = source.message(0, 0, own_motion)
+        data = source.message(0, 0, robot_motion)
         message: Any = standard_types().ros1.deserialize_ros1(data, "sensor_msgs/msg/LaserScan")
         return np.asarray(message.ranges)
 
     for distance_m in (2.0, 3.0, 1.0):
-        ranges = scan(own=own_motion.place_m, other=(10.0, 20.0 + distance_m, 5.0 + ANTENNA_M))
+        ranges = scan(own=robot_motion.position_m, other=(10.0, 20.0 + distance_m, 5.0 + ANTENNA_M))
         assert ranges[0] == pytest.approx(distance_m - BURGER_RADIUS_M, abs=6 * LASER_NOISE_M)
         half = math.floor(math.degrees(math.asin(BURGER_RADIUS_M / distance_m)))
         assert np.isfinite(ranges).nonzero()[0].tolist() == [*range(half + 1), *range(360 - half, 360)]

@@ -19,9 +19,9 @@ from fieldkit.core.units import parse_distance
 from fieldkit.ros.interfaces.types import standard_types
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.provisioning import _sensor
-from sim_backends.emulated.ros import own_motion
+from sim_backends.emulated.ros import robot_motion
 from sim_backends.emulated.ros.messages import GENERATORS, Source
-from sim_backends.emulated.ros.own_motion import AT_REST, Odometer, OwnMotion
+from sim_backends.emulated.ros.robot_motion import AT_REST, Odometer, RobotMotion
 from sim_backends.emulated.ros.sensor_specs import GENERATED_TYPES, LaserTarget, Sensor
 from sim_backends.world.motion import GRAVITY_M_S2
 from sim_backends.world.world import load_world
@@ -32,7 +32,14 @@ PROFILES: Final = locations.names("robots")
 METRES: Final = st.floats(-30, 30)
 ANGLES: Final = st.floats(-math.pi, math.pi)
 MOTIONS: Final = st.builds(
-    OwnMotion, METRES, METRES, ANGLES, st.floats(-2, 2), st.tuples(METRES, METRES, st.floats(0, 100)), ANGLES, ANGLES
+    RobotMotion,
+    METRES,
+    METRES,
+    ANGLES,
+    st.floats(-2, 2),
+    st.tuples(METRES, METRES, st.floats(0, 100)),
+    ANGLES,
+    ANGLES,
 )
 STORE: Final = standard_types().ros1
 
@@ -54,7 +61,7 @@ def sensors(kind: str = "") -> list[Sensor]:
     return [sensor for sensor in result.values() if kind in (sensor.type, "")]
 
 
-def publish(sensor: Sensor, now: OwnMotion = AT_REST, *, source: Source | None = None, number: int = 1) -> Any:  # noqa: ANN401 (of rosbags)
+def publish(sensor: Sensor, now: RobotMotion = AT_REST, *, source: Source | None = None, number: int = 1) -> Any:  # noqa: ANN401 (of rosbags)
     data = (source or Source(sensor)).message(number, number * S, now)
     return STORE.deserialize_ros1(data, sensor.type.replace("/", "/msg/"))
 
@@ -110,7 +117,7 @@ def test_stamps_are_those_passed_in() -> None:
 
 
 @given(MOTIONS)
-def test_quaternions_are_of_length_1(now: OwnMotion) -> None:
+def test_quaternions_are_of_length_1(now: RobotMotion) -> None:
     for sensor in sensors():
         for quaternion in quaternions(publish(sensor, now)):
             assert math.hypot(*quaternion) == pytest.approx(1.0)
@@ -134,7 +141,7 @@ def test_covariances_are_symmetric_and_positive_definite() -> None:
 
 
 @given(MOTIONS)
-def test_a_transform_is_the_pose_of_its_robot_s_odometry(now: OwnMotion) -> None:
+def test_a_transform_is_the_pose_of_its_robot_s_odometry(now: RobotMotion) -> None:
     """REP 105: odom is the parent, and the robot's base the child; both have the same pose."""
     for name in PROFILES:
         by_type = {sensor.type: sensor for sensor in of_profile(name).values()}
@@ -169,7 +176,7 @@ def test_a_scan_s_angles_and_times_fit_its_number_of_beams(sensor: Sensor) -> No
 
 
 @given(MOTIONS)
-def test_ranges_are_within_the_sensor_s_reach_or_infinite(now: OwnMotion) -> None:
+def test_ranges_are_within_the_sensor_s_reach_or_infinite(now: RobotMotion) -> None:
     """REP 117: minus infinity for too near, infinity for too far."""
     for sensor in sensors("sensor_msgs/LaserScan"):
         scan = publish(sensor, now)
@@ -188,11 +195,11 @@ def test_ranges_to_walls_follow_position_and_heading() -> None:
     room = LaserTarget(((8.0, 4.0), (12.0, 4.0), (12.0, 7.0), (8.0, 7.0)), 0.0, 0.0, 2.0)
     source = Source(sensor, [room])
     ahead, left = 0, (sensor.points or 0) // 4
-    after_drive = publish(sensor, OwnMotion(x_m=70.0, yaw_rad=1.0, place_m=(10.5, 5.5, 0.2)), source=source)
+    after_drive = publish(sensor, RobotMotion(x_m=70.0, yaw_rad=1.0, position_m=(10.5, 5.5, 0.2)), source=source)
     assert after_drive.ranges[ahead] == pytest.approx(1.5, abs=0.1)
     assert after_drive.ranges[left] == pytest.approx(1.5, abs=0.1)
     assert after_drive.ranges[2 * left] == pytest.approx(2.5, abs=0.1)
-    after_turn = publish(sensor, OwnMotion(place_m=(10.5, 5.0, 0.2), heading_rad=math.pi / 2), source=source)
+    after_turn = publish(sensor, RobotMotion(position_m=(10.5, 5.0, 0.2), heading_rad=math.pi / 2), source=source)
     assert after_turn.ranges[ahead] == pytest.approx(2.0, abs=0.1)
     assert after_turn.ranges[left] == pytest.approx(2.5, abs=0.1)
     assert (after_drive.intensities > 0).all()
@@ -224,7 +231,7 @@ def test_battery_values_are_plausible_or_nan() -> None:
 def test_an_imu_at_rest_measures_only_gravity(heading_rad: float) -> None:
     """REP 145: up is positive, and acceleration includes gravity."""
     for sensor in sensors("sensor_msgs/Imu"):
-        imu = publish(sensor, OwnMotion(heading_rad=heading_rad))
+        imu = publish(sensor, RobotMotion(heading_rad=heading_rad))
         acceleration = imu.linear_acceleration
         assert (acceleration.x, acceleration.y, acceleration.z) == pytest.approx((0, 0, GRAVITY_M_S2), abs=0.2)
         assert math.remainder(yaw_rad(imu.orientation) - heading_rad, 2 * math.pi) == pytest.approx(0, abs=1e-6)
@@ -235,7 +242,9 @@ def test_the_turn_rate_integrates_to_the_heading() -> None:
     source, rate_rad_s, count = Source(sensor), 0.5, round(2 * sensor.rate_hz)
     samples = [
         publish(
-            sensor, OwnMotion(heading_rad=rate_rad_s * number / sensor.rate_hz, turn_rad_s=rate_rad_s), source=source
+            sensor,
+            RobotMotion(heading_rad=rate_rad_s * number / sensor.rate_hz, turn_rad_s=rate_rad_s),
+            source=source,
         )
         for number in range(count + 1)
     ]
@@ -244,26 +253,28 @@ def test_the_turn_rate_integrates_to_the_heading() -> None:
 
 
 @given(MOTIONS)
-def test_heights_are_those_of_the_robot(now: OwnMotion) -> None:
+def test_heights_are_those_of_the_robot(now: RobotMotion) -> None:
     for sensor in sensors("sensor_msgs/NavSatFix"):
-        assert publish(sensor, now).altitude == pytest.approx(now.place_m[2], abs=5)
+        assert publish(sensor, now).altitude == pytest.approx(now.position_m[2], abs=5)
     for sensor in sensors("geometry_msgs/PoseStamped"):
         pose = publish(sensor, now).pose
-        assert (pose.position.x, pose.position.y, pose.position.z) == now.place_m
+        assert (pose.position.x, pose.position.y, pose.position.z) == now.position_m
         assert math.remainder(yaw_rad(pose.orientation) - now.heading_rad, 2 * math.pi) == pytest.approx(0, abs=1e-6)
     for sensor in sensors("sensor_msgs/Range"):
         down_m = publish(sensor, now).range
-        assert down_m == pytest.approx(max(0.1, now.place_m[2]), abs=0.1) or (now.place_m[2] > 3.8 and down_m > 3.8)
+        assert down_m == pytest.approx(max(0.1, now.position_m[2]), abs=0.1) or (
+            now.position_m[2] > 3.8 and down_m > 3.8
+        )
     pressure = publish(Sensor("/p", "sensor_msgs/FluidPressure", 1.0, "base_link", None), now)
     # 11.3 to 12.0 Pa less per metre below 600 m (ISO 2533).
     fallen_pa = 101_325 - pressure.fluid_pressure
-    assert 11.3 * now.place_m[2] - 20 < fallen_pa < 12.02 * now.place_m[2] + 20
+    assert 11.3 * now.position_m[2] - 20 < fallen_pa < 12.02 * now.position_m[2] + 20
 
 
 @given(ANGLES)
 def test_the_magnetic_field_points_north_for_any_heading(heading_rad: float) -> None:
     sensor = Sensor("/mag", "sensor_msgs/MagneticField", 1.0, "imu_link", None)
-    field = publish(sensor, OwnMotion(heading_rad=heading_rad)).magnetic_field
+    field = publish(sensor, RobotMotion(heading_rad=heading_rad)).magnetic_field
     towards_rad = math.atan2(field.y, field.x) + heading_rad
     assert math.remainder(towards_rad - math.pi / 2, 2 * math.pi) == pytest.approx(0, abs=0.05)
 
@@ -272,7 +283,7 @@ def test_the_magnetic_field_points_north_for_any_heading(heading_rad: float) -> 
 def test_the_speed_of_odometry_integrates_to_its_pose_and_to_the_path(sensor: Sensor, tmp_path: Path) -> None:
     placement = Placement(Scenario.LOS, Topology.MASTERLESS, parse_distance("10m"))
     world, move = load_world("lawn"), Move(Role.SENDER, (Leg(away_m=2.0), Leg(left_m=1.0), Leg(away_m=1.0)), 0.5)
-    own_motion.append_path(tmp_path / "motion", places.assigned_path(placement, move, world, 0))
+    robot_motion.append_path(tmp_path / "motion", places.assigned_path(placement, move, world, 0))
     odometer, source = Odometer(tmp_path / "motion", 0), Source(sensor)
     period_s, long_s = 1 / sensor.rate_hz, 8.0
     samples = [

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.emulated.ros import own_motion
+from sim_backends.emulated.ros import robot_motion
 from sim_backends.emulated.ros.motion_record import SILENT_NS, MotionRecord, RecordedMotion
-from sim_backends.emulated.ros.own_motion import AssignedPath, MotionReporter, Odometer
+from sim_backends.emulated.ros.robot_motion import AssignedPath, MotionReporter, Odometer
 
 S = 10**9
 FLOATS = st.floats(-1e3, 1e3)
@@ -75,12 +75,12 @@ def test_a_partly_written_record_is_ignored(
 def test_motion_is_extrapolated_until_the_timeout(motion: RecordedMotion, late_ns: int) -> None:
     now = motion.at(motion.time_ns + late_ns)
     for_s = min(late_ns, SILENT_NS) / 1e9
-    assert now.place_m == pytest.approx(
-        [p + v * for_s for p, v in zip(motion.place_m, motion.velocity_m_s, strict=True)], abs=1e-6
+    assert now.position_m == pytest.approx(
+        [p + v * for_s for p, v in zip(motion.position_m, motion.velocity_m_s, strict=True)], abs=1e-6
     )
     assert now.heading_rad == pytest.approx(motion.heading_rad + motion.turn_rad_s * for_s)
     assert now.is_moving == (motion.is_moving and late_ns < SILENT_NS)
-    assert motion.at(motion.time_ns - late_ns).place_m == motion.place_m, "never extrapolated into the past"
+    assert motion.at(motion.time_ns - late_ns).position_m == motion.position_m, "never extrapolated into the past"
     x, y, _ = now.odometry
     assert math.hypot(x - motion.odometry[0], y - motion.odometry[1]) == pytest.approx(
         abs(motion.speed_m_s) * for_s, abs=1e-6
@@ -89,40 +89,40 @@ def test_motion_is_extrapolated_until_the_timeout(motion: RecordedMotion, late_n
 
 def test_the_helm_gets_its_place_and_sensors_follow_it(tmp_path: Path) -> None:
     paths, record = tmp_path / "motion", tmp_path / "steered"
-    own_motion.append_path(paths, AssignedPath(5 * S, [(3.0, 6.0, 0.2)], 1.0, math.pi / 2))
+    robot_motion.append_path(paths, AssignedPath(5 * S, [(3.0, 6.0, 0.2)], 1.0, math.pi / 2))
     reporter, odometer = MotionReporter(paths, record, 6 * S), Odometer(paths, 6 * S, record)
     placement = reporter.poll_placement(6 * S)
     assert placement is not None
-    assert (placement.place_m, placement.heading_rad, placement.x_m) == ((3.0, 6.0, 0.2), math.pi / 2, 0.0)
+    assert (placement.position_m, placement.heading_rad, placement.x_m) == ((3.0, 6.0, 0.2), math.pi / 2, 0.0)
     assert reporter.poll_placement(7 * S) is None
     reporter.write(
         7 * S, (3.0, 7.0, 0.2), (0.0, 0.5, 0.0), heading_rad=math.pi / 2, turn_rad_s=0.1, odometry=(1.0, 0.0, 0.0)
     )
     now = odometer.at(7 * S + S // 10)
-    assert now.place_m == pytest.approx((3.0, 7.05, 0.2))
+    assert now.position_m == pytest.approx((3.0, 7.05, 0.2))
     assert (now.x_m, now.speed_m_s, now.turn_rad_s) == pytest.approx((1.05, 0.5, 0.1))
-    own_motion.append_path(paths, AssignedPath(8 * S, [(3.0, 6.0, 0.2)], 1.0, math.pi / 2))
+    robot_motion.append_path(paths, AssignedPath(8 * S, [(3.0, 6.0, 0.2)], 1.0, math.pi / 2))
     back = odometer.at(9 * S)
-    assert back.place_m == (3.0, 6.0, 0.2)
+    assert back.position_m == (3.0, 6.0, 0.2)
     assert back.x_m > 1.0, "odometry continues"
     reporter.write(9 * S, (3.0, 9.0, 0.2), odometry=(1.25, 0.0, 0.05))
-    assert odometer.at(9 * S).place_m == (3.0, 6.0, 0.2), "the lab has moved it since"
+    assert odometer.at(9 * S).position_m == (3.0, 6.0, 0.2), "the lab has moved it since"
     again = reporter.poll_placement(9 * S)
     assert again is not None
-    assert again.place_m == back.place_m
+    assert again.position_m == back.position_m
     assert again.x_m == pytest.approx(back.x_m, abs=0.01)
 
 
 def test_a_restarted_helm_continues_where_it_was(tmp_path: Path) -> None:
     paths, record = tmp_path / "motion", tmp_path / "steered"
-    own_motion.append_path(paths, AssignedPath(S, [(0.0, 0.0, 0.2)], 1.0, 0.0))
+    robot_motion.append_path(paths, AssignedPath(S, [(0.0, 0.0, 0.2)], 1.0, 0.0))
     reporter = MotionReporter(paths, record, 2 * S)
     reporter.poll_placement(2 * S)
     reporter.write(3 * S, (4.0, 0.0, 0.2), (1.0, 0.0, 0.0), odometry=(4.0, 0.0, 0.0))
     late_ns = 60 * S
     motion = MotionReporter(paths, record, late_ns).poll_placement(late_ns)
     assert motion is not None
-    assert motion.place_m == pytest.approx((4.0 + SILENT_NS / 1e9, 0.0, 0.2))
+    assert motion.position_m == pytest.approx((4.0 + SILENT_NS / 1e9, 0.0, 0.2))
     assert motion.speed_m_s == 0.0
 
 

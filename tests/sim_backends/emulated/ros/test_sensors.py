@@ -15,7 +15,7 @@ import pytest
 
 from sim_backends.emulated.provisioning import definition
 from sim_backends.emulated.ros import messages, sensors, tcpros
-from sim_backends.emulated.ros.own_motion import Odometer
+from sim_backends.emulated.ros.robot_motion import Odometer
 from sim_backends.emulated.ros.sensor_specs import Sensor
 from sim_backends.emulated.ros.sensors import Publication, Subscriber
 from sim_backends.ros1 import framing

@@ -13,9 +13,9 @@ from rosbags.typesys import Stores, get_typestore
 from fieldkit.core.model import Leg, Move, Placement, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
 from sim_backends.emulated import placement as places
-from sim_backends.emulated.ros import own_motion
+from sim_backends.emulated.ros import robot_motion
 from sim_backends.emulated.ros.messages import FIX_NOISE_M, Source
-from sim_backends.emulated.ros.own_motion import AT_REST, AssignedPath, Odometer, OwnMotion
+from sim_backends.emulated.ros.robot_motion import AT_REST, AssignedPath, Odometer, RobotMotion
 from sim_backends.emulated.ros.sensor_specs import Sensor
 from sim_backends.world.world import load_world
 from tests.helpers.casts import CAST
@@ -32,31 +32,31 @@ def write_paths(folder: Path, *assigned_paths: AssignedPath) -> Path:
     path = folder / "motion"
     path.unlink(missing_ok=True)
     for assigned in assigned_paths:
-        own_motion.append_path(path, assigned)
+        robot_motion.append_path(path, assigned)
     return path
 
 
 def test_odometry_along_a_path_with_a_left_turn(tmp_path: Path) -> None:
     odometer = Odometer(write_paths(tmp_path, AssignedPath(10 * S, CORNER, 2.0, 0.0)), 0)
-    assert odometer.at(10 * S) == OwnMotion(speed_m_s=2.0, place_m=CORNER[0])
-    assert odometer.at(11 * S) == OwnMotion(2.0, 0.0, 0.0, 2.0, (5.0, 6.0, UP_M))
+    assert odometer.at(10 * S) == RobotMotion(speed_m_s=2.0, position_m=CORNER[0])
+    assert odometer.at(11 * S) == RobotMotion(2.0, 0.0, 0.0, 2.0, (5.0, 6.0, UP_M))
     half = odometer.at(round(12.5 * S))
     assert (half.x_m, half.y_m, half.yaw_rad) == pytest.approx((4.0, 1.0, math.pi / 2))
-    assert half.place_m == pytest.approx((7.0, 7.0, 0.7)), "half way up"
+    assert half.position_m == pytest.approx((7.0, 7.0, 0.7)), "half way up"
     end = odometer.at(20 * S)
     assert (end.x_m, end.y_m, end.yaw_rad, end.speed_m_s) == pytest.approx((4.0, 2.0, math.pi / 2, 0.0))
-    assert end.place_m == CORNER[-1]
+    assert end.position_m == CORNER[-1]
 
 
 def test_a_robot_that_is_put_back_keeps_its_odometry(tmp_path: Path) -> None:
     path = write_paths(tmp_path, AssignedPath(0, CORNER, 2.0, 0.0))
     odometer = Odometer(path, 0)
     odometer.at(2 * S)
-    own_motion.append_path(path, AssignedPath(4 * S, CORNER[:1], 2.0, 0.0))
+    robot_motion.append_path(path, AssignedPath(4 * S, CORNER[:1], 2.0, 0.0))
     back = odometer.at(5 * S)
     assert (back.x_m, back.y_m) == pytest.approx((4.0, 2.0))
-    assert back.place_m == CORNER[0]
-    own_motion.append_path(path, AssignedPath(6 * S, CORNER, 2.0, 0.0))
+    assert back.position_m == CORNER[0]
+    robot_motion.append_path(path, AssignedPath(6 * S, CORNER, 2.0, 0.0))
     again = odometer.at(7 * S)
     # It faces as at first again, which its odometry has not recorded: ahead is to the left of the start.
     assert (again.x_m, again.y_m, again.yaw_rad) == pytest.approx((4.0, 4.0, math.pi / 2))
@@ -69,7 +69,7 @@ def test_a_missing_file_or_an_incomplete_line_is_ignored(tmp_path: Path) -> None
     path.write_text('{"start_ns": 0, "points_m": [[1.0,', encoding="ascii")
     assert odometer.at(2 * S) == AT_REST
     path.write_text('{"start_ns": 0, "points_m": [[1.0, 2.0, 0.2]], "speed_m_s": 1.0, "facing_rad": 0.0}\n')
-    assert odometer.at(3 * S).place_m == (1.0, 2.0, UP_M)
+    assert odometer.at(3 * S).position_m == (1.0, 2.0, UP_M)
 
 
 @given(POINTS, ANGLES, st.floats(0.1, 3), st.integers(0, 100 * S))
@@ -114,13 +114,13 @@ def test_away_is_ahead_and_left_is_to_the_left(tmp_path: Path, role: Role) -> No
     end = odometer.at(4 * S)
     assert (end.x_m, end.y_m) == pytest.approx((2.0, 1.0))
     motion = places.motion(CAST, placement, move, world)
-    assert end.place_m == pytest.approx(motion.at(4 * S)[CAST[role].name].position_m)
+    assert end.position_m == pytest.approx(motion.at(4 * S)[CAST[role].name].position_m)
 
 
 def test_messages_use_ros_s_frames_and_units() -> None:
     store, now = (
         get_typestore(Stores.ROS1_NOETIC),
-        OwnMotion(4.0, 2.0, math.pi / 2, 1.5, (300.0, 400.0, UP_M), math.pi / 2),
+        RobotMotion(4.0, 2.0, math.pi / 2, 1.5, (300.0, 400.0, UP_M), math.pi / 2),
     )
     messages: dict[str, Any] = {}
     for kind in ("nav_msgs/Odometry", "sensor_msgs/Imu", "sensor_msgs/NavSatFix"):

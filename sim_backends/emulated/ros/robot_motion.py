@@ -1,12 +1,13 @@
-"""Motion of an emulated robot for its sensors: wheel odometry and position, also of a robot that steers itself.
+"""Motion of an emulated robot as its sensors need it: wheel odometry and position.
 
-The lab sends each path when it starts, and the robot computes its motion on it, so that no message can be late. The
-wheels do not turn when the lab puts a robot back at its place, so the odometry continues from its last value.
+The lab sends a path only once, when the motion starts, and the robot computes its position on the path itself, so no
+position message can be late. The wheels do not turn when the lab puts a robot back, so the odometry continues from
+its last value.
 
-For a robot that steers itself, the process that steers it (a base controller or an autopilot) uses a
-`MotionReporter`. It reads the last place at which the lab has put the robot, computes the motion from there, and
-writes it to a record. The robot's sensors read this record, and the lab passes it to the medium. The lab may put the
-robot at another place at any time; records that refer to an earlier path are then ignored.
+Some robots steer themselves. The process that steers such a robot (a base controller or an autopilot) uses a
+`MotionReporter`: it reads the position at which the lab has last placed the robot, computes the motion from there,
+and writes it to a record. The robot's sensors read this record, and the lab passes it to the medium. The lab may
+place the robot at another position at any time; records that refer to an earlier path are then ignored.
 """
 
 import json
@@ -24,10 +25,12 @@ from sim_backends.world.motion import STILL, WayPoints
 
 @dataclass(frozen=True)
 class AssignedPath:
-    """Path on which the lab moves a robot, which stops at its end; a path of one point is a place.
+    """Path on which the lab moves a robot, which stops at its end.
+
+    A path of one point means that the robot stands there.
 
     Attributes:
-        start_ns: Start of the motion, by the monotonic clock, which all robots of a machine share.
+        start_ns: Start of the motion, as a time of the monotonic clock, which is common to all robots on one machine.
         points_m: Points of the path, metres east, north, up.
         speed_m_s: Speed along the path.
         facing_rad: Heading of the robot before the start, from east towards north.
@@ -40,15 +43,15 @@ class AssignedPath:
 
 
 @dataclass(frozen=True)
-class OwnMotion:
-    """State of motion of a robot at one time.
+class RobotMotion:
+    """State of the motion of a robot at one time.
 
     Attributes:
-        x_m: Odometry: distance ahead of the place where the robot was switched on, along its heading at that time.
+        x_m: Odometry: distance ahead of the point where the robot was switched on, along its heading at that time.
         y_m: Odometry: distance to the left of that heading.
         yaw_rad: Odometry: angle to the left of that heading.
         speed_m_s: Forward speed.
-        place_m: Position, metres east, north, up.
+        position_m: Position, metres east, north, up.
         heading_rad: Heading, from east towards north.
         turn_rad_s: Turn rate to the left; a robot on an assigned path turns in zero time, with a rate of 0.
     """
@@ -57,12 +60,12 @@ class OwnMotion:
     y_m: float = 0.0
     yaw_rad: float = 0.0
     speed_m_s: float = 0.0
-    place_m: Vector = (0.0, 0.0, 0.0)
+    position_m: Vector = (0.0, 0.0, 0.0)
     heading_rad: float = 0.0
     turn_rad_s: float = 0.0
 
 
-AT_REST: Final = OwnMotion()
+AT_REST: Final = RobotMotion()
 
 
 def append_path(file_path: Path, path: AssignedPath) -> None:
@@ -76,8 +79,8 @@ class Odometer:
 
     Args:
         path: The file of assigned paths, which may be missing.
-        now_ns: Time of the start, by the monotonic clock.
-        motion_record: The file in which a robot that steers itself records its motion; None for other robots.
+        now_ns: Time of the start, from the monotonic clock.
+        motion_record: The file with the recorded motion of a robot that steers itself; None for other robots.
     """
 
     def __init__(self, path: Path, now_ns: int, motion_record: Path | None = None) -> None:
@@ -93,10 +96,10 @@ class Odometer:
             motion = _motion_on(self._path, AT_REST, now_ns)
             yaw_rad = -motion.yaw_rad
             x_m, y_m = _rotate(motion.x_m, motion.y_m, yaw_rad)
-            self._base = OwnMotion(-x_m, -y_m, yaw_rad)
+            self._base = RobotMotion(-x_m, -y_m, yaw_rad)
 
-    def at(self, now_ns: int) -> OwnMotion:
-        """Return the robot's motion at a time; times must not decrease from call to call."""
+    def at(self, now_ns: int) -> RobotMotion:
+        """Return the robot's motion at a time, which must not be earlier than that of the last call."""
         self._read_paths(now_ns)
         return self._recorded_motion(now_ns) or self._assigned_motion(now_ns)
 
@@ -105,7 +108,7 @@ class Odometer:
         """Start of the last assigned path, 0 if there is none."""
         return 0 if self._path is None else self._path.start_ns
 
-    def _recorded_motion(self, now_ns: int) -> OwnMotion | None:
+    def _recorded_motion(self, now_ns: int) -> RobotMotion | None:
         """Return the recorded motion, or None if the robot has not steered itself since its last assigned path."""
         last = None if self._record is None else self._record.read()
         if last is None or last.path_start_ns != self.path_start_ns:
@@ -113,9 +116,9 @@ class Odometer:
         current = last.at(now_ns)
         # `RecordedMotion.at` changes the heading, but not the velocity, so the speed is that of the record.
         speed_m_s = last.speed_m_s if current.is_moving else 0.0
-        return OwnMotion(*current.odometry, speed_m_s, current.place_m, current.heading_rad, current.turn_rad_s)
+        return RobotMotion(*current.odometry, speed_m_s, current.position_m, current.heading_rad, current.turn_rad_s)
 
-    def _assigned_motion(self, now_ns: int) -> OwnMotion:
+    def _assigned_motion(self, now_ns: int) -> RobotMotion:
         """Return the motion on the last assigned path."""
         return self._base if self._path is None else _motion_on(self._path, self._base, now_ns)
 
@@ -138,7 +141,7 @@ class Odometer:
             self._path = path
 
 
-def _motion_on(path: AssignedPath, base: OwnMotion, now_ns: int) -> OwnMotion:
+def _motion_on(path: AssignedPath, base: RobotMotion, now_ns: int) -> RobotMotion:
     """Return a robot's motion on a path at a time; `base` is its motion when the path started."""
     elapsed_ns = now_ns - path.start_ns
     points_m = [(point_m[0], point_m[1], 0.0) for point_m in path.points_m]  # the speed is horizontal
@@ -147,10 +150,10 @@ def _motion_on(path: AssignedPath, base: OwnMotion, now_ns: int) -> OwnMotion:
     if velocity_m_s != STILL:
         heading_rad = math.atan2(velocity_m_s[1], velocity_m_s[0])
     elif elapsed_ns > 0 and len(points_m) > 1:
-        before, last = points_m[-2:]
-        heading_rad = math.atan2(last[1] - before[1], last[0] - before[0])
+        previous_m, last_m = points_m[-2:]
+        heading_rad = math.atan2(last_m[1] - previous_m[1], last_m[0] - previous_m[0])
     x_m, y_m = _rotate(east_m - points_m[0][0], north_m - points_m[0][1], base.yaw_rad - path.facing_rad)
-    return OwnMotion(
+    return RobotMotion(
         base.x_m + x_m,
         base.y_m + y_m,
         base.yaw_rad + math.remainder(heading_rad - path.facing_rad, 2 * math.pi),
@@ -182,9 +185,9 @@ class MotionReporter:
     Only the process that steers the robot may have one.
 
     Args:
-        paths: The file of the paths that the lab assigns (`own_motion.append_path`).
+        paths: The file of the paths that the lab assigns (`robot_motion.append_path`).
         record: The file in which the robot records its motion.
-        now_ns: Time of creation, by the monotonic clock.
+        now_ns: Time of creation, from the monotonic clock.
 
     Raises:
         OSError: The record cannot be created.
@@ -197,16 +200,16 @@ class MotionReporter:
 
     @property
     def path_start_ns(self) -> int:
-        """Start of the assigned path that put the robot at its place; 0 before the first one was read."""
+        """Start time of the path with which the lab last placed the robot; 0 if none has been read."""
         return self._path_start_ns or 0
 
-    def poll_placement(self, now_ns: int) -> OwnMotion | None:
-        """Return the place at which the lab has put the robot since the last call, or None if it has not moved it.
+    def poll_placement(self, now_ns: int) -> RobotMotion | None:
+        """Return the motion at the position where the lab has placed the robot since the last call, or None.
 
-        The first call returns the place of the robot, also after the process has been restarted.
+        The first call returns the current motion of the robot, also after the process has been restarted.
 
         Args:
-            now_ns: Time by the monotonic clock; must not decrease from call to call.
+            now_ns: Time from the monotonic clock; must not decrease from call to call.
         """
         motion = self._odometer.at(now_ns)
         if self._odometer.path_start_ns == self._path_start_ns:
@@ -217,21 +220,21 @@ class MotionReporter:
     def write(
         self,
         now_ns: int,
-        place_m: Vector,
+        position_m: Vector,
         velocity_m_s: Vector = STILL,
         *,
         heading_rad: float = 0.0,
         turn_rad_s: float = 0.0,
         odometry: Vector = (0.0, 0.0, 0.0),
     ) -> None:
-        """Record the robot's position and motion; see `RecordedMotion`.
+        """Record the robot's position and motion. The arguments are the attributes of `RecordedMotion`.
 
         Call it at least ten times a second while the robot moves, because a robot without a new record for
         `motion_record.SILENT_NS` counts as stopped. Call it once after the robot has stopped.
 
         Raises:
-            OSError: There is no space for it.
+            OSError: There is no space for the record.
         """
         self._record.write(
-            RecordedMotion(now_ns, self.path_start_ns, place_m, velocity_m_s, heading_rad, turn_rad_s, odometry)
+            RecordedMotion(now_ns, self.path_start_ns, position_m, velocity_m_s, heading_rad, turn_rad_s, odometry)
         )

@@ -1,0 +1,134 @@
+"""Requests and replies of a ping that a robot received more than once, because copies arrived over several links.
+
+The captures are on all interfaces (`LINUX_SLL2`), so each packet has the index of its interface.
+"""
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from fieldkit.core.columns import Figure, Kind, Measured, columns
+from fieldkit.core.units import format_count
+from fieldkit.measure.captures.arrays import Ints
+from fieldkit.measure.captures.headers import NO_INTERFACE
+from fieldkit.measure.captures.packets import ECHO_REPLY, NO_ECHO, Packets
+from fieldkit.measure.captures.pcap import Capture
+from fieldkit.measure.evidence.ping import Ping
+
+COLUMNS: Final = columns(
+    110,
+    (
+        "rtt_duplicates",
+        "count",
+        (
+            "Requests and replies of ping that arrived again over another link: for each packet, the number of "
+            "interfaces on which it arrived, minus one. Empty without a capture on all interfaces of both robots, or "
+            "if the requests are fragmented."
+        ),
+        Figure("duplicates over links", Kind.MEDIAN),
+    ),
+)
+
+_UNREAD_S: Final = 0.1
+_WAIT_SHARE: Final = 0.9
+"""As in `ping_checks`: the part of the last interval in which ping certainly prints replies."""
+
+
+class PingEchoes(NamedTuple):
+    """PingEchoes of a ping in one capture.
+
+    Attributes:
+        requests: Its requests.
+        replies: The replies to them.
+    """
+
+    requests: Packets
+    replies: Packets
+
+    @property
+    def are_fragmented(self) -> bool:
+        """Whether an echo is fragmented."""
+        return bool(self.requests.more_fragments.any() or self.replies.more_fragments.any())
+
+
+def captured_echoes(capture: Capture | None, source: str, destination: str, size_bytes: int) -> PingEchoes | None:
+    """Return the echoes between two addresses in a capture; None without a capture.
+
+    Args:
+        capture: The capture.
+        source: Source address of the requests.
+        destination: Their destination address.
+        size_bytes: Their ICMP size; echoes of another size belong to another ping.
+    """
+    if capture is None:
+        return None
+    outgoing, returning = capture.packets.icmp(source, destination), capture.packets.icmp(destination, source)
+    requests = outgoing.where((outgoing.echo != NO_ECHO) & (outgoing.echo < ECHO_REPLY))
+    replies = returning.where(returning.echo >= ECHO_REPLY)
+    return PingEchoes(_sized(requests, size_bytes), _sized(replies, size_bytes))
+
+
+def _sized(echoes: Packets, size_bytes: int) -> Packets:
+    """Return the echoes of an ICMP size, and the first fragments of fragmented echoes."""
+    return echoes.where(echoes.more_fragments | (echoes.ip_payload_bytes == size_bytes))
+
+
+def measure(sender: PingEchoes | None, receiver: PingEchoes | None) -> Measured:
+    """Return the column of the copies.
+
+    Args:
+        sender: PingEchoes in the sender's capture; None if it is missing or incomplete.
+        receiver: PingEchoes in the receiver's capture; None as above.
+    """
+    if sender is None or receiver is None:
+        return Measured.all_missing(COLUMNS, "a robot has no complete capture around the ping")
+    if sender.are_fragmented or receiver.are_fragmented:
+        return Measured.all_missing(COLUMNS, "the requests are fragmented")
+    arrived = receiver.requests, sender.replies
+    if any((echoes.interface == NO_INTERFACE).any() for echoes in arrived):
+        reason = "a capture does not contain interfaces: it needs a link with the interface lo, and tcpdump 4.99"
+        return Measured.all_missing(COLUMNS, reason)
+    return Measured({"rtt_duplicates": sum(map(count_copies, arrived))})
+
+
+def count_copies(echoes: Packets) -> int:
+    """Return the sum over all packets of the number of interfaces on which a packet arrived, minus one."""
+    rows = np.stack((_keys(echoes), echoes.interface))
+    return len(np.unique(rows, axis=1).T) - len(np.unique(rows[0]))
+
+
+def contradictions(
+    output: Ping, interval_s: float, sender: PingEchoes | None, receiver: PingEchoes | None
+) -> Iterator[str]:
+    """Yield the contradictions between the copies in the captures, the output of ping, and the answers.
+
+    Args:
+        output: The output.
+        interval_s: Time between requests.
+        sender: PingEchoes in the sender's capture; None if it is missing or incomplete.
+        receiver: PingEchoes in the receiver's capture; None as above.
+    """
+    if sender is None or receiver is None or sender.are_fragmented or receiver.are_fragmented:
+        return  # a copy of a fragmented echo may be incomplete
+    sent, arrived = sender
+    if len(sent):
+        until_ns = int(sent.time_ns.max()) + round(1e9 * (_WAIT_SHARE * interval_s - _UNREAD_S))
+        printed = Counter(reply.seq for reply in output.replies)
+        captured = Counter(arrived.echo_seq[arrived.time_ns <= until_ns].tolist())
+        unprinted = {seq: count for seq, count in (captured - printed).items() if printed[seq]}
+        if unprinted:
+            duplicates = format_count(sum(unprinted.values()), "duplicate")
+            reply = f"the first to request {min(unprinted)}"
+            yield f"the sender's capture has {duplicates} of replies that ping did not print, {reply}"
+    requests, answers = receiver
+    unrequested = Counter((_keys(answers) - (ECHO_REPLY << 16)).tolist()) - Counter(_keys(requests).tolist())
+    if unrequested:
+        answers_text = format_count(unrequested.total(), "answer")
+        yield f"the receiver's capture has {answers_text} to requests that it lacks"
+
+
+def _keys(echoes: Packets) -> Ints:
+    """Return a number for the identifier and the sequence number of each echo."""
+    return (echoes.echo << 16) | echoes.echo_seq
