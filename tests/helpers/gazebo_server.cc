@@ -1,16 +1,17 @@
 /* A server with the services and topics of Gazebo Fortress, for tests: DART moves the models of an SDF file.
  *
- * It follows the loop of Fortress (ign-gazebo6, SimulationRunner): the control service answers before anything
- * happens, as the services that create and remove models do; the clock of a step is published before the step is made, poses are limited to a rate in wall time, a request
- * without `pause` lets the world run, and a reset sets the time to 0 without moving the models. DART clears commands
- * to joints after each step. Unlike Fortress, a world that has been paused for some time iterates less often until the
- * next request, so that an idle server uses no processor.
+ * It follows the loop of Fortress (ign-gazebo6, SimulationRunner): The control service answers before the request is
+ * executed, as do the services that create and remove models; the clock of a step is published before the step is
+ * made; poses are limited to a rate in wall time; a request without `pause` starts the world; and a reset sets the
+ * time to 0 without moving the models. DART clears commands to joints after each step. Unlike Fortress, a world that
+ * has been paused for some time iterates less often until the next request, so that an idle server uses almost no
+ * processor time.
  *
  *     gazebo_server WORLD.sdf [--reset world] [--fault KIND@SECONDS]
  *
- * `--reset world` builds the world and its plugins again, as later versions do. A fault is what another program does
- * at a simulated time: `pause`, `reset`, `step` (one more step than requested), `remove` (the first model that moves),
- * `exit`. */
+ * With `--reset world`, a reset builds the world and its plugins again, as in later versions. A fault is an action of
+ * another program at a simulated time: `pause`, `reset`, `step` (one more step than requested), `remove` (the first
+ * model that moves), `exit`. */
 
 #include <ignition/msgs/boolean.pb.h>
 #include <ignition/msgs/clock.pb.h>
@@ -67,19 +68,19 @@ static std::string engine_path()
     return "";
 }
 
-/* Longer than the period of the slowest poses in the tests, 60 Hz. */
+/* ACTIVE_PERIOD is longer than the period of the slowest poses in the tests, 60 Hz. */
 static constexpr auto ACTIVE_PERIOD = std::chrono::milliseconds(40), IDLE_PERIOD = std::chrono::milliseconds(5);
 
 static volatile std::sig_atomic_t is_stopped = 0;
 
 /* ignition::math::SpeedLimiter without jerk. */
 struct Limiter {
-    double speed = 1e9, acceleration = 1e9, last = 0;
+    double max_speed = 1e9, max_acceleration = 1e9, current_speed = 0;
     double limit(double target, double step_s)
     {
-        target = std::clamp(target, -speed, speed);
-        last += std::clamp(target - last, -acceleration * step_s, acceleration * step_s);
-        return last;
+        target = std::clamp(target, -max_speed, max_speed);
+        current_speed += std::clamp(target - current_speed, -max_acceleration * step_s, max_acceleration * step_s);
+        return current_speed;
     }
 };
 
@@ -87,13 +88,13 @@ struct Model {
     std::string name;
     physics::Model3dPtr<Features> body;
     physics::Link3dPtr<Features> link;
-    std::vector<physics::Joint3dPtr<Features>> left, right;
+    std::vector<physics::Joint3dPtr<Features>> left_joints, right_joints;
     bool drives = false, flies = false, has_target = false;
-    double separation = 1, radius = 1, left_speed = 0, right_speed = 0;
+    double wheel_separation = 1, wheel_radius = 1, left_speed = 0, right_speed = 0;
     Limiter linear, angular;
-    std::mutex mutex; /* for the target, which is set by the thread of reception */
+    std::mutex mutex; /* for the target, which is set by the receiving thread */
     Eigen::Vector3d target_linear = Eigen::Vector3d::Zero(), target_angular = Eigen::Vector3d::Zero();
-    Eigen::Vector3d set_linear = Eigen::Vector3d::Zero(), set_angular = Eigen::Vector3d::Zero();
+    Eigen::Vector3d applied_linear = Eigen::Vector3d::Zero(), applied_angular = Eigen::Vector3d::Zero();
 
     void on_twist(const msgs::Twist &twist)
     {
@@ -107,29 +108,30 @@ struct Model {
         if (flies) {
             auto group = body->FindFreeGroup();
             Eigen::Matrix3d rotation = link->FrameDataRelativeToWorld().pose.linear();
-            group->SetWorldLinearVelocity(rotation * set_linear);
-            group->SetWorldAngularVelocity(rotation * set_angular);
+            group->SetWorldLinearVelocity(rotation * applied_linear);
+            group->SetWorldAngularVelocity(rotation * applied_angular);
         }
-        for (auto &joint : left)
+        for (auto &joint : left_joints)
             joint->SetVelocityCommand(0, left_speed);
-        for (auto &joint : right)
+        for (auto &joint : right_joints)
             joint->SetVelocityCommand(0, right_speed);
     }
 
     void post_update(double step_s)
     {
         std::lock_guard<std::mutex> guard(mutex);
-        set_linear = target_linear, set_angular = target_angular;
-        double forward = linear.limit(target_linear.x(), step_s), turn = angular.limit(target_angular.z(), step_s);
-        right_speed = (forward + turn * separation / 2) / radius;
-        left_speed = (forward - turn * separation / 2) / radius;
+        applied_linear = target_linear, applied_angular = target_angular;
+        double forward = linear.limit(target_linear.x(), step_s);
+        double yaw_rate = angular.limit(target_angular.z(), step_s);
+        right_speed = (forward + yaw_rate * wheel_separation / 2) / wheel_radius;
+        left_speed = (forward - yaw_rate * wheel_separation / 2) / wheel_radius;
     }
 };
 
 class Server {
 public:
-    Server(const std::string &path, bool rebuilds, std::string fault, double fault_s)
-        : rebuilds_(rebuilds), fault_(std::move(fault)), fault_ns_(std::llround(fault_s * 1e9))
+    Server(const std::string &path, bool resets_world, std::string fault, double fault_s)
+        : resets_world_(resets_world), fault_(std::move(fault)), fault_ns_(std::llround(fault_s * 1e9))
     {
         sdf::Errors errors = root_.Load(path);
         for (const auto &error : errors)
@@ -137,7 +139,7 @@ public:
         if (!errors.empty() || root_.WorldCount() != 1)
             std::exit(2);
         world_ = root_.WorldByIndex(0);
-        prefix_ = "/world/" + world_->Name();
+        topic_prefix_ = "/world/" + world_->Name();
         step_ns_ = std::llround(world_->PhysicsByIndex(0)->MaxStepSize() * 1e9);
         double factor = world_->PhysicsByIndex(0)->RealTimeFactor();
         period_ns_ = factor > 0 ? std::llround(double(step_ns_) / factor) : 0;
@@ -147,7 +149,7 @@ public:
             [this](const msgs::WorldControl &request, msgs::Boolean &answer) {
                 std::lock_guard<std::mutex> guard(mutex_);
                 controls_.push_back(request);
-                requested_.notify_all();
+                request_arrived_.notify_all();
                 answer.set_data(true);
                 return true;
             };
@@ -155,7 +157,7 @@ public:
                                                                                   msgs::Boolean &answer) {
             std::lock_guard<std::mutex> guard(mutex_);
             poses_.push_back(request);
-            requested_.notify_all();
+            request_arrived_.notify_all();
             answer.set_data(true);
             return true;
         };
@@ -163,7 +165,7 @@ public:
             [this](const msgs::EntityFactory &request, msgs::Boolean &answer) {
                 std::lock_guard<std::mutex> guard(mutex_);
                 creations_.push_back(request);
-                requested_.notify_all();
+                request_arrived_.notify_all();
                 answer.set_data(true);
                 return true;
             };
@@ -171,18 +173,18 @@ public:
                                                                                       msgs::Boolean &answer) {
             std::lock_guard<std::mutex> guard(mutex_);
             removals_.push_back(request);
-            requested_.notify_all();
+            request_arrived_.notify_all();
             answer.set_data(true);
             return true;
         };
-        node_.Advertise(prefix_ + "/create", on_create);
-        node_.Advertise(prefix_ + "/remove", on_remove);
-        node_.Advertise(prefix_ + "/control", on_control);
-        node_.Advertise(prefix_ + "/set_pose", on_pose);
-        clock_ = node_.Advertise<msgs::Clock>(prefix_ + "/clock");
+        node_.Advertise(topic_prefix_ + "/create", on_create);
+        node_.Advertise(topic_prefix_ + "/remove", on_remove);
+        node_.Advertise(topic_prefix_ + "/control", on_control);
+        node_.Advertise(topic_prefix_ + "/set_pose", on_pose);
+        clock_publisher_ = node_.Advertise<msgs::Clock>(topic_prefix_ + "/clock");
         transport::AdvertiseMessageOptions options;
-        options.SetMsgsPerSec(pose_hertz());
-        moving_ = node_.Advertise<msgs::Pose_V>(prefix_ + "/dynamic_pose/info", options);
+        options.SetMsgsPerSec(pose_rate_hz());
+        pose_publisher_ = node_.Advertise<msgs::Pose_V>(topic_prefix_ + "/dynamic_pose/info", options);
     }
 
     void run()
@@ -197,17 +199,17 @@ public:
                 continue;
             }
             std::unique_lock<std::mutex> lock(mutex_);
-            requested_.wait_for(lock, IDLE_PERIOD, [this] {
+            request_arrived_.wait_for(lock, IDLE_PERIOD, [this] {
                 return !controls_.empty() || !poses_.empty() || !creations_.empty() || !removals_.empty();
             });
         }
     }
 
 private:
-    /* Return true if poses and clock have been published often enough since the last request. */
+    /* Return true if the world is paused and ACTIVE_PERIOD has passed since the last request or step. */
     bool is_idle()
     {
-        if (!is_paused_ || rewinds_)
+        if (!is_paused_ || resets_time_)
             last_active_ = SteadyClock::now();
         return SteadyClock::now() - last_active_ > ACTIVE_PERIOD;
     }
@@ -217,97 +219,99 @@ private:
         return element->HasElement(key) ? element->GetElement(key)->Get<std::string>() : "";
     }
 
-    static double number(sdf::ElementPtr element, const char *key, double otherwise)
+    static double number(sdf::ElementPtr element, const char *key, double fallback)
     {
-        return element->HasElement(key) ? std::stod(value(element, key)) : otherwise;
+        return element->HasElement(key) ? std::stod(value(element, key)) : fallback;
     }
 
-    static void each_plugin(sdf::ElementPtr parent, const std::function<void(const std::string &, sdf::ElementPtr)> &use)
+    static void for_each_plugin(sdf::ElementPtr parent,
+                                const std::function<void(const std::string &, sdf::ElementPtr)> &use_plugin)
     {
         if (!parent->HasElement("plugin"))
             return;
         for (auto plugin = parent->GetElement("plugin"); plugin; plugin = plugin->GetNextElement("plugin")) {
             std::string name = plugin->Get<std::string>("name");
-            use(name.substr(name.rfind(':') + 1), plugin);
+            use_plugin(name.substr(name.rfind(':') + 1), plugin);
         }
     }
 
-    int pose_hertz() const
+    int pose_rate_hz() const
     {
-        int hertz = 60;
-        each_plugin(world_->Element(), [&](const std::string &name, sdf::ElementPtr plugin) {
+        int rate_hz = 60;
+        for_each_plugin(world_->Element(), [&](const std::string &name, sdf::ElementPtr plugin) {
             if (name == "SceneBroadcaster")
-                hertz = int(number(plugin, "dynamic_pose_hertz", 60));
+                rate_hz = int(number(plugin, "dynamic_pose_hertz", 60));
         });
-        return hertz;
+        return rate_hz;
     }
 
-    /* Build the world and its plugins, which subscribe to their topics. */
+    /* Build the world, and subscribe its plugins to their topics. */
     void build()
     {
-        plugins_.reset();
+        plugin_node_.reset();
         models_.clear();
-        removed_.clear();
+        removed_models_.clear();
         dart_ = nullptr;
         engine_ = nullptr;
         engine_ = physics::RequestEngine3d<Features>::From(loader_.Instantiate("ignition::physics::dartsim::Plugin"));
         dart_ = engine_->ConstructWorld(*world_);
-        plugins_ = std::make_unique<transport::Node>();
+        plugin_node_ = std::make_unique<transport::Node>();
         for (uint64_t i = 0; i < world_->ModelCount(); i++)
             if (!world_->ModelByIndex(i)->Static())
                 add(*world_->ModelByIndex(i));
-        each_plugin(world_->Element(), [&](const std::string &name, sdf::ElementPtr plugin) {
+        for_each_plugin(world_->Element(), [&](const std::string &name, sdf::ElementPtr plugin) {
             if (name != "TriggeredPublisher")
                 return;
-            passed_ = plugins_->Advertise<msgs::Empty>(plugin->GetElement("output")->Get<std::string>("topic"));
-            std::function<void(const msgs::Empty &)> pass = [this](const msgs::Empty &message) {
-                passed_.Publish(message);
+            trigger_publisher_ =
+                plugin_node_->Advertise<msgs::Empty>(plugin->GetElement("output")->Get<std::string>("topic"));
+            std::function<void(const msgs::Empty &)> publish_trigger = [this](const msgs::Empty &message) {
+                trigger_publisher_.Publish(message);
             };
-            plugins_->Subscribe(plugin->GetElement("input")->Get<std::string>("topic"), pass);
+            plugin_node_->Subscribe(plugin->GetElement("input")->Get<std::string>("topic"), publish_trigger);
         });
     }
 
-    void add(const sdf::Model &source)
+    void add(const sdf::Model &model_sdf)
     {
         auto model = std::make_unique<Model>();
-        Model *pointer = model.get();
-        model->name = source.Name();
-        model->body = dart_->GetModel(source.Name());
+        Model *model_pointer = model.get();
+        model->name = model_sdf.Name();
+        model->body = dart_->GetModel(model_sdf.Name());
         model->link = model->body->GetLink(0);
-        each_plugin(source.Element(), [&](const std::string &name, sdf::ElementPtr plugin) {
+        for_each_plugin(model_sdf.Element(), [&](const std::string &name, sdf::ElementPtr plugin) {
             if (name == "DiffDrive") {
                 model->drives = true;
-                model->separation = number(plugin, "wheel_separation", 1);
-                model->radius = number(plugin, "wheel_radius", 0.2);
-                model->linear.speed = number(plugin, "max_linear_velocity", 1e9);
-                model->linear.acceleration = number(plugin, "max_linear_acceleration", 1e9);
-                model->angular.speed = number(plugin, "max_angular_velocity", 1e9);
-                model->angular.acceleration = number(plugin, "max_angular_acceleration", 1e9);
+                model->wheel_separation = number(plugin, "wheel_separation", 1);
+                model->wheel_radius = number(plugin, "wheel_radius", 0.2);
+                model->linear.max_speed = number(plugin, "max_linear_velocity", 1e9);
+                model->linear.max_acceleration = number(plugin, "max_linear_acceleration", 1e9);
+                model->angular.max_speed = number(plugin, "max_angular_velocity", 1e9);
+                model->angular.max_acceleration = number(plugin, "max_angular_acceleration", 1e9);
                 for (auto *side : {"left_joint", "right_joint"})
                     for (auto joint = plugin->GetElement(side); joint; joint = joint->GetNextElement(side))
-                        (side[0] == 'l' ? model->left : model->right)
+                        (side[0] == 'l' ? model->left_joints : model->right_joints)
                             .push_back(model->body->GetJoint(joint->Get<std::string>()));
             } else if (name == "VelocityControl") {
                 model->flies = true;
                 auto initial = plugin->Get<ignition::math::Vector3d>("initial_linear", {0, 0, 0}).first;
-                model->target_linear = model->set_linear = {initial.X(), initial.Y(), initial.Z()};
+                model->target_linear = model->applied_linear = {initial.X(), initial.Y(), initial.Z()};
             } else {
                 return;
             }
-            std::function<void(const msgs::Twist &)> on_twist = [pointer](const msgs::Twist &twist) {
-                pointer->on_twist(twist);
+            std::function<void(const msgs::Twist &)> on_twist = [model_pointer](const msgs::Twist &twist) {
+                model_pointer->on_twist(twist);
             };
-            plugins_->Subscribe("/model/" + source.Name() + "/cmd_vel", on_twist);
+            plugin_node_->Subscribe("/model/" + model_sdf.Name() + "/cmd_vel", on_twist);
         });
         models_.push_back(std::move(model));
     }
 
     void iterate()
     {
-        if (rewinds_) {
-            rewinds_ = false;
+        if (resets_time_) {
+            resets_time_ = false;
             time_ns_ = 0;
-            if (rebuilds_)
+            if (resets_world_)
                 build();
         } else if (!is_paused_) {
             time_ns_ += step_ns_;
@@ -327,7 +331,7 @@ private:
                 model->post_update(double(step_ns_) / 1e9);
         }
         publish_poses();
-        if (!is_paused_ && pending_ > 0 && --pending_ == 0)
+        if (!is_paused_ && pending_steps_ > 0 && --pending_steps_ == 0)
             is_paused_ = true;
         cause_fault();
         std::lock_guard<std::mutex> guard(mutex_);
@@ -337,8 +341,8 @@ private:
             is_paused_ = control.pause();
             uint32_t steps = control.multi_step() ? control.multi_step() : control.step() ? 1 : 0;
             if (is_paused_ && steps > 0)
-                pending_ += steps, is_paused_ = false;
-            rewinds_ = control.has_reset() && (control.reset().all() || control.reset().time_only());
+                pending_steps_ += steps, is_paused_ = false;
+            resets_time_ = control.has_reset() && (control.reset().all() || control.reset().time_only());
         }
         controls_.clear();
     }
@@ -348,11 +352,11 @@ private:
         if (fault_.empty() || time_ns_ < fault_ns_)
             return;
         if (fault_ == "pause")
-            pending_ = 0, is_paused_ = true;
+            pending_steps_ = 0, is_paused_ = true;
         else if (fault_ == "reset")
-            rewinds_ = true;
+            resets_time_ = true;
         else if (fault_ == "step")
-            pending_++, is_paused_ = false;
+            pending_steps_++, is_paused_ = false;
         else if (fault_ == "remove")
             remove(models_.front()->name);
         else if (fault_ == "exit")
@@ -379,9 +383,9 @@ private:
     {
         for (auto model = models_.begin(); model != models_.end(); model++)
             if ((*model)->name == name) {
-                plugins_->Unsubscribe("/model/" + name + "/cmd_vel");
+                plugin_node_->Unsubscribe("/model/" + name + "/cmd_vel");
                 (*model)->body->Remove();
-                removed_.push_back(std::move(*model)); /* a callback may still use it */
+                removed_models_.push_back(std::move(*model)); /* a callback may still use it */
                 models_.erase(model);
                 return;
             }
@@ -402,10 +406,10 @@ private:
             std::cerr << "the SDF of " << creation.name() << " has no model" << std::endl;
             return;
         }
-        sdf::Model source = *root.Model();
-        source.SetName(creation.name());
-        dart_->ConstructModel(source);
-        add(source);
+        sdf::Model model_sdf = *root.Model();
+        model_sdf.SetName(creation.name());
+        dart_->ConstructModel(model_sdf);
+        add(model_sdf);
         msgs::Pose pose = creation.pose();
         pose.set_name(creation.name());
         std::lock_guard<std::mutex> guard(mutex_);
@@ -436,12 +440,12 @@ private:
         msgs::Clock message;
         message.mutable_sim()->set_sec(time_ns_ / 1000000000);
         message.mutable_sim()->set_nsec(int(time_ns_ % 1000000000));
-        clock_.Publish(message);
+        clock_publisher_.Publish(message);
     }
 
     void publish_poses()
     {
-        if (!moving_.HasConnections())
+        if (!pose_publisher_.HasConnections())
             return;
         msgs::Pose_V message;
         message.mutable_header()->mutable_stamp()->set_sec(time_ns_ / 1000000000);
@@ -459,47 +463,48 @@ private:
             pose->mutable_orientation()->set_y(rotation.y());
             pose->mutable_orientation()->set_z(rotation.z());
         }
-        message.add_pose()->set_name("chassis"); /* links follow the models, with poses relative to them */
-        moving_.Publish(message);
+        /* After the models, Gazebo lists their links, with poses relative to the models. */
+        message.add_pose()->set_name("chassis");
+        pose_publisher_.Publish(message);
     }
 
-    bool rebuilds_;
+    bool resets_world_;
     std::string fault_;
     int64_t fault_ns_, step_ns_ = 0, period_ns_ = 0, time_ns_ = 0;
-    int64_t pending_ = 0;
-    bool is_paused_ = true, rewinds_ = false;
-    std::string prefix_;
+    int64_t pending_steps_ = 0;
+    bool is_paused_ = true, resets_time_ = false;
+    std::string topic_prefix_;
     sdf::Root root_;
     const sdf::World *world_ = nullptr;
     ignition::plugin::Loader loader_;
     physics::Engine3dPtr<Features> engine_;
     physics::World3dPtr<Features> dart_;
-    std::vector<std::unique_ptr<Model>> models_, removed_;
+    std::vector<std::unique_ptr<Model>> models_, removed_models_;
     std::mutex mutex_; /* for the requests */
-    std::condition_variable requested_;
+    std::condition_variable request_arrived_;
     SteadyClock::time_point last_active_ = SteadyClock::now(); /* of the last request or step */
     std::vector<msgs::WorldControl> controls_;
     std::vector<msgs::Pose> poses_;
     std::vector<msgs::EntityFactory> creations_;
     std::vector<msgs::Entity> removals_;
-    transport::Node::Publisher clock_, moving_, passed_;
-    std::unique_ptr<transport::Node> plugins_;
+    transport::Node::Publisher clock_publisher_, pose_publisher_, trigger_publisher_;
+    std::unique_ptr<transport::Node> plugin_node_;
     transport::Node node_;
 };
 
-int main(int count, char **words)
+int main(int argc, char **argv)
 {
     std::string fault;
     double fault_s = 0;
-    bool rebuilds = false;
-    for (int i = 2; i + 1 < count; i += 2) {
-        std::string value = words[i + 1];
-        if (std::string(words[i]) == "--reset")
-            rebuilds = value == "world";
-        else if (std::string(words[i]) == "--fault")
+    bool resets_world = false;
+    for (int i = 2; i + 1 < argc; i += 2) {
+        std::string value = argv[i + 1];
+        if (std::string(argv[i]) == "--reset")
+            resets_world = value == "world";
+        else if (std::string(argv[i]) == "--fault")
             fault = value.substr(0, value.find('@')), fault_s = std::stod(value.substr(value.find('@') + 1));
     }
     std::signal(SIGTERM, [](int) { is_stopped = 1; });
-    Server(words[1], rebuilds, fault, fault_s).run();
+    Server(argv[1], resets_world, fault, fault_s).run();
     return 0;
 }

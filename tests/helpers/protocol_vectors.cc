@@ -13,7 +13,7 @@ Require(bool is_as_expected, const char* what)
 {
     if (!is_as_expected)
     {
-        throw Refusal(std::string("not as in the example: ") + what);
+        throw Refusal(std::string("differs from the example: ") + what);
     }
 }
 

@@ -32,17 +32,17 @@ class StationaryPhysics:
 
 
 class ScheduledProgram:
-    """Plans its next wake time, each time that it wakes, by the next entry of a list: a delay, or None for never."""
+    """A program that, at each wake, plans the next one by the next entry of a list: a delay, or None for never."""
 
-    def __init__(self, name: str, after_ns: Sequence[int | None], wakes: list[tuple[int, str]]) -> None:
+    def __init__(self, name: str, delays_ns: Sequence[int | None], wakes: list[tuple[int, str]]) -> None:
         self._name = name
-        self._after_ns = list(after_ns)[::-1]
+        self._delays_ns = list(delays_ns)[::-1]
         self._wakes = wakes
         self._wake_ns = self._next_ns(0)
 
     def _next_ns(self, now_ns: int) -> int | None:
-        after_ns = self._after_ns.pop() if self._after_ns else None
-        return None if after_ns is None else now_ns + after_ns
+        delay_ns = self._delays_ns.pop() if self._delays_ns else None
+        return None if delay_ns is None else now_ns + delay_ns
 
     def next_wake_ns(self) -> int | None:
         return self._wake_ns
@@ -78,16 +78,18 @@ def test_programs_wake_at_their_last_planned_time_and_when_they_receive(
                 if programs[name].next_wake_ns() == at_ns:
                     programs[name].wake(at_ns, state, ())
         assert wakes == expected
-        planned_ns = [wake_ns for program in programs.values() if (wake_ns := program.next_wake_ns()) is not None]
-        assert agents.next_wake_ns() == min(planned_ns, default=None)
+        planned_wakes_ns = [
+            wake_ns for program in programs.values() if (wake_ns := program.next_wake_ns()) is not None
+        ]
+        assert agents.next_wake_ns() == min(planned_wakes_ns, default=None)
 
 
 class PhysicsWithLateAgent(StationaryPhysics):
     """Physics in which an agent appears within a window."""
 
     def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
-        late = {"late": State((3.0, 4.0, 0.0))} if to_ns >= 12 * MS else {}
-        return {**super().advance(to_ns, commands), **late}
+        late_states = {"late": State((3.0, 4.0, 0.0))} if to_ns >= 12 * MS else {}
+        return {**super().advance(to_ns, commands), **late_states}
 
 
 @pytest.mark.parametrize("extrapolates", [False, True])
@@ -100,16 +102,16 @@ def test_an_agent_that_appears_during_a_run_can_receive_with_every_policy(policy
         "b": Periodic("to a", "a", period_ns=MS),
     }
     network = Disc(10.0, 1000, extrapolates=extrapolates)
-    make = make_policy(policy, window_s=0.005, longest_s=0.02)
-    run = Coordinator(Agents(physics, programs), network, make, [("b", "a")]).advance(60 * MS)
-    to_late = [fate for fate in run.fates.values() if fate.packet.destination == "late"]
-    assert len(to_late) >= 5
-    assert all(fate.assumed_states[1].position_m == (3.0, 4.0, 0.0) for fate in to_late)
+    sync_policy = make_policy(policy, window_s=0.005, longest_s=0.02)
+    run = Coordinator(Agents(physics, programs), network, sync_policy, [("b", "a")]).advance(60 * MS)
+    fates_to_late_agent = [fate for fate in run.fates.values() if fate.packet.destination == "late"]
+    assert len(fates_to_late_agent) >= 5
+    assert all(fate.assumed_states[1].position_m == (3.0, 4.0, 0.0) for fate in fates_to_late_agent)
     assert not any(fate.reason for fate in run.fates.values())
 
 
 class PhysicsWithAbsentAgent(StationaryPhysics):
-    """Physics in which an agent disappears within a window, and is there again later."""
+    """Physics in which an agent disappears within a window, and appears again later."""
 
     agents_disappear = True
 
@@ -128,13 +130,13 @@ def test_an_agent_that_the_physics_removes_is_absent_with_every_policy(policy: s
         "b": Periodic("to a", "a", period_ns=MS, first_ns=MS // 2),
     }
     network = Disc(10.0, 2 * MS, extrapolates=extrapolates)
-    make = make_policy(policy, window_s=0.005, longest_s=0.02)
-    run = Coordinator(Agents(physics, programs), network, make, [("a", "b"), ("b", "a")]).advance(60 * MS)
+    sync_policy = make_policy(policy, window_s=0.005, longest_s=0.02)
+    run = Coordinator(Agents(physics, programs), network, sync_policy, [("a", "b"), ("b", "a")]).advance(60 * MS)
     fates = {name: [fate for (flow, _), fate in run.fates.items() if flow == name] for name in ("to a", "to b")}
     assert len(fates["to b"]) >= 55
     assert 30 < len(fates["to a"]) <= 60 - 15, "its program sends nothing while the agent is absent"
     assert {fate.reason for name in fates for fate in fates[name]} == {"", ABSENT}
-    lost = [fate.packet.sent_ns for fate in fates["to b"] if fate.reason]
-    assert {*range(15, 30)} <= {at_ns // MS for at_ns in lost}
-    assert all(4 * MS <= at_ns < 37 * MS for at_ns in lost)
+    send_times_of_lost_ns = [fate.packet.sent_ns for fate in fates["to b"] if fate.reason]
+    assert {*range(15, 30)} <= {at_ns // MS for at_ns in send_times_of_lost_ns}
+    assert all(4 * MS <= at_ns < 37 * MS for at_ns in send_times_of_lost_ns)
     assert any(fate.arrived_ns is not None and fate.arrived_ns > 40 * MS for fate in fates["to a"])

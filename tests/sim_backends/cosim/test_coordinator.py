@@ -1,4 +1,4 @@
-"""The coordinator with federates that give random scripted answers."""
+"""The coordinator with federates that return random scripted answers."""
 
 import hashlib
 import heapq
@@ -54,16 +54,16 @@ class ScriptedProgram:
 
     def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:
         self.received += [(now_ns, datagram) for datagram in received]
-        to = [datagram.source for datagram in received if datagram.payload == "request"]
-        datagrams = [self._datagram(name, "reply") for name in to]
+        requesters = [datagram.source for datagram in received if datagram.payload == "request"]
+        datagrams = [self._datagram(name, "reply") for name in requesters]
         while self._sends and self._sends[-1][0] <= now_ns:
             datagrams.append(self._datagram(self._sends.pop()[1], "request"))
         return Action(datagrams)
 
-    def _datagram(self, to: str, payload: str) -> Datagram:
-        flow = f"{self._name} to {to}"
+    def _datagram(self, receiver: str, payload: str) -> Datagram:
+        flow = f"{self._name} to {receiver}"
         number = self._numbers[flow] = self._numbers.get(flow, -1) + 1
-        return Datagram(to, 10, flow, number, payload)
+        return Datagram(receiver, 10, flow, number, payload)
 
 
 class DelayNetwork:
@@ -73,7 +73,7 @@ class DelayNetwork:
         self._delays_ns = delays_ns
         self._events: list[tuple[int, int, bool, str]] = []
         self._now_ns = 0
-        self.entered_fates: list[Packet] = []
+        self.entered_packets: list[Packet] = []
 
     def advance(
         self, to_ns: int, packets: Sequence[Packet], states: Mapping[str, State]
@@ -84,7 +84,7 @@ class DelayNetwork:
             delay_ns = self._delays_ns[packet.packet_id % len(self._delays_ns)]
             event = packet.enters_ns + (delay_ns or 0), packet.packet_id, delay_ns is not LOST, packet.destination
             heapq.heappush(self._events, event)
-        self.entered_fates += packets
+        self.entered_packets += packets
         self._now_ns = to_ns
         arrivals, drops = [], []
         while self._events and self._events[0][0] <= to_ns:
@@ -141,7 +141,7 @@ class RepeatableRun:
         self.programs = {name: ScriptedProgram(name, self.sends[name]) for name in names}
         self.network = DelayNetwork(self.delays_ns)
         agents = Agents(UniformMotion(names, self.step_ns), self.programs)
-        pairs = [(source, to) for source in NAMES for to in NAMES if source != to]
+        pairs = [(source, receiver) for source in NAMES for receiver in NAMES if source != receiver]
         policy = ScriptedPolicy(self.lengths_ns, *self.flags)
         return Coordinator(agents, self.network, policy, pairs, observer=observer).advance(END_NS)
 
@@ -166,8 +166,8 @@ def test_packets_are_delivered_after_they_were_sent_and_decided_once(setting: Re
     lengths_ns = [end_ns - begin_ns for begin_ns, end_ns in pairwise([0, *run.windows_ns])]
     script = islice(cycle(setting.lengths_ns), 1, len(lengths_ns))
     assert lengths_ns[:-1] == list(script), "all windows but the last have the lengths of the policy"
-    assert [packet.packet_id for packet in setting.network.entered_fates] == list(
-        range(1, len(setting.network.entered_fates) + 1)
+    assert [packet.packet_id for packet in setting.network.entered_packets] == list(
+        range(1, len(setting.network.entered_packets) + 1)
     )
     for fate in run.fates.values():
         packet = fate.packet
@@ -183,25 +183,25 @@ def test_packets_are_delivered_after_they_were_sent_and_decided_once(setting: Re
             assert fate.counted_ns >= fate.arrived_ns
             assert fate.late_ns == 0 or not defers_arrivals
             assert fate.counted_ns + fate.late_ns in run.windows_ns
-    all_received = [item for program in setting.programs.values() for item in program.received]
-    for now_ns, received in all_received:
-        assert received.sent_ns <= received.arrived_ns <= now_ns
-    arrived = [fate for fate in run.fates.values() if fate.arrived_ns is not None]
-    assert len(all_received) <= len(arrived), "arrivals in the last window are not delivered any more"
-    assert len(arrived) - len(all_received) == sum(
-        fate.counted_ns is not None and fate.counted_ns + fate.late_ns == END_NS for fate in arrived
+    all_receptions = [reception for program in setting.programs.values() for reception in program.received]
+    for now_ns, datagram in all_receptions:
+        assert datagram.sent_ns <= datagram.arrived_ns <= now_ns
+    arrived_fates = [fate for fate in run.fates.values() if fate.arrived_ns is not None]
+    assert len(all_receptions) <= len(arrived_fates), "arrivals in the last window are not delivered any more"
+    assert len(arrived_fates) - len(all_receptions) == sum(
+        fate.counted_ns is not None and fate.counted_ns + fate.late_ns == END_NS for fate in arrived_fates
     )
 
 
 @dataclass
 class WindowRecorder:
-    """An observer that keeps all windows."""
+    """An observer that stores all windows."""
 
     windows: list[Window] = field(default_factory=list)
     decided_fates: list[tuple[tuple[str, int], int | None]] = field(default_factory=list)
 
     def begin(self, states: Mapping[str, State]) -> None:
-        self.first = states
+        self.first_states = states
 
     def window(self, window: Window) -> None:
         self.windows.append(window)
@@ -210,9 +210,9 @@ class WindowRecorder:
 
 @given(SETTINGS)
 def test_the_network_assumes_the_states_that_the_policy_determines(setting: RepeatableRun) -> None:
-    watching = WindowRecorder()
-    setting.run(watching)
-    for window in watching.windows:
+    recorder = WindowRecorder()
+    setting.run(recorder)
+    for window in recorder.windows:
         assumed_at_ns = window.end_ns if setting.flags[1] else window.begin_ns
         for fate in window.entered_fates:
             for assumed_states, true_states in zip(fate.assumed_states, fate.true_states, strict=True):
@@ -222,47 +222,47 @@ def test_the_network_assumes_the_states_that_the_policy_determines(setting: Repe
 
 @given(SETTINGS)
 def test_the_digest_is_independent_of_observers_and_of_the_order_of_names(setting: RepeatableRun) -> None:
-    run, watching = setting.run(), WindowRecorder()
-    assert setting.run(watching).digest == run.digest
+    run, recorder = setting.run(), WindowRecorder()
+    assert setting.run(recorder).digest == run.digest
     assert setting.run(backwards=True).digest == run.digest
 
 
 @given(SETTINGS)
-def test_an_observer_receives_everything_once_and_in_order(setting: RepeatableRun) -> None:
-    watching = WindowRecorder()
-    run = setting.run(watching)
-    assert [window.end_ns for window in watching.windows] == run.windows_ns
-    assert [window.begin_ns for window in watching.windows] == [0, *run.windows_ns[:-1]]
-    entered_fates = [fate for window in watching.windows for fate in window.entered_fates]
+def test_an_observer_receives_each_window_and_fate_once_and_in_order(setting: RepeatableRun) -> None:
+    recorder = WindowRecorder()
+    run = setting.run(recorder)
+    assert [window.end_ns for window in recorder.windows] == run.windows_ns
+    assert [window.begin_ns for window in recorder.windows] == [0, *run.windows_ns[:-1]]
+    entered_fates = [fate for window in recorder.windows for fate in window.entered_fates]
     assert entered_fates == list(run.fates.values())
-    decided: list[Fate] = [fate for fate in run.fates.values() if fate.is_decided]
-    assert sorted(watching.decided_fates) == sorted((fate.packet.identity, fate.arrived_ns) for fate in decided)
+    decided_fates: list[Fate] = [fate for fate in run.fates.values() if fate.is_decided]
+    assert sorted(recorder.decided_fates) == sorted((fate.packet.identity, fate.arrived_ns) for fate in decided_fates)
     for part, total_s in run.wall_s.items():
-        assert sum(window.wall_s[part] for window in watching.windows) == pytest.approx(total_s)
-    before = watching.first
-    for window in watching.windows:
-        assert window.assumed_states == (window.states if setting.flags[1] else before)
-        before = window.states
+        assert sum(window.wall_s[part] for window in recorder.windows) == pytest.approx(total_s)
+    begin_states = recorder.first_states
+    for window in recorder.windows:
+        assert window.assumed_states == (window.states if setting.flags[1] else begin_states)
+        begin_states = window.states
 
 
 @given(SETTINGS, SETTINGS)
 def test_different_runs_have_different_digests(setting: RepeatableRun, other: RepeatableRun) -> None:
     first, second = setting.run(), other.run()
-    same = first.windows_ns == second.windows_ns and [
+    is_equal = first.windows_ns == second.windows_ns and [
         (fate.packet, fate.arrived_ns, fate.reason) for fate in first.fates.values()
     ] == [(fate.packet, fate.arrived_ns, fate.reason) for fate in second.fates.values()]
-    assert (first.digest == second.digest) == same
+    assert (first.digest == second.digest) == is_equal
 
 
 ORIGIN = State((0.0, 0.0, 0.0))
-SENT = Packet(7, "a", "b", 10, ("a to b", 3), 100, 110, "udp")
-ARRIVED = Fate(SENT, (ORIGIN, ORIGIN), (ORIGIN, ORIGIN), arrived_ns=120, counted_ns=130)
+PACKET = Packet(7, "a", "b", 10, ("a to b", 3), 100, 110, "udp")
+ARRIVED_FATE = Fate(PACKET, (ORIGIN, ORIGIN), (ORIGIN, ORIGIN), arrived_ns=120, counted_ns=130)
 
 
-def digest(entered_fates: Sequence[Fate], left_network: Sequence[Fate], end_ns: int = 130) -> str:
+def digest(entered_fates: Sequence[Fate], decided_fates: Sequence[Fate], end_ns: int = 130) -> str:
     """Return the digest of one window."""
     event_digest = EventDigest()
-    event_digest.add_window(end_ns, entered_fates, left_network)
+    event_digest.add_window(end_ns, entered_fates, decided_fates)
     return event_digest.hexdigest()
 
 
@@ -275,22 +275,22 @@ def test_every_difference_in_a_window_changes_the_digest() -> None:
         "identity": ("a to b", 4),
     }
     fields |= {"sent_ns": 101, "enters_ns": 111, "protocol": "tcp"}
-    others = [replace(ARRIVED, packet=SENT._replace(**{name: value})) for name, value in fields.items()]
-    others.append(replace(ARRIVED, packet=SENT._replace(identity=("a to c", 3))))
-    fates = [ARRIVED, replace(ARRIVED, arrived_ns=121)]
-    fates += [replace(ARRIVED, arrived_ns=None, reason=reason) for reason in ("lost", "late")]
-    digests = [digest([fate], [ARRIVED]) for fate in (ARRIVED, *others)]
-    digests += [digest([ARRIVED], [fate]) for fate in fates[1:]]
-    digests += [digest([ARRIVED], []), digest([], [ARRIVED]), digest([ARRIVED], [ARRIVED], 131)]
+    changed_fates = [replace(ARRIVED_FATE, packet=PACKET._replace(**{name: value})) for name, value in fields.items()]
+    changed_fates.append(replace(ARRIVED_FATE, packet=PACKET._replace(identity=("a to c", 3))))
+    fates = [ARRIVED_FATE, replace(ARRIVED_FATE, arrived_ns=121)]
+    fates += [replace(ARRIVED_FATE, arrived_ns=None, reason=reason) for reason in ("lost", "late")]
+    digests = [digest([fate], [ARRIVED_FATE]) for fate in (ARRIVED_FATE, *changed_fates)]
+    digests += [digest([ARRIVED_FATE], [fate]) for fate in fates[1:]]
+    digests += [digest([ARRIVED_FATE], []), digest([], [ARRIVED_FATE]), digest([ARRIVED_FATE], [ARRIVED_FATE], 131)]
     assert len(set(digests)) == len(digests) == len(fields) + 2 + 3 + 3
 
 
 def test_quiet_windows_are_hashed_like_all_others() -> None:
-    """Computed by hand: the mark, number and time of each event, in order."""
+    """The expected digest is that of the mark, number and time of each event, in order."""
     event_digest = EventDigest()
     for end_ns in (100, 110):
         event_digest.quiet_ends_ns.append(end_ns)
-    event_digest.add_window(130, [ARRIVED], [ARRIVED])
+    event_digest.add_window(130, [ARRIVED_FATE], [ARRIVED_FATE])
     event_digest.quiet_ends_ns.append(140)
     events = struct.pack("<cQQcQQ", b"w", 0, 100, b"w", 1, 110)
     events += struct.pack("<QqqQQ", 7, 3, 10, 100, 110) + b"a\0b\0a to b\0udp\0"

@@ -30,7 +30,7 @@ from sim_backends.physics.paths import Paths
 from sim_backends.world.motion import State, WayPoints
 
 MS = 1_000_000
-FOR_EVER_S = 3600.0
+ENDLESS_S = 3600.0
 LIMIT_S = 0.25
 
 
@@ -68,62 +68,64 @@ def pair(
     ],
 )
 def test_a_timeout_names_the_federate_and_the_request(federate: str, message: str) -> None:
-    stall = Stall(7 * MS, FOR_EVER_S, LIMIT_S)
-    hanging = {
+    stall = Stall(7 * MS, ENDLESS_S, LIMIT_S)
+    stalled_coordinator = {
         "physics": lambda: pair(physics=with_stall(paths(), stall)),
         "network": lambda: pair(network=with_stall(Disc(1.0, MS), stall)),
         "program": lambda: pair(program=with_stall(periodic(), stall)),
     }[federate]()
-    with pytest.raises(UnansweredError) as raised:
-        hanging.advance(1000 * MS)
-    assert raised.value.what == message
-    assert raised.value.remedy
-    complete_ns = {"physics": 6, "network": 6, "program": 9}[federate] * MS
-    assert hanging.run.windows_ns[-1] == complete_ns, "the windows before are kept"
-    assert hanging.run.digest == pair().advance(complete_ns).digest
+    with pytest.raises(UnansweredError) as error_info:
+        stalled_coordinator.advance(1000 * MS)
+    assert error_info.value.what == message
+    assert error_info.value.remedy
+    last_window_ns = {"physics": 6, "network": 6, "program": 9}[federate] * MS
+    assert stalled_coordinator.run.windows_ns[-1] == last_window_ns, "the run contains the earlier windows"
+    assert stalled_coordinator.run.digest == pair().advance(last_window_ns).digest
 
 
-def test_an_error_of_a_policy_that_looks_ahead_has_the_time_that_the_window_has_reached() -> None:
+def test_an_error_of_a_policy_that_extends_windows_states_the_time_that_the_window_has_reached() -> None:
     class FaultyPolicy(ErrorBounded):
         def extended_end_ns(self, situation: Situation) -> int:
             if situation.now_ns >= 7 * MS:
                 next(iter(()))
             return situation.now_ns + MS
 
-    with pytest.raises(FederateError, match=r"policy error_bounded failed at the request .* StopIteration") as raised:
+    with pytest.raises(
+        FederateError, match=r"policy error_bounded failed at the request .* StopIteration"
+    ) as error_info:
         pair(policy=FaultyPolicy()).advance(1000 * MS)
-    assert "extend the window beyond 0.007 s" in str(raised.value)
+    assert "extend the window beyond 0.007 s" in str(error_info.value)
 
 
 @pytest.mark.parametrize("part", ["agents", "network"])
 def test_a_stall_below_the_deadline_only_adds_waiting_time(part: str) -> None:
     stall = Stall(7 * MS, 0.03, LIMIT_S)
-    waiting = (
+    stalled_run = (
         pair(physics=with_stall(paths(), stall))
         if part == "agents"
         else pair(network=with_stall(Disc(1.0, MS), stall))
     ).advance(1000 * MS)
-    plain = pair().advance(1000 * MS)
-    assert waiting.wall_s["wait"] >= 0.03
-    assert waiting.wall_s[part] > 0, "the other time is not waiting time"
-    assert plain.wall_s["wait"] == 0
-    assert (waiting.digest, waiting.fates) == (plain.digest, plain.fates)
+    reference_run = pair().advance(1000 * MS)
+    assert stalled_run.wall_s["wait"] >= 0.03
+    assert stalled_run.wall_s[part] > 0, "the remaining time is not waiting time"
+    assert reference_run.wall_s["wait"] == 0
+    assert (stalled_run.digest, stalled_run.fates) == (reference_run.digest, reference_run.fates)
 
 
 def test_a_stalled_federate_can_be_copied_and_has_its_attributes() -> None:
-    copied = copy.deepcopy(with_stall(paths(), Stall(7 * MS, 0.0)))
-    assert copied.step_ns == paths().step_ns
-    assert not hasattr(copied, "next_event_ns")
+    copied_physics = copy.deepcopy(with_stall(paths(), Stall(7 * MS, 0.0)))
+    assert copied_physics.step_ns == paths().step_ns
+    assert not hasattr(copied_physics, "next_event_ns")
 
 
 def test_all_stalls_of_one_federate_count_as_waiting_time() -> None:
     network = Disc(1.0, MS)
-    twice = with_stall(with_stall(network, Stall(7 * MS, 0.01)), Stall(20 * MS, 0.02))
-    assert pair(network=twice).advance(1000 * MS).wall_s["wait"] >= 0.03
+    network_with_two_stalls = with_stall(with_stall(network, Stall(7 * MS, 0.01)), Stall(20 * MS, 0.02))
+    assert pair(network=network_with_two_stalls).advance(1000 * MS).wall_s["wait"] >= 0.03
 
 
 class FailingFederate:
-    """Physics and program that fail from a time on."""
+    """Physics and a program that fail from a given time on."""
 
     step_ns = MS
     limits_m_s2: Mapping[str, float] = {}
@@ -185,9 +187,9 @@ class NetworkWithoutEvents(Disc):
     ],
 )
 def test_a_failure_names_the_federate_and_its_last_time(parts: dict[str, Any], message: str) -> None:
-    with pytest.raises(FederateError, match=message) as raised:
+    with pytest.raises(FederateError, match=message) as error_info:
         pair(**parts).advance(1000 * MS)
-    assert raised.value.__cause__ is not None
+    assert error_info.value.__cause__ is not None
 
 
 class FixedAnswerNetwork:
@@ -230,9 +232,9 @@ def test_a_physics_that_loses_an_agent_is_refused() -> None:
             states = super().advance(to_ns, commands)
             return states if to_ns < 5 * MS else {"a": states["a"]}
 
-    losing = LosingPhysics([WayPoints(name, [(0.0, 0.0, 0.0)], 1.0) for name in "ab"])
+    physics_without_b = LosingPhysics([WayPoints(name, [(0.0, 0.0, 0.0)], 1.0) for name in "ab"])
     with pytest.raises(FederateError, match=r"physics, requested to advance to 0\.006 s, has no state of b"):
-        pair(physics=losing).advance(1000 * MS)
+        pair(physics=physics_without_b).advance(1000 * MS)
 
 
 def test_agents_without_physics_are_refused_before_the_run() -> None:

@@ -28,10 +28,10 @@ def test_stacked_labels_do_not_overlap_and_keep_the_order_of_their_points(
 
 
 @given(st.lists(INSIDE, min_size=1, max_size=4))
-def test_a_few_labels_cover_nothing_and_are_within_the_bounds(points: list[tuple[float, float]]) -> None:
+def test_a_few_labels_overlap_nothing_and_are_within_the_bounds(points: list[tuple[float, float]]) -> None:
     marks = [LabelBox(x - 3, y - 3, 6, 6) for x, y in points]
-    placed = place_labels([[point] for point in points], [(40.0, 9.0)] * len(points), BOUNDS, marks)
-    boxes = [box for _, box in placed]
+    placements = place_labels([[point] for point in points], [(40.0, 9.0)] * len(points), BOUNDS, marks)
+    boxes = [box for _, box in placements]
     for first, second in combinations(boxes, 2):
         assert first.overlap(second) == 0
     for box in boxes:

@@ -32,9 +32,9 @@ def physics(carts: Any) -> Any:  # noqa: ANN401 (as above)
     return carts(make_hello(SCENARIO, WORLD, make_bodies(SCENARIO, WORLD), 1, PHYSICS))
 
 
-# The paper's rule as printed stops if a subscriber is faster, as the drone is immediately.
+# The paper's rule as printed stops if a subscriber is faster, and the drone is faster from the start.
 @pytest.mark.parametrize("policy", sorted({*BUILTIN} - {"velocity_aware_raw"}))
-def test_the_class_of_the_page_runs_with_every_policy(policy: str, carts: Any) -> None:  # noqa: ANN401 (as above)
+def test_the_documented_class_runs_with_every_policy(policy: str, carts: Any) -> None:  # noqa: ANN401 (as above)
     simulation = build(SCENARIO, policy=policy, physics=physics(carts))
     run = simulation.run(400 * MS)
     assert run.fates
@@ -48,16 +48,16 @@ def test_the_class_receives_commands_and_forks_do_not_change_it(carts: Any) -> N
     simulation.run(1000 * MS)
     # The leader is commanded 0.4 m/s, which this physics reaches immediately.
     assert simulation.agents.states(1000 * MS)["leader"].position_m[0] == pytest.approx(20.4, abs=0.001)
-    measured = local_errors(
+    errors_by_policy = local_errors(
         lambda policy: build(SCENARIO, policy=policy, physics=physics(carts)).coordinator,
         {"scheduled": Scheduled},
         (0.01, 0.02),
         [100 * MS, 203 * MS],
     )
-    assert measured["scheduled"].mean("delivery_s").shape == (2,)
+    assert errors_by_policy["scheduled"].mean("delivery_s").shape == (2,)
 
 
-LACKING = [
+INCOMPLETE = [
     ({"step_ns": None}, r"the physics \w+ has no step_ns, an integer above 0 \(it is None\)"),
     ({"step_ns": 1e6}, r"no step_ns, an integer above 0 \(it is 1000000.0\)"),
     ({"step_ns": 0}, "no step_ns, an integer above 0"),
@@ -70,20 +70,20 @@ LACKING = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "message"), LACKING)
+@pytest.mark.parametrize(("changes", "message"), INCOMPLETE)
 def test_an_incomplete_physics_is_refused_before_the_run(changes: dict[str, Any], message: str, carts: Any) -> None:  # noqa: ANN401
-    lacking = physics(carts)
-    vars(lacking).update(changes)
+    incomplete_physics = physics(carts)
+    vars(incomplete_physics).update(changes)
     with pytest.raises(FieldkitError, match=message):
-        build(SCENARIO, physics=lacking)
+        build(SCENARIO, physics=incomplete_physics)
 
 
 def test_a_program_that_drives_requires_states_with_a_heading(carts: Any) -> None:  # noqa: ANN401 (as above)
-    lacking = physics(carts)
-    advance = lacking.advance
-    lacking.advance = lambda to_ns, commands: {
+    incomplete_physics = physics(carts)
+    advance = incomplete_physics.advance
+    incomplete_physics.advance = lambda to_ns, commands: {
         name: State(state.position_m) for name, state in advance(to_ns, commands).items()
     }
     with pytest.raises(FieldkitError, match="the heading of its robot"):
-        build(SCENARIO, physics=lacking).run()
-    assert math.isfinite(lacking.step_ns)
+        build(SCENARIO, physics=incomplete_physics).run()
+    assert math.isfinite(incomplete_physics.step_ns)

@@ -35,15 +35,15 @@ def texts(svg: bytes) -> list[str]:
     )
 
 
-def draw_all(form: Format) -> list[bytes]:
-    return [log_figure([PANEL], form), run_figure("a run", PATHS_M, FLOWS, form)]
+def draw_all(file_format: Format) -> list[bytes]:
+    return [log_figure([PANEL], file_format), run_figure("a run", PATHS_M, FLOWS, file_format)]
 
 
-@pytest.mark.parametrize("form", FORMATS)
-def test_equal_figures_are_equal_files_in_every_format(form: Format) -> None:
-    figures = draw_all(form)
-    assert all(figure.startswith(MAGIC[form]) for figure in figures)
-    assert figures == draw_all(form)
+@pytest.mark.parametrize("file_format", FORMATS)
+def test_equal_figures_are_equal_files_in_every_format(file_format: Format) -> None:
+    figures = draw_all(file_format)
+    assert all(figure.startswith(MAGIC[file_format]) for figure in figures)
+    assert figures == draw_all(file_format)
 
 
 def test_each_curve_has_one_label_and_zeros_have_a_separate_line() -> None:
@@ -51,18 +51,18 @@ def test_each_curve_has_one_label_and_zeros_have_a_separate_line() -> None:
     for name in ("scheduled", "time_stepped", "event_driven", "another"):
         assert labels.count(name) == 2, "once in each panel"
     assert labels.count("0") == 2
-    without = LogPanel("x", "x", "y", PANEL.curves[:2])
-    assert "0" not in texts(log_figure([without], "svg"))
+    without_zeros = LogPanel("x", "x", "y", PANEL.curves[:2])
+    assert "0" not in texts(log_figure([without_zeros], "svg"))
 
 
 def test_obstacles_are_drawn_and_paths_have_an_arrow() -> None:
-    plain = run_figure("a run", PATHS_M, FLOWS, "svg").decode()
+    without_wall = run_figure("a run", PATHS_M, FLOWS, "svg").decode()
     wall = ObstacleOutline([(0.0, 1.0), (2.0, 1.0), (2.0, 1.2), (0.0, 1.2)], is_passable=False)
     with_wall = run_figure("a run", PATHS_M, FLOWS, "svg", [wall]).decode()
-    assert with_wall.count("<path") == plain.count("<path") + 1
-    assert texts(with_wall.encode()) == texts(plain.encode()), "the axes are unchanged"
-    stationary = run_figure("a run", {name: path[:1] for name, path in PATHS_M.items()}, FLOWS, "svg").decode()
-    assert plain.count("<path") > stationary.count("<path"), "an agent that does not move has no arrow"
+    assert with_wall.count("<path") == without_wall.count("<path") + 1
+    assert texts(with_wall.encode()) == texts(without_wall.encode()), "the axes are unchanged"
+    stationary_figure = run_figure("a run", {name: path[:1] for name, path in PATHS_M.items()}, FLOWS, "svg").decode()
+    assert without_wall.count("<path") > stationary_figure.count("<path"), "an agent that does not move has no arrow"
 
 
 def test_arrows_have_the_last_direction_of_travel() -> None:
@@ -72,7 +72,7 @@ def test_arrows_have_the_last_direction_of_travel() -> None:
     assert direction_arrow([(1.0, 1.0)]) is direction_arrow([(1.0, 1.0)] * 3) is None
 
 
-def test_the_park_has_light_outlines_below_roofs_and_dark_ones_of_boxes() -> None:
+def test_the_outlines_of_the_park_are_passable_below_roofs_and_impassable_at_boxes() -> None:
     park = load_world("baylands")
     park_outlines = list(outlines(park))
     assert any(outline.is_passable for outline in park_outlines)

@@ -1,4 +1,4 @@
-"""Sync policies against results computed by hand: robots pass each other, links have a hard range limit."""
+"""Sync policies compared with results computed by hand: robots pass each other, links have a hard range limit."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -44,7 +44,7 @@ PERIOD_NS, DELAY_NS = 3_700_001, 1_234_567
 FIXED = [Scheduled, SlidingWindow, TimeStepped]
 
 
-def passing(
+def passing_run(
     policy: SyncPolicy, *, a_m_s: float = 1.0, b_m_s: float = 0.7, to_ns: int = END_NS, step_ns: int = MS
 ) -> Run:
     """Let two robots pass each other at a distance of 1 m; one sends to the other."""
@@ -59,24 +59,24 @@ def passing(
     return Coordinator(agents, network, policy, [("a", "b")]).advance(to_ns)
 
 
-def in_range(at_ns: int) -> bool:
+def is_in_range(at_ns: int) -> bool:
     at_s = at_ns // MS / 1000
     return math.hypot(FAR_M - 1.7 * at_s, ASIDE_M) <= RANGE_M
 
 
-def begin(window_ns: int) -> Callable[[int], int]:
+def window_begin(window_ns: int) -> Callable[[int], int]:
     return lambda at_ns: at_ns // window_ns * window_ns
 
 
-def end(window_ns: int) -> Callable[[int], int]:
+def window_end(window_ns: int) -> Callable[[int], int]:
     return lambda at_ns: (at_ns // window_ns + 1) * window_ns
 
 
-def closed_end(window_ns: int) -> Callable[[int], int]:
+def closed_window_end(window_ns: int) -> Callable[[int], int]:
     return lambda at_ns: max(-(-at_ns // window_ns), 1) * window_ns
 
 
-def same(at_ns: int) -> int:
+def same_time(at_ns: int) -> int:
     return at_ns
 
 
@@ -85,86 +85,88 @@ class ExpectedTimes:
     """A policy, and functions for the entry time of packets, the time of assumed states, and the counted arrival."""
 
     policy: SyncPolicy
-    enters: Callable[[int], int] = same
-    assumes: Callable[[int], int] = same
-    counts: Callable[[int], int] = same
+    enters: Callable[[int], int] = same_time
+    assumes: Callable[[int], int] = same_time
+    counts: Callable[[int], int] = same_time
 
 
 W_NS = 1_100_000
 EXPECTATIONS = [
     ExpectedTimes(EventDriven()),
     ExpectedTimes(VariableStepped()),
-    ExpectedTimes(TimeStepped(0.0011), enters=end(W_NS), counts=end(W_NS)),
-    ExpectedTimes(Scheduled(0.0011), assumes=begin(W_NS), counts=end(W_NS)),
-    ExpectedTimes(SlidingWindow(0.0011), assumes=closed_end(W_NS)),
-    ExpectedTimes(SlidingWindow(0.25), assumes=closed_end(250 * MS)),
-    # 1 ms and the 0.3 ms by which the publisher is faster.
-    ExpectedTimes(VelocityAwareRaw(0.001), assumes=closed_end(1_300_000)),
-    # 1 ms and the 1.7 ms of the relative velocity.
-    ExpectedTimes(VelocityAware(0.001), assumes=closed_end(2_700_000)),
+    ExpectedTimes(TimeStepped(0.0011), enters=window_end(W_NS), counts=window_end(W_NS)),
+    ExpectedTimes(Scheduled(0.0011), assumes=window_begin(W_NS), counts=window_end(W_NS)),
+    ExpectedTimes(SlidingWindow(0.0011), assumes=closed_window_end(W_NS)),
+    ExpectedTimes(SlidingWindow(0.25), assumes=closed_window_end(250 * MS)),
+    # 1 ms, and 0.3 ms because the publisher is faster by 0.3 m/s.
+    ExpectedTimes(VelocityAwareRaw(0.001), assumes=closed_window_end(1_300_000)),
+    # 1 ms, and 1.7 ms because of the relative velocity of 1.7 m/s.
+    ExpectedTimes(VelocityAware(0.001), assumes=closed_window_end(2_700_000)),
     # At constant velocities the extrapolation is exact, so the window has its maximum length.
-    ExpectedTimes(ErrorBounded(0.1), counts=end(100 * MS)),
+    ExpectedTimes(ErrorBounded(0.1), counts=window_end(100 * MS)),
 ]
 
 
 @pytest.mark.parametrize("expected", EXPECTATIONS, ids=lambda expected: expected.policy.name)
 def test_fates_and_times_equal_those_computed_by_hand(expected: ExpectedTimes) -> None:
-    run = passing(expected.policy)
+    run = passing_run(expected.policy)
     assert len(run.fates) == -(-END_NS // PERIOD_NS)
-    lost = 0
+    lost_count = 0
     for (flow, number), fate in run.fates.items():
         sent_ns = number * PERIOD_NS
         enters_ns = expected.enters(sent_ns)
         arrives_ns = enters_ns + DELAY_NS
         assert (flow, fate.packet.sent_ns, fate.packet.enters_ns) == ("a", sent_ns, enters_ns)
-        if not in_range(expected.assumes(enters_ns)):
+        if not is_in_range(expected.assumes(enters_ns)):
             assert (fate.reason, fate.arrived_ns) == ("out of range", None)
-            lost += 1
+            lost_count += 1
         elif fate.arrived_ns is None:
             assert arrives_ns > END_NS - 250 * MS, "under way at the end"
         else:
             assert fate.arrived_ns == arrives_ns
             assert fate.counted_ns == expected.counts(arrives_ns)
-    assert lost > 100
+    assert lost_count > 100
 
 
 def test_exact_policies_agree_in_each_packet_and_only_sliding_windows_are_late() -> None:
-    reference, merged = passing(EventDriven()), passing(VariableStepped())
+    reference, variable_run = passing_run(EventDriven()), passing_run(VariableStepped())
     for identity, fate in reference.fates.items():
-        other = merged.fates[identity]
+        other = variable_run.fates[identity]
         assert (fate.arrived_ns, fate.reason, fate.assumed_states) == (
             other.arrived_ns,
             other.reason,
             other.assumed_states,
         )
-        held_m = 1.7 * (fate.packet.sent_ns % MS) / 1e9
-        assert position_error_m(fate) == pytest.approx(held_m, abs=1e-9), "states are held for a step"
+        hold_error_m = 1.7 * (fate.packet.sent_ns % MS) / 1e9
+        assert position_error_m(fate) == pytest.approx(hold_error_m, abs=1e-9), "states are held for a step"
         assert not fate.late_ns
-    assert any(fate.late_ns for fate in passing(SlidingWindow(0.05)).fates.values()), "receivers had passed the time"
-    assert not any(fate.late_ns for fate in passing(Scheduled(0.05)).fates.values())
+    assert any(fate.late_ns for fate in passing_run(SlidingWindow(0.05)).fates.values()), (
+        "some receivers had already passed the time of arrival"
+    )
+    assert not any(fate.late_ns for fate in passing_run(Scheduled(0.05)).fates.values())
 
 
-def windows(kind: Callable[[float], SyncPolicy]) -> st.SearchStrategy[Callable[[], SyncPolicy]]:
-    """Return functions that make a policy from a window in seconds, or a bound in metres."""
+def policies_with(kind: Callable[[float], SyncPolicy]) -> st.SearchStrategy[Callable[[], SyncPolicy]]:
+    """Return a strategy for functions that make a policy with a random window in seconds, or bound in metres."""
     return st.floats(0.001, 0.3).map(lambda value: partial(kind, value))
 
 
 POLICIES: st.SearchStrategy[Callable[[], SyncPolicy]] = st.one_of(
     st.just(EventDriven),
     st.just(VariableStepped),
-    *(windows(kind) for kind in (TimeStepped, Scheduled, SlidingWindow, VelocityAware)),
-    windows(ErrorBounded),
+    *(policies_with(kind) for kind in (TimeStepped, Scheduled, SlidingWindow, VelocityAware)),
+    policies_with(ErrorBounded),
 )
 
 
 @given(POLICIES, st.floats(0.0, 3.0), st.floats(0.0, 3.0))
 def test_packets_arrive_after_they_were_sent_and_equal_runs_have_equal_digests(
-    make: Callable[[], SyncPolicy], a_m_s: float, b_m_s: float
+    make_sync_policy: Callable[[], SyncPolicy], a_m_s: float, b_m_s: float
 ) -> None:
-    policy = make()
+    policy = make_sync_policy()
     a_m_s, b_m_s = max(a_m_s, 0.01), max(b_m_s, 0.01)
-    run = passing(policy, a_m_s=a_m_s, b_m_s=b_m_s, to_ns=1000 * MS)
-    assert passing(make(), a_m_s=a_m_s, b_m_s=b_m_s, to_ns=1000 * MS).digest == run.digest
+    run = passing_run(policy, a_m_s=a_m_s, b_m_s=b_m_s, to_ns=1000 * MS)
+    assert passing_run(make_sync_policy(), a_m_s=a_m_s, b_m_s=b_m_s, to_ns=1000 * MS).digest == run.digest
     assert run.windows_ns == sorted(run.windows_ns)
     assert run.windows_ns[-1] == 1000 * MS
     if not policy.exact:
@@ -193,32 +195,37 @@ def test_a_million_windows_end_at_a_million_times_their_length() -> None:
 
 def test_errors_equal_those_computed_by_hand() -> None:
     """Packets are sent at all phases of a window, so waiting for its end takes half a window on average."""
-    reference, window_s = passing(EventDriven()), 0.05
-    exact = compare_runs(reference, passing(VariableStepped()))
-    assert exact.delivery_error_s == Spread(0, 0, 0)
-    assert exact.position_error_m.mean == pytest.approx(1.7 * 0.001 / 2, rel=0.12), "states are held for 1 ms"
-    assert exact.position_error_m.largest <= 1.7 * 0.001
-    assert (exact.fate_disagreement, exact.first_disagreement, exact.causality_violations) == (0, None, 0)
-    sampled = compare_runs(reference, passing(Scheduled(window_s)))
-    assert sampled.delivery_error_s.mean == pytest.approx(window_s / 2, rel=0.01)
-    assert sampled.delivery_error_s.largest == pytest.approx(window_s, rel=0.01)
-    assert sampled.delay_added_s == pytest.approx(window_s / 2, rel=0.01)
-    assert sampled.exchanges_per_s == pytest.approx(1 / window_s)
-    assert sampled.causality_violations == 0
+    reference, window_s = passing_run(EventDriven()), 0.05
+    exact_errors = compare_runs(reference, passing_run(VariableStepped()))
+    assert exact_errors.delivery_error_s == Spread(0, 0, 0)
+    assert exact_errors.position_error_m.mean == pytest.approx(1.7 * 0.001 / 2, rel=0.12), "states are held for 1 ms"
+    assert exact_errors.position_error_m.largest <= 1.7 * 0.001
+    assert (exact_errors.fate_disagreement, exact_errors.first_disagreement, exact_errors.causality_violations) == (
+        0,
+        None,
+        0,
+    )
+    scheduled_errors = compare_runs(reference, passing_run(Scheduled(window_s)))
+    assert scheduled_errors.delivery_error_s.mean == pytest.approx(window_s / 2, rel=0.01)
+    assert scheduled_errors.delivery_error_s.largest == pytest.approx(window_s, rel=0.01)
+    assert scheduled_errors.delay_added_s == pytest.approx(window_s / 2, rel=0.01)
+    assert scheduled_errors.exchanges_per_s == pytest.approx(1 / window_s)
+    assert scheduled_errors.causality_violations == 0
     # Their relative speed is 1.7 m/s; the states are those at the beginning of the window.
-    assert sampled.position_error_m.largest == pytest.approx(1.7 * window_s, rel=0.03)
-    assert sampled.position_error_m.mean == pytest.approx(1.7 * window_s / 2, rel=0.02)
-    # Only in windows in which they enter or leave the range, packets have another fate.
-    differing = sampled.fate_disagreement * sampled.packets
-    assert 1 <= differing <= 2 * window_s * 1e9 / PERIOD_NS + 2
-    assert sampled.first_disagreement is not None
-    late = compare_runs(reference, passing(SlidingWindow(window_s)))
-    assert late.delivery_error_s == Spread(0, 0, 0), "arrivals keep their time"
-    assert late.position_error_m.mean == pytest.approx(1.7 * window_s / 2, rel=0.02)
-    assert late.causality_violations > 0.9 * sum(not fate.reason for fate in reference.fates.values())
-    stepped = compare_runs(reference, passing(TimeStepped(window_s)))
-    # Half a window before the network; after it, the rest of a window that the delay of the link leaves.
-    assert stepped.delay_added_s == pytest.approx(1.5 * window_s - DELAY_NS / 1e9, rel=0.01)
+    assert scheduled_errors.position_error_m.largest == pytest.approx(1.7 * window_s, rel=0.03)
+    assert scheduled_errors.position_error_m.mean == pytest.approx(1.7 * window_s / 2, rel=0.02)
+    # Packets have another fate only in windows in which the robots enter or leave the range.
+    differing_packets = scheduled_errors.fate_disagreement * scheduled_errors.packets
+    assert 1 <= differing_packets <= 2 * window_s * 1e9 / PERIOD_NS + 2
+    assert scheduled_errors.first_disagreement is not None
+    sliding_errors = compare_runs(reference, passing_run(SlidingWindow(window_s)))
+    assert sliding_errors.delivery_error_s == Spread(0, 0, 0), "arrivals keep their time"
+    assert sliding_errors.position_error_m.mean == pytest.approx(1.7 * window_s / 2, rel=0.02)
+    assert sliding_errors.causality_violations > 0.9 * sum(not fate.reason for fate in reference.fates.values())
+    stepped_errors = compare_runs(reference, passing_run(TimeStepped(window_s)))
+    # Packets wait for half a window before the network. They enter it at the beginning of a window, arrive after the
+    # delay of the link, and wait for the rest of that window.
+    assert stepped_errors.delay_added_s == pytest.approx(1.5 * window_s - DELAY_NS / 1e9, rel=0.01)
 
 
 @pytest.mark.parametrize("step_ns", [5 * MS, 10 * MS], ids=["half the window", "the window"])
@@ -227,22 +234,26 @@ def test_position_errors_are_half_a_window_for_any_step_of_the_physics(
     policy: Callable[[float], SyncPolicy], window_s: float | None, step_ns: int
 ) -> None:
     """All fixed windows have the same error; the exact policy has an error of half a step."""
-    error_m = compare_runs(passing(EventDriven()), passing(policy(0.01), step_ns=step_ns)).position_error_m
-    held_s = step_ns / 1e9 if window_s is None else window_s
-    assert error_m.mean == pytest.approx(1.7 * held_s / 2, rel=0.02)
-    assert error_m.largest == pytest.approx(1.7 * held_s, rel=0.02)
+    error_m = compare_runs(passing_run(EventDriven()), passing_run(policy(0.01), step_ns=step_ns)).position_error_m
+    hold_time_s = step_ns / 1e9 if window_s is None else window_s
+    assert error_m.mean == pytest.approx(1.7 * hold_time_s / 2, rel=0.02)
+    assert error_m.largest == pytest.approx(1.7 * hold_time_s, rel=0.02)
 
 
 @pytest.mark.parametrize("policy", FIXED)
-def test_half_the_window_has_half_the_error(policy: type[Scheduled | SlidingWindow | TimeStepped]) -> None:
+def test_windows_of_half_the_length_have_half_the_error(
+    policy: type[Scheduled | SlidingWindow | TimeStepped],
+) -> None:
     """All fixed windows are of the first order, in time or in space."""
-    reference = passing(EventDriven())
-    coarse, fine = (compare_runs(reference, passing(policy(window_s))) for window_s in (0.08, 0.04))
+    reference = passing_run(EventDriven())
+    errors_of_long_windows, errors_of_short_windows = (
+        compare_runs(reference, passing_run(policy(window_s))) for window_s in (0.08, 0.04)
+    )
     orders = [
         math.log2(coarse_error / fine_error)
         for coarse_error, fine_error in (
-            (coarse.delivery_error_s.mean, fine.delivery_error_s.mean),
-            (coarse.position_error_m.mean, fine.position_error_m.mean),
+            (errors_of_long_windows.delivery_error_s.mean, errors_of_short_windows.delivery_error_s.mean),
+            (errors_of_long_windows.position_error_m.mean, errors_of_short_windows.position_error_m.mean),
         )
         if coarse_error
     ]
@@ -250,12 +261,12 @@ def test_half_the_window_has_half_the_error(policy: type[Scheduled | SlidingWind
     assert orders == pytest.approx([1.0] * len(orders), abs=0.1)
 
 
-@pytest.mark.parametrize(("subscriber_m_s", "word"), [(2.0, "stops"), (2.5, "runs backwards")])
-def test_the_rule_as_printed_fails_if_the_subscriber_is_faster(subscriber_m_s: float, word: str) -> None:
-    with pytest.raises(PolicyError, match=rf"a publishes at 1 m/s to b at {subscriber_m_s:g} m/s.*time {word}"):
-        passing(VelocityAwareRaw(0.001), a_m_s=1.0, b_m_s=subscriber_m_s)
-    # With exchanged speeds the same pair has a window of 2 ms and more.
-    assert passing(VelocityAwareRaw(0.001), a_m_s=subscriber_m_s, b_m_s=1.0, to_ns=100 * MS).fates
+@pytest.mark.parametrize(("subscriber_m_s", "effect"), [(2.0, "stops"), (2.5, "runs backwards")])
+def test_the_rule_as_printed_fails_if_the_subscriber_is_faster(subscriber_m_s: float, effect: str) -> None:
+    with pytest.raises(PolicyError, match=rf"a publishes at 1 m/s to b at {subscriber_m_s:g} m/s.*time {effect}"):
+        passing_run(VelocityAwareRaw(0.001), a_m_s=1.0, b_m_s=subscriber_m_s)
+    # If the speeds are exchanged, the same pair has a window of at least 2 ms.
+    assert passing_run(VelocityAwareRaw(0.001), a_m_s=subscriber_m_s, b_m_s=1.0, to_ns=100 * MS).fates
 
 
 @pytest.mark.parametrize("window_s", [0.0, -1.0, math.inf, math.nan])
@@ -267,7 +278,7 @@ def test_a_window_that_is_not_a_positive_time_is_refused(window_s: float) -> Non
 
 def test_a_window_below_the_physics_step_is_refused() -> None:
     with pytest.raises(PolicyError, match="physics step, 1000000 ns"):
-        passing(SlidingWindow(0.0005))
+        passing_run(SlidingWindow(0.0005))
 
 
 SPEEDS = st.floats(-3, 3)
@@ -277,8 +288,8 @@ STATES = st.tuples(SPEEDS, SPEEDS, SPEEDS).map(lambda velocity: State((0.0, 0.0,
 @given(
     st.lists(STATES, min_size=2, max_size=5), st.floats(0.002, 2), st.floats(0, 5), st.floats(-1, 1), st.booleans()
 )
-def test_error_bounded_keeps_its_bound_for_any_motion_within_the_limits(
-    states: Sequence[State], bound_m: float, limit_m_s2: float, share: float, moves: bool
+def test_error_bounded_satisfies_its_bound_for_any_motion_within_the_limits(
+    states: Sequence[State], bound_m: float, limit_m_s2: float, share: float, assumes_motion: bool
 ) -> None:
     names = [f"r{number}" for number in range(len(states))]
     pairs = [(publisher, subscriber) for publisher in names for subscriber in names if publisher != subscriber]
@@ -292,34 +303,34 @@ def test_error_bounded_keeps_its_bound_for_any_motion_within_the_limits(
         dict.fromkeys(names, limit_m_s2),
         7 * MS,
     )
-    if moves:
+    if assumes_motion:
         situation.assumed_states = situation.states
     try:
         end_ns = ErrorBounded(bound_m, 100.0).next_window(situation)
     except PolicyError:
         # The motion in one step may exceed the bound.
         speeds_m_s = [math.dist(a.velocity_m_s, b.velocity_m_s) for a in [*states, State(STILL)] for b in states]
-        assert not moves
+        assert not assumes_motion
         assert max(speeds_m_s) * 0.001 > bound_m
         return
     window_s = (end_ns - 7 * MS) / 1e9
     assert (end_ns - 7 * MS) % MS == 0
     if end_ns == 8 * MS:
-        return  # the window of one step, in which nothing changes
+        return  # states are constant within a window of one step
     for publisher, subscriber in pairs:
-        ends = (situation.states[name].velocity_m_s for name in (publisher, subscriber))
-        v = [a - b for a, b in zip(*ends, strict=True)]
+        velocities = (situation.states[name].velocity_m_s for name in (publisher, subscriber))
+        v = [a - b for a, b in zip(*velocities, strict=True)]
         # Both accelerate at their limit in opposite directions, along or against their relative velocity.
         speed_m_s = math.hypot(*v)
-        error_m = (0 if moves else speed_m_s * window_s) + share * limit_m_s2 * window_s**2
+        error_m = (0 if assumes_motion else speed_m_s * window_s) + share * limit_m_s2 * window_s**2
         assert abs(error_m) <= bound_m * (1 + 1e-9)
 
 
 class ReplyingProgram:
-    """Replies to every datagram immediately, `times` times."""
+    """A program that replies immediately to the first `times` datagrams."""
 
     def __init__(self, peer: str, times: int, *, begins: bool) -> None:
-        self._peer, self._left, self._begins = peer, times, begins
+        self._peer, self._remaining, self._begins = peer, times, begins
         self.received_ns: list[int] = []
 
     def next_wake_ns(self) -> int | None:
@@ -328,10 +339,10 @@ class ReplyingProgram:
     def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:
         self._begins = False
         self.received_ns += [now_ns for _ in received]
-        self._left -= 1
-        if self._left < 0:
+        self._remaining -= 1
+        if self._remaining < 0:
             return Action()
-        return Action((Datagram(self._peer, 10, f"to {self._peer}", self._left, None),))
+        return Action((Datagram(self._peer, 10, f"to {self._peer}", self._remaining, None),))
 
 
 @pytest.mark.parametrize(
@@ -355,7 +366,7 @@ def test_round_trips_of_immediate_replies_have_the_delay_of_the_policy(policy: S
 
 
 class EndlessWakes:
-    """Wakes endlessly at one time."""
+    """A program that wakes endlessly at one instant."""
 
     def next_wake_ns(self) -> int:
         return 5

@@ -1,4 +1,4 @@
-"""A sync policy of another package: the example of docs/cosim-api.md, loaded by its entry point, and broken ones."""
+"""Sync policies of another package: the example of docs/cosim-api.md, loaded by its entry point, and faulty ones."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -34,7 +34,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
     registry.policies.cache_clear()
 
 
-def page_example() -> tuple[str, str, str]:
+def documented_example() -> tuple[str, str, str]:
     page = (ROOT / "docs" / "cosim-api.md").read_text(encoding="utf-8")
     (source,) = (
         block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "class TimeToContact" in block
@@ -44,8 +44,8 @@ def page_example() -> tuple[str, str, str]:
     return source, entry[1], entry[2]
 
 
-def test_the_policy_of_the_page_runs_by_its_name_with_the_parameters_that_it_has(install: Install) -> None:
-    source, name, target = page_example()
+def test_the_documented_policy_runs_by_its_name_with_the_parameters_that_it_has(install: Install) -> None:
+    source, name, target = documented_example()
     install(source, name, target)
     assert list(registry.policies())[-1] == name
     scenario = load_scenario("convoy", {"policy": {"name": name, "window": "5ms", "longest": "20ms"}})
@@ -67,10 +67,10 @@ def test_a_policy_that_cannot_be_used_is_refused_with_its_package(
 ) -> None:
     module = f"lazy_{len(message)}"
     install(source, "lazy", f"{module}:Lazy")
-    with pytest.raises(ConfigurationError, match=message) as caught:
+    with pytest.raises(ConfigurationError, match=message) as error_info:
         registry.make_policy("lazy")
     assert registry.make_policy("scheduled").name == "scheduled"
-    assert caught.value.where == f"entry point lazy = {module}:Lazy of contact-policy 1.0"
+    assert error_info.value.where == f"entry point lazy = {module}:Lazy of contact-policy 1.0"
 
 
 def test_a_policy_cannot_replace_a_built_in_one(install: Install) -> None:
@@ -79,15 +79,15 @@ def test_a_policy_cannot_replace_a_built_in_one(install: Install) -> None:
         registry.policies()
 
 
-def test_errors_of_its_code_name_the_policy(install: Install) -> None:
-    source, name, target = page_example()
+def test_errors_in_the_code_of_a_policy_name_the_policy(install: Install) -> None:
+    source, name, target = documented_example()
     install(source.replace("window_s=0.001,", "window,"), name, target.replace("contact", "contact_argument"))
     with pytest.raises(ConfigurationError, match=f"the sync policy '{name}' cannot be created: TypeError"):
         registry.make_policy(name)
 
 
-def test_an_end_that_is_not_a_whole_number_is_an_error(install: Install) -> None:
-    source, name, target = page_example()
+def test_a_window_end_that_is_not_a_whole_number_is_an_error(install: Install) -> None:
+    source, name, target = documented_example()
     install(
         source.replace("return situation", "return 0.5 + situation"), name, target.replace("contact", "contact_end")
     )

@@ -1,4 +1,4 @@
-"""Events of EMANE: their bytes compared with protobuf's, axes with PROJ, and the channel on loopback."""
+"""Events of EMANE: their bytes compared with those of protobuf, their axes with PROJ, and the channel on loopback."""
 
 import json
 import math
@@ -91,12 +91,12 @@ def messages() -> dict[str, Any]:
     for name, fields in MESSAGES.items():
         message = file.message_type.add(name=name)
         for field, number, kind in fields:
-            added = message.field.add(name=field, number=number)
-            added.label = Field.LABEL_REPEATED if field in REPEATED else Field.LABEL_OPTIONAL
+            descriptor = message.field.add(name=field, number=number)
+            descriptor.label = Field.LABEL_REPEATED if field in REPEATED else Field.LABEL_OPTIONAL
             if kind in MESSAGES:
-                added.type, added.type_name = Field.TYPE_MESSAGE, f".EMANEMessage.{kind}"
+                descriptor.type, descriptor.type_name = Field.TYPE_MESSAGE, f".EMANEMessage.{kind}"
             else:
-                added.type = getattr(Field, f"TYPE_{kind}")
+                descriptor.type = getattr(Field, f"TYPE_{kind}")
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
     return {
@@ -107,14 +107,14 @@ def messages() -> dict[str, Any]:
 def location_event(messages: dict[str, Any], **options: object) -> Any:  # noqa: ANN401 (a class made at run time)
     event = messages["LocationEvent"]()
     for location in LOCATIONS:
-        added = event.locations.add(nemId=location.nem, **options)
-        added.position.latitudeDegrees = location.latitude_deg
-        added.position.longitudeDegrees = location.longitude_deg
-        added.position.altitudeMeters = location.altitude_m
+        message = event.locations.add(nemId=location.nem, **options)
+        message.position.latitudeDegrees = location.latitude_deg
+        message.position.longitudeDegrees = location.longitude_deg
+        message.position.altitudeMeters = location.altitude_m
         if location.velocity is not None:
-            added.velocity.azimuthDegrees = location.velocity.azimuth_deg
-            added.velocity.elevationDegrees = location.velocity.elevation_deg
-            added.velocity.magnitude = location.velocity.speed_m_s
+            message.velocity.azimuthDegrees = location.velocity.azimuth_deg
+            message.velocity.elevationDegrees = location.velocity.elevation_deg
+            message.velocity.magnitude = location.velocity.speed_m_s
     return event
 
 
@@ -145,10 +145,10 @@ def test_a_datagram_has_the_bytes_of_protobuf_after_its_size(messages: dict[str,
     assert EventDatagram.decode(datagram.encode()) == datagram
 
 
-def test_a_datagram_has_these_bytes() -> None:
-    """Written by hand from the layout of the messages."""
+def test_a_datagram_has_the_bytes_written_by_hand() -> None:
+    """The bytes follow from the layout of the messages."""
     content = b"\x0a\x10" + UUID + b"\x10\xac\x02" + b"\x1a\x0e" + b"\x0a\x0c" + b"\x08\x05\x10\x65\x1a\x06"
-    loss = b"\x0a\x04\x08\x02\x15\x00"  # it ends too early, which the datagram does not check
+    loss = b"\x0a\x04\x08\x02\x15\x00"  # truncated, which the decoder of datagrams does not check
     datagram = EventDatagram(UUID, 300, [SerializedEvent(5, PATHLOSS, loss)])
     assert datagram.encode() == b"\x00\x25" + content + loss
     assert EventDatagram.decode(b"\x00\x25" + content + loss) == datagram
@@ -156,7 +156,7 @@ def test_a_datagram_has_these_bytes() -> None:
         decode_pathlosses(loss)
 
 
-def sized(content: bytes) -> bytes:
+def with_size(content: bytes) -> bytes:
     return struct.pack("!H", len(content)) + content
 
 
@@ -166,11 +166,11 @@ def sized(content: bytes) -> bytes:
         b"",
         b"\x00",
         b"\x00\x05abc",
-        sized(b""),
-        sized(b"\x0a\x02ab"),
-        sized(b"\x0a\x7f"),
-        sized(b"\x0b"),
-        sized(b"\x80" * 11),
+        with_size(b""),
+        with_size(b"\x0a\x02ab"),
+        with_size(b"\x0a\x7f"),
+        with_size(b"\x0b"),
+        with_size(b"\x80" * 11),
         EventDatagram(UUID, 1, [SerializedEvent(1, 100, b"x")]).encode()[:-1],
     ],
 )
@@ -186,13 +186,13 @@ def test_a_malformed_datagram_is_refused(datagram: bytes) -> None:
 )
 def test_altered_bytes_give_an_event_or_the_error(position: int, replacement: bytes, content: bytes) -> None:
     datagram = EventDatagram(UUID, 1, [SerializedEvent(1, 100, content)]).encode()
-    altered = datagram[:position] + replacement + datagram[position + len(replacement) :]
-    for decode in (EventDatagram.decode, lambda data: EventDatagram.decode(sized(data[2:]))):
+    altered_datagram = datagram[:position] + replacement + datagram[position + len(replacement) :]
+    for decode in (EventDatagram.decode, lambda data: EventDatagram.decode(with_size(data[2:]))):
         with suppress(MalformedEventError):
-            for event in decode(altered).events:
-                for read in (decode_locations, decode_pathlosses):
+            for event in decode(altered_datagram).events:
+                for decode_content in (decode_locations, decode_pathlosses):
                     with suppress(MalformedEventError):
-                        assert isinstance(read(event.content), list)
+                        assert isinstance(decode_content(event.content), list)
 
 
 def test_numbers_that_do_not_fit_are_refused() -> None:
@@ -213,9 +213,11 @@ def test_positions_agree_with_proj(reference: tuple[float, float, float]) -> Non
     )
     frame = LocalFrame(reference)
     for position_m in ((0.0, 0.0, 0.0), (120.0, -40.0, 8.5), (-3000.0, 20000.0, 100.0)):
-        place = frame.geodetic(position_m)
-        assert proj.transform(place[1], place[0], place[2]) == pytest.approx(position_m, abs=1e-6)
-        assert frame.position_m(place) == pytest.approx(position_m, abs=1e-6)
+        geodetic_position = frame.geodetic(position_m)
+        assert proj.transform(geodetic_position[1], geodetic_position[0], geodetic_position[2]) == pytest.approx(
+            position_m, abs=1e-6
+        )
+        assert frame.position_m(geodetic_position) == pytest.approx(position_m, abs=1e-6)
     north, east = frame.geodetic((0.0, 100.0, 0.0)), frame.geodetic((100.0, 0.0, 0.0))
     assert north[0] > latitude
     assert east[1] != longitude
@@ -235,7 +237,7 @@ def network() -> Iterator[None]:
         yield
 
 
-def received(listener: EventListener, limit_s: float = 0.0) -> list[SerializedEvent]:
+def receive_all(listener: EventListener, limit_s: float = 0.0) -> list[SerializedEvent]:
     events: list[SerializedEvent] = []
     while (event := listener.receive(limit_s)) is not None:
         events += event
@@ -253,15 +255,15 @@ def test_a_run_publishes_positions_and_path_losses(
         options = "emane.reference=[45.06, 7.66, 240]", "emane.nems={leader: 7, follower: 8, drone: 9}"
         code = main([*words, *(word for option in options for word in ("--set", option))])
         assert code == 0, capsys.readouterr().err
-        events = received(listener)
+        events = receive_all(listener)
     finally:
         listener.close()
     locations = [decode_locations(event.content) for event in events if event.event == LOCATION]
     assert len(locations) == 5  # at 0, 0.1, ..., 0.4 s
     frame = LocalFrame(TURIN)
-    starts = {location.nem: location for location in locations[0]}
+    first_locations = {location.nem: location for location in locations[0]}
     assert {event.nem for event in events if event.event == LOCATION} == {ALL_NEMS}
-    drone = (starts[9].latitude_deg, starts[9].longitude_deg, starts[9].altitude_m)
+    drone = (first_locations[9].latitude_deg, first_locations[9].longitude_deg, first_locations[9].altitude_m)
     assert frame.position_m(drone) == pytest.approx((19.0, 12.0, 8.0), abs=1e-6)
     assert locations[-1][0].velocity is not None
     assert locations[-1][0].velocity.azimuth_deg == pytest.approx(90.0, abs=1.0)  # the leader drives east
@@ -272,7 +274,7 @@ def test_a_run_publishes_positions_and_path_losses(
         9: [7, 8],
     }
     assert losses[7][0].forward_db == losses[8][0].forward_db == losses[7][0].reverse_db
-    assert 40 < losses[7][0].forward_db < 70  # 2 m
+    assert 40 < losses[7][0].forward_db < 70  # at a distance of 2 m
 
 
 STANDING: Final = """
@@ -330,20 +332,20 @@ def test_agents_follow_events(network: None, tmp_path: Path) -> None:
     assert run.wall_s["wait"] > 0.3  # it runs in real time
 
 
-def loss_event(messages: dict[str, Any], to_nem: int, **losses_db: tuple[float, float]) -> SerializedEvent:
+def loss_event(messages: dict[str, Any], receiver_nem: int, **losses_db: tuple[float, float]) -> SerializedEvent:
     """Return an event for a NEM with the bytes of protobuf: forward and reverse losses by the other NEM."""
     event = messages["PathlossEvent"]()
     for nem, (forward_db, reverse_db) in losses_db.items():
         event.pathlosses.add(nemId=int(nem[1:]), forwardPathlossdB=forward_db, reversePathlossdB=reverse_db)
-    return SerializedEvent(to_nem, PATHLOSS, event.SerializeToString())
+    return SerializedEvent(receiver_nem, PATHLOSS, event.SerializeToString())
 
 
 @pytest.mark.emulated
 @pytest.mark.parametrize(
-    ("follows", "expected"), [(True, {"two": False, "far": True}), (False, {"two": True, "far": False})]
+    ("uses_event_losses", "expected"), [(True, {"two": False, "far": True}), (False, {"two": True, "far": False})]
 )
 def test_path_losses_of_events_replace_those_of_the_world(
-    network: None, tmp_path: Path, messages: dict[str, Any], expected: dict[str, bool], *, follows: bool
+    network: None, tmp_path: Path, messages: dict[str, Any], expected: dict[str, bool], *, uses_event_losses: bool
 ) -> None:
     """As in EMANE, a receiver uses the forward loss from each transmitter, and no reverse loss."""
     path = tmp_path / "pair.yaml"
@@ -352,7 +354,7 @@ def test_path_losses_of_events_replace_those_of_the_world(
         "agents.far": {"robot": "husky", "at_m": [10, 50], "radio": {}},
         "traffic": [{"kind": "stream", "name": "state", "from": "one", "to": ["two", "far"], "rate": "20Hz"}],
         "physics.federate": "emane",
-        "physics.options": {"device": "lo", "reference": list(TURIN), "pathloss": follows},
+        "physics.options": {"device": "lo", "reference": list(TURIN), "pathloss": uses_event_losses},
     }
     losses = [
         loss_event(messages, 1, n2=(150.0, 60.0), n3=(70.0, 150.0), n77=(1.0, 1.0)),
@@ -368,7 +370,7 @@ def test_path_losses_of_events_replace_those_of_the_world(
         assert outcomes == {arrives}
 
 
-def test_given_path_losses_have_a_direction() -> None:
+def test_path_losses_of_events_have_a_direction() -> None:
     antennas = {name: Antenna("802.11g", 17.0, -82.0) for name in ("a", "b", "c")}
     channel = WorldChannel(1, antennas, RadioOptions.model_validate({"fading": False}))
     channel.move(0, {"a": (0.0, 0.0, 1.0), "b": (10.0, 0.0, 1.0), "c": (20.0, 0.0, 1.0)})
@@ -385,20 +387,20 @@ def test_given_path_losses_have_a_direction() -> None:
 
 
 @pytest.mark.emulated
-def test_the_physics_emane_passes_the_conformance_suite(network: None) -> None:
+def test_the_physics_emane_passes_the_conformance_checks(network: None) -> None:
     scenario = load_scenario("convoy", {"physics.options": {"device": "lo", "reference": list(TURIN)}})
     world = load_world(scenario.world)
     hello = make_hello(scenario, world, make_bodies(scenario, world), 1, PHYSICS)
-    starts = [agent.start.position_m for agent in hello.agents]
-    with publishing(*starts):
+    start_positions_m = [agent.start.position_m for agent in hello.agents]
+    with publishing(*start_positions_m):
         results = list(run_checks(Target(Pair(_load()), hello, windows=100)))
     assert [result for result in results if result.failure] == []
-    checked = {result.name for result in results if not result.skipped}
-    assert {"start", "remainders", "unknown_command", "fork_absence"} <= checked
+    check_names = {result.name for result in results if not result.skipped}
+    assert {"start", "remainders", "unknown_command", "fork_absence"} <= check_names
 
 
 @pytest.mark.emulated
-def test_what_the_physics_emane_cannot_do_is_refused(network: None) -> None:
+def test_commands_and_invalid_options_of_the_physics_emane_are_refused(network: None) -> None:
     scenario = load_scenario("convoy", {"physics.options": {"device": "lo"}})
     world = load_world(scenario.world)
     hello = make_hello(scenario, world, make_bodies(scenario, world), 1, PHYSICS)
@@ -411,9 +413,9 @@ def test_what_the_physics_emane_cannot_do_is_refused(network: None) -> None:
         ({"nems": {"leader": 1}}, "nems must list each agent once: follower is missing"),
         ({"nems": {"leader": 1, "follower": 1, "drone": 2}}, "two agents have the same identifier"),
     ):
-        changed = replace(hello, configuration=json.dumps({"options": options}).encode())
+        changed_hello = replace(hello, configuration=json.dumps({"options": options}).encode())
         with pytest.raises(ValueError, match=message):
-            EmaneLocations(changed)
+            EmaneLocations(changed_hello)
     with pytest.raises(ConfigurationError, match="there is no network interface 'none0'"):
         EventListener(CHANNEL, "none0")
 

@@ -66,7 +66,7 @@ def test_both_topics_are_recorded_completely_at_their_rates(shell: Shell, tmp_pa
     images, packets = messages.values()
     assert {(image.width, image.height, len(image.data)) for image in images} == {(320, 240, 320 * 240 * 3)}
     numbers = [image.header.seq for image in images]
-    assert numbers == list(range(numbers[0], numbers[0] + len(images))), "none is lost"
+    assert numbers == list(range(numbers[0], numbers[0] + len(images))), "no message is lost"
     assert {len(message.packet.data) for message in packets} == {12_000}
     assert 10 <= len(images) <= 31, "3 s of 10 Hz, less the time to subscribe"
     assert 20 <= len(packets) <= 62

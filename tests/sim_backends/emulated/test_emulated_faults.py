@@ -49,8 +49,8 @@ def output_of(shell: Shell, *argv: str) -> str:
     return shell.run(argv, deadline=Deadline.after(LONG_S)).stdout.decode()
 
 
-def wait_healed(shell: Shell, condition: Callable[[], bool] = lambda: True) -> None:
-    """Return when the robot is reachable and `condition` holds."""
+def wait_for_recovery(shell: Shell, condition: Callable[[], bool] = lambda: True) -> None:
+    """Return when the robot is reachable and the condition is true."""
     deadline = Deadline.after(LONG_S)
     while True:
         try:
@@ -59,17 +59,17 @@ def wait_healed(shell: Shell, condition: Callable[[], bool] = lambda: True) -> N
                 return
         except (LinkError, RobotError):
             pass
-        assert not deadline.expired, "it did not heal"
+        assert not deadline.expired, "the robot did not recover"
         time.sleep(0.01)
 
 
-def reaches(emulation: EmulatedTestbed, role: Role, of: Role, *, within_s: float = 10.0) -> bool:
+def reaches(emulation: EmulatedTestbed, role: Role, target: Role, *, within_s: float = 10.0) -> bool:
     """Return True if one robot gets an answer from another over the radio."""
-    argv = ("ping", "-c", "1", "-W", f"{within_s:g}", emulation.robots[of].spec.ip)
+    argv = ("ping", "-c", "1", "-W", f"{within_s:g}", emulation.robots[target].spec.ip)
     return emulation.shells[role].run(argv, deadline=Deadline.after(LONG_S), check=False).exit_code == 0
 
 
-def names(shell: Shell) -> list[str]:
+def process_names(shell: Shell) -> list[str]:
     return output_of(shell, "sh", "-c", "cat /proc/[0-9]*/comm 2>/dev/null || true").split()  # some exit meanwhile
 
 
@@ -84,11 +84,13 @@ def test_a_link_goes_down_and_comes_up_with_all_its_routes(emulation: EmulatedTe
 
 
 def test_the_duration_of_a_fault_is_returned(emulation: EmulatedTestbed) -> None:
-    lasted_s = emulation.inject(Fault(FaultKind.LINK_DOWN, Role.RECEIVER, 0.3))
-    assert lasted_s is not None
-    assert 0.3 <= lasted_s < LONG_S
+    duration_s = emulation.inject(Fault(FaultKind.LINK_DOWN, Role.RECEIVER, 0.3))
+    assert duration_s is not None
+    assert 0.3 <= duration_s < LONG_S
     assert emulation.inject(Fault(FaultKind.KILL, Role.RECEIVER, process="sensors")) == 0.0
-    wait_healed(emulation.shells[Role.RECEIVER], lambda: "sensors" in names(emulation.shells[Role.RECEIVER]))
+    wait_for_recovery(
+        emulation.shells[Role.RECEIVER], lambda: "sensors" in process_names(emulation.shells[Role.RECEIVER])
+    )
 
 
 @pytest.mark.parametrize("unreachable", FIXED_ROLES)
@@ -98,7 +100,7 @@ def test_a_robot_out_of_range_is_unreachable_and_without_the_relay_all_are(
     assert reaches(emulation, Role.SENDER, Role.RECEIVER)
     with inject_until_exit(emulation, Fault(FaultKind.OUT_OF_RANGE, unreachable, 1.5)):
         wait_until(lambda: not reaches(emulation, Role.SENDER, Role.RECEIVER, within_s=0.3), Deadline.after(LONG_S))
-    assert reaches(emulation, Role.SENDER, Role.RECEIVER), "back in its place"
+    assert reaches(emulation, Role.SENDER, Role.RECEIVER), "all robots are back at their places"
 
 
 def test_a_reboot_kills_every_process_and_keeps_only_the_sd_card(emulation: EmulatedTestbed) -> None:
@@ -116,17 +118,17 @@ def test_a_reboot_kills_every_process_and_keeps_only_the_sd_card(emulation: Emul
     start_s = time.monotonic()
     assert emulation.inject(Fault(FaultKind.REBOOT, Role.SENDER)) == 0.0
     assert time.monotonic() - start_s >= BOOT_S
-    wait_healed(sender, lambda: {"sshd", "sensors"} <= set(names(sender)))
-    assert "sleep" not in names(sender)
+    wait_for_recovery(sender, lambda: {"sshd", "sensors"} <= set(process_names(sender)))
+    assert "sleep" not in process_names(sender)
     assert re.fullmatch(r"[0-9a-f-]{36}\n", boot_id)
     assert output_of(sender, "cat", BOOT_ID) not in {
         boot_id,
         output_of(emulation.shells[Role.RECEIVER], "cat", BOOT_ID),
     }
-    left = output_of(
+    remaining_files = output_of(
         sender, "sh", "-c", 'ls -d "$@" /tmp/deep 2>/dev/null; true', "sh", *VOLATILE, *PERSISTENT
     ).split()
-    assert sorted(left) == sorted(PERSISTENT)
+    assert sorted(remaining_files) == sorted(PERSISTENT)
     assert "224.0.0.0/4" in output_of(sender, "ip", "route")
     assert reaches(emulation, Role.RECEIVER, Role.SENDER)
 
@@ -134,12 +136,12 @@ def test_a_reboot_kills_every_process_and_keeps_only_the_sd_card(emulation: Emul
 def test_a_robot_records_again_after_a_reboot_and_after_its_sensors_died(emulation: EmulatedTestbed) -> None:
     sender = emulation.shells[Role.SENDER]
     emulation.inject(Fault(FaultKind.REBOOT, Role.SENDER))
-    wait_healed(sender, lambda: _records(sender, "after-reboot"))
+    wait_for_recovery(sender, lambda: records_scan(sender, "after-reboot"))
     emulation.inject(Fault(FaultKind.KILL, Role.SENDER, process="sensors"))
-    wait_healed(sender, lambda: _records(sender, "after-kill"))
+    wait_for_recovery(sender, lambda: records_scan(sender, "after-kill"))
 
 
-def _records(shell: Shell, name: str) -> bool:
+def records_scan(shell: Shell, name: str) -> bool:
     result = shell.run(("bash", "-c", RECORD, name), deadline=Deadline.after(LONG_S), check=False)
     return result.stdout.decode().endswith(f"{name}.bag\n")
 
@@ -151,21 +153,21 @@ def test_a_robot_without_power_is_unreachable(emulation: EmulatedTestbed) -> Non
         robot.connect(5.0)
     wait_until(lambda: not reaches(emulation, Role.SENDER, Role.RECEIVER, within_s=0.3), Deadline.after(LONG_S))
     robot.boot()
-    wait_healed(emulation.shells[Role.RECEIVER])
+    wait_for_recovery(emulation.shells[Role.RECEIVER])
 
 
 def test_a_killed_server_restarts_with_another_process_id(emulation: EmulatedTestbed) -> None:
     sender = emulation.shells[Role.SENDER]
     listener = ("sh", "-c", "cd /proc; for p in [0-9]*; do echo sshd | cmp -s - $p/comm && echo $p && break; done")
-    before = output_of(sender, *listener)
+    pid_before = output_of(sender, *listener)
     emulation.inject(Fault(FaultKind.KILL, Role.SENDER, process="sshd"))
-    wait_healed(sender, lambda: output_of(sender, *listener) != before)
+    wait_for_recovery(sender, lambda: output_of(sender, *listener) != pid_before)
 
 
 def test_a_process_that_does_not_run_cannot_be_killed(emulation: EmulatedTestbed) -> None:
-    with pytest.raises(RobotError, match="no process named roscore runs") as caught:
+    with pytest.raises(RobotError, match="no process named roscore runs") as error_info:
         emulation.inject(Fault(FaultKind.KILL, Role.SENDER, process="roscore"))
-    assert "/proc/[0-9]*/comm" in caught.value.remedy
+    assert "/proc/[0-9]*/comm" in error_info.value.remedy
 
 
 def test_a_request_with_a_short_timeout_does_not_affect_later_ones(emulation: EmulatedTestbed) -> None:

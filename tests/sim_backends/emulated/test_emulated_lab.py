@@ -86,15 +86,17 @@ def output_of(shell: Shell, *argv: str, seconds: float = 30.0) -> str:
     return shell.run(argv, deadline=Deadline.after(seconds)).stdout.decode()
 
 
-def in_ros(shell: Shell, *argv: str) -> str:
+def run_in_ros(shell: Shell, *argv: str) -> str:
     return output_of(shell, *with_environment(argv, setup=[SETUP]), seconds=60)
 
 
 def messages_in(bag: Path, topic: str) -> list[Any]:
     store = standard_types().ros1
     with Reader(bag) as reader:
-        chosen = [connection for connection in reader.connections if connection.topic == topic]
-        return [store.deserialize_ros1(data, connection.msgtype) for connection, _, data in reader.messages(chosen)]
+        connections = [connection for connection in reader.connections if connection.topic == topic]
+        return [
+            store.deserialize_ros1(data, connection.msgtype) for connection, _, data in reader.messages(connections)
+        ]
 
 
 def namespaces_of(pid: int) -> set[str]:
@@ -137,7 +139,7 @@ def test_robots_reach_each_other_over_the_medium(emulation: EmulatedTestbed) -> 
 
 
 @pytest.mark.parametrize("destination", ["10.42.0.255", "255.255.255.255", "239.1.1.1"])
-def test_broadcast_and_multicast_leave_by_the_radio(sender: Shell, destination: str) -> None:
+def test_broadcast_and_multicast_are_sent_by_the_radio(sender: Shell, destination: str) -> None:
     assert "dev wlan0" in output_of(sender, "ip", "route", "get", destination)
 
 
@@ -145,14 +147,14 @@ def test_the_kernel_sends_nothing_without_a_request(sender: Shell) -> None:
     assert output_of(sender, "ip", "-6", "address") == ""
 
 
-def test_tcpdump_writes_where_root_does(emulation: EmulatedTestbed) -> None:
+def test_tcpdump_writes_captures_into_folders_of_root(emulation: EmulatedTestbed) -> None:
     script = (
         "umask 077; mkdir -p ~/deep/er && cd ~/deep/er && "
         "{ timeout 10 tcpdump -n -i wlan0 -c 2 -w x.pcap & } && "
         "until [ -e x.pcap ]; do sleep 0.01; done && ping -q -c 5 -i 0.05 10.42.0.3 && wait && stat -c %s x.pcap"
     )
     size_bytes = int(output_of(emulation.shells[Role.SENDER], "bash", "-c", script).splitlines()[-1])
-    # A file header of 24 bytes, and per packet 16 and a ping of 84 bytes.
+    # The file has a header of 24 bytes, and for each packet a header of 16 bytes and a ping of 84 bytes.
     assert size_bytes == 24 + 2 * (16 + 84)
 
 
@@ -166,11 +168,11 @@ def test_no_signal_is_ignored_or_blocked_in_a_session(sender: Shell) -> None:
     assert int(status["SigBlk"], 16) & standard == 0
 
 
-def test_only_the_lab_s_key_logs_in(emulation: EmulatedTestbed) -> None:
+def test_only_the_key_of_the_lab_can_log_in(emulation: EmulatedTestbed) -> None:
     robot = emulation.robots[Role.SENDER]
     # OpenSSH 9.9 prints its comments to standard output, too.
-    printed = output_of(emulation.shells[Role.SENDER], "ssh-keyscan", "127.0.0.1").splitlines()
-    _, host_key = next(line for line in printed if not line.startswith("#")).split(maxsplit=1)
+    key_lines = output_of(emulation.shells[Role.SENDER], "ssh-keyscan", "127.0.0.1").splitlines()
+    _, host_key = next(line for line in key_lines if not line.startswith("#")).split(maxsplit=1)
     other_login = SshShell(
         robot.name,
         connect=robot.connect,
@@ -186,12 +188,12 @@ def test_only_the_lab_s_key_logs_in(emulation: EmulatedTestbed) -> None:
 def rate_of(times_s: list[float]) -> float:
     """Return the messages per second, insensitive to one late message at either end."""
     half = len(times_s) // 2
-    return half / median(later - sooner for sooner, later in zip(times_s[:half], times_s[half:], strict=False))
+    return half / median(later - earlier for earlier, later in zip(times_s[:half], times_s[half:], strict=False))
 
 
 @pytest.mark.quiet
 def test_a_recorded_scan_has_the_sensor_s_rate_and_the_real_size(sender: Shell, tmp_path: Path) -> None:
-    in_ros(sender, "rosbag", "record", "--duration=5", "-O", "scan", "/scan")
+    run_in_ros(sender, "rosbag", "record", "--duration=5", "-O", "scan", "/scan")
     bag = tmp_path / "scan.bag"
     sender.fetch(("cat", "scan.bag"), bag, deadline=Deadline.after(30), limit_bytes=1 << 20)
     scans = messages_in(bag, "/scan")
@@ -202,15 +204,16 @@ def test_a_recorded_scan_has_the_sensor_s_rate_and_the_real_size(sender: Shell, 
     assert rate_of(stamps_s) == pytest.approx(5.0, rel=0.01)
     assert {scan.header.frame_id for scan in scans} == {"base_scan"}
     assert all(len(scan.ranges) == len(scan.intensities) == 360 for scan in scans)
-    # facts, section 1, with a frame of 9 letters: 57 + 4 + 8 * 360 bytes a message and 58 of the bag, 9,063 in all.
-    # Without ROS the message definition, which is in a bag twice, has no comments: 5,387 in all.
+    # A message with a frame of 9 letters has 57 + 4 + 8 * 360 bytes, and the bag adds 58 bytes to each. The rest of
+    # the bag has 9,063 bytes with ROS, and 5,387 without, because the message definition, which a bag contains twice,
+    # then has no comments.
     assert bag.stat().st_size - len(scans) * (57 + 4 + 8 * 360 + 58) in {9_063, 5_387}
 
 
 @pytest.mark.quiet
 def test_all_topics_keep_their_rates(sender: Shell, tmp_path: Path) -> None:
     rates_hz = {topic.name: topic.rate for topic in ros_of(master_cast()[Role.SENDER].profile).topics}
-    in_ros(sender, "rosbag", "record", "--duration=3", "-O", "all", *rates_hz)
+    run_in_ros(sender, "rosbag", "record", "--duration=3", "-O", "all", *rates_hz)
     bag = tmp_path / "all.bag"
     sender.fetch(("cat", "all.bag"), bag, deadline=Deadline.after(30), limit_bytes=8 << 20)
     for topic, rate_hz in rates_hz.items():
@@ -226,7 +229,7 @@ def test_all_topics_keep_their_rates(sender: Shell, tmp_path: Path) -> None:
 def test_a_lab_stops_after_any_error(error: type[BaseException]) -> None:
     processes: set[int] = set()
 
-    def use() -> None:
+    def run_lab() -> None:
         with testbed.bring_up(
             master_cast(), options=EmulatedOptions(), world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1
         ) as robots:
@@ -235,12 +238,12 @@ def test_a_lab_stops_after_any_error(error: type[BaseException]) -> None:
             raise error
 
     with pytest.raises(error):
-        use()
+        run_lab()
     assert len(processes) > 3 * 4
     wait_for_end(processes, within_s=0.0)
 
 
-def owner(folder: Path) -> tuple[subprocess.Popen[str], dict[str, Any]]:
+def start_owner(folder: Path) -> tuple[subprocess.Popen[str], dict[str, Any]]:
     """Start a process that owns a lab; `folder` is the clone that it runs from."""
     process = subprocess.Popen(
         [sys.executable, "-c", OWNER],
@@ -255,7 +258,7 @@ def owner(folder: Path) -> tuple[subprocess.Popen[str], dict[str, Any]]:
 
 
 def test_sigkill_of_the_owner_leaves_no_processes(untouched: NamespaceComparison) -> None:
-    process, pids = owner(ROOT)
+    process, pids = start_owner(ROOT)
     lab_pids = {pid for root in (*pids["robots"], pids["medium"]) for pid in (root, *descendants(root))}
     namespaces = set().union(*(namespaces_of(pid) for robot in pids["robots"] for pid in descendants(robot)))
     namespaces -= namespaces_of(os.getpid())
@@ -268,19 +271,19 @@ def test_sigkill_of_the_owner_leaves_no_processes(untouched: NamespaceComparison
 
 
 @pytest.mark.parametrize("parent", mark_nightly(["/root", "/tmp", "/opt"]))
-def test_a_clone_anywhere_works(parent: str) -> None:
+def test_a_clone_works_in_any_folder(parent: str) -> None:
     folder = Path(parent, f"fieldkit clone {os.getpid()}")
     try:
         for name in ("fieldkit", "sim_backends", "robots"):
             shutil.copytree(ROOT / name, folder / name)  # with compiled modules, which saves time
-        process, _ = owner(folder)
+        process, _ = start_owner(folder)
         process.communicate("", timeout=60)
         assert process.returncode == 0
     finally:
         shutil.rmtree(folder)
 
 
-def lone_robot(stack: ExitStack, **changes: str) -> EmulatedRobot:
+def robot_without_lab(stack: ExitStack, **changes: str) -> EmulatedRobot:
     cast = master_cast()
     spec = robot_spec(cast, Role.SENDER, ros=RosChoice.BUILTIN, login=KeyPair.make(), host_key=KeyPair.make())
     return stack.enter_context(EmulatedRobot(replace(spec, **changes)))  # type: ignore[arg-type]
@@ -288,17 +291,17 @@ def lone_robot(stack: ExitStack, **changes: str) -> EmulatedRobot:
 
 def test_a_server_that_does_not_start_is_named_with_its_output() -> None:
     with ExitStack() as stack:
-        robot = lone_robot(stack, host_key="no key")
+        robot = robot_without_lab(stack, host_key="no key")
         robot.build()
         robot.open_radio()
         with pytest.raises(RobotError, match=r"turtlebot-1: sshd exited with status 1: .*no hostkeys available"):
             robot.start()
 
 
-def test_a_robot_takes_less_than_15_mb_beyond_shared_pages() -> None:
-    """Two robots run, so that the pages of programs are shared whatever else runs on this machine."""
+def test_a_robot_uses_less_than_15_mb_of_unshared_memory() -> None:
+    """Two robots run, so that pages of programs are shared even if no other program on this machine uses them."""
     with ExitStack() as stack:
-        robots = [lone_robot(stack) for _ in range(2)]
+        robots = [robot_without_lab(stack) for _ in range(2)]
         for robot in robots:
             robot.build()
             robot.open_radio()
@@ -308,7 +311,7 @@ def test_a_robot_takes_less_than_15_mb_beyond_shared_pages() -> None:
 
 def test_a_rejected_address_is_reported() -> None:
     with ExitStack() as stack:
-        robot = lone_robot(stack, address="10.42.0.1/99")
+        robot = robot_without_lab(stack, address="10.42.0.1/99")
         robot.build()
         with pytest.raises(RobotError, match="turtlebot-1: ip rejected a setting"):
             robot.open_radio()
@@ -316,7 +319,7 @@ def test_a_rejected_address_is_reported() -> None:
 
 def test_a_killed_robot_is_reported() -> None:
     with ExitStack() as stack:
-        robot = lone_robot(stack)
+        robot = robot_without_lab(stack)
         robot.build()
         os.kill(robot.pid, signal.SIGKILL)
         with pytest.raises(TestbedLostError, match=r"turtlebot-1, pid .* does not answer: it was killed by SIGKILL"):

@@ -94,7 +94,7 @@ def cast_for(topology: Topology) -> Cast:
     return EmulatedBackend(None, None).cast(topology)
 
 
-def placed(scenario: Scenario, topology: Topology) -> Placement:
+def placement_of(scenario: Scenario, topology: Topology) -> Placement:
     return Placement(scenario, topology, parse_distance("10m"))
 
 
@@ -107,7 +107,7 @@ def read_back(data: bytes, kind: str) -> Any:  # noqa: ANN401 (rosbags makes its
 
 
 class TestBackend:
-    def test_the_default_lab_is_that_of_the_paper(self) -> None:
+    def test_the_default_lab_has_the_robots_of_the_paper(self) -> None:
         master, masterless = cast_for(Topology.MASTER), cast_for(Topology.MASTERLESS)
         assert {role: (robot.name, robot.address) for role, robot in master.items()} == {
             Role.SENDER: ("turtlebot-1", "10.42.0.1"),
@@ -167,7 +167,7 @@ class TestPlacement:
 
     def test_master_puts_the_relay_between_the_stations(self) -> None:
         cast = cast_for(Topology.MASTER)
-        los = placed(Scenario.LOS, Topology.MASTER)
+        los = placement_of(Scenario.LOS, Topology.MASTER)
         assert placement.positions_m(cast, los, self.LAWN) == {
             "turtlebot-1": pytest.approx((3.0, 6.0, 0.2)),
             "duckiedrone-1": pytest.approx((13.0, 6.0, 0.2)),
@@ -177,32 +177,36 @@ class TestPlacement:
 
     def test_masterless_puts_sender_and_receiver_the_distance_apart(self) -> None:
         cast = cast_for(Topology.MASTERLESS)
-        nlos = placed(Scenario.NLOS, Topology.MASTERLESS)
+        nlos = placement_of(Scenario.NLOS, Topology.MASTERLESS)
         positions = placement.positions_m(cast, nlos, self.LAWN)
         assert positions == {
             "turtlebot-1": pytest.approx((3.0, 18.0, 0.2)),
             "duckiedrone-1": pytest.approx((13.0, 18.0, 0.2)),
         }
         assert placement.relay(cast, nlos) is None
-        ends = (np.array([positions[name]]) for name in ("turtlebot-1", "duckiedrone-1"))
-        assert self.LAWN.crossings(*ends) != [()], "the sender is behind the wall"
+        endpoints = (np.array([positions[name]]) for name in ("turtlebot-1", "duckiedrone-1"))
+        assert self.LAWN.crossings(*endpoints) != [()], "the sender is behind the wall"
 
     def test_a_world_without_a_line_for_the_scenario_is_refused(self) -> None:
         without_lines = self.LAWN.model_copy(update={"lines": {}})
         with pytest.raises(ConfigurationError, match="no line for the positions of robots in the scenario los"):
-            placement.positions_m(cast_for(Topology.MASTER), placed(Scenario.LOS, Topology.MASTER), without_lines)
+            placement.positions_m(
+                cast_for(Topology.MASTER), placement_of(Scenario.LOS, Topology.MASTER), without_lines
+            )
 
 
 class TestRequirements:
     def test_missing_programs_are_named_with_their_packages(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr("os.geteuid", lambda: 0)
-        missing = {"sshd", "ping"}
-        monkeypatch.setattr("shutil.which", lambda name, **_: None if name in missing else f"/usr/bin/{name}")
-        with pytest.raises(ConfigurationError, match="sshd, ping") as caught:
+        missing_programs = {"sshd", "ping"}
+        monkeypatch.setattr(
+            "shutil.which", lambda name, **_: None if name in missing_programs else f"/usr/bin/{name}"
+        )
+        with pytest.raises(ConfigurationError, match="sshd, ping") as error_info:
             requirements.check()
-        assert caught.value.remedy.endswith("iputils-ping openssh-server")
+        assert error_info.value.remedy.endswith("iputils-ping openssh-server")
 
-    def test_ros_is_debian_s_where_it_is_installed(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def test_debians_ros_is_used_if_it_is_installed(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         monkeypatch.setattr(emulated_options, "ROS_FILES", (str(tmp_path),))
         assert requirements.ros_in_use(RosChoice.AUTO) is RosChoice.DEBIAN
         assert requirements.ros_in_use(RosChoice.BUILTIN) is RosChoice.BUILTIN
@@ -213,12 +217,12 @@ class TestRequirements:
 
 
 ROOM = LaserTarget(((2.0, 1.5), (-2.0, 1.5), (-2.0, -1.5), (2.0, -1.5)), 0.0, 0.0, 2.0)
-"""Around a robot in the origin, facing east."""
+"""Walls around a robot at the origin that faces east."""
 
 
 class TestMessages:
     @pytest.mark.parametrize("kind", messages.GENERATORS)
-    def test_every_type_reads_back_to_the_last_byte(self, kind: str) -> None:
+    def test_a_message_of_every_type_is_read_back_to_the_last_byte(self, kind: str) -> None:
         data = messages.Source(sensor(kind)).message(7, 1_500_000_000_123_456_789)
         message = read_back(data, kind)
         header = message.transforms[0].header if kind == "tf2_msgs/TFMessage" else message.header
@@ -242,7 +246,7 @@ class TestMessages:
         assert statistics.mean(turns) == pytest.approx(0.0, abs=0.0005)
         assert statistics.mean(imu.linear_acceleration.z for imu in imus) == pytest.approx(9.80665, abs=0.005)
 
-    def test_a_scan_shows_the_walls_of_the_room(self) -> None:
+    def test_the_ranges_of_a_scan_are_the_distances_to_the_walls(self) -> None:
         source = messages.Source(sensor(points=4), [ROOM])
         scans = [read_back(source.message(number, 0), "sensor_msgs/LaserScan") for number in range(200)]
         means_m = [statistics.mean(float(scan.ranges[beam]) for scan in scans) for beam in range(4)]
@@ -255,13 +259,15 @@ class TestMessages:
         assert "float32[] ranges" in definition("sensor_msgs/LaserScan").text
 
     @pytest.mark.parametrize("profile", locations.names("robots"))
-    def test_every_profile_s_topics_can_be_published(self, profile: str) -> None:
+    def test_the_topics_of_every_profile_can_be_published(self, profile: str) -> None:
         for topic in load_profile(profile).topics:
             sensor_specs.check(_sensor(topic))
 
-    def test_a_scan_has_the_real_size_and_is_within_the_laser_s_range(self) -> None:
+    def test_a_scan_has_the_real_size_and_is_within_the_range_of_the_laser(self) -> None:
         data = messages.Source(sensor(), [ROOM]).message(0, 0)
-        assert len(data) == 57 + 4 + 8 * 360  # facts, section 1: 57 + 8 per beam with a frame of 5 letters
+        assert (
+            len(data) == 57 + 4 + 8 * 360
+        )  # 57 bytes with a frame of 5 letters, 4 more letters, and 8 bytes per beam
         scan = read_back(data, "sensor_msgs/LaserScan")
         low_m, high_m = messages.LASER_RANGE_M
         assert low_m <= scan.ranges.min() <= scan.ranges.max() <= high_m + 1e-6
@@ -282,12 +288,12 @@ class TestTcpros:
     def test_a_header_is_read_from_chunks_of_any_size(self, fields: dict[str, str], cut: int) -> None:
         stream = framing.pack(framing.pack_header(fields)) + framing.pack(b"message")
         packets = framing.PacketSplitter()
-        received: list[bytes] = []
+        received_packets: list[bytes] = []
         for start in range(0, len(stream), cut):
             packets.feed(stream[start : start + cut])
-            received += packets
-        assert framing.unpack_header(received[0]) == fields
-        assert received[1:] == [b"message"]
+            received_packets += packets
+        assert framing.unpack_header(received_packets[0]) == fields
+        assert received_packets[1:] == [b"message"]
         assert packets.pending == 0
 
     def test_a_truncated_header_is_rejected(self) -> None:
@@ -319,11 +325,11 @@ class TestSystem:
         )
         assert result.stdout == f"{setup.parent}/bin:/bin\nnoetic http://127.0.0.1:11311\n"
 
-    def test_only_outermost_paths_inside_own_folders_are_bound(self) -> None:
+    def test_only_outermost_paths_inside_folders_of_the_robot_are_mounted(self) -> None:
         paths = [Path("/opt/a/b"), Path("/opt/a"), Path("/usr/lib"), Path("/root"), Path("/root/.pyenv/x")]
         assert set(mounts._outermost(paths)) == {Path("/opt/a"), Path("/root/.pyenv/x")}
 
-    def test_keys_are_in_openssh_format_and_new_each_time(self) -> None:
+    def test_keys_are_in_openssh_format_and_different_each_time(self) -> None:
         first, second = KeyPair.make(), KeyPair.make()
         assert first.private.startswith("-----BEGIN OPENSSH PRIVATE KEY-----\n")
         assert first.public.startswith("ssh-ed25519 AAAA")

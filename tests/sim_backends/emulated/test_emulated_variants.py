@@ -1,4 +1,4 @@
-"""Robots with other tools than this machine: the program with a tool's name is really that variant."""
+"""Robots with other tools than this machine: a tool's name starts the configured variant."""
 
 import contextlib
 import io
@@ -71,7 +71,7 @@ def emulation() -> Iterator[EmulatedTestbed]:
 
 
 def output_of(emulation: EmulatedTestbed, role: Role, *argv: str) -> str:
-    """Return both output streams of a program that may fail: some print their version in this way."""
+    """Return both output streams of a program that may fail: some programs print their version and fail."""
     result = emulation.shells[role].run(argv, deadline=Deadline.after(60), check=False)
     return (result.stdout + result.stderr).decode()
 
@@ -82,11 +82,13 @@ def has_program(emulation: EmulatedTestbed, role: Role, program: str) -> bool:
 
 @pytest.mark.emulated
 @pytest.mark.parametrize(
-    ("role", "words"),
+    ("role", "output_part"),
     [(Role.SENDER, "BusyBox"), (Role.RECEIVER, "OpenBSD netcat"), (Role.RELAY, "Ncat 7")],
 )
-def test_the_netcat_of_a_robot_is_the_only_one_it_has(emulation: EmulatedTestbed, role: Role, words: str) -> None:
-    assert words in output_of(emulation, role, "nc", "-h")
+def test_the_netcat_of_a_robot_is_the_only_one_it_has(
+    emulation: EmulatedTestbed, role: Role, output_part: str
+) -> None:
+    assert output_part in output_of(emulation, role, "nc", "-h")
     expected = {Role.SENDER: set(), Role.RECEIVER: {"nc.openbsd"}, Role.RELAY: {"ncat"}}[role]
     assert {
         name for name in ("nc.traditional", "nc.openbsd", "ncat") if has_program(emulation, role, name)
@@ -95,11 +97,11 @@ def test_the_netcat_of_a_robot_is_the_only_one_it_has(emulation: EmulatedTestbed
 
 @pytest.mark.emulated
 @pytest.mark.parametrize(
-    ("role", "words"), [(Role.SENDER, "seq=0"), (Role.RECEIVER, "seq=0"), (Role.RELAY, "icmp_seq=1")]
+    ("role", "output_part"), [(Role.SENDER, "seq=0"), (Role.RECEIVER, "seq=0"), (Role.RELAY, "icmp_seq=1")]
 )
-def test_the_ping_of_a_robot_crosses_the_radio(emulation: EmulatedTestbed, role: Role, words: str) -> None:
+def test_the_ping_of_a_robot_crosses_the_radio(emulation: EmulatedTestbed, role: Role, output_part: str) -> None:
     other = "10.42.0.1" if role is Role.RELAY else "10.42.0.3"
-    assert words in output_of(emulation, role, "ping", "-c", "1", other)
+    assert output_part in output_of(emulation, role, "ping", "-c", "1", other)
 
 
 @pytest.mark.emulated
@@ -114,11 +116,13 @@ def test_a_busybox_userland_has_no_other_programs(emulation: EmulatedTestbed, ro
 
 @pytest.mark.emulated
 def test_a_busybox_robot_records_and_captures(emulation: EmulatedTestbed) -> None:
-    words = ("rosbag", "record", "--duration=0.5", "-O", "scan", "/scan")
-    assert "Recording to 'scan.bag'" in output_of(emulation, Role.SENDER, *with_environment(words, setup=[SETUP]))
+    record_command = ("rosbag", "record", "--duration=0.5", "-O", "scan", "/scan")
+    assert "Recording to 'scan.bag'" in output_of(
+        emulation, Role.SENDER, *with_environment(record_command, setup=[SETUP])
+    )
     capture = "timeout 10 tcpdump -n -i wlan0 -c 2 -w x.pcap 2>/dev/null; wc -c <x.pcap"
     output = output_of(emulation, Role.SENDER, "sh", "-c", f"ping -q -c 50 -i 0.1 10.42.0.3 >/dev/null & {capture}")
-    # A file header of 24 bytes, and per packet 16 and a ping of 84 bytes.
+    # The file has a header of 24 bytes, and for each packet a header of 16 bytes and a ping of 84 bytes.
     assert int(output) == 24 + 2 * (16 + 84)
 
 
@@ -150,13 +154,13 @@ def test_a_robot_with_other_tools_recovers_from_a_reboot(emulation: EmulatedTest
     boot = ("cat", "/proc/sys/kernel/random/boot_id")
     before = output_of(emulation, Role.SENDER, *boot)
     emulation.inject(Fault(FaultKind.REBOOT, Role.SENDER))
-    assert until(
+    assert wait_for(
         lambda: emulation.shells[Role.SENDER].run(boot, deadline=Deadline.after(20)).stdout.decode() != before
     )
     assert "seq=0" in output_of(emulation, Role.SENDER, "ping", "-c", "1", "10.42.0.3")
 
 
-def until(condition: Callable[[], bool]) -> bool:
+def wait_for(condition: Callable[[], bool]) -> bool:
     deadline = Deadline.after(60)
     while not deadline.expired:
         with contextlib.suppress(LinkError):
@@ -176,16 +180,16 @@ def test_options_name_robots_of_the_lab() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "message"),
+    ("invalid_option", "message"),
     [
         ("netcat: bsd", "in emulated.robots.a.netcat: .*'openbsd'"),
         ("netcut: openbsd", "did you mean 'netcat'"),
         ("sftp: 0", "in emulated.robots.a.sftp"),
     ],
 )
-def test_wrong_variants_are_named_with_their_line(wrong: str, message: str) -> None:
+def test_wrong_variants_are_named_with_their_line(invalid_option: str, message: str) -> None:
     with pytest.raises(ConfigurationError, match=rf"fieldkit.yaml:6: .*{message}"):
-        backend(SITE.replace("netcat: openbsd, sftp: false", wrong))
+        backend(SITE.replace("netcat: openbsd, sftp: false", invalid_option))
 
 
 def test_a_variant_whose_package_is_missing_is_named_with_the_command(
@@ -194,22 +198,22 @@ def test_a_variant_whose_package_is_missing_is_named_with_the_command(
     monkeypatch.setattr(requirements, "PATH", str(tmp_path))
     for program in requirements.PACKAGE_OF:
         (tmp_path / program).touch(mode=0o755)
-    needed = RobotOptions(ssh="dropbear", netcat="openbsd", ping="busybox").programs()
+    needed_programs = RobotOptions(ssh="dropbear", netcat="openbsd", ping="busybox").programs()
     with pytest.raises(
         ConfigurationError,
         match=r"busybox, dropbear, .*nc.openbsd\n.*apt-get install .* busybox dropbear-bin netcat-openbsd$",
     ):
-        requirements.check(needed)
+        requirements.check(needed_programs)
 
 
 def test_every_variant_has_its_package() -> None:
-    everything = set(requirements.PACKAGE_OF | requirements.VARIANT_PACKAGE_OF)
+    all_programs = set(requirements.PACKAGE_OF | requirements.VARIANT_PACKAGE_OF)
     for field, value in (
         ("ssh", "dropbear"),
         ("userland", "busybox"),
         ("ping", "busybox"),
         *(("netcat", name) for name in ("traditional", "openbsd", "ncat", "busybox")),
     ):
-        assert RobotOptions.model_validate({field: value}).programs() <= everything
+        assert RobotOptions.model_validate({field: value}).programs() <= all_programs
     assert RobotOptions().programs() == set()
     assert EmulatedOptions().robots == {}

@@ -40,15 +40,17 @@ def backend(emulated: str = "") -> EmulatedBackend:
 
 
 @given(st.integers(1, 253), st.sampled_from(("lawn", "baylands", "open")))
-def test_robots_are_apart_inside_the_world(count: int, name: str) -> None:
+def test_robots_are_placed_apart_inside_the_world(count: int, name: str) -> None:
     world = load_world(name)
     places = square_m([str(number) for number in range(count)], world)
     assert len(set(places.values())) == count
     for east_m, north_m, _ in places.values():
         assert 0 < east_m < world.area_m[0]
         assert 0 < north_m < world.area_m[1]
-    nearest = min((math.dist(first, second) for first, second in combinations(places.values(), 2)), default=5.0)
-    assert 1 < nearest <= 5 + 1e-9
+    least_distance_m = min(
+        (math.dist(first, second) for first, second in combinations(places.values(), 2)), default=5.0
+    )
+    assert 1 < least_distance_m <= 5 + 1e-9
 
 
 HILL = """\
@@ -61,7 +63,7 @@ obstacles:
 
 
 @pytest.mark.parametrize(
-    ("to", "expected_m"),
+    ("destination", "expected_m"),
     [
         (Destination(3, 4, None, relative=False), (3, 4, 0.2)),
         (Destination(15, 5, None, relative=False), (15, 5, 1.2)),
@@ -72,13 +74,13 @@ obstacles:
         (Destination(-5, 5, -0.5, relative=True), (0, 10, 0)),
     ],
 )
-def test_a_robot_moves_over_the_ground(to: Destination, expected_m: Vector) -> None:
+def test_a_robot_moves_over_the_ground(destination: Destination, expected_m: Vector) -> None:
     hill = validate(parse(HILL, source="hill.yaml"), World)
-    assert destination_m((5, 5, 0.5), to, hill) == pytest.approx(expected_m)
+    assert destination_m((5, 5, 0.5), destination, hill) == pytest.approx(expected_m)
 
 
 @pytest.mark.parametrize(
-    ("to", "message"),
+    ("destination", "message"),
     [
         (Destination(20.1, 5, None, relative=False), "20.1 m east, 5 m north is outside of the world hill"),
         (Destination(0, 5.1, None, relative=True), "5 m east, 10.1 m north is outside"),
@@ -88,15 +90,15 @@ def test_a_robot_moves_over_the_ground(to: Destination, expected_m: Vector) -> N
         (Destination(5, 5, math.inf, relative=False), "inf m up is not a valid height"),
     ],
 )
-def test_a_robot_stays_in_the_world_and_above_its_ground(to: Destination, message: str) -> None:
+def test_a_robot_stays_in_the_world_and_above_its_ground(destination: Destination, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
-        destination_m((5, 5, 0.5), to, validate(parse(HILL, source="hill.yaml"), World))
+        destination_m((5, 5, 0.5), destination, validate(parse(HILL, source="hill.yaml"), World))
 
 
-def test_an_overview_survives_packing_and_unpacking() -> None:
-    above = backend("emulated: {world: baylands}\n").overview()
-    assert above.outlines
-    assert requests.unpack_overview(requests.pack_overview(above)) == above
+def test_an_overview_is_unchanged_by_packing_and_unpacking() -> None:
+    lab_overview = backend("emulated: {world: baylands}\n").overview()
+    assert lab_overview.outlines
+    assert requests.unpack_overview(requests.pack_overview(lab_overview)) == lab_overview
 
 
 def test_a_link_has_the_snr_of_its_closed_form() -> None:
@@ -111,7 +113,7 @@ def test_a_link_has_the_snr_of_its_closed_form() -> None:
 def test_a_link_names_the_obstacles_that_it_crosses() -> None:
     lawn, site = load_world("lawn"), validate(parse(SITE, source="fieldkit.yaml"), Site)
     members = members_of(site, None, {"a": "10.42.0.1", "b": "10.42.0.2"})
-    above = {
+    lab_overview = {
         scenario: overview(
             members,
             {name: (*line.at(metres), 0.2) for name, metres in (("a", 0.0), ("b", 9.0))},
@@ -120,31 +122,31 @@ def test_a_link_names_the_obstacles_that_it_crosses() -> None:
         )
         for scenario, line in lawn.lines.items()
     }
-    assert [link.through for link in above[Scenario.LOS].links] == [()]
-    assert [link.through for link in above[Scenario.NLOS].links] == [("wall",)]
-    assert b"dB, wall" in figures.overview(above[Scenario.NLOS], "svg")
+    assert [link.through for link in lab_overview[Scenario.LOS].links] == [()]
+    assert [link.through for link in lab_overview[Scenario.NLOS].links] == [("wall",)]
+    assert b"dB, wall" in figures.overview(lab_overview[Scenario.NLOS], "svg")
 
 
 def test_links_that_places_do_not_change_have_no_snr() -> None:
     assert backend("emulated: {radio: {loss: 10%}}\n").overview().links == []
 
 
-def test_shadowing_is_left_out() -> None:
-    plain, shadowed = backend(), backend("emulated: {radio: {shadowing_db: 8.0}}\n")
-    assert plain.overview() == shadowed.overview()
+def test_an_overview_excludes_shadowing() -> None:
+    without_shadowing, with_shadowing = backend(), backend("emulated: {radio: {shadowing_db: 8.0}}\n")
+    assert without_shadowing.overview() == with_shadowing.overview()
 
 
 @pytest.mark.parametrize("shape", [Box((3, 4, 1), (2, 6, 2), 0.7), Cylinder((-2, 5, 3), 1.5, 4)])
 def test_an_outline_is_the_edge_of_the_shape(shape: Box | Cylinder) -> None:
-    """A vertical path just inside a corner crosses the whole shape, just outside it nothing."""
+    """A vertical path just inside a corner crosses the shape, and one just outside does not."""
     centre = np.array(shape.centre_m[:2])
     for corner in shape.corners_m():
         for share, inside in ((0.999, True), (1.001, False)):
             east_m, north_m = centre + share * (np.array(corner) - centre)
             start, end = np.array([[east_m, north_m, -100]]), np.array([[east_m, north_m, shape.top_m]])
             assert (Solids([shape]).depths_m(start, end)[0, 0] > 0) == inside
-            above = np.array([[*centre, shape.top_m]]), np.array([[*centre, 100.0]])
-            assert Solids([shape]).depths_m(*above)[0, 0] == pytest.approx(0, abs=1e-9)
+            path_above = np.array([[*centre, shape.top_m]]), np.array([[*centre, 100.0]])
+            assert Solids([shape]).depths_m(*path_above)[0, 0] == pytest.approx(0, abs=1e-9)
 
 
 def test_the_figure_names_every_robot_and_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -53,17 +53,19 @@ def row() -> Iterator[Row]:
     options = schema.validate(schema.parse(text, source="fieldkit.yaml"), EmulatedOptions)
     members = {name: LabRobot(name, profile, address, ()) for name, address in ADDRESSES.items()}
     with (
-        running_robots(members, options=options, world=load_world("open"), ros=RosChoice.BUILTIN, seed=1) as running,
-        laptop_on_air(running, options.mesh) as laptop,
+        running_robots(
+            members, options=options, world=load_world("open"), ros=RosChoice.BUILTIN, seed=1
+        ) as running_lab,
+        laptop_on_air(running_lab, options.mesh) as laptop,
     ):
         places = {name: (SPACING_M * number, 0.0, 0.2) for number, name in enumerate(NAMES)}
-        running.medium.place(places | {LAPTOP_NAME: (0.0, 2.0, 0.2)})
-        yield Row(running, laptop)
+        running_lab.medium.place(places | {LAPTOP_NAME: (0.0, 2.0, 0.2)})
+        yield Row(running_lab, laptop)
 
 
 @pytest.fixture(scope="module")
 def first_shell(row: Row) -> Iterator[SshShell]:
-    """The shell of the first robot, once its routing daemon has found the route to the last one."""
+    """Return the shell of the first robot when its routing daemon has a route to the last robot."""
     with ExitStack() as stack:
         shell = SshShell(
             "r1",
@@ -78,11 +80,11 @@ def first_shell(row: Row) -> Iterator[SshShell]:
 
 
 def routes_over_neighbours(shell: SshShell) -> bool:
-    """Return True if the first robot's routes lead over its neighbours."""
+    """Return True if the routes of the first robot are those over its neighbours."""
     routes = output_of(shell, "ip", "-4", "route", "show", "proto", "babel").splitlines()
     neighbours = f"{LAPTOP_ADDRESS} via {LAPTOP_ADDRESS}"
-    over_r2 = {f"{ADDRESSES[name]} via 10.42.0.2" for name in NAMES[1:]}
-    return {line.split(" dev")[0] for line in routes} == {neighbours, *over_r2}
+    routes_over_r2 = {f"{ADDRESSES[name]} via 10.42.0.2" for name in NAMES[1:]}
+    return {line.split(" dev")[0] for line in routes} == {neighbours, *routes_over_r2}
 
 
 def reaches_last(shell: SshShell) -> bool:
@@ -118,20 +120,20 @@ def test_a_traceroute_follows_the_row(first_shell: SshShell) -> None:
 
 @pytest.mark.emulated
 def test_only_neighbours_receive_each_other(row: Row, first_shell: SshShell) -> None:
-    before = delivered(row)
+    frames_before = delivered_frames(row)
     wait_until(lambda: reaches_last(first_shell), Deadline.after(LONG_S))
-    receivers = {pair for pair, frames in delivered(row).items() if frames > before.get(pair, 0)}
+    receivers = {pair for pair, frames in delivered_frames(row).items() if frames > frames_before.get(pair, 0)}
     assert receivers == {*pairwise(NAMES), *pairwise(reversed(NAMES))}
 
 
-def delivered(row: Row) -> dict[tuple[str, str], int]:
-    """Return the number of frames that each robot has received from each other one."""
+def delivered_frames(row: Row) -> dict[tuple[str, str], int]:
+    """Return the number of frames that each robot has received from each other robot."""
     links = row.robots.medium.stats().links
     return {pair: link.delivered for pair, link in links.items() if LAPTOP_NAME not in pair}
 
 
 @pytest.mark.emulated
-def test_every_route_is_from_babel_and_leads_over_the_neighbour(first_shell: SshShell) -> None:
+def test_every_route_is_from_babel_and_over_a_neighbour(first_shell: SshShell) -> None:
     wait_until(lambda: routes_over_neighbours(first_shell), Deadline.after(LONG_S))
 
 
@@ -155,14 +157,14 @@ def test_a_multicast_reaches_neighbours_and_is_not_forwarded(first_shell: SshShe
     assert receivers - {"fe80::aff:fe2a:1"} == neighbours
 
 
-def test_the_laptop_announces_only_itself() -> None:
+def test_the_laptop_announces_only_its_address() -> None:
     settings = network.guest_command("wlan0", "10.42.0.254/24", HELLO_S)
     assert [word for word in settings if word.startswith("out ")] == ["out ip 10.42.0.254/32 allow", "out deny"]
 
 
 def test_a_missing_daemon_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "which", lambda name, **_: None if name == "babeld" else f"/bin/{name}")
-    with pytest.raises(ConfigurationError) as raised:
+    with pytest.raises(ConfigurationError) as error_info:
         requirements.check({"babeld"})
-    assert raised.value.what == "emulated robots need programs that are not installed: babeld"
-    assert raised.value.remedy.endswith("apt-get install --no-install-recommends babeld")
+    assert error_info.value.what == "emulated robots need programs that are not installed: babeld"
+    assert error_info.value.remedy.endswith("apt-get install --no-install-recommends babeld")

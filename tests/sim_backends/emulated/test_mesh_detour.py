@@ -44,14 +44,14 @@ def emulation() -> Iterator[EmulatedTestbed]:
         yield robots
 
 
-def forwarded(emulation: EmulatedTestbed) -> list[int]:
-    """Return the number of robots that forwarded each answer to three pings of the sender."""
+def forwarding_counts(emulation: EmulatedTestbed) -> list[int]:
+    """Return, for each answer to three pings of the sender, the number of robots that forwarded it."""
     argv = ("ping", "-n", "-c", "3", "-i", "0.1", "-W", "1", emulation.robots[Role.RECEIVER].spec.ip)
     text = emulation.shells[Role.SENDER].run(argv, deadline=Deadline.after(LONG_S), check=False).stdout.decode()
     return [FIRST_TTL - int(ttl) for ttl in re.findall(r"ttl=(\d+)", text)]
 
 
 def test_packets_take_the_longer_detour_while_the_shorter_route_is_lost(emulation: EmulatedTestbed) -> None:
-    wait_until(lambda: forwarded(emulation) == [2, 2, 2], Deadline.after(LONG_S))
+    wait_until(lambda: forwarding_counts(emulation) == [2, 2, 2], Deadline.after(LONG_S))
     emulation.robots[Role("first")].switch_off()
-    wait_until(lambda: forwarded(emulation) == [3, 3, 3], Deadline.after(LONG_S))
+    wait_until(lambda: forwarding_counts(emulation) == [3, 3, 3], Deadline.after(LONG_S))

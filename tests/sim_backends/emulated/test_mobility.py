@@ -1,4 +1,4 @@
-"""Mobility updates the medium while robots move, and puts them back at the end of a move, also after an error."""
+"""Mobility updates the medium while robots move, and returns them at the end of a move, also after an error."""
 
 import math
 import threading
@@ -80,8 +80,8 @@ def test_a_robot_moves_along_its_path_and_returns_to_its_place(mobility: Mobilit
         assert medium.position_of(Role.SENDER) == pytest.approx((place[0] - 0.4, *place[1:]))
         assert medium.calls[-1][1][CAST[Role.SENDER].name] == (0.0, 0.0, 0.0)
     assert medium.position_of(Role.SENDER) == place
-    on_the_way = [at[0] for at in medium.positions_of(Role.SENDER)[1:-1] if at is not None]
-    assert on_the_way == sorted(on_the_way, reverse=True)
+    eastings_m = [position_m[0] for position_m in medium.positions_of(Role.SENDER)[1:-1] if position_m is not None]
+    assert eastings_m == sorted(eastings_m, reverse=True)
     velocities = [velocity[CAST[Role.SENDER].name] for _, velocity in medium.calls[1:-2]]
     assert velocities
     assert all(velocity == pytest.approx((-2.0, 0.0, 0.0)) for velocity in velocities)
@@ -89,7 +89,7 @@ def test_a_robot_moves_along_its_path_and_returns_to_its_place(mobility: Mobilit
 
 
 @pytest.mark.parametrize("error", [RobotError("x", remedy="y"), KeyboardInterrupt()])
-def test_after_an_error_the_robot_is_back_and_no_thread_runs(
+def test_after_an_error_the_robot_is_at_its_place_and_no_thread_runs(
     mobility: Mobility, medium: RecordingMedium, error: BaseException
 ) -> None:
     place = medium.position_of(Role.SENDER)
@@ -141,11 +141,11 @@ def test_two_robots_can_move_at_the_same_time(mobility: Mobility, medium: Record
         sender, receiver = medium.position_of(Role.SENDER), medium.position_of(Role.RECEIVER)
     assert sender is not None
     assert receiver is not None
-    (first, _), (last, _) = medium.calls[0], medium.calls[-1]
-    assert first == last
-    assert sender[0] - first[CAST[Role.SENDER].name][0] == pytest.approx(-0.4)
-    at = first[CAST[Role.RECEIVER].name]
-    assert receiver == pytest.approx((at[0] - 0.2, at[1] + 0.3, at[2]))
+    (first_positions, _), (last_positions, _) = medium.calls[0], medium.calls[-1]
+    assert first_positions == last_positions
+    assert sender[0] - first_positions[CAST[Role.SENDER].name][0] == pytest.approx(-0.4)
+    start_m = first_positions[CAST[Role.RECEIVER].name]
+    assert receiver == pytest.approx((start_m[0] - 0.2, start_m[1] + 0.3, start_m[2]))
 
 
 def test_the_track_equals_the_positions_of_the_medium_and_discards_old_ones(
@@ -155,22 +155,22 @@ def test_the_track_equals_the_positions_of_the_medium_and_discards_old_ones(
         wait(lambda: not motion_threads())
     track = mobility.track(0)
     assert [point.position_m for point in track if point.role is Role.SENDER] == medium.positions_of(Role.SENDER)
-    assert all(point.utc_ns <= other.utc_ns for point, other in pairwise(track))
+    assert all(point.utc_ns <= next_point.utc_ns for point, next_point in pairwise(track))
     assert [point.role for point in track].count(Role.RELAY) == 1
-    last_known = mobility.track(time.time_ns())
-    assert sorted(point.role for point in last_known) == sorted(CAST)
-    assert mobility.track(0) == last_known
+    last_points = mobility.track(time.time_ns())
+    assert sorted(point.role for point in last_points) == sorted(CAST)
+    assert mobility.track(0) == last_points
 
 
 def test_the_update_period_depends_on_the_speed(mobility: Mobility, medium: RecordingMedium) -> None:
-    """Compares the period that each update returns, because a busy machine makes actual periods longer."""
-    slow, fast = (Move(Role.SENDER, (Leg(away_m=1e5),), speed_m_s) for speed_m_s in (0.2, 50.0))
-    due = []
-    for move in (slow, Move(Role.SENDER, (Leg(away_m=1e5),), 2.0), fast):
+    """The test compares the periods that updates return, because actual periods are longer on a busy machine."""
+    slow_move, fast_move = (Move(Role.SENDER, (Leg(away_m=1e5),), speed_m_s) for speed_m_s in (0.2, 50.0))
+    periods_s = []
+    for move in (slow_move, Move(Role.SENDER, (Leg(away_m=1e5),), 2.0), fast_move):
         with mobility.moving(move):
             wait(lambda: any(any(velocity.values()) for _, velocity in medium.calls[-1:]))
-            due.append(mobility._update_medium())
-    assert due == [0.1, STEP_M / 2.0, 0.02]
+            periods_s.append(mobility._update_medium())
+    assert periods_s == [0.1, STEP_M / 2.0, 0.02]
 
 
 def test_moving_without_a_placement_is_an_error(medium: RecordingMedium) -> None:
@@ -180,16 +180,18 @@ def test_moving_without_a_placement_is_an_error(medium: RecordingMedium) -> None
 
 
 @pytest.mark.parametrize("role", FIXED_ROLES)
-def test_away_increases_the_distance_to_the_other_end(
+def test_a_leg_away_increases_the_distance_to_the_other_end(
     mobility: Mobility, medium: RecordingMedium, role: Role
 ) -> None:
-    other = CAST[Role.RELAY if role is not Role.RELAY else Role.SENDER].name
-    before = medium.calls[-1][0]
+    other_name = CAST[Role.RELAY if role is not Role.RELAY else Role.SENDER].name
+    positions_before = medium.calls[-1][0]
     with mobility.moving(Move(role, (Leg(away_m=0.1),), 2.0)):
         wait(lambda: not motion_threads())
-        after = medium.calls[-1][0]
+        positions_after = medium.calls[-1][0]
     name = CAST[role].name
-    assert math.dist(after[name], after[other]) == pytest.approx(math.dist(before[name], before[other]) + 0.1)
+    assert math.dist(positions_after[name], positions_after[other_name]) == pytest.approx(
+        math.dist(positions_before[name], positions_before[other_name]) + 0.1
+    )
 
 
 @dataclass
@@ -198,20 +200,22 @@ class SteeringRobot:
 
     spec: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(steers=True))
     paths: list[AssignedPath] = field(default_factory=list)
-    recorded: RecordedMotion | None = None
+    last_recorded_motion: RecordedMotion | None = None
 
     def move(self, path: AssignedPath) -> None:
         self.paths.append(path)
 
     def recorded_motion(self) -> RecordedMotion | None:
-        return self.recorded
+        return self.last_recorded_motion
 
     def record(self, place_m: Vector, velocity_m_s: Vector = STILL) -> None:
-        self.recorded = RecordedMotion(time.monotonic_ns(), self.paths[-1].start_ns, place_m, velocity_m_s)
+        self.last_recorded_motion = RecordedMotion(
+            time.monotonic_ns(), self.paths[-1].start_ns, place_m, velocity_m_s
+        )
 
 
 @pytest.fixture
-def flying(medium: RecordingMedium) -> tuple[Mobility, SteeringRobot]:
+def flying_drone(medium: RecordingMedium) -> tuple[Mobility, SteeringRobot]:
     robot = SteeringRobot()
     robots = cast("Mapping[Role, EmulatedRobot]", {Role.RELAY: robot})
     mobility = Mobility(CAST, cast("MediumClient", medium), load_world("lawn"), None, robots)
@@ -220,9 +224,9 @@ def flying(medium: RecordingMedium) -> tuple[Mobility, SteeringRobot]:
 
 
 def test_the_medium_follows_a_robot_that_steers_itself_until_the_lab_places_it(
-    medium: RecordingMedium, flying: tuple[Mobility, SteeringRobot]
+    medium: RecordingMedium, flying_drone: tuple[Mobility, SteeringRobot]
 ) -> None:
-    mobility, robot = flying
+    mobility, robot = flying_drone
     place = medium.position_of(Role.RELAY)
     with mobility.watching():
         robot.record((7.0, 8.0, 9.0), (0.0, 0.0, 5.0))
@@ -234,7 +238,7 @@ def test_the_medium_follows_a_robot_that_steers_itself_until_the_lab_places_it(
         assert medium.position_of(Role.RELAY) == (7.0, 8.0, 12.0)
         mobility.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("10m")))
         assert medium.position_of(Role.RELAY) == place
-        robot.recorded = RecordedMotion(time.monotonic_ns(), robot.paths[0].start_ns, (1.0, 2.0, 3.0))
+        robot.last_recorded_motion = RecordedMotion(time.monotonic_ns(), robot.paths[0].start_ns, (1.0, 2.0, 3.0))
         mobility.set_out_of_range(None)
         assert medium.position_of(Role.RELAY) == place, "motion from before the placement is ignored"
     assert len(medium.calls) > calls
@@ -245,16 +249,16 @@ def test_the_medium_follows_a_robot_that_steers_itself_until_the_lab_places_it(
 
 
 def test_the_time_of_the_track_is_that_of_the_positions(
-    medium: RecordingMedium, flying: tuple[Mobility, SteeringRobot], monkeypatch: pytest.MonkeyPatch
+    medium: RecordingMedium, flying_drone: tuple[Mobility, SteeringRobot], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    mobility, robot = flying
-    placed_ns: list[int] = []
-    monkeypatch.setattr(medium, "place", lambda *_, **__: placed_ns.append(time.time_ns()))
+    mobility, robot = flying_drone
+    place_times_ns: list[int] = []
+    monkeypatch.setattr(medium, "place", lambda *_, **__: place_times_ns.append(time.time_ns()))
     robot.record((7.0, 8.0, 9.0), (0.0, 0.0, 5.0))
     mobility.set_out_of_range(Role.SENDER)
-    last = [point for point in mobility.track(0) if point.role is Role.RELAY][-1]
-    assert last.velocity_m_s == (0.0, 0.0, 5.0)
-    assert last.utc_ns <= placed_ns[-1], "the robot may have stopped before the medium answered"
+    last_point = [point for point in mobility.track(0) if point.role is Role.RELAY][-1]
+    assert last_point.velocity_m_s == (0.0, 0.0, 5.0)
+    assert last_point.utc_ns <= place_times_ns[-1], "the robot may have stopped before the medium answered"
 
 
 def test_a_driving_robot_stays_on_the_ground_and_a_silent_one_stops(medium: RecordingMedium) -> None:
@@ -270,15 +274,15 @@ def test_a_driving_robot_stays_on_the_ground_and_a_silent_one_stops(medium: Reco
     assert medium.calls[-1][1][CAST[Role.SENDER].name] == STILL
 
 
-def test_lasers_detect_robots_in_place_and_not_those_out_of_range(medium: RecordingMedium) -> None:
-    detections: list[Mapping[str, Vector]] = []
+def test_lasers_detect_robots_except_those_that_are_out_of_range(medium: RecordingMedium) -> None:
+    written_positions: list[Mapping[str, Vector]] = []
     mobility = Mobility(
-        CAST, cast("MediumClient", medium), load_world("lawn"), None, write_positions=detections.append
+        CAST, cast("MediumClient", medium), load_world("lawn"), None, write_positions=written_positions.append
     )
     mobility.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("10m")))
-    assert detections[-1] == medium.calls[-1][0]
-    mobility.set_out_of_range(Role.RELAY)  # no radio reaches another one, but the others are where they were
+    assert written_positions[-1] == medium.calls[-1][0]
+    mobility.set_out_of_range(Role.RELAY)  # no radio reaches another one, but the other robots keep their positions
     assert medium.calls[-1][0] == {}
-    assert detections[-1] == {
-        name: place_m for name, place_m in detections[0].items() if name != CAST[Role.RELAY].name
+    assert written_positions[-1] == {
+        name: place_m for name, place_m in written_positions[0].items() if name != CAST[Role.RELAY].name
     }

@@ -44,13 +44,13 @@ def emulation() -> Iterator[EmulatedTestbed]:
         yield running
 
 
-def in_ros(emulation: EmulatedTestbed, *argv: str) -> str:
+def run_in_ros(emulation: EmulatedTestbed, *argv: str) -> str:
     command = with_environment(argv, setup=emulation.robots[Role.SENDER].spec.setup)
     return emulation.shells[Role.SENDER].run(command, deadline=Deadline.after(LONG_S)).stdout.decode()
 
 
 def tf_report(emulation: EmulatedTestbed) -> Any:  # noqa: ANN401 (of JSON)
-    return json.loads(in_ros(emulation, "python3", str(LISTENER), "odom", *STAMPED))
+    return json.loads(run_in_ros(emulation, "python3", str(LISTENER), "odom", *STAMPED))
 
 
 @pytest.mark.emulated
@@ -69,7 +69,7 @@ def test_static_transforms_return_after_the_sensors_were_killed(emulation: Emula
     emulation.inject(Fault(FaultKind.KILL, Role.SENDER, process="sensors"))
     assert tf_report(emulation)["reached"]
     emulation.inject(Fault(FaultKind.KILL, Role.SENDER, process="ros_relay"))
-    wait_until(lambda: "/tf_static" in in_ros(emulation, "rostopic", "list"), Deadline.after(LONG_S))
+    wait_until(lambda: "/tf_static" in run_in_ros(emulation, "rostopic", "list"), Deadline.after(LONG_S))
     assert tf_report(emulation)["reached"]
 
 
@@ -77,7 +77,7 @@ def test_static_transforms_return_after_the_sensors_were_killed(emulation: Emula
 def test_packages_of_fieldkit_s_python_precede_debian_s(emulation: EmulatedTestbed) -> None:
     """Both must be importable: middlewares of the Python that runs fieldkit, and rospy."""
     origin = "import numpy, rospy, sys; print(sys.executable); print(numpy.__file__)"
-    executable, numpy = in_ros(emulation, "python3", "-c", origin).splitlines()
+    executable, numpy = run_in_ros(emulation, "python3", "-c", origin).splitlines()
     assert not numpy.startswith("/usr/lib/python3/dist-packages/")
     assert Path(numpy).parents[1].name == "site-packages", executable
 
@@ -92,24 +92,25 @@ print(json.dumps(rospy.wait_for_message("/scan", LaserScan, 60).ranges))
 
 @pytest.mark.emulated
 def test_the_laser_detects_the_wall_next_to_the_sender(emulation: EmulatedTestbed) -> None:
-    """In the lawn at (3, 18) facing west, the wall's near face 0.9 m behind it, from 4 m south to 4 m north."""
+    """The sender is at (3, 18) and faces west; the wall is 0.9 m behind it, from 4 m south to 4 m north."""
     emulation.place(Placement(Scenario.NLOS, Topology.MASTERLESS, parse_distance("5m")))
-    ranges_m = json.loads(in_ros(emulation, "python3", "-c", ONE_SCAN))
+    ranges_m = json.loads(run_in_ros(emulation, "python3", "-c", ONE_SCAN))
     assert len(ranges_m) == 360
     for beam, range_m in enumerate(ranges_m):
-        off_rad = math.radians(beam - 180)
-        true_m = 0.9 / math.cos(off_rad) if math.cos(off_rad) > 0 else math.inf
-        if abs(true_m - LASER_RANGE_M[1]) > 6 * LASER_NOISE_M:  # noise decides at this distance
+        angle_rad = math.radians(beam - 180)
+        true_m = 0.9 / math.cos(angle_rad) if math.cos(angle_rad) > 0 else math.inf
+        # At the greatest distance, noise decides between a range and infinity.
+        if abs(true_m - LASER_RANGE_M[1]) > 6 * LASER_NOISE_M:
             expected_m = true_m if true_m < LASER_RANGE_M[1] else math.inf
             assert range_m == pytest.approx(expected_m, abs=6 * LASER_NOISE_M), beam
     emulation.place(PLACED)
-    assert set(json.loads(in_ros(emulation, "python3", "-c", ONE_SCAN))) == {math.inf}
+    assert set(json.loads(run_in_ros(emulation, "python3", "-c", ONE_SCAN))) == {math.inf}
 
 
 @pytest.mark.emulated
 def test_bagpy_reads_a_recording_as_rosbags_does(emulation: EmulatedTestbed, tmp_path: Path) -> None:
     topics = ("/scan", "/odom", "/tf", "/tf_static", "/imu", "/battery_state")
-    in_ros(emulation, "rosbag", "record", "--duration=3", "-O", "clients", *topics)
+    run_in_ros(emulation, "rosbag", "record", "--duration=3", "-O", "clients", *topics)
     bag = tmp_path / "clients.bag"
     emulation.shells[Role.SENDER].fetch(
         ("cat", "clients.bag"), bag, deadline=Deadline.after(LONG_S), limit_bytes=1 << 22
@@ -130,9 +131,9 @@ def test_bagpy_reads_a_recording_as_rosbags_does(emulation: EmulatedTestbed, tmp
     environment = os.environ | {"PYTHONPATH": str(BAGPY)}
     result = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
-    read = json.loads(result.stdout.splitlines()[-1])
-    assert read["topics"] == {topic: [types[topic], counts[topic]] for topic in topics}
-    rows = [dict(zip(read["columns"], row, strict=True)) for row in read["rows"]]
+    bagpy_report = json.loads(result.stdout.splitlines()[-1])
+    assert bagpy_report["topics"] == {topic: [types[topic], counts[topic]] for topic in topics}
+    rows = [dict(zip(bagpy_report["columns"], row, strict=True)) for row in bagpy_report["rows"]]
     assert [int(row["header.stamp.nsecs"]) for row in rows] == [message.header.stamp.nanosec for message in odom]
     for row, message in zip(rows, odom, strict=True):
         assert (row["header.frame_id"], row["child_frame_id"]) == ("odom", "base_footprint")

@@ -76,9 +76,9 @@ def options(ros2: str, ros: str = "auto") -> EmulatedOptions:
 
 @contextmanager
 def lab(robots: Cast, ros2: str) -> Iterator[EmulatedTestbed]:
-    chosen = options(ros2)
+    lab_options = options(ros2)
     with testbed.bring_up(
-        robots, options=chosen, world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1
+        robots, options=lab_options, world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1
     ) as emulation:
         emulation.place(PLACED)
         yield emulation
@@ -90,7 +90,7 @@ def multicast() -> Iterator[EmulatedTestbed]:
         yield emulation
 
 
-def inside(emulation: EmulatedTestbed, *argv: str) -> tuple[str, ...]:
+def drone_command(emulation: EmulatedTestbed, *argv: str) -> tuple[str, ...]:
     """Return a command in the network namespace of the drone, which has no ROS 2."""
     return (
         "timeout",
@@ -106,13 +106,13 @@ def inside(emulation: EmulatedTestbed, *argv: str) -> tuple[str, ...]:
 
 
 @contextmanager
-def listening(
-    emulation: EmulatedTestbed, middleware_name: str, topic: str, kind: str, **network: object
+def subscribed(
+    emulation: EmulatedTestbed, middleware_name: str, topic: str, type_name: str, **network: object
 ) -> Iterator[Iterator[Any]]:
     """Yield the messages, of rosbags' types, that a node of DDS or Zenoh on the drone receives."""
     network_settings = {"address": emulation.robots[Role.RELAY].spec.ip, "node": "ears", **network}
     quality = offered_qos.LATCHED if topic == "/tf_static" else PROFILES["sensor_data"]
-    description = topics.describe(standard_types(), topic, kind, quality, domain=0, node="ears")
+    description = topics.describe(standard_types(), topic, type_name, quality, domain=0, node="ears")
     command = (
         sys.executable,
         str(WIRE_END),
@@ -122,7 +122,7 @@ def listening(
         json.dumps(description),
     )
     with subprocess.Popen(
-        inside(emulation, *command), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        drone_command(emulation, *command), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
         assert process.stdout is not None
         try:
@@ -135,9 +135,9 @@ def listening(
             process.communicate()
 
 
-def receive(emulation: EmulatedTestbed, middleware_name: str, topic: str, kind: str, **network: object) -> Any:  # noqa: ANN401 (of rosbags)
-    """Return the first message of `listening`."""
-    with listening(emulation, middleware_name, topic, kind, **network) as messages:
+def receive(emulation: EmulatedTestbed, middleware_name: str, topic: str, type_name: str, **network: object) -> Any:  # noqa: ANN401 (of rosbags)
+    """Return the first message that a node on the drone receives."""
+    with subscribed(emulation, middleware_name, topic, type_name, **network) as messages:
         return next(messages)
 
 
@@ -149,8 +149,8 @@ def stamp_s(message: Any) -> float:  # noqa: ANN401 (of rosbags)
 def report(multicast: EmulatedTestbed, tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Any]:
     """Return the report of a node of a real ROS 2 on the drone about the sender."""
     home = tmp_path_factory.mktemp("ros")
-    words = (str(COUNT), *(f"{topic}={kind}" for topic, kind in RECEIVED.items()))
-    command = inside(multicast, "env", f"ROS_HOME={home}", str(ROS2), str(LISTENER), *words)
+    words = (str(COUNT), *(f"{topic}={type_name}" for topic, type_name in RECEIVED.items()))
+    command = drone_command(multicast, "env", f"ROS_HOME={home}", str(ROS2), str(LISTENER), *words)
     result = subprocess.run(command, capture_output=True, check=False)
     assert result.returncode == 0, result.stderr
     report: Mapping[str, Any] = json.loads(result.stdout)
@@ -161,23 +161,25 @@ def report(multicast: EmulatedTestbed, tmp_path_factory: pytest.TempPathFactory)
 def test_a_real_ros_2_lists_the_topics_with_their_types_and_hashes(report: Mapping[str, Any]) -> None:
     expected = {**RECEIVED, "/tf": "tf2_msgs/msg/TFMessage", "/tf_static": "tf2_msgs/msg/TFMessage"}
     assert {topic: report["types"].get(topic) for topic in expected} == {
-        topic: [kind] for topic, kind in expected.items()
+        topic: [type_name] for topic, type_name in expected.items()
     }
     assert report["latched"] == ["TRANSIENT_LOCAL"]
-    assert report["hashes"] == {topic: [standard_types().get(kind).rihs01] for topic, kind in expected.items()}
+    assert report["hashes"] == {
+        topic: [standard_types().get(type_name).rihs01] for topic, type_name in expected.items()
+    }
 
 
 @pytest.mark.emulated
 def test_a_real_ros_2_lists_the_node_and_its_topics(report: Mapping[str, Any]) -> None:
     assert NODES[Role.SENDER] in report["nodes"]
-    topics_of_node = {topic for topic, _ in report["of_node"][NODES[Role.SENDER]]}
+    topics_of_node = {topic for topic, _ in report["topics_of_nodes"][NODES[Role.SENDER]]}
     assert topics_of_node == {*RECEIVED, "/tf", "/tf_static", "/rosout"}
 
 
 @pytest.mark.emulated
 def test_a_real_ros_2_reads_the_node_s_log(report: Mapping[str, Any]) -> None:
-    of_robot = NODES[Role.SENDER]
-    lines = [line for line in report["logged"] if line["name"] == of_robot]
+    node_name = NODES[Role.SENDER]
+    lines = [line for line in report["log"] if line["name"] == node_name]
     assert {f"{topic} has a subscriber" for topic in RECEIVED} <= {line["msg"] for line in lines}
     assert {line["level"] for line in lines} == {20}, "rcl_interfaces/msg/Log.INFO"
     assert all(0 <= time.time() - line["stamp"]["sec"] < LONG_S for line in lines)
@@ -186,17 +188,17 @@ def test_a_real_ros_2_reads_the_node_s_log(report: Mapping[str, Any]) -> None:
 
 
 @pytest.mark.emulated
-def test_the_documentation_lists_all_that_the_node_lacks(report: Mapping[str, Any]) -> None:
-    """Compared with the services and topics of a node of rclpy, whose names start with that of the node."""
-    of_robot = NODES[Role.SENDER]
+def test_the_documentation_lists_all_services_and_topics_that_the_node_lacks(report: Mapping[str, Any]) -> None:
+    """The reference is a node of rclpy: the names of its services and topics start with the name of the node."""
+    node_name = NODES[Role.SENDER]
     services_of_rclpy = {service.rpartition("/")[2] for service in report["services_of_node"]["listener"]}
     assert {"list_parameters", "get_type_description"} <= services_of_rclpy
-    assert report["services_of_node"][of_robot] == []
-    topics_of_robot = {topic for topic, _ in report["of_node"][of_robot]}
-    missing = services_of_rclpy | (set(report["own_topics"]) - topics_of_robot - {"/cmd_vel"})
+    assert report["services_of_node"][node_name] == []
+    topics_of_robot = {topic for topic, _ in report["topics_of_nodes"][node_name]}
+    missing_names = services_of_rclpy | (set(report["topics_of_listener"]) - topics_of_robot - {"/cmd_vel"})
     page = (ROOT / "docs" / "add-a-robot.md").read_text(encoding="utf-8")
     section = page.partition("### What its node lacks")[2].partition("\n## ")[0]
-    assert [name for name in sorted(missing) if f"`{name}`" not in section] == []
+    assert [name for name in sorted(missing_names) if f"`{name}`" not in section] == []
     assert "`/rosout`" in section
 
 
@@ -204,22 +206,22 @@ def test_the_documentation_lists_all_that_the_node_lacks(report: Mapping[str, An
 def test_a_real_ros_2_receives_the_right_values_over_the_medium(
     multicast: EmulatedTestbed, report: Mapping[str, Any]
 ) -> None:
-    received = report["heard"]
+    received_messages = report["messages"]
     for topic in RECEIVED:
         stamps_s = [
             message["header"]["stamp"]["sec"] + message["header"]["stamp"]["nanosec"] / 1e9
-            for message in received[topic]
+            for message in received_messages[topic]
         ]
         assert len(stamps_s) == COUNT
         assert all(0 <= time.time() - stamp_s < LONG_S for stamp_s in stamps_s), topic
-    scan = received["/scan"][0]
+    scan = received_messages["/scan"][0]
     assert scan["header"]["frame_id"] == "base_scan"
     assert scan["ranges"] == [math.inf] * 360, "the lawn has nothing within 3.5 m of the line"
-    odom = received["/odom"][0]
+    odom = received_messages["/odom"][0]
     assert (odom["header"]["frame_id"], odom["child_frame_id"]) == ("odom", "base_footprint")
     assert odom["pose"]["covariance"][:: 6 + 1] == list(ODOMETRY_VARIANCES)
-    assert received["/imu"][0]["linear_acceleration"]["z"] == pytest.approx(GRAVITY_M_S2, abs=0.2)
-    battery = received["/battery_state"][0]
+    assert received_messages["/imu"][0]["linear_acceleration"]["z"] == pytest.approx(GRAVITY_M_S2, abs=0.2)
+    battery = received_messages["/battery_state"][0]
     assert battery["percentage"] == pytest.approx(0.8)
     assert math.isnan(battery["current"])
     # A scan is 2.9 kB, in two fragments.
@@ -230,13 +232,11 @@ def test_a_real_ros_2_receives_the_right_values_over_the_medium(
 def test_a_real_ros_2_drives_the_robot_by_its_velocity_topic(
     multicast: EmulatedTestbed, report: Mapping[str, Any]
 ) -> None:
-    """In odometry, and in the world according to the medium."""
+    """The robot moves in its odometry, and in the world according to the medium."""
     assert report["types"]["/cmd_vel"] == ["geometry_msgs/msg/Twist"]
     assert report["driven_m"] >= DRIVEN_M
     places_m = [
-        whereabouts.position_m
-        for whereabouts in multicast.oracle.track(0)
-        if whereabouts.role is Role.SENDER and whereabouts.position_m
+        point.position_m for point in multicast.oracle.track(0) if point.role is Role.SENDER and point.position_m
     ]
     assert max(math.dist(places_m[0], place_m) for place_m in places_m) >= DRIVEN_M / 2
 
@@ -245,12 +245,12 @@ def test_a_real_ros_2_drives_the_robot_by_its_velocity_topic(
 def test_odometry_received_by_another_robot_integrates_to_the_path(multicast: EmulatedTestbed) -> None:
     move = Move(Role.SENDER, (Leg(away_m=1.0), Leg(left_m=0.5)), speed_m_s=0.5)
     multicast.place(PLACED)  # an earlier test may have driven it
-    with listening(multicast, "dds", "/odom", "nav_msgs/Odometry") as messages:
+    with subscribed(multicast, "dds", "/odom", "nav_msgs/Odometry") as messages:
         first = next(messages)
         start, start_ns = first.pose.pose.position, time.time_ns()
         with multicast.moving(move):
             samples = [first, *takewhile(lambda message: message.pose.pose.position.y < start.y + 0.499, messages)]
-            whereabouts = [position for position in multicast.oracle.track(start_ns) if position.role is Role.SENDER]
+            track = [point for point in multicast.oracle.track(start_ns) if point.role is Role.SENDER]
     x_m = y_m = 0.0
     for before, after in pairwise(samples):
         facing_rad = 2 * math.atan2(before.pose.pose.orientation.z, before.pose.pose.orientation.w)
@@ -259,7 +259,7 @@ def test_odometry_received_by_another_robot_integrates_to_the_path(multicast: Em
     end = samples[-1].pose.pose.position
     assert (x_m, y_m) == pytest.approx((end.x - start.x, end.y - start.y), abs=0.1)
     assert (x_m, y_m) == pytest.approx((1.0, 0.5), abs=0.1)
-    start_m, end_m = (whereabouts[number].position_m for number in (0, -1))
+    start_m, end_m = (track[number].position_m for number in (0, -1))
     assert start_m is not None
     assert end_m is not None
     # The medium is updated every 0.1 m.
@@ -268,17 +268,17 @@ def test_odometry_received_by_another_robot_integrates_to_the_path(multicast: Em
 
 @pytest.mark.emulated
 def test_topics_return_after_the_sensors_were_killed(multicast: EmulatedTestbed) -> None:
-    with listening(multicast, "dds", "/battery_state", "sensor_msgs/BatteryState") as messages:
-        last = next(messages)
+    with subscribed(multicast, "dds", "/battery_state", "sensor_msgs/BatteryState") as messages:
+        last_message = next(messages)
         multicast.inject(Fault(FaultKind.KILL, Role.SENDER, process="sensors"))
-        killed_s = time.time()
-        assert any(stamp_s(message) > killed_s for message in messages), f"none after {last}"
+        kill_time_s = time.time()
+        assert any(stamp_s(message) > kill_time_s for message in messages), f"none after {last_message}"
     # The relay continues: it has unsubscribed from the topic whose publisher exited.
     assert receive(multicast, "dds", "/odom", "nav_msgs/Odometry").child_frame_id == "base_footprint"
 
 
 @pytest.mark.emulated
-def test_zenoh_scouts_across_the_medium(multicast: EmulatedTestbed) -> None:
+def test_zenoh_discovers_nodes_across_the_medium(multicast: EmulatedTestbed) -> None:
     message = receive(multicast, "zenoh", "/tf", "tf2_msgs/TFMessage")
     (transform,) = message.transforms
     assert (transform.header.frame_id, transform.child_frame_id) == ("odom", "base_footprint")
@@ -304,10 +304,10 @@ def test_zenoh_works_with_a_router_on_the_relay() -> None:
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("middleware_name", ["dds", "zenoh"])
-def test_a_late_subscriber_gets_the_transforms_from_every_sensor_to_the_world(
+def test_a_late_subscriber_receives_the_transforms_from_every_sensor_to_the_world(
     multicast: EmulatedTestbed, middleware_name: str
 ) -> None:
-    """The look-up of tf2: from the frame of a message up to the frame in which the robot was switched on."""
+    """The parents lead from the frame of each message to the frame in which the robot was switched on, as in tf2."""
     parent_of = {
         transform.child_frame_id: transform.header.frame_id
         for topic in ("/tf_static", "/tf")
@@ -339,7 +339,7 @@ def test_specifications_have_the_ros2_settings() -> None:
     assert "zenoh_router" in [service.name for service in services.services(specs_by_role[Role.RELAY])]
 
 
-def test_the_built_in_ros_stays_off_the_air() -> None:
+def test_the_built_in_ros_sends_nothing_over_the_radio() -> None:
     assert specs(cast(sender="cyclonedds"), "{}", ros="builtin")[Role.SENDER].ros2 is None
 
 

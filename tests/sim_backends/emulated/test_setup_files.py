@@ -1,4 +1,4 @@
-"""Setup files at the paths of a real robot: the emulated robot has them there, although the host does not."""
+"""Setup files at the paths of a real robot: the emulated robot has them, although the host does not."""
 
 import shlex
 import subprocess
@@ -60,12 +60,12 @@ def output_of(shell: Shell, *argv: str) -> str:
 @pytest.mark.parametrize("path", SETUP)
 def test_a_setup_file_can_be_sourced_at_the_path_in_the_profile(path: str, shell: Shell) -> None:
     assert not Path(path).exists(), "the host must not have this file"
-    printed = output_of(shell, *with_environment(["sh", "-c", 'echo "$ROS_DISTRO"; command -v rosbag'], setup=[path]))
-    assert printed.split("\n") == ["noetic", f"{Path(path).parent}/bin/rosbag", ""]
+    output = output_of(shell, *with_environment(["sh", "-c", 'echo "$ROS_DISTRO"; command -v rosbag'], setup=[path]))
+    assert output.split("\n") == ["noetic", f"{Path(path).parent}/bin/rosbag", ""]
 
 
 @pytest.mark.emulated
-def test_the_rest_of_the_file_system_is_as_usual(shell: Shell, untouched: NamespaceComparison) -> None:
+def test_the_remaining_file_system_is_as_usual(shell: Shell, untouched: NamespaceComparison) -> None:
     assert output_of(shell, "hostname") == "turtlebot-1\n"
     assert output_of(shell, "getent", "hosts", "turtlebot-1").split() == ["10.42.0.1", "turtlebot-1"]
     for folder in ("/", "/etc", "/usr/share", "/etc/clearpath"):
@@ -78,8 +78,8 @@ def test_the_rest_of_the_file_system_is_as_usual(shell: Shell, untouched: Namesp
     untouched()
 
 
-# There /etc contains other mounts.
-AS_A_USER = f"""
+# In the namespace of an ordinary user, /etc contains other mounts.
+USER_SCRIPT = f"""
 mkdir robots
 echo 'emulated: {{ros: builtin}}' | cat {shlex.quote(str(DEFAULT_SITE))} - > fieldkit.yaml
 sed 's#setup: .*noetic.*#setup: [/code/ws/setup.bash, /etc/clearpath/setup.bash]#' \
@@ -92,7 +92,7 @@ sed 's#setup: .*noetic.*#setup: [/code/ws/setup.bash, /etc/clearpath/setup.bash]
 
 @pytest.mark.emulated
 def test_setup_files_work_for_an_ordinary_user_too() -> None:
-    words = ("sh", "-e", "-c", AS_A_USER, "sh", sys.executable, "-m", "fieldkit")
+    words = ("sh", "-e", "-c", USER_SCRIPT, "sh", sys.executable, "-m", "fieldkit")
     environment = ordinary_user.environment()
     result = subprocess.run(
         ordinary_user.command(*words), cwd="/", env=environment, capture_output=True, text=True, check=False

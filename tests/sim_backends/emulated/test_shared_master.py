@@ -57,17 +57,17 @@ def output_of(shell: Shell, *argv: str) -> str:
     return shell.run(argv, deadline=Deadline.after(LONG_S)).stdout.decode()
 
 
-def in_ros(emulation: EmulatedTestbed, role: Role, *argv: str) -> str:
+def run_in_ros(emulation: EmulatedTestbed, role: Role, *argv: str) -> str:
     return output_of(emulation.shells[role], *with_environment(argv, setup=emulation.robots[role].spec.setup))
 
 
-def names(shell: Shell) -> set[str]:
+def process_names(shell: Shell) -> set[str]:
     return set(
         output_of(shell, "sh", "-c", "cat /proc/[0-9]*/comm 2>/dev/null || true").split()
     )  # some exit meanwhile
 
 
-def answer_to(shell: Shell, need: Need) -> CommandResult:
+def run_probe(shell: Shell, need: Need) -> CommandResult:
     result = shell.run(need.argv, deadline=Deadline.after(LONG_S), check=False)
     return CommandResult((result.stdout + result.stderr).decode().strip(), result.exit_code)
 
@@ -75,17 +75,17 @@ def answer_to(shell: Shell, need: Need) -> CommandResult:
 @pytest.mark.emulated
 def test_the_relay_runs_roscore_and_the_others_no_master(emulation: EmulatedTestbed) -> None:
     masters = {"roscore", "rosmaster", "rosout"}
-    wait(lambda: masters <= names(emulation.shells[Role.RELAY]))
+    wait(lambda: masters <= process_names(emulation.shells[Role.RELAY]))
     for role in (Role.SENDER, Role.RECEIVER):
-        assert not masters & names(emulation.shells[role])
+        assert not masters & process_names(emulation.shells[role])
 
 
 @pytest.mark.emulated
 def test_every_robot_lists_all_topics_with_one_publisher_each(emulation: EmulatedTestbed) -> None:
     for role in emulation.shells:
-        topics = set(in_ros(emulation, role, "rostopic", "list").split())
+        topics = set(run_in_ros(emulation, role, "rostopic", "list").split())
         assert topics >= {"/scan", "/odom", "/imu", "/battery_state", "/pidrone/imu", "/rosout"}
-    info = in_ros(emulation, Role.RECEIVER, "rostopic", "info", "/scan")
+    info = run_in_ros(emulation, Role.RECEIVER, "rostopic", "info", "/scan")
     publishers = info.partition("Publishers:")[2].partition("Subscribers:")[0].split()
     assert publishers[:2] == ["*", "/sensors_turtlebot_1"], "the other TurtleBot's laser has the same name"
     assert len([publisher for publisher in publishers if publisher == "*"]) == 1
@@ -96,7 +96,7 @@ def test_every_robot_lists_all_topics_with_one_publisher_each(emulation: Emulate
 def test_subscriptions_to_another_robot_cross_the_medium(emulation: EmulatedTestbed, tmp_path: Path) -> None:
     receiver = emulation.shells[Role.RECEIVER]
     before = emulation.medium.stats().ports["turtlebot-1"].sent_packets
-    in_ros(emulation, Role.RECEIVER, "rosbag", "record", "--duration=3", "-O", "heard", "/scan")
+    run_in_ros(emulation, Role.RECEIVER, "rosbag", "record", "--duration=3", "-O", "heard", "/scan")
     bag = tmp_path / "heard.bag"
     receiver.fetch(("cat", "heard.bag"), bag, deadline=Deadline.after(LONG_S), limit_bytes=1 << 20)
     with Reader(bag) as reader:
@@ -114,11 +114,13 @@ def test_the_preflight_probe_detects_a_master_and_its_absence(emulation: Emulate
     cast = backend().cast(Topology.MASTER)
     scene = Scene(Protocol.TCP, cast, "f")
     (need,) = ros_master.needs(scene, Role.SENDER, program="rosbag")
-    answer = answer_to(emulation.shells[Role.SENDER], need)
+    answer = run_probe(emulation.shells[Role.SENDER], need)
     assert ros_master.judge(cast[Role.RELAY], answer)[0] is Verdict.OK, answer
-    wrong = {role: robot.model_copy(update={"ros_master": "10.42.0.2"}) for role, robot in cast.items()}
-    (need,) = ros_master.needs(Scene(Protocol.TCP, wrong, "f"), Role.SENDER, program="rosbag")
-    answer = answer_to(emulation.shells[Role.SENDER], need)
+    cast_with_another_master = {
+        role: robot.model_copy(update={"ros_master": "10.42.0.2"}) for role, robot in cast.items()
+    }
+    (need,) = ros_master.needs(Scene(Protocol.TCP, cast_with_another_master, "f"), Role.SENDER, program="rosbag")
+    answer = run_probe(emulation.shells[Role.SENDER], need)
     assert ros_master.judge(cast[Role.RECEIVER], answer)[0] is Verdict.FAIL
     assert "Connection refused" in answer.text
 
@@ -126,10 +128,10 @@ def test_the_preflight_probe_detects_a_master_and_its_absence(emulation: Emulate
 @pytest.mark.emulated
 def test_a_restarted_master_has_no_topics_until_nodes_register(emulation: EmulatedTestbed) -> None:
     relay, sender = emulation.shells[Role.RELAY], emulation.shells[Role.SENDER]
-    wait(lambda: "rosmaster" in names(relay))
+    wait(lambda: "rosmaster" in process_names(relay))
     emulation.inject(Fault(FaultKind.KILL, Role.RELAY, process="rosmaster"))
     wait(lambda: "/scan" not in topics_of(sender))
-    wait(lambda: {"rosmaster", "rosout"} <= names(relay))
+    wait(lambda: {"rosmaster", "rosout"} <= process_names(relay))
     assert "/scan" not in topics_of(sender)
     emulation.inject(Fault(FaultKind.KILL, Role.SENDER, process="ros_relay"))
     wait(lambda: "/scan" in topics_of(sender))
@@ -140,7 +142,7 @@ def topics_of(shell: Shell) -> list[str]:
     return shell.run(argv, deadline=Deadline.after(LONG_S), check=False).stdout.decode().split()
 
 
-def test_a_robot_alone_has_its_own_master() -> None:
+def test_a_robot_without_a_shared_master_has_a_separate_one() -> None:
     cast = backend().cast(Topology.MASTERLESS)
     keys = KeyPair.make(), KeyPair.make()
     spec = robot_spec(cast, Role.SENDER, ros=RosChoice.DEBIAN, login=keys[0], host_key=keys[1])
@@ -175,11 +177,11 @@ def test_the_first_of_equal_robots_publishes_and_the_relay_runs_roscore() -> Non
 
 
 def test_the_built_in_ros_has_no_shared_master(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ConfigurationError, match="which for emulated robots needs Debian's ROS") as caught:
+    with pytest.raises(ConfigurationError, match="which for emulated robots needs Debian's ROS") as error_info:
         requirements.check_shared_master(RosChoice.BUILTIN)
-    assert "python3-rosmaster" in caught.value.remedy
+    assert "python3-rosmaster" in error_info.value.remedy
     requirements.check_shared_master(RosChoice.DEBIAN)
     monkeypatch.setattr(requirements, "_MASTER_FILES", {"/no/roscore": "python3-roslaunch"})
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(ConfigurationError) as error_info:
         requirements.check_shared_master(RosChoice.DEBIAN)
-    assert caught.value.remedy.startswith("apt-get install --no-install-recommends python3-roslaunch, and")
+    assert error_info.value.remedy.startswith("apt-get install --no-install-recommends python3-roslaunch, and")

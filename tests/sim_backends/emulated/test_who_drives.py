@@ -1,4 +1,4 @@
-"""Which emulated robots are driven by their topic when a step moves them; the lab moves the others."""
+"""A step moves an emulated robot by its velocity topic only if the topic is unique; the lab moves all others."""
 
 from pathlib import Path
 
@@ -22,9 +22,9 @@ DOMAIN = {"\nlimits:": "\n  environment: {ROS_DOMAIN_ID: '7'}\nlimits:"}
 
 def write_profile(folder: Path, name: str, changes: dict[str, str]) -> None:
     text = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
-    for old, new in ({"name: turtlebot3_burger": f"name: {name}"} | changes).items():
-        assert old in text
-        text = text.replace(old, new)
+    for old_text, new_text in ({"name: turtlebot3_burger": f"name: {name}"} | changes).items():
+        assert old_text in text
+        text = text.replace(old_text, new_text)
     (folder / f"{name}.yaml").write_text(text, encoding="utf-8")
 
 
@@ -53,16 +53,18 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_robots_are_driven_by_topic_only_if_no_other_robot_subscribes_to_it(
     folder: Path, profiles: tuple[dict[str, str], dict[str, str]], ros: str, drives: set[str]
 ) -> None:
-    assert driving(folder, profiles, SITE.replace("ROS", ros)) == drives
+    assert driven_robots(folder, profiles, SITE.replace("ROS", ros)) == drives
 
 
-@pytest.mark.parametrize(("two", "drives"), [({}, set()), (OWN_TOPICS, {"one", "two"})])
-def test_on_a_shared_master_topics_must_differ(folder: Path, two: dict[str, str], drives: set[str]) -> None:
+@pytest.mark.parametrize(("changes_of_two", "drives"), [({}, set()), (OWN_TOPICS, {"one", "two"})])
+def test_on_a_shared_master_topics_must_differ(
+    folder: Path, changes_of_two: dict[str, str], drives: set[str]
+) -> None:
     text = SITE.replace("ROS", "debian") + "ros_master: relay\n"
-    assert driving(folder, ({}, two), text) == drives
+    assert driven_robots(folder, ({}, changes_of_two), text) == drives
 
 
-def driving(folder: Path, profiles: tuple[dict[str, str], dict[str, str]], site: str) -> set[str]:
+def driven_robots(folder: Path, profiles: tuple[dict[str, str], dict[str, str]], site: str) -> set[str]:
     """Return the names of the robots of a site file that are driven by their topic."""
     for name, changes in zip(("one", "two"), profiles, strict=True):
         write_profile(folder / "robots", name, changes)

@@ -1,7 +1,7 @@
 """A tf listener of ROS 1, run on a robot with its `python3` and setup file: `tf_listener.py FIXED TOPIC...`.
 
 It receives `/tf` and `/tf_static` with Debian's `tf2_msgs`, and the first message of each topic as bytes: every
-stamped message starts with its header. It prints as JSON the tree, the frame of each topic, and its path to the root.
+stamped message starts with its header. It prints JSON: the tree, the frame of each topic, and its path to the root.
 """
 
 import json
@@ -14,7 +14,7 @@ from tf2_msgs.msg import TFMessage
 
 LIMIT_S = 60.0
 
-fixed, *topics = sys.argv[1:]
+fixed_frame, *topics = sys.argv[1:]
 parents: dict[str, str] = {}
 latched: dict[str, bool] = {}
 frames: dict[str, str] = {}
@@ -57,6 +57,6 @@ report = {
     "frames": frames,
     "latched": latched,
     "paths": {frame: path(frame) for frame in sorted(set(frames.values()) - {""})},
-    "reached": all(fixed in path(frame) for frame in frames.values() if frame),
+    "reached": all(fixed_frame in path(frame) for frame in frames.values() if frame),
 }
 sys.stdout.write(json.dumps(report) + "\n")

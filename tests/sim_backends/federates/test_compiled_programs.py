@@ -23,7 +23,7 @@ def program(tmp_path: Path, text: str = "int main() { return 7; }\n", *packages:
     return CompiledProgram("seven", source, packages, INSTALL, flags=("-O0",))
 
 
-def test_it_is_compiled_once_and_again_if_its_source_changes(
+def test_a_program_is_compiled_once_and_again_if_its_source_changes(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     seven = program(tmp_path)
@@ -39,9 +39,9 @@ def test_it_is_compiled_once_and_again_if_its_source_changes(
 
 
 def test_a_missing_library_is_reported_with_the_command_that_installs_it(tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationError, match="seven needs the library no-such-library") as caught:
+    with pytest.raises(ConfigurationError, match="seven needs the library no-such-library") as error_info:
         program(tmp_path, "int main() {}\n", "no-such-library").path()
-    assert caught.value.remedy == INSTALL
+    assert error_info.value.remedy == INSTALL
 
 
 def test_an_error_of_the_compiler_is_shown_and_leaves_no_file(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Each check of the conformance suite fails for a federate that is broken in what it checks."""
+"""Each check of the conformance suite fails for a federate that violates the checked rule."""
 
 import math
 import random
@@ -27,7 +27,7 @@ States = Mapping[str, State]
 
 
 class WrappedPhysics:
-    """Moves agents as the example does; subclasses break it."""
+    """Physics that moves agents as the example does; subclasses alter its answers."""
 
     def __init__(self, hello: Any) -> None:  # noqa: ANN401
         self.carts = Carts(hello)
@@ -37,9 +37,9 @@ class WrappedPhysics:
 
     def advance(self, to_ns: int, commands: Mapping[str, Any]) -> States:
         self.calls += 1
-        return self.broken(self.carts.advance(to_ns, commands), to_ns)
+        return self.alter_answer(self.carts.advance(to_ns, commands), to_ns)
 
-    def broken(self, states: States, to_ns: int) -> States:
+    def alter_answer(self, states: States, to_ns: int) -> States:
         return states
 
 
@@ -49,17 +49,17 @@ def shifted(state: State, east_m: float) -> State:
 
 
 class StartsElsewhere(WrappedPhysics):
-    def broken(self, states: States, to_ns: int) -> States:
+    def alter_answer(self, states: States, to_ns: int) -> States:
         return {name: shifted(state, 1.0) for name, state in states.items()}
 
 
 class DriftingPhysics(WrappedPhysics):
-    def broken(self, states: States, to_ns: int) -> States:
+    def alter_answer(self, states: States, to_ns: int) -> States:
         return {name: shifted(state, 1e-6 * self.calls) for name, state in states.items()}
 
 
 class JumpingPhysics(WrappedPhysics):
-    def broken(self, states: States, to_ns: int) -> States:
+    def alter_answer(self, states: States, to_ns: int) -> States:
         return {name: shifted(state, 3.0 * (to_ns > 50 * MS)) for name, state in states.items()}
 
 
@@ -75,7 +75,7 @@ class HasWrongLimits(WrappedPhysics):
 
 
 class TremblingPhysics(WrappedPhysics):
-    def broken(self, states: States, to_ns: int) -> States:
+    def alter_answer(self, states: States, to_ns: int) -> States:
         return {name: shifted(state, random.random() * 1e-9) for name, state in states.items()}
 
 
@@ -85,12 +85,12 @@ class IsShared(WrappedPhysics):
 
 
 class LosesAnAgent(WrappedPhysics):
-    def broken(self, states: States, to_ns: int) -> States:
+    def alter_answer(self, states: States, to_ns: int) -> States:
         return {name: state for name, state in states.items() if name != "bob" or to_ns < 20 * MS}
 
 
 class LeavesOnTime(WrappedPhysics):
-    """Has no state of an agent outside of its lifetime, which may be shifted, or at another place."""
+    """Has no state of an agent outside of its lifetime; subclasses shift the lifetime or the position."""
 
     late_ns = 0
     east_m = 0.0
@@ -99,7 +99,7 @@ class LeavesOnTime(WrappedPhysics):
         super().__init__(hello)
         self.lifetimes = hello.lifetimes
 
-    def broken(self, states: States, to_ns: int) -> States:
+    def alter_answer(self, states: States, to_ns: int) -> States:
         return {
             name: shifted(state, self.east_m)
             for name, state in states.items()
@@ -112,8 +112,8 @@ class LeavesLate(LeavesOnTime):
 
 
 class LosesAnotherAgent(LeavesOnTime):
-    def broken(self, states: States, to_ns: int) -> States:
-        return {name: state for name, state in super().broken(states, to_ns).items() if name != "bob"}
+    def alter_answer(self, states: States, to_ns: int) -> States:
+        return {name: state for name, state in super().alter_answer(states, to_ns).items() if name != "bob"}
 
 
 class AppearsElsewhere(LeavesOnTime):
@@ -121,17 +121,17 @@ class AppearsElsewhere(LeavesOnTime):
 
 
 class AddsAnAgent(WrappedPhysics):
-    def broken(self, states: States, to_ns: int) -> States:
+    def alter_answer(self, states: States, to_ns: int) -> States:
         return {**states, **({"dan": states["bob"]} if to_ns > 20 * MS else {})}
 
 
 class IsNotFinite(WrappedPhysics):
-    def broken(self, states: States, to_ns: int) -> States:
+    def alter_answer(self, states: States, to_ns: int) -> States:
         return {name: shifted(state, math.nan * (to_ns > 0)) for name, state in states.items()}
 
 
 class SwapsAxes(WrappedPhysics):
-    def broken(self, states: States, to_ns: int) -> States:
+    def alter_answer(self, states: States, to_ns: int) -> States:
         return {name: state._replace(position_m=swapped(state.position_m)) for name, state in states.items()}
 
 
@@ -141,19 +141,19 @@ def swapped(position_m: tuple[float, float, float]) -> tuple[float, float, float
 
 
 class StandsStill(WrappedPhysics):
-    def broken(self, states: States, to_ns: int) -> States:
+    def alter_answer(self, states: States, to_ns: int) -> States:
         return {name: state._replace(velocity_m_s=(0.0, 0.0, 0.0)) for name, state in states.items()}
 
 
 class ReportsDegrees(WrappedPhysics):
-    def broken(self, states: States, to_ns: int) -> States:
+    def alter_answer(self, states: States, to_ns: int) -> States:
         return {
             name: state._replace(heading_rad=math.degrees(state.heading_rad or 0.0)) for name, state in states.items()
         }
 
 
 class ReportsOppositeTurns(WrappedPhysics):
-    def broken(self, states: States, to_ns: int) -> States:
+    def alter_answer(self, states: States, to_ns: int) -> States:
         return {name: state._replace(heading_rad=-(state.heading_rad or 0.0)) for name, state in states.items()}
 
 
@@ -161,14 +161,14 @@ class ChangesCommands(WrappedPhysics):
     """Moves as if it had received other commands."""
 
     def advance(self, to_ns: int, commands: Mapping[str, Any]) -> States:
-        return super().advance(to_ns, {name: self.changed(command) for name, command in commands.items()})
+        return super().advance(to_ns, {name: self.change_command(command) for name, command in commands.items()})
 
-    def changed(self, command: Any) -> Any:  # noqa: ANN401 (a command)
+    def change_command(self, command: Any) -> Any:  # noqa: ANN401 (a command)
         return command
 
 
 class TurnsRight(ChangesCommands):
-    def changed(self, command: Any) -> Any:  # noqa: ANN401 (a command)
+    def change_command(self, command: Any) -> Any:  # noqa: ANN401 (a command)
         return replace(command, turn_rad_s=-command.turn_rad_s) if isinstance(command, Twist) else command
 
 
@@ -177,19 +177,19 @@ class ReportsWrongSide(TurnsRight, ReportsOppositeTurns):
 
 
 class IgnoresYaw(ChangesCommands):
-    def changed(self, command: Any) -> Any:  # noqa: ANN401 (a command)
+    def change_command(self, command: Any) -> Any:  # noqa: ANN401 (a command)
         return replace(command, yaw_rad=None) if isinstance(command, Velocity) else command
 
 
 class ZeroesYaw(ChangesCommands):
-    def changed(self, command: Any) -> Any:  # noqa: ANN401 (a command)
+    def change_command(self, command: Any) -> Any:  # noqa: ANN401 (a command)
         return replace(command, yaw_rad=command.yaw_rad or 0.0) if isinstance(command, Velocity) else command
 
 
 class FliesForward(ChangesCommands):
     """Flies in the frame of its body, whose heading is pi/2 in the check."""
 
-    def changed(self, command: Any) -> Any:  # noqa: ANN401 (a command)
+    def change_command(self, command: Any) -> Any:  # noqa: ANN401 (a command)
         if not isinstance(command, Velocity):
             return command
         forward, left, up = command.velocity_m_s
@@ -205,7 +205,7 @@ Outcome = tuple[list[Arrival], list[Drop]]
 
 
 class DelayNetwork(Disc):
-    """Delivers after 2 ms within 100 km; subclasses break it."""
+    """A network that delivers after 2 ms within 100 km; subclasses alter its answers."""
 
     def __init__(self, hello: Any) -> None:  # noqa: ANN401
         super().__init__(1e5, 2 * MS, extrapolates=True)
@@ -213,16 +213,20 @@ class DelayNetwork(Disc):
 
     def advance(self, to_ns: int, packets: Sequence[Packet], states: States) -> tuple[list[Arrival], list[Drop]]:
         arrivals, drops = super().advance(to_ns, packets, states)
-        outcomes = self.broken(arrivals, drops, to_ns)
+        outcomes = self.alter_answer(arrivals, drops, to_ns)
         self.last_ns = to_ns
         return outcomes
 
-    def broken(self, arrivals: list[Arrival], drops: list[Drop], to_ns: int) -> tuple[list[Arrival], list[Drop]]:
+    def alter_answer(
+        self, arrivals: list[Arrival], drops: list[Drop], to_ns: int
+    ) -> tuple[list[Arrival], list[Drop]]:
         return arrivals, drops
 
 
-def net(broken: Callable[[DelayNetwork, list[Arrival], list[Drop], int], Outcome]) -> type[DelayNetwork]:
-    return type("Broken", (DelayNetwork,), {"broken": broken})
+def network_class(
+    alter_answer: Callable[[DelayNetwork, list[Arrival], list[Drop], int], Outcome],
+) -> type[DelayNetwork]:
+    return type("Broken", (DelayNetwork,), {"alter_answer": alter_answer})
 
 
 class DropsAtBorders(DelayNetwork):
@@ -258,9 +262,9 @@ class DeliversToAll(DelayNetwork):
 
 class ReckoningNetwork(DelayNetwork):
     def advance(self, to_ns: int, packets: Sequence[Packet], states: States) -> Outcome:
-        later = MS if isinstance(states, DeadReckoned) else 0
+        delay_ns = MS if isinstance(states, DeadReckoned) else 0
         return super().advance(
-            to_ns, [packet._replace(enters_ns=packet.enters_ns + later) for packet in packets], states
+            to_ns, [packet._replace(enters_ns=packet.enters_ns + delay_ns) for packet in packets], states
         )
 
 
@@ -278,7 +282,7 @@ class AnnouncesTooLate(DelayNetwork):
 class AnnouncesDropsTooLate(DelayNetwork):
     """Drops packets 2 ms after they entered, and announces 1 ms more."""
 
-    def broken(self, arrivals: list[Arrival], drops: list[Drop], to_ns: int) -> Outcome:
+    def alter_answer(self, arrivals: list[Arrival], drops: list[Drop], to_ns: int) -> Outcome:
         return [], [Drop(arrival.packet_id, "lost") for arrival in arrivals]
 
     def next_event_ns(self) -> int | None:
@@ -306,9 +310,9 @@ class LosesByKey(DelayNetwork):
     def advance(self, to_ns: int, packets: Sequence[Packet], states: States) -> Outcome:
         ends_m = [states[name].position_m for name in ("ann", "bob") if name in states]
         distance_m = math.dist(*ends_m) if len(ends_m) == 2 else 0.0
-        lost = [packet for packet in packets if distance_m > 30 and self.draw(packet) < 0.5]
-        arrivals, drops = super().advance(to_ns, [packet for packet in packets if packet not in lost], states)
-        return arrivals, [*drops, *(Drop(packet.packet_id, "bad luck") for packet in lost)]
+        lost_packets = [packet for packet in packets if distance_m > 30 and self.draw(packet) < 0.5]
+        arrivals, drops = super().advance(to_ns, [packet for packet in packets if packet not in lost_packets], states)
+        return arrivals, [*drops, *(Drop(packet.packet_id, "bad luck") for packet in lost_packets)]
 
     def draw(self, packet: Packet) -> float:
         return random.Random(f"{self.seed} {packet.identity}").random()
@@ -345,12 +349,12 @@ class UnknownTransmitter(DelayNetwork):
 
 
 def random_delay(self: DelayNetwork, arrivals: list[Arrival], drops: list[Drop], to_ns: int) -> Outcome:
-    lost = [arrival for arrival in arrivals if random.random() < 0.5]
-    remaining = [arrival for arrival in arrivals if arrival not in lost]
-    return remaining, [Drop(arrival.packet_id, "bad luck") for arrival in lost]
+    lost_arrivals = [arrival for arrival in arrivals if random.random() < 0.5]
+    remaining_arrivals = [arrival for arrival in arrivals if arrival not in lost_arrivals]
+    return remaining_arrivals, [Drop(arrival.packet_id, "bad luck") for arrival in lost_arrivals]
 
 
-def as_answer(kind: MessageKind) -> Alter:
+def turn_errors_into(kind: MessageKind) -> Alter:
     """Return a function that turns an error into an empty answer."""
 
     def alter(frame: bytes) -> bytes:
@@ -359,7 +363,7 @@ def as_answer(kind: MessageKind) -> Alter:
     return alter
 
 
-def later(kind: MessageKind, by: int) -> Alter:
+def add_to_first_integer(kind: MessageKind, by: int) -> Alter:
     """Return a function that changes the first integer in the body of messages."""
 
     def alter(frame: bytes) -> bytes:
@@ -370,7 +374,7 @@ def later(kind: MessageKind, by: int) -> Alter:
     return alter
 
 
-def silent(frame: bytes) -> bytes | None:
+def drop_answers(frame: bytes) -> bytes | None:
     return None if frame[4] in {MessageKind.STATES, MessageKind.OUTCOMES} else frame
 
 
@@ -388,21 +392,33 @@ def physics(make: Any, **settings: Any) -> Pair:  # noqa: ANN401
 PHYSICS_CASES = [
     BrokenFederate("handshake", physics(Carts, commands=(1, 2, 9)), "unknown types of commands: [9]"),
     BrokenFederate(
-        "ping", replace(physics(Carts), alter=later(MessageKind.PONG, 1)), "the ping 0 was answered with 1"
+        "ping",
+        replace(physics(Carts), alter=add_to_first_integer(MessageKind.PONG, 1)),
+        "the ping 0 was answered with 1",
     ),
     BrokenFederate(
-        "malformed", replace(physics(Carts), alter=as_answer(MessageKind.STATES)), "it must refuse a frame that ends"
+        "malformed",
+        replace(physics(Carts), alter=turn_errors_into(MessageKind.STATES)),
+        "it must refuse a frame that ends",
     ),
-    BrokenFederate("counts", replace(physics(Carts), alter=as_answer(MessageKind.STATES)), "it must refuse a count"),
     BrokenFederate(
-        "fork_absence", replace(physics(Carts, forks=False), alter=as_answer(MessageKind.DONE)), "it must refuse fork"
+        "counts", replace(physics(Carts), alter=turn_errors_into(MessageKind.STATES)), "it must refuse a count"
+    ),
+    BrokenFederate(
+        "fork_absence",
+        replace(physics(Carts, forks=False), alter=turn_errors_into(MessageKind.DONE)),
+        "it must refuse fork",
     ),
     BrokenFederate("bye", replace(physics(Carts), stays=True), "it has not closed the connection"),
     BrokenFederate("start", physics(StartsElsewhere), "ann starts 1 m away"),
-    BrokenFederate("remainders", replace(physics(Carts), alter=later(MessageKind.STATES, 1)), "instead of 0 ns"),
+    BrokenFederate(
+        "remainders", replace(physics(Carts), alter=add_to_first_integer(MessageKind.STATES, 1)), "instead of 0 ns"
+    ),
     BrokenFederate("remainders", physics(LosesAnAgent), "there is no state of bob"),
     BrokenFederate("remainders", physics(AddsAnAgent), "the agent dan appeared"),
-    BrokenFederate("remainders", replace(physics(Carts), alter=silent, deadline_s=0.2), "has not answered for 0.2 s"),
+    BrokenFederate(
+        "remainders", replace(physics(Carts), alter=drop_answers, deadline_s=0.2), "has not answered for 0.2 s"
+    ),
     BrokenFederate("remainders", physics(IsNotFinite), "with a malformed frame: byte 32: the state of agent 0"),
     BrokenFederate("drift", physics(DriftingPhysics), "windows instead of one: the positions of ann differ"),
     BrokenFederate("repeated_time", physics(DriftingPhysics), "a second request for 20000000 ns gave other states"),
@@ -413,7 +429,9 @@ PHYSICS_CASES = [
         "command_time", replace(physics(Carts), run_class=IgnoresFrom), "a command that applies from 100000000 ns"
     ),
     BrokenFederate(
-        "unknown_command", replace(physics(Carts), alter=as_answer(MessageKind.STATES)), "it must refuse a command"
+        "unknown_command",
+        replace(physics(Carts), alter=turn_errors_into(MessageKind.STATES)),
+        "it must refuse a command",
     ),
     BrokenFederate("determinism", physics(TremblingPhysics), "gave different answers"),
     BrokenFederate(
@@ -442,72 +460,96 @@ PHYSICS_CASES = [
 NETWORK_CASES = [
     BrokenFederate("handshake", physics(UnknownTransmitter), "KeyError: 'nobody'"),
     BrokenFederate(
-        "ping", replace(physics(DelayNetwork), alter=later(MessageKind.PONG, 1)), "the ping 0 was answered with 1"
+        "ping",
+        replace(physics(DelayNetwork), alter=add_to_first_integer(MessageKind.PONG, 1)),
+        "the ping 0 was answered with 1",
     ),
     BrokenFederate(
         "malformed",
-        replace(physics(DelayNetwork), alter=as_answer(MessageKind.OUTCOMES)),
+        replace(physics(DelayNetwork), alter=turn_errors_into(MessageKind.OUTCOMES)),
         "it must refuse a frame that ends",
     ),
     BrokenFederate(
-        "counts", replace(physics(DelayNetwork), alter=as_answer(MessageKind.OUTCOMES)), "it must refuse a count"
+        "counts",
+        replace(physics(DelayNetwork), alter=turn_errors_into(MessageKind.OUTCOMES)),
+        "it must refuse a count",
     ),
     BrokenFederate(
         "fork_absence",
-        replace(physics(DelayNetwork, forks=False), alter=as_answer(MessageKind.DONE)),
+        replace(physics(DelayNetwork, forks=False), alter=turn_errors_into(MessageKind.DONE)),
         "it must refuse fork",
     ),
     BrokenFederate("bye", replace(physics(DelayNetwork), stays=True), "it has not closed the connection"),
     BrokenFederate("first_request", physics(RefusesNegativeTimes), "ValueError: negative"),
     BrokenFederate(
-        "exactly_once", replace(physics(DelayNetwork), alter=later(MessageKind.OUTCOMES, 1)), "but advanced to"
+        "exactly_once",
+        replace(physics(DelayNetwork), alter=add_to_first_integer(MessageKind.OUTCOMES, 1)),
+        "but advanced to",
     ),
-    BrokenFederate("exactly_once", physics(net(lambda _, arrived, drops, to_ns: ([], drops))), "neither arrived nor"),
+    BrokenFederate(
+        "exactly_once", physics(network_class(lambda _, arrivals, drops, to_ns: ([], drops))), "neither arrived nor"
+    ),
     BrokenFederate(
         "exactly_once",
-        physics(net(lambda _, arrived, drops, to_ns: ([*arrived, *arrived[-1:]], drops))),
+        physics(network_class(lambda _, arrivals, drops, to_ns: ([*arrivals, *arrivals[-1:]], drops))),
         "reported twice",
     ),
     BrokenFederate(
         "exactly_once",
-        physics(net(lambda _, arrived, drops, to_ns: ([], [Drop(arrival.packet_id, "") for arrival in arrived]))),
+        physics(
+            network_class(
+                lambda _, arrivals, drops, to_ns: ([], [Drop(arrival.packet_id, "") for arrival in arrivals])
+            )
+        ),
         "was dropped without a reason",
     ),
     BrokenFederate(
         "exactly_once",
-        physics(net(lambda _, arrived, drops, to_ns: ([arrival._replace(receiver="cy") for arrival in arrived], []))),
+        physics(
+            network_class(
+                lambda _, arrivals, drops, to_ns: ([arrival._replace(receiver="cy") for arrival in arrivals], [])
+            )
+        ),
         "for bob arrived at cy",
     ),
     BrokenFederate(
         "exactly_once",
         physics(
-            net(lambda _, arrived, drops, to_ns: ([arrival._replace(at_ns=to_ns + 1) for arrival in arrived], []))
+            network_class(
+                lambda _, arrivals, drops, to_ns: ([arrival._replace(at_ns=to_ns + 1) for arrival in arrivals], [])
+            )
         ),
         "not between",
     ),
     BrokenFederate(
         "exactly_once",
-        physics(net(lambda _, arrived, drops, to_ns: ([Arrival(99, "bob", to_ns)], []))),
+        physics(network_class(lambda _, arrivals, drops, to_ns: ([Arrival(99, "bob", to_ns)], []))),
         "the fate of packet 99 was reported, but it was not sent to the network",
     ),
     BrokenFederate(
-        "exactly_once", physics(net(lambda _, arrived, drops, to_ns: (arrived[::-1], drops))), "order of time"
+        "exactly_once",
+        physics(network_class(lambda _, arrivals, drops, to_ns: (arrivals[::-1], drops))),
+        "order of time",
     ),
     BrokenFederate("exactly_once", physics(AnnouncesTooLate), "before the announced next event"),
     BrokenFederate("exactly_once", physics(AnnouncesThePast), "its next event is at 0 ns"),
     BrokenFederate("window_borders", physics(DropsAtBorders), "at the border of a window neither arrived"),
     BrokenFederate(
         "window_length",
-        physics(net(lambda _, arrived, drops, to_ns: ([arrival._replace(at_ns=to_ns) for arrival in arrived], []))),
+        physics(
+            network_class(
+                lambda _, arrivals, drops, to_ns: ([arrival._replace(at_ns=to_ns) for arrival in arrivals], [])
+            )
+        ),
         "windows of another length changed an arrival",
     ),
     BrokenFederate("far_away", physics(ForgetsFarAway), "1,000 km away neither arrived nor"),
     BrokenFederate(
         "unknown_transport",
-        replace(physics(DelayNetwork, transports=("udp",)), alter=as_answer(MessageKind.OUTCOMES)),
+        replace(physics(DelayNetwork, transports=("udp",)), alter=turn_errors_into(MessageKind.OUTCOMES)),
         "it must refuse a packet of a transport",
     ),
-    BrokenFederate("determinism", physics(net(random_delay)), "gave different arrivals or drops"),
+    BrokenFederate("determinism", physics(network_class(random_delay)), "gave different arrivals or drops"),
     BrokenFederate("new_agent", physics(KnowsNoNewAgents, agents_appear=True), "KeyError"),
     BrokenFederate(
         "absent_agent", physics(DeliversToAll, agents_disappear=True), "a packet arrived at bob, which has"
@@ -521,20 +563,20 @@ NETWORK_CASES = [
 ]
 
 
-def run(role: int, broken: BrokenFederate) -> ConformanceResult:
-    target = Target(broken.pair, replace(HELLO, role=role), windows=100)
-    return run_check(target, broken.check, checks(is_physics=role == PHYSICS)[broken.check])
+def run(role: int, broken_federate: BrokenFederate) -> ConformanceResult:
+    target = Target(broken_federate.pair, replace(HELLO, role=role), windows=100)
+    return run_check(target, broken_federate.check, checks(is_physics=role == PHYSICS)[broken_federate.check])
 
 
 @pytest.mark.parametrize(
-    ("role", "broken"),
+    ("role", "broken_federate"),
     [*((PHYSICS, case) for case in PHYSICS_CASES), *((NETWORK, case) for case in NETWORK_CASES)],
     ids=lambda value: value.check if isinstance(value, BrokenFederate) else str(value),
 )
-def test_a_broken_federate_fails(role: int, broken: BrokenFederate, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_broken_federate_fails(role: int, broken_federate: BrokenFederate, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(probe, "_CLOSE_S", 0.2)
-    result = run(role, broken)
-    assert broken.message in result.failure
+    result = run(role, broken_federate)
+    assert broken_federate.message in result.failure
     assert result.request
     assert result.answer
 
@@ -563,8 +605,10 @@ def test_the_federates_conform_before_they_are_broken(role: int) -> None:
     make = Carts if role == PHYSICS else LosesByKey
     for name in checks(is_physics=role == PHYSICS):
         settings: dict[str, Any] = {"transports": ("udp",)} if role == NETWORK else {}
-        used = LeavesOnTime if name == "lifetimes" else make
-        pair = physics(used, agents_appear=True, agents_disappear=True, forks=name != "fork_absence", **settings)
+        federate_class = LeavesOnTime if name == "lifetimes" else make
+        pair = physics(
+            federate_class, agents_appear=True, agents_disappear=True, forks=name != "fork_absence", **settings
+        )
         result = run(role, BrokenFederate(name, pair, ""))
         assert (result.failure, result.skipped) == ("", ""), result
 
@@ -576,7 +620,7 @@ def test_the_federates_conform_before_they_are_broken(role: int) -> None:
         ("yaw", (1, 2), slice(2), "the scenario has no agent that flies"),
     ],
 )
-def test_a_check_of_other_commands_does_not_apply(
+def test_a_check_does_not_apply_without_the_commands_or_agents_that_it_needs(
     check: str, commands: tuple[int, ...], agents: slice, message: str
 ) -> None:
     hello = replace(HELLO, agents=HELLO.agents[agents])

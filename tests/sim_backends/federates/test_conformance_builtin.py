@@ -19,13 +19,13 @@ from tests.helpers.federate_pairs import Pair
 SCENARIO = load_scenario("convoy")
 WORLD = load_world(SCENARIO.world)
 HELLO = make_hello(SCENARIO, WORLD, make_bodies(SCENARIO, WORLD), 1, PHYSICS)
-CASES = [(role, name) for role in (PHYSICS, NETWORK) for name in checks(is_physics=role == PHYSICS)]
+CASES = [(role, check_name) for role in (PHYSICS, NETWORK) for check_name in checks(is_physics=role == PHYSICS)]
 
 
-@pytest.mark.parametrize(("role", "name"), CASES, ids=str)
-def test_the_built_in_federates_conform(role: int, name: str) -> None:
+@pytest.mark.parametrize(("role", "check_name"), CASES, ids=str)
+def test_the_built_in_federates_conform(role: int, check_name: str) -> None:
     service = FederateService(partial(make_federate, role), agents_disappear=True)
     target = Target(Pair(service), replace(HELLO, role=role), windows=500)
-    result = run_check(target, name, checks(is_physics=role == PHYSICS)[name])
+    result = run_check(target, check_name, checks(is_physics=role == PHYSICS)[check_name])
     assert not result.failure, result
-    assert bool(result.skipped) == (name in {"fork_absence", "unknown_transport", "new_agent"})
+    assert bool(result.skipped) == (check_name in {"fork_absence", "unknown_transport", "new_agent"})

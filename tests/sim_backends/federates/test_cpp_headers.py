@@ -1,4 +1,4 @@
-"""The headers for federates in C++, with the frames of the documentation."""
+"""The C++ headers for federates, tested with the frames of the documentation."""
 
 import shutil
 import struct
@@ -25,8 +25,8 @@ def program(request: pytest.FixtureRequest) -> Path:
 
 
 def answers(program: Path, *requests: bytes) -> bytes:
-    done = subprocess.run([program], input=b"".join(requests), stdout=subprocess.PIPE, check=False, timeout=60)
-    return done.stdout
+    process = subprocess.run([program], input=b"".join(requests), stdout=subprocess.PIPE, check=False, timeout=60)
+    return process.stdout
 
 
 def test_frames_are_those_of_the_documentation(program: Path) -> None:
@@ -45,10 +45,12 @@ def error(program: Path, request: bytes) -> str:
 def test_a_malformed_frame_is_refused_with_its_position(program: Path) -> None:
     for name in REQUESTS:
         body = FRAMES[name][HEADER_BYTES:]
-        for wrong in (body[:9], body[:-1], body + b"\0"):
-            message = error(program, struct.pack("<I", len(wrong)) + FRAMES[name][4:HEADER_BYTES] + wrong)
+        for malformed_body in (body[:9], body[:-1], body + b"\0"):
+            message = error(
+                program, struct.pack("<I", len(malformed_body)) + FRAMES[name][4:HEADER_BYTES] + malformed_body
+            )
             position = int(message.removeprefix("byte ").partition(":")[0])
-            assert position <= HEADER_BYTES + len(wrong)
+            assert position <= HEADER_BYTES + len(malformed_body)
         assert message.endswith("1 bytes follow the message")
     hello, physics = FRAMES["hello"], FRAMES["advance physics"]
     assert error(program, struct.pack("<I", MAX_HELLO_BYTES + 1) + hello[4:]).startswith("byte 0: a size of 4194305")

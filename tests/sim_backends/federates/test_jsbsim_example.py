@@ -51,7 +51,7 @@ def test_the_module_is_short() -> None:
 
 
 @pytest.mark.parametrize("name", checks(is_physics=True))
-def test_it_conforms(name: str) -> None:
+def test_the_jsbsim_federate_conforms(name: str) -> None:
     scenario = load_scenario(SCENARIO)
     world = load_world(scenario.world)
     hello = make_hello(scenario, world, make_bodies(scenario, world), 1, PHYSICS)
@@ -61,7 +61,7 @@ def test_it_conforms(name: str) -> None:
 
 
 @pytest.mark.nightly
-def test_the_command_checks_it_by_its_name(
+def test_the_conform_command_checks_the_jsbsim_federate_by_its_name(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -86,6 +86,6 @@ def test_a_robot_that_drives_is_refused() -> None:
         build(load_scenario("convoy", {"physics.federate": "jsbsim"}))
 
 
-def test_it_has_no_options() -> None:
+def test_the_jsbsim_federate_has_no_options() -> None:
     with pytest.raises(ConfigurationError, match=r"in physics.options: unknown key wind; no keys are valid here"):
         load_scenario(SCENARIO, {"physics.federate": "jsbsim", "physics.options": {"wind": 1}})

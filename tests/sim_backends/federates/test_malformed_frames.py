@@ -26,24 +26,24 @@ BODIES = {name: frame[HEADER_BYTES:] for name, frame in example_frames().items()
 
 @pytest.mark.parametrize("name", sorted(DECODERS))
 def test_each_cut_frame_is_refused_with_its_position(name: str) -> None:
-    whole = {len(BODIES["outcomes"]) - 24} if name == "outcomes" else set()  # delay parts are optional
-    for length in set(range(len(BODIES[name]))) - whole:
-        with pytest.raises(MalformedFrameError, match=r"^byte \d+: ") as raised:
+    complete_lengths = {len(BODIES["outcomes"]) - 24} if name == "outcomes" else set()  # delay parts are optional
+    for length in set(range(len(BODIES[name]))) - complete_lengths:
+        with pytest.raises(MalformedFrameError, match=r"^byte \d+: ") as error_info:
             DECODERS[name](BODIES[name][:length])
-        assert 0 <= raised.value.position <= HEADER_BYTES + length
+        assert 0 <= error_info.value.position <= HEADER_BYTES + length
     with pytest.raises(MalformedFrameError, match=r"^byte \d+: "):
         DECODERS[name](BODIES[name] + b"\0")
 
 
 @pytest.mark.parametrize("name", sorted(DECODERS))
-def test_mutated_frames_raise_nothing_else_and_allocate_little(name: str) -> None:
-    draws = random.Random(name)
+def test_mutated_frames_raise_no_other_error_and_allocate_little_memory(name: str) -> None:
+    rng = random.Random(name)
     tracemalloc.start()
     try:
         for _ in range(400):
             body = bytearray(BODIES[name])
-            for _ in range(draws.randint(1, 6)):
-                body[draws.randrange(len(body))] = draws.choice((0, 1, 0x7F, 0x80, 0xFF, draws.randrange(256)))
+            for _ in range(rng.randint(1, 6)):
+                body[rng.randrange(len(body))] = rng.choice((0, 1, 0x7F, 0x80, 0xFF, rng.randrange(256)))
             with suppress(MalformedFrameError):
                 DECODERS[name](bytes(body))
         assert tracemalloc.get_traced_memory()[1] < 1_000_000
@@ -60,13 +60,13 @@ def test_mutated_frames_raise_nothing_else_and_allocate_little(name: str) -> Non
     ],
 )
 def test_a_wrong_header_is_refused(fields: tuple[int, ...], message: str) -> None:
-    with pytest.raises(MalformedFrameError) as raised:
+    with pytest.raises(MalformedFrameError) as error_info:
         read_header(struct.pack("<IHHII", *fields))
-    assert str(raised.value) == message
+    assert str(error_info.value) == message
 
 
 @pytest.mark.parametrize(
-    ("name", "position", "wrong", "message"),
+    ("name", "position", "wrong_bytes", "message"),
     [
         ("hello", 0, b"HTTP/1.1", "byte 16: this is not fieldkit's protocol for federates"),
         ("hello", 8, b"\2\0", "byte 24: protocol version 2; this program has 1"),
@@ -81,12 +81,14 @@ def test_a_wrong_header_is_refused(fields: tuple[int, ...], message: str) -> Non
         ("error", 2, b"\xff", "byte 18: the text is not UTF-8"),
     ],
 )
-def test_the_position_of_the_wrong_byte(name: str, position: int, wrong: bytes, message: str) -> None:
+def test_an_error_states_the_position_of_the_wrong_byte(
+    name: str, position: int, wrong_bytes: bytes, message: str
+) -> None:
     body = bytearray(BODIES[name])
-    body[position : position + len(wrong)] = wrong
-    with pytest.raises(MalformedFrameError) as raised:
+    body[position : position + len(wrong_bytes)] = wrong_bytes
+    with pytest.raises(MalformedFrameError) as error_info:
         DECODERS[name](bytes(body))
-    assert str(raised.value).startswith(message)
+    assert str(error_info.value).startswith(message)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e308])
@@ -103,7 +105,7 @@ def test_two_states_of_one_agent_are_refused() -> None:
         exchanges.decode_states(exchanges.encode_number(0) + struct.pack("<II", 0, 2) + 2 * state, agents())
 
 
-def test_our_own_limits() -> None:
+def test_frames_and_texts_of_fieldkit_have_a_maximum_size() -> None:
     with pytest.raises(ValueError, match="longer than"):
         encode(MessageKind.STATES, 1, 0, bytes(17 << 20))
     with pytest.raises(ValueError, match="a text of 1001 bytes is longer than 1000"):

@@ -62,7 +62,7 @@ def test_a_python_class_runs_in_this_process_and_a_program_in_another(tmp_path: 
         assert simulation.run().windows_ns
 
 
-def test_builtin_names_the_built_in_federates() -> None:
+def test_the_name_builtin_means_the_built_in_federates() -> None:
     scenario = load_scenario("convoy", {"physics.federate": "builtin", "network.federate": "builtin"})
     assert (scenario.physics.federate, scenario.network.federate) == (None, None)
 
@@ -79,9 +79,9 @@ def test_builtin_names_the_built_in_federates() -> None:
 def test_a_federate_that_cannot_be_used_is_refused_with_a_remedy(
     role: int, name: str, message: str, remedy: str
 ) -> None:
-    with pytest.raises(ConfigurationError, match=message) as caught:
+    with pytest.raises(ConfigurationError, match=message) as error_info:
         command_line(name, role)
-    assert caught.value.remedy == remedy
+    assert error_info.value.remedy == remedy
 
 
 def test_the_conformance_suite_checks_a_federate_by_its_name(

@@ -41,27 +41,27 @@ REQUESTS = ("advance physics", "ping", "fork", "release", "advance physics", "by
 CARTS = shlex.join((sys.executable, str(EXAMPLES / "carts.py")))
 
 
-def remote(alter: Alter) -> RemotePhysics:
+def remote_carts(alter: Alter) -> RemotePhysics:
     return RemotePhysics(*Pair(FederateService(carts(), name="carts"), alter=alter)(HELLO))
 
 
 @pytest.fixture(autouse=True)
-def no_process_is_left() -> Iterator[None]:
-    began_s = now_s()
+def no_process_remains() -> Iterator[None]:
+    start_s = now_s()
     yield
-    assert children(began_s) == set()
+    assert children(start_s) == set()
 
 
-def from_second(alter: Callable[[bytes], bytes | None]) -> Alter:
+def alter_from_second_states(alter: Callable[[bytes], bytes | None]) -> Alter:
     """Return a function that changes the second and later states."""
     count = 0
 
-    def altered(frame: bytes) -> bytes | None:
+    def alter_later_states(frame: bytes) -> bytes | None:
         nonlocal count
         count += frame[4] == MessageKind.STATES
         return alter(frame) if count > 1 else frame
 
-    return altered
+    return alter_later_states
 
 
 @pytest.mark.parametrize(
@@ -88,16 +88,16 @@ def from_second(alter: Callable[[bytes], bytes | None]) -> Alter:
         ),
     ],
 )
-def test_an_error_names_the_party_the_request_and_the_byte(
+def test_an_error_names_the_federate_the_request_and_the_byte(
     alter: Alter, error: type[Exception], message: str
 ) -> None:
-    physics = remote(from_second(alter))
+    physics = remote_carts(alter_from_second_states(alter))
     physics.advance(0, {})
     if error is UnansweredError:
         physics.session._deadline_s = 0.3
-    with pytest.raises(error) as raised:
+    with pytest.raises(error) as error_info:
         physics.advance(1_100_000, {"ann": Twist(0.5)})
-    text = str(raised.value)
+    text = str(error_info.value)
     assert message in text
     assert text.startswith("physics carts (test) ")
     with pytest.raises(FederateError, match="the connection to physics carts"):
@@ -105,12 +105,12 @@ def test_an_error_names_the_party_the_request_and_the_byte(
 
 
 def test_a_timeout_has_the_last_time() -> None:
-    physics = remote(from_second(lambda frame: None))
+    physics = remote_carts(alter_from_second_states(lambda frame: None))
     physics.advance(0, {})
     physics.session._deadline_s = 0.3
-    with pytest.raises(UnansweredError, match="; its last time is 0 s") as raised:
+    with pytest.raises(UnansweredError, match="; its last time is 0 s") as error_info:
         physics.advance(5 * MS, {})
-    assert raised.value.exit_code == 3
+    assert error_info.value.exit_code == 3
 
 
 class SlowPhysics:
@@ -129,40 +129,42 @@ class SlowPhysics:
         return {agent.name: agent.start for agent in HELLO.agents}
 
 
-def test_a_federate_that_reports_that_it_computes_may_take_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_federate_that_sends_heartbeats_may_need_longer_than_the_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
     hello = replace(HELLO, heartbeat_ms=50)
     physics = RemotePhysics(*Pair(FederateService(SlowPhysics), deadline_s=1.5)(hello))
     physics.advance(0, {})
     physics.advance(2 * MS, {})
     physics.advance(3 * MS, {})
     monkeypatch.setattr("sim_backends.federates.session.PATIENCE", 1)
-    impatient = RemotePhysics(*Pair(FederateService(SlowPhysics), deadline_s=1.5)(hello))
-    impatient.advance(0, {})
-    impatient.advance(2 * MS, {})
+    physics_without_patience = RemotePhysics(*Pair(FederateService(SlowPhysics), deadline_s=1.5)(hello))
+    physics_without_patience.advance(0, {})
+    physics_without_patience.advance(2 * MS, {})
     with pytest.raises(UnansweredError, match=r"its last time is 0.002 s; it last reported 0.002 s"):
-        impatient.advance(3 * MS, {})
+        physics_without_patience.advance(3 * MS, {})
 
 
 @pytest.mark.parametrize(
-    ("number", "message"),
+    ("signal_number", "message"),
     [
         (signal.SIGKILL, "the connection was closed; its last time is 0 s; it was terminated by SIGKILL"),
         (signal.SIGSTOP, "has not answered for 2 s: request to advance from 0 s to 0.003 s"),
     ],
 )
-def test_a_child_that_is_killed_or_suspended_is_named_and_ended(number: signal.Signals, message: str) -> None:
-    began_s = now_s()
+def test_a_child_that_is_killed_or_suspended_is_named_and_terminated(
+    signal_number: signal.Signals, message: str
+) -> None:
+    start_s = now_s()
     physics = open_physics(CARTS, HELLO, 20.0)
     physics.advance(0, {})
     physics.session._deadline_s = 2.0
-    (pid,) = children(began_s)
-    os.kill(pid, number)
-    with pytest.raises(FederateError, match=r"^physics carts \(.*carts.py'?\) ") as raised:
+    (pid,) = children(start_s)
+    os.kill(pid, signal_number)
+    with pytest.raises(FederateError, match=r"^physics carts \(.*carts.py'?\) ") as error_info:
         physics.advance(3 * MS, {})
-    assert message in str(raised.value)
+    assert message in str(error_info.value)
 
 
-def test_a_federate_that_fieldkit_has_not_started_is_named_and_left_alone() -> None:
+def test_a_federate_that_fieldkit_has_not_started_is_named_and_not_terminated() -> None:
     port = free_port()
     process = subprocess.Popen([*shlex.split(CARTS), f"tcp-listen:127.0.0.1:{port}"])
     try:
@@ -192,25 +194,25 @@ def test_a_child_that_fails_shows_its_last_output(tmp_path: Path) -> None:
     with pytest.raises(FederateError, match=r"it has exited with code 7; its last output: no licence"):
         open_physics(shlex.join((sys.executable, str(program))), HELLO, 20.0)
     program.write_text("import sys\nsys.exit('\\n'.join(f'at line {n}\\x1b' for n in range(20)))\n", encoding="utf-8")
-    with pytest.raises(FederateError) as caught:
+    with pytest.raises(FederateError) as error_info:
         open_physics(shlex.join((sys.executable, str(program))), HELLO, 20.0)
     lines = "".join(f"\n    at line {number} " for number in range(10, 20))
-    assert caught.value.what.endswith(f"it has exited with code 1; its last output:{lines}")
+    assert error_info.value.what.endswith(f"it has exited with code 1; its last output:{lines}")
     with pytest.raises(ConfigurationError, match="the federate /nowhere/at-all cannot be started"):
         open_physics("/nowhere/at-all", HELLO, 20.0)
 
 
-def test_a_child_that_prints_to_its_standard_output_gets_a_remedy() -> None:
-    with pytest.raises(FederateError, match="byte 4: there is no kind of message") as caught:
+def test_a_child_that_prints_to_its_standard_output_is_an_error_with_a_remedy() -> None:
+    with pytest.raises(FederateError, match="byte 4: there is no kind of message") as error_info:
         open_physics("sh -c 'echo loading the world ...; exec cat >/dev/null'", HELLO, 20.0)
-    assert caught.value.remedy == "standard output carries only frames; print to standard error"
+    assert error_info.value.remedy == "standard output carries only frames; print to standard error"
 
 
 def test_an_unknown_scheme_shows_the_addresses() -> None:
-    with pytest.raises(ConfigurationError, match=r"'quic:127.0.0.1:7000' is not an address") as caught:
+    with pytest.raises(ConfigurationError, match=r"'quic:127.0.0.1:7000' is not an address") as error_info:
         open_physics("quic:127.0.0.1:7000", HELLO, 20.0)
-    assert caught.value.remedy.startswith("use tcp:HOST:PORT, tcp-listen:HOST:PORT, udp:HOST:PORT, ")
-    assert caught.value.remedy.endswith(", or a command, for example 'python3 carts.py'")
+    assert error_info.value.remedy.startswith("use tcp:HOST:PORT, tcp-listen:HOST:PORT, udp:HOST:PORT, ")
+    assert error_info.value.remedy.endswith(", or a command, for example 'python3 carts.py'")
 
 
 def test_output_of_the_federates_code_does_not_reach_the_protocol(tmp_path: Path) -> None:
@@ -240,7 +242,7 @@ def free_port() -> int:
         return int(server.getsockname()[1])
 
 
-def served(address: str, **settings: object) -> threading.Thread:
+def start_server(address: str, **settings: object) -> threading.Thread:
     thread = threading.Thread(target=lambda: serve(carts(), address=address, runs=1, **settings), daemon=True)
     thread.start()
     return thread
@@ -248,15 +250,15 @@ def served(address: str, **settings: object) -> threading.Thread:
 
 @pytest.mark.parametrize("coordinator_first", [True, False])
 @pytest.mark.parametrize("federate_listens", [True, False])
-def test_either_side_may_listen_and_be_first(*, federate_listens: bool, coordinator_first: bool) -> None:
+def test_either_side_may_listen_and_start_first(*, federate_listens: bool, coordinator_first: bool) -> None:
     port = free_port()
     schemes = ("tcp-listen", "tcp") if federate_listens else ("tcp", "tcp-listen")
     address, other_address = (f"{scheme}:127.0.0.1:{port}" for scheme in schemes)
     if coordinator_first:
-        timer = threading.Timer(0.15, served, [address])
+        timer = threading.Timer(0.15, start_server, [address])
         timer.start()
     else:
-        served(address)
+        start_server(address)
     with closing(open_physics(other_address, HELLO, 20.0)) as physics:
         assert physics.advance(0, {})["ann"] == HELLO.agents[0].start
 
@@ -326,7 +328,7 @@ def test_other_programs_are_rejected_and_the_wait_continues(monkeypatch: pytest.
         assert physics.advance(0, {})
 
 
-def test_no_federate_within_the_deadline() -> None:
+def test_no_connection_within_the_deadline_is_an_error() -> None:
     port = free_port()
     for scheme, message in (
         ("tcp", "no connection to tcp:127"),
@@ -355,27 +357,27 @@ class StationaryPhysics:
         return self._states
 
 
-def mutated(frame: bytes, draws: random.Random) -> bytes:
+def mutate(frame: bytes, rng: random.Random) -> bytes:
     data = bytearray(frame)
-    for _ in range(draws.randint(1, 4)):
-        data[draws.randrange(len(data))] = draws.choice((0, 1, 0x7F, 0xFF, draws.randrange(256)))
-    return bytes(data[: draws.choice((len(data), len(data), draws.randrange(len(data) + 1)))])
+    for _ in range(rng.randint(1, 4)):
+        data[rng.randrange(len(data))] = rng.choice((0, 1, 0x7F, 0xFF, rng.randrange(256)))
+    return bytes(data[: rng.choice((len(data), len(data), rng.randrange(len(data) + 1)))])
 
 
 def test_mutated_requests_end_the_session_of_a_federate_or_are_answered() -> None:
     frames = [encode(MessageKind.HELLO, 1, 0, HELLO.encode()), *(example_frames()[name] for name in REQUESTS)]
     for seed in range(80):
-        draws = random.Random(seed)
+        rng = random.Random(seed)
         peer, other = socket.socketpair()
         channel = channel_of(other)
         thread = threading.Thread(
             target=serve_channel, args=(channel, FederateService(StationaryPhysics)), daemon=True
         )
         thread.start()
-        wrong = draws.randrange(len(frames))
+        mutated_number = rng.randrange(len(frames))
         with peer, suppress(BrokenPipeError, ConnectionResetError):
             for number, frame in enumerate(frames):
-                peer.sendall(mutated(frame, draws) if number == wrong else frame)
+                peer.sendall(mutate(frame, rng) if number == mutated_number else frame)
             peer.shutdown(socket.SHUT_WR)
         thread.join(20)
         assert not thread.is_alive(), seed
@@ -384,8 +386,8 @@ def test_mutated_requests_end_the_session_of_a_federate_or_are_answered() -> Non
 
 def test_mutated_answers_raise_only_errors_that_name_the_federate() -> None:
     for seed in range(80):
-        draws = random.Random(seed)
-        alter = from_second(lambda frame, draws=draws: mutated(frame, draws))  # type: ignore[misc]
+        rng = random.Random(seed)
+        alter = alter_from_second_states(lambda frame, rng=rng: mutate(frame, rng))  # type: ignore[misc]
         physics = RemotePhysics(
             *Pair(FederateService(StationaryPhysics, name="still"), alter=alter, deadline_s=0.05)(HELLO)
         )

@@ -31,7 +31,7 @@ agents:
 """
 
 
-def loaded(
+def load_changed(
     folder: Path, value: str = "reset: false", physics: str = "gazebo", network: str = "ns3", **changes: object
 ) -> CosimScenario:
     path = folder / "pair.yaml"
@@ -40,7 +40,7 @@ def loaded(
     return load_scenario(path, {key.replace("__", "."): value for key, value in changes.items()})
 
 
-def options_sent(scenario: CosimScenario, role: int) -> dict[str, object]:
+def sent_options(scenario: CosimScenario, role: int) -> dict[str, object]:
     world = load_world(scenario.world)
     hello = make_hello(scenario, world, make_bodies(scenario, world), 1, role)
     options: dict[str, object] = json.loads(hello.configuration)["options"]
@@ -60,44 +60,48 @@ def options_sent(scenario: CosimScenario, role: int) -> dict[str, object]:
     ],
 )
 def test_a_wrong_option_has_its_line_and_a_remedy(value: str, message: str, tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationError) as caught:
-        loaded(tmp_path, value)
-    assert message in caught.value.what
-    assert caught.value.where == f"{tmp_path / 'pair.yaml'}:8"
+    with pytest.raises(ConfigurationError) as error_info:
+        load_changed(tmp_path, value)
+    assert message in error_info.value.what
+    assert error_info.value.where == f"{tmp_path / 'pair.yaml'}:8"
 
 
 def test_an_option_of_the_command_line_is_validated_too(tmp_path: Path) -> None:
     with pytest.raises(
         ConfigurationError, match=r"in network.options.standard: '802.11ax' is not one of: 802.11a"
-    ) as caught:
-        loaded(tmp_path, network__options__standard="802.11ax")
-    assert "correct the option with this value" in caught.value.remedy
+    ) as error_info:
+        load_changed(tmp_path, network__options__standard="802.11ax")
+    assert "correct the option with this value" in error_info.value.remedy
     with pytest.raises(ConfigurationError, match="gazebo is a physics, not a network"):
-        loaded(tmp_path, network__federate="gazebo")
+        load_changed(tmp_path, network__federate="gazebo")
     with pytest.raises(ConfigurationError, match="unknown key gravity; no keys are valid here"):
-        loaded(tmp_path, physics__federate="mujoco", physics__options={"gravity": 1})
+        load_changed(tmp_path, physics__federate="mujoco", physics__options={"gravity": 1})
 
 
 def test_a_simulator_receives_all_options(tmp_path: Path) -> None:
-    scenario = loaded(tmp_path, "limit_m_s2: 3")
-    sent = options_sent(scenario, PHYSICS)
-    assert (sent["limit_m_s2"], sent["settle_s"], sent["acknowledge"]) == (3, 0.5, "auto")
-    assert "world" not in sent
-    assert options_sent(scenario, NETWORK) == {"ampdu_bytes": 100}
-    assert options_sent(loaded(tmp_path, network__options=None), NETWORK) == {"ampdu_bytes": 0}
+    scenario = load_changed(tmp_path, "limit_m_s2: 3")
+    physics_options = sent_options(scenario, PHYSICS)
+    assert (physics_options["limit_m_s2"], physics_options["settle_s"], physics_options["acknowledge"]) == (
+        3,
+        0.5,
+        "auto",
+    )
+    assert "world" not in physics_options
+    assert sent_options(scenario, NETWORK) == {"ampdu_bytes": 100}
+    assert sent_options(load_changed(tmp_path, network__options=None), NETWORK) == {"ampdu_bytes": 0}
     emane = load_scenario("convoy", {"physics.federate": "emane", "physics.options": {"nems": {"leader": 7}}})
-    assert EmaneOptions.model_validate(options_sent(emane, PHYSICS)) == emane.physics.options
+    assert EmaneOptions.model_validate(sent_options(emane, PHYSICS)) == emane.physics.options
 
 
 def test_a_command_and_an_address_have_any_options(tmp_path: Path) -> None:
-    scenario = loaded(tmp_path, "speed: [1, {x: y}]", "./carts", "tcp:127.0.0.1:7000")
-    assert options_sent(scenario, PHYSICS) == {"speed": [1, {"x": "y"}]}
+    scenario = load_changed(tmp_path, "speed: [1, {x: y}]", "./carts", "tcp:127.0.0.1:7000")
+    assert sent_options(scenario, PHYSICS) == {"speed": [1, {"x": "y"}]}
     assert not isinstance(scenario.network.options, SimulatorOptions)
 
 
-def test_another_simulator_does_not_get_the_options_of_the_one_that_it_replaces(tmp_path: Path) -> None:
-    scenario = loaded(tmp_path, physics__federate="mujoco", network__federate="builtin")
-    assert options_sent(scenario, PHYSICS) == {}
+def test_a_simulator_does_not_receive_the_options_of_the_simulator_that_it_replaces(tmp_path: Path) -> None:
+    scenario = load_changed(tmp_path, physics__federate="mujoco", network__federate="builtin")
+    assert sent_options(scenario, PHYSICS) == {}
     assert scenario.network.options is None
 
 
@@ -118,13 +122,13 @@ def test_another_simulator_does_not_get_the_options_of_the_one_that_it_replaces(
         ),
     ],
 )
-def test_what_a_simulator_does_not_support_has_its_line(line: str, message: str, tmp_path: Path) -> None:
+def test_an_unsupported_protocol_is_an_error_with_its_line(line: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "pair.yaml"
     path.write_text(SCENARIO.replace("PHYSICS", "gazebo").replace("VALUE", "{}") + line + "\n", encoding="utf-8")
     changes = {"physics.options": None, "network.federate": "ns3"}
-    with pytest.raises(ConfigurationError, match=message) as caught:
+    with pytest.raises(ConfigurationError, match=message) as error_info:
         load_scenario(path, changes)
-    assert caught.value.where.startswith(f"{path}:13")
+    assert error_info.value.where.startswith(f"{path}:13")
     load_scenario(path, changes | {"network.federate": "builtin", "network.options": None})
     load_scenario(path, changes | {"network.transports": "builtin"})
 
@@ -154,15 +158,15 @@ def test_options_of_ns3_without_an_effect_are_refused_with_their_line(
 ) -> None:
     path = tmp_path / "pair.yaml"
     path.write_text(NETWORK_ONLY.replace("KEYS", keys).replace("RADIO", radio), encoding="utf-8")
-    with pytest.raises(ConfigurationError, match=message) as caught:
+    with pytest.raises(ConfigurationError, match=message) as error_info:
         load_scenario(path)
-    assert caught.value.where == f"{path}:5"
+    assert error_info.value.where == f"{path}:5"
 
 
 def test_reliable_topics_over_ns3_are_refused_with_their_line(tmp_path: Path) -> None:
-    topics = {"kind": "stream", "from": "ann", "to": "bob", "rate": "10Hz", "protocol": "topic"}
-    best_effort = topics | {"qos": {"reliability": "best_effort"}}
-    loaded(tmp_path, traffic=[best_effort], network__options__topics="udp")
-    for traffic in (topics, topics | {"qos": {"reliability": "reliable"}}):
+    topic_traffic = {"kind": "stream", "from": "ann", "to": "bob", "rate": "10Hz", "protocol": "topic"}
+    best_effort = topic_traffic | {"qos": {"reliability": "best_effort"}}
+    load_changed(tmp_path, traffic=[best_effort], network__options__topics="udp")
+    for traffic in (topic_traffic, topic_traffic | {"qos": {"reliability": "reliable"}}):
         with pytest.raises(ConfigurationError, match="no reliable topics; set reliability: best_effort"):
-            loaded(tmp_path, traffic=[best_effort, traffic], network__options__topics="udp")
+            load_changed(tmp_path, traffic=[best_effort, traffic], network__options__topics="udp")

@@ -1,4 +1,4 @@
-"""The test vectors of federates: what the encoder gives, and what a decoder written by hand reads in them."""
+"""The test vectors of federates: they equal the encoded frames, and a decoder written by hand reads their values."""
 
 import hashlib
 import math
@@ -23,43 +23,43 @@ VECTORS = {name: bytes.fromhex(text) for name, text in ROWS}
 UGV = (0, 0, 1.0, 2.0, 0.5, 0.0, 0.0, 0.0, 0.25)
 
 
-class ByHand:
-    """Reads a frame by the tables of the page, without the code under test."""
+class ManualFrameReader:
+    """A reader of frames by the tables of the documentation, without the code under test."""
 
     def __init__(self, frame: bytes) -> None:
         size, self.kind, reserved, self.request, self.copy = struct.unpack("<IHHII", frame[:16])
-        self.rest = frame[16:]
-        assert (len(self.rest), reserved) == (size, 0)
+        self.remaining = frame[16:]
+        assert (len(self.remaining), reserved) == (size, 0)
 
     def unpack_values(self, layout: str) -> tuple[Any, ...]:
         size = struct.calcsize(f"<{layout}")
-        values, self.rest = struct.unpack(f"<{layout}", self.rest[:size]), self.rest[size:]
+        values, self.remaining = struct.unpack(f"<{layout}", self.remaining[:size]), self.remaining[size:]
         return values
 
     def text(self) -> str:
         (length,) = self.unpack_values("H")
-        text, self.rest = self.rest[:length], self.rest[length:]
+        text, self.remaining = self.remaining[:length], self.remaining[length:]
         return text.decode()
 
 
-def test_the_page_has_a_vector_of_each_layout() -> None:
+def test_the_documentation_has_a_vector_of_each_layout() -> None:
     frames = example_frames()
     assert len(frames) == len(MessageKind)
     assert {name: frame for name, frame in frames.items() if name not in WITHOUT_VECTOR} == VECTORS
 
 
-def test_the_handshake_by_hand() -> None:
-    join = ByHand(VECTORS["join"])
-    assert (join.kind, join.unpack_values("8sH"), join.text(), join.rest) == (1, (b"FIELDKIT", 1), "s3cret", b"")
-    hello = ByHand(VECTORS["hello"])
+def test_the_handshake_is_read_by_hand() -> None:
+    join = ManualFrameReader(VECTORS["join"])
+    assert (join.kind, join.unpack_values("8sH"), join.text(), join.remaining) == (1, (b"FIELDKIT", 1), "s3cret", b"")
+    hello = ManualFrameReader(VECTORS["hello"])
     assert (hello.kind, hello.request) == (2, 3)
     assert hello.unpack_values("8sHBBIQqq") == (b"FIELDKIT", 1, 1, 0, 1000, 7, 1_000_000, 2_000_000_000)
     assert hello.unpack_values("32s") == (hashlib.sha256(b"{}").digest(),)
     assert (hello.text(), hello.text(), hello.unpack_values("I")) == ("s3cret", "demo", (1,))
     assert (hello.text(), hello.text(), hello.unpack_values("Bd")) == ("ugv", "husky", (0, 0.5))
     assert hello.unpack_values("IIddddddd d") == (*UGV, 3.0)
-    assert (hello.unpack_values("I"), hello.rest) == ((2,), b"{}")
-    welcome = ByHand(VECTORS["welcome"])
+    assert (hello.unpack_values("I"), hello.remaining) == ((2,), b"{}")
+    welcome = ManualFrameReader(VECTORS["welcome"])
     assert welcome.kind == 3
     assert welcome.unpack_values("HBBIqq") == (1, 1, 0, 1 + 16, 1_000_000, -1)
     assert welcome.unpack_values("32s") == (hashlib.sha256(b"{}").digest(),)
@@ -69,52 +69,52 @@ def test_the_handshake_by_hand() -> None:
         (0,),
         (0, 0),
     )
-    assert not welcome.rest
+    assert not welcome.remaining
 
 
-def test_requests_and_answers_by_hand() -> None:
-    request = ByHand(VECTORS["advance physics"])
+def test_requests_and_answers_are_read_by_hand() -> None:
+    request = ManualFrameReader(VECTORS["advance physics"])
     assert (request.kind, request.unpack_values("qqI")) == (4, (11_100_000, 10_000_000, 2))
     assert request.unpack_values("IHHdd") == (0, 1, 16, 0.5, -0.125)
     *velocity, yaw_rad = request.unpack_values("IHHdddd")
-    assert (velocity, math.isnan(yaw_rad), request.rest) == ([1, 2, 32, 1.0, 0.0, 0.25], True, b"")
-    states = ByHand(VECTORS["states"])
+    assert (velocity, math.isnan(yaw_rad), request.remaining) == ([1, 2, 32, 1.0, 0.0, 0.25], True, b"")
+    states = ManualFrameReader(VECTORS["states"])
     assert (states.kind, states.unpack_values("qII"), states.text()) == (5, (11_000_000, 1, 1), "uav")
     assert (states.unpack_values("I"), states.unpack_values("II8d")) == ((2,), (*UGV, 3.0))
     *drone, heading_rad, limit_m_s2 = states.unpack_values("II8d")
     assert drone == [1, 0, -1.5, 0.0, 10.0, 0.0, 0.5, -0.25]
-    assert (math.isnan(heading_rad), limit_m_s2, states.rest) == (True, math.inf, b"")
-    network = ByHand(VECTORS["advance network"])
+    assert (math.isnan(heading_rad), limit_m_s2, states.remaining) == (True, math.inf, b"")
+    network = ManualFrameReader(VECTORS["advance network"])
     assert (network.kind, network.unpack_values("qqqII")) == (6, (11_099_999, 10_000_000, 1_000_000, 0, 1))
     assert (network.unpack_values("II8d"), network.unpack_values("I")) == ((*UGV, math.inf), (1,))
     assert network.unpack_values("QqQqqII") == (9, 4, 300, 10_000_000, 10_500_000, 0, 1)
-    assert (network.text(), network.text(), network.rest) == ("pose", "udp", b"")
-    outcomes = ByHand(VECTORS["outcomes"])
+    assert (network.text(), network.text(), network.remaining) == ("pose", "udp", b"")
+    outcomes = ManualFrameReader(VECTORS["outcomes"])
     assert (outcomes.kind, outcomes.unpack_values("qqI")) == (7, (11_099_999, 12_000_000, 1))
     assert (outcomes.unpack_values("QqII"), outcomes.unpack_values("IQ")) == ((9, 11_000_250, 1, 0), (1, 8))
-    assert (outcomes.text(), outcomes.unpack_values("3q"), outcomes.rest) == (
+    assert (outcomes.text(), outcomes.unpack_values("3q"), outcomes.remaining) == (
         "out of range",
         (100_000, 350_000, 33),
         b"",
     )
-    links = ByHand(VECTORS["links"])
+    links = ManualFrameReader(VECTORS["links"])
     assert (links.kind, links.unpack_values("IIIdqq")) == (17, (1, 0, 0, -95.0, 11_099_999, 2_000_000))
     *link, rx_rate_bit_s = links.unpack_values("IIIdd d")
     assert (link, math.isnan(rx_rate_bit_s)) == ([1, 0, 1, -61.5, 54e6], True)
-    assert (links.unpack_values("4Q"), links.rest) == ((12, 11, 3, 1), b"")
+    assert (links.unpack_values("4Q"), links.remaining) == ((12, 11, 3, 1), b"")
 
 
-def test_short_messages_by_hand() -> None:
+def test_short_messages_are_read_by_hand() -> None:
     for name, kind, number in (("ping", 8, 42), ("pong", 9, 42), ("busy", 10, 10_000_000)):
-        frame = ByHand(example_frames()[name])
-        assert (frame.kind, frame.unpack_values("Q"), frame.rest) == (kind, (number,), b"")
-    fork = ByHand(VECTORS["fork"])
-    assert (fork.kind, fork.unpack_values("I"), fork.rest) == (11, (2,), b"")
+        frame = ManualFrameReader(example_frames()[name])
+        assert (frame.kind, frame.unpack_values("Q"), frame.remaining) == (kind, (number,), b"")
+    fork = ManualFrameReader(VECTORS["fork"])
+    assert (fork.kind, fork.unpack_values("I"), fork.remaining) == (11, (2,), b"")
     for name, kind, copy in (("done", 12, 0), ("release", 13, 2), ("bye", 15, 0)):
-        frame = ByHand(example_frames()[name])
-        assert (frame.kind, frame.copy, frame.rest) == (kind, copy, b"")
-    error = ByHand(VECTORS["error"])
-    assert (error.kind, error.text(), error.rest) == (14, "ValueError: no wheels", b"")
+        frame = ManualFrameReader(example_frames()[name])
+        assert (frame.kind, frame.copy, frame.remaining) == (kind, copy, b"")
+    error = ManualFrameReader(VECTORS["error"])
+    assert (error.kind, error.text(), error.remaining) == (14, "ValueError: no wheels", b"")
 
 
 def body(name: str) -> bytes:
@@ -123,7 +123,7 @@ def body(name: str) -> bytes:
     return frame[HEADER_BYTES:]
 
 
-def test_our_decoder_reads_the_vectors() -> None:
+def test_the_decoder_of_fieldkit_reads_the_vectors() -> None:
     assert decode_join(body("join")) == "s3cret"
     assert Hello.decode(body("hello")) == HELLO
     assert Welcome.decode(body("welcome")) == WELCOME.__class__(

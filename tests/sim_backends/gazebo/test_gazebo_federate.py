@@ -1,4 +1,4 @@
-"""The physics federate `gazebo`, against a server like Gazebo Fortress with DART."""
+"""The physics federate `gazebo`, tested with a server that behaves like Gazebo Fortress with DART."""
 
 import math
 import os
@@ -43,27 +43,27 @@ WINDOW_NS = 10_000_000
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GazeboServer]:
-    """A server whose resets are like those of Fortress: they set the time only."""
-    with gazebo_server(tmp_path_factory.mktemp("gazebo"), SDF) as running:
-        yield running
+    """Return a server whose resets are like those of Fortress: they only set the time."""
+    with gazebo_server(tmp_path_factory.mktemp("gazebo"), SDF) as gazebo:
+        yield gazebo
 
 
-def hello(running: GazeboServer, options: Mapping[str, object], changes: Mapping[str, object]) -> Hello:
-    federate = {"physics.federate": "gazebo", "physics.options": {**running.options, **options}}
+def hello(gazebo: GazeboServer, options: Mapping[str, object], changes: Mapping[str, object]) -> Hello:
+    federate = {"physics.federate": "gazebo", "physics.options": {**gazebo.options, **options}}
     scenario = load_scenario("convoy", {**federate, **changes})
     world = load_world(scenario.world)
     return make_hello(scenario, world, make_bodies(scenario, world), 1, PHYSICS)
 
 
 @contextmanager
-def connected(
-    running: GazeboServer,
+def open_federate(
+    gazebo: GazeboServer,
     options: Mapping[str, object] | None = None,
     changes: Mapping[str, object] | None = None,
     deadline_s: float = 30.0,
 ) -> Iterator[RemotePhysics]:
     physics = open_physics(
-        shlex.quote(str(adapter().path())), hello(running, options or {}, changes or {}), deadline_s
+        shlex.quote(str(adapter().path())), hello(gazebo, options or {}, changes or {}), deadline_s
     )
     try:
         yield physics
@@ -72,7 +72,7 @@ def connected(
 
 
 def drive(physics: RemotePhysics, windows: int = 50) -> list[dict[str, State]]:
-    """Return the states at the ends of windows, in each of which all robots get a new command."""
+    """Return the states at the ends of windows; all robots have a new command in each window."""
     states = [dict(physics.advance(0, {}))]
     for window in range(1, windows + 1):
         commands = {
@@ -84,23 +84,23 @@ def drive(physics: RemotePhysics, windows: int = 50) -> list[dict[str, State]]:
     return states
 
 
-def error_of(running: GazeboServer, options: Mapping[str, object], windows: int = 100) -> str:
-    with pytest.raises(FederateError) as caught, connected(running, options) as physics:
+def error_of(gazebo: GazeboServer, options: Mapping[str, object], windows: int = 100) -> str:
+    with pytest.raises(FederateError) as error_info, open_federate(gazebo, options) as physics:
         drive(physics, windows)
-    return str(caught.value.what)
+    return str(error_info.value.what)
 
 
 @pytest.fixture(scope="module")
-def exact(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GazeboServer]:
-    """A server whose resets build the world again, as later versions do."""
-    with gazebo_server(tmp_path_factory.mktemp("exact"), SDF, "--reset", "world") as running:
-        running.options.update(deterministic=True, acknowledge="required")
-        yield running
+def rebuilding_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[GazeboServer]:
+    """Return a server whose resets build the world again, as later versions do."""
+    with gazebo_server(tmp_path_factory.mktemp("exact"), SDF, "--reset", "world") as gazebo:
+        gazebo.options.update(deterministic=True, acknowledge="required")
+        yield gazebo
 
 
-def test_it_passes_the_conformance_suite(exact: GazeboServer) -> None:
+def test_the_gazebo_federate_passes_the_conformance_checks(rebuilding_server: GazeboServer) -> None:
     opener = partial(open_session, PHYSICS, shlex.quote(str(adapter().path())), deadline_s=30.0)
-    target = Target(opener, hello(exact, {}, {}), windows=200)
+    target = Target(opener, hello(rebuilding_server, {}, {}), windows=200)
     results = [
         run_check(target, name, check)
         for name, check in checks(is_physics=True).items()
@@ -111,10 +111,10 @@ def test_it_passes_the_conformance_suite(exact: GazeboServer) -> None:
     assert {result.name for result in results if result.skipped} == {"fork"}
 
 
-def test_commands_apply_in_their_window_and_equal_runs_are_equal(exact: GazeboServer) -> None:
+def test_commands_apply_in_their_window_and_equal_runs_are_equal(rebuilding_server: GazeboServer) -> None:
     runs = []
     for _ in range(2):
-        with connected(exact) as physics:
+        with open_federate(rebuilding_server) as physics:
             runs.append(drive(physics))
     for first, second in zip(*runs, strict=True):
         for name, state in first.items():
@@ -130,42 +130,42 @@ def test_commands_apply_in_their_window_and_equal_runs_are_equal(exact: GazeboSe
     assert last["drone"].heading_rad == pytest.approx(0.43, abs=0.05)
 
 
-def test_poses_of_an_older_time_are_not_used(exact: GazeboServer, tmp_path: Path) -> None:
-    with connected(exact) as physics:
+def test_poses_of_an_older_time_are_not_used(rebuilding_server: GazeboServer, tmp_path: Path) -> None:
+    with open_federate(rebuilding_server) as physics:
         expected = drive(physics, 10)
     assert "<dynamic_pose_hertz>2000<" in SDF
-    slow = SDF.replace("<dynamic_pose_hertz>2000<", "<dynamic_pose_hertz>60<")
-    with gazebo_server(tmp_path, slow) as running, connected(running) as physics:
+    slow_sdf = SDF.replace("<dynamic_pose_hertz>2000<", "<dynamic_pose_hertz>60<")
+    with gazebo_server(tmp_path, slow_sdf) as gazebo, open_federate(gazebo) as physics:
         states = drive(physics, 10)
     for name, state in states[-1].items():
         assert state.position_m == pytest.approx(expected[-1][name].position_m, abs=1e-6)
 
 
-def test_it_reports_that_it_is_busy_if_gazebo_is_slow(tmp_path: Path) -> None:
+def test_the_federate_reports_that_it_is_busy_if_gazebo_is_slow(tmp_path: Path) -> None:
     assert "<real_time_factor>5<" in SDF
-    slow = SDF.replace("<real_time_factor>5<", "<real_time_factor>0.05<")
-    started_s = time.monotonic()
+    slow_sdf = SDF.replace("<real_time_factor>5<", "<real_time_factor>0.05<")
+    start_s = time.monotonic()
     # 0.2 s until the robots are at rest take 4 s, which is longer than the deadline.
-    with gazebo_server(tmp_path, slow) as running, connected(running, deadline_s=3.0) as physics:
-        assert time.monotonic() - started_s > 3
+    with gazebo_server(tmp_path, slow_sdf) as gazebo, open_federate(gazebo, deadline_s=3.0) as physics:
+        assert time.monotonic() - start_s > 3
         assert physics.advance(0, {}).keys() == {"leader", "follower", "drone"}
 
 
 def test_a_run_starts_with_robots_at_their_starts_and_an_obstacle_stops_them(server: GazeboServer) -> None:
-    with connected(server, {"velocity": "window"}) as physics:
+    with open_federate(server, {"velocity": "window"}) as physics:
         assert physics.welcome.software.startswith("Ignition Transport 11.")
         drive(physics)
-    places = {"agents.leader.at_m": [31.8, 53], "agents.follower.heading_deg": 90}
-    with connected(server, changes=places) as physics:
+    start_changes = {"agents.leader.at_m": [31.8, 53], "agents.follower.heading_deg": 90}
+    with open_federate(server, changes=start_changes) as physics:
         start = physics.advance(0, {})
         assert start["leader"].position_m[:2] == pytest.approx((31.8, 53), abs=0.01)
         assert start["follower"].heading_rad == pytest.approx(1.5708, abs=0.01)
-        stopped = physics.advance(1_500_000_000, {"leader": Twist(0.8)})
+        states_at_wall = physics.advance(1_500_000_000, {"leader": Twist(0.8)})
     # The western side of the box is at 33 m, and the Husky is 0.99 m long.
-    assert stopped["leader"].position_m[0] == pytest.approx(33 - 0.495, abs=0.02)
+    assert states_at_wall["leader"].position_m[0] == pytest.approx(33 - 0.495, abs=0.02)
 
 
-def test_parallel_runs_use_it_one_after_the_other_by_its_name(
+def test_parallel_runs_use_one_gazebo_in_sequence(
     server: GazeboServer, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -196,7 +196,7 @@ def test_parallel_runs_use_it_one_after_the_other_by_its_name(
 def test_a_world_that_does_not_fit_is_reported(
     server: GazeboServer, options: Mapping[str, object], message: str
 ) -> None:
-    with pytest.raises(FederateError, match=message), connected(server, {"timeout_s": 4, **options}):
+    with pytest.raises(FederateError, match=message), open_federate(server, {"timeout_s": 4, **options}):
         pass
 
 
@@ -210,20 +210,20 @@ def test_a_world_that_does_not_fit_is_reported(
     ],
 )
 def test_another_program_that_controls_gazebo_is_reported(tmp_path: Path, fault: str, message: str) -> None:
-    with gazebo_server(tmp_path, SDF, "--fault", f"{fault}@0.3545") as running:
-        error = error_of(running, {"timeout_s": 4})
+    with gazebo_server(tmp_path, SDF, "--fault", f"{fault}@0.3545") as gazebo:
+        error = error_of(gazebo, {"timeout_s": 4})
     assert error.startswith("physics gazebo (")
     assert "failed at the request to advance from 0.25 s to 0.26 s" in error or fault != "pause"
     assert "Gazebo world 'baylands', whose last time is 0.2" in error
     assert re.search(message, error), error
 
 
-def test_a_gazebo_that_ends_or_is_suspended_is_reported(tmp_path: Path) -> None:
-    with gazebo_server(tmp_path, SDF, "--fault", "exit@0.3545") as running:
-        assert "it has disappeared, or is suspended; Gazebo's clock is at 0.35" in error_of(running, {})
-    with gazebo_server(tmp_path, SDF) as running, connected(running) as physics:
+def test_a_gazebo_that_exits_or_is_suspended_is_reported(tmp_path: Path) -> None:
+    with gazebo_server(tmp_path, SDF, "--fault", "exit@0.3545") as gazebo:
+        assert "it has disappeared, or is suspended; Gazebo's clock is at 0.35" in error_of(gazebo, {})
+    with gazebo_server(tmp_path, SDF) as gazebo, open_federate(gazebo) as physics:
         physics.advance(WINDOW_NS, {})
-        running.suspend()
+        gazebo.suspend()
         with pytest.raises(
             FederateError, match=r"'baylands', whose last time is 0.01 s: it has disappeared, or is suspended"
         ):
@@ -233,7 +233,7 @@ def test_a_gazebo_that_ends_or_is_suspended_is_reported(tmp_path: Path) -> None:
 LIFETIMES = {"agents.leader.appears": "100ms", "agents.drone.disappears": "300.5ms"}
 
 
-def presence(physics: RemotePhysics) -> dict[str, list[int]]:
+def record_presence(physics: RemotePhysics) -> dict[str, list[int]]:
     """Return the times of each agent's states in ms; the leader drives from 150 ms on."""
     times_ms: dict[str, list[int]] = {}
     for time_ms in range(0, 401, 10):
@@ -250,33 +250,33 @@ def presence(physics: RemotePhysics) -> dict[str, list[int]]:
 def test_robots_appear_and_disappear_at_their_times(reset: str, tmp_path: Path) -> None:
     """A reset of Fortress keeps the models, so the end of a run restores those that it has created and removed."""
     changes = {**LIFETIMES, "agents.leader.at_m": [20, 53]}
-    with gazebo_server(tmp_path, SDF, "--reset", reset) as running:
+    with gazebo_server(tmp_path, SDF, "--reset", reset) as gazebo:
         for _ in range(2):
-            with connected(running, changes=changes) as physics:
-                times_ms = presence(physics)
-                moved_m = physics.advance(1_000_000_000, {})["leader"].position_m[0] - 20
+            with open_federate(gazebo, changes=changes) as physics:
+                times_ms = record_presence(physics)
+                driven_distance_m = physics.advance(1_000_000_000, {})["leader"].position_m[0] - 20
             assert times_ms["follower"] == list(range(0, 401, 10))
             assert times_ms["leader"] == list(range(100, 401, 10))
             assert times_ms["drone"] == list(range(0, 301, 10))
-            assert moved_m == pytest.approx(0.55, abs=0.1), "speed and acceleration are those of its model"
-        with connected(running) as physics:
+            assert driven_distance_m == pytest.approx(0.55, abs=0.1), "speed and acceleration are those of its model"
+        with open_federate(gazebo) as physics:
             assert physics.advance(0, {}).keys() == {"leader", "follower", "drone"}
 
 
-def test_the_next_run_restores_the_models_of_a_killed_one(tmp_path: Path) -> None:
+def test_the_next_run_restores_the_models_of_a_killed_run(tmp_path: Path) -> None:
     """The world has no model of the leader, which the killed run creates; it removes the drone."""
     changes = {**LIFETIMES, "agents.leader.at_m": [20, 53]}
     leader = re.search(r'<model name="leader">.*?</model>', SDF, re.DOTALL)
     assert leader is not None
-    with gazebo_server(tmp_path, SDF.replace(leader[0], "")) as running:
-        with connected(running, changes=changes) as physics:
-            presence(physics)
+    with gazebo_server(tmp_path, SDF.replace(leader[0], "")) as gazebo:
+        with open_federate(gazebo, changes=changes) as physics:
+            record_presence(physics)
             os.kill(adapter_pid(), signal.SIGKILL)
             with pytest.raises(FederateError, match="SIGKILL"):
                 physics.advance(1_000_000_000, {})
-        with connected(running, changes=changes) as physics:
-            assert presence(physics)["drone"] == list(range(0, 301, 10))
-        with pytest.raises(FederateError, match=r"it has no moving model leader \("), connected(running):
+        with open_federate(gazebo, changes=changes) as physics:
+            assert record_presence(physics)["drone"] == list(range(0, 301, 10))
+        with pytest.raises(FederateError, match=r"it has no moving model leader \("), open_federate(gazebo):
             pass
 
 
@@ -298,19 +298,19 @@ def test_a_robot_that_has_been_removed_is_no_obstacle(tmp_path: Path) -> None:
         "agents.follower.at_m": [18.4, 53],
         "agents.follower.heading_deg": 0,
     }
-    with gazebo_server(tmp_path, SDF) as running, connected(running, changes=changes) as physics:
+    with gazebo_server(tmp_path, SDF) as gazebo, open_federate(gazebo, changes=changes) as physics:
         physics.advance(0, {})
         end = physics.advance(2_500_000_000, {"follower": Twist(0.9)})
     assert end["follower"].position_m[0] > 20
 
 
-def test_the_file_of_a_model_can_be_given(tmp_path: Path) -> None:
+def test_a_model_can_be_created_from_a_file(tmp_path: Path) -> None:
     body = QuadrotorLimits(**{**vars(robot_limits.quadrotor("iris")), "height_m": 0.3})
     model = tmp_path / "model.sdf"
     model.write_text(model_sdf("any name", body, step_ns=1_000_000, version="fortress"), encoding="utf-8")
     options = {"model_files": {"drone": str(model)}}
     changes = {"agents.drone.appears": "20ms"}
-    with gazebo_server(tmp_path, SDF) as running, connected(running, options, changes) as physics:
+    with gazebo_server(tmp_path, SDF) as gazebo, open_federate(gazebo, options, changes) as physics:
         assert "drone" not in physics.advance(10_000_000, {})
         assert "drone" in physics.advance(20_000_000, {})
 
@@ -326,10 +326,10 @@ def test_a_model_that_cannot_be_created_is_reported(
     options: Mapping[str, object], message: str, tmp_path: Path
 ) -> None:
     with (
-        gazebo_server(tmp_path, SDF) as running,
-        connected(running, {"timeout_s": 3, **options}, LIFETIMES) as physics,
+        gazebo_server(tmp_path, SDF) as gazebo,
+        open_federate(gazebo, {"timeout_s": 3, **options}, LIFETIMES) as physics,
     ):
         physics.advance(50_000_000, {})
-        with pytest.raises(FederateError, match=message) as caught:
+        with pytest.raises(FederateError, match=message) as error_info:
             physics.advance(100_000_000, {})
-    assert "whose last time is 0.099 s" in caught.value.what
+    assert "whose last time is 0.099 s" in error_info.value.what

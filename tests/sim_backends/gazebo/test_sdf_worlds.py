@@ -66,10 +66,10 @@ def test_a_ramp_rises_along_its_first_edge() -> None:
     pitch_rad, yaw_rad = -pose[4], pose[5]
     assert size[0] == pytest.approx(math.hypot(4.0, 1.0))
     assert yaw_rad == pytest.approx(math.pi / 2)
-    for end, height_m in ((-1, 0.0), (0, 0.5), (1, 1.0)):  # points of its upper side, before the turn by yaw
-        along_m = end * size[0] / 2 * math.cos(pitch_rad) - size[2] / 2 * math.sin(pitch_rad)
-        up_m = end * size[0] / 2 * math.sin(pitch_rad) + size[2] / 2 * math.cos(pitch_rad)
-        assert pose[1] + along_m == pytest.approx(20 + 2.0 * end, abs=1e-6)
+    for position, height_m in ((-1, 0.0), (0, 0.5), (1, 1.0)):  # points of its upper side, before the turn by yaw
+        along_m = position * size[0] / 2 * math.cos(pitch_rad) - size[2] / 2 * math.sin(pitch_rad)
+        up_m = position * size[0] / 2 * math.sin(pitch_rad) + size[2] / 2 * math.cos(pitch_rad)
+        assert pose[1] + along_m == pytest.approx(20 + 2.0 * position, abs=1e-6)
         assert pose[2] + up_m == pytest.approx(height_m, abs=1e-6)
 
 
@@ -81,8 +81,8 @@ def test_robots_are_at_their_starts_with_their_plugins() -> None:
     drive = models["leader"].find("plugin[@name='ignition::gazebo::systems::DiffDrive']")
     assert drive is not None
     joints = {joint.attrib["name"] for joint in models["leader"].iter("joint")}
-    named = {element.text for side in ("left_joint", "right_joint") for element in drive.iter(side)}
-    assert named == joints
+    driven_joints = {element.text for side in ("left_joint", "right_joint") for element in drive.iter(side)}
+    assert driven_joints == joints
     assert len(joints) == 4
     # The velocity before a step compensates the fall in it.
     fly = models["drone"].find("plugin[@name='ignition::gazebo::systems::VelocityControl']")
@@ -122,6 +122,8 @@ def test_missing_libraries_are_reported_with_the_command_that_installs_them(
 ) -> None:
     monkeypatch.setenv("PKG_CONFIG_LIBDIR", str(tmp_path))
     monkeypatch.delenv("PKG_CONFIG_PATH", raising=False)
-    with pytest.raises(ConfigurationError, match="gazebo-adapter needs the library ignition-transport11") as caught:
+    with pytest.raises(
+        ConfigurationError, match="gazebo-adapter needs the library ignition-transport11"
+    ) as error_info:
         command_line("gazebo", PHYSICS)
-    assert "apt-get install g++ pkg-config nlohmann-json3-dev libignition-transport-dev" in caught.value.remedy
+    assert "apt-get install g++ pkg-config nlohmann-json3-dev libignition-transport-dev" in error_info.value.remedy

@@ -33,7 +33,7 @@ CONVOY_HELLO = make_hello(CONVOY, WORLD, make_bodies(CONVOY, WORLD), 1, PHYSICS)
 
 
 @pytest.mark.parametrize("name", checks(is_physics=True))
-def test_it_conforms(name: str) -> None:
+def test_the_mujoco_federate_conforms(name: str) -> None:
     result = run_check(Target(Pair(SERVICE), CONVOY_HELLO, windows=300), name, checks(is_physics=True)[name])
     assert not result.failure, result
     assert bool(result.skipped) == (name == "fork_absence")
@@ -47,16 +47,16 @@ def test_a_million_windows_do_not_drift() -> None:
 
 @pytest.mark.parametrize("step_ns", [300_000, 1_000_000, 3_000_000, 7_000_000])
 def test_the_motion_does_not_depend_on_the_calls(step_ns: int) -> None:
-    at_once, divided = (MujocoPhysics(replace(HELLO, step_ns=step_ns)) for _ in range(2))
+    single_call, many_calls = (MujocoPhysics(replace(HELLO, step_ns=step_ns)) for _ in range(2))
     end_ns = 400_000_000
-    for simulation in (at_once, divided):
+    for simulation in (single_call, many_calls):
         simulation.advance(0, {})
         simulation.advance(123_456_789, {})
-    expected = at_once.advance(end_ns, COMMANDS)
-    states = divided.advance(123_456_789, COMMANDS)
+    expected = single_call.advance(end_ns, COMMANDS)
+    states = many_calls.advance(123_456_789, COMMANDS)
     for window in range(1, 100):
-        states = divided.advance(123_456_789 + window * 1_100_001, {})
-    assert dict(divided.advance(end_ns, {})) == dict(expected)
+        states = many_calls.advance(123_456_789 + window * 1_100_001, {})
+    assert dict(many_calls.advance(end_ns, {})) == dict(expected)
     assert dict(states) != dict(expected)
     assert math.hypot(*expected["ann"].velocity_m_s) == pytest.approx(0.5, abs=0.05)
 
@@ -66,10 +66,10 @@ def test_a_copy_continues_as_the_original() -> None:
     original.advance(0, COMMANDS)
     original.advance(155_000_000, {})
     original.advance(155_000_000, {"cy": Velocity()})
-    copied = copy.deepcopy(original)
-    before = dict(original.advance(155_000_000, {}))
-    expected = dict(copied.advance(400_000_000, {"ann": Twist()}))
-    assert dict(original.advance(155_000_000, {})) == before
+    copied_physics = copy.deepcopy(original)
+    states_before = dict(original.advance(155_000_000, {}))
+    expected = dict(copied_physics.advance(400_000_000, {"ann": Twist()}))
+    assert dict(original.advance(155_000_000, {})) == states_before
     assert dict(original.advance(400_000_000, {"ann": Twist()})) == expected
 
 
@@ -91,22 +91,22 @@ def test_a_command_that_no_robot_can_follow_is_refused(command: dict[str, object
 def test_an_unstable_simulation_is_an_error_that_names_time_and_agent() -> None:
     simulation = MujocoPhysics(HELLO)
     simulation.advance(20_000_000, {})
-    first = simulation.model.joint("a1").dofadr[0]
-    simulation.data.qvel[first] = 1e12
-    with pytest.raises(FederateError, match=r"mujoco became unstable until 0\.03 s, first at bob") as caught:
+    first_dof = simulation.model.joint("a1").dofadr[0]
+    simulation.data.qvel[first_dof] = 1e12
+    with pytest.raises(FederateError, match=r"mujoco became unstable until 0\.03 s, first at bob") as error_info:
         simulation.advance(30_000_000, {})
-    assert "shorter step" in caught.value.remedy
+    assert "shorter step" in error_info.value.remedy
 
 
 def test_a_missing_mujoco_is_an_error_with_the_command_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "sim_backends.mujoco_physics.physics")
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(ConfigurationError, match="needs the Python package mujoco") as caught:
+    with pytest.raises(ConfigurationError, match="needs the Python package mujoco") as error_info:
         MUJOCO.load()
-    assert caught.value.remedy.endswith("-m pip install 'fieldkit[mujoco]'")
+    assert error_info.value.remedy.endswith("-m pip install 'fieldkit[mujoco]'")
 
 
-def test_an_agent_without_a_known_body_gets_one_of_its_kind_and_size() -> None:
+def test_an_agent_without_a_known_body_has_a_body_of_its_kind_and_size() -> None:
     agents = [
         AgentStart("rover", "rover", State((0.0, 0.0, 0.2))),
         AgentStart("drone", "drone", State((0.0, 3.0, 2.0)), flies=True),
@@ -132,7 +132,7 @@ def test_an_impossible_run_is_refused(changes: dict[str, object], message: str) 
         MujocoPhysics(replace(HELLO, **changes))  # type: ignore[arg-type]
 
 
-def test_it_is_found_by_its_name() -> None:
+def test_the_entry_point_mujoco_is_a_python_federate() -> None:
     from sim_backends.federates.named import named_federate  # noqa: PLC0415 (its entry point is under test)
 
     assert isinstance(named_federate("mujoco", PHYSICS), PythonFederate)

@@ -45,9 +45,9 @@ def test_the_longest_packet_has_45_fragments_on_ethernet() -> None:
 
 
 def test_every_fragment_has_separate_reproducible_draws() -> None:
-    names = [fragment.identity for fragment in fragments(packet(4000, number=5), 1)]
-    assert names == [("flow", 5), ("flow fragment 1", 5), ("flow fragment 2", 5)]
-    assert names == [fragment.identity for fragment in fragments(packet(4000, number=5), 99)]
+    identities = [fragment.identity for fragment in fragments(packet(4000, number=5), 1)]
+    assert identities == [("flow", 5), ("flow fragment 1", 5), ("flow fragment 2", 5)]
+    assert identities == [fragment.identity for fragment in fragments(packet(4000, number=5), 99)]
 
 
 @given(st.integers(1500, 20_000), st.randoms())

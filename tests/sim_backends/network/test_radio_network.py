@@ -1,4 +1,4 @@
-"""The radio network: exact order of time, stations placed only at events, one result per packet."""
+"""The radio network: exact order of events, stations that are placed only at events, and one result per packet."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -72,14 +72,14 @@ def run_passing_robots(
     return passing_robots(kind, policy, seed, disturbances).advance(250 * MS)
 
 
-JAM = [Jammer(5.0, 50 * MS, 80 * MS, agent="c"), Jammer(10.0, 60 * MS, 200 * MS, (40.0, 0.0, 1.0))]
+JAMMERS = [Jammer(5.0, 50 * MS, 80 * MS, agent="c"), Jammer(10.0, 60 * MS, 200 * MS, (40.0, 0.0, 1.0))]
 
 
 @settings(max_examples=6)
 @given(
     st.integers(0, 2**32),
     st.sampled_from([EventDriven, VariableStepped, lambda: Scheduled(0.0011), lambda: SlidingWindow(0.01)]),
-    st.sampled_from([[], JAM, [NodeLoss("c", 100 * MS, 150 * MS), LinkCut("a", "b", 60 * MS, None)]]),
+    st.sampled_from([[], JAMMERS, [NodeLoss("c", 100 * MS, 150 * MS), LinkCut("a", "b", 60 * MS, None)]]),
 )
 def test_placing_stations_only_at_events_does_not_change_results(
     seed: int, policy: type[SyncPolicy], disturbances: list[Disturbance]
@@ -93,7 +93,7 @@ def test_placing_stations_only_at_events_does_not_change_results(
 
 
 @settings(max_examples=4)
-@given(st.integers(0, 2**32), st.sampled_from([[], JAM]))
+@given(st.integers(0, 2**32), st.sampled_from([[], JAMMERS]))
 def test_exact_policies_agree_on_every_packet(seed: int, disturbances: list[Disturbance]) -> None:
     first, second = (
         run_passing_robots(RadioNetwork, policy, seed, disturbances) for policy in (EventDriven(), VariableStepped())
@@ -103,31 +103,31 @@ def test_exact_policies_agree_on_every_packet(seed: int, disturbances: list[Dist
     }
 
 
-def test_a_fork_during_frames_continues_like_its_origin() -> None:
-    origin = passing_robots(RadioNetwork, EventDriven(), 1, JAM)
-    origin.advance(70 * MS + 123_456)
-    fork = origin.fork()
-    assert fork.advance(150 * MS).digest == origin.advance(150 * MS).digest
-    assert fork.run.fates.keys() == origin.run.fates.keys()
+def test_a_fork_during_frames_continues_like_its_original() -> None:
+    original = passing_robots(RadioNetwork, EventDriven(), 1, JAMMERS)
+    original.advance(70 * MS + 123_456)
+    fork = original.fork()
+    assert fork.advance(150 * MS).digest == original.advance(150 * MS).digest
+    assert fork.run.fates.keys() == original.run.fates.keys()
 
 
 def test_events_in_a_fork_are_not_logged() -> None:
-    logged_ns: list[int] = []
+    log_times_ns: list[int] = []
 
     class Logged(RadioNetwork):
         def __init__(
             self, radio: RadioModel[Fragment], names: Sequence[str], *, disturbances: Sequence[Disturbance]
         ) -> None:
             super().__init__(radio, names, disturbances=disturbances)
-            self.log_ip(lambda at_ns, _name, _fragment: logged_ns.append(at_ns))
+            self.log_ip(lambda at_ns, _name, _fragment: log_times_ns.append(at_ns))
 
-    origin = passing_robots(Logged, EventDriven(), 1, [])
-    origin.advance(70 * MS)
-    count_before = len(logged_ns)
-    origin.fork().advance(150 * MS)
-    assert len(logged_ns) == count_before
-    origin.advance(150 * MS)
-    assert len(logged_ns) > count_before > 0
+    original = passing_robots(Logged, EventDriven(), 1, [])
+    original.advance(70 * MS)
+    count_before = len(log_times_ns)
+    original.fork().advance(150 * MS)
+    assert len(log_times_ns) == count_before
+    original.advance(150 * MS)
+    assert len(log_times_ns) > count_before > 0
 
 
 PLACES = st.tuples(st.floats(0, 120), st.floats(0, 120), st.just(1.0))
@@ -177,7 +177,7 @@ def test_every_packet_has_one_result_independent_of_windows(
     disturbances, relay = setting
     if "loss" in options:
         disturbances = [disturbance for disturbance in disturbances if not isinstance(disturbance, Jammer)]
-    sent, states = packets(sends), standing(places_m)
+    sent_packets, states = packets(sends), standing(places_m)
 
     def create_network() -> RadioNetwork:
         wireless = wifi(NAMES, RadioOptions.model_validate(options), seed=seed)
@@ -185,27 +185,27 @@ def test_every_packet_has_one_result_independent_of_windows(
         return network(radio, NAMES, disturbances=disturbances, relay=relay)
 
     net = create_network()
-    expected = carry(net, states, sent)
-    assert len(expected.arrived) + len(expected.dropped) == len(sent)
+    expected = carry(net, states, sent_packets)
+    assert len(expected.arrived) + len(expected.dropped) == len(sent_packets)
     assert net.next_event_ns() is None, "nothing is in flight"
     # The results are the same in windows of 5 ms, and from event to event.
     for next_end in (lambda now_ns, _: now_ns + 5 * MS, lambda _, next_ns: next_ns):
-        net, remaining, now_ns = create_network(), list(sent), 0
+        net, remaining, now_ns = create_network(), list(sent_packets), 0
         arrivals: list[Arrival] = []
         drops: list[Drop] = []
         while (next_ns := net.next_event_ns()) is not None or remaining:
-            ends = [
+            end_times_ns = [
                 end_ns for end_ns in (next_ns, remaining[0].enters_ns if remaining else None) if end_ns is not None
             ]
-            to_ns = next_end(now_ns, min(ends))
+            to_ns = next_end(now_ns, min(end_times_ns))
             entering = [packet for packet in remaining if packet.enters_ns <= to_ns]
             del remaining[: len(entering)]
-            arrived, dropped = net.advance(to_ns, entering, states)
-            assert all(now_ns <= arrival.at_ns <= to_ns for arrival in arrived)
-            arrivals += arrived
-            drops += dropped
+            window_arrivals, window_drops = net.advance(to_ns, entering, states)
+            assert all(now_ns <= arrival.at_ns <= to_ns for arrival in window_arrivals)
+            arrivals += window_arrivals
+            drops += window_drops
             now_ns = to_ns
-        assert outcome(sent, arrivals, drops) == expected
+        assert outcome(sent_packets, arrivals, drops) == expected
 
 
 class BroadcastTransport:
@@ -227,36 +227,38 @@ class BroadcastTransport:
         raise AssertionError("record_loss must not be called for broadcasts")
 
 
-def broadcast(places_m: dict[str, tuple[float, float, float]], sent: Sequence[Packet]) -> list[tuple[int, str, int]]:
-    create_network: list[BroadcastTransport] = []
+def broadcast(
+    places_m: dict[str, tuple[float, float, float]], sent_packets: Sequence[Packet]
+) -> list[tuple[int, str, int]]:
+    transports: list[BroadcastTransport] = []
 
     def make(wire: Wire) -> BroadcastTransport:
-        create_network.append(BroadcastTransport(wire))
-        return create_network[0]
+        transports.append(BroadcastTransport(wire))
+        return transports[0]
 
     net = network(wifi(list(places_m)), list(places_m), transports={"shout": make})
-    net.advance(10**9, sent, standing(places_m))
-    return create_network[0].received
+    net.advance(10**9, sent_packets, standing(places_m))
+    return transports[0].received
 
 
 def test_a_fragmented_broadcast_reaches_all_stations_in_range() -> None:
     places_m = {"a": (0.0, 0.0, 1.0), "b": (10.0, 0.0, 1.0), "c": (0.0, 20.0, 1.0), "d": (200.0, 0.0, 1.0)}
-    received = broadcast(places_m, packets([(0, "a", "b", 4000)], protocol="shout"))
-    assert [(host, number) for _, host, number in received] == [("b", 1), ("c", 1)]
+    arrivals = broadcast(places_m, packets([(0, "a", "b", 4000)], protocol="shout"))
+    assert [(host, number) for _, host, number in arrivals] == [("b", 1), ("c", 1)]
 
 
 @pytest.mark.parametrize("interval_ns", [5_000, 300_000, 1_000_000, 1_410_000, 1_430_000, 3_000_000])
-@pytest.mark.parametrize("hidden", [True, False])
-def test_overlapping_frames_of_hidden_stations_collide(hidden: bool, interval_ns: int) -> None:
+@pytest.mark.parametrize("are_hidden", [True, False])
+def test_overlapping_frames_of_hidden_stations_collide(are_hidden: bool, interval_ns: int) -> None:
     """A frame of 1000 bytes at 6 Mbit/s; both senders are equally far from the receiver, so both frames are lost."""
-    distance_m = 60.0 if hidden else 10.0
+    distance_m = 60.0 if are_hidden else 10.0
     places_m = {"a": (-distance_m, 0.0, 1.0), "b": (0.0, 0.0, 1.0), "c": (distance_m, 0.0, 1.0)}
-    sent = packets([(0, "a", "b", 1000), (interval_ns, "c", "b", 1000)], protocol="shout")
-    received = {number for _, host, number in broadcast(places_m, sent) if host == "b"}
+    sent_packets = packets([(0, "a", "b", 1000), (interval_ns, "c", "b", 1000)], protocol="shout")
+    received_numbers = {number for _, host, number in broadcast(places_m, sent_packets) if host == "b"}
     # Preamble of 20 us, extension of 6 us, symbols of 4 us with 24 bits each.
     airtime_ns = 26_000 + 4_000 * -(-(22 + 8 * 1036) // 24)
     assert airtime_ns == G_MODES[0].airtime_ns(1036)
-    assert received == (set() if hidden and interval_ns < airtime_ns else {1, 2})
+    assert received_numbers == (set() if are_hidden and interval_ns < airtime_ns else {1, 2})
 
 
 def test_simultaneous_events_run_in_the_documented_order() -> None:
@@ -320,10 +322,10 @@ class EchoingUdp(Udp):
 @pytest.mark.parametrize("delay_ms", [0, 2])
 def test_replies_without_delay_arrive_in_the_same_nanosecond(delay_ms: int) -> None:
     net = network(fixed(delay=f"{delay_ms}ms"), "ab", transports={"udp": EchoingUdp})
-    sent = packets([(MS, "a", "b", 10)])
-    assert outcome(sent, *net.advance(10 * MS, sent, standing(dict.fromkeys("ab", (0, 0, 0))))).arrived == {
-        ("a to b", 0): MS + 4 * delay_ms * MS
-    }
+    sent_packets = packets([(MS, "a", "b", 10)])
+    assert outcome(
+        sent_packets, *net.advance(10 * MS, sent_packets, standing(dict.fromkeys("ab", (0, 0, 0))))
+    ).arrived == {("a to b", 0): MS + 4 * delay_ms * MS}
 
 
 def test_a_timer_in_the_past_is_rejected() -> None:

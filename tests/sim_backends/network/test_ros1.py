@@ -1,4 +1,4 @@
-"""ROS 1 over a scripted link: which hosts must be reachable to establish and to keep a connection."""
+"""ROS 1 over a scripted link: the hosts that must be reachable to establish and to keep a connection."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -19,17 +19,17 @@ from tests.helpers.scripted_wire import Script, ScriptedWire
 
 MS = 1_000_000
 SECOND = 1000 * MS
-D_NS = MS
+DELAY_NS = MS
 TCPROS = Ros1Flow("a", "b")
 UDPROS = Ros1Flow("a", "b", "udpros")
 NOT_CONNECTED = "no subscriber is connected"
 
 
-def nodes(
+def make_wire(
     flow: Ros1Flow, script: Script | None = None, *, master: str = "m", options: Ros1Options | None = None
 ) -> ScriptedWire:
     """Return a wire on which a publishes to b, with a master."""
-    wire = ScriptedWire(D_NS, script=script, hosts=("a", "b", "m"))
+    wire = ScriptedWire(DELAY_NS, script=script, hosts=("a", "b", "m"))
     wire.transports["ros1"] = Ros1(wire, {"scan": flow}, master=master, options=options)
     return wire
 
@@ -52,18 +52,18 @@ def losing_between(begin_ns: int, end_ns: int, *hosts: str) -> tuple[Script, lis
 
 def test_a_connection_is_established_as_fast_as_with_rospy() -> None:
     """Captured from rosmaster and rospy 1.15.15: 12 delays, in addition to the handshake with the master."""
-    wire = nodes(TCPROS)
+    wire = make_wire(TCPROS)
     # A handshake with the master, call and response; the same with the publisher; another call to the master; and a
     # handshake and the subscriber's header.
-    connected_ns = (4 + 4 + 2 + 3) * D_NS
-    publish(wire, [0, connected_ns - 1, connected_ns + 1, connected_ns + 10 * D_NS])
+    connected_ns = (4 + 4 + 2 + 3) * DELAY_NS
+    publish(wire, [0, connected_ns - 1, connected_ns + 1, connected_ns + 10 * DELAY_NS])
     wire.run(SECOND)
     assert wire.dropped == dict.fromkeys((0, 1), NOT_CONNECTED)
-    assert wire.delivered == {2: connected_ns + 1 + D_NS, 3: connected_ns + 11 * D_NS}
+    assert wire.delivered == {2: connected_ns + 1 + DELAY_NS, 3: connected_ns + 11 * DELAY_NS}
 
 
 def test_only_the_first_connection_of_a_subscriber_queries_the_keep_alive_setting() -> None:
-    wire = ScriptedWire(D_NS, hosts=("a", "b", "m"))
+    wire = ScriptedWire(DELAY_NS, hosts=("a", "b", "m"))
     wire.transports["ros1"] = Ros1(
         wire, {"scan": TCPROS, "late": Ros1Flow("m", "b")}, master="m", options=Ros1Options(starts_ns={"m": SECOND})
     )
@@ -74,7 +74,7 @@ def test_only_the_first_connection_of_a_subscriber_queries_the_keep_alive_settin
 
 
 def test_a_response_uses_the_connection_of_its_call() -> None:
-    wire = nodes(TCPROS)
+    wire = make_wire(TCPROS)
     wire.run(SECOND)
     syns = [
         transmission.packet
@@ -86,19 +86,19 @@ def test_a_response_uses_the_connection_of_its_call() -> None:
 
 
 def test_udpros_is_connected_by_the_call_to_the_publisher() -> None:
-    wire = nodes(UDPROS)
-    connected_ns = (4 + 3) * D_NS
+    wire = make_wire(UDPROS)
+    connected_ns = (4 + 3) * DELAY_NS
     publish(wire, [connected_ns - 1, connected_ns + 1])
     wire.run(SECOND)
     assert wire.dropped == {0: NOT_CONNECTED}
-    assert wire.delivered == {1: connected_ns + 1 + D_NS}
+    assert wire.delivered == {1: connected_ns + 1 + DELAY_NS}
 
 
 def test_the_master_reports_a_publisher_that_starts_later() -> None:
-    wire = nodes(TCPROS, options=Ros1Options(starts_ns={"a": 5 * SECOND}))
+    wire = make_wire(TCPROS, options=Ros1Options(starts_ns={"a": 5 * SECOND}))
     # The publisher's call, the master's call, the subscriber's calls to the publisher and to the master, and the
     # header.
-    connected_ns = 5 * SECOND + (3 + 3 + 4 + 2 + 3) * D_NS
+    connected_ns = 5 * SECOND + (3 + 3 + 4 + 2 + 3) * DELAY_NS
     publish(wire, [connected_ns - 1, connected_ns + 1])
     wire.run(10 * SECOND)
     assert (wire.dropped, list(wire.delivered)) == ({0: NOT_CONNECTED}, [1])
@@ -106,7 +106,7 @@ def test_the_master_reports_a_publisher_that_starts_later() -> None:
 
 @pytest.mark.parametrize("master", ["a", "b"])
 def test_the_master_may_be_on_a_robot_that_publishes_or_subscribes(master: str) -> None:
-    wire = nodes(TCPROS, master=master)
+    wire = make_wire(TCPROS, master=master)
     publish(wire, [SECOND])
     wire.run(2 * SECOND)
     assert list(wire.delivered) == [0]
@@ -114,9 +114,9 @@ def test_the_master_may_be_on_a_robot_that_publishes_or_subscribes(master: str) 
 
 @pytest.mark.parametrize("flow", [TCPROS, UDPROS])
 def test_without_the_master_no_connection_is_established(flow: Ros1Flow) -> None:
-    """The robots can always reach each other; the SYN to the master that arrives is the one sent at 31 s."""
+    """The robots can always reach each other; the first SYN that the master receives is sent at 31 s."""
     script, wires = losing_between(0, 20 * SECOND, "b", "m")
-    wire = nodes(flow, script)
+    wire = make_wire(flow, script)
     wires.append(wire)
     publish(wire, [number * SECOND for number in range(40)])
     wire.run(50 * SECOND)
@@ -127,7 +127,7 @@ def test_without_the_master_no_connection_is_established(flow: Ros1Flow) -> None
 @pytest.mark.parametrize("flow", [TCPROS, UDPROS])
 def test_without_the_master_a_connection_continues(flow: Ros1Flow) -> None:
     script, wires = losing_between(SECOND // 2, 100 * SECOND, "a", "b", "m")
-    wire = nodes(
+    wire = make_wire(
         flow,
         lambda packet, receiver, number: (
             (0,) if "m" not in {packet.source, receiver} else script(packet, receiver, number)
@@ -139,10 +139,10 @@ def test_without_the_master_a_connection_continues(flow: Ros1Flow) -> None:
     assert len(wire.delivered) == 89
 
 
-def test_a_call_whose_connection_is_given_up_is_retried() -> None:
+def test_a_call_whose_connection_fails_is_retried() -> None:
     """With one retransmission of its SYN, TCP gives up after 1 s and 2 s more; 50 ms later another call starts."""
     script, wires = losing_between(0, 4 * SECOND, "b", "m")
-    wire = nodes(TCPROS, script, options=Ros1Options(tcp=TcpOptions(syn_retries=1)))
+    wire = make_wire(TCPROS, script, options=Ros1Options(tcp=TcpOptions(syn_retries=1)))
     wires.append(wire)
     wire.run(20 * SECOND)
     syns_ns = [
@@ -157,10 +157,10 @@ def test_a_call_whose_connection_is_given_up_is_retried() -> None:
     assert list(wire.delivered) == [0]
 
 
-def test_a_connection_that_tcp_gives_up_is_opened_again() -> None:
+def test_a_connection_that_fails_in_tcp_is_opened_again() -> None:
     """The publisher's TCP gives up early; the subscriber probes after a minute without messages, and reconnects."""
     script, wires = losing_between(2 * SECOND, 20 * SECOND, "a", "b")
-    wire = nodes(TCPROS, script, options=Ros1Options(tcp=TcpOptions(retries=3)))
+    wire = make_wire(TCPROS, script, options=Ros1Options(tcp=TcpOptions(retries=3)))
     wires.append(wire)
     publish(wire, [number * SECOND for number in range(1, 100)])
     wire.run(120 * SECOND)
@@ -170,10 +170,10 @@ def test_a_connection_that_tcp_gives_up_is_opened_again() -> None:
     assert wire.delivered.keys() == {0, *range(61, 99)}
 
 
-def test_a_subscriber_without_messages_gives_up_and_reconnects() -> None:
-    """Nine probes after 60 s without messages, at intervals of 10 s; then the publisher gets a new connection."""
+def test_a_subscriber_without_messages_closes_its_connection_and_reconnects() -> None:
+    """Nine probes follow 60 s without messages, at intervals of 10 s; then the publisher has a new connection."""
     script, wires = losing_between(2 * SECOND, 200 * SECOND, "a", "b")
-    wire = nodes(TCPROS, script, options=Ros1Options(tcp=TcpOptions(syn_retries=2)))
+    wire = make_wire(TCPROS, script, options=Ros1Options(tcp=TcpOptions(syn_retries=2)))
     wires.append(wire)
     publish(wire, [SECOND, 100 * SECOND, 250 * SECOND])
     wire.run(260 * SECOND)
@@ -195,16 +195,16 @@ def test_an_answered_probe_resets_the_probe_counter() -> None:
     def script(packet: IpPacket, receiver: str, number: int) -> Sequence[int]:
         return () if any(begin <= wires[0].now_ns < end for begin, end in outages_ns) else (0,)
 
-    wire = nodes(TCPROS, script)
+    wire = make_wire(TCPROS, script)
     wires.append(wire)
     publish(wire, [SECOND, 400 * SECOND])
     wire.run(401 * SECOND)
-    lost = [
+    lost_probes = [
         transmission
         for transmission in wire.transmitted
         if transmission.packet.identity[0] == "scan probe" and not transmission.arrived
     ]
-    assert len(lost) == 16
+    assert len(lost_probes) == 16
     assert not any("header 2" in transmission.packet.identity[0] for transmission in wire.transmitted)
     assert list(wire.delivered) == [0, 1]
 
@@ -213,7 +213,7 @@ def test_a_subscriber_that_the_master_cannot_reach_never_connects() -> None:
     """The subscriber registered first, and the master does not repeat its call, as in rosmaster."""
     script, wires = losing_between(SECOND, 10 * SECOND, "b", "m")
     options = Ros1Options(tcp=TcpOptions(syn_retries=1), starts_ns={"a": 2 * SECOND})
-    wire = nodes(TCPROS, script, options=options)
+    wire = make_wire(TCPROS, script, options=options)
     wires.append(wire)
     publish(wire, [100 * SECOND])
     wire.run(101 * SECOND)
@@ -226,7 +226,7 @@ def test_a_call_that_is_executed_twice_opens_one_connection() -> None:
     def script(packet: IpPacket, receiver: str, number: int) -> Sequence[int]:
         return () if (packet.source, receiver) == ("m", "a") and "back" in packet.identity[0] else (0,)
 
-    wire = nodes(TCPROS, script, options=Ros1Options(tcp=TcpOptions(retries=2)))
+    wire = make_wire(TCPROS, script, options=Ros1Options(tcp=TcpOptions(retries=2)))
     wire.run(20 * SECOND)
     updates = {
         transmission.packet.identity
@@ -244,7 +244,7 @@ def test_a_call_that_is_executed_twice_opens_one_connection() -> None:
 
 def test_a_header_without_response_is_sent_again() -> None:
     """The publisher's TCP gives up its header; the subscriber, which waits for it, probes after a minute."""
-    wire = nodes(
+    wire = make_wire(
         TCPROS,
         lambda packet, *_: () if packet.source == "a" and packet.identity[0].startswith("scan 1 ") else (0,),
         options=Ros1Options(tcp=TcpOptions(syn_retries=1)),
@@ -254,13 +254,13 @@ def test_a_header_without_response_is_sent_again() -> None:
     assert list(wire.delivered) == [0]
 
 
-def test_an_idle_connection_is_probed_and_kept() -> None:
-    wire = nodes(TCPROS)
+def test_an_idle_connection_is_probed_and_stays_open() -> None:
+    wire = make_wire(TCPROS)
     publish(wire, [SECOND, 600 * SECOND])
     wire.run(601 * SECOND)
-    kinds = Counter(transmission.packet.identity[0] for transmission in wire.transmitted)
+    flow_counts = Counter(transmission.packet.identity[0] for transmission in wire.transmitted)
     # Each response counts as a message, so that the next probe follows 60 s after it.
-    assert kinds["scan probe"] == kinds["scan probe answer"] == 9
+    assert flow_counts["scan probe"] == flow_counts["scan probe answer"] == 9
     assert list(wire.delivered) == [0, 1]
 
 
@@ -268,7 +268,7 @@ def test_an_idle_connection_is_probed_and_kept() -> None:
 def test_udpros_loses_a_message_if_any_block_is_lost(size_bytes: int, blocks: int) -> None:
     draws = PacketDraws(1, "link")
     loss, count = 0.1, 2000
-    wire = nodes(
+    wire = make_wire(
         UDPROS,
         lambda packet, *_: (
             (0,) if packet.size_bytes < 100 or wire.now_ns < SECOND or draws.draw(packet.identity) >= loss else ()
@@ -276,19 +276,23 @@ def test_udpros_loses_a_message_if_any_block_is_lost(size_bytes: int, blocks: in
     )
     publish(wire, [(1000 + number) * MS for number in range(count)], size_bytes)
     wire.run(10 * SECOND)
-    sent = [transmission.packet for transmission in wire.transmitted if "block" in transmission.packet.identity[0]]
-    assert len(sent) == blocks * count
+    block_packets = [
+        transmission.packet for transmission in wire.transmitted if "block" in transmission.packet.identity[0]
+    ]
+    assert len(block_packets) == blocks * count
     # Headers of length, UDPROS, UDP and IP.
-    assert sum(packet.size_bytes for packet in sent) == count * (size_bytes + 4 + blocks * (8 + 8 + 20))
+    assert sum(packet.size_bytes for packet in block_packets) == count * (size_bytes + 4 + blocks * (8 + 8 + 20))
     # The last block of a message may be too short for the script to lose it.
-    blocks_subject_to_loss = sum(packet.size_bytes >= 100 for packet in sent) / count
+    blocks_subject_to_loss = sum(packet.size_bytes >= 100 for packet in block_packets) / count
     expected = 1 - (1 - loss) ** blocks_subject_to_loss
     assert len(wire.dropped) / count == pytest.approx(expected, abs=4 * (expected * (1 - expected) / count) ** 0.5)
 
 
 @pytest.mark.parametrize("late_block", [0, 1])
 def test_udpros_loses_a_message_with_reordered_blocks(late_block: int) -> None:
-    wire = nodes(UDPROS, lambda packet, *_: (5 * MS,) if packet.identity == (f"scan block{late_block}", 0) else (0,))
+    wire = make_wire(
+        UDPROS, lambda packet, *_: (5 * MS,) if packet.identity == (f"scan block{late_block}", 0) else (0,)
+    )
     publish(wire, [SECOND, 2 * SECOND], 4000)
     wire.run(3 * SECOND)
     assert wire.dropped == {0: "blocks of UDPROS out of order"}
@@ -297,7 +301,9 @@ def test_udpros_loses_a_message_with_reordered_blocks(late_block: int) -> None:
 
 @settings(max_examples=20)
 @given(st.lists(st.one_of(st.just(()), st.just((0,)), st.just((0, 3 * MS)), st.just((20 * MS,))), max_size=60))
-def test_messages_arrive_once_in_order_and_finally_all_after_any_losses(losses: Sequence[Sequence[int]]) -> None:
+def test_messages_arrive_in_order_and_once_and_all_of_them_after_the_last_loss(
+    losses: Sequence[Sequence[int]],
+) -> None:
     remaining = iter(losses)
     fast_retry = CallRetry(MS, MS)
     options = Ros1Options(
@@ -309,7 +315,7 @@ def test_messages_arrive_once_in_order_and_finally_all_after_any_losses(losses: 
         silence_ns=SECOND,
         probe_ns=SECOND,
     )
-    wire = nodes(TCPROS, lambda *_: next(remaining, (0,)), options=options)
+    wire = make_wire(TCPROS, lambda *_: next(remaining, (0,)), options=options)
     publish(wire, [number * 2 * SECOND for number in range(60)])
     wire.run(300 * SECOND)
     assert list(wire.delivered) == sorted(wire.delivered)
@@ -318,7 +324,7 @@ def test_messages_arrive_once_in_order_and_finally_all_after_any_losses(losses: 
 
 
 def test_an_unknown_flow_is_rejected() -> None:
-    wire = nodes(TCPROS)
+    wire = make_wire(TCPROS)
     with pytest.raises(ConfigurationError, match="'scam'") as error:
         wire.transports["ros1"].send(Packet(0, "a", "b", 100, ("scam", 0), 0, 0, "ros1"))
     assert "did you mean 'scan'?" in error.value.remedy

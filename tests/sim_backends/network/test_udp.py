@@ -1,4 +1,4 @@
-"""UDP over analytically solvable links: loss of fragments, delay, queues, range."""
+"""UDP over links with closed-form results: loss of fragments, delay, queues, and range."""
 
 import pytest
 import scipy
@@ -16,8 +16,8 @@ def test_a_datagram_is_lost_if_any_fragment_is_lost(size_bytes: int, fragments: 
     """1 - (1 - p)^n, because fragments are lost independently."""
     loss, n = 0.1, 4000
     net = network(fixed(loss=f"{loss:.0%}"), "ab")
-    sent = packets([(number * MS, "a", "b", size_bytes) for number in range(n)])
-    result = carry(net, STATES, sent)
+    sent_packets = packets([(number * MS, "a", "b", size_bytes) for number in range(n)])
+    result = carry(net, STATES, sent_packets)
     interval = scipy.stats.binomtest(len(result.dropped), n).proportion_ci(confidence_level=0.99, method="wilson")
     assert interval.low <= 1 - (1 - loss) ** fragments <= interval.high
     assert set(result.dropped.values()) == {LOST}

@@ -47,25 +47,25 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> World:
     ],
     ids=str,
 )
-def test_its_losses_are_those_of_the_built_in_radio(options: dict[str, Any], world: World) -> None:
-    radio, draws = RadioOptions.model_validate(options), random.Random(3)
+def test_losses_in_ns3_equal_those_of_the_built_in_radio(options: dict[str, Any], world: World) -> None:
+    radio, rng = RadioOptions.model_validate(options), random.Random(3)
     channel = WorldChannel(9, dict.fromkeys(NAMES, Antenna("802.11g", 0.0, -82.0)), radio, world)
     links, expected_mw = [], []
-    jammed, jammer_mw = [], []
+    jammer_links, jammer_mw = [], []
     for _ in range(PLACES):
-        at_ns = draws.randrange(10**11)
-        places = {name: (draws.uniform(0, 60), draws.uniform(0, 60), draws.choice((0.4, 1.0, 6.0))) for name in NAMES}
+        at_ns = rng.randrange(10**11)
+        places = {name: (rng.uniform(0, 60), rng.uniform(0, 60), rng.choice((0.4, 1.0, 6.0))) for name in NAMES}
         channel.move(at_ns, places)
         for first, name in enumerate(NAMES):
             powers_mw = channel.powers_mw(first, at_ns)
             for second, other in enumerate(NAMES):
-                if first != second and powers_mw[second] > 0:  # metal may absorb everything that a float can hold
+                if first != second and powers_mw[second] > 0:  # the loss in metal may exceed the range of a float
                     links.append((at_ns, first, places[name], second, places[other]))
                     expected_mw.append(powers_mw[second])
-        jammer_m = draws.uniform(0, 60), draws.uniform(0, 60), 1.0
+        jammer_m = rng.uniform(0, 60), rng.uniform(0, 60), 1.0
         for name, power_mw in zip(NAMES, channel.received_mw(jammer_m, 0.0), strict=True):
             if power_mw > 0:
-                jammed.append((jammer_m, places[name]))
+                jammer_links.append((jammer_m, places[name]))
                 jammer_mw.append(power_mw)
     request = {
         "seed": 9,
@@ -73,7 +73,7 @@ def test_its_losses_are_those_of_the_built_in_radio(options: dict[str, Any], wor
         "world": world.model_dump(mode="json", by_alias=True, exclude_none=True),
         "names": NAMES,
         "links": links,
-        "places": jammed,
+        "places": jammer_links,
     }
     output = subprocess.run(
         [*command().split(), "losses"], input=json.dumps(request), capture_output=True, text=True, check=True

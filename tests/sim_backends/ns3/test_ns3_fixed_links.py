@@ -42,9 +42,9 @@ def test_each_datagram_has_the_fate_of_the_built_in_network(
         assert reasons(ns3) == expected
 
 
-def test_a_full_queue_and_an_unlimited_rate(tmp_path: Path) -> None:
-    full = {**LINK, "traffic": stream(rate="1kHz", size_bytes=1000)}
-    builtin, ns3 = (run_pair(tmp_path, network, full) for network in ("builtin", "ns3"))
+def test_a_full_queue_drops_packets_and_an_unlimited_rate_adds_no_delay(tmp_path: Path) -> None:
+    full_queue = {**LINK, "traffic": stream(rate="1kHz", size_bytes=1000)}
+    builtin, ns3 = (run_pair(tmp_path, network, full_queue) for network in ("builtin", "ns3"))
     assert reasons(ns3)["queue full"] == reasons(builtin)["queue full"] > 100
     run = run_pair(tmp_path, "ns3", {"radio.delay": "7ms", "radio.rate": "unlimited", "radio.queue_packets": 0})
     assert {(fate.arrived_ns or 0) - fate.packet.enters_ns for fate in arrived(run)} == {7_000_000}

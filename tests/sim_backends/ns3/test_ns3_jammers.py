@@ -42,21 +42,21 @@ def loss_power_dbm(folder: Path, network: str, mode: str, first_dbm: int) -> flo
             "traffic": stream(rate="500Hz", size_bytes=600),
         },
     )
-    sent: Counter[int] = Counter()
-    received: Counter[int] = Counter()
+    sent_counts: Counter[int] = Counter()
+    received_counts: Counter[int] = Counter()
     for fate in run.fates.values():
         step = fate.packet.sent_ns // (STEP_MS * MS) - 1
-        sent[step] += 1
-        received[step] += fate.arrived_ns is not None
-    shares = [received[step] / sent[step] for step in range(STEPS)]
-    for step, (before, after) in enumerate(pairwise(shares)):
-        if before >= 0.5 > after:
-            return first_dbm + step + (before - 0.5) / (before - after)
+        sent_counts[step] += 1
+        received_counts[step] += fate.arrived_ns is not None
+    shares = [received_counts[step] / sent_counts[step] for step in range(STEPS)]
+    for step, (share_before, share_after) in enumerate(pairwise(shares)):
+        if share_before >= 0.5 > share_after:
+            return first_dbm + step + (share_before - 0.5) / (share_before - share_after)
     raise AssertionError(f"no power at which half of the packets are lost: {shares}")
 
 
 @pytest.mark.parametrize(("mode", "first_dbm"), [("g54", -34), ("g24", -24), ("g6", -16)])
-def test_packets_are_lost_from_the_same_power_on_within_1_db(mode: str, first_dbm: int, tmp_path: Path) -> None:
+def test_packets_are_lost_above_the_same_jammer_power_within_1_db(mode: str, first_dbm: int, tmp_path: Path) -> None:
     """The noise of both is Gaussian, and their error rates are those of the same model."""
     builtin_dbm, ns3_dbm = (loss_power_dbm(tmp_path, network, mode, first_dbm) for network in NETWORKS)
     assert ns3_dbm == pytest.approx(builtin_dbm, abs=1.0)
@@ -67,10 +67,10 @@ def test_a_station_does_not_send_while_it_receives_strong_noise(network: str, tm
     jammer = {"kind": "jammer", "power_dbm": 20, "at_m": [0, 3], "from": "100ms", "to": "200ms"}
     changes = {"duration": "400ms", "faults": [jammer], "traffic": stream(size_bytes=300)}
     run = run_pair(tmp_path, network, changes)
-    assert reasons(run).total() <= 1, "the last one may be on its way"
-    late = [fate for fate in arrived(run) if 101 * MS < fate.packet.sent_ns < 199 * MS]
-    assert len(late) >= 9
-    assert all(200 * MS <= (fate.arrived_ns or 0) < 240 * MS for fate in late)
+    assert reasons(run).total() <= 1, "the last packet may be under way"
+    deferred_fates = [fate for fate in arrived(run) if 101 * MS < fate.packet.sent_ns < 199 * MS]
+    assert len(deferred_fates) >= 9
+    assert all(200 * MS <= (fate.arrived_ns or 0) < 240 * MS for fate in deferred_fates)
 
 
 @pytest.mark.parametrize("network", NETWORKS)
@@ -96,10 +96,10 @@ def test_jammers_are_announced_to_policies_that_bound_errors(tmp_path: Path) -> 
         "agents.eve": {"robot": "husky", "at_m": [40, 10]},
         "faults": [jammer | {"at_m": [78, 30], "height": "2m"}, jammer | {"agent": "eve"}],
     }
-    announced = []
+    emitters_by_network = []
     for network in NETWORKS:
         with build(load_scenario(path, {"network.federate": network, **changes})) as simulation:
-            announced.append((transmitters(simulation.network), fixed_emitters_m(simulation.network)))
-    assert announced[0] == announced[1]
-    ((_, _, up_m),) = announced[0][1]
-    assert up_m > 2, "it is on raised ground"
+            emitters_by_network.append((transmitters(simulation.network), fixed_emitters_m(simulation.network)))
+    assert emitters_by_network[0] == emitters_by_network[1]
+    ((_, _, up_m),) = emitters_by_network[0][1]
+    assert up_m > 2, "the jammer is on raised ground"

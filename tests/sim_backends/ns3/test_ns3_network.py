@@ -1,4 +1,4 @@
-"""The network federate of ns-3: conformance, results beside the built-in network, parts of delays, faults."""
+"""The network federate of ns-3: conformance, results compared with the built-in network, parts of delays, faults."""
 
 import csv
 import os
@@ -34,7 +34,7 @@ from tests.helpers.ns3_pair import RELAYED, SCENARIO, reasons, stream
 TCP = {"kind": "stream", "name": "log", "from": "bob", "to": "ann", "rate": "50Hz", "size_bytes": 5000}
 SATURATED_S = 0.2
 
-Simulated = Callable[..., Simulation]
+BuildSimulation = Callable[..., Simulation]
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def program() -> str:
 
 
 @pytest.fixture
-def simulated(tmp_path: Path) -> Any:  # noqa: ANN401 (an iterator of a function)
+def build_simulation(tmp_path: Path) -> Any:  # noqa: ANN401 (an iterator of a function)
     """Return a function that builds the scenario with changes; ns-3 is its network."""
     path = tmp_path / "line.yaml"
     path.write_text(SCENARIO, encoding="utf-8")
@@ -58,7 +58,7 @@ def simulated(tmp_path: Path) -> Any:  # noqa: ANN401 (an iterator of a function
 
 
 @pytest.mark.parametrize("name", checks(is_physics=False))
-def test_it_conforms(name: str, program: str) -> None:
+def test_the_ns3_federate_conforms(name: str, program: str) -> None:
     scenario = load_scenario("convoy", {"network.federate": "ns3", "network.options.topics": "udp"})
     world = load_world(scenario.world)
     hello = make_hello(scenario, world, make_bodies(scenario, world), 1, NETWORK)
@@ -74,8 +74,10 @@ def goodput_mbit_s(simulation: Simulation) -> float:
 
 
 @pytest.mark.parametrize("standard", ["802.11a", "802.11g"])
-def test_udp_has_the_goodput_and_losses_of_the_built_in_network(standard: str, simulated: Simulated) -> None:
-    """The bound is that of docs/studies/radio.md, 10 %; 54 Mbit/s end between 45 and 50 m."""
+def test_udp_has_the_goodput_and_losses_of_the_built_in_network(
+    standard: str, build_simulation: BuildSimulation
+) -> None:
+    """The bound is that of docs/studies/radio.md, 10 %; the range of 54 Mbit/s is between 45 and 50 m."""
     for distance_m in (10, 44, 52):
         changes = {
             "duration": f"{SATURATED_S}s",
@@ -83,8 +85,8 @@ def test_udp_has_the_goodput_and_losses_of_the_built_in_network(standard: str, s
             "agents__bob__at_m": [distance_m, 0],
             "traffic": stream(rate="4kHz", size_bytes=1000),
         }
-        builtin_mbit_s = goodput_mbit_s(simulated("builtin", **changes))
-        ns3_mbit_s = goodput_mbit_s(simulated(network__options__standard=standard, **changes))
+        builtin_mbit_s = goodput_mbit_s(build_simulation("builtin", **changes))
+        ns3_mbit_s = goodput_mbit_s(build_simulation(network__options__standard=standard, **changes))
         assert ns3_mbit_s == pytest.approx(builtin_mbit_s, rel=0.1), distance_m
         assert (builtin_mbit_s > 20) == (distance_m < 45)
 
@@ -92,10 +94,12 @@ def test_udp_has_the_goodput_and_losses_of_the_built_in_network(standard: str, s
 @pytest.mark.parametrize(
     "changes", [{}, RELAYED, {"network__options__ampdu_bytes": 65535}], ids=("", "relay", "ampdu")
 )
-def test_the_parts_of_each_delay_add_up_to_it(changes: dict[str, Any], simulated: Simulated, tmp_path: Path) -> None:
+def test_the_parts_of_each_delay_add_up_to_the_delay(
+    changes: dict[str, Any], build_simulation: BuildSimulation, tmp_path: Path
+) -> None:
     traffic = [*stream(), TCP | {"protocol": "tcp"}]
     standard = "802.11n" if "network__options__ampdu_bytes" in changes else "802.11a"
-    simulation = simulated(
+    simulation = build_simulation(
         traffic=traffic,
         network__options__standard=standard,
         network__options__delay_parts=str(tmp_path / "parts-{seed}.csv"),
@@ -105,11 +109,11 @@ def test_the_parts_of_each_delay_add_up_to_it(changes: dict[str, Any], simulated
     simulation.close()
     with (tmp_path / "parts-1.csv").open(encoding="utf-8") as file:
         rows = {(row.pop("flow"), int(row.pop("number"))): row for row in csv.DictReader(file)}
-    arrived = {identity: fate for identity, fate in run.fates.items() if fate.arrived_ns is not None}
-    assert {flow for flow, _ in arrived} == {"state/bob", "log/ann"}
-    assert rows.keys() == arrived.keys()
+    arrived_fates = {identity: fate for identity, fate in run.fates.items() if fate.arrived_ns is not None}
+    assert {flow for flow, _ in arrived_fates} == {"state/bob", "log/ann"}
+    assert rows.keys() == arrived_fates.keys()
     hops = 2 if "relay" in changes else 1
-    for identity, fate in arrived.items():
+    for identity, fate in arrived_fates.items():
         delay_ns, *parts_ns = map(int, rows[identity].values())
         assert fate.arrived_ns is not None
         assert sum(parts_ns) == delay_ns == fate.arrived_ns - fate.packet.enters_ns
@@ -122,49 +126,55 @@ def test_the_parts_of_each_delay_add_up_to_it(changes: dict[str, Any], simulated
     assert any(int(row["queueing_ns"]) > 100_000 for row in rows.values())
 
 
-def test_losses_have_reasons(simulated: Simulated) -> None:
-    sparse = stream(rate="10Hz", size_bytes=300)
-    distant_run = simulated(agents__bob__at_m=[500, 0], traffic=sparse).run()
+def test_losses_have_reasons(build_simulation: BuildSimulation) -> None:
+    sparse_traffic = stream(rate="10Hz", size_bytes=300)
+    distant_run = build_simulation(agents__bob__at_m=[500, 0], traffic=sparse_traffic).run()
     assert reasons(distant_run).keys() - {""} == {"retries exhausted"}
     assert not any(fate.arrived_ns for fate in distant_run.fates.values())
-    full = simulated(radio__mode="g6", traffic=stream(rate="4kHz", size_bytes=1000)).run()
-    assert reasons(full)["queue full"] > 1000
-    off = [
+    saturated_run = build_simulation(radio__mode="g6", traffic=stream(rate="4kHz", size_bytes=1000)).run()
+    assert reasons(saturated_run)["queue full"] > 1000
+    faults = [
         {"kind": "node-loss", "agent": "bob", "from": "100ms", "to": "200ms"},
         {"kind": "link-cut", "between": ["ann", "bob"], "from": "300ms", "to": "400ms"},
     ]
-    small = stream(rate="50Hz", size_bytes=300)
-    run = simulated(faults=off, traffic=small, radio__mode="g54", network__options__standard="802.11a").run()
-    lost_ns = [fate.packet.sent_ns for fate in run.fates.values() if fate.reason]
-    assert len(lost_ns) == pytest.approx(10, abs=2)
-    assert all(90e6 < at_ns < 200e6 or 290e6 < at_ns < 400e6 for at_ns in lost_ns)
-    relayed = {key.replace(".", "__"): value for key, value in RELAYED.items()}
-    unassociated = simulated(**relayed | {"agents__bob__at_m": [500, 0]}, traffic=sparse).run()
-    assert reasons(unassociated) == {"receiver not associated": 5}
+    small_traffic = stream(rate="50Hz", size_bytes=300)
+    run = build_simulation(
+        faults=faults, traffic=small_traffic, radio__mode="g54", network__options__standard="802.11a"
+    ).run()
+    send_times_of_lost_ns = [fate.packet.sent_ns for fate in run.fates.values() if fate.reason]
+    assert len(send_times_of_lost_ns) == pytest.approx(10, abs=2)
+    assert all(90e6 < at_ns < 200e6 or 290e6 < at_ns < 400e6 for at_ns in send_times_of_lost_ns)
+    relay_changes = {key.replace(".", "__"): value for key, value in RELAYED.items()}
+    unassociated_run = build_simulation(
+        **relay_changes | {"agents__bob__at_m": [500, 0]}, traffic=sparse_traffic
+    ).run()
+    assert reasons(unassociated_run) == {"receiver not associated": 5}
 
 
-def test_tcp_gives_up_its_connection_to_a_robot_out_of_range(simulated: Simulated) -> None:
+def test_a_tcp_connection_to_a_robot_out_of_range_fails(build_simulation: BuildSimulation) -> None:
     traffic = [TCP | {"protocol": "tcp", "rate": "1Hz"}]
-    run = simulated(duration="100s", policy__window="1s", agents__bob__at_m=[500, 0], traffic=traffic).run()
+    run = build_simulation(duration="100s", policy__window="1s", agents__bob__at_m=[500, 0], traffic=traffic).run()
     assert reasons(run).keys() - {""} == {"TCP connection given up"}
 
 
-def test_equal_seeds_give_equal_runs_and_others_do_not(simulated: Simulated) -> None:
+def test_equal_seeds_give_equal_runs_and_other_seeds_do_not(build_simulation: BuildSimulation) -> None:
     changes = {"duration": "200ms", "radio__fading": True, "agents__bob__at_m": [40, 0]}
-    hashes = [simulated(seeds=[seed], **changes).run().digest for seed in (4, 4, 5)]
+    hashes = [build_simulation(seeds=[seed], **changes).run().digest for seed in (4, 4, 5)]
     assert hashes[0] == hashes[1] != hashes[2]
 
 
-def test_it_announces_its_next_event_for_policies_that_need_it(simulated: Simulated) -> None:
-    run = simulated(duration="50ms", policy__name="event_driven", network__options__standard="802.11a").run()
+def test_the_federate_announces_its_next_event_for_policies_that_need_it(build_simulation: BuildSimulation) -> None:
+    run = build_simulation(duration="50ms", policy__name="event_driven", network__options__standard="802.11a").run()
     arrivals_ns = {fate.arrived_ns for fate in run.fates.values() if fate.arrived_ns is not None}
     assert arrivals_ns
     assert arrivals_ns <= set(run.windows_ns)
 
 
-def test_topics_of_best_effort_are_carried_as_udp_if_the_scenario_says_so(simulated: Simulated) -> None:
+def test_best_effort_topics_are_carried_as_udp_if_the_scenario_sets_the_option(
+    build_simulation: BuildSimulation,
+) -> None:
     best_effort = stream(protocol="topic", qos={"reliability": "best_effort"})
-    run = simulated(traffic=best_effort, network__options__topics="udp").run()
+    run = build_simulation(traffic=best_effort, network__options__topics="udp").run()
     assert sum(fate.arrived_ns is not None for fate in run.fates.values()) > 40
 
 
@@ -176,11 +186,11 @@ def test_topics_of_best_effort_are_carried_as_udp_if_the_scenario_says_so(simula
         ({"network__options__pcap": "/no/such/folder/"}, "pcap cannot be written: /no/such/folder/ann.pcap"),
     ],
 )
-def test_what_it_does_not_support_is_refused_with_the_reason(
-    changes: dict[str, Any], message: str, simulated: Simulated
+def test_unsupported_options_are_refused_with_the_reason(
+    changes: dict[str, Any], message: str, build_simulation: BuildSimulation
 ) -> None:
     with pytest.raises((FederateError, ConfigurationError), match=message):
-        simulated(**changes)
+        build_simulation(**changes)
 
 
 def test_a_missing_library_is_reported_with_the_command_that_installs_it(
@@ -190,30 +200,30 @@ def test_a_missing_library_is_reported_with_the_command_that_installs_it(
         (tmp_path / name).write_text("#!/bin/sh\nexit 1\n", encoding="ascii")
         (tmp_path / name).chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(ConfigurationError, match="needs the library ns3-core, which is not installed") as caught:
+    with pytest.raises(ConfigurationError, match="needs the library ns3-core, which is not installed") as error_info:
         command_line("ns3", NETWORK)
-    assert caught.value.remedy == "apt-get install g++ pkg-config libns3-dev nlohmann-json3-dev"
+    assert error_info.value.remedy == "apt-get install g++ pkg-config libns3-dev nlohmann-json3-dev"
     monkeypatch.setenv("PATH", "/nonexistent")
     with pytest.raises(ConfigurationError, match=r"needs g\+\+, which is not installed"):
         command_line("ns3", NETWORK)
 
 
 @pytest.mark.quiet
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=str)
-def test_a_killed_or_suspended_simulator_ends_the_run_with_its_name(
-    number: signal.Signals, simulated: Simulated
+@pytest.mark.parametrize("signal_number", [signal.SIGKILL, signal.SIGSTOP], ids=str)
+def test_a_run_stops_with_the_name_of_a_killed_or_suspended_simulator(
+    signal_number: signal.Signals, build_simulation: BuildSimulation
 ) -> None:
-    began_s = now_s()
-    simulation = simulated(deadline_s=4.0)
-    (pid,) = children(began_s)
+    start_s = now_s()
+    simulation = build_simulation(deadline_s=4.0)
+    (pid,) = children(start_s)
     simulation.run(100_000_000)
-    os.kill(pid, number)
+    os.kill(pid, signal_number)
     with pytest.raises(FederateError, match=r"network ns-3 \(ns3\) .*advance from 0.1 s.*; its last time is 0.1 s"):
         simulation.run()
-    assert children(began_s) == set()
+    assert children(start_s) == set()
 
 
-def test_the_command_line_runs_it_and_writes_the_tables(
+def test_the_command_runs_ns3_and_writes_the_tables(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -225,12 +235,14 @@ def test_the_command_line_runs_it_and_writes_the_tables(
     assert (tmp_path / "run" / "trial.csv").is_file()
 
 
-def test_it_captures_frames_with_radiotap_headers(simulated: Simulated, tmp_path: Path) -> None:
-    simulation = simulated(network__options__pcap=str(tmp_path / "air-{seed}-"))
+def test_the_federate_captures_frames_with_radiotap_headers(
+    build_simulation: BuildSimulation, tmp_path: Path
+) -> None:
+    simulation = build_simulation(network__options__pcap=str(tmp_path / "air-{seed}-"))
     simulation.run()
     simulation.close()
     frames = {name: list(PcapReader(str(tmp_path / f"air-1-{name}.pcap"))) for name in ("ann", "bob")}
-    for captured in frames.values():
-        assert len([frame for frame in captured if IP in frame]) >= 100, "two fragments of each datagram"
-        assert all(frame.haslayer(RadioTap) for frame in captured)
+    for robot_frames in frames.values():
+        assert len([frame for frame in robot_frames if IP in frame]) >= 100, "two fragments of each datagram"
+        assert all(frame.haslayer(RadioTap) for frame in robot_frames)
     assert any(frame[Dot11].type == 1 for frame in frames["ann"]), "an ACK"

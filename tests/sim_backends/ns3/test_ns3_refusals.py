@@ -1,4 +1,4 @@
-"""What the program of ns-3 refuses, with the reason: the coordinator prevents most of it, another client may not."""
+"""Requests that the ns-3 program refuses with a reason; the coordinator sends few of them, but other clients may."""
 
 import json
 import shlex
@@ -41,42 +41,42 @@ def hello_frame(hello: Hello, changes: Mapping[str, object] = MappingProxyType({
     """Return hello with changes of its configuration: values by their keys, `scenario/faults`."""
     configuration = json.loads(hello.configuration)
     for keys, value in changes.items():
-        *parents, last = keys.split("/")
+        *parents, last_key = keys.split("/")
         item: Any = configuration
         for key in parents:
             item = item[key]
-        item[last] = value
-    changed = replace(hello, configuration=json.dumps(configuration).encode())
-    return encode(MessageKind.HELLO, 1, 0, changed.encode())
+        item[last_key] = value
+    changed_hello = replace(hello, configuration=json.dumps(configuration).encode())
+    return encode(MessageKind.HELLO, 1, 0, changed_hello.encode())
 
 
 def advance_frame(
     to_ns: int = 10_000_000,
     packets: Sequence[Packet] = (),
     *,
-    announced: Sequence[str] = AGENTS,
-    copy: int = 0,
-    extra: str = "",
+    announced_agents: Sequence[str] = AGENTS,
+    copy_number: int = 0,
+    extra_agent: str = "",
 ) -> bytes:
-    states = {**STATES, **({extra: State((0.0, 0.0, 1.0))} if extra else {})}
-    body = AdvanceNetwork(to_ns, states, packets).encode(AgentTable(announced))
-    return encode(MessageKind.ADVANCE_NETWORK, 2, copy, body)
+    states = {**STATES, **({extra_agent: State((0.0, 0.0, 1.0))} if extra_agent else {})}
+    body = AdvanceNetwork(to_ns, states, packets).encode(AgentTable(announced_agents))
+    return encode(MessageKind.ADVANCE_NETWORK, 2, copy_number, body)
 
 
 def refusal(*frames: bytes) -> str:
     """Return the text of the error with which the program answers the last frame."""
-    done = subprocess.run(
+    process = subprocess.run(
         shlex.split(command()), input=b"".join(frames), stdout=subprocess.PIPE, check=False, timeout=60
     )
-    rest, kinds, body = done.stdout, [], b""
-    while rest:
-        size = int.from_bytes(rest[:4], "little")
-        kinds.append(rest[4])
-        body, rest = rest[HEADER_BYTES : HEADER_BYTES + size], rest[HEADER_BYTES + size :]
-    answers = [kind for kind in kinds if kind != MessageKind.BUSY]
+    remaining, message_kinds, body = process.stdout, [], b""
+    while remaining:
+        size = int.from_bytes(remaining[:4], "little")
+        message_kinds.append(remaining[4])
+        body, remaining = remaining[HEADER_BYTES : HEADER_BYTES + size], remaining[HEADER_BYTES + size :]
+    answers = [kind for kind in message_kinds if kind != MessageKind.BUSY]
     assert len(answers) == len(frames)
     assert answers[-1] == MessageKind.ERROR
-    assert done.returncode == 1
+    assert process.returncode == 1
     return body[2:].decode()
 
 
@@ -104,7 +104,7 @@ TOPIC = {"protocol": "topic", "from": "ann", "to": ["bob"]}
     ],
     ids=lambda value: None if isinstance(value, str) else next(iter(value)),
 )
-def test_a_configuration_that_it_cannot_simulate_is_refused(
+def test_a_configuration_that_ns3_cannot_simulate_is_refused(
     changes: Mapping[str, object], message: str, hello: Hello
 ) -> None:
     assert refusal(hello_frame(hello, changes)).startswith(message)
@@ -118,16 +118,19 @@ Frames = Callable[[Hello], Sequence[bytes]]
     [
         (lambda _: [advance_frame()], "hello is missing, or there is no such copy"),
         (lambda hello: [hello_frame(hello), hello_frame(hello)], "hello was sent twice"),
-        (lambda hello: [hello_frame(hello), advance_frame(copy=3)], "hello is missing, or there is no such copy"),
+        (
+            lambda hello: [hello_frame(hello), advance_frame(copy_number=3)],
+            "hello is missing, or there is no such copy",
+        ),
         (lambda hello: [hello_frame(hello), encode(MessageKind.FORK, 2, 0, b"\1\0\0\0")], "is not supported"),
         (
             lambda hello: [hello_frame(hello), encode(MessageKind.SAMPLE_LINKS, 2, 0, b"x")],
             "bytes follow the message",
         ),
         (lambda hello: [hello_frame(hello), advance_frame(5), advance_frame(4)], "time runs backwards to 4 ns"),
-        (lambda hello: [hello_frame(hello), advance_frame(extra="eve")], "an agent has appeared, which ns-3"),
+        (lambda hello: [hello_frame(hello), advance_frame(extra_agent="eve")], "an agent has appeared, which ns-3"),
         (
-            lambda hello: [hello_frame(hello), advance_frame(announced=[*AGENTS, "eve"], extra="eve")],
+            lambda hello: [hello_frame(hello), advance_frame(announced_agents=[*AGENTS, "eve"], extra_agent="eve")],
             "agent 2 was not announced",
         ),
         (

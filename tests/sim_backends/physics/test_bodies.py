@@ -40,24 +40,24 @@ COMMANDS = st.lists(
 )
 
 
-def run_commands(commands: list[tuple[int, str, Twist]], cuts: list[int]) -> tuple[dict[str, State], Bodies]:
-    """Return the states after 4.5 s; time is divided at the times of the commands and at `cuts`."""
+def run_commands(commands: list[tuple[int, str, Twist]], divisions_ns: list[int]) -> tuple[dict[str, State], Bodies]:
+    """Return the states after 4.5 s; time is divided at the times of the commands and at `divisions_ns`."""
     bodies = two_bodies()
-    by_time = {at_ns: (name, twist) for at_ns, name, twist in commands}
+    commands_by_time = {at_ns: (name, twist) for at_ns, name, twist in commands}
     twists: dict[str, Twist] = {}
-    for at_ns in sorted({*by_time, *cuts, 4000 * MS}):
+    for at_ns in sorted({*commands_by_time, *divisions_ns, 4000 * MS}):
         bodies.advance(at_ns, twists)
-        twists = dict([by_time[at_ns]] if at_ns in by_time else [])
+        twists = dict([commands_by_time[at_ns]] if at_ns in commands_by_time else [])
     return dict(bodies.advance(4500 * MS, twists)), bodies
 
 
 @settings(max_examples=25)
 @given(COMMANDS, st.lists(st.integers(0, 4000 * MS), max_size=30))
 def test_the_result_does_not_depend_on_the_division_of_time(
-    commands: list[tuple[int, str, Twist]], cuts: list[int]
+    commands: list[tuple[int, str, Twist]], divisions_ns: list[int]
 ) -> None:
     expected, bodies_once = run_commands(commands, [])
-    actual, bodies_often = run_commands(commands, cuts)
+    actual, bodies_often = run_commands(commands, divisions_ns)
     assert actual == expected
     assert bodies_often.collisions == bodies_once.collisions
 
@@ -66,7 +66,7 @@ def test_states_are_those_of_the_last_step_and_commands_take_effect_at_the_next(
     bodies = two_bodies(None)
     bodies.advance(1_500_000, {})
     assert bodies.advance(1_999_999, {"a": Twist(1.0)})["a"].velocity_m_s[0] == 0
-    # Commanded at 1.5 ms, so effective from 2 ms on; at 3 m/s^2 it has 3 mm/s a step later.
+    # The command of 1.5 ms takes effect at 2 ms; at 3 m/s^2, the speed is 3 mm/s one step later.
     assert bodies.advance(2_999_999, {})["a"].velocity_m_s[0] == 0
     assert bodies.advance(3_000_000, {})["a"].velocity_m_s[0] == pytest.approx(0.003)
     assert bodies.advance(3_000_000, {"a": Twist()})["a"].velocity_m_s[0] == pytest.approx(0.003)
@@ -76,11 +76,11 @@ def test_states_are_those_of_the_last_step_and_commands_take_effect_at_the_next(
 def test_a_snapshot_does_not_change() -> None:
     bodies = two_bodies(None)
     bodies.advance(0, {"a": Twist(-1.0)})
-    early = bodies.advance(1000 * MS, {})
-    late = bodies.advance(2000 * MS, {"a": Twist()})
-    # To 1 m/s over 1/6 m, in steps; the same distance to stop.
-    assert early["a"].position_m[0] == pytest.approx(-1 - 5 / 6, abs=1e-6)
-    assert late["a"].position_m[0] == pytest.approx(-2, abs=2e-6)
+    states_at_1_s = bodies.advance(1000 * MS, {})
+    states_at_2_s = bodies.advance(2000 * MS, {"a": Twist()})
+    # The robot reaches 1 m/s after 1/6 m, in steps, and stops after the same distance.
+    assert states_at_1_s["a"].position_m[0] == pytest.approx(-1 - 5 / 6, abs=1e-6)
+    assert states_at_2_s["a"].position_m[0] == pytest.approx(-2, abs=2e-6)
 
 
 @pytest.mark.parametrize(

@@ -34,11 +34,11 @@ def test_a_robot_that_heads_straight_into_a_wall_stops() -> None:
     state = bodies.advance(5000 * MS, {"a": Twist(1.0)})["a"]
     assert state.position_m == pytest.approx((2.95 - R_M, 0.0, 0.0), abs=1e-9)
     assert state.velocity_m_s == pytest.approx((0.0, 0.0, 0.0), abs=1e-12)
-    # 1/6 m and a third of a second to 1 m/s; one contact, however long the robot pushes.
+    # The robot reaches 1 m/s after 1/6 m and a third of a second. There is one contact, however long it pushes.
     contact_s = 1 / 3 + 2.95 - R_M - 1 / 6
     assert [(collision.body, collision.obstacle) for collision in bodies.collisions] == [("a", "wall")]
     assert bodies.collisions[0].at_ns == pytest.approx(contact_s * 1e9, abs=MS)
-    # Away from the wall it accelerates as its drive allows.
+    # It accelerates away from the wall as its drive allows.
     bodies.advance(5000 * MS, {"a": Twist(-1.0)})
     assert bodies.advance(5100 * MS, {})["a"].velocity_m_s[0] == pytest.approx(-0.3)
 
@@ -46,13 +46,13 @@ def test_a_robot_that_heads_straight_into_a_wall_stops() -> None:
 def test_a_robot_slides_along_a_wall() -> None:
     bodies = Bodies({"a": husky((2.0, 0.0), 60)}, world(wall((3, -50), (3, 50))))
     bodies.advance(0, {"a": Twist(1.0)})
-    before = bodies.advance(5000 * MS, {"a": Twist(1.0)})["a"]
-    after = bodies.advance(6000 * MS, {})["a"]
-    assert before.position_m[0] == after.position_m[0] == pytest.approx(2.95 - R_M, abs=1e-9)
-    # The component of the command along the wall, sin 60 degrees, and of that again the component along the wall.
+    earlier_state = bodies.advance(5000 * MS, {"a": Twist(1.0)})["a"]
+    later_state = bodies.advance(6000 * MS, {})["a"]
+    assert earlier_state.position_m[0] == later_state.position_m[0] == pytest.approx(2.95 - R_M, abs=1e-9)
+    # The speed is multiplied by sin 60 degrees twice: by the heading, and by the contact, which is along the wall.
     expected_m_s = math.sin(math.radians(60)) ** 2
-    assert before.velocity_m_s == pytest.approx((0.0, expected_m_s, 0.0), abs=1e-9)
-    assert after.position_m[1] - before.position_m[1] == pytest.approx(expected_m_s, rel=0.01)
+    assert earlier_state.velocity_m_s == pytest.approx((0.0, expected_m_s, 0.0), abs=1e-9)
+    assert later_state.position_m[1] - earlier_state.position_m[1] == pytest.approx(expected_m_s, rel=0.01)
 
 
 def test_a_robot_slides_around_a_trunk_and_passes_below_a_crown() -> None:
@@ -61,7 +61,7 @@ def test_a_robot_slides_around_a_trunk_and_passes_below_a_crown() -> None:
     bodies.advance(0, {"a": Twist(1.0)})
     state = bodies.advance(20_000 * MS, {"a": Twist(1.0)})["a"]
     assert state.position_m[0] > 10
-    # It leaves the trunk when the trunk is beside it.
+    # The robot leaves the trunk when the trunk is beside it.
     assert state.position_m[1] == pytest.approx(0.2 - 0.3 - R_M, abs=1e-6)
     assert [collision.obstacle for collision in bodies.collisions] == ["oak"]
 
@@ -75,15 +75,15 @@ def test_a_robot_neither_climbs_raised_ground_nor_drives_off_it() -> None:
     bodies.advance(0, {})
     states = bodies.advance(15_000 * MS, dict.fromkeys(("below", "above"), Twist(1.0)))
     assert states["below"].position_m == pytest.approx((2 - R_M, 0.0, 0.0), abs=1e-9)
-    # Across both areas, which form one plateau, along the edge at 1.5 m north, into the corner.
+    # It drives across both areas, which form one plateau, and along the edge at 1.5 m north into the corner.
     assert states["above"].position_m == pytest.approx((10.0, 1.5, 0.5), abs=1e-9)
     assert states["above"].velocity_m_s == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
 
 
 def test_a_fast_robot_does_not_pass_through_a_thin_wall() -> None:
     rocket = DriveLimits(300.0, 1e9, 1.0, 1.0, radius_m=0.3, height_m=0.4, friction=1e12)
-    thin = wall((7, -5), (7, 5), thickness="0.001m")
-    bodies = Bodies({"a": DifferentialDrive(rocket, (0.0, 0.0))}, world(thin), step_ns=20 * MS)
+    thin_wall = wall((7, -5), (7, 5), thickness="0.001m")
+    bodies = Bodies({"a": DifferentialDrive(rocket, (0.0, 0.0))}, world(thin_wall), step_ns=20 * MS)
     bodies.advance(0, {})
     assert bodies.advance(1000 * MS, {"a": Twist(300.0)})["a"].position_m[0] == pytest.approx(
         7 - 0.0005 - 0.3, abs=0.1
@@ -112,7 +112,9 @@ TWISTS = st.builds(Twist, st.floats(-1, 1), st.floats(-2, 2))
 
 @settings(max_examples=25)
 @given(st.lists(st.tuples(st.integers(1, 900), st.lists(TWISTS, min_size=4, max_size=4)), min_size=1, max_size=5))
-def test_bodies_do_not_overlap_and_errors_stay_within_the_limits(legs: list[tuple[int, list[Twist]]]) -> None:
+def test_bodies_do_not_overlap_and_extrapolation_errors_are_within_the_limits(
+    legs: list[tuple[int, list[Twist]]],
+) -> None:
     names = "abcd"
     yard = world(wall((1.5, -9), (1.5, 9)), wall((-9, 2), (9, 2.2)), wall((-2.5, -9), (-2, 9)))
     bodies = Bodies(
@@ -132,21 +134,21 @@ def test_bodies_do_not_overlap_and_errors_stay_within_the_limits(legs: list[tupl
                 assert states[name].position_m[0] <= 1.45 - R_M + 1e-6
         at_ms += ms
         bodies.advance(at_ms * MS, {})
-    for begin_ms, (begin, limits) in states_by_ms.items():
-        for end_ms, (end, _) in states_by_ms.items():
+    for begin_ms, (begin_states, limits) in states_by_ms.items():
+        for end_ms, (end_states, _) in states_by_ms.items():
             t = (end_ms - begin_ms) / 1000
             for name in names if t > 0.001 else ():
-                initial = begin[name]
+                initial = begin_states[name]
                 extrapolated_m = [
                     metres + v * t for metres, v in zip(initial.position_m, initial.velocity_m_s, strict=True)
                 ]
-                assert math.dist(end[name].position_m, extrapolated_m) <= limits[name] * t * t / 2 + 1e-6
+                assert math.dist(end_states[name].position_m, extrapolated_m) <= limits[name] * t * t / 2 + 1e-6
 
 
 def test_a_robot_that_drives_up_a_ramp_stops_below_an_obstacle_above_it() -> None:
     hill = {"name": "up", "kind": "ramp", "centre_m": (5, 0), "size_m": (10, 4, 2)}
-    hovering = Quadrotor(IRIS, (5.0, 0.0, 1.0 + 0.3))
-    bodies = Bodies({"a": DifferentialDrive(ROVER, (1.0, 0.0), antenna_m=0.0), "b": hovering}, world(hill))
+    hovering_drone = Quadrotor(IRIS, (5.0, 0.0, 1.0 + 0.3))
+    bodies = Bodies({"a": DifferentialDrive(ROVER, (1.0, 0.0), antenna_m=0.0), "b": hovering_drone}, world(hill))
     bodies.advance(0, {})
     state = bodies.advance(10_000 * MS, {"a": Twist(1.0)})["a"]
     assert state.position_m[2] == pytest.approx(0.2 * state.position_m[0], abs=1e-9)

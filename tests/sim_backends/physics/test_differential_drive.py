@@ -34,23 +34,23 @@ def state_after(bodies: Bodies, *legs: tuple[float, Twist]) -> State:
 def test_acceleration_and_braking_distances_are_v_squared_over_2a() -> None:
     heading = math.radians(30)
     state = state_after(drive(heading_rad=heading), (2.0, Twist(1.5)), (3.0, Twist()))
-    # To 1.5 m/s in 1.5 s over 1.125 m, 0.5 s at that speed, and the same distance to brake.
+    # The robot reaches 1.5 m/s after 1.5 s and 1.125 m, has this speed for 0.5 s, and brakes over the same distance.
     path_m = 1.5**2 / 2 + 0.5 * 1.5 + 1.5**2 / 2
     assert state.position_m == pytest.approx((path_m * math.cos(heading), path_m * math.sin(heading), 0.5), abs=1e-12)
     assert state.velocity_m_s == (0.0, 0.0, 0.0)
 
 
-def test_arcs_are_exact() -> None:
+def test_the_path_at_a_constant_yaw_rate_is_an_exact_arc() -> None:
     bodies = drive(DriveLimits(2.0, 1e9, 2.0, 1e9, radius_m=0.3, height_m=0.4, friction=1e12))
     state_after(bodies, (0.001, Twist(1.0, 0.5)))
     start = bodies.advance(S // 1000, {})["a"]
     assert start.heading_rad is not None
     # A circle of radius v / w = 2 m: after half a turn the robot is a diameter to the left.
-    half = bodies.advance(round((math.pi / 0.5 + 0.001) * S), {})["a"]
+    state_after_half_turn = bodies.advance(round((math.pi / 0.5 + 0.001) * S), {})["a"]
     left = -math.sin(start.heading_rad), math.cos(start.heading_rad)
-    assert half.position_m[0] == pytest.approx(start.position_m[0] + 4 * left[0], abs=2e-3)
-    assert half.position_m[1] == pytest.approx(start.position_m[1] + 4 * left[1], abs=2e-6)
-    assert math.hypot(*half.velocity_m_s) == pytest.approx(1.0)
+    assert state_after_half_turn.position_m[0] == pytest.approx(start.position_m[0] + 4 * left[0], abs=2e-3)
+    assert state_after_half_turn.position_m[1] == pytest.approx(start.position_m[1] + 4 * left[1], abs=2e-6)
+    assert math.hypot(*state_after_half_turn.velocity_m_s) == pytest.approx(1.0)
 
 
 def test_acceleration_on_an_arc_equals_the_integral_of_velocity() -> None:
@@ -61,10 +61,10 @@ def test_acceleration_on_an_arc_equals_the_integral_of_velocity() -> None:
     assert start is not None
     state = bodies.advance(S // 1000 + 2 * S, {"a": Twist(2.0, 1.3)})["a"]
     w, t = 1.3, 2.0
-    ahead = 0.7 * (math.cos(w * t) + w * t * math.sin(w * t) - 1) / w**2
+    ahead_m = 0.7 * (math.cos(w * t) + w * t * math.sin(w * t) - 1) / w**2
     left = 0.7 * (math.sin(w * t) - w * t * math.cos(w * t)) / w**2
     cos, sin = math.cos(start), math.sin(start)
-    assert state.position_m[:2] == pytest.approx((ahead * cos - left * sin, ahead * sin + left * cos), abs=1e-12)
+    assert state.position_m[:2] == pytest.approx((ahead_m * cos - left * sin, ahead_m * sin + left * cos), abs=1e-12)
 
 
 def test_a_growing_yaw_rate_gives_the_fresnel_integral() -> None:
@@ -81,12 +81,12 @@ def test_a_growing_yaw_rate_gives_the_fresnel_integral() -> None:
     assert state.heading_rad == pytest.approx(0.4 * 4.0)
 
 
-def test_limits_are_kept() -> None:
+def test_speeds_do_not_exceed_the_limits() -> None:
     state = state_after(drive(TURTLEBOT3_BURGER), (5.0, Twist(9.0, 0.0)))
     assert math.hypot(*state.velocity_m_s) == pytest.approx(0.22)
     bodies = drive(HUSKY_A200)
     state = state_after(bodies, (10.0, Twist(0.0, 9.0)))
-    # To 2 rad/s in a third of a second.
+    # The robot reaches 2 rad/s after a third of a second.
     assert state.heading_rad == pytest.approx(2.0 * 10 - 2.0**2 / 6 / 2, abs=1e-6)
     assert state.position_m == (0.0, 0.0, 0.5)
 
@@ -102,7 +102,7 @@ TWISTS = st.builds(Twist, st.floats(-3, 3), st.floats(-3, 3))
 
 
 @given(st.lists(st.tuples(st.floats(0.001, 1.0), TWISTS), min_size=1, max_size=6), st.sampled_from([1, 7, 50]))
-def test_extrapolation_errors_stay_within_the_limit(legs: list[tuple[float, Twist]], step_ms: int) -> None:
+def test_extrapolation_errors_are_within_the_limit(legs: list[tuple[float, Twist]], step_ms: int) -> None:
     bodies = drive(step_ns=step_ms * 1_000_000)
     start, at_ns = bodies.advance(0, {})["a"], 0
     limit = bodies.limits_m_s2["a"]

@@ -32,17 +32,18 @@ def state_after(bodies: Bodies, ms: int, twist: Twist) -> State:
 
 def test_a_robot_drives_up_a_ramp_onto_the_plateau_and_down_again() -> None:
     bodies = rover(0.0)
-    # 5 m to the ramp, sqrt(104) m up the ramp, and the rest on the plateau, minus the distance lost by accelerating.
-    speeding_up_m = 1 / (2 * 0.5 * GRAVITY_M_S2)
-    on_top_m = 18.0 - speeding_up_m - 5 - math.hypot(10, 2)
+    # It drives 5 m to the ramp, sqrt(104) m up the ramp, and the rest on the plateau. While it accelerates, it drives
+    # less far than at full speed.
+    acceleration_loss_m = 1 / (2 * 0.5 * GRAVITY_M_S2)
+    plateau_m = 18.0 - acceleration_loss_m - 5 - math.hypot(10, 2)
     halfway = state_after(bodies, 9000, Twist(1.0))
     horizontal, vertical = 1 / math.hypot(1, RISE), RISE / math.hypot(1, RISE)
     assert halfway.velocity_m_s == pytest.approx((horizontal, 0.0, vertical), abs=1e-12)
     assert halfway.position_m == pytest.approx(
-        (5 + (4 - speeding_up_m) * horizontal, 0.0, (4 - speeding_up_m) * vertical), abs=2e-3
+        (5 + (4 - acceleration_loss_m) * horizontal, 0.0, (4 - acceleration_loss_m) * vertical), abs=2e-3
     )
     state = bodies.advance(18_000 * MS, {})["a"]
-    assert state.position_m == pytest.approx((15 + on_top_m, 0.0, 2.0), abs=4e-3)
+    assert state.position_m == pytest.approx((15 + plateau_m, 0.0, 2.0), abs=4e-3)
     assert state.velocity_m_s == pytest.approx((1.0, 0.0, 0.0))
     bodies.advance(18_000 * MS, {"a": Twist(-1.0)})
     state = bodies.advance(36_000 * MS, {})["a"]
@@ -57,9 +58,7 @@ def test_a_robot_drives_up_a_ramp_onto_the_plateau_and_down_again() -> None:
 def test_the_grip_of_tires_limits_the_acceleration_on_a_slope(
     heading_deg: float, forward: float, along: float, across: float
 ) -> None:
-    """Friction is mu m g cos(slope); gravity adds or subtracts m g sin(slope) along the heading, and uses grip across
-    it.
-    """
+    """Friction is mu m g cos(slope); gravity adds m g sin(slope) along the heading or, across it, uses grip."""
     g_cos = GRAVITY_M_S2 / math.hypot(1, RISE)
     expected_m_s2 = g_cos * (math.sqrt(0.5**2 - across**2) + along)
     state = state_after(rover(10.0, heading_deg=heading_deg), 100, Twist(forward))
@@ -91,10 +90,10 @@ def test_a_slope_that_is_too_steep_is_a_wall_from_below_and_an_edge_from_above()
 
 
 def test_the_sides_of_a_ramp_are_walls_and_edges() -> None:
-    at_edge = state_after(rover(10.0, 1.0, heading_deg=90.0), 5000, Twist(1.0))
-    assert at_edge.position_m == pytest.approx((10.0, 2.0, 1.0), abs=1e-6)
-    stopped = state_after(rover(10.0, -4.0, heading_deg=90.0), 5000, Twist(1.0))
-    assert stopped.position_m == pytest.approx((10.0, -2.0 - 0.3, 0.0), abs=1e-6)
+    state_at_edge = state_after(rover(10.0, 1.0, heading_deg=90.0), 5000, Twist(1.0))
+    assert state_at_edge.position_m == pytest.approx((10.0, 2.0, 1.0), abs=1e-6)
+    state_at_wall = state_after(rover(10.0, -4.0, heading_deg=90.0), 5000, Twist(1.0))
+    assert state_at_wall.position_m == pytest.approx((10.0, -2.0 - 0.3, 0.0), abs=1e-6)
 
 
 @pytest.mark.parametrize("grade_offset", [0.0, -1e-15, -1e-12, -1e-6, -0.01])
@@ -103,7 +102,7 @@ def test_the_sides_of_a_ramp_are_walls_and_edges() -> None:
 def test_a_ramp_that_needs_all_of_the_friction_causes_no_error(
     grade_offset: float, twist: Twist, heading_rad: float
 ) -> None:
-    """With no friction left the speed cannot be changed; the robot may continue to roll."""
+    """If the slope uses all of the friction, the speed cannot be changed; the robot may continue to roll."""
     grade = HUSKY_A200.friction + grade_offset
     hill = world({"name": "hill", "kind": "ramp", "centre_m": (5, 0), "size_m": (10, 10, 10 * grade)})
     bodies = Bodies({"a": DifferentialDrive(HUSKY_A200, (5.0, 0.0), heading_rad)}, hill)
@@ -113,4 +112,4 @@ def test_a_ramp_that_needs_all_of_the_friction_causes_no_error(
         assert all(map(math.isfinite, (*state.position_m, *state.velocity_m_s)))
         assert math.hypot(*state.velocity_m_s) <= 1.0 + 1e-9
     if not grade_offset and not twist.turn_rad_s and heading_rad == 0.0 and twist.forward_m_s > 0:
-        assert state.position_m == place_m, "it does not move uphill"
+        assert state.position_m == place_m, "the robot does not move uphill"

@@ -1,4 +1,4 @@
-"""A neighbour list of many bodies equals the lists of all pairs; a grid search misses nothing nearby."""
+"""A neighbour list of many bodies equals the lists of all pairs; a grid search returns all bodies nearby."""
 
 import math
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ YARD = world({"name": "oak", "kind": "tree", "at_m": (0, 3), "trunk_radius": "0.
 
 @given(st.lists(PLACES, max_size=40), PLACES, st.floats(0, 20))
 @example([(1.0, 1.0, 0.0)], (1.0, 1.0, 0.0), 5e-324)
-def test_a_grid_search_contains_everything_nearby(
+def test_a_grid_search_returns_all_numbers_nearby(
     places_m: list[tuple[float, float, float]], place_m: tuple[float, float, float], within_m: float
 ) -> None:
     grid = CellGrid(within_m)
@@ -62,16 +62,16 @@ BODIES = st.lists(
 @settings(max_examples=examples(60))
 @given(BODIES)
 def test_a_list_of_many_bodies_equals_the_lists_of_all_pairs(bodies: dict[str, Body[Any]]) -> None:
-    whole_list = neighbour_list(bodies)
+    neighbours_of_all = neighbour_list(bodies)
     pairs = {pair: neighbour_list({name: bodies[name] for name in pair}) for pair in combinations(bodies, 2)}
     for name in bodies:
-        own_pairs = [pair for pair in pairs if name in pair]
+        pairs_of_body = [pair for pair in pairs if name in pair]
         expected = [
             next(other for other in pair if other != name)
-            for pair in own_pairs
+            for pair in pairs_of_body
             if name in pairs[pair].candidates and pairs[pair].candidates[name].bodies
         ]
-        assert (whole_list.candidates[name].bodies if name in whole_list.candidates else []) == expected
-        assert whole_list.min_time_to_contact_s(name) == min(
-            pairs[pair].min_time_to_contact_s(name) for pair in own_pairs
+        assert (neighbours_of_all.candidates[name].bodies if name in neighbours_of_all.candidates else []) == expected
+        assert neighbours_of_all.min_time_to_contact_s(name) == min(
+            pairs[pair].min_time_to_contact_s(name) for pair in pairs_of_body
         )

@@ -48,7 +48,7 @@ def test_the_tilt_balances_the_drag(limits: QuadrotorLimits, speed_m_s: float) -
     assert result["state"].position_m[2] == pytest.approx(100.0, abs=0.05)
 
 
-def test_without_thrust_it_reaches_its_terminal_velocity() -> None:
+def test_a_quadrotor_without_thrust_reaches_its_terminal_velocity() -> None:
     without_thrust = replace(IRIS, thrust_n=(0.0, 0.0))
     result = fly(without_thrust, 60.0, None, (0.0, 0.0, 5000.0))
     weight_n = IRIS.mass_kg * GRAVITY_M_S2
@@ -57,10 +57,10 @@ def test_without_thrust_it_reaches_its_terminal_velocity() -> None:
     assert result["state"].velocity_m_s == pytest.approx((0.0, 0.0, -terminal_m_s), rel=1e-6)
     # With quadratic drag only, v = V tanh(g t / V), and the height lost is V^2 / g ln(cosh(g t / V)).
     quadratic_drag = replace(without_thrust, drag_n_s_m=0.0)
-    fallen = fly(quadratic_drag, 2.0, None, (0.0, 0.0, 5000.0))["state"]
+    falling_state = fly(quadratic_drag, 2.0, None, (0.0, 0.0, 5000.0))["state"]
     v_m_s = math.sqrt(weight_n / a)
     path_m = v_m_s**2 / GRAVITY_M_S2 * math.log(math.cosh(GRAVITY_M_S2 * 2 / v_m_s))
-    assert 5000 - fallen.position_m[2] == pytest.approx(path_m, rel=1e-3)
+    assert 5000 - falling_state.position_m[2] == pytest.approx(path_m, rel=1e-3)
 
 
 def test_the_velocity_error_decays_with_the_gain() -> None:
@@ -69,8 +69,8 @@ def test_the_velocity_error_decays_with_the_gain() -> None:
     assert result.velocity_m_s[2] == pytest.approx(0.9 * (1 - math.exp(-4.0 * 0.5)), rel=2e-3)
 
 
-def test_it_turns_to_its_target_yaw_in_the_shorter_direction() -> None:
-    # From 3 rad by 0.78 rad across pi; 0.1 s at 90 degrees per second.
+def test_a_quadrotor_turns_to_its_target_yaw_in_the_shorter_direction() -> None:
+    # The shorter turn from 3 rad is by 0.78 rad, across pi. In 0.1 s it turns by 9 degrees, at 90 degrees per second.
     bodies = Bodies({"a": Quadrotor(DUCKIEDRONE, (0.0, 0.0, 1.0), 3.0)})
     bodies.advance(0, {"a": Velocity(yaw_rad=-2.5)})
     assert bodies.advance(S // 10, {"a": Velocity(yaw_rad=-2.5)})["a"].heading_rad == pytest.approx(
@@ -78,15 +78,15 @@ def test_it_turns_to_its_target_yaw_in_the_shorter_direction() -> None:
     )
 
 
-def test_it_lands_on_the_ground_and_on_roofs_and_stops_below_ceilings() -> None:
-    house = {"name": "house", "kind": "building", "centre_m": (10, 0), "size_m": (6, 6, 3)}
+def test_quadrotors_land_on_the_ground_and_on_roofs_and_stop_below_ceilings() -> None:
+    building = {"name": "house", "kind": "building", "centre_m": (10, 0), "size_m": (6, 6, 3)}
     bodies = Bodies(
         {
             "ground": Quadrotor(IRIS, (0.0, 0.0, 2.0)),
             "roof": Quadrotor(IRIS, (10.0, 0.0, 5.0)),
             "inside": Quadrotor(IRIS, (10.0, 0.0, 1.0)),
         },
-        world(house),
+        world(building),
     )
     bodies.advance(0, {})
     down, up = Velocity((0.0, 0.0, -1.0)), Velocity((0.0, 0.0, 1.0))
@@ -115,7 +115,7 @@ VELOCITIES = st.builds(Velocity, st.tuples(SPEEDS, SPEEDS, SPEEDS), st.none() | 
     st.lists(st.tuples(st.floats(0.001, 0.8), VELOCITIES), min_size=1, max_size=5),
     st.sampled_from([1, 20]),
 )
-def test_extrapolation_errors_stay_within_the_limit(
+def test_extrapolation_errors_are_within_the_limit(
     limits: QuadrotorLimits, legs: list[tuple[float, Velocity]], step_ms: int
 ) -> None:
     bodies = Bodies({"a": Quadrotor(limits, (0.0, 0.0, 1000.0))}, step_ns=step_ms * 1_000_000)
@@ -126,9 +126,9 @@ def test_extrapolation_errors_stay_within_the_limit(
             at_ns += round(part * seconds * S)
             state = bodies.advance(at_ns, {"a": velocity})["a"]
             samples.append((at_ns // bodies.step_ns * bodies.step_ns / S, state, bodies.limits_m_s2["a"]))
-    top_m_s = limits.top_speed_m_s()
+    top_speed_m_s = limits.top_speed_m_s()
     for number, (start_s, start, limit) in enumerate(samples):
-        assert math.hypot(*start.velocity_m_s) <= top_m_s
+        assert math.hypot(*start.velocity_m_s) <= top_speed_m_s
         for end_s, end, _ in samples[number:]:
             t = end_s - start_s
             assert math.dist(end.velocity_m_s, start.velocity_m_s) <= limit * t + 1e-9
@@ -136,13 +136,13 @@ def test_extrapolation_errors_stay_within_the_limit(
             assert math.dist(end.position_m, extrapolated_m) <= limit * t * t / 2 + 1e-9
 
 
-def test_roll_and_pitch_stay_within_their_limits() -> None:
+def test_roll_and_pitch_do_not_exceed_their_limits() -> None:
     controller = VelocityController(IRIS)
     pose = FlightPose((0.0, 0.0, 50.0))
     for number in range(3000):
         target = Velocity((12.0, 0.0, 3.0) if number // 300 % 2 else (-12.0, 12.0, -3.0))
-        later = controller.fly(pose, target, 0.001)
-        for value, previous in ((later.roll_rad, pose.roll_rad), (later.pitch_rad, pose.pitch_rad)):
+        next_pose = controller.fly(pose, target, 0.001)
+        for value, previous in ((next_pose.roll_rad, pose.roll_rad), (next_pose.pitch_rad, pose.pitch_rad)):
             assert abs(value - previous) <= IRIS.tilt_rate_rad_s * 0.001 + 1e-12
             assert abs(value) <= IRIS.tilt_rad
-        pose = later
+        pose = next_pose

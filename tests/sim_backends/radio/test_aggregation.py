@@ -65,22 +65,26 @@ def test_an_aggregate_is_limited_by_its_bytes_its_duration_and_the_window() -> N
     assert len(session(HT40_7).build_aggregate(frames(100), HT40_7).frames) == 61
     assert len(session(VHT80_9).build_aggregate(frames(100), VHT80_9).frames) == 64
     assert len(session(HE80_11).build_aggregate(frames(400), HE80_11).frames) == 256
-    slow = session(HT20[0]).build_aggregate(frames(100), HT20[0])
-    assert HT20[0].airtime_ns(slow.size_bytes) <= 5_484_000 < HT20[0].airtime_ns(slow.size_bytes + SUBFRAME_BYTES + 2)
+    slow_aggregate = session(HT20[0]).build_aggregate(frames(100), HT20[0])
+    assert (
+        HT20[0].airtime_ns(slow_aggregate.size_bytes)
+        <= 5_484_000
+        < HT20[0].airtime_ns(slow_aggregate.size_bytes + SUBFRAME_BYTES + 2)
+    )
 
 
 def test_a_single_frame_is_answered_by_an_ack_and_has_a_delimiter_only_in_vht_and_he() -> None:
     for mode, size_bytes in ((HT20_7, 1028 + QOS_HEADER_BYTES), (VHT80_9, SUBFRAME_BYTES)):
-        single = session(mode).build_aggregate(frames(1), mode)
-        assert (single.size_bytes, single.response_bytes) == (size_bytes, 14)
+        single_frame = session(mode).build_aggregate(frames(1), mode)
+        assert (single_frame.size_bytes, single_frame.response_bytes) == (size_bytes, 14)
     assert session(VHT80_9).build_aggregate(frames(2), VHT80_9).response_bytes == 32
     assert session(HE80_11).build_aggregate(frames(2), HE80_11).response_bytes == 56
 
 
 def test_each_subframe_but_the_last_is_padded_to_four_bytes() -> None:
-    padded, last = SUBFRAME_BYTES + 2, SUBFRAME_BYTES
+    padded_bytes, last_bytes = SUBFRAME_BYTES + 2, SUBFRAME_BYTES
     assert SUBFRAME_BYTES % 4 == 2
-    assert session(VHT80_9).build_aggregate(frames(3), VHT80_9).size_bytes == 2 * padded + last
+    assert session(VHT80_9).build_aggregate(frames(3), VHT80_9).size_bytes == 2 * padded_bytes + last_bytes
 
 
 def test_a_recipient_ignores_frames_that_it_has_received() -> None:
@@ -99,25 +103,39 @@ def test_only_frames_to_the_receiver_of_the_first_are_aggregated() -> None:
 
 def test_the_window_starts_at_the_oldest_unacknowledged_frame() -> None:
     queue, agreement = frames(100), session(VHT80_9)
-    first = agreement.build_aggregate(queue, VHT80_9)
-    remove_frames(queue, set(first.frames[1:]))
-    second = agreement.build_aggregate(queue, VHT80_9)
-    assert [frame.sequence for frame in second.frames] == [0], "sequence numbers 1 to 63 fill the rest of the window"
-    remove_frames(queue, set(first.frames[:1]))
+    first_aggregate = agreement.build_aggregate(queue, VHT80_9)
+    remove_frames(queue, set(first_aggregate.frames[1:]))
+    second_aggregate = agreement.build_aggregate(queue, VHT80_9)
+    assert [frame.sequence for frame in second_aggregate.frames] == [0], (
+        "sequence numbers 1 to 63 fill the rest of the window"
+    )
+    remove_frames(queue, set(first_aggregate.frames[:1]))
     assert [frame.sequence for frame in agreement.build_aggregate(queue, VHT80_9).frames] == list(range(64, 100))
 
 
 @given(st.lists(st.sets(st.integers(0, 19)), max_size=12), st.sets(st.integers(0, 19)))
-def test_a_recipient_passes_up_each_frame_once_in_order(decoded: list[set[int]], given_up: set[int]) -> None:
+def test_a_recipient_delivers_each_frame_once_and_in_order(
+    decoded_numbers: list[set[int]], skipped_numbers: set[int]
+) -> None:
     agreement = session(VHT80_9)
-    sent = list(agreement.build_aggregate(frames(20), VHT80_9).frames)
-    passed_up = [frame for numbers in decoded for frame in agreement.receive([sent[number] for number in numbers])]
-    assert [frame.sequence for frame in passed_up] == list(range(len(passed_up))), "no gap before any is given up"
-    passed_up += agreement.skip([frame for frame in sent if frame.sequence in given_up and not frame.is_received])
-    rest = [frame for frame in sent if not frame.is_received and frame.sequence not in given_up]
-    passed_up += agreement.receive(rest)
-    received = set().union(*decoded) | {frame.sequence for frame in rest}
-    assert [frame.sequence for frame in passed_up] == sorted(received)
+    sent_frames = list(agreement.build_aggregate(frames(20), VHT80_9).frames)
+    delivered_frames = [
+        frame
+        for numbers in decoded_numbers
+        for frame in agreement.receive([sent_frames[number] for number in numbers])
+    ]
+    assert [frame.sequence for frame in delivered_frames] == list(range(len(delivered_frames))), (
+        "there is no gap before a frame is skipped"
+    )
+    delivered_frames += agreement.skip(
+        [frame for frame in sent_frames if frame.sequence in skipped_numbers and not frame.is_received]
+    )
+    remaining_frames = [
+        frame for frame in sent_frames if not frame.is_received and frame.sequence not in skipped_numbers
+    ]
+    delivered_frames += agreement.receive(remaining_frames)
+    received_numbers = set().union(*decoded_numbers) | {frame.sequence for frame in remaining_frames}
+    assert [frame.sequence for frame in delivered_frames] == sorted(received_numbers)
 
 
 @pytest.mark.parametrize("mode", [HT20_7, VHT80_9, HE80_11], ids=lambda mode: mode.name)
@@ -140,7 +158,7 @@ def test_goodput_of_one_station_equals_the_closed_form(mode: WifiMode) -> None:
 
 @pytest.mark.parametrize("stations", [2, 5, 10, 20])
 def test_contending_stations_follow_bianchi_with_aggregates(stations: int) -> None:
-    """Bianchi, IEEE JSAC 18:535 (2000), eq. 7 to 13, with A-MPDU and Block Ack as the payload and its answer.
+    """Bianchi, IEEE JSAC 18:535 (2000), eq. 7 to 13, with an A-MPDU as the payload and a Block Ack as its answer.
 
     A collision lasts for the aggregate and the time until the sender senses a missing Block Ack.
     """
@@ -177,7 +195,7 @@ def test_goodput_is_within_five_percent_of_ns3(stations: int, ns3_mbit_s: float)
 
 
 def test_lost_frames_are_sent_again_within_later_aggregates_and_arrive_in_order() -> None:
-    """At a ratio where a tenth of the frames is corrupted, all arrive, once and in order."""
+    """At an SNR that corrupts a tenth of the frames, all frames arrive, once and in order."""
     channel = AggregatingPowers("ab", HT20_7)
     channel.rows = [[power * 1e-9 * 10**2.36 / 1e-4 for power in row] for row in channel.rows]
     channel.sensitivity_mw = [1e-9] * 2
@@ -186,16 +204,16 @@ def test_lost_frames_are_sent_again_within_later_aggregates_and_arrive_in_order(
     wifi.log_attempts(log.append)
     for number in range(500):
         wifi.send(0, "a", number, 1000 + HEADERS_BYTES, "b")
-    arrived = [payload for _, _, payload, _, _ in wifi.deliveries(10**10)]
+    arrived_numbers = [payload for _, _, payload, _, _ in wifi.deliveries(10**10)]
     attempts = [attempt for attempt in log if attempt.number]
-    assert arrived == list(range(500))
+    assert arrived_numbers == list(range(500))
     retries = [attempt for attempt in attempts if attempt.number > 1]
     assert 0.02 < len(retries) / len(attempts) < 0.5
-    together = {attempt.start_ns for attempt in attempts if attempt.number == 1}
-    assert any(attempt.start_ns in together for attempt in retries), "sent again together with new frames"
+    first_starts_ns = {attempt.start_ns for attempt in attempts if attempt.number == 1}
+    assert any(attempt.start_ns in first_starts_ns for attempt in retries), "sent again together with new frames"
 
 
-def test_frames_to_a_silent_receiver_are_given_up_after_the_retry_limit() -> None:
+def test_frames_to_a_silent_receiver_are_dropped_after_the_retry_limit() -> None:
     channel = AggregatingPowers("ab", HT20_7, without_link=[("a", "b")])
     wifi: Wifi[int] = Wifi(channel, 1)
     losses: list[tuple[int, str, str]] = []
@@ -212,7 +230,7 @@ def test_frames_to_a_silent_receiver_are_given_up_after_the_retry_limit() -> Non
 
 
 def test_frames_are_sent_again_until_their_block_ack_arrives() -> None:
-    """Without any Block Ack, frames are delivered once and given up later, but not reported as lost."""
+    """Without a Block Ack, frames are delivered once and dropped later, but not reported as lost."""
     channel = AggregatingPowers("ab", HT20_7)
     channel.rows[1][0] = 0.0
     rates: list[tuple[int, int]] = []
@@ -249,14 +267,14 @@ def test_frames_are_sent_again_until_their_block_ack_arrives() -> None:
     assert (station.tx_packets, station.tx_failures) == (3, 3)
 
 
-def test_a_frame_given_up_does_not_block_the_frames_after_it() -> None:
+def test_a_dropped_frame_does_not_block_the_frames_after_it() -> None:
     channel = AggregatingPowers("ab", HT20_7)
     wifi: Wifi[int] = Wifi(channel, 1)
-    receivable = channel.rows
-    channel.rows = [[power * 1e-9 for power in row] for row in receivable]
+    rows_in_range = channel.rows
+    channel.rows = [[power * 1e-9 for power in row] for row in rows_in_range]
     wifi.send(0, "a", 0, 1028, "b")
     assert wifi.deliveries(10**9) == []
-    channel.rows = receivable
+    channel.rows = rows_in_range
     wifi.send(10**9, "a", 1, 1028, "b")
     assert [payload for _, _, payload, _, _ in wifi.deliveries(2 * 10**9)] == [1]
 
@@ -267,11 +285,11 @@ def test_frames_of_a_station_that_is_switched_off_are_lost_once() -> None:
     wifi.log_losses(lambda _, payload, *rest: losses.append(payload))
     for number in range(200):
         wifi.send(0, "a", number, 1028, "b")
-    arrived = [payload for _, _, payload, _, _ in wifi.deliveries(3_000_000)]
+    arrived_numbers = [payload for _, _, payload, _, _ in wifi.deliveries(3_000_000)]
     wifi.switch_off(3_000_000, {"a"})
-    arrived += [payload for _, _, payload, _, _ in wifi.deliveries(10**10)]
-    assert sorted(arrived + losses) == list(range(200))
-    assert arrived == sorted(arrived)
+    arrived_numbers += [payload for _, _, payload, _, _ in wifi.deliveries(10**10)]
+    assert sorted(arrived_numbers + losses) == list(range(200))
+    assert arrived_numbers == sorted(arrived_numbers)
 
 
 def test_drivers_count_the_frames_of_aggregates() -> None:

@@ -39,7 +39,7 @@ def test_a_rescheduled_start_happens_once() -> None:
     assert (events.starts, events.next_ns()) == ({}, None)
 
 
-def test_a_call_may_schedule_another_for_the_same_time() -> None:
+def test_an_event_may_schedule_another_event_for_the_same_time() -> None:
     event_log = EventLog()
     events = EventQueue(lambda at_ns, index: events.schedule(at_ns, event_log.record, index))
     events.schedule_start(10, 3)

@@ -38,18 +38,18 @@ def test_each_further_attempt_is_one_step_slower() -> None:
 
 
 def test_losses_lower_the_mode_one_step_per_interval_and_success_raises_it_again() -> None:
-    """The signal says MCS 7, but only MCS 4 and slower modes arrive, as with interference at the receiver."""
-    rate, chosen = firmware(35.0), []
+    """The signal suffices for MCS 7, but only MCS 4 and slower modes arrive, as with interference at the receiver."""
+    rate, chosen_indices = firmware(35.0), []
     for number in range(1200):
-        works = (lambda index: index <= 4) if number < 600 else (lambda _: True)
+        is_received = (lambda index: index <= 4) if number < 600 else (lambda _: True)
         index = HT20.index(rate.choose(number * 1_000_000, ("a", number), 1))
-        rate.report(HT20[index], acknowledged=int(works(index)))
-        chosen.append(index)
-    assert chosen[50:600:100] == [7, 6, 5, 4, 5, 4]
-    assert chosen[-1] == 7
+        rate.report(HT20[index], acknowledged=int(is_received(index)))
+        chosen_indices.append(index)
+    assert chosen_indices[50:600:100] == [7, 6, 5, 4, 5, 4]
+    assert chosen_indices[-1] == 7
 
 
-def test_no_step_of_the_ladder_is_slower_or_needs_a_weaker_signal_than_the_one_below() -> None:
+def test_rates_and_required_signals_increase_from_step_to_step() -> None:
     steps = useful_modes(common_modes(VHT80, VHT80))
     assert [mode.rate_bit_s for mode in steps] == sorted({mode.rate_bit_s for mode in steps})
     assert [required_db(mode) for mode in steps] == sorted(required_db(mode) for mode in steps)
@@ -57,7 +57,7 @@ def test_no_step_of_the_ladder_is_slower_or_needs_a_weaker_signal_than_the_one_b
         assert any(step.rate_bit_s >= mode.rate_bit_s and required_db(step) <= required_db(mode) for step in steps)
 
 
-def test_the_noise_of_a_wide_channel_counts() -> None:
+def test_a_wide_channel_has_more_noise() -> None:
     narrow, wide = (format_modes("VHT", "5 GHz", width_mhz, 1, 800)[3] for width_mhz in (20, 80))
     assert required_db(wide) - required_db(narrow) == pytest.approx(decibel(4), abs=0.02)
 
@@ -71,18 +71,18 @@ def run_radio(rate_control: WifiRateControl, ratio_db: float) -> tuple[float, li
     wifi: Wifi[int] = Wifi(channel, 1)
     log: list[TransmissionAttempt] = []
     wifi.log_attempts(log.append)
-    lost: list[int] = []
-    wifi.log_losses(lambda _, payload, *rest: lost.append(payload))
+    lost_numbers: list[int] = []
+    wifi.log_losses(lambda _, payload, *rest: lost_numbers.append(payload))
     for number in range(150):
         wifi.send(0, "a", number, 1028, "b")
-    arrived = 0
+    arrival_count = 0
     while (now_ns := wifi.next_event_ns()) is not None and now_ns < 2_000_000_000:
-        finished = [payload for _, _, payload, _, _ in wifi.deliveries(now_ns)]
-        arrived += len(finished)
-        for number in finished + lost:
+        arrived_numbers = [payload for _, _, payload, _, _ in wifi.deliveries(now_ns)]
+        arrival_count += len(arrived_numbers)
+        for number in arrived_numbers + lost_numbers:
             wifi.send(now_ns, "a", number, 1028, "b")
-        lost.clear()
-    return arrived * 8000 / 2.0, [attempt for attempt in log if attempt.number]
+        lost_numbers.clear()
+    return arrival_count * 8000 / 2.0, [attempt for attempt in log if attempt.number]
 
 
 def closed_form_bit_s(mode: WifiMode, ratio_db: float) -> float:
@@ -99,7 +99,7 @@ def closed_form_bit_s(mode: WifiMode, ratio_db: float) -> float:
 
 
 @pytest.mark.parametrize(
-    ("rate_control", "ratio_db", "index", "least"),
+    ("rate_control", "ratio_db", "index", "min_ratio"),
     [
         ("firmware", 40.0, 7, 0.98),
         ("firmware", 20.0, 4, 0.98),
@@ -110,14 +110,14 @@ def closed_form_bit_s(mode: WifiMode, ratio_db: float) -> float:
     ],
 )
 def test_goodput_at_a_fixed_signal_follows_the_closed_form(
-    rate_control: WifiRateControl, ratio_db: float, index: int, least: float
+    rate_control: WifiRateControl, ratio_db: float, index: int, min_ratio: float
 ) -> None:
     """minstrel_ht starts at the slowest mode, and samples modes that fail or are slower, up to 50 times a second."""
     goodput, _ = run_radio(rate_control, ratio_db)
-    assert least <= goodput / closed_form_bit_s(HT20[index], ratio_db) <= 1.02
+    assert min_ratio <= goodput / closed_form_bit_s(HT20[index], ratio_db) <= 1.02
 
 
-def test_the_keys_of_a_profile_reach_the_model() -> None:
+def test_the_keys_of_a_profile_are_those_of_the_model() -> None:
     fields = {"interface": "wlan0", "standard": "802.11n 2.4 GHz", "tx_power_dbm": 17, "sensitivity_dbm": -82}
     phy = {
         "rate_control": "firmware",

@@ -28,7 +28,7 @@ from sim_backends.radio.modes import ack_ns, control_mode
         ("HE", 80, 1, 3200, (30.6, 61.3, 91.9, 122.5, 183.8, 245, 275.6, 306.3, 367.5, 408.3, 459.4, 510.4)),
     ],
 )
-def test_rates_are_those_of_the_tables(
+def test_rates_equal_those_of_the_tables(
     phy_format: HighThroughput, width_mhz: int, streams: int, guard_ns: int, rates: Sequence[float]
 ) -> None:
     modes = format_modes(phy_format, "5 GHz", width_mhz, streams, guard_ns)
@@ -37,10 +37,11 @@ def test_rates_are_those_of_the_tables(
 
 
 # Output of ns-3 (`benchmarks.high_throughput_vs_ns3`): WifiPhy::CalculateTxDuration at 5 GHz for 1538 bytes, in ns.
-# The second number is added: VHT-SIG-B (21.3.8.3.6), which ns-3 omits; HE-LTF of 7.2 us (27.3.11.10), for which ns-3
-# has 8 us; the end of the last symbol at a multiple of 4 us for short guard intervals (21.4.3).
+# The second number is the difference from ns-3: VHT-SIG-B (21.3.8.3.6), which ns-3 omits; HE-LTF of 7.2 us
+# (27.3.11.10), for which ns-3 has 8 us; the end of the last symbol at a multiple of 4 us for short guard intervals
+# (21.4.3).
 @pytest.mark.parametrize(
-    ("modes", "mcs", "ns3_ns", "added_ns"),
+    ("modes", "mcs", "ns3_ns", "difference_ns"),
     [
         (("VHT", 80, 2, 400), 9, 54_400, 4_000 + 1_600),
         (("HT", 40, 1, 800), 7, 128_000, 0),
@@ -49,11 +50,11 @@ def test_rates_are_those_of_the_tables(
     ],
 )
 def test_airtimes_equal_those_of_ns3(
-    modes: tuple[HighThroughput, int, int, int], mcs: int, ns3_ns: int, added_ns: int
+    modes: tuple[HighThroughput, int, int, int], mcs: int, ns3_ns: int, difference_ns: int
 ) -> None:
     phy_format, width_mhz, streams, guard_ns = modes
     mode = format_modes(phy_format, "5 GHz", width_mhz, streams, guard_ns)[mcs]
-    assert mode.airtime_ns(1538) == ns3_ns + added_ns
+    assert mode.airtime_ns(1538) == ns3_ns + difference_ns
 
 
 def test_a_frame_at_2_4_ghz_has_a_signal_extension_and_shorter_sifs() -> None:
@@ -89,7 +90,7 @@ N40 = Antenna("802.11g", 17.0, -82.0, PhyCapability("n", "2.4 GHz", 40, 2, 400))
 G, N = Antenna("802.11g", 17.0, -82.0), Antenna("802.11n", 17.0, -82.0)
 
 
-def test_two_stations_use_what_both_support() -> None:
+def test_two_stations_use_modes_that_both_support() -> None:
     assert {mode.name.split("-")[0] for mode in modes_between(AX80, AC40)} == {"vht40"}
     assert {mode.streams for mode in modes_between(AX80, AC40)} == {1}
     assert {mode.guard_interval_ns for mode in modes_between(AX80, AC40)} == {800}
@@ -115,6 +116,6 @@ def test_a_fixed_mode_must_exist_at_every_station() -> None:
         fixed_mode("vht80-mcs7-1ss-800ns", {"a": AX80, "b": AC40})
 
 
-def test_an_antenna_survives_its_encoding() -> None:
+def test_an_encoded_antenna_is_decoded_without_change() -> None:
     for antenna in (AX80, G):
         assert decode_antenna(asdict(antenna)) == antenna

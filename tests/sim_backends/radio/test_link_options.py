@@ -32,12 +32,12 @@ def test_empty_options_are_valid() -> None:
     ],
 )
 def test_invalid_options_are_named_in_the_error(text: str, message: str) -> None:
-    with pytest.raises(ConfigurationError, match=message) as caught:
+    with pytest.raises(ConfigurationError, match=message) as error_info:
         options(text)
-    assert caught.value.where == "radio.yaml:1"
+    assert error_info.value.where == "radio.yaml:1"
 
 
-def test_given_values_apply_to_every_link() -> None:
+def test_configured_values_apply_to_every_link() -> None:
     link_options = options("{loss: 10%, delay: 5ms, jitter: 1ms, rate: 20Mbit/s, queue_packets: 7}")
     links = mesh(link_options, ["a", "b", "c"])
     assert set(links) == {("a", "b"), ("b", "a"), ("a", "c"), ("c", "a"), ("b", "c"), ("c", "b")}
@@ -48,7 +48,7 @@ def test_given_values_apply_to_every_link() -> None:
 
 
 @pytest.mark.parametrize("text", ["loss: 0%", "delay: 0ms", "rate: unlimited", "jitter: 1ms"])
-def test_one_given_value_makes_every_link_fixed(text: str) -> None:
+def test_one_configured_value_makes_every_link_fixed(text: str) -> None:
     assert options(text).is_fixed
     assert not options("{fading: true, queue_packets: 3}").is_fixed
     assert options("rate: unlimited").link().rate_bit_s is None

@@ -76,70 +76,70 @@ def test_each_receiver_of_a_packet_is_reported_exactly_once(
     reports: Counter[tuple[int, str]] = Counter()
     model.log_losses(lambda _, number, name, __: reports.update([(number, name)]))
     model.place(0, places_m, relay)
-    sent: set[tuple[int, str]] = set()
-    off: frozenset[str] = frozenset()
+    sent_packets: set[tuple[int, str]] = set()
+    stations_off: frozenset[str] = frozenset()
     for number, (at_ns, event) in enumerate(events):
         if len(event) == 2:
-            off, cut = event
-            model.disturb(at_ns, off, cut)
+            stations_off, cut_links = event
+            model.disturb(at_ns, stations_off, cut_links)
             continue
         source, destination, size_bytes = event
-        if source in off or source == destination:
+        if source in stations_off or source == destination:
             continue
-        sent |= {(number, name) for name in (destination or NAMES) if name != source}
+        sent_packets |= {(number, name) for name in (destination or NAMES) if name != source}
         model.send(at_ns, source, number, size_bytes, destination)
     reports.update((number, name) for _, name, number, _, _ in model.deliveries(10**12))
     assert model.next_event_ns() is None
-    assert reports == Counter(sent)
+    assert reports == Counter(sent_packets)
 
 
-def losses(wifi: Wifi[int]) -> list[tuple[int, str, str]]:
-    lost: list[tuple[int, str, str]] = []
-    wifi.log_losses(lambda _, number, name, reason: lost.append((number, name, reason)))
-    return lost
+def record_losses(wifi: Wifi[int]) -> list[tuple[int, str, str]]:
+    losses: list[tuple[int, str, str]] = []
+    wifi.log_losses(lambda _, number, name, reason: losses.append((number, name, reason)))
+    return losses
 
 
 def test_exhausted_retries_are_reported_at_the_sender_and_the_relay() -> None:
-    for unheard_link, lost_at in ((("a", "r"), "a"), (("r", "b"), "r")):
-        wifi: Wifi[int] = Wifi(FixedPowers("abr", G54, without_link=[unheard_link]), 1)
+    for missing_link, losing_station in ((("a", "r"), "a"), (("r", "b"), "r")):
+        wifi: Wifi[int] = Wifi(FixedPowers("abr", G54, without_link=[missing_link]), 1)
         wifi.set_relay("r")
-        lost = losses(wifi)
+        losses = record_losses(wifi)
         wifi.send(0, "a", 1, 100, "b")
         assert wifi.deliveries(10**9) == []
-        assert lost == [(1, "b", RETRIES_EXHAUSTED)], lost_at
+        assert losses == [(1, "b", RETRIES_EXHAUSTED)], losing_station
 
 
-def test_a_frame_whose_acks_are_lost_was_delivered_not_lost() -> None:
+def test_a_frame_whose_acks_are_lost_is_delivered_and_not_lost() -> None:
     channel = FixedPowers("ab", G54)
     channel.rows[1][0] = 0.0
     wifi: Wifi[int] = Wifi(channel, 1)
-    lost, attempts = losses(wifi), Counter[int]()
+    losses, attempts = record_losses(wifi), Counter[int]()
     wifi.log_attempts(lambda attempt: attempts.update([attempt.number]))
     wifi.send(0, "a", 1, 100, "b")
     assert [payload for _, _, payload, _, _ in wifi.deliveries(10**9)] == [1]
     assert attempts[SHORT_RETRY_LIMIT] == 1, "all retries were made"
-    assert lost == []
+    assert losses == []
 
 
 def test_queue_drops_and_undecoded_broadcasts_are_reported() -> None:
     channel = FixedPowers("abc", G54, without_link=[("a", "c")])
     wifi: Wifi[int] = Wifi(channel, 1, queue_packets=1)
-    lost = losses(wifi)
+    losses = record_losses(wifi)
     for number in range(3):
         wifi.send(0, "a", number, 100, None)
     wifi.deliveries(10**9)
-    assert lost == [(2, "b", QUEUE_FULL), (2, "c", QUEUE_FULL), (0, "c", NOT_DECODED), (1, "c", NOT_DECODED)]
+    assert losses == [(2, "b", QUEUE_FULL), (2, "c", QUEUE_FULL), (0, "c", NOT_DECODED), (1, "c", NOT_DECODED)]
 
 
 def test_a_radio_that_is_switched_off_loses_its_queue_and_current_frame() -> None:
     wifi: Wifi[int] = Wifi(FixedPowers("ab", G54), 1)
-    lost, decoded_by = losses(wifi), list[tuple[str, ...]]()
+    losses, decoded_by = record_losses(wifi), list[tuple[str, ...]]()
     wifi.log_attempts(lambda attempt: decoded_by.append(attempt.received))
     for number in range(3):
         wifi.send(0, "a", number, 1500, "b")
     wifi.switch_off(1000, {"a"})
     assert wifi.deliveries(10**9) == []
-    assert lost == [(number, "b", RADIO_OFF) for number in range(3)]
+    assert losses == [(number, "b", RADIO_OFF) for number in range(3)]
     assert decoded_by == [()], "the transmission is aborted"
     wifi.switch_off(10**9, set())
     wifi.send(10**9, "a", 3, 1500, "b")
@@ -152,24 +152,24 @@ def test_a_radio_that_is_switched_off_loses_its_queue_and_current_frame() -> Non
 def test_fixed_links_report_the_reason(options: dict[str, str | int], reason: str) -> None:
     links: UniformLinks[int] = UniformLinks(1, RadioOptions.model_validate(options))
     links.place(0, dict.fromkeys("ab", (0.0, 0.0, 0.0)), None)
-    lost: list[tuple[int, str, str]] = []
-    links.log_losses(lambda at_ns, number, name, reason: lost.append((at_ns, name, reason)))
+    losses: list[tuple[int, str, str]] = []
+    links.log_losses(lambda at_ns, number, name, reason: losses.append((at_ns, name, reason)))
     links.send(5, "a", 1, 100, "b")
     links.send(7, "a", 2, 100, "b")
-    assert lost[-1] == (7, "b", reason)
+    assert losses[-1] == (7, "b", reason)
 
 
 def test_switching_off_a_radio_loses_queued_packets_of_fixed_links_but_not_those_in_flight() -> None:
     links: UniformLinks[int] = UniformLinks(1, RadioOptions.model_validate({"rate": "12Mbit/s", "delay": "5ms"}))
     links.place(0, dict.fromkeys("ab", (0.0, 0.0, 0.0)), None)
-    lost: list[tuple[int, int, str]] = []
-    links.log_losses(lambda at_ns, number, _, reason: lost.append((at_ns, number, reason)))
+    losses: list[tuple[int, int, str]] = []
+    links.log_losses(lambda at_ns, number, _, reason: losses.append((at_ns, number, reason)))
     # Each packet takes 1 ms to send; at 2.5 ms two have left and the third is being sent.
     for number in range(4):
         links.send(0, "a", number, 1500, "b")
     links.disturb(2_500_000, {"a"}, set())
     assert [(at_ns, number) for at_ns, _, number, _, _ in links.deliveries(10**9)] == [(6 * MS, 0), (7 * MS, 1)]
-    assert lost == [(2_500_000, 2, RADIO_OFF), (2_500_000, 3, RADIO_OFF)]
+    assert losses == [(2_500_000, 2, RADIO_OFF), (2_500_000, 3, RADIO_OFF)]
     counters = links.counters()["a", "b"]
     assert (counters.sent, counters.lost, counters.delivered) == (4, 2, 2)
 
@@ -188,24 +188,24 @@ def test_the_queue_of_a_fixed_link_is_empty_after_an_outage() -> None:
 def test_a_receiver_that_leaves_during_the_first_hop_is_reported() -> None:
     links: UniformLinks[int] = UniformLinks(1, RadioOptions.model_validate({"delay": "5ms", "rate": "unlimited"}))
     links.place(0, dict.fromkeys("abr", (0.0, 0.0, 0.0)), "r")
-    lost: list[tuple[int, str, str]] = []
-    links.log_losses(lambda at_ns, _, name, reason: lost.append((at_ns, name, reason)))
+    losses: list[tuple[int, str, str]] = []
+    links.log_losses(lambda at_ns, _, name, reason: losses.append((at_ns, name, reason)))
     links.send(0, "a", 1, 100, "b")
     links.place(MS, dict.fromkeys("ar", (0.0, 0.0, 0.0)), "r")
     assert links.deliveries(10**9) == []
-    assert lost == [(5 * MS, "b", OUT_OF_RANGE)]
+    assert losses == [(5 * MS, "b", OUT_OF_RANGE)]
 
 
 def test_a_cut_link_is_out_of_range_in_both_directions_until_restored() -> None:
     model: WifiInWorld[int] = WifiInWorld(1, RadioOptions(fading=False), dict.fromkeys("abc", ANTENNA), None)
     model.place(0, {name: (10.0 * number, 0.0, 1.0) for number, name in enumerate("abc")}, None)
-    lost: list[tuple[int, str]] = []
-    model.log_losses(lambda _, number, __, reason: lost.append((number, reason)))
+    losses: list[tuple[int, str]] = []
+    model.log_losses(lambda _, number, __, reason: losses.append((number, reason)))
     model.disturb(0, set(), {("a", "b")})
     for number, (source, destination) in enumerate([("a", "b"), ("b", "a"), ("a", "c"), ("c", "b")]):
         model.send(0, source, number, 100, destination)
     assert sorted(payload for _, _, payload, _, _ in model.deliveries(MS * 100)) == [2, 3]
-    assert lost == [(0, OUT_OF_RANGE), (1, OUT_OF_RANGE)]
+    assert losses == [(0, OUT_OF_RANGE), (1, OUT_OF_RANGE)]
     model.disturb(MS * 100, set(), set())
     model.send(MS * 100, "a", 4, 100, "b")
     assert [payload for _, _, payload, _, _ in model.deliveries(MS * 200)] == [4]

@@ -16,8 +16,8 @@ PHY = PhyCapability("n", "2.4 GHz", 20, 1, 800)
 
 
 def model(packet_time_ns: int, **options: object) -> WifiInWorld[int]:
-    slow = Antenna("802.11n", 15.0, -88.0, replace(PHY, packet_time_ns=packet_time_ns))
-    antennas = {"slow": slow, "fast": Antenna("802.11n", 15.0, -88.0, PHY)}
+    slow_antenna = Antenna("802.11n", 15.0, -88.0, replace(PHY, packet_time_ns=packet_time_ns))
+    antennas = {"slow": slow_antenna, "fast": Antenna("802.11n", 15.0, -88.0, PHY)}
     radio: WifiInWorld[int] = WifiInWorld(
         1, RadioOptions.model_validate({"fading": False, **options}), antennas, None
     )

@@ -35,22 +35,22 @@ LINK = st.builds(
 REQUEST = st.tuples(st.integers(0, 3 * MS), st.sampled_from("abr"), st.sampled_from("abr*"), st.integers(20, 1500))
 
 
-def engine(link: LinkParameters, relay: str | None = None) -> FixedLinks[int]:
+def make_links(link: LinkParameters, relay: str | None = None) -> FixedLinks[int]:
     links: FixedLinks[int] = FixedLinks(1)
     links.connect(dict.fromkeys(permutations("abr", 2), link), relay)
     return links
 
 
 def drain(links: FixedLinks[int]) -> list[Delivery[int]]:
-    arrived = links.deliveries(0)
+    deliveries = links.deliveries(0)
     while (at_ns := links.next_event_ns()) is not None:
-        arrived += links.deliveries(at_ns)
-    return arrived
+        deliveries += links.deliveries(at_ns)
+    return deliveries
 
 
-def burst(link: LinkParameters, packets: int, relay: str | None = None) -> DelayParts:
+def delays_of_burst(link: LinkParameters, packets: int, relay: str | None = None) -> DelayParts:
     """Return the delay parts at b of a burst of packets of 1,500 bytes sent by a."""
-    links = engine(link, relay)
+    links = make_links(link, relay)
     for number in range(packets):
         links.send(0, "a", number, 1500, "b")
     return delay_parts(sum(delay_sum for _, _, _, _, delay_sum in drain(links)))
@@ -60,7 +60,7 @@ def burst(link: LinkParameters, packets: int, relay: str | None = None) -> Delay
 def test_packets_of_a_burst_wait_for_earlier_ones(packets: int) -> None:
     # 1500 bytes at 12 Mbit/s take 1 ms, so that packet k waits k ms: (n - 1)/2 ms in the mean.
     link = LinkParameters(rate_bit_s=12_000_000, delay_ns=5 * MS)
-    assert burst(link, packets) == DelayParts(
+    assert delays_of_burst(link, packets) == DelayParts(
         packets=packets,
         processing_ns=0,
         transmission_ns=packets * MS,
@@ -73,7 +73,7 @@ def test_the_delay_of_a_relayed_packet_includes_both_hops() -> None:
     # Packets arrive at the relay one transmission time apart, at the rate at which it forwards them: none waits
     # there.
     link = LinkParameters(rate_bit_s=12_000_000, delay_ns=5 * MS)
-    assert burst(link, 10, relay="r") == DelayParts(
+    assert delays_of_burst(link, 10, relay="r") == DelayParts(
         packets=10,
         processing_ns=0,
         transmission_ns=10 * 2 * MS,
@@ -83,22 +83,22 @@ def test_the_delay_of_a_relayed_packet_includes_both_hops() -> None:
 
 
 def test_dropped_packets_do_not_add_to_the_delay() -> None:
-    parts = burst(LinkParameters(rate_bit_s=12_000_000, queue_packets=3), 20)
+    parts = delays_of_burst(LinkParameters(rate_bit_s=12_000_000, queue_packets=3), 20)
     assert (parts.packets, parts.transmission_ns, parts.queuing_ns) == (4, 4 * MS, 6 * MS)
 
 
 def test_lost_packets_do_not_add_to_the_delay() -> None:
-    links = engine(LinkParameters(loss=0.5, delay_ns=MS), "r")
+    links = make_links(LinkParameters(loss=0.5, delay_ns=MS), "r")
     for number in range(200):
         links.send(0, "a", number, 1500, "b")
-    arrived = drain(links)
-    parts = delay_parts(sum(delay_sum for _, _, _, _, delay_sum in arrived))
-    assert 0 < parts.packets == len(arrived) < links.counters()["a", "r"].delivered
-    assert parts.propagation_ns == len(arrived) * 2 * MS
+    deliveries = drain(links)
+    parts = delay_parts(sum(delay_sum for _, _, _, _, delay_sum in deliveries))
+    assert 0 < parts.packets == len(deliveries) < links.counters()["a", "r"].delivered
+    assert parts.propagation_ns == len(deliveries) * 2 * MS
 
 
 def test_jitter_and_reordering_wait_count_as_propagation() -> None:
-    links = engine(LinkParameters(delay_ns=MS, jitter_ns=2 * MS))
+    links = make_links(LinkParameters(delay_ns=MS, jitter_ns=2 * MS))
     for number in range(100):
         links.send(number, "a", number, 1500, "b")
     for at_ns, _, number, _, delay_sum in drain(links):
@@ -111,7 +111,7 @@ def test_jitter_and_reordering_wait_count_as_propagation() -> None:
 def test_the_parts_add_up_to_the_time_from_sending_to_arrival(
     traffic: list[tuple[int, str, str, int]], parameters: tuple[LinkParameters, LinkParameters], relay: str | None
 ) -> None:
-    links, now_ns, sent_ns = engine(parameters[0], relay), 0, []
+    links, now_ns, sent_ns = make_links(parameters[0], relay), 0, []
     for number, (wait_ns, source, destination, size_bytes) in enumerate(traffic):
         if number == len(traffic) // 2:
             links.connect(dict.fromkeys(permutations("abr", 2), parameters[1]), relay)
@@ -127,15 +127,15 @@ def test_the_parts_add_up_to_the_time_from_sending_to_arrival(
 
 @pytest.mark.parametrize("relay", [None, "r"])
 @pytest.mark.parametrize("destination", ["b", None])
-def test_the_delay_includes_an_earlier_delay(relay: str | None, destination: str | None) -> None:
+def test_the_delay_includes_the_delay_before_the_radio(relay: str | None, destination: str | None) -> None:
     wifi: Wifi[int] = Wifi(FixedPowers("abr", G_MODES[-1]), 1)
     wifi.set_relay(relay)
-    fixed = engine(LinkParameters(delay_ns=MS), relay)
+    fixed = make_links(LinkParameters(delay_ns=MS), relay)
     for model in (wifi, fixed):
         model.send(0, "a", 0, 1000, destination, before=PACKET + 7 * PROCESSING_NS)
-        arrived = model.deliveries(10**9)
-        assert arrived
-        for at_ns, _, _, _, delay_sum in arrived:
+        deliveries = model.deliveries(10**9)
+        assert deliveries
+        for at_ns, _, _, _, delay_sum in deliveries:
             parts = delay_parts(delay_sum)
             assert (parts.packets, parts.processing_ns, processing_ns(delay_sum)) == (1, 7, 7)
             assert parts.transmission_ns + parts.propagation_ns + parts.queuing_ns == at_ns

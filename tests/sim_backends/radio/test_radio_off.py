@@ -1,4 +1,4 @@
-"""A radio that is off relays nothing: if it is the access point, all links are down; else others continue."""
+"""A radio that is off relays nothing: without the access point, all links are down; other links continue."""
 
 import os
 import re
@@ -36,7 +36,7 @@ Bench = tuple[MediumClient, dict[str, Namespace]]
 
 @contextmanager
 def make_bench(options: RadioOptions) -> Iterator[Bench]:
-    """Three namespaces a, b, r on a medium."""
+    """Yield three namespaces a, b, r on a medium."""
     with ExitStack() as stack:
         medium = stack.enter_context(MediumClient(options, seed=1))
         namespaces = {name: stack.enter_context(Namespace()) for name in ADDRESSES}
@@ -135,8 +135,8 @@ def robots() -> Iterator[EmulatedTestbed]:
         world=load_world("lawn"),
         ros=RosChoice.BUILTIN,
         seed=1,
-    ) as started:
-        yield started
+    ) as emulation:
+        yield emulation
 
 
 FAULTS = [

@@ -32,7 +32,7 @@ def test_data_bits_per_symbol_follow_from_modulation_and_code(mode: WifiMode) ->
     assert mode.bits_per_symbol == subcarriers * bits * mode.code_rate
 
 
-def test_airtimes_computed_by_hand() -> None:
+def test_airtimes_equal_those_computed_by_hand() -> None:
     """1536 bytes at 54 Mbit/s: ceil((22 + 12288) / 216) = 57 symbols; an ACK of 14 bytes at 24: 2 symbols."""
     assert G_MODES[-1].airtime_ns(1536) == (20 + 57 * 4 + 6) * 1000
     assert N_MODES[-1].airtime_ns(1536) == (36 + 48 * 4 + 6) * 1000
@@ -45,8 +45,8 @@ def test_acks_use_the_fastest_mandatory_rate_up_to_that_of_the_frame() -> None:
 
 
 @MODES
-def test_uncoded_bit_error_equals_proakis(mode: WifiMode) -> None:
-    """Gray-coded M-QAM by Q functions, nearest neighbours only."""
+def test_the_uncoded_bit_error_rate_equals_that_of_proakis(mode: WifiMode) -> None:
+    """The expected rates are those of Gray-coded M-QAM by Q functions, with errors to nearest neighbours only."""
     for snr_db in (5.0, 10.0, 15.0):
         snr = 10 ** (snr_db / 10)
         q = scipy.stats.norm.sf
@@ -85,31 +85,31 @@ def test_packet_error_from_the_table_equals_the_formula(mode: WifiMode) -> None:
 
 
 def test_faster_modes_need_a_higher_snr() -> None:
-    def needed_db(mode: WifiMode) -> float:
+    def required_snr_db(mode: WifiMode) -> float:
         return next(ratio for ratio in np.arange(-5, 40, 0.05) if packet_error(mode, ratio, 1000) < 0.1)
 
     for modes in (G_MODES, N_MODES):
-        needed = [needed_db(mode) for mode in modes]
-        assert needed == sorted(needed)
-        assert 3 < needed[0] < 5
-        assert 21 < needed[-1] < 25
+        required_snrs_db = [required_snr_db(mode) for mode in modes]
+        assert required_snrs_db == sorted(required_snrs_db)
+        assert 3 < required_snrs_db[0] < 5
+        assert 21 < required_snrs_db[-1] < 25
 
 
 PLACES = st.tuples(st.floats(1, 300), st.floats(0.1, 3), st.floats(0.1, 3))
 
 
 @given(PLACES)
-def test_two_ray_loss_is_near_the_direct_path_and_symmetric(place: tuple[float, ...]) -> None:
-    distance_m, start_height_m, end_height_m = place
+def test_two_ray_loss_is_near_the_direct_path_and_symmetric(heights_and_distance: tuple[float, ...]) -> None:
+    distance_m, start_height_m, end_height_m = heights_and_distance
     start, end = np.array([[0, 0, start_height_m]]), np.array([[distance_m, 0, end_height_m]])
-    direct = propagation.free_space_db(start, end, WIFI_HZ)[0]
-    both = propagation.two_ray_db(start, end, WIFI_HZ)[0]
-    assert direct - 6.03 <= both <= direct + 40.01
-    assert both == pytest.approx(propagation.two_ray_db(end, start, WIFI_HZ)[0])
+    direct_db = propagation.free_space_db(start, end, WIFI_HZ)[0]
+    two_ray_db = propagation.two_ray_db(start, end, WIFI_HZ)[0]
+    assert direct_db - 6.03 <= two_ray_db <= direct_db + 40.01
+    assert two_ray_db == pytest.approx(propagation.two_ray_db(end, start, WIFI_HZ)[0])
 
 
 def test_far_two_ray_loss_is_40_db_per_decade() -> None:
-    """Beyond 4 pi h1 h2 / wavelength (Rappaport, eq. 4.52)."""
+    """Far means beyond 4 pi h1 h2 / wavelength (Rappaport, eq. 4.52)."""
     start = np.array([[0, 0, 0.5]] * 2)
     end = np.array([[100, 0, 0.5], [1000, 0, 0.5]])
     near_db, far_db = propagation.two_ray_db(start, end, WIFI_HZ)
@@ -118,7 +118,7 @@ def test_far_two_ray_loss_is_40_db_per_decade() -> None:
     assert far_db == pytest.approx(plane_earth, abs=1.5)
 
 
-def test_free_space_and_log_distance_computed_by_hand() -> None:
+def test_free_space_and_log_distance_losses_equal_those_computed_by_hand() -> None:
     start, end = np.zeros((2, 3)), np.array([[1.0, 0, 0], [10, 0, 0]])
     assert propagation.free_space_db(start, end, WIFI_HZ) == pytest.approx([40.18, 60.18], abs=0.01)
     assert propagation.log_distance_db(start, end, WIFI_HZ, 3.0) == pytest.approx([40.18, 70.18], abs=0.01)
@@ -180,13 +180,13 @@ def assert_clarke_correlation(power_gains: Floats, *paths: tuple[float, float]) 
     centred = power_gains - power_gains.mean()
     for steps in (2, 4, 8, 20):
         turns = 2 * math.pi * PATHS_M[steps] / WAVELENGTH_M
-        among_many = math.prod(scipy.special.j0(share * turns) ** 2 for share, _ in paths)
+        of_many_echoes = math.prod(scipy.special.j0(share * turns) ** 2 for share, _ in paths)
         echoes = np.ones(12, dtype=complex)
         for (share, angle), pairing in zip(paths, (5, 1, 7), strict=False):
             angles = (np.arange(12)[:, None] * pairing % 12 + np.linspace(0, 1, 101)) * math.pi / 6
             echoes *= np.exp(1j * share * turns * np.cos(angles - angle)).mean(axis=1)
         expected = (abs(echoes.sum()) ** 2 - (abs(echoes) ** 2).sum()) / (12**2 - 12)
-        assert expected == pytest.approx(among_many, abs=1 / 12)
+        assert expected == pytest.approx(of_many_echoes, abs=1 / 12)
         measured = (centred[:, :-steps] * centred[:, steps:]).mean() / centred.var()
         assert measured == pytest.approx(expected, abs=0.08)
 
@@ -232,5 +232,5 @@ def test_a_link_at_rest_does_not_fade() -> None:
 
 
 def test_fading_of_a_link_does_not_depend_on_other_links() -> None:
-    alone, among_many = fading(1, ("a", "b")), fading(1, ("a", "c"), ("a", "b"), ("b", "c"))
-    assert gains(alone, *RANDOM_ENDS[0], k=1.0) == gains(among_many, *RANDOM_ENDS[0], k=1.0, link=1)
+    single_link, many_links = fading(1, ("a", "b")), fading(1, ("a", "c"), ("a", "b"), ("b", "c"))
+    assert gains(single_link, *RANDOM_ENDS[0], k=1.0) == gains(many_links, *RANDOM_ENDS[0], k=1.0, link=1)

@@ -49,27 +49,27 @@ class Outcome:
 
 @cache
 def trial(scenario: Scenario, topology: Topology, distance: str, *, fading: bool = True) -> Outcome:
-    world, placed = load_world("lawn"), Placement(scenario, topology, parse_distance(distance))
+    world, robot_placement = load_world("lawn"), Placement(scenario, topology, parse_distance(distance))
     antennas = {robot.name: antenna_of(robot.profile.radio) for robot in CAST.values()}
     model: WifiInWorld[int] = WifiInWorld(1, RadioOptions(fading=fading), antennas, world)
-    model.place(0, placement.positions_m(CAST, placed, world), placement.relay(CAST, placed))
-    missing_after_one, missing_after_all, delays_ns = [], [], []
+    model.place(0, placement.positions_m(CAST, robot_placement, world), placement.relay(CAST, robot_placement))
+    missing_counts_after_one, missing_counts_after_all, delays_ns = [], [], []
     for number in range(DATAGRAMS):
         start_ns = number * INTERVAL_NS * MAX_TRANSMISSIONS
-        missing = set(FRAGMENTS)
+        missing_fragments = set(FRAGMENTS)
         for attempt in range(MAX_TRANSMISSIONS):
-            arrived_ns = send(model, start_ns + attempt * RETRANSMIT_NS, missing)
-            missing -= arrived_ns.keys()
+            arrived_ns = send(model, start_ns + attempt * RETRANSMIT_NS, missing_fragments)
+            missing_fragments -= arrived_ns.keys()
             if not attempt:
-                missing_after_one.append(len(missing))
-                if not missing:
+                missing_counts_after_one.append(len(missing_fragments))
+                if not missing_fragments:
                     delays_ns.append(max(arrived_ns.values()) - start_ns)
-        missing_after_all.append(len(missing))
+        missing_counts_after_all.append(len(missing_fragments))
     packets = DATAGRAMS * len(FRAGMENTS)
     return Outcome(
-        packets=sum(missing_after_one) / packets,
-        datagrams=sum(map(bool, missing_after_one)) / DATAGRAMS,
-        repaired=sum(missing_after_all) / packets,
+        packets=sum(missing_counts_after_one) / packets,
+        datagrams=sum(map(bool, missing_counts_after_one)) / DATAGRAMS,
+        repaired=sum(missing_counts_after_all) / packets,
         delay_s=float(np.median(delays_ns)) / 1e9,
     )
 
@@ -93,14 +93,14 @@ def test_behind_the_wall_loss_grows_with_distance_and_is_higher_for_datagrams_th
 ) -> None:
     outcomes = [trial(Scenario.NLOS, topology, distance) for distance in distances]
     assert all(nearer.packets < farther.packets for nearer, farther in pairwise(outcomes))
-    farther = outcomes[-1]
-    assert farther.packets < farther.datagrams < 6 * farther.packets
+    farthest = outcomes[-1]
+    assert farthest.packets < farthest.datagrams < 6 * farthest.packets
 
 
 @pytest.mark.parametrize(("topology", "distance"), [(Topology.MASTER, "30ft"), (Topology.MASTERLESS, "55ft")])
 def test_the_wall_increases_the_loss(topology: Topology, distance: str) -> None:
-    clear, blocked = (trial(scenario, topology, distance).packets for scenario in (Scenario.LOS, Scenario.NLOS))
-    assert blocked > clear + 0.001
+    los_loss, nlos_loss = (trial(scenario, topology, distance).packets for scenario in (Scenario.LOS, Scenario.NLOS))
+    assert nlos_loss > los_loss + 0.001
 
 
 @pytest.mark.parametrize("scenario", Scenario)
@@ -113,15 +113,19 @@ def test_retransmission_reduces_the_loss_below_one_percent(
 
 @pytest.mark.parametrize("distance", ["10ft", "30ft"])
 def test_the_access_point_adds_one_hop_of_delay(distance: str) -> None:
-    direct, relayed = (trial(Scenario.LOS, topology, distance).delay_s for topology in reversed(Topology))
-    assert 1.7 < relayed / direct < 2.3
+    direct_delay_s, relayed_delay_s = (
+        trial(Scenario.LOS, topology, distance).delay_s for topology in reversed(Topology)
+    )
+    assert 1.7 < relayed_delay_s / direct_delay_s < 2.3
 
 
-def test_without_fading_there_is_no_loss_at_the_paper_s_distances() -> None:
+def test_without_fading_no_packet_is_lost_at_the_distances_of_the_paper() -> None:
     for scenario in Scenario:
         assert trial(scenario, Topology.MASTERLESS, "55ft", fading=False).packets == 0
 
 
 @pytest.mark.parametrize(("topology", "distance"), [(Topology.MASTER, "30ft"), (Topology.MASTERLESS, "55ft")])
-def test_on_the_paper_s_lawn_less_than_a_third_of_datagrams_is_lost(topology: Topology, distance: str) -> None:
+def test_on_the_lawn_of_the_paper_less_than_a_third_of_the_datagrams_are_lost(
+    topology: Topology, distance: str
+) -> None:
     assert trial(Scenario.NLOS, topology, distance).datagrams < 1 / 3

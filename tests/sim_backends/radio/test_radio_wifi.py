@@ -70,7 +70,7 @@ def bianchi_bit_s(stations: int, mode: WifiMode) -> float:
 
 
 @pytest.mark.parametrize("stations", [2, 5, 10, 20])
-def test_the_goodput_of_many_stations_equals_bianchi_s_model(stations: int) -> None:
+def test_the_goodput_of_many_stations_equals_that_of_bianchis_model(stations: int) -> None:
     names = [f"s{n}" for n in range(stations)]
     goodput = saturate(FixedPowers([*names, "r"], G54), names, "r", seconds=4)
     total = sum(goodput.values())
@@ -81,30 +81,30 @@ def test_the_goodput_of_many_stations_equals_bianchi_s_model(stations: int) -> N
 
 
 def test_hidden_stations_collide_more_than_visible_ones() -> None:
-    visible = saturate(FixedPowers("abr", G6), "ab", "r", seconds=4)
-    hidden = saturate(FixedPowers("abr", G6, without_link=[("a", "b")]), "ab", "r", seconds=4)
-    assert sum(hidden.values()) < 0.75 * sum(visible.values())
+    visible_goodput = saturate(FixedPowers("abr", G6), "ab", "r", seconds=4)
+    hidden_goodput = saturate(FixedPowers("abr", G6, without_link=[("a", "b")]), "ab", "r", seconds=4)
+    assert sum(hidden_goodput.values()) < 0.75 * sum(visible_goodput.values())
 
 
 def test_an_access_point_needs_twice_the_airtime() -> None:
-    direct = saturate(FixedPowers("abr", G54), "a", "b", seconds=2)["a"]
-    relayed = saturate(FixedPowers("abr", G54), "a", "b", seconds=2, relay="r")["a"]
+    direct_goodput = saturate(FixedPowers("abr", G54), "a", "b", seconds=2)["a"]
+    relayed_goodput = saturate(FixedPowers("abr", G54), "a", "b", seconds=2, relay="r")["a"]
     # The access point competes with the station for each second hop, so a little is lost to collisions.
-    assert relayed == pytest.approx(direct / 2, rel=0.06)
+    assert relayed_goodput == pytest.approx(direct_goodput / 2, rel=0.06)
 
 
 def test_an_ack_follows_each_received_frame_after_sifs() -> None:
     log: list[TransmissionAttempt] = []
     saturate(FixedPowers("abr", G54, without_link=[("a", "b")]), "ab", "r", seconds=0.2, log=log)
     acks = [attempt for attempt in log if not attempt.number]
-    arrived = {
+    received_frames = {
         (attempt.end_ns, attempt.receiver, attempt.transmitter)
         for attempt in log
         if attempt.number and attempt.received
     }
-    assert {(ack.start_ns - SIFS_NS, ack.transmitter, ack.receiver) for ack in acks} <= arrived
+    assert {(ack.start_ns - SIFS_NS, ack.transmitter, ack.receiver) for ack in acks} <= received_frames
     # A station that is sending at that time sends no ACK; the last ACK may not have been sent yet.
-    assert 0.9 * len(arrived) < len(acks) <= len(arrived)
+    assert 0.9 * len(received_frames) < len(acks) <= len(received_frames)
     assert {(ack.end_ns - ack.start_ns, ack.mode.name, ack.payload) for ack in acks} == {(ack_ns(G54), "g24", None)}
 
 
@@ -147,9 +147,7 @@ def test_a_full_queue_drops_the_newest_packets() -> None:
 
 
 def test_interference_that_starts_late_corrupts_a_frame() -> None:
-    """The stations are hidden from each other; the second starts during the first's frame, and is equally strong at
-    r.
-    """
+    """The stations are hidden from each other; the second starts during the frame of the first, and is as strong."""
     log: list[TransmissionAttempt] = []
     wifi: Wifi[str] = Wifi(FixedPowers("abr", G6, without_link=[("a", "b")]), 1)
     wifi.log_attempts(log.append)
@@ -169,17 +167,17 @@ def test_a_strong_frame_survives_weak_interference() -> None:
 
 
 def test_the_loss_of_a_weak_link_equals_its_packet_error() -> None:
-    """Broadcasts, so that no retry hides a loss."""
+    """Packets are broadcast, so that no retry hides a loss."""
     channel, ratio_db, size_bytes, frames = FixedPowers("ab", G6), 4.05, 1500, 4000
     channel.rows[0][1] = NOISE_MW * 10 ** (ratio_db / 10)
     channel.sensitivity_mw = [NOISE_MW] * 2
     wifi: Wifi[int] = Wifi(channel, 1, queue_packets=frames)
     for number in range(frames):
         wifi.send(0, "a", number, size_bytes, None)
-    lost = 1 - len(wifi.deliveries(60 * 10**9)) / frames
+    loss = 1 - len(wifi.deliveries(60 * 10**9)) / frames
     expected = packet_error(G6, ratio_db, size_bytes + HEADER_BYTES)
     assert 0.02 < expected < 0.5
-    assert lost == pytest.approx(expected, abs=4 * math.sqrt(expected * (1 - expected) / frames))
+    assert loss == pytest.approx(expected, abs=4 * math.sqrt(expected * (1 - expected) / frames))
 
 
 def test_below_4_db_the_preamble_is_not_detected() -> None:
@@ -202,12 +200,14 @@ def test_equal_seeds_give_equal_results_in_order_of_time(seed: int, sent_frames:
             wifi.send(at_ns, "ab"[number % 2], number, size, "r")
         return wifi.deliveries(60 * 10**9), log
 
-    arrived, log = run()
-    assert run() == (arrived, log)
-    assert [delivery[0] for delivery in arrived] == sorted(delivery[0] for delivery in arrived)
-    assert len({delivery[2] for delivery in arrived}) == len(arrived), "a retry after a lost ACK is delivered once"
+    deliveries, log = run()
+    assert run() == (deliveries, log)
+    assert [delivery[0] for delivery in deliveries] == sorted(delivery[0] for delivery in deliveries)
+    assert len({delivery[2] for delivery in deliveries}) == len(deliveries), (
+        "a retry after a lost ACK is delivered once"
+    )
     for sender in "ab":
-        from_sender = [delivery[2] for delivery in arrived if "ab"[delivery[2] % 2] == sender]
+        from_sender = [delivery[2] for delivery in deliveries if "ab"[delivery[2] % 2] == sender]
         assert from_sender == sorted(from_sender), "frames of one station arrive in order"
     assert all(math.isfinite(attempt.end_ns) and attempt.end_ns > attempt.start_ns for attempt in log)
 
@@ -236,10 +236,10 @@ def test_the_number_of_events_per_frame_is_bounded() -> None:
     while (now_ns := wifi.next_event_ns()) is not None:
         wifi.deliveries(now_ns)
         steps += 1
-    sent = sum(attempt.number > 0 for attempt in log)
-    assert sent >= 400
+    data_attempts = sum(attempt.number > 0 for attempt in log)
+    assert data_attempts >= 400
     # Start and end of the frame, start and end of its ACK, and the timeout that the ACK made void.
-    assert steps <= 5 * sent
+    assert steps <= 5 * data_attempts
 
 
 def test_received_powers_follow_changes_of_the_channel() -> None:
@@ -263,14 +263,14 @@ def test_no_station_starts_while_it_detects_a_frame(seed: int, pairs_without_lin
     pairs = [(names[first], names[second]) for first, second in pairs_without_link if first != second]
     log: list[TransmissionAttempt] = []
     saturate(FixedPowers(names, G54, without_link=pairs), "abcd", "e", seconds=0.1, seed=seed, log=log)
-    hidden = {*pairs, *((second, first) for first, second in pairs)}
-    sent = [attempt for attempt in log if attempt.number]
-    frames = sorted(sent, key=lambda attempt: attempt.start_ns)
+    hidden_pairs = {*pairs, *((second, first) for first, second in pairs)}
+    data_attempts = [attempt for attempt in log if attempt.number]
+    frames = sorted(data_attempts, key=lambda attempt: attempt.start_ns)
     for number, first in enumerate(frames):
         for second in frames[number + 1 :]:
             if second.start_ns >= first.end_ns:
                 break
-            if (first.transmitter, second.transmitter) not in hidden:
+            if (first.transmitter, second.transmitter) not in hidden_pairs:
                 assert second.start_ns - first.start_ns <= CCA_TIME_NS
 
 
@@ -280,9 +280,9 @@ def test_the_parts_of_the_delay_add_up_to_the_elapsed_time(relay: str | None) ->
     wifi.set_relay(relay)
     for number in range(100):
         wifi.send(number * 1000, "a", number * 1000, 1000, "b")
-    arrived = wifi.deliveries(10**9)
-    assert len(arrived) == 100
-    for at_ns, _, sent_ns, source, delay_sum in arrived:
+    deliveries = wifi.deliveries(10**9)
+    assert len(deliveries) == 100
+    for at_ns, _, sent_ns, source, delay_sum in deliveries:
         parts = delay_parts(delay_sum)
         assert source == "a"
         assert parts.packets == 1
@@ -304,7 +304,7 @@ def test_frames_to_a_station_out_of_range_are_lost_immediately() -> None:
 
 @given(st.sets(st.integers(0, 59)), st.booleans())
 @settings(max_examples=30)
-def test_a_missing_packet_does_not_change_the_others(missing: set[int], relayed: bool) -> None:
+def test_a_missing_packet_does_not_change_the_others(missing_numbers: set[int], is_relayed: bool) -> None:
     """Every draw is keyed by the packet and the attempt, also with packets of other flows."""
 
     def attempts(numbers: Sequence[int]) -> dict[int, list[tuple[int, str, bool]]]:
@@ -313,7 +313,7 @@ def test_a_missing_packet_does_not_change_the_others(missing: set[int], relayed:
         log: list[TransmissionAttempt] = []
         wifi: Wifi[int] = Wifi(channel, 1)
         wifi.log_attempts(log.append)
-        wifi.set_relay("r" if relayed else None)
+        wifi.set_relay("r" if is_relayed else None)
         for number in numbers:
             wifi.send(number * 100_000_000, "a", number, 1000, "b", packet=(f"flow {number % 3}", number // 3))
         wifi.deliveries(10**12)
@@ -328,6 +328,6 @@ def test_a_missing_packet_does_not_change_the_others(missing: set[int], relayed:
 
     all_attempts = attempts(range(60))
     assert max(map(len, all_attempts.values())) > 2, "there are retries"
-    assert attempts([number for number in range(60) if number not in missing]) == {
-        number: packet_attempts for number, packet_attempts in all_attempts.items() if number not in missing
+    assert attempts([number for number in range(60) if number not in missing_numbers]) == {
+        number: packet_attempts for number, packet_attempts in all_attempts.items() if number not in missing_numbers
     }

@@ -1,4 +1,4 @@
-"""Random streams are identified by name and number, independent of the order of use."""
+"""Draws of random streams depend on name and number, and not on the order of use."""
 
 import math
 import subprocess
@@ -58,12 +58,12 @@ def test_draws_are_the_same_in_every_version() -> None:
 
 
 @given(seed=st.integers(0, 2**64), names=st.lists(st.tuples(st.text(), st.text())), count=st.integers(1, 200))
-def test_first_draws_are_those_of_the_streams(seed: int, names: list[tuple[str, str]], count: int) -> None:
+def test_first_draws_equal_the_draws_of_the_streams(seed: int, names: list[tuple[str, str]], count: int) -> None:
     draws = first_draws(seed, names, count)
     assert draws.tolist() == [RandomStream(seed, *name).first(count).tolist() for name in names]
 
 
-def test_the_first_draw_imports_nothing() -> None:
+def test_the_first_draw_imports_no_module() -> None:
     """An import at the first draw would delay the first packet by 7 ms."""
     program = (
         "import sys; from sim_backends.radio.random_streams import RandomStream; before = set(sys.modules); "

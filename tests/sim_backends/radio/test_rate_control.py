@@ -25,12 +25,12 @@ def attempted_modes(
     attempts_by_frame = []
     for number in range(start, start + frames):
         attempts: list[str] = []
-        acknowledged = False
-        while not acknowledged and len(attempts) < 7:
+        is_acknowledged = False
+        while not is_acknowledged and len(attempts) < 7:
             mode = rate.choose(number * STEP_NS, ("a", number), len(attempts) + 1)
             attempts.append(mode.name)
-            acknowledged = arrives(mode)
-            rate.report(mode, acknowledged=acknowledged)
+            is_acknowledged = arrives(mode)
+            rate.report(mode, acknowledged=is_acknowledged)
         attempts_by_frame.append(attempts)
     return attempts_by_frame
 
@@ -43,13 +43,15 @@ def test_the_initial_mode_follows_from_the_snr(snr_db: float, expected: str) -> 
 @pytest.mark.parametrize(
     ("snr_db", "expected"),
     [
-        # All reliable: twice the best, the second, the most robust (the fastest reliable one), then the slowest.
+        # All modes are reliable: two attempts each in the best, the second and the most robust mode, which is the
+        # fastest reliable one; then one in the slowest.
         (35.0, ["g54", "g54", "g48", "g48", "g54", "g54", "g6"]),
-        # At 48 Mbit/s 37 % of frames of 1200 bytes fail, so it ranks below 36 Mbit/s. An exchange takes 0.30 ms
-        # there, and the mean backoffs before the 2nd to 6th attempt are 67, 139, 283, 571 and 1147 us: six take 4.0
-        # ms, seven 6.6.
+        # At 48 Mbit/s, 37 % of frames of 1200 bytes fail, so this mode ranks below 36 Mbit/s. Its exchange takes
+        # 0.30 ms, and the mean backoffs before the 2nd to 6th attempt are 67, 139, 283, 571 and 1147 us: six attempts
+        # take 4.0 ms, and seven take 6.6 ms.
         (20.81, ["g36", "g36", "g48", "g48", "g48", "g48", "g48"]),
-        # Almost no success, so half as many as fit: three for the slowest, at 1.7 ms, and also for the next four.
+        # Almost all attempts fail, so each mode has half as many attempts as fit: one of three in the slowest mode,
+        # at 1.7 ms each, and two of four in the next one.
         (0.0, ["g6", "g9", "g9", "g6", "g6", "g6", "g6"]),
     ],
 )
@@ -59,16 +61,18 @@ def test_failed_attempts_fall_back_to_other_modes(snr_db: float, expected: list[
 
 
 def test_sampling_slower_modes_costs_nothing_if_the_fastest_succeeds() -> None:
-    first = Counter(attempts[0] for attempts in attempted_modes(minstrel(35.0), 20_000, lambda _: True))
-    assert first["g54"] > 0.98 * first.total()
-    assert set(first) == {mode.name for mode in G_MODES}, "each mode is sampled occasionally"
+    first_modes = Counter(attempts[0] for attempts in attempted_modes(minstrel(35.0), 20_000, lambda _: True))
+    assert first_modes["g54"] > 0.98 * first_modes.total()
+    assert set(first_modes) == {mode.name for mode in G_MODES}, "each mode is sampled occasionally"
 
 
-def test_samples_faster_modes_in_a_tenth_of_the_frames_and_each_four_times_per_update() -> None:
+def test_faster_modes_are_sampled_in_a_tenth_of_the_frames_and_each_at_most_four_times_per_update() -> None:
     frames = attempted_modes(minstrel(35.0), 20_000, lambda mode: mode.bits_per_symbol <= 96)[5_000:]
     samples = [attempts for attempts in frames if attempts[0] in {"g36", "g48", "g54"}]
     assert 0.06 < len(samples) / len(frames) < 0.1
-    assert {tuple(attempts[2:]) for attempts in samples} == {("g24",)}, "the sample twice, and then the best"
+    assert {tuple(attempts[2:]) for attempts in samples} == {("g24",)}, (
+        "two attempts in the sampled mode, and then the best mode"
+    )
     for start in range(0, len(frames), PER_UPDATE):
         counts = Counter(attempts[0] for attempts in frames[start : start + PER_UPDATE])
         assert max(counts[name] for name in ("g36", "g48", "g54")) <= 4
@@ -76,45 +80,47 @@ def test_samples_faster_modes_in_a_tenth_of_the_frames_and_each_four_times_per_u
 
 
 def test_modes_with_occasional_success_are_sampled_without_limit() -> None:
-    turns = iter(range(10**6))
+    attempts_of_g48 = iter(range(10**6))
     frames = attempted_modes(
         minstrel(35.0),
         20_000,
-        lambda mode: mode.bits_per_symbol <= 144 or (mode.name == "g48" and next(turns) % 3 == 0),
+        lambda mode: mode.bits_per_symbol <= 144 or (mode.name == "g48" and next(attempts_of_g48) % 3 == 0),
     )[5_000:]
-    per_update = [
+    samples_per_update = [
         Counter(attempts[0] for attempts in frames[start : start + PER_UPDATE])["g48"]
         for start in range(0, len(frames), PER_UPDATE)
     ]
-    assert max(per_update) > 4
+    assert max(samples_per_update) > 4
 
 
-def test_returns_to_a_mode_that_works_again() -> None:
+def test_a_mode_that_works_again_is_used_again() -> None:
     rate = minstrel(35.0)
     assert attempted_modes(rate, 2_000, lambda mode: mode.bits_per_symbol <= 48)[-1][0] == "g12"
     frames = attempted_modes(rate, 2_000, lambda _: True, start=2_000)
     assert Counter(attempts[0] for attempts in frames[-200:])["g54"] > 190
 
 
-def test_an_additional_frame_does_not_change_others() -> None:
+def test_an_additional_frame_does_not_change_the_modes_of_other_frames() -> None:
     numbers = range(60)
     with_frame, without_frame = minstrel(15.0), minstrel(15.0)
-    chosen = [with_frame.choose(0, ("a", number), 1) for number in numbers]
-    assert [without_frame.choose(0, ("a", number), 1) for number in numbers if number != 7] == chosen[:7] + chosen[8:]
-    assert len(set(chosen)) > 1
+    chosen_modes = [with_frame.choose(0, ("a", number), 1) for number in numbers]
+    assert [without_frame.choose(0, ("a", number), 1) for number in numbers if number != 7] == chosen_modes[
+        :7
+    ] + chosen_modes[8:]
+    assert len(set(chosen_modes)) > 1
 
 
 def test_aggregates_that_fail_lower_the_rate_within_the_interval() -> None:
-    """All frames of the fastest modes fail at once, as in a fade; the interval of updates is 100 ms."""
+    """From the start, all frames of the fastest modes fail, as in a fade; the interval of updates is 100 ms."""
     modes = format_modes("HE", "5 GHz", 80, 1, 800)
     control = Minstrel(modes, 60.0, PacketDraws(1, "a", "b"), frames_per_exchange=16)
-    chosen = []
+    chosen_modes = []
     for number in range(60):
         mode = control.choose(number * 500_000, ("flow", number), 1)
         control.report(mode, acknowledged=64 * (mode.rate_bit_s < 200e6), attempts=64)
-        chosen.append(mode.rate_bit_s)
-    assert chosen[0] > 500e6
-    assert sorted(chosen[-20:])[10] < 200e6, "the median of the last frames, some of which are samples"
+        chosen_modes.append(mode.rate_bit_s)
+    assert chosen_modes[0] > 500e6
+    assert sorted(chosen_modes[-20:])[10] < 200e6, "the median of the last frames, some of which are samples"
 
 
 def test_the_first_modes_consider_the_noise_of_the_width() -> None:
@@ -123,5 +129,5 @@ def test_the_first_modes_consider_the_noise_of_the_width() -> None:
         Minstrel(format_modes("HE", "5 GHz", width_mhz, 1, 800), 20.0, PacketDraws(1, "a", "b"))
         for width_mhz in (20, 80)
     )
-    first = [control.choose(0, ("flow", 5), 2).name for control in (narrow, wide)]
-    assert first == ["he20-mcs4-1ss-800ns", "he80-mcs3-1ss-800ns"]
+    first_modes = [control.choose(0, ("flow", 5), 2).name for control in (narrow, wide)]
+    assert first_modes == ["he20-mcs4-1ss-800ns", "he80-mcs3-1ss-800ns"]

@@ -21,7 +21,7 @@ BAND = HT20_7.band
 FRAMES = 41
 
 
-class Protecting(FixedPowers):
+class ProtectingPowers(FixedPowers):
     """Stations with RTS; in modes of 802.11n they aggregate frames and have the inter-frame space of best effort."""
 
     def __init__(
@@ -49,7 +49,7 @@ class Protecting(FixedPowers):
         return AMPDU_LIMITS["HT"] if self.mode.is_high_throughput else None
 
 
-def goodput(channel: Protecting, senders: Sequence[str], *, seconds: float, queued: int = 150) -> float:
+def goodput(channel: ProtectingPowers, senders: Sequence[str], *, seconds: float, queued: int = 150) -> float:
     return sum(saturate(channel, senders, "r", seconds=seconds, queued=queued).values())
 
 
@@ -67,7 +67,7 @@ def test_goodput_of_one_station_equals_the_closed_form() -> None:
         ifs_ns = BAND.best_effort_aifs_ns if mode.is_high_throughput else BAND.difs_ns
         _, busy_ns = exchange_ns(mode, size_bytes, answer_bytes)
         expected = frames * 8000 / (ifs_ns + CW_MIN / 2 * SLOT_NS + busy_ns) * 1e9
-        assert goodput(Protecting("ar", mode), ["a"], seconds=1.0) == pytest.approx(expected, rel=0.02)
+        assert goodput(ProtectingPowers("ar", mode), ["a"], seconds=1.0) == pytest.approx(expected, rel=0.02)
 
 
 @pytest.mark.parametrize("stations", [2, 5, 10])
@@ -84,39 +84,39 @@ def test_contending_stations_follow_bianchi_with_rts(stations: int) -> None:
     idle, single = (1 - tau) ** stations, stations * tau * (1 - tau) ** (stations - 1)
     slot_ns = idle * SLOT_NS + single * (busy_ns + BAND.difs_ns) + (1 - idle - single) * collision_ns
     names = [f"s{number}" for number in range(stations)]
-    measured = goodput(Protecting([*names, "r"], G54), names, seconds=1.5, queued=20)
-    assert measured == pytest.approx(single * 8000 / slot_ns * 1e9, rel=0.03)
+    measured_bit_s = goodput(ProtectingPowers([*names, "r"], G54), names, seconds=1.5, queued=20)
+    assert measured_bit_s == pytest.approx(single * 8000 / slot_ns * 1e9, rel=0.03)
 
 
 # ns-3 3.37: `benchmarks.high_throughput_vs_ns3`, A-MPDU with RTS, payloads of 1000 bytes.
 @pytest.mark.parametrize(("stations", "ns3_mbit_s"), [(1, 57.58), (5, 57.89), (10, 57.81)])
 def test_goodput_of_aggregates_with_rts_is_within_two_percent_of_ns3(stations: int, ns3_mbit_s: float) -> None:
     names = [f"s{number}" for number in range(stations)]
-    measured = goodput(Protecting([*names, "r"], HT20_7), names, seconds=1.0)
-    assert measured / 1e6 == pytest.approx(ns3_mbit_s, rel=0.02)
+    measured_bit_s = goodput(ProtectingPowers([*names, "r"], HT20_7), names, seconds=1.0)
+    assert measured_bit_s / 1e6 == pytest.approx(ns3_mbit_s, rel=0.02)
 
 
 def test_hidden_stations_collide_in_rts_and_not_in_data() -> None:
     log: list[TransmissionAttempt] = []
     rates = {}
     for threshold in (0, None):
-        channel = Protecting("abr", HT20_7, without_link=[("a", "b")], threshold=threshold)
+        channel = ProtectingPowers("abr", HT20_7, without_link=[("a", "b")], threshold=threshold)
         log.clear()
         rates[threshold] = sum(saturate(channel, "ab", "r", seconds=1.0, queued=150, log=log).values())
         data = [attempt for attempt in log if attempt.number]
         share = sum(bool(attempt.received) for attempt in data) / len(data)
         assert share > 0.97 if threshold == 0 else share < 0.7
         # The CTS keeps the hidden station silent during the data, unless it has sent RTS at the time of the CTS.
-        spans = {(attempt.start_ns, attempt.end_ns) for attempt in data}
+        data_spans_ns = {(attempt.start_ns, attempt.end_ns) for attempt in data}
         starts = [attempt.start_ns for attempt in log if attempt.control == "RTS"]
-        overlaps = sum(any(begin < start_ns < end for begin, end in spans) for start_ns in starts)
+        overlaps = sum(any(begin < start_ns < end for begin, end in data_spans_ns) for start_ns in starts)
         assert overlaps < 0.1 * len(starts) or threshold is None
     assert rates[0] > 1.2 * rates[None]
 
 
-def test_a_station_that_has_heard_another_cts_does_not_answer_an_rts() -> None:
-    """r hears the CTS of y, but not the data of x to y; a hears neither."""
-    wifi: Wifi[int] = Wifi(Protecting("arxy", G_MODES[0], without_link=[("a", "x"), ("a", "y"), ("r", "x")]), 1)
+def test_a_station_that_has_received_a_cts_for_another_station_does_not_answer_an_rts() -> None:
+    """Station r receives the CTS of y, but not the data from x to y; a receives neither."""
+    wifi: Wifi[int] = Wifi(ProtectingPowers("arxy", G_MODES[0], without_link=[("a", "x"), ("a", "y"), ("r", "x")]), 1)
     log: list[TransmissionAttempt] = []
     wifi.log_attempts(log.append)
     wifi.send(0, "x", 0, 1500, "y")
@@ -124,13 +124,13 @@ def test_a_station_that_has_heard_another_cts_does_not_answer_an_rts() -> None:
     assert len(wifi.deliveries(10**9)) == 2
     first_data = next(attempt for attempt in log if attempt.number)
     assert first_data.transmitter == "x"
-    during = [attempt for attempt in log if first_data.start_ns < attempt.start_ns < first_data.end_ns]
-    assert {(attempt.control, attempt.transmitter) for attempt in during} == {("RTS", "a")}
+    attempts_during_data = [attempt for attempt in log if first_data.start_ns < attempt.start_ns < first_data.end_ns]
+    assert {(attempt.control, attempt.transmitter) for attempt in attempts_during_data} == {("RTS", "a")}
 
 
 def test_frames_up_to_the_threshold_are_sent_without_rts() -> None:
     log: list[TransmissionAttempt] = []
-    wifi: Wifi[str] = Wifi(Protecting("ar", G54, threshold=1064), 1)
+    wifi: Wifi[str] = Wifi(ProtectingPowers("ar", G54, threshold=1064), 1)
     wifi.log_attempts(log.append)
     for size_bytes in (1028, 1029):
         wifi.send(0, "a", str(size_bytes), size_bytes, "r")
@@ -141,8 +141,8 @@ def test_frames_up_to_the_threshold_are_sent_without_rts() -> None:
 
 
 @pytest.mark.parametrize("mode", [G54, HT20_7], ids=lambda mode: mode.name)
-def test_frames_without_cts_are_given_up_and_no_data_is_sent(mode: WifiMode) -> None:
-    channel = Protecting("ar", mode, without_link=[("a", "r")])
+def test_frames_without_cts_are_dropped_and_no_data_is_sent(mode: WifiMode) -> None:
+    channel = ProtectingPowers("ar", mode, without_link=[("a", "r")])
     wifi: Wifi[int] = Wifi(channel, 1)
     log: list[TransmissionAttempt] = []
     wifi.log_attempts(log.append)
@@ -159,17 +159,17 @@ def test_frames_without_cts_are_given_up_and_no_data_is_sent(mode: WifiMode) -> 
 
 
 def test_after_rts_without_data_other_stations_wait_no_longer_than_for_the_cts() -> None:
-    """The receiver does not hear the RTS; b waits 2 SIFS, CTS, 20 us, 2 slots (10.3.2.4), DIFS and its backoff."""
-    channel = Protecting("abr", G_MODES[0], without_link=[("a", "r")])
+    """The RTS does not arrive; b waits 2 SIFS, CTS, 20 us, 2 slots (10.3.2.4), DIFS and its backoff."""
+    channel = ProtectingPowers("abr", G_MODES[0], without_link=[("a", "r")])
     wifi: Wifi[int] = Wifi(channel, 1)
     log: list[TransmissionAttempt] = []
     wifi.log_attempts(log.append)
     wifi.send(0, "a", 0, 1028, "r")
     wifi.send(1000, "b", 1, 1028, "r")
     wifi.deliveries(10**9)
-    sent = [attempt for attempt in log if attempt.control == "RTS"]
-    position = [attempt.transmitter for attempt in sent].index("b")
-    first, second = sent[position - 1 : position + 1]
+    rts_attempts = [attempt for attempt in log if attempt.control == "RTS"]
+    position = [attempt.transmitter for attempt in rts_attempts].index("b")
+    first, second = rts_attempts[position - 1 : position + 1]
     assert first.transmitter == "a"
     cts_ns = G_MODES[0].airtime_ns(14)
     waits_ns = second.start_ns - first.end_ns - 2 * BAND.sifs_ns - cts_ns - 20_000 - 2 * SLOT_NS - BAND.difs_ns
@@ -178,7 +178,7 @@ def test_after_rts_without_data_other_stations_wait_no_longer_than_for_the_cts()
 
 
 def test_a_station_switched_off_between_rts_and_data_sends_nothing_more() -> None:
-    wifi: Wifi[int] = Wifi(Protecting("ar", HT20_7), 1)
+    wifi: Wifi[int] = Wifi(ProtectingPowers("ar", HT20_7), 1)
     log: list[TransmissionAttempt] = []
     wifi.log_attempts(log.append)
     wifi.send(0, "a", 0, 1028, "r")

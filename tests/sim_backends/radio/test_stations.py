@@ -17,7 +17,7 @@ END_NS = 300_000_000
 
 
 class TrafficRun:
-    """Stations a and b always have packets for r, which replies to every fourth."""
+    """A run in which stations a and b always have packets for r, which replies to every fourth packet."""
 
     def __init__(self, channel: FixedPowers, *, metered: bool = True, samples_ns: Iterable[int] = ()) -> None:
         self.log: list[TransmissionAttempt] = []
@@ -29,7 +29,7 @@ class TrafficRun:
         for name in "ab":
             for _ in range(20):
                 self.wifi.send(0, name, name, 1000, "r")
-        due_ns = [*samples_ns]
+        due_times_ns = [*samples_ns]
         while (now_ns := self.wifi.next_event_ns()) is not None and now_ns < END_NS:
             for at_ns, receiver, source, _, _ in self.wifi.deliveries(now_ns):
                 self.delivered[source, receiver] += 1
@@ -37,8 +37,8 @@ class TrafficRun:
                     self.wifi.send(at_ns, source, source, 1000, "r")
                     if self.delivered[source, receiver] % 4 == 0:
                         self.wifi.send(at_ns, "r", "r", 200, source)
-            while due_ns and due_ns[0] <= now_ns:
-                due_ns.pop(0)
+            while due_times_ns and due_times_ns[0] <= now_ns:
+                due_times_ns.pop(0)
                 self.wifi.sample(now_ns, now_ns)
 
     def station_sample(self, name: str, peer: str) -> StationSample:
@@ -48,10 +48,10 @@ class TrafficRun:
 
 @pytest.fixture(params=["clear", "noisy", "hidden"])
 def channel(request: pytest.FixtureRequest) -> FixedPowers:
-    by_hand = FixedPowers("abr", G54, without_link=[("a", "b")] if request.param == "hidden" else [])
+    fixed_powers = FixedPowers("abr", G54, without_link=[("a", "b")] if request.param == "hidden" else [])
     if request.param == "noisy":
-        by_hand.noise_mw = [STRONG_MW / 10**2.22] * 3
-    return by_hand
+        fixed_powers.noise_mw = [STRONG_MW / 10**2.22] * 3
+    return fixed_powers
 
 
 def test_counters_equal_the_attempts_in_the_log(channel: FixedPowers) -> None:
@@ -89,19 +89,22 @@ def test_the_channel_is_busy_while_a_station_sends_or_detects_a_frame(channel: F
     traffic = TrafficRun(channel)
     without_link = {("a", "b"), ("b", "a")} if channel.rows[0][1] == 0 else set()
     for name in "abr":
-        detected = [attempt for attempt in traffic.log if (name, attempt.transmitter) not in without_link]
-        edges = sorted({edge for attempt in detected for edge in (attempt.start_ns, attempt.end_ns)})
+        detected_attempts = [attempt for attempt in traffic.log if (name, attempt.transmitter) not in without_link]
+        edges = sorted({edge for attempt in detected_attempts for edge in (attempt.start_ns, attempt.end_ns)})
         busy_ns = sum(
             stop - start
             for start, stop in pairwise(edges)
-            if any(attempt.start_ns <= start and attempt.end_ns >= stop for attempt in detected)
+            if any(attempt.start_ns <= start and attempt.end_ns >= stop for attempt in detected_attempts)
         )
         sample = traffic.wifi.sample(END_NS, END_NS)[name]
         assert sample.busy_ns == pytest.approx(busy_ns, abs=300_000), "except for a frame that is still on the air"
         assert sample.noise_dbm == pytest.approx(-90.0 if channel.noise_mw[0] == NOISE_MW else -62.2)
 
 
-def test_metering_does_not_change_the_traffic(channel: FixedPowers) -> None:
-    plain, measured = TrafficRun(channel, metered=False), TrafficRun(channel, samples_ns=range(0, END_NS, 1_000_000))
-    assert plain.log == measured.log
-    assert plain.wifi.sample(END_NS, END_NS) == {}
+def test_the_meter_does_not_change_the_traffic(channel: FixedPowers) -> None:
+    without_meter, with_meter = (
+        TrafficRun(channel, metered=False),
+        TrafficRun(channel, samples_ns=range(0, END_NS, 1_000_000)),
+    )
+    assert without_meter.log == with_meter.log
+    assert without_meter.wifi.sample(END_NS, END_NS) == {}

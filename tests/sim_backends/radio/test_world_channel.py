@@ -39,11 +39,14 @@ def link_states(channel: WorldChannel) -> list[tuple[list[float], list[int], lis
 
 @given(st.lists(PLACES, min_size=1, max_size=5))
 def test_links_depend_only_on_the_last_positions(moves: list[dict[str, Vector]]) -> None:
-    moved, fresh = WorldChannel(1, ANTENNAS, STEADY, BAYLANDS), WorldChannel(1, ANTENNAS, STEADY, BAYLANDS)
+    moved_channel, new_channel = (
+        WorldChannel(1, ANTENNAS, STEADY, BAYLANDS),
+        WorldChannel(1, ANTENNAS, STEADY, BAYLANDS),
+    )
     for now_ns, places in enumerate(moves):
-        moved.move(now_ns, places)
-    fresh.move(0, moves[-1])
-    assert link_states(moved) == link_states(fresh)
+        moved_channel.move(now_ns, places)
+    new_channel.move(0, moves[-1])
+    assert link_states(moved_channel) == link_states(new_channel)
 
 
 def count_computed_links(monkeypatch: pytest.MonkeyPatch) -> list[int]:
@@ -81,11 +84,11 @@ def test_only_the_links_of_moved_stations_are_computed_again(monkeypatch: pytest
 def test_a_move_does_not_change_the_powers_of_a_frame_on_the_air() -> None:
     channel = WorldChannel(1, ANTENNAS, STEADY)
     channel.move(0, {"a": (0.0, 0.0, 0.2), "b": (5.0, 0.0, 0.2)})
-    sent = channel.powers_mw(0, 0)
-    before = list(sent)
+    frame_powers_mw = channel.powers_mw(0, 0)
+    powers_before_mw = list(frame_powers_mw)
     channel.move(1, {"a": (0.0, 0.0, 0.2), "b": (50.0, 0.0, 0.2)})
-    assert sent == before
-    assert channel.powers_mw(0, 1) != before
+    assert frame_powers_mw == powers_before_mw
+    assert channel.powers_mw(0, 1) != powers_before_mw
 
 
 @given(
@@ -95,19 +98,19 @@ def test_a_move_does_not_change_the_powers_of_a_frame_on_the_air() -> None:
 def test_fading_is_continuous_across_position_updates(times_ns: list[int], velocity: Vector) -> None:
     """A link has the same gain after any number of position updates as by dead reckoning from the first."""
     places: dict[str, Vector] = {"a": (0.0, 0.0, 0.2), "b": (20.0, 0.0, 0.2)}
-    stepped, straight = WorldChannel(7, ANTENNAS, FADING), WorldChannel(7, ANTENNAS, FADING)
+    updated_channel, reckoned_channel = WorldChannel(7, ANTENNAS, FADING), WorldChannel(7, ANTENNAS, FADING)
     now_ns = 0
-    for channel in (stepped, straight):
+    for channel in (updated_channel, reckoned_channel):
         channel.move(0, places, {"b": velocity})
     for step_ns in times_ns:
         now_ns += step_ns
         current_place = 20.0 + velocity[0] * now_ns / 1e9, velocity[1] * now_ns / 1e9, 0.2
         # Station c is not part of the link.
-        stepped.move(now_ns, places | {"b": current_place, "c": (1.0, now_ns / 1e9, 0.2)}, {"b": velocity})
-        stepped.powers_mw(1, now_ns)
+        updated_channel.move(now_ns, places | {"b": current_place, "c": (1.0, now_ns / 1e9, 0.2)}, {"b": velocity})
+        updated_channel.powers_mw(1, now_ns)
     gains = [
         channel.powers_mw(0, now_ns)[1] / 10 ** ((17.0 - channel.loss_db(*as_arrays(places["a"], place_m))[0]) / 10)
-        for channel, place_m in ((stepped, current_place), (straight, places["b"]))
+        for channel, place_m in ((updated_channel, current_place), (reckoned_channel, places["b"]))
     ]
     assert gains[0] == pytest.approx(gains[1], rel=1e-5)
 
@@ -149,7 +152,7 @@ def test_links_of_many_moving_stations_are_computed_only_for_senders(monkeypatch
     for station in range(20):
         channel.powers_mw(station, 100)
     assert sum(computed_counts) == 20 * 19 / 2
-    assert computed_counts[-1] > 50, "the last ones together"
+    assert computed_counts[-1] > 50, "the last links are computed together"
 
 
 def test_a_station_of_802_11n_supports_the_modes_of_802_11g() -> None:
@@ -161,6 +164,6 @@ def test_a_station_of_802_11n_supports_the_modes_of_802_11g() -> None:
 
 def test_an_unsupported_fixed_mode_is_rejected_at_the_start() -> None:
     antennas = {"old": Antenna("802.11g", 15.0, -85.0), "new": Antenna("802.11n", 15.0, -92.0)}
-    with pytest.raises(ConfigurationError, match=r"radio\.mode n6 is not a mode of the radio of old") as caught:
+    with pytest.raises(ConfigurationError, match=r"radio\.mode n6 is not a mode of the radio of old") as error_info:
         WorldChannel(1, antennas, RadioOptions(mode="n6"))
-    assert "g54" in caught.value.remedy
+    assert "g54" in error_info.value.remedy

@@ -1,4 +1,4 @@
-"""ROS 1 nodes: messages through a real master, among Debian's own tools, nodes that have exited, and wrong types."""
+"""ROS 1 nodes: messages with a real master and Debian's tools, nodes that have exited, and wrong types."""
 
 import socket
 import subprocess
@@ -27,30 +27,30 @@ def master() -> Iterator[str]:
         yield uri
 
 
-def after_s(duration_s: float) -> float:
+def deadline_after(duration_s: float) -> float:
     return time.monotonic() + duration_s
 
 
-def until(condition: Callable[[], bool]) -> None:
+def wait_for(condition: Callable[[], bool]) -> None:
     wait_until(condition, Deadline.after(30))
 
 
 def test_messages_pass_between_nodes_and_to_ros(master: str) -> None:
     with closing(RosNode("/a", master)) as a, closing(RosNode("/b", master)) as b:
-        subscriber = b.subscribe("/data", MESSAGE, after_s(30))
-        publisher = a.publish("/data", MESSAGE, after_s(30))
-        until(lambda: publisher.connections == 1 and subscriber.connections == 1)
+        subscriber = b.subscribe("/data", MESSAGE, deadline_after(30))
+        publisher = a.publish("/data", MESSAGE, deadline_after(30))
+        wait_for(lambda: publisher.connections == 1 and subscriber.connections == 1)
         for body in (b"", b"\0" * 12, bytes(200_000)):
-            assert publisher.publish(body, after_s(30)) == 1
-            assert subscriber.receive(after_s(30)) == body
+            assert publisher.publish(body, deadline_after(30)) == 1
+            assert subscriber.receive(deadline_after(30)) == body
         subscriber.close()
-        until(lambda: publisher.connections == 0)
+        wait_for(lambda: publisher.connections == 0)
         result = subprocess.run(("rostopic", "info", "/data"), capture_output=True, text=True, timeout=60, check=True)
         assert "Type: std_msgs/UInt8MultiArray" in result.stdout
         assert " * /a (http://127.0.0.1:" in result.stdout
-        assert publisher.publish(b"", after_s(30)) == 0
+        assert publisher.publish(b"", deadline_after(30)) == 0
         with pytest.raises(TimeoutError):
-            subscriber.receive(after_s(0.01))
+            subscriber.receive(deadline_after(0.01))
 
 
 def test_another_type_and_a_node_that_has_exited_are_ignored(master: str) -> None:
@@ -58,16 +58,16 @@ def test_another_type_and_a_node_that_has_exited_are_ignored(master: str) -> Non
         with socket.create_server(("127.0.0.1", 0)) as server:
             closed_address = f"http://127.0.0.1:{server.getsockname()[1]}/"
         call(master, "registerPublisher", "/gone", "/data2", MESSAGE.name, closed_address)
-        strings = b.subscribe("/data2", OTHER, after_s(30))
-        bytes_of = b.subscribe("/data3", MESSAGE, after_s(30))
-        publishers = [a.publish(f"/data{number}", MESSAGE, after_s(30)) for number in (2, 3)]
-        until(lambda: publishers[1].connections == 1 and bytes_of.connections == 1)
-        assert strings.connections == publishers[0].connections == 0
+        string_subscriber = b.subscribe("/data2", OTHER, deadline_after(30))
+        byte_subscriber = b.subscribe("/data3", MESSAGE, deadline_after(30))
+        publishers = [a.publish(f"/data{number}", MESSAGE, deadline_after(30)) for number in (2, 3)]
+        wait_for(lambda: publishers[1].connections == 1 and byte_subscriber.connections == 1)
+        assert string_subscriber.connections == publishers[0].connections == 0
 
 
 def test_invalid_data_disconnect_only_their_sender(master: str) -> None:
     with closing(RosNode("/a", master)) as a:
-        publisher = a.publish("/data4", MESSAGE, after_s(30))
+        publisher = a.publish("/data4", MESSAGE, deadline_after(30))
         port = a._stream_server.getsockname()[1]
         for data in (b"\xff" * 8, pack(b"no header"), pack(pack_header({"topic": "/other"}))):
             with socket.create_connection(("127.0.0.1", port)) as stream:
@@ -88,13 +88,13 @@ class _StreamWithCallback(socket.socket):
             callback()
 
 
-def test_a_subscriber_that_has_the_header_gets_every_message() -> None:
-    """It counts as connected from then on, and may send a request whose answer is published immediately."""
-    near, far = socket.socketpair()
-    stream = _StreamWithCallback(fileno=near.detach())
+def test_a_subscriber_that_has_received_the_header_receives_every_message() -> None:
+    """From then on the subscriber counts as connected, and may request an answer that is published immediately."""
+    near_socket, far_socket = socket.socketpair()
+    stream = _StreamWithCallback(fileno=near_socket.detach())
     publisher = RosPublisher("/data", MESSAGE, "/a")
     counts: list[int] = []
-    publishing = threading.Thread(target=lambda: counts.append(publisher.publish(b"answer", after_s(30))))
+    publishing = threading.Thread(target=lambda: counts.append(publisher.publish(b"answer", deadline_after(30))))
 
     def publish() -> None:
         publishing.start()
@@ -103,21 +103,21 @@ def test_a_subscriber_that_has_the_header_gets_every_message() -> None:
     stream.on_sent = publish
     accepting = threading.Thread(target=publisher.accept, args=(stream, {"md5sum": "*"}))
     accepting.start()
-    until(lambda: publishing.ident is not None)
+    wait_for(lambda: publishing.ident is not None)
     publishing.join(30)
-    far.close()
+    far_socket.close()
     accepting.join(30)
     stream.close()
     assert counts == [1]
 
 
-def test_a_master_that_is_missing_or_another_program(master: str) -> None:
+def test_a_missing_master_and_a_refused_call_are_errors(master: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         uri = f"http://127.0.0.1:{server.getsockname()[1]}"
     with (
         closing(RosNode("/a", uri)) as a,
         pytest.raises(TimeoutError, match=f"no ROS master answers at {uri}"),
     ):
-        a.publish("/data", MESSAGE, after_s(0.2))
+        a.publish("/data", MESSAGE, deadline_after(0.2))
     with pytest.raises(MasterError, match="refused registerPublisher"):
         call(master, "registerPublisher", "/a", "", "", "")

@@ -1,4 +1,4 @@
-"""Waypoints: continuous motion at the given speed, with corners at the times of their distance."""
+"""Waypoints: continuous motion at a constant speed, with corners at the times of their distance."""
 
 import math
 from itertools import pairwise
@@ -17,8 +17,8 @@ SHARES = st.floats(0, 1)
 
 
 def state(way_points: WayPoints, time_ns: int) -> State:
-    (only,) = way_points.at(time_ns).values()
-    return only
+    (agent_state,) = way_points.at(time_ns).values()
+    return agent_state
 
 
 def length_m(points: list[Vector]) -> float:
@@ -39,33 +39,35 @@ def test_the_motion_is_continuous_and_never_faster_than_its_speed(
 ) -> None:
     way_points = WayPoints("a", points, speed_m_s)
     now_ns = round(share * way_points.end_ns)
-    moved_m = math.dist(state(way_points, now_ns).position_m, state(way_points, now_ns + later_ns).position_m)
+    distance_m = math.dist(state(way_points, now_ns).position_m, state(way_points, now_ns + later_ns).position_m)
     # Each corner is rounded to a nanosecond.
-    assert moved_m <= speed_m_s * (later_ns + len(points)) * 1e-9 + 1e-9
+    assert distance_m <= speed_m_s * (later_ns + len(points)) * 1e-9 + 1e-9
 
 
 @given(points=POINTS, speed_m_s=SPEEDS, share=SHARES)
 def test_the_velocity_is_that_of_the_leg(points: list[Vector], speed_m_s: float, share: float) -> None:
     way_points = WayPoints("a", points, speed_m_s)
     now_ns = round(share * way_points.end_ns)
-    now = state(way_points, now_ns)
+    current_state = state(way_points, now_ns)
     if now_ns >= way_points.end_ns:
-        assert now.velocity_m_s == STILL
+        assert current_state.velocity_m_s == STILL
         return
     # A leg of some nanoseconds has a speed with a large rounding error.
     legs_s = [math.dist(*leg) / speed_m_s for leg in pairwise(points)]
     if min(leg_s for leg_s in legs_s if leg_s) > 1e-6:
-        assert math.hypot(*now.velocity_m_s) == pytest.approx(speed_m_s, rel=1e-3)
+        assert math.hypot(*current_state.velocity_m_s) == pytest.approx(speed_m_s, rel=1e-3)
     next_m = state(way_points, now_ns + 1).position_m
-    expected = [metres + v * 1e-9 for metres, v in zip(now.position_m, now.velocity_m_s, strict=True)]
-    assert math.dist(next_m, expected) <= 1e-9 * 2 * max(speed_m_s, math.hypot(*now.velocity_m_s)) + 1e-9
+    expected = [
+        metres + v * 1e-9 for metres, v in zip(current_state.position_m, current_state.velocity_m_s, strict=True)
+    ]
+    assert math.dist(next_m, expected) <= 1e-9 * 2 * max(speed_m_s, math.hypot(*current_state.velocity_m_s)) + 1e-9
 
 
 @given(points=POINTS, speed_m_s=SPEEDS, shares=st.lists(SHARES, max_size=5))
 def test_states_do_not_depend_on_earlier_calls(points: list[Vector], speed_m_s: float, shares: list[float]) -> None:
-    reused = WayPoints("a", points, speed_m_s)
-    times_ns = [round(share * reused.end_ns) for share in shares]
-    assert [reused.at(time_ns) for time_ns in times_ns] == [
+    reused_path = WayPoints("a", points, speed_m_s)
+    times_ns = [round(share * reused_path.end_ns) for share in shares]
+    assert [reused_path.at(time_ns) for time_ns in times_ns] == [
         WayPoints("a", points, speed_m_s).at(time_ns) for time_ns in times_ns
     ]
 

@@ -38,7 +38,7 @@ def loss_db(yard: World, start: Vector, end: Vector) -> float:
     return float(yard.penetration_loss_db(np.array([start]), np.array([end]), WIFI_HZ)[0])
 
 
-def crossed(yard: World, start: Vector, end: Vector) -> list[tuple[str, float]]:
+def crossed_parts(yard: World, start: Vector, end: Vector) -> list[tuple[str, float]]:
     """Return the material and the rounded length in metres of each part that a path crosses."""
     (crossings,) = yard.crossings(np.array([start]), np.array([end]))
     return [(crossing.material, round(crossing.length_m, 9)) for crossing in crossings]
@@ -49,7 +49,7 @@ def test_the_loss_of_a_concrete_wall_follows_itu() -> None:
     sigma = 0.0326 * 2.437**0.8095
     expected = 0.2 * 1636 * sigma / math.sqrt(5.31) + 2 * 0.74
     assert loss_db(world(), (0, 5, 0.2), (10, 5, 0.2)) == pytest.approx(expected, abs=0.05)
-    assert crossed(world(), (0, 5, 0.2), (10, 5, 0.2)) == [("concrete", 0.2)]
+    assert crossed_parts(world(), (0, 5, 0.2), (10, 5, 0.2)) == [("concrete", 0.2)]
 
 
 @pytest.mark.parametrize(("name", "thickness_m"), [("concrete", 0.2), ("brick", 0.2), ("wood", 0.1), ("ground", 1.0)])
@@ -68,18 +68,18 @@ def test_the_loss_of_a_thick_wall_is_near_that_of_an_itu_slab(
     assert loss == pytest.approx(slab_db, abs=0.5)
 
 
-def test_moving_a_wall_changes_the_loss() -> None:
+def test_the_loss_depends_on_the_position_of_a_wall() -> None:
     start, end = (0.0, 5.0, 0.2), (10.0, 5.0, 0.2)
     assert loss_db(world(5), start, end) > 10
     assert loss_db(world(12), start, end) == 0
-    slanting = loss_db(world(5), (0, 2, 0.2), (10, 8, 0.2))
-    assert slanting > loss_db(world(5), start, end), "a slanting path is longer inside"
+    slanting_loss_db = loss_db(world(5), (0, 2, 0.2), (10, 8, 0.2))
+    assert slanting_loss_db > loss_db(world(5), start, end), "a slanting path is longer inside"
 
 
-def test_a_path_above_or_beside_a_wall_is_free() -> None:
+def test_a_path_above_or_beside_a_wall_has_no_crossings() -> None:
     starts = np.array([[0, 5, 0.2], [0, 5, 3.0], [0, 1, 0.2], [0, 8.5, 0.2]])
     ends = np.array([[10, 5, 0.2], [10, 5, 3.0], [10, 1, 0.2], [10, 8.5, 0.2]])
-    assert [not crossed for crossed in world().crossings(starts, ends)] == [False, True, True, True]
+    assert [not parts for parts in world().crossings(starts, ends)] == [False, True, True, True]
 
 
 def test_crossings_are_computed_separately_for_each_path() -> None:
@@ -114,7 +114,7 @@ def test_the_loss_of_foliage_depends_on_its_total_depth() -> None:
     )
     yard = world(text=WORLD[: WORLD.index("  - ")] + trees)
     assert loss_db(yard, (0, 0, 5), (40, 0, 5)) == pytest.approx(foliage.loss_db(24, WIFI_HZ))
-    assert {material for material, _ in crossed(yard, (0, 0, 1), (40, 0, 1))} == {"wood"}
+    assert {material for material, _ in crossed_parts(yard, (0, 0, 1), (40, 0, 1))} == {"wood"}
 
 
 def test_a_building_is_empty_inside() -> None:
@@ -122,9 +122,9 @@ def test_a_building_is_empty_inside() -> None:
         "  - {name: house, kind: building, centre_m: [10, 5], size_m: [6, 4, 3], thickness: 0.2m, material: brick}\n"
     )
     yard = world(text=WORLD[: WORLD.index("  - ")] + house)
-    assert crossed(yard, (0, 5, 1), (20, 5, 1)) == [("brick", 0.2)] * 2
-    assert crossed(yard, (9, 5, 1), (11, 5, 1)) == []
-    assert crossed(yard, (10, 5, 1), (10, 5, 5)) == [("brick", 0.2)]
+    assert crossed_parts(yard, (0, 5, 1), (20, 5, 1)) == [("brick", 0.2)] * 2
+    assert crossed_parts(yard, (9, 5, 1), (11, 5, 1)) == []
+    assert crossed_parts(yard, (10, 5, 1), (10, 5, 5)) == [("brick", 0.2)]
 
 
 @pytest.mark.parametrize("name", ["lawn", "baylands"])
@@ -150,9 +150,11 @@ def is_inside(shape: Shape, points: Floats) -> Any:  # noqa: ANN401 (a mask)
     x, y, z = (points - shape.centre_m).T
     if isinstance(shape, Cylinder):
         return (np.hypot(x, y) < shape.radius_m) & (abs(z) < shape.height_m / 2)
-    along = x * math.cos(shape.yaw_rad) + y * math.sin(shape.yaw_rad)
-    across = y * math.cos(shape.yaw_rad) - x * math.sin(shape.yaw_rad)
-    return (abs(along) < shape.size_m[0] / 2) & (abs(across) < shape.size_m[1] / 2) & (abs(z) < shape.size_m[2] / 2)
+    along_m = x * math.cos(shape.yaw_rad) + y * math.sin(shape.yaw_rad)
+    across_m = y * math.cos(shape.yaw_rad) - x * math.sin(shape.yaw_rad)
+    return (
+        (abs(along_m) < shape.size_m[0] / 2) & (abs(across_m) < shape.size_m[1] / 2) & (abs(z) < shape.size_m[2] / 2)
+    )
 
 
 @given(st.lists(SHAPE, min_size=1, max_size=3), POINT, POINT)
@@ -161,8 +163,8 @@ def test_depths_equal_a_sampling_along_the_path(shapes: list[Shape], start: Vect
     points = np.linspace(start, end, steps)
     length_m = math.dist(start, end)
     depths = Solids(shapes).depths_m(np.array([start]), np.array([end]))[0]
-    sampled = [is_inside(shape, points).mean() * length_m for shape in shapes]
-    assert depths == pytest.approx(sampled, abs=3 * length_m / steps + 1e-9)
+    sampled_depths_m = [is_inside(shape, points).mean() * length_m for shape in shapes]
+    assert depths == pytest.approx(sampled_depths_m, abs=3 * length_m / steps + 1e-9)
 
 
 @given(st.lists(SHAPE, max_size=3), POINT, POINT)
@@ -182,25 +184,29 @@ def test_solids_absorb_more_at_a_higher_frequency() -> None:
 
 
 @pytest.mark.parametrize(
-    ("replaced", "message"),
+    ("valid_text", "message"),
     [
         ("material: concrete", "there is no material 'concrte'; did you mean 'concrete'"),
         ("kind: wall", "kind"),
         ("height: 2.4m", "height"),
     ],
 )
-def test_an_invalid_world_is_reported_with_its_line(replaced: str, message: str) -> None:
-    broken = {"material: concrete": "material: concrte", "kind: wall": "kind: fence", "height: 2.4m": "height: 2.4"}
-    with pytest.raises(ConfigurationError, match=message) as caught:
-        world(text=WORLD.replace(replaced, broken[replaced]))
-    assert caught.value.where.startswith("yard.yaml:")
+def test_an_invalid_world_is_reported_with_its_line(valid_text: str, message: str) -> None:
+    invalid_texts = {
+        "material: concrete": "material: concrte",
+        "kind: wall": "kind: fence",
+        "height: 2.4m": "height: 2.4",
+    }
+    with pytest.raises(ConfigurationError, match=message) as error_info:
+        world(text=WORLD.replace(valid_text, invalid_texts[valid_text]))
+    assert error_info.value.where.startswith("yard.yaml:")
 
 
-def test_an_unknown_world_gets_a_suggestion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unknown_world_is_an_error_with_a_suggestion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ConfigurationError, match="no world 'lwn'") as caught:
+    with pytest.raises(ConfigurationError, match="no world 'lwn'") as error_info:
         load_world("lwn")
-    assert caught.value.remedy == "did you mean 'lawn'?"
+    assert error_info.value.remedy == "did you mean 'lawn'?"
     (tmp_path / "worlds").mkdir()
     (tmp_path / "worlds" / "yard.yaml").write_text(WORLD.replace("X", "5"), encoding="utf-8")
     assert load_world("yard").name == "yard"
@@ -211,4 +217,6 @@ def test_a_ramp_rises_evenly_and_blocks_radio_paths_in_steps() -> None:
     heights_m = [world(text=text).ground_m((10.5, north_m)) for north_m in (-1.1, -1.0, 0.0, 1.0, 3.0)]
     assert heights_m == pytest.approx([0.0, 0.0, 0.25, 0.5, 1.0], abs=1e-12)
     # Half of its length is higher than half of its height.
-    assert crossed(world(text=text), (10, -5, 0.5001), (10, 2.9, 0.5001)) == [("ground", 0.5)] * 3 + [("ground", 0.4)]
+    assert crossed_parts(world(text=text), (10, -5, 0.5001), (10, 2.9, 0.5001)) == [("ground", 0.5)] * 3 + [
+        ("ground", 0.4)
+    ]

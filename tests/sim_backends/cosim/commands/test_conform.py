@@ -1,4 +1,4 @@
-"""`fieldkit cosim conform`: the examples of the page conform, and each failure is printed with request and answer."""
+"""`fieldkit cosim conform`: the documented examples conform, and each failure is printed with request and answer."""
 
 import io
 import json
@@ -57,7 +57,7 @@ def test_the_example_in_python_conforms(carts_in_python: str) -> None:
     assert "20 checks passed, 2 not applicable, 0 failed" in run.err
 
 
-def test_a_failure_has_request_and_answer_and_exit_code_1(tmp_path: Path, carts_in_c: Path) -> None:
+def test_a_failure_is_printed_with_request_and_answer_and_exits_with_code_1(tmp_path: Path, carts_in_c: Path) -> None:
     source = (EXAMPLES / "carts.c").read_text(encoding="utf-8")
     broken = tmp_path / "broken.c"
     broken.write_text(source.replace("put(answer, (uint64_t)at_ns, 8)", "put(answer, (uint64_t)to_ns, 8)"))

@@ -21,8 +21,8 @@ from tests.helpers.runs import run_here
 INTERRUPTED_WINDOW = 7
 
 
-class Counting:
-    """An observer that counts windows, and can interrupt one."""
+class WindowCounter:
+    """An observer that counts windows, and can interrupt the process during one of them."""
 
     def __init__(self, *, interrupts: bool) -> None:
         self.windows = 0
@@ -38,20 +38,20 @@ class Counting:
 
 
 @pytest.mark.parametrize("interrupts", [True, False], ids=["while it is recorded", "while it is hashed"])
-def test_a_window_is_both_hashed_and_recorded_or_neither(
+def test_an_interrupted_window_is_either_both_hashed_and_recorded_or_neither(
     monkeypatch: pytest.MonkeyPatch, *, interrupts: bool
 ) -> None:
-    observer = Counting(interrupts=interrupts)
+    observer = WindowCounter(interrupts=interrupts)
     simulation = build(load_scenario("field_30ft"), recorder=observer)
     coordinator = simulation.coordinator
     if not interrupts:
         add_window = EventDigest.add_window
 
-        def interrupted(digest: EventDigest, *arguments: object) -> None:
+        def add_window_then_interrupt(digest: EventDigest, *arguments: object) -> None:
             add_window(digest, *arguments)  # type: ignore[arg-type]
             os.kill(os.getpid(), signal.SIGINT)
 
-        monkeypatch.setattr(EventDigest, "add_window", interrupted)
+        monkeypatch.setattr(EventDigest, "add_window", add_window_then_interrupt)
     with pytest.raises(KeyboardInterrupt), interrupt_between_windows(coordinator):
         simulation.run()
     digest = coordinator._digest
@@ -64,12 +64,12 @@ def ignore(_: Event) -> None:
 
 
 def test_ctrl_c_ends_all_seeds_on_a_single_processor(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a single processor, the runs are in the process that receives the signal."""
-    started: list[int | None] = []
+    """On a single processor, the runs take place in the process that receives the signal."""
+    started_seeds: list[int | None] = []
 
-    def interrupted(*arguments: object, seed: int, **options: object) -> object:
+    def build_interrupted(*arguments: object, seed: int, **options: object) -> object:
         simulation = build(*arguments, seed=seed, **options)  # type: ignore[arg-type]
-        started.append(seed)
+        started_seeds.append(seed)
         if seed == 2:
 
             def run(**_: object) -> object:
@@ -79,11 +79,11 @@ def test_ctrl_c_ends_all_seeds_on_a_single_processor(monkeypatch: pytest.MonkeyP
             monkeypatch.setattr(simulation, "run", run)
         return simulation
 
-    monkeypatch.setattr(execution, "build", interrupted)
+    monkeypatch.setattr(execution, "build", build_interrupted)
     monkeypatch.setattr(executors, "usable_processors", lambda: 1)
     scenario = load_scenario("baylands", {"duration": "50ms"})
-    results, ended = execution.simulate_all(scenario, "scheduled", [1, 2, 3], None, sink=ignore)
-    assert (started, ended) == ([1, 2], True)
+    results, is_interrupted = execution.simulate_all(scenario, "scheduled", [1, 2, 3], None, sink=ignore)
+    assert (started_seeds, is_interrupted) == ([1, 2], True)
     assert [(result.seed, result.is_interrupted) for result in results] == [(1, False), (2, True)]
     assert results[1].simulated_s == 0.02
 
@@ -112,15 +112,15 @@ def test_the_output_is_the_same_for_any_number_of_workers(tmp_path: Path) -> Non
     assert outputs[0] == outputs[1]
 
 
-def test_the_number_of_workers_is_that_of_the_option(monkeypatch: pytest.MonkeyPatch) -> None:
-    chosen = []
+def test_the_option_sets_the_number_of_workers_and_a_paced_run_has_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen_workers = []
 
-    def completed(*_: object, workers: Workers) -> Iterator[object]:
-        chosen.append(workers)
+    def record_workers(*_: object, workers: Workers) -> Iterator[object]:
+        chosen_workers.append(workers)
         yield from ()
 
-    monkeypatch.setattr(execution, "as_completed_tasks", completed)
+    monkeypatch.setattr(execution, "as_completed_tasks", record_workers)
     scenario = load_scenario("field_30ft")
     execution.simulate_all(scenario, "scheduled", [1, 2], None, sink=ignore, workers=Workers(2))
     execution.simulate_all(scenario, "scheduled", [1, 2], None, sink=ignore, pace=Pace(1), workers=Workers(2))
-    assert chosen == [Workers(2), Workers(1)]
+    assert chosen_workers == [Workers(2), Workers(1)]

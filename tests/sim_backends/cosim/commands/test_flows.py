@@ -1,4 +1,4 @@
-"""Results of flows, against a run computed by hand, and the harness's own jitter."""
+"""Results of flows compared with a run computed by hand, and their jitter with that of the harness."""
 
 import math
 from dataclasses import replace
@@ -15,25 +15,29 @@ from sim_backends.world.motion import State
 MS = 1_000_000
 
 
-def fate(number: int, delay_ms: float | None, *, decided: bool = True, held_ms: float = 2.0) -> Fate:
-    """A packet of one every 10 ms, from a sender 4 m away that drives east at 3 m/s; the policy delays it by 2 ms."""
+def fate(number: int, delay_ms: float | None, *, is_decided: bool = True, policy_delay_ms: float = 2.0) -> Fate:
+    """Return the fate of one packet of a flow with a packet every 10 ms.
+
+    The sender starts 4 m away and drives east at 3 m/s. The policy delays the packet by `policy_delay_ms` before it
+    enters the network, and by 5 ms after its arrival.
+    """
     sent_ns = number * 10 * MS
-    enters_ns = sent_ns + round(held_ms * MS)
+    enters_ns = sent_ns + round(policy_delay_ms * MS)
     packet = Packet(number, "a", "b", 100, ("flow", number), sent_ns, enters_ns, "udp")
-    ends = State((4.0 + 0.03 * number, 0.0, 0.0), (3.0, 0.0, 0.0)), State((0.0, 0.0, 0.0), (0.0, 4.0, 0.0))
+    end_states = State((4.0 + 0.03 * number, 0.0, 0.0), (3.0, 0.0, 0.0)), State((0.0, 0.0, 0.0), (0.0, 4.0, 0.0))
     if delay_ms is None:
-        return Fate(packet, ends, ends, reason="lost" if decided else "")
+        return Fate(packet, end_states, end_states, reason="lost" if is_decided else "")
     arrived_ns = enters_ns + round(delay_ms * MS)
-    return Fate(packet, ends, ends, arrived_ns, arrived_ns + 5 * MS)
+    return Fate(packet, end_states, end_states, arrived_ns, arrived_ns + 5 * MS)
 
 
-def run_of(*fates: Fate) -> Run:
+def run_with(*fates: Fate) -> Run:
     return Run(fates={fate.packet.identity: fate for fate in fates})
 
 
 def test_the_result_of_a_flow_follows_from_its_packets() -> None:
     (flow,) = flow_results(
-        run_of(fate(0, 1.0), fate(1, 3.0), fate(2, None), fate(3, 2.0), fate(4, None, decided=False))
+        run_with(fate(0, 1.0), fate(1, 3.0), fate(2, None), fate(3, 2.0), fate(4, None, is_decided=False))
     )
     assert (flow.sent_packets, flow.arrived_packets, flow.packets_under_way, flow.sent_bytes, flow.arrived_bytes) == (
         4,
@@ -55,25 +59,25 @@ def test_the_result_of_a_flow_follows_from_its_packets() -> None:
 
 def test_jitter_equals_that_of_the_harness_in_the_order_of_arrival() -> None:
     delays_ms = [1.0, 14.0, 2.0, 1.5, 30.0, 0.5]
-    (flow,) = flow_results(run_of(*(fate(number, delay_ms) for number, delay_ms in enumerate(delays_ms))))
-    order = np.argsort([10 * number + delay_ms for number, delay_ms in enumerate(delays_ms)])
-    assert flow.jitter_s == pytest.approx(jitter_s(np.rint(np.array(delays_ms)[order] * MS).astype(np.int64)))
+    (flow,) = flow_results(run_with(*(fate(number, delay_ms) for number, delay_ms in enumerate(delays_ms))))
+    arrival_order = np.argsort([10 * number + delay_ms for number, delay_ms in enumerate(delays_ms)])
+    assert flow.jitter_s == pytest.approx(jitter_s(np.rint(np.array(delays_ms)[arrival_order] * MS).astype(np.int64)))
 
 
 def test_values_without_arrivals_are_nan() -> None:
-    ends = fate(0, None).true_states
-    under_way = Fate(Packet(9, "a", "b", 1, ("waiting", 0), 0, 0, "tcp"), ends, ends)
-    lost, waiting = flow_results(run_of(fate(0, None), under_way))
-    assert (lost.loss, lost.arrived_bytes) == (1.0, 0)
-    assert math.isnan(waiting.loss)
-    for flow in (lost, waiting):
+    end_states = fate(0, None).true_states
+    under_way = Fate(Packet(9, "a", "b", 1, ("waiting", 0), 0, 0, "tcp"), end_states, end_states)
+    lost_flow, waiting_flow = flow_results(run_with(fate(0, None), under_way))
+    assert (lost_flow.loss, lost_flow.arrived_bytes) == (1.0, 0)
+    assert math.isnan(waiting_flow.loss)
+    for flow in (lost_flow, waiting_flow):
         assert all(
             math.isnan(value) for value in (flow.delay_s.mean, flow.jitter_s, flow.added_s, flow.first_to_last_s)
         )
 
 
-def test_a_round_trip_is_the_time_in_the_network_and_counts_when_it_is_decided() -> None:
-    """A request and a reply are lost, and one is under way; the 2 and 5 ms that the policy added do not count."""
+def test_a_round_trip_excludes_the_delays_of_the_policy_and_counts_only_decided_packets() -> None:
+    """One request and one reply are lost, and one reply is under way; the policy's 2 ms and 5 ms do not count."""
 
     def as_reply(request: Fate) -> Fate:
         packet = request.packet
@@ -81,8 +85,8 @@ def test_a_round_trip_is_the_time_in_the_network_and_counts_when_it_is_decided()
         return replace(request, packet=packet._replace(source="b", destination="a", identity=identity))
 
     requests = [fate(0, 1.0), fate(1, 2.0), fate(2, None), fate(3, 1.0), fate(4, 1.0)]
-    replies = [fate(0, 3.0), fate(1, 5.0), fate(3, None), fate(4, None, decided=False)]
-    flow, reply_flow = flow_results(run_of(*requests, *map(as_reply, replies)))
+    replies = [fate(0, 3.0), fate(1, 5.0), fate(3, None), fate(4, None, is_decided=False)]
+    flow, reply_flow = flow_results(run_with(*requests, *map(as_reply, replies)))
     trips = flow.round_trips
     assert trips is not None
     assert (trips.request_count, trips.reply_count) == (4, 2)
@@ -95,4 +99,4 @@ def test_a_round_trip_is_the_time_in_the_network_and_counts_when_it_is_decided()
 def test_flows_are_sorted_by_name_and_immutable() -> None:
     assert [flow.name for flow in flow_results(Run())] == []
     with pytest.raises(AttributeError):
-        flow_results(run_of(fate(0, 1.0)))[0].sent_packets = 3  # type: ignore[misc]
+        flow_results(run_with(fate(0, 1.0)))[0].sent_packets = 3  # type: ignore[misc]

@@ -1,4 +1,4 @@
-"""A scenario that reproduces a trial of robots: its rows against scapy's counts of its captures, and its errors."""
+"""A scenario that reproduces a trial of robots: its rows compared with scapy's counts of captures, and its errors."""
 
 from pathlib import Path
 
@@ -18,8 +18,8 @@ from tests.helpers.runs import Run, rows, run_here
 def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Run]:
     """Return the folder of a run of the shipped scenario, and its output."""
     folder = tmp_path_factory.mktemp("field")
-    on_ns3 = ("--network", "ns3", "--policy", "sliding_window", "--window", "5ms")
-    options = on_ns3 if request.param == "ns3" else ()
+    ns3_options = ("--network", "ns3", "--policy", "sliding_window", "--window", "5ms")
+    options = ns3_options if request.param == "ns3" else ()
     result = run_here(folder, "cosim", "run", "field_30ft", *options, "--out", "simulated")
     assert result.code == 0, result.err
     return folder / "simulated", result
@@ -42,9 +42,9 @@ def test_rows_have_the_identity_and_the_columns_of_the_trial(run: tuple[Path, Ru
     assert int(udp["ip_packets_sent"]) == len(fragments)
     assert int(udp["datagrams_sent"]) == sum(UDP in frame for frame in fragments) == 29
 
-    arrived = list(PcapReader(str(folder / "captures" / "receiver.pcap")))
-    first_s = next(float(frame.time) for frame in arrived if TCP in frame and frame[TCP].dport == 1234)
-    last_s = max(float(frame.time) for frame in arrived if TCP in frame and len(frame[TCP].payload))
+    received_frames = list(PcapReader(str(folder / "captures" / "receiver.pcap")))
+    first_s = next(float(frame.time) for frame in received_frames if TCP in frame and frame[TCP].dport == 1234)
+    last_s = max(float(frame.time) for frame in received_frames if TCP in frame and len(frame[TCP].payload))
     assert float(tcp["completion_s"]) == pytest.approx(last_s - first_s, abs=1e-5)
     assert tcp["tcp_congestion_control"] == "cubic"
     for row in (udp, tcp):
@@ -59,7 +59,7 @@ def test_rows_have_the_identity_and_the_columns_of_the_trial(run: tuple[Path, Ru
         assert int(row["rtt_sent"]) == len(requests) == 10
 
 
-def test_a_part_of_the_run_has_the_rows_of_what_was_sent(tmp_path: Path) -> None:
+def test_a_run_that_ends_during_a_transfer_has_a_failed_row(tmp_path: Path) -> None:
     result = run_here(tmp_path, "cosim", "run", "field_30ft", "--out", "short", "--duration", "600ms")
     assert result.code == 0, result.err
     (row,) = rows(tmp_path / "short")
@@ -79,7 +79,9 @@ def test_a_part_of_the_run_has_the_rows_of_what_was_sent(tmp_path: Path) -> None
         ({"traffic.2.start": "6s"}, "the traffic of one protocol starts before all traffic of the other protocol"),
     ],
 )
-def test_a_contradiction_to_the_procedure_is_refused(tmp_path: Path, changes: dict[str, str], message: str) -> None:
+def test_a_value_that_contradicts_the_procedure_is_refused(
+    tmp_path: Path, changes: dict[str, str], message: str
+) -> None:
     options = [word for key, value in changes.items() for word in ("--set", f"{key}={value}")]
     result = run_here(tmp_path, "cosim", "run", "field_30ft", "--out", "run", "--duration", "10ms", *options)
     assert result.code == 2
@@ -95,9 +97,14 @@ def test_the_distance_is_that_of_the_trial_in_each_topology() -> None:
 
 
 def test_a_contradiction_of_simulation_and_captures_makes_the_row_invalid() -> None:
-    measured: dict[str, Value] = {"datagrams_sent": 29, "tcp_received_bytes": 100, "reason": "text"}
-    agreeing: dict[str, Value] = {"datagrams_sent": 29, "received_bytes": 100, "sent_bytes": 7, "reason": "other"}
-    assert not differences(measured, agreeing)
-    assert differences(measured, {"received_bytes": 101}) == (
+    capture_row: dict[str, Value] = {"datagrams_sent": 29, "tcp_received_bytes": 100, "reason": "text"}
+    simulation_row: dict[str, Value] = {
+        "datagrams_sent": 29,
+        "received_bytes": 100,
+        "sent_bytes": 7,
+        "reason": "other",
+    }
+    assert not differences(capture_row, simulation_row)
+    assert differences(capture_row, {"received_bytes": 101}) == (
         "tcp_received_bytes is 100 in the captures and 101 in the simulation"
     )

@@ -1,4 +1,4 @@
-"""Tables in four formats: missing values stay missing, and CSV and JSON have SI units."""
+"""Tables in four formats: missing values are not replaced, and CSV and JSON have SI units."""
 
 import csv
 import io
@@ -22,7 +22,7 @@ SHEET = Sheet(
 )
 
 
-def test_csv_and_json_have_si_units_and_no_values_for_missing_ones(capsys: pytest.CaptureFixture[str]) -> None:
+def test_csv_and_json_have_si_units_and_leave_missing_values_empty(capsys: pytest.CaptureFixture[str]) -> None:
     SHEET.show("csv")
     rows = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
     assert [row["delay_s"] for row in rows] == ["0.0015", ""]
@@ -33,7 +33,7 @@ def test_csv_and_json_have_si_units_and_no_values_for_missing_ones(capsys: pytes
     ]
 
 
-def test_tables_have_each_part_and_each_meaning_once(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_table_shows_each_part_and_explains_each_column_once(capsys: pytest.CaptureFixture[str]) -> None:
     SHEET.show("table")
     out = capsys.readouterr().out
     assert out.count("delay: mean delay") == 1

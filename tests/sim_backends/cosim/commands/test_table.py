@@ -13,12 +13,12 @@ from sim_backends.cosim.studies.paper_claims import Claim
 from sim_backends.cosim.studies.paper_tables import PaperCell, PaperRow, Printed
 
 NAN = math.nan
-LOSS = PaperCell(Printed("10", 100, "10"), IntervalEstimate(0.07, 0.065, 0.075), 3)
-NOTHING = PaperCell(Printed("0.01"), IntervalEstimate(NAN, NAN, NAN), 0)
-WIDE = PaperCell(Printed("54.309"), IntervalEstimate(30.0, 0.0, 60.0), 3)
+LOSS_CELL = PaperCell(Printed("10", 100, "10"), IntervalEstimate(0.07, 0.065, 0.075), 3)
+EMPTY_CELL = PaperCell(Printed("0.01"), IntervalEstimate(NAN, NAN, NAN), 0)
+WIDE_CELL = PaperCell(Printed("54.309"), IntervalEstimate(30.0, 0.0, 60.0), 3)
 ROWS = [
-    PaperRow({"line": "los", "distance_m": 20, "protocol": "topic"}, NOTHING, LOSS, "out of range"),
-    PaperRow({"line": "nlos", "distance_m": 20, "protocol": "topic"}, WIDE, LOSS, ""),
+    PaperRow({"line": "los", "distance_m": 20, "protocol": "topic"}, EMPTY_CELL, LOSS_CELL, "out of range"),
+    PaperRow({"line": "nlos", "distance_m": 20, "protocol": "topic"}, WIDE_CELL, LOSS_CELL, ""),
 ]
 CLAIMS = [
     Claim("fixed window", "all", "delay", Printed("-12", 100), NAN, IntervalEstimate(-0.01, -0.02, 0.01), 5),
@@ -34,10 +34,14 @@ def test_csv_has_si_units_and_every_column(capsys: pytest.CaptureFixture[str]) -
     assert float(second["delay_off_s"]) == pytest.approx(30.0 - 54.309)
 
 
-def test_tables_have_labels_that_differ_between_rows_and_printed_digits(capsys: pytest.CaptureFixture[str]) -> None:
+def test_tables_show_only_labels_that_differ_between_rows_and_the_printed_digits(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     table.paper_sheet("title", ROWS, is_ping=False).show("table")
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert ["nlos", "54.309", "30", "0", "60", "3", "agrees", "-24.3"] in lines, "neither distance nor protocol"
+    assert ["nlos", "54.309", "30", "0", "60", "3", "agrees", "-24.3"] in lines, (
+        "all rows have the same distance and protocol"
+    )
     assert ["los", "10", "7", "6.5", "7.5", "agrees", "-3", "out", "of", "range"] in lines
 
 
@@ -46,7 +50,9 @@ def test_cells_that_agree_only_by_a_wide_interval_are_counted_separately() -> No
     assert "3 of 4 cells agree: 2 by the simulated mean, 1 only because the simulated interval is wide" in text
 
 
-def test_claims_are_next_to_the_papers_statements_and_tables(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_table_shows_claims_beside_the_statements_and_tables_of_the_paper(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     sheet = table.claim_sheet("title", CLAIMS)
     sheet.show("table")
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]

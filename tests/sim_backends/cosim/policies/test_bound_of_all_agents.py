@@ -39,7 +39,7 @@ class StateRecorder(Disc):
     extrapolates: bool
     transmitters: Sequence[str]
     fixed_emitters_m: Sequence[Vector]
-    used: list[tuple[int, Mapping[str, State]]] = field(default_factory=list)
+    assumptions: list[tuple[int, Mapping[str, State]]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         super().__init__(1e6, 3_456_789, extrapolates=self.extrapolates)
@@ -50,7 +50,7 @@ class StateRecorder(Disc):
         arrivals, drops = super().advance(to_ns, packets, states)
         for at_ns in (*(packet.enters_ns for packet in packets), *(arrival.at_ns for arrival in arrivals)):
             now = states.at(at_ns) if isinstance(states, DeadReckoned) else states
-            self.used.append((at_ns, {name: now[name] for name in NAMES if name in now}))
+            self.assumptions.append((at_ns, {name: now[name] for name in NAMES if name in now}))
         return arrivals, drops
 
 
@@ -62,7 +62,7 @@ MOTIONS = st.tuples(st.lists(PLACES, min_size=1, max_size=5), st.floats(0.05, 20
 @given(
     motions=st.tuples(MOTIONS, MOTIONS, MOTIONS, MOTIONS),
     transmitters=st.sets(st.sampled_from(["c", "d"])),
-    mast=st.booleans(),
+    has_mast=st.booleans(),
     bound_m=st.floats(0.002, 0.5),
     extrapolates=st.booleans(),
     period_ns=st.integers(STEP_NS // 3, 90 * STEP_NS),
@@ -72,16 +72,16 @@ def test_no_position_error_exceeds_the_bound(
     *,
     motions: Sequence[tuple[list[Vector], float]],
     transmitters: set[str],
-    mast: bool,
+    has_mast: bool,
     bound_m: float,
     extrapolates: bool,
     period_ns: int,
     pauses_ns: list[int],
 ) -> None:
     """The oracle is each motion itself, extrapolated between the steps of the physics."""
-    by_name = {name: WayPoints(name, *motion) for name, motion in zip(NAMES, motions, strict=True)}
-    network = StateRecorder(extrapolates, sorted(transmitters), [MAST_M] if mast else [])
-    agents = Agents(Paths([*by_name.values()]), {"a": Periodic("a", "b", period_ns=period_ns)})
+    motions_by_name = {name: WayPoints(name, *motion) for name, motion in zip(NAMES, motions, strict=True)}
+    network = StateRecorder(extrapolates, sorted(transmitters), [MAST_M] if has_mast else [])
+    agents = Agents(Paths([*motions_by_name.values()]), {"a": Periodic("a", "b", period_ns=period_ns)})
     coordinator = Coordinator(agents, network, ErrorBounded(bound_m, 0.2), [("a", "b")])
     try:
         for to_ns in sorted({*pauses_ns, END_NS}):
@@ -92,21 +92,24 @@ def test_no_position_error_exceeds_the_bound(
         assert 2 * fastest_m_s * STEP_NS / 1e9 > bound_m
 
     names = ["a", "b", *transmitters]
-    assert network.used or not extrapolates
-    for at_ns, assumed in network.used:
+    assert network.assumptions or not extrapolates
+    for at_ns, assumed_states in network.assumptions:
         step_ns = at_ns // STEP_NS * STEP_NS
-        true_m = {name: _extrapolated_m(by_name[name].at(step_ns)[name], at_ns - step_ns) for name in names}
+        true_m = {name: _extrapolated_m(motions_by_name[name].at(step_ns)[name], at_ns - step_ns) for name in names}
         errors_m = [
-            tuple(k - t for k, t in zip(assumed[name].position_m, true_m[name], strict=True)) for name in names
+            tuple(assumed - true for assumed, true in zip(assumed_states[name].position_m, true_m[name], strict=True))
+            for name in names
         ]
-        worst_m = max(math.dist(first, second) for first, second in combinations([*errors_m, (0.0, 0.0, 0.0)], 2))
-        assert worst_m <= bound_m * (1 + 1e-6) + 1e-9, f"at {at_ns} ns"
+        largest_error_m = max(
+            math.dist(first, second) for first, second in combinations([*errors_m, (0.0, 0.0, 0.0)], 2)
+        )
+        assert largest_error_m <= bound_m * (1 + 1e-6) + 1e-9, f"at {at_ns} ns"
     for fate in coordinator.run.fates.values():
         assert position_error_m(fate) <= bound_m * (1 + 1e-6) + 1e-9
 
 
-def _extrapolated_m(state: State, ns: int) -> tuple[float, ...]:
-    return tuple(x + v * ns / 1e9 for x, v in zip(state.position_m, state.velocity_m_s, strict=True))
+def _extrapolated_m(state: State, duration_ns: int) -> tuple[float, ...]:
+    return tuple(x + v * duration_ns / 1e9 for x, v in zip(state.position_m, state.velocity_m_s, strict=True))
 
 
 def test_the_host_of_a_ros_1_master_counts_because_it_sends_to_all() -> None:
@@ -151,11 +154,11 @@ def test_agents_that_forward_or_interfere_count_in_the_bound_and_in_the_errors(r
 def test_a_jammer_at_a_fixed_position_counts_if_two_robots_move_side_by_side() -> None:
     """Their distance does not change, but their distances from the jammer do."""
     motions = [WayPoints(name, [(0.0, y, 0.0), (9.0, y, 0.0)], 2.0) for name, y in (("a", 0.0), ("b", 1.0))]
-    for fixed_m, worst_m in ((), 0.0), ([MAST_M], 0.2):
-        network = StateRecorder(False, (), fixed_m)
+    for emitters_m, expected_m in ((), 0.0), ([MAST_M], 0.2):
+        network = StateRecorder(False, (), emitters_m)
         agents = Agents(Paths(motions), {"a": Periodic("a", "b", period_ns=3 * STEP_NS)})
         run = Coordinator(agents, network, Scheduled(0.1), [("a", "b")]).advance(2000 * STEP_NS)
-        assert max(map(position_error_m, run.fates.values())) == pytest.approx(worst_m, abs=0.005)
+        assert max(map(position_error_m, run.fates.values())) == pytest.approx(expected_m, abs=0.005)
 
 
 def test_a_bound_that_one_step_of_the_physics_exceeds_is_refused_with_a_remedy() -> None:

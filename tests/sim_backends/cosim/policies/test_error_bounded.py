@@ -1,4 +1,4 @@
-"""The bound of `error_bounded`: in complete runs of bodies that accelerate and collide, and in decibels."""
+"""The bound of `error_bounded` on positions, in complete runs with acceleration and collisions, and on path loss."""
 
 import math
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ END_NS = 1_200_000_000
 
 
 class Driver:
-    """Drives by a list of twists, one every 0.2 s, and publishes, by default at every step of the physics."""
+    """A program that drives by a list of twists, each for 0.2 s, and publishes, by default at every physics step."""
 
     def __init__(self, peer: str, twists: Sequence[Twist], period_ns: int = STEP_NS) -> None:
         self._peer, self._twists, self._period_ns = peer, twists, period_ns
@@ -64,7 +64,7 @@ TWISTS = st.lists(st.builds(Twist, st.floats(-1, 1), st.floats(-2, 2)), min_size
 
 @settings(max_examples=12)
 @given(TWISTS, TWISTS, st.floats(0.002, 0.3), st.booleans(), st.integers(STEP_NS, 100 * STEP_NS))
-def test_the_bound_holds_for_any_motion_and_any_collision(
+def test_no_error_exceeds_the_bound_in_any_motion_or_collision(
     a_twists: Sequence[Twist], b_twists: Sequence[Twist], bound_m: float, extrapolates: bool, period_ns: int
 ) -> None:
     bodies = Bodies(
@@ -79,15 +79,15 @@ def test_the_bound_holds_for_any_motion_and_any_collision(
         run = coordinator.advance(END_NS)
     except PolicyError:
         assert not extrapolates
-        assert bound_m < 2 * 1.0 * 0.001, "one step exceeds it"
+        assert bound_m < 2 * 1.0 * 0.001, "one step exceeds the bound"
         return
     assert len(run.fates) == END_NS // STEP_NS + -(-END_NS // period_ns)
     assert max(position_error_m(fate) for fate in run.fates.values()) <= bound_m * (1 + 1e-9)
-    assert len(run.windows_ns) < END_NS / STEP_NS, "windows are longer than a step if they can be"
+    assert len(run.windows_ns) < END_NS / STEP_NS, "some windows are longer than a step"
 
 
-def test_a_bound_is_kept_if_agents_steer_often_and_send_rarely() -> None:
-    """Positions are not used while they drive, so a window continues over any motion, and ends before they send."""
+def test_no_error_exceeds_the_bound_if_agents_steer_often_and_send_rarely() -> None:
+    """No position is used between packets, so a window may contain any motion; it ends before an agent sends."""
     bodies = Bodies({"a": DifferentialDrive(HUSKY_A200, (0.0, -8.0)), "b": DifferentialDrive(HUSKY_A200, (0.0, 8.0))})
     turns = [Twist(1.0, 2.0), Twist(1.0, -2.0)]
     agents = Agents(bodies, {"a": Driver("b", turns, 700_500_000), "b": Driver("a", [Twist(-1.0)], 700_500_000)})
@@ -103,7 +103,7 @@ def test_a_bound_is_kept_if_agents_steer_often_and_send_rarely() -> None:
 
 
 def test_a_collision_with_a_wall_does_not_exceed_the_bound() -> None:
-    """Side by side their relative position is constant, until one of them stops suddenly."""
+    """While they drive side by side, their relative position is constant, until one of them stops suddenly."""
     start = {"a": (0.0, -1.0), "b": (0.0, 6.0)}
     bodies = Bodies({name: DifferentialDrive(HUSKY_A200, place_m) for name, place_m in start.items()}, YARD)
     agents = Agents(bodies, {name: Driver(peer, [Twist(1.0)]) for name, peer in ("ab", "ba")})
@@ -115,35 +115,37 @@ def test_a_collision_with_a_wall_does_not_exceed_the_bound() -> None:
 
 
 def test_a_window_continues_while_positions_are_not_used() -> None:
-    """At 1 m/s a bound of 1 mm is one step; the window with an event begins at most one step before it."""
+    """At 1 m/s, one step reaches the bound of 1 mm; a window with an event begins at most one step before it."""
     states = {"a": State((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), "b": State((5.0, 0.0, 0.0))}
     limits = dict.fromkeys("ab", 0.0)
     policy = ErrorBounded(0.001, longest_s=0.1)
 
-    def ends_ns(now_ns: int, wake_ns: int | None, event_ns: int | None) -> int:
+    def window_end_ns(now_ns: int, wake_ns: int | None, event_ns: int | None) -> int:
         situation = Situation(
             now_ns, states, [("a", "b")], lambda: 0, lambda: event_ns, STEP_NS, limits, next_send_ns=wake_ns
         )
         return policy.next_window(situation)
 
-    assert ends_ns(0, 40_500_000, None) == 40 * STEP_NS
-    assert ends_ns(0, 90_000_000, 40_500_000) == 40 * STEP_NS
-    assert ends_ns(40 * STEP_NS, 40_500_000, None) == 41 * STEP_NS
-    assert ends_ns(0, None, None) == ends_ns(0, 10**12, None) == 100 * STEP_NS
+    assert window_end_ns(0, 40_500_000, None) == 40 * STEP_NS
+    assert window_end_ns(0, 90_000_000, 40_500_000) == 40 * STEP_NS
+    assert window_end_ns(40 * STEP_NS, 40_500_000, None) == 41 * STEP_NS
+    assert window_end_ns(0, None, None) == window_end_ns(0, 10**12, None) == 100 * STEP_NS
 
 
-def test_a_window_continues_until_the_error_leaves_less_than_a_step() -> None:
+def test_a_window_is_extended_until_less_than_a_step_of_the_bound_remains() -> None:
     """With an error rate of 1 m/s and a bound of 10 mm, the window may continue for the rest of the bound."""
     states = {"a": State((0.0, 0.0, 0.0)), "b": State((5.0, 0.0, 0.0), (1.0, 0.0, 0.0))}
     limits = dict.fromkeys("ab", 0.0)
-    begin = Situation(0, states, [("a", "b")], lambda: 0, lambda: None, STEP_NS, limits, 0, states)
+    initial_situation = Situation(0, states, [("a", "b")], lambda: 0, lambda: None, STEP_NS, limits, 0, states)
     policy = ErrorBounded(0.01, longest_s=0.1)
-    assert policy.next_window(begin) == 100 * STEP_NS, "at a constant velocity there is no error"
+    assert policy.next_window(initial_situation) == 100 * STEP_NS, "at a constant velocity there is no error"
 
     def extended_ns(error_m: float, sends_ns: int = 0) -> int:
         assumed_states = states | {"b": State((5.0 - error_m, 0.0, 0.0))}
         now_ns = 30 * STEP_NS
-        situation = replace(begin, now_ns=now_ns, assumed_states=assumed_states, next_send_ns=max(sends_ns, now_ns))
+        situation = replace(
+            initial_situation, now_ns=now_ns, assumed_states=assumed_states, next_send_ns=max(sends_ns, now_ns)
+        )
         return policy.extended_end_ns(situation)
 
     assert extended_ns(0.0) == extended_ns(0.0, 35 * STEP_NS) == 40 * STEP_NS
@@ -153,7 +155,7 @@ def test_a_window_continues_until_the_error_leaves_less_than_a_step() -> None:
     assert extended_ns(0.5, 10**12) == 100 * STEP_NS
 
 
-def loss_db(metres: float) -> float:
+def path_loss_db(metres: float) -> float:
     return 10 * EXPONENT * math.log10(max(metres, 1.0))
 
 
@@ -181,23 +183,23 @@ def window_ns(
 def test_the_path_loss_error_of_a_pair_does_not_exceed_the_bound(
     separation_m: float, speed_m_s: float, bound_db: float, course_rad: float, assumed_m_s: float
 ) -> None:
-    e_m_s, n_m_s = speed_m_s * math.cos(course_rad), speed_m_s * math.sin(course_rad)
+    east_m_s, north_m_s = speed_m_s * math.cos(course_rad), speed_m_s * math.sin(course_rad)
     try:
-        end_ns = window_ns(separation_m, (e_m_s, n_m_s, 0.0), bound_db, (assumed_m_s, 0.0, 0.0))
+        end_ns = window_ns(separation_m, (east_m_s, north_m_s, 0.0), bound_db, (assumed_m_s, 0.0, 0.0))
     except PolicyError:
         bound_m = max(separation_m, 1.0) * (1 - 10 ** (-bound_db / (10 * EXPONENT)))
-        assert math.hypot(e_m_s - assumed_m_s, n_m_s) * 0.001 > bound_m, "one step exceeds it"
+        assert math.hypot(east_m_s - assumed_m_s, north_m_s) * 0.001 > bound_m, "one step exceeds the bound"
         return
     if end_ns == STEP_NS:
-        return  # the window of one step, in which nothing changes
-    true_m = math.hypot(separation_m + e_m_s * end_ns / 1e9, n_m_s * end_ns / 1e9)
-    assumed_m = abs(separation_m + assumed_m_s * end_ns / 1e9)
-    assert abs(loss_db(true_m) - loss_db(assumed_m)) <= bound_db * (1 + 1e-9)
+        return  # states are constant within a window of one step
+    true_distance_m = math.hypot(separation_m + east_m_s * end_ns / 1e9, north_m_s * end_ns / 1e9)
+    assumed_distance_m = abs(separation_m + assumed_m_s * end_ns / 1e9)
+    assert abs(path_loss_db(true_distance_m) - path_loss_db(assumed_distance_m)) <= bound_db * (1 + 1e-9)
 
 
-def test_a_direct_approach_uses_the_whole_bound() -> None:
+def test_a_window_during_a_direct_approach_ends_when_the_error_equals_the_bound() -> None:
     end_ns = window_ns(50.0, (-2.0, 0.0, 0.0), 1.0)
-    assert loss_db(50.0) - loss_db(50.0 - 2.0 * end_ns / 1e9) == pytest.approx(1.0, rel=0.001)
+    assert path_loss_db(50.0) - path_loss_db(50.0 - 2.0 * end_ns / 1e9) == pytest.approx(1.0, rel=0.001)
 
 
 @pytest.mark.parametrize("values", [{"bound_m": 0.0}, {"bound_db": -1.0}, {"exponent": math.nan}])

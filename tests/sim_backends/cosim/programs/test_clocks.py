@@ -1,4 +1,4 @@
-"""Clocks that are wrong for a time, and programs that have no other clock."""
+"""Clocks that are wrong during an interval, and programs that read only such a clock."""
 
 from collections.abc import Sequence
 from fractions import Fraction
@@ -18,8 +18,8 @@ ORIGIN = State((0.0, 0.0, 0.0))
 MS = 1_000_000
 TIMES = st.integers(0, 10**11)
 CLOCKS = st.builds(
-    lambda begin_ns, lasts_ns, offset_ns, rate_ppb: AgentClock(
-        begin_ns, None if lasts_ns is None else begin_ns + lasts_ns, offset_ns, rate_ppb
+    lambda begin_ns, duration_ns, offset_ns, rate_ppb: AgentClock(
+        begin_ns, None if duration_ns is None else begin_ns + duration_ns, offset_ns, rate_ppb
     ),
     TIMES,
     st.none() | st.integers(1, 10**11),
@@ -30,19 +30,22 @@ CLOCKS = st.builds(
 
 @given(CLOCKS, TIMES)
 def test_the_reading_of_a_clock_follows_from_offset_and_rate(clock: AgentClock, now_ns: int) -> None:
-    wrong = clock.begin_ns <= now_ns and (clock.end_ns is None or now_ns < clock.end_ns)
-    exact = now_ns + wrong * (clock.offset_ns + Fraction(clock.rate_ppb, 10**9) * (now_ns - clock.begin_ns))
-    assert 0 <= exact - clock.reading_ns(now_ns) < 1
+    is_wrong = clock.begin_ns <= now_ns and (clock.end_ns is None or now_ns < clock.end_ns)
+    exact_ns = now_ns + is_wrong * (clock.offset_ns + Fraction(clock.rate_ppb, 10**9) * (now_ns - clock.begin_ns))
+    assert 0 <= exact_ns - clock.reading_ns(now_ns) < 1
 
 
 @given(CLOCKS, TIMES)
-def test_first_ns_is_the_first_time_at_which_the_clock_shows_a_reading(clock: AgentClock, shown_ns: int) -> None:
-    first_ns = clock.first_ns(shown_ns)
-    assert clock.reading_ns(first_ns) >= shown_ns
-    # Within an interval the reading never decreases, so the nanosecond before is the latest of all before.
-    edges = [at_ns for at_ns in (clock.begin_ns, clock.end_ns) if at_ns is not None]
-    before = [at_ns - 1 for at_ns in (first_ns, *edges) if 0 < at_ns <= first_ns]
-    assert all(clock.reading_ns(at_ns) < shown_ns for at_ns in before)
+def test_first_ns_is_the_first_time_at_which_the_clock_shows_a_reading(
+    clock: AgentClock, shown_reading_ns: int
+) -> None:
+    first_ns = clock.first_ns(shown_reading_ns)
+    assert clock.reading_ns(first_ns) >= shown_reading_ns
+    # Within an interval the reading never decreases, so only the last nanosecond before `first_ns` and before each
+    # border of an interval needs a check.
+    borders_ns = [at_ns for at_ns in (clock.begin_ns, clock.end_ns) if at_ns is not None]
+    last_times_ns = [at_ns - 1 for at_ns in (first_ns, *borders_ns) if 0 < at_ns <= first_ns]
+    assert all(clock.reading_ns(at_ns) < shown_reading_ns for at_ns in last_times_ns)
 
 
 @pytest.mark.parametrize("rate_ppb", [-(10**9), -2 * 10**9])
@@ -53,7 +56,7 @@ def test_a_clock_that_stops_or_runs_backwards_is_refused(rate_ppb: int) -> None:
 
 
 class Listener:
-    """Keeps received datagrams with the time of its own clock."""
+    """Records received datagrams with the readings of its clock."""
 
     def __init__(self) -> None:
         self.received: list[tuple[int, ReceivedDatagram]] = []
@@ -66,7 +69,7 @@ class Listener:
         return Action()
 
 
-def sent(program: Program, to_ns: int) -> list[tuple[int, Datagram]]:
+def sent_datagrams(program: Program, to_ns: int) -> list[tuple[int, Datagram]]:
     """Run a program alone, and return the datagrams that it sends, each with the true time."""
     datagrams = []
     while (wake_ns := program.next_wake_ns()) is not None and wake_ns <= to_ns:
@@ -76,7 +79,7 @@ def sent(program: Program, to_ns: int) -> list[tuple[int, Datagram]]:
 
 def test_a_program_with_a_fast_clock_sends_more_often_and_stamps_the_reading() -> None:
     fast = AgentClock(rate_ppb=100_000_000)
-    packets = sent(ProgramWithClock(Periodic("a", "b", period_ns=11 * MS), fast), 100 * MS)
+    packets = sent_datagrams(ProgramWithClock(Periodic("a", "b", period_ns=11 * MS), fast), 100 * MS)
     assert [at_ns for at_ns, _ in packets] == [number * 10 * MS for number in range(11)]
     listener = Listener()
     slow = AgentClock(offset_ns=-5 * MS)
@@ -89,12 +92,16 @@ def test_a_program_with_a_fast_clock_sends_more_often_and_stamps_the_reading() -
     ]
 
 
-def test_after_a_clock_was_set_right_no_datagram_is_repeated_or_sent_later() -> None:
-    ahead = AgentClock(begin_ns=20 * MS, end_ns=50 * MS, offset_ns=15 * MS)
-    times_ns = [at_ns for at_ns, _ in sent(ProgramWithClock(Periodic("a", "b", period_ns=10 * MS), ahead), 100 * MS)]
-    # The reading is 35 ms at 20 ms. At 50 ms it is 50 again after it has been 60, so the next datagram is due at 70.
+def test_the_correction_of_a_clock_neither_repeats_nor_delays_a_datagram() -> None:
+    fast_clock = AgentClock(begin_ns=20 * MS, end_ns=50 * MS, offset_ns=15 * MS)
+    times_ns = [
+        at_ns
+        for at_ns, _ in sent_datagrams(ProgramWithClock(Periodic("a", "b", period_ns=10 * MS), fast_clock), 100 * MS)
+    ]
+    # The reading is 35 ms at 20 ms, and 60 ms at 45 ms. At 50 ms it falls from 65 ms to 50 ms, so the datagram after
+    # the one at the reading 60 ms is sent at 70 ms.
     assert times_ns == [0, 10 * MS, 20 * MS, 25 * MS, 35 * MS, 45 * MS, 70 * MS, 80 * MS, 90 * MS, 100 * MS]
-    behind = AgentClock(end_ns=10_000 * MS, offset_ns=-9_000 * MS)
-    packets = sent(ProgramWithClock(Periodic("a", "b", period_ns=MS), behind), 10_001 * MS)
+    slow_clock = AgentClock(end_ns=10_000 * MS, offset_ns=-9_000 * MS)
+    packets = sent_datagrams(ProgramWithClock(Periodic("a", "b", period_ns=MS), slow_clock), 10_001 * MS)
     assert [at_ns for at_ns, _ in packets[-3:]] == [9_999 * MS, 10_000 * MS, 10_001 * MS]
     assert [datagram.number for _, datagram in packets] == list(range(len(packets)))

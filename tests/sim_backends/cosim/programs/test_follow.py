@@ -1,4 +1,4 @@
-"""Programs that follow others: their commands with and without received states."""
+"""Programs that follow other agents: their commands with and without received states."""
 
 import math
 
@@ -27,7 +27,7 @@ MS = 1_000_000
 S = 1000 * MS
 
 
-def state_of(
+def received_state(
     place_m: Vector, velocity_m_s: Vector = (0.0, 0.0, 0.0), *, sent_ns: int = 0, source: str = "a"
 ) -> ReceivedDatagram:
     return ReceivedDatagram(source, State(place_m, velocity_m_s), sent_ns, sent_ns)
@@ -37,11 +37,11 @@ FOLLOWER_STATE = State((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0)
 
 
 def test_the_state_of_a_leader_is_extrapolated_from_its_time_stamp() -> None:
-    """At 5 m and 1 m/s 0.3 s ago it is at 5.3 m, which is 3.3 m more than the desired 2 m at standstill."""
+    """A leader that was at 5 m with 1 m/s 0.3 s ago is at 5.3 m: 3.3 m more than the desired 2 m at standstill."""
     program = FollowAtHeadway("a", headway_s=0.5, standstill_m=2.0, gain_per_s=0.4)
     program.wake(0, FOLLOWER_STATE, [])
     twist = program.wake(
-        350 * MS, FOLLOWER_STATE, [state_of((5.0, 0.0, 0.0), (1.0, 0.0, 0.0), sent_ns=50 * MS)]
+        350 * MS, FOLLOWER_STATE, [received_state((5.0, 0.0, 0.0), (1.0, 0.0, 0.0), sent_ns=50 * MS)]
     ).command
     acceleration_m_s2 = (1.0 + 0.4 * 3.3) / 0.5
     assert (twist.forward_m_s, twist.turn_rad_s) == pytest.approx((0.05 * acceleration_m_s2, 0.0))
@@ -49,21 +49,23 @@ def test_the_state_of_a_leader_is_extrapolated_from_its_time_stamp() -> None:
 
 def test_older_states_and_other_datagrams_are_ignored() -> None:
     program = FollowAtHeadway("a")
-    latest = state_of((5.0, 0.0, 0.0), sent_ns=40 * MS)
+    latest = received_state((5.0, 0.0, 0.0), sent_ns=40 * MS)
     expected = FollowAtHeadway("a").wake(50 * MS, FOLLOWER_STATE, [latest])
-    ignored = [
-        state_of((9.0, 0.0, 0.0), sent_ns=30 * MS),
-        state_of((9.0, 0.0, 0.0), source="b", sent_ns=50 * MS),
+    ignored_datagrams = [
+        received_state((9.0, 0.0, 0.0), sent_ns=30 * MS),
+        received_state((9.0, 0.0, 0.0), source="b", sent_ns=50 * MS),
         ReceivedDatagram("a", "hello", 50 * MS, 50 * MS),
     ]
-    assert program.wake(50 * MS, FOLLOWER_STATE, [latest, *ignored]) == expected
+    assert program.wake(50 * MS, FOLLOWER_STATE, [latest, *ignored_datagrams]) == expected
 
 
 @pytest.mark.parametrize(
     ("place_m", "command"), [((-5.0, 0.0, 0.0), Twist(0.0, 2 * math.pi)), ((0.0, 0.0, 0.0), Twist())]
 )
-def test_it_turns_to_a_leader_behind_it_and_stops_at_one_in_its_position(place_m: Vector, command: Twist) -> None:
-    actual = FollowAtHeadway("a").wake(0, FOLLOWER_STATE, [state_of(place_m)]).command
+def test_a_follower_turns_to_a_leader_behind_it_and_stops_if_they_have_the_same_position(
+    place_m: Vector, command: Twist
+) -> None:
+    actual = FollowAtHeadway("a").wake(0, FOLLOWER_STATE, [received_state(place_m)]).command
     assert (actual.forward_m_s, abs(actual.turn_rad_s)) == pytest.approx((command.forward_m_s, command.turn_rad_s))
 
 
@@ -93,7 +95,7 @@ def test_a_follower_stops_without_states_and_continues_when_it_receives_them_aga
     assert speed_m_s(14_000 * MS) > 0.5
 
 
-def test_a_drone_that_holds_station_flies_above_the_centre_of_its_leaders() -> None:
+def test_a_drone_that_keeps_station_flies_above_the_centre_of_its_leaders() -> None:
     bodies = Bodies(
         {
             "a": DifferentialDrive(HUSKY_A200, (4.0, 0.0), antenna_m=0.0),
@@ -119,20 +121,22 @@ def test_a_drone_that_holds_station_flies_above_the_centre_of_its_leaders() -> N
     assert states["uav"].velocity_m_s == pytest.approx((0.8, 0.0, 0.0), abs=0.01)
 
 
-def test_a_drone_that_holds_station_hovers_without_states() -> None:
+def test_a_drone_that_keeps_station_hovers_without_states() -> None:
     program = HoldStation(["a", "b"], above_m=8.0, gain_per_s=1.0, timeout_ns=S)
     assert program.wake(0, FOLLOWER_STATE, []).command == Velocity()
     velocity = program.wake(
-        50 * MS, FOLLOWER_STATE, [state_of((2.0, 0.0, -8.0), (0.3, 0.0, 0.0), sent_ns=50 * MS)]
+        50 * MS, FOLLOWER_STATE, [received_state((2.0, 0.0, -8.0), (0.3, 0.0, 0.0), sent_ns=50 * MS)]
     ).command
     assert velocity.velocity_m_s == pytest.approx((2.3, 0.0, 0.0))
     assert program.wake(2 * S, FOLLOWER_STATE, []).command == Velocity()
 
 
-@pytest.mark.parametrize("wrong", [{"headway_s": 0.0}, {"standstill_m": -1.0}, {"period_ns": 0}, {"timeout_ns": 0}])
-def test_parameters_that_are_not_above_0_are_refused(wrong: dict[str, float]) -> None:
+@pytest.mark.parametrize(
+    "invalid_parameters", [{"headway_s": 0.0}, {"standstill_m": -1.0}, {"period_ns": 0}, {"timeout_ns": 0}]
+)
+def test_parameters_that_are_not_above_0_are_refused(invalid_parameters: dict[str, float]) -> None:
     with pytest.raises(ConfigurationError, match="above 0"):
-        FollowAtHeadway("a", **wrong)  # type: ignore[arg-type]
+        FollowAtHeadway("a", **invalid_parameters)  # type: ignore[arg-type]
     with pytest.raises(ConfigurationError, match="cannot fly"):
         HoldStation(["a"], above_m=0.0)
     with pytest.raises(ConfigurationError, match="no agent to follow"):
@@ -143,10 +147,10 @@ def test_a_profile_commands_its_legs_in_order_and_stops() -> None:
     bodies = Bodies({"a": DifferentialDrive(HUSKY_A200, (0.0, 0.0))})
     legs = [ProfileLeg(2 * S, Twist(0.9)), ProfileLeg(S, Twist(0.3, 0.5))]
     agents = Agents(bodies, {"a": VelocityProfile(legs, begin_ns=S)})
-    speeds = []
+    speeds_m_s = []
     for at_s in range(6):
         _, states = agents.advance((at_s - 1) * S, at_s * S - 1, at_s * S)
-        speeds.append(math.hypot(*states["a"].velocity_m_s))
-    assert speeds == pytest.approx([0.0, 0.0, 0.9, 0.9, 0.3, 0.0])
+        speeds_m_s.append(math.hypot(*states["a"].velocity_m_s))
+    assert speeds_m_s == pytest.approx([0.0, 0.0, 0.9, 0.9, 0.3, 0.0])
     with pytest.raises(ConfigurationError, match="has no duration"):
         VelocityProfile([])

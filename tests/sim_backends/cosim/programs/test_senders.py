@@ -1,4 +1,4 @@
-"""Programs that play bags, send files and pings, combined, and while their computer is off."""
+"""Programs that play bags, send files and send pings; combined programs, and programs on a computer that is off."""
 
 from collections.abc import Sequence
 
@@ -28,7 +28,7 @@ ORIGIN = State((0.0, 0.0, 0.0))
 MS = 1_000_000
 
 
-def sent(program: Program, to_ns: int) -> list[tuple[int, Datagram]]:
+def sent_datagrams(program: Program, to_ns: int) -> list[tuple[int, Datagram]]:
     """Run a program alone, and return the datagrams that it sends, each with its time."""
     datagrams = []
     while (wake_ns := program.next_wake_ns()) is not None and wake_ns <= to_ns:
@@ -37,7 +37,7 @@ def sent(program: Program, to_ns: int) -> list[tuple[int, Datagram]]:
 
 
 @given(st.integers(0, 10 * MS), st.floats(1, 1000), st.integers(0, 2**32))
-def test_a_recorded_bag_has_the_length_of_its_rate_and_delays_up_to_its_jitter(
+def test_a_generated_bag_has_the_message_count_of_its_rate_and_delays_up_to_its_jitter(
     jitter_ns: int, rate_hz: float, seed: int
 ) -> None:
     bag = generated_bag(
@@ -45,10 +45,10 @@ def test_a_recorded_bag_has_the_length_of_its_rate_and_delays_up_to_its_jitter(
     )
     assert len(bag) == round(0.5 * rate_hz)
     assert bag == sorted(bag, key=lambda message: message.at_ns)
-    # A message may have the delay of an earlier one, as the order is kept.
-    late_ns = [message.at_ns - round(number / rate_hz * 1e9) for number, message in enumerate(bag)]
-    assert all(0 <= late <= jitter_ns for late in late_ns)
-    assert len(set(late_ns)) > 1 or len(bag) < 2 or jitter_ns < 1000
+    # Messages keep their order, so a message may have the delay of an earlier one.
+    delays_ns = [message.at_ns - round(number / rate_hz * 1e9) for number, message in enumerate(bag)]
+    assert all(0 <= delay_ns <= jitter_ns for delay_ns in delays_ns)
+    assert len(set(delays_ns)) > 1 or len(bag) < 2 or jitter_ns < 1000
 
 
 def test_a_message_of_the_papers_bag_has_the_size_of_a_serialized_ros_message() -> None:
@@ -73,7 +73,7 @@ def test_a_message_of_the_papers_bag_has_the_size_of_a_serialized_ros_message() 
 
 def test_playback_sends_each_message_at_its_time() -> None:
     bag = [BagMessage(0, 10), BagMessage(3 * MS, 20), BagMessage(3 * MS, 30), BagMessage(9 * MS, 40)]
-    packets = sent(Playback("f", "b", bag, begin_ns=5 * MS, protocol="tcp"), 100 * MS)
+    packets = sent_datagrams(Playback("f", "b", bag, begin_ns=5 * MS, protocol="tcp"), 100 * MS)
     assert [(at_ns, datagram.size_bytes, datagram.number) for at_ns, datagram in packets] == [
         (5 * MS, 10, 0),
         (8 * MS, 20, 1),
@@ -94,24 +94,26 @@ def test_a_file_in_pieces_is_complete(size_bytes: int, piece_bytes: int) -> None
 
 
 def test_a_ping_sends_its_requests_and_every_request_gets_an_equal_reply() -> None:
-    requests = sent(
+    requests = sent_datagrams(
         EchoRequester("p/b", "b", count=3, interval_ns=100 * MS, size_bytes=56, first_ns=MS, protocol="tcp"), 10**12
     )
     assert [at_ns for at_ns, _ in requests] == [MS, 101 * MS, 201 * MS]
-    arrived = [ReceivedDatagram("a", request.payload, at_ns, at_ns + MS) for at_ns, request in requests]
-    other = ReceivedDatagram("a", ORIGIN, 0, MS)
-    replies = EchoResponder().wake(202 * MS, ORIGIN, [*arrived, other]).datagrams
+    received_requests = [ReceivedDatagram("a", request.payload, at_ns, at_ns + MS) for at_ns, request in requests]
+    other_datagram = ReceivedDatagram("a", ORIGIN, 0, MS)
+    replies = EchoResponder().wake(202 * MS, ORIGIN, [*received_requests, other_datagram]).datagrams
     assert replies == [Datagram("a", 56, "p/b/reply", number, None, "tcp") for number in range(3)]
     assert all(isinstance(request.payload, PingRequest) for _, request in requests)
 
 
 def test_a_periodic_program_stops_at_its_stop_time() -> None:
-    packets = sent(Periodic("f", "b", period_ns=10 * MS, first_ns=5 * MS, stop_ns=25 * MS, protocol="tcp"), 10**12)
+    packets = sent_datagrams(
+        Periodic("f", "b", period_ns=10 * MS, first_ns=5 * MS, stop_ns=25 * MS, protocol="tcp"), 10**12
+    )
     assert [at_ns for at_ns, _ in packets] == [5 * MS, 15 * MS]
 
 
 class CommandingProgram:
-    """Gives a command at given times, and keeps received datagrams."""
+    """Returns a command at each planned wake time, and records received datagrams."""
 
     def __init__(self, command: str, *wakes_ns: int) -> None:
         self._command = command
@@ -136,9 +138,9 @@ def test_combined_programs_wake_at_their_own_times_and_receive_all_datagrams() -
     while (wake_ns := program.next_wake_ns()) is not None:
         commands.append((wake_ns, program.wake(wake_ns, ORIGIN, ()).command))
     assert commands == [(3, "first"), (5, "second"), (7, "second")]
-    received = [ReceivedDatagram("a", None, 0, 9)]
-    assert program.wake(9, ORIGIN, received) == Action()
-    assert first.received == second.received == received
+    received_datagrams = [ReceivedDatagram("a", None, 0, 9)]
+    assert program.wake(9, ORIGIN, received_datagrams) == Action()
+    assert first.received == second.received == received_datagrams
     # With a fast clock a program may wake later than planned.
     assert (
         CombinedProgram([CommandingProgram("first", 3), CommandingProgram("second", 5)]).wake(4, ORIGIN, ()).command
@@ -147,8 +149,8 @@ def test_combined_programs_wake_at_their_own_times_and_receive_all_datagrams() -
 
 
 def test_a_computer_that_is_off_receives_and_sends_nothing_and_stops_its_body() -> None:
-    sends, steers = Periodic("f", "b", period_ns=10), CommandingProgram("go", 5, 15, 35)
-    program = Outage(CombinedProgram([sends, steers]), 12, 31, "stop")
+    sender, driver = Periodic("f", "b", period_ns=10), CommandingProgram("go", 5, 15, 35)
+    program = Outage(CombinedProgram([sender, driver]), 12, 31, "stop")
     actions = []
     while (wake_ns := program.next_wake_ns()) is not None and wake_ns <= 50:
         action = program.wake(wake_ns, ORIGIN, ())
@@ -165,12 +167,12 @@ def test_a_computer_that_is_off_receives_and_sends_nothing_and_stops_its_body() 
         (40, [4], None),
         (50, [5], None),
     ]
-    during, after = ReceivedDatagram("a", 1, 0, 29), ReceivedDatagram("a", 2, 0, 31)
-    outage = Outage(steers, 12, 31)
-    assert outage.wake(29, ORIGIN, [during]) == Action()
-    outage.wake(31, ORIGIN, [after])
-    assert steers.received == [after]
+    datagram_while_off, datagram_when_on = ReceivedDatagram("a", 1, 0, 29), ReceivedDatagram("a", 2, 0, 31)
+    outage = Outage(driver, 12, 31)
+    assert outage.wake(29, ORIGIN, [datagram_while_off]) == Action()
+    outage.wake(31, ORIGIN, [datagram_when_on])
+    assert driver.received == [datagram_when_on]
 
 
-def test_a_computer_without_an_end_of_its_outage_stays_off() -> None:
-    assert [at_ns for at_ns, _ in sent(Outage(Periodic("f", "b", period_ns=10), 12, None), 100)] == [0, 10]
+def test_a_computer_whose_outage_has_no_end_stays_off() -> None:
+    assert [at_ns for at_ns, _ in sent_datagrams(Outage(Periodic("f", "b", period_ns=10), 12, None), 100)] == [0, 10]

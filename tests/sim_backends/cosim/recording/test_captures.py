@@ -1,4 +1,4 @@
-"""Captures as scapy and tcpdump read them: the packets that each robot sent and received, exact in every bit."""
+"""Captures, read by scapy and tcpdump, contain the packets that each robot sent and received, exact in every bit."""
 
 import os
 import re
@@ -42,7 +42,7 @@ ADDRESSES = {name: f"10.0.0.{number}" for number, name in enumerate(NAMES, start
 
 
 @dataclass(frozen=True)
-class Recorded:
+class RecordedRun:
     """A recording of a run, and the packets that the network logged.
 
     Attributes:
@@ -55,7 +55,7 @@ class Recorded:
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+def recorded_run(tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
     """Three robots send over links with 10 % loss: UDP in fragments, and TCP with retransmissions."""
     folder = tmp_path_factory.mktemp("captures") / "run"
     links: UniformLinks[Fragment] = UniformLinks(
@@ -72,26 +72,26 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     log: list[tuple[int, str, Fragment]] = []
     with RunRecorder(folder, ABOUT, snap_bytes=65535, part_every_s=0.02) as recorder:
 
-        def log_twice(at_ns: int, host: str, fragment: Fragment) -> None:
+        def log_and_record(at_ns: int, host: str, fragment: Fragment) -> None:
             log.append((at_ns, host, fragment))
             recorder.log_ip(at_ns, host, fragment)
 
-        network.log_ip(log_twice)
+        network.log_ip(log_and_record)
         Coordinator(Agents(physics, programs), network, EventDriven(), pairs, observer=recorder).advance(700 * MS)
     assert read_recording(folder).run.fates
-    return Recorded(folder, log)
+    return RecordedRun(folder, log)
 
 
-def dissected(recorded: Recorded, name: str) -> list[Packet]:
-    return list(PcapReader(str(recorded.folder / "captures" / f"{name}.pcap")))
+def dissect(recorded_run: RecordedRun, name: str) -> list[Packet]:
+    return list(PcapReader(str(recorded_run.folder / "captures" / f"{name}.pcap")))
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_scapy_reads_the_packets_that_the_network_logged(recorded: Recorded, name: str) -> None:
-    frames = dissected(recorded, name)
-    logged = [(at_ns, fragment) for at_ns, host, fragment in recorded.log if host == name]
-    assert len(frames) == len(logged) > 100
-    for frame, (at_ns, fragment) in zip(frames, logged, strict=True):
+def test_scapy_reads_the_packets_that_the_network_logged(recorded_run: RecordedRun, name: str) -> None:
+    frames = dissect(recorded_run, name)
+    logged_fragments = [(at_ns, fragment) for at_ns, host, fragment in recorded_run.log if host == name]
+    assert len(frames) == len(logged_fragments) > 100
+    for frame, (at_ns, fragment) in zip(frames, logged_fragments, strict=True):
         packet = fragment.packet
         assert packet.destination is not None
         ip = frame[IP]
@@ -100,18 +100,18 @@ def test_scapy_reads_the_packets_that_the_network_logged(recorded: Recorded, nam
         assert (ip.len, len(frame), ip.id) == (fragment.size_bytes, fragment.size_bytes, fragment.ip_id % 65536)
         assert (ip.frag * 8, "MF" in ip.flags) == (fragment.offset_bytes, fragment.index + 1 < fragment.count)
         if packet.transport == "tcp":
-            check_tcp(ip[TCP], packet.body[1], forth=packet.source == "bravo")
+            check_tcp(ip[TCP], packet.body[1], is_forward=packet.source == "bravo")
         elif not fragment.index:
             assert ip[UDP].len == packet.size_bytes - 20
 
 
-def check_tcp(tcp: Packet, segment: Segment, *, forth: bool) -> None:
+def check_tcp(tcp: Packet, segment: Segment, *, is_forward: bool) -> None:
     options: Mapping[str, Any] = dict(tcp.options)
     assert (tcp.seq, tcp.ack) == (segment.first, segment.acknowledges or 0)
     flags = {"S": segment.syn, "A": segment.acknowledges is not None, "P": bool(segment.length)}
     assert {flag: flag in tcp.flags for flag in flags} == flags
     assert not set(str(tcp.flags)) - set(flags)
-    assert tcp.dport == 40001 if forth else tcp.sport == 40001, "the second flow of the run"
+    assert tcp.dport == 40001 if is_forward else tcp.sport == 40001, "the second flow of the run"
     assert options["Timestamp"] == (segment.sent_ns // MS, (segment.echoes_ns or 0) // MS)
     assert len(tcp.payload) == segment.length
     assert options.get("SAck", ()) == tuple(edge for block in segment.sacks for edge in block)
@@ -123,48 +123,50 @@ def check_tcp(tcp: Packet, segment: Segment, *, forth: bool) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_checksums_equal_those_that_scapy_computes(recorded: Recorded, name: str) -> None:
-    packets = [frame[IP] for frame in dissected(recorded, name)]
+def test_checksums_equal_those_that_scapy_computes(recorded_run: RecordedRun, name: str) -> None:
+    packets = [frame[IP] for frame in dissect(recorded_run, name)]
     for packet in packets:
-        assert packet.chksum == rebuilt(packet, IP).chksum
-    whole = [packet for packet in packets if not packet.frag and "MF" not in packet.flags]
-    together = reassembled(packets)
-    assert bool(together) == (name in {"alpha", "bravo"}), "both ends of the packets that need fragments"
-    for packet in whole + together:
+        assert packet.chksum == with_scapy_checksum(packet, IP).chksum
+    unfragmented = [packet for packet in packets if not packet.frag and "MF" not in packet.flags]
+    reassembled_packets = reassemble(packets)
+    assert bool(reassembled_packets) == (name in {"alpha", "bravo"}), "both ends of the packets that need fragments"
+    for packet in unfragmented + reassembled_packets:
         kind = TCP if TCP in packet else UDP
-        assert packet[kind].chksum == rebuilt(packet, kind)[kind].chksum
+        assert packet[kind].chksum == with_scapy_checksum(packet, kind)[kind].chksum
 
 
-def rebuilt(packet: Packet, kind: type[Packet]) -> Packet:
+def with_scapy_checksum(packet: Packet, kind: type[Packet]) -> Packet:
     """Return a packet with a checksum that scapy has computed."""
-    copy = IP(bytes(packet))
-    del copy[kind].chksum
-    return IP(bytes(copy))
+    packet_copy = IP(bytes(packet))
+    del packet_copy[kind].chksum
+    return IP(bytes(packet_copy))
 
 
-def reassembled(packets: Sequence[Packet]) -> list[Packet]:
-    """Return the packets of which all fragments were captured, reassembled."""
+def reassemble(packets: Sequence[Packet]) -> list[Packet]:
+    """Reassemble the packets whose fragments were all captured."""
     parts: dict[tuple[str, int], dict[int, Packet]] = {}
     for packet in packets:
         if packet.frag or "MF" in packet.flags:
             parts.setdefault((packet.src, packet.id), {})[packet.frag * 8] = packet
-    complete: list[Packet] = []
-    for by_offset in parts.values():
-        last = by_offset[max(by_offset)]
-        data = b"".join(bytes(by_offset[offset].payload) for offset in sorted(by_offset))
-        if "MF" not in last.flags and len(data) == max(by_offset) + len(last.payload):
-            complete.append(IP(bytes(IP(src=last.src, dst=last.dst, proto=last.proto) / data)))
-    return complete
+    whole_packets: list[Packet] = []
+    for fragments_by_offset in parts.values():
+        last_fragment = fragments_by_offset[max(fragments_by_offset)]
+        data = b"".join(bytes(fragments_by_offset[offset].payload) for offset in sorted(fragments_by_offset))
+        if "MF" not in last_fragment.flags and len(data) == max(fragments_by_offset) + len(last_fragment.payload):
+            whole_packets.append(
+                IP(bytes(IP(src=last_fragment.src, dst=last_fragment.dst, proto=last_fragment.proto) / data))
+            )
+    return whole_packets
 
 
 @pytest.mark.emulated
-def test_tcpdump_reports_every_checksum_as_correct(recorded: Recorded) -> None:
+def test_tcpdump_reports_every_checksum_as_correct(recorded_run: RecordedRun) -> None:
     for name in NAMES:
-        command = ["tcpdump", "-n", "-vv", "-r", str(recorded.folder / "captures" / f"{name}.pcap")]
+        command = ["tcpdump", "-n", "-vv", "-r", str(recorded_run.folder / "captures" / f"{name}.pcap")]
         result = subprocess.run(command, capture_output=True, text=True, check=True)
         assert "link-type RAW (Raw IP)" in result.stderr
         assert not re.findall("bad|incorrect|truncated|wrong|invalid", result.stdout)
-    # The last capture, carol's, has all of bravo's TCP, with losses.
+    # The last capture is that of carol, who receives bravo's TCP connection with its losses.
     assert result.stdout.count("(correct)") > 100
     assert re.search(r"options \[nop,nop,TS val \d+ ecr \d+,nop,nop,sack 1 \{\d+:\d+\}\]", result.stdout)
     assert re.search(r"Flags \[S\.\], .* options \[mss 1460,sackOK,TS val \d+ ecr \d+,nop,wscale 7\]", result.stdout)
@@ -175,25 +177,29 @@ def test_the_robots_of_a_scenario_capture_the_packets_of_their_network(tmp_path:
     with RunRecorder(tmp_path / "run", ABOUT) as recorder:
         run = build(scenario, policy="scheduled", recorder=recorder).run(2000 * MS)
     assert read_recording(tmp_path / "run").run == run
-    captured = {path.stem: len(list(PcapReader(str(path)))) for path in (tmp_path / "run" / "captures").iterdir()}
-    assert captured.keys() == scenario.agents.keys()
-    arrived = sum(fate.arrived_ns is not None for fate in run.fates.values())
-    assert sum(captured.values()) >= len(run.fates) + arrived > 10, "each packet at its sender, and at its receiver"
+    packet_counts = {
+        path.stem: len(list(PcapReader(str(path)))) for path in (tmp_path / "run" / "captures").iterdir()
+    }
+    assert packet_counts.keys() == scenario.agents.keys()
+    arrived_count = sum(fate.arrived_ns is not None for fate in run.fates.values())
+    assert sum(packet_counts.values()) >= len(run.fates) + arrived_count > 10, (
+        "each packet at its sender, and at its receiver"
+    )
 
 
-class LosesEveryThird(Disc):
+class EveryThirdPacketLost(Disc):
     def advance(
         self, to_ns: int, packets: Sequence[NetworkPacket], states: Mapping[str, State]
     ) -> tuple[list[Arrival], list[Drop]]:
-        lost = [packet for packet in packets if packet.packet_id % 3 == 0]
-        arrivals, _ = super().advance(to_ns, [packet for packet in packets if packet not in lost], states)
-        return arrivals, [Drop(packet.packet_id, "third") for packet in lost]
+        lost_packets = [packet for packet in packets if packet.packet_id % 3 == 0]
+        arrivals, _ = super().advance(to_ns, [packet for packet in packets if packet not in lost_packets], states)
+        return arrivals, [Drop(packet.packet_id, "third") for packet in lost_packets]
 
 
 def test_packets_of_another_network_are_captured_as_datagrams_at_both_ends(tmp_path: Path) -> None:
     scenario = load_scenario("baylands", {"duration": "2s"})
     with RunRecorder(tmp_path / "run", ABOUT) as recorder:
-        run = build(scenario, policy="scheduled", recorder=recorder, network=LosesEveryThird(1e6, 3 * MS)).run()
+        run = build(scenario, policy="scheduled", recorder=recorder, network=EveryThirdPacketLost(1e6, 3 * MS)).run()
     assert read_recording(tmp_path / "run").run == run
     assert any(fate.reason for fate in run.fates.values())
     for number, name in enumerate(sorted(scenario.agents), start=1):
@@ -259,12 +265,14 @@ def test_a_capture_that_is_interrupted_after_a_write_has_no_packet_twice(
     packet = IpPacket(name, "bravo", "udp", 40, ("flow", 0), 1)
     captures.log(1, name, Fragment(packet, 1, 0, 1, 0, 40))
 
-    def interrupted(write: Callable[[int, bytes, int], int], descriptor: int, data: bytes, at: int) -> int:
-        write(descriptor, data, at)
+    def write_then_interrupt(
+        write: Callable[[int, bytes, int], int], descriptor: int, data: bytes, offset: int
+    ) -> int:
+        write(descriptor, data, offset)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("os.pwrite", partial(interrupted, os.pwrite))
+        patch.setattr("os.pwrite", partial(write_then_interrupt, os.pwrite))
         with pytest.raises(KeyboardInterrupt):
             captures.flush()
     captures.log(2, name, Fragment(packet, 2, 0, 1, 0, 40))
@@ -274,7 +282,7 @@ def test_a_capture_that_is_interrupted_after_a_write_has_no_packet_twice(
     assert [frame[IP].id for frame in frames] == [1, 2]
 
 
-def test_pings_are_icmp_and_a_given_port_is_used(tmp_path: Path) -> None:
+def test_pings_are_icmp_and_a_configured_port_is_used(tmp_path: Path) -> None:
     flows = {
         "file": CapturedFlow(port=1234),
         "ask": CapturedFlow(ping="ask"),

@@ -37,7 +37,7 @@ def messages(recording: Recording) -> Messages:
     file = BytesIO()
     write_mcap(file, recording)
     reader = make_reader(BytesIO(file.getvalue()))
-    read = []
+    records = []
     validators: dict[int, Draft202012Validator] = {}
     for schema, channel, message in reader.iter_messages(log_time_order=False):
         assert schema is not None
@@ -45,9 +45,9 @@ def messages(recording: Recording) -> Messages:
         validators.setdefault(schema.id, Draft202012Validator(json.loads(schema.data))).validate(content)
         sec, nsec = content["timestamp"]["sec"], content["timestamp"]["nsec"]
         assert sec * 10**9 + nsec == message.log_time
-        read.append((channel.topic, message.log_time, content))
-    assert [at_ns for _, at_ns, _ in read] == sorted(at_ns for _, at_ns, _ in read)
-    return read
+        records.append((channel.topic, message.log_time, content))
+    assert [at_ns for _, at_ns, _ in records] == sorted(at_ns for _, at_ns, _ in records)
+    return records
 
 
 def test_packets_and_their_fates_are_those_of_the_run(recording: Recording, messages: Messages) -> None:
@@ -63,7 +63,7 @@ def test_packets_and_their_fates_are_those_of_the_run(recording: Recording, mess
         assert content.get("reason", "") == fate.reason
         if fate.counted_ns is not None and fate.arrived_ns is not None:
             assert content["delay_s"] == (fate.counted_ns - fate.packet.sent_ns) / 1e9
-            # The policy adds all of the delay except that of the link, by steps of 5 ms.
+            # The policy adds all of the delay except that of the link, in steps of 5 ms.
             assert content["delay_s"] - content["added_s"] == pytest.approx(0.001234567)
     assert {"arrived" in content for content in contents.values()} == {True, False}
     assert {content["size_bytes"] for content in contents.values()} == {100, 333}
@@ -81,9 +81,9 @@ def test_states_are_those_of_the_robots(recording: Recording, messages: Messages
 
 
 def test_transforms_have_the_heading_of_the_robot(recording: Recording) -> None:
-    heading = State((1.0, 2.0, 3.0), heading_rad=math.pi / 2)
+    turned_state = State((1.0, 2.0, 3.0), heading_rad=math.pi / 2)
     file = BytesIO()
-    write_mcap(file, replace(recording, run=Run(), states=[(5, "a", heading)]))
+    write_mcap(file, replace(recording, run=Run(), states=[(5, "a", turned_state)]))
     (transform,) = (
         json.loads(message.data)["transforms"][0]
         for _, channel, message in make_reader(BytesIO(file.getvalue())).iter_messages()
@@ -116,6 +116,6 @@ def test_the_file_can_be_read_from_the_middle(recording: Recording, tmp_path: Pa
     with path.open("wb") as file:
         write_mcap(file, recording)
     with path.open("rb") as file:
-        late = [message.log_time for _, _, message in make_reader(file).iter_messages(starting_at=900 * MS)]
-    assert late
-    assert min(late) >= 900 * MS
+        late_times_ns = [message.log_time for _, _, message in make_reader(file).iter_messages(starting_at=900 * MS)]
+    assert late_times_ns
+    assert min(late_times_ns) >= 900 * MS

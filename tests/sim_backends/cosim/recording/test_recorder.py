@@ -57,20 +57,21 @@ def record(folder: Path, policy: SyncPolicy | None = None, part_every_s: float =
 )
 def test_a_recording_reproduces_every_number(tmp_path: Path, policy: SyncPolicy) -> None:
     reference = passing_robots(policy=EventDriven()).advance(END_NS)
-    live = record(tmp_path / "run", policy)
+    live_run = record(tmp_path / "run", policy)
     recording = read_recording(tmp_path / "run")
-    assert recording.run == live
-    assert repr(compare_runs(reference, recording.run)) == repr(compare_runs(reference, live)), (
+    assert recording.run == live_run
+    assert repr(compare_runs(reference, recording.run)) == repr(compare_runs(reference, live_run)), (
         "also if values are nan"
     )
-    assert list(recording.run.fates) == list(live.fates), "in the same order, which affects the rounding of means"
+    assert list(recording.run.fates) == list(live_run.fates), "in the same order, which affects the rounding of means"
     assert recording.manifest.ending is RunEnding.COMPLETE
     assert recording.manifest.about == ABOUT
-    # States are at 10 Hz, at the first end of a window from then on; a drives at 1 m/s, in steps of 1 ms.
-    of_a = [(at_ns, state) for at_ns, agent, state in recording.states if agent == "a"]
-    assert [at_ns // (100 * MS) for at_ns, _ in of_a] == list(range(len(of_a)))
-    assert len(of_a) >= END_NS // (100 * MS)
-    assert all(state.position_m[0] == pytest.approx(at_ns // MS / 1000) for at_ns, state in of_a)
+    # States are recorded at 10 Hz, each at the first end of a window after its due time. Robot a drives at 1 m/s, in
+    # steps of 1 ms.
+    states_of_a = [(at_ns, state) for at_ns, agent, state in recording.states if agent == "a"]
+    assert [at_ns // (100 * MS) for at_ns, _ in states_of_a] == list(range(len(states_of_a)))
+    assert len(states_of_a) >= END_NS // (100 * MS)
+    assert all(state.position_m[0] == pytest.approx(at_ns // MS / 1000) for at_ns, state in states_of_a)
 
 
 @pytest.mark.parametrize(
@@ -90,21 +91,23 @@ def test_windows_have_the_pair_that_determined_them(tmp_path: Path, policy: Sync
 
 
 def test_the_tables_can_be_read_without_fieldkit(tmp_path: Path) -> None:
-    live = record(tmp_path / "run")
+    live_run = record(tmp_path / "run")
     packets = pq.read_table(tmp_path / "run" / "packets").to_pandas()
-    arrived = packets[packets.flow == "ab"].dropna(subset=["arrived_ns"])
-    assert set(arrived.arrived_ns - arrived.enters_ns) == {1_234_567}
-    assert (packets.reason == "out of range").sum() == sum(bool(fate.reason) for fate in live.fates.values()) > 100
-    under_way = packets[packets.arrived_ns.isna() & (packets.reason == "")]
-    assert list(under_way.sent_ns) == [1081 * 3_700_001], "sent less than its delay before the end"
+    arrived_packets = packets[packets.flow == "ab"].dropna(subset=["arrived_ns"])
+    assert set(arrived_packets.arrived_ns - arrived_packets.enters_ns) == {1_234_567}
+    assert (
+        (packets.reason == "out of range").sum() == sum(bool(fate.reason) for fate in live_run.fates.values()) > 100
+    )
+    packets_in_flight = packets[packets.arrived_ns.isna() & (packets.reason == "")]
+    assert list(packets_in_flight.sent_ns) == [1081 * 3_700_001], "sent less than its delay before the end"
     windows = pq.read_table(tmp_path / "run" / "windows")
-    assert windows.column("end_ns").to_pylist() == live.windows_ns
+    assert windows.column("end_ns").to_pylist() == live_run.windows_ns
     assert windows.schema.field("wait_s").metadata[b"unit"] == b"s"
 
 
 @contextmanager
-def child(folder: Path, *limit_bytes: int) -> Iterator[subprocess.Popen[str]]:
-    """Let another process record an endless run, which prints its progress in lines."""
+def recording_process(folder: Path, *limit_bytes: int) -> Iterator[subprocess.Popen[str]]:
+    """Let another process record an endless run, which prints a line of progress every hundred windows."""
     command = [sys.executable, "-m", "tests.helpers.passing_robots", str(folder), *map(str, limit_bytes)]
     with subprocess.Popen(command, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         try:
@@ -118,27 +121,27 @@ def check_equals_run(run: Run) -> None:
     expected = passing_robots().advance(run.windows_ns[-1])
     assert run.windows_ns == expected.windows_ns
     assert all(fate == expected.fates[identity] for identity, fate in run.fates.items())
-    decided = {identity for identity, fate in expected.fates.items() if fate.is_decided}
-    assert decided <= run.fates.keys(), "all decided packets are recorded"
+    decided_identities = {identity for identity, fate in expected.fates.items() if fate.is_decided}
+    assert decided_identities <= run.fates.keys(), "all decided packets are recorded"
 
 
-@pytest.mark.parametrize("hundreds", [1, 6, 30])
-def test_a_run_that_is_killed_keeps_the_parts_written_before(tmp_path: Path, hundreds: int) -> None:
-    with child(tmp_path / "run") as process:
+@pytest.mark.parametrize("line_count", [1, 6, 30])
+def test_a_run_that_is_killed_keeps_the_parts_written_before(tmp_path: Path, line_count: int) -> None:
+    with recording_process(tmp_path / "run") as process:
         assert process.stdout is not None
-        for _ in range(hundreds):
+        for _ in range(line_count):
             process.stdout.readline()
         assert read_manifest(tmp_path / "run").ending is RunEnding.UNDER_WAY
-        before = len(list((tmp_path / "run" / "windows").glob("*.parquet")))
+        part_count = len(list((tmp_path / "run" / "windows").glob("*.parquet")))
         process.send_signal(signal.SIGKILL)
         process.wait(EXIT_S)
     recording = read_recording(tmp_path / "run")
     assert (recording.manifest.ending, recording.run.digest) == (RunEnding.KILLED, "")
-    assert len(list((tmp_path / "run" / "windows").glob("*.parquet"))) >= before
-    if before:
+    assert len(list((tmp_path / "run" / "windows").glob("*.parquet"))) >= part_count
+    if part_count:
         check_equals_run(recording.run)
         check_captures(tmp_path / "run", recording.run)
-    assert before or hundreds < 30
+    assert part_count or line_count < 30
 
 
 def check_captures(folder: Path, run: Run) -> None:
@@ -151,7 +154,7 @@ def check_captures(folder: Path, run: Run) -> None:
 
 
 def test_a_run_that_is_interrupted_is_recorded_completely(tmp_path: Path) -> None:
-    with child(tmp_path / "run") as process:
+    with recording_process(tmp_path / "run") as process:
         assert process.stdout is not None
         for _ in range(5):
             process.stdout.readline()
@@ -166,8 +169,8 @@ def test_a_run_that_is_interrupted_is_recorded_completely(tmp_path: Path) -> Non
 
 
 def test_a_full_disk_ends_the_run_and_keeps_the_parts_written_before(tmp_path: Path) -> None:
-    """A limit on the size of files stands in for a full disk."""
-    with child(tmp_path / "run", 20_000) as process:
+    """A limit of the file size simulates a full disk."""
+    with recording_process(tmp_path / "run", 20_000) as process:
         _, stderr = process.communicate(timeout=EXIT_S)
     assert "RecordingError" in stderr
     assert f"{tmp_path / 'run'}: the recording cannot be written: File too large" in stderr
@@ -187,12 +190,12 @@ def test_a_full_disk_is_reported_and_the_packets_are_kept(tmp_path: Path, size: 
         command = [sys.executable, "-m", "fieldkit", "cosim", "run", "baylands", "--out", str(disk / "run")]
         changes = [f"traffic.{number}.rate=1000Hz" for number in (0, 1)]
         options = [option for change in changes for option in ("--set", change)]
-        done = subprocess.run(
+        result = subprocess.run(
             [*command, *options], cwd=ROOT, capture_output=True, text=True, check=False, timeout=300
         )
-        assert done.returncode == 2, done.stdout
-        assert "the recording cannot be written: No space left on device" in " ".join(done.stderr.split())
-        assert "Traceback" not in done.stderr
+        assert result.returncode == 2, result.stdout
+        assert "the recording cannot be written: No space left on device" in " ".join(result.stderr.split())
+        assert "Traceback" not in result.stderr
         recording = read_recording(disk / "run")
         assert recording.run.fates
         assert recording.manifest.ending is RunEnding.FAILED
@@ -202,29 +205,29 @@ def test_a_full_disk_is_reported_and_the_packets_are_kept(tmp_path: Path, size: 
 
 
 def test_a_disk_without_space_is_refused_before_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(descriptor: int, offset: int, length: int) -> None:
+    def raise_disk_full(descriptor: int, offset: int, length: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(os, "posix_fallocate", full)
-    with pytest.raises(RecordingError, match="No space left on device") as raised:
+    monkeypatch.setattr(os, "posix_fallocate", raise_disk_full)
+    with pytest.raises(RecordingError, match="No space left on device") as error_info:
         record(tmp_path / "run")
-    assert raised.value.remedy == "free some space"
+    assert error_info.value.remedy == "free some space"
 
 
-def test_the_recording_names_what_failed(tmp_path: Path) -> None:
+def test_the_recording_states_the_error_of_a_failed_policy(tmp_path: Path) -> None:
     class FailingPolicy(EventDriven):
         def next_window(self, situation: Situation) -> int | None:
             return super().next_window(situation) if situation.now_ns < 100 * MS else 1 // 0
 
     with (
-        pytest.raises(FederateError, match="policy event_driven failed") as raised,
+        pytest.raises(FederateError, match="policy event_driven failed") as error_info,
         RunRecorder(tmp_path / "run", ABOUT) as recorder,
     ):
         passing_robots(recorder, FailingPolicy()).advance(MS * 200)
     recording = read_recording(tmp_path / "run")
     assert (recording.manifest.ending, recording.manifest.why) == (
         RunEnding.FAILED,
-        f"FederateError: {raised.value}",
+        f"FederateError: {error_info.value}",
     )
     expected = passing_robots(policy=EventDriven()).advance(recording.run.windows_ns[-1])
     assert recording.run.digest == expected.digest
@@ -239,9 +242,9 @@ def test_a_scenario_that_is_refused_leaves_no_files(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_recording_is_not_overwritten(recorded: Path) -> None:
+def test_a_recording_is_not_overwritten(recorded_folder: Path) -> None:
     with pytest.raises(ConfigurationError, match="already a recording"):
-        record(recorded)
+        record(recorded_folder)
 
 
 def damage(folder: Path, column: str, *, forge: bool) -> None:
@@ -253,11 +256,11 @@ def damage(folder: Path, column: str, *, forge: bool) -> None:
         if (table := pq.read_table(path, partitioning=None)).column(column).null_count < len(table)
     )
     values = table.column(column).to_pylist()
-    first, value = next((index, value) for index, value in enumerate(values) if value is not None)
-    values[first] = value + 1 if isinstance(value, int) else [value[0] + 1, *value[1:]]
-    place = table.schema.get_field_index(column)
+    row, value = next((index, value) for index, value in enumerate(values) if value is not None)
+    values[row] = value + 1 if isinstance(value, int) else [value[0] + 1, *value[1:]]
+    index_of_column = table.schema.get_field_index(column)
     field = table.schema.field(column)
-    pq.write_table(table.set_column(place, field, pa.array(values, field.type)), path)
+    pq.write_table(table.set_column(index_of_column, field, pa.array(values, field.type)), path)
     if forge:
         manifest = read_manifest(folder)
         parts = {**manifest.parts, str(path.relative_to(folder)): packet_tables.file_checksum(path)}
@@ -265,16 +268,16 @@ def damage(folder: Path, column: str, *, forge: bool) -> None:
 
 
 @pytest.mark.parametrize("column", ["arrived_ns", "known_source_m", "late_ns"])
-def test_a_recording_that_was_changed_is_refused(tmp_path: Path, recorded: Path, column: str) -> None:
-    shutil.copytree(recorded, tmp_path / "run")
+def test_a_recording_that_was_changed_is_refused(tmp_path: Path, recorded_folder: Path, column: str) -> None:
+    shutil.copytree(recorded_folder, tmp_path / "run")
     damage(tmp_path / "run", column, forge=False)
     with pytest.raises(EvidenceError, match="changed after the run"):
         read_recording(tmp_path / "run")
 
 
 @pytest.mark.parametrize("column", ["arrived_ns", "sent_ns", "size_bytes", "packet_id", "number"])
-def test_the_digest_alone_detects_a_changed_event(tmp_path: Path, recorded: Path, column: str) -> None:
-    shutil.copytree(recorded, tmp_path / "run")
+def test_the_digest_alone_detects_a_changed_event(tmp_path: Path, recorded_folder: Path, column: str) -> None:
+    shutil.copytree(recorded_folder, tmp_path / "run")
     damage(tmp_path / "run", column, forge=True)
     with pytest.raises(EvidenceError, match="its events have digest"):
         read_recording(tmp_path / "run")
@@ -283,32 +286,32 @@ def test_the_digest_alone_detects_a_changed_event(tmp_path: Path, recorded: Path
 @settings(max_examples=25)
 @given(
     table=st.sampled_from(packet_tables.TABLES),
-    which=st.integers(0),
-    at=st.integers(0),
+    part_number=st.integers(0),
+    offset=st.integers(0),
     change=st.sampled_from(["cut", "gone", "flip"]),
 )
 def test_a_recording_that_was_truncated_or_damaged_anywhere_is_refused(
-    recorded: Path, table: str, which: int, at: int, change: str
+    recorded_folder: Path, table: str, part_number: int, offset: int, change: str
 ) -> None:
-    parts = sorted((recorded / table).glob("*.parquet"))
-    path = parts[which % len(parts)]
+    parts = sorted((recorded_folder / table).glob("*.parquet"))
+    path = parts[part_number % len(parts)]
     content = path.read_bytes()
-    at %= len(content)
+    offset %= len(content)
     try:
         if change == "gone":
             path.unlink()
         elif change == "cut":
-            path.write_bytes(content[:at])
+            path.write_bytes(content[:offset])
         else:
-            path.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
+            path.write_bytes(content[:offset] + bytes([content[offset] ^ 1]) + content[offset + 1 :])
         with pytest.raises(EvidenceError, match=r"truncated|changed"):
-            read_recording(recorded)
+            read_recording(recorded_folder)
     finally:
         path.write_bytes(content)
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recorded") / "run"
     with RunRecorder(folder, ABOUT, part_every_s=0.02) as recorder:
         passing_robots(recorder).advance(1_000 * MS)
@@ -327,14 +330,14 @@ def test_a_folder_without_a_recording_is_reported_without_a_traceback(tmp_path: 
 
 
 @pytest.mark.parametrize("key", ["digest", "parts"])
-def test_a_complete_run_without_digest_or_parts_is_refused(tmp_path: Path, recorded: Path, key: str) -> None:
-    shutil.copytree(recorded, tmp_path / "changed")
+def test_a_complete_run_without_digest_or_parts_is_refused(tmp_path: Path, recorded_folder: Path, key: str) -> None:
+    shutil.copytree(recorded_folder, tmp_path / "changed")
     manifest = tmp_path / "changed" / "run.json"
     content = json.loads(manifest.read_bytes())
     manifest.write_text(json.dumps(content | {key: type(content[key])()}), encoding="utf-8")
-    with pytest.raises(EvidenceError, match="the record has no digest or no parts") as caught:
+    with pytest.raises(EvidenceError, match="the record has no digest or no parts") as error_info:
         read_recording(tmp_path / "changed")
-    assert caught.value.remedy
+    assert error_info.value.remedy
 
 
 @pytest.mark.parametrize(
@@ -342,9 +345,9 @@ def test_a_complete_run_without_digest_or_parts_is_refused(tmp_path: Path, recor
     [('"seed": 1', '"seed": 2'), ('"policy": "', '"policy": "not_'), ('"ending": "whole"', '"ending": "failed"')],
 )
 def test_a_manifest_that_was_changed_afterwards_is_refused(
-    tmp_path: Path, recorded: Path, old: str, new: str
+    tmp_path: Path, recorded_folder: Path, old: str, new: str
 ) -> None:
-    shutil.copytree(recorded, tmp_path / "run")
+    shutil.copytree(recorded_folder, tmp_path / "run")
     path = tmp_path / "run" / "run.json"
     text = path.read_text(encoding="utf-8")
     assert text.count(old) == 1
@@ -355,8 +358,8 @@ def test_a_manifest_that_was_changed_afterwards_is_refused(
     assert read_recording(tmp_path / "run").manifest.about == ABOUT, "the formatting does not matter"
 
 
-def test_a_scenario_that_was_changed_afterwards_is_refused(tmp_path: Path, recorded: Path) -> None:
-    shutil.copytree(recorded, tmp_path / "run")
+def test_a_scenario_that_was_changed_afterwards_is_refused(tmp_path: Path, recorded_folder: Path) -> None:
+    shutil.copytree(recorded_folder, tmp_path / "run")
     path = tmp_path / "run" / "run.json"
     path.write_text(path.read_text().replace("robots: two", "robots: three"))
     with pytest.raises(EvidenceError, match="its hash differs"):

@@ -13,17 +13,17 @@ from sim_backends.cosim.scenario.loading import editor_schema, scenario_files
 SCHEMA = editor_schema()
 
 
-def data_of(name: str) -> Any:  # noqa: ANN401 (any YAML value)
+def scenario_data(name: str) -> Any:  # noqa: ANN401 (any YAML value)
     return schema.read(scenario_files()[name]).data
 
 
-def test_it_is_a_json_schema() -> None:
+def test_the_schema_of_editors_is_a_valid_json_schema() -> None:
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
 
 
 @pytest.mark.parametrize("name", scenario_files())
 def test_every_shipped_scenario_is_valid(name: str) -> None:
-    jsonschema.validate(data_of(name), SCHEMA)
+    jsonschema.validate(scenario_data(name), SCHEMA)
 
 
 @pytest.mark.parametrize(
@@ -43,17 +43,17 @@ def test_every_shipped_scenario_is_valid(name: str) -> None:
     ids=str,
 )
 def test_wrong_scenarios_are_invalid(keys: tuple[str | int, ...], value: object) -> None:
-    data = data_of("baylands")
-    inner = data
+    data = scenario_data("baylands")
+    parent = data
     for key in keys[:-1]:
-        inner = inner[key]
-    inner[keys[-1]] = value
+        parent = parent[key]
+    parent[keys[-1]] = value
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate(data, SCHEMA)
 
 
-def test_options_of_a_simulator_are_valid_where_it_is_used() -> None:
-    data = data_of("baylands")
+def test_options_of_a_simulator_are_valid_if_the_scenario_uses_it() -> None:
+    data = scenario_data("baylands")
     for federate, options in (("gazebo", {"settle_s": 1}), ("mujoco", None), ("./carts", {"speed": 1})):
         data["physics"] = {"federate": federate, "options": options}
         jsonschema.validate(data, SCHEMA)

@@ -1,4 +1,4 @@
-"""Scenarios with external federates: equal results with the built-in ones, recordings and processes after faults."""
+"""Scenarios with external federates: their results equal those of built-in ones, and no process remains."""
 
 import json
 import os
@@ -23,17 +23,17 @@ from tests.helpers.federate_pairs import children, now_s
 from tests.helpers.runs import cosim, finish, start, wait_during
 from tests.helpers.sshd import free_port
 
-SERVED = shlex.join((sys.executable, "-m", "sim_backends.cosim.scenario.served"))
+SERVE_COMMAND = shlex.join((sys.executable, "-m", "sim_backends.cosim.scenario.served"))
 DURATION = {"duration": "400ms"}
 
 
 @pytest.fixture(scope="module")
-def served() -> Iterator[dict[str, str]]:
-    """The built-in federates as processes that listen, and serve one run after another: addresses by role."""
+def served_addresses() -> Iterator[dict[str, str]]:
+    """Return the addresses, by role, of processes that serve the built-in federates to one run after another."""
     processes, addresses = [], {}
     for role in ("physics", "network"):
         port = free_port()
-        command = [*shlex.split(SERVED), role, f"tcp-listen:127.0.0.1:{port}"]
+        command = [*shlex.split(SERVE_COMMAND), role, f"tcp-listen:127.0.0.1:{port}"]
         processes.append(subprocess.Popen(command, stderr=subprocess.DEVNULL))
         addresses[role] = f"tcp:127.0.0.1:{port}"
     yield addresses
@@ -48,22 +48,28 @@ def digest(scenario: CosimScenario, policy: str) -> str:
 
 
 @pytest.mark.parametrize("policy", sorted(BUILTIN))
-def test_the_built_in_federates_give_the_same_events_as_processes(policy: str, served: dict[str, str]) -> None:
-    external = load_scenario("convoy", {f"{role}.federate": address for role, address in served.items()} | DURATION)
+def test_the_built_in_federates_give_the_same_events_as_processes(
+    policy: str, served_addresses: dict[str, str]
+) -> None:
+    external = load_scenario(
+        "convoy", {f"{role}.federate": address for role, address in served_addresses.items()} | DURATION
+    )
     assert external.physics.federate
     assert digest(external, policy) == digest(without_federates(external), policy)
 
 
 def test_pipes_give_the_same_events() -> None:
-    changes = {f"{role}.federate": f"{SERVED} {role}" for role in ("physics", "network")}
+    changes = {f"{role}.federate": f"{SERVE_COMMAND} {role}" for role in ("physics", "network")}
     external = load_scenario("convoy", changes | DURATION)
-    began_s = now_s()
+    start_s = now_s()
     assert digest(external, "sliding_window") == digest(without_federates(external), "sliding_window")
-    assert children(began_s) == set()
+    assert children(start_s) == set()
 
 
-def test_a_simulation_with_external_federates_can_be_copied(served: dict[str, str]) -> None:
-    external = load_scenario("convoy", {f"{role}.federate": address for role, address in served.items()} | DURATION)
+def test_a_simulation_with_external_federates_can_be_copied(served_addresses: dict[str, str]) -> None:
+    external = load_scenario(
+        "convoy", {f"{role}.federate": address for role, address in served_addresses.items()} | DURATION
+    )
     digests = set()
     for scenario in (external, without_federates(external)):
         with build(scenario) as simulation:
@@ -73,15 +79,17 @@ def test_a_simulation_with_external_federates_can_be_copied(served: dict[str, st
     assert len(digests) == 1
 
 
-def test_a_federate_that_listens_serves_one_seed_after_another(served: dict[str, str], tmp_path: Path) -> None:
+def test_a_federate_that_listens_serves_one_seed_after_another(
+    served_addresses: dict[str, str], tmp_path: Path
+) -> None:
     options = ("--seeds", "2", "--duration", "200ms", "--format", "json")
-    federates = [word for role, address in served.items() for word in (f"--{role}", address)]
+    federates = [word for role, address in served_addresses.items() for word in (f"--{role}", address)]
     external, built_in = (cosim(tmp_path, "run", "convoy", *words, *options) for words in (federates, ()))
     assert (external.code, built_in.code) == (0, 0), external.err
     assert json.loads(external.out) == json.loads(built_in.out)
 
 
-def test_a_network_without_next_events_suits_policies_with_windows(tmp_path: Path) -> None:
+def test_a_network_that_does_not_report_its_next_event_runs_only_with_policies_with_windows(tmp_path: Path) -> None:
     program = tmp_path / "net.py"
     program.write_text(
         "from sim_backends.federates.serving import serve\n"
@@ -110,9 +118,9 @@ def processes_of(program: Path) -> list[int]:
     return pids
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
-def test_no_federate_is_left_if_the_run_is_interrupted_or_killed(
-    number: signal.Signals, code: int, tmp_path: Path
+@pytest.mark.parametrize(("signal_number", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
+def test_no_federate_remains_if_the_run_is_interrupted_or_killed(
+    signal_number: signal.Signals, code: int, tmp_path: Path
 ) -> None:
     program = tmp_path / "carts.py"
     program.write_bytes((EXAMPLES / "carts.py").read_bytes())
@@ -121,7 +129,7 @@ def test_no_federate_is_left_if_the_run_is_interrupted_or_killed(
     process = start(tmp_path, *words)
     wait_during(process, lambda: any((tmp_path / "run").rglob("*.parquet")))
     assert processes_of(program)
-    process.send_signal(number)
+    process.send_signal(signal_number)
     assert finish(process).code == code
     deadline_s = time.monotonic() + 300
     while processes_of(program):

@@ -1,4 +1,4 @@
-"""Each fault of a federate, over each transport and for both roles: the run ends, names it, and is readable."""
+"""Faults of federates, over each transport and in both roles: the run names the federate and can be replayed."""
 
 import json
 import os
@@ -73,17 +73,19 @@ def check_run(lab: Path, role: str, fault: str, address: str) -> None:
 
 @pytest.mark.parametrize("role", ["physics", "network"])
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_over_a_pipe(fault: str, role: str, tmp_path: Path) -> None:
-    began_s = now_s()
+def test_a_faulty_federate_on_a_pipe_ends_the_run_with_an_error(fault: str, role: str, tmp_path: Path) -> None:
+    start_s = now_s()
     words = (sys.executable, "-m", "tests.helpers.faulty_federates", role, fault)
     check_run(tmp_path, role, fault, shlex.join(words))
-    assert children(began_s) == set()
+    assert children(start_s) == set()
 
 
 @pytest.mark.parametrize("role", ["physics", "network"])
 @pytest.mark.parametrize("fault", FAULTS)
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_a_fault_over_a_transport(scheme: str, fault: str, role: str, federates: Federates, tmp_path: Path) -> None:
+def test_a_faulty_federate_on_a_transport_ends_the_run_with_an_error(
+    scheme: str, fault: str, role: str, federates: Federates, tmp_path: Path
+) -> None:
     served_at, address = new_addresses(scheme)
     pid = federates.start(role, fault, served_at)
     check_run(tmp_path, role, fault, address)

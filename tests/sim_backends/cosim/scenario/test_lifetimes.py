@@ -54,50 +54,52 @@ def path(tmp_path: Path) -> Path:
     return file
 
 
-def run_of(path: Path, policy: str, changes: Mapping[str, Any] | None = None) -> Run:
+def run_scenario(path: Path, policy: str, changes: Mapping[str, Any] | None = None) -> Run:
     with build(load_scenario(path, changes), policy=policy) as simulation:
         return simulation.run()
 
 
-def flow(run: Run, name: str) -> list[Fate]:
+def fates_of_flow(run: Run, name: str) -> list[Fate]:
     return [fate for (flow_name, _), fate in run.fates.items() if flow_name == name]
 
 
-def is_there(at_ns: int) -> bool:
+def is_present(at_ns: int) -> bool:
     return BEGIN_NS <= at_ns < END_NS
 
 
 def check_fates(run: Run) -> None:
-    """Check each packet from and to the agent."""
-    with_c = [fate for fate in run.fates.values() if "c" in (fate.packet.source, fate.packet.destination)]
-    assert not any(fate.packet.source == "c" and not is_there(fate.packet.sent_ns) for fate in with_c)
-    for fate in with_c:
-        if not is_there(fate.packet.sent_ns):
+    """Check each packet from and to agent c."""
+    fates_of_c = [fate for fate in run.fates.values() if "c" in (fate.packet.source, fate.packet.destination)]
+    assert not any(fate.packet.source == "c" and not is_present(fate.packet.sent_ns) for fate in fates_of_c)
+    for fate in fates_of_c:
+        if not is_present(fate.packet.sent_ns):
             assert fate.reason == ABSENT
         if fate.arrived_ns is not None:
-            assert is_there(fate.arrived_ns)
-    assert all(fate.is_decided for fate in with_c)
-    assert not any(fate.reason == ABSENT for fate in flow(run, "ab/b"))
-    lost = Counter(name for (name, _), fate in run.fates.items() if fate.reason and is_there(fate.packet.sent_ns))
-    assert lost["ac/c"] + lost["cb/b"] <= 8, "only those that were under way"
-    assert len(flow(run, "cb/b")) == pytest.approx(50, abs=1)
-    assert len(flow(run, "ac/c")) == pytest.approx(120, abs=1)
+            assert is_present(fate.arrived_ns)
+    assert all(fate.is_decided for fate in fates_of_c)
+    assert not any(fate.reason == ABSENT for fate in fates_of_flow(run, "ab/b"))
+    lost_counts = Counter(
+        name for (name, _), fate in run.fates.items() if fate.reason and is_present(fate.packet.sent_ns)
+    )
+    assert lost_counts["ac/c"] + lost_counts["cb/b"] <= 8, "only those that were under way"
+    assert len(fates_of_flow(run, "cb/b")) == pytest.approx(50, abs=1)
+    assert len(fates_of_flow(run, "ac/c")) == pytest.approx(120, abs=1)
     flows = {name for name, _ in run.fates} - {"ab/b", "ac/c", "cb/b"}
     for name in flows:
-        assert any(fate.arrived_ns is not None for fate in flow(run, name)), name
+        assert any(fate.arrived_ns is not None for fate in fates_of_flow(run, name)), name
 
 
 @pytest.mark.parametrize("policy", sorted({*BUILTIN} - {"velocity_aware_raw"}))
 def test_packets_from_and_to_an_absent_agent_are_dropped_with_every_policy(policy: str, path: Path) -> None:
-    check_fates(run_of(path, policy, {"policy.window": "5ms", "policy.longest": "20ms"}))
+    check_fates(run_scenario(path, policy, {"policy.window": "5ms", "policy.longest": "20ms"}))
 
 
 def test_exact_policies_agree(path: Path) -> None:
-    runs = [run_of(path, policy) for policy in ("event_driven", "variable_stepped")]
+    runs = [run_scenario(path, policy) for policy in ("event_driven", "variable_stepped")]
     assert runs[0].fates == runs[1].fates
 
 
-def states_of(scenario: CosimScenario, policy: str = "event_driven") -> dict[str, list[int]]:
+def state_times_ns(scenario: CosimScenario, policy: str = "event_driven") -> dict[str, list[int]]:
     samples = StateSamples()
     build(scenario, policy=policy, recorder=samples).run()
     times_ns: dict[str, list[int]] = {}
@@ -106,14 +108,14 @@ def states_of(scenario: CosimScenario, policy: str = "event_driven") -> dict[str
     return times_ns
 
 
-def test_states_are_those_of_present_agents(path: Path) -> None:
-    times_ns = states_of(load_scenario(path))
+def test_only_present_agents_have_states(path: Path) -> None:
+    times_ns = state_times_ns(load_scenario(path))
     assert min(times_ns["a"]) == 0
-    assert all(is_there(at_ns) for at_ns in times_ns["c"])
+    assert all(is_present(at_ns) for at_ns in times_ns["c"])
     assert len(times_ns["c"]) == 5
 
 
-SERVED = shlex.join((sys.executable, "-m", "sim_backends.cosim.scenario.served"))
+SERVE_COMMAND = shlex.join((sys.executable, "-m", "sim_backends.cosim.scenario.served"))
 CARTS = shlex.join((sys.executable, str(EXAMPLES / "carts.py")))
 WITHOUT_TOPIC = [
     {"kind": "stream", "name": "ab", "from": "a", "to": "b", "rate": "41Hz"},
@@ -131,8 +133,8 @@ serve(lambda hello: Disc(1000.0, 100_000))
 
 @pytest.mark.parametrize("policy", ["event_driven", "error_bounded"])
 def test_the_built_in_federates_give_the_same_events_as_processes(policy: str, path: Path) -> None:
-    external = {f"{role}.federate": f"{SERVED} {role}" for role in ("physics", "network")}
-    assert run_of(path, policy, external).digest == run_of(path, policy).digest
+    external = {f"{role}.federate": f"{SERVE_COMMAND} {role}" for role in ("physics", "network")}
+    assert run_scenario(path, policy, external).digest == run_scenario(path, policy).digest
 
 
 @pytest.mark.parametrize(
@@ -146,31 +148,31 @@ def test_the_built_in_federates_give_the_same_events_as_processes(policy: str, p
     ids=["mujoco", "carts", "ns3", "mujoco and ns3"],
 )
 def test_fates_are_the_same_with_external_federates(changes: Mapping[str, Any], path: Path) -> None:
-    check_fates(run_of(path, "sliding_window", {"policy.window": "5ms", **changes}))
+    check_fates(run_scenario(path, "sliding_window", {"policy.window": "5ms", **changes}))
 
 
-def test_a_network_that_knows_no_absent_agents_needs_nothing(path: Path, tmp_path: Path) -> None:
+def test_absent_agents_need_no_support_by_the_network(path: Path, tmp_path: Path) -> None:
     program = tmp_path / "net.py"
     program.write_text(SIMPLE_NETWORK, encoding="utf-8")
-    check_fates(run_of(path, "event_driven", {"network.federate": shlex.join((sys.executable, str(program)))}))
+    check_fates(run_scenario(path, "event_driven", {"network.federate": shlex.join((sys.executable, str(program)))}))
 
 
 @pytest.mark.parametrize("physics", ["builtin", "mujoco"])
 def test_an_agent_appears_at_its_start_and_moves_from_then_on(physics: str, path: Path) -> None:
     with build(load_scenario(path, {"physics.federate": physics})) as simulation:
-        places_m = []
+        states_of_c = []
         for at_ns in range(50 * MS, 900 * MS, 50 * MS):
             simulation.run(at_ns)
-            places_m.append(simulation.agents.states(at_ns).get("c"))
-    assert places_m[:7] == [None] * 7
-    assert [round(state.position_m[0], 2) for state in places_m[7:9] if state] == [30.0, 30.0]
-    assert places_m[-1] is not None
-    assert 30.03 < places_m[-1].position_m[0] < 30.1
+            states_of_c.append(simulation.agents.states(at_ns).get("c"))
+    assert states_of_c[:7] == [None] * 7
+    assert [round(state.position_m[0], 2) for state in states_of_c[7:9] if state] == [30.0, 30.0]
+    assert states_of_c[-1] is not None
+    assert 30.03 < states_of_c[-1].position_m[0] < 30.1
 
 
 @pytest.mark.parametrize("physics", ["builtin", "mujoco"])
 def test_an_absent_agent_is_no_obstacle(physics: str, path: Path) -> None:
-    """A robot drives through the place where another one has been, and collides with it while it is there."""
+    """A robot drives through the place of an agent that has disappeared, and collides with one that is present."""
     motion = {"kind": "velocity-profile", "legs": [{"duration": "5s", "speed": "1m/s"}]}
     changes = {
         "physics.federate": physics,
@@ -181,15 +183,15 @@ def test_an_absent_agent_is_no_obstacle(physics: str, path: Path) -> None:
         "agents.c.motion": {"kind": "standing"},
         "agents.c.radio": {},
     }
-    places_m = {}
+    eastings_m = {}
     for disappears in ("900ms", "4s"):
         with build(
             load_scenario(path, {**changes, "agents.c.disappears": disappears}), policy="sliding_window"
         ) as simulation:
             simulation.run()
-            places_m[disappears] = simulation.agents.states(4000 * MS)["a"].position_m[0]
-    assert places_m["900ms"] > 31.5
-    assert places_m["4s"] < places_m["900ms"] - 0.2, "it stops, or pushes the other"
+            eastings_m[disappears] = simulation.agents.states(4000 * MS)["a"].position_m[0]
+    assert eastings_m["900ms"] > 31.5
+    assert eastings_m["4s"] < eastings_m["900ms"] - 0.2, "the robot stops, or pushes the other robot"
 
 
 def test_a_run_with_lifetimes_can_be_recorded_and_replayed(path: Path) -> None:
@@ -210,4 +212,4 @@ def test_a_run_with_lifetimes_can_be_recorded_and_replayed(path: Path) -> None:
 )
 def test_an_impossible_lifetime_is_an_error(changes: Mapping[str, Any], message: str, path: Path) -> None:
     with pytest.raises(FieldkitError, match=message):
-        run_of(path, "event_driven", changes)
+        run_scenario(path, "event_driven", changes)

@@ -1,4 +1,4 @@
-"""Periods that are commensurate with windows, against counted phases of packets."""
+"""Detection of periods that are commensurate with windows, compared with counted phases of packets."""
 
 from fractions import Fraction
 
@@ -27,15 +27,16 @@ def test_events_are_commensurate_if_few_phases_are_counted(period_ms: int, windo
     """With whole milliseconds, the number of phases is the denominator of period over window in lowest terms."""
     phases = Fraction(period_ms, window_ms).denominator
     commensurate = commensurate_events(pair(rate=f"{1000 / period_ms:.20f}Hz"), [window_ms / 1000])
-    events = 10_000 // period_ms
-    counted = len({number * period_ms % window_ms for number in range(events)})
-    assert counted == min(phases, events)
+    event_count = 10_000 // period_ms
+    counted_phases = len({number * period_ms % window_ms for number in range(event_count)})
+    assert counted_phases == min(phases, event_count)
     if phases <= MAX_PHASES:
-        assert [item.phases for item in commensurate] == [phases]
-    for item in commensurate:
-        # If there are more phases, they are near the reported ones: that many events later the phase is about equal.
-        moved_ms = [number * period_ms % window_ms for number in range(0, events, item.phases)]
-        assert all(min(ms, window_ms - ms) < window_ms / item.phases for ms in moved_ms)
+        assert [event.phases for event in commensurate] == [phases]
+    for event in commensurate:
+        # If there are more phases than reported, every further phase is close to a reported one: after `event.phases`
+        # events, the phase is nearly the same again.
+        phases_ms = [number * period_ms % window_ms for number in range(0, event_count, event.phases)]
+        assert all(min(ms, window_ms - ms) < window_ms / event.phases for ms in phases_ms)
 
 
 @pytest.mark.parametrize(
@@ -45,7 +46,7 @@ def test_events_are_commensurate_if_few_phases_are_counted(period_ms: int, windo
 def test_nearly_commensurate_events_are_reported_unless_they_drift_over_all_phases(
     rate: str, window_s: float, phases: list[int]
 ) -> None:
-    assert [item.phases for item in commensurate_events(pair(rate=rate), [window_s])] == phases
+    assert [event.phases for event in commensurate_events(pair(rate=rate), [window_s])] == phases
 
 
 def test_the_proposed_window_is_not_commensurate() -> None:
@@ -63,11 +64,11 @@ def test_every_flow_begins_at_a_random_phase(kind: dict[str, object]) -> None:
         del keys["rate"]
     traffic = [{"from": "ann", "to": "bob", "start": "100ms", **keys}]
     scenario = load_scenario("convoy", {"agents": AGENTS, "traffic": traffic, "duration": "2s"})
-    firsts_ns = set()
+    first_wakes_ns = set()
     for seed in range(8):
         wakes_ns = build(scenario, seed=seed).agents.programs["ann"].next_wake_ns()
         assert wakes_ns is not None
-        firsts_ns.add(wakes_ns)
-    assert len(firsts_ns) == 8
-    assert min(firsts_ns) >= 100_000_000
-    assert len({at_ns % 10_000_000 // 1_000_000 for at_ns in firsts_ns}) > 3, "phases of a window of 10 ms"
+        first_wakes_ns.add(wakes_ns)
+    assert len(first_wakes_ns) == 8
+    assert min(first_wakes_ns) >= 100_000_000
+    assert len({at_ns % 10_000_000 // 1_000_000 for at_ns in first_wakes_ns}) > 3, "phases of a window of 10 ms"

@@ -1,4 +1,4 @@
-"""Any scenario within the schema either runs, or is refused before the run with its place and a remedy."""
+"""Any scenario within the schema either runs, or is refused before the run with a location and a remedy."""
 
 import json
 import re
@@ -23,40 +23,44 @@ def optional_keys(**values: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[st
     return st.fixed_dictionaries({}, optional=values)
 
 
-def kind(name: str, required: dict[str, Any], **optional: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
-    return st.fixed_dictionaries({"kind": st.just(name), **required}, optional=optional)
+def entry_of_kind(
+    name: str, required_entries: dict[str, Any], **optional_entries: st.SearchStrategy[Any]
+) -> st.SearchStrategy[Any]:
+    return st.fixed_dictionaries({"kind": st.just(name), **required_entries}, optional=optional_entries)
 
 
-def written(unit: str, *values: float) -> st.SearchStrategy[str]:
+def quantities(unit: str, *values: float) -> st.SearchStrategy[str]:
     return st.sampled_from(values).map(lambda value: f"{value:g}{unit}")
 
 
 AGENT = st.sampled_from((*NAMES * 10, "five"))
 PLACES = st.tuples(st.integers(0, 40), st.integers(0, 40)).map(list)
-TIMES = written("ms", 0, 1, 5, 12.5, 20)
-SENDS = {"from": AGENT, "to": st.lists(AGENT, min_size=1, max_size=3) | AGENT}
-SENDING = {
+TIMES = quantities("ms", 0, 1, 5, 12.5, 20)
+ENDPOINT_KEYS = {"from": AGENT, "to": st.lists(AGENT, min_size=1, max_size=3) | AGENT}
+SENDER_KEYS = {
     "protocol": st.sampled_from(("udp", "udp", "tcp", "topic", "ros1", "ros1-udp")),
     "start": TIMES,
     "qos": optional_keys(reliability=st.sampled_from(("reliable", "best_effort")), depth=st.integers(1, 5)),
 }
 LEGS = st.fixed_dictionaries(
-    {"duration": written("ms", 3, 10)},
+    {"duration": quantities("ms", 3, 10)},
     optional={
-        "speed": written("m/s", 0, 0.5),
-        # A body that flies refuses the one, a body that drives the other.
+        "speed": quantities("m/s", 0, 0.5),
+        # A robot that flies cannot turn, and a robot that drives cannot climb.
         "turn_deg_s": st.sampled_from((0, 0, 0, -30, 15)),
         "climb_m_s": st.sampled_from((0, 0, 0, -2, 1)),
     },
 )
 MOTIONS = st.one_of(
-    kind("standing", {}),
-    kind("station-keeping", {}),
-    kind("velocity-profile", {"legs": st.lists(LEGS, min_size=1, max_size=3)}),
-    kind("follow", {"leader": AGENT | st.lists(AGENT, min_size=1, max_size=2), "distance": written("m", 1, 3)}),
-    kind(
+    entry_of_kind("standing", {}),
+    entry_of_kind("station-keeping", {}),
+    entry_of_kind("velocity-profile", {"legs": st.lists(LEGS, min_size=1, max_size=3)}),
+    entry_of_kind(
+        "follow", {"leader": AGENT | st.lists(AGENT, min_size=1, max_size=2), "distance": quantities("m", 1, 3)}
+    ),
+    entry_of_kind(
         "way-points",
-        {"points_m": st.lists(PLACES, min_size=1, max_size=3), "speed": written("m/s", 0.2, 5)},
+        {"points_m": st.lists(PLACES, min_size=1, max_size=3), "speed": quantities("m/s", 0.2, 5)},
         relative=st.booleans(),
         wait=TIMES,
     ),
@@ -67,31 +71,36 @@ ROBOTS = st.sampled_from((*("turtlebot3_burger", "duckiedrone") * 10, "husky", "
 def agents(east_m: int) -> st.SearchStrategy[dict[str, Any]]:
     """Return a strategy for agents that start near an easting, so that few overlap."""
     places = st.tuples(st.integers(east_m, east_m + 10), st.integers(0, 40)).map(list)
-    flying = {"robot": st.sampled_from(("iris", "duckiedrone")), "along": written("m", east_m, east_m + 5)}
+    flying = {"robot": st.sampled_from(("iris", "duckiedrone")), "along": quantities("m", east_m, east_m + 5)}
     radio = optional_keys(tx_power_dbm=st.integers(0, 20), standard=st.sampled_from(("802.11n", "802.11g")))
     return st.fixed_dictionaries(
         {"robot": ROBOTS, "at_m": places}, optional={"radio": radio, "motion": MOTIONS}
     ) | st.fixed_dictionaries(
         flying | {"radio": radio},
-        optional={"height": written("m", 0, 3), "motion": MOTIONS, "aside_m": st.integers(-9, 9)},
+        optional={"height": quantities("m", 0, 3), "motion": MOTIONS, "aside_m": st.integers(-9, 9)},
     )
 
 
 TRAFFIC = st.one_of(
-    kind("stream", SENDS | {"rate": written("Hz", 30, 999.9)}, **SENDING, size_bytes=st.integers(1, 3000)),
-    kind("bag", SENDS, **SENDING, jitter=TIMES),
-    kind("file", SENDS | {"size_bytes": st.integers(1, 20_000)}, **SENDING),
-    kind("ping", SENDS, **SENDING, interval=written("ms", 5, 10), count=st.integers(1, 9)),
+    entry_of_kind(
+        "stream",
+        ENDPOINT_KEYS | {"rate": quantities("Hz", 30, 999.9)},
+        **SENDER_KEYS,
+        size_bytes=st.integers(1, 3000),
+    ),
+    entry_of_kind("bag", ENDPOINT_KEYS, **SENDER_KEYS, jitter=TIMES),
+    entry_of_kind("file", ENDPOINT_KEYS | {"size_bytes": st.integers(1, 20_000)}, **SENDER_KEYS),
+    entry_of_kind("ping", ENDPOINT_KEYS, **SENDER_KEYS, interval=quantities("ms", 5, 10), count=st.integers(1, 9)),
 )
-TIMED = {"from": TIMES, "to": TIMES}
+INTERVAL_KEYS = {"from": TIMES, "to": TIMES}
 FAULTS = st.one_of(
-    kind("node-loss", {"agent": AGENT}, **TIMED),
-    kind("link-cut", {"between": st.lists(AGENT, min_size=2, max_size=2)}, **TIMED),
-    kind("jammer", {"power_dbm": st.integers(-50, 40)}, **TIMED, at_m=PLACES, agent=AGENT),
-    kind(
+    entry_of_kind("node-loss", {"agent": AGENT}, **INTERVAL_KEYS),
+    entry_of_kind("link-cut", {"between": st.lists(AGENT, min_size=2, max_size=2)}, **INTERVAL_KEYS),
+    entry_of_kind("jammer", {"power_dbm": st.integers(-50, 40)}, **INTERVAL_KEYS, at_m=PLACES, agent=AGENT),
+    entry_of_kind(
         "clock-skew",
         {"agent": AGENT},
-        **TIMED,
+        **INTERVAL_KEYS,
         offset_ms=st.integers(-10, 10),
         rate_ppm=st.integers(-100_000, 100_000),
     ),
@@ -106,9 +115,9 @@ SCENARIOS = st.fixed_dictionaries(
     },
     optional={
         "line": st.sampled_from(("los", "nlos")),
-        "physics": optional_keys(step=written("ms", 0.5, 1)),
+        "physics": optional_keys(step=quantities("ms", 0.5, 1)),
         "policy": optional_keys(
-            name=st.sampled_from([*BUILTIN]), window=written("ms", 1, 3.7), bound=written("cm", 0.1, 5)
+            name=st.sampled_from([*BUILTIN]), window=quantities("ms", 1, 3.7), bound=quantities("cm", 0.1, 5)
         ),
         "topology": st.sampled_from(("master", "masterless")),
         "relay": AGENT,
@@ -121,7 +130,7 @@ SCENARIOS = st.fixed_dictionaries(
 
 @settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(SCENARIOS)
-def test_any_scenario_runs_or_is_refused_with_its_place_and_a_remedy(tmp_path: Path, data: dict[str, Any]) -> None:
+def test_any_scenario_runs_or_is_refused_with_a_location_and_a_remedy(tmp_path: Path, data: dict[str, Any]) -> None:
     path = tmp_path / "any.yaml"
     path.write_text(json.dumps(data, indent=1), encoding="utf-8")
     caught: ConfigurationError | None = None

@@ -125,16 +125,20 @@ def _a_body_without_a_profile(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(robot_limits.BODIES, "cart", HUSKY_A200)
 
 
-def error_of(text: str, folder: Path) -> ConfigurationError:
-    with pytest.raises(ConfigurationError) as caught:
-        load_scenario(_written(text, folder))
-    return caught.value
+def loading_error(text: str, folder: Path) -> ConfigurationError:
+    with pytest.raises(ConfigurationError) as error_info:
+        load_scenario(write_scenario(text, folder))
+    return error_info.value
 
 
-@pytest.mark.parametrize(("right", "wrong", "line", "message"), WRONG, ids=lambda value: str(value).strip()[:40])
-def test_an_error_has_its_line_and_a_remedy(right: str, wrong: str, line: int, message: str, tmp_path: Path) -> None:
-    assert SCENARIO.count(right) >= 1
-    error = error_of(SCENARIO.replace(right, wrong, 1), tmp_path)
+@pytest.mark.parametrize(
+    ("old_text", "new_text", "line", "message"), WRONG, ids=lambda value: str(value).strip()[:40]
+)
+def test_an_error_has_its_line_and_a_remedy(
+    old_text: str, new_text: str, line: int, message: str, tmp_path: Path
+) -> None:
+    assert SCENARIO.count(old_text) >= 1
+    error = loading_error(SCENARIO.replace(old_text, new_text, 1), tmp_path)
     assert re.search(message, str(error)), str(error)
     assert error.where == f"{tmp_path / 'meadow.yaml'}:{line}"
     assert error.remedy
@@ -142,13 +146,13 @@ def test_an_error_has_its_line_and_a_remedy(right: str, wrong: str, line: int, m
 
 def test_the_scenario_without_errors_runs(tmp_path: Path) -> None:
     text = SCENARIO.replace("kind: follow", "kind: standing").replace("      leader: one\n      distance: 2m\n", "")
-    run = build(load_scenario(_written(text, tmp_path))).run(100_000_000)
+    run = build(load_scenario(write_scenario(text, tmp_path))).run(100_000_000)
     assert run.windows_ns == [number * 5_000_000 for number in range(1, 21)]
 
 
 def test_a_jammer_among_fixed_links_is_refused(tmp_path: Path) -> None:
     text = SCENARIO.replace("node-loss, agent: one", "jammer, power_dbm: 20, agent: one")
-    error = error_of(text.replace("topology: masterless", "radio: {loss: 10%}"), tmp_path)
+    error = loading_error(text.replace("topology: masterless", "radio: {loss: 10%}"), tmp_path)
     assert "fixed links ignore a jammer" in error.what
     assert error.where.endswith(":24")
 
@@ -159,7 +163,7 @@ def test_a_robot_that_drives_cannot_follow_several_leaders(tmp_path: Path) -> No
     )
     text = text.replace("to: [one]", "to: [one, three]")
     text = text.replace("faults:", "  - {kind: stream, from: three, to: two, rate: 10Hz}\nfaults:")
-    error = error_of(text, tmp_path)
+    error = loading_error(text, tmp_path)
     assert "does not fly, and only robots that fly follow several leaders" in error.what
     assert error.where.endswith(":14")
     assert error.remedy == "choose one of one, three"
@@ -217,7 +221,7 @@ def test_a_motion_beyond_the_limits_is_refused_and_not_clipped(
     text = SCENARIO.replace(
         "robot: cart, at_m: [30, 10]", f"robot: {robot}, at_m: [30, 10],\n    motion: {{{motion}}}"
     )
-    error = error_of(text, tmp_path)
+    error = loading_error(text, tmp_path)
     assert re.search(f"three has .*{message}", error.what), error.what
     assert error.where.endswith(":17"), error.where
     assert error.remedy == f"choose a lower value, or a robot that is faster than {robot}"
@@ -226,7 +230,7 @@ def test_a_motion_beyond_the_limits_is_refused_and_not_clipped(
 def test_a_motion_at_the_limits_is_accepted(tmp_path: Path) -> None:
     motion = "kind: way-points, points_m: [[20, 10]], speed: 1m/s"
     text = SCENARIO.replace("robot: cart, at_m: [30, 10]", f"robot: husky, at_m: [30, 10], motion: {{{motion}}}")
-    build(load_scenario(_written(text, tmp_path)))
+    build(load_scenario(write_scenario(text, tmp_path)))
 
 
 def test_a_scenario_of_the_lab_has_priority_over_a_shipped_one(
@@ -243,8 +247,8 @@ def test_a_scenario_of_the_lab_has_priority_over_a_shipped_one(
 
 
 def test_values_are_changed_by_their_keys() -> None:
-    changed = load_scenario("baylands", {"agents.husky-2.along": "40m", "traffic.0.size_bytes": 64, "line": "nlos"})
-    assert (changed.agents["husky-2"].along, changed.traffic[0].size_bytes, changed.line) == (40, 64, "nlos")
+    scenario = load_scenario("baylands", {"agents.husky-2.along": "40m", "traffic.0.size_bytes": 64, "line": "nlos"})
+    assert (scenario.agents["husky-2"].along, scenario.traffic[0].size_bytes, scenario.line) == (40, 64, "nlos")
     assert load_scenario("baylands", {"physics.step": "2ms", "policy.window": "4ms"}).physics.step_ns == 2_000_000
     for key in ("traffic.9.rate", "traffic.x.rate", "name.x", "traffic.0.kind.x.y"):
         with pytest.raises(ConfigurationError, match=f"with {key}=1: the key {key} cannot be changed"):
@@ -261,8 +265,8 @@ def test_a_run_that_needs_too_much_memory_is_refused_with_both_sizes(
     monkeypatch.setattr(checks, "MEMINFO", meminfo)
     # 10 Hz for 2 s and a bag of 100 packets are 120 packets of 1200 bytes; 2000 windows and 10 per packet have 40
     # bytes each; and there are three pairs of agents.
-    assert checks.needed_bytes(load_scenario(_written(SCENARIO, tmp_path))) == 120 * 1200 + 3200 * 40 + 3 * 1600
-    error = error_of(SCENARIO.replace("rate: 10Hz", "rate: 1kHz"), tmp_path)
+    assert checks.needed_bytes(load_scenario(write_scenario(SCENARIO, tmp_path))) == 120 * 1200 + 3200 * 40 + 3 * 1600
+    error = loading_error(SCENARIO.replace("rate: 10Hz", "rate: 1kHz"), tmp_path)
     assert "2 s of 3 agents would need 3.4 MB of memory, but only 1.0 MB are available" in error.what
     assert "choose a shorter duration, or send less: one-stream alone has 2,000 packets" in error.remedy
     assert error.where.endswith(":4")
@@ -273,19 +277,19 @@ def test_a_run_that_needs_too_much_memory_is_refused_with_both_sizes(
 def test_too_many_agents_for_the_memory_are_refused_before_they_are_built(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text, _, rest = SCENARIO.partition("  one: ")
+    text, _, remaining_text = SCENARIO.partition("  one: ")
     agents = "".join(f"  n{number}: {{robot: turtlebot3_burger, at_m: [0, 0]}}\n" for number in range(300))
     meminfo = tmp_path / "meminfo"
     meminfo.write_text("MemAvailable:    70200 kB\n", encoding="ascii")
     monkeypatch.setattr(checks, "MEMINFO", meminfo)
-    # 44,850 pairs need 72 MB. If the bodies were built, the error would be that all are in one place.
-    error = error_of(f"{text}{agents}  one: {rest}", tmp_path)
+    # 44,850 pairs need 72 MB. If the bodies were built, the error would be that all have one position.
+    error = loading_error(f"{text}{agents}  one: {remaining_text}", tmp_path)
     assert "2 s of 303 agents would need 73 MB of memory, but only 72 MB are available" in error.what
     assert error.where.endswith(":7")
     assert error.remedy == "use fewer agents"
 
 
-def _written(text: str, folder: Path) -> Path:
+def write_scenario(text: str, folder: Path) -> Path:
     path = folder / "meadow.yaml"
     path.write_text(text, encoding="utf-8")
     return path

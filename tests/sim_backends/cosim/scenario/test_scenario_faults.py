@@ -33,7 +33,7 @@ traffic:
 faults:
 """
 MS = 1_000_000
-ALL = {"ab/b", "cb/b", "ping/c", "ping/c/reply"}
+ALL_FLOWS = {"ab/b", "cb/b", "ping/c", "ping/c/reply"}
 
 
 RunOf = Callable[..., tuple[CosimScenario, Run]]
@@ -41,7 +41,7 @@ RunOf = Callable[..., tuple[CosimScenario, Run]]
 
 @pytest.fixture
 def run_of(tmp_path: Path) -> RunOf:
-    """Return a function that runs the scenario with a fault, and with changes if they are given."""
+    """Return a function that runs the scenario with a fault, and optionally with changes."""
 
     def run(fault: str, changes: Mapping[str, Any] | None = None) -> tuple[CosimScenario, Run]:
         path = tmp_path / "line.yaml"
@@ -52,47 +52,47 @@ def run_of(tmp_path: Path) -> RunOf:
     return run
 
 
-def sent_ms(run: Run, flow: str) -> list[float]:
+def send_times_ms(run: Run, flow: str) -> list[float]:
     return [fate.packet.sent_ns / MS for (name, _), fate in run.fates.items() if name == flow]
 
 
-def lost_ms(run: Run, flow: str) -> list[float]:
+def send_times_of_lost_ms(run: Run, flow: str) -> list[float]:
     """Return the times of sending, in ms, of the packets of a flow that never arrived."""
     return [fate.packet.sent_ns / MS for (name, _), fate in run.fates.items() if name == flow and fate.reason]
 
 
-def within(times_ms: list[float], begin_ms: float, end_ms: float) -> bool:
+def are_within(times_ms: list[float], begin_ms: float, end_ms: float) -> bool:
     return all(begin_ms <= at_ms < end_ms for at_ms in times_ms)
 
 
 def test_an_agent_that_is_off_sends_and_receives_nothing_and_recovers(run_of: RunOf) -> None:
     scenario, run = run_of("{kind: node-loss, agent: c, from: 1s, to: 2s}")
-    assert not [at_ms for at_ms in sent_ms(run, "cb/b") if 1000 <= at_ms < 2000]
-    assert len(sent_ms(run, "cb/b")) == pytest.approx(200, abs=1)
-    assert not lost_ms(run, "ab/b")
-    lost = lost_ms(run, "ping/c")
-    assert len(lost) == 10
-    assert within(lost, 1000, 2000)
-    by_flow = {recovery.flow: recovery for recovery in recoveries(scenario, run)}
-    assert by_flow.keys() == ALL - {"ab/b"}
-    lost_packets = {flow: recovery.lost_packets for flow, recovery in by_flow.items()}
+    assert not [at_ms for at_ms in send_times_ms(run, "cb/b") if 1000 <= at_ms < 2000]
+    assert len(send_times_ms(run, "cb/b")) == pytest.approx(200, abs=1)
+    assert not send_times_of_lost_ms(run, "ab/b")
+    lost_times_ms = send_times_of_lost_ms(run, "ping/c")
+    assert len(lost_times_ms) == 10
+    assert are_within(lost_times_ms, 1000, 2000)
+    recoveries_by_flow = {recovery.flow: recovery for recovery in recoveries(scenario, run)}
+    assert recoveries_by_flow.keys() == ALL_FLOWS - {"ab/b"}
+    lost_packets = {flow: recovery.lost_packets for flow, recovery in recoveries_by_flow.items()}
     assert lost_packets == {"cb/b": 0, "ping/c": 10, "ping/c/reply": 0}
     for flow, period_s in (("cb/b", 0.01), ("ping/c", 0.1), ("ping/c/reply", 0.1)):
-        recovered_s = by_flow[flow].recovered_s
+        recovered_s = recoveries_by_flow[flow].recovered_s
         assert recovered_s is not None
         assert 0 < recovered_s < period_s + 0.01
 
 
-@pytest.mark.parametrize("lost", ["b", "c"])
-def test_a_timer_that_was_moved_and_came_due_while_its_host_was_off_fires_when_the_host_is_on(
-    run_of: RunOf, lost: str
+@pytest.mark.parametrize("agent", ["b", "c"])
+def test_a_rescheduled_timer_that_was_due_while_its_host_was_off_fires_when_the_host_is_on(
+    run_of: RunOf, agent: str
 ) -> None:
-    """The fault is during registration at the master, when every reply moves the timers of the connection."""
+    """The fault is during registration at the master, when every reply reschedules the timers of the connection."""
     ros1 = {"traffic.1.protocol": "ros1", "relay": "b"}
-    _, run = run_of(f"{{kind: node-loss, agent: {lost}, from: 10ms, to: 500ms}}", ros1)
-    late = [fate for (flow, _), fate in run.fates.items() if flow == "cb/b" and fate.packet.sent_ns > 2500 * MS]
-    assert len(late) == pytest.approx(50, abs=1)
-    assert not any(fate.reason for fate in late)
+    _, run = run_of(f"{{kind: node-loss, agent: {agent}, from: 10ms, to: 500ms}}", ros1)
+    late_fates = [fate for (flow, _), fate in run.fates.items() if flow == "cb/b" and fate.packet.sent_ns > 2500 * MS]
+    assert len(late_fates) == pytest.approx(50, abs=1)
+    assert not any(fate.reason for fate in late_fates)
 
 
 TOPIC = {"traffic.1.protocol": "topic"}
@@ -100,27 +100,27 @@ DISCOVERED_MS = 200
 """Time at which discovery of publishers and subscribers is complete."""
 
 
-def test_a_subscriber_that_was_off_for_less_than_a_lease_gets_the_history_of_its_writer(run_of: RunOf) -> None:
+def test_a_subscriber_that_was_off_for_less_than_a_lease_receives_the_history_of_its_writer(run_of: RunOf) -> None:
     scenario, run = run_of("{kind: node-loss, agent: b, from: 1s, to: 2s}", TOPIC)
     fates = [
         fate for (flow, _), fate in run.fates.items() if flow == "cb/b" and fate.packet.sent_ns > DISCOVERED_MS * MS
     ]
-    lost = [fate for fate in fates if fate.reason]
-    assert {fate.reason for fate in lost} == {"evicted from the writer's history before it was acknowledged"}
-    assert within([fate.packet.sent_ns / MS for fate in lost], 990, 1910)
+    lost_fates = [fate for fate in fates if fate.reason]
+    assert {fate.reason for fate in lost_fates} == {"evicted from the writer's history before it was acknowledged"}
+    assert are_within([fate.packet.sent_ns / MS for fate in lost_fates], 990, 1910)
     # The writer keeps the last ten samples; each arrives within a heartbeat period after b is on.
-    delivered = [fate for fate in fates if not fate.reason and 1000 * MS < fate.packet.sent_ns < 2000 * MS]
-    assert len(lost) + len(delivered) == pytest.approx(100, abs=1)
-    assert 9 <= len(delivered) <= 10
-    assert all(fate.arrived_ns is not None and 2000 < fate.arrived_ns / MS < 2120 for fate in delivered)
+    delivered_fates = [fate for fate in fates if not fate.reason and 1000 * MS < fate.packet.sent_ns < 2000 * MS]
+    assert len(lost_fates) + len(delivered_fates) == pytest.approx(100, abs=1)
+    assert 9 <= len(delivered_fates) <= 10
+    assert all(fate.arrived_ns is not None and 2000 < fate.arrived_ns / MS < 2120 for fate in delivered_fates)
     (recovery,) = (recovery for recovery in recoveries(scenario, run) if recovery.flow == "cb/b")
-    assert recovery.lost_packets == pytest.approx(len(lost), abs=1)
+    assert recovery.lost_packets == pytest.approx(len(lost_fates), abs=1)
 
 
 def test_a_topic_whose_publisher_was_off_loses_no_published_sample(run_of: RunOf) -> None:
     _, run = run_of("{kind: node-loss, agent: c, from: 1s, to: 2s}", TOPIC)
-    assert len(sent_ms(run, "cb/b")) == pytest.approx(200, abs=1)
-    assert within(lost_ms(run, "cb/b"), 0, DISCOVERED_MS)
+    assert len(send_times_ms(run, "cb/b")) == pytest.approx(200, abs=1)
+    assert are_within(send_times_of_lost_ms(run, "cb/b"), 0, DISCOVERED_MS)
 
 
 @pytest.mark.parametrize("reliability", ["reliable", "best_effort"])
@@ -135,8 +135,8 @@ def test_a_topic_removes_a_subscriber_whose_lease_has_expired_and_discovers_it_a
     # Announcements are sent every 8 s; one that was due during the fault is sent when the agent is on again.
     assert recovery.recovered_s is not None
     assert 0 < recovery.recovered_s < 8.2
-    lost = [at_ms for at_ms in lost_ms(run, "cb/b") if at_ms > DISCOVERED_MS]
-    assert within(lost, 5000, 20_000 + 1000 * recovery.recovered_s)
+    lost_times_ms = [at_ms for at_ms in send_times_of_lost_ms(run, "cb/b") if at_ms > DISCOVERED_MS]
+    assert are_within(lost_times_ms, 5000, 20_000 + 1000 * recovery.recovered_s)
     reasons = {fate.reason for (flow, _), fate in run.fates.items() if flow == "cb/b"}
     assert ("the lease of the subscriber expired" in reasons) == (reliability == "reliable")
     assert "not matched yet" in reasons
@@ -144,10 +144,10 @@ def test_a_topic_removes_a_subscriber_whose_lease_has_expired_and_discovers_it_a
 
 def test_a_cut_link_affects_both_ends_and_no_other_agent(run_of: RunOf) -> None:
     scenario, run = run_of("{kind: link-cut, between: [c, a], from: 500ms, to: 1500ms}")
-    assert not lost_ms(run, "ab/b")
-    assert not lost_ms(run, "cb/b")
-    assert len(lost_ms(run, "ping/c")) == 10
-    assert within(lost_ms(run, "ping/c"), 500, 1500)
+    assert not send_times_of_lost_ms(run, "ab/b")
+    assert not send_times_of_lost_ms(run, "cb/b")
+    assert len(send_times_of_lost_ms(run, "ping/c")) == 10
+    assert are_within(send_times_of_lost_ms(run, "ping/c"), 500, 1500)
     assert {recovery.flow for recovery in recoveries(scenario, run)} == {"ping/c", "ping/c/reply"}
     trips_s = round_trips_s(run, "ping/c")
     assert (trips_s.shape, np.isnan(trips_s).sum()) == ((28,), 10)
@@ -157,11 +157,11 @@ def test_a_cut_link_affects_both_ends_and_no_other_agent(run_of: RunOf) -> None:
 def test_a_fault_of_the_relay_affects_all_flows_that_pass_it(run_of: RunOf) -> None:
     master = {"topology": "master", "relay": "b"}
     scenario, run = run_of("{kind: link-cut, between: [a, b], from: 500ms, to: 1500ms}", master)
-    assert len(lost_ms(run, "ping/c")) == 10
-    assert {recovery.flow for recovery in recoveries(scenario, run)} == ALL - {"cb/b"}
+    assert len(send_times_of_lost_ms(run, "ping/c")) == 10
+    assert {recovery.flow for recovery in recoveries(scenario, run)} == ALL_FLOWS - {"cb/b"}
     scenario, run = run_of("{kind: node-loss, agent: b, from: 500ms, to: 1500ms}", master)
-    assert len(lost_ms(run, "ping/c")) == 10
-    assert {recovery.flow for recovery in recoveries(scenario, run)} == ALL
+    assert len(send_times_of_lost_ms(run, "ping/c")) == 10
+    assert {recovery.flow for recovery in recoveries(scenario, run)} == ALL_FLOWS
 
 
 def test_a_jammer_affects_all_agents_and_without_an_end_has_no_recovery(run_of: RunOf) -> None:
@@ -169,24 +169,26 @@ def test_a_jammer_affects_all_agents_and_without_an_end_has_no_recovery(run_of: 
     # Stations that sense the noise defer, so that packets that are not lost arrive late.
     arrived_ms = [fate.arrived_ns / MS for fate in run.fates.values() if fate.arrived_ns is not None]
     assert not [at_ms for at_ms in arrived_ms if 1010 < at_ms < 2000]
-    after = recoveries(scenario, run)
-    assert {recovery.flow for recovery in after} == ALL
-    assert all(recovery.recovered_s is not None and recovery.recovered_s < 0.3 for recovery in after)
+    measured_recoveries = recoveries(scenario, run)
+    assert {recovery.flow for recovery in measured_recoveries} == ALL_FLOWS
+    assert all(recovery.recovered_s is not None and recovery.recovered_s < 0.3 for recovery in measured_recoveries)
     scenario, run = run_of("{kind: jammer, power_dbm: 60, agent: b, from: 1s}")
     assert not recoveries(scenario, run)
     assert max(fate.arrived_ns or 0 for fate in run.fates.values()) < 1100 * MS
 
 
 def test_a_fast_clock_sends_more(run_of: RunOf) -> None:
-    _, right = run_of("{kind: node-loss, agent: c, from: 2.9s}")
-    _, fast = run_of("{kind: clock-skew, agent: a, rate_ppm: 100000, from: 1s, to: 2s}")
-    # For one second it runs at 110 Hz.
-    assert len(sent_ms(fast, "ab/b")) - len(sent_ms(right, "ab/b")) == pytest.approx(0, abs=1)
-    during = [at_ms for at_ms in sent_ms(fast, "ab/b") if 1000 <= at_ms < 2000]
-    assert len(during) == pytest.approx(110, abs=1)
+    _, reference = run_of("{kind: node-loss, agent: c, from: 2.9s}")
+    _, run_with_fast_clock = run_of("{kind: clock-skew, agent: a, rate_ppm: 100000, from: 1s, to: 2s}")
+    # For one second the sender runs at 110 Hz.
+    assert len(send_times_ms(run_with_fast_clock, "ab/b")) - len(send_times_ms(reference, "ab/b")) == pytest.approx(
+        0, abs=1
+    )
+    times_during_fault_ms = [at_ms for at_ms in send_times_ms(run_with_fast_clock, "ab/b") if 1000 <= at_ms < 2000]
+    assert len(times_during_fault_ms) == pytest.approx(110, abs=1)
     # After it was set back by 100 ms, the program waits until the clock reaches the same reading again.
-    assert not [at_ms for at_ms in sent_ms(fast, "ab/b") if 2000 <= at_ms < 2099]
-    assert len([at_ms for at_ms in sent_ms(fast, "cb/b") if 1000 <= at_ms < 2000]) == 100
+    assert not [at_ms for at_ms in send_times_ms(run_with_fast_clock, "ab/b") if 2000 <= at_ms < 2099]
+    assert len([at_ms for at_ms in send_times_ms(run_with_fast_clock, "cb/b") if 1000 <= at_ms < 2000]) == 100
 
 
 @pytest.mark.parametrize("federate", ["physics", "network"])

@@ -13,7 +13,7 @@ from sim_backends.cosim.scenario.loading import scenario_files
 from tests.helpers.paths import ROOT
 
 SECOND_NS = 1_000_000_000
-AGAIN = """
+DIGEST_SCRIPT = """
 import json, sys
 from sim_backends.cosim import build, load_scenario
 until_ns, *pairs = json.loads(sys.argv[1])
@@ -41,7 +41,7 @@ def test_another_process_gives_the_same_digests() -> None:
     assert len(set(digests)) > len(pairs) / 2
     # Another hash seed gives another order of sets.
     environment = os.environ | {"PYTHONHASHSEED": "7"}
-    command = sys.executable, "-c", AGAIN, json.dumps([until_ns, *pairs])
+    command = sys.executable, "-c", DIGEST_SCRIPT, json.dumps([until_ns, *pairs])
     result = subprocess.run(
         command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True, timeout=300
     )

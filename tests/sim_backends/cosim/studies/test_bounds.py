@@ -1,4 +1,4 @@
-"""The cost of a bound, against results computed by hand."""
+"""The cost of a bound, compared with results computed by hand."""
 
 import math
 
@@ -30,7 +30,7 @@ class LateStart(Motion):
         return {"a": State((distance_m, 0.0, 0.0), (speed_m_s, 0.0, 0.0))}
 
 
-def sprint(policy: SyncPolicy) -> Run:
+def run_late_start(policy: SyncPolicy) -> Run:
     physics = Paths([LateStart(), WayPoints("b", [(9.0, 3.0, 0.0)], 1.0)], limits_m_s2={"a": 4.0})
     agents = Agents(physics, {"a": Periodic("a", "b", period_ns=2_300_001)})
     return Coordinator(agents, Disc(100.0, 10, extrapolates=True), policy, [("a", "b")]).advance(5_000 * MS)
@@ -38,35 +38,36 @@ def sprint(policy: SyncPolicy) -> Run:
 
 def test_an_agent_with_a_mostly_constant_velocity_needs_few_exchanges() -> None:
     """A fixed window must be short enough for the fastest second; the bound only limits changes of the velocity."""
-    cost = bound_cost(sprint, 0.01, step_s=0.001)
+    cost = bound_cost(run_late_start, 0.01, step_s=0.001)
     assert cost.largest_m <= 0.01
-    # At 2 m/s a window of 5 ms keeps 10 mm; states are those at steps, and packets are sent every 2.3 ms.
+    # At 2 m/s, the error of a window of 5 ms is 10 mm; states change at steps, and packets are sent every 2.3 ms.
     assert cost.window_s == pytest.approx(0.005, rel=0.2)
     assert cost.fixed_exchanges == pytest.approx(5 / cost.window_s, rel=0.01)
-    # For half a second 4 m/s^2 allow windows of t: 4 m/s^2 t^2 / 2 = 10 mm, t = 70.7 ms. Otherwise they last 0.1 s.
+    # During half a second of 4 m/s^2, the bound allows windows of t = 70.7 ms: 4 m/s^2 t^2 / 2 = 10 mm. All others
+    # last 0.1 s.
     assert 45 + 0.5 / 0.0708 <= cost.exchanges <= 45 + 0.5 / 0.068 + 2
     assert cost.factor == cost.fixed_exchanges / cost.exchanges
     assert cost.factor > 15
 
 
-def test_a_bound_that_no_fixed_window_keeps_has_no_factor() -> None:
+def test_a_bound_that_no_fixed_window_satisfies_has_no_factor() -> None:
     """A window that does not end at whole steps of the physics has an error of a step."""
-    cost = bound_cost(sprint, 1e-6, step_s=0.0015)
+    cost = bound_cost(run_late_start, 1e-6, step_s=0.0015)
     assert cost.largest_m <= 1e-6
     assert math.isnan(cost.factor)
 
 
-def test_the_longest_window_is_the_result_if_it_keeps_the_bound() -> None:
-    cost = bound_cost(sprint, 1.0, step_s=0.001)
+def test_the_longest_window_is_the_result_if_it_satisfies_the_bound() -> None:
+    cost = bound_cost(run_late_start, 1.0, step_s=0.001)
     assert (cost.window_s, cost.fixed_exchanges, cost.exchanges) == (0.1, 50, 50)
 
 
-def test_the_window_for_all_runs_keeps_the_bound_in_each() -> None:
+def test_the_window_for_all_runs_satisfies_the_bound_in_each_run() -> None:
     """The second run has an error of 2 m/s times the window, except, by chance, between 10 and 11 ms."""
 
     def costs(window_s: float) -> list[FixedCost]:
-        other_m = 0.0 if 0.01 < window_s < 0.011 else 2 * window_s
-        return [FixedCost(window_s, round(1 / window_s)), FixedCost(other_m, round(1 / window_s))]
+        second_error_m = 0.0 if 0.01 < window_s < 0.011 else 2 * window_s
+        return [FixedCost(window_s, round(1 / window_s)), FixedCost(second_error_m, round(1 / window_s))]
 
     window_s, fixed = longest_sufficient_window([0.017, 0.0105], costs, 0.0105)
     assert fixed == costs(window_s)

@@ -1,4 +1,4 @@
-"""Convoys against transfer functions derived by hand, on a network with a constant delay."""
+"""Convoys compared with transfer functions derived by hand, on a network with a constant delay."""
 
 import math
 
@@ -22,32 +22,35 @@ PERIOD_S = math.tau / RATE_RAD_S
 
 
 def test_the_limit_of_string_stability_is_where_the_gain_exceeds_one() -> None:
-    rates = np.geomspace(1e-3, 1e3, 2000)
+    rates_rad_s = np.geomspace(1e-3, 1e3, 2000)
     for headway_s, gain_per_s in ((0.3, 2.0), (1.0, 1.0), (0.5, 0.2)):
         limit_s = formation.longest_delay_s(headway_s, gain_per_s)
         for delay_s in (0.0, 0.5 * limit_s, 0.99 * limit_s):
-            gains = formation.gain(rates, delay_s=delay_s, headway_s=headway_s, gain_per_s=gain_per_s)
+            gains = formation.gain(rates_rad_s, delay_s=delay_s, headway_s=headway_s, gain_per_s=gain_per_s)
             assert gains.max() <= 1 + 1e-12
         for delay_s in (1.01 * limit_s, 2 * limit_s):
-            assert formation.gain(rates, delay_s=delay_s, headway_s=headway_s, gain_per_s=gain_per_s).max() > 1 + 1e-9
+            assert (
+                formation.gain(rates_rad_s, delay_s=delay_s, headway_s=headway_s, gain_per_s=gain_per_s).max()
+                > 1 + 1e-9
+            )
 
 
-@pytest.mark.parametrize(("delay_s", "stable"), [(0.04, True), (0.3, False)])
-def test_a_row_amplifies_as_its_transfer_function_predicts(delay_s: float, stable: bool) -> None:
-    """On both sides of the limit, which is at 83 ms."""
-    assert (delay_s < formation.longest_delay_s(HEADWAY_S, GAIN_PER_S)) == stable
-    settled_s = 3 * PERIOD_S
+@pytest.mark.parametrize(("delay_s", "is_stable"), [(0.04, True), (0.3, False)])
+def test_a_row_amplifies_as_its_transfer_function_predicts(delay_s: float, is_stable: bool) -> None:
+    """The limit is 83 ms; one delay is below it and one above it."""
+    assert (delay_s < formation.longest_delay_s(HEADWAY_S, GAIN_PER_S)) == is_stable
+    settling_time_s = 3 * PERIOD_S
     times_s, places = positions_m(
-        EventDriven(), delay_s=delay_s, headway_s=HEADWAY_S, followers=2, seconds=settled_s + PERIOD_S
+        EventDriven(), delay_s=delay_s, headway_s=HEADWAY_S, followers=2, seconds=settling_time_s + PERIOD_S
     )
-    speeds = formation.speeds_m_s(times_s, places)[times_s >= settled_s]
+    speeds = formation.speeds_m_s(times_s, places)[times_s >= settling_time_s]
     ratios = formation.amplifications(speeds)
     # A state is sent every 10 ms, and a command is held for 10 ms: half of each adds to the delay.
     expected = formation.gain(
         np.array([RATE_RAD_S]), delay_s=delay_s + 0.01, headway_s=HEADWAY_S, gain_per_s=GAIN_PER_S
     )
     assert ratios == pytest.approx([expected[0]] * 2, rel=0.01)
-    assert all((ratio <= 1) == stable for ratio in ratios)
+    assert all((ratio <= 1) == is_stable for ratio in ratios)
 
 
 def run(policy: SyncPolicy) -> tuple[Floats, Floats]:
@@ -69,14 +72,14 @@ def test_the_position_error_of_a_closed_loop_grows_with_the_window() -> None:
     assert np.abs(spacing_m[times_s > 2]).max() == pytest.approx(expected_m, rel=0.2)
 
 
-def test_measures_of_a_known_row() -> None:
+def test_the_measures_of_a_row_equal_those_computed_by_hand() -> None:
     times_s = np.linspace(0, 10, 1001)
-    lead = np.stack([2 * times_s, 0 * times_s, 0 * times_s], axis=-1)
-    behind = lead - np.array([5.0, 0.0, 0.0])
-    places = np.stack([lead, behind], axis=1)
+    leader_m = np.stack([2 * times_s, 0 * times_s, 0 * times_s], axis=-1)
+    follower_m = leader_m - np.array([5.0, 0.0, 0.0])
+    places = np.stack([leader_m, follower_m], axis=1)
     assert formation.speeds_m_s(times_s, places) == pytest.approx(np.full((1001, 2), 2.0))
     assert formation.spacing_errors_m(times_s, places, 2.0, 1.0) == pytest.approx(np.full((1001, 1), 1.0))
-    station = lead + np.array([-2.5, 3.0, 14.0])
+    station = leader_m + np.array([-2.5, 3.0, 14.0])
     assert formation.station_errors_m(places, station, 10.0) == pytest.approx(np.full(1001, 5.0))
     wave = np.sin(times_s)
     assert formation.amplifications(np.stack([wave, 0.5 * wave + 3, 0 * wave], axis=1)) == pytest.approx([0.5, 0.0])

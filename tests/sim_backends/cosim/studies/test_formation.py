@@ -1,4 +1,4 @@
-"""How well followers keep their positions, on known paths."""
+"""Measures of how well followers keep their positions, on known paths."""
 
 import math
 
@@ -31,15 +31,16 @@ def tracks(gap_m: float, above_m: float) -> Tracks:
 
 
 def test_the_shipped_convoy_is_measured_with_the_distances_of_its_file() -> None:
-    """2 m and 1 s behind, 8 m above: at 1 m/s the follower is 3 m behind; its oscillation is half as large."""
+    """The file states 2 m and 1 s behind, and 8 m above: at 1 m/s the desired gap is 3 m."""
     scenario = load_scenario("convoy")
-    measured = compute_formation(scenario, tracks(gap_m=3.0, above_m=8.5))
-    assert (measured.station_mean_m, measured.station_max_m) == pytest.approx((0.5, 0.5))
-    assert measured.amplification == pytest.approx(0.5, rel=0.01)
-    # 0.1 sin wt of the gap less 1 s times 0.1 w cos wt of the speed: the amplitude is 0.1 sqrt(1 + w^2).
+    result = compute_formation(scenario, tracks(gap_m=3.0, above_m=8.5))
+    assert (result.station_mean_m, result.station_max_m) == pytest.approx((0.5, 0.5))
+    assert result.amplification == pytest.approx(0.5, rel=0.01)
+    # The gap oscillates by 0.1 sin wt, and the desired gap by 1 s times 0.1 w cos wt: the amplitude of the
+    # difference is 0.1 sqrt(1 + w^2).
     amplitude_m = 0.1 * math.hypot(1, math.tau / 10)
-    assert measured.spacing_max_m == pytest.approx(amplitude_m, rel=0.02)
-    assert measured.spacing_mean_m == pytest.approx(amplitude_m * 2 / math.pi, rel=0.02)
+    assert result.spacing_max_m == pytest.approx(amplitude_m, rel=0.02)
+    assert result.spacing_mean_m == pytest.approx(amplitude_m * 2 / math.pi, rel=0.02)
     assert compute_formation(scenario, tracks(gap_m=4.0, above_m=8.0)).spacing_mean_m == pytest.approx(1, rel=0.02)
 
 
@@ -60,7 +61,7 @@ def test_the_mean_of_several_runs_has_means_and_the_largest_maxima() -> None:
 
 def test_tracks_of_a_recording_have_every_agent_at_every_time() -> None:
     rows = [(0, "b", 0.0), (0, "a", 5.0), (10**8, "b", 1.0), (10**8, "a", 5.0)]
-    recorded = tracks_of((at_ns, name, State((east_m, 0.0, 0.0))) for at_ns, name, east_m in rows)
-    assert (recorded.names, recorded.times_s.tolist()) == (("b", "a"), [0.0, 0.1])
-    assert recorded.positions_m[:, :, 0].tolist() == [[0.0, 5.0], [1.0, 5.0]]
+    recorded_tracks = tracks_of((at_ns, name, State((east_m, 0.0, 0.0))) for at_ns, name, east_m in rows)
+    assert (recorded_tracks.names, recorded_tracks.times_s.tolist()) == (("b", "a"), [0.0, 0.1])
+    assert recorded_tracks.positions_m[:, :, 0].tolist() == [[0.0, 5.0], [1.0, 5.0]]
     assert tracks_of([]).positions_m.shape == (0, 0, 3)

@@ -1,4 +1,4 @@
-"""Intervals against scipy, and their coverage."""
+"""Confidence intervals compared with those of scipy, and the number of repeats that a study needs."""
 
 import math
 
@@ -14,7 +14,7 @@ def normal(*shape: int) -> Floats:
 
 
 @pytest.mark.parametrize("degrees", [1, 2, 3, 4, 7, 19, 20, 99, 1000])
-def test_students_quantile_equals_scipys(degrees: int) -> None:
+def test_the_quantile_of_students_t_equals_that_of_scipy(degrees: int) -> None:
     assert t_quantile(degrees) == pytest.approx(scipy.stats.t.ppf(0.975, degrees), rel=1e-9)
 
 
@@ -27,26 +27,30 @@ def test_a_mean_has_students_interval_and_a_single_value_has_none() -> None:
     assert math.isnan(mean(np.array([3.0])).low)
 
 
-@pytest.mark.parametrize(("low", "high", "certain"), [(0.1, 0.3, True), (-0.3, -0.1, True), (-0.1, 0.1, False)])
-def test_a_sign_is_certain_if_the_interval_excludes_0(low: float, high: float, certain: bool) -> None:
-    assert IntervalEstimate((low + high) / 2, low, high).is_certain is certain
+@pytest.mark.parametrize(("low", "high", "is_certain"), [(0.1, 0.3, True), (-0.3, -0.1, True), (-0.1, 0.1, False)])
+def test_a_sign_is_certain_if_the_interval_excludes_0(low: float, high: float, is_certain: bool) -> None:
+    assert IntervalEstimate((low + high) / 2, low, high).is_certain is is_certain
 
 
 def test_the_jackknife_of_a_mean_is_students_interval() -> None:
     values = normal(12)
-    without = np.array([np.delete(values, index).mean() for index in range(12)])
-    estimate, expected = jackknife(float(values.mean()), without), mean(values)
+    means_without_one_value = np.array([np.delete(values, index).mean() for index in range(12)])
+    estimate, expected = jackknife(float(values.mean()), means_without_one_value), mean(values)
     assert (estimate.low, estimate.high) == pytest.approx((expected.low, expected.high))
 
 
 @pytest.mark.parametrize(("difference", "deviation"), [(1.0, 1.0), (0.5, 1.0), (0.2, 1.0), (3.0, 1.5)])
-def test_the_needed_repeats_detect_a_difference_in_four_of_five_studies(difference: float, deviation: float) -> None:
+def test_the_needed_repeats_detect_a_difference_in_four_out_of_five_studies(
+    difference: float, deviation: float
+) -> None:
     """The exact power is computed with the noncentral t distribution."""
 
     def power(count: int) -> float:
-        wide, centre = scipy.stats.t.ppf(0.975, count - 1), difference / deviation * math.sqrt(count)
-        below, above = scipy.stats.nct.cdf([-wide, wide], count - 1, centre)
-        return float(below + 1 - above)
+        critical_value, centre = scipy.stats.t.ppf(0.975, count - 1), difference / deviation * math.sqrt(count)
+        probability_below, probability_above = scipy.stats.nct.cdf(
+            [-critical_value, critical_value], count - 1, centre
+        )
+        return float(probability_below + 1 - probability_above)
 
     count = repeats_needed(difference, deviation)
     assert count is not None

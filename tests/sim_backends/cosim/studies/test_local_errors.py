@@ -1,4 +1,4 @@
-"""Local errors against results computed by hand: a moving pair, a hard range limit, a constant delay."""
+"""Local errors compared with results computed by hand: a moving pair, a hard range limit, a constant delay."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -33,12 +33,8 @@ from tests.helpers.moving_pair import DELAY_NS, LEAVES_NS, PERIOD_NS, SPEED_M_S,
 MS = 1_000_000
 DELAY_S = DELAY_NS / 1e9
 WINDOWS_S = (0.02, 0.06, 0.2)
-WITHIN = low_discrepancy_times_ns(4_000 * MS, 7_500 * MS, 30, STEP_NS)
-"""Beginnings of windows that are within range until their end."""
-
-
-def half(window_s: float) -> float:
-    return window_s / 2
+STARTS_IN_RANGE_NS = low_discrepancy_times_ns(4_000 * MS, 7_500 * MS, 30, STEP_NS)
+"""Starts of windows during which the pair is always within range."""
 
 
 def mean_wait_s(window_s: float) -> float:
@@ -46,27 +42,30 @@ def mean_wait_s(window_s: float) -> float:
     return window_s**2 / 2 / (window_s + DELAY_S)
 
 
-def held_twice(window_s: float) -> float:
-    """Return the same if packets also wait for the end of the window in which they are sent."""
+def mean_wait_at_both_ends_s(window_s: float) -> float:
+    """Return the mean wait if packets also wait for the end of the window in which they are sent."""
     return (window_s**2 / 2 + DELAY_S * (window_s - DELAY_S / 2)) / (window_s + DELAY_S)
 
 
-def path(window_s: float) -> float:
+def path_error_m(window_s: float) -> float:
     return SPEED_M_S * window_s / 2
 
 
-HELD_M = SPEED_M_S * STEP_NS / 1e9
-"""Motion during a step of the physics, for which states are held."""
+STEP_MOTION_M = SPEED_M_S * STEP_NS / 1e9
+"""Motion during a step of the physics; states do not change within a step."""
 
 
 Law = Callable[[float], float]
 LAWS: dict[str, tuple[Callable[[float], SyncPolicy], dict[str, Law]]] = {
-    "time_stepped": (TimeStepped, {"delivery_s": held_twice, "position_m": path}),
-    "scheduled": (Scheduled, {"delivery_s": mean_wait_s, "position_m": path}),
-    "sliding_window": (SlidingWindow, {"late_s": mean_wait_s, "position_m": path}),
-    "velocity_aware_raw": (VelocityAwareRaw, {"late_s": mean_wait_s, "position_m": path}),
-    "velocity_aware": (lambda window_s: VelocityAware(window_s, 1.0), {"late_s": mean_wait_s, "position_m": path}),
-    # Both keep their velocities, so the extrapolation is exact, and windows have their maximum length.
+    "time_stepped": (TimeStepped, {"delivery_s": mean_wait_at_both_ends_s, "position_m": path_error_m}),
+    "scheduled": (Scheduled, {"delivery_s": mean_wait_s, "position_m": path_error_m}),
+    "sliding_window": (SlidingWindow, {"late_s": mean_wait_s, "position_m": path_error_m}),
+    "velocity_aware_raw": (VelocityAwareRaw, {"late_s": mean_wait_s, "position_m": path_error_m}),
+    "velocity_aware": (
+        lambda window_s: VelocityAware(window_s, 1.0),
+        {"late_s": mean_wait_s, "position_m": path_error_m},
+    ),
+    # Both velocities are constant, so the extrapolation is exact, and windows have their maximum length.
     "error_bounded": (lambda window_s: ErrorBounded(1e-9, window_s), {"delivery_s": mean_wait_s}),
     "variable_stepped": (lambda _: VariableStepped(), {}),
     "event_driven": (lambda _: EventDriven(), {}),
@@ -74,15 +73,15 @@ LAWS: dict[str, tuple[Callable[[float], SyncPolicy], dict[str, Law]]] = {
 
 
 def test_each_method_has_the_errors_and_the_order_computed_by_hand() -> None:
-    by_policy = local_errors(
-        moving_pair, {name: kind for name, (kind, _) in LAWS.items()}, WINDOWS_S, WITHIN, tail_ns=20 * MS
+    errors_by_policy = local_errors(
+        moving_pair, {name: kind for name, (kind, _) in LAWS.items()}, WINDOWS_S, STARTS_IN_RANGE_NS, tail_ns=20 * MS
     )
     for name, (_, laws) in LAWS.items():
-        errors = by_policy[name]
+        errors = errors_by_policy[name]
         lengths_s = errors.window_s.mean(axis=1)
         for measure in MEASURES:
             if measure not in laws:
-                limit = HELD_M * errors.counts[measure] if measure == "position_m" else 1e-9
+                limit = STEP_MOTION_M * errors.counts[measure] if measure == "position_m" else 1e-9
                 assert (errors.sums[measure] <= limit).all(), f"{name} has no error in {measure}"
                 continue
             expected = [laws[measure](length_s) for length_s in lengths_s]
@@ -90,7 +89,7 @@ def test_each_method_has_the_errors_and_the_order_computed_by_hand() -> None:
             order = errors.order(measure)
             assert order.value == pytest.approx(1.0, abs=0.05), f"{name} {measure}"
             assert order.low < order.value < order.high < order.low + 0.1, "a narrow interval"
-    assert by_policy["velocity_aware_raw"].window_s[0] == pytest.approx(0.02 + SPEED_M_S / 1000)
+    assert errors_by_policy["velocity_aware_raw"].window_s[0] == pytest.approx(0.02 + SPEED_M_S / 1000)
 
 
 def test_the_share_of_packets_with_another_fate_at_the_range_limit_is_proportional_to_the_window() -> None:
@@ -151,7 +150,7 @@ def chase(policy: SyncPolicy, physics: PhysicsFederate | None = None) -> Coordin
 
 
 def test_the_position_error_of_one_window_in_a_closed_loop_is_of_the_second_order() -> None:
-    """It accelerates by 2 m/s^2; without datagrams in a window w its path is shorter by w^2: half of 2 m/s^2."""
+    """The chaser accelerates by 2 m/s^2; without datagrams in a window w, its path is shorter by 2 m/s^2 w^2 / 2."""
     begins_ns = low_discrepancy_times_ns(100 * MS, 900 * MS, 6, STEP_NS)
     errors = local_errors(chase, {"scheduled": Scheduled}, WINDOWS_S, begins_ns, tail_ns=5 * MS)["scheduled"]
     # The mean over two agents, one of which does not move.
@@ -160,30 +159,32 @@ def test_the_position_error_of_one_window_in_a_closed_loop_is_of_the_second_orde
 
 
 def test_the_position_error_of_a_whole_run_grows_and_is_of_the_first_order() -> None:
-    """As with solvers of differential equations. The mean lag is w / 2, so the speed is too low by 2 m/s^2 w / 2."""
+    """As in solvers of differential equations; the mean lag is w / 2, so the speed is too low by 2 m/s^2 w / 2."""
 
     def tracks(policy: SyncPolicy) -> Tracks:
-        sampled = SampledPhysics(CommandedMotion(), 50 * MS)
-        chase(policy, sampled).advance(1000 * MS)
-        return sampled.tracks
+        sampled_physics = SampledPhysics(CommandedMotion(), 50 * MS)
+        chase(policy, sampled_physics).advance(1000 * MS)
+        return sampled_physics.tracks
 
     exact = tracks(EventDriven())
     assert exact.names == ("lead", "chaser")
     assert exact.times_s == pytest.approx(np.arange(21) * 0.05)
-    coarse, fine = (tracks(Scheduled(window_s)).distances_m(exact)[:, 1] for window_s in (0.1, 0.05))
-    assert fine == pytest.approx(exact.times_s * 0.05, abs=0.05**2)
-    assert coarse[-1] / fine[-1] == pytest.approx(2.0, rel=0.03)
+    errors_of_long_windows_m, errors_of_short_windows_m = (
+        tracks(Scheduled(window_s)).distances_m(exact)[:, 1] for window_s in (0.1, 0.05)
+    )
+    assert errors_of_short_windows_m == pytest.approx(exact.times_s * 0.05, abs=0.05**2)
+    assert errors_of_long_windows_m[-1] / errors_of_short_windows_m[-1] == pytest.approx(2.0, rel=0.03)
 
 
 def test_windows_of_several_runs_are_pooled() -> None:
     first, second = (
         local_errors(moving_pair, {"scheduled": Scheduled}, (0.05, 0.1), begins_ns, tail_ns=20 * MS)["scheduled"]
-        for begins_ns in (WITHIN[:5], WITHIN[5:12])
+        for begins_ns in (STARTS_IN_RANGE_NS[:5], STARTS_IN_RANGE_NS[5:12])
     )
-    both = pool([first, second])
-    assert both.window_s.shape == (2, 12)
+    pooled_errors = pool([first, second])
+    assert pooled_errors.window_s.shape == (2, 12)
     total = first.sums["delivery_s"].sum(axis=1) + second.sums["delivery_s"].sum(axis=1)
-    assert both.sums["delivery_s"].sum(axis=1) == pytest.approx(total)
+    assert pooled_errors.sums["delivery_s"].sum(axis=1) == pytest.approx(total)
 
 
 SHARED: list[int] = []

@@ -29,7 +29,7 @@ NAN = math.nan
 
 
 @pytest.mark.parametrize(
-    ("printed", "ours", "expected"),
+    ("printed_value", "estimate", "expected"),
     [
         # The mean rounds to the printed number, with any interval.
         (Printed("0.4"), IntervalEstimate(0.36, 0.355, 0.365), Agreement.AGREES),
@@ -51,8 +51,10 @@ NAN = math.nan
         (Printed("0.4"), IntervalEstimate(NAN, NAN, NAN), Agreement.NO_VALUE),
     ],
 )
-def test_cases_by_hand(printed: Printed, ours: IntervalEstimate, expected: Agreement) -> None:
-    assert compare(printed, ours) is expected
+def test_agreements_equal_those_determined_by_hand(
+    printed_value: Printed, estimate: IntervalEstimate, expected: Agreement
+) -> None:
+    assert compare(printed_value, estimate) is expected
 
 
 @given(
@@ -62,8 +64,8 @@ def test_cases_by_hand(printed: Printed, ours: IntervalEstimate, expected: Agree
 )
 def test_a_rounded_number_agrees_with_its_original(value: Decimal, places: int, per_si: int) -> None:
     text = str(value.quantize(Decimal(1).scaleb(-places), ROUND_HALF_UP))
-    ours = float(value / per_si)
-    assert compare(Printed(text, per_si), IntervalEstimate(ours, NAN, NAN)) is Agreement.AGREES
+    estimate = float(value / per_si)
+    assert compare(Printed(text, per_si), IntervalEstimate(estimate, NAN, NAN)) is Agreement.AGREES
 
 
 @given(
@@ -73,14 +75,14 @@ def test_a_rounded_number_agrees_with_its_original(value: Decimal, places: int, 
     st.booleans(),
 )
 def test_a_number_more_than_half_a_step_away_disagrees(
-    number: Decimal, step: str, deviation: float, above: bool
+    number: Decimal, step: str, deviation: float, is_above: bool
 ) -> None:
-    printed = Printed(str(number), step=step)
-    ours = printed.value + deviation * float(step) * (1 if above else -1)
-    expected = Agreement.ABOVE if above else Agreement.BELOW
-    assert compare(printed, IntervalEstimate(ours, NAN, NAN)) is expected
-    ends = printed.value, ours
-    assert compare(printed, IntervalEstimate(ours, min(ends), max(ends))) is Agreement.AGREES
+    printed_value = Printed(str(number), step=step)
+    estimate = printed_value.value + deviation * float(step) * (1 if is_above else -1)
+    expected = Agreement.ABOVE if is_above else Agreement.BELOW
+    assert compare(printed_value, IntervalEstimate(estimate, NAN, NAN)) is expected
+    bounds = printed_value.value, estimate
+    assert compare(printed_value, IntervalEstimate(estimate, min(bounds), max(bounds))) is Agreement.AGREES
 
 
 SHORT = {"duration": "1200ms"}
@@ -128,8 +130,8 @@ def test_samples_count_the_packets_of_a_run() -> None:
 
 def test_out_of_range_no_packet_arrives_and_there_is_no_delay() -> None:
     setups = {"far": master_based(Sight.NLOS, 100, "ros1", SHORT)}
-    (by_flow,) = flow_samples(setups, [1], workers=Workers(1))["far"]
-    (sample,) = by_flow.values()
+    (samples_by_flow,) = flow_samples(setups, [1], workers=Workers(1))["far"]
+    (sample,) = samples_by_flow.values()
     assert sample.arrived_packets == 0
     assert sample.loss == 1
     assert math.isnan(sample.delay_sum_s)
@@ -139,8 +141,8 @@ def test_out_of_range_no_packet_arrives_and_there_is_no_delay() -> None:
 
 def test_the_delays_of_pings_are_round_trips() -> None:
     setups = {"mesh": mesh({"radio": {"rate": "1Mbit/s"}}, {"duration": "2s"})}
-    (by_flow,) = flow_samples(setups, [1], workers=Workers(1))["mesh"]
-    sample = by_flow["before/node-10"]
+    (samples_by_flow,) = flow_samples(setups, [1], workers=Workers(1))["mesh"]
+    sample = samples_by_flow["before/node-10"]
     assert sample.arrived_packets == sample.sent_packets == 15, "ten per second from 0.5 s on"
     # Payload, headers of UDP and IP at 1 Mbit/s, and 0.2 ms in addition, in both directions.
     assert sample.delay_mean_s == pytest.approx(2 * (8 * (56 + 8 + 20) / 1e6 + 0.0002))
@@ -149,9 +151,9 @@ def test_the_delays_of_pings_are_round_trips() -> None:
 def test_a_row_has_the_mean_over_seeds_and_the_printed_number() -> None:
     study = paper_table("1", SHORT)
     flow = only_flow(study.setups["los 40 m topic"])
-    some = FlowSample(500, 490, 0.1, {"pushed out": 6, UNDER_WAY: 4})
-    none = FlowSample(500, 0, math.nan, {"not matched yet": 500})
-    seeds = [some, replace(some, delay_sum_s=0.3), none]
+    partial_sample = FlowSample(500, 490, 0.1, {"pushed out": 6, UNDER_WAY: 4})
+    empty_sample = FlowSample(500, 0, math.nan, {"not matched yet": 500})
+    seeds = [partial_sample, replace(partial_sample, delay_sum_s=0.3), empty_sample]
     samples = {name: [{only_flow(setup): sample} for sample in seeds] for name, setup in study.setups.items()}
     row = study.rows(samples)[1]
     assert row.labels == {"line": "los", "distance_m": 40, "protocol": "topic"}

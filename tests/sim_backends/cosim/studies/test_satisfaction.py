@@ -31,12 +31,12 @@ def test_an_accepted_loss_is_an_error_relative_to_the_reference() -> None:
     threshold = REFERENCE - 3 * PERIOD_NS / 10e9
     result = satisfy(moving_run, lambda window_s: VelocityAware(window_s, 10.0), threshold=threshold, window_s=0.3)
     assert result.is_satisfied
-    last = result.rounds[-1]
-    assert last.loss <= threshold < result.reference_loss
-    assert last.errors.fate_disagreement >= result.reference_loss - last.loss
+    last_round = result.rounds[-1]
+    assert last_round.loss <= threshold < result.reference_loss
+    assert last_round.errors.fate_disagreement >= result.reference_loss - last_round.loss
 
 
 def test_a_rule_that_does_not_change_the_window_ends_the_loop() -> None:
-    unchanged = satisfy(moving_run, lambda window_s: VelocityAware(window_s, 0.1), threshold=0.0, window_s=0.1)
-    assert (len(unchanged.rounds), unchanged.is_satisfied) == (1, False)
-    assert "does not change the window" in unchanged.reason
+    result = satisfy(moving_run, lambda window_s: VelocityAware(window_s, 0.1), threshold=0.0, window_s=0.1)
+    assert (len(result.rounds), result.is_satisfied) == (1, False)
+    assert "does not change the window" in result.reason

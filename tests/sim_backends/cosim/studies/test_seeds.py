@@ -1,4 +1,4 @@
-"""Many runs in parallel: any order, any number of workers, errors that name their run, no processes left."""
+"""Many runs in parallel: any order and number of workers, errors that name their run, and no process that remains."""
 
 import os
 import signal
@@ -32,17 +32,17 @@ def random_result(task: Task) -> tuple[str, int, float]:
     return task.policy, task.seed, stream.draw(0)
 
 
-def failing(task: Task) -> int:
+def fail_for_seed_2(task: Task) -> int:
     if task.seed == 2:
         raise ConfigurationError("no window", where="at 3 s", remedy="another")
     return task.seed
 
 
-def wrong(task: Task) -> int:
+def divide_by_zero_for_seed_1(task: Task) -> int:
     return 1 // (task.seed - 1)
 
 
-def killed(task: Task) -> int:
+def kill_worker_for_seed_1(task: Task) -> int:
     if task.seed == 1:
         os.kill(os.getpid(), signal.SIGKILL)
     return task.seed
@@ -50,13 +50,13 @@ def killed(task: Task) -> int:
 
 def test_results_are_in_the_order_of_the_tasks() -> None:
     expected = [random_result(task) for task in TASKS]
-    counted: list[int] = []
-    assert run_many(random_result, TASKS, workers=Workers(2), progress=counted.append) == expected
-    assert counted == [1, 2, 3, 4, 5, 6]
+    progress_counts: list[int] = []
+    assert run_many(random_result, TASKS, workers=Workers(2), progress=progress_counts.append) == expected
+    assert progress_counts == [1, 2, 3, 4, 5, 6]
 
 
 @given(st.permutations(TASKS))
-def test_one_worker_and_any_order_give_the_same(tasks: list[Task]) -> None:
+def test_one_worker_and_any_order_give_the_same_results(tasks: list[Task]) -> None:
     results = dict(zip(tasks, run_many(random_result, tasks, workers=Workers(1)), strict=True))
     assert [results[task] for task in TASKS] == [random_result(task) for task in TASKS]
 
@@ -64,15 +64,15 @@ def test_one_worker_and_any_order_give_the_same(tasks: list[Task]) -> None:
 @pytest.mark.parametrize("workers", [1, 2])
 def test_an_error_names_its_policy_and_seed_and_keeps_its_class(workers: int) -> None:
     with pytest.raises(ConfigurationError, match=r"policy one, seed 2: at 3 s: no window\n  remedy: another"):
-        run_many(failing, [Task("one", 1), Task("one", 2)], workers=Workers(workers))
+        run_many(fail_for_seed_2, [Task("one", 1), Task("one", 2)], workers=Workers(workers))
     with pytest.raises(FieldkitError, match="policy one, seed 1: ZeroDivisionError"):
-        run_many(wrong, [Task("one", 2), Task("one", 1)], workers=Workers(workers))
+        run_many(divide_by_zero_for_seed_1, [Task("one", 2), Task("one", 1)], workers=Workers(workers))
 
 
 def test_the_repeated_death_of_a_process_is_an_error() -> None:
-    with pytest.raises(FieldkitError, match=r"seed 1: its worker died \d times") as raised:
-        run_many(killed, TASKS, workers=Workers(2))
-    assert "fewer workers" in raised.value.remedy
+    with pytest.raises(FieldkitError, match=r"seed 1: its worker died \d times") as error_info:
+        run_many(kill_worker_for_seed_1, TASKS, workers=Workers(2))
+    assert "fewer workers" in error_info.value.remedy
 
 
 ENDLESS = """
@@ -89,10 +89,10 @@ def work(task):
 
 
 @pytest.mark.parametrize("stop_signal", [signal.SIGINT, signal.SIGKILL])
-def test_the_end_of_the_parent_ends_its_workers(stop_signal: signal.Signals, tmp_path: Path) -> None:
+def test_workers_exit_when_their_parent_exits(stop_signal: signal.Signals, tmp_path: Path) -> None:
     (tmp_path / "endless.py").write_text(ENDLESS, encoding="utf-8")
-    started = tmp_path / "started"
-    started.mkdir()
+    started_folder = tmp_path / "started"
+    started_folder.mkdir()
     call = (
         "import endless as e; e.run_many(e.work, [e.Task('one', seed) for seed in (1, 2, 3)], workers=e.Workers(2))"
     )
@@ -102,9 +102,9 @@ def test_the_end_of_the_parent_ends_its_workers(stop_signal: signal.Signals, tmp
         cwd=tmp_path,
         stderr=subprocess.PIPE,
     ) as process:
-        wait_until(lambda: len(list(started.iterdir())) == 2, Deadline.after(EXIT_S))
+        wait_until(lambda: len(list(started_folder.iterdir())) == 2, Deadline.after(EXIT_S))
         process.send_signal(stop_signal)
         _, stderr = process.communicate(timeout=EXIT_S)
     assert process.returncode == -stop_signal
     assert (b"KeyboardInterrupt" in stderr) == (stop_signal == signal.SIGINT)
-    wait_until(lambda: not any(alive(int(path.name)) for path in started.iterdir()), Deadline.after(EXIT_S))
+    wait_until(lambda: not any(alive(int(path.name)) for path in started_folder.iterdir()), Deadline.after(EXIT_S))

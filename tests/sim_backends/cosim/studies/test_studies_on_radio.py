@@ -30,8 +30,8 @@ def three_robots(policy: SyncPolicy) -> Coordinator:
     antennas = dict.fromkeys(motions, Antenna("802.11g", 15.0, -90.0))
     network = RadioNetwork(WifiInWorld(3, RadioOptions(), antennas, None), list(motions))
     programs = {
-        source: Periodic(f"{source} to {to}", to, period_ns=period_ns, size_bytes=400)
-        for (source, to), period_ns in PERIODS_NS.items()
+        source: Periodic(f"{source} to {destination}", destination, period_ns=period_ns, size_bytes=400)
+        for (source, destination), period_ns in PERIODS_NS.items()
     }
     return Coordinator(Agents(Paths(list(motions.values())), programs), network, policy, list(PERIODS_NS))
 
@@ -39,16 +39,18 @@ def three_robots(policy: SyncPolicy) -> Coordinator:
 def test_exact_policies_agree_on_the_radio_and_a_fixed_window_does_not() -> None:
     reference = three_robots(EventDriven()).advance(600 * MS)
     assert lost_share(reference) > 0.03, "losses that could differ"
-    merged = compare_runs(reference, three_robots(VariableStepped()).advance(600 * MS))
-    assert merged.packets == len(reference.fates) - sum(not fate.is_decided for fate in reference.fates.values())
-    assert merged.delivery_error_s == merged.late_s == Spread(0, 0, 0)
-    assert merged.position_error_m == compare_runs(reference, reference).position_error_m, (
+    errors_of_variable_steps = compare_runs(reference, three_robots(VariableStepped()).advance(600 * MS))
+    assert errors_of_variable_steps.packets == len(reference.fates) - sum(
+        not fate.is_decided for fate in reference.fates.values()
+    )
+    assert errors_of_variable_steps.delivery_error_s == errors_of_variable_steps.late_s == Spread(0, 0, 0)
+    assert errors_of_variable_steps.position_error_m == compare_runs(reference, reference).position_error_m, (
         "states are held for equal steps"
     )
-    assert (merged.fate_disagreement, merged.causality_violations) == (0, 0)
-    windowed = compare_runs(reference, three_robots(Scheduled(0.02)).advance(600 * MS))
-    assert windowed.delivery_error_s.mean > 0.005
-    assert windowed.fate_disagreement > 0
+    assert (errors_of_variable_steps.fate_disagreement, errors_of_variable_steps.causality_violations) == (0, 0)
+    errors_of_fixed_window = compare_runs(reference, three_robots(Scheduled(0.02)).advance(600 * MS))
+    assert errors_of_fixed_window.delivery_error_s.mean > 0.005
+    assert errors_of_fixed_window.fate_disagreement > 0
 
 
 def test_the_papers_rule_reports_the_pair_for_which_time_runs_backwards() -> None:
@@ -57,12 +59,12 @@ def test_the_papers_rule_reports_the_pair_for_which_time_runs_backwards() -> Non
 
 
 def test_local_errors_can_be_measured_from_any_state_of_the_radio() -> None:
-    by_policy = local_errors(
+    errors_by_policy = local_errors(
         three_robots,
         {"scheduled": Scheduled, "exact": lambda _: VariableStepped()},
         (0.02, 0.04),
         [50 * MS, 100 * MS],
         tail_ns=60 * MS,
     )
-    assert not any(by_policy["exact"].sums[measure].any() for measure in by_policy["exact"].sums)
-    assert by_policy["scheduled"].mean("delivery_s") == pytest.approx([0.01, 0.02], rel=0.4)
+    assert not any(errors_by_policy["exact"].sums[measure].any() for measure in errors_by_policy["exact"].sums)
+    assert errors_by_policy["scheduled"].mean("delivery_s") == pytest.approx([0.01, 0.02], rel=0.4)

@@ -18,19 +18,19 @@ RUNS: Final = 8
 LIMIT_S: Final = 600
 
 
-def in_mount_namespace(folder: Path, script: str) -> str:
+def run_in_mount_namespace(folder: Path, script: str) -> str:
     """Return the output of a shell script; `$PYTHON` is the interpreter, and mounts vanish with the script."""
     namespace = ("unshare", "--mount", "--propagation", "private", "--", "sh", "-euc", script)
     environment = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "PYTHONPATH": str(ROOT), "HOME": str(folder)}
     environment["PYTHON"] = sys.executable
-    done = subprocess.run(
+    result = subprocess.run(
         namespace, cwd=folder, env=environment, capture_output=True, text=True, timeout=LIMIT_S, check=False
     )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+    assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout
 
 
-def dataset(folder: Path) -> dict[str, bytes]:
+def read_dataset(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*.parquet")}
 
 
@@ -38,7 +38,7 @@ def test_a_sweep_on_a_full_disk_keeps_its_finished_runs_and_continues(tmp_path: 
     (tmp_path / "pair.yaml").write_text(PAIR, encoding="utf-8")
     (tmp_path / "disk").mkdir()
     words = " ".join(SWEEP)
-    output = in_mount_namespace(
+    output = run_in_mount_namespace(
         tmp_path,
         f"""mount -t tmpfs -o size=24k tmpfs disk
         "$PYTHON" -m fieldkit {words} --jobs 2 -o disk/sweep 2>&1 || echo "exit code $?"
@@ -50,9 +50,9 @@ def test_a_sweep_on_a_full_disk_keeps_its_finished_runs_and_continues(tmp_path: 
     )
     assert "No space left on device" in output
     assert "exit code 2\n" in output
-    finished = int(output.split("count: ")[1].split()[0])
-    assert 0 < finished < RUNS
-    assert f"{finished} are done" in output
+    finished_runs = int(output.split("count: ")[1].split()[0])
+    assert 0 < finished_runs < RUNS
+    assert f"{finished_runs} are done" in output
     assert run_here(tmp_path, *SWEEP, "--jobs", "1", "-o", "reference").code == 0
-    assert dataset(tmp_path / "copy") == dataset(tmp_path / "reference")
-    assert dataset(tmp_path / "copy")
+    assert read_dataset(tmp_path / "copy") == read_dataset(tmp_path / "reference")
+    assert read_dataset(tmp_path / "copy")

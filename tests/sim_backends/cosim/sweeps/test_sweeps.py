@@ -38,8 +38,8 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a finished sweep."""
     folder = tmp_path_factory.mktemp("lab")
     (folder / "pair.yaml").write_text(PAIR, encoding="utf-8")
-    done = run_here(folder, *SWEEP, "--jobs", "1", "-o", "sweep")
-    assert (done.code, f"{RUNS} runs: 4 settings with 2 seeds" in done.out) == (0, True), done.err
+    result = run_here(folder, *SWEEP, "--jobs", "1", "-o", "sweep")
+    assert (result.code, f"{RUNS} runs: 4 settings with 2 seeds" in result.out) == (0, True), result.err
     return folder
 
 
@@ -58,13 +58,13 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_a_wrong_setting_is_refused_before_any_run(overrides: str, message: str, tmp_path: Path) -> None:
-    done = run_here(tmp_path, "cosim", "sweep", "baylands", "--over", overrides, "-o", "out")
-    assert done.code == 2
-    assert message in done.err
+    result = run_here(tmp_path, "cosim", "sweep", "baylands", "--over", overrides, "-o", "out")
+    assert result.code == 2
+    assert message in result.err
     assert not (tmp_path / "out").exists()
 
 
-def placed(scenario: str, *overrides: str) -> list[Mapping[str, float | None]]:
+def positions_by_setting(scenario: str, *overrides: str) -> list[Mapping[str, float | None]]:
     """Return the positions of agents along the line in each setting."""
 
     def along_m(setting: CosimScenario) -> dict[str, float | None]:
@@ -74,13 +74,13 @@ def placed(scenario: str, *overrides: str) -> list[Mapping[str, float | None]]:
 
 
 def test_a_distance_moves_the_agents_on_the_line() -> None:
-    assert placed("baylands", "distance=30m,40m") == [
+    assert positions_by_setting("baylands", "distance=30m,40m") == [
         {"husky-1": 0, "husky-2": 30, "iris": 30},
         {"husky-1": 0, "husky-2": 40, "iris": 40},
     ]
-    assert placed("field_30ft", "distance=10m") == [{"sender": 0, "receiver": 20, "drone": 10}]
+    assert positions_by_setting("field_30ft", "distance=10m") == [{"sender": 0, "receiver": 20, "drone": 10}]
     with pytest.raises(ConfigurationError, match="distance needs a first flow"):
-        placed("convoy", "distance=10m")
+        positions_by_setting("convoy", "distance=10m")
 
 
 def test_a_list_is_one_value() -> None:
@@ -93,7 +93,7 @@ def test_a_failed_run_states_its_reason_and_is_tried_a_limited_number_of_times(
 ) -> None:
     calls: list[int] = []
 
-    def failing(scenario: CosimScenario, policy: str, seed: int, folder: None) -> Any:  # noqa: ANN401 (as simulate)
+    def simulate_or_fail(scenario: CosimScenario, policy: str, seed: int, folder: None) -> Any:  # noqa: ANN401 (as simulate)
         calls.append(seed)
         if seed == 2 and policy == "scheduled":
             raise LinkError("no answer", where="network", remedy="start it")
@@ -101,15 +101,15 @@ def test_a_failed_run_states_its_reason_and_is_tried_a_limited_number_of_times(
 
     arguments = (*SWEEP, "--jobs", "1", "-o", "failing")
     with monkeypatch.context() as patch:
-        patch.setattr(sweep_runner, "simulate", failing)
-        done = run_here(lab, *arguments)
-        assert (done.code, len(calls)) == (3, RUNS + 2 * 2)
-        assert "2 of 8 runs failed; the first, after 3 attempts: network: no answer" in done.err
-        assert f"start it; to try them again: fieldkit {' '.join(SWEEP[:6])}" in done.err
+        patch.setattr(sweep_runner, "simulate", simulate_or_fail)
+        result = run_here(lab, *arguments)
+        assert (result.code, len(calls)) == (3, RUNS + 2 * 2)
+        assert "2 of 8 runs failed; the first, after 3 attempts: network: no answer" in result.err
+        assert f"start it; to try them again: fieldkit {' '.join(SWEEP[:6])}" in result.err
         failures = [json.loads(path.read_text()) for path in (lab / "failing" / "failed").iterdir()]
         assert {(failure["attempts"], failure["reason"]) for failure in failures} == {(3, "network: no answer")}
         assert run_here(lab, *arguments).code == 3
-        assert len(calls) == RUNS + 2 * 2, "no attempt is left"
+        assert len(calls) == RUNS + 2 * 2, "no attempt remains"
     assert run_here(lab, *arguments, "--again").code == 0
     assert not list((lab / "failing" / "failed").iterdir())
     assert dataset(lab / "failing") == dataset(lab / "sweep")
@@ -121,22 +121,22 @@ def test_a_failure_that_would_occur_again_is_tried_once(
 ) -> None:
     calls: list[int] = []
 
-    def failing(scenario: CosimScenario, policy: str, seed: int, folder: None) -> Any:  # noqa: ANN401 (as simulate)
+    def simulate_or_fail(scenario: CosimScenario, policy: str, seed: int, folder: None) -> Any:  # noqa: ANN401 (as simulate)
         calls.append(seed)
         if seed == 2:
             raise error
         return simulate(scenario, policy, seed, folder)
 
-    monkeypatch.setattr(sweep_runner, "simulate", failing)
+    monkeypatch.setattr(sweep_runner, "simulate", simulate_or_fail)
     arguments = (*SWEEP, "--jobs", "1", "-o", str(tmp_path / "once"))
     for _ in range(2):
-        done = run_here(lab, *arguments)
-        assert (done.code, str(error) in done.err) == (getattr(error, "exit_code", 1), True)
+        result = run_here(lab, *arguments)
+        assert (result.code, str(error) in result.err) == (getattr(error, "exit_code", 1), True)
     if isinstance(error, ConfigurationError):
         assert calls == [1, 2, 2], "it is an error of the worker, which ends the sweep"
     else:
         assert len(calls) == RUNS
-        assert "4 of 8 runs failed; the first, after 1 attempt:" in done.err
+        assert "4 of 8 runs failed; the first, after 1 attempt:" in result.err
 
 
 def dataset(folder: Path) -> dict[str, bytes]:
@@ -144,31 +144,31 @@ def dataset(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.glob("results/**/*.parquet")}
 
 
-def test_a_full_disk_is_one_error_and_loses_no_finished_run(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_reported_once_and_no_finished_run_is_lost(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     arguments = (*SWEEP, "--jobs", "1", "-o", "full")
-    write, written = files.write, list[Path]()
+    write, written_paths = files.write, list[Path]()
 
     def write_until_full(path: Path, content: bytes) -> None:
-        if len(written) == 4:
+        if len(written_paths) == 4:
             raise OSError(errno.ENOSPC, "No space left on device", str(path))
         write(path, content)
-        written.append(path)
+        written_paths.append(path)
 
     with monkeypatch.context() as patch:
         patch.setattr(files, "write", write_until_full)
-        done = run_here(lab, *arguments)
-    assert (done.code, done.err.count("error:")) == (2, 1)
-    assert "No space left on device" in done.err
-    assert "then continue: fieldkit cosim sweep pair.yaml" in done.err
+        result = run_here(lab, *arguments)
+    assert (result.code, result.err.count("error:")) == (2, 1)
+    assert "No space left on device" in result.err
+    assert "then continue: fieldkit cosim sweep pair.yaml" in result.err
     assert len(list((lab / "full" / "runs").iterdir())) == 3  # the first file is sweep.json
-    done = run_here(lab, *arguments)
-    assert (done.code, "3 are done" in done.out) == (0, True)
+    result = run_here(lab, *arguments)
+    assert (result.code, "3 are done" in result.out) == (0, True)
     assert dataset(lab / "full") == dataset(lab / "sweep")
 
 
 def test_another_sweep_is_refused(lab: Path) -> None:
-    done = run_here(lab, *SWEEP[:4], "policy=scheduled", "-o", "sweep")
-    assert (done.code, "this is a sweep with other factors" in done.err) == (2, True)
+    result = run_here(lab, *SWEEP[:4], "policy=scheduled", "-o", "sweep")
+    assert (result.code, "this is a sweep with other factors" in result.err) == (2, True)
 
 
 def test_pandas_polars_and_duckdb_read_the_dataset(lab: Path) -> None:
@@ -189,24 +189,24 @@ def test_pandas_polars_and_duckdb_read_the_dataset(lab: Path) -> None:
 
 
 def test_aggregate_compare_and_load_read_the_folder_like_trials(lab: Path) -> None:
-    done = run_here(lab, "aggregate", "sweep", "--quantity", "added_delay_mean_s", "--format", "csv")
-    cells = list(csv.DictReader(done.out.splitlines()))
-    assert (done.code, done.err, len(cells)) == (0, "", 4)
+    result = run_here(lab, "aggregate", "sweep", "--quantity", "added_delay_mean_s", "--format", "csv")
+    cells = list(csv.DictReader(result.out.splitlines()))
+    assert (result.code, result.err, len(cells)) == (0, "", 4)
     conditions = {(cell["flow"], cell["policy"], cell["window_s"], cell["n_valid"]) for cell in cells}
     assert ("pose/b", "scheduled", "0.013", "2") in conditions
     cell = fieldkit.load(lab / "sweep").cell(policy="scheduled", window="13ms")
     assert cell.n_valid == 2
     assert 0.003 < cell["added_delay_mean_s"].value < 0.013
-    compared = run_here(lab, "compare", "sweep", "sweep", "--format", "csv")
-    assert compared.code == 0, compared.err
-    assert {float(row["difference"] or 0) for row in csv.DictReader(compared.out.splitlines())} == {0}
+    comparison = run_here(lab, "compare", "sweep", "sweep", "--format", "csv")
+    assert comparison.code == 0, comparison.err
+    assert {float(row["difference"] or 0) for row in csv.DictReader(comparison.out.splitlines())} == {0}
 
 
 def test_two_settings_of_a_sweep_are_compared(lab: Path) -> None:
     between = ("--between", "policy=sliding_window,scheduled")
-    done = run_here(lab, "compare", "sweep", *between, "--format", "csv")
-    assert done.code == 0, done.err
-    rows = list(csv.DictReader(done.out.splitlines()))
+    result = run_here(lab, "compare", "sweep", *between, "--format", "csv")
+    assert result.code == 0, result.err
+    rows = list(csv.DictReader(result.out.splitlines()))
     assert {(row["flow"], row["window_s"], row["n_a"], row["n_b"]) for row in rows} == {
         ("pose/b", "0.007", "2", "2"),
         ("pose/b", "0.013", "2", "2"),
@@ -221,16 +221,16 @@ def test_two_settings_of_a_sweep_are_compared(lab: Path) -> None:
         if row["quantity"] == "added_delay_mean_s" and row["window_s"] == "0.013"
     )
     assert difference == pytest.approx(cells["scheduled"] - cells["sliding_window"], rel=1e-6)
-    some = run_here(lab, "compare", "sweep", *between, "--where", "window_s == 0.013", "--format", "csv")
-    assert some.code == 0, some.err
-    assert {row["window_s"] for row in csv.DictReader(some.out.splitlines())} == {"0.013"}
+    filtered_result = run_here(lab, "compare", "sweep", *between, "--where", "window_s == 0.013", "--format", "csv")
+    assert filtered_result.code == 0, filtered_result.err
+    assert {row["window_s"] for row in csv.DictReader(filtered_result.out.splitlines())} == {"0.013"}
 
 
 @pytest.mark.parametrize("between", ["window=7ms,13ms", "window_s=0.007,0.013"])
 def test_two_values_with_units_are_compared_in_both_forms(lab: Path, between: str) -> None:
-    done = run_here(lab, "compare", "sweep", "--between", between, "--format", "csv")
-    assert done.code == 0, done.err
-    rows = list(csv.DictReader(done.out.splitlines()))
+    result = run_here(lab, "compare", "sweep", "--between", between, "--format", "csv")
+    assert result.code == 0, result.err
+    rows = list(csv.DictReader(result.out.splitlines()))
     assert {(row["flow"], row["policy"], row["n_a"], row["n_b"]) for row in rows} == {
         ("pose/b", "scheduled", "2", "2"),
         ("pose/b", "sliding_window", "2", "2"),
@@ -248,32 +248,37 @@ def test_two_values_with_units_are_compared_in_both_forms(lab: Path, between: st
     ],
 )
 def test_a_wrong_comparison_of_two_settings_is_explained(lab: Path, options: tuple[str, ...], message: str) -> None:
-    done = run_here(lab, "compare", "sweep", *options)
-    assert (done.code, message in done.err) == (2, True), done.err
+    result = run_here(lab, "compare", "sweep", *options)
+    assert (result.code, message in result.err) == (2, True), result.err
 
 
 def test_a_report_of_many_settings_has_heat_maps_in_the_order_of_numbers(lab: Path) -> None:
     factors = ("radio.loss=20%,0%,10%,5%", "window=13ms,7ms")
     command = ("cosim", "sweep", "pair.yaml", "--set", "policy.name=scheduled", "--over", *factors, "--seeds", "1")
     assert run_here(lab, *command, "--jobs", "1", "-o", "many").code == 0
-    done = run_here(lab, "report", "many", "-o", "many.html")
-    assert done.code == 0, done.err
+    result = run_here(lab, "report", "many", "-o", "many.html")
+    assert result.code == 0, result.err
     page = (lab / "many.html").read_text(encoding="utf-8")
     assert "<h1>Sweep over radio_loss and window</h1>" in page
     assert 'id="map-added_delay_mean_s"' in page
-    (words,) = re.findall(r'aria-label="added delay, mean, pose/b[^"]*"', page)  # for screen readers
+    (label,) = re.findall(r'aria-label="added delay, mean, pose/b[^"]*"', page)  # for screen readers
     cells = [(loss, window) for window in ("7ms", "13ms") for loss in ("0%", "5%", "10%", "20%")]
-    assert re.findall(r"radio_loss (\S+), window (\S+): \d", words) == cells
+    assert re.findall(r"radio_loss (\S+), window (\S+): \d", label) == cells
     assert "Figures with a line or a strip per setting are left out" in page
     assert 'id="strips"' not in page
-    aggregated = run_here(lab, "aggregate", "many", "--quantity", "byte_loss", "--format", "csv")
-    values = [row["radio_loss_value"] for row in csv.DictReader(aggregated.out.splitlines())]
+    aggregation = run_here(lab, "aggregate", "many", "--quantity", "byte_loss", "--format", "csv")
+    values = [row["radio_loss_value"] for row in csv.DictReader(aggregation.out.splitlines())]
     assert values == [value for value in ("0", "0.05", "0.1", "0.2") for _ in range(2)]
 
 
 def test_factors_with_units_are_numbers() -> None:
-    words = ["radio.loss=2%,10%", "traffic.0.rate=1kHz,10Hz", "radio.tx_power=-3dBm,20dBm", "agents.a.along=-5m,5m"]
-    loss, rate, power, along = parse_factors(words)
+    factor_texts = [
+        "radio.loss=2%,10%",
+        "traffic.0.rate=1kHz,10Hz",
+        "radio.tx_power=-3dBm,20dBm",
+        "agents.a.along=-5m,5m",
+    ]
+    loss, rate, power, along = parse_factors(factor_texts)
     assert loss.numbers == ("radio_loss_value", "1", (0.02, 0.1))
     assert rate.numbers == ("traffic_0_rate_hz", "Hz", (1000, 10))
     assert power.numbers == ("radio_tx_power_dbm", "dBm", (-3, 20))

@@ -1,4 +1,4 @@
-"""The emulated autopilot as ArduCopter: modes of pymavlink's table, behaviour, and a flight with MAVProxy."""
+"""The emulated autopilot as ArduCopter: the modes of pymavlink, its behaviour, and a flight with MAVProxy."""
 
 import math
 from collections.abc import Callable
@@ -31,7 +31,7 @@ def gcs() -> GroundStation:
     return station
 
 
-def mode(gcs: GroundStation) -> str:
+def flight_mode(gcs: GroundStation) -> str:
     gcs.wait(1.1)
     return str(mavutil.mode_mapping_acm[gcs.last("HEARTBEAT").custom_mode])
 
@@ -57,7 +57,7 @@ def send_set_point(gcs: GroundStation, mask: int, vector: tuple[float, float, fl
     )
 
 
-def texts(gcs: GroundStation) -> list[str]:
+def status_texts(gcs: GroundStation) -> list[str]:
     gcs.wait(0.1)
     return [text for severity, text in gcs.texts() if severity <= d.MAV_SEVERITY_NOTICE]
 
@@ -65,25 +65,25 @@ def texts(gcs: GroundStation) -> list[str]:
 def test_heartbeat_identifies_arducopter(gcs: GroundStation) -> None:
     assert gcs.last("HEARTBEAT").autopilot == d.MAV_AUTOPILOT_ARDUPILOTMEGA
     assert mavutil.mode_mapping_bynumber(gcs.last("HEARTBEAT").type) == mavutil.mode_mapping_acm
-    assert mode(gcs) == "STABILIZE"
+    assert flight_mode(gcs) == "STABILIZE"
 
 
 def test_take_off_fly_and_land(gcs: GroundStation) -> None:
     take_off(gcs)
-    assert mode(gcs) == "GUIDED"
+    assert flight_mode(gcs) == "GUIDED"
     assert -gcs.last("LOCAL_POSITION_NED").z == pytest.approx(3.0, abs=0.15)
     send_set_point(gcs, POSITION_ONLY, (2.0, 1.0, -3.0))
-    gcs.wait(20)  # much longer than GUID_TIMEOUT: it stays
+    gcs.wait(20)  # much longer than GUID_TIMEOUT: the drone stays at the set point
     position = gcs.last("LOCAL_POSITION_NED")
     assert math.dist((position.x, position.y, -position.z), (2.0, 1.0, 3.0)) < 0.15
-    assert mode(gcs) == "GUIDED"
+    assert flight_mode(gcs) == "GUIDED"
     assert change_mode(gcs, "LAND") == OK
     gcs.wait(14)
     assert not gcs.last("HEARTBEAT").base_mode & d.MAV_MODE_FLAG_SAFETY_ARMED
-    assert mode(gcs) == "LAND"
+    assert flight_mode(gcs) == "LAND"
 
 
-def test_it_returns_at_the_height_of_its_parameter(gcs: GroundStation) -> None:
+def test_the_drone_returns_at_the_height_of_its_parameter(gcs: GroundStation) -> None:
     gcs.send_message(d.MAVLink_param_set_message(SYSTEM, 1, b"RTL_ALT", 500, d.MAV_PARAM_TYPE_REAL32))
     take_off(gcs)
     send_set_point(gcs, POSITION_ONLY, (8.0, 0.0, -3.0))
@@ -97,7 +97,7 @@ def test_it_returns_at_the_height_of_its_parameter(gcs: GroundStation) -> None:
     assert positions[-1].z == pytest.approx(0.0, abs=0.01)
 
 
-def test_refusals_have_an_answer_without_a_text(gcs: GroundStation) -> None:
+def test_refused_commands_are_answered_without_a_status_text(gcs: GroundStation) -> None:
     def take_off_again() -> int:
         return gcs.command(d.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 3)
 
@@ -115,10 +115,10 @@ def test_refusals_have_an_answer_without_a_text(gcs: GroundStation) -> None:
     assert take_off_again() == FAILED, "it is flying"
     assert gcs.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 0) == FAILED
     assert change_mode(gcs, "AUTO") == FAILED, "it has no mission"
-    assert texts(gcs) == ["Mode change to AUTO failed: init failed"]
+    assert status_texts(gcs) == ["Mode change to AUTO failed: init failed"]
 
 
-def test_set_points_neither_lift_off_nor_lead_outside_the_fence(gcs: GroundStation) -> None:
+def test_set_points_cause_neither_a_take_off_nor_a_flight_outside_the_fence(gcs: GroundStation) -> None:
     assert change_mode(gcs, "GUIDED") == OK
     assert gcs.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 1) == OK
     send_set_point(gcs, POSITION_ONLY, (0.0, 0.0, -3.0))
@@ -136,28 +136,28 @@ def test_a_velocity_times_out_and_a_fence_breach_returns_home(gcs: GroundStation
     send_set_point(gcs, VELOCITY_ONLY, (1.0, 0.0, 0.0))
     gcs.wait(10)
     assert 2.0 < gcs.last("LOCAL_POSITION_NED").x < 6.0
-    assert mode(gcs) == "GUIDED"
+    assert flight_mode(gcs) == "GUIDED"
     for _ in range(10):
         send_set_point(gcs, VELOCITY_ONLY, (2.0, 0.0, 0.0))
         gcs.wait(1)
-    assert mode(gcs) == "RTL"
+    assert flight_mode(gcs) == "RTL"
     assert (d.MAV_SEVERITY_NOTICE, "Circle fence breached") in gcs.texts()
 
 
-@pytest.mark.parametrize("seconds", [0, 200])
-def test_it_reports_why_it_cannot_be_armed(gcs: GroundStation, seconds: int) -> None:
-    gcs.autopilot.vehicle.battery.charge -= seconds / 1000
+@pytest.mark.parametrize("used_permille", [0, 200])
+def test_the_autopilot_reports_the_reason_if_it_cannot_be_armed(gcs: GroundStation, used_permille: int) -> None:
+    gcs.autopilot.vehicle.battery.charge -= used_permille / 1000
     gcs.send_message(d.MAVLink_param_set_message(SYSTEM, 1, b"BATT_ARM_VOLT", 12.5, d.MAV_PARAM_TYPE_REAL32))
-    low = bool(seconds)
+    is_low = bool(used_permille)
     assert gcs.command(d.MAV_CMD_RUN_PREARM_CHECKS) == OK
-    assert gcs.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 1) == (FAILED if low else OK)
+    assert gcs.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 1) == (FAILED if is_low else OK)
     reason = "Battery 1 below minimum arming voltage"
-    assert texts(gcs) == [f"PreArm: {reason}", f"Arm: {reason}"] * low
+    assert status_texts(gcs) == [f"PreArm: {reason}", f"Arm: {reason}"] * is_low
     gcs.wait(1)
-    assert bool(gcs.last("SYS_STATUS").onboard_control_sensors_health & d.MAV_SYS_STATUS_PREARM_CHECK) != low
+    assert bool(gcs.last("SYS_STATUS").onboard_control_sensors_health & d.MAV_SYS_STATUS_PREARM_CHECK) != is_low
 
 
-def test_mavproxy_flies_it_with_arducopter_s_modes(tmp_path: Path) -> None:
+def test_mavproxy_flies_the_drone_with_the_modes_of_arducopter(tmp_path: Path) -> None:
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot), mavproxy(port, str(tmp_path)) as terminal:
         (type_line, output), drone = terminal, autopilot.vehicle
 

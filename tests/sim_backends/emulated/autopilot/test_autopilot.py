@@ -16,7 +16,7 @@ from sim_backends.emulated.autopilot.parameters import FlightLimits
 from tests.helpers.ground_station import HOME_M, SYSTEM, GroundStation
 
 OK = d.MAV_RESULT_ACCEPTED
-NOT_NOW = d.MAV_RESULT_TEMPORARILY_REJECTED
+REJECTED = d.MAV_RESULT_TEMPORARILY_REJECTED
 CUSTOM = d.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 RELATIVE = d.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT
 
@@ -46,13 +46,13 @@ def item(number: int, east_m: float, north_m: float, up_m: float, command: int =
 
 def upload(gcs: GroundStation, items: list[Message]) -> int:
     """Upload items, repeating messages without an answer; return the result."""
-    pending = d.MAVLink_mission_count_message(SYSTEM, 1, len(items))
+    message = d.MAVLink_mission_count_message(SYSTEM, 1, len(items))
     for _ in range(200):
-        for answer in gcs.send_message(pending) + gcs.wait(0.3):
+        for answer in gcs.send_message(message) + gcs.wait(0.3):
             if answer.get_type() == "MISSION_ACK":
                 return int(answer.type)
             if answer.get_type() == "MISSION_REQUEST_INT":
-                pending = items[answer.seq]
+                message = items[answer.seq]
     raise AssertionError("the upload did not end")
 
 
@@ -81,13 +81,13 @@ class TestTelemetry:
         gcs.send_message(d.MAVLink_request_data_stream_message(SYSTEM, 1, d.MAV_DATA_STREAM_POSITION, 2, 1))
         assert abs(Counter(message.get_type() for message in gcs.wait(10))["LOCAL_POSITION_NED"] - 100) <= 1
 
-    def test_it_sends_its_version_on_request(self, gcs: GroundStation) -> None:
+    def test_the_autopilot_sends_its_version_on_request(self, gcs: GroundStation) -> None:
         assert gcs.command(d.MAV_CMD_REQUEST_MESSAGE, d.MAVLINK_MSG_ID_AUTOPILOT_VERSION) == OK
         assert gcs.last("AUTOPILOT_VERSION").capabilities & d.MAV_PROTOCOL_CAPABILITY_MISSION_INT
         assert gcs.command(d.MAV_CMD_REQUEST_MESSAGE, math.nan) == d.MAV_RESULT_DENIED
         assert gcs.command(d.MAV_CMD_DO_PARACHUTE) == d.MAV_RESULT_UNSUPPORTED
 
-    def test_silent_clients_receive_nothing_more(self, gcs: GroundStation) -> None:
+    def test_silent_clients_receive_no_more_messages(self, gcs: GroundStation) -> None:
         later_ns = gcs.now_ns + 16_000_000_000
         assert not list(gcs.autopilot.advance(later_ns))
         assert gcs.autopilot.next_ns() is None
@@ -113,17 +113,17 @@ class TestFlight:
         assert gcs.last("EXTENDED_SYS_STATE").landed_state == d.MAV_LANDED_STATE_ON_GROUND
         assert not gcs.last("HEARTBEAT").base_mode & d.MAV_MODE_FLAG_SAFETY_ARMED
 
-    def test_refused_commands(self, gcs: GroundStation) -> None:
-        assert gcs.command(d.MAV_CMD_NAV_TAKEOFF) == NOT_NOW
-        assert gcs.command(d.MAV_CMD_NAV_LAND) == NOT_NOW
-        assert gcs.command(d.MAV_CMD_MISSION_START) == NOT_NOW
-        assert gcs.command(d.MAV_CMD_DO_SET_MODE, CUSTOM, 6, 0) == NOT_NOW
+    def test_commands_are_refused_in_the_wrong_state(self, gcs: GroundStation) -> None:
+        assert gcs.command(d.MAV_CMD_NAV_TAKEOFF) == REJECTED
+        assert gcs.command(d.MAV_CMD_NAV_LAND) == REJECTED
+        assert gcs.command(d.MAV_CMD_MISSION_START) == REJECTED
+        assert gcs.command(d.MAV_CMD_DO_SET_MODE, CUSTOM, 6, 0) == REJECTED
         assert gcs.command(d.MAV_CMD_DO_SET_MODE, CUSTOM, 99, 0) == d.MAV_RESULT_DENIED
         assert gcs.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 1) == OK
-        assert gcs.command(d.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 1000) == NOT_NOW
+        assert gcs.command(d.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 1000) == REJECTED
         take_off(gcs)
-        assert gcs.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 0) == NOT_NOW
-        assert gcs.command(d.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 5) == NOT_NOW
+        assert gcs.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 0) == REJECTED
+        assert gcs.command(d.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 5) == REJECTED
         gcs.wait(1)
         assert "Takeoff denied: not armed" in status_texts(gcs)
         assert "Disarming denied: not landed" in status_texts(gcs)
@@ -134,26 +134,26 @@ class TestFlight:
             assert gcs.command(d.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 3) == OK
             gcs.wait(0.5)
 
-    def test_a_forced_disarm_in_the_air_makes_it_fall(self, gcs: GroundStation) -> None:
+    def test_a_drone_that_is_disarmed_in_the_air_by_force_falls(self, gcs: GroundStation) -> None:
         take_off(gcs)
         assert gcs.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 0, 21196) == OK
         gcs.wait(1)
         assert gcs.last("LOCAL_POSITION_NED").z == 0
 
-    def test_it_disarms_if_it_does_not_take_off(self, gcs: GroundStation) -> None:
+    def test_the_drone_disarms_if_it_does_not_take_off(self, gcs: GroundStation) -> None:
         assert gcs.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 1) == OK
         gcs.wait(9)
         assert gcs.autopilot.vehicle.is_armed
         gcs.wait(2)
         assert not gcs.autopilot.vehicle.is_armed
 
-    def test_it_follows_set_points_until_they_stop(self, gcs: GroundStation) -> None:
+    def test_the_drone_follows_set_points_until_they_stop(self, gcs: GroundStation) -> None:
         take_off(gcs)
-        only_velocity = 0b111111000111
+        velocity_mask = 0b111111000111
         for number in range(30):
             gcs.send_message(
                 d.MAVLink_set_position_target_local_ned_message(
-                    0, SYSTEM, 1, d.MAV_FRAME_LOCAL_NED, only_velocity, 0, 0, 0, 1.0, 0, 0, 0, 0, 0, 0, 0
+                    0, SYSTEM, 1, d.MAV_FRAME_LOCAL_NED, velocity_mask, 0, 0, 0, 1.0, 0, 0, 0, 0, 0, 0, 0
                 )
             )
             if number == 0:
@@ -165,7 +165,7 @@ class TestFlight:
         assert gcs.last("HEARTBEAT").custom_mode == 4 << 16 | 3 << 24
         assert (d.MAV_SEVERITY_CRITICAL, "Failsafe activated") in gcs.texts()
 
-    def test_set_points_do_not_lead_over_the_fence(self, gcs: GroundStation) -> None:
+    def test_set_points_do_not_move_the_drone_over_the_fence(self, gcs: GroundStation) -> None:
         take_off(gcs)
         gcs.send_message(d.MAVLink_param_set_message(SYSTEM, 1, b"GF_MAX_HOR_DIST", 10.0, d.MAV_PARAM_TYPE_REAL32))
         for number in range(100):
@@ -209,12 +209,12 @@ class TestFlight:
 
 
 class TestLimits:
-    """Any commands keep it within the limits of its profile, except for half a metre while it brakes.
+    """No command moves the drone beyond the limits of its profile, except by half a metre while it brakes.
 
     Its speed may exceed the limit by a twentieth for a short time, since its attitude lags behind the commands.
     """
 
-    BEYOND_M, FASTER = 0.5, 1.05
+    OVERSHOOT_M, SPEED_FACTOR = 0.5, 1.05
     LIMITS = FlightLimits(speed_m_s=2.0, height_m=6.0, fence_m=12.0)
     velocities = st.tuples(*[st.floats(-30, 30)] * 3)
     places = st.tuples(*[st.floats(-40, 40)] * 3)
@@ -231,14 +231,14 @@ class TestLimits:
         ]
     )  # brakes twice at the fence
     def test_commands_do_not_exceed_the_limits(
-        self, orders: list[tuple[bool, tuple[float, float, float], tuple[float, float, float]]]
+        self, commands: list[tuple[bool, tuple[float, float, float], tuple[float, float, float]]]
     ) -> None:
         gcs = GroundStation(limits=self.LIMITS)
         gcs.wait(1)
         for name, value in ((b"GF_MAX_HOR_DIST", 99.0), (b"GF_MAX_VER_DIST", 99.0), (b"MPC_XY_VEL_MAX", 9.0)):
             gcs.send_message(d.MAVLink_param_set_message(SYSTEM, 1, name, value, d.MAV_PARAM_TYPE_REAL32))
         take_off(gcs)
-        for by_velocity, velocity, place in orders:
+        for uses_velocity, velocity, place in commands:
             east_m, north_m, up_m = place
             x, y = degrees_e7(HOME_M[0] + east_m, HOME_M[1] + north_m)
             gcs.send_message(
@@ -246,7 +246,7 @@ class TestLimits:
                     SYSTEM, 1, RELATIVE, d.MAV_CMD_DO_REPOSITION, 0, 0, -1, 1, 0, 0, x, y, up_m
                 )
             )
-            mask = 0b111111000111 if by_velocity else 0b110111111000
+            mask = 0b111111000111 if uses_velocity else 0b110111111000
             for number in range(40):
                 gcs.send_message(
                     d.MAVLink_set_position_target_local_ned_message(
@@ -257,15 +257,15 @@ class TestLimits:
                     gcs.command(d.MAV_CMD_DO_SET_MODE, CUSTOM, 6, 0)
                 gcs.wait(0.1)
                 body = gcs.autopilot.vehicle.body
-                assert math.hypot(*body.position_m[:2]) <= self.LIMITS.fence_m + self.BEYOND_M
-                assert -0.01 <= body.position_m[2] <= self.LIMITS.height_m + self.BEYOND_M
-                assert math.hypot(*body.velocity_m_s[:2]) <= self.LIMITS.speed_m_s * self.FASTER
+                assert math.hypot(*body.position_m[:2]) <= self.LIMITS.fence_m + self.OVERSHOOT_M
+                assert -0.01 <= body.position_m[2] <= self.LIMITS.height_m + self.OVERSHOOT_M
+                assert math.hypot(*body.velocity_m_s[:2]) <= self.LIMITS.speed_m_s * self.SPEED_FACTOR
 
     def test_a_take_off_and_a_mission_outside_the_limits_are_refused(self) -> None:
         gcs = GroundStation(limits=self.LIMITS)
         gcs.wait(1)
         assert gcs.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 1) == OK
-        assert gcs.command(d.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 6.1) == NOT_NOW
+        assert gcs.command(d.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 6.1) == REJECTED
         assert upload(gcs, [item(0, 0, 0, 5), item(1, 12.5, 0, 5)]) == d.MAV_MISSION_DENIED
         assert upload(gcs, [item(0, 0, 0, 5), item(1, 0, 11.5, 5)]) == d.MAV_MISSION_ACCEPTED
 
@@ -278,10 +278,10 @@ class TestParameters:
 
     def test_values_outside_the_range_are_rejected(self, gcs: GroundStation) -> None:
         for requested, expected in ((2.0, 2.0), (30.0, 2.0), (math.nan, 2.0)):
-            (now,) = gcs.send_message(
+            (answer,) = gcs.send_message(
                 d.MAVLink_param_set_message(SYSTEM, 1, b"MPC_XY_VEL_MAX", requested, d.MAV_PARAM_TYPE_REAL32)
             )
-            assert now.param_value == expected
+            assert answer.param_value == expected
         assert not gcs.send_message(d.MAVLink_param_request_read_message(SYSTEM, 1, b"NO_SUCH", -1))
 
 
@@ -299,36 +299,38 @@ class TestMission:
         gcs.autopilot.vehicle.arm()
         for _ in range(30):
             gcs.send_message(d.MAVLink_command_long_message(SYSTEM, 1, d.MAV_CMD_MISSION_START, 0, *(0,) * 7))
-        nearest = dict.fromkeys(self.PLACES, math.inf)
+        least_distances_m = dict.fromkeys(self.PLACES, math.inf)
         for _ in range(600):
             gcs.wait(0.1)
             position = gcs.autopilot.vehicle.body.position_m
-            nearest = {place: min(distance_m, math.dist(place, position)) for place, distance_m in nearest.items()}
-        assert max(nearest.values()) < 0.5
+            least_distances_m = {
+                place: min(distance_m, math.dist(place, position)) for place, distance_m in least_distances_m.items()
+            }
+        assert max(least_distances_m.values()) < 0.5
         assert not gcs.autopilot.vehicle.is_armed
         if not loss:
-            reached = [message.seq for message in gcs.received if message.get_type() == "MISSION_ITEM_REACHED"]
-            assert list(dict.fromkeys(reached)) == [0, 1, 2, 3]
-            assert reached.count(3) == 1 + REPEATS, "repeated in case of loss"
+            reached_items = [message.seq for message in gcs.received if message.get_type() == "MISSION_ITEM_REACHED"]
+            assert list(dict.fromkeys(reached_items)) == [0, 1, 2, 3]
+            assert reached_items.count(3) == 1 + REPEATS, "repeated in case of loss"
 
     def test_a_mission_can_be_downloaded(self, gcs: GroundStation) -> None:
         items = [item(number, *place) for number, place in enumerate(self.PLACES)]
         assert upload(gcs, items) == d.MAV_MISSION_ACCEPTED
         (count,) = gcs.send_message(d.MAVLink_mission_request_list_message(SYSTEM, 1))
         assert count.count == len(items)
-        for sent in items:
-            (downloaded,) = gcs.send_message(d.MAVLink_mission_request_int_message(SYSTEM, 1, sent.seq))
+        for uploaded_item in items:
+            (downloaded,) = gcs.send_message(d.MAVLink_mission_request_int_message(SYSTEM, 1, uploaded_item.seq))
             assert (downloaded.x, downloaded.y, downloaded.z, downloaded.command) == (
-                sent.x,
-                sent.y,
-                sent.z,
-                sent.command,
+                uploaded_item.x,
+                uploaded_item.y,
+                uploaded_item.z,
+                uploaded_item.command,
             )
         (ack,) = gcs.send_message(d.MAVLink_mission_request_int_message(SYSTEM, 1, 3))
         assert ack.type == d.MAV_MISSION_INVALID_SEQUENCE
 
     @pytest.mark.parametrize(
-        ("wrong", "result"),
+        ("invalid_item", "result"),
         [
             (item(0, 500.0, 0.0, 3.0), d.MAV_MISSION_DENIED),
             (item(0, 1.0, 0.0, 31.0), d.MAV_MISSION_DENIED),
@@ -336,8 +338,8 @@ class TestMission:
             (item(0, 0.0, 0.0, 3.0, d.MAV_CMD_DO_PARACHUTE), d.MAV_MISSION_UNSUPPORTED),
         ],
     )
-    def test_unsupported_items_are_refused(self, gcs: GroundStation, wrong: Message, result: int) -> None:
-        assert upload(gcs, [wrong]) == result
+    def test_unsupported_items_are_refused(self, gcs: GroundStation, invalid_item: Message, result: int) -> None:
+        assert upload(gcs, [invalid_item]) == result
         assert not gcs.autopilot.vehicle.mission.items
 
     def test_an_abandoned_upload_is_cancelled(self, gcs: GroundStation) -> None:
@@ -348,7 +350,7 @@ class TestMission:
 
 
 def frames() -> list[bytes]:
-    """Return one frame of every message of the dialect, with zeros, and some with extreme requests."""
+    """Return frames of requests, some with extreme values."""
     link = d.MAVLink(None, srcSystem=255, srcComponent=190)
     requests = [
         d.MAVLink_mission_count_message(SYSTEM, 1, 65_535),
@@ -372,13 +374,13 @@ def frames() -> list[bytes]:
 FRAMES = frames()
 
 
-def changed(frame: bytes, place: int, value: int) -> bytes:
-    place %= len(frame)
-    return frame[:place] + bytes([value]) + frame[place + 1 :]
+def with_changed_byte(frame: bytes, index: int, value: int) -> bytes:
+    index %= len(frame)
+    return frame[:index] + bytes([value]) + frame[index + 1 :]
 
 
-mutated = st.builds(changed, st.sampled_from(FRAMES), st.integers(0, 279), st.integers(0, 255))
-cut = st.builds(lambda frame, end: frame[: end % len(frame)], st.sampled_from(FRAMES), st.integers(0, 279))
+mutated_frames = st.builds(with_changed_byte, st.sampled_from(FRAMES), st.integers(0, 279), st.integers(0, 255))
+cut_frames = st.builds(lambda frame, end: frame[: end % len(frame)], st.sampled_from(FRAMES), st.integers(0, 279))
 
 
 def with_valid_checksum(frame: bytes) -> bytes:
@@ -392,13 +394,19 @@ def with_valid_checksum(frame: bytes) -> bytes:
     return frame[:-2] + checksum.to_bytes(2, "little")
 
 
-hostile = st.one_of(st.binary(max_size=300), mutated, cut, mutated.map(with_valid_checksum), st.sampled_from(FRAMES))
+hostile_datagrams = st.one_of(
+    st.binary(max_size=300),
+    mutated_frames,
+    cut_frames,
+    mutated_frames.map(with_valid_checksum),
+    st.sampled_from(FRAMES),
+)
 
 
 class TestHostile:
     @settings(deadline=None)
-    @given(st.lists(hostile, min_size=1, max_size=12))
-    def test_any_bytes_are_survived(self, datagrams: list[bytes]) -> None:
+    @given(st.lists(hostile_datagrams, min_size=1, max_size=12))
+    def test_the_autopilot_survives_any_bytes(self, datagrams: list[bytes]) -> None:
         gcs = GroundStation()
         for datagram in datagrams:
             gcs.send(datagram)

@@ -30,7 +30,7 @@ def test_ping_logs_and_files_have_an_answer(firmware: Firmware) -> None:
     gcs = station(firmware)
     (ping,) = gcs.send_message(d.MAVLink_ping_message(123_456, 7, 0, 0))
     assert (ping.time_usec, ping.seq, ping.target_system, ping.target_component) == (123_456, 7, 255, 190)
-    assert gcs.send_message(d.MAVLink_ping_message(1, 1, SYSTEM, 1)) == [], "an answer has no answer"
+    assert gcs.send_message(d.MAVLink_ping_message(1, 1, SYSTEM, 1)) == [], "a response is not answered"
     (log,) = gcs.send_message(d.MAVLink_log_request_list_message(SYSTEM, 1, 0, 0xFFFF))
     assert log.num_logs == 0
     for opcode, expected, error in ((4, 129, 10), (3, 129, 6), (77, 129, 7), (2, 128, None)):
@@ -45,16 +45,16 @@ def checksum_extra(name: str, fields: list[tuple[str, str, int]]) -> int:
     """Return the CRC_EXTRA of a message (https://mavlink.io/en/guide/serialization.html#crc_extra)."""
     sizes = {"uint32_t": 4, "uint16_t": 2}
     crc = d.x25crc(f"{name} ".encode())
-    for kind, field, length in sorted(fields, key=lambda field: -sizes.get(field[0], 1)):
-        crc.accumulate(f"{kind} {field} ".encode() + bytes([length] * (length > 0)))
+    for field_type, field, length in sorted(fields, key=lambda field: -sizes.get(field[0], 1)):
+        crc.accumulate(f"{field_type} {field} ".encode() + bytes([length] * (length > 0)))
     return int(crc.crc & 0xFF ^ crc.crc >> 8)
 
 
-def fields_of(message: Any, system: int = 1) -> Any:  # noqa: ANN401 (of pymavlink)
+def pack_frame(message: Any, system: int = 1) -> Any:  # noqa: ANN401 (of pymavlink)
     return message.pack(d.MAVLink(None, srcSystem=system))
 
 
-def test_messages_that_pymavlink_lacks_have_the_right_checksums() -> None:
+def test_messages_that_pymavlink_does_not_have_have_valid_checksums() -> None:
     definitions = {
         "PROTOCOL_VERSION": [
             ("uint16_t", "version", 0),
@@ -66,23 +66,23 @@ def test_messages_that_pymavlink_lacks_have_the_right_checksums() -> None:
         "COMPONENT_METADATA": [("uint32_t", "time_boot_ms", 0), ("uint32_t", "file_crc", 0), ("char", "uri", 100)],
     }
     for message in (mavlink_frames.protocol_version(), mavlink_frames.component_metadata(1, "mftp://x")):
-        frame = fields_of(message)
+        frame = pack_frame(message)
         crc = d.x25crc(frame[1:-2])
         crc.accumulate(bytes([checksum_extra(message.get_type(), definitions[message.get_type()])]))
         assert int.from_bytes(frame[-2:], "little") == crc.crc
-    frame = fields_of(mavlink_frames.available_modes(9, 2, 4, 0x05040000, "Return"))
+    frame = pack_frame(mavlink_frames.available_modes(9, 2, 4, 0x05040000, "Return"))
     (mode,) = development.MAVLink(None).parse_buffer(frame)
     assert (mode.number_modes, mode.mode_index, mode.standard_mode) == (9, 2, 4)
     assert (mode.custom_mode, mode.mode_name) == (0x05040000, "Return")
 
 
-class Raw(GroundStation):
-    """A ground station that reads the ids of messages missing in pymavlink's dialect."""
+class RawStation(GroundStation):
+    """A ground station that reads the ids of messages that pymavlink's dialect does not have."""
 
-    def answers(self, kind: int, param2: float = 0) -> tuple[int, list[int]]:
+    def answers(self, message_id: int, param2: float = 0) -> tuple[int, list[int]]:
         """Return the result of MAV_CMD_REQUEST_MESSAGE, and the ids of the other messages received."""
         command = d.MAVLink_command_long_message(
-            SYSTEM, 1, d.MAV_CMD_REQUEST_MESSAGE, 0, kind, param2, 0, 0, 0, 0, 0
+            SYSTEM, 1, d.MAV_CMD_REQUEST_MESSAGE, 0, message_id, param2, 0, 0, 0, 0, 0
         ).pack(self._link)
         frames = [frame for _, frame in self.autopilot.receive(command, ("gcs", 1), self.now_ns)]
         (ack,) = d.MAVLink(None).parse_buffer(frames[0])
@@ -90,7 +90,7 @@ class Raw(GroundStation):
 
 
 @pytest.mark.parametrize(
-    ("kind", "px4", "ardupilot"),
+    ("message_id", "px4", "ardupilot"),
     [
         (d.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, OK, OK),
         (d.MAVLINK_MSG_ID_HIGHRES_IMU, OK, FAILED),
@@ -103,19 +103,19 @@ class Raw(GroundStation):
         (12_345, DENIED, FAILED),
     ],
 )
-def test_messages_on_request(kind: int, px4: int, ardupilot: int) -> None:
+def test_a_message_is_sent_on_request_if_the_firmware_has_it(message_id: int, px4: int, ardupilot: int) -> None:
     for firmware, expected in ((PX4, px4), (ARDUCOPTER, ardupilot)):
-        gcs = Raw(firmware=firmware)
+        gcs = RawStation(firmware=firmware)
         gcs.wait(1)
-        assert gcs.answers(kind) == (expected, [kind] if expected == OK else [])
+        assert gcs.answers(message_id) == (expected, [message_id] if expected == OK else [])
 
 
 @FIRMWARES
 def test_each_mode_is_listed(firmware: Firmware) -> None:
-    gcs = Raw(firmware=firmware)
+    gcs = RawStation(firmware=firmware)
     gcs.wait(1)
-    result, kinds = gcs.answers(mavlink_frames.AVAILABLE_MODES, 0)
-    assert (result, kinds) == (OK, [mavlink_frames.AVAILABLE_MODES] * len(firmware.names))
+    result, message_ids = gcs.answers(mavlink_frames.AVAILABLE_MODES, 0)
+    assert (result, message_ids) == (OK, [mavlink_frames.AVAILABLE_MODES] * len(firmware.names))
     assert gcs.answers(mavlink_frames.AVAILABLE_MODES, 1) == (OK, [mavlink_frames.AVAILABLE_MODES])
     assert gcs.answers(mavlink_frames.AVAILABLE_MODES, 200)[0] != OK
 
@@ -146,17 +146,17 @@ def test_attitude_and_acceleration_agree_in_flight() -> None:
     body_speed = (odometry.vx**2 + odometry.vy**2 + odometry.vz**2) ** 0.5
     assert body_speed == pytest.approx((local.vx**2 + local.vy**2 + local.vz**2) ** 0.5, abs=0.2)
     assert local.vy > 1.0, "it is flying east"
-    assert odometry.vx == pytest.approx(body_speed, abs=0.2), "with its nose ahead"
+    assert odometry.vx == pytest.approx(body_speed, abs=0.2), "the nose points along the path"
 
 
 def pitch_of(quaternion: Any) -> float:  # noqa: ANN401 (of pymavlink)
     """Return the pitch of a quaternion, computed by pymavlink's library."""
-    turned = Quaternion([quaternion.q1, quaternion.q2, quaternion.q3, quaternion.q4])
-    return float(turned.euler[1])
+    rotation = Quaternion([quaternion.q1, quaternion.q2, quaternion.q3, quaternion.q4])
+    return float(rotation.euler[1])
 
 
 class TestParameters:
-    def test_px4_integers_are_bytewise(self) -> None:
+    def test_px4_encodes_integer_parameters_bytewise(self) -> None:
         gcs = station(PX4)
         values = {
             value.param_id: value for value in gcs.send_message(d.MAVLink_param_request_list_message(SYSTEM, 1))
@@ -169,7 +169,7 @@ class TestParameters:
         gcs.wait(0.1)
         assert (d.MAV_SEVERITY_INFO, "[pm] param types mismatch param: COM_DL_LOSS_T") in gcs.texts()
 
-    def test_arducopter_integers_are_cast(self) -> None:
+    def test_arducopter_casts_integer_parameters_to_floats(self) -> None:
         gcs = station(ARDUCOPTER)
         (value,) = gcs.send_message(d.MAVLink_param_request_read_message(SYSTEM, 1, b"SYSID_MYGCS", -1))
         assert (value.param_value, value.param_type) == (255.0, d.MAV_PARAM_TYPE_INT32)
@@ -178,7 +178,7 @@ class TestParameters:
         assert value.param_value == 245.0
 
     @pytest.mark.parametrize(("firmware", "texts"), [(PX4, ["[pm] unknown param: NO_SUCH"]), (ARDUCOPTER, [])])
-    def test_an_unknown_name(self, firmware: Firmware, texts: list[str]) -> None:
+    def test_only_px4_reports_an_unknown_parameter_name(self, firmware: Firmware, texts: list[str]) -> None:
         gcs = station(firmware)
         assert not gcs.send_message(d.MAVLink_param_set_message(SYSTEM, 1, b"NO_SUCH", 1.0, d.MAV_PARAM_TYPE_REAL32))
         gcs.wait(0.1)

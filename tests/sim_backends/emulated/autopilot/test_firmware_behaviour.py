@@ -28,7 +28,7 @@ LOCAL, STATUS, EKF = (
 
 
 class Station(GroundStation):
-    """A ground station of one system id."""
+    """A ground station with methods for modes, flights and heartbeats."""
 
     def __init__(self, firmware: Firmware, boot_s: float = 0.0) -> None:
         super().__init__(firmware=firmware, boot_s=boot_s)
@@ -57,8 +57,8 @@ class Station(GroundStation):
         """Advance the time while only a station of this system id sends heartbeats."""
         link = d.MAVLink(None, srcSystem=system, srcComponent=190)
         for _ in range(seconds):
-            beat = d.MAVLink_heartbeat_message(d.MAV_TYPE_GCS, 8, 0, 0, 4, 3).pack(link)
-            list(self.autopilot.receive(beat, ("gcs", 1), self.now_ns))
+            heartbeat = d.MAVLink_heartbeat_message(d.MAV_TYPE_GCS, 8, 0, 0, 4, 3).pack(link)
+            list(self.autopilot.receive(heartbeat, ("gcs", 1), self.now_ns))
             self.wait_silently(1)
 
     def poll(self, condition: str, limit_s: float) -> Iterator[None]:
@@ -100,9 +100,9 @@ def test_arducopter_sends_only_heartbeat_and_timesync_without_a_request(copter: 
     assert counts["TIMESYNC"] == 6
 
 
-@pytest.mark.parametrize("by", ["parameter", "request"])
-def test_stream_rates_of_arducopter_are_parameters(copter: Station, by: str) -> None:
-    if by == "parameter":
+@pytest.mark.parametrize("source", ["parameter", "request"])
+def test_stream_rates_of_arducopter_are_parameters(copter: Station, source: str) -> None:
+    if source == "parameter":
         copter.set("SR0_POSITION", 4)
     else:
         copter.send_message(d.MAVLink_request_data_stream_message(SYSTEM, 1, d.MAV_DATA_STREAM_POSITION, 4, 1))
@@ -120,7 +120,9 @@ def test_stream_rates_of_arducopter_are_parameters(copter: Station, by: str) -> 
     )
 
 
-def other_frames(autopilot: Autopilot, now_ns: int, system: int, message: object) -> dict[int, Counter[str]]:
+def send_from_other_client(
+    autopilot: Autopilot, now_ns: int, system: int, message: object
+) -> dict[int, Counter[str]]:
     """Send a message from another client; return the message types that each client port received as answers."""
     link = d.MAVLink(None, srcSystem=system, srcComponent=190)
     readers = {port: d.MAVLink(None) for port in (1, 2)}
@@ -133,31 +135,34 @@ def other_frames(autopilot: Autopilot, now_ns: int, system: int, message: object
 def test_rates_belong_to_the_port_and_acknowledgements_to_the_sender(copter: Station) -> None:
     copter.request_rate(10, LOCAL)
     stop = d.MAVLink_command_long_message(SYSTEM, 1, d.MAV_CMD_SET_MESSAGE_INTERVAL, 0, LOCAL, -1, 0, 0, 0, 0, 0)
-    counts = other_frames(copter.autopilot, copter.now_ns, 245, stop)
+    counts = send_from_other_client(copter.autopilot, copter.now_ns, 245, stop)
     assert counts == {1: Counter(), 2: Counter(COMMAND_ACK=1)}
     assert "LOCAL_POSITION_NED" not in {message.get_type() for message in copter.wait(5)}, (
         "the other client stopped it"
     )
-    read = d.MAVLink_param_request_read_message(SYSTEM, 1, b"RTL_ALT", -1)
-    counts = other_frames(copter.autopilot, copter.now_ns, 245, read)
+    read_request = d.MAVLink_param_request_read_message(SYSTEM, 1, b"RTL_ALT", -1)
+    counts = send_from_other_client(copter.autopilot, copter.now_ns, 245, read_request)
     assert counts == {1: Counter(PARAM_VALUE=1), 2: Counter(PARAM_VALUE=1)}, (
         "a message without a target goes to all clients"
     )
 
 
-def test_arducopter_has_a_position_once_its_estimate_has_an_origin() -> None:
+def test_arducopter_has_a_position_when_its_estimate_has_an_origin() -> None:
     copter = Station(ARDUCOPTER, boot_s=10)
     copter.request_rate(5, LOCAL, EKF, d.MAVLINK_MSG_ID_GPS_RAW_INT)
-    early = copter.wait(9)
+    early_messages = copter.wait(9)
     assert copter.arm() == FAILED
-    late = copter.wait(5)
-    assert {message.flags for message in early if message.get_type() == "EKF_STATUS_REPORT"} == {0xA7}
+    late_messages = copter.wait(5)
+    assert {message.flags for message in early_messages if message.get_type() == "EKF_STATUS_REPORT"} == {0xA7}
     assert copter.last("EKF_STATUS_REPORT").flags == 831
-    assert "LOCAL_POSITION_NED" not in {message.get_type() for message in early}
+    assert "LOCAL_POSITION_NED" not in {message.get_type() for message in early_messages}
     assert copter.last("LOCAL_POSITION_NED").z == 0
-    assert next(message.fix_type for message in early if message.get_type() == "GPS_RAW_INT") == d.GPS_FIX_TYPE_NO_FIX
+    assert (
+        next(message.fix_type for message in early_messages if message.get_type() == "GPS_RAW_INT")
+        == d.GPS_FIX_TYPE_NO_FIX
+    )
     assert copter.last("GPS_RAW_INT").fix_type == d.GPS_FIX_TYPE_RTK_FIXED == 6
-    texts = [message.text for message in early + late if message.get_type() == "STATUSTEXT"]
+    texts = [message.text for message in early_messages + late_messages if message.get_type() == "STATUSTEXT"]
     assert texts == [
         "PreArm: Need Position Estimate",
         "Arm: Need Position Estimate",
@@ -171,7 +176,7 @@ def test_arducopter_has_a_position_once_its_estimate_has_an_origin() -> None:
     assert copter.command(d.MAV_CMD_SET_MESSAGE_INTERVAL, d.MAVLINK_MSG_ID_RADIO_STATUS, 1e5) == DENIED
 
 
-def test_px4_is_not_armed_before_its_estimate_is_good() -> None:
+def test_px4_cannot_be_armed_before_its_estimate_is_good() -> None:
     px4 = Station(PX4, boot_s=10)
     px4.wait(5)
     assert px4.arm() == d.MAV_RESULT_TEMPORARILY_REJECTED
@@ -183,7 +188,7 @@ def test_px4_is_not_armed_before_its_estimate_is_good() -> None:
     assert px4.arm() == OK
 
 
-def test_spool_up_landing_and_the_mode_afterwards(copter: Station) -> None:
+def test_the_drone_spools_up_before_take_off_and_keeps_its_mode_after_landing(copter: Station) -> None:
     assert copter.change_mode("GUIDED") == OK
     assert copter.arm() == OK
     assert copter.take_off(3.0) == OK
@@ -200,12 +205,12 @@ def test_spool_up_landing_and_the_mode_afterwards(copter: Station) -> None:
     for _ in copter.poll("landed", 12):
         if copter.autopilot.vehicle.body.on_ground:
             break
-    down_s = (copter.now_ns - start_ns) / 1e9
+    landing_s = (copter.now_ns - start_ns) / 1e9
     for _ in copter.poll("disarmed", 5):
         if not copter.autopilot.vehicle.is_armed:
             break
-    assert down_s == pytest.approx(6.4, abs=0.6), "as real ArduCopter from 3 m"
-    assert (copter.now_ns - start_ns) / 1e9 - down_s == pytest.approx(2.1, abs=0.2)
+    assert landing_s == pytest.approx(6.4, abs=0.6), "as real ArduCopter from 3 m"
+    assert (copter.now_ns - start_ns) / 1e9 - landing_s == pytest.approx(2.1, abs=0.2)
     copter.wait(1)
     assert copter.mode == "LAND"
     assert copter.arm() == FAILED
@@ -214,7 +219,7 @@ def test_spool_up_landing_and_the_mode_afterwards(copter: Station) -> None:
     assert (INFO, "Arming motors") in copter.texts()
 
 
-def test_an_unknown_mode_and_pilot_modes(copter: Station) -> None:
+def test_an_unknown_mode_is_refused_and_pilot_modes_keep_the_height(copter: Station) -> None:
     assert copter.command(d.MAV_CMD_DO_SET_MODE, CUSTOM, 99) == FAILED
     copter.wait(0.1)
     assert copter.texts() == [(WARNING, "No such mode 99")]
@@ -226,7 +231,7 @@ def test_an_unknown_mode_and_pilot_modes(copter: Station) -> None:
         assert copter.autopilot.vehicle.body.position_m[2] == pytest.approx(3.0, abs=0.3)
 
 
-def test_acknowledgements_carry_no_progress(copter: Station) -> None:
+def test_acknowledgements_contain_no_progress(copter: Station) -> None:
     copter.command(d.MAV_CMD_RUN_PREARM_CHECKS)
     ack = copter.last("COMMAND_ACK")
     assert (ack.progress, ack.result_param2) == (0, 0)
@@ -252,7 +257,7 @@ def test_arducopter_turns_along_its_path_unless_a_heading_is_set(
     assert yaw_deg == pytest.approx(heading_deg, abs=5)
 
 
-def test_home_is_where_it_was_armed_last(copter: Station) -> None:
+def test_home_is_the_position_of_the_last_arming(copter: Station) -> None:
     copter.request_rate(5, LOCAL, d.MAVLINK_MSG_ID_HOME_POSITION)
     copter.fly()
     copter.send_message(local_set_point(4.0, 3.0))
@@ -265,7 +270,7 @@ def test_home_is_where_it_was_armed_last(copter: Station) -> None:
     home, position = copter.last("HOME_POSITION"), copter.last("LOCAL_POSITION_NED")
     assert (home.x, home.y) == pytest.approx((position.x, position.y), abs=0.01)
     assert (position.x, position.y) == pytest.approx((4.0, 3.0), abs=0.3)
-    # If a person carries it back, the origin of its frame stays.
+    # If a person carries the drone back, the origin of its frame does not change.
     copter.autopilot.vehicle.place((HOME_M[0], HOME_M[1] + 1.0, 0.0), 0.0, copter.now_ns)
     copter.wait(1)
     position = copter.last("LOCAL_POSITION_NED")
@@ -342,8 +347,8 @@ def test_px4_lands_with_a_low_battery_as_its_parameter_requires(px4: Station, ac
     assert px4.autopilot.vehicle.is_armed != lands
 
 
-@pytest.mark.parametrize(("action", "sub"), [(0, 3), (3, 5), (4, 6)])
-def test_px4_without_set_points_acts_as_its_parameter_requires(px4: Station, action: int, sub: int) -> None:
+@pytest.mark.parametrize(("action", "sub_mode"), [(0, 3), (3, 5), (4, 6)])
+def test_px4_without_set_points_acts_as_its_parameter_requires(px4: Station, action: int, sub_mode: int) -> None:
     px4.set("COM_OBL_RC_ACT", action)
     px4.fly()
     px4.send_message(local_set_point(0.0, 0.0))
@@ -351,7 +356,7 @@ def test_px4_without_set_points_acts_as_its_parameter_requires(px4: Station, act
     px4.wait(0.5)
     assert px4_mode(px4) == 6 << 16
     px4.wait(1.5)
-    assert px4_mode(px4) == 4 << 16 | sub << 24
+    assert px4_mode(px4) == 4 << 16 | sub_mode << 24
 
 
 @pytest.mark.parametrize("action", [3, 4])

@@ -1,4 +1,4 @@
-"""The script that flies a user's simulated firmware, against the emulated ArduCopter."""
+"""The script that flies a user's simulated firmware, tested with the emulated ArduCopter."""
 
 from itertools import islice
 
@@ -7,7 +7,7 @@ from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
 from tests.helpers import drones
 
 
-def test_the_first_cases_pass() -> None:
+def test_the_autopilot_passes_the_first_cases_of_the_comparison() -> None:
     with drones.autopilot_at_udp(firmware=ARDUCOPTER, boot_s=1.0) as (port, autopilot):
         results = list(islice(rows(f"udpout:127.0.0.1:{port}"), 3))
         assert [(row.case, row.passed, row.observation if not row.passed else "") for row in results] == [

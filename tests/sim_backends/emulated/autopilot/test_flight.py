@@ -27,7 +27,7 @@ velocities = st.tuples(coordinates, coordinates, coordinates)
 quadrotors = st.sampled_from([DUCKIEDRONE, IRIS])
 
 
-def flying(limits: QuadrotorLimits = DUCKIEDRONE, heading_rad: float = 0.0) -> Airframe:
+def hovering_drone(limits: QuadrotorLimits = DUCKIEDRONE, heading_rad: float = 0.0) -> Airframe:
     """Return a drone that hovers 10 m above the ground, where its home is."""
     body = Airframe(limits, (3.0, 4.0, 10.0), heading_rad, FLOOR, 0)
     body.motors_on = True
@@ -38,7 +38,7 @@ def flying(limits: QuadrotorLimits = DUCKIEDRONE, heading_rad: float = 0.0) -> A
 @settings(max_examples=12)
 @given(quadrotors, st.lists(st.tuples(velocities, st.integers(1, 100)), min_size=1, max_size=4))
 def test_commands_do_not_exceed_the_limits(limits: QuadrotorLimits, commands: list[tuple[Vector, int]]) -> None:
-    body = flying(limits)
+    body = hovering_drone(limits)
     for velocity_m_s, steps in commands:
         for _ in range(steps):
             body.step(velocity_m_s, limits)
@@ -51,8 +51,8 @@ def test_commands_do_not_exceed_the_limits(limits: QuadrotorLimits, commands: li
 
 @settings(max_examples=12)
 @given(quadrotors, points)
-def test_it_reaches_a_point_with_little_overshoot(limits: QuadrotorLimits, goal: Vector) -> None:
-    body = flying(limits)
+def test_the_drone_reaches_a_point_with_little_overshoot(limits: QuadrotorLimits, goal: Vector) -> None:
+    body = hovering_drone(limits)
     direct_m = math.hypot(*goal[:2])
     for _ in range(30_000):
         body.step(velocity_to(goal, body, limits), limits)
@@ -66,36 +66,38 @@ def test_it_reaches_a_point_with_little_overshoot(limits: QuadrotorLimits, goal:
 
 @settings(max_examples=12)
 @given(quadrotors, velocities)
-def test_it_stops_where_predicted(limits: QuadrotorLimits, velocity_m_s: Vector) -> None:
-    body = flying(limits)
+def test_the_drone_stops_at_the_predicted_position(limits: QuadrotorLimits, velocity_m_s: Vector) -> None:
+    body = hovering_drone(limits)
     for _ in range(500):
         body.step((velocity_m_s[0], velocity_m_s[1], 0.0), limits)
     predicted_m = stop_m(body, limits)
     while math.hypot(*body.velocity_m_s) > 1e-3:
         body.step((0.0, 0.0, 0.0), limits)
-    out_m, predicted_out_m = math.hypot(*body.position_m[:2]), math.hypot(*predicted_m[:2])
-    assert out_m <= predicted_out_m + 0.1
+    distance_m, predicted_distance_m = math.hypot(*body.position_m[:2]), math.hypot(*predicted_m[:2])
+    assert distance_m <= predicted_distance_m + 0.1
 
 
-def test_without_motors_it_falls_with_drag_and_comes_to_rest() -> None:
+def test_a_drone_without_motors_falls_with_drag_and_comes_to_rest() -> None:
     """Linear drag alone, from rest: v(t) = g m / c (1 - exp(-c t / m))."""
     limits = replace(DUCKIEDRONE, drag_n_s2_m2=0.0)
-    body = flying(limits)
+    body = hovering_drone(limits)
     body.motors_on = False
-    fallen = []
+    climb_rates_m_s = []
     while not body.on_ground:
         body.step((0.0, 0.0, 5.0), limits)
-        fallen.append(body.velocity_m_s[2])
+        climb_rates_m_s.append(body.velocity_m_s[2])
     tau_s = limits.mass_kg / limits.drag_n_s_m
-    assert fallen[99] == pytest.approx(-GRAVITY_M_S2 * tau_s * (1 - math.exp(-100 * STEP_S / tau_s)), rel=0.01)
+    assert climb_rates_m_s[99] == pytest.approx(
+        -GRAVITY_M_S2 * tau_s * (1 - math.exp(-100 * STEP_S / tau_s)), rel=0.01
+    )
     assert body.velocity_m_s == (0.0, 0.0, 0.0)
     assert body.tilt_rad == (0.0, 0.0)
     assert body.place_m[2] == pytest.approx(0.0, abs=1e-6)
 
 
-def test_it_tilts_towards_its_acceleration() -> None:
-    """Speeding up eastwards with the nose north is a roll to the right; ahead, the nose goes down."""
-    body = flying(heading_rad=math.pi / 2)
+def test_the_drone_tilts_towards_its_acceleration() -> None:
+    """With its nose to the north, it accelerates to the east by rolling right, and to the north by pitching down."""
+    body = hovering_drone(heading_rad=math.pi / 2)
     for _ in range(20):
         body.step((0.2, 0.0, 0.0), DUCKIEDRONE)
     assert body.tilt_rad[0] > 0.01
@@ -105,13 +107,13 @@ def test_it_tilts_towards_its_acceleration() -> None:
 
 
 def house() -> Sequence[Footprint]:
-    """Return a house of 3 m, from 4 m to 8 m east."""
+    """Return a house with a height of 3 m, from 4 m to 8 m east."""
     box = {"name": "house", "kind": "box", "material": "concrete", "centre_m": [6, 0], "size_m": [4, 4, 3]}
     world = World.model_validate({"name": "w", "summary": "", "area_m": [40, 40], "obstacles": [box]})
     return Ground(world, None).obstacles
 
 
-def test_it_lands_on_the_roof_below_it_and_a_wall_stops_it() -> None:
+def test_the_drone_lands_on_the_roof_below_it_and_a_wall_stops_it() -> None:
     body = Airframe(DUCKIEDRONE, (0.0, 0.0, 0.0), 0.0, house(), 0)
     body.motors_on = True
     for _ in range(2_000):

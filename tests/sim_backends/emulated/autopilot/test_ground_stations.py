@@ -41,11 +41,11 @@ def emulation() -> Iterator[EmulatedTestbed]:
 def fly(emulation: EmulatedTestbed, program: str) -> dict[str, Any]:
     """Let a program on the sender's robot fly the drone; return its report."""
     drone = emulation.robots[Role.RELAY].spec
-    carried = emulation.medium.stats().ports[drone.name].sent_packets
+    sent_before = emulation.medium.stats().ports[drone.name].sent_packets
     words = (sys.executable, "-m", f"tests.helpers.{program}", drone.ip, str(drone.mavlink_port), LOSS)
     argv = ("env", f"PYTHONPATH={ROOT}", *words)
     result = emulation.shells[Role.SENDER].run(argv, deadline=Deadline.after(240))
-    assert emulation.medium.stats().ports[drone.name].sent_packets - carried > 100
+    assert emulation.medium.stats().ports[drone.name].sent_packets - sent_before > 100
     log = emulation.shells[Role.RELAY].run(("cat", "/run/robot/autopilot.log"), deadline=Deadline.after(10))
     assert log.stdout == b""
     report: dict[str, Any] = json.loads(result.stdout.decode().splitlines()[-1])
@@ -60,18 +60,17 @@ def test_mavsdk_flies_a_mission_of_three_points_although_every_twentieth_datagra
     assert report["items"] == 3
     assert 90 <= report["battery"] < 100.1
     # The lab recorded the same flight, down to the ground below its last corner.
-
-    flown_m = [
+    path_m = [
         point.position_m for point in emulation.oracle.track(0) if point.role is Role.RELAY and point.position_m
     ]
-    (east_m, north_m, up_m), last_m = flown_m[0], flown_m[-1]
-    assert max(point[2] for point in flown_m) - up_m == pytest.approx(1.0, abs=0.2)
-    assert min(math.dist(point[:2], (east_m + 2.0, north_m + 2.0)) for point in flown_m) < 0.5
+    (east_m, north_m, up_m), last_m = path_m[0], path_m[-1]
+    assert max(point[2] for point in path_m) - up_m == pytest.approx(1.0, abs=0.2)
+    assert min(math.dist(point[:2], (east_m + 2.0, north_m + 2.0)) for point in path_m) < 0.5
     assert math.dist(last_m, (east_m, north_m + 2.0, up_m)) < 0.6
 
 
 def test_mavproxy_flies_a_mission_although_every_twentieth_datagram_is_lost(emulation: EmulatedTestbed) -> None:
     report = fly(emulation, "mavproxy_flight")
     assert report["height_m"] < 0.2
-    for words in ("Loaded 4 waypoints in ", "COMPONENT_ARM_DISARM: ACCEPTED", "DISARMED"):
-        assert words in report["output"]
+    for text in ("Loaded 4 waypoints in ", "COMPONENT_ARM_DISARM: ACCEPTED", "DISARMED"):
+        assert text in report["output"]

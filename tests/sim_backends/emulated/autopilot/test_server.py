@@ -1,4 +1,4 @@
-"""The autopilot's process and datagrams that are not MAVLink, that were altered, or that have arbitrary values."""
+"""The autopilot's process with datagrams that are not MAVLink, that were altered, or that have arbitrary values."""
 
 import random
 import re
@@ -31,18 +31,22 @@ serve(drone, assigned_paths=folder / "motion", motion_record=folder / "steered",
 """
 
 
-def frame_with_any_values(dice: random.Random) -> bytes:
+def frame_with_any_values(rng: random.Random) -> bytes:
     """Return a valid frame of any message with arbitrary field values; most are addressed to the drone."""
-    kind = dice.choice(list(d.mavlink_map.values()))
-    link = d.MAVLink(None, srcSystem=dice.randrange(1, 256), srcComponent=190)
-    size = struct.calcsize(kind.unpacker.format)
-    payload = bytearray(dice.choice((dice.randbytes(size), bytes(size), b"\xff" * size)))
-    at = 0
-    for name, form in zip(kind.ordered_fieldnames, re.findall("[0-9]*[a-zA-Z]", kind.unpacker.format), strict=True):
-        if name in {"target_system", "target_component"} and dice.random() < 0.9:
-            payload[at] = SYSTEM if name == "target_system" else 1
-        at += struct.calcsize(f"<{form}")
-    packed: bytes = d.MAVLink_message(kind.id, kind.msgname)._pack(link, kind.crc_extra, bytes(payload))
+    message_class = rng.choice(list(d.mavlink_map.values()))
+    link = d.MAVLink(None, srcSystem=rng.randrange(1, 256), srcComponent=190)
+    size = struct.calcsize(message_class.unpacker.format)
+    payload = bytearray(rng.choice((rng.randbytes(size), bytes(size), b"\xff" * size)))
+    offset = 0
+    for name, field_format in zip(
+        message_class.ordered_fieldnames, re.findall("[0-9]*[a-zA-Z]", message_class.unpacker.format), strict=True
+    ):
+        if name in {"target_system", "target_component"} and rng.random() < 0.9:
+            payload[offset] = SYSTEM if name == "target_system" else 1
+        offset += struct.calcsize(f"<{field_format}")
+    packed: bytes = d.MAVLink_message(message_class.id, message_class.msgname)._pack(
+        link, message_class.crc_extra, bytes(payload)
+    )
     return packed
 
 
@@ -67,8 +71,8 @@ def heartbeat(port: int) -> d.MAVLink_message:
 
 
 def test_the_process_survives_any_datagrams_without_output(tmp_path: Path) -> None:
-    dice, port, sender = random.Random(11), free_port(), Sender(255, 190)
-    seeds = [
+    rng, port, sender = random.Random(11), free_port(), Sender(255, 190)
+    valid_frames = [
         sender.frame(message)
         for message in (
             d.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3),
@@ -80,16 +84,18 @@ def test_the_process_survives_any_datagrams_without_output(tmp_path: Path) -> No
     argv = (sys.executable, "-c", PROGRAM, str(port), str(tmp_path))
     with subprocess.Popen(argv, stderr=subprocess.PIPE) as autopilot:
         try:
-            before = heartbeat(port)
+            first_heartbeat = heartbeat(port)
             clients = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(4)]
             for number in range(DATAGRAMS):
-                hostile = (
-                    mutated(dice.choice(seeds), seeds, dice)[:60_000] if number % 3 else frame_with_any_values(dice)
+                datagram = (
+                    mutated(rng.choice(valid_frames), valid_frames, rng)[:60_000]
+                    if number % 3
+                    else frame_with_any_values(rng)
                 )
-                clients[number % 4].sendto(hostile, ("127.0.0.1", port))
+                clients[number % 4].sendto(datagram, ("127.0.0.1", port))
             for client in clients:
                 client.close()
-            assert heartbeat(port).get_srcSystem() == before.get_srcSystem() == SYSTEM
+            assert heartbeat(port).get_srcSystem() == first_heartbeat.get_srcSystem() == SYSTEM
             assert autopilot.poll() is None
         finally:
             autopilot.kill()

@@ -34,8 +34,8 @@ pytestmark = pytest.mark.emulated
 def test_pings_cross_the_network_with_every_policy(policy: str, tmp_path: Path) -> None:
     sync = SyncOptions.model_validate({"name": policy, "window": "5ms"})
     with cosim_bench(tmp_path, sync=sync) as bench:
-        ends = "a", "b", socket.IPPROTO_ICMP, 0
-        bench.medium.delays(*ends)
+        endpoints = "a", "b", socket.IPPROTO_ICMP, 0
+        bench.medium.delays(*endpoints)
         assert len(bench.ping()) == 20
         stats = bench.medium.stats()
         assert stats.ports["b"].delivered_packets == 20
@@ -49,15 +49,15 @@ def test_ns3_carries_unicast_and_broadcast_packets(tmp_path: Path) -> None:
     options = default_options("ns3", NETWORK)
     with cosim_bench(tmp_path, network=network, network_options=options) as bench:
         assert len(bench.ping()) == 20
-        parts = bench.medium.stats().delays["a", "b"]
+        delays = bench.medium.stats().delays["a", "b"]
         (sample,) = bench.medium.links(continue_sampling=False)["a"]
         bench.ping("-b", count=3, address="10.9.0.255")
         stats = bench.medium.stats()
         assert stats.ports["b"].delivered_packets == 23
         assert stats.ports["a"].delivered_packets == 20
-    assert parts.packets == 20
-    assert 20 * 30_000 < parts.transmission_ns < 20 * 20_000_000, "84 bytes, from 65 Mbit/s to 1 Mbit/s with retries"
-    assert 20 * 20 < parts.propagation_ns < 20 * 40, "9 m at the speed of light"
+    assert delays.packets == 20
+    assert 20 * 30_000 < delays.transmission_ns < 20 * 20_000_000, "84 bytes, from 65 Mbit/s to 1 Mbit/s with retries"
+    assert 20 * 20 < delays.propagation_ns < 20 * 40, "9 m at the speed of light"
     (peer,) = sample.stations
     assert (peer.station, peer.tx_packets, peer.rx_packets, peer.tx_failures) == ("b", 20, 20, 0)
     assert peer.tx_rate_bit_s is not None
@@ -65,7 +65,7 @@ def test_ns3_carries_unicast_and_broadcast_packets(tmp_path: Path) -> None:
     assert 1e6 <= min(peer.tx_rate_bit_s, peer.rx_rate_bit_s) <= 65e6
     assert sample.busy_ns is not None
     assert sample.active_ns is not None
-    assert parts.transmission_ns < sample.busy_ns < sample.active_ns
+    assert delays.transmission_ns < sample.busy_ns < sample.active_ns
     (tmp_path / "builtin").mkdir()
     with cosim_bench(tmp_path / "builtin") as bench:
         (expected,) = bench.medium.links(continue_sampling=False)["a"]
@@ -97,25 +97,25 @@ with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as speaker:
 """
 
 
-def disc_command(folder: Path, spent_s: float) -> str:
-    """Return the command of a network with a delay of 30 ms that takes a time for each answer."""
+def disc_command(folder: Path, answer_s: float) -> str:
+    """Return the command of a network with a delay of 30 ms that needs `answer_s` for each answer."""
     program = folder / "slow.py"
     program.write_text(DISC, encoding="utf-8")
-    return shlex.join((sys.executable, str(program), str(spent_s)))
+    return shlex.join((sys.executable, str(program), str(answer_s)))
 
 
 def test_the_delay_of_the_network_and_of_the_policy_are_separate(tmp_path: Path) -> None:
     """Packets arrive within windows of 20 ms: they wait for 10 ms on average."""
     sync = SyncOptions.model_validate({"name": "sliding_window", "window": "20ms"})
     with cosim_bench(tmp_path, network=disc_command(tmp_path, 0), sync=sync) as bench:
-        ends = "a", "b", socket.IPPROTO_UDP, 7000
-        bench.medium.delays(*ends)
+        endpoints = "a", "b", socket.IPPROTO_UDP, 7000
+        bench.medium.delays(*endpoints)
         bench.spaces["a"].run(sys.executable, "-c", SEND)
-        wait_until(lambda: bench.medium.delays(*ends).packets == 20, Deadline.after(30))
-        parts = bench.medium.delays(*ends)
-        assert parts.undivided_ns == 20 * 30_000_000
-        assert parts.policy_ns is not None
-        assert 4e6 < parts.policy_ns / parts.packets < 16e6
+        wait_until(lambda: bench.medium.delays(*endpoints).packets == 20, Deadline.after(30))
+        delays = bench.medium.delays(*endpoints)
+        assert delays.undivided_ns == 20 * 30_000_000
+        assert delays.policy_ns is not None
+        assert 4e6 < delays.policy_ns / delays.packets < 16e6
 
 
 def test_a_network_that_cannot_keep_up_makes_packets_and_windows_late(tmp_path: Path) -> None:
@@ -128,16 +128,16 @@ def test_a_network_that_cannot_keep_up_makes_packets_and_windows_late(tmp_path: 
         bench.ping(count=2)
         stats = bench.medium.stats()
         assert max(stats.packet_lateness_counts) > 100_000_000
-        late = Lateness(bound_ns=100_000_000, packets={}, windows=stats.window_lateness_counts)
-        reason = oracle_delays.lateness_problem(late)
+        lateness = Lateness(bound_ns=100_000_000, packets={}, windows=stats.window_lateness_counts)
+        reason = oracle_delays.lateness_problem(lateness)
         assert reason is not None
         assert re.fullmatch(r"\d+ windows of the .* too late, by up to [\d.e+]+ ms; the bound is 100 ms", reason)
-        text = oracle_delays.lateness_text(Lateness(bound_ns=100_000_000, packets={}, windows={}), late)
+        text = oracle_delays.lateness_text(Lateness(bound_ns=100_000_000, packets={}, windows={}), lateness)
         (tmp_path / "lateness.txt").write_text(text, encoding="ascii")
-        assert oracle_delays.read_lateness(tmp_path / "lateness.txt") == late
+        assert oracle_delays.read_lateness(tmp_path / "lateness.txt") == lateness
 
 
-def test_a_multicast_and_a_station_out_of_range(tmp_path: Path) -> None:
+def test_a_broadcast_is_delivered_unless_a_station_has_no_place(tmp_path: Path) -> None:
     with cosim_bench(tmp_path) as bench:
         assert len(bench.ping("-b", count=3, address="10.9.0.255")) <= 3
         assert bench.medium.stats().links["a", "b"].delivered == 3
@@ -148,19 +148,19 @@ def test_a_multicast_and_a_station_out_of_range(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("physics", ["kinematic", "mujoco"])
-def test_a_robot_hits_the_wall_and_is_put_elsewhere(physics: str, tmp_path: Path) -> None:
+def test_a_robot_stops_at_the_wall_and_can_be_placed_elsewhere(physics: str, tmp_path: Path) -> None:
     """The wall of the lawn begins at 3.9 m; the chassis of MuJoCo is shorter than the cylinder that contains it."""
     places_m: dict[str, Vector] = {**PLACES, "a": (3.6, 18.0, ANTENNA_M)}
     with cosim_bench(tmp_path, physics=physics, world=load_world("lawn"), places_m=places_m) as bench:
-        stopped = bench.driven.drive(0.2, 3.0)
-        assert 3.9 - BODY.limits.radius_m - 0.02 < stopped.position_m[0] < 3.9
-        assert not math.hypot(*stopped.velocity_m_s) > 0.02
+        motion_at_wall = bench.driven.drive(0.2, 3.0)
+        assert 3.9 - BODY.limits.radius_m - 0.02 < motion_at_wall.position_m[0] < 3.9
+        assert not math.hypot(*motion_at_wall.velocity_m_s) > 0.02
         places_m["a"] = PLACES["a"]
         bench.driven.assign(places_m["a"], facing_rad=math.pi / 2)
         bench.medium.place(places_m)
-        moved = bench.driven.drive(0.2, 1.0)
-        assert moved.position_m[0] == pytest.approx(PLACES["a"][0], abs=0.02)
-        assert moved.position_m[1] == pytest.approx(PLACES["a"][1] + 0.2, abs=0.1)
+        later_motion = bench.driven.drive(0.2, 1.0)
+        assert later_motion.position_m[0] == pytest.approx(PLACES["a"][0], abs=0.02)
+        assert later_motion.position_m[1] == pytest.approx(PLACES["a"][1] + 0.2, abs=0.1)
         assert bench.ping(count=3)
 
 
@@ -171,11 +171,11 @@ def test_a_robot_stops_if_its_physics_is_suspended_or_killed(physics: str, tmp_p
         pid = bench.medium.pid
         bench.driven.drive(0.2, 1.0)
         os.kill(pid, signal.SIGSTOP)
-        last = bench.driven.drive(0.2, SILENT_NS / 1e9)
-        assert last.is_moving
-        at_rest = last.at(time.monotonic_ns() + SILENT_NS)
-        assert not at_rest.is_moving
-        assert distance_m(at_rest, last.position_m) <= 0.2 * SILENT_NS / 1e9 + 0.01
+        last_motion = bench.driven.drive(0.2, SILENT_NS / 1e9)
+        assert last_motion.is_moving
+        motion_at_rest = last_motion.at(time.monotonic_ns() + SILENT_NS)
+        assert not motion_at_rest.is_moving
+        assert distance_m(motion_at_rest, last_motion.position_m) <= 0.2 * SILENT_NS / 1e9 + 0.01
         os.kill(pid, signal.SIGCONT)
         wait_until(lambda: (motion := bench.driven.motion()) is not None and not motion.is_moving, Deadline.after(60))
         wait_until(lambda: bench.driven.drive(0.2, 0.5).is_moving, Deadline.after(60))
@@ -186,17 +186,17 @@ def test_a_robot_stops_if_its_physics_is_suspended_or_killed(physics: str, tmp_p
         assert not motion.at(time.monotonic_ns() + SILENT_NS).is_moving
 
 
-def test_a_robot_cannot_be_put_into_the_wall(tmp_path: Path) -> None:
+def test_a_robot_cannot_be_placed_within_the_wall(tmp_path: Path) -> None:
     with cosim_bench(tmp_path, world=load_world("lawn")) as bench:
-        inside_m = 4.0, 18.0, ANTENNA_M
-        bench.driven.assign(inside_m)
+        wall_place_m = 4.0, 18.0, ANTENNA_M
+        bench.driven.assign(wall_place_m)
         with pytest.raises(RobotError, match="a would be within wall, at 4, 18"):
-            bench.medium.place({**PLACES, "a": inside_m})
+            bench.medium.place({**PLACES, "a": wall_place_m})
 
 
 def test_a_driven_robot_stops_without_commands_and_at_its_next_place(tmp_path: Path) -> None:
     with cosim_bench(tmp_path) as bench:
-        moved = bench.driven.drive(0.2, 1.0)
-        assert distance_m(moved, PLACES["a"]) == pytest.approx(0.2, abs=0.1)
-        assert moved.heading_rad == pytest.approx(0)
-        assert moved.odometry[0] == pytest.approx(distance_m(moved, PLACES["a"]))
+        later_motion = bench.driven.drive(0.2, 1.0)
+        assert distance_m(later_motion, PLACES["a"]) == pytest.approx(0.2, abs=0.1)
+        assert later_motion.heading_rad == pytest.approx(0)
+        assert later_motion.odometry[0] == pytest.approx(distance_m(later_motion, PLACES["a"]))

@@ -33,18 +33,20 @@ def server(tmp_path: Path) -> Iterator[GazeboServer]:
     robots = {name: SdfRobot(BODY.limits, (*place_m[:2], 0.0), 0.0) for name, place_m in PLACES.items()}
     folder = tmp_path / "gazebo"
     folder.mkdir()
-    with gazebo_server(folder, world_sdf(LAWN, robots)) as running:
-        yield running
+    with gazebo_server(folder, world_sdf(LAWN, robots)) as started_server:
+        yield started_server
 
 
-def fails(bench: CosimBench) -> bool:
-    """Drive; raises if the co-simulation has ended."""
+def drive_and_check(bench: CosimBench) -> bool:
+    """Drive, and raise if the co-simulation has stopped; return False."""
     bench.driven.drive(0.2, 0.1)
     bench.medium.check_alive()
     return False
 
 
-def test_it_puts_robots_at_places_and_drives_them_into_the_wall(server: GazeboServer, tmp_path: Path) -> None:
+def test_gazebo_places_robots_and_stops_them_at_the_wall_until_it_is_killed(
+    server: GazeboServer, tmp_path: Path
+) -> None:
     options = default_options("gazebo", PHYSICS) | server.options
     with cosim_bench(
         tmp_path,
@@ -56,16 +58,18 @@ def test_it_puts_robots_at_places_and_drives_them_into_the_wall(server: GazeboSe
     ) as bench:
         wait_until(lambda: bench.driven.drive(0.2, 2.0).position_m[0] > 3.75, Deadline.after(60))
         wait_until(lambda: not bench.driven.drive(0.2, 0.5).is_moving, Deadline.after(60))
-        stopped = bench.driven.drive(0.2, 0.5)
-        assert stopped.position_m[:2] == pytest.approx((3.831, 18.0), abs=0.02), "the chassis has 69 mm in front"
+        motion_at_wall = bench.driven.drive(0.2, 0.5)
+        assert motion_at_wall.position_m[:2] == pytest.approx((3.831, 18.0), abs=0.02), (
+            "the chassis extends 69 mm ahead"
+        )
         bench.driven.assign(PLACES["a"])
         bench.medium.place(PLACES)
         wait_until(lambda: bench.driven.drive(0.2, 0.5).position_m[0] > PLACES["a"][0] + 0.1, Deadline.after(60))
-        moved = bench.driven.drive(0.2, 0.1)
-        assert moved.position_m[0] < stopped.position_m[0]
-        assert moved.position_m[1] == pytest.approx(PLACES["a"][1], abs=0.02)
+        later_motion = bench.driven.drive(0.2, 0.1)
+        assert later_motion.position_m[0] < motion_at_wall.position_m[0]
+        assert later_motion.position_m[1] == pytest.approx(PLACES["a"][1], abs=0.02)
         assert bench.ping(count=3)
         os.kill(server.process.pid, signal.SIGKILL)
         with pytest.raises(TestbedLostError, match="Gazebo"):
-            wait_until(lambda: fails(bench), Deadline.after(60))
+            wait_until(lambda: drive_and_check(bench), Deadline.after(60))
         assert not bench.driven.drive(0.2, 0.1).at(time.monotonic_ns() + SILENT_NS).is_moving

@@ -34,7 +34,7 @@ pytestmark = pytest.mark.emulated
 DRONE = RobotBody("duckiedrone", DUCKIEDRONE)
 START_M: Vector = (2.5, 18.0, 0.0)
 WALL_M = 3.9
-"""East of its start, the lawn's wall begins here; it is 2 m high."""
+"""East coordinate of the lawn's wall, which is 2 m high."""
 HEIGHT_M = 1.0
 
 
@@ -45,7 +45,7 @@ class Drone:
     Attributes:
         bench: The bench.
         autopilot: The autopilot.
-        reporter: Its placements.
+        reporter: Reads the placements of the drone and reports its motion.
     """
 
     bench: CosimBench
@@ -57,7 +57,7 @@ class Drone:
         return self.autopilot.vehicle
 
     def fly(self, until: Callable[[], bool], limit_s: float = 60.0) -> None:
-        """Run the autopilot as its process does, until something has happened."""
+        """Run the autopilot as its process does, until a condition is true."""
         deadline = Deadline.after(limit_s)
         while not until():
             assert not deadline.expired, f"{self.vehicle.mode} at {self.vehicle.body.place_m}"
@@ -116,11 +116,11 @@ def drone(folder: Path, physics: str) -> Iterator[Drone]:
 
 
 @pytest.mark.parametrize("physics", ["kinematic", "mujoco"])
-def test_a_wall_stops_it_and_without_its_autopilot_it_falls(physics: str, tmp_path: Path) -> None:
+def test_a_wall_stops_the_drone_and_without_its_autopilot_the_drone_falls(physics: str, tmp_path: Path) -> None:
     """Its rotors stop `TIMEOUT_NS` after the last command, and it falls for sqrt(2 h / g)."""
-    with drone(tmp_path, physics) as flown:
-        flown.take_off()
-        vehicle = flown.vehicle
+    with drone(tmp_path, physics) as simulated_drone:
+        simulated_drone.take_off()
+        vehicle = simulated_drone.vehicle
         assert vehicle.body.place_m == pytest.approx((*START_M[:2], HEIGHT_M), abs=0.15)
         nearest_m = WALL_M - DUCKIEDRONE.radius_m
 
@@ -130,15 +130,15 @@ def test_a_wall_stops_it_and_without_its_autopilot_it_falls(physics: str, tmp_pa
 
         push()
         vehicle.change_mode(Mode.OFFBOARD)
-        flown.fly(push)
+        simulated_drone.fly(push)
         end_ns = time.monotonic_ns() + 500_000_000
-        flown.fly(lambda: not push() or time.monotonic_ns() > end_ns)
+        simulated_drone.fly(lambda: not push() or time.monotonic_ns() > end_ns)
         assert time.monotonic_ns() > end_ns, "it stays at the wall"
         assert vehicle.body.place_m[0] < nearest_m + 0.02
         assert not vehicle.body.on_ground
 
         last_ns = time.monotonic_ns()
-        flights = flown.fall_to_ground()
+        flights = simulated_drone.fall_to_ground()
         contact = next(flight for flight in flights if flight.is_supported)
         fall_s = math.sqrt(2 * flights[0].place_m[2] / GRAVITY_M_S2)
         # A busy machine detects the end of the commands later.
@@ -146,8 +146,8 @@ def test_a_wall_stops_it_and_without_its_autopilot_it_falls(physics: str, tmp_pa
         assert max(-flight.velocity_m_s[2] for flight in flights) == pytest.approx(GRAVITY_M_S2 * fall_s, rel=0.15)
         assert flights[-1].place_m[2] == pytest.approx(0.0, abs=0.005)
 
-        flown.bench.driven.assign((*START_M[:2], ANTENNA_M))
-        flown.bench.medium.place({**PLACES, "a": (*START_M[:2], ANTENNA_M)})
-        flown.fly(lambda: not vehicle.is_armed)
+        simulated_drone.bench.driven.assign((*START_M[:2], ANTENNA_M))
+        simulated_drone.bench.medium.place({**PLACES, "a": (*START_M[:2], ANTENNA_M)})
+        simulated_drone.fly(lambda: not vehicle.is_armed)
         assert vehicle.body.place_m == START_M
-        flown.take_off()
+        simulated_drone.take_off()

@@ -1,4 +1,4 @@
-"""VelocityCommand velocities of a robot, also while the simulation lags behind real time."""
+"""Commanded velocities of a robot, also while the simulation lags behind real time."""
 
 import time
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ def record(driven: Driven) -> Iterator[VelocityCommandRecord]:
     record.close()
 
 
-def placed(driven: Driven) -> tuple[GroundSteering, int]:
+def place_robot(driven: Driven) -> tuple[GroundSteering, int]:
     """Return the steering of a robot at its place, and the time of its placement."""
     start_ns = time.monotonic_ns()
     steering = GroundSteering(driven.descriptors, start_ns)
@@ -41,20 +41,20 @@ def placed(driven: Driven) -> tuple[GroundSteering, int]:
 def test_a_simulation_that_lags_applies_every_velocity_at_its_time(
     driven: Driven, record: VelocityCommandRecord
 ) -> None:
-    """It lags by 200 ms, more than the interval of the velocities, 50 ms: each is read before it applies."""
-    steering, start_ns = placed(driven)
-    applied: list[tuple[int, Command]] = []
+    """The lag of 200 ms exceeds the interval of the velocities, 50 ms, so each is read before its time."""
+    steering, start_ns = place_robot(driven)
+    applied_commands: list[tuple[int, Command]] = []
     for command in range(1, 21):
         at_ns = start_ns + 50 * MS * command
         record.write(VelocityCommand(at_ns, 0.01 * command, 0.0))
-        applied += steering.commands(at_ns - 200 * MS)
-    assert applied == [(start_ns + 50 * MS * command, Twist(0.01 * command)) for command in range(1, 17)]
+        applied_commands += steering.commands(at_ns - 200 * MS)
+    assert applied_commands == [(start_ns + 50 * MS * command, Twist(0.01 * command)) for command in range(1, 17)]
 
 
 def test_the_stop_after_a_missing_velocity_precedes_a_later_one(
     driven: Driven, record: VelocityCommandRecord
 ) -> None:
-    steering, start_ns = placed(driven)
+    steering, start_ns = place_robot(driven)
     first_ns, later_ns = start_ns + MS, start_ns + MS + 2 * TIMEOUT_NS
     record.write(VelocityCommand(first_ns, 0.2, 0.1))
     assert list(steering.commands(first_ns)) == [(first_ns, Twist(0.2, 0.1))]
@@ -64,7 +64,7 @@ def test_the_stop_after_a_missing_velocity_precedes_a_later_one(
 
 
 def test_a_velocity_from_before_a_placement_is_dropped(driven: Driven, record: VelocityCommandRecord) -> None:
-    steering, start_ns = placed(driven)
+    steering, start_ns = place_robot(driven)
     record.write(VelocityCommand(start_ns + 10 * MS, 0.2, 0.0))
     assert list(steering.commands(start_ns)) == []
     driven.assign((3.0, 2.0, ANTENNA_M))

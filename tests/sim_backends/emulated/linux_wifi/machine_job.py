@@ -1,4 +1,4 @@
-"""Runs in the virtual machine of `test_virtual_machine.py`: robots on an access point; prints results as JSON.
+"""A job in the virtual machine of `test_virtual_machine.py`: runs robots on an access point, prints results as JSON.
 
 The lab has the three robots of a trial in topology `master`. Imports need most of the time.
 """
@@ -38,10 +38,10 @@ JOIN_S = 60.0
 
 def run(*argv: str, may_fail: bool = False) -> str:
     """Return the output of a program; the job ends if it fails."""
-    ended = subprocess.run(argv, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
-    if ended.returncode and not may_fail:
-        sys.exit(f"{' '.join(argv)} failed with {ended.returncode}: {ended.stdout}")
-    return ended.stdout
+    result = subprocess.run(argv, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+    if result.returncode and not may_fail:
+        sys.exit(f"{' '.join(argv)} failed with {result.returncode}: {result.stdout}")
+    return result.stdout
 
 
 class Lab:
@@ -52,14 +52,14 @@ class Lab:
         assert isinstance(running.medium, WifiClient)
         self.medium = running.medium
 
-    def within(self, role: Role, *argv: str, may_fail: bool = False) -> str:
+    def run_on_robot(self, role: Role, *argv: str, may_fail: bool = False) -> str:
         """Run a program in the network of a robot."""
         return run("nsenter", "-t", str(self.robots[role].pid), "-n", *argv, may_fail=may_fail)
 
     def ping(self, count: int) -> int:
         """Return the number of replies from the receiver to the sender."""
         argv = ("ping", "-c", str(count), "-i", "0.2", "-W", "1", CAST[Role.RECEIVER].address)
-        return int(self.within(Role.SENDER, *argv, may_fail=True).split(" received")[0].rsplit(" ", 1)[-1])
+        return int(self.run_on_robot(Role.SENDER, *argv, may_fail=True).split(" received")[0].rsplit(" ", 1)[-1])
 
     def wait_for_link(self) -> bool:
         end_s = time.monotonic() + JOIN_S
@@ -76,10 +76,10 @@ class Lab:
     def dump_and_totals(self) -> tuple[str, object]:
         """Return the sender's station dump and the medium's totals, taken while no frame was sent in between."""
         while True:
-            before = self.totals()
-            dump = self.within(Role.SENDER, "iw", "dev", "wlan0", "station", "dump")
-            if self.totals() == before:
-                return dump, before
+            totals = self.totals()
+            dump = self.run_on_robot(Role.SENDER, "iw", "dev", "wlan0", "station", "dump")
+            if self.totals() == totals:
+                return dump, totals
 
 
 def start_medium(client: WifiClient) -> None:
@@ -104,7 +104,7 @@ def start_medium(client: WifiClient) -> None:
 def main() -> None:
     results: dict[str, object] = {}
 
-    def note(name: str, value: object) -> None:
+    def record_result(name: str, value: object) -> None:
         results[name] = value
         uptime_s = Path("/proc/uptime").read_text().split()[0]
         sys.stdout.write(f"{uptime_s} s: {name} = {value}\n")
@@ -112,38 +112,38 @@ def main() -> None:
 
     options = EmulatedOptions.model_validate({"wifi": "linux", "ros": "builtin", "radio": OPTIONS})
     world = load_world("open")
-    note("imported", True)
+    record_result("imported", True)
     with running_robots(CAST, options=options, world=world, ros=RosChoice.BUILTIN, seed=1) as running:
         lab = Lab(running)
-        note("access_point", lab.within(Role.RELAY, "iw", "dev", "wlan0", "station", "dump"))
+        record_result("access_point", lab.run_on_robot(Role.RELAY, "iw", "dev", "wlan0", "station", "dump"))
         lab.medium.place(NEAR)
-        note("link", lab.within(Role.SENDER, "iw", "dev", "wlan0", "link"))
+        record_result("link", lab.run_on_robot(Role.SENDER, "iw", "dev", "wlan0", "link"))
         lab.ping(1)
-        before = lab.dump_and_totals()
-        note("near", lab.ping(10))
-        note("dumps_and_totals", (*before, *lab.dump_and_totals()))
+        first_dump = lab.dump_and_totals()
+        record_result("near", lab.ping(10))
+        record_result("dumps_and_totals", (*first_dump, *lab.dump_and_totals()))
         lab.medium.place(FAR)
-        note("far", lab.ping(3))
+        record_result("far", lab.ping(3))
         lab.medium.place(NEAR)
-        note("near_again", lab.wait_for_link())
-        note("counts", lab.medium._worker.request({"do": "totals"})[0])
+        record_result("near_again", lab.wait_for_link())
+        record_result("counts", lab.medium._worker.request({"do": "totals"})[0])
         os.kill(lab.medium.pid, signal.SIGSTOP)
-        note("suspended", lab.ping(3))
+        record_result("suspended", lab.ping(3))
         os.kill(lab.medium.pid, signal.SIGCONT)
-        note("continued", lab.wait_for_link())
+        record_result("continued", lab.wait_for_link())
         os.kill(lab.medium.pid, signal.SIGKILL)
-        note("killed", lab.ping(3))
+        record_result("killed", lab.ping(3))
         try:
             lab.medium.check_alive()
         except FieldkitError as error:
-            note("error", str(error))
+            record_result("error", str(error))
         start_medium(lab.medium)
-        note("restarted", lab.wait_for_link())
-    note("ended", True)
+        record_result("restarted", lab.wait_for_link())
+    record_result("ended", True)
     end_s = time.monotonic() + JOIN_S
     while len(find_radios()) < 3 and time.monotonic() < end_s:
         time.sleep(0.2)
-    note("radios", [radio.interface for radio in find_radios()])
+    record_result("radios", [radio.interface for radio in find_radios()])
     sys.stdout.write(f"RESULTS {json.dumps(results)}\n")
 
 

@@ -38,16 +38,16 @@ def run(air: Air) -> tuple[AirEvents, int]:
     """Run until no frame is on the air; return the events and the time of the last one."""
     events, now_ns = AirEvents(), 0
     while (next_ns := air.next_event_ns()) is not None:
-        new = air.pop_events(next_ns)
-        events.receptions += new.receptions
-        events.statuses += new.statuses
-        if new.statuses:
+        new_events = air.pop_events(next_ns)
+        events.receptions += new_events.receptions
+        events.statuses += new_events.statuses
+        if new_events.statuses:
             now_ns = next_ns
     return events, now_ns
 
 
 def signal_dbm(distance_m: float) -> float:
-    """Received power without fading, of the channel in the radio's own tests."""
+    """Return the received power without fading, by the channel model of the radio."""
     channel = WorldChannel(1, dict.fromkeys("ab", ANTENNA), STEADY)
     channel.move(0, {"a": (0.0, 0.0, 1.0), "b": (distance_m, 0.0, 1.0)})
     return decibel(channel.powers_mw(0, 0)[1])
@@ -69,7 +69,7 @@ def test_a_frame_takes_its_airtime_and_that_of_its_acknowledgement(stage: RateSt
 
 
 def test_tries_are_lost_as_often_as_the_packet_error_rate_of_their_mode() -> None:
-    """Each frame has one try in 54 Mbit/s and then one in 6 Mbit/s, at a signal where 54 Mbit/s often fails."""
+    """Each frame has one try at 54 Mbit/s and then one at 6 Mbit/s, at a signal with which 54 Mbit/s often fails."""
     ack = control_mode(G54)
     distance_m = next(
         distance / 10
@@ -77,7 +77,7 @@ def test_tries_are_lost_as_often_as_the_packet_error_rate_of_their_mode() -> Non
         if packet_error(G54, signal_dbm(distance / 10) + 95.0, LENGTH_BYTES + 4) > 0.4
     )
     snr_db = signal_dbm(distance_m) + 95.0
-    lost = packet_error(G54, snr_db, LENGTH_BYTES + 4)
+    loss_probability = packet_error(G54, snr_db, LENGTH_BYTES + 4)
     assert packet_error(G6, snr_db, LENGTH_BYTES + 4) < 1e-6
     assert packet_error(ack, snr_db, ACK_BYTES) < 1e-6
     frames = 2000
@@ -88,7 +88,9 @@ def test_tries_are_lost_as_often_as_the_packet_error_rate_of_their_mode() -> Non
     assert len(events.statuses) == len(events.receptions) == frames
     retried = sum(status.attempts == 2 for status in events.statuses)
     assert all(status.chain.tries_made(status.attempts) in ([1], [1, 1]) for status in events.statuses)
-    assert abs(retried - frames * lost) < 4 * math.sqrt(frames * lost * (1 - lost))
+    assert abs(retried - frames * loss_probability) < 4 * math.sqrt(
+        frames * loss_probability * (1 - loss_probability)
+    )
 
 
 def test_all_tries_fail_out_of_range_and_need_airtime() -> None:
@@ -103,21 +105,21 @@ def test_all_tries_fail_out_of_range_and_need_airtime() -> None:
 
 
 @pytest.mark.parametrize("receiver", [None, "a"])
-def test_a_frame_to_an_address_of_no_other_radio_is_not_acknowledged(receiver: str | None) -> None:
+def test_a_frame_to_an_address_without_another_radio_is_not_acknowledged(receiver: str | None) -> None:
     air = air_with(3.0)
     air.transmit(START_NS, frame(RateStage(11, 4)), "a", receiver)
     (status,) = run(air)[0].statuses
     assert (status.is_acknowledged, status.attempts) == (False, 4)
 
 
-def test_a_frame_that_wants_no_acknowledgement_is_tried_once() -> None:
+def test_a_frame_that_requests_no_acknowledgement_is_sent_once() -> None:
     air = air_with(FAR_M)
     air.transmit(START_NS, frame(RateStage(11, 4), flags=FLAG_NO_ACK), "a", "b")
     (status,) = run(air)[0].statuses
     assert status.attempts == 1
 
 
-def test_a_broadcast_arrives_at_all_in_range_without_acknowledgement() -> None:
+def test_a_broadcast_arrives_at_all_radios_in_range_and_is_not_acknowledged() -> None:
     air = Air(1, STEADY, dict.fromkeys("abcd", ANTENNA))
     air.place(0, {"a": (0.0, 0.0, 1.0), "b": (3.0, 0.0, 1.0), "c": (0.0, 3.0, 1.0), "d": (FAR_M, 0.0, 1.0)})
     air.transmit(START_NS, frame(RateStage(0, 1), group=True, flags=FLAG_NO_ACK), "a", None)
@@ -135,7 +137,7 @@ def test_a_rate_that_the_model_does_not_have_fails_without_airtime() -> None:
     assert (status.is_acknowledged, status.attempts, events.receptions) == (False, 0, [])
 
 
-def test_radios_hear_each_other_only_on_one_channel_until_they_return_to_it() -> None:
+def test_radios_receive_frames_only_while_they_are_on_the_same_channel() -> None:
     air, times_ns = air_with(3.0), count(START_NS, 1_000_000_000)
 
     def is_acknowledged(source: str, receiver: str, frequency_mhz: int) -> bool:
@@ -153,7 +155,7 @@ def test_radios_hear_each_other_only_on_one_channel_until_they_return_to_it() ->
     assert results == [True, False, False, True, True]
 
 
-def test_frames_sent_together_wait_for_each_other() -> None:
+def test_a_radio_defers_its_frame_while_another_is_on_the_air() -> None:
     """Two radios in range of each other: the second starts after the first one's ACK, so both arrive."""
     air = Air(1, STEADY, dict.fromkeys("abc", ANTENNA))
     air.place(0, {"a": (0.0, 0.0, 1.0), "b": (3.0, 0.0, 1.0), "c": (0.0, 3.0, 1.0)})

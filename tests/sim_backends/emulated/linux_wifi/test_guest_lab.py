@@ -1,4 +1,4 @@
-"""The client of a lab in the virtual machine, with the relay of the machine before a lab of this host."""
+"""The client of a lab in the virtual machine: the machine's relay program runs here and forwards to a local lab."""
 
 import socket
 import subprocess
@@ -25,14 +25,14 @@ from tests.helpers.runs import fieldkit
 
 pytestmark = pytest.mark.emulated
 
-WITHIN_S = 60.0
+LIMIT_S = 60.0
 MEMBERS = {
     name: LabRobot(name, load_profile("turtlebot3_burger"), f"10.42.0.{number}")
     for number, name in enumerate(("robot-1", "robot-2"), start=1)
 }
 
 
-def draw(places_m: Mapping[str, Vector]) -> Overview:
+def draw_overview(places_m: Mapping[str, Vector]) -> Overview:
     return interactive_lab.overview(MEMBERS, places_m, EmulatedOptions.defaults(), load_world("open"))
 
 
@@ -40,8 +40,8 @@ def draw(places_m: Mapping[str, Vector]) -> Overview:
 def directory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The folder of a running lab, with a name that needs quoting."""
     path = tmp_path_factory.mktemp("a 100% lab")
-    up = fieldkit(path, "lab", "up", "--robots", "2")
-    assert up.code == 0, up.err
+    started = fieldkit(path, "lab", "up", "--robots", "2")
+    assert started.code == 0, started.err
     yield path
     fieldkit(path, "lab", "down")
 
@@ -50,15 +50,15 @@ def directory(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def lab(directory: Path) -> Iterator[GuestLab]:
     host, guest = socket.socketpair()
     with host, guest:
-        served = threading.Thread(target=lab_relay.relay, args=(guest.fileno(), folder.of_directory(directory)))
+        relay_thread = threading.Thread(target=lab_relay.relay, args=(guest.fileno(), folder.of_directory(directory)))
         streams = ChannelStreams(host.fileno())
         reader = threading.Thread(target=streams.run)
-        for thread in (served, reader):
+        for thread in (relay_thread, reader):
             thread.start()
-        yield GuestLab(streams, MEMBERS, lambda: None, draw, Deadline.after(WITHIN_S))
+        yield GuestLab(streams, MEMBERS, lambda: None, draw_overview, Deadline.after(LIMIT_S))
         host.shutdown(socket.SHUT_RDWR)
-        for thread in (served, reader):
-            thread.join(WITHIN_S)
+        for thread in (relay_thread, reader):
+            thread.join(LIMIT_S)
             assert not thread.is_alive()
 
 
@@ -76,40 +76,40 @@ def test_ssh_logs_in_on_a_robot_through_the_channel(lab: GuestLab, directory: Pa
     key.touch(mode=0o600)
     key.write_text(lab.login.private_key)
     known_hosts.write_text("".join(f"{name} {host_key}\n" for name, host_key in lab.login.host_keys.items()))
-    robot = lab.connect("robot-2", WITHIN_S)
-    robot.settimeout(None)
+    robot_socket = lab.connect("robot-2", LIMIT_S)
+    robot_socket.settimeout(None)
     listener = socket.create_server(("127.0.0.1", 0))
 
-    def join() -> None:
+    def forward_connection() -> None:
         client, _ = listener.accept()
-        with client, robot:
-            lab_relay._copy_both_ways(client, robot)
+        with client, robot_socket:
+            lab_relay._copy_both_ways(client, robot_socket)
 
     with listener:
-        thread = threading.Thread(target=join)
+        thread = threading.Thread(target=forward_connection)
         thread.start()
         options = ("-i", str(key), "-o", f"UserKnownHostsFile={known_hosts}", "-o", "HostKeyAlias=robot-2", "-n")
         port = str(listener.getsockname()[1])
         argv = ("ssh", "-F", "none", *options, "-p", port, f"{lab.login.user}@127.0.0.1", "hostname; seq 50000")
-        done = subprocess.run(argv, capture_output=True, text=True, timeout=WITHIN_S, check=False)
-        thread.join(WITHIN_S)
-    assert done.stdout.splitlines() == ["robot-2", *map(str, range(1, 50_001))], done.stderr
+        login = subprocess.run(argv, capture_output=True, text=True, timeout=LIMIT_S, check=False)
+        thread.join(LIMIT_S)
+    assert login.stdout.splitlines() == ["robot-2", *map(str, range(1, 50_001))], login.stderr
 
 
 def test_errors_of_the_lab_reach_the_client(lab: GuestLab) -> None:
     with pytest.raises(ConnectionError, match="no robot 'robot-9'"):
-        lab.connect("robot-9", WITHIN_S)
+        lab.connect("robot-9", LIMIT_S)
 
 
-def test_a_machine_that_has_ended_is_reported() -> None:
+def test_a_machine_that_has_exited_is_reported() -> None:
     def check_alive() -> None:
         raise TestbedLostError("ended")
 
     with socket.socketpair()[0] as host, pytest.raises(TestbedLostError, match="ended"):
-        GuestLab(ChannelStreams(host.fileno()), MEMBERS, check_alive, draw, Deadline.after(WITHIN_S))
+        GuestLab(ChannelStreams(host.fileno()), MEMBERS, check_alive, draw_overview, Deadline.after(LIMIT_S))
 
 
-def test_a_machine_that_answers_nonsense_is_reported() -> None:
+def test_an_invalid_answer_of_the_machine_is_reported() -> None:
     host, guest = socket.socketpair()
     with host, guest:
         streams = ChannelStreams(host.fileno())
@@ -122,6 +122,6 @@ def test_a_machine_that_answers_nonsense_is_reported() -> None:
 
         threading.Thread(target=answer).start()
         with pytest.raises(LinkError, match="no valid answer"):
-            GuestLab(streams, MEMBERS, lambda: None, draw, Deadline.after(WITHIN_S))
+            GuestLab(streams, MEMBERS, lambda: None, draw_overview, Deadline.after(LIMIT_S))
         host.shutdown(socket.SHUT_RDWR)
-        reader.join(WITHIN_S)
+        reader.join(LIMIT_S)

@@ -1,4 +1,4 @@
-"""Messages of hwsim: bytes computed by hand from the kernel's header, and hostile ones."""
+"""Messages of hwsim: bytes computed by hand from the kernel's header, and malformed messages."""
 
 import struct
 import sys
@@ -71,7 +71,7 @@ def test_a_sent_frame_is_decoded_with_its_rate_chain() -> None:
     assert not event.is_group
 
 
-def test_a_kernel_that_sends_no_rate_flags_is_understood() -> None:
+def test_a_frame_without_rate_flags_is_decoded() -> None:
     _, attributes = decode_generic(encode_sent(SENT))
     del attributes[21]
     event = decode_event(encode_generic(CMD_FRAME, 1, attributes))
@@ -85,7 +85,7 @@ def test_the_address_of_an_interface_is_the_attribute_receiver() -> None:
     assert event == InterfaceAddress(RADIO, interface, is_added=True)
 
 
-def test_other_commands_are_no_events() -> None:
+def test_other_commands_are_not_events() -> None:
     assert decode_event(encode_generic(4, 1, {})) is None
 
 

@@ -28,11 +28,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def write_site(emulated: str, more: str = "") -> None:
-    Path("fieldkit.yaml").write_text(f"{SITE}emulated: {emulated}\n{more}")
+def write_site(emulated: str, other_lines: str = "") -> None:
+    Path("fieldkit.yaml").write_text(f"{SITE}emulated: {emulated}\n{other_lines}")
 
 
-def test_lab_up_lists_what_is_missing(
+def test_lab_up_lists_all_missing_requirements(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(virtual_machine, "kernel_roots", lambda: (tmp_path,))
@@ -45,7 +45,7 @@ def test_lab_up_lists_what_is_missing(
 
 
 @pytest.mark.parametrize(
-    ("emulated", "more", "cause"),
+    ("emulated", "other_lines", "cause"),
     [
         ("{wifi: linux, physics: kinematic}", "", "`physics`"),
         ("{wifi: linux, mesh: {daemon: babeld}}", "", "`mesh`"),
@@ -55,9 +55,9 @@ def test_lab_up_lists_what_is_missing(
     ],
 )
 def test_options_that_linux_wifi_excludes_are_refused(
-    emulated: str, more: str, cause: str, capsys: pytest.CaptureFixture[str]
+    emulated: str, other_lines: str, cause: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_site(emulated, more)
+    write_site(emulated, other_lines)
     assert main(["trial", "los", "30ft", "--dry-run"]) == 2
     text = capsys.readouterr().err
     assert cause in text
@@ -79,7 +79,7 @@ def test_a_trial_runs_its_command_line_in_the_machine_and_returns_its_exit_code(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The machine itself is tested by `test_virtual_machine`; here its call is recorded."""
-    calls = recorded_calls(monkeypatch)
+    calls = record_calls(monkeypatch)
     write_site("{wifi: linux}")
     words = ["trial", "los", "30ft", "--repeats", "1", "--notes", "it's windy", "--out", "my results"]
     assert main(words) == 4
@@ -92,8 +92,8 @@ def test_a_trial_runs_its_command_line_in_the_machine_and_returns_its_exit_code(
     assert f"cd {shlex.quote(str(folder))} || exit" in script
 
 
-def recorded_calls(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
-    """Return the options of later calls of `run_in_machine`, which give exit code 4."""
+def record_calls(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
+    """Return the options of later calls of `run_in_machine`, which return exit code 4."""
     calls: dict[str, object] = {}
 
     def run_in_machine(kernel: Kernel, script: str, deadline: object, **options: object) -> JobResult:
@@ -109,7 +109,7 @@ def recorded_calls(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
 
 
 def test_check_and_campaign_run_in_the_machine_too(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = recorded_calls(monkeypatch)
+    calls = record_calls(monkeypatch)
     write_site("{wifi: linux}")
     assert main(["check", "los"]) == 4
     assert calls["results"] == folder / "trials"
@@ -121,7 +121,7 @@ def test_check_and_campaign_run_in_the_machine_too(folder: Path, monkeypatch: py
 def test_a_report_that_the_machine_would_lose_is_refused(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    recorded_calls(monkeypatch)
+    record_calls(monkeypatch)
     write_site("{wifi: linux}")
     assert main(["trial", "los", "30ft", "--junit", "report.xml"]) == 2
     assert "--junit trials/report.xml" in capsys.readouterr().err

@@ -11,12 +11,12 @@ from fieldkit.core.errors import ConfigurationError
 from sim_backends.emulated.linux_wifi.virtual_machine import find_kernel, require_machine, uncompressed_kernel
 
 
-def test_all_that_is_missing_is_listed_with_its_packages(tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationError) as caught:
+def test_all_missing_programs_are_listed_with_their_packages(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError) as error_info:
         require_machine((tmp_path,))
-    assert "qemu-system-x86_64" in caught.value.what
+    assert "qemu-system-x86_64" in error_info.value.what
     for package in ("qemu-system-x86", "linux-image-amd64", "iw", "hostapd", "wpasupplicant", "busybox"):
-        assert f" {package}" in caught.value.remedy
+        assert f" {package}" in error_info.value.remedy
 
 
 def test_the_newest_kernel_with_hwsim_is_used(tmp_path: Path) -> None:
@@ -45,6 +45,6 @@ def test_a_kernel_is_decompressed_if_it_is_compressed_with_xz(sectors: int) -> N
     elf = b"\x7fELF" + bytes(range(256)) * 9
     size = struct.pack("<I", len(elf))
     assert uncompressed_kernel(image(lzma.compress(elf, check=lzma.CHECK_CRC32) + size)) == elf
-    other = image(gzip.compress(elf))
-    assert uncompressed_kernel(other) == other
+    gzip_image = image(gzip.compress(elf))
+    assert uncompressed_kernel(gzip_image) == gzip_image
     assert uncompressed_kernel(b"HdrS") == b"HdrS"

@@ -1,4 +1,4 @@
-"""The medium as a process, with a kernel that is one end of a socket pair, and without hwsim."""
+"""The medium program, with a socket pair in place of the kernel, and without hwsim."""
 
 import json
 import os
@@ -70,10 +70,10 @@ class MediumOwner:
 
 
 @contextmanager
-def running() -> Iterator[MediumOwner]:
-    """Run a medium in a thread; it must exit when its requests end."""
-    socket_here, program_socket = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    socket_here.settimeout(DEADLINE_S)
+def running_medium() -> Iterator[MediumOwner]:
+    """Run a medium in a thread; it must exit when its pipe of requests is closed."""
+    kernel_socket, program_socket = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    kernel_socket.settimeout(DEADLINE_S)
     program_socket.setblocking(False)
     request_read, request_write = os.pipe()
     reply_read, reply_write = os.pipe()
@@ -81,7 +81,7 @@ def running() -> Iterator[MediumOwner]:
         target=serve, args=(PairedKernel(program_socket), RequestLines(request_read), reply_write)
     )
     thread.start()
-    owner = MediumOwner(socket_here, request_write, reply_read)
+    owner = MediumOwner(kernel_socket, request_write, reply_read)
     try:
         yield owner
     finally:
@@ -91,12 +91,12 @@ def running() -> Iterator[MediumOwner]:
         owner.close()
         for fd in (request_read, reply_read, reply_write):
             os.close(fd)
-        socket_here.close()
+        kernel_socket.close()
         program_socket.close()
 
 
 def test_a_frame_passes_through_the_program() -> None:
-    with running() as owner:
+    with running_medium() as owner:
         assert owner.request(SETUP) == {}
         assert owner.request(PLACE) == {}
         owner.send_frame()
@@ -109,7 +109,7 @@ def test_a_frame_passes_through_the_program() -> None:
 
 
 def test_frames_before_the_setup_are_discarded_and_bad_bytes_are_counted() -> None:
-    with running() as owner:
+    with running_medium() as owner:
         owner.send_frame()
         assert "do" in owner.request({"do": "totals"})["error"]
         owner.request(SETUP)
@@ -131,7 +131,7 @@ def test_frames_before_the_setup_are_discarded_and_bad_bytes_are_counted() -> No
     ],
 )
 def test_an_invalid_request_gets_an_error_and_changes_nothing(request_: object) -> None:
-    with running() as owner:
+    with running_medium() as owner:
         owner.request(SETUP)
         assert owner.request(request_)["error"]
         assert owner.request(PLACE) == {}
@@ -139,7 +139,7 @@ def test_an_invalid_request_gets_an_error_and_changes_nothing(request_: object) 
 
 @pytest.mark.parametrize("address", ["42:00", "zz:00:00:00:01:00", ""])
 def test_a_setup_with_a_wrong_address_is_refused(address: str) -> None:
-    with running() as owner:
+    with running_medium() as owner:
         assert "is not an address" in owner.request({"seed": 1, "radios": {"r1": {"address": address}}})["error"]
         assert owner.request(SETUP) == {}
 
@@ -150,14 +150,14 @@ def test_a_request_without_end_stops_the_program(tmp_path: Path) -> None:
     with endless.open("rb") as requests:
         lines = RequestLines(requests.fileno())
         with pytest.raises(ValueError, match="longer than"):
-            read_all(lines)
+            read_all_lines(lines)
 
 
-def read_all(lines: RequestLines) -> list[bytes]:
-    read: list[bytes] = []
+def read_all_lines(lines: RequestLines) -> list[bytes]:
+    all_lines: list[bytes] = []
     while not lines.is_at_end:
-        read += lines.read()
-    return read
+        all_lines += lines.read()
+    return all_lines
 
 
 @pytest.mark.skipif(Path("/sys/module/mac80211_hwsim").exists(), reason="this kernel has loaded hwsim")

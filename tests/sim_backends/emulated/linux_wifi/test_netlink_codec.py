@@ -46,12 +46,14 @@ def test_messages_of_one_datagram_are_separated() -> None:
     st.dictionaries(st.integers(0, 0x3FFF), st.binary(max_size=70), max_size=8),
     st.integers(0, 0xFFFF),
 )
-def test_what_is_encoded_is_decoded(command: int, attributes: dict[int, bytes], kind: int) -> None:
-    message = NetlinkMessage(kind, 1, 2, encode_generic(command, 1, attributes))
-    (decoded,) = decode_messages(message.encode())
+def test_an_encoded_message_is_decoded_without_change(
+    command: int, attributes: dict[int, bytes], message_type: int
+) -> None:
+    message = NetlinkMessage(message_type, 1, 2, encode_generic(command, 1, attributes))
+    (decoded_message,) = decode_messages(message.encode())
     # The padding of the last attribute is part of the payload.
-    assert decoded == message
-    assert decode_generic(decoded.payload) == (command, attributes)
+    assert decoded_message == message
+    assert decode_generic(decoded_message.payload) == (command, attributes)
 
 
 @given(st.binary(max_size=80))
@@ -63,16 +65,16 @@ def test_any_bytes_are_decoded_or_rejected(data: bytes) -> None:
 
 
 @pytest.mark.parametrize(
-    "damaged",
+    "invalid_message",
     [
         FAMILY_REQUEST[:10],
         b"\x0f" + FAMILY_REQUEST[1:],  # shorter than its header
         b"\x25" + FAMILY_REQUEST[1:],  # longer than the datagram
     ],
 )
-def test_a_wrong_length_of_a_message_is_rejected(damaged: bytes) -> None:
+def test_a_wrong_length_of_a_message_is_rejected(invalid_message: bytes) -> None:
     with pytest.raises(NetlinkFormatError):
-        list(decode_messages(damaged))
+        list(decode_messages(invalid_message))
 
 
 @pytest.mark.parametrize("size", [0, 15, 17])

@@ -43,6 +43,6 @@ def test_too_few_radios_are_an_error_with_the_command_that_adds_them(
 ) -> None:
     monkeypatch.setattr(radios, "find_radios", lambda: [HwsimRadio("phy0", "wlan0", "42:00:00:00:00:00")])
     assert len(radios.require_radios(1, wait_s=0.0)) == 1
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(ConfigurationError) as error_info:
         radios.require_radios(3, wait_s=0.0)
-    assert "radios=3" in caught.value.remedy
+    assert "radios=3" in error_info.value.remedy

@@ -34,7 +34,7 @@ from sim_backends.radio.modes import SHORT_RETRY_LIMIT
         (RateStage(9, 1, RATE_VHT), 5180, None),  # 256-QAM
     ],
 )
-def test_the_mode_of_a_stage(stage: RateStage, frequency_mhz: int, name: str | None) -> None:
+def test_a_stage_has_the_mode_of_its_rate_and_band(stage: RateStage, frequency_mhz: int, name: str | None) -> None:
     mode = mode_of(stage, frequency_mhz)
     assert (mode.name if mode else None) == name
 
@@ -57,8 +57,8 @@ def test_a_stage_that_the_model_does_not_have_counts_as_failed() -> None:
     chain = rate_chain((RateStage(15, 2, RATE_MCS), RateStage(7, 2, RATE_MCS)), 2437)
     assert [mode.name for mode in chain.modes] == ["n7", "n7"]
     assert chain.tries_made(1) == [2, 1]
-    only = rate_chain((RateStage(15, 3, RATE_MCS),), 2437)
-    assert (only.modes, only.tries_made(0)) == ((), [3])
+    unknown_chain = rate_chain((RateStage(15, 3, RATE_MCS),), 2437)
+    assert (unknown_chain.modes, unknown_chain.tries_made(0)) == ((), [3])
 
 
 stages = st.builds(
@@ -74,6 +74,6 @@ def test_any_chain_has_few_tries_and_its_report_adds_up(
     assert len(chain.modes) <= max_tries
     for attempts in range(1, len(chain.modes) + 1):
         tries = chain.tries_made(attempts)
-        on_air = sum(count for count, skipped in zip(tries, chain.is_skipped, strict=False) if not skipped)
-        assert on_air == attempts
+        tries_on_air = sum(count for count, skipped in zip(tries, chain.is_skipped, strict=False) if not skipped)
+        assert tries_on_air == attempts
         assert all(0 <= count <= 255 for count in tries)

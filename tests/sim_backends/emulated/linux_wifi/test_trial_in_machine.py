@@ -1,4 +1,4 @@
-"""`fieldkit trial los 30ft` with Linux's Wi-Fi, as its user runs it: in the virtual machine, with results here."""
+"""`fieldkit trial los 30ft` with Linux's Wi-Fi in the virtual machine, as a user runs it; results are on the host."""
 
 import csv
 import gzip
@@ -60,6 +60,6 @@ def test_link_columns_are_those_of_iw(row: dict[str, str]) -> None:
 
 def test_times_of_an_emulated_processor_are_withheld_and_the_row_has_the_reason(row: dict[str, str]) -> None:
     assert row["backend"] == "emulated (wifi linux, clock instructions)"
-    times = [name for name in row if name.endswith(("_s", "_ppm")) and not name.endswith("_rate_bit_s")]
-    assert {"rtt_median_s", "transfer_s", "goodput_bit_s", "one_way_median_s"} <= set(times)
-    assert [name for name in times if row[name]] == []
+    time_columns = [name for name in row if name.endswith(("_s", "_ppm")) and not name.endswith("_rate_bit_s")]
+    assert {"rtt_median_s", "transfer_s", "goodput_bit_s", "one_way_median_s"} <= set(time_columns)
+    assert [name for name in time_columns if row[name]] == []

@@ -19,7 +19,7 @@ from tests.helpers.paths import ROOT
 
 pytestmark = pytest.mark.emulated
 
-# Without KVM a minute on an idle machine; the clock of the machine does not depend on it.
+# Without KVM, the boot takes a minute on an idle host.
 BOOT_S = 1800.0
 IMPORTED = (
     "fieldkit.config.profiles",
@@ -32,7 +32,7 @@ IMPORTED = (
 
 @pytest.fixture(scope="module", autouse=True)
 def extracted_packages() -> Iterator[None]:
-    """Use the packages that .ci/install extracts: with iw on the PATH, fieldkit samples links in other tests, too."""
+    """Use the packages that .ci/install extracts; if iw were on the PATH, other tests would sample links, too."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(ROOT_VARIABLE, str(ROOT / ".linux"))
         yield
@@ -53,8 +53,8 @@ def results(kernel: Kernel) -> dict[str, Any]:
     result = run_in_machine(kernel, script, Deadline.after(BOOT_S), radios=3)
     assert result.code == 0, result.output
     line = next(line for line in result.output.splitlines() if line.startswith("RESULTS "))
-    measured: dict[str, Any] = json.loads(line.removeprefix("RESULTS "))
-    return measured
+    job_results: dict[str, Any] = json.loads(line.removeprefix("RESULTS "))
+    return job_results
 
 
 def number(dump: str, label: str) -> int:
@@ -75,22 +75,22 @@ def test_robots_reach_each_other_only_in_range(results: dict[str, Any]) -> None:
     assert results["near_again"], results
 
 
-def test_the_driver_of_the_robot_shows_what_the_medium_reported(results: dict[str, Any]) -> None:
-    dump_before, before, dump, totals = results["dumps_and_totals"]
+def test_counters_of_the_driver_equal_those_of_the_medium(results: dict[str, Any]) -> None:
+    dump_before, totals_before, dump, totals = results["dumps_and_totals"]
 
-    def added(label: str) -> int:
+    def increase(label: str) -> int:
         return number(dump, label) - number(dump_before, label)
 
-    frames = totals["frames"] - before["frames"]
-    assert added("tx packets") == frames >= 10
-    assert added("tx retries") == totals["reported_tries"] - before["reported_tries"] - frames
-    assert added("tx failed") == frames - (totals["acknowledged"] - before["acknowledged"])
+    frames = totals["frames"] - totals_before["frames"]
+    assert increase("tx packets") == frames >= 10
+    assert increase("tx retries") == totals["reported_tries"] - totals_before["reported_tries"] - frames
+    assert increase("tx failed") == frames - (totals["acknowledged"] - totals_before["acknowledged"])
     # Without fading the signal is the same in both directions.
     assert number(dump, "signal") == totals["signal_dbm"]
 
 
 @pytest.mark.parametrize("state", ["suspended", "killed"])
-def test_without_the_medium_nothing_arrives(results: dict[str, Any], state: str) -> None:
+def test_no_packet_arrives_without_the_medium(results: dict[str, Any], state: str) -> None:
     """hwsim would deliver all frames without loss if the registered socket were closed."""
     assert results[state] == 0
 
@@ -106,10 +106,10 @@ def test_the_kernel_accepts_the_messages_of_the_medium(results: dict[str, Any]) 
     assert (counts["rejected"], counts["overruns"]) == (0, 0)
 
 
-def test_the_radios_return_when_the_robots_end(results: dict[str, Any]) -> None:
+def test_the_radios_return_when_the_robots_stop(results: dict[str, Any]) -> None:
     assert len(results["radios"]) == 3
 
 
-def test_a_machine_that_does_not_end_in_time_is_removed(kernel: Kernel) -> None:
+def test_a_machine_that_does_not_exit_in_time_is_killed(kernel: Kernel) -> None:
     with pytest.raises(TestbedLostError, match="did not switch off in time"):
         run_in_machine(kernel, "true", Deadline.after(0.5), radios=1)

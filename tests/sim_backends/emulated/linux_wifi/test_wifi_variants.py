@@ -35,8 +35,8 @@ def results() -> dict[str, Any]:
     )
     assert result.code == 0, result.output
     line = next(line for line in result.output.splitlines() if line.startswith("RESULTS "))
-    measured: dict[str, Any] = json.loads(line.removeprefix("RESULTS "))
-    return measured
+    job_results: dict[str, Any] = json.loads(line.removeprefix("RESULTS "))
+    return job_results
 
 
 def test_stations_join_with_sae_and_protected_management_frames(results: dict[str, Any]) -> None:
@@ -60,7 +60,7 @@ def test_frames_are_forwarded_in_the_mesh_by_the_robot_in_between(results: dict[
     assert all("type mesh point" in text for text in results["interfaces"].values())
     macs = {role: text.split("addr ")[1].split()[0] for role, text in results["interfaces"].items()}
     paths = [line.split()[:2] for line in results["paths"].splitlines()]
-    assert [macs["receiver"], macs["relay"]] in paths, "destination and next hop"
+    assert [macs["receiver"], macs["relay"]] in paths, "the receiver is reached over the relay"
 
 
 def test_the_mesh_has_no_path_without_the_relay_and_heals(results: dict[str, Any]) -> None:
@@ -70,10 +70,10 @@ def test_the_mesh_has_no_path_without_the_relay_and_heals(results: dict[str, Any
 
 
 def test_a_station_roams_to_the_other_access_point_and_keeps_its_connections(results: dict[str, Any]) -> None:
-    before, after = results["access point before"], results["access point after"]
-    assert before
-    assert after
-    assert before != after
-    assert re.search(rf"connected to {after}|roamed.* {after}", results["events"]), results["events"]
+    address_before, address_after = results["access point before"], results["access point after"]
+    assert address_before
+    assert address_after
+    assert address_before != address_after
+    assert re.search(rf"connected to {address_after}|roamed.* {address_after}", results["events"]), results["events"]
     assert results["link over the bridge"], results
     assert results["ping over the bridge"] >= 8

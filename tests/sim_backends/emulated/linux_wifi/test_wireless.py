@@ -1,4 +1,4 @@
-"""Parts of robots in Linux's Wi-Fi, and the configurations of hostapd and wpa_supplicant."""
+"""Wi-Fi specifications of robots by their roles, and the configurations of hostapd and wpa_supplicant."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -28,7 +28,7 @@ RADIO = {
 }
 
 
-def parts(
+def specs_of(
     robots: dict[Role, Robot], *, radio: Mapping[str, object] = MappingProxyType({}), **settings: object
 ) -> dict[Role, WifiSpec]:
     options = EmulatedOptions.model_validate({"wifi": "linux", "linux_wifi": settings, "radio": dict(radio)})
@@ -41,32 +41,32 @@ def settings_of(text: str) -> dict[str, str]:
     return {key: value for key, _, value in lines}
 
 
-def test_the_relay_has_the_access_point_and_the_others_its_passphrase() -> None:
-    specs = parts(TRIO)
+def test_the_relay_is_the_access_point_and_the_other_robots_have_its_passphrase() -> None:
+    specs = specs_of(TRIO)
     assert [specs[role].mode for role in TRIO] == ["station", "station", "access point"]
     (passphrase,) = {spec.passphrase for spec in specs.values()}
     assert 8 <= len(passphrase) <= 63, "WPA-PSK, IEEE 802.11-2020, J.4.1"
-    assert passphrase not in {spec.passphrase for spec in parts(TRIO).values()}, "a new one for each lab"
-    assert {spec.mode for spec in parts(PAIR).values()} == {"ad hoc"}
+    assert passphrase not in {spec.passphrase for spec in specs_of(TRIO).values()}, "a new one for each lab"
+    assert {spec.mode for spec in specs_of(PAIR).values()} == {"ad hoc"}
 
 
 @pytest.mark.parametrize("robots", [TRIO, PAIR], ids=["with a relay", "without"])
 def test_in_a_mesh_all_robots_are_mesh_points(robots: dict[Role, Robot]) -> None:
-    assert {(spec.mode, spec.passphrase) for spec in parts(robots, mesh=True).values()} == {("mesh point", "")}
+    assert {(spec.mode, spec.passphrase) for spec in specs_of(robots, mesh=True).values()} == {("mesh point", "")}
 
 
 @pytest.mark.parametrize("mesh", [False, True])
 @pytest.mark.parametrize("robots", [TRIO, PAIR], ids=["with a relay", "without"])
-def test_all_robots_have_the_monitor_interface_or_none(robots: dict[Role, Robot], *, mesh: bool) -> None:
-    assert {spec.has_monitor for spec in parts(robots, mesh=mesh, monitor=True).values()} == {True}
-    assert {spec.has_monitor for spec in parts(robots, mesh=mesh).values()} == {False}
+def test_either_all_robots_or_no_robots_have_the_monitor_interface(robots: dict[Role, Robot], *, mesh: bool) -> None:
+    assert {spec.has_monitor for spec in specs_of(robots, mesh=mesh, monitor=True).values()} == {True}
+    assert {spec.has_monitor for spec in specs_of(robots, mesh=mesh).values()} == {False}
 
 
 @pytest.mark.parametrize(
     ("security", "key_management", "protection"), [("wpa2", "WPA-PSK", "0"), ("wpa3", "SAE", "2")]
 )
 def test_access_point_and_station_have_the_same_security(security: str, key_management: str, protection: str) -> None:
-    specs = parts(TRIO, security=security)
+    specs = specs_of(TRIO, security=security)
     access_point = settings_of(wireless.configuration("wlan0", specs[Role.RELAY]))
     station = settings_of(wireless.configuration("wlan0", specs[Role.SENDER]))
     assert (access_point["wpa_key_mgmt"], access_point["ieee80211w"]) == (key_management, protection)
@@ -77,7 +77,7 @@ def test_access_point_and_station_have_the_same_security(security: str, key_mana
 
 
 def test_with_access_points_that_are_not_robots_all_robots_roam_between_them() -> None:
-    specs = parts(PAIR, radio=RADIO)
+    specs = specs_of(PAIR, radio=RADIO)
     assert len(set(specs.values())) == 1
     station = specs[Role.SENDER]
     text = wireless.configuration("wlan0", station)
@@ -89,12 +89,12 @@ def test_with_access_points_that_are_not_robots_all_robots_roam_between_them() -
     assert access_point["beacon_int"] != other["beacon_int"], "beacons of hwsim would always collide"
     assert (access_point["interface"], access_point["bridge"]) == ("wlan7", access_points.BRIDGE)
     assert access_point["wpa_passphrase"] == station.passphrase
-    assert "bgscan" not in wireless.configuration("wlan0", parts(TRIO)[Role.SENDER])
+    assert "bgscan" not in wireless.configuration("wlan0", specs_of(TRIO)[Role.SENDER])
 
 
 def test_a_mesh_and_access_points_cannot_be_combined() -> None:
     with pytest.raises(ValidationError, match=r"radio\.access_points"):
-        parts(PAIR, radio=RADIO, mesh=True)
+        specs_of(PAIR, radio=RADIO, mesh=True)
 
 
 def test_unknown_security_is_refused() -> None:

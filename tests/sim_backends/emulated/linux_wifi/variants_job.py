@@ -1,6 +1,6 @@
-"""Runs in the virtual machine of `test_wifi_variants.py`: WPA3 with monitor interfaces, an 802.11s mesh, roaming.
+"""A job in the virtual machine of `test_wifi_variants.py`: WPA3, monitor interfaces, an 802.11s mesh, and roaming.
 
-Prints results as JSON. The labs have three robots of a trial in topology `master`, or two and two access points.
+It prints results as JSON. The labs have three robots in topology `master`, or two robots and two access points.
 """
 
 import json
@@ -41,7 +41,7 @@ HANDOVER = ("tcpdump", "-i", "mon0", "-y", "IEEE802_11_RADIO", "-U", "-w", "-", 
 Running = RunningRobots[Role]
 
 
-def within(running: Running, role: Role, *argv: str) -> str:
+def run_on_robot(running: Running, role: Role, *argv: str) -> str:
     """Return the output of a program in the network of a robot."""
     command = ("nsenter", "-t", str(running.robots[role].pid), "-n", *argv)
     return subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False).stdout
@@ -50,7 +50,7 @@ def within(running: Running, role: Role, *argv: str) -> str:
 def ping(running: Running, count: int) -> int:
     """Return the number of replies from the receiver to the sender."""
     argv = ("ping", "-c", str(count), "-i", "0.2", "-W", "1", ADDRESSES[Role.RECEIVER])
-    return int(within(running, Role.SENDER, *argv).split(" received")[0].rsplit(" ", 1)[-1])
+    return int(run_on_robot(running, Role.SENDER, *argv).split(" received")[0].rsplit(" ", 1)[-1])
 
 
 def wait_for_link(running: Running) -> bool:
@@ -63,28 +63,28 @@ def wait_for_link(running: Running) -> bool:
 
 def frames(capture: bytes) -> list[tuple[str, int, str]]:
     """Return frame control (hexadecimal), bytes without FCS, and receiver of each frame in a capture (radiotap)."""
-    found, offset = [], 24
+    frame_facts, offset = [], 24
     while offset + 16 <= len(capture):
         (size_bytes,) = struct.unpack_from("<I", capture, offset + 8)
         packet = capture[offset + 16 : offset + 16 + size_bytes]
         frame = packet[int.from_bytes(packet[2:4], "little") :]
-        found.append((frame[:2].hex(), len(frame), frame[4:10].hex(":")))
+        frame_facts.append((frame[:2].hex(), len(frame), frame[4:10].hex(":")))
         offset += 16 + size_bytes
-    return found
+    return frame_facts
 
 
 def access_point(running: Running) -> str:
-    """Return the address of the sender's access point; empty without one."""
-    words = within(running, Role.SENDER, "iw", "dev", "wlan0", "link").split()
+    """Return the address of the sender's access point, or an empty text if it has none."""
+    words = run_on_robot(running, Role.SENDER, "iw", "dev", "wlan0", "link").split()
     return words[2] if words[:2] == ["Connected", "to"] else ""
 
 
-def wait_for_handover(running: Running, left: str) -> str:
+def wait_for_handover(running: Running, left_access_point: str) -> str:
     """Return the address of the sender's next access point."""
     end_s = time.monotonic() + JOIN_S
-    while (present := access_point(running)) in {left, ""} and time.monotonic() < end_s:
+    while (current_access_point := access_point(running)) in {left_access_point, ""} and time.monotonic() < end_s:
         time.sleep(0.2)
-    return present
+    return current_access_point
 
 
 @contextmanager
@@ -101,41 +101,43 @@ def lab(settings: dict[str, object], *, roles: Collection[Role] = tuple(CAST), *
 def main() -> None:
     results: dict[str, object] = {}
 
-    def note(name: str, value: object) -> None:
+    def record_result(name: str, value: object) -> None:
         results[name] = value
         sys.stdout.write(f"{time.monotonic():.0f} s: {name} = {value}\n")
         sys.stdout.flush()
 
     with lab({"security": "wpa3", "monitor": True}) as running:
         running.medium.place(TRIANGLE)
-        note("wpa3 link", wait_for_link(running))
-        note("wpa3 stations", within(running, Role.RELAY, "iw", "dev", "wlan0", "station", "dump"))
+        record_result("wpa3 link", wait_for_link(running))
+        record_result("wpa3 stations", run_on_robot(running, Role.RELAY, "iw", "dev", "wlan0", "station", "dump"))
         capture = subprocess.Popen(
             ("nsenter", "-t", str(running.robots[Role.SENDER].pid), "-n", *CAPTURE),
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
         )
-        note("wpa3 ping", ping(running, 20))
-        note("frames", capture.communicate(timeout=JOIN_S)[0])
+        record_result("wpa3 ping", ping(running, 20))
+        record_result("frames", capture.communicate(timeout=JOIN_S)[0])
     with lab({"mesh": True}) as running:
         running.medium.place(ROW)
-        note("mesh link", wait_for_link(running))
-        note("mesh ping", ping(running, 20))
-        note("paths", within(running, Role.SENDER, "iw", "dev", "wlan0", "mpath", "dump"))
-        note("interfaces", {str(role): within(running, role, "iw", "dev", "wlan0", "info") for role in CAST})
+        record_result("mesh link", wait_for_link(running))
+        record_result("mesh ping", ping(running, 20))
+        record_result("paths", run_on_robot(running, Role.SENDER, "iw", "dev", "wlan0", "mpath", "dump"))
+        record_result(
+            "interfaces", {str(role): run_on_robot(running, role, "iw", "dev", "wlan0", "info") for role in CAST}
+        )
         running.medium.place(GAP)
-        note("mesh without relay", ping(running, 3))
+        record_result("mesh without relay", ping(running, 3))
         running.medium.place(ROW)
-        note("mesh again", wait_for_link(running))
+        record_result("mesh again", wait_for_link(running))
         running.robots[Role.SENDER].switch_off()
         running.robots[Role.SENDER].switch_on()
-        note("mesh after switching", wait_for_link(running))
+        record_result("mesh after switching", wait_for_link(running))
     pair = (Role.SENDER, Role.RECEIVER)
     with lab({"monitor": True}, roles=pair, access_points=ACCESS_POINTS, roaming=ROAMING) as running:
         running.medium.place(START)
-        note("roam link", wait_for_link(running))
-        note("access point before", wait_for_handover(running, ""))
+        record_result("roam link", wait_for_link(running))
+        record_result("access point before", wait_for_handover(running, ""))
         events = subprocess.Popen(
             ("nsenter", "-t", str(running.robots[Role.SENDER].pid), "-n", "iw", "event", "-t"),
             stdout=subprocess.PIPE,
@@ -147,14 +149,14 @@ def main() -> None:
             stderr=subprocess.DEVNULL,
         )
         running.medium.place(END)
-        note("access point after", wait_for_handover(running, str(results["access point before"])))
-        note("link over the bridge", wait_for_link(running))
-        note("ping over the bridge", ping(running, 10))
+        record_result("access point after", wait_for_handover(running, str(results["access point before"])))
+        record_result("link over the bridge", wait_for_link(running))
+        record_result("ping over the bridge", ping(running, 10))
         handover.terminate()
-        note("handover", frames(handover.communicate()[0]))
+        record_result("handover", frames(handover.communicate()[0]))
         events.terminate()
-        note("events", events.communicate()[0])
-        note("scan", within(running, Role.SENDER, "iw", "dev", "wlan0", "scan", "dump"))
+        record_result("events", events.communicate()[0])
+        record_result("scan", run_on_robot(running, Role.SENDER, "iw", "dev", "wlan0", "scan", "dump"))
     sys.stdout.write(f"RESULTS {json.dumps(results)}\n")
 
 

@@ -1,4 +1,4 @@
-"""Radio transmissions as a capture and a table: fieldkit's reader and scapy agree about them."""
+"""Radio transmissions as a capture and a table, read equally by fieldkit and scapy."""
 
 import csv
 import os
@@ -108,11 +108,11 @@ def test_each_hop_of_a_ping_is_in_both_files(
     acks = [frame for frame in rdpcap(str(tmp_path / air_log.PCAP)) if (frame.type, frame.subtype) == (1, 13)]
     assert {(frame.addr1, len(frame)) for frame in acks} >= {(MAC[sender], 10) for sender, _ in hops}
     assert len(acks) == sum(line["attempt"] == "0" for line in all_lines)
-    read = pcap.read(tmp_path / air_log.PCAP)
-    assert read.damage is None
-    assert read.frames == len(table(tmp_path))
+    capture = pcap.read(tmp_path / air_log.PCAP)
+    assert capture.damage is None
+    assert capture.frames == len(table(tmp_path))
     starts_ns = [int(line["start_ns"]) for line in all_lines if line["attempt"] != "0"]
-    assert read.packets.time_ns.tolist() == starts_ns
+    assert capture.packets.time_ns.tolist() == starts_ns
     assert all(int(line["end_ns"]) > int(line["start_ns"]) for line in lines)
 
 
@@ -125,7 +125,7 @@ def test_a_site_file_with_record_air_adds_the_files_to_the_evidence(tmp_path: Pa
     assert f"lab_bytes: {air_log.LIMIT_BYTES}" in (trial / "trial.yaml").read_text(encoding="utf-8")
     (row,) = [row for row in rows(trial) if row["status"] == "valid"]
     (folder,) = (trial / "repeats").glob("udp-01")
-    sent = [line for line in table(folder) if line["transmitter"] == row["sender"] and line["attempt"] == "1"]
-    assert len(sent) >= int(row["ip_packets_sent"]) > 0
+    sent_lines = [line for line in table(folder) if line["transmitter"] == row["sender"] and line["attempt"] == "1"]
+    assert len(sent_lines) >= int(row["ip_packets_sent"]) > 0
     assert pcap.read(folder / air_log.PCAP).frames == len(table(folder))
     assert run_here(lab, "verify", str(trial)).code == 0

@@ -25,12 +25,12 @@ ADDRESSES = {"a": OWN_ADDRESS, **OTHER_ADDRESSES}
 RADIO = Radio(interface="wlan0", standard="802.11g", tx_power_dbm=17, sensitivity_dbm=-82)
 
 
-def test_a_mac_address_is_of_one_station_and_locally_administered() -> None:
+def test_a_mac_address_belongs_to_one_station_and_is_locally_administered() -> None:
     assert {name: mac_of(interface.ip).hex(":") for name, interface in ADDRESSES.items()} == MACS
 
 
 @pytest.mark.parametrize(
-    ("to", "expected"),
+    ("destination", "expected"),
     [
         ("10.42.0.2", "b"),
         ("10.42.0.255", None),
@@ -40,8 +40,8 @@ def test_a_mac_address_is_of_one_station_and_locally_administered() -> None:
         ("192.168.0.1", NO_ROBOT),
     ],
 )
-def test_a_bare_packet_goes_to_its_destination_address(to: str, expected: str | None) -> None:
-    packet = bytes(IP(src="10.42.0.1", dst=to) / UDP())
+def test_a_bare_packet_goes_to_its_destination_address(destination: str, expected: str | None) -> None:
+    packet = bytes(IP(src="10.42.0.1", dst=destination) / UDP())
     assert BARE.carries(packet)
     assert BARE.destination(packet, BARE.routes(OWN_ADDRESS, OTHER_ADDRESSES)) == expected
     assert BARE.destination(packet, BARE.routes(OWN_ADDRESS, {})) == NO_ROBOT
@@ -49,7 +49,7 @@ def test_a_bare_packet_goes_to_its_destination_address(to: str, expected: str | 
 
 
 @pytest.mark.parametrize(
-    ("to", "expected"),
+    ("destination", "expected"),
     [
         (MACS["b"], "b"),
         ("ff:ff:ff:ff:ff:ff", None),
@@ -58,15 +58,15 @@ def test_a_bare_packet_goes_to_its_destination_address(to: str, expected: str | 
         ("02:00:0a:2a:00:09", NO_ROBOT),
     ],
 )
-def test_a_frame_goes_to_the_next_hop_with_any_payload(to: str, expected: str | None) -> None:
+def test_a_frame_goes_to_the_next_hop_with_any_payload(destination: str, expected: str | None) -> None:
     for inner in (IP(dst="10.42.0.3"), IPv6(dst="ff02::1:6"), ARP()):
-        frame = bytes(Ether(dst=to, src=MACS["a"]) / inner)
+        frame = bytes(Ether(dst=destination, src=MACS["a"]) / inner)
         assert ETHERNET.carries(frame)
         assert ETHERNET.destination(frame, ETHERNET.routes(OWN_ADDRESS, OTHER_ADDRESSES)) == expected
         assert ETHERNET.destination(frame, ETHERNET.routes(OWN_ADDRESS, {})) == NO_ROBOT
 
 
-def test_the_packet_in_a_frame_is_found_by_its_type() -> None:
+def test_a_frame_contains_an_ipv4_packet_if_its_ether_type_is_ipv4() -> None:
     packet = bytes(IP(dst="10.42.0.3") / UDP())
     frame = bytes(Ether(dst=MACS["b"], src=MACS["a"]) / IP(packet))
     assert (ETHERNET.ipv4(frame), BARE.ipv4(packet)) == (packet, packet)
@@ -76,7 +76,7 @@ def test_the_packet_in_a_frame_is_found_by_its_type() -> None:
 
 
 @given(st.binary(min_size=1, max_size=40), st.ip_addresses(v=4))
-def test_any_bytes_are_handled(frame: bytes, address: IPv4Address) -> None:
+def test_any_bytes_are_carried_or_ignored(frame: bytes, address: IPv4Address) -> None:
     routes = ETHERNET.routes(OWN_ADDRESS, {"x": IPv4Interface(address)})
     assert not ETHERNET.carries(frame) or len(frame) >= 14
     assert ETHERNET.destination(frame, routes) in {None, NO_ROBOT, "x"}
@@ -84,33 +84,33 @@ def test_any_bytes_are_handled(frame: bytes, address: IPv4Address) -> None:
 
 @pytest.fixture
 def air() -> Iterator[tuple[MediumClient, dict[str, socket.socket]]]:
-    """A medium of frames between a, b and c 60 m apart, of which a and c are out of range."""
+    """Return a medium of frames between a, b and c, in a row 60 m apart; a and c are out of range of each other."""
     with ExitStack() as stack:
         medium = stack.enter_context(MediumClient(RadioOptions(fading=False), seed=1, framing=ETHERNET))
-        ends: dict[str, socket.socket] = {}
+        robot_ends: dict[str, socket.socket] = {}
         for name, address in ADDRESSES.items():
             robot_end, medium_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-            ends[name] = stack.enter_context(robot_end)
+            robot_ends[name] = stack.enter_context(robot_end)
             robot_end.settimeout(30)
             with medium_end:
                 medium.attach(name, str(address), RADIO, medium_end.fileno())
         medium.place({name: (60.0 * number, 0.0, 0.2) for number, name in enumerate(ADDRESSES)})
-        yield medium, ends
+        yield medium, robot_ends
 
 
 def test_a_broadcast_reaches_only_robots_in_range(
     air: tuple[MediumClient, dict[str, socket.socket]],
 ) -> None:
-    medium, ends = air
-    everyone = bytes(Ether(dst="ff:ff:ff:ff:ff:ff", src=MACS["b"]) / IP(dst="255.255.255.255") / UDP())
-    ends["b"].send(everyone)
-    assert [ends[name].recv(2000) for name in ("a", "c")] == [everyone, everyone]
-    # Robot a is out of range: it next receives what b sends after that.
-    ends["c"].send(bytes(Ether(dst="33:33:00:01:00:06", src=MACS["c"]) / IPv6()))
-    assert ends["b"].recv(2000)[:6] == bytes.fromhex("333300010006")
-    onward = bytes(Ether(dst=MACS["a"], src=MACS["b"]) / IP(src="10.42.0.3", dst="10.42.0.1") / UDP())
-    ends["b"].send(onward)
-    assert ends["a"].recv(2000) == onward
+    medium, robot_ends = air
+    broadcast = bytes(Ether(dst="ff:ff:ff:ff:ff:ff", src=MACS["b"]) / IP(dst="255.255.255.255") / UDP())
+    robot_ends["b"].send(broadcast)
+    assert [robot_ends[name].recv(2000) for name in ("a", "c")] == [broadcast, broadcast]
+    # Robot a is out of range of c, so the next frame that it receives is from b.
+    robot_ends["c"].send(bytes(Ether(dst="33:33:00:01:00:06", src=MACS["c"]) / IPv6()))
+    assert robot_ends["b"].recv(2000)[:6] == bytes.fromhex("333300010006")
+    forwarded_frame = bytes(Ether(dst=MACS["a"], src=MACS["b"]) / IP(src="10.42.0.3", dst="10.42.0.1") / UDP())
+    robot_ends["b"].send(forwarded_frame)
+    assert robot_ends["a"].recv(2000) == forwarded_frame
     links = medium.stats().links
     assert (links["b", "a"].delivered, links["b", "c"].delivered, links["c", "b"].delivered) == (2, 1, 1)
     assert ("c", "a") not in links or not links["c", "a"].delivered
@@ -119,11 +119,11 @@ def test_a_broadcast_reaches_only_robots_in_range(
 def test_a_frame_out_of_range_is_lost_and_an_unknown_address_is_counted(
     air: tuple[MediumClient, dict[str, socket.socket]],
 ) -> None:
-    medium, ends = air
-    for to in (MACS["c"], "02:00:00:00:00:99"):
-        ends["a"].send(bytes(Ether(dst=to, src=MACS["a"]) / IP(dst="10.42.0.3")))
-    ends["a"].send(last := bytes(Ether(dst=MACS["b"], src=MACS["a"]) / IP(dst="10.42.0.3")))
-    assert ends["b"].recv(2000) == last
+    medium, robot_ends = air
+    for destination in (MACS["c"], "02:00:00:00:00:99"):
+        robot_ends["a"].send(bytes(Ether(dst=destination, src=MACS["a"]) / IP(dst="10.42.0.3")))
+    robot_ends["a"].send(last_frame := bytes(Ether(dst=MACS["b"], src=MACS["a"]) / IP(dst="10.42.0.3")))
+    assert robot_ends["b"].recv(2000) == last_frame
     stats = medium.stats()
     assert stats.links["a", "c"].lost == 1
     assert (stats.ports["a"].unroutable_packets, stats.ports["c"].delivered_packets) == (1, 0)

@@ -1,4 +1,4 @@
-"""Keys of `radio.phy` in the medium: real packets of robots get a category by their DSCP, and wait for beacons."""
+"""Keys of `radio.phy` in the medium: real packets of robots have a category by their DSCP, and wait for beacons."""
 
 import os
 import re

@@ -47,7 +47,7 @@ with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
     print("ready", flush=True)
     print(listener.recv(100).decode(), flush=True)
 """
-SPEAK = """
+SEND = """
 import socket, sys
 with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as speaker:
     speaker.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
@@ -101,7 +101,7 @@ def ping(space: Namespace, address: str, *options: str, count: int = 20) -> list
     return [float(value) for value in re.findall(r"time=([\d.]+)", space.run(*argv, timeout_s=60).stdout)]
 
 
-def until(condition: Callable[[], bool], condition_text: str) -> None:
+def wait_for(condition: Callable[[], bool], condition_text: str) -> None:
     deadline = Deadline.after(LONG_S)
     while not condition():
         assert not deadline.expired, f"not within {LONG_S:g} s: {condition_text}"
@@ -117,7 +117,7 @@ def test_robots_ping_each_other_and_counters_agree(bench: Bench) -> None:
     assert ("a", "r") not in stats.links or stats.links["a", "r"].sent == 0
     assert stats.ports["b"].delivered_packets == 20
     assert stats.scheduling.startswith(("fifo", "normal"))
-    assert len([*Path(f"/proc/{medium.pid}/task").iterdir()]) == 1, "numpy's OpenBLAS has no threads there"
+    assert len([*Path(f"/proc/{medium.pid}/task").iterdir()]) == 1, "numpy's OpenBLAS starts no threads in the medium"
 
 
 def test_delay_applies_in_both_directions_and_twice_through_the_relay(bench: Bench) -> None:
@@ -130,30 +130,30 @@ def test_delay_applies_in_both_directions_and_twice_through_the_relay(bench: Ben
     assert medium.stats().links["r", "b"].delivered == 20
 
 
-def test_links_are_sampled_while_requested_without_traffic_on_the_air(bench: Bench) -> None:
+def test_links_are_sampled_on_request_without_traffic_on_the_air(bench: Bench) -> None:
     medium, spaces = bench("{fading: false}")
     medium.place(PLACES, relay="r")
-    first = medium.links(continue_sampling=True)
-    assert {name: len(samples) for name, samples in first.items()} == {"a": 1, "b": 1, "r": 1}
+    first_samples = medium.links(continue_sampling=True)
+    assert {name: len(samples) for name, samples in first_samples.items()} == {"a": 1, "b": 1, "r": 1}
     assert len(ping(spaces["a"], ADDRESSES["b"], count=80)) == 80
-    last, stats = medium.links(continue_sampling=False), medium.stats()
-    assert len(last["a"]) >= 4, "in 0.8 s"
-    sent = {name: port.sent_packets - port.other_packets for name, port in stats.ports.items()}
-    assert sent == {"a": 80, "b": 80, "r": 0}, "a kernel looks for routers of IPv6 once"
+    last_samples, stats = medium.links(continue_sampling=False), medium.stats()
+    assert len(last_samples["a"]) >= 4, "in 0.8 s"
+    sent_counts = {name: port.sent_packets - port.other_packets for name, port in stats.ports.items()}
+    assert sent_counts == {"a": 80, "b": 80, "r": 0}, "a kernel solicits routers of IPv6 once, which is not counted"
     assert sum(link.sent for link in stats.links.values()) == 4 * 80, "two hops each way, and nothing else"
-    stations = {name: samples[-1].stations for name, samples in last.items()}
+    stations = {name: samples[-1].stations for name, samples in last_samples.items()}
     assert [station.station for station in stations["a"]] == ["r"], "a station lists its access point"
     assert [(station.station, station.tx_packets, station.rx_packets) for station in stations["r"]] == [
         ("a", 80, 80),
         ("b", 80, 80),
     ]
-    air_s = [sample.busy_ns / 1e9 for sample in (last["a"][-1],) if sample.busy_ns is not None]
-    assert 0 < air_s[0] < 1
+    busy_s = [sample.busy_ns / 1e9 for sample in (last_samples["a"][-1],) if sample.busy_ns is not None]
+    assert 0 < busy_s[0] < 1
     assert stations["a"][0].signal_dbm == pytest.approx(stations["r"][0].signal_dbm), "both send with the same power"
 
 
-def in_a_fade(options: RadioOptions) -> dict[str, Vector]:
-    """Return places of b and r some 78 m apart, in range on average and out of range in a deep fade."""
+def places_in_a_fade(options: RadioOptions) -> dict[str, Vector]:
+    """Return places of b and r about 78 m apart, which are in range on average but out of range in a deep fade."""
     channel = WorldChannel(1, {"b": antenna_of(RADIO), "r": antenna_of(RADIO)}, options)
     for centimetres in range(7700, 7900):
         places: dict[str, Vector] = {"b": (0.0, 0.0, 0.0), "r": (centimetres / 100, 0.0, 0.0)}
@@ -166,14 +166,14 @@ def in_a_fade(options: RadioOptions) -> dict[str, Vector]:
 def test_a_moving_robot_leaves_a_fade(bench: Bench) -> None:
     text = "{fading: true, k_db: -20, stir_m_s: 0}"
     medium, spaces = bench(text)
-    places = in_a_fade(schema.validate(schema.parse(text, source="radio.yaml"), RadioOptions))
+    places = places_in_a_fade(schema.validate(schema.parse(text, source="radio.yaml"), RadioOptions))
     medium.place(places)
     assert ping(spaces["b"], ADDRESSES["r"]) == []
     medium.place(places, velocities_m_s={"b": (-10.0, 0.0, 0.0)})
     assert ping(spaces["b"], ADDRESSES["r"])
 
 
-def test_the_parts_of_the_delay_are_end_to_end(bench: Bench) -> None:
+def test_the_parts_of_a_delay_are_those_of_all_hops(bench: Bench) -> None:
     medium, spaces = bench("{loss: 0%, delay: 20ms, rate: 8Mbit/s}")
     for hops, relay in ((1, None), (2, "r")):
         medium.place(PLACES, relay=relay)
@@ -181,8 +181,10 @@ def test_the_parts_of_the_delay_are_end_to_end(bench: Bench) -> None:
         rtt_ms = ping(spaces["a"], ADDRESSES["b"], "-s", "972", "-i", "0.1")  # so that no packet queues
         after = medium.stats().delays["a", "b"]
         assert after.policy_ns is None, "there is no co-simulation"
-        changed = {name: value - getattr(before, name) for name, value in vars(after).items() if value is not None}
-        delta = DelayParts(**changed)
+        differences = {
+            name: value - getattr(before, name) for name, value in vars(after).items() if value is not None
+        }
+        delta = DelayParts(**differences)
         assert (delta.packets, delta.queuing_ns) == (20, 0)
         assert delta.propagation_ns == hops * 20 * 20_000_000
         assert delta.transmission_ns == hops * 20 * 1_000_000, "1,000 bytes at 8 Mbit/s"
@@ -197,12 +199,12 @@ def test_the_parts_of_the_delay_are_end_to_end(bench: Bench) -> None:
 
 
 def test_flows_of_one_pair_are_distinguished_in_fragments_and_mixed(bench: Bench) -> None:
-    """Known truth: 8 Mbit/s, 20 ms; 2 datagrams of 6 fragments each, and 3 small ones, beside a ping."""
+    """The link has 8 Mbit/s and 20 ms; traffic is 2 datagrams of 6 fragments each, 3 small ones, and a ping."""
     medium, spaces = bench("{loss: 0%, delay: 20ms, rate: 8Mbit/s}")
     medium.place(PLACES)
     flows = {port: ("a", "b", socket.IPPROTO_UDP, port) for port in (1234, 1235)}
-    back = ("b", "a", socket.IPPROTO_UDP, 1234)
-    for flow in (*flows.values(), back):
+    reverse_flow = ("b", "a", socket.IPPROTO_UDP, 1234)
+    for flow in (*flows.values(), reverse_flow):
         assert medium.delays(*flow) == NO_PACKETS
     sender_program = "import socket,sys; s=socket.socket(socket.AF_INET,socket.SOCK_DGRAM)\n"
     sender_program += "for n, size, port in ((2, 8192, 1234), (3, 972, 1235), (1, 9000, 99)):\n"
@@ -214,21 +216,21 @@ def test_flows_of_one_pair_are_distinguished_in_fragments_and_mixed(bench: Bench
     assert (large.packets, large.propagation_ns) == (12, 12 * 20_000_000)
     assert large.transmission_ns == 2 * 1000 * (8200 + 6 * 20), "a byte takes 1 us"
     assert (small.packets, small.transmission_ns) == (3, 3 * 1_000_000)
-    assert medium.delays(*back) == NO_PACKETS
+    assert medium.delays(*reverse_flow) == NO_PACKETS
 
 
-def test_large_packets_arrive_whole_in_fragments(bench: Bench) -> None:
+def test_large_packets_arrive_complete_in_fragments(bench: Bench) -> None:
     medium, spaces = bench("{fading: false}")
     medium.place(PLACES)
     assert len(ping(spaces["a"], ADDRESSES["b"], "-s", "8192", "-p", "a5", count=5)) == 5
     assert medium.stats().links["a", "b"].sent == 5 * 6
 
 
-def test_loss_has_the_set_value(bench: Bench) -> None:
+def test_the_loss_has_the_configured_value(bench: Bench) -> None:
     medium, spaces = bench("{loss: 10%, delay: 0ms, rate: unlimited}")
     medium.place(PLACES)
-    spaces["a"].run(sys.executable, "-c", SPEAK, ADDRESSES["b"], "3000").check_returncode()
-    until(lambda: medium.stats().links["a", "b"].sent == 3000, "all datagrams are on the air")
+    spaces["a"].run(sys.executable, "-c", SEND, ADDRESSES["b"], "3000").check_returncode()
+    wait_for(lambda: medium.stats().links["a", "b"].sent == 3000, "all datagrams are on the air")
     counters = medium.stats().links["a", "b"]
     interval = scipy.stats.binomtest(counters.lost, counters.sent).proportion_ci(
         confidence_level=0.99, method="wilson"
@@ -240,18 +242,18 @@ def test_lateness_of_the_medium_is_reported(bench: Bench) -> None:
     medium, spaces = bench("{loss: 0%, delay: 1500ms, rate: unlimited}")
     medium.place(PLACES)
     request = spaces["a"].start("ping", "-n", "-c", "1", ADDRESSES["b"])
-    until(lambda: medium.stats().links["a", "b"].sent == 1, "the request is on the air")
+    wait_for(lambda: medium.stats().links["a", "b"].sent == 1, "the request is on the air")
     os.kill(medium.pid, signal.SIGSTOP)
     assert ping(spaces["b"], ADDRESSES["a"], "-W", "2", count=1) == [], "the medium is stopped"
     os.kill(medium.pid, signal.SIGCONT)
     request.communicate(timeout=LONG_S)
-    late = medium.stats().packet_lateness_counts
-    assert sum(late.values()) >= 2
-    # Two seconds, of which 1.5 s were the request's own.
-    assert 0.25e9 < max(late) < LONG_S * 1e9
+    lateness_counts = medium.stats().packet_lateness_counts
+    assert sum(lateness_counts.values()) >= 2
+    # The medium was stopped for two seconds; the delay of the request was 1.5 s of them.
+    assert 0.25e9 < max(lateness_counts) < LONG_S * 1e9
 
 
-def test_at_full_loss_nothing_arrives(bench: Bench) -> None:
+def test_no_packet_arrives_at_a_loss_of_100_percent(bench: Bench) -> None:
     medium, spaces = bench("{loss: 100%}")
     medium.place(PLACES)
     assert ping(spaces["a"], ADDRESSES["b"], count=5) == []
@@ -259,7 +261,7 @@ def test_at_full_loss_nothing_arrives(bench: Bench) -> None:
     assert (stats.links["a", "b"].lost, stats.ports["b"].delivered_packets) == (5, 0)
 
 
-def test_walking_out_of_range_ends_the_link_and_coming_back_restores_it(bench: Bench) -> None:
+def test_a_link_ends_out_of_range_and_is_restored_in_range(bench: Bench) -> None:
     medium, spaces = bench("{fading: false}")
     medium.place(PLACES | {"b": (5000.0, 0.0, 0.0)})
     assert ping(spaces["a"], ADDRESSES["b"], count=3) == []
@@ -272,13 +274,13 @@ def test_packets_that_waited_to_be_read_count_as_late(bench: Bench) -> None:
     medium.place(PLACES)
     assert len(ping(spaces["a"], ADDRESSES["b"])) == 20
     os.kill(medium.pid, signal.SIGSTOP)
-    until(lambda: ") T " in Path(f"/proc/{medium.pid}/stat").read_text(), "the medium is stopped")
-    spaces["a"].run(sys.executable, "-c", SPEAK, ADDRESSES["b"], "200").check_returncode()
+    wait_for(lambda: ") T " in Path(f"/proc/{medium.pid}/stat").read_text(), "the medium is stopped")
+    spaces["a"].run(sys.executable, "-c", SEND, ADDRESSES["b"], "200").check_returncode()
     time.sleep(0.5)
     os.kill(medium.pid, signal.SIGCONT)
-    until(lambda: medium.stats().ports["b"].delivered_packets >= 220, "all datagrams are delivered")
+    wait_for(lambda: medium.stats().ports["b"].delivered_packets >= 220, "all datagrams are delivered")
     stats = medium.stats()
-    # With an error of one poll timeout, 10 ms; most of the 200 are not read immediately.
+    # The error is one poll timeout, 10 ms; most of the 200 packets are not read immediately.
     assert sum(count for late_ns, count in stats.packet_lateness_counts.items() if late_ns >= 0.49e9) >= 200
     assert stats.delays["a", "b"].processing_ns >= 200 * 0.49e9
     assert sum(stats.packet_lateness_counts.values()) == sum(parts.packets for parts in stats.delays.values())
@@ -286,7 +288,7 @@ def test_packets_that_waited_to_be_read_count_as_late(bench: Bench) -> None:
 
 @pytest.mark.parametrize("address", ["239.1.1.1", "10.9.0.255", "255.255.255.255"])
 @pytest.mark.parametrize("relay", [None, "r"])
-def test_multicast_and_broadcast_reach_everyone(
+def test_multicast_and_broadcast_reach_all_robots(
     routed_namespaces: tuple[MediumClient, dict[str, Namespace]], address: str, relay: str | None
 ) -> None:
     medium, spaces = routed_namespaces
@@ -295,8 +297,8 @@ def test_multicast_and_broadcast_reach_everyone(
     for listener in listeners.values():
         assert listener.stdout is not None
         assert listener.stdout.readline() == "ready\n"
-    spoken = spaces["a"].run(sys.executable, "-c", SPEAK, address, "1")
-    assert spoken.returncode == 0, spoken.stderr
+    sender = spaces["a"].run(sys.executable, "-c", SEND, address, "1")
+    assert sender.returncode == 0, sender.stderr
     assert {name: listener.communicate(timeout=LONG_S)[0] for name, listener in listeners.items()} == {
         "b": "hello\n",
         "r": "hello\n",
@@ -316,7 +318,7 @@ def test_unroutable_packets_are_counted_and_not_carried(bench: Bench) -> None:
     assert medium.stats().ports["a"].unroutable_packets == 8
 
 
-def test_the_medium_outlives_a_robot(bench: Bench) -> None:
+def test_the_medium_continues_after_a_robot_has_gone(bench: Bench) -> None:
     medium, spaces = bench(PLAIN)
     medium.place(PLACES)
     spaces["r"].close()
@@ -325,7 +327,7 @@ def test_the_medium_outlives_a_robot(bench: Bench) -> None:
     assert medium.stats().ports["a"].unroutable_packets == 2
 
 
-def test_a_packet_socket_is_a_transport_too_and_may_close() -> None:
+def test_a_packet_socket_can_be_attached_and_closed() -> None:
     packet = bytes((0x45, 0, 0, 20, *(0,) * 8, 10, 9, 0, 1, 10, 9, 0, 2))
     with ExitStack() as stack:
         options = schema.validate(schema.parse(PLAIN, source="radio.yaml"), RadioOptions)
@@ -368,7 +370,7 @@ def test_invalid_requests_are_rejected(routed_namespaces: tuple[MediumClient, di
         medium.place({"a": PLACES["a"]}, relay="r")
 
 
-def test_close_ends_the_medium_and_may_be_repeated() -> None:
+def test_close_stops_the_medium_and_may_be_repeated() -> None:
     medium = MediumClient(RadioOptions(), seed=1)
     medium.stats()
     medium.close()
@@ -381,12 +383,12 @@ def test_a_killed_medium_raises_an_error() -> None:
         medium.stats()
         os.kill(medium.pid, signal.SIGKILL)
         for _ in range(2):
-            with pytest.raises(LinkError, match="does not answer") as caught:
+            with pytest.raises(LinkError, match="does not answer") as error_info:
                 medium.stats()
-        assert str(medium.pid) in caught.value.where
+        assert str(medium.pid) in error_info.value.where
 
 
-OWN_A_MEDIUM = """
+MEDIUM_OWNER = """
 import time
 from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.radio.radio_options import RadioOptions
@@ -399,16 +401,16 @@ time.sleep(600)
 """
 
 
-def test_killing_the_owner_ends_the_medium() -> None:
-    owner = subprocess.Popen([sys.executable, "-c", OWN_A_MEDIUM], stdout=subprocess.PIPE, text=True, cwd=ROOT)
+def test_the_medium_exits_if_its_owner_is_killed() -> None:
+    owner = subprocess.Popen([sys.executable, "-c", MEDIUM_OWNER], stdout=subprocess.PIPE, text=True, cwd=ROOT)
     assert owner.stdout is not None
     pid = int(owner.stdout.readline())
     owner.kill()
     owner.communicate()
-    until(lambda: not alive(pid), "the medium ends")
+    wait_for(lambda: not alive(pid), "the medium exits")
 
 
-def test_closing_the_control_socket_ends_the_medium() -> None:
+def test_the_medium_exits_if_its_control_socket_is_closed() -> None:
     robot_end, medium_end = socket.socketpair()
     with robot_end, medium_end:
         argv = [sys.executable, "-m", "sim_backends.emulated.medium.process", str(medium_end.fileno()), "1", "ip"]

@@ -1,4 +1,4 @@
-"""Checks whether an ordinary user can create namespaces, from files."""
+"""Checks from files that an ordinary user can create namespaces."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ OWNERS = st.from_regex(r"[a-z0-9_][a-z0-9_-]{0,30}", fullmatch=True)
 
 
 @given(st.lists(st.builds(IdRange, OWNERS, NUMBERS, NUMBERS)))
-def test_id_ranges_read_back(ranges: list[IdRange]) -> None:
+def test_written_id_ranges_can_be_read(ranges: list[IdRange]) -> None:
     text = "".join(f"{ids.owner}:{ids.first}:{ids.count}\n" for ids in ranges)
     assert namespaces.id_ranges(text) == ranges
     assert namespaces.id_ranges(text.rstrip("\n")) == ranges

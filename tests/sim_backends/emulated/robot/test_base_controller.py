@@ -25,10 +25,10 @@ def test_any_velocities_stay_within_limits_and_odometry_follows(
     controller, now_ns = BaseController(BASE, 0), 0
     controller.reset(START)
     x_m, y_m, yaw_rad = START.x_m, START.y_m, START.yaw_rad
-    for later_ns, ahead_m_s, turn_rad_s in commands:
-        now_ns += later_ns
+    for interval_ns, forward_m_s, turn_rad_s in commands:
+        now_ns += interval_ns
         controller.advance(now_ns)
-        controller.set_velocity(now_ns, ahead_m_s, turn_rad_s)
+        controller.set_velocity(now_ns, forward_m_s, turn_rad_s)
         for _ in range(20):
             before, (x0, y0, yaw0) = controller.pose, controller.odometry
             now_ns += STEP_NS
@@ -37,14 +37,14 @@ def test_any_velocities_stay_within_limits_and_odometry_follows(
             assert abs(after.speed_m_s) <= BASE.speed_m_s + 1e-9
             assert abs(after.turn_rad_s) <= BASE.turn_rad_s + 1e-9
             assert abs(after.speed_m_s - before.speed_m_s) <= BASE.acceleration_m_s2 * 2 * STEP_NS / S + 1e-9
-            ahead = math.hypot(x_m - x0, y_m - y0)
-            assert ahead == pytest.approx(math.dist(after.place_m, before.place_m), abs=1e-9)
+            forward_m = math.hypot(x_m - x0, y_m - y0)
+            assert forward_m == pytest.approx(math.dist(after.place_m, before.place_m), abs=1e-9)
             # Odometry and world show the same change of heading.
             assert yaw_rad - yaw0 == pytest.approx(after.heading_rad - before.heading_rad, abs=1e-9)
     assert yaw_rad - START.yaw_rad == pytest.approx(controller.pose.heading_rad - START.heading_rad, abs=1e-6)
 
 
-def test_it_drives_while_velocities_arrive_and_then_stops() -> None:
+def test_the_robot_drives_while_velocities_arrive_and_then_stops() -> None:
     controller = BaseController(BASE, 0)
     controller.reset(START)
     assert controller.is_idle
@@ -57,14 +57,14 @@ def test_it_drives_while_velocities_arrive_and_then_stops() -> None:
     assert controller.pose.speed_m_s == pytest.approx(0.4), "before the timeout"
     controller.advance(last_ns + TIMEOUT_NS + S // 2)
     assert controller.is_idle
-    stopped_m = controller.pose.place_m
+    stop_place_m = controller.pose.place_m
     controller.advance(100 * S)
-    assert controller.pose.place_m == stopped_m
+    assert controller.pose.place_m == stop_place_m
     # Deceleration takes as long as acceleration.
-    far_m = 0.4 * (1.9 + TIMEOUT_NS / S)
-    assert math.dist(stopped_m, START.position_m) == pytest.approx(far_m, abs=0.02)
-    along = math.atan2(stopped_m[1] - START.position_m[1], stopped_m[0] - START.position_m[0])
-    assert along == pytest.approx(START.heading_rad)
+    distance_m = 0.4 * (1.9 + TIMEOUT_NS / S)
+    assert math.dist(stop_place_m, START.position_m) == pytest.approx(distance_m, abs=0.02)
+    course_rad = math.atan2(stop_place_m[1] - START.position_m[1], stop_place_m[0] - START.position_m[0])
+    assert course_rad == pytest.approx(START.heading_rad)
     x_m, y_m, _ = controller.odometry
     assert math.atan2(y_m - START.y_m, x_m - START.x_m) == pytest.approx(START.yaw_rad)
 
@@ -80,9 +80,9 @@ def test_a_reset_robot_is_at_rest_at_the_new_place() -> None:
 
 
 def test_velocities_are_packed_exactly_and_other_datagrams_are_ignored() -> None:
-    kinds = get_typestore(Stores.ROS1_NOETIC).types
-    vector = kinds["geometry_msgs/msg/Vector3"]
-    twist = kinds["geometry_msgs/msg/Twist"](vector(0.25, 1.0, 2.0), vector(3.0, 4.0, -0.5))
+    message_types = get_typestore(Stores.ROS1_NOETIC).types
+    vector = message_types["geometry_msgs/msg/Vector3"]
+    twist = message_types["geometry_msgs/msg/Twist"](vector(0.25, 1.0, 2.0), vector(3.0, 4.0, -0.5))
     assert base_process.unpack(base_process.pack(twist)) == (0.25, -0.5)
     assert base_process.unpack(b"") is None
     assert base_process.unpack(bytes(base_process.BYTES + 1)) is None

@@ -1,4 +1,4 @@
-"""Recorders with publishers, and a publisher with subscribers, that violate TCPROS: all of them keep running."""
+"""Recorders and publishers keep running if their peers violate TCPROS."""
 
 import fcntl
 import random
@@ -60,7 +60,7 @@ class Publishers:
 
     Args:
         folder: Folder of their sockets.
-        what: Bytes by topic.
+        content: Bytes by topic.
     """
 
     def __init__(self, folder: Path, content: dict[str, bytes]) -> None:
@@ -82,8 +82,8 @@ class Publishers:
     def __exit__(self, *_: object) -> None:
         self._stopped.set()
         for server, thread in self._servers:
-            with socket.socket(socket.AF_UNIX) as last, suppress(OSError):
-                last.connect(server.getsockname())
+            with socket.socket(socket.AF_UNIX) as last_connection, suppress(OSError):
+                last_connection.connect(server.getsockname())
             thread.join()
             server.close()
 
@@ -109,13 +109,15 @@ class Publishers:
 
 @pytest.mark.parametrize("ros", ["ros1", "ros2"])
 def test_a_recorder_survives_hostile_publishers(ros: str, tmp_path: Path) -> None:
-    dice, seeds = random.Random(7), [stream_of(GOOD, 3), stream_of("/other", 3), b"\xff" * 40]
-    topics = {f"/bad{number}": mutated(dice.choice(seeds), seeds, dice)[:100_000] for number in range(HOSTILE)}
+    rng, valid_streams = random.Random(7), [stream_of(GOOD, 3), stream_of("/other", 3), b"\xff" * 40]
+    topics = {
+        f"/bad{number}": mutated(rng.choice(valid_streams), valid_streams, rng)[:100_000] for number in range(HOSTILE)
+    }
     # Damaged only in the messages, or only in the headers.
-    topics |= {f"/torn{number}": stream_of(f"/torn{number}", 2) + dice.randbytes(40) for number in range(10)}
+    topics |= {f"/torn{number}": stream_of(f"/torn{number}", 2) + rng.randbytes(40) for number in range(10)}
     topics |= {
-        f"/odd{number}": stream_of(f"/odd{number}", 2).replace(b"std_msgs/Float64", kind.ljust(16, b"x"))
-        for number, kind in enumerate(
+        f"/odd{number}": stream_of(f"/odd{number}", 2).replace(b"std_msgs/Float64", type_name.ljust(16, b"x"))
+        for number, type_name in enumerate(
             (b"std_msgs/Nothing", b"\xc3\x28/x", b"", b"sensor_msgs/Imu/", b"std_msgs/String_")
         )
     }
@@ -130,9 +132,9 @@ def test_a_recorder_survives_hostile_publishers(ros: str, tmp_path: Path) -> Non
             _, errors = recorder.communicate(timeout=60)
     assert b"Traceback" not in errors
     with AnyReader([tmp_path / BAGS[ros]]) as reader:
-        good = [connection for connection in reader.connections if connection.topic == GOOD]
+        good_connections = [connection for connection in reader.connections if connection.topic == GOOD]
         messages: list[Any] = [
-            reader.deserialize(data, connection.msgtype) for connection, _, data in reader.messages(good)
+            reader.deserialize(data, connection.msgtype) for connection, _, data in reader.messages(good_connections)
         ]
     numbers = [message.data for message in messages]
     assert numbers == list(range(COUNT))
@@ -140,7 +142,7 @@ def test_a_recorder_survives_hostile_publishers(ros: str, tmp_path: Path) -> Non
 
 def test_a_publisher_survives_hostile_subscribers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tcpros, "FOLDER", str(tmp_path))
-    dice, request = random.Random(3), tcpros.request("/test", SENSOR.topic)
+    rng, request = random.Random(3), tcpros.request("/test", SENSOR.topic)
     selector = selectors.DefaultSelector()
     odometer = Odometer(tmp_path / "motion", 0)
     publication = Publication(SENSOR, definition(SENSOR.type), 0.0, odometer, selector)
@@ -150,7 +152,7 @@ def test_a_publisher_survives_hostile_subscribers(tmp_path: Path, monkeypatch: p
         stream.connect(str(tcpros.socket_path(SENSOR.topic)))
         stream.setblocking(False)
         with suppress(BlockingIOError):
-            stream.send(request if number == HOSTILE else mutated(request, [request], dice)[:50_000])
+            stream.send(request if number == HOSTILE else mutated(request, [request], rng)[:50_000])
         if number % 3 == 1:
             stream.close()
         streams.append(stream)

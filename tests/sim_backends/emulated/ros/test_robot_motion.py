@@ -31,35 +31,36 @@ ANGLES = st.floats(-math.pi, math.pi)
 def write_paths(folder: Path, *assigned_paths: AssignedPath) -> Path:
     path = folder / "motion"
     path.unlink(missing_ok=True)
-    for assigned in assigned_paths:
-        robot_motion.append_path(path, assigned)
+    for assigned_path in assigned_paths:
+        robot_motion.append_path(path, assigned_path)
     return path
 
 
-def test_odometry_along_a_path_with_a_left_turn(tmp_path: Path) -> None:
+def test_odometry_follows_a_path_with_a_left_turn(tmp_path: Path) -> None:
     odometer = Odometer(write_paths(tmp_path, AssignedPath(10 * S, CORNER, 2.0, 0.0)), 0)
     assert odometer.at(10 * S) == RobotMotion(speed_m_s=2.0, position_m=CORNER[0])
     assert odometer.at(11 * S) == RobotMotion(2.0, 0.0, 0.0, 2.0, (5.0, 6.0, UP_M))
-    half = odometer.at(round(12.5 * S))
-    assert (half.x_m, half.y_m, half.yaw_rad) == pytest.approx((4.0, 1.0, math.pi / 2))
-    assert half.position_m == pytest.approx((7.0, 7.0, 0.7)), "half way up"
+    middle = odometer.at(round(12.5 * S))
+    assert (middle.x_m, middle.y_m, middle.yaw_rad) == pytest.approx((4.0, 1.0, math.pi / 2))
+    assert middle.position_m == pytest.approx((7.0, 7.0, 0.7)), "half way up"
     end = odometer.at(20 * S)
     assert (end.x_m, end.y_m, end.yaw_rad, end.speed_m_s) == pytest.approx((4.0, 2.0, math.pi / 2, 0.0))
     assert end.position_m == CORNER[-1]
 
 
-def test_a_robot_that_is_put_back_keeps_its_odometry(tmp_path: Path) -> None:
+def test_a_robot_that_is_placed_again_keeps_its_odometry(tmp_path: Path) -> None:
     path = write_paths(tmp_path, AssignedPath(0, CORNER, 2.0, 0.0))
     odometer = Odometer(path, 0)
     odometer.at(2 * S)
     robot_motion.append_path(path, AssignedPath(4 * S, CORNER[:1], 2.0, 0.0))
-    back = odometer.at(5 * S)
-    assert (back.x_m, back.y_m) == pytest.approx((4.0, 2.0))
-    assert back.position_m == CORNER[0]
+    placed_motion = odometer.at(5 * S)
+    assert (placed_motion.x_m, placed_motion.y_m) == pytest.approx((4.0, 2.0))
+    assert placed_motion.position_m == CORNER[0]
     robot_motion.append_path(path, AssignedPath(6 * S, CORNER, 2.0, 0.0))
-    again = odometer.at(7 * S)
-    # It faces as at first again, which its odometry has not recorded: ahead is to the left of the start.
-    assert (again.x_m, again.y_m, again.yaw_rad) == pytest.approx((4.0, 4.0, math.pi / 2))
+    second_drive = odometer.at(7 * S)
+    # The robot was turned to its first heading, which its odometry has not recorded: ahead is to the left of the
+    # start in its odometry frame.
+    assert (second_drive.x_m, second_drive.y_m, second_drive.yaw_rad) == pytest.approx((4.0, 4.0, math.pi / 2))
 
 
 def test_a_missing_file_or_an_incomplete_line_is_ignored(tmp_path: Path) -> None:
@@ -78,10 +79,10 @@ def test_odometry_starts_at_zero_when_it_is_created(
     points_m: list[tuple[float, float, float]],
     facing_rad: float,
     speed_m_s: float,
-    on_ns: int,
+    start_ns: int,
 ) -> None:
     path = write_paths(tmp_path_factory.getbasetemp(), AssignedPath(0, points_m, speed_m_s, facing_rad))
-    motion = Odometer(path, on_ns).at(on_ns)
+    motion = Odometer(path, start_ns).at(start_ns)
     assert (motion.x_m, motion.y_m, motion.yaw_rad) == pytest.approx((0, 0, 0), abs=1e-6)
 
 
@@ -94,20 +95,20 @@ def test_odometry_is_the_integral_of_the_speed(
 ) -> None:
     path = write_paths(tmp_path_factory.getbasetemp(), AssignedPath(0, points_m, speed_m_s, facing_rad))
     odometer = Odometer(path, 0)
-    long_s = sum(math.dist(*pair) for pair in pairwise(points_m)) / speed_m_s
+    path_s = sum(math.dist(*pair) for pair in pairwise(points_m)) / speed_m_s
     steps = 400
-    samples = [odometer.at(round((n + 0.5) * long_s * S / steps)) for n in range(steps)]
-    x_m = sum(sample.speed_m_s * math.cos(sample.yaw_rad) for sample in samples) * long_s / steps
-    y_m = sum(sample.speed_m_s * math.sin(sample.yaw_rad) for sample in samples) * long_s / steps
-    end = odometer.at(round(long_s * S) + S)
-    off_m = 2 * len(points_m) * speed_m_s * long_s / steps + 1e-6
-    assert (end.x_m, end.y_m) == pytest.approx((x_m, y_m), abs=off_m)
+    samples = [odometer.at(round((n + 0.5) * path_s * S / steps)) for n in range(steps)]
+    x_m = sum(sample.speed_m_s * math.cos(sample.yaw_rad) for sample in samples) * path_s / steps
+    y_m = sum(sample.speed_m_s * math.sin(sample.yaw_rad) for sample in samples) * path_s / steps
+    end = odometer.at(round(path_s * S) + S)
+    tolerance_m = 2 * len(points_m) * speed_m_s * path_s / steps + 1e-6
+    assert (end.x_m, end.y_m) == pytest.approx((x_m, y_m), abs=tolerance_m)
     start = points_m[0]
     assert math.hypot(end.x_m, end.y_m) == pytest.approx(math.dist(start[:2], points_m[-1][:2]), abs=1e-6)
 
 
 @pytest.mark.parametrize("role", [Role.SENDER, Role.RECEIVER])
-def test_away_is_ahead_and_left_is_to_the_left(tmp_path: Path, role: Role) -> None:
+def test_a_leg_away_is_ahead_and_a_leg_left_is_to_the_left(tmp_path: Path, role: Role) -> None:
     placement = Placement(Scenario.LOS, Topology.MASTERLESS, parse_distance("10m"))
     world, move = load_world("lawn"), Move(role, (Leg(away_m=2.0), Leg(left_m=1.0)), 1.0)
     odometer = Odometer(write_paths(tmp_path, places.assigned_path(placement, move, world, 0)), 0)
@@ -117,21 +118,23 @@ def test_away_is_ahead_and_left_is_to_the_left(tmp_path: Path, role: Role) -> No
     assert end.position_m == pytest.approx(motion.at(4 * S)[CAST[role].name].position_m)
 
 
-def test_messages_use_ros_s_frames_and_units() -> None:
-    store, now = (
+def test_messages_use_the_frames_and_units_of_ros() -> None:
+    store, motion = (
         get_typestore(Stores.ROS1_NOETIC),
         RobotMotion(4.0, 2.0, math.pi / 2, 1.5, (300.0, 400.0, UP_M), math.pi / 2),
     )
     messages: dict[str, Any] = {}
     for kind in ("nav_msgs/Odometry", "sensor_msgs/Imu", "sensor_msgs/NavSatFix"):
-        data = Source(Sensor("/x", kind, 10.0, "frame", None)).message(1, 2 * S, now)
+        data = Source(Sensor("/x", kind, 10.0, "frame", None)).message(1, 2 * S, motion)
         messages[kind.partition("/")[2]] = store.deserialize_ros1(data, kind.replace("/", "/msg/"))
     odom, imu, fix = (messages[kind] for kind in ("Odometry", "Imu", "NavSatFix"))
-    half = math.sqrt(0.5)
+    half_sqrt = math.sqrt(0.5)
     assert (odom.pose.pose.position.x, odom.pose.pose.position.y) == (4.0, 2.0)
     assert (odom.child_frame_id, odom.twist.twist.linear.x) == ("base_link", 1.5)
-    for turned in (odom.pose.pose.orientation, imu.orientation):
-        assert (turned.x, turned.y, turned.z, turned.w) == pytest.approx((0, 0, half, half))
+    for orientation in (odom.pose.pose.orientation, imu.orientation):
+        assert (orientation.x, orientation.y, orientation.z, orientation.w) == pytest.approx(
+            (0, 0, half_sqrt, half_sqrt)
+        )
     across_m, up_m = FIX_NOISE_M
     assert fix.position_covariance.tolist() == pytest.approx([across_m**2, 0, 0, 0, across_m**2, 0, 0, 0, up_m**2])
     assert (fix.latitude, fix.longitude) == pytest.approx((400 / 110_574.28, 300 / 111_319.49), abs=5e-6)

@@ -1,4 +1,4 @@
-"""The robot's `ros2 bag record` writes real ROS 2 bags and behaves like the original."""
+"""The emulated robot's `ros2 bag record` writes ROS 2 bags and behaves like the original program."""
 
 import io
 import sqlite3
@@ -85,7 +85,7 @@ def robots() -> Iterator[Robots]:
     cast = {
         role: master[role].model_copy(update={"profile": ros2_profile(name)}) for role, name in distributions.items()
     }
-    # Debian's ROS is for robots with ROS 1; these get the built-in recorder anyway.
+    # Debian's ROS is for robots with ROS 1; robots with ROS 2 always have the built-in recorder.
     with testbed.bring_up(
         cast, options=EmulatedOptions(), world=load_world("lawn"), ros=RosChoice.DEBIAN, seed=1
     ) as emulation:
@@ -95,7 +95,7 @@ def robots() -> Iterator[Robots]:
 def record(
     robots: Robots,
     distribution: str,
-    into: Path,
+    target_folder: Path,
     argv: Sequence[str],
     *,
     signal: int = 2,
@@ -104,10 +104,10 @@ def record(
 ) -> Recording:
     driver = (sys.executable, "-c", DRIVER, str(signal), until, str(for_s), "ros2", "bag", "record", *argv)
     command = with_environment(driver, setup=ros_of(ros2_profile(distribution)).command.setup)
-    packed = robots[distribution].run(command, deadline=Deadline.after(180)).stdout
-    with tarfile.open(fileobj=io.BytesIO(packed)) as tar:
-        tar.extractall(into, filter="data")
-    return Recording(int((into / "code").read_text()), (into / "err").read_text())
+    archive = robots[distribution].run(command, deadline=Deadline.after(180)).stdout
+    with tarfile.open(fileobj=io.BytesIO(archive)) as tar:
+        tar.extractall(target_folder, filter="data")
+    return Recording(int((target_folder / "code").read_text()), (target_folder / "err").read_text())
 
 
 def scans(bag: Path, store: Stores) -> list[Any]:
@@ -165,15 +165,17 @@ def test_a_recording_is_a_complete_ros2_bag(
         with closing(sqlite3.connect(tmp_path / "scan" / file)) as database:
             topics = "SELECT name, type, serialization_format FROM topics"
             assert database.execute(topics).fetchall() == [("/scan", "sensor_msgs/msg/LaserScan", "cdr")]
-            ((stored,),) = database.execute("SELECT offered_qos_profiles FROM topics")
-            written = parse(stored, source="topics").data
-            assert written == (offered if distribution == "jazzy" else parse(offered, source="metadata").data)
+            ((stored_profiles,),) = database.execute("SELECT offered_qos_profiles FROM topics")
+            written_profiles = parse(stored_profiles, source="topics").data
+            assert written_profiles == (
+                offered if distribution == "jazzy" else parse(offered, source="metadata").data
+            )
             assert database.execute("SELECT count(*) FROM messages").fetchone() == (len(messages),)
 
 
 @pytest.mark.emulated
 @pytest.mark.parametrize(("distribution", "signal", "code"), [("foxy", 2, 2), ("foxy", 15, 0), ("jazzy", 2, 0)])
-def test_the_exit_code_is_that_of_the_distribution(
+def test_the_exit_code_equals_that_of_the_distribution(
     robots: Robots, tmp_path: Path, distribution: str, signal: int, code: int
 ) -> None:
     argv = ["-o", "x", "/none"]
@@ -190,15 +192,15 @@ def offered_by(connection: Connection) -> tuple[QosReliability, QosDurability]:
 
 
 @pytest.mark.emulated
-@pytest.mark.parametrize("words", [["-a"], ["--topics", "/scan", "odom", "tf", "imu", "battery_state"]])
-def test_every_topic_of_a_turtlebot_can_be_recorded(robots: Robots, tmp_path: Path, words: list[str]) -> None:
-    recording = record(robots, "jazzy", tmp_path, ["-o", "all", *words], until="Listening for topics", for_s=5.0)
+@pytest.mark.parametrize("arguments", [["-a"], ["--topics", "/scan", "odom", "tf", "imu", "battery_state"]])
+def test_every_topic_of_a_turtlebot_can_be_recorded(robots: Robots, tmp_path: Path, arguments: list[str]) -> None:
+    recording = record(robots, "jazzy", tmp_path, ["-o", "all", *arguments], until="Listening for topics", for_s=5.0)
     assert recording.code == 0, recording.output
     with Reader(tmp_path / "all") as reader:
         counts = {connection.topic: connection.msgcount for connection in reader.connections}
         offered = {connection.topic: offered_by(connection) for connection in reader.connections}
     rates_hz = {topic.name: topic.rate for topic in ros_of(ros2_profile("jazzy")).topics}
-    if "-a" in words:
+    if "-a" in arguments:
         rates_hz["/tf_static"] = 1  # one message in total, because it is latched
         assert counts["/tf_static"] == 1
         assert offered["/tf_static"] == (QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL)
@@ -210,7 +212,7 @@ def test_every_topic_of_a_turtlebot_can_be_recorded(robots: Robots, tmp_path: Pa
 
 @pytest.mark.emulated
 @pytest.mark.parametrize(
-    ("words", "code", "output"),
+    ("arguments", "code", "output"),
     [
         (["-o", ".", "/scan"], 1, "Output folder '.' already exists."),
         (["-o", "scan"], 1, "topics or --all"),
@@ -219,9 +221,9 @@ def test_every_topic_of_a_turtlebot_can_be_recorded(robots: Robots, tmp_path: Pa
     ],
 )
 def test_a_wrong_command_line_is_rejected(
-    robots: Robots, tmp_path: Path, words: list[str], code: int, output: str
+    robots: Robots, tmp_path: Path, arguments: list[str], code: int, output: str
 ) -> None:
-    recording = record(robots, "foxy", tmp_path, words, until="Listening")
+    recording = record(robots, "foxy", tmp_path, arguments, until="Listening")
     assert recording.code == code
     assert output in recording.output
     assert not (tmp_path / "scan").exists()

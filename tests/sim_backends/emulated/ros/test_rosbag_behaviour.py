@@ -1,6 +1,6 @@
-"""The robot's `rosbag` behaves like ROS's own: outputs, exit codes, files, signals.
+"""The emulated robot's `rosbag` behaves like that of ROS: outputs, exit codes, files, signals.
 
-`tests/data/rosbag/1.15.15/outputs.json` has the output and behaviour of ROS's own, verbatim. Run this file as a
+`tests/data/rosbag/1.15.15/outputs.json` has the output and behaviour of ROS's rosbag, verbatim. Run this file as a
 program to record them again: `python -m tests.sim_backends.emulated.ros.test_rosbag_behaviour`.
 """
 
@@ -24,7 +24,7 @@ from sim_backends.emulated.ros import rosbag
 from sim_backends.world.world import load_world
 from tests.helpers.paths import DATA
 
-RECORDED: Final = DATA / "rosbag" / "1.15.15"
+RECORDED_OUTPUTS: Final = DATA / "rosbag" / "1.15.15"
 SETUP: Final = "/opt/ros/noetic/setup.bash"
 
 # One case: command line after `rosbag`, files that exist before, the signal and its receiver after the bag is open:
@@ -60,7 +60,7 @@ CASES: Final[dict[str, dict[str, Any]]] = {
     },
 }
 
-# Runs one case on the robot. A recorder that outlives its wrapper gets some seconds to exit; then its files are
+# Runs one case on the robot. A recorder that outlives its wrapper has some seconds to exit. Then its files are
 # listed, and it is killed.
 DRIVER: Final = r"""
 import json, os, pathlib, signal, subprocess, sys, tempfile, time
@@ -110,27 +110,27 @@ print(json.dumps(result))
 Result = dict[str, Any]
 
 
-def observe(shell: Shell, case: dict[str, Any], *, patience_s: float) -> Result:
+def run_case(shell: Shell, case: dict[str, Any], *, patience_s: float) -> Result:
     argv = with_environment([sys.executable, "-c", DRIVER, json.dumps(case), str(patience_s)], setup=[SETUP])
     result: Result = json.loads(shell.run(argv, deadline=Deadline.after(180)).stdout)
     return result
 
 
-def comparable(result: Result) -> Result:
-    """Replace what changes from run to run: time stamps and dates."""
+def without_times(result: Result) -> Result:
+    """Replace time stamps and dates, which differ between runs."""
     text = json.dumps(result)
     text = re.sub(r"\[\d{10}\.\d{9}\]", "[STAMP]", text)
-    same: Result = json.loads(re.sub(r"\d{4}(-\d\d){5}", "DATE", text))
-    return same
+    normalized: Result = json.loads(re.sub(r"\d{4}(-\d\d){5}", "DATE", text))
+    return normalized
 
 
 def start_turtlebot(stack: ExitStack, ros: RosChoice) -> Shell:
     cast = EmulatedBackend(None, None).cast(Topology.MASTERLESS)
-    alone = {Role.SENDER: cast[Role.SENDER]}
-    up = stack.enter_context(
-        testbed.bring_up(alone, options=EmulatedOptions(), world=load_world("lawn"), ros=ros, seed=1)
+    sender_only = {Role.SENDER: cast[Role.SENDER]}
+    emulation = stack.enter_context(
+        testbed.bring_up(sender_only, options=EmulatedOptions(), world=load_world("lawn"), ros=ros, seed=1)
     )
-    return up.shells[Role.SENDER]
+    return emulation.shells[Role.SENDER]
 
 
 @pytest.fixture(scope="module", params=[RosChoice.BUILTIN, RosChoice.DEBIAN])
@@ -140,28 +140,28 @@ def shell(request: pytest.FixtureRequest) -> Iterator[Shell]:
 
 
 @pytest.fixture(scope="module")
-def observed() -> dict[str, Result]:
-    outputs: dict[str, Result] = json.loads((RECORDED / "outputs.json").read_text(encoding="utf-8"))
+def recorded_results() -> dict[str, Result]:
+    outputs: dict[str, Result] = json.loads((RECORDED_OUTPUTS / "outputs.json").read_text(encoding="utf-8"))
     return outputs
 
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("name", CASES)
-def test_rosbag_behaves_like_ros_s_own(name: str, shell: Shell, observed: dict[str, Result]) -> None:
-    patience_s = 1.0 if observed[name]["recorder_lives_on"] else 60.0
-    assert comparable(observe(shell, CASES[name], patience_s=patience_s)) == comparable(observed[name])
+def test_rosbag_behaves_like_that_of_ros(name: str, shell: Shell, recorded_results: dict[str, Result]) -> None:
+    patience_s = 1.0 if recorded_results[name]["recorder_lives_on"] else 60.0
+    assert without_times(run_case(shell, CASES[name], patience_s=patience_s)) == without_times(recorded_results[name])
 
 
-@pytest.mark.parametrize("bag", sorted(path.name for path in RECORDED.glob("*.bag*")))
+@pytest.mark.parametrize("bag", sorted(path.name for path in RECORDED_OUTPUTS.glob("*.bag*")))
 def test_info_prints_the_same_as_that_of_ros(
     bag: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("TZ", "UTC")
-    monkeypatch.chdir(RECORDED)
+    monkeypatch.chdir(RECORDED_OUTPUTS)
     monkeypatch.setattr(sys, "argv", ["rosbag", "info", bag])
     exit_code = rosbag.main()
     out, err = capsys.readouterr()
-    expected = json.loads((RECORDED / "info.json").read_text(encoding="utf-8"))[bag]
+    expected = json.loads((RECORDED_OUTPUTS / "info.json").read_text(encoding="utf-8"))[bag]
     assert {"exit_code": exit_code, "stdout": out, "stderr": err} == expected
 
 
@@ -170,7 +170,7 @@ def test_every_option_is_one_of_the_original(capsys: pytest.CaptureFixture[str])
         rosbag.record(["--help"])
     assert stopped.value.code == 0
     builtin = capsys.readouterr().out
-    original = (RECORDED / "record-help.txt").read_text(encoding="utf-8")
+    original = (RECORDED_OUTPUTS / "record-help.txt").read_text(encoding="utf-8")
     assert builtin.splitlines()[:5] == original.splitlines()[:5]
     assert set(re.findall(r"-[a-zA-Z]\b|--[a-z0-9-]+", builtin)) <= set(
         re.findall(r"-[a-zA-Z]\b|--[a-z0-9-]+", original)
@@ -178,11 +178,11 @@ def test_every_option_is_one_of_the_original(capsys: pytest.CaptureFixture[str])
 
 
 def main() -> None:
-    """Record the behaviour of ROS's own rosbag again."""
+    """Record the behaviour of ROS's rosbag again."""
     with ExitStack() as stack:
         shell = start_turtlebot(stack, RosChoice.DEBIAN)
-        outputs = {name: observe(shell, case, patience_s=5.0) for name, case in CASES.items()}
-    (RECORDED / "outputs.json").write_text(json.dumps(outputs, indent=1) + "\n", encoding="utf-8")
+        outputs = {name: run_case(shell, case, patience_s=5.0) for name, case in CASES.items()}
+    (RECORDED_OUTPUTS / "outputs.json").write_text(json.dumps(outputs, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

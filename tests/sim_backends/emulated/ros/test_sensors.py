@@ -1,4 +1,4 @@
-"""Sensors publish what is due to their subscribers, never wait for one of them, and load no unneeded modules."""
+"""Sensors publish due messages to their subscribers, never wait for a subscriber, and load no unneeded modules."""
 
 import json
 import math
@@ -24,8 +24,8 @@ HEADER: Final = framing.pack(b"the header")
 REQUEST: Final = tcpros.request("/test", "/imu")
 IMU: Final = Sensor("/imu", "sensor_msgs/Imu", rate_hz=5.0, frame="imu", points=None)
 
-# Forks with an open descriptor, as a robot's init process does; the fork prints its state, and fails.
-FORKED: Final = """
+# Forks with an open descriptor, as a robot's init process does; the fork prints its state and raises an error.
+FORK_PROGRAM: Final = """
 import json, os, signal, sys
 from pathlib import Path
 from sim_backends.emulated.robot import services
@@ -51,7 +51,7 @@ print(os.waitstatus_to_exitcode(status))
 
 
 class Peer:
-    """A subscriber and its other end."""
+    """A subscriber of a publication, and the other end of its connection."""
 
     def __init__(self) -> None:
         self.selector = selectors.DefaultSelector()
@@ -65,7 +65,7 @@ class Peer:
                 key.data(events)
 
     def output(self) -> list[bytes]:
-        """Return all packets that it has sent."""
+        """Return all packets that were sent to the subscriber."""
         packets = framing.PacketSplitter()
         self.stream.setblocking(False)
         while True:
@@ -91,7 +91,7 @@ def peer() -> Iterator[Peer]:
         peer.serve_all()
 
 
-def test_a_subscriber_is_answered_once_its_request_is_complete(peer: Peer) -> None:
+def test_a_subscriber_is_answered_when_its_request_is_complete(peer: Peer) -> None:
     for byte in REQUEST[:-1]:
         peer.stream.send(bytes([byte]))
         peer.serve_all()
@@ -112,7 +112,7 @@ def test_a_subscriber_with_another_protocol_is_disconnected(peer: Peer, data: by
     assert peer.stream.recv(1) == b""
 
 
-def test_a_closed_subscriber_is_removed_and_gets_nothing(peer: Peer) -> None:
+def test_a_closed_subscriber_is_removed_and_receives_nothing(peer: Peer) -> None:
     peer.stream.send(REQUEST)
     peer.serve_all()
     peer.stream.close()
@@ -129,12 +129,12 @@ def test_a_closed_subscriber_is_detected_while_sending(peer: Peer) -> None:
 
 def test_a_slow_subscriber_loses_whole_messages_without_blocking(peer: Peer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sensors, "QUEUE_BYTES", 1 << 16)
-    sent = [bytes([number]) * 50_000 for number in range(100)]
-    for message in sent:
+    messages_sent = [bytes([number]) * 50_000 for number in range(100)]
+    for message in messages_sent:
         peer.subscriber.send(framing.pack(message))
-    received = peer.output()
-    assert 2 <= len(received) < len(sent)
-    assert received == sent[: len(received)]
+    messages_received = peer.output()
+    assert 2 <= len(messages_received) < len(messages_sent)
+    assert messages_received == messages_sent[: len(messages_received)]
     peer.subscriber.send(framing.pack(b"again"))
     assert peer.output() == [b"again"]
 
@@ -169,8 +169,8 @@ class Topic:
                 key.data(events)
 
 
-def received(stream: socket.socket) -> list[Any]:
-    """Return the connection header, if it is new, and the numbers of the messages received."""
+def read_messages(stream: socket.socket) -> list[Any]:
+    """Return the connection header, if it was received, and the numbers of the received messages."""
     packets = framing.PacketSplitter()
     packets.feed(stream.recv(1 << 20, socket.MSG_DONTWAIT))
     return [
@@ -189,7 +189,7 @@ def test_messages_are_numbered_and_due_by_the_clock_also_after_a_pause(
     assert topic.publication.publish() == pytest.approx(0.09)
     topic.now_s = 1000.41
     assert topic.publication.publish() == pytest.approx(0.19)
-    header, *numbers = received(first)
+    header, *numbers = read_messages(first)
     assert header["topic"] == "/imu"
     assert header["md5sum"] == definition(IMU.type).md5
     assert header["message_definition"] == definition(IMU.type).text
@@ -197,7 +197,7 @@ def test_messages_are_numbered_and_due_by_the_clock_also_after_a_pause(
     topic.now_s = 1000.85  # the process was delayed: overdue messages are sent immediately, in order
     topic.publication.publish()
     assert topic.publication.publish() == pytest.approx(0.15)
-    assert received(first) == [3, 4]
+    assert read_messages(first) == [3, 4]
     first.close()
     topic.serve()
     assert topic.publication.publish() == math.inf
@@ -206,7 +206,7 @@ def test_messages_are_numbered_and_due_by_the_clock_also_after_a_pause(
     assert topic.publication.publish() == pytest.approx(0.15)
     topic.now_s = 4600.21
     topic.publication.publish()
-    assert received(second)[1:] == [18001]
+    assert read_messages(second)[1:] == [18001]
     second.close()
 
 
@@ -214,7 +214,7 @@ def test_a_socket_left_by_a_killed_process_is_replaced(monkeypatch: pytest.Monke
     Topic(monkeypatch, tmp_path)
     topic = Topic(monkeypatch, tmp_path)
     stream = topic.subscriber()
-    assert len(received(stream)) == 1
+    assert len(read_messages(stream)) == 1
     stream.close()
 
 
@@ -230,7 +230,9 @@ def test_the_noise_does_not_depend_on_the_process() -> None:
 
 def test_a_fork_has_its_own_name_session_log_and_descriptors(tmp_path: Path) -> None:
     log = tmp_path / "log"
-    result = subprocess.run((sys.executable, "-c", FORKED, str(log)), capture_output=True, text=True, check=True)
+    result = subprocess.run(
+        (sys.executable, "-c", FORK_PROGRAM, str(log)), capture_output=True, text=True, check=True
+    )
     assert result.stdout == "1\n"
     output, *trace = log.read_text(encoding="utf-8").splitlines()
     assert json.loads(output) == {"name": "worker", "session": True, "open": [0, 1, 2], "wakes": -1, "children": True}
@@ -239,8 +241,8 @@ def test_a_fork_has_its_own_name_session_log_and_descriptors(tmp_path: Path) -> 
 
 def test_robot_processes_import_only_the_standard_library() -> None:
     """numpy and rosbags, which the lab has, would cost each robot 20 MB and most of its startup time."""
-    imported = "import sim_backends.emulated.robot.init"
-    program = f"import sys; before = set(sys.modules); {imported}; print(*set(sys.modules) - before)"
+    import_statement = "import sim_backends.emulated.robot.init"
+    program = f"import sys; before = set(sys.modules); {import_statement}; print(*set(sys.modules) - before)"
     result = subprocess.run((sys.executable, "-c", program), capture_output=True, text=True, check=True)
-    foreign = {name.split(".")[0] for name in result.stdout.split()} - sys.stdlib_module_names
-    assert foreign == {"fieldkit", "sim_backends"}
+    other_packages = {name.split(".")[0] for name in result.stdout.split()} - sys.stdlib_module_names
+    assert other_packages == {"fieldkit", "sim_backends"}

@@ -41,11 +41,19 @@ def test_a_turtlebots_frames_are_those_of_its_description() -> None:
 
 def test_the_message_can_be_deserialized_by_ros_1() -> None:
     links = (("base_link", "a"), ("base_link", "b"))
-    read: Any = standard_types().ros1.deserialize_ros1(
+    message: Any = standard_types().ros1.deserialize_ros1(
         static_frames.message(links, 3_000_000_004), "tf2_msgs/msg/TFMessage"
     )
-    for (parent, child), transform in zip(links, read.transforms, strict=True):
+    for (parent, child), transform in zip(links, message.transforms, strict=True):
         assert (transform.header.frame_id, transform.child_frame_id) == (parent, child)
         assert (transform.header.stamp.sec, transform.header.stamp.nanosec) == (3, 4)
-        move, turn = transform.transform.translation, transform.transform.rotation
-        assert (move.x, move.y, move.z, turn.x, turn.y, turn.z, turn.w) == (0, 0, 0, 0, 0, 0, 1)
+        translation, rotation = transform.transform.translation, transform.transform.rotation
+        assert (translation.x, translation.y, translation.z, rotation.x, rotation.y, rotation.z, rotation.w) == (
+            0,
+            0,
+            0,
+            0,
+            0,
+            0,
+            1,
+        )

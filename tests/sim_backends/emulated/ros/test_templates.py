@@ -39,16 +39,16 @@ def topic(text: str) -> PublishedTopic:
 
 def read_message(topic: PublishedTopic) -> Any:  # noqa: ANN401 (rosbags makes its classes as it goes)
     store = get_typestore(Stores.ROS1_NOETIC)
-    kind = topic.type.replace("/", "/msg/")
+    message_type = topic.type.replace("/", "/msg/")
     if topic.definition:
-        store.register(get_types_from_msg(topic.definition, kind))
+        store.register(get_types_from_msg(topic.definition, message_type))
     data = messages.Source(_sensor(topic)).message(7, 1_500_000_000_123_456_789)
-    message = store.deserialize_ros1(data, kind)
-    assert bytes(store.serialize_ros1(message, kind)) == data, "to the last byte"
+    message = store.deserialize_ros1(data, message_type)
+    assert bytes(store.serialize_ros1(message, message_type)) == data, "to the last byte"
     return message
 
 
-def custom(definition: str, keys: str) -> PublishedTopic:
+def custom_topic(definition: str, keys: str) -> PublishedTopic:
     return topic(f"type: my_msgs/Scan, {keys}").model_copy(update={"definition": definition})
 
 
@@ -83,17 +83,17 @@ def test_a_point_cloud_holds_finite_points_of_four_floats() -> None:
     assert source.message(1, 0)[20:] != source.message(2, 0)[20:]
 
 
-def test_a_custom_type_is_filled_by_its_definition() -> None:
-    message = read_message(custom(LIDAR, "size: 3kB"))
+def test_a_message_of_a_custom_type_is_filled_by_its_definition() -> None:
+    message = read_message(custom_topic(LIDAR, "size: 3kB"))
     assert len(message.packets) == 0
-    assert len(message.first.data) == 3000, "the first list of numbers, wherever it is"
+    assert len(message.first.data) == 3000, "the first list of numbers, also in an inner message"
     assert (len(message.ranges), len(message.rest), message.names) == (0, 0, ["", ""])
     assert (message.pose.orientation.w, message.pose.orientation.x) == (1.0, 0.0)
     assert not message.bias.any()
 
 
 def test_a_type_without_a_header_begins_with_its_fields() -> None:
-    message = read_message(custom(PLAIN, "size: 400B"))
+    message = read_message(custom_topic(PLAIN, "size: 400B"))
     assert (message.number, len(message.samples)) == (0, 100)
     assert np.isfinite(message.samples).all()
 
@@ -110,19 +110,19 @@ def test_the_md5_sum_of_a_definition_is_that_of_ros() -> None:
 
 
 @pytest.mark.parametrize(
-    ("published", "error_text"),
+    ("topic_spec", "error_text"),
     [
         (topic("type: my_msgs/Scan"), "cannot publish my_msgs/Scan"),
-        (custom("other_msgs/Thing thing\n", ""), "cannot publish my_msgs/Scan"),
-        (custom("float32 3x = [\n", ""), "definition of my_msgs/Scan cannot be read"),
+        (custom_topic("other_msgs/Thing thing\n", ""), "cannot publish my_msgs/Scan"),
+        (custom_topic("float32 3x = [\n", ""), "definition of my_msgs/Scan cannot be read"),
         (topic("type: std_msgs/String, size: 10B"), "no list of numbers whose size can be 10 bytes"),
-        (custom(PLAIN, "size: 401B"), "no list of numbers whose size can be 401 bytes"),
+        (custom_topic(PLAIN, "size: 401B"), "no list of numbers whose size can be 401 bytes"),
     ],
 )
-def test_unsupported_types_are_rejected_with_a_remedy(published: PublishedTopic, error_text: str) -> None:
-    with pytest.raises(ConfigurationError, match=error_text) as caught:
-        templates.template_of(published)
-    assert caught.value.remedy
+def test_unsupported_types_are_rejected_with_a_remedy(topic_spec: PublishedTopic, error_text: str) -> None:
+    with pytest.raises(ConfigurationError, match=error_text) as error_info:
+        templates.template_of(topic_spec)
+    assert error_info.value.remedy
 
 
 def test_a_template_has_serialized_head_and_tail() -> None:

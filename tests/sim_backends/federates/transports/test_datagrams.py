@@ -35,7 +35,7 @@ Forward = Callable[[bytes, bool], list[bytes]]
 """Returns the datagrams that the network delivers when it receives one; the flag is the direction."""
 
 
-def after_s(duration_s: float) -> float:
+def deadline_after(duration_s: float) -> float:
     return time.monotonic() + duration_s
 
 
@@ -67,11 +67,11 @@ class Network:
                     self.count += 1
                     if side is self._client_side:
                         self._client = peer
-                    for forwarded in self.forward(datagram, side is self._client_side):
+                    for forwarded_datagram in self.forward(datagram, side is self._client_side):
                         if side is self._client_side:
-                            self._server_side.send(forwarded)
+                            self._server_side.send(forwarded_datagram)
                         else:
-                            self._client_side.sendto(forwarded, self._client)
+                            self._client_side.sendto(forwarded_datagram, self._client)
 
     def stop(self) -> None:
         self._stopped.set()
@@ -80,47 +80,49 @@ class Network:
         self._server_side.close()
 
 
-def unchanged(datagram: bytes, _: bool) -> list[bytes]:
+def forward_unchanged(datagram: bytes, _: bool) -> list[bytes]:
     return [datagram]
 
 
-def lossy(seed: int) -> Forward:
+def make_lossy(seed: int) -> Forward:
     """Return a network that loses 20 % of the datagrams, repeats 10 %, and delays 10 % until after the next one."""
-    draws = random.Random(seed)
+    rng = random.Random(seed)
     delayed_by_direction: dict[bool, list[bytes]] = {True: [], False: []}
 
     def forward(datagram: bytes, is_to_server: bool) -> list[bytes]:
-        draw, delayed = draws.random(), delayed_by_direction[is_to_server]
-        if draw < 0.2:
+        draw_value, delayed_datagrams = rng.random(), delayed_by_direction[is_to_server]
+        if draw_value < 0.2:
             return []
-        if draw < 0.3:
-            delayed.append(datagram)
+        if draw_value < 0.3:
+            delayed_datagrams.append(datagram)
             return []
-        late = tuple(delayed)
-        delayed.clear()
-        return [datagram] * (2 if draw < 0.4 else 1) + list(late)
+        released_datagrams = tuple(delayed_datagrams)
+        delayed_datagrams.clear()
+        return [datagram] * (2 if draw_value < 0.4 else 1) + list(released_datagrams)
 
     return forward
 
 
 @contextmanager
-def connected(forward: Forward) -> Iterator[tuple[FrameChannel, FrameChannel, Network]]:
-    """Yield both channels of a connection: of the side that connected, of the side that listened; and the network."""
+def open_connection(forward: Forward) -> Iterator[tuple[FrameChannel, FrameChannel, Network]]:
+    """Yield the channel of the side that connected, the channel of the side that listened, and the network."""
     port = free_port()
     network = Network(port, forward)
     hello = encode(MessageKind.PING, 0, 0, b"8 bytes.")
     try:
         with UdpAddress("udp", "127.0.0.1", port, listens=True).listen() as listener:
-            accepted: list[FrameChannel] = []
-            thread = threading.Thread(target=lambda: accepted.append(listener.accept(after_s(30))), daemon=True)
+            accepted_channels: list[FrameChannel] = []
+            thread = threading.Thread(
+                target=lambda: accepted_channels.append(listener.accept(deadline_after(30))), daemon=True
+            )
             thread.start()
-            federate_end = UdpAddress("udp", "127.0.0.1", network.port).connect(after_s(30))
-            federate_end.send(hello, after_s(30))
+            federate_end = UdpAddress("udp", "127.0.0.1", network.port).connect(deadline_after(30))
+            federate_end.send(hello, deadline_after(30))
             while thread.is_alive():
                 with suppress(DeadlineError):
-                    federate_end.receive(after_s(0.05))
-            with closing(federate_end), closing(accepted[0]) as coordinator_end:
-                assert coordinator_end.receive(after_s(30)).body == b"8 bytes."
+                    federate_end.receive(deadline_after(0.05))
+            with closing(federate_end), closing(accepted_channels[0]) as coordinator_end:
+                assert coordinator_end.receive(deadline_after(30)).body == b"8 bytes."
                 yield federate_end, coordinator_end, network
     finally:
         network.stop()
@@ -131,20 +133,20 @@ def exchange(federate_end: FrameChannel, coordinator_end: FrameChannel, bodies: 
 
     def answer() -> None:
         for body in bodies:
-            assert coordinator_end.receive(after_s(60)).body == body
-            coordinator_end.send(encode(MessageKind.STATES, 1, 0, body), after_s(60))
+            assert coordinator_end.receive(deadline_after(60)).body == body
+            coordinator_end.send(encode(MessageKind.STATES, 1, 0, body), deadline_after(60))
         # The last answer is resent until it is acknowledged; the network may lose the end of the connection.
         with suppress(ClosedError):
             while not closed.is_set():
                 with suppress(DeadlineError):
-                    coordinator_end.receive(after_s(0.1))
+                    coordinator_end.receive(deadline_after(0.1))
 
     closed = threading.Event()
     thread = threading.Thread(target=answer, daemon=True)
     thread.start()
     for body in bodies:
-        federate_end.send(encode(MessageKind.PING, 1, 0, body), after_s(60))
-        assert federate_end.receive(after_s(60)).body == body
+        federate_end.send(encode(MessageKind.PING, 1, 0, body), deadline_after(60))
+        assert federate_end.receive(deadline_after(60)).body == body
     federate_end.close()
     closed.set()
     thread.join(60)
@@ -153,29 +155,29 @@ def exchange(federate_end: FrameChannel, coordinator_end: FrameChannel, bodies: 
 
 @pytest.mark.parametrize("seed", mark_nightly([1, 2, 3, 4]))
 def test_lost_repeated_and_reordered_datagrams_change_nothing(seed: int) -> None:
-    draws = random.Random(seed)
-    bodies = [draws.randbytes(draws.choice((0, 8, 700, 1160, 5000))) for _ in range(15)]
-    bodies += [draws.randbytes(100_000)]  # more than the window
-    with connected(lossy(seed)) as (federate_end, coordinator_end, network):
+    rng = random.Random(seed)
+    bodies = [rng.randbytes(rng.choice((0, 8, 700, 1160, 5000))) for _ in range(15)]
+    bodies += [rng.randbytes(100_000)]  # more than the window
+    with open_connection(make_lossy(seed)) as (federate_end, coordinator_end, network):
         exchange(federate_end, coordinator_end, bodies)
         assert network.count > 2 * len(bodies)
 
 
 def test_an_answer_acknowledges_the_request_so_that_an_exchange_has_two_datagrams() -> None:
-    with connected(unchanged) as (federate_end, coordinator_end, network):
+    with open_connection(forward_unchanged) as (federate_end, coordinator_end, network):
         federate_end._timer.interval_s = coordinator_end._timer.interval_s = 10.0  # type: ignore[attr-defined]
-        before = network.count
+        count_before = network.count
         exchange(federate_end, coordinator_end, [bytes(700)] * 20)
-        assert network.count - before <= 40 + 6
+        assert network.count - count_before <= 40 + 6
 
 
 def test_datagrams_of_other_programs_are_ignored() -> None:
-    with connected(unchanged) as (federate_end, coordinator_end, network):
+    with open_connection(forward_unchanged) as (federate_end, coordinator_end, network):
         header = DatagramHeader(DatagramKind.DATA, federate_end._identity[0], 12345, federate_end._number)  # type: ignore[attr-defined]
-        forged = [pack_datagram(header, b"forged"), b"", b"garbage" * 20, pack_datagram(header)[:30]]
+        forged_datagrams = [pack_datagram(header, b"forged"), b"", b"garbage" * 20, pack_datagram(header)[:30]]
         close = DatagramHeader(DatagramKind.CLOSE, federate_end._identity[0], 0, federate_end._number)  # type: ignore[attr-defined]
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-            for datagram in (*forged, pack_datagram(close)):
+            for datagram in (*forged_datagrams, pack_datagram(close)):
                 other.sendto(datagram, ("127.0.0.1", network.port))
                 other.sendto(datagram, coordinator_end._socket.getsockname())  # type: ignore[attr-defined]
         network._client = federate_end._socket.getsockname()  # type: ignore[attr-defined]
@@ -194,7 +196,7 @@ def test_only_a_program_that_returns_the_cookie_of_its_address_is_accepted() -> 
             endpoint.settimeout(20)
         forger.send(pack_datagram(DatagramHeader(DatagramKind.OPEN, 7)))
         with pytest.raises(DeadlineError, match="no program has connected"):
-            listener.accept(after_s(0.05))
+            listener.accept(deadline_after(0.05))
         cookie = unpack_datagram(forger.recv(2000))
         assert cookie is not None
         assert (cookie.kind, cookie.connection) == (DatagramKind.COOKIE, 7)
@@ -202,26 +204,26 @@ def test_only_a_program_that_returns_the_cookie_of_its_address_is_accepted() -> 
         other.send(data)  # the cookie of another address
         forger.send(pack_datagram(DatagramHeader(DatagramKind.DATA, 7, cookie.cookie ^ 1)))
         with pytest.raises(DeadlineError):
-            listener.accept(after_s(0.05))
+            listener.accept(deadline_after(0.05))
         forger.send(data)
-        listener.accept(after_s(20)).close()
+        listener.accept(deadline_after(20)).close()
 
 
-def test_the_other_process_has_exited_or_closed() -> None:
-    with connected(unchanged) as (federate_end, coordinator_end, _):
+def test_a_closed_connection_is_an_error_at_the_other_end() -> None:
+    with open_connection(forward_unchanged) as (federate_end, coordinator_end, _):
         coordinator_end.close()
         with pytest.raises(ClosedError):
-            federate_end.receive(after_s(20))
+            federate_end.receive(deadline_after(20))
 
 
-def test_a_process_that_exits_is_noticed_by_the_refusal_of_its_machine() -> None:
+def test_an_exit_of_the_peer_is_detected_by_the_icmp_error_of_its_host() -> None:
     sender, peer = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
     peer.bind(("127.0.0.1", 0))
     sender.connect(peer.getsockname())
     peer.close()
     channel = datagrams.DatagramChannel(sender, 1, 2)
     with pytest.raises(ClosedError, match="the connection was closed"):
-        channel.receive(after_s(20))
+        channel.receive(deadline_after(20))
     channel.close()
 
 
@@ -240,7 +242,7 @@ def test_the_timer_follows_rfc_6298() -> None:
     assert timer.interval_s == 0.02
 
 
-def test_the_layout_by_hand() -> None:
+def test_the_layout_of_a_datagram_equals_that_written_by_hand() -> None:
     frame = encode(MessageKind.BYE, 0, 0)
     datagram = pack_datagram(DatagramHeader(DatagramKind.DATA, 1, 2, 3, 4), frame)
     assert datagram == b"FKUD" + struct.pack("<BBHQQQQ", 1, 3, 0, 1, 2, 3, 4) + frame
@@ -250,7 +252,7 @@ def test_the_layout_by_hand() -> None:
     assert unpack_datagram(b"FKUD" + struct.pack("<BBHQQQQ", 2, 3, 0, 1, 2, 3, 4)) is None
 
 
-def test_the_example_of_the_page() -> None:
+def test_the_example_of_the_documentation_is_a_datagram() -> None:
     page = (ROOT / "docs" / "reference" / "federate-protocol.md").read_text(encoding="utf-8")
     header = DatagramHeader(DatagramKind.DATA, 0x1122334455667788, 0xA1B2C3D4E5F60718, 5, 4)
     datagram = pack_datagram(header, encode(MessageKind.PING, 3, 0, encode_number(42)))

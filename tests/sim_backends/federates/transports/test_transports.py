@@ -1,4 +1,4 @@
-"""Each transport: addresses, tokens, order of starts, several runs, large frames; the page lists all of them."""
+"""Each transport: addresses, tokens, order of starts, several runs, and large frames; the documentation lists all."""
 
 import re
 import socket
@@ -28,11 +28,11 @@ from tests.helpers.federate_transports import SCHEMES, new_addresses, ros_master
 from tests.helpers.paths import ROOT
 
 MS: Final = 1_000_000
-MANY: Final = [
+MANY_AGENTS: Final = [
     AgentStart(f"r{number}", "husky", State((float(number), 0.0, 0.0), heading_rad=0.0)) for number in range(2000)
 ]
 
-WRITE_EARLY: Final = """
+EARLY_WRITER: Final = """
 import sys
 from sim_backends.federates.transports.dds import DdsBus, parse
 
@@ -51,7 +51,7 @@ def federates() -> Iterator[Federates]:
         yield forked
 
 
-def test_the_page_lists_every_form_of_address() -> None:
+def test_the_documentation_lists_every_form_of_address() -> None:
     page = (ROOT / "docs" / "federates.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `((?:[a-z0-9]+)(?:-listen)?:[^`]*)` \|", page, re.MULTILINE)
     assert rows == FORMS
@@ -85,9 +85,9 @@ def test_a_token_is_needed_beyond_loopback(address: str, monkeypatch: pytest.Mon
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_federate_serves_several_runs_with_large_frames(scheme: str, federates: Federates) -> None:
-    served_at, address = new_addresses(scheme)
-    federates.start("physics", "none", served_at, runs=3)
-    large_hello = replace(HELLO, agents=MANY)  # 144 kB of states in each answer
+    federate_address, address = new_addresses(scheme)
+    federates.start("physics", "none", federate_address, runs=3)
+    large_hello = replace(HELLO, agents=MANY_AGENTS)  # 144 kB of states in each answer
     for hello in (HELLO, large_hello, HELLO):
         with closing(open_physics(address, hello, 30.0)) as physics:
             for step in range(5):
@@ -96,34 +96,34 @@ def test_a_federate_serves_several_runs_with_large_frames(scheme: str, federates
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_the_coordinator_may_be_first(scheme: str, federates: Federates) -> None:
-    served_at, address = new_addresses(scheme)
-    federates.start("physics", "none", served_at, delay_s=0.5)
+def test_the_coordinator_may_start_first(scheme: str, federates: Federates) -> None:
+    federate_address, address = new_addresses(scheme)
+    federates.start("physics", "none", federate_address, delay_s=0.5)
     with closing(open_physics(address, HELLO, 30.0)) as physics:
         assert physics.advance(0, {})["ann"] == HELLO.agents[0].start
 
 
 def test_a_federate_may_connect_by_udp(federates: Federates) -> None:
-    listened_at, connected_to = new_addresses("udp")
-    federates.start("physics", "none", connected_to)
-    with closing(open_physics(listened_at, HELLO, 30.0)) as physics:
+    listening_address, connecting_address = new_addresses("udp")
+    federates.start("physics", "none", connecting_address)
+    with closing(open_physics(listening_address, HELLO, 30.0)) as physics:
         assert physics.advance(0, {})
 
 
 def test_a_hello_that_is_sent_before_discovery_arrives(federates: Federates, monkeypatch: pytest.MonkeyPatch) -> None:
     """The sides discover each other at different times: the coordinator may send before the federate can receive."""
     monkeypatch.setattr(DdsBus, "has_peer", lambda _: True)
-    served_at, address = new_addresses("dds")
-    federates.start("physics", "none", served_at, delay_s=0.5)
+    federate_address, address = new_addresses("dds")
+    federates.start("physics", "none", federate_address, delay_s=0.5)
     with closing(open_physics(address, HELLO, 30.0)) as physics:
         assert physics.advance(0, {})["ann"] == HELLO.agents[0].start
 
 
 def test_the_last_answers_reach_a_coordinator_that_discovers_their_writer_late() -> None:
-    """The last two samples are kept, because an error is followed by the end of the run."""
+    """A writer keeps its last two samples, because the sample after an error is the end of the run."""
     address = new_addresses("dds")[1]
     with subprocess.Popen(
-        (sys.executable, "-c", WRITE_EARLY, address), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        (sys.executable, "-c", EARLY_WRITER, address), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as writer:
         assert writer.stdout is not None
         assert writer.stdout.readline() == "written\n"
@@ -139,8 +139,8 @@ def test_the_last_answers_reach_a_coordinator_that_discovers_their_writer_late()
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_federate_refuses_a_wrong_token(scheme: str, federates: Federates, monkeypatch: pytest.MonkeyPatch) -> None:
-    served_at, address = new_addresses(scheme)
-    federates.start("physics", "none", served_at)
+    federate_address, address = new_addresses(scheme)
+    federates.start("physics", "none", federate_address)
     monkeypatch.setenv(TOKEN_VARIABLE, "wrong")
     with pytest.raises(FieldkitError, match="PermissionError: the token is wrong"):
         open_physics(address, HELLO, 30.0)
@@ -149,8 +149,8 @@ def test_a_federate_refuses_a_wrong_token(scheme: str, federates: Federates, mon
 @pytest.mark.parametrize("scheme", ["dds", "ros1"])
 def test_both_federates_of_a_run_may_use_one_transport(scheme: str, federates: Federates) -> None:
     addresses = [new_addresses(scheme) for _ in range(2)]
-    for role, (served_at, _) in zip(("physics", "network"), addresses, strict=True):
-        federates.start(role, "none", served_at)
+    for role, (federate_address, _) in zip(("physics", "network"), addresses, strict=True):
+        federates.start(role, "none", federate_address)
     with (
         closing(open_physics(addresses[0][1], HELLO, 30.0)) as physics,
         closing(open_network(addresses[1][1], replace(HELLO, role=NETWORK), 30.0)) as network,
@@ -167,13 +167,13 @@ def test_both_federates_of_a_run_may_use_one_transport(scheme: str, federates: F
         ("ros1", "no federate has been discovered at ros1:"),
     ],
 )
-def test_no_federate_within_the_deadline(scheme: str, message: str, federates: Federates) -> None:
-    with pytest.raises(UnansweredError, match=message) as raised:
+def test_no_federate_within_the_deadline_is_an_error(scheme: str, message: str, federates: Federates) -> None:
+    with pytest.raises(UnansweredError, match=message) as error_info:
         open_physics(new_addresses(scheme)[1], HELLO, 0.3)
-    assert raised.value.exit_code == 3
+    assert error_info.value.exit_code == 3
 
 
-def test_no_master_within_the_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_master_within_the_deadline_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     monkeypatch.setenv("ROS_MASTER_URI", f"http://127.0.0.1:{port}")

@@ -40,14 +40,16 @@ def test_slow_start_grows_by_acknowledged_bytes_up_to_the_threshold(make: Callab
     assert not control.in_slow_start
 
 
-@pytest.mark.parametrize(("segments", "acked", "growth"), [(1, 1, 1), (1, 2, 1), (2, 2, 2), (2, 3, 2), (None, 9, 9)])
-def test_the_growth_per_ack_can_be_limited(segments: int | None, acked: int, growth: int) -> None:
+@pytest.mark.parametrize(
+    ("segments", "acked_segments", "growth"), [(1, 1, 1), (1, 2, 1), (2, 2, 2), (2, 3, 2), (None, 9, 9)]
+)
+def test_the_growth_per_ack_can_be_limited(segments: int | None, acked_segments: int, growth: int) -> None:
     control = NewReno(TcpOptions(bytes_counted_segments=segments))
-    control.on_ack(0, acked * MSS, 20 * MS)
+    control.on_ack(0, acked_segments * MSS, 20 * MS)
     assert control.window_bytes == (10 + growth) * MSS
 
 
-def test_reno_halves_the_flight_and_grows_by_a_segment_per_round_trip() -> None:
+def test_reno_halves_the_window_and_grows_by_a_segment_per_round_trip() -> None:
     control = NewReno(TcpOptions())
     control.on_loss(80 * MSS)
     assert control.window_bytes == control.threshold_bytes == 40 * MSS
@@ -64,7 +66,7 @@ def test_a_repeated_timeout_keeps_the_threshold() -> None:
     assert (control.window_bytes, control.threshold_bytes) == (MSS, 50 * MSS)
 
 
-def after_a_loss(max_segments: int) -> Cubic:
+def cubic_after_a_loss(max_segments: int) -> Cubic:
     """Return a window that was reduced for the first time when it had `max_segments` segments."""
     control = Cubic(TcpOptions(initial_window_segments=max_segments))
     control.on_loss(max_segments * MSS)
@@ -73,7 +75,7 @@ def after_a_loss(max_segments: int) -> Cubic:
 
 @pytest.mark.parametrize(("max_segments", "round_trip_ms"), [(1000, 100), (400, 100), (300, 200)])
 def test_cubic_follows_its_curve(max_segments: int, round_trip_ms: int) -> None:
-    control = after_a_loss(max_segments)
+    control = cubic_after_a_loss(max_segments)
     assert control.window_bytes == max_segments * MSS * 7 // 10
     # RFC 9438: W(t) = C (t - K)^3 + W_max, K = cbrt((W_max - cwnd) / C), with C = 0.4, cwnd = 0.7 W_max.
     plateau_s = (0.3 * max_segments / 0.4) ** (1 / 3)
@@ -85,16 +87,16 @@ def test_cubic_follows_its_curve(max_segments: int, round_trip_ms: int) -> None:
 
 def test_cubic_is_not_slower_than_reno_with_its_reduction() -> None:
     # RFC 9438, 4.3: AIMD with 3 (1 - 0.7) / (1 + 0.7) = 0.53 segments per round trip, and one once W_max is reached.
-    control = after_a_loss(20)
+    control = cubic_after_a_loss(20)
     samples = windows(control, 0.8, round_trip_ns=10 * MS)
-    reached_s = (20 - 14) / (9 / 17) * 0.01
+    maximum_s = (20 - 14) / (9 / 17) * 0.01
     for at_s, window in samples:
-        expected = 14 + 9 / 17 * at_s / 0.01 if at_s < reached_s else 20 + (at_s - reached_s) / 0.01
+        expected = 14 + 9 / 17 * at_s / 0.01 if at_s < maximum_s else 20 + (at_s - maximum_s) / 0.01
         assert window == pytest.approx(expected, rel=0.03)
 
 
 def test_cubic_lowers_its_plateau_when_its_peak_falls() -> None:
-    control = after_a_loss(1000)
+    control = cubic_after_a_loss(1000)
     control.on_loss(control.window_bytes)  # at 700 of 1000: W_max becomes 700 (1 + 0.7) / 2 = 595
     assert control.window_bytes == 490 * MSS
     plateau_s = ((595 - 490) / 0.4) ** (1 / 3)
@@ -104,7 +106,7 @@ def test_cubic_lowers_its_plateau_when_its_peak_falls() -> None:
 
 
 def test_cubic_starts_at_its_plateau_after_a_timeout() -> None:
-    control = after_a_loss(1000)
+    control = cubic_after_a_loss(1000)
     control.on_timeout(500 * MSS, is_repeated=False)
     control.on_ack(SECOND, 349 * MSS, 100 * MS)
     assert control.window_bytes == control.threshold_bytes == 350 * MSS
@@ -113,8 +115,8 @@ def test_cubic_starts_at_its_plateau_after_a_timeout() -> None:
         assert window == pytest.approx(350 + max(0.4 * at_s**3, 9 / 17 * at_s / 0.1), rel=0.02)
 
 
-def test_idle_time_does_not_count_on_the_curve() -> None:
-    continuous, idle = after_a_loss(1000), after_a_loss(1000)
+def test_idle_time_does_not_advance_the_curve_of_cubic() -> None:
+    continuous, idle = cubic_after_a_loss(1000), cubic_after_a_loss(1000)
     windows(continuous, 3, round_trip_ns=100 * MS)
     windows(idle, 3, round_trip_ns=100 * MS)
     idle.on_idle(20 * SECOND)

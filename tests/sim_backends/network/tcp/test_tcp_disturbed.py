@@ -16,7 +16,12 @@ AT_ORIGIN = standing(dict.fromkeys("ab", (0.0, 0.0, 1.0)))
 
 
 class DisturbedTransfer:
-    """Messages of 100 bytes from a to b, 10 ms away, and the packets that both ends sent while one was off."""
+    """A transfer of messages of 100 bytes from a to b over a delay of 10 ms, while one host is off for a time.
+
+    Attributes:
+        sent: Times of the packets that each host sent.
+        arrived_ns: Times of arrival of the messages.
+    """
 
     def __init__(self, sent_ns: list[int], loss: NodeLoss) -> None:
         self.sent: dict[str, list[int]] = {"a": [], "b": []}
@@ -46,14 +51,14 @@ def test_the_timers_of_a_sender_that_stays_off_never_fire() -> None:
 
 
 def test_a_delayed_ack_of_a_receiver_that_is_off_is_sent_when_it_is_on_again() -> None:
-    # The ACK would have been sent at 1.05 s. The sender retransmits at 1.2 s in vain.
+    # The ACK would have been sent at 1.05 s. The retransmission at 1.2 s is lost.
     transfer = DisturbedTransfer([0, SECOND], NodeLoss("b", SECOND + 20 * MS, SECOND + 500 * MS))
     assert [at_ns for at_ns in transfer.sent["a"] if at_ns > SECOND] == [SECOND + 200 * MS]
     assert [at_ns for at_ns in transfer.sent["b"] if at_ns > SECOND] == [SECOND + 500 * MS]
 
 
 def test_a_sender_reaches_its_receiver_again_with_exponential_backoff() -> None:
-    """Sent at 2 s and again after 0.2, 0.4, 0.8 and 1.6 s: the last copy, at 5 s, reaches the receiver."""
+    """The message is sent at 2 s, and again after 0.2, 0.4, 0.8 and 1.6 s; the last copy, at 5 s, arrives."""
     transfer = DisturbedTransfer([0, 2 * SECOND], NodeLoss("b", SECOND, 5 * SECOND))
     assert [at_ns for at_ns in transfer.sent["a"] if at_ns > SECOND] == [
         2 * SECOND + tenths * 100 * MS for tenths in (0, 2, 6, 14, 30)
@@ -62,8 +67,8 @@ def test_a_sender_reaches_its_receiver_again_with_exponential_backoff() -> None:
 
 
 def test_a_stream_pauses_while_a_jammer_passes_and_then_continues() -> None:
-    """An agent with a jammer passes the sender: within 10 m the sender finds the channel busy and does not send."""
-    blocked_m = 10.0
+    """An agent with a jammer passes the sender, which detects a busy channel within 10 m and does not send."""
+    jamming_range_m = 10.0
     power_dbm = ENERGY_DETECTION_DBM + 40.18 + 30.0
     net = RadioNetwork(wifi("ab"), "ab", transports={"tcp": Tcp}, disturbances=[Jammer(power_dbm, 0, agent="j")])
     messages = [Packet(number, "a", "b", 1000, ("f", number), 0, 0, "tcp") for number in range(6000)]
@@ -77,7 +82,7 @@ def test_a_stream_pauses_while_a_jammer_passes_and_then_continues() -> None:
         now_ns = (step + 1) * 100 * MS
         arrivals, drops = net.advance(now_ns, messages if step == 0 else [], states)
         assert not drops
-        if abs(east_m) < blocked_m:
+        if abs(east_m) < jamming_range_m:
             arrivals_while_jammed.append(len(arrivals))
         numbers += [arrival.packet_id for arrival in arrivals]
         arrived_ns += [arrival.at_ns for arrival in arrivals]

@@ -48,11 +48,11 @@ def test_the_timeout_has_bounds(round_trip_ms: int, timeout_ms: int) -> None:
 def test_the_timeout_doubles_until_the_next_sample() -> None:
     round_trips = RoundTrips(TcpOptions())
     round_trips.sample(100 * MS)
-    backed_off_ms = []
+    timeouts_ms = []
     for _ in range(10):
         round_trips.back_off()
-        backed_off_ms.append(round_trips.timeout_ns // MS)
-    assert backed_off_ms == [600, 1200, 2400, 4800, 9600, 19_200, 38_400, 76_800, 120_000, 120_000]
+        timeouts_ms.append(round_trips.timeout_ns // MS)
+    assert timeouts_ms == [600, 1200, 2400, 4800, 9600, 19_200, 38_400, 76_800, 120_000, 120_000]
     round_trips.sample(100 * MS)
     assert round_trips.timeout_ns == (100 + 4 * 37.5) * MS
 
@@ -60,29 +60,29 @@ def test_the_timeout_doubles_until_the_next_sample() -> None:
 @given(st.lists(st.integers(1, 10**10), min_size=1, max_size=50))
 def test_integer_arithmetic_stays_close_to_the_real_equations(samples_ns: list[int]) -> None:
     round_trips = RoundTrips(TcpOptions(min_timeout_ns=1, clock_granularity_ns=1))
-    smoothed, variation = float(samples_ns[0]), samples_ns[0] / 2
+    smoothed_ns, variation_ns = float(samples_ns[0]), samples_ns[0] / 2
     for count, sample_ns in enumerate(samples_ns):
         round_trips.sample(sample_ns)
         if count:
-            variation = 0.75 * variation + 0.25 * abs(smoothed - sample_ns)
-            smoothed = 0.875 * smoothed + 0.125 * sample_ns
-        assert round_trips.smoothed_ns == pytest.approx(smoothed, abs=20)
-        assert round_trips.timeout_ns == pytest.approx(smoothed + max(1, 4 * variation), abs=100)
+            variation_ns = 0.75 * variation_ns + 0.25 * abs(smoothed_ns - sample_ns)
+            smoothed_ns = 0.875 * smoothed_ns + 0.125 * sample_ns
+        assert round_trips.smoothed_ns == pytest.approx(smoothed_ns, abs=20)
+        assert round_trips.timeout_ns == pytest.approx(smoothed_ns + max(1, 4 * variation_ns), abs=100)
 
 
-def test_after_one_loss_half_as_much_is_sent_as_arrives() -> None:
+def test_after_one_loss_every_second_ack_allows_a_segment() -> None:
     # 100 in flight, of which one is lost, and a threshold of 50: every second ACK allows one segment.
-    reduction, pipe, sent = ProportionalReduction(50, 100, 1), 96, []
+    reduction, pipe, sent_bytes = ProportionalReduction(50, 100, 1), 96, []
     for _ in range(90):
         pipe -= 1
-        sent.append(reduction.window_bytes(pipe, 1, is_safe=False) - pipe)
-        reduction.on_sent(sent[-1])
-        pipe += sent[-1]
-    assert sent[:8] == [1, 0, 1, 0, 1, 0, 1, 0]
+        sent_bytes.append(reduction.window_bytes(pipe, 1, is_safe=False) - pipe)
+        reduction.on_sent(sent_bytes[-1])
+        pipe += sent_bytes[-1]
+    assert sent_bytes[:8] == [1, 0, 1, 0, 1, 0, 1, 0]
     assert pipe == 51  # 96 - 90 + 45
 
 
-def test_after_many_losses_as_much_is_sent_as_arrives_and_one_more_per_safe_ack() -> None:
+def test_after_many_losses_each_ack_allows_what_it_delivers_and_a_safe_ack_one_more() -> None:
     # 60 of 100 are lost: the bytes in flight are below the threshold from the start.
     reduction = ProportionalReduction(50, 100, 1)
     assert reduction.window_bytes(37, 1, is_safe=False) == 38
@@ -97,18 +97,18 @@ def test_after_many_losses_as_much_is_sent_as_arrives_and_one_more_per_safe_ack(
 
 @given(st.lists(st.tuples(st.integers(1, 3), st.integers(0, 3)), max_size=80))
 def test_no_more_is_sent_than_arrives_while_losses_are_detected(acks: list[tuple[int, int]]) -> None:
-    reduction, pipe, sent, arrived = ProportionalReduction(50, 100, 1), 97, 0, 0
-    for delivered, lost in acks:
-        arrived += delivered
-        pipe = max(pipe - delivered - lost, 0)
-        allowed = reduction.window_bytes(pipe, delivered, is_safe=False) - pipe
-        reduction.on_sent(allowed)
-        pipe, sent = pipe + allowed, sent + allowed
-        assert 0 <= sent <= arrived
+    reduction, pipe, sent_bytes, arrived_bytes = ProportionalReduction(50, 100, 1), 97, 0, 0
+    for delivered_bytes, lost_bytes in acks:
+        arrived_bytes += delivered_bytes
+        pipe = max(pipe - delivered_bytes - lost_bytes, 0)
+        allowed_bytes = reduction.window_bytes(pipe, delivered_bytes, is_safe=False) - pipe
+        reduction.on_sent(allowed_bytes)
+        pipe, sent_bytes = pipe + allowed_bytes, sent_bytes + allowed_bytes
+        assert 0 <= sent_bytes <= arrived_bytes
 
 
-def test_at_the_threshold_nothing_more_is_sent() -> None:
-    # By the proportional share, which applies above the threshold, one would be sent.
+def test_at_the_threshold_no_segment_is_sent() -> None:
+    # The proportional share, which applies above the threshold, would allow one segment.
     assert ProportionalReduction(50, 100, 1).window_bytes(50, 1, is_safe=True) == 50
     assert ProportionalReduction(50, 100, 1).window_bytes(51, 1, is_safe=True) == 52
 
@@ -121,12 +121,12 @@ def test_a_sender_that_sent_more_than_arrived_waits() -> None:
 
 
 def test_a_safe_ack_allows_one_segment_more_than_it_delivers() -> None:
-    """For any amount sent before: MAX(prr_delivered - prr_out, DeliveredData) + MSS, in bytes."""
+    """The allowed amount is MAX(prr_delivered - prr_out, DeliveredData) + MSS, in bytes, for any earlier amount."""
     reduction = ProportionalReduction(50_000, 100_000, 1448)
     reduction.on_sent(9 * 1448)
     assert reduction.window_bytes(10_000, 2 * 1448, is_safe=True) == 10_000 + 3 * 1448
     assert reduction.window_bytes(10_000, 2 * 1448, is_safe=False) == 10_000
-    # With 15 more that arrived, 10 may be sent in addition to the one.
+    # After 15 more segments were delivered, 16 may be sent: DeliveredData + MSS.
     assert reduction.window_bytes(10_000, 15 * 1448, is_safe=True) == 10_000 + 16 * 1448
     reduction.on_sent(5 * 1448)
     assert reduction.window_bytes(10_000, 1448, is_safe=True) == 10_000 + 7 * 1448
@@ -139,16 +139,16 @@ STEPS = st.lists(st.tuples(st.integers(0, 120), st.integers(0, 9), st.booleans()
 def test_the_window_equals_the_equations_of_the_rfc(
     threshold: int, flight: int, segment: int, steps: list[tuple[int, int, bool, int]]
 ) -> None:
-    reduction, delivered_so_far, sent_so_far = ProportionalReduction(threshold, flight, segment), 0, 0
-    for pipe, delivered, is_safe, sent in steps:
-        delivered_so_far += delivered
+    reduction, total_delivered_bytes, total_sent_bytes = ProportionalReduction(threshold, flight, segment), 0, 0
+    for pipe, delivered_bytes, is_safe, sent_bytes in steps:
+        total_delivered_bytes += delivered_bytes
         if pipe > threshold:
-            count = math.ceil(Fraction(delivered_so_far * threshold, flight)) - sent_so_far
+            count = math.ceil(Fraction(total_delivered_bytes * threshold, flight)) - total_sent_bytes
         else:
-            limit = delivered_so_far - sent_so_far
+            limit = total_delivered_bytes - total_sent_bytes
             if is_safe:
-                limit = max(limit, delivered) + segment
+                limit = max(limit, delivered_bytes) + segment
             count = min(threshold - pipe, limit)
-        assert reduction.window_bytes(pipe, delivered, is_safe=is_safe) == max(pipe, pipe + count)
-        reduction.on_sent(sent)
-        sent_so_far += sent
+        assert reduction.window_bytes(pipe, delivered_bytes, is_safe=is_safe) == max(pipe, pipe + count)
+        reduction.on_sent(sent_bytes)
+        total_sent_bytes += sent_bytes

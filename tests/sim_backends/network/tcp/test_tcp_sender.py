@@ -46,9 +46,11 @@ class Transfer:
             transport.send(Packet(number, "a", "b", MSS, ("f", number), 0, 0, "tcp"))
         self.wire.run(until_ns)
 
-    def sent(self, *, times: int | None = None) -> list[tuple[int, int]]:
-        """Return time and number of each transmitted data segment; with `times` only those retransmitted so many
-        times.
+    def transmissions(self, *, times: int | None = None) -> list[tuple[int, int]]:
+        """Return time and number of each transmission of a data segment.
+
+        Args:
+            times: Return only transmissions with this number of earlier ones, or all.
         """
         return [
             (transmission.at_ns, transmission.packet.body[1].number)
@@ -71,26 +73,26 @@ def losing_data(numbers: Collection[int], *, times: int = 1) -> Script:
     return script
 
 
-@pytest.mark.parametrize("per_ack", [1, 2])
+@pytest.mark.parametrize("segments_per_ack", [1, 2])
 @pytest.mark.parametrize("congestion", ["newreno", "cubic"])
-def test_slow_start_doubles_the_window_per_round_trip(per_ack: int, congestion: str) -> None:
-    options = TcpOptions(segments_per_ack=per_ack, congestion=congestion)  # type: ignore[arg-type]
+def test_slow_start_doubles_the_window_per_round_trip(segments_per_ack: int, congestion: str) -> None:
+    options = TcpOptions(segments_per_ack=segments_per_ack, congestion=congestion)  # type: ignore[arg-type]
     transfer = Transfer(2000, options)
-    per_round = Counter(at_ns for at_ns, _ in transfer.sent())
+    segments_per_round = Counter(at_ns for at_ns, _ in transfer.transmissions())
     # SYN and SYN-ACK take the first round trip; then 10, 20, 40, ... (RFC 6928, and RFC 5681 with all bytes counted).
-    rounds = {(1 + number) * ROUND_TRIP_NS: 10 << number for number in range(7)}
-    assert per_round == rounds | {8 * ROUND_TRIP_NS: 2000 - sum(rounds.values())}
+    doubled_windows = {(1 + number) * ROUND_TRIP_NS: 10 << number for number in range(7)}
+    assert segments_per_round == doubled_windows | {8 * ROUND_TRIP_NS: 2000 - sum(doubled_windows.values())}
 
 
 def test_reno_counts_acks_if_configured() -> None:
     # RFC 5681 increases the window by a segment per ACK: with an ACK for every second segment, by half.
     options = TcpOptions(initial_window_segments=16, bytes_counted_segments=1)
     transfer = Transfer(1000, options, until_ns=5 * ROUND_TRIP_NS)
-    per_round = Counter(at_ns for at_ns, _ in transfer.sent())
-    assert list(per_round.values())[:4] == [16, 24, 36, 54]
+    segments_per_round = Counter(at_ns for at_ns, _ in transfer.transmissions())
+    assert list(segments_per_round.values())[:4] == [16, 24, 36, 54]
 
 
-def test_a_link_is_used_at_its_full_rate() -> None:
+def test_a_transfer_uses_the_full_rate_of_a_link() -> None:
     transfer = Transfer(3000, TcpOptions(), rate_bit_s=20_000_000)
     # 20 Mbit/s for 20 ms are 33 segments; slow start is over long before the thousandth.
     arrivals_ns = list(transfer.wire.delivered.values())
@@ -99,22 +101,25 @@ def test_a_link_is_used_at_its_full_rate() -> None:
 
 @pytest.mark.parametrize("congestion", ["newreno", "cubic"])
 @pytest.mark.parametrize(
-    "lost", [{70}, {70, 71}, {70, 90}, set(range(70, 100)), set(range(70, 146, 2)), set(range(70, 108)), {70, 147}]
+    "lost_numbers",
+    [{70}, {70, 71}, {70, 90}, set(range(70, 100)), set(range(70, 146, 2)), set(range(70, 108)), {70, 147}],
 )
-def test_losses_in_a_window_are_repaired_in_one_round_trip(congestion: str, lost: set[int]) -> None:
+def test_losses_in_a_window_are_repaired_in_one_round_trip(congestion: str, lost_numbers: set[int]) -> None:
     # The segments 70 to 149 are one window, sent together; so are the ACKs of those that arrive. RFC 6937 sends no
     # more than arrives after the first two, so all of half a window but two can be repaired in that time.
     options = TcpOptions(segments_per_ack=1, congestion=congestion)  # type: ignore[arg-type]
-    transfer = Transfer(150, options, script=losing_data(lost))
+    transfer = Transfer(150, options, script=losing_data(lost_numbers))
     sent_ns = 4 * ROUND_TRIP_NS
-    assert [at_ns for at_ns, number in transfer.sent(times=0) if number in lost] == [sent_ns] * len(lost)
-    assert transfer.sent(times=1) == [(sent_ns + ROUND_TRIP_NS, number) for number in sorted(lost)]
-    assert len(transfer.sent()) == 150 + len(lost)
+    assert [at_ns for at_ns, number in transfer.transmissions(times=0) if number in lost_numbers] == [sent_ns] * len(
+        lost_numbers
+    )
+    assert transfer.transmissions(times=1) == [(sent_ns + ROUND_TRIP_NS, number) for number in sorted(lost_numbers)]
+    assert len(transfer.transmissions()) == 150 + len(lost_numbers)
     assert len(transfer.events("loss")) == 1
     assert not transfer.events("timeout")
     assert transfer.wire.delivered[149] == sent_ns + ROUND_TRIP_NS + DELAY_NS
     # The flight was 80 segments minus those acknowledged before: the window is reduced to half, or to 7 tenths.
-    flight = 80 - (min(lost) - 70)
+    flight = 80 - (min(lost_numbers) - 70)
     assert transfer.events("loss")[0].window_bytes == flight * MSS * {"newreno": 5, "cubic": 7}[congestion] // 10
 
 
@@ -128,19 +133,19 @@ def test_limited_transmit_sends_two_segments_before_a_loss_is_detected() -> None
     start_ns = ROUND_TRIP_NS + 80_000
     first_ack_ns = start_ns + 34_667 + 2 * MS + DELAY_NS + 42_667 + DELAY_NS
     ack_times_ns = [first_ack_ns + number * MS for number in range(3)]
-    sent = [(at_ns, number) for at_ns, number in transfer.sent() if at_ns > start_ns][:3]
-    assert sent == list(zip(ack_times_ns, [10, 11, 0], strict=True))
-    # They do not count when the window is halved (RFC 5681, 3.2, step 2).
+    sent_segments = [(at_ns, number) for at_ns, number in transfer.transmissions() if at_ns > start_ns][:3]
+    assert sent_segments == list(zip(ack_times_ns, [10, 11, 0], strict=True))
+    # These two segments do not count when the window is halved (RFC 5681, 3.2, step 2).
     assert transfer.events("loss")[0].window_bytes == 5 * MSS
 
 
 def test_a_segment_overtaken_by_two_others_is_not_sent_again() -> None:
-    # Two later segments overtake it (RFC 5681: three would make it lost).
+    # Two later segments overtake segment 20; RFC 5681 considers it lost only after three.
     def script(packet: IpPacket, *_: object) -> Sequence[int]:
         return (2 * MS + 1,) if packet.body[1].number == 20 and packet.body[1].length else (0,)
 
     transfer = Transfer(60, ACK_EACH_SEGMENT, script=script, rate_bit_s=12_000_000)
-    assert len(transfer.sent()) == 60
+    assert len(transfer.transmissions()) == 60
     assert not transfer.events("loss")
 
 
@@ -152,36 +157,38 @@ def test_the_last_segment_is_retransmitted_with_exponential_backoff(times: int) 
     # immediately.
     ack_times_ns = 2 * ROUND_TRIP_NS
     retransmissions_ns = [ack_times_ns + (2**count - 1) * 200 * MS for count in range(1, times + 1)]
-    assert [at_ns for at_ns, number in transfer.sent() if number == 4][1:] == retransmissions_ns
+    assert [at_ns for at_ns, number in transfer.transmissions() if number == 4][1:] == retransmissions_ns
     assert transfer.wire.delivered[4] == retransmissions_ns[-1] + DELAY_NS
     assert [sample.window_bytes for sample in transfer.events("timeout")] == [MSS] * times
 
 
 def test_after_a_timeout_slow_start_retransmits_only_missing_segments() -> None:
-    # All segments of a window but the last two are lost, so there are no three later ones that indicate the loss.
-    lost = set(range(30, 68))
-    transfer = Transfer(70, ACK_EACH_SEGMENT, script=losing_data(lost))
+    # All segments of a window except the last two are lost, so fewer than three later segments indicate the loss.
+    lost_numbers = set(range(30, 68))
+    transfer = Transfer(70, ACK_EACH_SEGMENT, script=losing_data(lost_numbers))
     assert len(transfer.events("timeout")) == 1
     assert not transfer.events("loss")
-    assert Counter(number for _, number in transfer.sent()) == Counter({n: 1 + (n in lost) for n in range(70)})
+    assert Counter(number for _, number in transfer.transmissions()) == Counter(
+        {n: 1 + (n in lost_numbers) for n in range(70)}
+    )
     start_ns = transfer.events("timeout")[0].at_ns
-    per_round = Counter((at_ns - start_ns) // ROUND_TRIP_NS for at_ns, _ in transfer.sent(times=1))
-    assert per_round == {0: 1, 1: 2, 2: 4, 3: 8, 4: 16, 5: 7}
+    segments_per_round = Counter((at_ns - start_ns) // ROUND_TRIP_NS for at_ns, _ in transfer.transmissions(times=1))
+    assert segments_per_round == {0: 1, 1: 2, 2: 4, 3: 8, 4: 16, 5: 7}
 
 
 def test_a_repeatedly_lost_segment_waits_for_another_timeout() -> None:
     # RFC 6675, 5.1: after a timeout no loss is detected by SACK until all data sent before is acknowledged.
-    lost = set(range(30, 68))
+    lost_numbers = set(range(30, 68))
 
     def script(packet: IpPacket, *_: object) -> Sequence[int]:
         segment: Segment = packet.body[1]
-        times = 2 if segment.number == 31 else 1 if segment.number in lost else 0
+        times = 2 if segment.number == 31 else 1 if segment.number in lost_numbers else 0
         return () if segment.length and segment.earlier_transmissions < times else (0,)
 
     transfer = Transfer(70, ACK_EACH_SEGMENT, script=script)
     assert len(transfer.events("timeout")) == 2
     assert not transfer.events("loss")
-    assert max(Counter(number for _, number in transfer.sent(times=1)).values()) == 1
+    assert max(Counter(number for _, number in transfer.transmissions(times=1)).values()) == 1
 
 
 @pytest.mark.parametrize("congestion", ["newreno", "cubic-rfc9438"])
@@ -208,7 +215,7 @@ def test_a_filled_gap_is_acknowledged_immediately() -> None:
     assert [transmission.at_ns for transmission in transfer.wire.transmitted][-1] == transfer.wire.delivered[4]
 
 
-def test_an_ack_of_two_echoes_the_timestamp_of_the_first() -> None:
+def test_an_ack_of_two_segments_echoes_the_timestamp_of_the_first() -> None:
     # RFC 7323, 4.2 (1): the measured round trip includes the whole ACK delay, here 30 ms.
     samples: list[TcpSample] = []
     wire = ScriptedWire(DELAY_NS)
@@ -254,9 +261,9 @@ def test_nagle_delays_small_segments_while_others_are_in_flight() -> None:
 
 def test_the_receive_window_limits_the_bytes_in_flight() -> None:
     transfer = Transfer(500, TcpOptions(receive_window_bytes=25 * MSS))
-    per_round = Counter(at_ns for at_ns, _ in transfer.sent())
+    segments_per_round = Counter(at_ns for at_ns, _ in transfer.transmissions())
     # 25, minus one segment that waits for a second one before it is acknowledged.
-    assert list(per_round.values())[:5] == [10, 20, 25, 24, 24]
+    assert list(segments_per_round.values())[:5] == [10, 20, 25, 24, 24]
 
 
 @pytest.mark.parametrize(("restart", "burst"), [(True, 10), (False, 40)])
@@ -267,8 +274,8 @@ def test_the_window_is_reset_after_an_idle_period(*, restart: bool, burst: int) 
     for number in range(70, 270):
         wire.transports["tcp"].send(Packet(number, "a", "b", MSS, ("f", number), 0, 0, "tcp"))
     wire.run()
-    per_round = Counter(at_ns for at_ns, _ in transfer.sent())
-    assert per_round[5 * SECOND] == burst
+    segments_per_round = Counter(at_ns for at_ns, _ in transfer.transmissions())
+    assert segments_per_round[5 * SECOND] == burst
 
 
 def test_the_window_does_not_grow_if_the_program_does_not_use_it() -> None:
@@ -281,10 +288,12 @@ def test_the_window_does_not_grow_if_the_program_does_not_use_it() -> None:
     assert {sample.window_bytes for sample in samples} == {10 * MSS}
 
 
-@pytest.mark.parametrize(("lost", "window"), [(1, 10), (2, 1)])
-def test_more_than_one_lost_syn_reduces_the_initial_window_to_one_segment(lost: int, window: int) -> None:
-    transfer = Transfer(50, TcpOptions(), script=losing({"a": range(lost)}))
-    assert Counter(at_ns for at_ns, _ in transfer.sent())[(2**lost - 1) * SECOND + ROUND_TRIP_NS] == window
+@pytest.mark.parametrize(("lost_syns", "window"), [(1, 10), (2, 1)])
+def test_more_than_one_lost_syn_reduces_the_initial_window_to_one_segment(lost_syns: int, window: int) -> None:
+    transfer = Transfer(50, TcpOptions(), script=losing({"a": range(lost_syns)}))
+    assert (
+        Counter(at_ns for at_ns, _ in transfer.transmissions())[(2**lost_syns - 1) * SECOND + ROUND_TRIP_NS] == window
+    )
 
 
 @pytest.mark.parametrize("period", [300, 1200])
@@ -307,7 +316,7 @@ def test_renos_sawtooth_has_the_throughput_of_mathis(period: int) -> None:
 
 @pytest.mark.parametrize("congestion", ["cubic", "cubic-rfc9438"])
 def test_cubic_follows_its_curve_with_acks_over_a_link(congestion: Literal["cubic", "cubic-rfc9438"]) -> None:
-    # The receive window of 200 segments limits the window until the loss.
+    # The receive window limits the window to 200 segments until the loss.
     options = TcpOptions(segments_per_ack=1, receive_window_bytes=200 * MSS, congestion=congestion)
     delay_ns, until_ns = 50 * MS, 6 * SECOND
     transfer = Transfer(20_000, options, script=losing_data({1500}), delay_ns=delay_ns, until_ns=until_ns)
@@ -330,18 +339,18 @@ def test_cubic_follows_its_curve_with_acks_over_a_link(congestion: Literal["cubi
 
 def integer_sawtooth(period: int) -> float:
     """Return segments per round trip of a window that grows by 8/15 of a segment per round trip, with factor 0.7."""
-    window, credit, per_round_trip, rounds = 10, 0.0, 0, 0
+    window, growth, per_round_trip, rounds = 10, 0.0, 0, 0
     for _ in range(100):
-        acknowledged = 0
-        while acknowledged < period:
-            acknowledged += window
+        acknowledged_segments = 0
+        while acknowledged_segments < period:
+            acknowledged_segments += window
             rounds += 1
-            credit += 8 / 15
-            if credit >= 1:
-                window, credit = window + 1, credit - 1
+            growth += 8 / 15
+            if growth >= 1:
+                window, growth = window + 1, growth - 1
         # The window does not grow in the round trip of the recovery, and is a whole number of segments.
-        window, credit = math.floor(0.7 * window), 0.0
-        per_round_trip, rounds = per_round_trip + acknowledged + window, rounds + 1
+        window, growth = math.floor(0.7 * window), 0.0
+        per_round_trip, rounds = per_round_trip + acknowledged_segments + window, rounds + 1
     return per_round_trip / rounds
 
 
@@ -364,7 +373,7 @@ def test_linux_detects_a_lost_retransmission_within_a_round_trip() -> None:
     transfer = Transfer(2000, TcpOptions(segments_per_ack=1), script=losing_data({70}, times=3))
     assert not transfer.events("timeout")
     assert len(transfer.events("loss")) == 1
-    sent_ns = [at_ns for at_ns, number in transfer.sent() if number == 70]
+    sent_ns = [at_ns for at_ns, number in transfer.transmissions() if number == 70]
     assert len(sent_ns) == 4
     assert all(later - earlier <= 2 * ROUND_TRIP_NS for earlier, later in pairwise(sent_ns))
 
@@ -372,13 +381,13 @@ def test_linux_detects_a_lost_retransmission_within_a_round_trip() -> None:
 def test_linux_detects_a_loss_by_two_later_segments_after_a_quarter_of_a_round_trip() -> None:
     # RFC 8985, 6.2: the reordering window is a quarter of the minimum round trip while fewer than three have arrived.
     transfer = Transfer(10, TcpOptions(segments_per_ack=1), script=losing_data({7}))
-    sent_ns = [at_ns for at_ns, number in transfer.sent() if number == 7]
+    sent_ns = [at_ns for at_ns, number in transfer.transmissions() if number == 7]
     assert sent_ns == [ROUND_TRIP_NS, 2 * ROUND_TRIP_NS + ROUND_TRIP_NS // 4]
     assert not transfer.events("timeout")
 
 
-@given(lost=st.sets(st.integers(0, 90), max_size=30), control=st.sampled_from(get_args(Congestion)))
-def test_without_reordering_only_lost_segments_are_sent_again(lost: set[int], control: Congestion) -> None:
+@given(lost_numbers=st.sets(st.integers(0, 90), max_size=30), control=st.sampled_from(get_args(Congestion)))
+def test_without_reordering_only_lost_segments_are_sent_again(lost_numbers: set[int], control: Congestion) -> None:
     options = TcpOptions(segments_per_ack=1, congestion=control)
-    transfer = Transfer(100, options, script=losing_data(lost), rate_bit_s=20_000_000)
-    assert {number for _, number in transfer.sent(times=1)} == lost
+    transfer = Transfer(100, options, script=losing_data(lost_numbers), rate_bit_s=20_000_000)
+    assert {number for _, number in transfer.transmissions(times=1)} == lost_numbers

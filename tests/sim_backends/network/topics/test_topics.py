@@ -77,9 +77,10 @@ def messages(wire: ScriptedWire) -> list[tuple[int, str, tuple[Submessage, ...]]
 @pytest.mark.parametrize(
     ("submessages", "size_bytes"),
     [
-        # Clause 9.4.5: 4 bytes of header each; DATA 20 more, after INFO_TS with 12; HEARTBEAT 28 more.
+        # Clause 9.4.5: every submessage has a header of 4 bytes. DATA has 20 more and follows an INFO_TS of 12 bytes;
+        # HEARTBEAT has 28 more.
         ((Data(Sample(100, 0), 0, 1, 1, 1344), Heartbeat(1, 1, 1, final=True, directed=False)), 12 + 24 + 100 + 32),
-        # All of a LaserScan in one DATA_FRAG, whose header has 32 bytes more.
+        # One DATA_FRAG, whose header has 32 bytes more, contains a complete LaserScan.
         ((Data(Sample(SCAN_BYTES, 0), 0, 3, 3, 1344),), 12 + 36 + SCAN_BYTES),
         ((Data(Sample(SCAN_BYTES, 0), 2, 1, 3, 1344),), 36 + SCAN_BYTES - 2 * 1344),
         # Messages for one end contain its participant in an INFO_DST of 16 bytes.
@@ -127,7 +128,7 @@ def test_a_lost_sample_is_requested_after_the_next_heartbeat() -> None:
         (reported_ns + DELAY_NS, "a", (*messages(wire)[2][2][:1], Heartbeat(2, 3, 4, final=False, directed=True))),
         (reported_ns + 2 * DELAY_NS, "b", (AckNack(4, (), 3),)),
     ]
-    # Later samples waited for it.
+    # Later samples wait for the lost one.
     assert wire.delivered[1] == wire.delivered[2] == reported_ns + 2 * DELAY_NS
     assert list(wire.delivered) == [0, 1, 2, 3]
 
@@ -137,16 +138,18 @@ def test_a_duplicate_request_is_ignored() -> None:
         return {("b", 1): (), ("a", 1): (0, DELAY_NS)}.get((receiver, number), (0,))
 
     wire = publish_samples(KEEP_LAST, 4, script=script, size_bytes=100)
-    repeated = [transmission for transmission in wire.transmitted if "again" in transmission.packet.identity[0]]
-    assert [transmission.packet.identity for transmission in repeated] == [("scan data0 again2", 1)]
+    repeated_transmissions = [
+        transmission for transmission in wire.transmitted if "again" in transmission.packet.identity[0]
+    ]
+    assert [transmission.packet.identity for transmission in repeated_transmissions] == [("scan data0 again2", 1)]
 
 
 def test_a_large_sample_is_repaired_first_by_one_fragment_then_by_the_missing_ones() -> None:
     wire = publish_samples(KEEP_LAST, 3, script=losing({"a": {1}}))
-    kinds = [
+    submessage_types = [
         [type(submessage) for submessage in message] for at_ns, _, message in messages(wire) if at_ns > 2 * PERIOD_NS
     ]
-    assert kinds[:7] == [
+    assert submessage_types[:7] == [
         [AckNack],
         # With the fragment the heartbeat would exceed 1456 bytes.
         [Data],
@@ -178,10 +181,10 @@ def test_a_request_for_an_evicted_sample_is_answered_by_a_gap() -> None:
         return {("b", 1): (), ("a", 1): (15 * MS,)}.get((receiver, number), (0,))
 
     wire = publish_samples(Qos(depth=2), 4, script=script, size_bytes=100)
-    requested_ns = 2 * PERIOD_NS + DELAY_NS
-    assert (requested_ns, "b", (AckNack(2, (2,), 2),)) in messages(wire)
+    request_ns = 2 * PERIOD_NS + DELAY_NS
+    assert (request_ns, "b", (AckNack(2, (2,), 2),)) in messages(wire)
     response = (Gap(2, 3), Heartbeat(3, 4, 5, final=False, directed=True))
-    assert (requested_ns + 15 * MS + DELAY_NS, "a", response) in messages(wire)
+    assert (request_ns + 15 * MS + DELAY_NS, "a", response) in messages(wire)
     assert wire.dropped == {1: EVICTED}
 
 
@@ -191,15 +194,15 @@ def test_best_effort_has_the_loss_of_the_link(loss: float, size_bytes: int, fram
     count = 1000
     wire = publish_samples(BEST_EFFORT, count, script=losing_frames(loss), size_bytes=size_bytes)
     expected = 1 - (1 - loss) ** frames
-    lost = len(wire.dropped)
-    assert lost + len(wire.delivered) == count
-    assert abs(lost / count - expected) < 4 * math.sqrt(expected * (1 - expected) / count)
-    assert Counter(wire.dropped.values()) == {"lost by script": lost}
+    lost_count = len(wire.dropped)
+    assert lost_count + len(wire.delivered) == count
+    assert abs(lost_count / count - expected) < 4 * math.sqrt(expected * (1 - expected) / count)
+    assert Counter(wire.dropped.values()) == {"lost by script": lost_count}
     assert all(type(submessage) is Data for _, _, message in messages(wire) for submessage in message)
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.2, 0.6])
-def test_reliable_keep_all_loses_nothing(loss: float) -> None:
+def test_a_reliable_writer_that_keeps_all_samples_loses_none(loss: float) -> None:
     wire = publish_samples(KEEP_ALL, 100, script=losing_frames(loss), size_bytes=500)
     assert list(wire.delivered) == list(range(100))
     assert not wire.dropped
@@ -217,9 +220,11 @@ def test_reliable_keep_all_loses_nothing(loss: float) -> None:
         (KEEP_ALL, 0.2, 1000, 0),
     ],
 )
-def test_as_many_samples_arrive_as_with_cyclonedds(qos: Qos, loss: float, cyclonedds: int, tolerance: int) -> None:
-    arrived = len(publish_samples(qos, 1000, script=losing_frames(loss)).delivered)
-    assert abs(arrived - cyclonedds) <= tolerance
+def test_the_number_of_arrivals_is_near_that_of_cyclonedds(
+    qos: Qos, loss: float, cyclonedds: int, tolerance: int
+) -> None:
+    arrival_count = len(publish_samples(qos, 1000, script=losing_frames(loss)).delivered)
+    assert abs(arrival_count - cyclonedds) <= tolerance
 
 
 def test_a_blocked_writer_drops_samples_after_max_blocking_time() -> None:
@@ -249,7 +254,7 @@ DELIVERIES = st.lists(
 )
 
 
-def scripted(deliveries: Sequence[DeliveryDelays]) -> Script:
+def make_script(deliveries: Sequence[DeliveryDelays]) -> Script:
     """Return a script that delivers packets of both ends in order as given; all later packets arrive."""
     remaining = iter(deliveries)
     return lambda *_: next(remaining, (0,))
@@ -264,7 +269,7 @@ def scripted(deliveries: Sequence[DeliveryDelays]) -> Script:
 def test_samples_arrive_in_order_and_once_after_any_losses(
     deliveries: Sequence[DeliveryDelays], count: int, size_bytes: int, qos: Qos
 ) -> None:
-    wire = publish_samples(qos, count, script=scripted(deliveries), size_bytes=size_bytes)
+    wire = publish_samples(qos, count, script=make_script(deliveries), size_bytes=size_bytes)
     assert list(wire.delivered) == sorted(wire.delivered)
     # The wire raises an error for a second result of a sample; each sample has one.
     assert sorted([*wire.delivered, *wire.dropped]) == list(range(count))
@@ -276,7 +281,7 @@ def test_samples_arrive_in_order_and_once_after_any_losses(
 def test_best_effort_samples_arrive_in_order_and_once(
     deliveries: Sequence[DeliveryDelays], count: int, size_bytes: int
 ) -> None:
-    wire = publish_samples(BEST_EFFORT, count, script=scripted(deliveries), size_bytes=size_bytes)
+    wire = publish_samples(BEST_EFFORT, count, script=make_script(deliveries), size_bytes=size_bytes)
     assert list(wire.delivered) == sorted(wire.delivered)
     assert sorted([*wire.delivered, *wire.dropped]) == list(range(count))
     assert set(wire.dropped.values()) <= {"lost by script", "overtaken by a later sample"}
@@ -287,24 +292,24 @@ def test_an_event_is_scheduled_while_samples_are_unacknowledged(
     deliveries: Sequence[DeliveryDelays], count: int
 ) -> None:
     """Run from event to event until the writer has received the acknowledgement of its last sample."""
-    wire = publish_samples(KEEP_ALL, count, script=scripted(deliveries), until_ns=0)
-    acknowledged = 0
+    wire = publish_samples(KEEP_ALL, count, script=make_script(deliveries), until_ns=0)
+    last_acknowledged = 0
     topics = wire.transports["topic"]
     receive = topics.receive
 
-    def recording_receive(host: str, packet: IpPacket) -> None:
-        nonlocal acknowledged
+    def record_acknowledgement(host: str, packet: IpPacket) -> None:
+        nonlocal last_acknowledged
         message: RtpsMessage = packet.body
-        acknowledged = max(
+        last_acknowledged = max(
             [
-                acknowledged,
+                last_acknowledged,
                 *(submessage.base - 1 for submessage in message.submessages if isinstance(submessage, AckNack)),
             ]
         )
         receive(host, packet)
 
-    topics.receive = recording_receive  # type: ignore[method-assign]
-    while acknowledged < count:
+    topics.receive = record_acknowledgement  # type: ignore[method-assign]
+    while last_acknowledged < count:
         next_ns = wire.next_event_ns()
         assert next_ns is not None
         wire.run(next_ns)

@@ -49,7 +49,7 @@ def run_until_matched(wire: ScriptedWire) -> None:
         assert wire.now_ns < 1000 * SECOND
 
 
-def losing_in(*spans_ns: tuple[int, int], sources: str = "ab") -> tuple[Script, list[ScriptedWire]]:
+def lose_during(*spans_ns: tuple[int, int], sources: str = "ab") -> tuple[Script, list[ScriptedWire]]:
     """Return a script that loses packets of these hosts in these spans of time, and a list for its wire."""
     wires: list[ScriptedWire] = []
 
@@ -61,7 +61,7 @@ def losing_in(*spans_ns: tuple[int, int], sources: str = "ab") -> tuple[Script, 
 
 
 def test_announcements_follow_the_schedule() -> None:
-    """At 0, 0.1, 8.1 and 16.1 s as multicast; and each participant responds to the other four times."""
+    """Announcements are multicast at 0, 0.1, 8.1 and 16.1 s; each participant responds to the other four times."""
     wire = two_participants()
     wire.run(20 * SECOND)
     announcements = [
@@ -81,7 +81,7 @@ def test_announcements_follow_the_schedule() -> None:
 
 
 def test_participants_match_within_milliseconds() -> None:
-    """An announcement, a heartbeat 1 ms after it, a request, and the endpoint; each takes the delay."""
+    """Matching needs an announcement, a heartbeat 1 ms later, a request, and the endpoint; each has the delay."""
     wire = two_participants()
     run_until_matched(wire)
     assert wire.now_ns == MS + 4 * DELAY_NS
@@ -116,7 +116,7 @@ def test_without_discovery_only_samples_are_sent() -> None:
 
 
 def test_a_participant_is_removed_after_its_lease_and_discovered_again() -> None:
-    script, wires = losing_in((20 * SECOND, 60 * SECOND))
+    script, wires = lose_during((20 * SECOND, 60 * SECOND))
     wire = two_participants(script)
     wires.append(wire)
     publish(wire, [at_ns * SECOND for at_ns in (10, 25, 50, 75)])
@@ -134,7 +134,7 @@ def test_a_participant_is_removed_after_its_lease_and_discovered_again() -> None
 @pytest.mark.parametrize("sources", ["a", "b"])
 def test_a_participant_removed_on_one_side_only_is_discovered_again(sources: str) -> None:
     """The other side still receives everything and has no new endpoints, so the data must be requested."""
-    script, wires = losing_in((20 * SECOND, 60 * SECOND), sources=sources)
+    script, wires = lose_during((20 * SECOND, 60 * SECOND), sources=sources)
     wire = two_participants(script)
     wires.append(wire)
     publish(wire, [*(number * SECOND for number in range(1, 100))])
@@ -153,7 +153,7 @@ def test_a_participant_removed_on_one_side_only_is_discovered_again(sources: str
     assert sorted([*wire.delivered, *wire.dropped]) == list(range(99))
 
 
-def losing_with(probability: float, seed: int) -> Script:
+def lose_with_probability(probability: float, seed: int) -> Script:
     draws = PacketDraws(seed, "link")
     return lambda packet, *_: (0,) if draws.draw(packet.identity) >= probability else ()
 
@@ -162,7 +162,7 @@ def matching_time_s(loss: float, period_ns: int, seed: int) -> float:
     """Return the time from the start of b, between announcements of a, until both endpoints are matched."""
     starts_ns = 5 * SECOND + seed * 41 * MS
     discovery = DiscoveryTiming(period_ns=period_ns, starts_ns={"b": starts_ns})
-    wire = two_participants(losing_with(loss, seed), discovery=discovery)
+    wire = two_participants(lose_with_probability(loss, seed), discovery=discovery)
     run_until_matched(wire)
     return (wire.now_ns - starts_ns) / 1e9
 
@@ -176,7 +176,7 @@ def matching_time_s(loss: float, period_ns: int, seed: int) -> float:
         (0.5, SECOND // 2, 1.1, 6),
     ],
 )
-def test_discovery_takes_as_long_as_with_cyclonedds(
+def test_the_duration_of_discovery_is_near_that_of_cyclonedds(
     loss: float, period_ns: int, median_s: float, measurements: int
 ) -> None:
     """The median measured with real programs must be within the 99 % range of medians of as many simulated runs."""
@@ -204,9 +204,7 @@ def test_participants_match_after_any_losses(losses: Sequence[bool], starts_ns: 
 
 
 def test_heartbeats_for_several_participants_share_a_message() -> None:
-    """The first heartbeat after an announcement is separate; without responses, later ones at whole periods are
-    multicast.
-    """
+    """The first heartbeat after an announcement is separate; later ones without a response are multicast."""
     hosts = ("a", "b", "c")
     wire = ScriptedWire(DELAY_NS, hosts=hosts, script=lambda packet, *_: (0,) if packet.destination is None else ())
     flows = {source + peer: TopicFlow(source, peer) for source in hosts for peer in hosts if source != peer}
@@ -248,8 +246,10 @@ def test_participants_match_again_after_any_outages(spans: Sequence[tuple[int, i
 
     def script(packet: IpPacket, receiver: str, number: int) -> Sequence[int]:
         now_s = wires[0].now_ns / SECOND
-        is_out = any(begin <= now_s < begin + length and packet.source in sources for begin, length, sources in spans)
-        return () if is_out else (0,)
+        is_outage = any(
+            begin <= now_s < begin + length and packet.source in sources for begin, length, sources in spans
+        )
+        return () if is_outage else (0,)
 
     wire = two_participants(script)
     wires.append(wire)
@@ -266,7 +266,7 @@ def test_many_participants_all_match() -> None:
     flows: Mapping[str, TopicFlow] = {
         f"{source} {peer}": TopicFlow(source, peer) for source in hosts for peer in hosts if source != peer
     }
-    wire = ScriptedWire(DELAY_NS, hosts=hosts, script=losing_with(0.1, 1))
+    wire = ScriptedWire(DELAY_NS, hosts=hosts, script=lose_with_probability(0.1, 1))
     topics = wire.transports["topic"] = Topics(wire, flows)
     wire.run(30 * SECOND)
     assert all(

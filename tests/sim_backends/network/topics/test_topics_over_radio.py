@@ -31,11 +31,11 @@ def run_messages(protocol: str, *, relay: str | None = None, disturbances: tuple
         relay=relay,
     )
     times_ns = [number * PERIOD_NS for number in range(COUNT)]
-    sent = [
+    sent_packets = [
         Packet(number, "ugv", "other", 2000, ("state", number), at_ns, at_ns, protocol)
         for number, at_ns in enumerate(times_ns)
     ]
-    return outcome(sent, *net.advance(5000 * MS, sent, STATES))
+    return outcome(sent_packets, *net.advance(5000 * MS, sent_packets, STATES))
 
 
 @pytest.mark.parametrize("relay", [None, "uav"])

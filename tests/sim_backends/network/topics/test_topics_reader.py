@@ -1,4 +1,4 @@
-"""The reader of a flow alone: its responses to submessages of its writer."""
+"""The reader of a flow without its writer: its responses to submessages."""
 
 from sim_backends.network.topics.qos import MS, SECOND, Qos, RtpsTiming, TopicFlow
 from sim_backends.network.topics.reader import TopicReader

@@ -1,4 +1,4 @@
-"""Airtime of neighbours and ovens: measured shares against the given ones, and what is left for a robot."""
+"""Airtime of neighbours and ovens: measured shares compared with the configured ones, and a robot's goodput."""
 
 import pytest
 
@@ -29,8 +29,8 @@ def busy_share(radio: WifiInWorld[int], until_ns: int) -> float:
     return sample.busy_ns / until_ns
 
 
-def delivered(radio: WifiInWorld[int], until_ns: int) -> int:
-    """Return how many packets of a saturated sender arrive."""
+def count_deliveries(radio: WifiInWorld[int], until_ns: int) -> int:
+    """Return the number of packets of a saturated sender that arrive."""
     for number in range(900):
         radio.send(0, "a", number, 1000, "b")
     return len(radio.deliveries(until_ns))
@@ -48,10 +48,10 @@ def test_a_robot_out_of_range_of_a_neighbour_finds_its_channel_idle() -> None:
 
 
 def test_a_neighbour_shares_the_channel_with_a_robot() -> None:
-    alone, shared = delivered(model(), 300 * MS), delivered(
+    count_alone, count_beside_neighbour = count_deliveries(model(), 300 * MS), count_deliveries(
         model(neighbours={"office": {"at_m": [10, 0], "duty": "40%"}}), 300 * MS
     )  # fmt: skip
-    assert shared == pytest.approx(0.6 * alone, rel=0.15)
+    assert count_beside_neighbour == pytest.approx(0.6 * count_alone, rel=0.15)
 
 
 def test_a_neighbour_is_not_a_robot() -> None:
@@ -59,8 +59,8 @@ def test_a_neighbour_is_not_a_robot() -> None:
     radio.send(0, "a", 1, 100, None)
     losses: list[str] = []
     radio.log_losses(lambda _, __, receiver, ___: losses.append(receiver))
-    arrived = [receiver for _, receiver, _, _, _ in radio.deliveries(S)]
-    assert arrived + losses == ["b"]
+    receivers = [receiver for _, receiver, _, _, _ in radio.deliveries(S)]
+    assert receivers + losses == ["b"]
     assert radio.sample(S, S).keys() == {"a", "b"}
     assert radio.counters().keys() == {("a", "b"), ("b", "a")}
 
@@ -69,18 +69,20 @@ def test_a_neighbour_is_not_a_robot() -> None:
 def test_an_oven_keeps_the_channel_busy_for_half_of_each_cycle(mains_hz: int) -> None:
     oven = {"kitchen": {"at_m": [2, 0], "mains_hz": mains_hz}}
     assert busy_share(model(microwave_ovens=oven), S) == pytest.approx(0.5, abs=0.01)
-    assert delivered(model(microwave_ovens=oven), 200 * MS) < 0.55 * delivered(model(), 200 * MS)
+    assert count_deliveries(model(microwave_ovens=oven), 200 * MS) < 0.55 * count_deliveries(model(), 200 * MS)
 
 
 def test_an_oven_that_is_weaker_than_the_carrier_sense_threshold_only_adds_noise() -> None:
     oven = {"kitchen": {"at_m": [60, 0], "power_dbm": 30}}
     assert busy_share(model(microwave_ovens=oven), S) == 0
-    assert delivered(model(microwave_ovens=oven, mode="g54"), 200 * MS) < 0.8 * delivered(model(mode="g54"), 200 * MS)
+    assert count_deliveries(model(microwave_ovens=oven, mode="g54"), 200 * MS) < 0.8 * count_deliveries(
+        model(mode="g54"), 200 * MS
+    )
 
 
 def test_a_jammer_and_an_oven_are_independent() -> None:
     radio = model(microwave_ovens={"kitchen": {"at_m": [5000, 0]}})
     radio.jam(0, [Emitter("kitchen", (2.0, 0.0, 1.0), 30.0)])
-    assert delivered(radio, 100 * MS) == 0
+    assert count_deliveries(radio, 100 * MS) == 0
     radio.jam(100 * MS, [])
     assert len(radio.deliveries(200 * MS)) > 50

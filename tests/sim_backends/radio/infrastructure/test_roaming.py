@@ -1,4 +1,4 @@
-"""Roaming between two access points: route of packets, gap of a handover against its closed form, losses."""
+"""Roaming between two access points: route of packets, gap of a handover compared with its closed form, losses."""
 
 from collections import Counter
 from copy import deepcopy
@@ -22,7 +22,7 @@ MS, S = 10**6, 10**9
 ANTENNA = Antenna("802.11n", 15.0, -88.0)
 ACCESS_POINTS = {"west": {"at_m": [0, 3]}, "east": {"at_m": [100, 3]}}
 AT_WEST, AT_EAST, FAR = (0.0, 0.0, 0.2), (100.0, 0.0, 0.2), (9e4, 0.0, 0.2)
-QUICK: dict[str, Any] = {"short": "1s", "long": "1s", "threshold_dbm": -40}
+EVERY_SECOND: dict[str, Any] = {"short": "1s", "long": "1s", "threshold_dbm": -40}
 """A scan each second."""
 
 Packet = tuple[str, int]
@@ -74,13 +74,13 @@ class Lab:
 
 
 def test_a_robot_roams_to_the_stronger_access_point_and_packets_follow_it() -> None:
-    lab = Lab(**QUICK)
+    lab = Lab(**EVERY_SECOND)
     lab.run(2 * S, AT_WEST)
     lab.run(9 * S, AT_EAST)
     lab.finish()
     assert lab.access_points == ["west", "east"]
-    last = lab.sent[-1][0][1]
-    assert {(("walker", last - 1), "base"), (("base", last), "walker")} <= lab.arrived_ns.keys()
+    last_number = lab.sent[-1][0][1]
+    assert {(("walker", last_number - 1), "base"), (("base", last_number), "walker")} <= lab.arrived_ns.keys()
     assert lab.model.counters()["west", "base"].delivered > 400
     assert lab.model.counters()["east", "walker"].delivered > 150
 
@@ -97,15 +97,15 @@ VARIANTS = {
 
 @pytest.mark.parametrize("phy", VARIANTS.values(), ids=VARIANTS.keys())
 def test_each_packet_is_delivered_or_lost_once(phy: PhyCapability | None) -> None:
-    lab = Lab(interval_ns=40 * MS, antenna=Antenna("802.11n", 15.0, -88.0, phy), **QUICK)
+    lab = Lab(interval_ns=40 * MS, antenna=Antenna("802.11n", 15.0, -88.0, phy), **EVERY_SECOND)
     for second in range(2, 20, 3):
         lab.run(second * S, AT_WEST if second % 2 else AT_EAST)
     lab.model.send(lab.now_ns, "walker", ("walker", -1), 84, None)
     lab.sent.append((("walker", -1), lab.now_ns))
     lab.finish()
-    lost = [packet for packet, _, _ in lab.lost]
-    delivered = [packet for packet, _ in lab.arrived_ns]
-    assert Counter(lost + delivered) == Counter(packet for packet, _ in lab.sent)
+    lost_packets = [packet for packet, _, _ in lab.lost]
+    delivered_packets = [packet for packet, _ in lab.arrived_ns]
+    assert Counter(lost_packets + delivered_packets) == Counter(packet for packet, _ in lab.sent)
     assert {receiver for _, receiver, _ in lab.lost} <= {"base", "walker"}
     assert NOT_ASSOCIATED in {reason for _, _, reason in lab.lost}
 
@@ -114,11 +114,11 @@ def test_each_packet_is_delivered_or_lost_once(phy: PhyCapability | None) -> Non
 def test_the_gap_of_a_handover_is_the_sum_of_its_frames_and_processing_times(handshake: bool) -> None:
     """Without other traffic: sum of (DIFS + backoff + frame + SIFS + ACK) and of the processing times."""
     processing_ns = 3 * MS
-    lab = Lab(handshake=handshake, processing="3ms", channels=1, **QUICK)
+    lab = Lab(handshake=handshake, processing="3ms", channels=1, **EVERY_SECOND)
     lab.run(S, AT_WEST)
     lab.interval_ns = MS
     lab.run(2 * S + 300 * MS, AT_EAST)
-    (lost_ns, joined_ns) = next(
+    (disconnect_ns, connect_ns) = next(
         (start_ns, end_ns)
         for (start_ns, start), (end_ns, end) in pairwise(lab.cells)
         if start is None and end == "east"
@@ -130,11 +130,11 @@ def test_the_gap_of_a_handover_is_the_sum_of_its_frames_and_processing_times(han
     # Each frame is sent at a rate of at least 6 Mbit/s; at the highest rate its airtime is about 0.1 ms.
     airtimes_ns = sum(mode.airtime_ns(size) for size in sizes)
     waits_ns = len(sizes) * (CW_MIN * SLOT_NS + MS)
-    assert shortest_ns - airtimes_ns - MS <= joined_ns - lost_ns <= shortest_ns + waits_ns + MS
+    assert shortest_ns - airtimes_ns - MS <= connect_ns - disconnect_ns <= shortest_ns + waits_ns + MS
 
 
 def test_a_scan_delays_packets_and_loses_none() -> None:
-    lab = Lab(dwell="61ms", home="200ms", channels=4, **QUICK)
+    lab = Lab(dwell="61ms", home="200ms", channels=4, **EVERY_SECOND)
     lab.run(6 * S, AT_WEST)
     lab.finish()
     assert lab.access_points == ["west"]
@@ -142,18 +142,18 @@ def test_a_scan_delays_packets_and_loses_none() -> None:
     delays_ms = [(lab.arrived_ns[packet, receiver] - sent_ns) / MS for packet, sent_ns in lab.sent
                  for receiver in ("base", "walker") if (packet, receiver) in lab.arrived_ns]  # fmt: skip
     assert 40 < max(delays_ms) < 63
-    # Five scans (4 visited channels without the current one) in six seconds, of packets in two directions.
-    held = sum(delay_ms > 10 for delay_ms in delays_ms)
-    assert held == pytest.approx(5 * 3 * 2 * 50 / 20, rel=0.3)
+    # Five scans in six seconds, each of three other channels, delay packets in two directions.
+    delayed_packets = sum(delay_ms > 10 for delay_ms in delays_ms)
+    assert delayed_packets == pytest.approx(5 * 3 * 2 * 50 / 20, rel=0.3)
 
 
-def test_a_robot_that_leaves_loses_its_association_and_gets_one_again_when_it_returns() -> None:
+def test_a_robot_out_of_range_loses_its_association_and_associates_again_when_it_returns() -> None:
     lab = Lab(interval_ns=100 * MS)
     lab.run(2 * S, AT_WEST)
     lab.run(8 * S, FAR)
-    lost_ns = lab.cells[-1][0]
+    disconnect_ns = lab.cells[-1][0]
     assert lab.cells[-1][1] is None
-    assert 2 * S + LINK_LOSS_NS - 200 * MS <= lost_ns <= 2 * S + LINK_LOSS_NS + 300 * MS
+    assert 2 * S + LINK_LOSS_NS - 200 * MS <= disconnect_ns <= 2 * S + LINK_LOSS_NS + 300 * MS
     lab.run(16 * S, AT_EAST)
     assert lab.access_points == ["west", "east"]
 
@@ -167,7 +167,7 @@ def test_a_robot_and_an_access_point_have_different_names() -> None:
 def test_a_copy_during_a_scan_continues_like_its_original() -> None:
     options = {
         "access_points": ACCESS_POINTS,
-        "roaming": QUICK,
+        "roaming": EVERY_SECOND,
         "neighbours": {"office": {"at_m": [50, 0], "duty": "20%"}},
         "microwave_ovens": {"kitchen": {"at_m": [20, 0]}},
     }
@@ -177,14 +177,14 @@ def test_a_copy_during_a_scan_continues_like_its_original() -> None:
     model.place(0, {"base": AT_WEST, "walker": AT_WEST}, None)
     model.place(S, {"base": AT_WEST, "walker": AT_EAST}, None)
     model.advance(1100 * MS)
-    twin = deepcopy(model)
+    model_copy = deepcopy(model)
     results = []
-    for radio in (model, twin):
+    for radio in (model, model_copy):
         radio.use_meter()
         for number in range(100):
             radio.send(1100 * MS + number * 50 * MS, "walker", ("walker", number), 84, "base")
-        arrived = [(at_ns, packet) for at_ns, _, packet, _, _ in radio.deliveries(8 * S)]
+        arrivals = [(at_ns, packet) for at_ns, _, packet, _, _ in radio.deliveries(8 * S)]
         sample = radio.sample(8 * S, 0)["walker"]
-        results.append((arrived, sample.cell, sample.busy_ns))
+        results.append((arrivals, sample.cell, sample.busy_ns))
     assert results[0] == results[1]
     assert (len(results[0][0]) > 50, results[0][1]) == (True, "east")
