@@ -1,10 +1,10 @@
 """Aggregate an archive of 10,000 trials, compared with pandas and DuckDB: `python -m benchmarks.archive`.
 
 Each round runs `fieldkit aggregate ARCHIVE --where ...` as a user would: without an index, the first time (which
-writes the index), and with the index. The peers read the same tables in the same round, choose the same rows, and
-compute count, mean and median of one quantity per condition without intervals: pandas concatenates all tables, DuckDB
-reads them in one query (`read_csv` with `union_by_name`), and DuckDB reads a Parquet file that was written before.
-The benchmark stops if their figures differ from those of fieldkit.
+writes the index), and with the index. The other tools read the same tables in the same round, select the same rows,
+and compute count, mean and median of one quantity per condition without intervals: pandas concatenates all tables,
+DuckDB reads them in one query (`read_csv` with `union_by_name`), and DuckDB reads a Parquet file that was written
+before. The benchmark stops if their figures differ from those of fieldkit.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from benchmarks.archive_trials import write_archive
 
 WHERE: Final = 'distance_m < 20 and topology == "master"'
 AGE_S: Final = 3.0
-"""Tables must not be new, or they get no entry in the index."""
+"""Minimum age of a table before the runs: fieldkit writes no index entry for a newer one."""
 
 
 def _fieldkit(archive: Path, out: Path, *options: str) -> Run:
@@ -97,7 +97,9 @@ def run_round(archive: Path, work: Path) -> dict[str, Run]:
 def show(rounds: Sequence[Mapping[str, Run]]) -> None:
     """Print a table; ratios are medians over the rounds of the ratio in each round."""
     names = list(rounds[0])
-    print("| | s, median (lowest to highest) | processor time (s) | peak memory (MB) | of pandas | of DuckDB |")
+    print(
+        "| | s, median (lowest to highest) | processor time (s) | peak memory (MB) | time / pandas | time / DuckDB |"
+    )
     print("| --- | --- | --- | --- | --- | --- |")
     for name in names:
         runs = [result[name] for result in rounds]

@@ -15,7 +15,7 @@ PARQUET: Final = "archive.parquet"
 
 def by_pandas(folder: Path) -> list[list[Any]]:
     """Return conditions with number, mean and median."""
-    import pandas as pd  # noqa: PLC0415 (the peers must not import each other)
+    import pandas as pd  # noqa: PLC0415 (a process imports only the library that it measures)
 
     tables = sorted(folder.glob("**/trial.csv"))
     rows = pd.concat([pd.read_csv(table, dtype={"distance_m": float}) for table in tables], ignore_index=True)

@@ -51,13 +51,13 @@ Deliver = Callable[[bytes], None]
 
 @dataclass(frozen=True)
 class MessagePath:
-    """A path of messages: a publisher, a subscriber, and perhaps a bridge between them.
+    """A path of messages: a publisher, a subscriber, and optionally a bridge between them.
 
     Attributes:
-        name: Its printed name.
+        name: Name in the output.
         publisher: Kind of the publisher.
         subscriber: Kind of the subscriber.
-        reference: Name of the path with which it is compared.
+        reference: Name of the path with which this path is compared; empty if there is none.
     """
 
     name: str
@@ -245,9 +245,9 @@ class RunningPath:
 
     def run(self, duration_s: float, rate_hz: float) -> tuple[int, list[tuple[int, int]]]:
         """Send; return the number of messages, and the arrival time and delay of each received one in ns."""
-        sent = int(_query(self.publisher, f"{duration_s} {rate_hz}"))
+        sent_count = int(_query(self.publisher, f"{duration_s} {rate_hz}"))
         time.sleep(SETTLING_S)
-        return sent, json.loads(_query(self.subscriber, "report"))
+        return sent_count, json.loads(_query(self.subscriber, "report"))
 
 
 def _query(process: "subprocess.Popen[str]", line: str) -> str:
@@ -312,19 +312,19 @@ def measure(rounds: int) -> list[dict[str, Any]]:
             path.run(SETTLING_S, RATE_HZ)  # in this time publisher and subscriber discover each other
         for number in range(rounds):
             for path in paths if number % 2 else reversed(paths):
-                sent, received = path.run(COUNT / RATE_HZ, RATE_HZ)
-                burst, arrived = path.run(BURST_S, 0)
-                lasted_s = (arrived[-1][0] - arrived[0][0]) / 1e9
+                sent_count, arrivals = path.run(COUNT / RATE_HZ, RATE_HZ)
+                burst_count, burst_arrivals = path.run(BURST_S, 0)
+                burst_s = (burst_arrivals[-1][0] - burst_arrivals[0][0]) / 1e9
                 measurements.append(
                     {
                         "round": number,
                         "path": path.message_path.name,
-                        "sent": sent,
-                        "received": len(received),
-                        "delay_ms": median(delay_ns for _, delay_ns in received) / 1e6,
-                        "burst_sent": burst,
-                        "burst_received": len(arrived),
-                        "per_s": (len(arrived) - 1) / lasted_s,
+                        "sent": sent_count,
+                        "received": len(arrivals),
+                        "delay_ms": median(delay_ns for _, delay_ns in arrivals) / 1e6,
+                        "burst_sent": burst_count,
+                        "burst_received": len(burst_arrivals),
+                        "per_s": (len(burst_arrivals) - 1) / burst_s,
                     }
                 )
     return measurements

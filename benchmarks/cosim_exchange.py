@@ -1,11 +1,11 @@
 """Time of an exchange with an external federate: `python -m benchmarks.cosim_exchange [--json]`.
 
-An exchange with a physics is a request without commands and an answer with the states of all agents; an exchange with
-a network is a request with these states and an answer without packets. The federate does nothing else. The time is
-that of the coordinator's call; the rounds of all transports alternate. The lower bound is a plain socket between two
-Python programs, over which the same number of bytes is sent and received without further processing. `to C` is
-`docs/examples/federates/carts.c`. The peers, HELICS and mosaik, exchange the same amount of data in each step
-(`cosim_peers`).
+An exchange with a physics simulator is a request without commands and an answer with the states of all agents; an
+exchange with a network simulator is a request with these states and an answer without packets. The federate does
+nothing else. The time is that of the coordinator's call; the rounds of all transports alternate. The lower bound is a
+plain socket between two Python programs, over which the same number of bytes is sent and received without further
+processing. `to C` is `docs/examples/federates/carts.c`. The peers, HELICS and mosaik, exchange the same amount of
+data in each step (`cosim_peers`).
 
 Both processes share the machine's processors, so other load changes the wall time: its minimum over the rounds is the
 time on an idle machine, if one round was not disturbed. The processor time is that of both processes.
@@ -55,10 +55,10 @@ Exchange = Callable[[int], object]
 
 
 class StationaryPhysics:
-    """A physics whose robots do not move.
+    """A physics simulator whose robots do not move.
 
     Args:
-        hello: The agents.
+        hello: First message of the run, which contains the agents.
     """
 
     def __init__(self, hello: Hello) -> None:
@@ -73,7 +73,7 @@ class StationaryPhysics:
 
 
 class IdleNetwork:
-    """A network without packets."""
+    """A network simulator without packets."""
 
     def __init__(self, hello: Hello) -> None:
         del hello

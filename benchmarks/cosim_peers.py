@@ -23,7 +23,7 @@ from typing import Any, Final
 from sim_backends.federates.agent_states import STATE
 
 MESSAGE: Final = bytes(36)
-"""A message with the size of a request to a physics."""
+"""A message with the size of a request to a physics simulator."""
 PEERS: Final = ("helics inproc", "helics zmq_ss", "mosaik inproc", "mosaik subprocess")
 """Without the core `ipc` of HELICS: its broker has one name for the whole machine, so two runs disturb each other."""
 _STATE_NUMBERS: Final = STATE.size // 8
@@ -55,7 +55,7 @@ class HelicsFederate:
     """
 
     def __init__(self, core: str, name: str, other: str, options: str) -> None:
-        import helics  # noqa: PLC0415 (slow)
+        import helics  # noqa: PLC0415 (takes long, and few benchmarks need it)
 
         self._helics = helics
         info = helics.helicsCreateFederateInfo()
@@ -92,7 +92,7 @@ class HelicsFederate:
 
 def run_helics(core: str, count: int, steps: int) -> tuple[float, float]:
     """Return the seconds of wall time and of processor time of a run with HELICS."""
-    import helics  # noqa: PLC0415 (slow)
+    import helics  # noqa: PLC0415 (takes long, and few benchmarks need it)
 
     name = "benchmark"
     if core == "zmq_ss":
@@ -127,7 +127,7 @@ def run_other_helics(core: str, count: int, steps: int, options: str) -> float:
 
 def mosaik_simulator(value: Any) -> Any:  # noqa: ANN401 (a class of mosaik, which has no types)
     """Return the class of a simulator that returns a value in each step."""
-    import mosaik_api_v3  # noqa: PLC0415 (slow)
+    import mosaik_api_v3  # noqa: PLC0415 (takes long, and few benchmarks need it)
 
     class Constant(mosaik_api_v3.Simulator):  # type: ignore[misc]
         last_step: tuple[int, Callable[[], None]] = -1, lambda: None
@@ -153,7 +153,7 @@ def mosaik_simulator(value: Any) -> Any:  # noqa: ANN401 (a class of mosaik, whi
 
 def run_mosaik(kind: str, count: int, steps: int) -> tuple[float, float]:
     """Return the seconds of wall time and of processor time of a run with mosaik."""
-    import mosaik  # noqa: PLC0415 (slow)
+    import mosaik  # noqa: PLC0415 (takes long, and few benchmarks need it)
 
     globals()["StatesSimulator"] = mosaik_simulator([[0.5] * _STATE_NUMBERS] * count)
     globals()["MessageSimulator"] = mosaik_simulator(MESSAGE.decode())
@@ -204,7 +204,7 @@ def processor_s(pids: Sequence[int]) -> float:
 def main() -> None:
     """Measure one peer, or run the other side of an exchange."""
     if sys.argv[1] == "states":
-        import mosaik_api_v3  # noqa: PLC0415 (slow)
+        import mosaik_api_v3  # noqa: PLC0415 (takes long, and few benchmarks need it)
 
         host, _, port = sys.argv[3].rpartition(":")
         simulator = mosaik_simulator([[0.5] * _STATE_NUMBERS] * int(sys.argv[2]))

@@ -2,11 +2,11 @@
 
 Driving robots, 5 m apart, send 10 packets of 100 bytes per second to the next robot by UDP over fading Wi-Fi, under
 `sliding_window` with windows of 1.1 ms. The figures per number of robots are medians of several rounds: the real-time
-factor; exchanges between physics and network per second; the cost of an exchange without the time of physics,
-programs and network; and the cost of the coordinator relative to a plain loop that steps the same programs, physics
-and network through the same windows, without policies, ledger or hash. If the two deliver different packets, or at
-different times, the benchmark raises an error. Shipped scenarios follow; then robots that drive and fly in MuJoCo, in
-windows of 10 ms, relative to MuJoCo's own steps.
+factor; exchanges between the physics and the network simulator per second; the cost of an exchange without the time
+of both simulators and of the programs; and the cost of the coordinator relative to a plain loop that steps the same
+programs and simulators through the same windows, without policies, ledger or hash. If the two deliver different
+packets, or at different times, the benchmark raises an error. Shipped scenarios follow; then robots that drive and
+fly in MuJoCo, in windows of 10 ms, relative to MuJoCo's own steps.
 
 The benchmark runs in one thread without waiting, so all times are processor times. Other load still slows it down
 through shared caches and a lower clock.
@@ -65,7 +65,7 @@ class Fleet:
         self.first_ns = {name: number * PERIOD_NS // count for number, name in enumerate(self.names)}
 
     def physics(self) -> Paths:
-        """Return the physics of the robots."""
+        """Return the physics simulator, which moves the robots."""
         side = round(len(self.names) ** 0.5)
         motions = []
         for number, name in enumerate(self.names):
@@ -82,7 +82,7 @@ class Fleet:
         }
 
     def network(self) -> RadioNetwork:
-        """Return the network between the robots."""
+        """Return the network simulator."""
         return RadioNetwork(WifiInWorld(1, RadioOptions(), dict.fromkeys(self.names, ANTENNA), None), self.names)
 
 
@@ -113,7 +113,7 @@ def figures(run: Run, spent_s: float) -> Figures:
 
 
 class PlainLoop:
-    """A minimal loop that advances programs, physics and network together.
+    """A minimal loop that advances programs, physics and network simulator together.
 
     It reads the wake times of the programs, passes them their packets, sends theirs, and stores payloads in transit.
     In this benchmark arrivals do not change the wake times of programs, so the loop does not read them again.

@@ -179,12 +179,12 @@ class Ns3Link:
         self._run = partial(ns3, loss=loss, queue=QUEUE_PACKETS, RngRun=run, **mode_options)
 
     def udp(self) -> tuple[float, float]:
-        """Return goodput in Mbit/s and loss, as `Link.udp`."""
+        """Return goodput in Mbit/s and loss; see `Link.udp`."""
         goodput, lost = self._run(what="udp", rate=RATE_MBIT_S, payload=PAYLOAD_BYTES, seconds=SECONDS).split()
         return float(goodput), float(lost)
 
     def tcp(self, control: Control, seconds: float = SECONDS) -> tuple[float, Trace]:
-        """Return goodput and congestion window, as `Link.tcp`."""
+        """Return goodput and congestion window; see `Link.tcp`."""
         name = self._control.format(CONTROLS[control])
         lines = self._run(what="tcp", control=name, seconds=seconds).splitlines()
         trace = [(int(at) / 1e9, int(window) / SEGMENT_BYTES) for at, _, window in map(str.split, lines[:-1])]

@@ -1,4 +1,6 @@
-"""The paper's EMANE experiment in a lab: `python -m benchmarks.emane [--rounds 3] [--json]`, as root.
+"""The EMANE experiment of the paper in a lab: `python -m benchmarks.emane [--rounds 3] [--json]`, as root.
+
+*The paper* is the publication whose field trials fieldkit automates (docs/index.md).
 
 The first of ten robots sends 100 pings of 64 bytes to the tenth, before and after the tenth moves by 100 m along each
 axis. Each radio and round has a new lab, started by the commands of docs/studies/emane.md. ping prints 64 bytes: 56

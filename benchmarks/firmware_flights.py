@@ -43,7 +43,7 @@ class Row:
     duration_s: float
 
 
-class CaseFailed(Exception):  # noqa: N818 (a result)
+class CaseFailed(Exception):  # noqa: N818 (it is the result of a case)
     """A case failed; the text is the observation."""
 
 
@@ -51,7 +51,7 @@ class Bench:
     """Runs the programs of the agent against one connection.
 
     Args:
-        connection: As `mavlink.connection` of a profile.
+        connection: Name of the connection to the autopilot, as in the key `mavlink.connection` of a profile.
         program: The agent.
         folder: Folder for orders and logs.
     """
@@ -202,7 +202,7 @@ def _place(line: dict[str, Any]) -> tuple[float, float, float] | None:
 
 def _messages(log: Path) -> dict[str, int]:
     """Return the number of messages of each type in a telemetry log."""
-    from pymavlink import mavutil  # noqa: PLC0415 (0.3 s)
+    from pymavlink import mavutil  # noqa: PLC0415 (takes 0.3 s)
 
     counts: dict[str, int] = {}
     reader = mavutil.mavlink_connection(str(log))

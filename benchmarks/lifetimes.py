@@ -182,7 +182,7 @@ def _filter_events(channel: socket.socket, *kinds: int) -> None:
 def _identify(pid: int, namespaces: frozenset[int], programs: frozenset[str]) -> tuple[str, list[str]] | None:
     """Return name and command line of a process after its exec, or None if it is not watched."""
     with suppress(OSError):  # it has exited already
-        with open(f"/proc/{pid}/cmdline", "rb", buffering=0) as file:  # noqa: PTH123 (a race: pathlib is slower)
+        with open(f"/proc/{pid}/cmdline", "rb", buffering=0) as file:  # noqa: PTH123 (pathlib is slower, and the process may exit)
             argv = file.read().decode(errors="replace").split("\0")[:-1]
         names = [word.rsplit("/", 1)[-1] for word in argv[:2]]
         name = names[-1] if names[:1] in _INTERPRETERS else "".join(names[:1])

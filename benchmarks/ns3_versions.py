@@ -1,9 +1,10 @@
-"""Tests of the network ns-3 with other versions of ns-3: `python -m benchmarks.ns3_versions [trixie] [sid] [wheel]`.
+"""Test the ns-3 network simulator of fieldkit with other versions of ns-3.
 
-The name of a Debian release selects libns3-dev of that release with all libraries that it needs, from the mirror in
-the sources of apt; `wheel` selects the headers and libraries in the PyPI package `ns3`. They are extracted into a
-folder (about 1 GB per release), and nothing is installed. The g++ of this machine compiles the network against them,
-and the program runs with their libraries. Then the conformance suite and the tests in `tests/sim_backends/ns3` run.
+Usage: `python -m benchmarks.ns3_versions [trixie] [sid] [wheel]`. The name of a Debian release selects libns3-dev of
+that release with all libraries that it needs, from the Debian mirror in apt's sources; `wheel` selects the headers
+and libraries in the PyPI package `ns3`. They are extracted into a folder (about 1 GB per release), and nothing is
+installed. This machine's g++ compiles fieldkit's C++ program for ns-3 against them, and the program runs with their
+libraries. Then the conformance suite and the tests in `tests/sim_backends/ns3` run.
 Each line of the output states the version that the program reports, and the results. The exit code is 1 if something
 failed.
 """
@@ -33,16 +34,16 @@ def run(*words: str | Path) -> None:
 
 
 def mirror() -> str:
-    """Return the address of Debian in the sources of apt.
+    """Return the URL of the Debian mirror in apt's sources.
 
     Raises:
-        RuntimeError: There is none.
+        RuntimeError: They contain no Debian mirror.
     """
     folder = Path("/etc/apt")
     for file in (folder / "sources.list", *sorted(folder.glob("sources.list.d/*"))):
         if file.is_file() and (match := _MIRROR.search(file.read_text(encoding="utf-8"))):
             return match[1]
-    raise RuntimeError("the sources of apt have no mirror of Debian")
+    raise RuntimeError("apt's sources contain no Debian mirror")
 
 
 def extract_release(release: str, folder: Path) -> None:
@@ -53,14 +54,14 @@ def extract_release(release: str, folder: Path) -> None:
     (apt / "status").touch()
     source = f"deb [signed-by=/usr/share/keyrings/debian-archive-keyring.gpg] {mirror()} {release} main\n"
     (apt / "etc/apt/sources.list").write_text(source, encoding="utf-8")
-    places = {
+    apt_directories = {
         "Dir::Etc": "etc/apt",
         "Dir::State": "state",
         "Dir::State::status": "status",
         "Dir::Cache": "cache",
     }
-    options = [word for name, place in places.items() for word in ("-o", f"{name}={apt / place}")]
-    # Without root, apt would refuse to lock; the user `_apt` may not read the folder.
+    options = [word for name, path in apt_directories.items() for word in ("-o", f"{name}={apt / path}")]
+    # Without root privileges apt cannot take its locks, and the user `_apt` might not be able to read the folder.
     options += ["-o", "Debug::NoLocking=1", "-o", "APT::Sandbox::User=root", "-q"]
     run("apt-get", *options, "update")
     run("apt-get", *options, "install", "--download-only", "--no-install-recommends", "-y", *PACKAGES)
@@ -92,7 +93,7 @@ def environment(folder: Path, *, is_wheel: bool) -> dict[str, str]:
     if is_wheel:
         libraries = root / "ns3/lib64"
         flags = f'-I{root}/ns3/include "$@" -L{libraries} -Wl,-rpath,{libraries} -Wl,--allow-shlib-undefined'
-        descriptions = f"{libraries}/pkgconfig:/usr/share/pkgconfig"
+        pkg_config_path = f"{libraries}/pkgconfig:/usr/share/pkgconfig"
     else:
         libraries = root / LIBRARIES
         loader = root / "lib64/ld-linux-x86-64.so.2"
@@ -102,7 +103,7 @@ def environment(folder: Path, *, is_wheel: bool) -> dict[str, str]:
             f'--sysroot={root} -L{libraries} "$@" -Wl,--dynamic-linker={loader} -Wl,--allow-shlib-undefined'
             f" -Wl,--disable-new-dtags -Wl,-rpath,{':'.join(map(str, paths))}"
         )
-        descriptions = f"{libraries}/pkgconfig:{root}/usr/share/pkgconfig"
+        pkg_config_path = f"{libraries}/pkgconfig:{root}/usr/share/pkgconfig"
     wrapper = folder / "bin/g++"
     wrapper.parent.mkdir(exist_ok=True)
     wrapper.write_text(
@@ -112,7 +113,7 @@ def environment(folder: Path, *, is_wheel: bool) -> dict[str, str]:
     return {
         **os.environ,
         "PATH": f"{wrapper.parent}:{os.environ['PATH']}",
-        "PKG_CONFIG_LIBDIR": descriptions,
+        "PKG_CONFIG_LIBDIR": pkg_config_path,
         "XDG_CACHE_HOME": str(folder / "cache"),
     }
 
@@ -126,11 +127,11 @@ def check(name: str, folder: Path) -> bool:
         else:
             extract_release(name, folder)
     variables = environment(folder, is_wheel=name == "wheel")
-    conform = _last_line(folder, variables, "-m", "fieldkit", "cosim", "conform", "ns3")
+    conformance = _last_line(folder, variables, "-m", "fieldkit", "cosim", "conform", "ns3")
     tests = _last_line(folder, variables, "-m", "pytest", "-q", "-n0", "-p", "no:cacheprovider", TESTS)
     version = _output(variables, "pkg-config", "--modversion", "ns3-core")
-    print(f"{name}: ns-3 {version}: conformance {conform[1]}; tests: {tests[1]}", flush=True)
-    return conform[0] and tests[0]
+    print(f"{name}: ns-3 {version}: conformance {conformance[1]}; tests: {tests[1]}", flush=True)
+    return conformance[0] and tests[0]
 
 
 def _output(variables: Mapping[str, str], *words: str) -> str:
@@ -138,10 +139,16 @@ def _output(variables: Mapping[str, str], *words: str) -> str:
 
 
 def _last_line(folder: Path, variables: Mapping[str, str], *words: str) -> tuple[bool, str]:
-    """Run a program in Python; return True if it succeeded, and the last line of its output, which a file keeps."""
-    done = subprocess.run((sys.executable, *words), env=dict(variables), capture_output=True, text=True, check=False)
-    (folder / f"{words[1]}.txt").write_text(done.stdout + done.stderr, encoding="utf-8")
-    return not done.returncode, (done.stdout.strip() or done.stderr.strip()).rpartition("\n")[2]
+    """Run a Python module and save its output to a file.
+
+    Returns:
+        True if it succeeded, and the last line of its output.
+    """
+    completed = subprocess.run(
+        (sys.executable, *words), env=dict(variables), capture_output=True, text=True, check=False
+    )
+    (folder / f"{words[1]}.txt").write_text(completed.stdout + completed.stderr, encoding="utf-8")
+    return not completed.returncode, (completed.stdout.strip() or completed.stderr.strip()).rpartition("\n")[2]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""The own time of a repeat by phase: its wall time minus the time of the tools on the robots."""
+"""The overhead of a repeat by phase (*own time*): its wall time minus the time of the tools on the robots."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ class Repeat:
     Attributes:
         peer: `fieldkit` or `script`.
         protocol: Protocol under test.
-        own_ms: Own time per phase, in ms.
+        own_ms: Overhead per phase, in ms.
         trips: Sequential round trips over control links; 0 if they are not counted.
     """
 
@@ -28,7 +28,7 @@ class Repeat:
 
     @property
     def total_ms(self) -> float:
-        """Own time of the repeat, in ms."""
+        """Overhead of the repeat, in ms."""
         return sum(self.own_ms.values())
 
 

@@ -4,9 +4,10 @@ The captures are of a UDP transfer of 200,000 IP packets with a loss of 10 %: fr
 128 bytes captured of each, as in a trial. Each peer reads both captures into columns and matches the packets by
 identification and offset. In every round all peers run one after the other, and all must compute the same losses.
 fieldkit computes all values that `fieldkit.measure.transfers.transfer_measures` computes from captures: losses of
-packets, datagrams and bytes, the transfer's time, the paper's counts. The peers, dpkt, tshark and scapy, only count
-lost packets. scapy would take minutes, so it reads only the first packets; tshark is omitted if it is not installed.
-Times are processor times, including child processes, because other load affects them less.
+packets, datagrams and bytes, the transfer's time, and the counts of the paper (docs/index.md). The other readers,
+dpkt, tshark and scapy, only count lost packets. scapy would take minutes, so it reads only the first packets; tshark
+is omitted if it is not installed. Times are processor times, including child processes, because other load affects
+them less.
 
 At the end fieldkit streams a sparse file of 10 GB in a separate process, whose peak memory is printed. With `--whole
 MIB` another process reads a capture of this size into columns, as a trial does.

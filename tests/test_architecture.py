@@ -34,8 +34,8 @@ MAY_IMPORT = {
     "telemetry": {"backends", "config", "measure", "remote", "steps"},
     "trial": {"analysis", "backends", "config", "measure", "remote", "steps", "telemetry"},
     "campaign": {"analysis", "backends", "config", "trial"},
-    "report": {"analysis", "lab", "measure", "trial"},
-    "export": {"analysis", "measure", "trial"},
+    "report": {"analysis", "lab", "measure", "telemetry", "trial"},
+    "export": {"analysis", "measure", "telemetry", "trial"},
     "api": {"analysis", "export", "measure", "report", "trial"},
     "cli": {
         "agent",

@@ -1,7 +1,7 @@
 """Every sync policy on every pair of simulators: `python -m benchmarks.studies.combinations run FILE.csv`.
 
-The program runs one scenario with each physics, each network, each sync policy and each seed, and appends a row per
-run to a CSV file. It does not run combinations again that are in the file. `table FILE.csv --page
+The program runs one scenario with each physics simulator, network simulator, sync policy and seed, and appends a row
+per run to a CSV file. It does not run combinations again that are in the file. `table FILE.csv --page
 docs/studies/simulators.md` writes the tables of the documentation. For `gazebo`, a Gazebo must be running.
 """
 
@@ -39,8 +39,8 @@ class StudyRow(NamedTuple):
     """The result of one run; nan if a value is unknown.
 
     Attributes:
-        physics: Name of the physics.
-        network: Name of the network.
+        physics: Name of the physics simulator.
+        network: Name of the network simulator.
         policy: Name of the sync policy.
         seed: Seed of all random draws.
         loss: Share of lost packets.
@@ -70,7 +70,7 @@ class StudyRow(NamedTuple):
 
     @property
     def pair(self) -> tuple[str, str]:
-        """Its physics and network."""
+        """Names of its physics and network simulator."""
         return self.physics, self.network
 
 

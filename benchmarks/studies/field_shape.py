@@ -1,5 +1,7 @@
 """The paper's field trial on emulated robots: `python -m benchmarks.studies.field_shape [--figures FOLDER]`, as root.
 
+*The paper* is the publication whose field trials fieldkit automates (docs/index.md).
+
 Four campaigns (benchmarks/studies/lawn/: two topologies, with line of sight and behind the wall) run in parallel,
 because a repeat mostly waits; 640 repeats take 21 to 25 minutes. The program can be stopped at any time; the same
 command continues the campaigns. At the end it prints the table of docs/studies/field-shape.md and draws its two

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from benchmarks.studies.middleware_cells import MiddlewareCell
-from fieldkit.analysis.statistics import wilsons
+from fieldkit.analysis.statistics import wilson_intervals
 
 TOGETHER_S: Final = 0.5
 """Samples within this time count as one trial."""
@@ -44,7 +44,7 @@ def interval(loss: float, size_bytes: int, samples: int) -> tuple[float, float]:
     """
     _, rate_hz = _SAMPLES[size_bytes >= IMAGE_BYTES]
     trials = samples / max(rate_hz * TOGETHER_S, 1.0)
-    limits = wilsons(np.array([loss * trials]), np.array([trials]))
+    limits = wilson_intervals(np.array([loss * trials]), np.array([trials]))
     return float(limits.low[0]), float(limits.high[0])
 
 

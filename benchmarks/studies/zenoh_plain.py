@@ -18,10 +18,10 @@ SETTLING_S: Final = 0.5
 DRAIN_S: Final = 2.0
 
 
-def subscribe(session: Any, request: dict[str, Any]) -> None:  # noqa: ANN401 (untyped)
+def subscribe(session: Any, request: dict[str, Any]) -> None:  # noqa: ANN401 (Zenoh declares no types)
     """Print each sample until standard input ends."""
 
-    def print_sample(sample: Any) -> None:  # noqa: ANN401 (untyped)
+    def print_sample(sample: Any) -> None:  # noqa: ANN401 (Zenoh declares no types)
         data = sample.payload.to_bytes()
         at_ns = time.time_ns()
         print(json.dumps([HEAD.unpack_from(data)[0], at_ns]), flush=True)
@@ -32,7 +32,7 @@ def subscribe(session: Any, request: dict[str, Any]) -> None:  # noqa: ANN401 (u
     declared.undeclare()
 
 
-def publish(session: Any, request: dict[str, Any]) -> None:  # noqa: ANN401 (untyped)
+def publish(session: Any, request: dict[str, Any]) -> None:  # noqa: ANN401 (Zenoh declares no types)
     """Publish samples at their times with congestion control DROP, as rmw_zenoh does except for KEEP_ALL."""
     publisher = session.declare_publisher(request["key"], congestion_control=zenoh.CongestionControl.DROP)
     while not publisher.matching_status.matching:

@@ -76,7 +76,7 @@ def _run(item: dict[str, Any]) -> int:
 
 def _digest(scenario: str, policy: str, seed: int, until_ns: int) -> str:
     """Return the hash over the events of a simulation."""
-    from sim_backends.cosim import build, load_scenario  # noqa: PLC0415 (of the tree, and only if needed)
+    from sim_backends.cosim import build, load_scenario  # noqa: PLC0415 (imported from the tree under test, and only if needed)
 
     return str(build(load_scenario(scenario), policy=policy, seed=seed).run(until_ns).digest)
 

@@ -285,7 +285,7 @@ class _Shaper:
         return repr(value)
 
     def _dotted(self, node: ast.Attribute) -> str:
-        """Return `module.name` if the module is imported, or an empty text."""
+        """Return `module.name` if the module is imported, or an empty string."""
         parts = [node.attr]
         inner: ast.expr = node.value
         while isinstance(inner, ast.Attribute):

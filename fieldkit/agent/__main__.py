@@ -71,7 +71,7 @@ def main(argv: Sequence[str]) -> int:
 
 def _route(arguments: Arguments, stop_event: threading.Event) -> int:
     """Run a Zenoh router until `stop_event` is set."""
-    from fieldkit.agent.messaging import zenoh  # noqa: PLC0415 (loaded only if needed)
+    from fieldkit.agent.messaging import zenoh  # noqa: PLC0415 (each subcommand loads only its modules)
 
     router = zenoh.route(Network(**arguments["network"]))
     _report(f"up, {router.version}")
@@ -83,7 +83,7 @@ def _route(arguments: Arguments, stop_event: threading.Event) -> int:
 
 def _record(arguments: Arguments, stop_event: threading.Event, path: str) -> int:
     """Record MAVLink messages until `stop_event` is set."""
-    from fieldkit.agent.autopilots import mavlink  # noqa: PLC0415 (loaded only if needed)
+    from fieldkit.agent.autopilots import mavlink  # noqa: PLC0415 (each subcommand loads only its modules)
 
     with _add_connection_to_errors(arguments["connection"]):
         try:
@@ -109,8 +109,8 @@ def _drive(arguments: Arguments, stop_event: threading.Event, path: str) -> int:
 
 
 def _fly(arguments: Arguments, stop_event: threading.Event) -> int:
-    """Fly a drone, guard it or rescue it, as the plan requires; return the exit code."""
-    from fieldkit.agent.flying import flight, flight_plan  # noqa: PLC0415 (loaded only if needed)
+    """Run the pilot, the guard or the rescue program of a flight; return the exit code."""
+    from fieldkit.agent.flying import flight, flight_plan  # noqa: PLC0415 (each subcommand loads only its modules)
 
     with _add_connection_to_errors(arguments["connection"]):
         return flight.fly(flight_plan.FlightPlan(**arguments), stop_event)
@@ -118,7 +118,7 @@ def _fly(arguments: Arguments, stop_event: threading.Event) -> int:
 
 def _check_arming(arguments: Arguments, stop_event: threading.Event) -> int:
     """Print the faults that prevent a flight; return the exit code."""
-    from fieldkit.agent.flying import arming, flight_plan  # noqa: PLC0415 (loaded only if needed)
+    from fieldkit.agent.flying import arming, flight_plan  # noqa: PLC0415 (each subcommand loads only its modules)
 
     with _add_connection_to_errors(arguments["connection"]):
         return arming.check_arming(arguments["connection"], flight_plan.FlightNeeds(**arguments["needs"]), stop_event)
@@ -126,7 +126,7 @@ def _check_arming(arguments: Arguments, stop_event: threading.Event) -> int:
 
 def _survey(arguments: Arguments, stop_event: threading.Event) -> int:
     """Test a connection; print the result and other possible connections; return the exit code."""
-    from fieldkit.agent.links import survey  # noqa: PLC0415 (loaded only if needed)
+    from fieldkit.agent.links import survey  # noqa: PLC0415 (each subcommand loads only its modules)
 
     with _add_connection_to_errors(arguments["connection"]):
         return survey.survey(arguments["connection"], stop_event)
@@ -134,7 +134,7 @@ def _survey(arguments: Arguments, stop_event: threading.Event) -> int:
 
 def _link(arguments: Arguments, stop_event: threading.Event) -> int:
     """Start a link server, which shares a connection to an autopilot between the programs on this computer."""
-    from fieldkit.agent.links import server  # noqa: PLC0415 (loaded only if needed)
+    from fieldkit.agent.links import server  # noqa: PLC0415 (each subcommand loads only its modules)
 
     with _add_connection_to_errors(arguments["connection"]):
         server.serve(arguments["connection"], stop_event)
@@ -143,7 +143,7 @@ def _link(arguments: Arguments, stop_event: threading.Event) -> int:
 
 def _datagrams(arguments: Arguments, stop_event: threading.Event) -> int:
     """Send test datagrams to other robots, or count received ones; return the exit code."""
-    from fieldkit.agent import datagrams  # noqa: PLC0415 (loaded only if needed)
+    from fieldkit.agent import datagrams  # noqa: PLC0415 (each subcommand loads only its modules)
 
     return datagrams.run(arguments, stop_event)
 
@@ -162,7 +162,7 @@ def _stream(arguments: Arguments, stop_event: threading.Event, path: str, *, pub
     settings = Stream(**arguments["stream"])
     start_middleware = middleware.adapter(settings.over)
     log = Log(path)
-    log.origin(time.time_ns(), records.PUBLISHER if publishes else records.SUBSCRIBER, arguments["topic"]["name"])
+    log.write_role(time.time_ns(), records.PUBLISHER if publishes else records.SUBSCRIBER, arguments["topic"]["name"])
     log.note(records.DISCOVERY_STARTED, time.time_ns())
     session = start_middleware(Network(**arguments["network"]))
     try:
@@ -180,7 +180,7 @@ def _stream_video(arguments: Arguments, stop_event: threading.Event, path: str, 
     from fieldkit.agent.messaging import rtp_stream  # noqa: PLC0415 (loaded only if needed)
 
     log = Log(path)
-    log.origin(time.time_ns(), records.PUBLISHER if sends else records.SUBSCRIBER, rtp_stream.NAME)
+    log.write_role(time.time_ns(), records.PUBLISHER if sends else records.SUBSCRIBER, rtp_stream.NAME)
     log.note(records.DISCOVERY_STARTED, time.time_ns())
     transfer = rtp_stream.send if sends else rtp_stream.receive
     transfer(rtp_stream.Video(**arguments), log, stop_event)

@@ -13,7 +13,7 @@ def now_s() -> float:
 
 
 def boot_id() -> str:
-    """Return the boot ID of the kernel (random(4)), or an empty text if it is unknown."""
+    """Return the boot ID of the kernel (random(4)), or an empty string if it is unknown."""
     try:
         with open("/proc/sys/kernel/random/boot_id", encoding="ascii") as file:  # noqa: PTH123 (Python 3.8)
             return file.read(100).strip()

@@ -17,11 +17,11 @@ from fieldkit.analysis.statistics import (
     means,
     medians,
     shares,
-    wilsons,
+    wilson_intervals,
 )
 from fieldkit.core.columns import Column, Kind
 from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.model import ENDED, Status
+from fieldkit.core.model import FINAL_STATUSES, Status
 from fieldkit.core.units import parse_distance
 
 Indices = NDArray[np.int64]
@@ -35,8 +35,9 @@ class RepeatValues:
         low: Value of each repeat; the lower bound of the value if it is censored.
         high: Upper bound of the value of each repeat; infinity if the value is censored, or if the statistic over all
             sent items (see `columns.Figure.of_sent`) is infinite.
-        lost: Number of lost items, or 1 for true; None unless the quantity is counted or a flag.
-        sent: Number of sent items, or 1 for a flag.
+        lost: Number of lost items; for a flag, 1 if it is true, else 0. None unless the quantity is counted or a
+            flag.
+        sent: Number of sent items; for a flag, 1. None unless the quantity is counted or a flag.
     """
 
     low: NDArray[np.float64]
@@ -115,9 +116,10 @@ class Cell:
         n_valid: Number of valid repeats, from which all estimates are computed.
         n_void: Number of attempts with incomplete evidence.
         n_failed: Number of attempts that failed.
-        estimates: Estimates by name of the quantity, in the order of quantities. Quantities without a valid repeat
-            are omitted.
-        tallies: Word counts by name of the column, in order. Columns without a valid repeat are omitted.
+        estimates: Estimates by name of the quantity, in the order of `Repeats.quantities` or as requested.
+            Quantities without a valid repeat are omitted.
+        tallies: Word counts by name of the column, in the order of `Repeats.word_columns` or as requested. Columns
+            without a valid repeat are omitted.
         payload_bytes: ICMP payload sizes of the valid repeats, ascending, by the name of each quantity that depends
             on them; see `Quantity.payload`.
         quantities_without_value: Quantities that were measured in the valid repeats, but have no value in any of
@@ -151,7 +153,9 @@ def aggregate(
     """
     keys, cells = _conditions(repeats, by)
     status = repeats.texts["status"]
-    valid, void, failed = (np.bincount(cells[status == ending], minlength=len(keys)).tolist() for ending in ENDED)
+    valid, void, failed = (
+        np.bincount(cells[status == final_status], minlength=len(keys)).tolist() for final_status in FINAL_STATUSES
+    )
     rows = np.argsort(cells, kind="stable")
     rows = rows[status[rows] == Status.VALID]
     if "started_utc_ns" in repeats.numbers:  # sort the repeats of a cell by time, unknown times last
@@ -209,7 +213,7 @@ def _correct_p_values(estimates: Sequence[dict[str, Estimate]]) -> None:
     tested = [(cell, estimate) for cell in estimates for estimate in cell.values() if estimate.p_order is not None]
     if not tested:
         return
-    from fieldkit.analysis import independence  # noqa: PLC0415 (few repeats cannot be tested)
+    from fieldkit.analysis import independence  # noqa: PLC0415 (needed only for cells of 10 repeats or more)
 
     corrected = independence.corrected(
         np.array([estimate.p_order for _, estimate in tested], dtype=np.float64)
@@ -271,24 +275,28 @@ def _same_size_estimates(repeats: Repeats, quantity: Quantity, cell_rows: Indice
     observed, is_bound = repeats.observed(quantity)
     values, censored = observed[cell_rows], is_bound[cell_rows]
     upper = np.where(censored, np.inf, values)
-    of_sent = _upper_of_sent(repeats, quantity, cell_rows, upper)
+    upper_of_sent = _upper_of_sent(repeats, quantity, cell_rows, upper)
     counts = _counts(repeats, quantity, cell_rows)
     mean, median, p95 = values.mean(axis=1), np.median(values, axis=1), np.percentile(values, 95, axis=1)
     if counts is not None:
         lost, sent = (count.sum(axis=1) for count in counts)
-        pooled = wilsons(lost, sent)
+        pooled = wilson_intervals(lost, sent)
         point_estimates = shares(*counts) if quantity.kind is Kind.COUNTED else pooled
         counted = [column.astype(np.int64).tolist() for column in (lost, sent)]
     else:
         point_estimates = _mean_or_median(quantity, values, upper)
         pooled = Intervals(point_estimates.value, *np.full((2, len(values)), np.nan))
         counted = [[None] * len(values)] * 2
-    high_of_sent = point_estimates.high if of_sent is upper else _mean_or_median(quantity, values, of_sent).high
+    high_of_sent = (
+        point_estimates.high if upper_of_sent is upper else _mean_or_median(quantity, values, upper_of_sent).high
+    )
     n = values.shape[1]
     coverage = assured(n) if quantity.kind is Kind.MEDIAN and n > 1 else None
     samples = [
         RepeatValues(
-            values[cell], of_sent[cell], *((None, None) if counts is None else (count[cell] for count in counts))
+            values[cell],
+            upper_of_sent[cell],
+            *((None, None) if counts is None else (count[cell] for count in counts)),
         )
         for cell in range(len(values))
     ]
@@ -338,7 +346,7 @@ def _p_order(repeats: Repeats, quantity: Quantity, cell_rows: Indices) -> NDArra
         return np.full(len(cell_rows), np.nan)
     if cell_rows.shape[1] < MIN_FOR_INDEPENDENCE_TESTS:
         return np.full(len(cell_rows), np.nan)
-    from fieldkit.analysis import independence  # noqa: PLC0415 (few repeats cannot be tested)
+    from fieldkit.analysis import independence  # noqa: PLC0415 (needed only for cells of 10 repeats or more)
 
     p_values = independence.p_values(repeats.observed(quantity)[0][cell_rows])
     return np.where(np.isnan(repeats.numbers["started_utc_ns"][cell_rows]).any(axis=1), np.nan, p_values)
@@ -347,8 +355,9 @@ def _p_order(repeats: Repeats, quantity: Quantity, cell_rows: Indices) -> NDArra
 def _counts(repeats: Repeats, quantity: Quantity, cell_rows: Indices) -> tuple[NDArray[np.float64], ...] | None:
     """Return the numbers of lost and of sent items of each repeat. For a flag, these are its values and ones.
 
-    The result is None for other quantities. A number of lost items can be negative: with segmentation offload, the
-    paper's filter matches different frames at the two ends.
+    The result is None for other quantities. A number of lost items can be negative: `paper_received` can be larger
+    than `paper_packets`, because the two captures contain different frames with the same data if a network card
+    splits or merges frames (segmentation offload).
     """
     if quantity.kind is Kind.FLAG:
         flags = repeats.numbers[quantity.name][cell_rows]

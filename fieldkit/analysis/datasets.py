@@ -39,7 +39,9 @@ def _metadata(folder: Path, key: str) -> object:
 
 
 def condition(folder: Path) -> dict[str, str]:
-    """Return the columns that identify a condition, the flow and the factors of the sweep; raises as `read`.
+    """Return the columns that identify a condition, the flow and the factors of the sweep.
+
+    Raises the same errors as `read`.
 
     Returns:
         The columns in order. The value is the column with the same values as written in the command of the sweep.
@@ -49,7 +51,7 @@ def condition(folder: Path) -> dict[str, str]:
 
 
 def declared_columns(folder: Path) -> tuple[Column, ...]:
-    """Return the columns that the dataset declares; raises as `read`."""
+    """Return the columns that the dataset declares. Raises the same errors as `read`."""
     partitions = dict(_metadata(folder, "partitions") or {})  # type: ignore[call-overload]
     return (
         *(Column(name, "text", meaning) for name, meaning in partitions.items()),
@@ -58,12 +60,12 @@ def declared_columns(folder: Path) -> tuple[Column, ...]:
 
 
 def names(folder: Path) -> tuple[str, ...]:
-    """Return the names of all columns; raises as `read`."""
+    """Return the names of all columns. Raises the same errors as `read`."""
     return tuple(dict.fromkeys((*(column.name for column in declared_columns(folder)), *_schema(folder).names)))
 
 
 def read(folder: Path, declared: Mapping[str, Column]) -> tuple[dict[str, Numbers], dict[str, Texts], int]:
-    """Return columns and the number of rows, as `parsing.columns`.
+    """Return columns and the number of rows in the form of `parsing.columns`.
 
     Raises:
         EvidenceError: The dataset is empty or damaged.

@@ -31,7 +31,7 @@ def share_low(met: int, n: int) -> float:
 
 
 def share_high(met: int, n: int) -> float:
-    """Return the one-sided upper bound of the share of all repeats that meet a requirement, as `share_low`."""
+    """Return the one-sided upper bound of the share of all repeats that meet a requirement; see `share_low`."""
     return 1 - share_low(n - met, n)
 
 

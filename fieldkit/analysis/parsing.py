@@ -39,7 +39,7 @@ def csv_columns(
 ) -> tuple[Mapping[str, pa.ChunkedArray], int]:
     """Return the declared columns of a table, with the types of `arrow_type`, and the number of rows.
 
-    Arguments and errors as for `columns`.
+    The arguments and errors are those of `columns`.
     """
     present = [name for name in declared if name in names]
     if not body or not present:

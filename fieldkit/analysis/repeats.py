@@ -161,7 +161,7 @@ def parse(content: bytes, declared: Iterable[Column], where: str = "trial.csv") 
     try:
         return parse_rows(header_names(header), body, columns_by_name)
     except ValueError as error:
-        from fieldkit.analysis.table_errors import first_problem  # noqa: PLC0415 (tables of fieldkit are valid)
+        from fieldkit.analysis.table_errors import first_problem  # noqa: PLC0415 (needed only for tables with errors)
 
         raise first_problem(where, content, columns_by_name) or EvidenceError(
             f"its values do not agree with the declarations of its columns: {error}",

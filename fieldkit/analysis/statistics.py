@@ -53,7 +53,7 @@ class Intervals:
     high: Floats
 
 
-def wilsons(events: ArrayLike, trials: ArrayLike) -> Intervals:
+def wilson_intervals(events: ArrayLike, trials: ArrayLike) -> Intervals:
     """Return the share `events/trials` of each cell with its score interval.
 
     The coverage of the interval is also correct near 0 and 1, values that are typical of packet loss (Wilson 1927,
@@ -83,7 +83,7 @@ def shares(lost: ArrayLike, sent: ArrayLike) -> Intervals:
     nearly all losses.
 
     If no item was lost, or all items were lost, the data contain no information about bursts, and each repeat is one
-    trial of `wilsons`.
+    trial of `wilson_intervals`.
 
     Args:
         lost: Number of lost items of each repeat, shape (cells, n).

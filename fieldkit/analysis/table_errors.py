@@ -12,7 +12,7 @@ from fieldkit.analysis.parsing import Numbers
 from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.core.columns import MISSING, SCHEMA_VERSION, Column, Kind
 from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError
-from fieldkit.core.model import ENDED
+from fieldkit.core.model import FINAL_STATUSES
 
 _MAX_SHOWN: Final = 40
 _TOLERANCE: Final = 1e-6  # larger than the rounding errors of numbers in a table
@@ -92,8 +92,8 @@ def _explain_row(
         return EvidenceError(message, where=where, remedy=_REMEDY)
     if cells["schema_version"] not in MISSING and float(cells["schema_version"]) > SCHEMA_VERSION:
         return _newer_schema_error(where, float(cells["schema_version"]))
-    if cells["status"] not in ENDED:
-        possible = ", ".join(sorted(ENDED))
+    if cells["status"] not in FINAL_STATUSES:
+        possible = ", ".join(sorted(FINAL_STATUSES))
         return EvidenceError(
             f"status is {_quoted_cell(cells['status'])}, not one of: {possible}", where=where, remedy=_REMEDY
         )

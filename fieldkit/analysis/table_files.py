@@ -14,7 +14,7 @@ from fieldkit.analysis import parsing, table_errors
 from fieldkit.analysis.repeats import SOURCE, Repeats, by_name, header_names, parse_rows
 from fieldkit.core.columns import SCHEMA_VERSION, Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError, shell_command
-from fieldkit.core.model import ENDED
+from fieldkit.core.model import FINAL_STATUSES
 
 IDENTITY: Final = ("schema_version", "trial", "protocol", "repeat", "attempt", "status")
 """Columns that a table of repeats must have."""
@@ -172,7 +172,7 @@ def names(path: Path) -> tuple[str, ...]:
 
     Raises:
         ConfigurationError: The file cannot be read.
-        EvidenceError: As for `datasets.names`.
+        EvidenceError: For the same reasons as `datasets.names`.
     """
     if path.is_dir():
         from fieldkit.analysis import datasets  # noqa: PLC0415 (imports pandas if it is installed)
@@ -251,7 +251,10 @@ def _typed(
 
 
 def _read_dataset(path: Path, declared: Mapping[str, Column]) -> Repeats:
-    """Return the rows of a dataset of Parquet files; raises as `datasets.read`, and if a value is not possible."""
+    """Return the rows of a dataset of Parquet files.
+
+    Raises the same errors as `datasets.read`, and an error if a value is not possible.
+    """
     from fieldkit.analysis import datasets  # noqa: PLC0415 (imports pandas if it is installed)
 
     numbers, texts, rows = datasets.read(path, declared)
@@ -264,7 +267,7 @@ def _read_dataset(path: Path, declared: Mapping[str, Column]) -> Repeats:
 def _read_large(path: Path, declared: Mapping[str, Column]) -> Repeats | None:
     """Return the rows of a large table, which is read in blocks, or None for a small or invalid table.
 
-    Raises as `_header` for an invalid header.
+    Raises the same errors as `_header` if the header is invalid.
     """
     with _readable(path):
         if path.stat().st_size < 2 * _BATCH_BYTES:
@@ -288,7 +291,7 @@ def _is_valid(rows: Repeats, declared: Mapping[str, Column]) -> bool:
     """Return True if all rows have a known schema version, a final status, and possible and consistent numbers."""
     return (
         not (rows.numbers["schema_version"] > SCHEMA_VERSION).any()
-        and set(ENDED).issuperset(rows.texts["status"])
+        and set(FINAL_STATUSES).issuperset(rows.texts["status"])
         and all(table_errors.are_possible(column, declared[name]) for name, column in rows.numbers.items())
         and table_errors.contradiction(rows.numbers, rows.quantities) is None
     )

@@ -139,7 +139,7 @@ class TableIndex:
     def read(
         self, entries: Sequence[Entry], declared: Mapping[str, Column]
     ) -> tuple[dict[str, Numbers], dict[str, Texts]]:
-        """Return the rows of some tables in order, as `parsing.columns`.
+        """Return the rows of some tables in order, in the form of `parsing.columns`.
 
         Raises:
             pa.ArrowException: The index is damaged.

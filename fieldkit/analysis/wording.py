@@ -11,7 +11,7 @@ from fieldkit.analysis.quantities import Quantity, Tally, in_order
 from fieldkit.analysis.statistics import CONFIDENCE, MIN_FOR_ORDER_STATISTICS, assured
 from fieldkit.core import columns
 from fieldkit.core.columns import Kind
-from fieldkit.core.model import ENDED, Status
+from fieldkit.core.model import FINAL_STATUSES, Status
 
 _MIN_IN_SECONDS_S: Final = 10.0
 _MIN_IN_MBIT_BIT_S: Final = 1e6
@@ -54,7 +54,7 @@ class Scale:
         return f"{label} ({self.unit})" if self.unit else label
 
     def interval(self, low: float | None, high: float | None) -> str:
-        """Return `[low, high]`, `[low, ...)` if the upper end is open, or an empty text without an interval."""
+        """Return `[low, high]`, `[low, ...)` if the upper end is open, or an empty string without an interval."""
         if low is None:
             return ""
         return f"[{self.number(low)}, ...)" if high is None else f"[{self.number(low)}, {self.number(high)}]"
@@ -253,4 +253,4 @@ def _word_counts(words: Tally) -> Iterator[str]:
 
 def status_counts(numbers: Mapping[str, int]) -> str:
     """Return the numbers of attempts by final status, such as `20 valid, 1 void`."""
-    return ", ".join(f"{numbers[status]} {status}" for status in ENDED if numbers.get(status)) or "none"
+    return ", ".join(f"{numbers[status]} {status}" for status in FINAL_STATUSES if numbers.get(status)) or "none"

@@ -96,7 +96,7 @@ class FieldBackend:
         return frozenset(key for key, section in sections if section.permission in self.permissions)
 
     @contextmanager
-    def open(self, cast: Cast, *, seed: int, sink: Sink, operator: Operator) -> Iterator[Testbed]:  # noqa: ARG002 (starts nothing)
+    def open(self, cast: Cast, *, seed: int, sink: Sink, operator: Operator) -> Iterator[Testbed]:  # noqa: ARG002 (real robots need no seed)
         """Yield the testbed; see `Backend.open`. Each robot is connected at its first command."""
         shells: dict[Role, Shell] = {}
         try:
@@ -129,8 +129,8 @@ class FieldBackend:
             name,
             robot,
             self._passwords[name],
-            patience_s=self._site.patience,
-            notice=lambda text: sink(Note(text)),
+            reconnect_timeout_s=self._site.patience,
+            on_notice=lambda text: sink(Note(text)),
             crosses_radio=self._site.control is Control.RADIO,
         )
 
@@ -149,7 +149,7 @@ class FieldTestbed:
         cast: The robot in each role.
         shells: Control connection of each robot.
         operator: The operator.
-        permissions: See `Attended`.
+        permissions: Actions that the operator has permitted; see `Attended`.
     """
 
     oracle: Final = None

@@ -9,7 +9,7 @@ from typing import Protocol
 from fieldkit.remote import passwords
 from fieldkit.remote.keys import read_private_key
 from fieldkit.remote.sockets import over_tcp
-from fieldkit.remote.ssh import PATIENCE_S, SshShell
+from fieldkit.remote.ssh import RECONNECT_TIMEOUT_S, SshShell
 
 
 class SshAccess(Protocol):
@@ -49,7 +49,10 @@ class SshAccess(Protocol):
 def find_password(
     name: str, access: SshAccess, ask: passwords.PasswordSource = passwords.read_from_terminal
 ) -> str | None:
-    """Return the password of a robot from its source; None if it needs no password. Raises as `passwords`."""
+    """Return the password of a robot from its source; None if it needs no password.
+
+    Raises the same errors as `passwords`.
+    """
     source = access.password
     if source is None:
         return None
@@ -62,8 +65,8 @@ def open_shell(
     access: SshAccess,
     password: str | None,
     *,
-    patience_s: float = PATIENCE_S,
-    notice: Callable[[str], None] = lambda _: None,
+    reconnect_timeout_s: float = RECONNECT_TIMEOUT_S,
+    on_notice: Callable[[str], None] = lambda _: None,
     crosses_radio: bool = False,
 ) -> SshShell:
     """Return the connection to a robot, which is opened at its first use.
@@ -72,8 +75,8 @@ def open_shell(
         name: Name of the robot.
         access: Its SSH access data.
         password: Its password; None if it needs no password.
-        patience_s: As for `SshShell`.
-        notice: Called with a line of text when the connection is lost or restored.
+        reconnect_timeout_s: Time after a loss during which attempts to reopen the connection are made.
+        on_notice: Called with a line of text when the connection is lost or restored.
         crosses_radio: Whether the connection crosses the radio under test.
 
     Raises:
@@ -89,7 +92,7 @@ def open_shell(
         password=password,
         host=host,
         port=access.port,
-        patience_s=patience_s,
-        notice=notice,
+        reconnect_timeout_s=reconnect_timeout_s,
+        on_notice=on_notice,
         crosses_radio=crosses_radio,
     )

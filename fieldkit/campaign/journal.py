@@ -43,7 +43,7 @@ class CampaignEntry:
         took_s: Duration of placing the robots, in seconds.
         valid: Number of valid repeats.
         failed: Number of failed repeats.
-        unmet: Number of expectations that are not shown to hold.
+        unmet: Number of expectations that are not met or undecided.
     """
 
     utc_ns: int

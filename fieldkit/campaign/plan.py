@@ -75,8 +75,8 @@ class CampaignFile(Strict):
         walk: Maximum distance over which the robots are carried in total, `300m`; without it, three times the
             shortest path.
         left_out: List of exclusions: trials that match every key of an entry are excluded.
-        expect: [Expectations](values.md#expectations) of every trial that measures the figure, in addition to the
-            expectations of its procedure.
+        expect: [Expectations](values.md#expectations). Each applies to every trial that measures its quantity, in
+            addition to the expectations of the trial's procedure.
     """
 
     name: Annotated[
@@ -95,7 +95,10 @@ class CampaignFile(Strict):
 
 
 def load_campaign(path: Path) -> tuple[CampaignFile, Document]:
-    """Return a campaign file, and its document for messages with lines; errors as `schema.load`."""
+    """Return a campaign file and its parsed document, which locates errors by line.
+
+    Raises the same errors as `schema.load`.
+    """
     document = schema.read(path)
     return schema.validate(document, CampaignFile), document
 
@@ -104,8 +107,8 @@ def load_procedures(campaign: CampaignFile, document: Document) -> tuple[Procedu
     """Return the procedures of a campaign, with the campaign's expectations of figures that they measure.
 
     Raises:
-        ConfigurationError: As for `load_procedure`, with the line; or no procedure measures the figure of an
-            expectation.
+        ConfigurationError: A procedure cannot be loaded (see `load_procedure`), an expectation is invalid, or no
+            procedure measures its figure.
     """
     procedures = []
     for index, name in enumerate(campaign.procedures):
@@ -149,14 +152,14 @@ def trials_of(
     for index, exclusion in enumerate(campaign.left_out):
         if not any(map(exclusion.matches, combinations)):
             raise ConfigurationError(
-                "this leaves out no trial: no trial of the campaign matches",
+                "this entry excludes nothing: no trial of the campaign matches it",
                 where=document.where(("except", index)),
                 remedy="use values of procedures, topologies and distances",
             )
     included = tuple(trial for trial in combinations if not _is_excluded(trial, campaign.left_out))
     if not included:
         raise ConfigurationError(
-            "except leaves out every trial", where=document.where(("except",)), remedy="leave out fewer"
+            "except excludes every trial", where=document.where(("except",)), remedy="exclude fewer trials"
         )
     return included
 
@@ -195,11 +198,11 @@ class CampaignPlan(Strict):
 
 
 def make_plan(path: Path, backend: str) -> tuple[CampaignPlan, Document]:
-    """Return the plan of a campaign file, and its document for messages with lines.
+    """Return the plan of a campaign file and the parsed document, which locates errors by line.
 
     Raises:
-        ConfigurationError: As for `load_campaign`, `load_procedures` and `trials_of`, or `walk` is too short for
-            any order.
+        ConfigurationError: The file is invalid (see `load_campaign`, `load_procedures` and `trials_of`), or `walk` is
+            too short for any order.
     """
     campaign, document = load_campaign(path)
     procedures = load_procedures(campaign, document)
@@ -210,7 +213,8 @@ def make_plan(path: Path, backend: str) -> tuple[CampaignPlan, Document]:
         raise ConfigurationError(
             f"the shortest path through all places is {shortest_m:.1f} m, walk allows {limit_m:g} m",
             where=document.where(("walk",)),
-            remedy=f"walk: {shortest_m + 0.05:.1f}m allows only sweeps up and down; twice that allows a random order",
+            remedy=f"walk: {shortest_m + 0.05:.1f}m allows only ascending or descending distances; "
+            "twice that allows a random order",
         )
     plan = CampaignPlan(
         file_sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
@@ -228,7 +232,7 @@ def started_plan(folder: Path, current_plan: CampaignPlan, document: Document) -
 
     Args:
         folder: The campaign's folder.
-        current_plan: The plan of the present file.
+        current_plan: The plan made from the current file.
         document: The document of the file.
 
     Raises:
@@ -237,7 +241,7 @@ def started_plan(folder: Path, current_plan: CampaignPlan, document: Document) -
     if not (folder / CAMPAIGN_FILE).is_file():
         return None
     plan = schema.load(folder / CAMPAIGN_FILE, CampaignPlan)
-    frozen_values, current_values = _keys(plan), _keys(current_plan)
+    frozen_values, current_values = _fixed_values(plan), _fixed_values(current_plan)
     changed_keys = [key for key in current_values if current_values[key] != frozen_values[key]]
     if changed_keys:
         raise ConfigurationError(
@@ -248,7 +252,7 @@ def started_plan(folder: Path, current_plan: CampaignPlan, document: Document) -
     return plan
 
 
-def _keys(plan: CampaignPlan) -> dict[str, Any]:
+def _fixed_values(plan: CampaignPlan) -> dict[str, Any]:
     """Return the values that must not change during a campaign, by their key in the file or a description."""
     data = plan.model_dump(mode="json", by_alias=True)
     return {**data["campaign"], "a file of its procedures": data["procedures"], "backend": data["backend"]}
@@ -271,7 +275,7 @@ def unmeasured(paths: Iterable[Path], sources: Collection[str], note: Note) -> I
             try:
                 yield from _unmeasured_trials(folder, sources)
             except FieldkitError as error:
-                note(f"the missing trials are not known: {error.located}")
+                note(f"cannot determine which trials are missing: {error.located}")
 
 
 def _subfolders(path: Path) -> list[Path]:

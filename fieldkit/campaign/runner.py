@@ -41,7 +41,7 @@ class CampaignOutcome:
     Attributes:
         remaining: Trials that have not ended.
         failed: Number of failed repeats in the trials that have ended.
-        unmet: Number of expectations that are not shown to hold.
+        unmet: Number of expectations that are not met or undecided.
         folders: Folders of the trials that have ended.
     """
 

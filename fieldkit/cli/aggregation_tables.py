@@ -197,7 +197,7 @@ def _shown_judgements(
 
 
 def _show_expected(condition_columns: Sequence[str], cells: Sequence[Cell], judgements: Sequence[Judgement]) -> None:
-    """Print for each condition whether its expectations are shown to hold; without expectations, print nothing."""
+    """Print for each condition whether its expectations are met; without expectations, print nothing."""
     differing_columns, _ = wording.varying_and_common(condition_columns, cells)
     rows = []
     for judgement in judgements:

@@ -101,7 +101,7 @@ def backend(arguments: argparse.Namespace, sink: Sink) -> tuple[str, Backend]:
     """Return the name of the backend that the options and the site file select, and the backend.
 
     Raises:
-        ConfigurationError: As `load_site` and `load_backend`.
+        ConfigurationError: For the same reasons as `load_site` and `load_backend`.
     """
     site, document = lab_site(arguments)
     if site is None and arguments.backend is None:

@@ -45,7 +45,7 @@ def read(arguments: argparse.Namespace) -> Sides:
     """Return the attempts of both sides.
 
     Raises:
-        ConfigurationError: The number of paths is wrong, or as for `sources.find`.
+        ConfigurationError: The number of paths is wrong, or a path contains no measurements; see `sources.find`.
     """
     paths = [arguments.a, *([] if arguments.b is None else [arguments.b]), *arguments.more]
     if len(paths) == 1 and arguments.between:

@@ -249,7 +249,10 @@ def _serialize(sink: Sink) -> Sink:
 
 
 def event_text(event: Event, width: int | None = None) -> Text | None:
-    """Return the displayed text of an event, or None if only the live line shows it. Raises as `event_words`."""
+    """Return the displayed text of an event, or None if only the live line shows it.
+
+    Raises the same errors as `event_words`.
+    """
     parts = event_words(event, width)
     return _sanitized(Text.assemble(*((add_options(text), style) for text, style in parts))) if parts else None
 

@@ -22,7 +22,7 @@ class Terminal:
         self._sink = sink
 
     def ask(self, request: str, *, may_skip: bool = False) -> Answer:
-        """Ask the operator to do something, as `Operator.ask`."""
+        """Ask the operator to do something; see `Operator.ask`."""
         _require_terminal(
             f"a person must {request}",
             "place the robots first, then add --yes; or give the answers by --answers FILE",
@@ -34,7 +34,7 @@ class Terminal:
         return answer
 
     def enter(self, question: Question) -> str:
-        """Ask the operator for a value, as `Operator.enter`."""
+        """Ask the operator for a value; see `Operator.enter`."""
         _require_terminal(
             f"a person must answer: {question.text}",
             "give the answers by --answers FILE; with --yes no question is asked",

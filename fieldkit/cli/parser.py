@@ -117,7 +117,7 @@ class Parser(argparse.ArgumentParser):
         """Return the error for an unknown word, with the most similar option."""
         name = word.partition("=")[0]
         for parser in filter(None, (self, *map(self.command, self.subcommands()))):
-            if similar := difflib.get_close_matches(name, parser._options(), n=1):  # noqa: SLF001 (of another Parser)
+            if similar := difflib.get_close_matches(name, parser._options(), n=1):  # noqa: SLF001 (a method of this class)
                 command = "" if parser is self else f"{parser.prog} "
                 return ConfigurationError(
                     f"{self.prog} has no option or argument {word!r}",

@@ -15,7 +15,7 @@ def lab_site(arguments: argparse.Namespace) -> tuple[Site, Document] | tuple[Non
     """Return the site file that the options choose, with its document, or None for both without a site file.
 
     Raises:
-        ConfigurationError: As `load_site`.
+        ConfigurationError: For the same reasons as `load_site`.
     """
     path: Path | None = arguments.site
     if path is None and Path(SITE_FILE).is_file():

@@ -24,7 +24,10 @@ Item = TypeVar("Item", bound=Named)
 
 
 def load(kind: Kind, name: str, model: type[Item]) -> Item:
-    """Return the file of `name` as a frozen `model`; errors as `find`, `schema.read` and `validate_named`."""
+    """Return the file of `name` as a frozen `model`.
+
+    Raises the same errors as `find`, `schema.read` and `validate_named`.
+    """
     path = find(kind, name)
     return validate_named(schema.read(path), model, path.stem)
 
@@ -33,7 +36,8 @@ def validate_named(document: schema.Document, model: type[Item], name: str) -> I
     """Return a document as a frozen `model` with this name.
 
     Raises:
-        ConfigurationError: As `schema.validate`, or the `name` in the file is not its file name.
+        ConfigurationError: For the same reasons as `schema.validate`, or because the `name` in the file is not its
+            file name.
     """
     loaded = schema.validate(document, model)
     if loaded.name != name:

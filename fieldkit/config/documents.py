@@ -217,7 +217,7 @@ class Document:
 
 
 def read(path: Path) -> Document:
-    """Read one YAML file; raises as `parse`, and if the file cannot be read."""
+    """Read one YAML file. Raises the same errors as `parse`, and an error if the file cannot be read."""
     return parse(_text(path), source=str(path))
 
 

@@ -118,7 +118,7 @@ class RobotBridge(Strict):
 
     Attributes:
         to: `dds` or `zenoh`.
-        topics: Topics carried to this middleware, each `NAME:TYPE` or `NAME:TYPE:QOS` as for `fieldkit bridge`.
+        topics: Topics carried to this middleware, each `NAME:TYPE` or `NAME:TYPE:QOS`, as in `fieldkit bridge`.
         back: Topics carried in the other direction.
         domain: ROS 2 domain, 0 to 101.
         router: Host of a Zenoh router, and its port if it is not 7447; without it, peers are found by scouting.

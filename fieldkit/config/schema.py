@@ -105,7 +105,7 @@ def validation_error(text: str, *at: str | int) -> Exception:
     return PydanticCustomError("fieldkit_error", "{text}", {"text": text, "at": at})
 
 
-def pattern_field(pattern: str, description: str) -> Any:  # noqa: ANN401 (as pydantic's own `Field`)
+def pattern_field(pattern: str, description: str) -> Any:  # noqa: ANN401 (pydantic's `Field` also returns Any)
     """Return the `Field` of a text that must match a pattern.
 
     Args:
@@ -236,7 +236,7 @@ class Strict(BaseModel):
     def _unknown_key(cls, key: Any, data: Mapping[Any, Any]) -> Exception:  # noqa: ANN401 (any YAML value)
         if package := cls.missing_package(str(key)):
             return _unknown(str(key), f"it needs the package {package}, which is not installed")
-        from fieldkit.config import yaml_errors  # noqa: PLC0415 (most files have no errors; also below)
+        from fieldkit.config import yaml_errors  # noqa: PLC0415 (needed only for files with errors; also below)
 
         outer = [_types(model) for model in _ENCLOSING.get()[:-1]]
         hint, index = yaml_errors.misplaced_hint(key, data, _types(cls), outer)
@@ -349,7 +349,7 @@ def _validated_under(key: str, model: type[AnyModel], value: object) -> AnyModel
 
 
 def load(path: Path, model: type[Model]) -> Model:
-    """Read `path` and validate it against `model`; errors as `read` and `validate`."""
+    """Read `path` and validate it against `model`. Raises the same errors as `read` and `validate`."""
     return validate(read(path), model)
 
 

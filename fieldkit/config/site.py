@@ -152,7 +152,7 @@ def load_site(path: Path) -> tuple[Site, schema.Document]:
     """Return the site file and its document, from which each backend validates its section.
 
     Raises:
-        ConfigurationError: As `schema.load`.
+        ConfigurationError: For the same reasons as `schema.load`.
     """
     document = schema.read(path)
     return schema.validate(document, Site), document

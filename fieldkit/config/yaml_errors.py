@@ -52,7 +52,7 @@ def misplaced_hint(key: str, data: Mapping[Any, Any], fields: Fields, outer: Seq
     return did_you_mean(key, fields, valid), -1
 
 
-def _inner_keys(kind: Any, depth: int = 0) -> Iterator[Sequence[str]]:  # noqa: ANN401 (any type)
+def _inner_keys(kind: Any, depth: int = 0) -> Iterator[Sequence[str]]:  # noqa: ANN401 (any type annotation)
     """Yield the valid keys of each model that a type allows; models in lists and in mappings by name are omitted."""
     fields = getattr(kind, "model_fields", None)
     if fields is not None:
@@ -64,7 +64,7 @@ def _inner_keys(kind: Any, depth: int = 0) -> Iterator[Sequence[str]]:  # noqa: 
         yield from _inner_keys(part, depth + 1)
 
 
-def _is_opaque_mapping(kind: Any) -> bool:  # noqa: ANN401 (any type)
+def _is_opaque_mapping(kind: Any) -> bool:  # noqa: ANN401 (any type annotation)
     """Return True if a type is a mapping whose keys another package validates."""
     return any(get_args(part) == (str, object) for part in (kind, *get_args(kind)))
 
@@ -84,7 +84,7 @@ def explain(problems: Sequence[Any], document: Document, descriptions: Mapping[s
         descriptions: Description of a valid text by pattern.
     """
 
-    def line(problem: Any) -> int:  # noqa: ANN401 (as in `explain`)
+    def line(problem: Any) -> int:  # noqa: ANN401 (an `ErrorDetails` of pydantic, which is not imported here)
         return int(document.where(_location(problem)).rsplit(":", 1)[1])
 
     problems = sorted(_without_cascading_errors(problems), key=line)
@@ -114,7 +114,7 @@ def explain(problems: Sequence[Any], document: Document, descriptions: Mapping[s
     )
 
 
-def _indentation_message(problem: Any, document: Document) -> str:  # noqa: ANN401 (as in `explain`)
+def _indentation_message(problem: Any, document: Document) -> str:  # noqa: ANN401 (an `ErrorDetails` of pydantic, which is not imported here)
     """Return the message for a key of an enclosing mapping, with the indentation of that mapping's keys."""
     place, context = problem["loc"], problem["ctx"]
     key, outer = context["key"], context["outer"]
@@ -124,7 +124,7 @@ def _indentation_message(problem: Any, document: Document) -> str:  # noqa: ANN4
     return f"unknown key {key} here; it is a key {owner}: indent it like {place[depth]}:"
 
 
-def _missing_key(problem: Any) -> str:  # noqa: ANN401 (as in `explain`)
+def _missing_key(problem: Any) -> str:  # noqa: ANN401 (an `ErrorDetails` of pydantic, which is not imported here)
     """Return the key that a mapping lacks, or an empty string for another problem."""
     last = problem["loc"][-1] if problem["loc"] else None
     return last if problem["type"] == "missing" and isinstance(last, str) else ""
@@ -133,7 +133,7 @@ def _missing_key(problem: Any) -> str:  # noqa: ANN401 (as in `explain`)
 def _without_cascading_errors(problems: Sequence[Any]) -> list[Any]:
     """Return the problems, except about lists that are too short only because of errors in their items."""
 
-    def is_cascading(problem: Any) -> bool:  # noqa: ANN401 (as in `explain`)
+    def is_cascading(problem: Any) -> bool:  # noqa: ANN401 (an `ErrorDetails` of pydantic, which is not imported here)
         depth = len(problem["loc"])
         return problem["type"] == "too_short" and any(
             other["loc"][:depth] == problem["loc"] and len(other["loc"]) > depth for other in problems
@@ -142,7 +142,7 @@ def _without_cascading_errors(problems: Sequence[Any]) -> list[Any]:
     return [problem for problem in problems if not is_cascading(problem)]
 
 
-def _location(problem: Any) -> Location:  # noqa: ANN401 (as in `explain`)
+def _location(problem: Any) -> Location:  # noqa: ANN401 (an `ErrorDetails` of pydantic, which is not imported here)
     location: Location = problem["loc"]
     context = problem.get("ctx", {})
     key = context.get("key")

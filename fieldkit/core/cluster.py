@@ -40,7 +40,7 @@ class ClusterExecutor(WorkerExecutor):
         LinkError: The scheduler does not answer.
     """
 
-    MIN_SUBMITTED: ClassVar[int] = 100  # enough to hide the network delay; the scheduler queues them
+    MIN_SUBMISSION_LIMIT: ClassVar[int] = 100  # enough to hide the network delay; the scheduler queues them
 
     def __init__(self, address: str) -> None:
         if address.endswith(".json") and not Path(address).is_file():

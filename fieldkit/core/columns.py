@@ -50,7 +50,7 @@ _NUMBER: Final = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[
 _MAX_INT_DIGITS: Final = 19  # digits of the largest 64-bit integer
 _BOOL_TEXTS: Final = frozenset(("true", "True", "TRUE", "1", "false", "False", "FALSE", "0"))
 MISSING: Final = ("", "nan", "NaN")
-"""Texts of a cell without a value; fieldkit itself writes the empty text."""
+"""Texts of a cell without a value; fieldkit itself writes the empty string."""
 
 _NAME: Final = re.compile(r"[a-z][a-z0-9_]*(?:\.[a-z][a-z0-9_]*)*")
 _MAX_LENGTHS: Final = {"name": 100, "unit": 20, "meaning": 1000, "label": 100}
@@ -92,12 +92,13 @@ class Figure:
         sent: Column with the number of sent items; None unless the kind is `counted`.
         rank: Sort key among the figures of a table; figures of equal rank keep the order of columns. The ranks of
             fieldkit's figures are below `FIRST_EXTERNAL_RANK`, or `BACKGROUND` and above.
-        at_least: Column with the observed duration if the event had not ended (a right-censored value). It has a
-            value only in repeats in which the figure's column is empty for this reason. Only for medians; it has the
-            same unit and no figure.
+        at_least: Column with the duration observed so far, for repeats in which the event had not ended (a
+            right-censored value); in these repeats the figure's own column is empty. Allowed only for medians. The
+            column must have the same unit and no figure.
         of_sent: Column with the same statistic over all sent items, in which the value of a lost item is infinite;
-            empty if the result is infinite. For a figure that is computed from received items only, such as a
-            median RTT. An expectation `NAME < AMOUNT` must hold for both. Only for medians; it has the same unit.
+            empty if the result is infinite. It is used for a figure that is computed from received items only, such
+            as a median RTT. An expectation `NAME < AMOUNT` must then be true for this column and for the figure's own
+            column. Allowed only for medians. The column must have the same unit.
     """
 
     label: str
@@ -146,7 +147,7 @@ class Column:
     def declaration_error(self) -> str | None:
         """Return the error in this declaration, such as an invalid name, or None if it is valid."""
         if not _NAME.fullmatch(self.name):
-            return "its name is not made of lower-case letters, digits and _, with points between parts"
+            return "its name must consist of lower-case letters, digits and underscores, in parts separated by dots"
         texts = {"name": self.name, "unit": self.unit, "meaning": self.meaning}
         if self.figure is not None:
             texts["label"] = self.figure.label
@@ -221,8 +222,8 @@ def with_step_name(name: str, column: Column) -> Column:
     figure = column.figure
     if figure is not None:
         arrived, sent, at_least, of_sent = (
-            other and step_prefixed(name, other)
-            for other in (figure.arrived, figure.sent, figure.at_least, figure.of_sent)
+            related_column and step_prefixed(name, related_column)
+            for related_column in (figure.arrived, figure.sent, figure.at_least, figure.of_sent)
         )
         label = f"{name}: {figure.label}"
         figure = replace(figure, label=label, arrived=arrived, sent=sent, at_least=at_least, of_sent=of_sent)
@@ -312,7 +313,7 @@ def csv_text(names: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
 
 
 def csv_line(values: Iterable[object]) -> str:
-    """Return values as one CSV line with line end; text that a spreadsheet would read as a formula is escaped."""
+    """Return values as one CSV line with a line feed; text that a spreadsheet would read as a formula is escaped."""
     out = io.StringIO()
     cells = (escape_formula(cell(value)) if isinstance(value, str) else cell(value) for value in values)
     csv.writer(out, lineterminator="\n").writerow(cells)

@@ -7,8 +7,8 @@ from enum import StrEnum
 class CheckOutcome(StrEnum):
     """Consequence of a contradiction.
 
-    `void`: the repeat does not count; `withheld`: the columns are empty, and the reason is reported; `unchecked`: the
-    quantity has one source only.
+    `void`: the repeat does not count; `withheld`: the values could be wrong, so the columns are empty, and the reason
+    is reported; `unchecked`: the quantity has only one source.
     """
 
     VOID = "void"

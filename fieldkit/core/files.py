@@ -139,7 +139,7 @@ def read(path: Path, limit_bytes: int | None = None) -> bytes:
     """Return the content of a regular file.
 
     Raises:
-        OSError: As `open_plain`, or the file is larger than `limit_bytes`.
+        OSError: For the same reasons as `open_plain`, or because the file is larger than `limit_bytes`.
     """
     with os.fdopen(open_plain(path), "rb") as file:
         if limit_bytes is not None and os.fstat(file.fileno()).st_size > limit_bytes:
@@ -148,7 +148,7 @@ def read(path: Path, limit_bytes: int | None = None) -> bytes:
 
 
 def special_file_type(mode: int) -> str:
-    """Return a description of the file type, or an empty text for a regular file or a directory."""
+    """Return a description of the file type, or an empty string for a regular file or a directory."""
     types = (
         (stat.S_ISLNK, "it is a symbolic link"),
         (stat.S_ISFIFO, "it is a pipe"),
@@ -159,7 +159,7 @@ def special_file_type(mode: int) -> str:
 
 
 def unexpected_type(path: Path) -> str:
-    """Return the type of a special file, or an empty text if `path` is a regular file or directory, or is missing."""
+    """Return the type of a special file, or an empty string if `path` is a regular file, a directory or missing."""
     try:
         return special_file_type(path.lstat().st_mode)
     except FileNotFoundError:

@@ -1,7 +1,7 @@
 """Names of the files in an attempt's folder that only the laptop writes, for itself or for its testbed.
 
 The modules that write these files import the names. An archive from a robot that contains one of them is refused,
-because a robot must not provide the data of a testbed's oracle or of the operator.
+because a robot must not provide the data of the operator or of a modelled radio (`backends.protocols.Oracle`).
 """
 
 import re
@@ -13,7 +13,7 @@ LATENESS: Final = "lateness.txt"
 MEDIUM: Final = "medium.txt"
 """File of each transfer; the name of the transfer is its prefix."""
 AIR: Final = ("air.pcap", "air.csv")
-"""Files that a testbed's oracle may write into an attempt's folder (`Oracle.record_air`)."""
+"""Files that a modelled radio may write into an attempt's folder (`Oracle.record_air`)."""
 POSITIONS: Final = "positions.json"
 EXCHANGES: Final = "exchanges.txt"
 UNFETCHED: Final = "unfetched.txt"

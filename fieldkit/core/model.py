@@ -116,7 +116,7 @@ LOOP: Final = "for"
 MAX_STEPS: Final = 1000
 """Maximum number of steps of a procedure's file after its loops are expanded."""
 
-ENDED: Final = (Status.VALID, Status.VOID, Status.FAILED)
+FINAL_STATUSES: Final = (Status.VALID, Status.VOID, Status.FAILED)
 """Final states of an attempt."""
 
 
@@ -316,7 +316,9 @@ class RepeatId:
 
 @dataclass(frozen=True, kw_only=True)
 class DelayParts:
-    """One-way delay of packets in the four components of the paper's eq. 2, each summed over all packets.
+    """One-way delay of packets in its four components, each summed over all packets.
+
+    These are the components in equation 2 of the paper whose field trials fieldkit automates (docs/index.md).
 
     Attributes:
         packets: Number of packets.

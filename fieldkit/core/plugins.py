@@ -99,7 +99,7 @@ def load(point: EntryPoint) -> Any:  # noqa: ANN401 (any object of another packa
 
 
 @cache
-def _selector(search_path: tuple[str, ...]) -> Callable[..., EntryPoints]:  # noqa: ARG001 (the key of the cache)
+def _selector(search_path: tuple[str, ...]) -> Callable[..., EntryPoints]:  # noqa: ARG001 (it is the key of the cache)
     """Return the function that selects entry points of the installed packages. Reading their metadata takes 10 ms."""
     return metadata.entry_points().select
 

@@ -21,10 +21,11 @@ class WorkerExecutor(Executor):
     """An executor that reports the number of its workers and their deaths.
 
     Attributes:
-        MIN_SUBMITTED: Minimum number of tasks that are submitted, for any number of workers.
+        MIN_SUBMISSION_LIMIT: Smallest limit for the number of tasks that are submitted but not finished. The limit
+            increases with the number of workers.
     """
 
-    MIN_SUBMITTED: ClassVar[int] = 4
+    MIN_SUBMISSION_LIMIT: ClassVar[int] = 4
 
     @abstractmethod
     def capacity(self) -> int:

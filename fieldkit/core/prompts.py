@@ -95,12 +95,12 @@ class Operator(Protocol):
         ...
 
     def enter(self, question: Question) -> str:
-        """Show a question and return its answer in the form of `Question.read`; raises as `ask`."""
+        """Show a question and return its answer in the form of `Question.read`. Raises the same errors as `ask`."""
         ...
 
 
 class Unattended(Operator):
-    """Substitute for the operator with `--yes`: each request is done, and each question has its default answer."""
+    """Substitute for the operator with `--yes`: requests count as done, and questions have their default answer."""
 
     @override
     def ask(self, request: str, *, may_skip: bool = False) -> Answer:

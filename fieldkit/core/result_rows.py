@@ -47,16 +47,20 @@ class EstimateRow:
     )
     estimate: str | None = _column(
         "text",
-        "Kind of `value`: counted, mean, median, or share of the repeats (flag; words, which has no interval).",
+        "How `value` was estimated: `counted`, `mean`, `median`, `flag` (share of the repeats in which it is true), "
+        "or `words` (share of the repeats with the word, without an interval).",
     )
     wilson_low: float | None = _column(
         "unit",
-        "Lower end of the 95 % Wilson interval, which assumes that all counted items are independent. Only if "
-        "counted; empty if more items arrived than were sent, which offload causes for the paper's filter.",
+        "Lower end of the 95 % Wilson interval, which assumes that all counted items are independent. Only for "
+        "counted quantities; empty if more items arrived than were sent. This is possible in the `paper_*` columns "
+        "if a network card splits or merges frames (offload).",
     )
     wilson_high: float | None = _column("unit", "Upper end of the 95 % Wilson interval.")
     events: int | None = _column(
-        "count", "Items that were lost, repeats that are true or have the word; empty for means and medians."
+        "count",
+        "Number of lost items, or of repeats in which the flag is true or the word occurs; empty for means and "
+        "medians.",
     )
     trials: int | None = _column("count", "Number of items or repeats among which `events` are counted.")
     mean: float | None = _column("unit", "Mean over repeats.")
@@ -82,7 +86,7 @@ class DifferenceRow:
     missing_in: str | None = _column("text", "A or B if that run has no such condition; empty if both have it.")
     quantity: str | None = _column("text", "Column of trial.csv that was compared.")
     unit: str | None = _column("text", "Unit of all numbers except counts: s, bit/s, share, or that of the column.")
-    estimate: str | None = _column("text", "Kind of a and b: counted, mean, median, or flag (share of the repeats).")
+    estimate: str | None = _column("text", "How a and b were estimated: `counted`, `mean`, `median`, or `flag`.")
     n_a: int | None = _column("count", "Valid repeats of A that have a value of the quantity.")
     n_b: int | None = _column("count", "Valid repeats of B that have a value of the quantity.")
     a: float | None = _column("unit", "Estimate of A, as `value` of summary.csv; empty if A did not measure it.")
@@ -96,7 +100,9 @@ class DifferenceRow:
     p_holm: float | None = _column(
         "share", "p-value of the difference, corrected by Holm's method for the number of all comparisons."
     )
-    threshold: float | None = _column("unit", "Largest acceptable distance of a and b; empty if none was given.")
+    threshold: float | None = _column(
+        "unit", "Largest acceptable difference between a and b; empty if none was given."
+    )
     within: bool | None = _column("bool", "Whether the whole interval is within the threshold.")
     verdict: str | None = _column("text", "Result in words.")
 

@@ -67,7 +67,7 @@ def completed(
         note: Receives a sentence when a worker died or when no worker is connected.
 
     Raises:
-        ConfigurationError: As for `Workers.open`.
+        ConfigurationError: For the same reasons as `Workers.open`.
         LinkError: The scheduler of the cluster does not answer, or the connection was lost.
     """
     if tasks and workers.processes(len(tasks)) != 1:
@@ -120,7 +120,7 @@ class _Submission(Generic[Task, Result]):
         if not capacity and not self._has_no_worker:
             self._note(f"no worker is connected to {self._workers.cluster} yet; waiting for one")
         self._has_no_worker = not capacity
-        limit = max(_PER_WORKER * capacity, self._executor.MIN_SUBMITTED)
+        limit = max(_PER_WORKER * capacity, self._executor.MIN_SUBMISSION_LIMIT)
         while not self._executor.is_broken():
             if self._run_alone:
                 if self._submitted:

@@ -63,11 +63,11 @@ def run_parallel(
             have 10 s to return, so that they no longer write to files. Without this function, Ctrl-C does not wait
             for the threads.
         end_others: Ends the waits of all calls after one has failed. It is called repeatedly until all threads have
-            returned. Their `FieldkitError`s are consequences and are ignored. Another exception is a mistake in the
-            code of a call, and is raised instead of the first error. Without this function, all calls run to their
+            returned. Their `FieldkitError`s are consequences and are ignored. Another exception is a bug in the code
+            of a call, and is raised instead of the first error. Without this function, all calls run to their
             end.
     """
-    from concurrent.futures import ALL_COMPLETED, FIRST_EXCEPTION, Future, wait  # noqa: PLC0415 (logging, 5 ms)
+    from concurrent.futures import ALL_COMPLETED, FIRST_EXCEPTION, Future, wait  # noqa: PLC0415 (it imports logging, which takes 5 ms)
 
     # All futures exist before the first thread starts, so that Ctrl-C while a thread starts does not lose its future.
     futures: list[Future[T]] = [Future() for _ in items]
@@ -97,7 +97,7 @@ def run_parallel(
 
 
 def is_mistake(error: BaseException | None) -> bool:
-    """Return True for an exception that is a mistake in code. Another error must not hide it."""
+    """Return True if an exception shows a bug in the code. Another error must not hide it."""
     return isinstance(error, Exception) and not isinstance(error, FieldkitError)
 
 

@@ -76,7 +76,7 @@ def parse_distance(text: str) -> Distance:
 
 
 def parse_offset_m(text: str) -> float:
-    """Return a length in metres that may be negative, `-30ft`; raises as `parse_quantity`."""
+    """Return a length in metres that may be negative, `-30ft`. Raises the same errors as `parse_quantity`."""
     length_m = parse_quantity(text.removeprefix("-"), METRES_PER_UNIT, "length")
     return -length_m if text.startswith("-") else length_m
 
@@ -89,7 +89,7 @@ def format_distance(distance: Distance) -> str:
 
 
 def parse_duration_s(text: str, what: str = "duration") -> float:
-    """Return a duration in seconds; `what` and errors as for `parse_quantity`."""
+    """Return a duration in seconds; `what` and the errors are those of `parse_quantity`."""
     return parse_quantity(text, SECONDS_PER_UNIT, what)
 
 

@@ -15,7 +15,7 @@ from fieldkit.analysis.judgement_words import judgement_texts
 from fieldkit.analysis.judgements import Judgement
 from fieldkit.analysis.quantities import quantities
 from fieldkit.core import files
-from fieldkit.core.model import ENDED, RepeatId, Status
+from fieldkit.core.model import FINAL_STATUSES, RepeatId, Status
 from fieldkit.core.text import sanitized
 from fieldkit.trial import journal, store
 from fieldkit.trial.journal import JournalEntry
@@ -42,7 +42,7 @@ def write(path: Path, folders: Iterable[Path]) -> None:
 
 
 def text(folders: Iterable[Path]) -> bytes:
-    """Return trials as XML; raises as `write`."""
+    """Return trials as XML. Raises the same errors as `write`."""
     top = ET.Element("testsuites", name="fieldkit")
     # This is a list, because `extend` converts an exception of an iterator to a TypeError.
     top.extend([_suite(folder) for folder in folders])
@@ -76,7 +76,7 @@ def _repeat_cases(plan: Plan, entries: Iterable[JournalEntry]) -> Iterator[ET.El
         started_ns, last_status = 0, Status.PLANNED
         for entry in entries_by_repeat[repeat]:
             started_ns = entry.utc_ns if entry.status is Status.RUNNING else started_ns
-            if entry.status in ENDED:
+            if entry.status in FINAL_STATUSES:
                 duration_s += max(entry.utc_ns - started_ns, 0) / 1e9
                 reasons += [f"attempt {entry.attempt} {entry.status}: {entry.reason}"] if entry.reason else []
             last_status = entry.status

@@ -14,7 +14,7 @@ from typing import Final
 
 from fieldkit.core import geometry
 from fieldkit.core.errors import EvidenceError, shell_command
-from fieldkit.core.model import ENDED, Role, Status, Vector
+from fieldkit.core.model import FINAL_STATUSES, Role, Status, Vector
 from fieldkit.export import robot_messages, schemas
 from fieldkit.export.mcap import Channel, Json, Message
 from fieldkit.export.schemas import Level
@@ -75,9 +75,13 @@ def messages(folder: Path, plan: Plan) -> Iterator[Message]:
             "no repeat has ended yet", where=str(folder), remedy=shell_command("fieldkit", "resume", folder)
         )
     # Planned and measured positions have different origins, so a file has only one kind.
-    places = (folder, *(store.attempt_folder(folder, attempt.folder) for attempt in attempts))
-    has_positions = any((place / name).exists() for place in places for name in (track.FILE, position_sources.FILE))
-    ended_ns = {(entry.repeat, entry.attempt): entry.utc_ns for entry in entries if entry.status in ENDED}
+    folders = (folder, *(store.attempt_folder(folder, attempt.folder) for attempt in attempts))
+    has_positions = any(
+        (position_folder / name).exists()
+        for position_folder in folders
+        for name in (track.FILE, position_sources.FILE)
+    )
+    ended_ns = {(entry.repeat, entry.attempt): entry.utc_ns for entry in entries if entry.status in FINAL_STATUSES}
 
     @lru_cache(maxsize=_OPEN_ATTEMPTS)
     def evidence(attempt: Attempt) -> AttemptEvidence:

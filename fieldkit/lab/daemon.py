@@ -98,7 +98,7 @@ def run(folder: LabFolder, backend: LabBackend, *, seed: int, sink: Sink, on_rea
 
     Raises:
         ConfigurationError: A lab of this directory is already up.
-        FieldkitError: As `LabBackend.open_lab`.
+        FieldkitError: For the same reasons as `LabBackend.open_lab`.
     """
     with (
         _until_signal(),
@@ -121,7 +121,9 @@ def _lab_lock(folder: LabFolder) -> Iterator[None]:
         try:
             stack.enter_context(runtime.hold_lock(folder.lock_name))
         except NameHeldError as error:
-            raise ConfigurationError("this directory has a lab that is up", remedy="fieldkit lab down") from error
+            raise ConfigurationError(
+                "a lab is already running in this directory", remedy="fieldkit lab down"
+            ) from error
         yield
 
 

@@ -115,12 +115,12 @@ def unpack_state(answer: bytes) -> LabState:
 
 
 def unpack_place_m(answer: bytes) -> Vector:
-    """Return the position in an answer; raises as `unpack_state`."""
+    """Return the position in an answer. Raises the same errors as `unpack_state`."""
     return _PLACE.parse(_read(answer)).place_m
 
 
 def unpack_overview(answer: bytes) -> Overview:
-    """Return the plan view of the lab in an answer; raises as `unpack_state`."""
+    """Return the plan view of the lab in an answer. Raises the same errors as `unpack_state`."""
     return _OVERVIEW.parse(_read(answer))
 
 
@@ -163,15 +163,16 @@ def state(folder: LabFolder) -> LabState:
 
 
 def overview(folder: LabFolder) -> Overview:
-    """Return the current plan view of the lab. Errors as `state`."""
+    """Return the current plan view of the lab; raises the same errors as `state`."""
     return _request(folder, "overview", unpack_overview)
 
 
 def move(folder: LabFolder, robot: str, destination: Destination) -> Vector:
-    """Move a robot instantly and return the new position of its antenna in metres. Errors as `state`.
+    """Move a robot instantly and return the new position of its antenna in metres.
 
     Raises:
         ConfigurationError: There is no such robot, or the destination is not in the world.
+        FieldkitError: For the same reasons as `state`.
     """
     return _request(folder, f"move {robot} {pack_destination(destination)}", unpack_place_m)
 

@@ -98,7 +98,7 @@ class AttemptEvidence:
         testbed_samples = self.read_or_none(link_samples.read, link_samples.FILE) or {}
         if samples := testbed_samples.get(role):
             return samples
-        from fieldkit.measure.evidence import robot_link_samples  # noqa: PLC0415 (testbed_samples radios need no parser of iw)
+        from fieldkit.measure.evidence import robot_link_samples  # noqa: PLC0415 (needed only for real radios)
 
         return self.read_or_none(robot_link_samples.read, "", role) or ()
 

@@ -41,7 +41,7 @@ class AbortActions(ProcedureSection, RootModel[dict[Role, OnAbort]]):
         for role in self.root:
             if mavlink_of(plan.cast[role].profile) is None:
                 reason = "on_abort must bring it down, but its profile has no mavlink"
-                yield Refusal(role, reason, f"leave {role} out of on_abort, or use a drone")
+                yield Refusal(role, reason, f"remove {role} from on_abort, or use a drone")
 
     @override
     def dry_run_notes(self, plan: TrialOutline) -> Iterator[str]:

@@ -68,14 +68,14 @@ def halt_attempt(shell: Shell, folder: str, operator: str, deadline: Deadline) -
 
 
 def poll_states(shell: Shell, programs: Iterable[str], deadline: Deadline) -> HaltResult:
-    """Return the current state of programs that `halt_attempt` returned; raises the errors of `halt_attempt`."""
+    """Return the current state of programs that `halt_attempt` returned. Raises the same errors as `halt_attempt`."""
     return HaltResult(_states(call(shell, "motion_states", *programs, deadline=deadline)))
 
 
 def read_liveness(shell: Shell, file: str, deadline: Deadline) -> bytes:
     """Return the liveness file of a drone's pilot and guard, followed by /proc/uptime.
 
-    Raises the errors of `halt_attempt`.
+    Raises the same errors as `halt_attempt`.
     """
     return call(shell, "life_signs", file, deadline=deadline)
 

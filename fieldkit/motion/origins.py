@@ -91,7 +91,7 @@ class Origins(Protocol):
         Then no robot moves until a person confirms.
 
         Raises:
-            OSError: As `record`.
+            OSError: For the same reasons as `record`.
         """
         ...
 
@@ -103,7 +103,7 @@ class Origins(Protocol):
 
         Raises:
             MotionHeldError: A fault stopped a robot earlier, and no person has confirmed since.
-            OSError: As `record`.
+            OSError: For the same reasons as `record`.
         """
         ...
 

@@ -1,7 +1,7 @@
 """`fieldkit stop`: stop robots that fieldkit moves, immediately.
 
-An operator waits for it, so it imports only the code that connects to robots: neither pydantic nor profiles, steps
-and trials.
+The operator waits for this command, so it imports only the code that connects to robots: neither pydantic nor the
+modules of profiles, steps and trials.
 """
 
 import argparse
@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 @contextmanager
 def _robots(arguments: argparse.Namespace) -> Iterator[Robots]:
-    """Yield the robots that the options or the site file select: of the field, of another backend, or of a lab."""
+    """Yield the robots that the options or the site file select: real robots, or those of a lab or of a backend."""
     path: Path | None = arguments.site
     if path is None and Path(SITE_FILE).is_file():
         path = Path(SITE_FILE)

@@ -96,7 +96,7 @@ class EvidenceKeeper:
 
     @property
     def folder(self) -> EvidenceFolder:
-        """The folder for evidence of the present phase."""
+        """The folder for evidence of the current phase."""
         return self._set_up_folder if self._is_set_up else self._test_folder
 
     def add_event(self, event: Event) -> None:

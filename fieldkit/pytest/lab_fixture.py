@@ -52,11 +52,11 @@ class UncapturedTerminal:
         self._terminal = Terminal(self._show)
 
     def ask(self, request: str, *, may_skip: bool = False) -> Answer:  # noqa: ARG002 (a test cannot be skipped here)
-        """Ask a person to do something, as `Operator.ask`."""
+        """Ask a person to do something; see `Operator.ask`."""
         return self._ask_uncaptured(request, lambda: self._terminal.ask(request))
 
     def enter(self, question: Question) -> str:
-        """Ask a person a question, as `Operator.enter`."""
+        """Ask a person a question; see `Operator.enter`."""
         return self._ask_uncaptured(f"answer: {question.text}", lambda: self._terminal.enter(question))
 
     def _ask_uncaptured(self, task: str, ask: Callable[[], T]) -> T:
@@ -132,12 +132,12 @@ class OpenedLab:
 
     @property
     def testbed(self) -> Testbed:
-        """The testbed of the open robots; errors as for `open`."""
+        """The testbed of the open robots; raises the same errors as `open`."""
         return self.open()
 
     @property
     def cast(self) -> Cast:
-        """The robot in each role; errors as for `open`."""
+        """The robot in each role; raises the same errors as `open`."""
         self.open()
         return self._cast
 

@@ -79,8 +79,8 @@ _PUT: Final = (
 )
 
 
-class OpenRobots(Protocol):
-    """Open robots, as a lab provides them; errors as for `OpenedLab.open`."""
+class OpenedRobots(Protocol):
+    """The opened robots of a lab. Its properties raise the errors of `OpenedLab.open`."""
 
     @property
     def testbed(self) -> Testbed:
@@ -105,7 +105,7 @@ class RobotHandle:
         lab: Its lab.
     """
 
-    def __init__(self, role: Role, lab: OpenRobots) -> None:
+    def __init__(self, role: Role, lab: OpenedRobots) -> None:
         self.role = role
         self._lab = lab
 
@@ -162,14 +162,14 @@ class RobotHandle:
         )
 
     @contextmanager
-    def running(self, argv: Sequence[str], *, ros: bool = False) -> "Iterator[RunningProgram]":
+    def running(self, argv: Sequence[str], *, ros: bool = False) -> Iterator[RunningProgram]:
         """Run a program while the body runs, then stop it with SIGINT, and if needed with SIGTERM and SIGKILL.
 
         It is also stopped if this process or the connection to the robot ends.
 
         Args:
-            argv: As for `run`.
-            ros: As for `run`.
+            argv: The program with its arguments.
+            ros: Whether it runs in the ROS environment of the robot's profile.
 
         Raises:
             LinkError: The robot could not be reached.
@@ -202,7 +202,7 @@ class RobotHandle:
             content, mode = source.read_bytes(), source.stat().st_mode & 0o777
         except OSError as error:
             raise ConfigurationError(
-                f"cannot be read: {error.strerror}", where=str(source), remedy="name an existing file"
+                f"cannot be read: {error.strerror}", where=str(source), remedy="give the path of a readable file"
             ) from error
         command = ("sh", "-c", _PUT, "sh", remote, str(len(content)), f"{mode:o}")
         self._shell.run(command, deadline=Deadline.after(_seconds_for(len(content))), stdin=content)
@@ -212,7 +212,7 @@ class RobotHandle:
         """Copy a file from the robot; return its local path.
 
         Args:
-            remote: Its path on the robot, as for `put`.
+            remote: Its path on the robot, absolute or relative to the home folder of the login user.
             local: Local path; if it is an existing folder, the file keeps its name.
             limit_bytes: Maximum size.
 
@@ -228,29 +228,29 @@ class RobotHandle:
         return path
 
     def link(self) -> LinkSample:
-        """Return the present state of its radio's links: signal, rates, counters per station.
+        """Return the current state of its radio's links: signal, rates, counters per station.
 
         On a real robot this is the output of `iw`; without `iw` there are no stations.
 
         Raises:
             LinkError: The robot, or the process of the modelled radio, did not answer.
         """
-        testbed = self._lab.testbed
-        if testbed.oracle is not None:
-            return testbed.oracle.links(continue_sampling=False)[self.role][-1]
+        radio_model = self._lab.testbed.oracle  # the source of exact data about a modelled radio
+        if radio_model is not None:
+            return radio_model.links(continue_sampling=False)[self.role][-1]
         command = ("iw", "dev", self._robot.profile.radio.interface, "station", "dump")
         result = self._shell.run(command, deadline=Deadline.after(TIMEOUT_S), check=False)
         return LinkSample(time.time_ns(), robot_link_samples.parse_stations(result.stdout.decode(errors="replace")))
 
     @property
     def _robot(self) -> Robot:
-        cast = self._lab.cast
-        if self.role not in cast:
+        robots_by_role = self._lab.cast
+        if self.role not in robots_by_role:
             raise ConfigurationError(
-                f"no robot has the role {self.role} any more: other robots were opened",
-                remedy="use the topology of the lab in trials",
+                f"no robot has the role {self.role} any more: a trial opened the robots with another topology",
+                remedy="run trials with the topology of the lab",
             )
-        return cast[self.role]
+        return robots_by_role[self.role]
 
     @property
     def _shell(self) -> Shell:
@@ -268,12 +268,12 @@ class RobotHandle:
         ros_profile = self._robot.profile.ros
         if ros_profile is None:
             raise ConfigurationError(
-                f"its profile {self.profile} has no ros:", where=self.name, remedy="leave ros=True out"
+                f"its profile {self.profile} has no section ros:", where=self.name, remedy="remove ros=True"
             )
         return with_environment(argv, setup=ros_profile.command.setup, environment=ros_profile.environment)
 
     def _result(self, argv: Sequence[str], wait: Callable[[], Completed], *, check: bool = False) -> ProgramOutput:
-        """Return the result of a program; a timeout fails the test and is not an error of the robot."""
+        """Return the result of a program; a timeout is a test failure, not a robot error."""
         __tracebackhide__ = True
         command_text = f"{self.name} $ {quote(argv)}"
         try:
@@ -298,7 +298,7 @@ class RobotHandles:
         lab: The lab.
     """
 
-    def __init__(self, lab: OpenRobots) -> None:
+    def __init__(self, lab: OpenedRobots) -> None:
         self._lab = lab
 
     def __repr__(self) -> str:
@@ -310,11 +310,11 @@ class RobotHandles:
         Raises:
             ConfigurationError: There is no such robot.
         """
-        cast = self._lab.cast
-        for role, robot in cast.items():
+        robots_by_role = self._lab.cast
+        for role, robot in robots_by_role.items():
             if name in {role, robot.name}:
                 return RobotHandle(role, self._lab)
-        names = [*cast, *(robot.name for robot in cast.values())]
+        names = [*robots_by_role, *(robot.name for robot in robots_by_role.values())]
         raise ConfigurationError(
             f"there is no robot {name!r} in this lab",
             remedy=did_you_mean(name, names, f"its robots: {', '.join(names)}"),

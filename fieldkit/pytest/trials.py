@@ -1,4 +1,4 @@
-"""Complete trials in tests: run as by `fieldkit trial`, returned as by `fieldkit.load`."""
+"""Complete trials in tests. They run like those of `fieldkit trial`, and are returned as by `fieldkit.load`."""
 
 import argparse
 from collections.abc import Iterable, Sequence
@@ -49,7 +49,7 @@ class TrialRunner:
         record: str | None = None,
         notes: str = "",
     ) -> Trials:
-        """Run a trial and return it with all its evidence; arguments as the options of `fieldkit trial`.
+        """Run a trial and return it with all its evidence. The arguments are the options of `fieldkit trial`.
 
         Args:
             procedure: Name of the procedure.
@@ -65,7 +65,7 @@ class TrialRunner:
             ExpectationError: All repeats are valid, but a figure does not meet an expectation of the procedure.
             ConfigurationError: An argument is wrong.
             EvidenceError: A repeat failed.
-            FieldkitError: As for `OpenedLab.open` and `runner.run_trial`.
+            FieldkitError: For the same reasons as `OpenedLab.open` and `runner.run_trial`.
         """
         __tracebackhide__ = True
         protocols = (protocol,) if isinstance(protocol, str) else tuple(protocol)

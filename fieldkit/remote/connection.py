@@ -27,8 +27,8 @@ class Connection:
         address: Address of the robot.
         connect: Opens the stream.
         credentials: Host key and login.
-        patience_s: Time after the loss of a link during which attempts to reopen it are made.
-        notice: Called with a line of text when the link is lost, and when it is restored.
+        reconnect_timeout_s: Time after the loss of a link during which attempts to reopen it are made.
+        on_notice: Called with a line of text when the link is lost, and when it is restored.
         crosses_radio: Whether the link crosses the radio under test.
         timing: Timeouts of the link.
 
@@ -43,8 +43,8 @@ class Connection:
         connect: Connect,
         credentials: Credentials,
         *,
-        patience_s: float,
-        notice: Callable[[str], None],
+        reconnect_timeout_s: float,
+        on_notice: Callable[[str], None],
         crosses_radio: bool,
         timing: Timing,
     ) -> None:
@@ -52,13 +52,13 @@ class Connection:
         self.shells = ShellPool()
         self._connect = connect
         self._credentials = credentials
-        self._patience_s = patience_s
-        self._notice = notice
+        self._reconnect_timeout_s = reconnect_timeout_s
+        self._on_notice = on_notice
         self._crosses_radio = crosses_radio
         self._timing = timing
         self._connecting = threading.Lock()  # held by the thread that logs in
         self._lock = threading.Lock()  # protects the attributes below; no thread waits while it holds this lock
-        # `close` sets this event and replaces it by a new one. A wait uses the event that was present at its start.
+        # `close` sets this event and replaces it with a new one. A wait uses the event that was present at its start.
         self._close_event = threading.Event()
         self._link: Link | None = None
         self._was_up = False
@@ -73,7 +73,7 @@ class Connection:
         return self._close_event
 
     def link(self, deadline: Deadline) -> Link:
-        """Return the link, which is opened again if it is not alive; raises as `log_in`."""
+        """Return the link, which is opened again if it is not alive. Raises the same errors as `log_in`."""
         close_event, limit = self._close_event, deadline.earlier_of(self._timing.connect_s)
         if not self._connecting.acquire(timeout=limit.remaining_s):
             raise LinkLostError("another command is still connecting", where=self.address.robot)
@@ -102,21 +102,21 @@ class Connection:
             self._connecting.release()
         if lost_at_s is not None and not self._suppress_notices:
             duration = format_duration(time.monotonic() - lost_at_s)
-            self._notice(f"{self.address.robot}: the link is open again after {duration}")
+            self._on_notice(f"{self.address.robot}: the link is open again after {duration}")
         return link
 
     def run_with_retries(self, attempt: Callable[[Deadline], T], deadline: Deadline) -> T:
         """Return the result of `attempt`, which is repeated after each loss of the link.
 
         Only a link that was open before is reopened, so that a wrong address is reported immediately. A repeated
-        attempt has at least `Timing.reply_s`. The total time is limited to the sum of the times of `deadline`,
-        `patience_s`, one login, and `Timing.reply_s`.
+        attempt has at least `Timing.reply_s`. The total time is at most the time until `deadline`, plus
+        `reconnect_timeout_s`, the time of one login, and `Timing.reply_s`.
 
         Raises:
             LinkError: The deadline passed with an open link, the link was not restored, or `close` was called.
-            FieldkitError: As `attempt` and `log_in`.
+            FieldkitError: `attempt` or `log_in` raised it.
         """
-        close_event, final_deadline = self._close_event, Deadline(deadline.at_s + self._patience_s)
+        close_event, final_deadline = self._close_event, Deadline(deadline.at_s + self._reconnect_timeout_s)
         while True:
             try:
                 return attempt(deadline)
@@ -131,9 +131,11 @@ class Connection:
     def _wait_for_link(
         self, error: LinkLostError | LoginRefusedError, final_deadline: Deadline, close_event: threading.Event
     ) -> None:
-        """Wait until the link is open again; raise the last error after `patience_s`, or at `final_deadline`.
+        """Wait until the link is open again.
 
-        A robot that refuses the login although it accepted it before is treated as a robot that boots.
+        The last error is raised after `reconnect_timeout_s`, or at `final_deadline`.
+
+        If a robot that accepted the login before refuses it now, the robot is assumed to be booting.
         """
         with self._lock:
             if self._link is not None and self._link.alive:
@@ -143,7 +145,7 @@ class Connection:
                 self._register_loss()
             lost_at_s = self._lost_at_s = self._lost_at_s or time.monotonic()
         silence_s = self._wait_for_silence(error, close_event, notify=is_first)
-        end = Deadline(min(final_deadline.at_s, lost_at_s + silence_s + self._patience_s))
+        end = Deadline(min(final_deadline.at_s, lost_at_s + silence_s + self._reconnect_timeout_s))
         if is_first and not silence_s and not self._suppress_notices:
             self._notify_lost(end)
         pause_s = self._pause_s
@@ -174,22 +176,27 @@ class Connection:
 
     def _notify_lost(self, end: Deadline) -> None:
         if not end.expired:
-            patience = format_duration(end.remaining_s)
-            self._notice(f"{self.address.robot}: the link is lost; trying again for {patience}")
+            duration = format_duration(end.remaining_s)
+            self._on_notice(f"{self.address.robot}: the link is lost; trying again for {duration}")
 
     def _wait_for_silence(self, error: Exception, close_event: threading.Event, *, notify: bool) -> float:
         """Wait until the radio is no longer measured; return the expected maximum of this time, in seconds."""
         initial_s = self._silence_s()
         if initial_s and notify:
             wait = format_duration(initial_s)
-            self._notice(f"{self.address.robot}: the link is lost; for {wait} at most its radio is being measured")
+            self._on_notice(
+                f"{self.address.robot}: the link is lost; it is not reopened while its radio is being "
+                f"measured, for up to {wait}"
+            )
         while silence_s := self._silence_s():
             if close_event.wait(min(_POLL_S, silence_s)):
                 raise closed_error(self.address) from error
         return initial_s
 
     def open_spare_channels(self, link: Link, shell_command: str | None) -> None:
-        """Start to open channels for later commands, unless the radio is measured, because this sends packets.
+        """Start to open channels for later commands.
+
+        While the radio is being measured, no channels are opened, because this would send packets.
 
         Args:
             link: The link of a command that has ended.
@@ -207,10 +214,10 @@ class Connection:
 
     @contextmanager
     def silence(self, seconds: float) -> Iterator[None]:
-        """Send no packets on the link during the body, as `Shell.silence`.
+        """Send no packets on the link during the body; see `Shell.silence`.
 
-        A link without answers is not closed during this time, because keepalive probes are packets. The body
-        starts after the channels that are being opened are open.
+        Keepalive probes are not sent either, so the link is not closed for lack of answers during this time. The
+        body starts after the channels that are being opened are open.
         """
         if not self._crosses_radio:
             yield

@@ -19,7 +19,7 @@ def wait_for_output(channel: Execution, expected: bytes, *, deadline: Deadline, 
     """Wait until the command has written as many bytes as `expected` has; return False if it ended earlier.
 
     Raises:
-        ExpiredError, EOFError, RobotError: As `drain`.
+        ExpiredError, EOFError, RobotError: For the same reasons as `drain`.
     """
     remaining_bytes = len(expected)
     while remaining_bytes and not deadline.expired:

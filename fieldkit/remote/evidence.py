@@ -77,22 +77,25 @@ def boot_id(shell: Shell) -> str:
 
 
 def end_jobs(shell: Shell, folder: str) -> None:
-    """Stop all running jobs of the attempt, and block the start of others; raises as `begin`."""
+    """Stop all running jobs of the attempt, and block the start of others. Raises the same errors as `begin`."""
     call(shell, "end", folder, deadline=Deadline.after(2 * REPLY_S))
 
 
 def end_all(shell: Shell, trial: str) -> None:
-    """Stop all running jobs of `trial`; raises as `begin`."""
+    """Stop all running jobs of `trial`. Raises the same errors as `begin`."""
     call(shell, "halt", f"{HOME}/{trial}", deadline=Deadline.after(2 * REPLY_S))
 
 
 def discard_attempt(shell: Shell, folder: str) -> None:
-    """Delete an attempt's folder on the robot; raises as `begin`."""
+    """Delete an attempt's folder on the robot. Raises the same errors as `begin`."""
     call(shell, "drop", folder, deadline=Deadline.after(REPLY_S))
 
 
 def discard(shell: Shell, trial: str, *, kept_folders: Collection[str] = ()) -> None:
-    """Delete all files of `trial` on the robot, except `kept_folders` of attempts; raises as `begin`."""
+    """Delete all files of `trial` on the robot, except `kept_folders` of attempts.
+
+    Raises the same errors as `begin`.
+    """
     if kept_folders:
         names = (folder.rpartition("/")[2] for folder in kept_folders)
         call(shell, "tidy", f"{HOME}/{trial}", *names, deadline=Deadline.after(REPLY_S))

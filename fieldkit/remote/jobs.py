@@ -224,7 +224,7 @@ def serve(shell: Shell, job: Job) -> PendingJob:
 
     Raises:
         LinkError: The robot did not answer in time.
-        RobotError: As `start`.
+        RobotError: For the same reasons as `start`.
     """
     session = shell.begin(command("serve", job), deadline=Deadline.after(REPLY_S), until=_READY_OUTPUT)
     if not session.is_ready:
@@ -260,8 +260,8 @@ def stop(
         signal: Name without `SIG`.
         grace_s: Time until SIGKILL, in whole seconds.
         settle: File in the job's folder that must stop growing before the signal.
-        end_text: Text in the log which shows that the job has finished its work. `stop` then does not wait for its
-            end; `fetching.fetch` does so, and fails if its exit code is not 0.
+        end_text: Text in the log that shows that the job has finished its work. `stop` then does not wait for its
+            end; `fetching.fetch` waits for it, and fails if its exit code is not 0.
 
     Returns:
         The job's exit code, or `KILLED`; 0 if `end_text` is in its log.
@@ -295,7 +295,7 @@ class AbortResult:
 
     Attributes:
         locked: Whether the robot was locked.
-        jobs: A line per stopped or signalled job, as from `left`.
+        jobs: A line per stopped or signalled job, in the format of `list_running`.
         landing: Programs that still land a drone, `TRIAL/ATTEMPT/.jobs/NAME` below the robot's home, each with its
             `motion_states.MotionState`.
         error: The error if a part failed; None otherwise.

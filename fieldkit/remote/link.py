@@ -200,7 +200,7 @@ class Link:
             RobotError: The host key is not the pinned one.
             LoginRefusedError: The robot refused the user, the key or the password.
             ConfigurationError: There is no key for the login.
-            OSError, SSHException, EOFError: As `exchange_keys`.
+            OSError, SSHException, EOFError: For the same reasons as `exchange_keys`.
         """
         pinned_key = credentials.host_key
         server_key = self.exchange_keys(pinned_key.kind)

@@ -16,7 +16,8 @@ class MotionState(StrEnum):
         LAND: A drone is landing at its position.
         RETURN: A drone is returning, and will then land.
         SILENT: The program received a signal and has not confirmed anything. A driving program was killed.
-        ALARM: The program cannot land its drone now: the autopilot sends no heartbeat, or another party flies it.
+        ALARM: The program cannot land its drone now: the autopilot sends no heartbeat, or a person or another program
+            flies it.
     """
 
     NOTHING = "nothing"

@@ -46,7 +46,7 @@ def read_from_keyring(user: str, host: str, robot: str) -> str:
         ) from error
     if password is None:
         raise ConfigurationError(
-            f"the keyring has no password of {user}@{host}", where=robot, remedy=_store_command(user, host)
+            f"the keyring has no password for {user}@{host}", where=robot, remedy=_store_command(user, host)
         )
     return password
 

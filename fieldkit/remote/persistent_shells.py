@@ -66,7 +66,7 @@ class ShellPool:
         return command
 
     def restore(self, link: Link, command: str) -> None:
-        """Start to open a shell by `command` if `link` has too few, unless an earlier attempt failed on this link."""
+        """Start to open a shell with `command` if `link` has too few, unless an earlier attempt on it failed."""
         with self._lock:
             if self._link is not link:
                 self._link, self._shells, self._opening = link, [], False
@@ -106,7 +106,7 @@ class PersistentShell:
 
     @classmethod
     def open(cls, channel: Channel, command: str) -> Self:
-        """Start a shell by `command` on `channel`, and return it when it is ready.
+        """Start a shell with `command` on `channel`, and return it when it is ready.
 
         Raises:
             EOFError: The shell did not start, or a login shell printed a greeting before it started.

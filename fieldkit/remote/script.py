@@ -1,4 +1,4 @@
-"""The job script on a robot: installed once per version, and called for all tasks that must survive a connection."""
+"""The job script on a robot: installed once per version, and called for all tasks that must outlive a connection."""
 
 import hashlib
 import re
@@ -47,7 +47,7 @@ _COPY_SCRIPT: Final = (
 )
 
 _MISSING_PROGRAM: Final = b"it lacks "
-_INSTALL: Final = "install it: apt-get install util-linux coreutils gawk grep tar, or a whole busybox"
+_INSTALL: Final = "install it: apt-get install util-linux coreutils gawk grep tar, or a full busybox"
 _GREETING_BYTES: Final = 60
 _READ_ONLY_REMEDY: Final = "on the robot: dmesg | tail; a failing SD card becomes read-only, so save its data"
 
@@ -111,7 +111,7 @@ def call(shell: Shell, verb: str, *words: str, deadline: Deadline) -> bytes:
 
 
 def require_success(shell: Shell, completed: Completed, *, remedy: str = "") -> None:
-    """Check that a call of the script succeeded; raises as `call` otherwise."""
+    """Check that a call of the script succeeded. Raises the same errors as `call`."""
     if completed.exit_code == 0:
         return
     # A login shell that refuses the login (nologin) prints its message to either stream.

@@ -99,7 +99,7 @@ class Shell(Protocol):
         """Run a command and write its standard output to the file `to` (`stdout` of the result is empty).
 
         Raises:
-            LinkError: As `run`.
+            LinkError: For the same reasons as `run`.
             RobotError: The exit code is not 0, or there is more output than `limit_bytes`.
         """
         ...

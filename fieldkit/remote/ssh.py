@@ -20,7 +20,7 @@ from fieldkit.remote.shell import Completed
 from fieldkit.remote.sockets import Connect, Timing
 
 CONNECT_S: Final = Timing.connect_s
-PATIENCE_S: Final = 60.0
+RECONNECT_TIMEOUT_S: Final = 60.0
 
 _MAX_OUTPUT_BYTES: Final = 16 << 20
 _DISK_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
@@ -38,8 +38,8 @@ class SshShell:
         password: The password, which is then the only login method; None to use keys.
         host: Host name or address, for messages; empty for the name of the robot.
         port: SSH port, for messages.
-        patience_s: Time after a loss during which attempts to reopen the connection are made.
-        notice: Called with one line when the connection is lost, and when it is restored.
+        reconnect_timeout_s: Time after a loss during which attempts to reopen the connection are made.
+        on_notice: Called with one line when the connection is lost, and when it is restored.
         crosses_radio: Whether the connection crosses the radio under test.
         timing: Timeouts of the connection.
 
@@ -58,17 +58,17 @@ class SshShell:
         password: str | None = None,
         host: str = "",
         port: int = 22,
-        patience_s: float = PATIENCE_S,
-        notice: Callable[[str], None] = lambda text: None,  # noqa: ARG005
+        reconnect_timeout_s: float = RECONNECT_TIMEOUT_S,
+        on_notice: Callable[[str], None] = lambda text: None,  # noqa: ARG005
         crosses_radio: bool = False,
-        timing: Timing = Timing(),  # noqa: B008 (frozen)
+        timing: Timing = Timing(),  # noqa: B008 (the default is immutable)
     ) -> None:
         self._connection = Connection(
             Address(robot, host or robot, port, user),
             connect,
             Credentials(HostKey.parse(host_key, robot), private_key, password),
-            patience_s=patience_s,
-            notice=notice,
+            reconnect_timeout_s=reconnect_timeout_s,
+            on_notice=on_notice,
             crosses_radio=crosses_radio,
             timing=timing,
         )
@@ -84,16 +84,16 @@ class SshShell:
         return self._connection.address.ssh_arguments
 
     def begin(self, argv: Sequence[str], *, deadline: Deadline, until: bytes | None = None) -> "SshSession":
-        """Start a command and return when the robot has accepted it, or has written `until`; as `Shell.begin`."""
+        """Start a command and return when the robot has accepted it, or has written `until`; see `Shell.begin`."""
         return self._begin(argv, deadline, ends_on_request=until is None, until=until or b"")
 
     def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
-        """Run a command and wait for its end; as `Shell.run`."""
+        """Run a command and wait for its end; see `Shell.run`."""
         session = self._begin(argv, deadline, has_input=bool(stdin))
         return session.end(deadline=deadline, stdin=stdin, check=check)
 
     def fetch(self, argv: Sequence[str], to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
-        """Run a command and write its standard output to a file; as `Shell.fetch`."""
+        """Run a command and write its standard output to a file; see `Shell.fetch`."""
         session = self._begin(argv, deadline)
         with to.open("wb") as out:
             return session.end(deadline=deadline, out=out, limit_bytes=limit_bytes)
@@ -128,7 +128,7 @@ class SshShell:
         return self._connection.run_with_retries(attempt, deadline)
 
     def silence(self, seconds: float) -> contextlib.AbstractContextManager[None]:
-        """Keep the connection silent during the body, if it crosses the radio under test; as `Shell.silence`."""
+        """Keep the connection silent during the body, if it crosses the radio under test; see `Shell.silence`."""
         return self._connection.silence(seconds)
 
     def close(self) -> None:
@@ -174,7 +174,7 @@ class SshSession:
         out: IO[bytes] | None = None,
         limit_bytes: int = _MAX_OUTPUT_BYTES,
     ) -> Completed:
-        """Wait for the end of the command; as `Session.end`, `Shell.run` and `Shell.fetch`.
+        """Wait for the end of the command; see `Session.end`, `Shell.run` and `Shell.fetch`.
 
         Args:
             deadline: When to give up.

@@ -1,7 +1,7 @@
 """Times and flows in one attempt on the clock of the first sending robot.
 
-The times are those of packets, pings, jobs, faults and moves. The flows are the rate of iperf3, the payload of
-transfers, and the panels of steps that draw them (`DrawsPanels`).
+The times are those of packets, pings, jobs, faults and moves. The flows are panels over time: the payload rate that
+iperf3 measured, and the panels that steps draw themselves (`DrawsPanels`).
 """
 
 import math
@@ -32,8 +32,9 @@ from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import PlacedStep
 
 _SHOWN_BY_EVIDENCE: Final = frozenset(("record", "send", "listen", "ping"))
-"""Jobs whose evidence has more exact times."""
-_HEALS_SUFFIX: Final = "-heals"
+"""Jobs whose evidence contains more accurate times than the start and end of the job."""
+_RECOVERY_JOB_SUFFIX: Final = "-heals"
+"""Suffix of the name of the job that waits until the robot has recovered from a fault."""
 _LONGEST_PAUSE_NS: Final = 1_000_000_000
 """Longest time between two changes of position of a moving robot."""
 
@@ -175,7 +176,7 @@ def _clock_offset(
     )
     unknown_text = f"The offset between the clocks of {ends[0]} and {ends[1]} is not known"
     if offset_ns is None:
-        return 0, f"{unknown_text}: each time is by the clock of its robot."
+        return 0, f"{unknown_text}: the times of each robot are those of its clock."
     return offset_ns, f"{unknown_text}: here the delay of the first packet is assumed to be 0."
 
 
@@ -230,11 +231,15 @@ def _activities_of_jobs(times: AttemptTimes) -> Iterator[Activity]:
 
 
 def _activities_of_faults(times: AttemptTimes, evidence: AttemptEvidence) -> Iterator[Activity]:
-    """Yield each fault from its start to the end of its cause, which is the start of the job that awaits recovery."""
+    """Yield each fault from its start to the end of its cause, at which the job that waits for recovery starts."""
     for (role, name), (recovery_ns, _) in times.jobs.items():
         step, _, what = name.rpartition(".")
-        kind = what.removeprefix("fault-").removesuffix(_HEALS_SUFFIX)
-        if what.startswith("fault-") and what.endswith(_HEALS_SUFFIX) and kind in {str(fault) for fault in FaultKind}:
+        kind = what.removeprefix("fault-").removesuffix(_RECOVERY_JOB_SUFFIX)
+        if (
+            what.startswith("fault-")
+            and what.endswith(_RECOVERY_JOB_SUFFIX)
+            and kind in {str(fault) for fault in FaultKind}
+        ):
             note = step_prefixed(step, outage.note_file(FaultKind(kind)))
             lasted_s = evidence.read_or_none(outage.cause_duration_s, note) or 0.0
             yield Activity(
@@ -259,7 +264,7 @@ def _outage(
 
 
 def _activities_of_moves(evidence: AttemptEvidence) -> Iterator[Activity]:
-    """Yield the time in which each robot moved during the attempt, by the track of the testbed."""
+    """Yield the period in which each robot moved during the attempt, according to the testbed's track."""
     samples = evidence.read_or_none(track.read, track.FILE) or ()
     for role in dict.fromkeys(sample.role for sample in samples):
         track_points = [sample for sample in samples if sample.role == role]
@@ -293,7 +298,7 @@ _ENDS: Final = (Style("blue", line="solid"), Style("green", line="dashed"))
 
 
 def flow_panels(evidence: AttemptEvidence, plan: Plan, times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
-    """Yield the panels of steps whose evidence has times: tests of iperf3, and steps that draw their panels.
+    """Yield the panels of steps whose evidence has times: iperf3 tests, and steps that draw panels themselves.
 
     Args:
         evidence: Evidence of the attempt.
@@ -309,7 +314,7 @@ def flow_panels(evidence: AttemptEvidence, plan: Plan, times: AttemptTimes, zero
 
 
 def _iperf3(placed_step: PlacedStep, evidence: AttemptEvidence, times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
-    """Yield the payload rate that each end counted per second. The first second starts with the client."""
+    """Yield the payload rate that each end counted per second. The first second begins when the client starts."""
     step = placed_step.step
     client = next((span for (_, job), span in times.jobs.items() if job == step.prefixed_name("iperf3-client")), None)
     if client is None:

@@ -167,7 +167,7 @@ def build_contents(
     Args:
         repeats: Attempts, with the column `source`.
         title: Its title; empty for a generated one.
-        repeat: Repeat for the time line, as `repeat_to_draw`.
+        repeat: Repeat for the time line, in the form of `repeat_to_draw`.
         command: The words of the operator's command, without `--rebuild`.
         paths: The paths in it.
         quantities: Names of quantities to draw in addition to the default ones.

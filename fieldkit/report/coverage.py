@@ -11,7 +11,7 @@ from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.quantities import Quantity
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.core.columns import plain_name, step_prefixed
-from fieldkit.core.model import ENDED, Status
+from fieldkit.core.model import FINAL_STATUSES, Status
 from fieldkit.report import wording
 from fieldkit.report.trial_folders import Evidence
 
@@ -107,7 +107,7 @@ def repeat_counts(cell: Cell, evidence: Evidence, silent: Rows) -> RepeatCounts:
         plan = evidence.plans.get(source)
         started_count = sum(key[0] == source for key in last_statuses)
         planned += max(started_count, plan.repeats) if plan else started_count
-    valid, void, failed = (statuses.count(status) for status in ENDED)
+    valid, void, failed = (statuses.count(status) for status in FINAL_STATUSES)
     is_silent = silent[rows] & (texts["status"][rows] == Status.VALID)
     return RepeatCounts(planned, valid, void, failed, int(is_silent.sum()))
 

@@ -44,7 +44,7 @@ ET.register_namespace("xlink", _XLINK)
 
 
 def write(contents: Contents, out: Path) -> None:
-    """Write the page; raises as `explaining_write_errors`."""
+    """Write the page. Raises the same errors as `explaining_write_errors`."""
     with explaining_write_errors(out, "-o"):
         files.write(out, render(contents, out).encode())
 

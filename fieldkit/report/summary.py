@@ -155,7 +155,7 @@ def _factor_names(sweep: Mapping[str, str]) -> str:
 
 
 def title(cells: Sequence[Cell], sweep: Mapping[str, str]) -> str:
-    """Return the default title of a report; `sweep` as for `paragraph`."""
+    """Return the default title of a report; see `paragraph` for `sweep`."""
     if len(sweep) > 1:
         return f"Sweep over {_factor_names(sweep)}"
     return f"Loss and delay: {wording.join_names(_values(cells, 'procedure'))}"

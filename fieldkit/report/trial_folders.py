@@ -153,7 +153,7 @@ def load_evidence(repeats: Repeats, attempt: str = "") -> Evidence:
 
     Args:
         repeats: The table.
-        attempt: An attempt whose evidence must be available, as for `Repeats.row`; empty for none.
+        attempt: An attempt whose evidence must be available, in the form of `Repeats.row`; empty for none.
 
     Raises:
         ConfigurationError: There is no such attempt, or there are several.

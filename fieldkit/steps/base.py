@@ -106,7 +106,7 @@ class Step(Strict, ABC):
         """Return the roles that the step needs. By default these are the roles among the values of its fields."""
         return frozenset(role for name in type(self).model_fields for role in _roles_in(getattr(self, name)))
 
-    def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (the same for every protocol)
+    def expected_s(self, protocol: Protocol) -> float:  # noqa: ARG002 (subclasses need it)
         """Return the approximate duration of the step on a good link, in seconds."""
         return 0.0
 
@@ -172,7 +172,7 @@ def step_types() -> LazyMapping[type[Step]]:
     """Return the class of every kind of step by name, built-in kinds first.
 
     Raises:
-        ConfigurationError: See `kinds.find`.
+        ConfigurationError: For the same reasons as `kinds.find`.
     """
     return LazyMapping(kinds.find(), _load)
 
@@ -197,5 +197,5 @@ class StepEntry:
     step: Step
 
     @classmethod
-    def __get_pydantic_core_schema__(cls, *_: Any) -> CoreSchema:  # noqa: ANN401 (of pydantic)
+    def __get_pydantic_core_schema__(cls, *_: Any) -> CoreSchema:  # noqa: ANN401 (pydantic declares them as Any)
         return schema.by_kind(step_types, cls, lambda entry: (entry.kind, entry.step), "step")

@@ -92,9 +92,9 @@ class LoadOptions(OverLink):
         Args:
             scene: The attempt.
             reverse: Whether the server sends.
-            ports: As `LoadStreams.ports`.
-            duration_s: As `FlowSchedule.duration_s`.
-            receiver_end_ns: As `FlowSchedule.receiver_end_ns`.
+            ports: Ports of the streams; see `LoadStreams.ports`.
+            duration_s: Duration of the load; see `FlowSchedule.duration_s`.
+            receiver_end_ns: Time at which the receiver stopped; see `FlowSchedule.receiver_end_ns`.
         """
         ends = [scene.link(role, self.over).address for role in (self.sender, self.receiver)]
         source, destination = reversed(ends) if reverse else ends

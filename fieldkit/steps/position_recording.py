@@ -58,7 +58,7 @@ def run_while_recording(
         nest: The step.
         scene: The attempt.
         testbed: The robots.
-        announce: As for `Step.run`.
+        announce: Called when a phase of the step starts; see `Step.run`.
         recordings: Jobs that record until they are stopped.
         make_sources: Returns the sources of positions; None if the recordings contain no positions.
         extra_s: Returns the whole seconds for which a recording continues after the last step, so that a position at

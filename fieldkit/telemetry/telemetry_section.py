@@ -335,7 +335,7 @@ class TelemetrySource(Strict):
 
         Args:
             radio: The interface under test, over which nothing may be sent; `-` on another computer.
-            credentials_file: As for `argv`.
+            credentials_file: File with the credentials of the command; see `argv`.
         """
         tested_interface = "-" if self.wired else radio
         times = (f"{self.interval:.0f}", f"{self.limit:.0f}")

@@ -132,7 +132,8 @@ def installed_columns() -> tuple[Column, ...]:
     """Return the columns of every trial, of robots in fixed roles, and of step kinds of other packages.
 
     Raises:
-        ConfigurationError: As for `step_types`, or a kind declares an invalid column or a column that exists already.
+        ConfigurationError: For the same reasons as `step_types`, or because a kind declares an invalid column or a
+            column that exists already.
     """
     columns_by_name = {**_common_columns(), **{column.name: column for column in robot_columns(FIXED_ROLES)}}
     for kind, step in step_types().items():

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
-from fieldkit.core.model import ENDED, Protocol, RepeatId, Status
+from fieldkit.core.model import FINAL_STATUSES, Protocol, RepeatId, Status
 from fieldkit.core.units import TimeEstimate, format_duration
 from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.plan import Plan
@@ -46,7 +46,7 @@ def finished_repeats(plan: Plan, entries: Iterable[JournalEntry]) -> list[Finish
     for entry in entries:
         if entry.status is Status.RUNNING:
             start_ns[entry.repeat] = entry.utc_ns
-        elif entry.status in ENDED and entry.repeat in start_ns and not entry.excused:
+        elif entry.status in FINAL_STATUSES and entry.repeat in start_ns and not entry.excused:
             attempt_s = max(entry.utc_ns - start_ns[entry.repeat], 0) / 1e9
             duration_s[entry.repeat] = duration_s.get(entry.repeat, 0.0) + attempt_s
             finished |= {entry.repeat: None} if entry.status is not Status.VOID else {}

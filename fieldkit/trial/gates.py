@@ -87,7 +87,9 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
                 problems += impossible.values()
             result = result.without(impossible)
             if placement_problem:
-                dependent = {name: placement_problem for name in result.values if position_columns.is_dependent(name)}
+                dependent = {
+                    name: placement_problem for name in result.values if position_columns.depends_on_positions(name)
+                }
                 result = result.without(dependent)
             if has_no_times:
                 result = result.without({column.name: _NO_TIMES for column in columns if column.unit in _TIME_UNITS})
@@ -179,7 +181,7 @@ _TESTBED_FILES: Final[tuple[tuple[Callable[[Path], object], str], ...]] = (
 
 
 def _testbed_problems(evidence: AttemptEvidence) -> Iterator[str]:
-    """Yield the problems of the files that the testbed's oracle wrote, if there is an oracle."""
+    """Yield the problems of the files with the data of a modelled radio (`Testbed.oracle`), if there are any."""
     for read, name in _TESTBED_FILES:
         try:
             content = evidence.read(read, name) if evidence.has(name) else None

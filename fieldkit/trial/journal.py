@@ -11,7 +11,7 @@ from fieldkit.config.json_records import Codec
 from fieldkit.config.schema import Field
 from fieldkit.core import jsonl, laptop_files
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.model import ENDED, Protocol, RepeatId, Status
+from fieldkit.core.model import FINAL_STATUSES, Protocol, RepeatId, Status
 from fieldkit.remote import jobs
 from fieldkit.trial.plan import Plan
 
@@ -86,16 +86,19 @@ class Attempt:
     @property
     def folders(self) -> tuple[str, ...]:
         """All names that the folder may have, depending on the final status."""
-        return tuple(self.repeat.folder(status, self.number) for status in ENDED)
+        return tuple(self.repeat.folder(status, self.number) for status in FINAL_STATUSES)
 
 
 def locked(folder: Path) -> AbstractContextManager[None]:
-    """Return a context that locks a trial against other processes of fieldkit; raises as `jsonl.locked`."""
+    """Return a context that locks a trial against other processes of fieldkit.
+
+    Raises the same errors as `jsonl.locked`.
+    """
     return jsonl.locked(folder / JOURNAL_FILE, "trial")
 
 
 def append(folder: Path, *entries: JournalEntry) -> None:
-    """Add entries to the journal of a trial; raises as `jsonl.append`."""
+    """Add entries to the journal of a trial. Raises the same errors as `jsonl.append`."""
     jsonl.append(folder / JOURNAL_FILE, *map(_CODEC.dump, entries))
 
 
@@ -105,14 +108,18 @@ def reopen_failed(folder: Path, plan: Plan) -> int:
     `ended_attempts` then returns the failed attempts as void.
 
     Raises:
-        EvidenceError: As for `history`.
+        EvidenceError: For the same reasons as `history`.
         OSError: The disk is full or was removed.
     """
     remove_torn_line(folder)
     now = time.time_ns()
-    failed = [attempt.repeat for attempt in ended_attempts(history(folder, plan)) if attempt.status is Status.FAILED]
-    append(folder, *(JournalEntry(now, repeat.protocol, repeat.number, 0, Status.PLANNED) for repeat in failed))
-    return len(failed)
+    failed_repeats = [
+        attempt.repeat for attempt in ended_attempts(history(folder, plan)) if attempt.status is Status.FAILED
+    ]
+    append(
+        folder, *(JournalEntry(now, repeat.protocol, repeat.number, 0, Status.PLANNED) for repeat in failed_repeats)
+    )
+    return len(failed_repeats)
 
 
 def remove_torn_line(folder: Path) -> None:
@@ -121,7 +128,7 @@ def remove_torn_line(folder: Path) -> None:
 
 
 def read(folder: Path) -> list[JournalEntry]:
-    """Return the entries of a trial's journal; raises as `jsonl.read`."""
+    """Return the entries of a trial's journal. Raises the same errors as `jsonl.read`."""
     return jsonl.read(folder / JOURNAL_FILE, _CODEC.parse, remedy="name the folder of a trial")
 
 
@@ -129,7 +136,8 @@ def history(folder: Path, plan: Plan) -> list[JournalEntry]:
     """Return the entries of a trial's journal after a check that their sequence is possible.
 
     Raises:
-        EvidenceError: As for `read`; or an entry contradicts earlier entries, or its repeat is not in the plan.
+        EvidenceError: For the same reasons as `read`, or because an entry contradicts earlier entries, or because
+            its repeat is not in the plan.
     """
     entries = read(folder)
     for line, reason in _impossible_entries(entries, plan):
@@ -159,14 +167,16 @@ def _impossible_entries(entries: list[JournalEntry], plan: Plan) -> Iterator[tup
             started.add(attempt)
         elif attempt not in started or attempt in ended:
             yield line, f"attempt {entry.attempt} at {repeat} is {entry.status}, although it is not running"
-        elif entry.status in ENDED:
+        elif entry.status in FINAL_STATUSES:
             ended.add(attempt)
             final_status |= {repeat: entry.status} if entry.status is not Status.VOID else {}
 
 
 def ended_attempts(entries: list[JournalEntry]) -> list[Attempt]:
     """Return the attempts that ended, in the order of their ends. Failed attempts of a reopened repeat are void."""
-    started = {(entry.repeat, entry.attempt): entry.utc_ns for entry in entries if entry.status is Status.RUNNING}
+    start_ns_by_attempt = {
+        (entry.repeat, entry.attempt): entry.utc_ns for entry in entries if entry.status is Status.RUNNING
+    }
     planned_at = {entry.repeat: line for line, entry in enumerate(entries) if entry.status is Status.PLANNED}
 
     def to_attempt(entry: JournalEntry, *, is_before_reopening: bool) -> Attempt:
@@ -174,7 +184,7 @@ def ended_attempts(entries: list[JournalEntry]) -> list[Attempt]:
         return Attempt(
             repeat=entry.repeat,
             number=entry.attempt,
-            started_utc_ns=started[entry.repeat, entry.attempt],
+            started_utc_ns=start_ns_by_attempt[entry.repeat, entry.attempt],
             status=Status.VOID if reopened else entry.status,
             reason=entry.reason,
             excused=entry.excused or is_before_reopening,
@@ -190,14 +200,14 @@ def ended_attempts(entries: list[JournalEntry]) -> list[Attempt]:
 
 def interrupted_attempts(entries: list[JournalEntry]) -> list[Attempt]:
     """Return the attempts that did not end because fieldkit was killed; their status is `running` or `measured`."""
-    ended = {(attempt.repeat, attempt.number) for attempt in ended_attempts(entries)}
-    started = {
+    ended_keys = {(attempt.repeat, attempt.number) for attempt in ended_attempts(entries)}
+    start_ns_by_attempt = {
         (entry.repeat, entry.attempt): entry.utc_ns
         for entry in entries
-        if entry.status is Status.RUNNING and (entry.repeat, entry.attempt) not in ended
+        if entry.status is Status.RUNNING and (entry.repeat, entry.attempt) not in ended_keys
     }
-    measured = {(entry.repeat, entry.attempt) for entry in entries if entry.status is Status.MEASURED}
+    measured_keys = {(entry.repeat, entry.attempt) for entry in entries if entry.status is Status.MEASURED}
     return [
-        Attempt(repeat, number, utc_ns, Status.MEASURED if (repeat, number) in measured else Status.RUNNING)
-        for (repeat, number), utc_ns in started.items()
+        Attempt(repeat, number, utc_ns, Status.MEASURED if (repeat, number) in measured_keys else Status.RUNNING)
+        for (repeat, number), utc_ns in start_ns_by_attempt.items()
     ]

@@ -66,7 +66,7 @@ class Manifest:
             self._save()
 
     def write(self) -> None:
-        """Write the manifest: checksums of the added attempts, and of the present top-level files.
+        """Write the manifest: checksums of the added attempts, and of the current top-level files.
 
         The plan does not change during a trial, so its first checksum is kept.
         """

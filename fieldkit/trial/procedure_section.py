@@ -43,11 +43,11 @@ class ProcedureSection:
         """Yield the reasons why the section cannot be used with the robots of a trial."""
         return iter(())
 
-    def dry_run_notes(self, plan: TrialOutline) -> Iterator[str]:  # noqa: ARG002 (some have no such actions)
+    def dry_run_notes(self, plan: TrialOutline) -> Iterator[str]:  # noqa: ARG002 (subclasses need it)
         """Yield a line for each action that is not a command on a robot. `--dry-run` prints these lines."""
         return iter(())
 
-    def abort_notes(self, plan: TrialOutline) -> Iterator[str]:  # noqa: ARG002 (most move no robot)
+    def abort_notes(self, plan: TrialOutline) -> Iterator[str]:  # noqa: ARG002 (subclasses need it)
         """Yield a sentence about the reaction of each moving robot if an attempt is stopped immediately.
 
         If there are such sentences, a request to stop takes effect immediately.

@@ -140,7 +140,7 @@ def summary(folder: Path, plan: Plan, table: str) -> tuple[Cell, ...]:
 
 
 def write_summary(folder: Path, plan: Plan, table: str) -> tuple[Cell, ...]:
-    """Write summary.csv for a trial's table and return its cells; errors as for `summary`."""
+    """Write summary.csv for a trial's table and return its cells. Raises the same errors as `summary`."""
     cells = summary(folder, plan, table)
     files.write(folder / store.SUMMARY_CSV, result_tables.to_csv(DEFAULT_BY, cells).encode())
     return cells

@@ -91,7 +91,7 @@ def _start(cast: Cast, shell: Shell, planned_job: Planned) -> None:
 
 
 def _stop(shell: Shell, job: Job) -> str:
-    """Stop a job, and return a description of the problem, or an empty text if there was none."""
+    """Stop a job, and return a description of the problem, or an empty string if there was none."""
     try:
         was_running = any(f"{job.folder}/" in line for line in jobs.list_running(shell, Deadline.after(jobs.REPLY_S)))
         code = jobs.stop(shell, job, grace_s=_GRACE_S)

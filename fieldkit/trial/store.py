@@ -62,22 +62,22 @@ def attempt_folder(folder: Path, name: str) -> Path:
 
 def open_attempt(folder: Path, repeat: RepeatId) -> Path:
     """Create and return an empty folder for an attempt's evidence. Files of an interrupted attempt are removed."""
-    partial = _partial_folder(folder, repeat)
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir()
-    return partial
+    partial_folder = _partial_folder(folder, repeat)
+    shutil.rmtree(partial_folder, ignore_errors=True)
+    partial_folder.mkdir()
+    return partial_folder
 
 
 def reopen_attempt(folder: Path, repeat: RepeatId) -> Path:
     """Return the folder of an attempt whose evidence is fetched again. Partially fetched files are kept in it."""
-    partial = _partial_folder(folder, repeat)
-    partial.mkdir(exist_ok=True)
-    for path in partial.iterdir():
+    partial_folder = _partial_folder(folder, repeat)
+    partial_folder.mkdir(exist_ok=True)
+    for path in partial_folder.iterdir():
         if path.is_dir():
             shutil.rmtree(path)
         elif not is_partial(path):
             path.unlink()
-    return partial
+    return partial_folder
 
 
 def _partial_folder(folder: Path, repeat: RepeatId) -> Path:
@@ -89,15 +89,15 @@ def is_partial(path: Path) -> bool:
     return path.name.startswith(".")
 
 
-def commit_attempt(partial: Path, name: str) -> Path:
+def commit_attempt(partial_folder: Path, name: str) -> Path:
     """Sync an attempt's files to disk and rename its folder to `name`. Partially fetched files are removed."""
-    for path in filter(is_partial, list(partial.iterdir())):
+    for path in filter(is_partial, list(partial_folder.iterdir())):
         path.unlink()
-    files.sync((partial, *partial.rglob("*")))
-    final = partial.with_name(name)
-    partial.rename(final)
-    files.sync_folder(final.parent)
-    return final
+    files.sync((partial_folder, *partial_folder.rglob("*")))
+    final_folder = partial_folder.with_name(name)
+    partial_folder.rename(final_folder)
+    files.sync_folder(final_folder.parent)
+    return final_folder
 
 
 def find_committed_attempt(folder: Path, names: Iterable[str]) -> Path | None:

@@ -213,8 +213,8 @@ class EmulatedBackend:
             ros=ros,
             seed=seed,
             control=self._site.control,
-            patience_s=self._site.patience,
-            notice=lambda text: sink(Note(text)),
+            reconnect_timeout_s=self._site.patience,
+            on_notice=lambda text: sink(Note(text)),
             operator=operator,
         ) as opened_testbed:
             yield opened_testbed

@@ -26,7 +26,7 @@ from fieldkit.core.model import (
 )
 from fieldkit.core.prompts import DONE, UNATTENDED, Answer, Operator
 from fieldkit.remote.shell import Shell
-from fieldkit.remote.ssh import PATIENCE_S, SshShell
+from fieldkit.remote.ssh import RECONNECT_TIMEOUT_S, SshShell
 from sim_backends.emulated import placement as positions
 from sim_backends.emulated.emulated_options import EmulatedOptions, MeshOptions, RosChoice
 from sim_backends.emulated.medium.media import Media
@@ -206,8 +206,8 @@ def bring_up(
     ros: RosChoice,
     seed: int,
     control: Control = Control.SEPARATE,
-    patience_s: float = PATIENCE_S,
-    notice: Callable[[str], None] = lambda text: None,  # noqa: ARG005
+    reconnect_timeout_s: float = RECONNECT_TIMEOUT_S,
+    on_notice: Callable[[str], None] = lambda text: None,  # noqa: ARG005
     operator: Operator = UNATTENDED,
 ) -> Iterator[EmulatedTestbed]:
     """Yield the testbed of a cast; leaving the context stops all its processes.
@@ -219,8 +219,8 @@ def bring_up(
         ros: Source of ROS for robots with ROS 1, `debian` or `builtin`.
         seed: Seed of all random numbers of the medium.
         control: Network of SSH; over the radio, a robot out of the laptop's range cannot be reached.
-        patience_s: Time to wait for a lost control connection.
-        notice: Called with a message when a control connection is lost or restored.
+        reconnect_timeout_s: Time to wait for a lost control connection.
+        on_notice: Called with a message when a control connection is lost or restored.
         operator: The person who answers the questions of steps.
 
     Raises:
@@ -235,7 +235,7 @@ def bring_up(
             )
         shells: dict[Role, Shell] = {}
         for role in running.robots:
-            shell = _shell(running, role, laptop, patience_s, notice)
+            shell = _shell(running, role, laptop, reconnect_timeout_s, on_notice)
             shells[role] = stack.enter_context(closing(shell))
         kind = LinuxWifiTestbed if options.has_linux_wifi else EmulatedTestbed
         testbed = kind(cast, running, shells, options=options, world=world, laptop=laptop, operator=operator)
@@ -256,7 +256,11 @@ def laptop_on_air(running: RunningRobots[RobotKey], mesh: MeshOptions | None) ->
 
 
 def _shell(
-    running: RunningRobots[Role], role: Role, laptop: Laptop | None, patience_s: float, notice: Callable[[str], None]
+    running: RunningRobots[Role],
+    role: Role,
+    laptop: Laptop | None,
+    reconnect_timeout_s: float,
+    on_notice: Callable[[str], None],
 ) -> SshShell:
     """Return the control connection of a robot, over the radio if the laptop is on the air."""
     robot = running.robots[role]
@@ -274,7 +278,7 @@ def _shell(
         user=USER,
         host_key=running.host_keys[role],
         private_key=running.private_key,
-        patience_s=patience_s,
-        notice=notice,
+        reconnect_timeout_s=reconnect_timeout_s,
+        on_notice=on_notice,
         crosses_radio=laptop is not None,
     )

@@ -39,9 +39,9 @@ struct Agent
         return pose;
     }
 
-    Vector AntennaAt(const Pose& place) const
+    Vector AntennaAt(const Pose& model_pose) const
     {
-        return place.position + place.Rotated(antenna);
+        return model_pose.position + model_pose.Rotated(antenna);
     }
 
     double YawError() const

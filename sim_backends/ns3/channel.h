@@ -179,12 +179,12 @@ class Channel
         }
     }
 
-    double Field(const Point& place) const
+    double Field(const Point& point) const
     {
         double sum = 0;
         for (const auto& wave : m_waves)
         {
-            sum += std::cos(place[0] * wave[0] + place[1] * wave[1] + wave[2]);
+            sum += std::cos(point[0] * wave[0] + point[1] * wave[1] + wave[2]);
         }
         return sum * std::sqrt(2.0 / kWaves);
     }

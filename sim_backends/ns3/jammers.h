@@ -54,17 +54,17 @@ class Jammers
     {
     }
 
-    // Emit noise between two times; `place` returns false if the jammer is absent.
-    void Add(double power_dbm, Time from, Time until, std::function<bool(Point&)> place)
+    // Emit noise between two times; `locate` sets the position of the jammer, and returns false if the jammer is absent.
+    void Add(double power_dbm, Time from, Time until, std::function<bool(Point&)> locate)
     {
-        Simulator::Schedule(from - Simulator::Now(), [this, power_dbm, until, place] { Emit(power_dbm, until, place); });
+        Simulator::Schedule(from - Simulator::Now(), [this, power_dbm, until, locate] { Emit(power_dbm, until, locate); });
     }
 
   private:
     // The power is constant for this interval, because a robot hardly moves in it.
     static constexpr int64_t kSliceNs = 1'000'000;
 
-    void Emit(double power_dbm, Time until, const std::function<bool(Point&)>& place)
+    void Emit(double power_dbm, Time until, const std::function<bool(Point&)>& locate)
     {
         Time slice = std::min(NanoSeconds(kSliceNs), until - Simulator::Now());
         Point at;
@@ -72,7 +72,7 @@ class Jammers
         {
             return;
         }
-        if (place(at))
+        if (locate(at))
         {
             for (const Station& station : m_stations)
             {
@@ -85,7 +85,7 @@ class Jammers
                 }
             }
         }
-        Simulator::Schedule(slice, [this, power_dbm, until, place] { Emit(power_dbm, until, place); });
+        Simulator::Schedule(slice, [this, power_dbm, until, locate] { Emit(power_dbm, until, locate); });
     }
 
     const std::vector<Station>& m_stations;

@@ -324,14 +324,14 @@ class Network
     }
 
     // Add a jammer, which an agent carries if it has no position.
-    void AddJammer(const Json& fault, const Json& place_m)
+    void AddJammer(const Json& fault, const Json& position_m)
     {
-        std::function<bool(Point&)> place;
-        if (place_m.is_null())
+        std::function<bool(Point&)> locate;
+        if (position_m.is_null())
         {
             auto carrier = AgentNamed(fault.at("agent"));
             m_transmitters.insert(carrier);
-            place = [this, carrier](Point& at) {
+            locate = [this, carrier](Point& at) {
                 Vector here = m_agents[carrier].mobility->GetPosition();
                 at = {here.x, here.y, here.z};
                 return m_agents[carrier].is_present;
@@ -339,15 +339,15 @@ class Network
         }
         else
         {
-            Point fixed = place_m.get<Point>();
+            Point fixed = position_m.get<Point>();
             m_emitters_m.push_back(fixed);
-            place = [fixed](Point& at) {
+            locate = [fixed](Point& at) {
                 at = fixed;
                 return true;
             };
         }
         Time until = fault.contains("to") ? At(fault["to"]) : Time::Max();
-        m_jammers->Add(Number(fault.at("power_dbm")), At(fault.at("from")), until, place);
+        m_jammers->Add(Number(fault.at("power_dbm")), At(fault.at("from")), until, locate);
     }
 
     protocol::LinkSample SampleLink(size_t number, size_t peer)

@@ -105,7 +105,7 @@ def check_exchange(cable: Cable, tmp_path: Path, middleware_name: str, **network
     assert subscriber.returncode == 0
     sent_rows, received_rows = topic_logs.rows(sent_log), topic_logs.rows(received_log)
     kinds = [row[0] for row in sent_rows if row[0] != records.SKIPPED]
-    assert kinds[:3] == [records.ORIGIN, records.DISCOVERY_STARTED, records.MATCHED]
+    assert kinds[:3] == [records.WRITER, records.DISCOVERY_STARTED, records.MATCHED]
     expected = [row[2:5] for row in sent_rows if row[0] == records.SAMPLE]
     assert expected
     assert [row[2:5] for row in received_rows if row[0] == records.SAMPLE] == expected

@@ -6,7 +6,7 @@ import scipy
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from fieldkit.analysis.statistics import means, medians, shares, student, wilsons
+from fieldkit.analysis.statistics import means, medians, shares, student, wilson_intervals
 from fieldkit.core.model import Interval
 from tests.helpers.single import mean, mean_share, median, share, wilson
 
@@ -43,7 +43,7 @@ def test_no_loss_of_36_packets_has_an_upper_bound_of_ten_percent() -> None:
 
 
 def test_impossible_counts_have_no_interval() -> None:
-    intervals = wilsons([-1, 6, 2], [5, 5, 5])
+    intervals = wilson_intervals([-1, 6, 2], [5, 5, 5])
     assert np.isnan(intervals.low).tolist() == np.isnan(intervals.high).tolist() == [True, True, False]
 
 

@@ -17,7 +17,7 @@ from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.analysis.statistics import medians
 from fieldkit.core.columns import Column, Figure, Kind, columns, with_step_name
-from fieldkit.core.model import ENDED
+from fieldkit.core.model import FINAL_STATUSES
 from fieldkit.measure.evidence import ping, ping_gaps
 
 BY = ("protocol",)
@@ -34,7 +34,7 @@ def repeats_of(declared: Sequence[Column], **values: Sequence[OptionalValue]) ->
     n = len(next(iter(values.values())))
     numbers = {column.name: np.full(n, NAN) for column in declared}
     numbers |= {name: np.array(repeat_values, dtype=np.float64) for name, repeat_values in values.items()}
-    texts = {"protocol": np.full(n, "udp", np.object_), "status": np.full(n, ENDED[0], np.object_)}
+    texts = {"protocol": np.full(n, "udp", np.object_), "status": np.full(n, FINAL_STATUSES[0], np.object_)}
     return Repeats(numbers, texts, tuple(declared))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fieldkit.analysis.statistics import Intervals, assured, mean_shares, means, medians, shares, wilsons
+from fieldkit.analysis.statistics import Intervals, assured, mean_shares, means, medians, shares, wilson_intervals
 from tests.helpers.nightly import mark_nightly
 
 CELLS: Final = 4000  # leaves a standard error of 0.35 % at a coverage of 95 %
@@ -70,7 +70,7 @@ def test_intervals_of_shares_cover_for_any_burst_length(
         n_lost = burst_losses(random, rate, burst, (CELLS, REPEATS), packets)
         n_sent = np.full(n_lost.shape, packets)
         coverages.append(coverage_percent(shares(n_lost, n_sent), rate))
-        wilson_coverages.append(coverage_percent(wilsons(n_lost.sum(axis=1), n_sent.sum(axis=1)), rate))
+        wilson_coverages.append(coverage_percent(wilson_intervals(n_lost.sum(axis=1), n_sent.sum(axis=1)), rate))
     record_property(
         "result", f"share, 20 repeats of {packets}, {rate:.0%} lost, bursts {BURSTS}: {as_text(coverages)}"
     )

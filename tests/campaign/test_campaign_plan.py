@@ -63,8 +63,8 @@ def test_exclusions_match_trials_by_all_their_keys(tmp_path: Path) -> None:
         ("seed: 7", "seed: 7\nrecord: 0s", 6, "greater than 0"),
         ("seed: 7", "seed: 7\nwalk: far", 6, "not a length"),
         ("seed: 7", "seed: 7\nprotocols: [sctp]", 6, "'sctp' is not one of: tcp, udp"),
-        ("seed: 7", "seed: 7\nexcept: [{distance: 55ft}]", 6, "leaves out no trial"),
-        ("seed: 7", "seed: 7\nexcept: [{}]", 6, "leaves out every trial"),
+        ("seed: 7", "seed: 7\nexcept: [{distance: 55ft}]", 6, "excludes nothing"),
+        ("seed: 7", "seed: 7\nexcept: [{}]", 6, "excludes every trial"),
     ],
 )
 def test_an_invalid_file_is_reported_with_its_line(

@@ -15,7 +15,7 @@ from fieldkit.cli.event_words import event_words
 from fieldkit.cli.progress import ProgressBar
 from fieldkit.core.campaign_events import CampaignTrial
 from fieldkit.core.events import NOTHING_ARRIVED, PhaseStarted, RepeatEnded, TrialStarted
-from fieldkit.core.model import ENDED, Status
+from fieldkit.core.model import FINAL_STATUSES, Status
 
 WORD = st.text(st.sampled_from("abcXYZ019-_/.%[]漢é"), min_size=1, max_size=40)
 CELL = st.lists(WORD, max_size=6).map(" ".join)
@@ -53,7 +53,7 @@ def test_a_table_keeps_every_word_and_is_no_wider_than_the_terminal(data: st.Dat
 FIGURES = st.lists(st.from_regex(r"[a-zA-Z]{1,15} (loss|RTT) [0-9]{1,4}\.[0-9] (%|ms)", fullmatch=True), min_size=1)
 
 
-@given(FIGURES, st.integers(40, 200), st.sampled_from(ENDED), st.text("ab ", max_size=60))
+@given(FIGURES, st.integers(40, 200), st.sampled_from(FINAL_STATUSES), st.text("ab ", max_size=60))
 def test_line_of_a_repeat_is_complete_at_any_width(parts: list[str], width: int, status: Status, reason: str) -> None:
     event = RepeatEnded("udp-07", 1, status, reason.strip(), ", ".join(parts), 7, 40, 0.0)
     text = "".join(part for part, _ in event_words(event, width))

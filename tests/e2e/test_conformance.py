@@ -25,8 +25,8 @@ from tests.helpers.loopback import Command, dropbear, openssh, serve
 
 pytestmark = pytest.mark.emulated
 
-PATIENCE_S = 5.0
-GIVE_UP_S = PATIENCE_S + CONNECT_S
+RECONNECT_TIMEOUT_S = 5.0
+GIVE_UP_S = RECONNECT_TIMEOUT_S + CONNECT_S
 QUICK = Timing(connect_s=5.0)
 TOPOLOGY = Topology.MASTER
 
@@ -34,7 +34,7 @@ TOPOLOGY = Topology.MASTER
 @contextmanager
 def on_loopback(folder: Path, command: Command) -> Iterator[Subject]:
     with serve(folder, command) as server, Forwarder({"robot": server.connect}) as links:
-        shell = server.shell(connect=partial(links.reach, "robot"), patience_s=1.0, timing=QUICK)
+        shell = server.shell(connect=partial(links.reach, "robot"), reconnect_timeout_s=1.0, timing=QUICK)
         yield Subject(
             shell, partial(links.cut, "robot"), partial(links.restore, "robot"), give_up_s=1.0 + QUICK.connect_s
         )
@@ -62,7 +62,7 @@ def emulated(folder: Path, control: str) -> Iterator[tuple[Cast, EmulatedTestbed
     site = folder / "fieldkit.yaml"
     text = DEFAULT_SITE.read_text(encoding="utf-8")
     options = "{ros: builtin, record_air: true, radio: {fading: false}}"
-    extra_keys = f"control: {control}\npatience: {PATIENCE_S:g}s\nemulated: {options}\n"
+    extra_keys = f"control: {control}\npatience: {RECONNECT_TIMEOUT_S:g}s\nemulated: {options}\n"
     site.write_text(text + extra_keys, encoding="utf-8")
     backend = EmulatedBackend(*load_site(site))
     cast = backend.cast(TOPOLOGY)
@@ -148,7 +148,7 @@ class TestField(OfTestbed):
     @classmethod
     def opened(cls, field_robots: FieldRobots) -> Iterator[tuple[Cast, Testbed]]:
         site = field_robots.folder / "fieldkit.yaml"
-        site.write_text(f"patience: {PATIENCE_S:g}s\n{site.read_text(encoding='utf-8')}", encoding="utf-8")
+        site.write_text(f"patience: {RECONNECT_TIMEOUT_S:g}s\n{site.read_text(encoding='utf-8')}", encoding="utf-8")
         backend = load_backend("field", *load_site(site))
         cast = backend.cast(TOPOLOGY)
         with backend.open(cast, seed=1, sink=lambda _: None, operator=Unattended()) as testbed:

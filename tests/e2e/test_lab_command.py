@@ -259,7 +259,7 @@ def test_sockets_and_keys_of_the_robots_are_closed_to_other_users(lab: Path) -> 
 def test_a_second_lab_in_a_directory_is_rejected(lab: Path) -> None:
     second = fieldkit(lab, "lab", "up")
     assert second.code == 2
-    assert "this directory has a lab that is up\n  remedy: fieldkit lab down" in second.err
+    assert "a lab is already running in this directory\n  remedy: fieldkit lab down" in second.err
     assert "air-1" in run_here(lab, "lab", "ps").out
 
 

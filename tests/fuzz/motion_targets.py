@@ -86,7 +86,7 @@ def _measure_drive(data: bytes, place: Path) -> None:
 def _read_drive_status(data: bytes, _: Path) -> None:
     lease = DriveLease(cast("Shell", None), _JOB, "{}", 1.0)
     lease.output = data
-    assert lease.end_state.isprintable()
+    assert lease.final_state.isprintable()
 
 
 def _read_answer(data: bytes, place: Path) -> None:

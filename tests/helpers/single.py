@@ -12,7 +12,7 @@ from fieldkit.core.model import Interval
 
 
 def wilson(events: int, trials: int) -> Interval:
-    interval = _single(statistics.wilsons([events], [trials]))
+    interval = _single(statistics.wilson_intervals([events], [trials]))
     assert interval is not None
     return interval
 

@@ -129,7 +129,7 @@ def write(topic_attempt: TopicAttempt, folder: Path, *, signed: bool = True) -> 
         path = folder / f"{role}-topic.bin"
         log = Log(str(path))
         if signed:
-            log.origin(rows[0][-1] - 1, log_kind, topic_attempt.plan.topic)
+            log.write_role(rows[0][-1] - 1, log_kind, topic_attempt.plan.topic)
         for kind, size, number, sent_ns, at_ns in rows:
             log.note(kind, at_ns, size=size, sequence=number, sent_ns=sent_ns)
         log.end(end_ns)

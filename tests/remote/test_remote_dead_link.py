@@ -63,7 +63,7 @@ class Robot:
 
 
 @contextmanager
-def robot(patience_s: float) -> Iterator[Robot]:
+def robot(reconnect_timeout_s: float) -> Iterator[Robot]:
     cast = EmulatedBackend(None, None).cast(Topology.MASTERLESS)
     notices: list[str] = []
     with testbed.bring_up(
@@ -72,8 +72,8 @@ def robot(patience_s: float) -> Iterator[Robot]:
         world=load_world("lawn"),
         ros=RosChoice.BUILTIN,
         seed=1,
-        patience_s=patience_s,
-        notice=notices.append,
+        reconnect_timeout_s=reconnect_timeout_s,
+        on_notice=notices.append,
     ) as emulation:
         robot_under_test = Robot(emulation, notices)
         jobs.install(robot_under_test.shell, Deadline.after(30))
@@ -87,7 +87,7 @@ def silent_job(script: str) -> Job:
 
 @pytest.mark.quiet
 def test_loss_of_a_silent_link_is_detected_within_10_s() -> None:
-    with robot(patience_s=0.0) as emulated, ThreadPoolExecutor(1) as pool:
+    with robot(reconnect_timeout_s=0.0) as emulated, ThreadPoolExecutor(1) as pool:
         # Standard input has ended and is acknowledged, so neither side sends anything afterwards.
         argv = ("sh", "-c", f"cat; touch {FOLDER}/up; sleep 60")
         future = pool.submit(emulated.shell.run, argv, deadline=Deadline.after(SOON))
@@ -100,7 +100,7 @@ def test_loss_of_a_silent_link_is_detected_within_10_s() -> None:
 
 
 def test_result_of_a_job_that_outlives_its_link_is_collected_once() -> None:
-    with robot(patience_s=SOON) as emulated, ThreadPoolExecutor(1) as pool:
+    with robot(reconnect_timeout_s=SOON) as emulated, ThreadPoolExecutor(1) as pool:
         future = pool.submit(
             jobs.run,
             emulated.shell,
@@ -123,7 +123,7 @@ def test_result_of_a_job_that_outlives_its_link_is_collected_once() -> None:
 
 def test_wait_of_the_robot_for_a_cut_link_has_a_timeout() -> None:
     """The SSH server does not detect the loss, and keeps standard input open for hours."""
-    with robot(patience_s=0.0) as emulated:
+    with robot(reconnect_timeout_s=0.0) as emulated:
         pending = jobs.begin(emulated.shell, replace(silent_job("touch up"), limit_s=1, ready_s=1))
         wait_until(lambda: emulated.has("up"), Deadline.after(SOON))
         emulated.set_link("down")

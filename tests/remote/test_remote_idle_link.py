@@ -19,7 +19,7 @@ SOON = 60.0
 def test_loss_of_an_idle_link_is_detected_within_10_s(server: Server) -> None:
     notices: list[str] = []
     with Forwarder({"robot": server.connect}) as links, ThreadPoolExecutor(1) as pool:
-        shell = server.shell(connect=lambda within_s: links.reach("robot", within_s), notice=notices.append)
+        shell = server.shell(connect=lambda within_s: links.reach("robot", within_s), on_notice=notices.append)
         shell.run(("true",), deadline=Deadline.after(SOON))
         links.cut("robot")
         links.drop("robot")

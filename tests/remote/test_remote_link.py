@@ -440,7 +440,7 @@ def notices() -> list[str]:
 
 @pytest.fixture
 def shell(server: Server, line: CuttableLine, notices: list[str]) -> Iterator[SshShell]:
-    test_shell = server.shell(connect=line.connect, timing=QUICK, patience_s=SOON, notice=notices.append)
+    test_shell = server.shell(connect=line.connect, timing=QUICK, reconnect_timeout_s=SOON, on_notice=notices.append)
     yield test_shell
     test_shell.close()
 
@@ -576,7 +576,9 @@ def test_robot_that_refuses_logins_while_it_boots_is_retried(
         return ssh_server(stream, rsa, "refuse" if len(logins) in {2, 3} else "never")
 
     fake_server = start_fake_server(serve)
-    shell = server.shell(connect=fake_server.connect, host_key=pinned_key(rsa), timing=QUICK, notice=notices.append)
+    shell = server.shell(
+        connect=fake_server.connect, host_key=pinned_key(rsa), timing=QUICK, on_notice=notices.append
+    )
     shell.begin(("true",), deadline=soon())
     logins[0].shutdown(socket.SHUT_RDWR)
     wait_until(lambda: not is_up(shell), soon())
@@ -650,14 +652,16 @@ def test_link_over_the_radio_is_not_reopened_during_a_measurement(
     ended_by: str,
 ) -> None:
     shell = server.shell(
-        connect=line.connect, timing=QUICK, patience_s=SOON, notice=notices.append, crosses_radio=True
+        connect=line.connect, timing=QUICK, reconnect_timeout_s=SOON, on_notice=notices.append, crosses_radio=True
     )
     session = shell.begin(waiting_command.argv, deadline=soon())
     with shell.silence(SOON if ended_by == "the body" else HANGS_S):
         line.cut()
         future = pool.submit(session.end, deadline=soon())
         wait_until(lambda: bool(notices), soon())
-        assert re.match("robot: the link is lost; for .* at most its radio is being measured", notices[0])
+        assert re.match(
+            "robot: the link is lost; it is not reopened while its radio is being measured, for up to .*", notices[0]
+        )
         assert line.attempts == 1
         if ended_by == "its time":
             clock.start()
@@ -715,7 +719,7 @@ def test_silence_lasts_until_the_latest_end(server: Server) -> None:
 
 
 def test_patience_applies_once_per_loss_of_the_link(shell: SshShell, line: CuttableLine, server: Server) -> None:
-    impatient_shell = server.shell(connect=line.connect, timing=QUICK, patience_s=2.0)
+    impatient_shell = server.shell(connect=line.connect, timing=QUICK, reconnect_timeout_s=2.0)
     assert impatient_shell.run(("echo", "up"), deadline=soon()).stdout == b"up\n"
     line.accepts_connections = False
     line.cut()
@@ -788,7 +792,7 @@ def test_close_ends_a_waiting_command(
 def test_close_ends_the_wait_for_a_lost_link(
     server: Server, line: CuttableLine, waiting_command: WaitingCommand, notices: list[str], pool: ThreadPoolExecutor
 ) -> None:
-    shell = server.shell(connect=line.connect, patience_s=60.0, notice=notices.append)
+    shell = server.shell(connect=line.connect, reconnect_timeout_s=60.0, on_notice=notices.append)
     future = pool.submit(shell.run, waiting_command.argv, deadline=soon())
     waiting_command.wait_for_starts(1)
     line.accepts_connections = False

@@ -131,7 +131,7 @@ def test_missing_keyring_entry_is_reported_with_a_command(
     if path == "with":
         program.touch(mode=0o755)
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(ConfigurationError, match=r"no password of duckie@192\.168\.4\.1") as error_info:
+    with pytest.raises(ConfigurationError, match=r"no password for duckie@192\.168\.4\.1") as error_info:
         passwords.read_from_keyring("duckie", "192.168.4.1", "duckiedrone-1")
     keyring_command = "keyring" if path == "with" else f"{shlex.quote(sys.executable)} -m keyring"
     assert error_info.value.remedy == f"{keyring_command} set fieldkit duckie@192.168.4.1"

@@ -93,7 +93,7 @@ def test_server_with_few_channels_runs_commands_in_sequence(tmp_path: Path, sess
 def test_server_without_sessions_is_reported_and_not_polled(tmp_path: Path) -> None:
     notices: list[str] = []
     with sshd(tmp_path, MaxSessions="0") as server_without_sessions:
-        shell = server_without_sessions.shell(patience_s=4.0, notice=notices.append)
+        shell = server_without_sessions.shell(reconnect_timeout_s=4.0, on_notice=notices.append)
         with pytest.raises(LinkError, match="its SSH server opens no session") as error_info:
             shell.run(("true",), deadline=Deadline.after(4))
         shell.close()

@@ -105,10 +105,10 @@ def test_a_position_recorded_by_the_laptop_is_compared_with_the_plan(
     ],
 )
 def test_columns_that_depend_on_positions(column: str, dependent: bool) -> None:
-    assert position_columns.is_dependent(column) is dependent
+    assert position_columns.depends_on_positions(column) is dependent
 
 
 def test_every_column_of_positions_depends_on_them() -> None:
     from fieldkit.measure.evidence.track import Separation  # noqa: PLC0415
 
-    assert all(position_columns.is_dependent(f"rtt_{name}") for name in Separation.__dataclass_fields__)
+    assert all(position_columns.depends_on_positions(f"rtt_{name}") for name in Separation.__dataclass_fields__)

@@ -121,7 +121,7 @@ def test_a_named_column_has_named_figures_and_counts() -> None:
 @pytest.mark.parametrize(
     ("column", "flaw"),
     [
-        (Column("Level", "dBm", "x"), "its name is not made of lower-case letters"),
+        (Column("Level", "dBm", "x"), "its name must consist of lower-case letters"),
         (Column("a..b", "dBm", "x"), "its name"),
         (Column("a" * 101, "dBm", "x"), "its name is not 1 to 100"),
         (Column("a", "", "x"), "its unit"),
@@ -200,7 +200,7 @@ def test_columns_of_steps_follow_in_the_order_of_the_procedure() -> None:
         (("meter: {measures: [status]}",), "fieldkit has another column 'status'"),
         (("meter: {}", "meter: {}"), "two steps have a column 'meter_level'"),
         (("meter: {called: a, measures: [x, x]}",), "two steps have a column 'a.x'"),
-        (("meter: {measures: [Level]}",), "its name is not made of lower-case letters"),
+        (("meter: {measures: [Level]}",), "its name must consist of lower-case letters"),
     ],
 )
 @pytest.mark.usefixtures("meters")

@@ -51,7 +51,7 @@ class FlightRecording:
     """Parameters of a recording.
 
     Attributes:
-        connection: Name of the connection to the autopilot, as for `mavlink_links.open_link`.
+        connection: Name of the connection to the autopilot; see `mavlink_links.open_link`.
         intervals_us: Requested interval by message id, which is a text because keys of JSON are texts.
         system: System id of the autopilot; 0 for the first one whose heartbeat arrives.
     """

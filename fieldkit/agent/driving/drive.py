@@ -1,4 +1,4 @@
-"""Drive a ground robot along its path by its velocity topic, in a closed loop on its odometry.
+"""Drive a ground robot along its path through its velocity topic, in a closed loop with its odometry.
 
 The laptop renews its order repeatedly (`orders`). If no order arrives within the lease of the task, the laptop or the
 link to it is lost, and the robot stops. Velocities are published `RATE_HZ` times per second; the base of a robot
@@ -78,7 +78,7 @@ def drive(middleware: Middleware, arguments: Mapping[str, Any], log: Path, stop_
         if task.origin is not None and task.frame_id != boot_id():
             driver.on_odometry(*poses.pop(0))
             driver.refuse(
-                "its computer was restarted after its origin was recorded, so its odometry has another frame"
+                "its computer was restarted after its origin was recorded, so its odometry uses another frame"
             )
         try:
             while not driver.is_finished and not stop_event.is_set():

@@ -72,7 +72,8 @@ class Driver:
     Attributes:
         stop_reason: The reason for an early stop; empty before a stop.
         phase: `waits` until the robot is stationary and ordered to start; `returns` while it first drives to its
-            origin; then `out`, `there`, `back`, `home`.
+            origin; then `out` on its path, `there` at its end, `back` on the path back, and `home` at its
+            origin.
         driven_m: Distance since the start of `out`.
         refused: Whether the robot did not start because it is not at the required place.
     """

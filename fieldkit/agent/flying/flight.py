@@ -23,7 +23,21 @@ from fieldkit.agent.boot_clock import boot_id
 from fieldkit.agent.flying import guard, rescue
 from fieldkit.agent.flying.arming import ArmingCheck
 from fieldkit.agent.flying.flight_log import FlightLog
-from fieldkit.agent.flying.flight_plan import CLIMB, GO, HOME, MISPLACED, FlightPlan, point_on_path
+from fieldkit.agent.flying.flight_plan import (
+    AT_PATH_END,
+    AT_PATH_START,
+    CLIMB,
+    CLIMBING,
+    DESCENDING,
+    GO,
+    HOME,
+    MISPLACED,
+    ON_GROUND,
+    ON_PATH,
+    RETURNING,
+    FlightPlan,
+    point_on_path,
+)
 from fieldkit.agent.flying.landing import (
     REFUSED,
     TAKEN_OVER,
@@ -44,7 +58,8 @@ _LIFTED_M = 0.3
 _RISEN_FRACTION = 0.9
 """After a take-off by command, set-points are sent from this fraction of the target height."""
 _SET_POINTS_S = 1.0
-"""Set-points are sent for this time before the mode that follows them is selected (PX4 user guide, offboard mode)."""
+"""Set-points are sent for this time before the mode is selected in which the autopilot follows set-points (PX4 user
+guide, offboard mode)."""
 _COORDINATES_S = 3.0
 """Timeout for latitude and longitude, which some drones do not report."""
 
@@ -86,9 +101,11 @@ class OffboardPilot:
             self._loop.session.close()
 
     def _abort_flight(self, error: Exception) -> None:
-        """Land the drone after an error unless another party flies it; log an alarm if it does not land.
+        """Land the drone after an error, unless a person or another program flies it.
 
-        Raises the errors of `bring_down`.
+        An alarm is logged if the drone does not land.
+
+        Raises the same errors as `bring_down`.
         """
         drone = self._drone
         if isinstance(error, FlightError) and error.code == TAKEN_OVER:
@@ -97,7 +114,7 @@ class OffboardPilot:
             return
         log_line(f"{self._plan.abort}: {error}")
         self._loop.state = LANDING
-        self._log.phase = "coming down"
+        self._log.phase = DESCENDING
         try:
             with landing_marker(self._plan.landing_marker):
                 bring_down(self._loop.session, self._plan.abort, lambda: drone.guided, self._loop.update)
@@ -116,7 +133,7 @@ class OffboardPilot:
         loop.set_origin(origin, start_m[2])
         self._log.begin(origin, start_m[2])
         log_line(f"origin {json.dumps(asdict(origin))}")
-        self._start_phase("standing")
+        self._start_phase(ON_GROUND)
         loop.run_until(lambda: loop.orders.order in (CLIMB, HOME))
         if loop.orders.order == CLIMB:
             corners_m = plan.corners_m(origin, start_m[2])
@@ -124,7 +141,7 @@ class OffboardPilot:
             self._fly_path(corners_m)
             if plan.end == "return":
                 self._fly_to_origin(origin)
-        self._start_phase("coming down")
+        self._start_phase(DESCENDING)
         loop.state = LANDING if loop.has_armed else loop.state
         with landing_marker(plan.landing_marker):
             bring_down(loop.session, "land", lambda: self._drone.guided, loop.update)
@@ -137,16 +154,16 @@ class OffboardPilot:
         if drone.dialect is None:
             raise FlightError(REFUSED, _fault_text(ArmingCheck(drone, self._plan.needs)))
         if drone.armed:
-            log_line("waiting until its motors have stopped: another party flies it, or it is landing")
+            log_line("waiting until its motors have stopped: a person or another program flies it, or it is landing")
         self._loop.run_until(lambda: not drone.armed and drone.position_m is not None and drone.yaw_rad is not None)
         assert drone.position_m is not None
         return drone.dialect, drone.position_m
 
     def _origin(self, start_m: Position) -> FlightOrigin:
-        """Return the origin in the frame of this start.
+        """Return the origin in the coordinate frame that the autopilot has used since it was started.
 
         Raises:
-            FlightError: The drone is not at the origin of its trial, or this is unknown.
+            FlightError: The drone is not at the origin of its trial, or it cannot be determined whether it is there.
         """
         drone, start_s = self._drone, time.monotonic()
         self._loop.run_until(
@@ -178,9 +195,9 @@ class OffboardPilot:
         )
         loop.state = FLYING
         self._require_armable(start_set_point)
-        loop.command_until(lambda: drone.commands.send(ARM, 1), lambda: drone.armed, "to arm", start_set_point)
+        loop.command_until(lambda: drone.commands.send(ARM, 1), lambda: drone.armed, "arming", start_set_point)
         loop.has_armed = True
-        self._start_phase("climbing")
+        self._start_phase(CLIMBING)
         if commands:
             self._climb_by_commands(commands, start_m)
         path_m, start_s = [drone.position_m or start_m, (*start_m[:2], top_m[2]), top_m], time.monotonic()
@@ -188,7 +205,7 @@ class OffboardPilot:
             lambda: _is_near(drone.position_m, top_m) or loop.orders.order == HOME,
             set_point=lambda: point_on_path(path_m, (time.monotonic() - start_s) * self._plan.climb_m_s),
         )
-        self._start_phase("up")
+        self._start_phase(AT_PATH_START)
         loop.run_until(lambda: loop.orders.order in (GO, HOME), set_point=lambda: top_m)
 
     def _require_armable(self, start_set_point: Callable[[], Position] | None) -> None:
@@ -216,19 +233,20 @@ class OffboardPilot:
             return start_m[2] - drone.position_m[2] if drone.position_m else 0.0
 
         def has_risen() -> bool:
-            slow_height_m = height_m / 2 if drone.speed_m_s < _SLOW_M_S else math.inf
-            return risen_m() > min(_RISEN_FRACTION * height_m, slow_height_m)
+            # A drone that hovers above half of the target height has also finished its take-off.
+            hover_threshold_m = height_m / 2 if drone.speed_m_s < _SLOW_M_S else math.inf
+            return risen_m() > min(_RISEN_FRACTION * height_m, hover_threshold_m)
 
         *preceding_commands, last_command = commands
         for command in commands:
             drone.command_results.pop(int(command[0]), None)
         for command in preceding_commands:
             self._loop.command_until(
-                partial(drone.commands.send, *command), partial(self._has_result, command[0]), "a climb speed"
+                partial(drone.commands.send, *command), partial(self._has_result, command[0]), "the climb speed"
             )
         # The acknowledgement may be lost, and a second command to take off is refused in the air.
         is_accepted = lambda: drone.command_results.get(int(last_command[0])) == ACCEPTED or risen_m() > _LIFTED_M  # noqa: E731
-        self._loop.command_until(partial(drone.commands.send, *last_command), is_accepted, "to take off")
+        self._loop.command_until(partial(drone.commands.send, *last_command), is_accepted, "the take-off")
         self._loop.run_until(lambda: has_risen() or self._loop.orders.order == HOME)
 
     def _has_result(self, command: float) -> bool:
@@ -238,13 +256,13 @@ class OffboardPilot:
         """Fly the path, and wait at its end for the order `home`."""
         loop, start_s, has_arrived = self._loop, time.monotonic(), False
         if loop.orders.order == GO:
-            self._start_phase("flying")
+            self._start_phase(ON_PATH)
         for _ in loop.iterate(lambda: point_on_path(corners_m, (time.monotonic() - start_s) * self._plan.speed_m_s)):
             if loop.orders.order == HOME:
                 return
             if not has_arrived and _is_near(self._drone.position_m, corners_m[-1]):
                 has_arrived = True
-                self._start_phase("there")
+                self._start_phase(AT_PATH_END)
 
     def _fly_to_origin(self, origin: FlightOrigin) -> None:
         """Fly to the point above the origin."""
@@ -253,7 +271,7 @@ class OffboardPilot:
         position_m = drone.last_position_m
         above_m, start_s = origin.position_at(0.0, 0.0, position_m[2]), time.monotonic()
         path_m = [position_m, above_m]
-        self._start_phase("coming back")
+        self._start_phase(RETURNING)
         self._loop.run_until(
             lambda: _is_near(drone.position_m, above_m) and drone.speed_m_s < _SLOW_M_S,
             set_point=lambda: point_on_path(path_m, (time.monotonic() - start_s) * self._plan.speed_m_s),
@@ -266,7 +284,7 @@ class OffboardPilot:
 
 
 def fly(plan: FlightPlan, stop_event: threading.Event) -> int:
-    """Fly, guard or rescue a drone, as the plan requires; return the exit code.
+    """Run the pilot, the guard or the rescue program of a flight; return the exit code.
 
     Raises:
         OSError: The connection cannot be opened.

@@ -19,7 +19,7 @@ class FlightLog:
         path: The file; empty to write none.
 
     Attributes:
-        phase: Phase of the flight: `standing`, `climbing`, `up`, `flying`, `there`, `coming back` or `coming down`.
+        phase: Phase of the flight, one of `flight_plan.PHASES`; empty before the first one.
     """
 
     def __init__(self, path: str) -> None:
@@ -42,10 +42,13 @@ class FlightLog:
         self._write({"utc_ns": time.time_ns(), "origin": asdict(origin)})
 
     def note(self, drone: AutopilotState) -> None:
-        """Write position, speed and mode of the drone, and the rate of its reports; does nothing before `begin`."""
+        """Write position, speed and mode of the drone, and the rate at which it reports positions.
+
+        Do nothing before `begin`.
+        """
         if self._lines is None or self._origin is None or drone.position_m is None or not self.phase:
             return
-        rate = drone.link.messages.get(LOCAL_POSITION_NED)
+        position_rate = drone.link.messages.get(LOCAL_POSITION_NED)
         ahead_m, left_m = self._origin.relative_m(drone.position_m)
         self._write(
             {
@@ -57,7 +60,7 @@ class FlightLog:
                 "up_m": round(self._ground_m - drone.position_m[2], 3),
                 "speed_m_s": round(drone.speed_m_s, 3),
                 "mode": drone.mode_name,
-                "rate_hz": round(rate.hz if rate else 0.0, 3),
+                "rate_hz": round(position_rate.hz if position_rate else 0.0, 3),
             }
         )
 

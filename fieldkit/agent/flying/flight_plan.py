@@ -11,6 +11,14 @@ from fieldkit.agent.flying.origin import FlightOrigin, Position
 STAY, CLIMB, GO, HOME, LEAVE = "stay", "climb", "go", "home", "leave"
 """Orders: wait, climb to the height, fly the path, land, and stop the program without a command to the drone."""
 
+ON_GROUND, CLIMBING, AT_PATH_START, ON_PATH = "standing", "climbing", "up", "flying"
+AT_PATH_END, RETURNING, DESCENDING = "there", "coming back", "coming down"
+PHASES = (ON_GROUND, CLIMBING, AT_PATH_START, ON_PATH, AT_PATH_END, RETURNING, DESCENDING)
+"""Phases of a flight in chronological order, with their names in logs.
+
+The drone waits on the ground, climbs, waits above the origin for the order to fly, flies the path, waits at its end
+for the order to land, returns to the origin if the plan requires it, and descends.
+"""
 
 MISPLACED = "misplaced"
 """Log line of a pilot that does not fly because the drone is not at the origin of its trial."""
@@ -37,15 +45,18 @@ class FlightNeeds:
 
 @dataclass(frozen=True)
 class FlightPlan:
-    """Parameters of a program that flies, guards or rescues a drone.
+    """Parameters of a program that controls a drone during a flight.
+
+    The program is the pilot, which flies the drone; the guard, which lands it if the pilot stops; or the rescue
+    program, which lands it if both have stopped.
 
     Attributes:
-        connection: Name of the connection to the autopilot, as for `mavlink_links.open_link`.
+        connection: Name of the connection to the autopilot; see `mavlink_links.open_link`.
         orders: The file of orders.
         abort: Command if the flight is aborted: `land` or `return`.
         lease_s: Timeout for the first order.
-        guards: Whether the program guards the drone instead of flying it.
-        rescues: Whether the program only lands the drone, because neither its pilot nor its guard runs.
+        guards: Whether the program is the guard.
+        rescues: Whether the program is the rescue program.
         end: End of the flight: `land` at the current position, or `return` to the origin and land.
         height_m: Height of the take-off.
         legs: The path after the take-off: metres ahead, to the left and up per leg, relative to the origin's heading.

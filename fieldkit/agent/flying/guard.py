@@ -120,7 +120,7 @@ class FlightGuard:
         return is_program or drone.mode == self._first_mode
 
     def _abort_flight(self, error: FlightError) -> None:
-        """Land the drone if the guard may control it. Raises the errors of `bring_down` after an alarm in the log."""
+        """Land the drone if the guard may control it; if it cannot be landed, log an alarm and raise the error."""
         drone = self._drone
         if not drone.armed or not (self._pilot_flies if self._liveness is not None else self._may_command()):
             return

@@ -17,8 +17,8 @@ from fieldkit.agent.autopilots.px4 import Px4
 from fieldkit.agent.flying.session import AutopilotSession
 
 LEASE_EXPIRED, REFUSED, TAKEN_OVER, CANCELLED, PEER_STOPPED, FENCE_BREACHED = 4, 5, 6, 7, 8, 9
-"""Exit codes: the lease expired; the autopilot refused a command or did not answer; another party flies the drone;
-the job was cancelled; the other program of the flight stopped; the drone was outside its fence."""
+"""Exit codes: the lease expired; the autopilot refused a command or did not answer; a person or another program flies
+the drone; the job was cancelled; the other program of the flight stopped; the drone was outside its fence."""
 
 RETRY_S = 0.4
 """Retry interval of a command without an answer."""
@@ -68,8 +68,8 @@ def bring_down(
         each_iteration: Called in each iteration.
 
     Raises:
-        FlightError: Another party flies the drone (`TAKEN_OVER`), no heartbeat was received for `NO_HEARTBEAT_S`, or
-            its motors are still running after `_LANDING_TIMEOUT_S`.
+        FlightError: A person or another program flies the drone (`TAKEN_OVER`), no heartbeat was received for
+            `NO_HEARTBEAT_S`, or its motors are still running after `_LANDING_TIMEOUT_S`.
     """
     drone, retry_s, start_s, has_warned = session.drone, 0.0, time.monotonic(), False
     command = (drone.dialect or Px4()).bring_down_command(action)  # other families accept the commands of PX4
@@ -99,7 +99,9 @@ def bring_down(
         elif not drone.lands_or_returns and (
             drone.dialect is not None or drone.command_results.get(command_id) != ACCEPTED
         ):
-            raise FlightError(TAKEN_OVER, f"another party flies it, so nothing more is sent ({status_text(drone)})")
+            raise FlightError(
+                TAKEN_OVER, f"a person or another program flies it, so nothing more is sent ({status_text(drone)})"
+            )
         each_iteration()
         session.exchange(_POLL_S)
 

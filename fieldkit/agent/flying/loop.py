@@ -131,7 +131,7 @@ class FlightLoop:
             yield
 
     def run_until(self, condition: Callable[[], bool], set_point: Callable[[], Position] | None = None) -> None:
-        """Iterate until `condition` returns True; arguments and errors as for `iterate`."""
+        """Iterate until `condition` returns True; arguments and errors are those of `iterate`."""
         for _ in self.iterate(set_point):
             if condition():
                 return
@@ -148,8 +148,8 @@ class FlightLoop:
         Args:
             send_command: Sends the command.
             is_done: Returns True if the command is executed.
-            what: The command, for the message of the error.
-            set_point: As for `iterate`.
+            what: The command as the object of "the autopilot refuses", for the error message.
+            set_point: Returns the next set-point; None for no set-points.
 
         Raises:
             FlightError: The command was not executed in time; the message contains the autopilot's last text.
@@ -188,7 +188,7 @@ class FlightLoop:
         if not drone.guided:
             if self._liveness is not None and self._liveness.other_state == LANDING:
                 raise FlightError(PEER_STOPPED, "the guard lands it")
-            raise FlightError(TAKEN_OVER, f"another party flies it ({status_text(drone)})")
+            raise FlightError(TAKEN_OVER, f"a person or another program flies it ({status_text(drone)})")
         if not self.has_armed:
             return
         if not drone.armed:

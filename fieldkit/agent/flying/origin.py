@@ -166,7 +166,7 @@ class FlightFence:
         )
 
     def breach(self, position_m: Position) -> str:
-        """Return the reason if a position is more than `FENCE_MARGIN_M` outside the fence, else an empty text."""
+        """Return the reason if a position is more than `FENCE_MARGIN_M` outside the fence, else an empty string."""
         for distance_m, limit_m, direction in (
             (self.origin.distance_m(position_m), self.radius_m, "from its origin"),
             (self.ground_m - position_m[2], self.ceiling_m, "above the ground"),

@@ -33,7 +33,8 @@ def rescue(plan: FlightPlan) -> None:
         plan: A plan with the liveness file that the pilot and the guard share.
 
     Raises:
-        FlightError: No heartbeat arrived for `NO_HEARTBEAT_S`, another party flies the drone, or it did not land.
+        FlightError: No heartbeat arrived for `NO_HEARTBEAT_S`, a person or another program flies the drone, or it did
+            not land.
         OSError: The liveness file cannot be opened.
         ValueError: The name of the connection is invalid.
     """

@@ -16,7 +16,7 @@ class AutopilotSession:
     """Exchanges messages with an autopilot. The link server reopens a lost connection, and repeats requests.
 
     Args:
-        connection: Name of the connection, as for `mavlink_links.open_link`.
+        connection: Name of the connection; see `mavlink_links.open_link`.
         on_state: Called at the end of each `exchange` with the state of the autopilot.
         component: Component id of this program.
 

@@ -46,7 +46,7 @@ class FlightDevice(Protocol):
         """
 
     def flush(self) -> None:
-        """Send queued bytes of a slow line; raises the errors of `write`."""
+        """Send queued bytes of a slow line. Raises the same errors as `write`."""
 
     def close(self) -> None:
         """Close the connection."""

@@ -333,7 +333,7 @@ def serve(connection: str, stop_event: threading.Event) -> None:
             connection
         ) as address:
             with suppress(FileNotFoundError):
-                os.unlink(address)  # noqa: PTH108 (of a server that was killed)
+                os.unlink(address)  # noqa: PTH108 (left by a server that was killed)
             listener.bind(address)
             os.chmod(address, 0o600)  # noqa: PTH101
             listener.listen(_MAX_CLIENTS)
@@ -342,7 +342,7 @@ def serve(connection: str, stop_event: threading.Event) -> None:
             LinkServer(connection, listener).run(stop_event)
             link_files.remove(connection)  # while the lock is held
         code = 0
-    except Exception:  # noqa: BLE001 (it is in the log; clients start another server)
+    except Exception:  # noqa: BLE001 (the error is logged, and clients start another server)
         traceback.print_exc()
     finally:
         sys.stderr.flush()

@@ -170,7 +170,7 @@ def unpadded(data: bytes) -> bytes:
     return data if not padding else data[:3] + bytes([data[3] & ~3]) + data[4:-padding]
 
 
-def hide_type_description(topic: DdsTopic) -> Any:  # noqa: ANN401 (of ctypes)
+def hide_type_description(topic: DdsTopic) -> Any:  # noqa: ANN401 (ctypes declares no type for it)
     """Let discovery announce only the name of a topic's type; must be called before endpoints are created.
 
     CycloneDDS 11.0 cannot read the type descriptions of Fast DDS 3 (ROS 2 Kilted), and endpoints do not match if both

@@ -1,4 +1,4 @@
-"""The newest sample, which a program reads at ticks, as the control loop of a robot or a display does."""
+"""The newest sample, which a program reads periodically, like the control loop of a robot or a display."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class NewestSample:
 def logged_reads(newest: NewestSample, rate_hz: float, log: Log, stop_event: threading.Event) -> Iterator[None]:
     """Read the newest sample at a rate, and log each read, while the body runs; do nothing if the rate is 0.
 
-    A tick whose time has passed is left out.
+    A read whose scheduled time has passed is skipped.
 
     Args:
         newest: The newest sample.
@@ -44,7 +44,7 @@ def logged_reads(newest: NewestSample, rate_hz: float, log: Log, stop_event: thr
         stop_event: Set if the log cannot be written.
 
     Raises:
-        LogError: As `Log.note`.
+        LogError: For the same reasons as `Log.note`.
     """
     if rate_hz <= 0:
         yield

@@ -35,15 +35,15 @@ MATCHED = 3
 REFUSED = 4
 """A sample that the middleware did not accept."""
 SKIPPED = 5
-"""Samples that were not sent because writing the previous one took too long; `sequence` is their number."""
+"""Samples that were not sent, because writing the previous one took too long. `sequence` is how many were skipped."""
 FOREIGN = 6
 """A received sample that does not belong to this stream."""
 END = 7
 """The last record; `sequence` is the number of samples.
 
-If the send time is `CHECKED`, `size` is the CRC-32 of the whole file with 0 in that field.
+If the send time is `CHECKED`, the log has a checksum: `size` is the CRC-32 of the whole file, computed with `size` 0.
 """
-ORIGIN = 8
+WRITER = 8
 """The role of the program that writes the log: `sequence` is `PUBLISHER` or `SUBSCRIBER`, `size` is the CRC-32 of the
 topic's name."""
 
@@ -104,8 +104,8 @@ class Log:
         self._piece[self._offset : end] = record
         self._offset = end
 
-    def origin(self, at_ns: int, role: int, topic: str) -> None:
-        """Write an `ORIGIN` record.
+    def write_role(self, at_ns: int, role: int, topic: str) -> None:
+        """Write a `WRITER` record.
 
         Args:
             at_ns: The local time.
@@ -115,7 +115,7 @@ class Log:
         Raises:
             LogError: The disk is full.
         """
-        self.note(ORIGIN, at_ns, size=zlib.crc32(topic.encode()), sequence=role)
+        self.note(WRITER, at_ns, size=zlib.crc32(topic.encode()), sequence=role)
 
     def end(self, at_ns: int) -> None:
         """Write the last record with a checksum, and flush the file to disk.
@@ -140,7 +140,7 @@ class Log:
         return zlib.crc32(end_record, crc)
 
     def _map_from(self, position: int) -> None:
-        """Map a piece of the log that starts at the page of a position, where the next record is written."""
+        """Map the piece of the log that starts at the page of `position`, at which the next record is written."""
         offset = position % mmap.ALLOCATIONGRANULARITY
         piece_start = position - offset
         try:

@@ -66,7 +66,7 @@ class Ros1Middleware:
         """Subscribe to a topic; return a function that returns the number of connected publishers."""
         own_name = rospy.get_name()
 
-        def on_message(message: Any) -> None:  # noqa: ANN401 (untyped)
+        def on_message(message: Any) -> None:  # noqa: ANN401 (rospy declares no types)
             at_ns = time.time_ns()
             if message._connection_header["callerid"] != own_name:
                 deliver(bytes(message._buff), at_ns)
@@ -145,7 +145,7 @@ def _queue_size(topic: Topic) -> int:
 class Ros1Publisher:
     """A publisher of serialized messages of one type."""
 
-    def __init__(self, publisher: Any, message_class: type) -> None:  # noqa: ANN401 (untyped)
+    def __init__(self, publisher: Any, message_class: type) -> None:  # noqa: ANN401 (rospy declares no types)
         self._publisher = publisher
         self._message_class = message_class
 

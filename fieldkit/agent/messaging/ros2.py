@@ -55,7 +55,7 @@ def profile(qos: Quality) -> QoSProfile:
     return QoSProfile(**policies)
 
 
-def message_type(name: str) -> Any:  # noqa: ANN401 (generated)
+def message_type(name: str) -> Any:  # noqa: ANN401 (a generated class)
     """Return the class of a message type, for example `std_msgs/msg/UInt8MultiArray`.
 
     Raises:
@@ -149,7 +149,7 @@ class Ros2Middleware:
 class Ros2Publisher:
     """A publisher of serialized messages."""
 
-    def __init__(self, publisher: Any) -> None:  # noqa: ANN401 (untyped)
+    def __init__(self, publisher: Any) -> None:  # noqa: ANN401 (rclpy declares no types)
         self._publisher = publisher
 
     def write(self, data: bytes) -> bool:

@@ -71,7 +71,7 @@ def send(video: Video, log: Log, stop_event: threading.Event) -> None:
     """Pass frames to a pipeline at their scheduled times, and log each of them.
 
     Raises:
-        LogError: As `Log.note`.
+        LogError: For the same reasons as `Log.note`.
         MiddlewareError: The pipeline does not start, or ended early.
     """
     read_end, write_end = os.pipe()
@@ -101,7 +101,7 @@ def receive(video: Video, log: Log, stop_event: threading.Event) -> None:
     Writes `up` to standard error when the pipeline is playing.
 
     Raises:
-        LogError: As `Log.note`.
+        LogError: For the same reasons as `Log.note`.
         MiddlewareError: The pipeline does not start, or ended early.
     """
     read_end, write_end = os.pipe()
@@ -136,9 +136,9 @@ def _frames(file: IO[bytes], size: int) -> Iterator[bytes]:
 
 def _write_all(file: IO[bytes], data: bytes) -> None:
     """Write to a pipe, which may accept only a part of the data at a time."""
-    rest = memoryview(data)
-    while rest:
-        rest = rest[file.write(rest) :]
+    remaining_data = memoryview(data)
+    while remaining_data:
+        remaining_data = remaining_data[file.write(remaining_data) :]
 
 
 @contextmanager

@@ -109,7 +109,7 @@ def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, stop
         stop_event: Set to stop early.
 
     Raises:
-        LogError: As `Log.note`.
+        LogError: For the same reasons as `Log.note`.
     """
     codec = SampleCodec(stream)
     publisher = middleware.publisher(topic)
@@ -136,7 +136,7 @@ def scheduled(rate_hz: float, duration_s: float, log: Log, stop_event: threading
     A sample whose time has passed before the next value is requested is skipped, as timers of robots do.
 
     Raises:
-        LogError: As `Log.note`.
+        LogError: For the same reasons as `Log.note`.
     """
     start_s, sequence, tick, ticks = time.monotonic(), 0, 0, round(duration_s * rate_hz)
     while tick < ticks:
@@ -152,10 +152,12 @@ def scheduled(rate_hz: float, duration_s: float, log: Log, stop_event: threading
 
 
 def subscribe(middleware: Middleware, topic: Topic, stream: Stream, log: Log, stop_event: threading.Event) -> None:
-    """Log each received sample, and each read of the newest, until `stop_event` is set; arguments as for `publish`.
+    """Log each received sample, and each read of the newest sample, until `stop_event` is set.
+
+    The arguments are those of `publish`.
 
     Raises:
-        LogError: As `Log.note`; `stop_event` is set then.
+        LogError: For the same reasons as `Log.note`; `stop_event` is set then.
     """
     codec, newest = SampleCodec(stream), NewestSample()
     errors: list[LogError] = []

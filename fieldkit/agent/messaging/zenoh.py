@@ -58,7 +58,7 @@ def configuration(network: Network, mode: str) -> dict[str, Any]:
     return {**config, **{path: _parse_setting(text) for path, text in network.settings.items()}}
 
 
-def _parse_setting(text: str) -> Any:  # noqa: ANN401 (of JSON)
+def _parse_setting(text: str) -> Any:  # noqa: ANN401 (any JSON value)
     try:
         return json.loads(text)
     except ValueError:
@@ -116,7 +116,7 @@ class ZenohMiddleware:
     def subscribe(self, topic: Topic, deliver: Deliver) -> Callable[[], int]:
         """Subscribe to a topic; return a function that returns -1, because Zenoh does not count publishers."""
 
-        def on_sample(sample: Any) -> None:  # noqa: ANN401 (untyped)
+        def on_sample(sample: Any) -> None:  # noqa: ANN401 (Zenoh declares no types)
             at_ns = time.time_ns()
             deliver(sample.payload.to_bytes(), at_ns)
 
@@ -161,7 +161,7 @@ class ZenohMiddleware:
 class ZenohPublisher:
     """A publisher whose samples have attachments."""
 
-    def __init__(self, publisher: Any, matching: Any, identifier: bytes) -> None:  # noqa: ANN401 (untyped)
+    def __init__(self, publisher: Any, matching: Any, identifier: bytes) -> None:  # noqa: ANN401 (Zenoh declares no types)
         self._publisher = publisher
         self._matching = matching
         self._gid = identifier

@@ -43,15 +43,17 @@ def run(arguments: argparse.Namespace) -> int:
 
     with showing_events(as_json=arguments.json) as sink, interruptible() as stop:
         name, backend = cli_options.backend(arguments, sink)
-        planned, document = plan.make_plan(arguments.file, name)
+        current_plan, document = plan.make_plan(arguments.file, name)
         if (
             not arguments.dry_run
             and (code := cli_options.run_elsewhere(backend, arguments, arguments.out)) is not None
         ):
             return code
-        folder = arguments.out / f"campaign_{planned.campaign.name}"
-        started = plan.started_plan(folder, planned, document)
-        campaign = CampaignRun(started or planned, CampaignJournal(folder), backend, sink, failed=arguments.failed)
+        folder = arguments.out / f"campaign_{current_plan.campaign.name}"
+        started_plan = plan.started_plan(folder, current_plan, document)
+        campaign = CampaignRun(
+            started_plan or current_plan, CampaignJournal(folder), backend, sink, failed=arguments.failed
+        )
         campaign.announce()
         if arguments.dry_run:
             return 0
@@ -74,7 +76,7 @@ def _report_outcome(outcome: "CampaignOutcome", file: Path, folder: Path) -> int
     if outcome.unmet:
         unmet = format_count(outcome.unmet, "expectation")
         show_error(
-            f"{unmet} not shown to hold\n  remedy: {shell_command('fieldkit', 'aggregate', folder)} lists them"
+            f"{unmet} not met or undecided\n  remedy: {shell_command('fieldkit', 'aggregate', folder)} lists them"
         )
     if outcome.failed:
         return EvidenceError.exit_code

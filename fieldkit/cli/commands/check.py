@@ -67,11 +67,11 @@ def run(arguments: argparse.Namespace) -> int:
         name, backend = cli_options.backend(arguments, sink)
         if (code := cli_options.run_elsewhere(backend, arguments, Path("trials"))) is not None:
             return code
-        cast = backend.cast(request.effective_topology)
+        robots_by_role = backend.cast(request.effective_topology)
         plan = make_plan(
             request,
             backend=name,
-            cast=cast,
+            cast=robots_by_role,
             now=datetime.now(UTC),
             lab_bytes=backend.lab_bytes,
             simulators=simulators_of(backend),

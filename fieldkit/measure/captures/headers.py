@@ -35,7 +35,7 @@ def check_link_type(*link_types: int, where: str) -> None:
     """
     if RAW_LINKS & set(link_types):
         return
-    from fieldkit.measure.captures.link_layers import LINKS  # noqa: PLC0415 (other link types only)
+    from fieldkit.measure.captures.link_layers import LINKS  # noqa: PLC0415 (needed only for other link types)
 
     if not LINKS.keys() & set(link_types):
         raise EvidenceError(
@@ -53,7 +53,7 @@ def network(integers: Integers, frames: Frames) -> Ints:
         if link_type in RAW_LINKS:
             header_at[rows] = frames.start[rows]
             continue
-        from fieldkit.measure.captures.link_layers import LINKS  # noqa: PLC0415 (other link types only)
+        from fieldkit.measure.captures.link_layers import LINKS  # noqa: PLC0415 (needed only for other link types)
 
         if link_type in LINKS:
             header_at[rows] = LINKS[link_type](integers, frames.where(rows))
@@ -151,7 +151,7 @@ def ip_headers(integers: Integers, frames: Frames, at: Ints) -> Headers:
     parts = [_ipv4_headers(integers, ipv4_frames, at[ipv4_frames], captured[ipv4_frames], wire[ipv4_frames])]
     if not len(ipv6_frames):
         return parts[0]
-    from fieldkit.measure.captures.ipv6_headers import ipv6_headers  # noqa: PLC0415 (most captures have none)
+    from fieldkit.measure.captures.ipv6_headers import ipv6_headers  # noqa: PLC0415 (most captures contain no IPv6)
 
     headers = Headers.concatenated(
         [*parts, ipv6_headers(integers, ipv6_frames, at[ipv6_frames], captured[ipv6_frames], wire[ipv6_frames])]

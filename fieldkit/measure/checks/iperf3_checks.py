@@ -26,45 +26,54 @@ _TIMESTAMP_S: Final = 2
 
 CROSS_CHECKS: Final = (
     CrossCheck(
-        "payload per interval",
-        ("iperf3_*_bytes", "iperf3_throughput_bit_s", "iperf3_interval_*"),
-        "`ROLE-iperf3.json`: `intervals[].sum`",
-        (
+        quantity="payload per interval",
+        columns=("iperf3_*_bytes", "iperf3_throughput_bit_s", "iperf3_interval_*"),
+        source="`ROLE-iperf3.json`: `intervals[].sum`",
+        against=(
             "the same file: `streams`, `bits_per_second`, `end`",
             "the other end's `end`",
             "both captures: payload up to the end of each interval",
             "without captures: the receiver's interface counters",
         ),
-        "none within a file; with captures 0.5 s of traffic and the socket buffers, because iperf3 counts reads",
+        tolerance=(
+            "no difference within a file; compared with the captures, 0.5 s of traffic plus the socket buffers, "
+            "because "
+            "iperf3 counts bytes when it reads them"
+        ),
     ),
     CrossCheck(
-        "datagrams expected and lost",
-        ("iperf3_datagrams_*", "iperf3_loss"),
-        "receiver's `ROLE-iperf3.json`: `intervals[].sum.packets`, `.lost_packets`",
-        ("the same file: `end.sum`", "the sender's `end.sum`", "both captures: datagrams sent and received"),
-        "datagrams dropped at a socket buffer (RcvbufErrors, SndbufErrors) or at the sender's queue before its "
-        "capture, and those after the end of the test",
+        quantity="datagrams expected and lost",
+        columns=("iperf3_datagrams_*", "iperf3_loss"),
+        source="receiver's `ROLE-iperf3.json`: `intervals[].sum.packets`, `.lost_packets`",
+        against=("the same file: `end.sum`", "the sender's `end.sum`", "both captures: datagrams sent and received"),
+        tolerance=(
+            "datagrams dropped at a socket buffer (RcvbufErrors, SndbufErrors) or at the sender's queue before its "
+            "capture, and those after the end of the test"
+        ),
     ),
     CrossCheck(
-        "identity of the test",
-        ("iperf3_*",),
-        "`ROLE-iperf3.json`: `cookie`, `connected`, `test_start`, `timestamp`",
-        ("the other end's", "the procedure", "ports in both captures", "the robot's clock before and after"),
-        "2 s, because the time stamp is in whole seconds",
+        quantity="identity of the test",
+        columns=("iperf3_*",),
+        source="`ROLE-iperf3.json`: `cookie`, `connected`, `test_start`, `timestamp`",
+        against=("the other end's", "the procedure", "ports in both captures", "the robot's clock before and after"),
+        tolerance="start times may differ by 2 s, because the time stamp is in whole seconds",
     ),
     CrossCheck(
-        "last jitter value",
-        ("iperf3_jitter_s",),
-        "receiver's `ROLE-iperf3.json`: `end.sum.jitter_ms`",
-        ("the sender's `end.sum.jitter_ms`",),
-        "none",
+        quantity="last jitter value",
+        columns=("iperf3_jitter_s",),
+        source="receiver's `ROLE-iperf3.json`: `end.sum.jitter_ms`",
+        against=("the sender's `end.sum.jitter_ms`",),
+        tolerance="none",
     ),
     CrossCheck(
-        "retransmissions",
-        ("iperf3_retransmits",),
-        "sender's `ROLE-iperf3.json`: `intervals[].sum.retransmits`",
-        ("the same file: `end.sum_sent.retransmits`", "the sender's capture: retransmitted segments"),
-        "a factor of 2 and 20 segments: offload joins segments, and the kernel counts handshakes too",
+        quantity="retransmissions",
+        columns=("iperf3_retransmits",),
+        source="sender's `ROLE-iperf3.json`: `intervals[].sum.retransmits`",
+        against=("the same file: `end.sum_sent.retransmits`", "the sender's capture: retransmitted segments"),
+        tolerance=(
+            "the counts may differ by a factor of 2 plus 20 segments: offload joins segments, and the kernel counts "
+            "handshakes too"
+        ),
     ),
 )
 

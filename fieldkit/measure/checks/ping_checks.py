@@ -110,39 +110,56 @@ _CLOCK_SLACK_S: Final = 1.0
 
 CROSS_CHECKS: Final = (
     CrossCheck(
-        "requests and replies",
-        ("rtt_sent", "rtt_received", "rtt_loss", "rtt_gap_lost*"),
-        "`ping.txt`: reply lines and summary",
-        ("the procedure: count", "each capture: echoes by sequence number", "the same file: summary and lines"),
-        "a reply in the last 0.1 s of ping, or later than one interval after the last request",
+        quantity="requests and replies",
+        columns=("rtt_sent", "rtt_received", "rtt_loss", "rtt_gap_lost*"),
+        source="`ping.txt`: reply lines and summary",
+        against=(
+            "the procedure: count",
+            "each capture: echoes by sequence number",
+            "the same file: summary and lines",
+        ),
+        tolerance=(
+            "ping may not count a reply that arrives in its last 0.1 s, or later than one interval after the last "
+            "request"
+        ),
     ),
     CrossCheck(
-        "round-trip time of each reply",
-        ("rtt_*_s", "paper_delay_s", "paper_transfer_s"),
-        "`ping.txt`: `time=`",
-        ("sender's capture: request to complete reply", "the same file: min/avg/max"),
-        "0.6 % (3 digits), and 20 ms for one reply, 1 ms for the median (5 times that for busybox): a busy robot",
+        quantity="round-trip time of each reply",
+        columns=("rtt_*_s", "paper_delay_s", "paper_transfer_s"),
+        source="`ping.txt`: `time=`",
+        against=("sender's capture: request to complete reply", "the same file: min/avg/max"),
+        tolerance=(
+            "0.6 %, because ping prints 3 digits, plus 20 ms for one reply or 1 ms for the median (5 times as much "
+            "for "
+            "busybox), because a busy robot delays ping"
+        ),
     ),
     CrossCheck(
-        "time of each reply",
-        ("rtt_gap_s", "rtt_gap_at_least_s", "rtt_distance_*", "rtt_*_speed_m_s"),
-        "`ping.txt`: time stamps in brackets",
-        ("sender's capture: time of the reply", "the robot's clock before and after"),
-        "1 s for one reply, 50 ms for the median, because ping prints the time of printing",
+        quantity="time of each reply",
+        columns=("rtt_gap_s", "rtt_gap_at_least_s", "rtt_distance_*", "rtt_*_speed_m_s"),
+        source="`ping.txt`: time stamps in brackets",
+        against=("sender's capture: time of the reply", "the robot's clock before and after"),
+        tolerance=(
+            "1 s for one reply, 50 ms for the median, because the time stamp is the time at which ping prints the "
+            "line"
+        ),
     ),
     CrossCheck(
-        "payload of a request",
-        ("rtt_payload_bytes", "paper_window_bytes"),
-        "`ping.txt`: first line",
-        ("the procedure", "each capture: size of echoes"),
-        "none",
+        quantity="payload of a request",
+        columns=("rtt_payload_bytes", "paper_window_bytes"),
+        source="`ping.txt`: first line",
+        against=("the procedure", "each capture: size of echoes"),
+        tolerance="none",
     ),
     CrossCheck(
-        "copies over several links",
-        ("rtt_duplicates",),
-        "captures on all interfaces: interface of each echo",
-        ("`ping.txt`: replies with `(DUP!)`", "receiver's capture: at most one reply per received request"),
-        "a copy in the last 0.1 s of ping, or later than one interval after the last request; fragmented requests",
+        quantity="copies over several links",
+        columns=("rtt_duplicates",),
+        source="captures on all interfaces: interface of each echo",
+        against=("`ping.txt`: replies with `(DUP!)`", "receiver's capture: at most one reply per received request"),
+        tolerance=(
+            "ping may not count a copy that arrives in its last 0.1 s, or later than one interval after the last "
+            "request; fragmented requests are not compared"
+        ),
     ),
 )
 

@@ -64,10 +64,12 @@ def find_contradictions(
 
 
 def _files(evidence: AttemptEvidence, transfer: Transfer) -> _Files | None:
-    sent = evidence.read_or_none(reading.size, transfer.sent_file)
-    received = evidence.read_or_none(reading.size, transfer.received_file)
-    common = evidence.read_or_none(reading.common_prefix_bytes, "", transfer.sent_file, transfer.received_file)
-    return None if sent is None or received is None or common is None else _Files(sent, received, common)
+    sent_bytes = evidence.read_or_none(reading.size, transfer.sent_file)
+    received_bytes = evidence.read_or_none(reading.size, transfer.received_file)
+    common_bytes = evidence.read_or_none(reading.common_prefix_bytes, "", transfer.sent_file, transfer.received_file)
+    if sent_bytes is None or received_bytes is None or common_bytes is None:
+        return None
+    return _Files(sent_bytes, received_bytes, common_bytes)
 
 
 def _earlier_traffic(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:
@@ -206,69 +208,76 @@ def _is_refused(sent: Packets, answers: Packets) -> bool:
 CROSS_CHECKS: Final = (
     udp_file_checks.CROSS_CHECK,
     CrossCheck(
-        "file received over TCP",
-        ("received_bytes", "file_loss", "hash_match", "goodput_bit_s", "completion_s"),
-        "`recv.bag`",
-        ("`scan.bag`: its first bytes", "both captures: bytes that arrived", "how the listener ended"),
-        "bytes that its listener did not read before its time limit",
+        quantity="file received over TCP",
+        columns=("received_bytes", "file_loss", "hash_match", "goodput_bit_s", "completion_s"),
+        source="`recv.bag`",
+        against=(
+            "`scan.bag`: its first bytes",
+            "both captures: bytes that arrived",
+            "exit code of the listener",
+        ),
+        tolerance="the file may lack bytes that the listener did not read before its time limit",
     ),
     CrossCheck(
-        "file sent",
-        ("sent_bytes", "bag_messages", "bag_duration_s"),
-        "`scan.bag`",
-        ("sender's capture: bytes that left", "the procedure: topics and duration"),
-        "half of the duration, because a recorder needs time to subscribe",
+        quantity="file sent",
+        columns=("sent_bytes", "bag_messages", "bag_duration_s"),
+        source="`scan.bag`",
+        against=("sender's capture: bytes that left", "the procedure: topics and duration"),
+        tolerance=(
+            "a bag may be shorter than planned by half of its duration, because a recorder needs time to subscribe"
+        ),
     ),
     CrossCheck(
-        "packets sent and received",
-        (
+        quantity="packets sent and received",
+        columns=(
             *("ip_*", "datagram*", "byte_loss", "tcp_*", "paper_packets", "paper_received", "paper_loss"),
             *("transfer_s", "transfer_from", "throughput_bit_s", "paper_window_bytes"),
         ),
-        "`sender.pcap`, `receiver.pcap`",
-        ("each other", "`ROLE-capture.log`: tcpdump's counters", "TCP's acknowledgments", "both files"),
-        "none: losses, copies and reordering on the link are no contradictions",
+        source="`sender.pcap`, `receiver.pcap`",
+        against=("each other", "`ROLE-capture.log`: tcpdump's counters", "TCP's acknowledgments", "both files"),
+        tolerance="none; losses, copies and reordering on the link are no contradictions",
     ),
     CrossCheck(
-        "delay and its variation",
-        ("one_way_*", "delay_variation_*", "jitter_s", "clock_*"),
-        "times in `sender.pcap` and `receiver.pcap`",
-        ("packets in both directions: offset and skew of the clocks", "each robot's clock before and after"),
-        (
-            "withheld if the error of the offset, with one time stamp wrong, is above a tenth of the delay, or the "
-            "clocks were unsteady"
+        quantity="delay and its variation",
+        columns=("one_way_*", "delay_variation_*", "jitter_s", "clock_*"),
+        source="times in `sender.pcap` and `receiver.pcap`",
+        against=("packets in both directions: offset and skew of the clocks", "each robot's clock before and after"),
+        tolerance=(
+            "the error of the clock offset, computed with one wrong time stamp, may be a tenth of the delay; the "
+            "clocks "
+            "must advance at constant rates"
         ),
-        CheckOutcome.WITHHELD,
+        outcome=CheckOutcome.WITHHELD,
     ),
     CrossCheck(
-        "the paper's delay",
-        ("paper_delay_s", "paper_transfer_s"),
-        "`ping.txt`: `time=`",
-        ("as for the round-trip time of the step ping",),
-        "as for the step ping",
+        quantity="the paper's delay",
+        columns=("paper_delay_s", "paper_transfer_s"),
+        source="`ping.txt`: `time=`",
+        against=("the sources with which the round-trip times of the step `ping` are compared",),
+        tolerance="the same as for the step `ping`",
     ),
     CrossCheck(
-        "datagrams that the kernel refused",
-        ("receiver_udp_buffer_errors", "receiver_reassembly_failures"),
-        "`ROLE-before.txt`, `ROLE-after.txt`: /proc/net/snmp",
-        (),
-        "only the kernel counts them; a counter that is missing or decreased is withheld",
-        CheckOutcome.UNCHECKED,
+        quantity="datagrams that the kernel refused",
+        columns=("receiver_udp_buffer_errors", "receiver_reassembly_failures"),
+        source="`ROLE-before.txt`, `ROLE-after.txt`: /proc/net/snmp",
+        against=(),
+        tolerance="only the kernel counts them; the column is empty if a counter is missing or has decreased",
+        outcome=CheckOutcome.UNCHECKED,
     ),
     CrossCheck(
-        "components of the delay in the emulator",
-        ("delay_s", "delay_*_s", "delay_packets"),
-        "`medium.txt`",
-        (),
-        "only the emulator can measure them; the file is rejected if a robot provides it",
-        CheckOutcome.UNCHECKED,
+        quantity="components of the delay in the emulator",
+        columns=("delay_s", "delay_*_s", "delay_packets"),
+        source="`medium.txt`",
+        against=(),
+        tolerance="only the emulator can measure them; the file is rejected if a robot provides it",
+        outcome=CheckOutcome.UNCHECKED,
     ),
     CrossCheck(
-        "distance and speed during the transfer",
-        ("transfer_distance_*", "transfer_*_speed_m_s"),
-        "`track.csv` of the emulator, else `positions.json`",
-        (),
-        "compared if steps move robots or record positions",
-        CheckOutcome.UNCHECKED,
+        quantity="distance and speed during the transfer",
+        columns=("transfer_distance_*", "transfer_*_speed_m_s"),
+        source="`track.csv` of the emulator, else `positions.json`",
+        against=(),
+        tolerance="the positions are compared only if steps move robots or record positions",
+        outcome=CheckOutcome.UNCHECKED,
     ),
 )

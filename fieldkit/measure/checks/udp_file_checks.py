@@ -21,12 +21,15 @@ from fieldkit.measure.evidence import reading
 from fieldkit.measure.transfers.transfer_spec import Transfer
 
 CROSS_CHECK: Final = CrossCheck(
-    "file received over UDP",
-    ("received_bytes", "file_loss", "hash_match"),
-    "`recv.bag`",
-    ("both captures: datagrams that arrived completely, in their order", "`scan.bag`: their content"),
-    "datagrams that the receiver's kernel counts as dropped (InErrors, ReasmFails, NoPorts); all later ones, if the "
-    "listener was stopped at its time limit",
+    quantity="file received over UDP",
+    columns=("received_bytes", "file_loss", "hash_match"),
+    source="`recv.bag`",
+    against=("both captures: datagrams that arrived completely, in their order", "`scan.bag`: their content"),
+    tolerance=(
+        "the file may lack datagrams that the receiver's kernel counts as dropped (InErrors, ReasmFails, NoPorts), "
+        "and the "
+        "last ones if the listener was stopped at its time limit"
+    ),
 )
 
 

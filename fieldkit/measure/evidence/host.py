@@ -161,7 +161,10 @@ def job_times_ns(path: Path) -> Mapping[str, tuple[int, int]]:
 
 
 def stations(path: Path) -> str:
-    """Return the output of `iw station dump`, or an empty text if it is missing; raises as `state`."""
+    """Return the output of `iw station dump`, or an empty string if it is missing.
+
+    Raises the same errors as `state`.
+    """
     return _sections(reading.text(path)).get("iw station dump", "")
 
 

@@ -35,7 +35,7 @@ def count(document: Mapping[str, Any], key: str) -> int | None:
 
 @dataclass(frozen=True)
 class IperfStart:
-    """Parameters of a test. A parameter that the JSON does not contain is None or an empty text.
+    """Parameters of a test. A parameter that the JSON does not contain is None or an empty string.
 
     Attributes:
         cookie: Random text that is the same at both ends of a test.

@@ -1,4 +1,6 @@
-"""Delays that a testbed's oracle reports: lateness of deliveries, and air delay of a transfer's packets.
+"""Delays that a modelled radio reports: lateness of deliveries, and air delay of a transfer's packets.
+
+The source of exact data about a modelled radio is called *oracle* (`backends.protocols.Oracle`).
 
 A packet is late if it is delivered later than the radio model determines (`Oracle.lateness`). In a co-simulation,
 windows also have a lateness, and the sync policy adds to the delay of packets. The air delay has four components

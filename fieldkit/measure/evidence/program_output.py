@@ -54,7 +54,7 @@ def _compile_path(text: str) -> Any:  # noqa: ANN401 (jmespath declares no types
 @cache
 def _compile_expression(text: str) -> Any:  # noqa: ANN401 (re2 declares no types)
     """Return a compiled expression; raises ValueError if the text is not a regular expression."""
-    import re2  # noqa: PLC0415 (as jmespath)
+    import re2  # noqa: PLC0415 (an optional package; see jmespath above)
 
     options = re2.Options()
     options.log_errors = False
@@ -80,7 +80,7 @@ def document(path: Path) -> object:
     """Return the parsed JSON that a program printed.
 
     Raises:
-        EvidenceError: As `text`, or the output is not JSON.
+        EvidenceError: For the same reasons as `text`, or because the output is not JSON.
     """
     try:
         return parse_json(text(path))
@@ -102,7 +102,8 @@ def at_path(path: Path, where: str) -> object:
     """Return the value at the path `where` in the JSON that a program printed, or None if there is no value.
 
     Raises:
-        EvidenceError: As `document`, or a function in the path was applied to a value of the wrong type.
+        EvidenceError: For the same reasons as `document`, or because a function in the path was applied to a value
+            of the wrong type.
     """
     printed = document(path)
     try:
@@ -129,7 +130,7 @@ def by_expression(path: Path, expression: str) -> object:
     """Return the text of the expression's group in the first match in a program's output, or None without a match.
 
     Raises:
-        EvidenceError: As `text`.
+        EvidenceError: For the same reasons as `text`.
     """
     return search_text(text(path), expression)
 

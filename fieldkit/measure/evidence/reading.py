@@ -53,7 +53,7 @@ def mapped(path: Path) -> bytes | mmap:
 
 
 def common_prefix_bytes(folder: Path, first: str, second: str) -> int:
-    """Return the length of the common prefix of two files in a folder, in bytes; raises as `size`."""
+    """Return the length of the common prefix of two files in a folder, in bytes. Raises the same errors as `size`."""
     with _open_regular(folder / first) as left, _open_regular(folder / second) as right:
         common_bytes = 0
         while (left_chunk := left.read(_CHUNK_BYTES)) == (right_chunk := right.read(_CHUNK_BYTES)) and left_chunk:

@@ -44,7 +44,7 @@ def serve(answer: Callable[[Json], Json]) -> None:
 
 
 def _apply_limits(memory_bytes: int, disk_bytes: int, cpu_s: int) -> None:
-    """Limit the resources that this process may use in addition to its present use."""
+    """Limit the resources that this process may use in addition to its current use."""
     used_bytes = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
     used = resource.getrusage(resource.RUSAGE_SELF)
     limits = {

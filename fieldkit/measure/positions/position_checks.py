@@ -6,26 +6,30 @@ from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
 
 POSITION_CHECKS: Final = (
     CrossCheck(
-        "planned positions in the record",
-        ("positions_from",),
-        "`positions.json`: positions and their start times",
-        ("the placement in `trial.yaml`",),
-        "1 mm of rounding: the laptop wrote both",
+        quantity="planned positions in the record",
+        columns=("positions_from",),
+        source="`positions.json`: positions and their start times",
+        against=("the placement in `trial.yaml`",),
+        tolerance="1 mm for rounding, because the laptop wrote both",
     ),
     CrossCheck(
-        "recorded positions",
-        ("*_distance_*", "*_relative_speed_m_s", "*_sender_speed_m_s"),
-        "positions that a step or a person recorded",
-        ("the placement in `trial.yaml`",),
-        "10 % of the distance plus 2 m (plus 15 m for satellite receivers), for errors of placement and of receivers",
-        CheckOutcome.WITHHELD,
+        quantity="recorded positions",
+        columns=("*_distance_*", "*_relative_speed_m_s", "*_sender_speed_m_s"),
+        source="positions that a step or a person recorded",
+        against=("the placement in `trial.yaml`",),
+        tolerance=(
+            "distances may differ by 10 % plus 2 m, or plus 15 m with satellite receivers, because of errors of "
+            "placement "
+            "and of receivers"
+        ),
+        outcome=CheckOutcome.WITHHELD,
     ),
     CrossCheck(
-        "error of the robots' clocks",
-        ("positions_clock_error_s",),
-        "`positions.json`: clocks, read before and after",
-        (),
-        "only the laptop reads them",
-        CheckOutcome.UNCHECKED,
+        quantity="error of the robots' clocks",
+        columns=("positions_clock_error_s",),
+        source="`positions.json`: clocks, read before and after",
+        against=(),
+        tolerance="only the laptop reads them",
+        outcome=CheckOutcome.UNCHECKED,
     ),
 )

@@ -11,9 +11,10 @@ from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import track
 
-DEPENDENT: Final = (
+POSITION_DEPENDENT_PATTERNS: Final = (
     "*distance_start_m",
-    "*distance_m??_m",
+    "*distance_min_m",
+    "*distance_max_m",
     "*distance_mean_m",
     "*relative_speed_m_s",
     "*sender_speed_m_s",
@@ -40,7 +41,7 @@ def measure(
     """
     if not are_recorded(evidence):
         return track.measure(evidence.read_or_none(track.read, track.FILE), columns, ends, times_ns)
-    from fieldkit.measure.positions import recorded_positions  # noqa: PLC0415 (few attempts have such positions)
+    from fieldkit.measure.positions import recorded_positions  # noqa: PLC0415 (few attempts have recorded positions)
 
     return recorded_positions.measure(evidence, columns, ends, times_ns)
 
@@ -70,6 +71,6 @@ def trial_folder(evidence: AttemptEvidence) -> Path | None:
     return parent.parent if parent.name == _ATTEMPTS else None
 
 
-def is_dependent(column: str) -> bool:
+def depends_on_positions(column: str) -> bool:
     """Return True if a column depends on positions."""
-    return any(fnmatch(column, pattern) for pattern in DEPENDENT)
+    return any(fnmatch(column, pattern) for pattern in POSITION_DEPENDENT_PATTERNS)

@@ -191,7 +191,10 @@ def _offset_ns(sources: PositionSources, role: Role) -> int:
 
 
 def clock_offset_ns(evidence: AttemptEvidence, role: Role) -> int:
-    """Return the offset of a robot's clock from the laptop's, or 0 if unknown; raises as `read_position_sources`."""
+    """Return the offset of a robot's clock from the laptop's, or 0 if unknown.
+
+    Raises the same errors as `read_position_sources`.
+    """
     return _offset_ns(read_position_sources(evidence), role)
 
 

@@ -27,8 +27,8 @@ _Snapshots = Mapping[Role, tuple[Snapshot, Snapshot]]
 def measure(evidence: AttemptEvidence, names: Mapping[Role, str], measured: Measured) -> Measured:
     """Return the columns of an attempt, and the columns of the robots' states.
 
-    If a one-way delay is withheld because the offset of the clocks is unknown, the reason also contains wrong clocks
-    and missing time sources.
+    If a one-way delay is empty because the offset of the clocks is unknown, the reason also names wrong clocks and
+    missing time sources.
 
     Args:
         evidence: The attempt.
@@ -37,10 +37,10 @@ def measure(evidence: AttemptEvidence, names: Mapping[Role, str], measured: Meas
     """
     snapshots_by_role = {role: snapshots.read_attempt(evidence, role) for role in names}
     clock_columns, clock_marks, has_clocks = _measure_clocks(evidence, names, snapshots_by_role, measured)
-    computers = {
+    health_by_role = {
         role: (health.parse(before), health.parse(after)) for role, (before, after) in snapshots_by_role.items()
     }
-    flags = {role: health.flags_during(*states) for role, states in computers.items()}
+    flags = {role: health.flags_during(*states) for role, states in health_by_role.items()}
     radio_columns, radio_marks, has_airtime = _measure_radios(names, snapshots_by_role)
     all_marks = (*clock_marks, *health.marks(names, flags), *radio_marks)
     is_known = has_clocks or has_airtime or any(value is not None for value in flags.values())
@@ -48,7 +48,9 @@ def measure(evidence: AttemptEvidence, names: Mapping[Role, str], measured: Meas
         _with_clock_reasons(measured, "; ".join(mark.reason for mark in clock_marks)) | clock_columns | radio_columns
     )
     for role in names:
-        measured |= health.measure(role, *computers[role]) | Measured.all_missing(declare_columns(role), _NO_SOURCE)
+        measured |= health.measure(role, *health_by_role[role]) | Measured.all_missing(
+            declare_columns(role), _NO_SOURCE
+        )
     return measured | marks.measure(all_marks, is_known=is_known)
 
 

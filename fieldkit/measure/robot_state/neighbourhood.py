@@ -89,7 +89,7 @@ class RadioState:
 
     Attributes:
         channel: Channel of the radio.
-        country: Regulatory domain: two letters of the country, or `00` for the world.
+        country: Regulatory domain: two-letter country code, or `00` (world).
         signals_dbm: Received power of each network of others on the channel; None for a power that is not reported.
         others_share: Share of the airtime in which the channel was busy, minus the radio's transmissions.
     """

@@ -51,7 +51,7 @@ def parse(output: SourceOutput) -> ClockReport:
 
 
 def _problem(state: str, *, has_master: bool) -> str:
-    """Return the reason why the clock is not synchronized, or an empty text if it is."""
+    """Return the reason why the clock is not synchronized, or an empty string if it is."""
     if state in {"MASTER", "GRAND_MASTER"}:
         return "ptp4l has no source and serves its own clock"
     if not has_master:

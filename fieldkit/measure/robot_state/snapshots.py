@@ -1,8 +1,8 @@
 """Snapshots of a robot's sources: outputs of programs that report the state of its clock and computer at one time.
 
 `fieldkit/remote/snapshot.sh` runs the command of each source and writes the snapshot. For each source, it contains a
-line `==> NAME <==`, the lines of the output, each after a blank, and the line ` code CODE`. A source is missing if
-the robot does not have its program.
+line `==> NAME <==`, the lines of the output, each preceded by a space, and the line ` code CODE`. A source is missing
+if the robot does not have its program.
 """
 
 import re

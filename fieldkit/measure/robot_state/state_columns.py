@@ -10,7 +10,7 @@ from fieldkit.core.columns import BACKGROUND, CLOCK_DIFFERENCE_BOUNDS_S, Column,
 MARKS: Final = "marks"
 MARK_SEPARATOR: Final = " and "
 NO_MARKS: Final = "none"
-"""Value of the column `marks` if sources of the robots answered, and none of their reports causes a mark."""
+"""Value of the column `marks` if a source on a robot could be read, and nothing that was reported causes a mark."""
 
 MARK_COLUMNS: Final = columns(
     160,
@@ -72,7 +72,7 @@ def declare_columns(role: str) -> tuple[Column, ...]:
         (
             f"{role}_temperature_c",
             "degC",
-            f"Highest temperature of a sensor of the {role} before and after the repeat, in degrees Celsius.",
+            f"Highest temperature of all sensors of the {role}, before or after the repeat, in degrees Celsius.",
             (-100.0, 300.0),
         ),
         (
@@ -88,22 +88,25 @@ def declare_columns(role: str) -> tuple[Column, ...]:
         (
             f"{role}_channel",
             "text",
-            f"Channel of the radio of the {role} before and after the repeat, with its width.",
+            f"Channel and channel width of the radio of the {role}, before and after the repeat.",
         ),
         (
             f"{role}_regulatory_domain",
             "text",
-            f"Regulatory domain of the radio of the {role}: two letters of the country, or `00` for the world.",
+            f"Regulatory domain of the radio of the {role}: two-letter country code, or `00` (world).",
         ),
         (
             f"{role}_other_networks",
             "count",
-            f"Networks of others that the {role} receives on its channel: the larger number of before and after.",
+            (
+                f"Number of other networks that the {role} receives on its channel: the larger of the counts before "
+                "and after the repeat."
+            ),
         ),
         (
             f"{role}_other_networks_max_dbm",
             "dBm",
-            f"Strongest signal of these networks at the {role}; empty if it receives no such network.",
+            f"Strongest signal of another network on the channel of the {role}; empty if it receives none.",
             (-300.0, 100.0),
         ),
         (

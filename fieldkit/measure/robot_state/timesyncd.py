@@ -1,7 +1,7 @@
 """Parsers of the output of `timedatectl timesync-status` and `timedatectl show` (systemd 239 and later).
 
 `Offset` is the time of the server minus the clock at the last poll; timesyncd then corrects the clock by this amount.
-The present offset of the clock is therefore between `-Offset` and 0. Its maximum error is the sum of `Root distance`,
+The current offset of the clock is therefore between `-Offset` and 0. Its maximum error is the sum of `Root distance`,
 the maximum error of the server, half of the round trip (`Delay`; RFC 5905, section 11.2), and the correction itself.
 """
 

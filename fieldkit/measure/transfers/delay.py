@@ -80,7 +80,7 @@ SENT_COLUMNS: Final = columns(
 )
 
 LARGEST_ERROR: Final = 0.1
-"""Maximum error of a one-way delay as a share of the delay. With a larger error, the delay is withheld."""
+"""Maximum error of a one-way delay as a share of the delay. With a larger error, the column of the delay is empty."""
 
 UNSTEADY: Final = (
     "no offset and drift fit all times: a clock was set during the attempt, or drifts by more than 500 ppm"
@@ -184,7 +184,7 @@ def packet_delays(
     Return None if the clock offset cannot be estimated, or if its error is unlimited.
 
     Args:
-        pairs: The transfer's packets as for `measure`; all must have times.
+        pairs: The transfer's packets, paired as for `measure`; all must have times.
         sender: Packets of the sender's capture, all with times.
         receiver: Packets of the receiver's capture, all with times.
         transfer: Identifies the transfer's packets.
@@ -297,10 +297,11 @@ def _one_way(delay_s: Floats, error_s: float, sent: int) -> Measured:
     return (
         Measured({"one_way_error_s": error_s})
         | Measured.from_optional(
-            {"one_way_median_sent_s": of_sent}, "the median is withheld, or half of the packets were lost"
+            {"one_way_median_sent_s": of_sent},
+            "the error of the median is too large, or half of the packets were lost",
         )
         | Measured.from_optional(values, "its error is above a tenth of its value")
-        | Measured.from_optional({"one_way_withheld": reason}, "nothing is withheld")
+        | Measured.from_optional({"one_way_withheld": reason}, "no one-way delay is empty")
     )
 
 

@@ -72,7 +72,7 @@ class Delivery:
         at_ns: Times of arrival of new payload, ascending. Shape (n,).
         begin_ns: Time of the first packet of the stream, which is the SYN for TCP.
         end_ns: Time until which payload was due; None if all payload arrived.
-        interval_s: As `FlowSchedule.interval_s`.
+        interval_s: Sending interval; see `FlowSchedule.interval_s`.
         min_stall_s: Minimum length of a stall: payload is overdue for longer than this.
     """
 
@@ -167,7 +167,7 @@ def advancing_frames(frames: Packets) -> tuple[Ints, Ints]:
         frames: Frames of one TCP connection in one direction, in the order of the capture.
 
     Raises:
-        EvidenceError: As for `tcp_streams.cut`.
+        EvidenceError: For the same reasons as `tcp_streams.cut`.
     """
     # SYN frames are included, because they define the position of the first byte. The number in an RST is arbitrary.
     relevant = np.flatnonzero((frames.tcp_payload_bytes > 0) | (frames.tcp_flags & SYN != 0))

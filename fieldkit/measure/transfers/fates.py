@@ -176,8 +176,8 @@ class _MatchedPackets:
         sent: Packets in the sender's capture.
         received: Packets in the receiver's capture.
         is_transfer_packet: Mask of the sent packets that belong to the transfer.
-        lost: As `SentPackets.lost`.
-        sent_again: As `SentPackets.sent_again`.
+        lost: Whether each packet was lost; see `SentPackets.lost`.
+        sent_again: Whether the data of each packet was sent again; see `SentPackets.sent_again`.
         copies: Indices of the matched sent packets, and indices of their copies among the received packets.
     """
 
@@ -197,7 +197,7 @@ def read_sent_packets(evidence: AttemptEvidence, transfer: Transfer) -> SentPack
         transfer: Identifies the packets of the transfer.
 
     Raises:
-        EvidenceError: As for `both_packets` and `tcp_streams.cut`.
+        EvidenceError: For the same reasons as `both_packets` and `tcp_streams.cut`.
     """
     sender, receiver = both_packets(evidence, transfer)
     packets = {Protocol.UDP: _match_udp, Protocol.TCP: _match_tcp}[transfer.protocol](sender, receiver, transfer)

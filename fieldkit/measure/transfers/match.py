@@ -91,7 +91,7 @@ def match(sent: Packets, received: Packets) -> Match:
         received: Packets captured at the receiver; its clock may have any offset.
 
     Raises:
-        EvidenceError: As for `tcp_streams.cut`.
+        EvidenceError: For the same reasons as `tcp_streams.cut`.
     """
     frames = _match_frames(sent, received)
     if not sent.tcp_payload_bytes.any() and not received.tcp_payload_bytes.any():
@@ -121,7 +121,7 @@ def match_payload(sent: Packets, received: Packets) -> Payload:
         received: Packets captured at the receiver; its clock may have any offset.
 
     Raises:
-        EvidenceError: As for `tcp_streams.cut`.
+        EvidenceError: For the same reasons as `tcp_streams.cut`.
     """
     return _match_pieces(sent, received, _match_frames(sent, received))
 

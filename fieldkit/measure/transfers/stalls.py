@@ -132,7 +132,7 @@ def measure(flow: str, deliveries: Callable[[], Sequence[Delivery]]) -> Measured
     """Return the columns for a flow.
 
     Args:
-        flow: As for `declare_columns`.
+        flow: Prefix of the columns' names; see `declare_columns`.
         deliveries: Function that returns the deliveries of each stream; raises `EvidenceError` if they are unknown.
     """
     declared_columns = declare_columns(flow, flow, 0)
@@ -165,7 +165,7 @@ def flow_schedule(evidence: AttemptEvidence, transfer: Transfer, listener: str) 
 
 
 def read_transfer_deliveries(evidence: AttemptEvidence, transfer: Transfer, listener: str) -> list[Delivery]:
-    """Return the deliveries of each connection; arguments as for `flow_schedule`.
+    """Return the deliveries of each connection. The arguments are those of `flow_schedule`.
 
     Raises:
         EvidenceError: The deliveries cannot be determined from the captures.
@@ -181,12 +181,14 @@ def read_transfer_deliveries(evidence: AttemptEvidence, transfer: Transfer, list
 
 
 def udp_deliveries(packets: UdpPackets, schedule: FlowSchedule) -> list[Delivery]:
-    """Return the deliveries of a UDP transfer; errors as `deliveries.udp_delivery`."""
+    """Return the deliveries of a UDP transfer. Raises the same errors as `deliveries.udp_delivery`."""
     return [deliveries.udp_delivery(packets, packets.is_transfer_datagram[:-1], schedule)]
 
 
 def tcp_deliveries(frames: TcpFrames, answers: Packets, schedule: FlowSchedule) -> list[Delivery]:
-    """Return the deliveries of each connection of a TCP transfer; errors as `deliveries.tcp_delivery`.
+    """Return the deliveries of each connection of a TCP transfer.
+
+    Raises the same errors as `deliveries.tcp_delivery`.
 
     Args:
         frames: Frames of the connections in both captures.

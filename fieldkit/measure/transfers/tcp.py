@@ -82,7 +82,7 @@ def match_transfer(sender: Packets, receiver: Packets, transfer: Transfer) -> Tc
     earlier transfer, which may continue for minutes.
 
     Raises:
-        EvidenceError: As for `tcp_streams.cut`.
+        EvidenceError: For the same reasons as `tcp_streams.cut`.
     """
     sent, received = (
         forward.where(forward.dport == transfer.port)
@@ -95,7 +95,7 @@ def match_transfer(sender: Packets, receiver: Packets, transfer: Transfer) -> Tc
 
 
 def match_frames(sent: Packets, received: Packets) -> TcpFrames:
-    """Match TCP frames of one direction in both captures; raises as `match_transfer`."""
+    """Match TCP frames of one direction in both captures. Raises the same errors as `match_transfer`."""
     return TcpFrames(sent, received, match_payload(sent, received), 0)
 
 

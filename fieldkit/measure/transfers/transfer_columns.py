@@ -1,4 +1,7 @@
-"""Columns of one transfer: loss on each layer, duration, delay, and the paper's figures."""
+"""Columns of one transfer: loss on each layer, duration, delay, and the figures of the paper.
+
+*The paper* is the publication whose field trials fieldkit automates (docs/index.md).
+"""
 
 from typing import Final
 
@@ -182,12 +185,12 @@ PAPER: Final = columns(
     (
         "paper_packets",
         "count",
-        "Frames in the sender's capture that match the paper's filter: src and port of the transfer.",
+        "Frames in the sender's capture that match the filter of the paper, `src SENDER and port PORT`.",
     ),
     (
         "paper_received",
         "count",
-        "Frames in the receiver's capture that match the paper's filter: dst and port of the transfer.",
+        "Frames in the receiver's capture that match the filter of the paper, `dst RECEIVER and port PORT`.",
     ),
     ("paper_window_bytes", "B", "Ping payload that the paper uses for the protocol: TCP 502, UDP 8192."),
     (

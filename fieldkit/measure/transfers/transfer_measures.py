@@ -1,8 +1,9 @@
 """All columns of one transfer, computed from files, captures, the output of ping, and counters of the hosts.
 
-The columns of the paper are computed as in the paper, for comparison with the columns of fieldkit. The paper's
-filters are tcpdump's `src SENDER and port P` at the sender and `dst RECEIVER and port P` at the receiver. `port`
-matches the source or destination port of TCP, UDP or SCTP (pcap-filter(7)), so later fragments do not match.
+*The paper* is the publication whose field trials fieldkit automates (docs/index.md). The columns `paper_*` are
+computed as in the paper, for comparison with the columns of fieldkit. The paper's filters are tcpdump's
+`src SENDER and port P` at the sender and `dst RECEIVER and port P` at the receiver. `port` matches the source or
+destination port of TCP, UDP or SCTP (pcap-filter(7)), so later fragments do not match.
 """
 
 from collections.abc import Mapping
@@ -132,13 +133,13 @@ def loss(arrived: int | None, sent: int | None) -> float | None:
 
 
 def _files(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
-    sent = evidence.read_or_none(reading.size, transfer.sent_file)
-    received = evidence.read_or_none(reading.size, transfer.received_file)
+    sent_bytes = evidence.read_or_none(reading.size, transfer.sent_file)
+    received_bytes = evidence.read_or_none(reading.size, transfer.received_file)
     contents = evidence.read_or_none(recordings.read, transfer.sent_file)
     files: dict[str, Value | None] = {
-        "sent_bytes": sent,
-        "received_bytes": received,
-        "file_loss": loss(received, sent),
+        "sent_bytes": sent_bytes,
+        "received_bytes": received_bytes,
+        "file_loss": loss(received_bytes, sent_bytes),
         "hash_match": evidence.read_or_none(reading.have_equal_bytes, "", transfer.sent_file, transfer.received_file),
     }
     messages: dict[str, Value | None] = {

@@ -31,7 +31,7 @@ COLUMNS: Final = columns(
     (
         "drive_out_m",
         "m",
-        "Distance driven until the robot turned back. Distances, speeds and headings of a drive are by odometry.",
+        "Distance driven until the robot turned back. Distances, speeds and headings of a drive are from odometry.",
         Figure("distance driven", Kind.MEDIAN),
     ),
     ("drive_farthest_m", "m", "Largest distance of the robot from its starting position."),

@@ -8,8 +8,9 @@ from typing import Final
 
 import numpy as np
 
+from fieldkit.agent.flying.flight_plan import PHASES
 from fieldkit.measure.captures.arrays import Floats
-from fieldkit.motion.logs.fly_log import PHASES, FlightMoment
+from fieldkit.motion.logs.fly_log import FlightMoment
 from fieldkit.motion.logs.motion_log import time_contradictions
 
 POSITION_ERROR_M: Final = 5.0

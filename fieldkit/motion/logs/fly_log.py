@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from fieldkit.agent.flying.flight_plan import AT_PATH_END, DESCENDING, ON_PATH, PHASES
 from fieldkit.core.columns import Figure, Kind, Measured, Value, columns
 from fieldkit.motion.logs import motion_log
 from fieldkit.motion.logs.motion_log import LAST_NS, LONGEST_M, LONGEST_S
@@ -53,12 +54,8 @@ COLUMNS: Final = columns(
 )
 """Columns of trials with a step `fly`."""
 
-_ON_PATH: Final = "flying"
-_STEP_PHASES: Final = frozenset({_ON_PATH, "there"})
+_STEP_PHASES: Final = frozenset({ON_PATH, AT_PATH_END})
 """Phases in which the inner steps run."""
-_LAST_PHASE: Final = "coming down"
-PHASES: Final = ("standing", "climbing", "up", _ON_PATH, "there", "coming back", _LAST_PHASE)
-"""Phases of a flight in chronological order."""
 
 
 @dataclass(frozen=True)
@@ -121,13 +118,13 @@ def measure(log: Sequence[FlightMoment] | None) -> Measured:
     if not log:
         return Measured.all_missing(COLUMNS, "the drone wrote no log of its flight")
     heights_m = [moment.up_m for moment in log if moment.phase in _STEP_PHASES]
-    speeds_m_s = [moment.speed_m_s for moment in log if moment.phase == _ON_PATH]
+    speeds_m_s = [moment.speed_m_s for moment in log if moment.phase == ON_PATH]
     values: dict[str, Value | None] = {
         "fly_height_median_m": float(np.median(heights_m)) if heights_m else None,
         "fly_height_max_m": max(moment.up_m for moment in log),
         "fly_farthest_m": max(moment.off_m for moment in log),
         "fly_speed_median_m_s": float(np.median(speeds_m_s)) if speeds_m_s else None,
         "fly_speed_max_m_s": max(moment.speed_m_s for moment in log),
-        "fly_back_off_m": log[-1].off_m if log[-1].phase == _LAST_PHASE else None,
+        "fly_back_off_m": log[-1].off_m if log[-1].phase == DESCENDING else None,
     }
     return Measured.from_optional(values, "the log has no line of this phase of the flight")

@@ -88,7 +88,7 @@ def numbered_lines_problem(path: Path) -> str | None:
     """Return the reason why a log is not complete; None if it is, or if its lines have no numbers.
 
     Raises:
-        EvidenceError: As `reading.text`.
+        EvidenceError: For the same reasons as `reading.text`.
     """
     log_text = reading.text(path)
     lines = log_text.splitlines(keepends=True)

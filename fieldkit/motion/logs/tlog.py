@@ -272,7 +272,7 @@ def contradictions(
 
 
 def crc32_of(path: Path) -> int:
-    """Return the CRC-32 of a log; raises the errors of `reading.mapped`."""
+    """Return the CRC-32 of a log. Raises the same errors as `reading.mapped`."""
     return zlib.crc32(reading.mapped(path))
 
 
@@ -302,13 +302,13 @@ def positions(path: Path, system: int, kind: str) -> list[list[Any]]:
     """Return the autopilot's positions in the messages with the name `kind`; see `tlog_reader`.
 
     Raises:
-        EvidenceError: As `read`.
+        EvidenceError: For the same reasons as `read`.
     """
     rows: list[list[Any]] = _query(path, system, positions=kind)["rows"]
     return rows
 
 
-def _query(path: Path, system: int, **parameters: object) -> Any:  # noqa: ANN401 (JSON)
+def _query(path: Path, system: int, **parameters: object) -> Any:  # noqa: ANN401 (any JSON value)
     try:
         size_bytes = reading.size(path)
         return _READER.query({"path": str(path.absolute()), "system": system, **parameters}, size_bytes)

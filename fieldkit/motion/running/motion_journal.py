@@ -156,7 +156,7 @@ class MotionJournal:
     def add(
         self, event: MotionEvent, robot: str, *, place: str = "", origin: MotionOrigin | None = None, reason: str = ""
     ) -> None:
-        """Add an entry; raises the errors of `jsonl.append`."""
+        """Add an entry. Raises the same errors as `jsonl.append`."""
         entry = MotionEntry(time.time_ns(), event, robot, place, origin, shorten(reason))
         jsonl.append(self._path, _CODEC.dump(entry))
         self._entries.append(entry)
@@ -174,7 +174,10 @@ class MotionJournal:
 
 
 def read(path: Path) -> list[MotionEntry]:
-    """Return the entries of a journal of motions; empty if there is no file. Raises the errors of `jsonl.read`."""
+    """Return the entries of a journal of motions; empty if there is no file.
+
+    Raises the same errors as `jsonl.read`.
+    """
     return jsonl.read(path, _CODEC.parse, remedy="restore it from a copy") if path.is_file() else []
 
 
@@ -186,7 +189,7 @@ class JournaledOrigins:
         folder: The trial, for messages.
         robots: Name of the robot in each role.
         placement: The placement of the trial.
-        may_return: See `Origins`.
+        may_return: Whether a robot may drive back to its origin; see `Origins`.
     """
 
     robots_stay = True

@@ -32,7 +32,7 @@ def require_one_place(plans: Sequence[Plan], backend: Backend, operator: Operato
     if not backend.by_hand or not isinstance(operator, Unattended):
         return
     for earlier, later in pairwise(plans):
-        for role in _self_moving(later):
+        for role in _self_moving_roles(later):
             if motion_journal.place_of(role, earlier.placement) != motion_journal.place_of(role, later.placement):
                 raise ConfigurationError(
                     f"{later.cast[role].name} moves without a person and must be at another place for "
@@ -41,7 +41,7 @@ def require_one_place(plans: Sequence[Plan], backend: Backend, operator: Operato
                 )
 
 
-def _self_moving(plan: Plan) -> tuple[Role, ...]:
+def _self_moving_roles(plan: Plan) -> tuple[Role, ...]:
     moving_roles = plan.procedure.moved_roles()
     return tuple(
         role for role, robot in plan.cast.items() if role in moving_roles and (can_drive(robot) or can_fly(robot))
@@ -65,7 +65,7 @@ class MotionPermission:
 
     def __init__(self, plan: Plan, testbed: Testbed, folder: Path) -> None:
         self.origins: Origins
-        self._moving = {role: plan.cast[role].name for role in _self_moving(plan)}
+        self._moving = {role: plan.cast[role].name for role in _self_moving_roles(plan)}
         self._testbed = testbed
         self._journaled_origins: JournaledOrigins | None = None
         if isinstance(testbed, Transient):
@@ -82,7 +82,7 @@ class MotionPermission:
         """Check that robots may move in the next attempt. After a fault, a person must type `confirm`.
 
         Raises:
-            ConfigurationError: As for `Operator.enter`.
+            ConfigurationError: For the same reasons as `Operator.enter`.
             MotionHeldError: No person has confirmed.
             OSError: The disk is full or was removed.
         """

@@ -19,12 +19,15 @@ from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 
 START_S: Final = 40.0
-"""Time for the start of Python, the middleware and both topics."""
+"""Timeout for the first status: the program starts the middleware, and connects to the topics of velocity and
+odometry."""
 _RENEWALS: Final = 5
 """Number of renewals within the duration of a lease."""
-_SILENT_S: Final = 10.0
+_STATUS_TIMEOUT_S: Final = 10.0
+"""After this time without a new status, the driver is regarded as stopped."""
 STATUS: Final = "drive.status"
-"""File with the status of the driver; its name is prefixed as `driving.drive_job` describes."""
+"""File with the status of the driver. In the job's folder its name has the step's name as a prefix, such as
+`up.drive.status`."""
 
 
 class DriveLease(LeaseKeeper):
@@ -33,13 +36,18 @@ class DriveLease(LeaseKeeper):
     Args:
         shell: Connection to the robot.
         job: The running program.
-        name: See `driving.drive_job`.
+        name_pattern: Names of the step's files, with `{}` in place of the name without the prefix.
         lease_s: Duration of the lease; the robot stops if it is not renewed in this time.
     """
 
-    def __init__(self, shell: Shell, job: Job, name: str, lease_s: float) -> None:
+    def __init__(self, shell: Shell, job: Job, name_pattern: str, lease_s: float) -> None:
         super().__init__(
-            shell, job, output_file=name.format(STATUS), order=drive_plan.WAIT, lease_s=lease_s, renewals=_RENEWALS
+            shell,
+            job,
+            output_file=name_pattern.format(STATUS),
+            order=drive_plan.WAIT,
+            lease_s=lease_s,
+            renewals=_RENEWALS,
         )
 
     def turn_back(self) -> None:
@@ -79,22 +87,22 @@ class DriveLease(LeaseKeeper):
         return _parse_status(self.output)
 
     @property
-    def end_state(self) -> str:
-        """Reason why the drive has ended, `home` if the robot is back at its place; empty while it drives.
+    def final_state(self) -> str:
+        """State of the robot after the drive: `home` at its place, or else the reason why it stopped; empty before.
 
         The driver writes its status ten times a second. If there is no new one, it has exited or cannot be reached.
         """
         status, silent_s = self.status, self.unchanged_s
-        if isinstance(ended := status.get("ended"), str) and ended:
-            return shorten(ended)
-        if silent_s > (_SILENT_S if status else START_S):
+        if isinstance(state := status.get("ended"), str) and state:
+            return shorten(state)
+        if silent_s > (_STATUS_TIMEOUT_S if status else START_S):
             return f"its driver sent no status for {silent_s:.0f} s"
         return super().end_reason
 
     @property
     @override
     def end_reason(self) -> str:
-        return "" if self.end_state in {"", drive_log.HOME} else f"it stopped on its path: {self.end_state}"
+        return "" if self.final_state in {"", drive_log.HOME} else f"it stopped on its path: {self.final_state}"
 
     def wait(self, condition: Callable[[], object], deadline: Deadline) -> None:
         """Wait until a condition is true or the deadline has passed."""

@@ -68,30 +68,30 @@ def path_duration_s(robot: Robot, move: Move) -> float:
     return round(drive_plan.path_duration_s(DriveTask.from_json(_task(robot, move))), 3)
 
 
-def drive_job(scene: Scene, move: Move, inside_s: float, name: str) -> Planned:
+def drive_job(scene: Scene, move: Move, inside_s: float, name_pattern: str) -> Planned:
     """Return the job that drives a robot.
 
     Args:
         scene: The attempt.
         move: Path and speed.
         inside_s: Maximum duration of the steps inside.
-        name: Pattern of the names of the step's jobs and files, from `Step.prefixed_name`; `{}` is replaced.
+        name_pattern: Pattern of the names of the step's jobs and files, from `Step.prefixed_name`; `{}` is replaced.
     """
     robot = scene.robot(move.role)
     argv = (
         robot.profile.tools.python,
         agent.path_from_job(),
         "drive",
-        _driver_arguments(scene, move, name),
-        name.format(drive_log.FILE),
+        _driver_arguments(scene, move, name_pattern),
+        name_pattern.format(drive_log.FILE),
     )
     setup = agent_commands.setup(robot)
     job = Job(
         folder=scene.folder,
-        name=name.format("drive"),
+        name=name_pattern.format("drive"),
         argv=with_environment(argv, setup=setup, environment=robot.ros_environment),
         limit_s=START_S + 2 * limit_s(move) + inside_s,
-        log=name.format(_LOG),
+        log=name_pattern.format(_LOG),
         ready="log:up,",
     )
     program = robot.profile.tools.python
@@ -115,9 +115,9 @@ def refusals(scene: Scene, move: Move) -> Iterator[Refusal]:
         yield Refusal(move.role, reason, remedy)
 
 
-def files(name: str) -> tuple[str, ...]:
-    """Return the files that a drive writes; see `drive_job` for `name`."""
-    return tuple(name.format(file) for file in (drive_log.FILE, orders_file("drive"), STATUS, _LOG))
+def files(name_pattern: str) -> tuple[str, ...]:
+    """Return the files that a drive writes; see `drive_job` for `name_pattern`."""
+    return tuple(name_pattern.format(file) for file in (drive_log.FILE, orders_file("drive"), STATUS, _LOG))
 
 
 def _drive(robot: Robot) -> Drive:
@@ -139,10 +139,10 @@ def _origin(scene: Scene, move: Move) -> dict[str, Any]:
     origin, last = origins.get(move.role), origins.last(move.role)
     if origin is None or not origins.robots_stay:
         return {}
-    places = {"origin": (origin.x_m, origin.y_m, origin.heading_rad)}
+    origin_fields = {"origin": (origin.x_m, origin.y_m, origin.heading_rad)}
     if last is not None:
-        places["last"] = (last.x_m, last.y_m, last.heading_rad)
-    return {**places, "frame_id": origin.frame_id, "may_return": origins.may_return}
+        origin_fields["last"] = (last.x_m, last.y_m, last.heading_rad)
+    return {**origin_fields, "frame_id": origin.frame_id, "may_return": origins.may_return}
 
 
 def _task(robot: Robot, move: Move) -> dict[str, Any]:
@@ -160,7 +160,7 @@ def _task(robot: Robot, move: Move) -> dict[str, Any]:
     }
 
 
-def _driver_arguments(scene: Scene, move: Move, name: str) -> str:
+def _driver_arguments(scene: Scene, move: Move, name_pattern: str) -> str:
     """Return the argument of the driver program, as JSON."""
     from fieldkit.ros.interfaces import topics, types  # noqa: PLC0415 (takes 50 ms and is needed only here)
     from fieldkit.ros.interfaces.qos import PROFILES  # noqa: PLC0415
@@ -193,9 +193,9 @@ def _driver_arguments(scene: Scene, move: Move, name: str) -> str:
         **({"frame": drive.frame} if drive.type == TWIST_STAMPED else {}),
         "odometry": topic(drive.odometry, "nav_msgs/msg/Odometry", "sensor_data", 2),
         "task": {**_task(robot, move), **_origin(scene, move)},
-        "orders": orders_file(name.format("drive")),
-        "status": name.format(STATUS),
-        "stationary": jobs.stationary_file(name.format("drive")),
+        "orders": orders_file(name_pattern.format("drive")),
+        "status": name_pattern.format(STATUS),
+        "stationary": jobs.stationary_file(name_pattern.format("drive")),
     }
     return agent_commands.compact(arguments)
 
@@ -219,7 +219,7 @@ def _network(robot: Robot, middleware: MiddlewareName) -> dict[str, Any]:
 
 
 @contextmanager
-def drive_robot(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str) -> Iterator[DriveLease]:
+def drive_robot(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name_pattern: str) -> Iterator[DriveLease]:
     """Drive a robot along its path while the body runs, and back to its place afterwards; yield its lease.
 
     After an error in the body the robot drives back, too; if it cannot, the operator brings it back. After an
@@ -234,7 +234,7 @@ def drive_robot(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name:
     shell, robot = testbed.shells[move.role], scene.robot(move.role)
     lease_s = _drive(robot).lease
     mover = RobotMover(robot.name, shell, scene.folder, f"it stops automatically within {lease_s:g} s")
-    drive_lease = DriveLease(shell, plan.job, name, lease_s)
+    drive_lease = DriveLease(shell, plan.job, name_pattern, lease_s)
     with scene.motions.moving(mover), lease.start_program(shell, plan.job), drive_lease, ExitStack() as stack:
         try:
             _wait_until_ready(scene, drive_lease, move)
@@ -247,11 +247,11 @@ def drive_robot(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name:
 
 def _wait_until_ready(scene: Scene, drive_lease: DriveLease, move: Move) -> None:
     """Wait until a robot is stationary at its place, and record its origin before its first start there."""
-    drive_lease.wait(lambda: drive_lease.is_ready or drive_lease.end_state, Deadline.after(START_S))
+    drive_lease.wait(lambda: drive_lease.is_ready or drive_lease.final_state, Deadline.after(START_S))
     if drive_lease.is_refused:
-        origins_of(scene).refuse(move.role, drive_lease.end_state)
+        origins_of(scene).refuse(move.role, drive_lease.final_state)
         raise MotionHeldError(
-            f"it does not start: {drive_lease.end_state}",
+            f"it does not start: {drive_lease.final_state}",
             where=scene.robot(move.role).name,
             remedy="put it at its place with its initial direction, then resume without --yes and confirm it",
         )
@@ -265,18 +265,18 @@ def _wait_until_ready(scene: Scene, drive_lease: DriveLease, move: Move) -> None
         origins_of(scene).record(move.role, pose)
 
 
-def _out_and_back(  # noqa: PLR0917 (the parts of one motion)
+def _out_and_back(  # noqa: PLR0917 (all of them belong to one motion)
     scene: Scene, testbed: Testbed, shell: Shell, job: Job, drive_lease: DriveLease, move: Move, motion: RobotMotion
 ) -> Iterator[DriveLease]:
     """Drive a robot along its path while the body runs, then back; see `drive_robot`."""
 
     def bring_back() -> str:
-        end_state = _bring_back(testbed, shell, job, drive_lease, move, by_hand=not origins_of(scene).robots_stay)
-        if end_state == drive_log.HOME:
+        final_state = _bring_back(testbed, shell, job, drive_lease, move, by_hand=not origins_of(scene).robots_stay)
+        if final_state == drive_log.HOME:
             motion.mark_ended(drive_lease.pose)
         elif drive_lease.status.get("ended"):
             motion.at = drive_lease.pose
-        return end_state
+        return final_state
 
     try:
         with suppress(LinkError, RobotError):  # each renewal repeats the order
@@ -293,8 +293,8 @@ def _out_and_back(  # noqa: PLR0917 (the parts of one motion)
         _end(shell, job)
         raise
     early_end = drive_lease.end_reason
-    end_state = bring_back()
-    if early_end or end_state != drive_log.HOME:
+    final_state = bring_back()
+    if early_end or final_state != drive_log.HOME:
         reason = early_end or drive_lease.end_reason or "it stopped on its path: it was not back in time"
         raise drive_lease.failure(reason)
 
@@ -302,7 +302,7 @@ def _out_and_back(  # noqa: PLR0917 (the parts of one motion)
 def _bring_back(
     testbed: Testbed, shell: Shell, job: Job, drive_lease: DriveLease, move: Move, *, by_hand: bool
 ) -> str:
-    """Order a robot back, and return `DriveLease.end_state`.
+    """Order a robot back, and return `DriveLease.final_state`.
 
     If the robot does not come back and `by_hand` is set, the operator is asked to bring it back.
 
@@ -310,12 +310,12 @@ def _bring_back(
     put it at its place (`fieldkit.motion.running.permission`).
     """
     drive_lease.turn_back()
-    drive_lease.wait(lambda: drive_lease.end_state, Deadline.after(START_S + limit_s(move)))
-    end_state = drive_lease.end_state
+    drive_lease.wait(lambda: drive_lease.final_state, Deadline.after(START_S + limit_s(move)))
+    final_state = drive_lease.final_state
     _end(shell, job)
-    if by_hand or end_state == drive_log.HOME:
-        testbed.bring_back(move.role, has_returned=end_state == drive_log.HOME)
-    return end_state
+    if by_hand or final_state == drive_log.HOME:
+        testbed.bring_back(move.role, has_returned=final_state == drive_log.HOME)
+    return final_state
 
 
 def _end(shell: Shell, job: Job) -> None:

@@ -32,14 +32,14 @@ def alarm_after_failure(
     try:
         yield
     except BaseException as error:
-        if text := _alarm(flight, guard, rescue, log, landing_s if isinstance(error, RobotError) else 0.0):
+        if text := _alarm_text(flight, guard, rescue, log, landing_s if isinstance(error, RobotError) else 0.0):
             announce(text, None)
             if isinstance(error, FieldkitError):
                 error.what, error.remedy = f"{error.what}. {text}", f"{MANUAL_ACTION}; then {error.remedy}"
         raise
 
 
-def _alarm(flight: FlightLease, guard: Planned, rescue: FlightRescue, log: str, within_s: float) -> str:
+def _alarm_text(flight: FlightLease, guard: Planned, rescue: FlightRescue, log: str, within_s: float) -> str:
     """Return the alarm; empty if the drone is on the ground or lands in this time.
 
     The function does not wait if no program can land the drone any longer: its pilot and its guard have exited, and
@@ -51,7 +51,7 @@ def _alarm(flight: FlightLease, guard: Planned, rescue: FlightRescue, log: str, 
     while flight.is_aloft:
         with suppress(FieldkitError):
             flight.refresh()
-            tails = flight.tails(names)
+            tails = flight.read_tails(names)
         _, guard_lines, rescue_lines, guard_code, rescue_code = tails
         if any(line.endswith(" landed") for line in (*guard_lines, *rescue_lines)):
             return ""
@@ -68,12 +68,12 @@ def _alarm(flight: FlightLease, guard: Planned, rescue: FlightRescue, log: str, 
         shorten(lines[-1].partition(" ")[2]) if lines else "none" for lines in (guard_lines, rescue_lines)
     )
     return (
-        f"ALARM: {flight.robot} MAY STILL BE IN THE AIR. LAST KNOWN: {_state(position_lines)}. {MANUAL_ACTION}. "
+        f"ALARM: {flight.robot} MAY STILL BE IN THE AIR. LAST KNOWN: {_state_text(position_lines)}. {MANUAL_ACTION}. "
         f"Last line of its pilot: {pilot_line}; of its guard: {guard_line}; of its rescue: {rescue_line}"
     )
 
 
-def _state(lines: Sequence[str]) -> str:
+def _state_text(lines: Sequence[str]) -> str:
     """Return the last known state of a drone as text, from the last lines of its position file (untrusted)."""
     for line in reversed(lines):
         with suppress(*JSON_ERRORS):

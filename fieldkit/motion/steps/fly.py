@@ -7,7 +7,7 @@ from typing import Annotated, Final
 
 from typing_extensions import override
 
-from fieldkit.agent.flying.flight_plan import CLIMB, GO, HOME, FlightPlan
+from fieldkit.agent.flying.flight_plan import AT_PATH_START, CLIMB, GO, HOME, ON_GROUND, FlightPlan
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field, Length, Speed
@@ -160,7 +160,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         limits, mavlink = profile.limits, mavlink_of(profile)
         origin = origins_of(scene).get(self.robot)
         return FlightPlan(
-            connection=piloting.connection(scene.robot(self.robot)),
+            connection=piloting.onboard_connection(scene.robot(self.robot)),
             orders=orders_file(self.prefixed_name("fly")),
             abort=abort_of(scene, self.robot).value,
             lease_s=self.lease,
@@ -231,7 +231,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         if mavlink_of(profile) is None:
             yield Refusal(self.robot, "it cannot fly: its profile has no mavlink", "use a drone in this role")
         elif not can_fly(scene.robot(self.robot)):
-            remedy = "--allow-motion, if its path is clear and a pilot can take over; see: fieldkit docs mavlink"
+            remedy = "use --allow-motion if its path is clear and a pilot can take over; see: fieldkit docs mavlink"
             yield Refusal(self.robot, "it is a real drone, and flights are not allowed", remedy)
         for quantity, planned_m, limit_m, key in (
             ("height", self._highest_m, limits.max_height_m, "max_height_m"),
@@ -301,7 +301,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         with origins_of(scene).moving(self.robot) as motion:
             announce(f"take off with {name}", self._climb_s)
             flight.give_order(CLIMB)
-            flight.wait_for("up", self._climb_s + _SLACK_S)
+            flight.wait_for(AT_PATH_START, self._climb_s + _SLACK_S)
             announce(f"fly {name}", None)
             flight.give_order(GO)
             run_inside(self, flight, scene, testbed, announce)
@@ -313,7 +313,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
     def _wait_for_start(self, scene: Scene, flight: piloting.FlightLease) -> None:
         """Wait until the drone is ready at its origin; record the origin before the first start."""
         try:
-            flight.wait_for("standing", _MOTORS_OFF_S)
+            flight.wait_for(ON_GROUND, _MOTORS_OFF_S)
         except RobotError as error:
             if flight.is_misplaced:
                 origins_of(scene).refuse(self.robot, error.what)

@@ -40,7 +40,7 @@ def orders_file(name: str) -> str:
 def start_program(shell: Shell, job: Job) -> Iterator[None]:
     """Install the agent on a robot and start one of its programs, which the body stops.
 
-    Raises the errors of `jobs.start`.
+    Raises the same errors as `jobs.start`.
     """
     agent.install(shell)
     jobs.start(shell, job)
@@ -113,7 +113,7 @@ class LeaseKeeper:
         self.renew()
 
     def renew(self) -> bytes:
-        """Renew the last order, and return the content of the output file; raises the errors of `give_order`."""
+        """Renew the last order, and return the content of the output file. Raises the same errors as `give_order`."""
         return self._send(jobs.REPLY_S)
 
     def pause(self) -> None:
@@ -186,7 +186,10 @@ class LeaseKeeper:
 
 
 def run_inside(nest: Nest, keeper: LeaseKeeper, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-    """Run the steps inside `nest`; abort them if its leased program ends. Raises the errors of `run_while_leased`."""
+    """Run the steps inside `nest`; abort them if its leased program ends.
+
+    Raises the same errors as `run_while_leased`.
+    """
     inner_scene = replace(scene, halt=scene.halt.child())
 
     def end() -> None:

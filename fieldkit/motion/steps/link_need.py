@@ -15,7 +15,7 @@ _KINDS = {
     "udpin": "UDP, the autopilot sends first",
     "tcp": "TCP",
 }
-_SHARED = {True: "use it through the link server", False: "uses it through the link server"}
+_LINK_SERVER_TEXTS = {True: "use it through the link server", False: "uses it through the link server"}
 
 
 def link_need(robot: Robot, role: Role, connection: str, programs: Sequence[str]) -> Need:
@@ -40,7 +40,7 @@ def link_need(robot: Robot, role: Role, connection: str, programs: Sequence[str]
 def _judge(connection: str, programs: Sequence[str], result: CommandResult) -> tuple[Verdict, str, str]:
     """Return verdict, detail and remedy from the output of the agent's `survey`."""
     kind = _KINDS.get(connection.partition(":")[0], "serial line")
-    users = f"{' and '.join(programs)} {_SHARED[len(programs) > 1]}"
+    users = f"{' and '.join(programs)} {_LINK_SERVER_TEXTS[len(programs) > 1]}"
     try:
         survey = json.loads(result.text)
         error, system = sanitized(survey["error"]), int(survey["system"])

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from typing_extensions import override
 
-from fieldkit.agent.flying.flight_plan import LEAVE, MISPLACED, STAY, FlightPlan
+from fieldkit.agent.flying.flight_plan import CLIMBING, LEAVE, MISPLACED, STAY, FlightPlan
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError
@@ -51,7 +51,7 @@ _SEPARATOR: Final = "\x1e"
 _TAILS: Final = 'for name do tail -c 2000 "$name" 2>/dev/null | tr "\\036" " "; printf "\\036"; done'
 
 
-def connection(robot: Robot) -> str:
+def onboard_connection(robot: Robot) -> str:
     """Return the connection from a drone's onboard computer to its autopilot.
 
     Raises:
@@ -95,7 +95,7 @@ def guard_job(
         has_pilot: Whether a pilot program flies the drone, with which the guard shares the liveness file.
     """
     plan = FlightPlan(
-        connection=connection(scene.robot(role)),
+        connection=onboard_connection(scene.robot(role)),
         orders=orders_file(name),
         abort=abort,
         lease_s=lease_s,
@@ -113,10 +113,10 @@ def rescue_job(scene: Scene, role: Role, name: str, guard_name: str, *, abort: s
         role: Role of the drone.
         name: Name of the job.
         guard_name: Name of the guard's job.
-        abort: As for `guard_job`.
+        abort: Action that ends the flight, a value of `OnAbort`.
     """
     plan = FlightPlan(
-        connection=connection(scene.robot(role)),
+        connection=onboard_connection(scene.robot(role)),
         orders="",
         abort=abort,
         lease_s=0.0,
@@ -135,7 +135,10 @@ def liveness_file(guard_name: str) -> str:
 def guarding(
     scene: Scene, shell: Shell, program: Planned, *, lease_s: float = LEASE_S, body_s: float
 ) -> Iterator["FlightLease"]:
-    """Start the guard of a drone, yield its lease, and stop it after the body; errors as for `leased_program`."""
+    """Start the guard of a drone, yield its lease, and stop it after the body.
+
+    Raises the same errors as `leased_program`.
+    """
     with leased_program(scene, shell, program, lease_s=lease_s, body_s=body_s, exit_s=_GUARD_EXIT_S) as flight:
         yield flight
         flight.release()
@@ -185,7 +188,7 @@ class FlightLease(LeaseKeeper):
         return shorten(match["reason"]) if match else ""
 
     def release(self) -> None:
-        """Order the program to exit without a command to the drone; raises the errors of `give_order`."""
+        """Order the program to exit without a command to the drone. Raises the same errors as `give_order`."""
         self.give_order(LEAVE)
 
     @property
@@ -197,7 +200,7 @@ class FlightLease(LeaseKeeper):
     def is_aloft(self) -> bool:
         """Whether the drone has taken off and not landed, according to the log of the program."""
         marks = [line.rpartition(" ")[2] for line in self._lines]
-        return "climbing" in marks and "landed" not in marks
+        return CLIMBING in marks and "landed" not in marks
 
     @property
     def last_lines(self) -> Sequence[str]:
@@ -224,10 +227,10 @@ class FlightLease(LeaseKeeper):
         """Whether the program refuses to fly because the drone is not at its origin."""
         return any(line.endswith(f" {MISPLACED}") for line in self._lines)
 
-    def tails(self, names: Sequence[str]) -> list[list[str]]:
+    def read_tails(self, names: Sequence[str]) -> list[list[str]]:
         """Return the lines in the last 2,000 bytes of files in the attempt's folder; a missing file has no lines.
 
-        Raises the errors of `give_order`.
+        Raises the same errors as `give_order`.
         """
         files = [f"{self._job.folder}/{name}" for name in names]
         result = self._shell.run(("sh", "-c", _TAILS, "sh", *files), deadline=Deadline.after(_QUERY_S))
@@ -235,7 +238,7 @@ class FlightLease(LeaseKeeper):
         return [[shorten(line, 1000) for line in tail.splitlines()] for tail in tails]
 
     def refresh(self) -> None:
-        """Renew the order with a short timeout; raises the errors of `give_order`."""
+        """Renew the order with a short timeout. Raises the same errors as `give_order`."""
         self._send(_QUERY_S)
 
     def wait_for(self, mark: str, within_s: float) -> None:

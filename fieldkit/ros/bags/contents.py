@@ -107,8 +107,9 @@ def repair(path: Path, to: Path) -> WriteResult:
     """Write the readable messages of a damaged bag to a new bag of the same format; the damaged bag is not changed.
 
     Raises:
-        ConfigurationError: As `inspect`; or `to` exists already, or its name does not fit the format.
-        EvidenceError: As `inspect`; or no message can be read.
+        ConfigurationError: For the same reasons as `inspect`, or because `to` exists already, or because its name
+            does not fit the format.
+        EvidenceError: For the same reasons as `inspect`, or because no message can be read.
     """
     bag = find(path)
     if (bag.format is BagFormat.ROS1) != (to.suffix == ".bag"):
@@ -137,8 +138,9 @@ def convert(path: Path, to: Path, *, storage: BagFormat = BagFormat.MCAP, distri
         distribution: ROS distribution of its message types; Noetic or Jazzy if empty.
 
     Raises:
-        ConfigurationError: As `inspect`; or `to` exists already, or the distribution does not fit its format.
-        EvidenceError: As `inspect`; or the bag is damaged, or cannot be converted.
+        ConfigurationError: For the same reasons as `inspect`, or because `to` exists already, or because the
+            distribution does not fit its format.
+        EvidenceError: For the same reasons as `inspect`, or because the bag is damaged, or cannot be converted.
     """
     bag, is_ros1 = find(path), to.suffix == ".bag"
     distribution = distribution or ("noetic" if is_ros1 else "jazzy")

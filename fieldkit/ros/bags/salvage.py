@@ -219,7 +219,7 @@ def _topics(database: sqlite3.Connection) -> Iterator[tuple[int, BagConnection]]
     columns = [
         name for name in ("id", "name", "type", "offered_qos_profiles", "type_description_hash") if name in available
     ]
-    for row in database.execute(f"SELECT {', '.join(columns)} FROM topics"):  # noqa: S608 (names of this module)
+    for row in database.execute(f"SELECT {', '.join(columns)} FROM topics"):  # noqa: S608 (the names are constants of this module)
         values = dict(zip(columns, row, strict=True))
         yield (
             values["id"],

@@ -41,11 +41,11 @@ class Side:
     """One side of a bridge.
 
     Attributes:
-        over: Name of the middleware, one of `middleware.ADAPTERS`.
+        middleware_name: Name of the middleware, one of `middleware.ADAPTERS`.
         network: Its network settings.
     """
 
-    over: str
+    middleware_name: str
     network: Network
 
 
@@ -104,21 +104,24 @@ class Forwarder:
     def counts(self) -> CrossingCounts:
         """Return the counters of the forwarded samples."""
         with self._lock:
-            return self._tally.counts(self._crossing, self._source.over, self._target.over)
+            return self._tally.counts(self._crossing, self._source.middleware_name, self._target.middleware_name)
 
 
 @dataclass(frozen=True)
 class _RunningSide:
     """A side of a bridge with its running middleware."""
 
-    over: str
+    middleware_name: str
     network: Network
     middleware: Middleware
 
     def other_types(self, topic: Topic) -> Sequence[str]:
         """Return a sentence for each other type of the topic on this side."""
         types = sorted(self.middleware.other_types(topic))
-        return [f"{topic.name} is of type {other_type} in {self.over}, not {topic.type}" for other_type in types]
+        return [
+            f"{topic.name} is of type {other_type} in {self.middleware_name}, not {topic.type}"
+            for other_type in types
+        ]
 
 
 @contextmanager
@@ -157,10 +160,11 @@ def check(near: Side, far: Side, crossings: Sequence[Crossing], types: MessageTy
     Raises:
         ConfigurationError: A topic cannot be bridged.
     """
-    if near.over == far.over:
+    if near.middleware_name == far.middleware_name:
         # Forwarded samples could not be recognized, because both sides are the same node, or share a network.
         raise ConfigurationError(
-            f"a bridge cannot connect {near.over} with {far.over}", remedy="name two different middlewares"
+            f"a bridge cannot connect {near.middleware_name} with {far.middleware_name}",
+            remedy="name two different middlewares",
         )
     directions = [(crossing.topic, crossing.back) for crossing in crossings]
     for crossing in crossings:
@@ -178,7 +182,7 @@ def check(near: Side, far: Side, crossings: Sequence[Crossing], types: MessageTy
 
 
 def _uses_ros1(*sides: "Side | _RunningSide") -> bool:
-    return any(side.over == "ros1" for side in sides)
+    return any(side.middleware_name == "ros1" for side in sides)
 
 
 @contextmanager
@@ -189,11 +193,11 @@ def _running_side(side: Side) -> Iterator[_RunningSide]:
             # rospy always writes a log. It is not needed, so it is deleted with the folder.
             os.environ["ROS_LOG_DIR"] = stack.enter_context(tempfile.TemporaryDirectory(prefix="fieldkit-"))
         try:
-            running = middleware.adapter(side.over)(side.network)
+            running = middleware.adapter(side.middleware_name)(side.network)
         except MiddlewareError as error:
-            raise LinkError(f"the bridge does not start: {error}", remedy=_REMEDIES[side.over]) from error
+            raise LinkError(f"the bridge does not start: {error}", remedy=_REMEDIES[side.middleware_name]) from error
         stack.callback(running.close)
-        yield _RunningSide(side.over, side.network, running)
+        yield _RunningSide(side.middleware_name, side.network, running)
 
 
 def _create_forwarder(

@@ -2,9 +2,9 @@
 
 A candidate is a middleware with its settings and its quality of service. It passes only if it meets the criterion in
 every cell, that is, for every sample size at every place. Missing data never counts as a pass: a candidate stays
-undecided if there are too few valid repeats, if a delay was withheld, or if a publisher discovered no subscription.
-The rule is the same as for expectations (`fieldkit.analysis.judgements`): `every loss <= BOUND`, or
-`90 % of loss <= BOUND` if a share is given.
+undecided if there are too few valid repeats, if a delay is empty because its measurement was not accurate enough, or
+if a publisher discovered no subscription. The rule is the same as for expectations (`fieldkit.analysis.judgements`):
+`every loss <= BOUND`, or `90 % of loss <= BOUND` if a share is given.
 """
 
 import json
@@ -21,7 +21,7 @@ from fieldkit.analysis.one_sided_bounds import share_low
 from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.measure.evidence import reading
 from fieldkit.ros.middlewares.middleware import MiddlewareName
-from fieldkit.ros.recommendation.link_cells import LinkCell, LinkCriterion, figure, link_cell, topic_columns
+from fieldkit.ros.recommendation.link_cells import LinkCell, LinkCriterion, estimate_text, link_cell, topic_columns
 from fieldkit.ros.streams.stream_options import StreamOptions
 from fieldkit.steps.base import Step
 from fieldkit.trial.stored import plans
@@ -34,16 +34,16 @@ class Candidate:
     """A middleware with settings.
 
     Attributes:
-        over: The middleware.
+        middleware: Name of the middleware.
         transport: Transport of Zenoh.
         settings: Its settings by path, as JSON with sorted keys.
-        quality: `reliability history depth`, as named in ROS 2.
+        qos: Reliability, history and depth, with their names in ROS 2: `reliable keep_last 10`.
     """
 
-    over: str
+    middleware: str
     transport: str
     settings: str
-    quality: str
+    qos: str
 
     @property
     def settings_by_path(self) -> Mapping[str, str]:
@@ -51,8 +51,8 @@ class Candidate:
         return dict(json.loads(self.settings))
 
     def __str__(self) -> str:
-        transport = f" by {self.transport}" if self.over == "zenoh" else ""
-        return f"{self.over}{transport}, {self.quality}, settings {self.settings}"
+        transport = f" over {self.transport}" if self.middleware == "zenoh" else ""
+        return f"{self.middleware}{transport}, {self.qos}, settings {self.settings}"
 
 
 @dataclass(frozen=True)
@@ -193,6 +193,6 @@ def evidence(assessment: Assessment, criterion: LinkCriterion) -> Iterator[str]:
                 met, n = judgement.met, judgement.estimate.n
                 share_text = f"at least {100 * share_low(met, n):.0f} % of all repeats, with 95 % confidence"
                 yield f"  {judgement.expectation.text} in {met} of {n} repeats: in {share_text}"
-        yield f"  loss in %: {figure(cell.loss, 100.0)}"
-        yield f"  delay of 95 % of the samples in ms: {figure(cell.delay, 1e3)}"
+        yield f"  loss in %: {estimate_text(cell.loss, 100.0)}"
+        yield f"  95th percentile of the sample delay in ms: {estimate_text(cell.delay, 1e3)}"
         yield f"  trials: {', '.join(cell.sources)}"

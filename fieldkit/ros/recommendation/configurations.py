@@ -23,11 +23,11 @@ _TRANSPORTS: Final = "FASTDDS_BUILTIN_TRANSPORTS"
 _NAMESPACE: Final = "http://www.eprosima.com"
 
 
-def configuration_text(over: str, transport: str, settings: Mapping[str, str], comment: Sequence[str]) -> str:
+def configuration_text(middleware: str, transport: str, settings: Mapping[str, str], comment: Sequence[str]) -> str:
     """Return the text of a configuration file with the measured settings, and the evidence in a comment.
 
     Args:
-        over: The middleware: `dds`, `zenoh` or `ros2` for Fast DDS.
+        middleware: `dds`, `zenoh` or `ros2` for Fast DDS.
         transport: Transport of Zenoh.
         settings: The middleware's settings by their path.
         comment: Lines of the comment.
@@ -35,14 +35,16 @@ def configuration_text(over: str, transport: str, settings: Mapping[str, str], c
     Raises:
         ConfigurationError: The middleware has no such file, or the file cannot contain one of the settings.
     """
-    if over == "dds":
+    if middleware == "dds":
         return _xml(_cyclonedds(settings), comment)
-    if over == "ros2":
+    if middleware == "ros2":
         return _xml(_fastdds(settings), comment)
-    if over == "zenoh":
+    if middleware == "zenoh":
         lines = "".join(f"// {line}\n" for line in _printable(comment))
         return lines + json.dumps(_zenoh(transport, settings), indent=2) + "\n"
-    raise ConfigurationError(f"{over} has no configuration file", remedy="apply the measured settings in your nodes")
+    raise ConfigurationError(
+        f"{middleware} has no configuration file", remedy="apply the measured settings in your nodes"
+    )
 
 
 def _printable(comment: Sequence[str]) -> list[str]:

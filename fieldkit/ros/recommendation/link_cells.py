@@ -160,7 +160,7 @@ def link_cell(place: str, size_bytes: float, tables: Sequence[Repeats]) -> LinkC
     return LinkCell(place, size_bytes, tuple(dict.fromkeys(map(str, texts[SOURCE]))), cell)
 
 
-def figure(estimate: Estimate | None, factor: float) -> str:
+def estimate_text(estimate: Estimate | None, factor: float) -> str:
     """Return an estimate with its 95 % interval and the value of each repeat, multiplied by `factor`."""
     if estimate is None or estimate.sample is None:
         return "unknown"

@@ -89,9 +89,9 @@ def recommend(arguments: argparse.Namespace) -> int:
         print_text(sanitized(f"{result}: {assessment.candidate}"))
         for reason in (*assessment.failures, *assessment.missing_evidence):
             print_text(sanitized(f"  {reason}"))
-        current = best.get(assessment.candidate.over)
+        current = best.get(assessment.candidate.middleware)
         if assessment.passed and (current is None or assessment.rank < current.rank):
-            best[assessment.candidate.over] = assessment
+            best[assessment.candidate.middleware] = assessment
     written_files = [_write(arguments, assessment, criterion) for assessment in best.values()]
     if any(written_files):
         return 0
@@ -121,7 +121,7 @@ def _write(arguments: argparse.Namespace, assessment: "Assessment", criterion: "
     """Write a file with the settings that passed. Return False if the middleware has no file for these settings."""
     from fieldkit.ros.recommendation import candidates
 
-    middleware = assessment.candidate.over
+    middleware = assessment.candidate.middleware
     comment = list(candidates.evidence(assessment, criterion))
     try:
         text = configurations.configuration_text(

@@ -93,11 +93,14 @@ class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpa
 
     cross_checks = (
         CrossCheck(
-            "content of a bag, and times of reception",
-            ("*",),
-            "the bag",
-            ("the procedure: topics and duration", "duration of the recorder's job"),
-            "half of the duration, because a recorder needs time to subscribe",
+            quantity="content of a bag, and times of reception",
+            columns=("*",),
+            source="the bag",
+            against=("the procedure: topics and duration", "duration of the recorder's job"),
+            tolerance=(
+                "a bag may be shorter than planned by half of its duration, because a recorder needs time to "
+                "subscribe"
+            ),
         ),
     )
 

@@ -239,8 +239,8 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
         """Return the columns of topics, which only trials with this step have."""
         from fieldkit.ros.streams import sample_reads, topic_columns, topic_stalls  # noqa: PLC0415 (only this step)
 
-        of_reads = sample_reads.declare_columns(self._reads_prefix, "topic_sent") if self.reads else ()
-        return (*topic_columns.COLUMNS, *topic_stalls.COLUMNS, *of_reads)
+        read_columns = sample_reads.declare_columns(self._reads_prefix, "topic_sent") if self.reads else ()
+        return (*topic_columns.COLUMNS, *topic_stalls.COLUMNS, *read_columns)
 
     @override
     def check(self, view: View) -> Iterator[str]:
@@ -351,6 +351,6 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
             yield f"topic loss {100 * loss:.1f} %"
         if isinstance(delay_s := values.get("topic_delay_median_s"), float):
             yield f"topic delay {1e3 * delay_s:.1f} ms"
-        for name, text in (("seen_age_p95_s", "age of what is seen"), ("used_age_p95_s", "age of what is used")):
+        for name, text in (("seen_age_p95_s", "age of displayed frames"), ("used_age_p95_s", "age of used samples")):
             if isinstance(age_s := values.get(name), float):
                 yield f"{text} {1e3 * age_s:.1f} ms"

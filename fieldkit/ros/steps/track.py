@@ -93,8 +93,9 @@ class TrackedRobot(Strict):
     """Source of the position of one robot.
 
     Attributes:
-        topic: `nav_msgs/Odometry`, `sensor_msgs/NavSatFix`, or of a tracker `geometry_msgs/PoseStamped`,
-            `PoseWithCovarianceStamped`, `TransformStamped` or `tf2_msgs/TFMessage`. Either this or `at`.
+        topic: A topic of `nav_msgs/Odometry` or `sensor_msgs/NavSatFix`, or a tracker's topic of
+            `geometry_msgs/PoseStamped`, `PoseWithCovarianceStamped`, `TransformStamped` or `tf2_msgs/TFMessage`.
+            Either this or `at` is required.
         facing: Direction in which the robot faces when the step begins; required for odometry. `away`: away from the
             robot at the other end of its link; `towards`: towards that robot; `left` and `right`: to the left and to
             the right of the direction `away`.
@@ -126,7 +127,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
     ([method](method-radio.md#where-robots-were)). Robots that are not listed are assumed to stay at their placement,
     unless they move. A repeat has at most one `track`; moves, faults and `together` are inside it. Adds the columns
     `positions_from` and `positions_clock_error_s`. Writes `track_ROLE.bag` (ROS 2: a folder) and `positions.json`,
-    which records the source of each position and how far the robots' clocks were ahead of the laptop's.
+    which records the source of each position, and the offset of each robot's clock from the laptop's clock.
 
     Attributes:
         robots: Source of each robot's position, by role.

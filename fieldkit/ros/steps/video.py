@@ -1,4 +1,4 @@
-"""Send the video of a synthetic camera over RTP from one robot to another; measure the age of what is seen."""
+"""Send the video of a synthetic camera over RTP from one robot to another; measure the age of displayed frames."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
@@ -60,7 +60,7 @@ class VideoStep(AlongStep, Prepares, HasNeeds, UsesSpace, Listens, SendsTraffic,
         noise: Share of each frame that is random, which determines the bit rate.
         buffer: Delay of the receiver's jitter buffer; `0s` shows each frame as soon as it is complete.
         reads: Refreshes of the display.
-        duration: How long it sends.
+        duration: Duration of sending.
         port: UDP port of the receiver.
     """
 
@@ -273,4 +273,4 @@ class VideoStep(AlongStep, Prepares, HasNeeds, UsesSpace, Listens, SendsTraffic,
         if isinstance(loss := values.get("video_loss"), float):
             yield f"frame loss {100 * loss:.1f} %"
         if isinstance(age_s := values.get("seen_age_p95_s"), float):
-            yield f"age of what is seen {1e3 * age_s:.1f} ms"
+            yield f"age of displayed frames {1e3 * age_s:.1f} ms"

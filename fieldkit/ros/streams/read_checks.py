@@ -51,26 +51,28 @@ def cross_checks(prefix: str, stream: str) -> tuple[CrossCheck, ...]:
     log = f"`ROLE-{stream}.bin` of the subscriber"
     return (
         CrossCheck(
-            f"newest {'frame' if prefix == 'seen' else 'sample'} at each read of a {stream}",
-            columns,
-            f"{log}: reads",
-            (f"{log}: arrivals", "the log of the publisher: times of sending"),
-            "a sample may arrive up to 0.2 s before its first read on a busy robot; no read is before the arrival",
+            quantity=f"newest {'frame' if prefix == 'seen' else 'sample'} at each read of a {stream}",
+            columns=columns,
+            source=f"{log}: reads",
+            against=(f"{log}: arrivals", "the log of the publisher: times of sending"),
+            tolerance=(
+                "a sample may arrive up to 0.2 s before its first read on a busy robot; no read is before the arrival"
+            ),
         ),
         CrossCheck(
-            f"clocks of the age at a read of a {stream}",
-            (f"{prefix}_age_*", f"{prefix}_late"),
-            f"{log}: reads and times of sending",
-            ("the captures: packets in both directions, which limit the clock offset",),
-            "the clock error is at most a tenth of the age",
-            CheckOutcome.WITHHELD,
+            quantity=f"clocks of the age at a read of a {stream}",
+            columns=(f"{prefix}_age_*", f"{prefix}_late"),
+            source=f"{log}: reads and times of sending",
+            against=("the captures: packets in both directions, which limit the clock offset",),
+            tolerance="the clock error is at most a tenth of the age",
+            outcome=CheckOutcome.WITHHELD,
         ),
         CrossCheck(
-            f"number of reads of a {stream}",
-            (f"{prefix}_reads", f"{prefix}_age_*", f"{prefix}_gap*", f"{prefix}_repeated", f"{prefix}_blank"),
-            f"{log}: reads",
-            ("the rate of reads in the procedure",),
-            "at least 90 %: a busy robot misses single ticks",
-            CheckOutcome.WITHHELD,
+            quantity=f"number of reads of a {stream}",
+            columns=(f"{prefix}_reads", f"{prefix}_age_*", f"{prefix}_gap*", f"{prefix}_repeated", f"{prefix}_blank"),
+            source=f"{log}: reads",
+            against=("the rate of reads in the procedure",),
+            tolerance="at least 90 %: a busy robot misses single ticks",
+            outcome=CheckOutcome.WITHHELD,
         ),
     )

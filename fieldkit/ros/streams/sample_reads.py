@@ -1,4 +1,4 @@
-"""Age of the newest sample when a program reads it, as the control loop of a robot or a display of video does.
+"""Age of the newest sample when a program reads it, for example the control loop of a robot, or a video display.
 
 The age is the age of information (Kaul, Yates and Gruteser, "Real-time status: how often should one update?", INFOCOM
 2012), sampled at the reads. With a constant delay D and a sending interval T its mean is D + T/2, and its 95th
@@ -28,7 +28,7 @@ from fieldkit.ros.streams.topic_samples import SampleReads, TopicLog, TopicSampl
 RANK: Final = 130
 """Position of the columns in trial.csv: after the columns of earlier versions."""
 MIN_READS: Final = 0.9
-"""If a program read less often than this share of the planned reads, columns that need each read are withheld."""
+"""If a program read less often than this share of the planned reads, columns that need each read are empty."""
 _TAIL: Final = 0.95
 
 
@@ -53,10 +53,10 @@ def declare_columns(prefix: str, sent: str) -> tuple[Column, ...]:
     """Return the columns of reads.
 
     Args:
-        prefix: As in `ReadPlan`.
+        prefix: Prefix of the columns; see `ReadPlan.prefix`.
         sent: Column with the number of samples that were sent.
     """
-    item, what = ("frame", "what is seen") if prefix == "seen" else ("sample", "what is used")
+    item, items_text = ("frame", "displayed frames") if prefix == "seen" else ("sample", "used samples")
     empty = f"Empty if {prefix}_withheld has the reason."
     return columns(
         RANK,
@@ -67,19 +67,19 @@ def declare_columns(prefix: str, sent: str) -> tuple[Column, ...]:
                 f"95th percentile, over the reads, of the age of the newest {item}: time of the read minus time of "
                 f"sending. A read before the first {item} counts as older than all others. {empty}"
             ),
-            Figure(f"age of {what}, 95 %", Kind.MEDIAN, rank=88),
+            Figure(f"age of {items_text}, 95 %", Kind.MEDIAN, rank=88),
         ),
         (
             f"{prefix}_age_mean_s",
             "s",
             f"Mean age over the reads from the first {item} on (age of information, Kaul et al. 2012). {empty}",
-            Figure(f"age of {what}, mean", Kind.MEDIAN, rank=89),
+            Figure(f"age of {items_text}, mean", Kind.MEDIAN, rank=89),
         ),
         (
             f"{prefix}_age_max_s",
             "s",
             f"Largest age at a read. {empty}",
-            Figure(f"age of {what}, largest", Kind.MEDIAN, rank=90),
+            Figure(f"age of {items_text}, largest", Kind.MEDIAN, rank=90),
         ),
         (f"{prefix}_age_error_s", "s", "Maximum error of each age that is caused by the clocks."),
         (f"{prefix}_withheld", "text", "Reason why ages are empty; empty if all of them have a value."),

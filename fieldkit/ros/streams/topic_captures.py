@@ -31,9 +31,9 @@ from fieldkit.ros.streams.topic_columns import first_arrivals
 from fieldkit.ros.streams.topic_samples import SampleFlow, SampleHeads, TopicLog, TopicSamples
 
 SLOW_S: Final = 0.02
-"""A delay is withheld if the subscriber's program caused more than this time and more than a tenth of the delay: such
-a program cannot be distinguished from a log with wrong times. On two idle hosts the maximum of 100 delays was
-0.3 to 13 ms."""
+"""A delay is not reported if the subscriber's program caused more than this time and more than a tenth of the delay,
+because such a program cannot be distinguished from a log with wrong times. On two idle hosts the maximum of 100
+delays was 0.3 to 13 ms."""
 
 PROGRAM_DELAY_FIGURES: Final = {
     "topic_delay_median_s": "median",

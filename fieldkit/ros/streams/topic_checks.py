@@ -159,67 +159,87 @@ _SAME_FILE: Final = "the same file: checksum and count of samples"
 
 CROSS_CHECKS: Final = (
     CrossCheck(
-        "samples sent",
-        ("topic_sent", "topic_refused", "topic_skipped", "topic_loss"),
-        "`ROLE-topic.bin` of the publisher: samples",
-        ("the rate and duration of the procedure", "the publisher's capture: heads of samples", _SAME_FILE),
-        "none: every number from 0 on is sent, refused or skipped; a sample in the capture is in the log",
+        quantity="samples sent",
+        columns=("topic_sent", "topic_refused", "topic_skipped", "topic_loss"),
+        source="`ROLE-topic.bin` of the publisher: samples",
+        against=("the rate and duration of the procedure", "the publisher's capture: heads of samples", _SAME_FILE),
+        tolerance=(
+            "none; every number from 0 on is sent, refused or skipped, and a sample in the capture is in the log"
+        ),
     ),
     CrossCheck(
-        "samples received",
-        ("topic_received", "topic_loss", "topic_repeated"),
-        "`ROLE-topic.bin` of the subscriber: samples",
-        (
+        quantity="samples received",
+        columns=("topic_received", "topic_loss", "topic_repeated"),
+        source="`ROLE-topic.bin` of the subscriber: samples",
+        against=(
             "the publisher's log: numbers, sizes and times of sending",
             "the subscriber's capture: heads, packets and bytes of samples",
             _SAME_FILE,
         ),
-        "a sample that arrived may be missing if the subscriber's queue overflowed, if an earlier one is missing and "
-        "the middleware preserves the order, or within 0.3 s of the match or of the end",
+        tolerance=(
+            "a sample that arrived may be missing if the subscriber's queue overflowed, if an earlier one is missing "
+            "and "
+            "the middleware preserves the order, or within 0.3 s of the match or of the end"
+        ),
     ),
     CrossCheck(
-        "time of sending of each sample",
-        ("topic_delay_*", "topic_age_*", "topic_jitter_s"),
-        "`ROLE-topic.bin` of both ends: time in the sample",
-        ("the publisher's capture: time in the sample, and time of its packet", "the subscriber's capture"),
-        "the packet of the fastest sample leaves within 5 ms (20 ms if there are fewer than 20 samples)",
+        quantity="time of sending of each sample",
+        columns=("topic_delay_*", "topic_age_*", "topic_jitter_s"),
+        source="`ROLE-topic.bin` of both ends: time in the sample",
+        against=("the publisher's capture: time in the sample, and time of its packet", "the subscriber's capture"),
+        tolerance=(
+            "the packet of the fastest sample may leave 5 ms after the time in the sample (20 ms if there are fewer "
+            "than 20 "
+            "samples)"
+        ),
     ),
     CrossCheck(
-        "time of arrival of each sample",
-        ("topic_delay_*", "topic_age_*", "topic_jitter_s"),
-        "`ROLE-topic.bin` of the subscriber: time of the record",
-        ("the subscriber's capture: time of the packet with the sample", "the robot's clock around the attempt"),
-        "no record is earlier than its packet; the fastest is at most 5 ms later (20 ms if there are fewer than 20)",
+        quantity="time of arrival of each sample",
+        columns=("topic_delay_*", "topic_age_*", "topic_jitter_s"),
+        source="`ROLE-topic.bin` of the subscriber: time of the record",
+        against=(
+            "the subscriber's capture: time of the packet with the sample",
+            "the robot's clock before and after the attempt",
+        ),
+        tolerance=(
+            "a record must not be earlier than its packet; the fastest one may be 5 ms later (20 ms if there are "
+            "fewer than 20)"
+        ),
     ),
     CrossCheck(
-        "delay added by the subscriber's program",
-        ("topic_delay_*", "topic_age_*", "topic_jitter_s", "topic_deadline_misses"),
-        "`ROLE-topic.bin` of the subscriber: time of the record",
-        ("the subscriber's capture: time of the packet with the sample",),
-        "up to 20 ms, or a tenth of the figure: a busy robot delays single samples",
-        CheckOutcome.WITHHELD,
+        quantity="delay added by the subscriber's program",
+        columns=("topic_delay_*", "topic_age_*", "topic_jitter_s", "topic_deadline_misses"),
+        source="`ROLE-topic.bin` of the subscriber: time of the record",
+        against=("the subscriber's capture: time of the packet with the sample",),
+        tolerance="20 ms, or a tenth of the value in the column, because a busy robot delays single samples",
+        outcome=CheckOutcome.WITHHELD,
     ),
     CrossCheck(
-        "discovery",
-        ("topic_discovered", "topic_discovery_s"),
-        "`ROLE-topic.bin` of the publisher: start and match",
-        ("the robot's clock around the attempt", "the first sample, 0.5 s after the match"),
-        "a first sample that is up to 0.1 s late, as on a busy robot; if it is later, the discovery time is withheld",
+        quantity="discovery",
+        columns=("topic_discovered", "topic_discovery_s"),
+        source="`ROLE-topic.bin` of the publisher: start and match",
+        against=("the robot's clock before and after the attempt", "the first sample, 0.5 s after the match"),
+        tolerance=(
+            "the first sample may be 0.1 s late, as on a busy robot; if it is later, the discovery time is empty"
+        ),
     ),
     CrossCheck(
-        "completeness of a topic's captures",
-        ("topic_capture_withheld",),
-        "`ROLE-capture.log`: packets dropped before tcpdump",
-        ("`ROLE.pcap`: number of packets, which is in the log too",),
-        "none: if a packet was dropped, all columns that need the captures are empty; those of the logs remain",
-        CheckOutcome.WITHHELD,
+        quantity="completeness of a topic's captures",
+        columns=("topic_capture_withheld",),
+        source="`ROLE-capture.log`: packets dropped before tcpdump",
+        against=("`ROLE.pcap`: number of packets, which is in the log too",),
+        tolerance=(
+            "none; if a packet was dropped, all columns that need the captures are empty, and those of the logs "
+            "remain"
+        ),
+        outcome=CheckOutcome.WITHHELD,
     ),
     CrossCheck(
-        "packets and bytes of a topic",
-        ("topic_data_*", "topic_discovery_packets", "topic_discovery_bytes", "topic_packet_loss"),
-        "the captures: packets of its ports",
-        (),
-        "the logs give a lower bound of the data packets; only the captures contain discovery",
-        CheckOutcome.UNCHECKED,
+        quantity="packets and bytes of a topic",
+        columns=("topic_data_*", "topic_discovery_packets", "topic_discovery_bytes", "topic_packet_loss"),
+        source="the captures: packets of its ports",
+        against=(),
+        tolerance="only the captures contain discovery; the logs give a lower bound of the number of data packets",
+        outcome=CheckOutcome.UNCHECKED,
     ),
 )

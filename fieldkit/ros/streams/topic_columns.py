@@ -234,7 +234,7 @@ def withheld_mark(reason: str) -> Measured:
     Args:
         reason: The reason why the captures are not used; empty if they are used.
     """
-    return Measured.from_optional({"topic_capture_withheld": reason or None}, "nothing is withheld")
+    return Measured.from_optional({"topic_capture_withheld": reason or None}, "no packet was dropped before tcpdump")
 
 
 def first_arrivals(log: TopicLog) -> TopicSamples:

@@ -26,7 +26,8 @@ _ENVELOPE_BYTES: Final = MappingProxyType(
 _ROS1_QUEUE: Final = 1000
 """Queue size in samples that the agent sets in ROS 1 for the history `keep_all` (`fieldkit.agent.messaging.ros1`)."""
 _LATE_S: Final = 0.1
-"""If the first sample after discovery and the publisher's wait is later than this, the discovery time is withheld."""
+"""If the first sample after discovery and the publisher's wait is later than this, the column of the discovery time
+is empty."""
 
 
 def plan(step: StreamOptions) -> TopicPlan:
@@ -75,7 +76,7 @@ def captured_topic(step: StreamOptions, view: View) -> CapturedTopic:
 
 
 def dropped_reason(step: StreamOptions, view: View) -> str:
-    """Return the reason why columns that need captures are withheld; empty if the kernel dropped no packet."""
+    """Return the reason why columns that need captures are empty; an empty string if the kernel dropped no packet."""
     counts = {role: view.dropped_packets(role) for role in (step.sender, step.receiver)}
     return " and ".join(
         f"the capture of {role} lacks {format_count(count, 'packet')} that its kernel dropped"

@@ -6,7 +6,7 @@ killed, the log ends with zeros, because the file grows by blocks.
 The agent starts each sample with the empty layout of `std_msgs/UInt8MultiArray` and the length of its data, followed
 by the head (`fieldkit.agent.messaging.stream`): magic number, sequence number and time of sending. The head is in a
 capture if that part of the packet was captured. This is always true for the first sample of a packet, but TCP or a
-middleware may put further samples behind it. An image has the same head in its first pixels.
+middleware may put further samples after it in the same packet. An image has the same head in its first pixels.
 """
 
 import struct
@@ -35,11 +35,11 @@ _RECORD: Final = np.dtype(
 RECORD_BYTES: Final = _RECORD.itemsize
 
 _KINDS: Final = range(1, 11)
-_SAMPLE, DISCOVERY_STARTED, MATCHED, REFUSED, SKIPPED, FOREIGN, _END, _ORIGIN, READ, UNREADABLE = _KINDS
+_SAMPLE, DISCOVERY_STARTED, MATCHED, REFUSED, SKIPPED, FOREIGN, _END, _WRITER, READ, UNREADABLE = _KINDS
 PUBLISHER: Final = 1
 SUBSCRIBER: Final = 2
 _HAS_CHECKSUM: Final = 1
-"""Marks an end record whose size field is a checksum. Older logs, without origin records, have no checksum."""
+"""Marks an end record whose size field is a checksum. Older logs, without writer records, have no checksum."""
 _SIZE_AT: Final = 4
 
 
@@ -95,8 +95,8 @@ class TopicLog:
         kinds: Number of records of each kind.
         times_ns: Time of every record in the order of the log, by the writer's clock.
         numbers: Sequence number of each sample that was passed to the middleware or arrived, including refused ones.
-        role: `PUBLISHER` or `SUBSCRIBER`; None in a log of a version without origin records.
-        topic_sum: CRC-32 of the topic's name; None in a log of a version without origin records.
+        role: `PUBLISHER` or `SUBSCRIBER`; None in a log of a version without writer records.
+        topic_sum: CRC-32 of the topic's name; None in a log of a version without writer records.
         reads: Reads of the newest sample by the subscriber's program.
         unreadable: Number of received frames of a camera whose pixels have no number and time.
     """
@@ -140,8 +140,8 @@ def read_log(path: Path) -> TopicLog:
         raise EvidenceError(
             "does not have the number of samples in its end record", where=str(path), remedy="repeat the measurement"
         )
-    start_records, match_records, origin_records = by_kind[DISCOVERY_STARTED], by_kind[MATCHED], by_kind[_ORIGIN]
-    if len(ends) and not _is_intact(content, ends[0], required=len(origin_records) > 0):
+    start_records, match_records, writer_records = by_kind[DISCOVERY_STARTED], by_kind[MATCHED], by_kind[_WRITER]
+    if len(ends) and not _is_intact(content, ends[0], required=len(writer_records) > 0):
         raise EvidenceError("was changed: its checksum is wrong", where=str(path), remedy="repeat the measurement")
     offered_records = records[(records["kind"] == _SAMPLE) | (records["kind"] == REFUSED)]
     return TopicLog(
@@ -155,8 +155,8 @@ def read_log(path: Path) -> TopicLog:
         kinds={kind: len(records_of_kind) for kind, records_of_kind in by_kind.items()},
         times_ns=records["at_ns"].astype(np.int64),
         numbers=offered_records["sequence"].astype(np.int64),
-        role=int(origin_records["sequence"][0]) if len(origin_records) else None,
-        topic_sum=int(origin_records["size"][0]) if len(origin_records) else None,
+        role=int(writer_records["sequence"][0]) if len(writer_records) else None,
+        topic_sum=int(writer_records["size"][0]) if len(writer_records) else None,
         reads=SampleReads(*(by_kind[READ][name].astype(np.int64) for name in ("sequence", "sent_ns", "at_ns"))),
         unreadable=len(by_kind[UNREADABLE]),
     )
@@ -198,7 +198,7 @@ def find_bytes(path: Path, pattern: bytes) -> Occurrences:
     Occurrences that start in a later IP fragment, or that the snap length truncated, are not found.
 
     Raises:
-        EvidenceError: As for `pcap.read`.
+        EvidenceError: For the same reasons as `pcap.read`.
     """
     data = reading.mapped(path)
     integers = Integers(data)
@@ -303,7 +303,7 @@ class SampleFlow:
 
 
 def find_heads(path: Path, size_bytes: int, width: int = 0) -> Occurrences:
-    """Return the heads of samples in a capture; raises the errors of `find_bytes`.
+    """Return the heads of samples in a capture. Raises the same errors as `find_bytes`.
 
     Args:
         path: The capture.

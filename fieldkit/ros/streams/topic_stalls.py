@@ -70,7 +70,7 @@ def measure(
 
     Args:
         flow: Identifies its packets.
-        logs: Logs of publisher and subscriber as for `delivery`.
+        logs: Logs of publisher and subscriber; see `delivery`.
         captures: Packets that their robots captured; None without a complete capture.
         schedule: Interval and duration of the stream.
     """

@@ -64,7 +64,7 @@ def read(path: Path, port: int) -> RtpPackets:
     """Return the RTP packets to a UDP port in a capture.
 
     Raises:
-        EvidenceError: As for `pcap.read`.
+        EvidenceError: For the same reasons as `pcap.read`.
     """
     data = reading.mapped(path)
     integers = Integers(data).with_order(BIG)

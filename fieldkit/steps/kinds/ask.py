@@ -118,7 +118,14 @@ class AskStep(Step, DescribesActions, AsksOperator, WritesOnLaptop, Summarizes):
         return None
 
     cross_checks = (
-        CrossCheck("answer", ("*",), "`answer-COLUMN.txt`", (), "only the operator knows it", CheckOutcome.UNCHECKED),
+        CrossCheck(
+            quantity="answer",
+            columns=("*",),
+            source="`answer-COLUMN.txt`",
+            against=(),
+            tolerance="only the operator knows it",
+            outcome=CheckOutcome.UNCHECKED,
+        ),
     )
 
     @override

@@ -89,17 +89,21 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
 
     cross_checks = (
         CrossCheck(
-            "packets captured and dropped",
-            ("*_captured", "*_capture_dropped"),
-            "`ROLE.pcap`, `ROLE-capture.log`",
-            (
+            quantity="packets captured and dropped",
+            columns=("*_captured", "*_capture_dropped"),
+            source="`ROLE.pcap`, `ROLE-capture.log`",
+            against=(
                 "each other",
                 "each robot's clock before and after",
                 "the order of times in the file",
                 "checksums of IPv4 headers",
             ),
-            "0.1 s backwards between two packets, because two processors receive them; packets dropped before "
-            "tcpdump if only topics and pings run inside, which withhold the columns that depend on them",
+            tolerance=(
+                "a packet may be 0.1 s earlier than the previous one, because two processors receive them; if only "
+                "topics and pings run inside, packets may be dropped before tcpdump, and the columns that depend on "
+                "them "
+                "are empty"
+            ),
         ),
     )
 
@@ -330,7 +334,7 @@ def _problems(role: Role, file: str, log_file: str, view: View, *, needs_all: bo
 
 
 def _time_problems(role: Role, capture: Capture, view: View) -> Iterator[str]:
-    """Yield contradictions of the packets' times with each other and with the robot's clock around the attempt."""
+    """Yield contradictions of the packets' times with each other and with the robot's clock before and after it."""
     times_ns = capture.packets.time_ns[capture.packets.time_ns != NO_TIME]
     if not len(times_ns):
         return

@@ -49,8 +49,8 @@ _LASTING: Final = frozenset({FaultKind.LINK_DOWN, FaultKind.OUT_OF_RANGE})
 class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     """Causes a fault of a robot while the steps in `during` run; their losses are a result, not an error.
 
-    The emulated backend causes the fault. In the field the operator is asked to cause it; with `--yes` no operator is
-    asked, and the attempts are void.
+    The backend of simulated robots causes the fault. In the field the operator is asked to cause it; with `--yes` no
+    operator is asked, and the attempts are void.
 
     - `link-down`: the interface of the radio, or of `link`, is down for `for`, then up again.
     - `out-of-range`: no other robot receives packets of the robot for `for`. If it is the relay, no robot receives
@@ -80,11 +80,11 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     columns = outage_columns.COLUMNS
     cross_checks = (
         CrossCheck(
-            "outage and recovery",
-            ("*_outage_s", "*_recovery_s", "*_recovery_at_least_s", "*_recovered"),
-            "`fault-KIND-ping.txt`, `fault-KIND-watch.txt`",
-            ("`fault-KIND.txt`: duration of the cause", "termination of the observer's job"),
-            "two intervals of the observer",
+            quantity="outage and recovery",
+            columns=("*_outage_s", "*_recovery_s", "*_recovery_at_least_s", "*_recovered"),
+            source="`fault-KIND-ping.txt`, `fault-KIND-watch.txt`",
+            against=("`fault-KIND.txt`: duration of the cause", "termination of the observer's job"),
+            tolerance="durations may differ by two ping intervals of the observer",
         ),
         *recoveries.CROSS_CHECKS,
     )
@@ -144,7 +144,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """Cause the fault in this thread, in which the operator can be prompted; the steps inside run in another."""
-        from concurrent.futures import ThreadPoolExecutor, wait  # noqa: PLC0415 (with logging, 5 ms)
+        from concurrent.futures import ThreadPoolExecutor, wait  # noqa: PLC0415 (it imports logging, which takes 5 ms)
 
         watch, observer = self._watch(scene), self._observer(scene)
         shell = testbed.shells[observer.role]

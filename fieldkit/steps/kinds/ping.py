@@ -53,7 +53,7 @@ def command_line(scene: Scene, role: Role, options: Iterable[str], address: str)
 
 
 class Payloads(Strict):
-    """ICMP payload in bytes per protocol; the defaults are the values that the paper calls the protocol's window.
+    """ICMP payload in bytes per protocol; the defaults are the windows of the protocols in the paper (docs/index.md).
 
     Attributes:
         tcp: In TCP repeats.

@@ -37,19 +37,19 @@ class RoamStep(Nest, DescribesActions, Roams, Summarizes):
 
     cross_checks = (
         CrossCheck(
-            "access points",
-            ("roam_ap_*", "roam_handovers", "roam_ping_pongs"),
-            "`ROLE-link.txt`, or `link.csv` of a lab",
-            (),
-            "only the driver of the robot reports its access point",
-            CheckOutcome.UNCHECKED,
+            quantity="access points",
+            columns=("roam_ap_*", "roam_handovers", "roam_ping_pongs"),
+            source="`ROLE-link.txt`, or `link.csv` of a lab",
+            against=(),
+            tolerance="only the driver of the robot reports its access point",
+            outcome=CheckOutcome.UNCHECKED,
         ),
         CrossCheck(
-            "gaps of handovers",
-            ("roam_gap_*", "roam_lost"),
-            "`ping.txt`, `ROLE-link.txt` or `link.csv`",
-            ("the summary of ping, and captures, as for all columns of the ping",),
-            "the interval of the ping",
+            quantity="gaps of handovers",
+            columns=("roam_gap_*", "roam_lost"),
+            source="`ping.txt`, `ROLE-link.txt` or `link.csv`",
+            against=("the summary of ping, and the captures, as for the other columns of the ping",),
+            tolerance="a gap may differ by one interval of the ping",
         ),
     )
 

@@ -287,12 +287,12 @@ class RunStep(Step, UsesSpace, Summarizes):
 
     cross_checks = (
         CrossCheck(
-            "output of a program of the lab",
-            ("*",),
-            "the step's output file",
-            (),
-            "fieldkit cannot check the program; `expect:` bounds its values",
-            CheckOutcome.UNCHECKED,
+            quantity="output of a program of the lab",
+            columns=("*",),
+            source="the step's output file",
+            against=(),
+            tolerance="fieldkit cannot check the program; `expect:` bounds its values",
+            outcome=CheckOutcome.UNCHECKED,
         ),
     )
 

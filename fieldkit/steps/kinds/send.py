@@ -67,7 +67,7 @@ class SendStep(TransferStep):
     def placement_error(self, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
         return None
 
-    def _file_to_send(self, scene: Scene) -> RecordedFile:  # noqa: ARG002 (no step records it)
+    def _file_to_send(self, scene: Scene) -> RecordedFile:  # noqa: ARG002 (subclasses need it)
         return RecordedFile(self.sender, self.prefixed_name(FILE), self.size)
 
     def _file_refusals(self, scene: Scene) -> Iterator[Refusal]:  # noqa: ARG002 (there is no recorder)

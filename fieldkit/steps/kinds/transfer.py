@@ -363,7 +363,7 @@ class TransferStep(
             measured = host.without_shared_counters(measured)
         if self._shares_port(view):
             measured = measured.without(
-                dict.fromkeys(transfer_measures.PAPER_COUNTS, "the paper's filter counts another flow, too")
+                dict.fromkeys(transfer_measures.PAPER_COUNTS, "the filter of the paper also counts another flow")
             )
         return measured
 

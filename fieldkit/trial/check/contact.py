@@ -27,7 +27,7 @@ def log_in(shell: Shell) -> None:
 def judge(shell: Shell, report: Report) -> Offset | None:
     """Report that the robot can be reached, and return the offset of its clock.
 
-    The offset is None if the robot sent no time. Raises as `log_in`.
+    The offset is None if the robot sent no time. The function raises the same errors as `log_in`.
     """
     log_in(shell)
     exchanges = clocks.exchanges(shell, CONTACT_S)

@@ -56,7 +56,7 @@ def read_reports(shell: Shell) -> tuple[ClockReport, ...]:
 
 
 def read(shell: Shell) -> RobotTime:
-    """Log in on a robot and return the state of its clock; raises as `read_reports`."""
+    """Log in on a robot and return the state of its clock. Raises the same errors as `read_reports`."""
     jobs.install(shell, Deadline.after(contact.CONTACT_S))
     exchanges = clock_exchanges.exchanges(shell, contact.CONTACT_S)
     return RobotTime(offset(exchanges) if exchanges else None, read_reports(shell))

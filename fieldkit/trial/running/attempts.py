@@ -40,7 +40,7 @@ class Attempts:
         variants: Variants of the tools of each robot.
         sink: Receives the start of each phase.
         motions: The robots that move without a person.
-        origins: See `Scene.origins`.
+        origins: Origins of the robots' motions; see `Scene.origins`.
     """
 
     def __init__(
@@ -75,52 +75,55 @@ class Attempts:
         Raises:
             ConfigurationError: This machine has no space for the evidence.
             FieldkitError: The trial cannot continue. The attempt is stored, but is not one of the allowed attempts.
-            KeyboardInterrupt: As for `FieldkitError`; but if its steps have ended, `recover` completes the attempt.
+            KeyboardInterrupt: The user pressed Ctrl-C. The attempt is stored, but is not one of the allowed attempts.
+                If its steps have ended, `recover` completes the attempt.
             OSError: The disk is full or was removed.
         """
         self._robots.check_alive()
         store.require_space(self._folder, size.attempt_bytes(self._plan))
-        started = self._ledger.begin(repeat)
-        partial = store.open_attempt(self._folder, repeat)
-        remote = started.remote(self._plan.trial)
+        running_attempt = self._ledger.begin(repeat)
+        partial_folder = store.open_attempt(self._folder, repeat)
+        remote_folder = running_attempt.remote(self._plan.trial)
         self._progress = None
-        with self._storing_interrupted(started, partial):
-            times_ns = self._robots.begin(remote, old=self._last_remote or None)
-            (partial / exchanges.FILE).write_text(exchanges.text(times_ns), encoding="ascii")
-            failure = self._run_steps(started, remote, partial)
+        with self._storing_interrupted(running_attempt, partial_folder):
+            times_ns = self._robots.begin(remote_folder, old=self._last_remote or None)
+            (partial_folder / exchanges.FILE).write_text(exchanges.text(times_ns), encoding="ascii")
+            failure = self._run_steps(running_attempt, remote_folder, partial_folder)
             reasons = [failure.located] if failure else []
             if reasons:
                 self._robots.check_alive()  # raises if a process that the robots need has exited
             else:
-                self._ledger.record_measured(started)
+                self._ledger.record_measured(running_attempt)
                 self._progress = Status.MEASURED
             self._sink(PhaseStarted("collect evidence", str(repeat)))
-            reasons += self._robots.fetch(remote, partial, ended_normally=not reasons)
-            verdict = self._judge(started, partial)
+            reasons += self._robots.fetch(remote_folder, partial_folder, ended_normally=not reasons)
+            verdict = self._judge(running_attempt, partial_folder)
             for note in verdict.notes:
                 self._sink(Note(f"{repeat}: {note}"))
             tracebacks = [failure.traceback_text] if isinstance(failure, StepError) else []
-            step_errors.store([*tracebacks, *verdict.step_errors], partial)
+            step_errors.store([*tracebacks, *verdict.step_errors], partial_folder)
             has_failed = bool(tracebacks) or (not reasons and verdict.has_failed)
             notes = [step_errors.SEE_LOG] if tracebacks or (not reasons and verdict.step_errors) else []
             reasons = reasons or list(verdict.problems)
-            self._last_remote = remote
+            self._last_remote = remote_folder
             if reasons:
                 self._robots.check_alive()
                 self._robots.require_locks()  # an attempt that another user aborted does not use an allowed attempt
         status = Status.FAILED if has_failed or self._ledger.is_last(repeat) else Status.VOID
         reasons = [*hosts.drop_effects_of_reboots(reasons), *notes]
-        ended = replace(started, status=status if reasons else Status.VALID, reason="; ".join(reasons))
-        self._ledger.commit(partial, ended, verdict.measured)
+        ended_attempt = replace(
+            running_attempt, status=status if reasons else Status.VALID, reason="; ".join(reasons)
+        )
+        self._ledger.commit(partial_folder, ended_attempt, verdict.measured)
         if has_failed:
-            log = step_errors.log_file(store.attempt_folder(self._folder, ended.folder))
+            log = step_errors.log_file(store.attempt_folder(self._folder, ended_attempt.folder))
             return f"{step_errors.REPORT}, with {log}"
         return failure.remedy if failure else ""
 
     def recover(self, interrupted_attempt: Attempt) -> None:
-        """Complete an attempt during which fieldkit was killed; raises as `make`."""
+        """Complete an attempt during which fieldkit was killed. Raises the same errors as `make`."""
         self._sink(PhaseStarted("recover", str(interrupted_attempt.repeat)))
-        remote, was_measured = (
+        remote_folder, was_measured = (
             interrupted_attempt.remote(self._plan.trial),
             interrupted_attempt.status is Status.MEASURED,
         )
@@ -128,7 +131,9 @@ class Attempts:
         evidence_folder = committed_folder or store.reopen_attempt(self._folder, interrupted_attempt.repeat)
         # Partial evidence of an interrupted attempt is stored like the evidence of any void attempt.
         fetch_problems = (
-            [] if committed_folder else self._robots.fetch(remote, evidence_folder, ended_normally=was_measured)
+            []
+            if committed_folder
+            else self._robots.fetch(remote_folder, evidence_folder, ended_normally=was_measured)
         )
         verdict = self._judge(interrupted_attempt, evidence_folder)
         if not committed_folder:
@@ -142,15 +147,15 @@ class Attempts:
         has_failed = was_measured and not fetch_problems and verdict.has_failed
         status = Status.FAILED if has_failed else Status.VOID if reasons else Status.VALID
         is_excused = bool(reasons) and not has_failed
-        ended = replace(interrupted_attempt, status=status, reason="; ".join(reasons), excused=is_excused)
-        self._ledger.commit(evidence_folder, ended, verdict.measured)
-        self._last_remote = remote
+        ended_attempt = replace(interrupted_attempt, status=status, reason="; ".join(reasons), excused=is_excused)
+        self._ledger.commit(evidence_folder, ended_attempt, verdict.measured)
+        self._last_remote = remote_folder
 
-    def _run_steps(self, started: Attempt, remote: str, laptop_folder: Path) -> FieldkitError | None:
+    def _run_steps(self, running_attempt: Attempt, remote_folder: str, laptop_folder: Path) -> FieldkitError | None:
         """Run the steps of an attempt. Return the error that makes the attempt void, or None."""
-        repeat = started.repeat
+        repeat = running_attempt.repeat
         self._progress = Status.RUNNING
-        planned = self._plan.scene(repeat, remote, self._variants)
+        planned = self._plan.scene(repeat, remote_folder, self._variants)
         scene = replace(planned, laptop_folder=laptop_folder, motions=self._motions, origins=self._origins)
 
         def announce(name: str, expected_s: float | None) -> None:
@@ -166,7 +171,7 @@ class Attempts:
         return None
 
     @contextmanager
-    def _storing_interrupted(self, started: Attempt, partial: Path) -> Iterator[None]:
+    def _storing_interrupted(self, running_attempt: Attempt, partial_folder: Path) -> Iterator[None]:
         """If the body is interrupted, stop its jobs and store the attempt as void, without using an allowed attempt.
 
         After a request to stop, nothing is fetched. The measurements stay on the robots, and the reason states this.
@@ -177,7 +182,7 @@ class Attempts:
             if not isinstance(error, Exception) or isinstance(error, TestbedLostError):
                 self._robots.close_connections()  # unblocks threads that wait for an answer
             with suppress(FieldkitError):  # on a robot that cannot be reached, jobs are stopped at their time limits
-                self._robots.stop_jobs(started.remote(self._plan.trial))
+                self._robots.stop_jobs(running_attempt.remote(self._plan.trial))
             if isinstance(error, OSError):
                 raise  # nothing can be written; `resume` continues from the started attempt
             is_fetched_later = self._progress is Status.MEASURED and not self._robots.is_transient
@@ -185,9 +190,9 @@ class Attempts:
                 raise  # the attempt is complete: `resume` fetches the evidence
             reason = STOPPED if self._motions.is_ordered else _interruption_reason(error)
             if self._progress:
-                self._robots.unfetched.mark_all(started.remote(self._plan.trial), partial, reason)
-            ended = replace(started, status=Status.VOID, reason=reason, excused=True)
-            self._ledger.commit(partial, ended, self._judge(started, partial).measured)
+                self._robots.unfetched.mark_all(running_attempt.remote(self._plan.trial), partial_folder, reason)
+            ended_attempt = replace(running_attempt, status=Status.VOID, reason=reason, excused=True)
+            self._ledger.commit(partial_folder, ended_attempt, self._judge(running_attempt, partial_folder).measured)
             if isinstance(error, LockLostError) and self._last_remote:
                 with suppress(FieldkitError):  # an aborted trial may never be resumed
                     self._robots.delete_remote(self._last_remote)

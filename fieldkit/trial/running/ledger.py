@@ -121,7 +121,10 @@ class Ledger:
         return started
 
     def record_measured(self, attempt: Attempt) -> None:
-        """Record that the steps of an attempt have ended. Its evidence is on the robots. Raises as `begin`."""
+        """Record that the steps of an attempt have ended. Its evidence is on the robots.
+
+        Raises the same errors as `begin`.
+        """
         self._append(attempt, time.time_ns(), Status.MEASURED)
 
     def commit(self, evidence: Path, attempt: Attempt, measured: Measured) -> None:
@@ -133,7 +136,7 @@ class Ledger:
             measured: Measured values of the attempt.
 
         Raises:
-            OSError: As for `begin`.
+            OSError: For the same reasons as `begin`.
         """
         with self._stop.saving_files():
             final = store.commit_attempt(evidence, attempt.folder)
@@ -147,7 +150,10 @@ class Ledger:
                 self._write()
 
     def summarize(self) -> tuple[Cell, ...]:
-        """Write the table and the summary of all committed attempts, and return the summary; raises as `begin`."""
+        """Write the table and the summary of all committed attempts, and return the summary.
+
+        Raises the same errors as `begin`.
+        """
         with self._stop.saving_files():
             cells = rows.write_summary(self._folder, self._plan, self._table())
             self._write()

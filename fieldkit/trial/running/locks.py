@@ -30,7 +30,7 @@ _HELD: Final = re.compile(rb"(?P<token>\S+) (?P<left>[0-9]{1,11}) (?P<who>\S+) (
 
 @dataclass(frozen=True)
 class Holder:
-    """Holder of a lock on robots. Of each text, at most 80 letters, digits and characters of `._@-` are used.
+    """Holder of a lock on robots. At most 80 letters, digits and characters of `._@-` of each text are used.
 
     Attributes:
         token: ID of the trial. A holder with the same token can lock its robots again.
@@ -49,7 +49,7 @@ def locked_exclusively(shells: Shells, holder: Holder, *, sink: Sink) -> Iterato
 
     Raises:
         ConfigurationError: Another process uses the token. It would use the same locks and release them.
-        FieldkitError: As for `locked`.
+        FieldkitError: For the same reasons as `locked`.
     """
     with ExitStack() as stack:
         try:

@@ -29,7 +29,7 @@ class MotionClearance(Protocol):
         """Check that robots may move in the next attempt.
 
         Raises:
-            ConfigurationError: As for `Operator.enter`.
+            ConfigurationError: For the same reasons as `Operator.enter`.
             MotionHeldError: A person must first confirm the motion.
             OSError: The disk is full or was removed.
         """
@@ -83,7 +83,7 @@ def require_one_place(plans: Sequence[Plan], backend: Backend, operator: Operato
 
 
 def permission(plan: Plan, testbed: Testbed, folder: Path) -> MotionClearance:
-    """Return the permission of a trial; raises as `MotionSupport.permission`."""
+    """Return the permission of a trial. Raises the same errors as `MotionSupport.permission`."""
     # Even if this trial has no moves, a fault in another trial of its campaign may have stopped a robot.
     has_journal = any((place / laptop_files.MOTION).exists() for place in (folder, folder.parent))
     return (

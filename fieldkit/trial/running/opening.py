@@ -71,8 +71,9 @@ def run(
         The outcome of each trial; None for a trial that the operator skipped.
 
     Raises:
-        ConfigurationError: As for `motion_control.require_one_place`.
-        FieldkitError: As for `opened` and `runner.run_trial`; a note lists the trials that were not started.
+        ConfigurationError: For the same reasons as `motion_control.require_one_place`.
+        FieldkitError: For the same reasons as `opened` and `runner.run_trial`; a note lists the trials that were not
+            started.
     """
     motion_control.require_one_place(plans, backend, operator)
     store.prepare(out)
@@ -83,7 +84,7 @@ def run(
     ) as testbed:
         try:
             for plan in plans:
-                outcomes.append(runner.run_trial(plan, testbed, out, sink, stop))  # noqa: PERF401 (used below if a trial stops)
+                outcomes.append(runner.run_trial(plan, testbed, out, sink, stop))  # noqa: PERF401 (needed after an exception)
         except BaseException:
             # `resume` continues only the interrupted trial, so the operator must start the later trials.
             if later_plans := plans[len(outcomes) + 1 :]:

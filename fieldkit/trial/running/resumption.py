@@ -38,8 +38,8 @@ def resume(
         The outcome; None if the operator skipped the trial.
 
     Raises:
-        FieldkitError: The trial was started with other code, on another backend or with other robots; or as for
-            `opened` and `resume_trial`.
+        FieldkitError: The trial was started with other code, on another backend or with other robots; or `opened` or
+            `resume_trial` raised the error.
     """
     plan = resumable(folder)
     for change in _step_code_changes(plan.step_packages):
@@ -56,7 +56,10 @@ def resume(
 def resume_trial(
     folder: Path, testbed: Testbed, sink: Sink, stop: Stop | None = None, *, failed: bool = False
 ) -> Outcome | None:
-    """Place the robots and resume a trial; None if the operator skipped it. Raises as `continue_trial`."""
+    """Place the robots and resume a trial; None if the operator skipped it.
+
+    Raises the same errors as `place` and `continue_trial`.
+    """
     placement = place(resumable(folder), testbed, sink)
     if placement.answer.skip:
         return None
@@ -76,14 +79,14 @@ def continue_trial(
         testbed: The robots of the trial, at their places.
         sink: Receives events.
         stop: Request to stop the trial.
-        report_resume: As for `begin`.
+        report_resume: True to report the command that resumes this trial if it stops.
         failed: True to repeat failed repeats as well, each with as many attempts as the procedure allows.
 
     Raises:
         ConfigurationError: `folder` is not a trial, the trial was started with other code, or another process runs
             it.
         EvidenceError: The journal is damaged.
-        FieldkitError: As for `begin`.
+        FieldkitError: For the same reasons as `begin`.
     """
     plan = resumable(folder)
     radio_settings.require_unchanged(plan, testbed.shells)

@@ -73,7 +73,8 @@ class Robots:
             Laptop's clock before the request to each robot and after the response; see `robot_state.exchanges`.
 
         Raises:
-            FieldkitError: As for `evidence.begin` and `programs.copy`; or a program of the lab has changed.
+            FieldkitError: For the same reasons as `evidence.begin` and `programs.copy`, or because a program of the
+                lab has changed.
         """
         plan = self._plan
         copies = [(put, put.program.content()) for put in plan.program_copies()]
@@ -114,7 +115,10 @@ class Robots:
         return telemetry_queries.queries_by_role(cast)
 
     def measure(self, scene: Scene, announce: Announce) -> None:
-        """Run all steps, and store the measurements of the testbed's oracle, if it has one; raises as `Step.run`."""
+        """Run all steps, and store the data of a modelled radio (`Testbed.oracle`), if the radio is not real.
+
+        Raises the same errors as `Step.run`.
+        """
         oracle = self._testbed.oracle
         if oracle is None:
             self._run_steps(scene, announce)
@@ -228,7 +232,7 @@ class Robots:
         return None
 
     def check_alive(self) -> None:
-        """Raise an error, as `Transient.check_alive`, if a process that the robots need has exited."""
+        """Raise the error of `Transient.check_alive` if a process that the robots need has exited."""
         if isinstance(self._testbed, Transient):
             self._testbed.check_alive()
 
@@ -252,11 +256,14 @@ class Robots:
         self._run_on_all(check_lock)
 
     def stop_jobs(self, remote: str) -> None:
-        """Stop all jobs of an attempt; raises as `evidence.end_jobs`."""
+        """Stop all jobs of an attempt. Raises the same errors as `evidence.end_jobs`."""
         self._run_on_all(lambda role: evidence.end_jobs(self.shells[role], remote))
 
     def stop_leftover_jobs(self) -> None:
-        """Stop all jobs of this trial that a killed run left on the robots; raises as `evidence.end_all`."""
+        """Stop all jobs of this trial that a killed run left on the robots.
+
+        Raises the same errors as `evidence.end_all`.
+        """
 
         def stop(role: Role) -> None:
             jobs.install(self.shells[role], Deadline.after(jobs.REPLY_S))
@@ -276,7 +283,7 @@ class Robots:
         Evidence that was not fetched is kept.
 
         Raises:
-            FieldkitError: As for `evidence.discard`.
+            FieldkitError: For the same reasons as `evidence.discard`.
         """
 
         def remove(role: Role) -> None:

@@ -23,7 +23,7 @@ from fieldkit.core.events import (
     TrialStarted,
     TrialStopped,
 )
-from fieldkit.core.model import ENDED, RepeatId
+from fieldkit.core.model import FINAL_STATUSES, RepeatId
 from fieldkit.core.prompts import Answer
 from fieldkit.core.units import TimeEstimate
 from fieldkit.trial import estimates, journal, rows, store
@@ -59,7 +59,10 @@ class Outcome:
 
 
 def run_trial(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop | None = None) -> Outcome | None:
-    """Place the robots and run a trial; None if the operator skipped it. Raises as `place` and `begin`."""
+    """Place the robots and run a trial; None if the operator skipped it.
+
+    Raises the same errors as `place` and `begin`.
+    """
     placement = place(plan, testbed, sink)
     if placement.answer.skip:
         return None
@@ -80,7 +83,7 @@ class PlacementResult:
 
 
 def place(plan: Plan, testbed: Testbed, sink: Sink) -> PlacementResult:
-    """Bring the robots to the places of a trial; raises as `Testbed.place`."""
+    """Bring the robots to the places of a trial. Raises the same errors as `Testbed.place`."""
     started_s = time.monotonic()
     placement = PlacementResult(testbed.place(plan.placement), time.monotonic() - started_s)
     sink(Placed(placement.answer.skip, placement.answer.note, placement.duration_s))
@@ -175,7 +178,7 @@ def run_repeats(
     cells = ledger.summarize()
     robots.delete_remote()
     _report_unfetched(robots, sink)
-    valid, void, failed = map(ledger.counts, ENDED)
+    valid, void, failed = map(ledger.counts, FINAL_STATUSES)
     judgements = _judge(plan, cells, sink) if plan.procedure.expect else ()
     sink(TrialEnded(str(folder), valid, void, failed))
     return Outcome(folder, cells, valid, failed, judgements)
@@ -257,5 +260,5 @@ def converting_write_errors(folder: Path) -> Iterator[None]:
             where=str(error.filename or folder),
             remedy=f"{remedy}, then: {shell_command('fieldkit', 'resume', folder)}"
             if folder.is_dir()
-            else "fieldkit resume FOLDER, with the present path of the folder",
+            else "fieldkit resume FOLDER, with the current path of the folder",
         ) from error

@@ -49,7 +49,7 @@ class UnfetchedEvidence:
         (into / unfetched_file(role)).write_text(encodable(text), encoding="utf-8")
 
     def mark_all(self, remote: str, into: Path, reason: str) -> None:
-        """Leave an attempt's folder on all robots; arguments as for `mark`."""
+        """Leave an attempt's folder on all robots; the arguments are those of `mark`."""
         for role in self.folders:
             self.mark(role, remote, into, reason)
 

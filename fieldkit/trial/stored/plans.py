@@ -39,7 +39,7 @@ def read_plan(folder: Path) -> Plan:
 
     Raises:
         ConfigurationError: The folder has no plan, or the plan was edited.
-        EvidenceError: As for `require_plain`.
+        EvidenceError: For the same reasons as `require_plain`.
     """
     require_plain(folder)
     if not (folder / PLAN_FILE).is_file():

@@ -47,7 +47,7 @@ def rebuild(folder: Path) -> RebuildResult:
             "the evidence has changed since it was measured, so the tables are not rebuilt: "
             f"{verification.summarize(differences)}",
             where=str(folder),
-            remedy="restore it from a copy; or show the results of the present evidence: "
+            remedy="restore it from a copy; or show the results of the current evidence: "
             + shell_command("fieldkit", "aggregate", folder, "--rebuild"),
         )
     names = (store.TRIAL_CSV, store.SUMMARY_CSV)
@@ -69,7 +69,7 @@ def measure_rows(folder: Path, plan: Plan) -> list[Row]:
     """Return the rows of a trial's attempts, measured again from the evidence. Nothing is written.
 
     Raises:
-        EvidenceError: As for `journal.history`.
+        EvidenceError: For the same reasons as `journal.history`.
     """
     return _rows(folder, plan, journal.history(folder, plan))
 

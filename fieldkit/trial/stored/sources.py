@@ -109,7 +109,7 @@ class Sources:
         Both are None, which means all, if there are no names.
 
         Raises:
-            ConfigurationError: As for `quantity`, with `option` in the message.
+            ConfigurationError: For the same reasons as `quantity`, with `option` in the message.
         """
         if not names:
             return None, None
@@ -117,7 +117,7 @@ class Sources:
         return quantities, [self.words[name] for name in names if name in self.words]
 
     def quantity(self, name: str, *, option: str = "--quantity") -> Quantity:
-        """Return the quantity with a name; `option` as for `condition`.
+        """Return the quantity with a name; see `condition` for `option`.
 
         Raises:
             ConfigurationError: There is no such quantity.
@@ -150,7 +150,7 @@ class Sources:
     def read(
         self, columns: Collection[str] | None = None, *, also: Collection[str] = (), undeclared: bool = False
     ) -> Repeats:
-        """Return the attempts in the tables without duplicates, as `table_files.read`.
+        """Return the attempts in the tables without duplicates; see `table_files.read`.
 
         Args:
             columns: Columns to read; None for all declared columns.
@@ -209,7 +209,7 @@ class Sources:
         """Return these sources with only the rows that satisfy an expression, or with all rows if it is empty.
 
         Raises:
-            ConfigurationError: As for `parse_filter`.
+            ConfigurationError: For the same reasons as `parse_filter`.
         """
         columns = {column.name: column for column in self.columns}
         return replace(self, row_filter=parse_filter(text, columns)) if text else self
@@ -233,7 +233,8 @@ def find(
         use_index: True to read many tables from an index, which does not change the result.
 
     Raises:
-        ConfigurationError: A path does not exist or contains no trial; or as for `tables.declared_columns`.
+        ConfigurationError: A path does not exist or contains no trial, or the columns cannot be determined; see
+            `tables.declared_columns`.
         EvidenceError: No trial has a table.
     """
     return find_each([paths], note, rebuild=rebuild, workers=workers, use_index=use_index)[0]
@@ -247,7 +248,7 @@ def find_each(
     workers: Workers = ALL_PROCESSORS,
     use_index: bool = True,
 ) -> list[Sources]:
-    """Return the sources at the paths of each run, as `find`. Each of them has the columns of all runs."""
+    """Return the sources at the paths of each run; see `find`. Each of them has the columns of all runs."""
     tables_by_run = [_find_tables(paths, note, rebuild=rebuild) for paths in runs]
     all_tables = list(dict.fromkeys(table for run_tables in tables_by_run for table in run_tables))
     indexed = indexed_tables.find(all_tables, workers, note) if use_index and not rebuild else NO_INDEX
@@ -346,7 +347,7 @@ def _remeasured_tables(tables: Sequence[Path], workers: Workers, note: Note) -> 
     """Return a function that returns the table of a trial, measured again from its raw evidence."""
     if workers.is_default and len(tables) < _IN_PARALLEL:
         return partial(_remeasured_table, note=note)
-    from fieldkit.core.tasks import completed  # noqa: PLC0415 (as for rebuild below)
+    from fieldkit.core.tasks import completed  # noqa: PLC0415 (needed only to measure again)
 
     contents: dict[Path, bytes] = {}
     absolute = [table.absolute() for table in tables]  # workers of a cluster have another working directory
@@ -383,7 +384,7 @@ def _remeasured_table(table: Path, note: Note) -> bytes:
 
 def note_differences(folder: Path, note: Note) -> None:
     """Show a note if the evidence that is measured again has changed since it was first measured."""
-    from fieldkit.trial.stored import verification  # noqa: PLC0415 (as above)
+    from fieldkit.trial.stored import verification  # noqa: PLC0415 (needed only to measure again)
 
     if differences := verification.differences(folder):
         note(f"{folder}: measured from changed evidence: {verification.summarize(differences)}")

@@ -51,7 +51,10 @@ def declared_columns(tables: Sequence[Path], facts: Facts = no_facts) -> tuple[C
 
 
 def planned_columns(tables: Iterable[Path]) -> tuple[Column, ...]:
-    """Return all columns in the plans of tables; raises as `declared_columns`, and if a plan cannot be read."""
+    """Return all columns in the plans of tables.
+
+    Raises the same errors as `declared_columns`, and an error if a plan cannot be read.
+    """
     plan_files = [table.parent / PLAN_FILE for table in tables if (table.parent / PLAN_FILE).is_file()]
     common_columns = set(trial_columns())
     declared = (

@@ -12,7 +12,7 @@ from typing_extensions import override
 from sim_backends.emulated.robot.base_controller import TIMEOUT_NS, odometry
 from sim_backends.emulated.robot.velocity_command import VelocityCommandRecord
 from sim_backends.emulated.ros.flight_records import FlightCommandRecord, FlightMotion, FlightRecord
-from sim_backends.emulated.ros.robot_motion import AT_REST, MotionReporter, RobotMotion
+from sim_backends.emulated.ros.robot_motion import AT_REST, MotionReporter, RobotMotionState
 from sim_backends.physics.body import Twist, Velocity
 from sim_backends.physics.quadrotor import ROTORS_OFF, FlightStatus, FlightTarget
 from sim_backends.world.motion import STILL, State
@@ -62,7 +62,7 @@ class Steering(ABC):
         self._pending: deque[TimedCommand] = deque(maxlen=_PENDING_COMMANDS)
         self._reporter = MotionReporter(_path(paths), _path(motion_record), now_ns)
         self.is_driven = False
-        self._start: RobotMotion = AT_REST
+        self._start: RobotMotionState = AT_REST
         self.is_placed = False
         self._stop_due_ns: int | None = None
         self._last_report: tuple[int, float] | None = None
@@ -72,7 +72,7 @@ class Steering(ABC):
     def _read_command(self) -> TimedCommand | None:
         """Return the last command of the robot's programs, or None if there is none."""
 
-    def poll_placement(self, now_ns: int) -> RobotMotion | None:
+    def poll_placement(self, now_ns: int) -> RobotMotionState | None:
         """Return the motion at the position where the lab has placed the robot since the last call, or None.
 
         The robot is at rest there, and earlier commands are dropped.

@@ -9,7 +9,7 @@ from typing import Final
 
 from fieldkit.core.model import Vector
 from sim_backends.emulated.robot.spec import Base
-from sim_backends.emulated.ros.robot_motion import AT_REST, RobotMotion
+from sim_backends.emulated.ros.robot_motion import AT_REST, RobotMotionState
 from sim_backends.physics.body import Twist
 from sim_backends.physics.differential_drive import DifferentialDrive, DrivePose
 from sim_backends.physics.robot_limits import DriveLimits
@@ -23,7 +23,7 @@ _TURN_RISE_S: Final = 0.5
 """Time in which the turn rate rises from 0 to its limit."""
 
 
-def odometry(start: RobotMotion, position_m: Vector, heading_rad: float) -> Vector:
+def odometry(start: RobotMotionState, position_m: Vector, heading_rad: float) -> Vector:
     """Return the odometry of a robot after a motion; see `RecordedMotion.odometry`.
 
     Args:
@@ -76,7 +76,7 @@ class BaseController:
         """Odometry; see `RecordedMotion.odometry`."""
         return odometry(self._start, self._pose.place_m, self._pose.heading_rad)
 
-    def reset(self, motion: RobotMotion) -> None:
+    def reset(self, motion: RobotMotionState) -> None:
         """Start again at rest where the lab has placed the robot; earlier velocities are dropped."""
         self._start = motion
         self._pose = DrivePose(motion.position_m, motion.heading_rad)

@@ -19,7 +19,7 @@ from random import Random
 from typing import Final
 
 from sim_backends.emulated.ros.laser import ranges_m
-from sim_backends.emulated.ros.robot_motion import AT_REST, RobotMotion
+from sim_backends.emulated.ros.robot_motion import AT_REST, RobotMotionState
 from sim_backends.emulated.ros.sensor_specs import LASER_SCAN, LaserTarget, Sensor, Template, check, packed_string
 from sim_backends.world.motion import GRAVITY_M_S2
 
@@ -50,7 +50,7 @@ _FLOATS_BYTES: Final = 16  # the size of a point, so that the fields of points s
 _ONE_TRANSFORM: Final = struct.pack("<I", 1)
 
 
-Generator = Callable[[Sensor, Random, RobotMotion], bytes]
+Generator = Callable[[Sensor, Random, RobotMotionState], bytes]
 """Returns the serialized fields that follow the header."""
 
 
@@ -82,7 +82,7 @@ class Source:
         # The seed is the topic, so that equal robots publish equal values, independently of their start time.
         self._noise = Random(sensor.topic)  # noqa: S311 (no secret)
 
-    def message(self, number: int, stamp_ns: int, motion: RobotMotion = AT_REST) -> bytes:
+    def message(self, number: int, stamp_ns: int, motion: RobotMotionState = AT_REST) -> bytes:
         """Return message `number`, serialized, for a motion and a time stamp in nanoseconds since the epoch."""
         if not self._has_header:
             return self._generate(self._sensor, self._noise, motion)
@@ -100,7 +100,7 @@ def _template_generator(template: Template) -> Generator:
     head, tail, size_bytes = bytes.fromhex(template.head), bytes.fromhex(template.tail), template.size_bytes
     pool = b""
 
-    def generate(_: Sensor, noise: Random, __: RobotMotion) -> bytes:
+    def generate(_: Sensor, noise: Random, __: RobotMotionState) -> bytes:
         nonlocal pool
         if not template.floats:
             return head + noise.randbytes(size_bytes) + tail
@@ -148,7 +148,7 @@ def _reported_range_m(value_m: float, low_m: float, high_m: float) -> float:
 def _laser_scan(
     sensor: Sensor,
     noise: Random,
-    motion: RobotMotion,
+    motion: RobotMotionState,
     targets: Sequence[LaserTarget] = (),
     moving_targets: Callable[[], Sequence[LaserTarget]] = tuple,
 ) -> bytes:
@@ -165,7 +165,7 @@ def _laser_scan(
     return scalars + _float32s(ranges) + _float32s(echoes)
 
 
-def _imu(_: Sensor, noise: Random, motion: RobotMotion) -> bytes:
+def _imu(_: Sensor, noise: Random, motion: RobotMotionState) -> bytes:
     # On an assigned path the robot turns and accelerates in zero time, which gyroscope and accelerometer cannot show.
     orientation_covariance, angular_covariance, acceleration_covariance = (
         _diagonal(*[variance] * 3) for variance in IMU_VARIANCES
@@ -180,7 +180,7 @@ def _child_frame(sensor: Sensor) -> bytes:
     return packed_string(sensor.child_frame or "base_link")
 
 
-def _odometry(sensor: Sensor, noise: Random, motion: RobotMotion) -> bytes:
+def _odometry(sensor: Sensor, noise: Random, motion: RobotMotionState) -> bytes:
     covariance = _diagonal(*ODOMETRY_VARIANCES)
     angular = (0.0, 0.0, noise.gauss(motion.turn_rad_s, 1e-3))
     pose = _float64s((motion.x_m, motion.y_m, 0.0), _heading_quaternion(motion.yaw_rad), covariance)
@@ -188,12 +188,12 @@ def _odometry(sensor: Sensor, noise: Random, motion: RobotMotion) -> bytes:
     return _child_frame(sensor) + pose + twist
 
 
-def _transforms(sensor: Sensor, _: Random, motion: RobotMotion) -> bytes:
+def _transforms(sensor: Sensor, _: Random, motion: RobotMotionState) -> bytes:
     """Return one transform, from the odometry frame to the robot's frame: the robot's pose in odometry (REP 105)."""
     return _child_frame(sensor) + _float64s((motion.x_m, motion.y_m, 0.0), _heading_quaternion(motion.yaw_rad))
 
 
-def _battery_state(_: Sensor, noise: Random, _motion: RobotMotion) -> bytes:
+def _battery_state(_: Sensor, noise: Random, _motion: RobotMotionState) -> bytes:
     voltage, design_capacity, percentage = noise.gauss(11.1, 0.01), 1.8, 0.8
     unknown = math.nan  # sensor_msgs/BatteryState: "if unmeasured NaN"
     discharging, good, polymer, present = 2, 1, 3, True  # POWER_SUPPLY_STATUS, _HEALTH, _TECHNOLOGY
@@ -203,14 +203,14 @@ def _battery_state(_: Sensor, noise: Random, _motion: RobotMotion) -> bytes:
     return measured_fields + state + no_cells + packed_string("") * 2  # location and serial number of the battery
 
 
-def _range(_: Sensor, noise: Random, motion: RobotMotion) -> bytes:
+def _range(_: Sensor, noise: Random, motion: RobotMotionState) -> bytes:
     infrared = 1  # sensor_msgs/Range.INFRARED
     low_m, high_m = 0.02, 4.0
     down_m = max(STANDING_M, motion.position_m[2]) + abs(noise.gauss(0.0, 0.005))
     return struct.pack("<B4f", infrared, math.radians(25.0), low_m, high_m, _reported_range_m(down_m, low_m, high_m))
 
 
-def _nav_sat_fix(_: Sensor, noise: Random, motion: RobotMotion) -> bytes:
+def _nav_sat_fix(_: Sensor, noise: Random, motion: RobotMotionState) -> bytes:
     fix, gps, diagonal_known = 0, 1, 2  # NavSatStatus.STATUS_FIX, .SERVICE_GPS; COVARIANCE_TYPE_DIAGONAL_KNOWN
     east_m, north_m, up_m = motion.position_m
     latitude, longitude = math.degrees(north_m / NORTH_RADIUS_M), math.degrees(east_m / EAST_RADIUS_M)
@@ -221,23 +221,23 @@ def _nav_sat_fix(_: Sensor, noise: Random, motion: RobotMotion) -> bytes:
     return struct.pack("<bH", fix, gps) + _float64s(fix_position, covariance) + struct.pack("<B", diagonal_known)
 
 
-def _magnetic_field(_: Sensor, noise: Random, motion: RobotMotion) -> bytes:
+def _magnetic_field(_: Sensor, noise: Random, motion: RobotMotionState) -> bytes:
     north_t, up_t = FIELD_T
     ahead_t, left_t = north_t * math.sin(motion.heading_rad), north_t * math.cos(motion.heading_rad)
     return _float64s(_gaussian(noise, 1e-7, ahead_t, left_t, up_t), _diagonal(*[1e-14] * 3))
 
 
-def _fluid_pressure(_: Sensor, noise: Random, motion: RobotMotion) -> bytes:
+def _fluid_pressure(_: Sensor, noise: Random, motion: RobotMotionState) -> bytes:
     # Standard atmosphere, ISO 2533, at a height above the sea; then the variance.
     pressure_pa = 101_325.0 * (1 - 0.0065 * motion.position_m[2] / 288.15) ** 5.25588
     return _float64s((noise.gauss(pressure_pa, 3.0), 9.0))
 
 
-def _temperature(_: Sensor, noise: Random, _motion: RobotMotion) -> bytes:
+def _temperature(_: Sensor, noise: Random, _motion: RobotMotionState) -> bytes:
     return _float64s((noise.gauss(20.0, 0.1), 0.01))  # then the variance
 
 
-def _pose_stamped(_: Sensor, __: Random, motion: RobotMotion) -> bytes:
+def _pose_stamped(_: Sensor, __: Random, motion: RobotMotionState) -> bytes:
     return _float64s(
         motion.position_m, _heading_quaternion(motion.heading_rad)
     )  # in the world's frame, `map` of REP 105

@@ -43,7 +43,7 @@ class AssignedPath:
 
 
 @dataclass(frozen=True)
-class RobotMotion:
+class RobotMotionState:
     """State of the motion of a robot at one time.
 
     Attributes:
@@ -65,7 +65,7 @@ class RobotMotion:
     turn_rad_s: float = 0.0
 
 
-AT_REST: Final = RobotMotion()
+AT_REST: Final = RobotMotionState()
 
 
 def append_path(file_path: Path, path: AssignedPath) -> None:
@@ -96,9 +96,9 @@ class Odometer:
             motion = _motion_on(self._path, AT_REST, now_ns)
             yaw_rad = -motion.yaw_rad
             x_m, y_m = _rotate(motion.x_m, motion.y_m, yaw_rad)
-            self._base = RobotMotion(-x_m, -y_m, yaw_rad)
+            self._base = RobotMotionState(-x_m, -y_m, yaw_rad)
 
-    def at(self, now_ns: int) -> RobotMotion:
+    def at(self, now_ns: int) -> RobotMotionState:
         """Return the robot's motion at a time, which must not be earlier than that of the last call."""
         self._read_paths(now_ns)
         return self._recorded_motion(now_ns) or self._assigned_motion(now_ns)
@@ -108,7 +108,7 @@ class Odometer:
         """Start of the last assigned path, 0 if there is none."""
         return 0 if self._path is None else self._path.start_ns
 
-    def _recorded_motion(self, now_ns: int) -> RobotMotion | None:
+    def _recorded_motion(self, now_ns: int) -> RobotMotionState | None:
         """Return the recorded motion, or None if the robot has not steered itself since its last assigned path."""
         last = None if self._record is None else self._record.read()
         if last is None or last.path_start_ns != self.path_start_ns:
@@ -116,9 +116,11 @@ class Odometer:
         current = last.at(now_ns)
         # `RecordedMotion.at` changes the heading, but not the velocity, so the speed is that of the record.
         speed_m_s = last.speed_m_s if current.is_moving else 0.0
-        return RobotMotion(*current.odometry, speed_m_s, current.position_m, current.heading_rad, current.turn_rad_s)
+        return RobotMotionState(
+            *current.odometry, speed_m_s, current.position_m, current.heading_rad, current.turn_rad_s
+        )
 
-    def _assigned_motion(self, now_ns: int) -> RobotMotion:
+    def _assigned_motion(self, now_ns: int) -> RobotMotionState:
         """Return the motion on the last assigned path."""
         return self._base if self._path is None else _motion_on(self._path, self._base, now_ns)
 
@@ -141,7 +143,7 @@ class Odometer:
             self._path = path
 
 
-def _motion_on(path: AssignedPath, base: RobotMotion, now_ns: int) -> RobotMotion:
+def _motion_on(path: AssignedPath, base: RobotMotionState, now_ns: int) -> RobotMotionState:
     """Return a robot's motion on a path at a time; `base` is its motion when the path started."""
     elapsed_ns = now_ns - path.start_ns
     points_m = [(point_m[0], point_m[1], 0.0) for point_m in path.points_m]  # the speed is horizontal
@@ -153,7 +155,7 @@ def _motion_on(path: AssignedPath, base: RobotMotion, now_ns: int) -> RobotMotio
         previous_m, last_m = points_m[-2:]
         heading_rad = math.atan2(last_m[1] - previous_m[1], last_m[0] - previous_m[0])
     x_m, y_m = _rotate(east_m - points_m[0][0], north_m - points_m[0][1], base.yaw_rad - path.facing_rad)
-    return RobotMotion(
+    return RobotMotionState(
         base.x_m + x_m,
         base.y_m + y_m,
         base.yaw_rad + math.remainder(heading_rad - path.facing_rad, 2 * math.pi),
@@ -203,7 +205,7 @@ class MotionReporter:
         """Start time of the path with which the lab last placed the robot; 0 if none has been read."""
         return self._path_start_ns or 0
 
-    def poll_placement(self, now_ns: int) -> RobotMotion | None:
+    def poll_placement(self, now_ns: int) -> RobotMotionState | None:
         """Return the motion at the position where the lab has placed the robot since the last call, or None.
 
         The first call returns the current motion of the robot, also after the process has been restarted.

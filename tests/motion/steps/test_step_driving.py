@@ -241,9 +241,9 @@ def test_lease_repeats_the_order_until_robot_is_home() -> None:
     link = RecordingShell(status=["", '{"ended": ""}', "{", '{"ended": "home"}'])
     with lease_of(link) as lease:
         assert lease.status in ({}, {"ended": ""})  # A renewal can precede this line.
-        assert lease.end_state == ""
+        assert lease.final_state == ""
         lease.give_order("back")
-        lease.wait(lambda: lease.end_state, Deadline.after(60))
+        lease.wait(lambda: lease.final_state, Deadline.after(60))
         assert lease.status == {"ended": "home"}
     orders = [text.split()[1] for text in link.orders]
     assert orders[0] == "wait"
@@ -253,15 +253,15 @@ def test_lease_repeats_the_order_until_robot_is_home() -> None:
 @pytest.mark.parametrize("status_text", ["[1]", "[" * 100_000, '{"ended": ["home"]}'])
 def test_invalid_status_is_ignored(status_text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with lease_of(RecordingShell(status=[status_text])) as lease:
-        assert lease.end_state == ""
+        assert lease.final_state == ""
         monkeypatch.setattr(DriveLease, "unchanged_s", 41.0)
-        assert lease.end_state == "its driver sent no status for 41 s"
+        assert lease.final_state == "its driver sent no status for 41 s"
 
 
 def test_reason_of_driver_is_one_short_line() -> None:
     with lease_of(RecordingShell(status=[json.dumps({"ended": "\ud800\x1b[2J" + "long\n" * 1000})])) as lease:
-        assert lease.end_state.startswith("??[2Jlong long ")
-        assert len(lease.end_state) == 200
+        assert lease.final_state.startswith("??[2Jlong long ")
+        assert len(lease.final_state) == 200
 
 
 def test_lost_link_does_not_stop_the_wait() -> None:

@@ -106,7 +106,9 @@ def log(shell: Shell) -> str:
 @pytest.mark.nightly  # CI tests the takeover of an ArduCopter
 def test_takeover_by_a_person_aborts_the_nested_steps(shell: Shell) -> None:
     with drones.autopilot_at_udp() as (port, autopilot):
-        with pytest.raises(RobotError, match="here: its flight ended early: another party flies it") as error_info:
+        with pytest.raises(
+            RobotError, match="here: its flight ended early: a person or another program flies it"
+        ) as error_info:
             fly(shell, port, "60min", lambda: autopilot.vehicle.change_mode(Mode.LAND))
         assert "the wait was interrupted" in str(error_info.value.__cause__)
         assert "landed" not in log(shell), "the pilot released the drone"
@@ -273,7 +275,7 @@ def test_pilot_lands_drone_whose_guard_does_not_run(shell: Shell, signal_number:
 def test_no_program_commands_a_drone_after_takeover_by_a_person(shell: Shell) -> None:
     """A person switches an ArduCopter to LOITER by remote control. Then the job is stopped, as by Ctrl-C."""
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
-        with pytest.raises(RobotError, match=r"another party flies it \(mode LOITER") as error_info:
+        with pytest.raises(RobotError, match=r"a person or another program flies it \(mode LOITER") as error_info:
             fly(shell, port, "60min", lambda: autopilot.vehicle.change_mode(Mode.LOITER))
         assert "MAY STILL BE IN THE AIR" in str(error_info.value)
         assert "the wait was interrupted" in str(error_info.value.__cause__)

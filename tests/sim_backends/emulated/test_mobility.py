@@ -175,7 +175,7 @@ def test_the_update_period_depends_on_the_speed(mobility: Mobility, medium: Reco
 
 def test_moving_without_a_placement_is_an_error(medium: RecordingMedium) -> None:
     empty = Mobility(CAST, cast("MediumClient", medium), load_world("lawn"), None)
-    with pytest.raises(RobotError, match="no places"), empty.moving(MOVE):
+    with pytest.raises(RobotError, match="have not been placed yet"), empty.moving(MOVE):
         raise AssertionError
 
 

@@ -338,7 +338,7 @@ def test_a_moved_folder_stops_the_trial_which_can_be_resumed_there(
     monkeypatch.setattr(Robots, "fetch", moving)
     with pytest.raises(ConfigurationError, match="cannot be written: No such file or directory") as caught:
         run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
-    assert caught.value.remedy == "fieldkit resume FOLDER, with the present path of the folder"
+    assert caught.value.remedy == "fieldkit resume FOLDER, with the current path of the folder"
     monkeypatch.setattr(Robots, "fetch", fetch)
     resume_trial(tmp_path / "moved", IdleTestbed(), lambda _: None)
     assert verification.verify(tmp_path / "moved") == []

@@ -10,12 +10,12 @@ from rosbags.typesys import Stores, get_typestore
 from sim_backends.emulated.robot import base_process
 from sim_backends.emulated.robot.base_controller import STEP_NS, TIMEOUT_NS, BaseController
 from sim_backends.emulated.robot.spec import Base
-from sim_backends.emulated.ros.robot_motion import RobotMotion
+from sim_backends.emulated.ros.robot_motion import RobotMotionState
 
 S = 10**9
 BASE = Base("/cmd_vel", "geometry_msgs/Twist", 0.5, 1.0, 2.0)
 ANY = st.floats(allow_nan=True, allow_infinity=True)
-START = RobotMotion(x_m=1.0, y_m=2.0, yaw_rad=0.5, position_m=(30.0, 40.0, 0.2), heading_rad=-1.0)
+START = RobotMotionState(x_m=1.0, y_m=2.0, yaw_rad=0.5, position_m=(30.0, 40.0, 0.2), heading_rad=-1.0)
 
 
 @given(st.lists(st.tuples(st.integers(0, S), st.one_of(st.floats(-2, 2), ANY), st.one_of(st.floats(-9, 9), ANY))))

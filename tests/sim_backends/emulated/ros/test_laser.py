@@ -18,7 +18,7 @@ from sim_backends.emulated.provisioning import laser_targets, neighbour
 from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.emulated.ros.laser import Neighbourhood, PositionsWriter, ranges_m
 from sim_backends.emulated.ros.messages import LASER_NOISE_M, Source
-from sim_backends.emulated.ros.robot_motion import RobotMotion
+from sim_backends.emulated.ros.robot_motion import RobotMotionState
 from sim_backends.emulated.ros.sensor_specs import LASER_SCAN, LaserTarget, Neighbour, Sensor
 from sim_backends.world.shapes import Box, Cylinder, Solids
 from sim_backends.world.world import World, load_world
@@ -167,7 +167,7 @@ def test_the_range_to_a_robot_is_its_distance_less_its_radius(writer: PositionsW
     bodies = [neighbour(1, load_profile("turtlebot3_burger"))]
     scanner = Sensor("/scan", LASER_SCAN, 5.0, "base_scan", 360)
     source = Source(scanner, (), lambda: neighbourhood.targets(bodies))
-    robot_motion = RobotMotion(position_m=(10.0, 20.0, 5.0 + ANTENNA_M), heading_rad=math.pi / 2)
+    robot_motion = RobotMotionState(position_m=(10.0, 20.0, 5.0 + ANTENNA_M), heading_rad=math.pi / 2)
 
     def scan(**places_m: Vector) -> np.ndarray:
         writer.write(places_m)

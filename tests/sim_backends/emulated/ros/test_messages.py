@@ -21,7 +21,7 @@ from sim_backends.emulated import placement as places
 from sim_backends.emulated.provisioning import _sensor
 from sim_backends.emulated.ros import robot_motion
 from sim_backends.emulated.ros.messages import GENERATORS, Source
-from sim_backends.emulated.ros.robot_motion import AT_REST, Odometer, RobotMotion
+from sim_backends.emulated.ros.robot_motion import AT_REST, Odometer, RobotMotionState
 from sim_backends.emulated.ros.sensor_specs import GENERATED_TYPES, LaserTarget, Sensor
 from sim_backends.world.motion import GRAVITY_M_S2
 from sim_backends.world.world import load_world
@@ -32,7 +32,7 @@ PROFILES: Final = locations.names("robots")
 METRES: Final = st.floats(-30, 30)
 ANGLES: Final = st.floats(-math.pi, math.pi)
 MOTIONS: Final = st.builds(
-    RobotMotion,
+    RobotMotionState,
     METRES,
     METRES,
     ANGLES,
@@ -61,7 +61,9 @@ def sensors(kind: str = "") -> list[Sensor]:
     return [sensor for sensor in result.values() if kind in (sensor.type, "")]
 
 
-def publish(sensor: Sensor, motion: RobotMotion = AT_REST, *, source: Source | None = None, number: int = 1) -> Any:  # noqa: ANN401 (of rosbags)
+def publish(
+    sensor: Sensor, motion: RobotMotionState = AT_REST, *, source: Source | None = None, number: int = 1
+) -> Any:  # noqa: ANN401 (of rosbags)
     data = (source or Source(sensor)).message(number, number * S, motion)
     return STORE.deserialize_ros1(data, sensor.type.replace("/", "/msg/"))
 
@@ -119,7 +121,7 @@ def test_stamps_equal_the_passed_time() -> None:
 
 
 @given(MOTIONS)
-def test_quaternions_have_length_1(motion: RobotMotion) -> None:
+def test_quaternions_have_length_1(motion: RobotMotionState) -> None:
     for sensor in sensors():
         for quaternion in quaternions(publish(sensor, motion)):
             assert math.hypot(*quaternion) == pytest.approx(1.0)
@@ -143,7 +145,7 @@ def test_covariances_are_symmetric_and_positive_definite() -> None:
 
 
 @given(MOTIONS)
-def test_a_transform_is_the_pose_of_its_robot_s_odometry(motion: RobotMotion) -> None:
+def test_a_transform_is_the_pose_of_its_robot_s_odometry(motion: RobotMotionState) -> None:
     """REP 105: odom is the parent, and the robot's base the child; both have the same pose."""
     for name in PROFILES:
         sensors_by_type = {sensor.type: sensor for sensor in sensors_of_profile(name).values()}
@@ -182,7 +184,7 @@ def test_the_angles_and_times_of_a_scan_match_its_number_of_beams(sensor: Sensor
 
 
 @given(MOTIONS)
-def test_ranges_are_within_the_sensor_s_reach_or_infinite(motion: RobotMotion) -> None:
+def test_ranges_are_within_the_sensor_s_reach_or_infinite(motion: RobotMotionState) -> None:
     """REP 117: minus infinity for too near, infinity for too far."""
     for sensor in sensors("sensor_msgs/LaserScan"):
         scan = publish(sensor, motion)
@@ -201,12 +203,14 @@ def test_ranges_to_walls_follow_position_and_heading() -> None:
     room = LaserTarget(((8.0, 4.0), (12.0, 4.0), (12.0, 7.0), (8.0, 7.0)), 0.0, 0.0, 2.0)
     source = Source(sensor, [room])
     ahead, left = 0, (sensor.points or 0) // 4
-    scan_after_drive = publish(sensor, RobotMotion(x_m=70.0, yaw_rad=1.0, position_m=(10.5, 5.5, 0.2)), source=source)
+    scan_after_drive = publish(
+        sensor, RobotMotionState(x_m=70.0, yaw_rad=1.0, position_m=(10.5, 5.5, 0.2)), source=source
+    )
     assert scan_after_drive.ranges[ahead] == pytest.approx(1.5, abs=0.1)
     assert scan_after_drive.ranges[left] == pytest.approx(1.5, abs=0.1)
     assert scan_after_drive.ranges[2 * left] == pytest.approx(2.5, abs=0.1)
     scan_after_turn = publish(
-        sensor, RobotMotion(position_m=(10.5, 5.0, 0.2), heading_rad=math.pi / 2), source=source
+        sensor, RobotMotionState(position_m=(10.5, 5.0, 0.2), heading_rad=math.pi / 2), source=source
     )
     assert scan_after_turn.ranges[ahead] == pytest.approx(2.0, abs=0.1)
     assert scan_after_turn.ranges[left] == pytest.approx(2.5, abs=0.1)
@@ -239,7 +243,7 @@ def test_battery_values_are_plausible_or_nan() -> None:
 def test_an_imu_at_rest_measures_only_gravity(heading_rad: float) -> None:
     """REP 145: up is positive, and acceleration includes gravity."""
     for sensor in sensors("sensor_msgs/Imu"):
-        imu = publish(sensor, RobotMotion(heading_rad=heading_rad))
+        imu = publish(sensor, RobotMotionState(heading_rad=heading_rad))
         acceleration = imu.linear_acceleration
         assert (acceleration.x, acceleration.y, acceleration.z) == pytest.approx((0, 0, GRAVITY_M_S2), abs=0.2)
         assert math.remainder(yaw_rad(imu.orientation) - heading_rad, 2 * math.pi) == pytest.approx(0, abs=1e-6)
@@ -251,7 +255,7 @@ def test_the_turn_rate_integrates_to_the_heading() -> None:
     samples = [
         publish(
             sensor,
-            RobotMotion(heading_rad=rate_rad_s * number / sensor.rate_hz, turn_rad_s=rate_rad_s),
+            RobotMotionState(heading_rad=rate_rad_s * number / sensor.rate_hz, turn_rad_s=rate_rad_s),
             source=source,
         )
         for number in range(count + 1)
@@ -263,7 +267,7 @@ def test_the_turn_rate_integrates_to_the_heading() -> None:
 
 
 @given(MOTIONS)
-def test_heights_are_those_of_the_robot(motion: RobotMotion) -> None:
+def test_heights_are_those_of_the_robot(motion: RobotMotionState) -> None:
     for sensor in sensors("sensor_msgs/NavSatFix"):
         assert publish(sensor, motion).altitude == pytest.approx(motion.position_m[2], abs=5)
     for sensor in sensors("geometry_msgs/PoseStamped"):
@@ -286,7 +290,7 @@ def test_heights_are_those_of_the_robot(motion: RobotMotion) -> None:
 @given(ANGLES)
 def test_the_magnetic_field_points_north_for_any_heading(heading_rad: float) -> None:
     sensor = Sensor("/mag", "sensor_msgs/MagneticField", 1.0, "imu_link", None)
-    field = publish(sensor, RobotMotion(heading_rad=heading_rad)).magnetic_field
+    field = publish(sensor, RobotMotionState(heading_rad=heading_rad)).magnetic_field
     direction_rad = math.atan2(field.y, field.x) + heading_rad
     assert math.remainder(direction_rad - math.pi / 2, 2 * math.pi) == pytest.approx(0, abs=0.05)
 

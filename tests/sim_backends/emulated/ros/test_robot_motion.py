@@ -15,7 +15,7 @@ from fieldkit.core.units import parse_distance
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.ros import robot_motion
 from sim_backends.emulated.ros.messages import FIX_NOISE_M, Source
-from sim_backends.emulated.ros.robot_motion import AT_REST, AssignedPath, Odometer, RobotMotion
+from sim_backends.emulated.ros.robot_motion import AT_REST, AssignedPath, Odometer, RobotMotionState
 from sim_backends.emulated.ros.sensor_specs import Sensor
 from sim_backends.world.world import load_world
 from tests.helpers.casts import CAST
@@ -38,8 +38,8 @@ def write_paths(folder: Path, *assigned_paths: AssignedPath) -> Path:
 
 def test_odometry_follows_a_path_with_a_left_turn(tmp_path: Path) -> None:
     odometer = Odometer(write_paths(tmp_path, AssignedPath(10 * S, CORNER, 2.0, 0.0)), 0)
-    assert odometer.at(10 * S) == RobotMotion(speed_m_s=2.0, position_m=CORNER[0])
-    assert odometer.at(11 * S) == RobotMotion(2.0, 0.0, 0.0, 2.0, (5.0, 6.0, UP_M))
+    assert odometer.at(10 * S) == RobotMotionState(speed_m_s=2.0, position_m=CORNER[0])
+    assert odometer.at(11 * S) == RobotMotionState(2.0, 0.0, 0.0, 2.0, (5.0, 6.0, UP_M))
     middle = odometer.at(round(12.5 * S))
     assert (middle.x_m, middle.y_m, middle.yaw_rad) == pytest.approx((4.0, 1.0, math.pi / 2))
     assert middle.position_m == pytest.approx((7.0, 7.0, 0.7)), "half way up"
@@ -121,7 +121,7 @@ def test_a_leg_away_is_ahead_and_a_leg_left_is_to_the_left(tmp_path: Path, role:
 def test_messages_use_the_frames_and_units_of_ros() -> None:
     store, motion = (
         get_typestore(Stores.ROS1_NOETIC),
-        RobotMotion(4.0, 2.0, math.pi / 2, 1.5, (300.0, 400.0, UP_M), math.pi / 2),
+        RobotMotionState(4.0, 2.0, math.pi / 2, 1.5, (300.0, 400.0, UP_M), math.pi / 2),
     )
     messages: dict[str, Any] = {}
     for kind in ("nav_msgs/Odometry", "sensor_msgs/Imu", "sensor_msgs/NavSatFix"):
