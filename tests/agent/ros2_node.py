@@ -1,4 +1,4 @@
-"""A ROS 2 node for a Python with rclpy: it republishes messages of `/stream` on `/again`, and prints a report.
+"""A ROS 2 node that republishes messages of `/stream` on `/again`, and prints a report. It requires rclpy.
 
 Usage: python ros2_node.py COUNT TYPE. It exits after COUNT messages, and prints one JSON object.
 """
@@ -15,9 +15,9 @@ from rclpy.serialization import deserialize_message, serialize_message
 LIMIT_S = 60.0
 
 
-def main(count: int, kind: str) -> None:
-    """Receive so many messages of a type, and print a report."""
-    package, _, name = kind.split("/")
+def main(count: int, type_name: str) -> None:
+    """Receive `count` messages of a type, and print a report."""
+    package, _, name = type_name.split("/")
     message_type = getattr(importlib.import_module(f"{package}.msg"), name)
     rclpy.init()
     node = rclpy.create_node("real")

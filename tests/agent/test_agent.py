@@ -1,4 +1,4 @@
-"""The agent as it runs on robots: one file, on two hosts with one cable, over each middleware."""
+"""The agent as it runs on robots: a single file on two hosts with a cable, over each middleware."""
 
 import ast
 import json
@@ -32,17 +32,17 @@ MODULES = sorted((ROOT / "fieldkit" / "agent").glob("*.py"))
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: path.name)
-def test_agent_needs_only_python_3_8_and_its_middleware(path: Path) -> None:
+def test_module_requires_only_python_3_8_and_its_middleware(path: Path) -> None:
     tree = ast.parse(path.read_text(encoding="utf-8"), feature_version=(3, 8))
     names = {row.module or "" for row in ast.walk(tree) if isinstance(row, ast.ImportFrom)}
     names |= {alias.name for row in ast.walk(tree) if isinstance(row, ast.Import) for alias in row.names}
-    of = {
+    packages_by_file = {
         "dds.py": {"cyclonedds"},
         "zenoh.py": {"zenoh"},
         "ros1.py": {"rospy", "rosgraph"},
         "ros2.py": {"rclpy"},
     }
-    expected = of.get(path.name, set())
+    expected = packages_by_file.get(path.name, set())
     for name in names:
         root = name.split(".")[0]
         assert name.startswith("fieldkit.agent") or root in sys.stdlib_module_names | expected, name
@@ -64,15 +64,17 @@ class Cable:
     def arguments(self, middleware_name: str, host: TestHost, **network: object) -> dict[str, Any]:
         node = f"fieldkit_{host.pid}"
         topic = topics.describe(standard_types(), "/stream", TYPE, PROFILES["default"], domain=3, node=node)
-        taking_part = {"address": host.address, "domain": 3, "node": node, **network}
-        return {"network": taking_part, "topic": topic, "stream": {"over": middleware_name, **STREAM}}
+        network_arguments = {"address": host.address, "domain": 3, "node": node, **network}
+        return {"network": network_arguments, "topic": topic, "stream": {"over": middleware_name, **STREAM}}
 
     @contextmanager
     def running(
-        self, host: TestHost, verb: str, arguments: dict[str, Any], *words: str
+        self, host: TestHost, verb: str, arguments: dict[str, Any], *additional_arguments: str
     ) -> Iterator[subprocess.Popen[bytes]]:
         """Run the agent on a host; it is ready when the body starts, and is stopped after it."""
-        with host.start((sys.executable, str(self.program), verb, json.dumps(arguments), *words)) as process:
+        with host.start(
+            (sys.executable, str(self.program), verb, json.dumps(arguments), *additional_arguments)
+        ) as process:
             assert process.stderr is not None
             output_text = process.stderr.readline()
             assert output_text.startswith(b"up, "), output_text + process.stderr.read()
@@ -91,23 +93,23 @@ def cable(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cable]:
         yield Cable(hosts, program)
 
 
-def exchanged(cable: Cable, tmp_path: Path, middleware_name: str, **network: object) -> None:
+def check_exchange(cable: Cable, tmp_path: Path, middleware_name: str, **network: object) -> None:
     """Stream from one host to the other, and check that all samples arrive unchanged."""
     first_host, second_host = cable.hosts
-    sent, received = tmp_path / "sent", tmp_path / "came"
+    sent_log, received_log = tmp_path / "sent", tmp_path / "received"
     subscriber_arguments = cable.arguments(middleware_name, second_host, peers=(first_host.address,), **network)
-    with cable.running(second_host, "subscribe", subscriber_arguments, str(received)) as subscriber:
+    with cable.running(second_host, "subscribe", subscriber_arguments, str(received_log)) as subscriber:
         publisher_arguments = cable.arguments(middleware_name, first_host, peers=(second_host.address,), **network)
-        with cable.running(first_host, "publish", publisher_arguments, str(sent)) as publisher:
+        with cable.running(first_host, "publish", publisher_arguments, str(sent_log)) as publisher:
             assert publisher.wait(timeout=60) == 0
     assert subscriber.returncode == 0
-    left, arrived = topic_logs.rows(sent), topic_logs.rows(received)
-    kinds = [row[0] for row in left if row[0] != records.SKIPPED]
+    sent_rows, received_rows = topic_logs.rows(sent_log), topic_logs.rows(received_log)
+    kinds = [row[0] for row in sent_rows if row[0] != records.SKIPPED]
     assert kinds[:3] == [records.WRITER, records.DISCOVERY_STARTED, records.MATCHED]
-    expected = [row[2:5] for row in left if row[0] == records.SAMPLE]
+    expected = [row[2:5] for row in sent_rows if row[0] == records.SAMPLE]
     assert expected
-    assert [row[2:5] for row in arrived if row[0] == records.SAMPLE] == expected
-    kind, _, _, count, checked, _ = arrived[-1]
+    assert [row[2:5] for row in received_rows if row[0] == records.SAMPLE] == expected
+    kind, _, _, count, checked, _ = received_rows[-1]
     assert (kind, count, checked) == (records.END, len(expected), records.CHECKED)
 
 
@@ -115,20 +117,22 @@ def exchanged(cable: Cable, tmp_path: Path, middleware_name: str, **network: obj
 @pytest.mark.parametrize("discovery", ["multicast", "peers"])
 @pytest.mark.parametrize("middleware_name", ["dds", "zenoh"])
 def test_samples_arrive_without_a_master(cable: Cable, tmp_path: Path, middleware_name: str, discovery: str) -> None:
-    exchanged(cable, tmp_path, middleware_name, discovery=discovery)
+    check_exchange(cable, tmp_path, middleware_name, discovery=discovery)
 
 
 @pytest.mark.emulated
 def test_samples_arrive_over_udp(cable: Cable, tmp_path: Path) -> None:
-    exchanged(cable, tmp_path, "zenoh", discovery="peers", transport="udp")
+    check_exchange(cable, tmp_path, "zenoh", discovery="peers", transport="udp")
 
 
 @pytest.mark.emulated
 def test_samples_arrive_through_a_router(cable: Cable, tmp_path: Path) -> None:
     first_host, _ = cable.hosts
-    routes = {"network": {"address": first_host.address, "discovery": "router", "server": first_host.address}}
-    with cable.running(first_host, "route", routes):
-        exchanged(cable, tmp_path, "zenoh", discovery="router", server=first_host.address)
+    route_arguments = {
+        "network": {"address": first_host.address, "discovery": "router", "server": first_host.address}
+    }
+    with cable.running(first_host, "route", route_arguments):
+        check_exchange(cable, tmp_path, "zenoh", discovery="router", server=first_host.address)
 
 
 @pytest.mark.emulated
@@ -137,38 +141,43 @@ def test_samples_arrive_with_a_ros_1_master(cable: Cable, tmp_path: Path) -> Non
     with ExitStack() as stack:
         master = stack.enter_context(first_host.start(("rosmaster", "--core", "-p", "11311")))
         stack.callback(master.terminate)
-        exchanged(cable, tmp_path, "ros1", discovery="master", server=first_host.address)
+        check_exchange(cable, tmp_path, "ros1", discovery="master", server=first_host.address)
 
 
 @pytest.mark.emulated
 def test_killed_subscriber_leaves_received_samples(cable: Cable, tmp_path: Path) -> None:
     first_host, second_host = cable.hosts
-    sent, received = tmp_path / "sent", tmp_path / "came"
-    with cable.running(second_host, "subscribe", cable.arguments("dds", second_host), str(received)) as subscriber:
-        with cable.running(first_host, "publish", cable.arguments("dds", first_host), str(sent)) as publisher:
+    sent_log, received_log = tmp_path / "sent", tmp_path / "received"
+    with cable.running(
+        second_host, "subscribe", cable.arguments("dds", second_host), str(received_log)
+    ) as subscriber:
+        with cable.running(first_host, "publish", cable.arguments("dds", first_host), str(sent_log)) as publisher:
             assert publisher.wait(timeout=60) == 0
         subscriber.kill()
-    arrived = [row[3] for row in topic_logs.rows(received) if row[0] == records.SAMPLE]
-    assert arrived == [row[3] for row in topic_logs.rows(sent) if row[0] == records.SAMPLE]
-    assert topic_logs.rows(received)[-1][0] == records.SAMPLE
+    received_sequences = [row[3] for row in topic_logs.rows(received_log) if row[0] == records.SAMPLE]
+    assert received_sequences == [row[3] for row in topic_logs.rows(sent_log) if row[0] == records.SAMPLE]
+    assert topic_logs.rows(received_log)[-1][0] == records.SAMPLE
 
 
 @pytest.mark.emulated
 def test_publisher_stops_without_acknowledgements(cable: Cable, tmp_path: Path) -> None:
     first_host, second_host = cable.hosts
-    sent, received = tmp_path / "sent", tmp_path / "came"
-    with cable.running(second_host, "subscribe", cable.arguments("dds", second_host), str(received)) as subscriber:
+    sent_log, received_log = tmp_path / "sent", tmp_path / "received"
+    with cable.running(
+        second_host, "subscribe", cable.arguments("dds", second_host), str(received_log)
+    ) as subscriber:
         publisher_arguments = cable.arguments("dds", first_host)
-        publisher_arguments["stream"]["duration_s"] = 3.0  # stopped before it has received all samples
-        with cable.running(first_host, "publish", publisher_arguments, str(sent)) as publisher:
-            wait_until(lambda: any(row[0] == records.SAMPLE for row in topic_logs.rows(sent)), Deadline.after(60))
+        # The subscriber is suspended before it has received all samples.
+        publisher_arguments["stream"]["duration_s"] = 3.0
+        with cable.running(first_host, "publish", publisher_arguments, str(sent_log)) as publisher:
+            wait_until(lambda: any(row[0] == records.SAMPLE for row in topic_logs.rows(sent_log)), Deadline.after(60))
             subscriber.send_signal(signal.SIGSTOP)
             try:
                 _, output_text = publisher.communicate(timeout=60)
             finally:
                 subscriber.send_signal(signal.SIGCONT)
             assert publisher.returncode == 0, output_text
-    assert topic_logs.rows(sent)[-1][0] == records.END
+    assert topic_logs.rows(sent_log)[-1][0] == records.END
 
 
 @pytest.mark.emulated
@@ -189,8 +198,8 @@ def test_missing_master_is_reported(cable: Cable, tmp_path: Path) -> None:
 def test_invalid_command_line_is_rejected(argv: list[str], tmp_path: Path) -> None:
     program = tmp_path / "agent.pyz"
     program.write_bytes(agent.content())
-    done = subprocess.run((sys.executable, program, *argv), capture_output=True, check=False)
-    assert (done.returncode, done.stderr[:6]) == (2, b"usage:")
+    completed = subprocess.run((sys.executable, program, *argv), capture_output=True, check=False)
+    assert (completed.returncode, completed.stderr[:6]) == (2, b"usage:")
 
 
 def test_log_without_disk_space_is_reported(tmp_path: Path) -> None:
@@ -198,9 +207,9 @@ def test_log_without_disk_space_is_reported(tmp_path: Path) -> None:
     program.write_bytes(agent.content())
     arguments = json.dumps({"stream": {"over": "dds", **STREAM}})
     argv = ("prlimit", "--fsize=1000", sys.executable, program, "subscribe", arguments, tmp_path / "log")
-    done = subprocess.run(argv, capture_output=True, text=True, check=False)
-    assert done.returncode == 3
-    assert done.stderr == f"error: the log {tmp_path / 'log'} cannot be written: File too large\n"
+    completed = subprocess.run(argv, capture_output=True, text=True, check=False)
+    assert completed.returncode == 3
+    assert completed.stderr == f"error: the log {tmp_path / 'log'} cannot be written: File too large\n"
 
 
 def test_missing_middleware_is_reported(tmp_path: Path) -> None:
@@ -209,56 +218,56 @@ def test_missing_middleware_is_reported(tmp_path: Path) -> None:
     arguments = json.dumps({"stream": {"over": "zenoh", **STREAM}})
     # Isolated and without site-packages, Python has only its standard library.
     argv = (sys.executable, "-I", "-S", program, "publish", arguments, tmp_path / "log")
-    done = subprocess.run(argv, capture_output=True, check=False)
-    assert done.returncode == 3
-    assert done.stderr.startswith(b"error: zenoh is not installed here: ")
+    completed = subprocess.run(argv, capture_output=True, check=False)
+    assert completed.returncode == 3
+    assert completed.stderr.startswith(b"error: zenoh is not installed here: ")
 
 
-def attacked(host: TestHost, *words: str) -> None:
+def send_hostile_packets(host: TestHost, *arguments: str) -> None:
     """Let a host send hostile packets, and wait until it has finished."""
-    argv = ("env", f"PYTHONPATH={ROOT}", sys.executable, "-m", "tests.helpers.hostile_wire", *words)
+    argv = ("env", f"PYTHONPATH={ROOT}", sys.executable, "-m", "tests.helpers.hostile_wire", *arguments)
     with host.start(argv) as process:
         _, output_text = process.communicate(timeout=120)
     assert output_text.endswith(b"done\n"), output_text.decode()
 
 
 @contextmanager
-def unharmed(cable: Cable, tmp_path: Path, middleware_name: str, **network: object) -> Iterator[Path]:
+def streaming_during_attack(cable: Cable, tmp_path: Path, middleware_name: str, **network: object) -> Iterator[Path]:
     """Stream from one host to the other while the body runs; both programs must survive and stop cleanly after it.
 
     Yields the log of the received samples.
     """
     first_host, second_host = cable.hosts
-    received, sent = tmp_path / "came", tmp_path / "sent"
+    received_log, sent_log = tmp_path / "received", tmp_path / "sent"
     subscriber_arguments = cable.arguments(middleware_name, first_host, peers=(second_host.address,), **network)
     publisher_arguments = cable.arguments(middleware_name, second_host, peers=(first_host.address,), **network)
     endless = {**publisher_arguments, "stream": {**publisher_arguments["stream"], "duration_s": 600.0}}
-    with cable.running(first_host, "subscribe", subscriber_arguments, str(received)) as subscriber:
-        with cable.running(second_host, "publish", endless, str(sent)) as publisher:
-            yield received
+    with cable.running(first_host, "subscribe", subscriber_arguments, str(received_log)) as subscriber:
+        with cable.running(second_host, "publish", endless, str(sent_log)) as publisher:
+            yield received_log
             assert publisher.poll() is None
         assert subscriber.poll() is None
     assert (subscriber.returncode, publisher.returncode) == (0, 0)
-    for log in (sent, received):
+    for log in (sent_log, received_log):
         assert records.SAMPLE in {row[0] for row in topic_logs.rows(log)}
         assert topic_logs.rows(log)[-1][0] == records.END
 
 
 @pytest.mark.emulated
 def test_changed_rtps_messages_stop_neither_program(cable: Cable, tmp_path: Path) -> None:
-    """Their messages may be lost permanently, because RTPS trusts packets in the name of another participant."""
-    with unharmed(cable, tmp_path, "dds"):
-        attacked(cable.hosts[1], "rtps", "1000")
+    """Their messages may be lost permanently, because RTPS accepts packets in the name of another participant."""
+    with streaming_during_attack(cable, tmp_path, "dds"):
+        send_hostile_packets(cable.hosts[1], "rtps", "1000")
 
 
 @pytest.mark.emulated
 def test_forged_heartbeat_silences_a_subscription(cable: Cable, tmp_path: Path) -> None:
     """CycloneDDS follows RTPS: samples before the oldest available one are lost; see docs/studies/hostile.md."""
-    with unharmed(cable, tmp_path, "dds") as received:
-        attacked(cable.hosts[1], "heartbeat")
-        output_text = newest(tmp_path / "sent") + 1  # sent, and perhaps not yet in the log
-        wait_until(lambda: newest(tmp_path / "sent") > output_text + 50, Deadline.after(60))
-        assert 0 <= newest(received) <= output_text
+    with streaming_during_attack(cable, tmp_path, "dds") as received_log:
+        send_hostile_packets(cable.hosts[1], "heartbeat")
+        last_sequence = newest(tmp_path / "sent") + 1  # sent, and perhaps not yet in the log
+        wait_until(lambda: newest(tmp_path / "sent") > last_sequence + 50, Deadline.after(60))
+        assert 0 <= newest(received_log) <= last_sequence
 
 
 def newest(log: Path) -> int:
@@ -273,15 +282,15 @@ def test_invalid_tcpros_data_stop_neither_program(cable: Cable, tmp_path: Path) 
     with ExitStack() as stack:
         process = stack.enter_context(first_host.start(("rosmaster", "--core", "-p", "11311")))
         stack.callback(process.terminate)
-        with unharmed(cable, tmp_path, "ros1", **network) as received:
-            attacked(
+        with streaming_during_attack(cable, tmp_path, "ros1", **network) as received_log:
+            send_hostile_packets(
                 second_host,
                 "tcpros",
                 f"http://{first_host.address}:11311",
                 f"{first_host.address}:40001",
                 f"{second_host.address}:40001",
             )
-            sequences = {row[3] for row in topic_logs.rows(received) if row[0] == records.SAMPLE}
+            sequences = {row[3] for row in topic_logs.rows(received_log) if row[0] == records.SAMPLE}
             deadline_s = time.monotonic() + 60
-            while {row[3] for row in topic_logs.rows(received) if row[0] == records.SAMPLE} <= sequences:
-                assert time.monotonic() < deadline_s, "nothing comes any more"
+            while {row[3] for row in topic_logs.rows(received_log) if row[0] == records.SAMPLE} <= sequences:
+                assert time.monotonic() < deadline_s, "no more samples arrive"

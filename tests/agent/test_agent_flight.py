@@ -1,4 +1,4 @@
-"""The program that flies a drone: its messages compared with pymavlink, its path, its orders, and invalid bytes."""
+"""The program that flies a drone: its messages compared with pymavlink, its path, and invalid messages."""
 
 import math
 from collections.abc import Iterator
@@ -27,28 +27,28 @@ class MemoryLink:
 
     def __init__(self) -> None:
         self.sent: list[bytes] = []
-        self.coming: list[bytes] = []
+        self.incoming_frames: list[bytes] = []
         self.messages: dict[int, MessageRate] = {}
 
     def fileno(self) -> int:
-        raise AssertionError("no test waits for it")
+        raise AssertionError("no test waits for this link")
 
     def receive(self) -> Iterator[bytes]:
-        coming, self.coming = self.coming, []
-        yield from coming
+        frames, self.incoming_frames = self.incoming_frames, []
+        yield from frames
 
     def send(self, frame: bytes) -> None:
         self.sent.append(frame)
 
     def close(self) -> None:
-        raise AssertionError("no test closes it")
+        raise AssertionError("no test closes this link")
 
 
 def state_from(*messages: d.MAVLink_message, system: int = 7) -> tuple[AutopilotState, MemoryLink]:
     """Return the state of an autopilot that has sent these messages after its heartbeat."""
     link, writer = MemoryLink(), d.MAVLink(None, srcSystem=system, srcComponent=1)
-    beat = d.MAVLink_heartbeat_message(2, PX4, ARMED, 6 << 16, 4, 3)
-    link.coming = [message.pack(writer) for message in (beat, *messages)]
+    heartbeat = d.MAVLink_heartbeat_message(2, PX4, ARMED, 6 << 16, 4, 3)
+    link.incoming_frames = [message.pack(writer) for message in (heartbeat, *messages)]
     state = AutopilotState(link)
     state.receive()
     return state, link
@@ -78,14 +78,14 @@ def test_state_from_messages_of_an_autopilot() -> None:
 def test_other_systems_and_damaged_frames_are_ignored() -> None:
     state, link = state_from(d.MAVLink_local_position_ned_message(1, 1.0, 2.0, 3.0, 0, 0, 0))
     other_system = d.MAVLink(None, srcSystem=9, srcComponent=1)
-    elsewhere = d.MAVLink_local_position_ned_message(2, 99.0, 99.0, 99.0, 0, 0, 0)
-    damaged = bytearray(elsewhere.pack(d.MAVLink(None, srcSystem=7, srcComponent=1)))
+    other_position = d.MAVLink_local_position_ned_message(2, 99.0, 99.0, 99.0, 0, 0, 0)
+    damaged = bytearray(other_position.pack(d.MAVLink(None, srcSystem=7, srcComponent=1)))
     damaged[15] ^= 1
-    nowhere = d.MAVLink_local_position_ned_message(2, math.nan, 0, 0, 0, 0, 0)
-    link.coming = [
-        elsewhere.pack(other_system),
+    nan_position = d.MAVLink_local_position_ned_message(2, math.nan, 0, 0, 0, 0, 0)
+    link.incoming_frames = [
+        other_position.pack(other_system),
         bytes(damaged),
-        nowhere.pack(d.MAVLink(None, srcSystem=7, srcComponent=1)),
+        nan_position.pack(d.MAVLink(None, srcSystem=7, srcComponent=1)),
     ]
     state.receive()
     assert state.position_m == (1.0, 2.0, 3.0)
@@ -98,14 +98,14 @@ def test_any_payload_is_tolerated(payloads: list[tuple[int, bytes]]) -> None:
     for kind, payload in payloads:
         body = bytes((len(payload), 0, 0, 0, 7, 1)) + kind.to_bytes(3, "little") + payload
         total = mavlink_frames.checksum(body + bytes((mavlink_frames.CRC_EXTRA[kind],)))
-        link.coming.append(b"\xfd" + body + total.to_bytes(2, "little"))
+        link.incoming_frames.append(b"\xfd" + body + total.to_bytes(2, "little"))
     state.receive()
     numbers = (*(state.position_m or ()), state.yaw_rad or 0.0, *state.parameters.values())
     assert all(map(math.isfinite, numbers))
     assert all(fault.what and fault.remedy for fault in check.faults())
 
 
-def test_sent_messages_are_those_of_pymavlink() -> None:
+def test_pymavlink_parses_the_sent_messages() -> None:
     state, link = state_from()
     state.commands.send_heartbeat()
     assert state.dialect is not None
@@ -116,23 +116,25 @@ def test_sent_messages_are_those_of_pymavlink() -> None:
     state.commands.request_stream(mavlink_frames.ATTITUDE, 10.0)
     reader = d.MAVLink(None)
     messages = [message for frame in link.sent for message in reader.parse_buffer(frame)]
-    beat, mode, arm, land, lead, ask = messages
-    assert (beat.type, beat.autopilot) == (d.MAV_TYPE_ONBOARD_CONTROLLER, d.MAV_AUTOPILOT_INVALID)
-    assert {(message.target_system, message.target_component) for message in (mode, arm, land, lead, ask)} == {(7, 1)}
+    heartbeat, mode, arm, land, set_point, rate_request = messages
+    assert (heartbeat.type, heartbeat.autopilot) == (d.MAV_TYPE_ONBOARD_CONTROLLER, d.MAV_AUTOPILOT_INVALID)
+    assert {
+        (message.target_system, message.target_component) for message in (mode, arm, land, set_point, rate_request)
+    } == {(7, 1)}
     assert (mode.command, mode.param1, mode.param2) == (d.MAV_CMD_DO_SET_MODE, 1, 6)
     assert (arm.command, arm.param1, arm.param2) == (d.MAV_CMD_COMPONENT_ARM_DISARM, 1, 0)
     assert land.command == d.MAV_CMD_NAV_LAND
     assert state.dialect.bring_down_command("return") == (d.MAV_CMD_NAV_RETURN_TO_LAUNCH,)
-    assert (lead.x, lead.y, lead.z) == (1.5, -2.5, -3.0)
-    assert lead.coordinate_frame == d.MAV_FRAME_LOCAL_NED
-    assert lead.yaw == -2.0
-    mask, flags = lead.type_mask, d.enums["POSITION_TARGET_TYPEMASK"]
+    assert (set_point.x, set_point.y, set_point.z) == (1.5, -2.5, -3.0)
+    assert set_point.coordinate_frame == d.MAV_FRAME_LOCAL_NED
+    assert set_point.yaw == -2.0
+    mask, flags = set_point.type_mask, d.enums["POSITION_TARGET_TYPEMASK"]
     ignored = {
         flag.name.removeprefix("POSITION_TARGET_TYPEMASK_") for bit, flag in flags.items() if mask & bit == bit
     }
     rates = {f"{kind}{axis}_IGNORE" for axis in "XYZ" for kind in "VA"}
     assert ignored == {*rates, "YAW_RATE_IGNORE"}
-    assert (ask.param1, ask.param2) == (d.MAVLINK_MSG_ID_ATTITUDE, 100_000)
+    assert (rate_request.param1, rate_request.param2) == (d.MAVLINK_MSG_ID_ATTITUDE, 100_000)
 
 
 def plan(legs: list[tuple[float, float, float]]) -> FlightPlan:
@@ -140,9 +142,9 @@ def plan(legs: list[tuple[float, float, float]]) -> FlightPlan:
 
 
 def test_acknowledgements_for_others_and_in_progress_are_ignored() -> None:
-    companion, other = (245, 191), (255, 190)
+    companion, other_station = (245, 191), (255, 190)
     state, _ = state_from(
-        d.MAVLink_command_ack_message(400, d.MAV_RESULT_DENIED, 0, 0, *other),
+        d.MAVLink_command_ack_message(400, d.MAV_RESULT_DENIED, 0, 0, *other_station),
         d.MAVLink_command_ack_message(22, d.MAV_RESULT_IN_PROGRESS, 40, 0, *companion),
         d.MAVLink_command_ack_message(176, d.MAV_RESULT_ACCEPTED, 0, 0, *companion),
         d.MAVLink_command_ack_message(21, d.MAV_RESULT_FAILED),
@@ -156,30 +158,31 @@ def test_acknowledgements_for_others_and_in_progress_are_ignored() -> None:
 
 @given(legs, st.floats(-math.pi, math.pi), st.tuples(metres, metres, metres))
 def test_path_length_is_independent_of_position_and_heading(
-    path_legs: list[tuple[float, float, float]], yaw_rad: float, begin_m: tuple[float, float, float]
+    path_legs: list[tuple[float, float, float]], yaw_rad: float, start_m: tuple[float, float, float]
 ) -> None:
-    corners_m = plan(path_legs).corners_m(FlightOrigin("local", "", begin_m[0], begin_m[1], yaw_rad), begin_m[2])
-    assert corners_m[0] == pytest.approx((begin_m[0], begin_m[1], begin_m[2] - 3.0))
+    corners_m = plan(path_legs).corners_m(FlightOrigin("local", "", start_m[0], start_m[1], yaw_rad), start_m[2])
+    assert corners_m[0] == pytest.approx((start_m[0], start_m[1], start_m[2] - 3.0))
     assert [math.dist(a, b) for a, b in pairwise(corners_m)] == pytest.approx(
         [math.hypot(*leg) for leg in path_legs], abs=1e-6
     )
-    assert corners_m[-1][2] == pytest.approx(begin_m[2] - 3.0 - sum(up for _, _, up in path_legs))
+    assert corners_m[-1][2] == pytest.approx(start_m[2] - 3.0 - sum(up for _, _, up in path_legs))
 
 
 def test_legs_ahead_and_left_follow_the_heading() -> None:
     _, ahead, left = plan([(4.0, 0.0, 0.0), (0.0, 2.0, 1.0)]).corners_m(
         FlightOrigin("local", "", 0.0, 0.0, math.pi / 2), 0.0
     )
-    assert ahead == pytest.approx((0.0, 4.0, -3.0)), "east"
-    assert left == pytest.approx((2.0, 4.0, -4.0)), "north of it, and up"
+    assert ahead == pytest.approx((0.0, 4.0, -3.0)), "the first leg is to the east"
+    assert left == pytest.approx((2.0, 4.0, -4.0)), "the second leg is to the north and up"
 
 
 @given(legs, st.floats(0, 400), st.floats(0, 400))
-def test_points_on_a_path_do_not_exceed_the_speed(
-    path_legs: list[tuple[float, float, float]], one_m: float, other_m: float
+def test_distance_of_two_points_does_not_exceed_the_path_between_them(
+    path_legs: list[tuple[float, float, float]], first_m: float, second_m: float
 ) -> None:
     corners_m = plan(path_legs).corners_m(FlightOrigin("local", "", 0.0, 0.0, 0.0), 0.0)
     assert (
-        math.dist(point_on_path(corners_m, one_m), point_on_path(corners_m, other_m)) <= abs(one_m - other_m) + 1e-6
+        math.dist(point_on_path(corners_m, first_m), point_on_path(corners_m, second_m))
+        <= abs(first_m - second_m) + 1e-6
     )
     assert point_on_path(corners_m, 1e6) == corners_m[-1]

@@ -21,46 +21,46 @@ from tests.helpers import drones
 from tests.helpers.sshd import free_port
 
 NEEDS = FlightNeeds(highest_m=3.0, farthest_m=20.0, ceiling_m=10.0, least_charge=0.2, returns=True)
-ALL = d.MAV_SYS_STATUS_SENSOR_GPS | d.MAV_SYS_STATUS_PREARM_CHECK
-WELL = 831
+ALL_SENSORS = d.MAV_SYS_STATUS_SENSOR_GPS | d.MAV_SYS_STATUS_PREARM_CHECK
+READY_EKF_FLAGS = 831
 """Flags of EKF_STATUS_REPORT of a ready ArduCopter, from its logs."""
 
 
-def beat(autopilot: int, mode: int = 0, base: int = 0) -> Any:  # noqa: ANN401 (of pymavlink)
+def heartbeat(autopilot: int, mode: int = 0, base: int = 0) -> Any:  # noqa: ANN401 (a type of pymavlink)
     return d.MAVLink_heartbeat_message(d.MAV_TYPE_QUADROTOR, autopilot, base, mode, d.MAV_STATE_STANDBY, 3)
 
 
-def status(healthy: int = ALL, charge: int = 90) -> Any:  # noqa: ANN401
-    return d.MAVLink_sys_status_message(ALL, ALL, healthy, 0, 12_000, 0, charge, 0, 0, 0, 0, 0, 0)
+def status(healthy: int = ALL_SENSORS, charge: int = 90) -> Any:  # noqa: ANN401
+    return d.MAVLink_sys_status_message(ALL_SENSORS, ALL_SENSORS, healthy, 0, 12_000, 0, charge, 0, 0, 0, 0, 0, 0)
 
 
 def parameter(name: str, value: float) -> Any:  # noqa: ANN401
     return d.MAVLink_param_value_message(name.encode(), value, d.MAV_PARAM_TYPE_REAL32, 1, 0)
 
 
-WITHOUT_FAULT: Mapping[str, Any] = {
-    "place": d.MAVLink_local_position_ned_message(1, 0, 0, 0, 0, 0, 0),
-    "estimate": d.MAVLink_ekf_status_report_message(WELL, 0.1, 0.1, 0.1, 0.1, 0.1),
+READY_MESSAGES: Mapping[str, Any] = {
+    "position": d.MAVLink_local_position_ned_message(1, 0, 0, 0, 0, 0, 0),
+    "estimate": d.MAVLink_ekf_status_report_message(READY_EKF_FLAGS, 0.1, 0.1, 0.1, 0.1, 0.1),
     "status": status(),
     "home": d.MAVLink_home_position_message(0, 0, 0, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0),
-    "back": parameter("RTL_ALT", 900),
+    "return_height": parameter("RTL_ALT", 900),
     "fence": parameter("FENCE_ENABLE", 1),
-    "kinds": parameter("FENCE_TYPE", 3),
-    "top": parameter("FENCE_ALT_MAX", 9),
+    "fence_type": parameter("FENCE_TYPE", 3),
+    "fence_height": parameter("FENCE_ALT_MAX", 9),
     "radius": parameter("FENCE_RADIUS", 50),
 }
 
 
-def faults(needs: FlightNeeds = NEEDS, first: Any = None, **replaced: Any) -> list[str]:  # noqa: ANN401
-    """Return the faults if an autopilot sends messages without a fault, except for those replaced by `replaced`."""
+def faults(needs: FlightNeeds = NEEDS, first_heartbeat: Any = None, **replacements: Any) -> list[str]:  # noqa: ANN401
+    """Return the faults if an autopilot sends the messages of a ready autopilot with replacements."""
     link, writer = MemoryLink(), d.MAVLink(None, srcSystem=7, srcComponent=1)
-    drone = AutopilotState(link)
-    link.coming = [(first or beat(d.MAV_AUTOPILOT_ARDUPILOTMEGA)).pack(writer)]
-    drone.receive()
-    check = ArmingCheck(drone, needs)
-    messages = [item for item in {**WITHOUT_FAULT, **replaced}.values() if item is not None]
-    link.coming = [item.pack(writer) for item in messages]
-    drone.receive()
+    autopilot = AutopilotState(link)
+    link.incoming_frames = [(first_heartbeat or heartbeat(d.MAV_AUTOPILOT_ARDUPILOTMEGA)).pack(writer)]
+    autopilot.receive()
+    check = ArmingCheck(autopilot, needs)
+    messages = [item for item in {**READY_MESSAGES, **replacements}.values() if item is not None]
+    link.incoming_frames = [item.pack(writer) for item in messages]
+    autopilot.receive()
     reported = list(check.faults())
     assert all(item.remedy for item in reported)
     return [item.what for item in reported]
@@ -69,15 +69,21 @@ def faults(needs: FlightNeeds = NEEDS, first: Any = None, **replaced: Any) -> li
 def test_no_faults_for_a_ready_autopilot() -> None:
     assert faults() == []
     assert faults(status=status(charge=-1)) == [], "the charge is unknown"
-    assert faults(replace(NEEDS, returns=False), home=None, back=None) == []
+    assert faults(replace(NEEDS, returns=False), home=None, return_height=None) == []
 
 
 @pytest.mark.parametrize(
-    ("replaced", "fault"),
+    ("replacements", "fault"),
     [
-        ({"first": beat(d.MAV_AUTOPILOT_GENERIC)}, "its autopilot is neither PX4 nor ArduCopter (0, 2)"),
-        ({"first": beat(d.MAV_AUTOPILOT_PX4, base=d.MAV_MODE_FLAG_SAFETY_ARMED)}, "its motors are running"),
-        ({"place": None}, "it does not report its position"),
+        (
+            {"first_heartbeat": heartbeat(d.MAV_AUTOPILOT_GENERIC)},
+            "its autopilot is neither PX4 nor ArduCopter (0, 2)",
+        ),
+        (
+            {"first_heartbeat": heartbeat(d.MAV_AUTOPILOT_PX4, base=d.MAV_MODE_FLAG_SAFETY_ARMED)},
+            "its motors are running",
+        ),
+        ({"position": None}, "it does not report its position"),
         (
             {"estimate": d.MAVLink_ekf_status_report_message(0xA7, 1, 1, 1, 1, 1)},
             "its position estimate is not valid",
@@ -89,42 +95,42 @@ def test_no_faults_for_a_ready_autopilot() -> None:
         ({"text": d.MAVLink_statustext_message(2, b"PreArm: Gyros inconsistent")}, "arm: Gyros inconsistent"),
         ({"home": None}, "it has no home position"),
         (
-            {"top": parameter("FENCE_ALT_MAX", 2.5)},
+            {"fence_height": parameter("FENCE_ALT_MAX", 2.5)},
             "the fence of its autopilot ends 2.5 m above home, but the flight needs 3 m",
         ),
         (
             {"radius": parameter("FENCE_RADIUS", 15)},
             "the fence of its autopilot ends 15 m from home, but the flight needs 20 m",
         ),
-        ({"back": parameter("RTL_ALT", 1500)}, "it returns at a height of 15 m, but only 10 m are allowed"),
+        ({"return_height": parameter("RTL_ALT", 1500)}, "it returns at a height of 15 m, but only 10 m are allowed"),
     ],
 )
-def test_each_fault_is_reported(replaced: dict[str, Any], fault: str) -> None:
-    assert any(fault in item for item in faults(**replaced)), faults(**replaced)
+def test_each_fault_is_reported(replacements: dict[str, Any], fault: str) -> None:
+    assert any(fault in item for item in faults(**replacements)), faults(**replacements)
 
 
 def test_text_in_pieces_is_joined() -> None:
-    long = b"PreArm: Battery 1 below minimum arming voltage, which is set by BATT_ARM_VOLT"
-    pieces = {f"text{n}": d.MAVLink_statustext_message(2, long[50 * n :][:50], 5, n) for n in range(2)}
+    long_text = b"PreArm: Battery 1 below minimum arming voltage, which is set by BATT_ARM_VOLT"
+    pieces = {f"text{n}": d.MAVLink_statustext_message(2, long_text[50 * n :][:50], 5, n) for n in range(2)}
     (fault,) = faults(**pieces)
     assert fault.endswith("to arm: Battery 1 below minimum arming voltage, which is set by BATT_ARM_VOLT")
 
 
 @pytest.mark.parametrize("firmware", [PX4, ARDUCOPTER])
 def test_emulated_autopilots(firmware: Firmware, capsys: pytest.CaptureFixture[str]) -> None:
-    unfit: list[str] = []
-    with drones.at_udp(firmware=replace(firmware, arming_errors=lambda _parameters, _battery: unfit)) as port:
+    arming_errors: list[str] = []
+    with drones.at_udp(firmware=replace(firmware, arming_errors=lambda _parameters, _battery: arming_errors)) as port:
         for reasons in ([], ["Gyros inconsistent"]):
-            unfit[:] = reasons
+            arming_errors[:] = reasons
             assert (
                 arming.check_arming(f"udpout:127.0.0.1:{port}", replace(NEEDS, ceiling_m=30.0), threading.Event())
                 == 0
             )
             *reported, summary = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
             assert summary["charge"] == 1.0
-            assert [item["what"].rpartition(": ")[2] for item in reported] == unfit
-            # The checks of PX4 apply to its present mode, which is not the item of the flight.
-            assert [item["grave"] for item in reported] == [summary["autopilot"] == "ArduCopter"] * len(unfit)
+            assert [item["what"].rpartition(": ")[2] for item in reported] == arming_errors
+            # PX4 checks its present mode, not the mode of the flight, so its errors do not prevent the flight.
+            assert [item["grave"] for item in reported] == [summary["autopilot"] == "ArduCopter"] * len(arming_errors)
 
 
 def test_missing_heartbeat_is_reported(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

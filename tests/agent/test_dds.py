@@ -1,4 +1,4 @@
-"""The adapter of CycloneDDS: its configuration, QoS policies, and types with the serialization of rosbags."""
+"""The CycloneDDS adapter: configuration, QoS policies, and types compared with the serialization of rosbags."""
 
 import xml.etree.ElementTree as ET
 
@@ -19,23 +19,23 @@ CUSTOM_TYPE = (
 )
 
 
-def topic(name: str, types: MessageTypes | None = None) -> Topic:
-    message_types = types or standard_types()
+def topic(name: str, message_types: MessageTypes | None = None) -> Topic:
+    message_types = message_types or standard_types()
     return Topic.from_json(topics.describe(message_types, "/t", name, PROFILES["default"], domain=0, node="n"))
 
 
-def test_serialized_scan_is_that_of_rosbags() -> None:
+def test_serialized_scan_equals_that_of_rosbags() -> None:
     store = standard_types().ros2
-    kinds = {name: store.types[f"{name}"] for name in topic("sensor_msgs/LaserScan").members}
-    time, header = kinds["builtin_interfaces/msg/Time"](5, 6), kinds["std_msgs/msg/Header"]
+    message_classes = {name: store.types[f"{name}"] for name in topic("sensor_msgs/LaserScan").members}
+    time, header = message_classes["builtin_interfaces/msg/Time"](5, 6), message_classes["std_msgs/msg/Header"]
     ranges = np.arange(360, dtype=np.float32)
-    message = kinds["sensor_msgs/msg/LaserScan"](header(time, "base"), 0, 1, 2, 3, 4, 5, 6, ranges, ranges)
+    message = message_classes["sensor_msgs/msg/LaserScan"](header(time, "base"), 0, 1, 2, 3, 4, 5, 6, ranges, ranges)
     written = bytes(store.serialize_cdr(message, "sensor_msgs/msg/LaserScan"))
 
     scan = dds.struct_type(topic("sensor_msgs/LaserScan"))
-    read = scan.deserialize(written)  # type: ignore[attr-defined]
-    assert read.header.frame_id == "base"
-    assert read.serialize(use_version_2=False) == written
+    parsed_message = scan.deserialize(written)  # type: ignore[attr-defined]
+    assert parsed_message.header.frame_id == "base"
+    assert parsed_message.serialize(use_version_2=False) == written
 
 
 @pytest.mark.parametrize(
@@ -43,28 +43,33 @@ def test_serialized_scan_is_that_of_rosbags() -> None:
     ["nav_msgs/Odometry", "sensor_msgs/Imu", "sensor_msgs/BatteryState", "geometry_msgs/Twist", "tf2_msgs/TFMessage"],
 )
 def test_all_types_of_robots_can_be_built(name: str) -> None:
-    """The binding reads and writes an all-zero message with the size from rosbags."""
-    described = topic(name)
-    struct = dds.struct_type(described)
+    """The binding reads and writes an all-zero message with the same size as rosbags."""
+    topic_description = topic(name)
+    struct = dds.struct_type(topic_description)
     empty = bytes((0, 1, 0, 0)) + bytes(2000)
-    read = struct.deserialize(empty)  # type: ignore[attr-defined]
-    written = read.serialize(use_version_2=False)
+    parsed_message = struct.deserialize(empty)  # type: ignore[attr-defined]
+    written = parsed_message.serialize(use_version_2=False)
     store = standard_types().ros2
-    converted = store.serialize_cdr(store.deserialize_cdr(written, described.type), described.type)
+    converted = store.serialize_cdr(store.deserialize_cdr(written, topic_description.type), topic_description.type)
     assert bytes(converted) == written
 
 
 def test_custom_type_can_be_built() -> None:
     types = MessageTypes(definitions={"lab_msgs/Radio": CUSTOM_TYPE})
-    kind = types.ros2.types["lab_msgs/msg/Radio"]
+    message_class = types.ros2.types["lab_msgs/msg/Radio"]
     level, raw = np.array([1, 2, 3, 4], np.float32), np.array([9, 8], np.uint8)
-    message = kind(
+    message = message_class(
         level, "x", raw, np.array([1], np.int16), good=True, one=7, wide=0.5, big=np.array([1, 2], np.int64)
     )
     written = bytes(types.ros2.serialize_cdr(message, "lab_msgs/msg/Radio"))
-    read = dds.struct_type(topic("lab_msgs/Radio", types)).deserialize(written)  # type: ignore[attr-defined]
-    assert (read.name, read.few, read.good, read.wide) == ("x", [1], True, 0.5)
-    assert read.serialize(use_version_2=False) == written
+    parsed_message = dds.struct_type(topic("lab_msgs/Radio", types)).deserialize(written)  # type: ignore[attr-defined]
+    assert (parsed_message.name, parsed_message.few, parsed_message.good, parsed_message.wide) == (
+        "x",
+        [1],
+        True,
+        0.5,
+    )
+    assert parsed_message.serialize(use_version_2=False) == written
 
 
 def test_types_have_the_dds_names_of_ros_2() -> None:
@@ -98,7 +103,7 @@ def test_setting_may_be_an_attribute() -> None:
 
 
 def test_library_accepts_the_recommended_settings() -> None:
-    """It does not start if it does not know an element."""
+    """CycloneDDS does not start with an unknown element."""
     settings = dict(tuning.recommended_settings("dds", "tcp"))
     dds.start(Network("127.0.0.1", discovery="peers", domain=97, settings=settings)).close()
     with pytest.raises(MiddlewareError, match="does not start"):

@@ -1,4 +1,4 @@
-"""A router that stops in flight and does not restart: all programs of the flight stop in time, with an alarm."""
+"""A router stops during a flight and does not restart: all programs of the flight stop in time, with an alarm."""
 
 import json
 import signal
@@ -23,7 +23,7 @@ from tests.helpers.mavlink_router import MavlinkRouter
 from tests.helpers.sshd import wait_until
 
 NO_HEARTBEAT_S: Final = 5.0
-"""Replaces `landing.NO_HEARTBEAT_S` by a shorter time, which is longer than the 4 s before an alarm."""
+"""The value of `landing.NO_HEARTBEAT_S` in this test. It is short, but longer than the 4 s before an alarm."""
 PROGRAM: Final = f"""\
 import sys
 from fieldkit.agent.flying import landing
@@ -35,10 +35,10 @@ HEIGHT_M: Final = 0.6
 
 
 @contextmanager
-def program(plan: FlightPlan, log: Path) -> Iterator["subprocess.Popen[bytes]"]:
+def running_program(plan: FlightPlan, log: Path) -> Iterator["subprocess.Popen[bytes]"]:
     with log.open("wb") as file:
-        words = (sys.executable, "-c", PROGRAM, "fly", json.dumps(asdict(plan)))
-        process = subprocess.Popen(words, stderr=file)
+        argv = (sys.executable, "-c", PROGRAM, "fly", json.dumps(asdict(plan)))
+        process = subprocess.Popen(argv, stderr=file)
     try:
         yield process
     finally:
@@ -46,7 +46,7 @@ def program(plan: FlightPlan, log: Path) -> Iterator["subprocess.Popen[bytes]"]:
         process.wait(60)
 
 
-def lines(log: Path) -> list[str]:
+def log_texts(log: Path) -> list[str]:
     return [line.partition(" ")[2] for line in log.read_text(encoding="utf-8").splitlines()]
 
 
@@ -61,27 +61,27 @@ def test_all_programs_stop_in_time_after_a_signal(tmp_path: Path) -> None:
         guard_plan = replace(pilot_plan, guards=True)
         pilot_plan = replace(pilot_plan, height_m=HEIGHT_M, ceiling_m=10.0, fence_m=20.0)
         logs = tmp_path / "guard.log", tmp_path / "pilot.log"
-        with program(guard_plan, logs[0]) as guard:
-            wait_until(lambda: "ready" in lines(logs[0]), Deadline.after(60))
-            with program(pilot_plan, logs[1]) as pilot:
+        with running_program(guard_plan, logs[0]) as guard:
+            wait_until(lambda: "ready" in log_texts(logs[0]), Deadline.after(60))
+            with running_program(pilot_plan, logs[1]) as pilot:
                 wait_until(lambda: autopilot.vehicle.body.position_m[2] > 0.9 * HEIGHT_M, Deadline.after(60))
-                wait_until(lambda: "up" in lines(logs[1]), Deadline.after(60))
+                wait_until(lambda: "up" in log_texts(logs[1]), Deadline.after(60))
                 server = server_pid(connection)
                 router.restart(3600.0)
                 for process in (pilot, guard):
                     process.send_signal(signal.SIGINT)
-                began_s = time.monotonic()
+                start_s = time.monotonic()
                 assert [process.wait(60) for process in (pilot, guard)] == [landing.REFUSED] * 2
-                ended_s = time.monotonic() - began_s
+                duration_s = time.monotonic() - start_s
                 wait_until(lambda: not is_running(server), Deadline.after(60))
-        assert ended_s >= NO_HEARTBEAT_S
-        assert autopilot.vehicle.is_armed, "it received no command"
+        assert duration_s >= NO_HEARTBEAT_S
+        assert autopilot.vehicle.is_armed, "the autopilot received no command"
     for log in logs:
-        texts = lines(log)
+        texts = log_texts(log)
         assert texts[-1] == f"error: no heartbeat of the autopilot for {NO_HEARTBEAT_S:g} s"
-        first = next(text for text in texts if text.startswith("ALARM: THE DRONE MAY STILL BE IN THE AIR"))
-        assert "LAST HEARTBEAT 4 S AGO" in first
-        assert first.endswith(landing.MANUAL_ACTION)
+        first_alarm = next(text for text in texts if text.startswith("ALARM: THE DRONE MAY STILL BE IN THE AIR"))
+        assert "LAST HEARTBEAT 4 S AGO" in first_alarm
+        assert first_alarm.endswith(landing.MANUAL_ACTION)
 
 
 def server_pid(connection: str) -> int:

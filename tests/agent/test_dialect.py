@@ -13,7 +13,7 @@ COPTER, PX4 = ArduCopter(), Px4()
 ACM = {name: number for number, name in mavutil.mode_mapping_acm.items()}
 
 
-def test_crc_extra_is_that_of_the_definitions() -> None:
+def test_crc_extra_equals_that_of_pymavlink() -> None:
     assert {kind: d.mavlink_map[kind].crc_extra for kind in mavlink_frames.CRC_EXTRA} == mavlink_frames.CRC_EXTRA
 
 
@@ -31,11 +31,11 @@ def test_crc_extra_is_that_of_the_definitions() -> None:
         (dialect.REQUEST, "REQUEST_MESSAGE"),
     ],
 )
-def test_command_numbers_are_those_of_pymavlink(number: int, name: str) -> None:
+def test_command_numbers_equal_those_of_pymavlink(number: int, name: str) -> None:
     assert d.enums["MAV_CMD"][number].name == f"MAV_CMD_{name}"
 
 
-def test_arducopter_modes_are_those_of_pymavlink() -> None:
+def test_arducopter_modes_equal_those_of_pymavlink() -> None:
     def mode(name: str) -> tuple[float, ...]:
         return (d.MAV_CMD_DO_SET_MODE, d.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, ACM[name])
 
@@ -45,7 +45,7 @@ def test_arducopter_modes_are_those_of_pymavlink() -> None:
     assert [name for name, number in ACM.items() if COPTER.is_guided(number)] == ["GUIDED"]
 
 
-def test_px4_modes_are_those_of_pymavlink() -> None:
+def test_px4_modes_equal_those_of_pymavlink() -> None:
     base, main, _ = mavutil.px4_map["OFFBOARD"]
     assert base & d.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
     assert PX4.guided_command() == (d.MAV_CMD_DO_SET_MODE, d.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, main)
@@ -53,14 +53,16 @@ def test_px4_modes_are_those_of_pymavlink() -> None:
     assert guided == ["OFFBOARD"]
 
 
-def test_mode_names_are_those_of_pymavlink() -> None:
-    px4 = {name: PX4.mode_name(main << 16 | sub << 24) for name, (_, main, sub) in mavutil.px4_map.items()}
-    del px4["RTGS"], px4["FOLLOWME"]  # not in px4_custom_mode.h any more, which has FOLLOW_TARGET
-    assert {name: full_name.rpartition(".")[2] for name, full_name in px4.items()} == {name: name for name in px4}
+def test_mode_names_equal_those_of_pymavlink() -> None:
+    px4_modes = {name: PX4.mode_name(main << 16 | sub << 24) for name, (_, main, sub) in mavutil.px4_map.items()}
+    del px4_modes["RTGS"], px4_modes["FOLLOWME"]  # no longer in px4_custom_mode.h, which has FOLLOW_TARGET
+    assert {name: full_name.rpartition(".")[2] for name, full_name in px4_modes.items()} == {
+        name: name for name in px4_modes
+    }
     assert PX4.mode_name(4 << 16 | 6 << 24) == "AUTO.LAND"
     obsolete = {"POSITION", "OF_LOITER", "RATE_ACRO"}
-    named = {name: COPTER.mode_name(number) for name, number in ACM.items() if name not in obsolete}
-    assert named == {name: name for name in named}
+    acm_types = {name: COPTER.mode_name(number) for name, number in ACM.items() if name not in obsolete}
+    assert acm_types == {name: name for name in acm_types}
     assert (COPTER.mode_name(99), PX4.mode_name(99 << 16)) == ("99", str(99 << 16))
 
 
@@ -69,20 +71,20 @@ def test_program_controlled_and_landing_modes() -> None:
     assert {name for name, number in ACM.items() if COPTER.lands_or_returns(number)} == {
         *("RTL", "LAND", "SMART_RTL", "AUTO_RTL")
     }
-    px4 = {name: main << 16 | sub << 24 for name, (_, main, sub) in mavutil.px4_map.items()}
-    assert {name for name in px4 if PX4.is_program_controlled(px4[name])} == {
+    px4_modes = {name: main << 16 | sub << 24 for name, (_, main, sub) in mavutil.px4_map.items()}
+    assert {name for name in px4_modes if PX4.is_program_controlled(px4_modes[name])} == {
         "OFFBOARD",
         "TAKEOFF",
         "LOITER",
         "MISSION",
     }
-    assert {name for name in px4 if PX4.lands_or_returns(px4[name])} == {"RTL", "LAND"}
+    assert {name for name in px4_modes if PX4.lands_or_returns(px4_modes[name])} == {"RTL", "LAND"}
 
 
-def test_dialect_for_an_autopilot() -> None:
-    flown = {kind for kind in range(64) if COPTER.matches(d.MAV_AUTOPILOT_ARDUPILOTMEGA, kind)}
-    named = {kind for kind in range(64) if mavutil.mode_mapping_byname(kind) == ACM}
-    assert flown == named
+def test_each_dialect_matches_its_autopilots() -> None:
+    copter_types = {kind for kind in range(64) if COPTER.matches(d.MAV_AUTOPILOT_ARDUPILOTMEGA, kind)}
+    acm_types = {kind for kind in range(64) if mavutil.mode_mapping_byname(kind) == ACM}
+    assert copter_types == acm_types
     assert not COPTER.matches(d.MAV_AUTOPILOT_PX4, d.MAV_TYPE_QUADROTOR)
     assert PX4.matches(d.MAV_AUTOPILOT_PX4, d.MAV_TYPE_QUADROTOR)
     assert not PX4.matches(d.MAV_AUTOPILOT_ARDUPILOTMEGA, d.MAV_TYPE_QUADROTOR)

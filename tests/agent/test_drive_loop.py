@@ -1,4 +1,4 @@
-"""The loop of the driver on a simulated clock: messages compared with rosbags, the lease, zeros at the end."""
+"""The loop of the driver on a simulated clock: messages compared with rosbags, the lease, and the final zeros."""
 
 import json
 import math
@@ -40,13 +40,15 @@ def odometry(pose: OdometryPose, *, cdr: bool, frame: str = "odom", child_frame:
     stamp = kinds["builtin_interfaces/msg/Time"](0, 0)
     header = kinds["std_msgs/msg/Header"](*((stamp, frame) if cdr else (numbers[0], stamp, frame)))
     point = kinds["geometry_msgs/msg/Point"](pose.x_m, pose.y_m, 0.0)
-    turned = kinds["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(pose.yaw_rad / 2), math.cos(pose.yaw_rad / 2))
+    orientation = kinds["geometry_msgs/msg/Quaternion"](
+        0.0, 0.0, math.sin(pose.yaw_rad / 2), math.cos(pose.yaw_rad / 2)
+    )
     zeros = __import__("numpy").zeros(36)
     vector = kinds["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
     message = kinds["nav_msgs/msg/Odometry"](
         header,
         child_frame,
-        kinds["geometry_msgs/msg/PoseWithCovariance"](kinds["geometry_msgs/msg/Pose"](point, turned), zeros),
+        kinds["geometry_msgs/msg/PoseWithCovariance"](kinds["geometry_msgs/msg/Pose"](point, orientation), zeros),
         kinds["geometry_msgs/msg/TwistWithCovariance"](kinds["geometry_msgs/msg/Twist"](vector, vector), zeros),
     )
     serialize = store.serialize_cdr if cdr else store.serialize_ros1
@@ -54,11 +56,11 @@ def odometry(pose: OdometryPose, *, cdr: bool, frame: str = "odom", child_frame:
 
 
 @pytest.mark.parametrize("cdr", [False, True])
-@pytest.mark.parametrize("names", [("odom", "base_footprint"), ("", ""), ("o", "abcdefghi")])
-def test_messages_are_those_of_rosbags(names: tuple[str, str], cdr: bool) -> None:
+@pytest.mark.parametrize("frame_names", [("odom", "base_footprint"), ("", ""), ("o", "abcdefghi")])
+def test_messages_equal_those_of_rosbags(frame_names: tuple[str, str], cdr: bool) -> None:
     pose = OdometryPose(3.5, -2.25, 1.25)
-    read = read_odometry(odometry(pose, cdr=cdr, frame=names[0], child_frame=names[1]), cdr=cdr)
-    assert read == pytest.approx(pose)
+    parsed_pose = read_odometry(odometry(pose, cdr=cdr, frame=frame_names[0], child_frame=frame_names[1]), cdr=cdr)
+    assert parsed_pose == pytest.approx(pose)
     kinds = STORES[cdr].types
     vector = kinds["geometry_msgs/msg/Vector3"]
     expected = kinds["geometry_msgs/msg/Twist"](vector(0.25, 0.0, 0.0), vector(0.0, 0.0, -0.5))
@@ -72,7 +74,7 @@ def test_messages_are_those_of_rosbags(names: tuple[str, str], cdr: bool) -> Non
     st.integers(0, (1 << 31) * 10**9 - 1),
     st.booleans(),
 )
-def test_stamped_velocities_are_those_of_rosbags(frame: str, at_ns: int, cdr: bool) -> None:
+def test_stamped_velocities_equal_those_of_rosbags(frame: str, at_ns: int, cdr: bool) -> None:
     store, kind = STORES[cdr], "geometry_msgs/msg/TwistStamped"
     encoder = VelocityEncoder(kind, frame, cdr=cdr)
     for sequence in (1, 2):
@@ -96,8 +98,8 @@ def test_invalid_odometry_is_none(data: bytes, cdr: bool) -> None:
 
 def test_odometry_with_nan_is_none() -> None:
     sample = odometry(OdometryPose(1.0, 2.0, 0.5), cdr=False)
-    at = sample.index(struct.pack("<d", 1.0))
-    assert read_odometry(sample[:at] + struct.pack("<d", math.nan) + sample[at + 8 :], cdr=False) is None
+    offset = sample.index(struct.pack("<d", 1.0))
+    assert read_odometry(sample[:offset] + struct.pack("<d", math.nan) + sample[offset + 8 :], cdr=False) is None
 
 
 class World:
@@ -105,9 +107,9 @@ class World:
 
     version = "world 1"
 
-    def __init__(self, orders: Path, *, leaves_s: float = math.inf) -> None:
+    def __init__(self, orders: Path, *, orders_end_s: float = math.inf) -> None:
         self.now_s = 100.0
-        self.orders, self.leaves_s = orders, leaves_s
+        self.orders, self.orders_end_s = orders, orders_end_s
         self.pose = OdometryPose(1.0, 1.0, 0.3)
         self.sent: list[DriveVelocity] = []
         self.stamps_ns: list[int] = []
@@ -115,7 +117,7 @@ class World:
         self.types: set[str] = set()
         self.count_subscribers: Callable[[], int] = lambda: 1
         self.deliver: Deliver | None = None
-        self.over = False
+        self.is_stopped = False
 
     # The methods of a clock and of an event.
     def monotonic(self) -> float:
@@ -125,10 +127,10 @@ class World:
         return round(1e9 * self.now_s)
 
     def sleep(self, for_s: float) -> None:
-        self.wait(for_s)  # the robot moves on and reports its odometry
+        self.wait(for_s)  # the robot continues to move and reports its odometry
 
     def is_set(self) -> bool:
-        return self.over
+        return self.is_stopped
 
     def wait(self, for_s: float) -> bool:
         self.now_s += for_s
@@ -140,10 +142,10 @@ class World:
         )
         if self.deliver is not None:
             self.deliver(odometry(self.pose, cdr=False), 0)
-        if self.now_s < self.leaves_s:
+        if self.now_s < self.orders_end_s:
             order = "out" if self.now_s < 104 else "back"
             self.orders.write_text(f"{round(1e3 * self.now_s)} {order} 2\n", encoding="ascii")
-        return self.over
+        return self.is_stopped
 
     # The methods of a middleware.
     def publisher(self, topic: Topic) -> Any:  # noqa: ANN401
@@ -169,7 +171,7 @@ class World:
 def run(
     world: World, monkeypatch: pytest.MonkeyPatch, folder: Path, *, kind: str = "geometry_msgs/msg/Twist"
 ) -> tuple[str, list[dict[str, Any]], dict[str, Any]]:
-    """Drive; return the reason for the end, the log and the last status."""
+    """Drive; return the reason for the stop, the log and the last status."""
     monkeypatch.setattr(drive, "time", world)
     monkeypatch.setattr(drive, "now_s", world.monotonic)
     arguments: Mapping[str, Any] = {
@@ -181,15 +183,17 @@ def run(
         "orders": str(world.orders),
         "status": str(folder / "status"),
     }
-    reason = drive.drive(world, arguments, folder / "log", world)  # type: ignore[arg-type]
+    stop_reason = drive.drive(world, arguments, folder / "log", world)  # type: ignore[arg-type]
     log = [json.loads(line) for line in (folder / "log").read_text(encoding="ascii").splitlines()]
-    return reason, log, json.loads((folder / "status").read_text(encoding="ascii"))
+    return stop_reason, log, json.loads((folder / "status").read_text(encoding="ascii"))
 
 
-def test_drives_out_and_back_and_ends_with_zero_velocity(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_robot_drives_out_and_back_and_ends_with_zero_velocity(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     world = World(tmp_path / "orders")
-    ended, log, status = run(world, monkeypatch, tmp_path)
-    assert (ended, status["ended"], status["phase"]) == ("", "home", "home")
+    stop_reason, log, status = run(world, monkeypatch, tmp_path)
+    assert (stop_reason, status["ended"], status["phase"]) == ("", "home", "home")
     assert log[-1].items() - {("crc32", log[-1]["crc32"]), ("n", log[-1]["n"])} <= status.items()
     assert max(line["x_m"] for line in log) == pytest.approx(0.5, abs=0.05)
     assert math.dist(world.pose[:2], (1.0, 1.0)) < 0.05
@@ -202,28 +206,28 @@ def test_stamped_velocities_have_the_time_of_the_robot_and_the_frame_of_its_prof
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     world = World(tmp_path / "orders")
-    ended, log, status = run(world, monkeypatch, tmp_path, kind=STAMPED)
-    assert (ended, status["ended"], world.frames) == ("", "home", {"base"})
+    stop_reason, log, status = run(world, monkeypatch, tmp_path, kind=STAMPED)
+    assert (stop_reason, status["ended"], world.frames) == ("", "home", {"base"})
     assert world.stamps_ns == sorted(set(world.stamps_ns))
     assert log[0]["utc_ns"] in world.stamps_ns
     assert world.sent[-8:] == [DriveVelocity()] * 8
 
 
 @pytest.mark.parametrize("kind", ["geometry_msgs/msg/Twist", STAMPED])
-def test_lost_laptop_stops_it(kind: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    world = World(tmp_path / "orders", leaves_s=100.9)
-    ended, log, status = run(world, monkeypatch, tmp_path, kind=kind)
-    assert ended == status["ended"] == "no order from the laptop for 2 s"
+def test_lost_laptop_stops_the_robot(kind: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    world = World(tmp_path / "orders", orders_end_s=100.9)
+    stop_reason, log, status = run(world, monkeypatch, tmp_path, kind=kind)
+    assert stop_reason == status["ended"] == "no order from the laptop for 2 s"
     assert log[-1]["utc_ns"] / 1e9 < 100.9 + 2.0 + 0.7
     assert world.sent[-8:] == [DriveVelocity()] * 8
 
 
-def test_signal_stops_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_signal_stops_the_robot(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     world = World(tmp_path / "orders")
-    world.count_subscribers = lambda: setattr(world, "over", world.now_s > 100.5) or 1  # type: ignore[func-returns-value]
+    world.count_subscribers = lambda: setattr(world, "is_stopped", world.now_s > 100.5) or 1  # type: ignore[func-returns-value]
     monkeypatch.setattr(World, "is_set", lambda self: self.now_s > 101.0)
-    ended, _, status = run(world, monkeypatch, tmp_path)
-    assert ended == status["ended"] == "ordered to stop"
+    stop_reason, _, status = run(world, monkeypatch, tmp_path)
+    assert stop_reason == status["ended"] == "ordered to stop"
     assert world.sent[-8:] == [DriveVelocity()] * 8
 
 

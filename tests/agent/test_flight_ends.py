@@ -25,14 +25,14 @@ from tests.helpers.sshd import wait_until
 HEIGHT_M = 0.6
 LIMITS = ("GAP_S", "HEARTBEAT_S", "COMMAND_TIMEOUT_S", "_FLIGHT_HEARTBEAT_TIMEOUT_S", "_POSITION_TIMEOUT_S")
 """Time limits of a flight, each of which could end it on a busy machine."""
-LONG_S = 60.0
+LONG_LIMIT_S = 60.0
 SLOW_MACHINE = f"""\
 import sys
 from fieldkit.agent.flying import landing
 from fieldkit.agent.flying import guard, liveness, loop
-landing._MODE_WAIT_S = guard.GAP_S = liveness.SILENCE_TIMEOUT_S = {LONG_S}
+landing._MODE_WAIT_S = guard.GAP_S = liveness.SILENCE_TIMEOUT_S = {LONG_LIMIT_S}
 for name in {LIMITS}:
-    setattr(loop, name, {LONG_S})
+    setattr(loop, name, {LONG_LIMIT_S})
 from fieldkit.agent.__main__ import main
 sys.exit(main(sys.argv[1:]))
 """
@@ -41,9 +41,9 @@ sys.exit(main(sys.argv[1:]))
 
 @pytest.fixture
 def _long_limits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Set limits that a busy machine does not exceed; a test shortens the one that it needs."""
+    """Set limits that a busy machine does not exceed. A test shortens the limit under test."""
     for name in LIMITS:
-        monkeypatch.setattr(loop, name, LONG_S)
+        monkeypatch.setattr(loop, name, LONG_LIMIT_S)
 
 
 def plan(folder: Path, port: int) -> FlightPlan:
@@ -68,8 +68,8 @@ def wait_until_down(autopilot: Autopilot) -> None:
 
 @contextmanager
 def agent(flight_plan: FlightPlan) -> Iterator["subprocess.Popen[bytes]"]:
-    words = (sys.executable, "-c", SLOW_MACHINE, "fly", json.dumps(asdict(flight_plan)))
-    process = subprocess.Popen(words, stderr=subprocess.PIPE)
+    argv = (sys.executable, "-c", SLOW_MACHINE, "fly", json.dumps(asdict(flight_plan)))
+    process = subprocess.Popen(argv, stderr=subprocess.PIPE)
     try:
         yield process
     finally:
@@ -90,7 +90,7 @@ def test_pilot_without_disk_space_for_its_output_lands(tmp_path: Path) -> None:
         assert process.wait(60) == 0
 
 
-def test_full_disk_does_not_end_a_flight(tmp_path: Path) -> None:
+def test_log_on_a_full_disk_does_not_end_a_flight(tmp_path: Path) -> None:
     """The log of positions ends, but the flight continues."""
     order(tmp_path, 1, CLIMB)
     with (
@@ -106,7 +106,7 @@ def test_full_disk_does_not_end_a_flight(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("_long_limits")
 @pytest.mark.parametrize(
-    ("lost", "reason"),
+    ("lost_message", "reason"),
     [
         (None, "no heartbeat of the autopilot for 2 s"),
         (LOCAL_POSITION_NED, "it has not reported its position for 2 s"),
@@ -114,19 +114,23 @@ def test_full_disk_does_not_end_a_flight(tmp_path: Path) -> None:
     ids=["everything", "positions"],
 )
 def test_autopilot_without_reports_is_commanded_to_land(
-    lost: int | None, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    lost_message: int | None,
+    reason: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
-    """It may receive commands although its answers are lost."""
-    monkeypatch.setattr(loop, "_POSITION_TIMEOUT_S" if lost else "_FLIGHT_HEARTBEAT_TIMEOUT_S", 2.0)
-    is_silent, codes = threading.Event(), list[int]()
+    """The autopilot may still receive commands although its messages are lost."""
+    monkeypatch.setattr(loop, "_POSITION_TIMEOUT_S" if lost_message else "_FLIGHT_HEARTBEAT_TIMEOUT_S", 2.0)
+    is_silent, exit_codes = threading.Event(), list[int]()
     order(tmp_path, 1, CLIMB)
 
     def damage(frame: bytes) -> list[bytes]:
-        return [] if is_silent.is_set() and lost in {None, parse_frame(frame).kind} else [frame]
+        return [] if is_silent.is_set() and lost_message in {None, parse_frame(frame).kind} else [frame]
 
     with drones.autopilot_at_udp(damage) as (port, autopilot):
         flight_plan, finished = plan(tmp_path, port), threading.Event()
-        pilot = threading.Thread(target=lambda: codes.append(flight.fly(flight_plan, finished)))
+        pilot = threading.Thread(target=lambda: exit_codes.append(flight.fly(flight_plan, finished)))
         pilot.start()
         try:
             wait_until_up(autopilot)
@@ -137,7 +141,7 @@ def test_autopilot_without_reports_is_commanded_to_land(
         finally:
             finished.set()
             pilot.join(60)
-    assert codes == [landing.REFUSED]
+    assert exit_codes == [landing.REFUSED]
     assert reason in capfd.readouterr().err
 
 
@@ -145,14 +149,14 @@ def test_autopilot_without_reports_is_commanded_to_land(
 def test_silent_autopilot_ends_the_flight_with_an_alarm(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """As behind a stopped router: the alarm is logged first, and the program exits some time later."""
+    """As if its router had stopped: the alarm is logged first, and the program exits some time later."""
     monkeypatch.setattr(loop, "_FLIGHT_HEARTBEAT_TIMEOUT_S", 5.0)
     monkeypatch.setattr(landing, "NO_HEARTBEAT_S", 1.0)
-    is_silent, finished, codes = threading.Event(), threading.Event(), list[int]()
+    is_silent, finished, exit_codes = threading.Event(), threading.Event(), list[int]()
     order(tmp_path, 1, CLIMB)
     with drones.autopilot_at_udp(lambda frame: [] if is_silent.is_set() else [frame]) as (port, autopilot):
         flight_plan = plan(tmp_path, port)
-        pilot = threading.Thread(target=lambda: codes.append(flight.fly(flight_plan, finished)))
+        pilot = threading.Thread(target=lambda: exit_codes.append(flight.fly(flight_plan, finished)))
         pilot.start()
         try:
             wait_until_up(autopilot)
@@ -161,7 +165,7 @@ def test_silent_autopilot_ends_the_flight_with_an_alarm(
         finally:
             finished.set()
             pilot.join(60)
-    assert codes == [landing.REFUSED]
+    assert exit_codes == [landing.REFUSED]
     lines = capfd.readouterr().err.splitlines()
     texts = [line.partition(" ")[2] for line in lines]
     alarms = [number for number, text in enumerate(texts) if text.startswith("ALARM: THE DRONE MAY STILL BE")]
@@ -171,7 +175,7 @@ def test_silent_autopilot_ends_the_flight_with_an_alarm(
 
 
 def test_drone_with_stopped_motors_is_released(tmp_path: Path) -> None:
-    """As after a crash, or by a kill switch; an ArduCopter keeps its mode."""
+    """As after a crash or by a kill switch. An ArduCopter does not change its mode."""
     order(tmp_path, 1, CLIMB)
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot), agent(plan(tmp_path, port)) as process:
         wait_until_up(autopilot)
@@ -202,8 +206,8 @@ def test_guard_does_not_command_drone_taken_over_from_suspended_pilot(tmp_path: 
                 wait_until_up(autopilot)
                 is_silent.set()
                 autopilot.vehicle.change_mode(Mode.LOITER)
-                received = guard_iterations() + 2
-                wait_until(lambda: guard_iterations() >= received, Deadline.after(60))
+                min_iterations = guard_iterations() + 2
+                wait_until(lambda: guard_iterations() >= min_iterations, Deadline.after(60))
                 pilot.send_signal(signal.SIGSTOP)
                 assert pilot.wait(60) == -signal.SIGKILL
                 is_silent.clear()

@@ -15,7 +15,7 @@ from fieldkit.agent.flying.liveness import GUARD, PILOT, LivenessFile
 from fieldkit.core.deadline import Deadline
 from tests.helpers.sshd import wait_until
 
-BEATS = """\
+PILOT_PROGRAM = """\
 import sys, time
 from fieldkit.agent.flying.liveness import FLYING, PILOT, LivenessFile
 file = LivenessFile(sys.argv[1], PILOT)
@@ -27,8 +27,8 @@ for count in range(10**9):
 
 
 @contextmanager
-def pilot(path: Path, beats: int) -> Iterator["subprocess.Popen[bytes]"]:
-    process = subprocess.Popen((sys.executable, "-c", BEATS, str(path), str(beats)))
+def running_pilot(path: Path, n_updates: int) -> Iterator["subprocess.Popen[bytes]"]:
+    process = subprocess.Popen((sys.executable, "-c", PILOT_PROGRAM, str(path), str(n_updates)))
     try:
         yield process
     finally:
@@ -38,8 +38,8 @@ def pilot(path: Path, beats: int) -> Iterator["subprocess.Popen[bytes]"]:
 
 def test_exit_suspension_and_hang_are_detected(tmp_path: Path) -> None:
     liveness_file = LivenessFile(str(tmp_path / "file"), GUARD)
-    assert liveness_file.poll() == "has ended", "it has not started"
-    with pilot(tmp_path / "file", 10**9) as process:
+    assert liveness_file.poll() == "has ended", "the pilot has not started"
+    with running_pilot(tmp_path / "file", 10**9) as process:
         wait_until(lambda: liveness_file.poll() == "", Deadline.after(60))
         assert liveness_file.other_state == liveness.FLYING
         process.send_signal(signal.SIGSTOP)
@@ -47,7 +47,7 @@ def test_exit_suspension_and_hang_are_detected(tmp_path: Path) -> None:
         liveness_file.kill_other()
         assert process.wait(60) == -signal.SIGKILL
         assert liveness_file.poll() == "has ended"
-    with pilot(tmp_path / "file", 5):
+    with running_pilot(tmp_path / "file", 5):
         wait_until(lambda: liveness_file.poll().startswith("has not run for"), Deadline.after(60))
 
 
@@ -63,6 +63,6 @@ def test_other_process_with_the_same_pid_is_not_killed(tmp_path: Path) -> None:
     assert os.getpid()
 
 
-def test_full_disk_prevents_the_flight() -> None:
+def test_file_that_cannot_be_created_prevents_the_flight() -> None:
     with pytest.raises(FileNotFoundError):
         LivenessFile("/nowhere/liveness", PILOT)

@@ -1,4 +1,4 @@
-"""The origin of flights and their fence: later starts, reboots, and points outside."""
+"""The origin of flights and their fence: later starts, reboots, and points outside the fence."""
 
 import math
 from dataclasses import replace
@@ -38,19 +38,21 @@ def test_after_a_reboot_latitude_and_longitude_give_the_position() -> None:
     start = replace(FIRST, frame_id=rebooted, x_m=0.0, y_m=0.0, latitude_deg=48.0 + 1.0 / 111_200)
     origin = resolve_origin(FIRST, start)
     assert (origin.x_m, origin.y_m) == pytest.approx((-1.0, 0.0), abs=0.01)
-    east = replace(start, latitude_deg=48.0, longitude_deg=11.0 + 1.0 / (111_200 * math.cos(math.radians(48))))
-    assert resolve_origin(FIRST, east).y_m == pytest.approx(-1.0, abs=0.01)
+    farther_east = replace(
+        start, latitude_deg=48.0, longitude_deg=11.0 + 1.0 / (111_200 * math.cos(math.radians(48)))
+    )
+    assert resolve_origin(FIRST, farther_east).y_m == pytest.approx(-1.0, abs=0.01)
 
 
 def test_distant_start_and_reboot_without_gps_are_rejected() -> None:
-    unknown = {"latitude_deg": None, "longitude_deg": None}
+    without_gps = {"latitude_deg": None, "longitude_deg": None}
     with pytest.raises(OriginError, match=r"2\.5 m from the place .* bearing of 90 degrees"):
-        resolve_origin(FIRST, replace(FIRST, y_m=FIRST.y_m + START_M + 0.5, **unknown))  # type: ignore[arg-type]
+        resolve_origin(FIRST, replace(FIRST, y_m=FIRST.y_m + START_M + 0.5, **without_gps))  # type: ignore[arg-type]
     with pytest.raises(OriginError, match="has rebooted"):
-        resolve_origin(FIRST, replace(FIRST, frame_id=frame_id("boot", 500.0), **unknown))  # type: ignore[arg-type]
+        resolve_origin(FIRST, replace(FIRST, frame_id=frame_id("boot", 500.0), **without_gps))  # type: ignore[arg-type]
 
 
-def test_same_frame_until_a_reboot() -> None:
+def test_frame_is_the_same_until_a_reboot() -> None:
     assert is_same_frame(frame_id("boot", 100.0), frame_id("boot", 103.0))
     assert not is_same_frame(frame_id("boot", 100.0), frame_id("other", 100.0))
     assert not is_same_frame(frame_id("boot", 100.0), frame_id("boot", 160.0))
@@ -69,9 +71,9 @@ def test_set_points_are_clamped_to_the_fence(north_m: float, east_m: float, down
 
 def test_position_beyond_fence_and_margin_is_a_breach() -> None:
     fence = FlightFence(FIRST, 0.0, radius_m=20.0, ceiling_m=5.0)
-    out_m = 20.0 + FENCE_MARGIN_M
-    assert not fence.breach((FIRST.x_m + out_m - 0.1, FIRST.y_m, -4.0))
-    assert "from its origin" in fence.breach((FIRST.x_m + out_m + 0.1, FIRST.y_m, -4.0))
+    limit_m = 20.0 + FENCE_MARGIN_M
+    assert not fence.breach((FIRST.x_m + limit_m - 0.1, FIRST.y_m, -4.0))
+    assert "from its origin" in fence.breach((FIRST.x_m + limit_m + 0.1, FIRST.y_m, -4.0))
     assert "above the ground" in fence.breach((FIRST.x_m, FIRST.y_m, -5.1 - FENCE_MARGIN_M))
 
 

@@ -1,4 +1,4 @@
-"""Node information of DDS participants: the same bytes as rosbags writes for the message of ROS 2."""
+"""Node information of DDS participants: compared with the serialization of the ROS 2 message by rosbags."""
 
 from typing import Any
 
@@ -20,22 +20,24 @@ TYPES_BY_DISTRIBUTION = {
 
 @pytest.mark.parametrize("distribution", TYPES_BY_DISTRIBUTION)
 @given(GUIDS, st.from_regex(r"[a-z][a-z0-9_]{0,20}", fullmatch=True), st.lists(GUIDS), st.lists(GUIDS))
-def test_message_is_that_of_rosbags(
+def test_message_equals_that_of_rosbags(
     distribution: Distribution, participant: bytes, node: str, readers: list[bytes], writers: list[bytes]
 ) -> None:
     store, size = TYPES_BY_DISTRIBUTION[distribution].ros2, distribution.gid_bytes
-    kinds: Any = store.types
+    message_types: Any = store.types
 
-    def gid(guid: bytes) -> Any:  # noqa: ANN401 (of rosbags)
-        return kinds["rmw_dds_common/msg/Gid"](np.frombuffer(guid.ljust(size, b"\0"), np.uint8))
+    def gid(guid: bytes) -> Any:  # noqa: ANN401 (a type of rosbags)
+        return message_types["rmw_dds_common/msg/Gid"](np.frombuffer(guid.ljust(size, b"\0"), np.uint8))
 
     gids = [[gid(guid) for guid in guids] for guids in (readers, writers)]
-    actual = kinds[TYPE](gid(participant), [kinds["rmw_dds_common/msg/NodeEntitiesInfo"]("/", node, *gids)])
+    actual = message_types[TYPE](
+        gid(participant), [message_types["rmw_dds_common/msg/NodeEntitiesInfo"]("/", node, *gids)]
+    )
     assert graph.entities_info(participant, node, readers, writers, size) == bytes(store.serialize_cdr(actual, TYPE))
 
 
 @pytest.mark.parametrize("distribution", TYPES_BY_DISTRIBUTION)
-def test_members_are_those_of_the_distribution(distribution: Distribution) -> None:
+def test_members_match_the_distribution(distribution: Distribution) -> None:
     fields = TYPES_BY_DISTRIBUTION[distribution].fields(TYPE)
     actual = graph.topic(distribution.gid_bytes)
     # The bound of a name has no effect on readers.

@@ -22,14 +22,14 @@ LIMIT_S = "90"
 
 
 @contextmanager
-def end(host: TestHost, verb: str, middleware_name: str, file: Path) -> Iterator[subprocess.Popen[str]]:
+def running_endpoint(host: TestHost, verb: str, middleware_name: str, file: Path) -> Iterator[subprocess.Popen[str]]:
     """Run a publisher or subscription while the body runs."""
     quality = parse_qos(f"transient_local,depth={DEPTH}")
     topic = topics.describe(standard_types(), "/map", TYPE, quality, domain=0, node=verb)
     network = {"address": host.address, "node": verb}
-    words = (verb, middleware_name, json.dumps(network), json.dumps(topic), str(file))
-    inside = ("timeout", "-k", "10", LIMIT_S, "nsenter", "-t", str(host.pid), "-n")
-    command = (*inside, sys.executable, str(WIRE_END), *words)
+    arguments = (verb, middleware_name, json.dumps(network), json.dumps(topic), str(file))
+    namespace_command = ("timeout", "-k", "10", LIMIT_S, "nsenter", "-t", str(host.pid), "-n")
+    command = (*namespace_command, sys.executable, str(WIRE_END), *arguments)
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             yield process
@@ -47,16 +47,16 @@ def test_late_subscription_receives_the_last_samples(middleware_name: str, tmp_p
     file.write_text("\n".join(published), encoding="ascii")
     with (
         two_connected_hosts() as (publishing, subscribing),
-        end(publishing, "say", middleware_name, file) as publisher,
+        running_endpoint(publishing, "say", middleware_name, file) as publisher,
     ):
-        with end(subscribing, "hear", middleware_name, file) as early_subscriber:
+        with running_endpoint(subscribing, "hear", middleware_name, file) as early_subscriber:
             assert early_subscriber.stdout is not None
             for line in early_subscriber.stdout:
                 if line.strip() == published[-1]:
                     break
             assert publisher.stdout is not None
             assert publisher.stdout.readline() == "matched\n"
-        # All samples were published before.
-        with end(subscribing, "hear", middleware_name, file) as late_subscriber:
+        # All samples have been published before this subscription starts.
+        with running_endpoint(subscribing, "hear", middleware_name, file) as late_subscriber:
             assert late_subscriber.stdout is not None
             assert [late_subscriber.stdout.readline().strip() for _ in range(DEPTH)] == published[-DEPTH:]

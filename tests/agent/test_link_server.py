@@ -1,4 +1,4 @@
-"""The link server with its clients: each kind of connection, faults of the server, restarts of a router."""
+"""The link server with its clients: all kinds of connections, faults of the server, and restarts of a router."""
 
 import json
 import os
@@ -35,11 +35,11 @@ def drone_at(kind: str) -> Iterator[str]:
         with drones.at_terminal() as path:
             yield f"{path}:115200"
     elif kind == "udpin":
-        with socket.socket(type=socket.SOCK_DGRAM) as drone, socket.socket(type=socket.SOCK_DGRAM) as free:
+        with socket.socket(type=socket.SOCK_DGRAM) as drone, socket.socket(type=socket.SOCK_DGRAM) as free_socket:
             drone.bind(("127.0.0.1", 0))
-            free.bind(("127.0.0.1", 0))
-            address = free.getsockname()
-            free.close()
+            free_socket.bind(("127.0.0.1", 0))
+            address = free_socket.getsockname()
+            free_socket.close()
             with drones.flying(drone.fileno(), lambda frame: drone.sendto(frame, address), drone.recv) as autopilot:
                 greeting = drones.Sender(255, 190).frame(drones.beat())
                 list(autopilot.receive(greeting, drones.PEER, time.monotonic_ns()))
@@ -70,23 +70,23 @@ def links_of(sessions: list[AutopilotSession]) -> list[SharedLink]:
 
 def exchange_until(sessions: list[AutopilotSession], condition: Callable[[], bool]) -> float:
     """Let clients exchange messages until a condition is true; return the duration."""
-    began_s = time.monotonic()
+    start_s = time.monotonic()
     while not condition():
-        assert time.monotonic() < began_s + PATIENCE_S
+        assert time.monotonic() < start_s + PATIENCE_S
         for session in sessions:
             session.exchange(0.02)
-    return time.monotonic() - began_s
+    return time.monotonic() - start_s
 
 
 def servers(connection: str) -> list[int]:
-    """Return the server processes of a connection."""
+    """Return the process ids of the servers of a connection."""
     pids = list[int]()
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         try:
-            words = path.read_bytes().split(b"\0")
+            arguments = path.read_bytes().split(b"\0")
         except OSError:
             continue
-        if b"link" in words and json.dumps({"connection": connection}).encode() in words:
+        if b"link" in arguments and json.dumps({"connection": connection}).encode() in arguments:
             pids.append(int(path.parent.name))
     return pids
 

@@ -1,4 +1,4 @@
-"""Reads of the newest sample at a rate, with the records that they leave in the log."""
+"""Reads of the newest sample at a fixed rate, and their records in the log."""
 
 import threading
 from pathlib import Path
@@ -24,42 +24,42 @@ def test_newest_sample_has_the_highest_number(numbers: list[int]) -> None:
         assert sample.read() == (highest, 1000 + highest)
 
 
-class WatchedLog(Log):
-    """A log that sets an event at a number of reads, and may be full then."""
+class CountingLog(Log):
+    """A log that sets an event after a number of reads, and optionally reports a full disk at this read."""
 
     def __init__(self, path: Path, *, reads: int, is_full: bool = False) -> None:
         super().__init__(str(path))
         self.reached = threading.Event()
-        self._missing, self._is_full = reads, is_full
+        self._remaining_reads, self._is_full = reads, is_full
 
     def note(self, kind: int, at_ns: int, *, size: int = 0, sequence: int = 0, sent_ns: int = 0) -> None:
         super().note(kind, at_ns, size=size, sequence=sequence, sent_ns=sent_ns)
-        self._missing -= 1
-        if self._missing == 0:
+        self._remaining_reads -= 1
+        if self._remaining_reads == 0:
             self.reached.set()
             if self._is_full:
                 raise LogError("the disk is full")
 
 
 def test_reads_are_logged_at_the_rate_until_the_body_ends(tmp_path: Path) -> None:
-    log, sample = WatchedLog(tmp_path / "log", reads=21), NewestSample()
+    log, sample = CountingLog(tmp_path / "log", reads=21), NewestSample()
     with logged_reads(sample, 200.0, log, threading.Event()):
         assert log.reached.wait(LIMIT_S)
         log.reached.clear()
-        log._missing = 10
+        log._remaining_reads = 10
         sample.offer(4, 17)
         assert log.reached.wait(LIMIT_S)
     rows = topic_logs.rows(tmp_path / "log")
     assert {row[0] for row in rows} == {records.READ}
-    read = [(row[3], row[4]) for row in rows]
-    assert read[:21] == [(-1, 0)] * 21
-    assert read[-1] == (4, 17)
+    logged_samples = [(row[3], row[4]) for row in rows]
+    assert logged_samples[:21] == [(-1, 0)] * 21
+    assert logged_samples[-1] == (4, 17)
     first_ns, last_ns = rows[0][-1], rows[-1][-1]
-    # A tick is never early; on a busy machine some are left out.
+    # A read is never early, and a busy machine omits some reads.
     assert len(rows) <= (last_ns - first_ns) / 1e9 * 200 + 2
 
 
-def test_without_a_rate_nothing_is_read(tmp_path: Path) -> None:
+def test_no_sample_is_read_without_a_rate(tmp_path: Path) -> None:
     log = Log(str(tmp_path / "log"))
     threads = threading.active_count()
     with logged_reads(NewestSample(), 0.0, log, threading.Event()):
@@ -68,6 +68,6 @@ def test_without_a_rate_nothing_is_read(tmp_path: Path) -> None:
 
 
 def test_full_disk_stops_the_program(tmp_path: Path) -> None:
-    log, stop_event = WatchedLog(tmp_path / "log", reads=3, is_full=True), threading.Event()
+    log, stop_event = CountingLog(tmp_path / "log", reads=3, is_full=True), threading.Event()
     with pytest.raises(LogError, match="full"), logged_reads(NewestSample(), 1000.0, log, stop_event):
         assert stop_event.wait(LIMIT_S)

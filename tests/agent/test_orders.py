@@ -1,4 +1,4 @@
-"""Orders of the laptop: each is read once and in sequence, expires, and invalid files are ignored."""
+"""Orders of the laptop are read once and in sequence, and expire; invalid files are ignored."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ def test_orders_are_read_once_in_sequence_and_expire(tmp_path: Path) -> None:
     path = tmp_path / "orders"
     orders = Orders(str(path), ORDERS, 60.0)
     assert not orders.poll(), "there is no file"
-    for text, order, new in (
+    for text, order, is_new in (
         ("", "stay", False),
         ("1 climb 30\n", "climb", True),
         ("1 home 30", "climb", False),
@@ -29,7 +29,7 @@ def test_orders_are_read_once_in_sequence_and_expire(tmp_path: Path) -> None:
         ("8 home 30", "home", True),
     ):
         path.write_text(text, encoding="ascii")
-        assert orders.poll() is new, text
+        assert orders.poll() is is_new, text
         assert orders.order == order, text
         assert not orders.expired
     path.write_text("9 home -1", encoding="ascii")

@@ -1,4 +1,4 @@
-"""The agent with a real ROS 2: rclpy of Kilted over Fast DDS, from separate packages (`.ci/install --dev`)."""
+"""The agent with a real ROS 2 node: rclpy of Kilted over Fast DDS, installed separately by `.ci/install --dev`."""
 
 import json
 import signal
@@ -28,10 +28,10 @@ SIZE = 201
 
 
 def arguments(host: TestHost, topic: str, node: str) -> str:
-    described = topics.describe(standard_types(), topic, TYPE, PROFILES["default"], domain=DOMAIN, node=node)
+    topic_description = topics.describe(standard_types(), topic, TYPE, PROFILES["default"], domain=DOMAIN, node=node)
     network = {"address": host.address, "domain": DOMAIN, "node": node}
     stream = {"over": "dds", "size_bytes": SIZE, "rate_hz": 20.0, "duration_s": 3.0, "patience_s": 60.0}
-    return json.dumps({"network": network, "topic": described, "stream": stream})
+    return json.dumps({"network": network, "topic": topic_description, "stream": stream})
 
 
 def samples(path: Path) -> dict[int, int]:
@@ -44,16 +44,18 @@ def samples(path: Path) -> dict[int, int]:
 def test_real_node_and_agent_exchange_samples(tmp_path: Path) -> None:
     program = tmp_path / "agent.pyz"
     program.write_bytes(agent.content())
-    sent, received = tmp_path / "sent", tmp_path / "came"
+    sent_log, received_log = tmp_path / "sent", tmp_path / "received"
     command = (sys.executable, str(program))
     with (
         two_connected_hosts() as (agent_ns, ros2_ns),
-        agent_ns.start((*command, "subscribe", arguments(agent_ns, "/again", "ears"), str(received))) as subscriber,
-        agent_ns.start((*command, "publish", arguments(agent_ns, "/stream", "mouth"), str(sent))) as publisher,
+        agent_ns.start(
+            (*command, "subscribe", arguments(agent_ns, "/again", "listener"), str(received_log))
+        ) as subscriber,
+        agent_ns.start((*command, "publish", arguments(agent_ns, "/stream", "talker"), str(sent_log))) as publisher,
     ):
         environment = ("env", f"ROS_DOMAIN_ID={DOMAIN}", f"ROS_HOME={tmp_path}")
-        inside = ("nsenter", "-t", str(ros2_ns.pid), "-n", *environment, str(ROS2), str(NODE), str(COUNT), TYPE)
-        completed = subprocess.run(inside, capture_output=True, check=False, timeout=120)
+        node_command = ("nsenter", "-t", str(ros2_ns.pid), "-n", *environment, str(ROS2), str(NODE), str(COUNT), TYPE)
+        completed = subprocess.run(node_command, capture_output=True, check=False, timeout=120)
         publisher.communicate(timeout=120)
         subscriber.send_signal(signal.SIGINT)
         subscriber.communicate(timeout=30)
@@ -63,7 +65,7 @@ def test_real_node_and_agent_exchange_samples(tmp_path: Path) -> None:
     assert (report["reliability"], report["depth"]) == ("RELIABLE", PROFILES["default"].depth)
     assert report["subscribers"] == [TYPE]
 
-    times = samples(sent)
+    sent_ns_by_sequence = samples(sent_log)
     codec = SampleCodec(Stream("dds", SIZE, 20.0, 3.0, 60.0))
     assert len(report["heard"]) == COUNT
     for sample, republished in zip(
@@ -71,10 +73,10 @@ def test_real_node_and_agent_exchange_samples(tmp_path: Path) -> None:
     ):
         _, sequence, sent_ns = HEAD.unpack_from(sample, struct.calcsize("<4sIII"))
         expected = codec.encode(sequence, sent_ns)
-        assert times[sequence] == sent_ns
+        assert sent_ns_by_sequence[sequence] == sent_ns
         # Equal to the serialization of ROS 2, except for the padding of the last word.
         assert republished.startswith(expected)
         assert len(republished) - len(expected) < 4
-    received_samples = samples(received)
+    received_samples = samples(received_log)
     assert received_samples
-    assert all(times[sequence] == sent_ns for sequence, sent_ns in received_samples.items())
+    assert all(sent_ns_by_sequence[sequence] == sent_ns for sequence, sent_ns in received_samples.items())

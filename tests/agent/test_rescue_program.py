@@ -1,4 +1,4 @@
-"""The rescue program: it kills the pilot and the guard, and lands a drone that their flight still controls."""
+"""The rescue program kills the pilot and the guard, and lands a drone that their flight still controls."""
 
 import signal
 import subprocess
@@ -23,7 +23,7 @@ from tests.helpers import drones
 from tests.helpers.sshd import wait_until
 
 HEIGHT_M = 1.0
-BEATS = """\
+UPDATE_LOOP = """\
 import sys, time
 from fieldkit.agent.flying.liveness import FLYING, IDLE, LivenessFile
 file = LivenessFile(sys.argv[1], int(sys.argv[2]))
@@ -39,25 +39,25 @@ def plan(folder: Path, port: int) -> FlightPlan:
 
 
 @contextmanager
-def programs(folder: Path) -> Iterator[list["subprocess.Popen[bytes]"]]:
-    """Run a pilot and a guard that are suspended after a while."""
+def suspended_programs(folder: Path) -> Iterator[list["subprocess.Popen[bytes]"]]:
+    """Run a pilot and a guard, and suspend both after their start."""
     path = folder / "liveness"
     with ExitStack() as stack:
-        pair = [
-            subprocess.Popen((sys.executable, "-c", BEATS, str(path), str(party)))
-            for party in (liveness.PILOT, liveness.GUARD)
+        processes = [
+            subprocess.Popen((sys.executable, "-c", UPDATE_LOOP, str(path), str(role)))
+            for role in (liveness.PILOT, liveness.GUARD)
         ]
-        for process in pair:
+        for process in processes:
             stack.callback(process.wait, 60)
             stack.callback(process.kill)
         wait_until(lambda: have_started(path), Deadline.after(60))
-        for process in pair:
+        for process in processes:
             process.send_signal(signal.SIGSTOP)
-        yield pair
+        yield processes
 
 
 def have_started(path: Path) -> bool:
-    """Return True if both programs are in the file."""
+    """Return True if both programs have updated the file."""
     life_entries = entries(path) if path.exists() else ()
     return bool(life_entries) and all(entry.iterations for entry in life_entries)
 
@@ -68,7 +68,7 @@ def entries(path: Path) -> tuple[liveness.LifeEntry, ...]:
 
 
 def fly_up(autopilot: Autopilot, firmware: Firmware) -> None:
-    """Let the drone hover in the guided mode; a PX4 follows one set-point and then misses the next one."""
+    """Let the drone hover in guided mode. Afterwards a PX4 receives no more set-points."""
     vehicle = autopilot.vehicle
     wait_until(lambda: not vehicle.arming_errors, Deadline.after(60))
     if firmware is PX4:
@@ -79,26 +79,26 @@ def fly_up(autopilot: Autopilot, firmware: Firmware) -> None:
         wait_until(lambda: send_set_point(autopilot) > 0.8 * HEIGHT_M, Deadline.after(60))
     else:
         vehicle.take_off(HEIGHT_M)
-        wait_until(lambda: vehicle.mode is Mode.OFFBOARD and up_m(autopilot) > 0.8 * HEIGHT_M, Deadline.after(60))
+        wait_until(lambda: vehicle.mode is Mode.OFFBOARD and height_m(autopilot) > 0.8 * HEIGHT_M, Deadline.after(60))
 
 
 def send_set_point(autopilot: Autopilot) -> float:
     autopilot.vehicle.accept_set_point(SetPoint((0.0, 0.0, HEIGHT_M), is_position=True))
-    return up_m(autopilot)
+    return height_m(autopilot)
 
 
-def up_m(autopilot: Autopilot) -> float:
+def height_m(autopilot: Autopilot) -> float:
     return autopilot.vehicle.body.position_m[2]
 
 
 @pytest.mark.parametrize("firmware", [PX4, ARDUCOPTER], ids=["px4", "arducopter"])
 def test_pilot_and_guard_are_killed_before_the_drone_lands(tmp_path: Path, firmware: Firmware) -> None:
-    with drones.autopilot_at_udp(firmware=firmware) as (port, autopilot), programs(tmp_path) as pair:
+    with drones.autopilot_at_udp(firmware=firmware) as (port, autopilot), suspended_programs(tmp_path) as processes:
         fly_up(autopilot, firmware)
         if firmware is PX4:
             wait_until(lambda: autopilot.vehicle.mode is Mode.LOITER, Deadline.after(60))
         assert flight.fly(plan(tmp_path, port), threading.Event()) == 0
-        assert [process.wait(60) for process in pair] == [-signal.SIGKILL] * 2
+        assert [process.wait(60) for process in processes] == [-signal.SIGKILL] * 2
         assert not autopilot.vehicle.is_armed
         assert autopilot.vehicle.body.on_ground
 
@@ -107,21 +107,21 @@ def test_pilot_and_guard_are_killed_before_the_drone_lands(tmp_path: Path, firmw
 def test_drone_that_a_person_has_taken_over_is_not_commanded(
     tmp_path: Path, firmware: Firmware, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    with drones.autopilot_at_udp(firmware=firmware) as (port, autopilot), programs(tmp_path):
+    with drones.autopilot_at_udp(firmware=firmware) as (port, autopilot), suspended_programs(tmp_path):
         fly_up(autopilot, firmware)
         if firmware is PX4:
             wait_until(lambda: autopilot.vehicle.mode is Mode.LOITER, Deadline.after(60))
         autopilot.vehicle.change_mode(Mode.LOITER if firmware is PX4 else Mode.POSHOLD)
         assert flight.fly(plan(tmp_path, port), threading.Event()) == landing.TAKEN_OVER
         assert autopilot.vehicle.is_armed
-        assert up_m(autopilot) > 0.5 * HEIGHT_M
+        assert height_m(autopilot) > 0.5 * HEIGHT_M
     assert "nothing more is sent" in capfd.readouterr().err
 
 
 def test_stop_signal_does_not_stop_the_rescue(tmp_path: Path) -> None:
     finished = threading.Event()
     finished.set()
-    with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot), programs(tmp_path):
+    with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot), suspended_programs(tmp_path):
         fly_up(autopilot, ARDUCOPTER)
         assert flight.fly(plan(tmp_path, port), finished) == 0
         assert autopilot.vehicle.body.on_ground
@@ -145,6 +145,8 @@ def test_connection_that_cannot_be_opened_ends_with_an_alarm(
 ) -> None:
     monkeypatch.setattr(rescue, "NO_HEARTBEAT_S", 1.0)
     (tmp_path / "liveness").touch()
-    closed = FlightPlan("tcp:127.0.0.1:9", "", "land", 0.0, rescues=True, liveness=str(tmp_path / "liveness"))
-    assert flight.fly(closed, threading.Event()) == landing.REFUSED
+    unreachable_plan = FlightPlan(
+        "tcp:127.0.0.1:9", "", "land", 0.0, rescues=True, liveness=str(tmp_path / "liveness")
+    )
+    assert flight.fly(unreachable_plan, threading.Event()) == landing.REFUSED
     assert landing.MANUAL_ACTION in capfd.readouterr().err

@@ -1,4 +1,4 @@
-"""The adapter of Zenoh: attachments compared with Zenoh's serializer, and the configuration of the library."""
+"""The Zenoh adapter: attachments compared with the serializer of Zenoh, and the configuration of the library."""
 
 import json
 
@@ -12,11 +12,11 @@ from fieldkit.agent.messaging import zenoh as adapter
 from fieldkit.agent.messaging.middleware import Network
 from fieldkit.ros.middlewares import tuning
 
-numbers = st.integers(-(2**63), 2**63 - 1)
+int64_values = st.integers(-(2**63), 2**63 - 1)
 
 
-@given(numbers, numbers, st.binary(min_size=16, max_size=16))
-def test_attachments_are_those_of_zenohs_serializer(sequence: int, at_ns: int, gid: bytes) -> None:
+@given(int64_values, int64_values, st.binary(min_size=16, max_size=16))
+def test_attachments_equal_those_of_the_zenoh_serializer(sequence: int, at_ns: int, gid: bytes) -> None:
     """`zenoh::ext::Serializer` with the three values that rmw_zenoh uses."""
     fields = (zenoh.ext.Int64(sequence), zenoh.ext.Int64(at_ns), gid)
     assert adapter.ATTACHMENT.pack(sequence, at_ns, len(gid), gid) == zenoh.ext.z_serialize(fields).to_bytes()
@@ -55,7 +55,7 @@ def test_router_contacts_no_peers() -> None:
     assert "connect/endpoints" not in configuration
 
 
-def test_settings_are_json_values_or_texts() -> None:
+def test_settings_are_json_values_or_strings() -> None:
     network = Network("10.0.0.1", settings={"transport/link/tx/batch_size": "1400", "mode": "client"})
     configuration = adapter.configuration(network, "peer")
     assert (configuration["transport/link/tx/batch_size"], configuration["mode"]) == (1400, "client")
@@ -63,7 +63,7 @@ def test_settings_are_json_values_or_texts() -> None:
 
 @pytest.mark.parametrize("transport", ["tcp", "udp"])
 def test_library_accepts_the_recommended_settings(transport: str) -> None:
-    """It refuses a path, or a value, that it does not know."""
+    """The library rejects unknown paths and values."""
     recommended_settings = tuning.recommended_settings("zenoh", transport)
     configuration = adapter.configuration(
         Network("10.0.0.1", transport=transport, settings=recommended_settings), "peer"

@@ -54,7 +54,7 @@ def test_counts_are_summed_and_intervals_are_over_repeats() -> None:
     assert cell.estimates["rtt_loss"].value == 0
 
 
-def test_shares_of_bytes_and_times_vary_by_the_repeat() -> None:
+def test_intervals_of_byte_shares_and_times_are_over_repeats() -> None:
     rows = [replace(UDP, byte_loss=0.01 * n, transfer_s=1.0 + n) for n in range(9)]
     (cell,) = summarize(rows)
     loss, time = cell.estimates["byte_loss"], cell.estimates["transfer_s"]
@@ -79,8 +79,8 @@ def test_a_cell_without_a_valid_row_is_kept_without_estimates() -> None:
     cells = summarize([replace(UDP, status="failed")])
     assert cells[0].estimates == {}
     header, line = result_tables.to_csv(DEFAULT_BY, cells).splitlines()
-    named = dict(zip(header.split(","), line.split(","), strict=True))
-    assert {name: value for name, value in named.items() if value} == {
+    values = dict(zip(header.split(","), line.split(","), strict=True))
+    assert {name: value for name, value in values.items() if value} == {
         "procedure": "los",
         "scenario": "los",
         "topology": "master",
@@ -102,7 +102,7 @@ def test_a_single_repeat_has_no_interval_over_repeats() -> None:
     assert cell.estimates["ip_loss"].wilson_low is not None
 
 
-def test_more_arrivals_than_sent_because_of_offload_give_no_interval() -> None:
+def test_more_received_than_sent_packets_because_of_offload_give_no_interval() -> None:
     (cell,) = summarize([replace(UDP, paper_packets=22, paper_received=209, paper_loss=1 - 209 / 22)])
     loss = cell.estimates["paper_loss"]
     assert (loss.value, loss.low, loss.wilson_low, loss.wilson_high) == (1 - 209 / 22, None, None, None)
@@ -153,17 +153,17 @@ def test_any_column_can_identify_conditions_and_missing_values_come_first() -> N
 def test_intervals_depend_only_on_the_rows_of_their_cell() -> None:
     rows = [replace(UDP, transfer_s=float(n) ** 1.5, byte_loss=n / 97) for n in range(12)]
     (cell,) = summarize(rows)
-    among = summarize([replace(UDP, distance="1m"), *rows])[1]
-    assert among == cell
+    same_cell = summarize([replace(UDP, distance="1m"), *rows])[1]
+    assert same_cell == cell
 
 
 def test_no_rows_give_no_cells() -> None:
     assert summarize([]) == ()
 
 
-def test_columns_that_an_older_table_lacks_are_missing() -> None:
-    read = parse(b"protocol,status,transfer_s,hash_match\nudp,valid,1.5,true\nudp,void,,\n", trial_columns())
-    assert read.column("transfer_s") == [1.5, None]
-    assert read.column("hash_match") == [1.0, None]
-    assert read.column("ip_loss") == [None, None]
-    assert read.column("scenario") == ["", ""]
+def test_columns_that_an_older_table_lacks_have_no_values() -> None:
+    older_table = parse(b"protocol,status,transfer_s,hash_match\nudp,valid,1.5,true\nudp,void,,\n", trial_columns())
+    assert older_table.column("transfer_s") == [1.5, None]
+    assert older_table.column("hash_match") == [1.0, None]
+    assert older_table.column("ip_loss") == [None, None]
+    assert older_table.column("scenario") == ["", ""]

@@ -1,4 +1,4 @@
-"""Tests for independence in time: exact variances, rate of false alarms, and power."""
+"""Statistical tests of independence in time: exact variances, false positive rate, and power."""
 
 import json
 from itertools import permutations
@@ -17,13 +17,13 @@ START_NS = 1_795_262_410_000_000_000
 
 def autoregressive(random: np.random.Generator, cells: int, n: int, coefficient: float) -> independence.Floats:
     values = np.zeros((cells, n + 50))
-    for at in range(1, n + 50):
-        values[:, at] = coefficient * values[:, at - 1] + random.normal(size=cells)
+    for index in range(1, n + 50):
+        values[:, index] = coefficient * values[:, index - 1] + random.normal(size=cells)
     return values[:, 50:]
 
 
 @pytest.mark.parametrize("ranks", [[0, 1, 2, 3, 4, 5], [0, 0, 0, 1, 2, 2], [0, 0, 5, 5, 5, 9]])
-def test_the_variances_are_those_over_all_permutations(ranks: list[int]) -> None:
+def test_the_variances_equal_those_over_all_permutations(ranks: list[int]) -> None:
     centred = np.array(list(permutations(ranks)), dtype=np.float64)
     centred -= centred.mean(axis=1, keepdims=True)
     statistic, variance = independence._von_neumann(centred)
@@ -38,17 +38,17 @@ def test_ranks_and_trend_equal_scipy() -> None:
     assert independence._ranks(values) + 1 == pytest.approx(scipy.stats.rankdata(values, axis=1))
     centred = independence._ranks(values)
     centred -= centred.mean(axis=1, keepdims=True)
-    by_scipy = [scipy.stats.spearmanr(row, np.arange(25)) for row in values]
+    scipy_results = [scipy.stats.spearmanr(row, np.arange(25)) for row in values]
     correlation, variance = independence._spearman(centred)
-    assert correlation == pytest.approx([abs(item.statistic) for item in by_scipy])
+    assert correlation == pytest.approx([abs(result.statistic) for result in scipy_results])
     assert 2 * independence._upper_tail(correlation, variance) == pytest.approx(
-        [item.pvalue for item in by_scipy], rel=0.02
+        [result.pvalue for result in scipy_results], rel=0.02
     )
 
 
 def test_the_correction_equals_scipy() -> None:
-    some = np.random.default_rng(2).random(40) ** 3
-    assert independence.corrected(some) == pytest.approx(scipy.stats.false_discovery_control(some))
+    p_values = np.random.default_rng(2).random(40) ** 3
+    assert independence.corrected(p_values) == pytest.approx(scipy.stats.false_discovery_control(p_values))
     assert not len(independence.corrected(np.empty(0)))
 
 
@@ -57,15 +57,15 @@ def test_the_correction_equals_scipy() -> None:
 def test_about_5_percent_of_the_tables_of_independent_repeats_have_a_mark(n: int, ties: bool) -> None:
     random = np.random.default_rng(3)
     tables, cells = 1500, 30
-    drawn = random.binomial(29, 0.3, (tables * cells, n)) if ties else random.normal(size=(tables * cells, n))
-    values = np.asarray(drawn, dtype=np.float64)
+    samples = random.binomial(29, 0.3, (tables * cells, n)) if ties else random.normal(size=(tables * cells, n))
+    values = np.asarray(samples, dtype=np.float64)
     result = np.nan_to_num(independence.p_values(values), nan=1.0).reshape(tables, cells)
-    marked = np.mean([(independence.corrected(item) < 0.05).any() for item in result])
-    assert 0.03 < marked < 0.08
+    marked_share = np.mean([(independence.corrected(table_p_values) < 0.05).any() for table_p_values in result])
+    assert 0.03 < marked_share < 0.08
 
 
 @pytest.mark.parametrize(("n", "coefficient", "result"), [(10, 0.8, 48), (20, 0.8, 86), (40, 0.8, 99), (20, 0.5, 51)])
-def test_the_power_for_dependent_repeats_is_that_of_the_docs(n: int, coefficient: float, result: float) -> None:
+def test_the_power_for_dependent_repeats_equals_that_in_the_docs(n: int, coefficient: float, result: float) -> None:
     values = autoregressive(np.random.default_rng(4), 4000, n, coefficient)
     assert 100 * (independence.p_values(values) < 0.05).mean() == pytest.approx(result, abs=2.5)
 
@@ -77,24 +77,24 @@ def test_too_few_repeats_or_values_are_not_tested() -> None:
 
 
 def rows(times_s: list[float]) -> list[RepeatRow]:
-    """Repeats whose rows are not in the order of time."""
+    """Return repeats whose rows are not in chronological order."""
     table = [
         replace(ROW, repeat=1 + n, started_utc_ns=START_NS + n * 10**10, transfer_s=time_s, rtt_median_s=None)
         for n, time_s in enumerate(times_s)
     ]
-    return [table[at] for at in np.random.default_rng(5).permutation(len(table))]
+    return [table[index] for index in np.random.default_rng(5).permutation(len(table))]
 
 
 def test_a_trend_is_reported_in_tables_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     noise = np.random.default_rng(6).normal(0, 0.2, 20)
     path = write(tmp_path, rows([1 + 0.1 * n + noise[n] for n in range(20)]))
-    words = ["aggregate", str(path), "--quantity", "transfer_s", "--format"]
-    assert main([*words, "table"]) == 0
+    argv = ["aggregate", str(path), "--quantity", "transfer_s", "--format"]
+    assert main([*argv, "table"]) == 0
     output = capsys.readouterr().out
     assert "]!" in output
     assert "! repeats are not independent in time" in output
     assert "Randomize the order" in output
-    assert main([*words, "json"]) == 0
+    assert main([*argv, "json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert "transfer time" in result["cautions"][0]
     assert result["cells"][0]["estimates"]["transfer_s"]["p_order"] < 0.001

@@ -1,4 +1,4 @@
-"""Many tables of repeats read as one."""
+"""Reading of several tables of repeats as a single table."""
 
 import ctypes
 import os
@@ -29,9 +29,11 @@ CLONE_FS: Final = 0x200
 
 
 def are_equal(first: Repeats, second: Repeats) -> bool:
-    texts = all((column == second.texts[name]).all() for name, column in first.texts.items() if name != "source")
-    return texts and all(
-        np.array_equal(column, second.numbers[name], equal_nan=True) for name, column in first.numbers.items()
+    texts_are_equal = all(
+        (array == second.texts[name]).all() for name, array in first.texts.items() if name != "source"
+    )
+    return texts_are_equal and all(
+        np.array_equal(array, second.numbers[name], equal_nan=True) for name, array in first.numbers.items()
     )
 
 
@@ -60,7 +62,7 @@ def test_a_dataset_is_read_from_a_thread_with_another_working_folder(tmp_path: P
 
     def read_relative() -> int:
         assert ctypes.CDLL(None).unshare(CLONE_FS) == 0
-        os.chdir(tmp_path)  # of this thread only
+        os.chdir(tmp_path)  # changes the folder of this thread only
         return len(read([Path("results")], trial_columns()))
 
     with ThreadPoolExecutor(1) as pool:
@@ -71,10 +73,10 @@ def test_a_dataset_is_read_from_a_thread_with_another_working_folder(tmp_path: P
 def test_tables_of_other_versions_are_in_the_order_of_the_paths(tmp_path: Path) -> None:
     rows = repeats(ROW, 6)
     paths = [write(tmp_path / str(n), [row]) for n, row in enumerate(rows)]
-    short = ("schema_version", "trial", "protocol", "repeat", "attempt", "status", "transfer_s")
+    old_columns = ("schema_version", "trial", "protocol", "repeat", "attempt", "status", "transfer_s")
     for path, row in list(zip(paths, rows, strict=True))[::2]:
-        values = [str(getattr(row, name)) for name in short]
-        path.write_text(f"{','.join(short)}\n{','.join(values)}\n", encoding="utf-8")
+        values = [str(getattr(row, name)) for name in old_columns]
+        path.write_text(f"{','.join(old_columns)}\n{','.join(values)}\n", encoding="utf-8")
     rows_read = read(paths, trial_columns())
     assert rows_read.column("transfer_s") == pytest.approx([row.transfer_s for row in rows])
     assert rows_read.column("scenario") == ["", "los"] * 3
@@ -90,12 +92,12 @@ VALUES: dict[str, st.SearchStrategy[Any]] = {
     "count": st.integers(0, 2**53) | st.integers(0, 9),
     "B": st.integers(0, 2**53),
 }
-"""Values of a column by its unit; those of all others are floats."""
+"""Values of a column by its unit. Columns with other units have floats."""
 
 
 @st.composite
 def rows_of_anything(draw: st.DrawFn) -> list[dict[str, Any]]:
-    """Return rows in which each of a few columns has any value that its unit allows, or none."""
+    """Return rows in which a few columns have any values that their units allow, or no value."""
     names = draw(st.lists(st.sampled_from(list(UNITS)), max_size=8, unique=True))
     values = {name: VALUES.get(UNITS[name], st.floats()) for name in names}
     return draw(st.lists(st.fixed_dictionaries({}, optional=values), max_size=4))
@@ -112,10 +114,10 @@ def test_rows_equal_those_read_from_their_table(rows: list[dict[str, Any]]) -> N
         ]
 
 
-splits = st.lists(st.integers(0, 12), max_size=5).map(sorted)
+cut_points = st.lists(st.integers(0, 12), max_size=5).map(sorted)
 
 
-@given(splits)
+@given(cut_points)
 def test_any_split_into_files_gives_the_same_rows(cuts: list[int]) -> None:
     rows = [*repeats(ROW, 6), *repeats(replace(ROW, protocol="tcp", reason='a "quoted", reason'), 6)]
     parts = [rows[low:high] for low, high in zip([0, *cuts], [*cuts, 12], strict=True)]
@@ -128,7 +130,7 @@ def test_any_split_into_files_gives_the_same_rows(cuts: list[int]) -> None:
 
 
 @pytest.mark.parametrize(
-    "spell",
+    "save",
     [
         lambda text: text.replace("\n", "\r\n"),
         lambda text: "\ufeff" + text,
@@ -137,10 +139,10 @@ def test_any_split_into_files_gives_the_same_rows(cuts: list[int]) -> None:
     ],
     ids=["Windows", "byte order mark", "empty lines", "quotes"],
 )
-def test_a_table_saved_by_a_spreadsheet_is_read(tmp_path: Path, spell: Callable[[str], str]) -> None:
+def test_a_table_saved_by_a_spreadsheet_is_read(tmp_path: Path, save: Callable[[str], str]) -> None:
     paths = [write(tmp_path / name, repeats(replace(ROW, trial=name), 3)) for name in "ab"]
     before = read(paths, trial_columns())
-    paths[0].write_text(spell(paths[0].read_text(encoding="utf-8")), encoding="utf-8", newline="")
+    paths[0].write_text(save(paths[0].read_text(encoding="utf-8")), encoding="utf-8", newline="")
     rows_read = read(paths, trial_columns())
     assert are_equal(rows_read, before)
     assert list(rows_read.texts["source"]) == list(before.texts["source"])
@@ -164,33 +166,33 @@ def test_the_error_of_a_damaged_line_names_file_and_line(
     paths = [write(tmp_path / name, repeats(replace(ROW, trial=name), 4)) for name in "abc"]
     lines = damage(paths[1].read_text(encoding="utf-8").splitlines())
     paths[1].write_text("\n".join([*lines, ""]), encoding="utf-8", errors="surrogateescape")
-    with pytest.raises(EvidenceError, match=message) as caught:
+    with pytest.raises(EvidenceError, match=message) as error_info:
         read(paths, trial_columns())
-    assert caught.value.where == f"{paths[1]}:{line}"
+    assert error_info.value.where == f"{paths[1]}:{line}"
 
 
 def test_a_table_truncated_in_its_last_line_is_refused_or_lacks_that_line(tmp_path: Path) -> None:
-    """A truncated last cell of a row can be another valid number: 1533679 of 15336791.6."""
+    """A truncated last cell can be another valid number: 15336791.6 truncated to 1533679."""
     path = write(tmp_path / "a", repeats(ROW, 2))
     content = path.read_bytes()
-    last = content.rindex(b"\n", 0, -1) + 1
-    for end in range(last, len(content)):
+    last_line_start = content.rindex(b"\n", 0, -1) + 1
+    for end in range(last_line_start, len(content)):
         path.write_bytes(content[:end])
-        if end == last:
+        if end == last_line_start:
             assert len(read([path], trial_columns())) == 1
             continue
         with pytest.raises(
             EvidenceError, match="the last line has no line feed: the table may be truncated"
-        ) as caught:
+        ) as error_info:
             read([path], trial_columns())
-        assert caught.value.where == f"{path}:3"
+        assert error_info.value.where == f"{path}:3"
 
 
 def test_a_newer_schema_requires_a_newer_fieldkit(tmp_path: Path) -> None:
     path = write(tmp_path, repeats(replace(ROW, schema_version=SCHEMA_VERSION + 1), 2))
-    with pytest.raises(ConfigurationError, match="newer fieldkit") as caught:
+    with pytest.raises(ConfigurationError, match="newer fieldkit") as error_info:
         read([path], trial_columns())
-    assert caught.value.remedy == "upgrade fieldkit"
+    assert error_info.value.remedy == "upgrade fieldkit"
 
 
 @pytest.mark.parametrize(
@@ -202,7 +204,7 @@ def test_a_newer_schema_requires_a_newer_fieldkit(tmp_path: Path) -> None:
         ("{header}" + 140_000 * "x", "lacks schema_version, trial"),
     ],
 )
-def test_a_table_of_something_else_is_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_a_file_without_the_required_columns_is_refused(tmp_path: Path, text: str, message: str) -> None:
     header = to_csv([], trial_columns()).strip()
     path = tmp_path / "other.csv"
     path.write_text(text.format(header=header), encoding="utf-8")
@@ -259,7 +261,7 @@ def test_a_damaged_line_of_a_large_table_has_its_number_in_the_whole_file(
 
 
 @given(st.lists(st.tuples(st.sampled_from("ab"), st.sampled_from([1.0, 2.0, None])), min_size=1))
-def test_rows_have_equal_codes_exactly_if_their_columns_are_equal(keys: list[tuple[str, float | None]]) -> None:
+def test_rows_have_equal_codes_if_and_only_if_their_columns_are_equal(keys: list[tuple[str, float | None]]) -> None:
     table = [replace(ROW, repeat=1 + n, sender=text, distance_m=metres) for n, (text, metres) in enumerate(keys)]
     codes = parse(to_csv(table, trial_columns()).encode(), trial_columns()).codes(("sender", "distance_m")).tolist()
     assert [[a == b for b in codes] for a in codes] == [[a == b for b in keys] for a in keys]

@@ -11,8 +11,8 @@ from fieldkit.core.model import Interval
 from tests.helpers.single import mean, mean_share, median, share, wilson
 
 counts = st.integers(1, 10**6).flatmap(lambda trials: st.tuples(st.integers(0, trials), st.just(trials)))
-a_repeat = st.integers(1, 300).flatmap(lambda sent: st.tuples(st.integers(0, sent), st.just(sent)))
-repeats = st.lists(a_repeat, min_size=2, max_size=30)
+lost_and_sent = st.integers(1, 300).flatmap(lambda n_sent: st.tuples(st.integers(0, n_sent), st.just(n_sent)))
+repeats = st.lists(lost_and_sent, min_size=2, max_size=30)
 values = st.lists(st.floats(-1e6, 1e6).map(lambda value: round(value, 6)), min_size=2, max_size=30)
 
 BURSTY = np.array([0, 0, 20, 1, 0, 0, 9, 0, 2, 0, 0, 0, 31, 0, 0, 4, 0, 0, 0, 0])
@@ -33,8 +33,8 @@ def test_wilson_equals_scipy(count: tuple[int, int]) -> None:
     assert 0 <= interval.low <= interval.value <= interval.high <= 1
 
 
-def test_nothing_lost_of_36_still_allows_ten_per_cent() -> None:
-    """Field notes; at no event the upper bound is z²/(n + z²)."""
+def test_no_loss_of_36_packets_has_an_upper_bound_of_ten_percent() -> None:
+    """A value from field notes. Without events, the upper bound is z²/(n + z²)."""
     interval = wilson(0, 36)
     z = scipy.stats.norm.ppf(0.975)
     assert (interval.value, interval.low) == (0, 0)
@@ -48,20 +48,20 @@ def test_impossible_counts_have_no_interval() -> None:
 
 
 def test_student_equals_scipy() -> None:
-    free = np.concatenate([[1], np.linspace(2, 30, 281), [100, 1e5]])
-    assert student(free) == pytest.approx(scipy.stats.t.ppf(0.975, free), rel=2e-4)
+    degrees_of_freedom = np.concatenate([[1], np.linspace(2, 30, 281), [100, 1e5]])
+    assert student(degrees_of_freedom) == pytest.approx(scipy.stats.t.ppf(0.975, degrees_of_freedom), rel=2e-4)
     assert student(np.array([1, 2])) == pytest.approx(scipy.stats.t.ppf(0.975, [1, 2]), rel=1e-12)
 
 
-@pytest.mark.parametrize("sent", [np.full(20, 36), np.arange(33, 53)], ids=["equal", "unequal"])
-def test_a_share_s_interval_contains_the_values_that_a_score_test_accepts(sent: np.ndarray) -> None:
+@pytest.mark.parametrize("n_sent", [np.full(20, 36), np.arange(33, 53)], ids=["equal", "unequal"])
+def test_the_interval_of_a_share_contains_the_values_that_a_score_test_accepts(n_sent: np.ndarray) -> None:
     """The bounds solve |share - p| = t sqrt(p (1 - p) / trials), found here by bisection."""
-    interval = not_none(share(BURSTY, sent))
-    rate = BURSTY.sum() / sent.sum()
-    off = BURSTY - rate * sent
-    variance = np.var(off, ddof=1) * len(sent) / sent.sum() ** 2
+    interval = not_none(share(BURSTY, n_sent))
+    rate = BURSTY.sum() / n_sent.sum()
+    deviations = BURSTY - rate * n_sent
+    variance = np.var(deviations, ddof=1) * len(n_sent) / n_sent.sum() ** 2
     trials = rate * (1 - rate) / variance
-    t = scipy.stats.t.ppf(0.975, 2 * (off**2).sum() ** 2 / (off**4).sum())
+    t = scipy.stats.t.ppf(0.975, 2 * (deviations**2).sum() ** 2 / (deviations**4).sum())
 
     def beyond(p: float) -> float:
         return float((rate - p) ** 2 - t * t * p * (1 - p) / trials)
@@ -72,20 +72,20 @@ def test_a_share_s_interval_contains_the_values_that_a_score_test_accepts(sent: 
 
 
 def test_bursts_make_the_interval_wider_than_wilsons() -> None:
-    bursty, spread = not_none(share(BURSTY, [36] * 20)), wilson(int(BURSTY.sum()), 720)
-    assert bursty.low < spread.low < spread.high < bursty.high
-    assert bursty.high - bursty.low > 3 * (spread.high - spread.low)
+    bursty, independent = not_none(share(BURSTY, [36] * 20)), wilson(int(BURSTY.sum()), 720)
+    assert bursty.low < independent.low < independent.high < bursty.high
+    assert bursty.high - bursty.low > 3 * (independent.high - independent.low)
 
 
 def test_repeats_that_agree_give_nearly_wilsons_interval() -> None:
-    """Only the squared ratio of the t quantile to the normal quantile remains as a difference."""
-    lost = np.random.default_rng(1).binomial(1000, 0.1, size=5000)
-    interval, reference = not_none(share(lost, [1000] * 5000)), wilson(int(lost.sum()), 5_000_000)
+    """The intervals differ only by the squared ratio of the t quantile to the normal quantile."""
+    n_lost = np.random.default_rng(1).binomial(1000, 0.1, size=5000)
+    interval, reference = not_none(share(n_lost, [1000] * 5000)), wilson(int(n_lost.sum()), 5_000_000)
     assert (interval.low, interval.high) == pytest.approx((reference.low, reference.high), rel=1e-3)
 
 
 @pytest.mark.parametrize("n", [2, 3, 20])
-def test_if_nothing_or_all_is_lost_a_repeat_is_one_trial(n: int) -> None:
+def test_a_repeat_counts_as_one_trial_if_all_or_no_packets_are_lost(n: int) -> None:
     assert share([0] * n, [36] * n) == wilson(0, n)
     assert share([36] * n, [36] * n) == wilson(n, n)
     assert mean_share([0.0] * n) == wilson(0, n)
@@ -98,14 +98,14 @@ def test_one_repeat_that_lost_everything_gives_a_wide_interval() -> None:
     assert 0.3 < interval.high < 0.7
 
 
-@pytest.mark.parametrize(("lost", "sent"), [(1, 36), (7, 157)])  # the second share is not exact in binary
-def test_two_equal_repeats_are_not_certain(lost: int, sent: int) -> None:
-    interval = not_none(share([lost, lost], [sent, sent]))
+@pytest.mark.parametrize(("n_lost", "n_sent"), [(1, 36), (7, 157)])  # the second share is not exact in binary
+def test_two_equal_repeats_have_a_wide_interval(n_lost: int, n_sent: int) -> None:
+    interval = not_none(share([n_lost, n_lost], [n_sent, n_sent]))
     assert interval.low < interval.value / 5
     assert interval.high > 5 * interval.value
 
 
-def test_many_small_repeats_and_a_large_one_count_as_few() -> None:
+def test_many_small_repeats_and_a_large_one_count_as_few_trials() -> None:
     """Kish: (30 + 19)^2 / (30^2 + 19) trials, not 20."""
     interval = not_none(share([0] * 20, [30] + [1] * 19))
     assert interval.high == pytest.approx(wilson(0, 1000).high * 1000 / (49**2 / 919), rel=0.7)
@@ -113,18 +113,18 @@ def test_many_small_repeats_and_a_large_one_count_as_few() -> None:
 
 
 @given(repeats)
-def test_bounds_of_a_share_enclose_it(some: list[tuple[int, int]]) -> None:
-    lost, sent = np.array(some).T
-    interval = not_none(share(lost, sent))
+def test_the_interval_of_a_share_contains_it(samples: list[tuple[int, int]]) -> None:
+    n_lost, n_sent = np.array(samples).T
+    interval = not_none(share(n_lost, n_sent))
     assert 0 <= interval.low <= interval.value <= interval.high <= 1
-    bound = not_none(share(sent - lost, sent))
-    assert (1 - bound.high, 1 - bound.low) == pytest.approx((interval.low, interval.high), abs=1e-9)
+    complement = not_none(share(n_sent - n_lost, n_sent))
+    assert (1 - complement.high, 1 - complement.low) == pytest.approx((interval.low, interval.high), abs=1e-9)
 
 
-@pytest.mark.parametrize("lost", [7, 15])
-def test_equal_repeats_are_not_distinguished_by_rounding(lost: int) -> None:
+@pytest.mark.parametrize("n_lost", [7, 15])
+def test_equal_repeats_are_not_distinguished_by_rounding(n_lost: int) -> None:
     """22 times a share of 15/22 is not exactly 15; the losses are then assumed to be independent."""
-    interval = not_none(share([lost] * 2, [22] * 2))
+    interval = not_none(share([n_lost] * 2, [22] * 2))
     assert interval.high - interval.low > 0.5
 
 
@@ -138,7 +138,7 @@ def test_shares_are_means_if_one_is_outside_of_0_to_1() -> None:
     assert mean_share([0.1, -0.01, 0.2]) == mean([0.1, -0.01, 0.2])
 
 
-def test_without_skewness_a_mean_has_students_interval() -> None:
+def test_a_mean_without_skewness_has_students_interval() -> None:
     interval = not_none(mean([1.0, -1.0] * 10))
     reference = scipy.stats.t.interval(0.95, 19, 0, scipy.stats.sem([1.0, -1.0] * 10))
     assert (interval.low, interval.high) == pytest.approx(reference, rel=1e-4)
@@ -155,12 +155,12 @@ def test_a_mean_has_the_bootstrap_t_interval() -> None:
 
 
 @given(values, st.floats(-100, 100), st.floats(0.01, 100))
-def test_a_mean_is_shifted_and_scaled_with_its_values(some: list[float], shift: float, factor: float) -> None:
-    original, moved = not_none(mean(some)), not_none(mean(shift + factor * np.array(some)))
+def test_a_mean_is_shifted_and_scaled_with_its_values(samples: list[float], shift: float, factor: float) -> None:
+    original, transformed = not_none(mean(samples)), not_none(mean(shift + factor * np.array(samples)))
     assert original.low <= original.value <= original.high
-    size = factor * (np.abs(some).max() + abs(shift) + 1)
-    ends = (shift + factor * original.low, shift + factor * original.high)
-    assert (moved.low, moved.high) == pytest.approx(ends, rel=1e-3, abs=1e-3 * size)
+    size = factor * (np.abs(samples).max() + abs(shift) + 1)
+    expected_bounds = (shift + factor * original.low, shift + factor * original.high)
+    assert (transformed.low, transformed.high) == pytest.approx(expected_bounds, rel=1e-3, abs=1e-3 * size)
 
 
 def test_the_mean_of_tiny_values_has_a_tiny_interval() -> None:
@@ -180,7 +180,7 @@ def test_a_median_lies_between_the_two_nearest_order_intervals(n: int) -> None:
 
 
 @pytest.mark.parametrize("n", [2, 3, 5])
-def test_few_repeats_have_students_interval_for_a_median_and_all_repeats_in_it(n: int) -> None:
+def test_the_median_of_few_repeats_has_students_interval_extended_to_all_values(n: int) -> None:
     times = SKEWED[:n]
     low, high = scipy.stats.t.interval(0.95, n - 1, times.mean(), scipy.stats.sem(times))
     interval = not_none(median(times))
@@ -194,22 +194,22 @@ def test_few_repeats_have_students_interval_for_a_median_and_all_repeats_in_it(n
 @example([0.0, 0.0, 4.6e-169])  # the square of the deviation is 0
 @example([0.1] * 3)  # the sum of three is not three times the value
 @example([0.7] * 20)
-def test_bounds_enclose_a_median(some: list[float]) -> None:
-    interval = not_none(median(some))
+def test_the_interval_of_a_median_contains_it(samples: list[float]) -> None:
+    interval = not_none(median(samples))
     assert interval.low <= interval.value <= interval.high
 
 
 def test_vectorized_cells_equal_single_cells() -> None:
     random = np.random.default_rng(8)
-    lost, sent = random.integers(0, 5, (7, 20)), random.integers(5, 40, (7, 20))
+    n_lost, n_sent = random.integers(0, 5, (7, 20)), random.integers(5, 40, (7, 20))
     times = random.lognormal(size=(7, 20))
-    for batch, ones in (
-        (shares(lost, sent), [share(*cell) for cell in zip(lost, sent, strict=True)]),
+    for batch, single_cells in (
+        (shares(n_lost, n_sent), [share(*cell) for cell in zip(n_lost, n_sent, strict=True)]),
         (means(times), [mean(cell) for cell in times]),
         (medians(times), [median(cell) for cell in times]),
     ):
         rows = zip(batch.value, batch.low, batch.high, strict=True)
-        assert [Interval(*map(float, row)) for row in rows] == ones
+        assert [Interval(*map(float, row)) for row in rows] == single_cells
 
 
 def test_a_single_repeat_has_no_interval() -> None:

@@ -1,4 +1,4 @@
-"""Untrusted words in Markdown, as rendered by GitHub."""
+"""Untrusted text in Markdown, as rendered by GitHub."""
 
 import pytest
 
@@ -19,6 +19,6 @@ from fieldkit.analysis.paper_tables import markdown_escaped, markdown_line
         ("two\r\nlines", "two lines"),
     ],
 )
-def test_untrusted_words_are_not_markup(text: str, expected: str) -> None:
+def test_untrusted_text_is_not_markup(text: str, expected: str) -> None:
     assert markdown_escaped(text) == expected
     assert markdown_line([text, "x"]) == f"| {expected} | x |\n"

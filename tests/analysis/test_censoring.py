@@ -39,13 +39,13 @@ def repeats_of(declared: Sequence[Column], **values: Sequence[OptionalValue]) ->
 
 
 def gaps(closed: Sequence[float], still_open: Sequence[float] = (), missing: int = 0) -> Cell:
-    """Return the cell of repeats with an ended, an open or no longest gap."""
-    none = [None] * missing
+    """Return the cell of repeats whose longest gap has ended, is still open, or is missing."""
+    missing_values = [None] * missing
     (cell,) = aggregate(
         repeats_of(
             GAP,
-            rtt_gap_s=[*closed, *(None for _ in still_open), *none],
-            rtt_gap_at_least_s=[*(None for _ in closed), *still_open, *none],
+            rtt_gap_s=[*closed, *(None for _ in still_open), *missing_values],
+            rtt_gap_at_least_s=[*(None for _ in closed), *still_open, *missing_values],
         ),
         BY,
     )
@@ -60,7 +60,7 @@ def judge_text(text: str, cell: Cell, declared: Sequence[Column] = GAP) -> Judge
 def test_open_gaps_count_with_their_observed_length() -> None:
     estimate = gaps([0.2] * 7, [2.3, 2.5, 2.8]).estimates["rtt_gap_s"]
     assert (estimate.n, estimate.n_censored, estimate.missing) == (10, 3, 0)
-    # Three censored of ten are above all others, so the median is known, but not the upper end of its interval.
+    # The three censored values are above the seven others, so the median is known, but not the upper bound.
     assert (estimate.value, estimate.is_lower_bound) == (0.2, False)
     assert (estimate.low, estimate.high) == (0.2, None)
     assert estimate.maximum == 2.8
@@ -77,17 +77,17 @@ def test_a_median_of_open_gaps_is_a_lower_bound() -> None:
 @given(
     st.lists(st.tuples(st.floats(0, 10), st.floats(0, 10), st.booleans()), min_size=2, max_size=25),
 )
-def test_an_interval_contains_that_of_the_uncensored_values(drawn: list[tuple[float, float, bool]]) -> None:
-    """The oracle is the interval of the true values, of which the test observes less."""
-    true = np.array([[start + more for start, more, _ in drawn]])
-    is_open = np.array([[is_open for _, _, is_open in drawn]])
-    observed = np.where(is_open, [[start for start, _, _ in drawn]], true)
+def test_an_interval_contains_the_interval_of_the_uncensored_values(repeats: list[tuple[float, float, bool]]) -> None:
+    """The oracle is the interval of the true values; open values are observed only in part."""
+    true = np.array([[observed + remaining for observed, remaining, _ in repeats]])
+    is_open = np.array([[is_open for _, _, is_open in repeats]])
+    observed = np.where(is_open, [[observed for observed, _, _ in repeats]], true)
     result = medians(observed, 0, upper=np.where(is_open, np.inf, true))
     oracle = medians(true, 0)
     assert result.value <= oracle.value
-    if len(drawn) >= 6:
+    if len(repeats) >= 6:
         assert result.low <= oracle.low
-    assert result.high >= oracle.high if len(drawn) >= 6 else result.high >= true[~is_open].max(initial=0)
+    assert result.high >= oracle.high if len(repeats) >= 6 else result.high >= true[~is_open].max(initial=0)
     if not is_open.any():
         assert (result.value, result.low, result.high) == (oracle.value, oracle.low, oracle.high)
 
@@ -111,14 +111,14 @@ def test_missing_repeats_are_counted_in_all_outputs() -> None:
     markdown = paper_tables.to_markdown(BY, [cell], [quantity for quantity in quantities if quantity])
     assert "(8 of 10)" in markdown
     assert "(8 of 10)" in paper_tables.to_latex(BY, [cell], [quantity for quantity in quantities if quantity])
-    (written,) = json.loads(result_tables.to_json(BY, [cell]))["cells"]
-    assert (written["n_valid"], written["estimates"]["rtt_gap_s"]["n"]) == (10, 8)
+    (json_cell,) = json.loads(result_tables.to_json(BY, [cell]))["cells"]
+    assert (json_cell["n_valid"], json_cell["estimates"]["rtt_gap_s"]["n"]) == (10, 8)
 
 
 def test_open_gaps_are_in_every_table_format() -> None:
     cell = gaps([0.2] * 2, [1.5] * 5)
-    (written,) = json.loads(result_tables.to_json(BY, [cell]))["cells"]
-    estimate = written["estimates"]["rtt_gap_s"]
+    (json_cell,) = json.loads(result_tables.to_json(BY, [cell]))["cells"]
+    estimate = json_cell["estimates"]["rtt_gap_s"]
     assert (estimate["n_censored"], estimate["is_lower_bound"], estimate["high"]) == (5, True, None)
     quantities = [quantity for column in GAP if (quantity := Quantity.of(column))]
     assert "| >= 1500 [200, ...) (5 of 7 not ended) |" in paper_tables.to_markdown(BY, [cell], quantities)
@@ -148,13 +148,13 @@ def test_no_expectation_holds_on_missing_or_open_repeats(
         assert "of" in result.why
 
 
-def rtt(medians_s: Sequence[OptionalValue], of_sent_s: Sequence[OptionalValue]) -> Cell:
-    (cell,) = aggregate(repeats_of(RTT, rtt_median_s=medians_s, rtt_median_sent_s=of_sent_s), BY)
+def rtt(medians_s: Sequence[OptionalValue], sent_medians_s: Sequence[OptionalValue]) -> Cell:
+    (cell,) = aggregate(repeats_of(RTT, rtt_median_s=medians_s, rtt_median_sent_s=sent_medians_s), BY)
     return cell
 
 
 @pytest.mark.parametrize(
-    ("of_sent_s", "ruling", "reason"),
+    ("sent_medians_s", "ruling", "reason"),
     [
         ([0.1] * 10, Ruling.HOLDS, ""),
         ([0.15] * 10, Ruling.HOLDS, ""),
@@ -172,13 +172,13 @@ def rtt(medians_s: Sequence[OptionalValue], of_sent_s: Sequence[OptionalValue]) 
     ],
 )
 def test_a_median_rtt_of_the_answers_is_judged_over_all_requests(
-    of_sent_s: list[OptionalValue], ruling: Ruling, reason: str
+    sent_medians_s: list[OptionalValue], ruling: Ruling, reason: str
 ) -> None:
-    cell = rtt([0.1] * 10, of_sent_s)
+    cell = rtt([0.1] * 10, sent_medians_s)
     result = judge_text("rtt_median_s < 200 ms", cell, RTT)
     assert (result.ruling, result.why) == (ruling, reason)
     assert result.estimate is not None
-    assert (result.estimate.value, result.estimate.high) == (0.1, 0.1), "the figure itself is unchanged"
+    assert (result.estimate.value, result.estimate.high) == (0.1, 0.1), "the displayed figure does not change"
     assert judge_text("rtt_median_s < 50 ms", cell, RTT).ruling is Ruling.FAILS
     every = judge_text("every rtt_median_s < 200 ms", cell, RTT)
     assert every.holds is (ruling is Ruling.HOLDS)
@@ -203,7 +203,7 @@ def test_steps_with_names_have_separate_optional_columns() -> None:
     assert gap.figure.at_least == "up.rtt_gap_at_least_s"
 
 
-def test_means_have_no_lower_bounds() -> None:
+def test_means_cannot_have_lower_bounds() -> None:
     (column,) = columns(100, ("stalls", "count", "Stalls.", Figure("stalls", Kind.MEAN, at_least="other")))
     error = "only a median can have a column of lower bounds (at_least) or of all sent items (of_sent)"
     assert column.declaration_error() == error

@@ -1,4 +1,4 @@
-"""Repeats and packets that expectations need, compared with judgements of trials with the best possible results."""
+"""Repeats and packets that expectations require, compared with judgements of trials with perfect results."""
 
 import pytest
 from hypothesis import given
@@ -11,10 +11,10 @@ from fieldkit.core.columns import Kind
 from tests.analysis.test_expectations import PACKETS, losses
 
 GAP = Quantity("rtt_gap_s", "longest gap", Kind.MEDIAN, "s")
-BACK = Quantity("link_down_recovered", "back after link-down", Kind.FLAG, "share")
+RECOVERED = Quantity("link_down_recovered", "back after link-down", Kind.FLAG, "share")
 RATE = Quantity("goodput_bit_s", "goodput", Kind.MEDIAN, "bit/s")
 RETRIES = Quantity("retries", "retries", Kind.MEAN, "count")
-QUANTITIES = (PACKETS, GAP, BACK, RATE, RETRIES)
+QUANTITIES = (PACKETS, GAP, RECOVERED, RATE, RETRIES)
 
 
 def warning(text: str, repeats: int) -> str:
@@ -74,12 +74,14 @@ def warning(text: str, repeats: int) -> str:
         ("retries < 3", 2, ""),
     ],
 )  # fmt: skip
-def test_the_needs_of_an_expectation_are_reported_before_a_trial(text: str, repeats: int, message: str) -> None:
+def test_unmet_requirements_of_an_expectation_are_reported_before_a_trial(
+    text: str, repeats: int, message: str
+) -> None:
     assert warning(text, repeats) == (message and f"expected {text}: {message}")
 
 
 @given(st.integers(1, 60), st.integers(1, 60))
-def test_without_a_warning_a_perfect_trial_holds_and_with_one_it_does_not(percent: int, repeats: int) -> None:
+def test_an_expectation_holds_in_a_perfect_trial_unless_there_is_a_warning(percent: int, repeats: int) -> None:
     for text in (f"ip_loss < {percent} %", f"{percent} % of ip_loss < 1 %"):
         (judgement,) = judgements.judge([expectations.parse(text, QUANTITIES)], [losses(*[0] * repeats)])
         assert (judgement.ruling is Ruling.HOLDS) is (warning(text, repeats) == "")

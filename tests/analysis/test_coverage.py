@@ -15,10 +15,10 @@ from tests.helpers.nightly import mark_nightly
 
 CELLS: Final = 4000  # leaves a standard error of 0.35 % at a coverage of 95 %
 REPEATS: Final = 20
-ORDERED: Final = 98.6
-"""Order statistics are discrete, so the coverage of their intervals is above 95 %."""
+MAX_MEDIAN_COVERAGE: Final = 98.6
+"""Order statistics are discrete, so the coverage of their intervals may be above 95 %."""
 BAND: Final = (93.0, 97.0)
-BURSTS: Final = (0, 1, 5, 20)  # mean length of a burst; 0: independent losses, 1: never two in a row
+BURSTS: Final = (0, 1, 5, 20)  # mean length of a burst; 0: independent losses; 1: never two consecutive losses
 RATES: Final = (0.01, 0.05, 0.35)
 # At most seven losses or two bursts are expected in a cell, so a cell without losses is likely, and an interval can
 # miss the true value only on one side.
@@ -29,24 +29,24 @@ Floats = NDArray[np.float64]
 Draw = Callable[[np.random.Generator, tuple[int, int]], Floats]
 
 
-def lost_in_bursts(
+def burst_losses(
     random: np.random.Generator, rate: float, burst: int, shape: tuple[int, int], packets: int
 ) -> NDArray[np.int64]:
     """Return the number of lost packets per repeat on a Gilbert-Elliott link, whose bad state loses all packets."""
     if burst == 0:
         return random.binomial(packets, rate, shape)
-    recovers = 1 / burst
-    fails = recovers * rate / (1 - rate)
+    recovery_probability = 1 / burst
+    failure_probability = recovery_probability * rate / (1 - rate)
     bad = random.random(shape) < rate
-    lost = bad.astype(np.int64)
+    n_lost = bad.astype(np.int64)
     for _ in range(packets - 1):
         uniform = random.random(shape, dtype=np.float32)
-        bad = np.where(bad, uniform >= recovers, uniform < fails)
-        lost += bad
-    return lost
+        bad = np.where(bad, uniform >= recovery_probability, uniform < failure_probability)
+        n_lost += bad
+    return n_lost
 
 
-def covered(intervals: Intervals, truth: float) -> float:
+def coverage_percent(intervals: Intervals, truth: float) -> float:
     """Return the percentage of cells whose interval contains the true value, with a tolerance for rounding."""
     slack = 1e-9
     return 100 * float(np.mean((intervals.low <= truth + slack) & (truth - slack <= intervals.high)))
@@ -54,42 +54,44 @@ def covered(intervals: Intervals, truth: float) -> float:
 
 def table_row(*key: str) -> list[float]:
     """Return the numbers of the row of coverage.md that starts with these cells."""
-    begin = re.escape("| " + " | ".join(key) + " |")
-    (row,) = re.findall(rf"^{begin}(.*)\|$", TABLES.read_text(encoding="utf-8"), re.MULTILINE)
+    row_start = re.escape("| " + " | ".join(key) + " |")
+    (row,) = re.findall(rf"^{row_start}(.*)\|$", TABLES.read_text(encoding="utf-8"), re.MULTILINE)
     return [float(number) for number in row.split("|")]
 
 
 @pytest.mark.parametrize("rate", mark_nightly(RATES))
 @pytest.mark.parametrize("packets", mark_nightly([36, 215]))
-def test_shares_cover_for_any_burst_length(
+def test_intervals_of_shares_cover_for_any_burst_length(
     packets: int, rate: float, record_property: Callable[[str, object], None]
 ) -> None:
     random = np.random.default_rng(11)
-    coverages, naive = [], []
+    coverages, wilson_coverages = [], []
     for burst in BURSTS:
-        lost = lost_in_bursts(random, rate, burst, (CELLS, REPEATS), packets)
-        sent = np.full(lost.shape, packets)
-        coverages.append(covered(shares(lost, sent), rate))
-        naive.append(covered(wilson_intervals(lost.sum(axis=1), sent.sum(axis=1)), rate))
+        n_lost = burst_losses(random, rate, burst, (CELLS, REPEATS), packets)
+        n_sent = np.full(n_lost.shape, packets)
+        coverages.append(coverage_percent(shares(n_lost, n_sent), rate))
+        wilson_coverages.append(coverage_percent(wilson_intervals(n_lost.sum(axis=1), n_sent.sum(axis=1)), rate))
     record_property(
-        "result", f"share, 20 repeats of {packets}, {rate:.0%} lost, bursts {BURSTS}: {rounded(coverages)}"
+        "result", f"share, 20 repeats of {packets}, {rate:.0%} lost, bursts {BURSTS}: {as_text(coverages)}"
     )
-    record_property("result", f"the same by Wilson: {rounded(naive)}")
+    record_property("result", f"the same by Wilson: {as_text(wilson_coverages)}")
     low, high = (96.0, 99.5) if (packets, rate) in RARE else BAND
     assert all(low <= percentage <= high for percentage in coverages)
-    assert BAND[0] <= naive[0] <= BAND[1], "Wilson, of losses independent losses"
-    assert naive[-1] < 75, "Wilson, of long bursts"
+    assert BAND[0] <= wilson_coverages[0] <= BAND[1], "Wilson interval, independent losses"
+    assert wilson_coverages[-1] < 75, "Wilson interval, long bursts"
     assert table_row(f"{packets}", f"{rate:.0%}".replace("%", " %")) == pytest.approx(
-        [*coverages, naive[0], naive[-1]], abs=0.8
+        [*coverages, wilson_coverages[0], wilson_coverages[-1]], abs=0.8
     )
 
 
 @pytest.mark.parametrize("n", mark_nightly([2, 3, 5, 10]))
-def test_shares_of_few_repeats_cover_nearly_as_often(n: int, record_property: Callable[[str, object], None]) -> None:
+def test_intervals_of_shares_of_few_repeats_have_nearly_the_same_coverage(
+    n: int, record_property: Callable[[str, object], None]
+) -> None:
     random = np.random.default_rng(12)
     coverages = [
-        covered(
-            shares(lost_in_bursts(random, rate, burst, (CELLS, n), 36), np.full((CELLS, n), 36)),
+        coverage_percent(
+            shares(burst_losses(random, rate, burst, (CELLS, n), 36), np.full((CELLS, n), 36)),
             rate,
         )
         for rate in RATES
@@ -100,13 +102,13 @@ def test_shares_of_few_repeats_cover_nearly_as_often(n: int, record_property: Ca
 
 
 @pytest.mark.parametrize("burst", mark_nightly(BURSTS, in_ci=[5]))
-def test_shares_cover_if_repeats_send_different_numbers(
+def test_intervals_of_shares_cover_if_repeats_send_different_numbers(
     burst: int, record_property: Callable[[str, object], None]
 ) -> None:
     random = np.random.default_rng(13)
-    sent = np.concatenate([np.full((CELLS, 10), size) for size in (36, 215)], axis=1)
-    lost = np.concatenate([lost_in_bursts(random, 0.05, burst, (CELLS, 10), size) for size in (36, 215)], axis=1)
-    coverages = covered(shares(lost, sent), 0.05)
+    n_sent = np.concatenate([np.full((CELLS, 10), size) for size in (36, 215)], axis=1)
+    n_lost = np.concatenate([burst_losses(random, 0.05, burst, (CELLS, 10), size) for size in (36, 215)], axis=1)
+    coverages = coverage_percent(shares(n_lost, n_sent), 0.05)
     record_property(
         "result", f"share, 10 repeats of 36 and 10 of 215, 5 % lost, bursts of {burst}: {coverages:.1f} %"
     )
@@ -122,13 +124,13 @@ def test_shares_cover_less_if_repeats_differ_strongly(
     random, prior = np.random.default_rng(17), 1 / 0.3 - 1
     coverages = []
     for n in (5, 10, 20, 40):
-        sent = np.broadcast_to(np.where(np.arange(n) % 2, largest, 36), (CELLS, n))
-        lost = random.binomial(sent, random.beta(prior * rate, prior * (1 - rate), sent.shape))
-        coverages.append(covered(shares(lost, sent), rate))
+        n_sent = np.broadcast_to(np.where(np.arange(n) % 2, largest, 36), (CELLS, n))
+        n_lost = random.binomial(n_sent, random.beta(prior * rate, prior * (1 - rate), n_sent.shape))
+        coverages.append(coverage_percent(shares(n_lost, n_sent), rate))
     label = f"{rate:.0%} lost, ".replace("%", " %") + (
         "all of 36" if largest == 36 else f"half of 36, half of {largest}"
     )
-    record_property("result", f"share, repeats that differ by far, {label}: {rounded(coverages)}")
+    record_property("result", f"share, repeats that differ by far, {label}: {as_text(coverages)}")
     assert table_row(label) == pytest.approx(coverages, abs=0.8)
 
 
@@ -154,38 +156,44 @@ def percentile_bootstrap(random: np.random.Generator, values: Floats) -> Interva
 @pytest.mark.parametrize("name", mark_nightly(TIMES, in_ci=["lognormal, sigma 1"]))
 def test_means_and_medians_cover_skewed_repeats(name: str, record_property: Callable[[str, object], None]) -> None:
     random = np.random.default_rng(14)
-    draw, mean, middle = TIMES[name]
+    draw, mean, true_median = TIMES[name]
     samples = [draw(random, (CELLS, n)) for n in (5, 10, REPEATS)]
-    of_mean = [covered(means(values), mean) for values in samples]
-    of_median = [covered(medians(values), middle) for values in samples]
-    plain = covered(percentile_bootstrap(random, samples[-1]), mean)
+    mean_coverages = [coverage_percent(means(values), mean) for values in samples]
+    median_coverages = [coverage_percent(medians(values), true_median) for values in samples]
+    bootstrap_coverage = coverage_percent(percentile_bootstrap(random, samples[-1]), mean)
     record_property(
-        "result", f"mean, {name}, 5, 10, 20 repeats: {rounded(of_mean)}, percentile bootstrap {plain:.1f}"
+        "result",
+        f"mean, {name}, 5, 10, 20 repeats: {as_text(mean_coverages)}, percentile bootstrap {bootstrap_coverage:.1f}",
     )
-    record_property("result", f"median, {name}, 5, 10, 20 repeats: {rounded(of_median)}")
-    assert BAND[0] <= of_mean[-1] <= BAND[1]
-    assert all(BAND[0] <= percentage <= ORDERED for percentage in of_median)
-    assert abs(of_mean[-1] - 95) < abs(plain - 95)
-    assert table_row(name) == pytest.approx([*of_mean, plain, *of_median], abs=0.8)
+    record_property("result", f"median, {name}, 5, 10, 20 repeats: {as_text(median_coverages)}")
+    assert BAND[0] <= mean_coverages[-1] <= BAND[1]
+    assert all(BAND[0] <= percentage <= MAX_MEDIAN_COVERAGE for percentage in median_coverages)
+    assert abs(mean_coverages[-1] - 95) < abs(bootstrap_coverage - 95)
+    assert table_row(name) == pytest.approx([*mean_coverages, bootstrap_coverage, *median_coverages], abs=0.8)
 
 
 @pytest.mark.parametrize("burst", mark_nightly([5, 20]))
 def test_means_and_medians_cover_bursty_shares(burst: int, record_property: Callable[[str, object], None]) -> None:
     random = np.random.default_rng(15)
     packets, rate = 215, 0.35
-    middle = float(np.median(lost_in_bursts(random, rate, burst, (1, 100_000), packets))) / packets
-    shares = [lost_in_bursts(random, rate, burst, (CELLS, n), packets) / packets for n in (5, 10, REPEATS)]
-    of_mean = [covered(mean_shares(values), rate) for values in shares]
-    of_median = [covered(medians(values), middle) for values in shares]
-    plain = covered(percentile_bootstrap(random, shares[-1]), rate)
-    record_property("result", f"shares lost, bursts of {burst}: mean {rounded(of_mean)}, median {rounded(of_median)}")
-    assert all(BAND[0] <= percentage <= BAND[1] for percentage in of_mean)
-    assert all(BAND[0] <= percentage <= ORDERED for percentage in of_median)
-    assert table_row(f"share lost, bursts of {burst}") == pytest.approx([*of_mean, plain, *of_median], abs=0.8)
+    true_median = float(np.median(burst_losses(random, rate, burst, (1, 100_000), packets))) / packets
+    shares = [burst_losses(random, rate, burst, (CELLS, n), packets) / packets for n in (5, 10, REPEATS)]
+    mean_coverages = [coverage_percent(mean_shares(values), rate) for values in shares]
+    median_coverages = [coverage_percent(medians(values), true_median) for values in shares]
+    bootstrap_coverage = coverage_percent(percentile_bootstrap(random, shares[-1]), rate)
+    record_property(
+        "result",
+        f"shares lost, bursts of {burst}: mean {as_text(mean_coverages)}, median {as_text(median_coverages)}",
+    )
+    assert all(BAND[0] <= percentage <= BAND[1] for percentage in mean_coverages)
+    assert all(BAND[0] <= percentage <= MAX_MEDIAN_COVERAGE for percentage in median_coverages)
+    assert table_row(f"share lost, bursts of {burst}") == pytest.approx(
+        [*mean_coverages, bootstrap_coverage, *median_coverages], abs=0.8
+    )
 
 
 def two_modes(share: float, apart: float) -> tuple[Draw, float]:
-    """Mixture of two normal distributions, `share` in the lower one; the median is in it, or between equal ones."""
+    """Return a mixture of two normal distributions, with `share` in the lower one, and its median."""
 
     def draw(random: np.random.Generator, shape: tuple[int, ...]) -> Floats:
         return np.where(random.random(shape) < share, random.normal(0, 1, shape), random.normal(apart, 1, shape))
@@ -202,7 +210,7 @@ SHAPES: Final[dict[str, tuple[Draw, float]]] = {
     "one of three values": (lambda random, shape: random.integers(0, 3, shape).astype(float), 1.0),
     "one of two values, 55:45": (lambda random, shape: (random.random(shape) < 0.45).astype(float), 0.0),
 }
-FEW_AND_MANY: Final = (2, 3, 4, 5, 6, 7, 10, 20, 30)
+REPEAT_NUMBERS: Final = (2, 3, 4, 5, 6, 7, 10, 20, 30)
 
 
 @pytest.mark.parametrize("name", mark_nightly(SHAPES, in_ci=["two modes, 60:40"]))
@@ -210,12 +218,12 @@ def test_medians_have_the_assured_coverage_for_any_distribution(
     name: str, record_property: Callable[[str, object], None]
 ) -> None:
     random = np.random.default_rng(16)
-    draw, middle = SHAPES[name]
-    coverages = {n: covered(medians(draw(random, (CELLS, n))), middle) for n in FEW_AND_MANY}
-    record_property("result", f"median, {name}, of {FEW_AND_MANY}: {rounded(list(coverages.values()))}")
+    draw, true_median = SHAPES[name]
+    coverages = {n: coverage_percent(medians(draw(random, (CELLS, n))), true_median) for n in REPEAT_NUMBERS}
+    record_property("result", f"median, {name}, of {REPEAT_NUMBERS}: {as_text(list(coverages.values()))}")
     assert all(percentage >= 100 * assured(n) - 1 for n, percentage in coverages.items())
     assert table_row(f"median, {name}") == pytest.approx(list(coverages.values()), abs=0.8)
 
 
-def rounded(coverages: list[float]) -> str:
+def as_text(coverages: list[float]) -> str:
     return ", ".join(f"{percentage:.1f}" for percentage in coverages)

@@ -19,17 +19,17 @@ PACKETS = 216
 
 
 def drifting(loss: float) -> Draw:
-    """Repeats whose loss varies about `loss`, by a beta distribution."""
+    """Return a generator of repeats whose loss has a beta distribution with the mean `loss`."""
     return lambda random, shape: random.binomial(PACKETS, random.beta(1, 1 / loss - 1, shape)).astype(float)
 
 
 def bursts(loss: float, length: float) -> Draw:
-    """Repeats with a Poisson number of bursts of geometric length."""
+    """Return a generator of repeats with a Poisson number of bursts of geometric length."""
 
     def draw(random: np.random.Generator, shape: tuple[int, int]) -> Floats:
         count = random.poisson(PACKETS * loss / length, shape)
-        lost = count + random.negative_binomial(np.maximum(count, 1), 1 / length)
-        return np.minimum(PACKETS, np.where(count > 0, lost, 0)).astype(float)
+        n_lost = count + random.negative_binomial(np.maximum(count, 1), 1 / length)
+        return np.minimum(PACKETS, np.where(count > 0, n_lost, 0)).astype(float)
 
     return draw
 
@@ -47,13 +47,13 @@ def loss_intervals(values: Floats) -> Intervals:
 
 
 def differences(a: Intervals, b: Intervals) -> list[Interval]:
-    sides = [[Interval(*ends) for ends in zip(side.value, side.low, side.high, strict=True)] for side in (a, b)]
+    sides = [[Interval(*bounds) for bounds in zip(side.value, side.low, side.high, strict=True)] for side in (a, b)]
     return [between(first, second) for first, second in zip(*sides, strict=True)]
 
 
 @cache
 def mean(loss: float, length: float) -> float:
-    """The mean loss of `bursts`, of which a repeat cannot lose more than all packets."""
+    """Return the mean loss of `bursts`. It is below `loss`, because a repeat cannot lose more than all packets."""
     return float(bursts(loss, length)(np.random.default_rng(9), (1, 1_000_000)).mean()) / PACKETS
 
 
@@ -69,7 +69,7 @@ def mean(loss: float, length: float) -> float:
     ],
     ids=["drift", "heavy", "bursts", "one bursts", "times", "one varies"],
 )
-def test_an_interval_of_twenty_repeats_each_covers(
+def test_intervals_of_differences_of_twenty_repeats_have_the_stated_coverage(
     a: Draw, b: Draw, estimates: Callable[[Floats], Intervals], true: Callable[[], float]
 ) -> None:
     """`true` is a function because collection must not draw samples."""

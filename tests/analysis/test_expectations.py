@@ -81,9 +81,9 @@ def test_the_text_of_an_expectation_is_parsed(
     ],
 )
 def test_an_invalid_text_is_an_error_with_a_remedy(text: str, message: str) -> None:
-    with pytest.raises(ConfigurationError, match=message) as caught:
+    with pytest.raises(ConfigurationError, match=message) as error_info:
         expectations.parse(text, QUANTITIES)
-    assert caught.value.remedy
+    assert error_info.value.remedy
 
 
 @pytest.mark.parametrize(
@@ -96,18 +96,20 @@ def test_an_invalid_text_is_an_error_with_a_remedy(text: str, message: str) -> N
         (None, None, Ruling.OPEN, Ruling.OPEN),
     ],
 )
-def test_the_whole_interval_decides(low: float | None, high: float | None, below: Ruling, above: Ruling) -> None:
-    demanded = [expectations.parse(f"up.file_loss {sign} 2 %", QUANTITIES) for sign in "<>"]
-    result = judgements.judge(demanded, [cell("tcp", estimate(LOSS, 0.01, low, high))])
+def test_an_expectation_holds_if_the_whole_interval_meets_it(
+    low: float | None, high: float | None, below: Ruling, above: Ruling
+) -> None:
+    parsed_expectations = [expectations.parse(f"up.file_loss {sign} 2 %", QUANTITIES) for sign in "<>"]
+    result = judgements.judge(parsed_expectations, [cell("tcp", estimate(LOSS, 0.01, low, high))])
     assert [item.ruling for item in result] == [below, above]
 
 
 @given(st.floats(-1, 1), st.floats(-1, 1), st.floats(0, 1))
-def test_nothing_both_holds_and_fails(first: float, second: float, bound: float) -> None:
+def test_opposite_expectations_never_both_hold(first: float, second: float, bound: float) -> None:
     low, high = sorted((first, second))
-    demanded = [expectations.parse(f"signal_dbm {sign} {bound:.6f} dBm", QUANTITIES) for sign in "<>"]
+    parsed_expectations = [expectations.parse(f"signal_dbm {sign} {bound:.6f} dBm", QUANTITIES) for sign in "<>"]
     cells = [cell("tcp", estimate(SIGNAL, low, low, high))]
-    below, above = (item.ruling for item in judgements.judge(demanded, cells))
+    below, above = (item.ruling for item in judgements.judge(parsed_expectations, cells))
     assert not (below is Ruling.HOLDS and above is Ruling.HOLDS)
     assert (below is Ruling.HOLDS) == (high < float(f"{bound:.6f}"))
     assert (above is Ruling.HOLDS) == (low > float(f"{bound:.6f}"))
@@ -132,32 +134,34 @@ def test_the_scope_of_an_expectation(text: str, scope: Scope, is_inclusive: bool
     assert (result.scope, result.is_inclusive, result.share) == (scope, is_inclusive, share)
 
 
-def losses(*lost: int, sent: int = 1250) -> Cell:
-    """The cell of UDP repeats that lost these numbers of `sent` packets each."""
+def losses(*lost_counts: int, n_sent: int = 1250) -> Cell:
+    """Return the cell of UDP repeats with these numbers of lost packets, of `n_sent` sent packets each."""
     rows = [
-        replace(ROW, repeat=number, ip_packets_sent=sent, ip_packets_received=sent - item, ip_loss=item / sent)
-        for number, item in enumerate(lost, 1)
+        replace(
+            ROW, repeat=number, ip_packets_sent=n_sent, ip_packets_received=n_sent - n_lost, ip_loss=n_lost / n_sent
+        )
+        for number, n_lost in enumerate(lost_counts, 1)
     ]
     (cell,) = aggregate(parsed(rows), ("protocol",), quantities=[PACKETS])
     return cell
 
 
-def ruling(text: str, cell_: Cell) -> Ruling:
-    (judgement,) = judgements.judge([expectations.parse(text, QUANTITIES)], [cell_])
+def ruling(text: str, judged_cell: Cell) -> Ruling:
+    (judgement,) = judgements.judge([expectations.parse(text, QUANTITIES)], [judged_cell])
     return judgement.ruling
 
 
 def test_a_perfect_link_meets_an_expectation_of_all_packets() -> None:
     """Issue 21: 0 of 7,500 datagrams lost in 6 repeats of 3 s was undecided, while 0.5 % of loss passed."""
-    gate = "ip_loss < 2 % of all packets"
-    assert ruling(gate, losses(0, 0, 0, 0, 0, 0)) is Ruling.HOLDS
-    assert ruling(gate, losses(6, 6, 6, 6, 6, 7)) is Ruling.HOLDS
-    assert ruling(gate, losses(0, 0, 37, 0, 0, 0)) is Ruling.OPEN, "0.5 % in one burst"
-    assert ruling(gate, losses(25, 25, 25, 25, 25, 25)) is Ruling.FAILS
+    text = "ip_loss < 2 % of all packets"
+    assert ruling(text, losses(0, 0, 0, 0, 0, 0)) is Ruling.HOLDS
+    assert ruling(text, losses(6, 6, 6, 6, 6, 7)) is Ruling.HOLDS
+    assert ruling(text, losses(0, 0, 37, 0, 0, 0)) is Ruling.OPEN, "0.5 % in one burst"
+    assert ruling(text, losses(25, 25, 25, 25, 25, 25)) is Ruling.FAILS
     assert ruling("ip_loss <= 2 % of all packets", losses(25, 25, 25, 25, 25, 25)) is Ruling.OPEN
-    assert ruling("ip_loss < 2 %", losses(0, 0, 0, 0, 0, 0)) is Ruling.OPEN, "a statement on other repeats"
-    (few,) = judgements.judge([expectations.parse(gate, QUANTITIES)], [losses(0, 0, sent=100)])
-    assert judgement_texts(few)[2:] == (
+    assert ruling("ip_loss < 2 %", losses(0, 0, 0, 0, 0, 0)) is Ruling.OPEN, "this is a statement about other repeats"
+    (judgement_of_few,) = judgements.judge([expectations.parse(text, QUANTITIES)], [losses(0, 0, n_sent=100)])
+    assert judgement_texts(judgement_of_few)[2:] == (
         "0.00 %", "14.98 % or less", "undecided: 200 packets were sent, but at least 1498 are needed",
     )  # fmt: skip
 
@@ -175,7 +179,7 @@ def test_fewer_losses_never_make_a_ruling_worse(pairs: list[tuple[int, int]], te
 
 
 @pytest.mark.parametrize(
-    ("lost", "every", "share"),
+    ("lost_counts", "every", "share"),
     [
         ([0] * 29, Ruling.HOLDS, Ruling.HOLDS),
         ([0] * 28, Ruling.HOLDS, Ruling.OPEN),
@@ -185,9 +189,11 @@ def test_fewer_losses_never_make_a_ruling_worse(pairs: list[tuple[int, int]], te
         ([25] * 29, Ruling.FAILS, Ruling.FAILS),
     ],
 )
-def test_every_repeat_and_a_share_of_them(lost: list[int], every: Ruling, share: Ruling) -> None:
-    assert ruling("every ip_loss < 2 %", losses(*lost)) is every
-    assert ruling("90 % of ip_loss < 2 %", losses(*lost)) is share
+def test_rulings_on_every_repeat_and_on_a_share_of_repeats(
+    lost_counts: list[int], every: Ruling, share: Ruling
+) -> None:
+    assert ruling("every ip_loss < 2 %", losses(*lost_counts)) is every
+    assert ruling("90 % of ip_loss < 2 %", losses(*lost_counts)) is share
 
 
 def test_the_measured_value_is_shown_for_each_scope() -> None:
@@ -209,11 +215,11 @@ def test_the_measured_value_is_shown_for_each_scope() -> None:
 
 def test_only_one_protocol_is_judged_and_a_missing_figure_is_undecided() -> None:
     cells = [cell("tcp", estimate(RTT, 0.002, 0.001, 0.003)), cell("udp")]
-    (single,) = judgements.judge([expectations.parse("tcp rtt_median_s < 5 ms", QUANTITIES)], cells)
-    assert single.holds
-    both = judgements.judge([expectations.parse("rtt_median_s < 5 ms", QUANTITIES)], cells)
-    assert [item.ruling for item in both] == [Ruling.HOLDS, Ruling.OPEN]
-    assert [judgement_texts(item)[1:] for item in both] == [
+    (tcp_judgement,) = judgements.judge([expectations.parse("tcp rtt_median_s < 5 ms", QUANTITIES)], cells)
+    assert tcp_judgement.holds
+    judgements_of_both = judgements.judge([expectations.parse("rtt_median_s < 5 ms", QUANTITIES)], cells)
+    assert [item.ruling for item in judgements_of_both] == [Ruling.HOLDS, Ruling.OPEN]
+    assert [judgement_texts(item)[1:] for item in judgements_of_both] == [
         ("TCP", "2.00 ms", "[1.00, 3.00]", "holds"),
         ("UDP", "nothing", "", "undecided: 0 of 5 repeats have a value"),
     ]

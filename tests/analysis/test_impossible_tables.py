@@ -65,26 +65,26 @@ def test_the_error_of_an_impossible_value_names_its_place(tmp_path: Path, name: 
         writer = csv.DictWriter(file, lines[0], lineterminator="\n")
         writer.writeheader()
         writer.writerows(lines)
-    with pytest.raises(EvidenceError) as caught:
+    with pytest.raises(EvidenceError) as error_info:
         read([path], trial_columns())
-    assert caught.value.where == f"{path}:4"
-    assert caught.value.what.startswith(f"{name} is '{text[:40]}")
-    assert caught.value.what.endswith(f", {reason}")
-    assert "fieldkit rebuild TRIAL" in caught.value.remedy
+    assert error_info.value.where == f"{path}:4"
+    assert error_info.value.what.startswith(f"{name} is '{text[:40]}")
+    assert error_info.value.what.endswith(f", {reason}")
+    assert "fieldkit rebuild TRIAL" in error_info.value.remedy
 
 
 def test_a_share_that_its_counts_contradict_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path, [*repeats(ROW, 2), replace(ROW, repeat=3, ip_loss=0.5)])
-    with pytest.raises(EvidenceError, match=r"ip_loss is 0\.5, but ip_packets_received is 206 of 216") as caught:
+    with pytest.raises(EvidenceError, match=r"ip_loss is 0\.5, but ip_packets_received is 206 of 216") as error_info:
         read([path], trial_columns())
-    assert caught.value.where == f"{path}:4"
+    assert error_info.value.where == f"{path}:4"
 
 
 @pytest.mark.parametrize(
-    ("spoil", "message"),
+    ("damage", "message"),
     [
         (lambda text: text.replace(",", ";").encode(), "its cells are separated by semicolons"),
-        (lambda text: quoted(text, ";").encode(), "its cells are separated by semicolons"),
+        (lambda text: in_quotes(text, ";").encode(), "its cells are separated by semicolons"),
         (lambda text: text.replace(",", "\t").encode(), "its cells are separated by tabs"),
         (lambda text: text.encode("utf-16"), "its encoding is UTF-16"),
         (lambda text: b'"' + b"x" * 200_000 + text.encode(), "it lacks schema_version"),
@@ -92,16 +92,16 @@ def test_a_share_that_its_counts_contradict_is_refused(tmp_path: Path) -> None:
     ids=["semicolons", "semicolons, quoted", "tabs", "UTF-16", "no table"],
 )
 def test_a_table_that_a_spreadsheet_changed_is_an_error(
-    tmp_path: Path, spoil: Callable[[str], bytes], message: str
+    tmp_path: Path, damage: Callable[[str], bytes], message: str
 ) -> None:
     path = tmp_path / "saved.csv"
-    path.write_bytes(spoil(as_csv(repeats(ROW, 2))))
+    path.write_bytes(damage(as_csv(repeats(ROW, 2))))
     with pytest.raises(ConfigurationError, match=message):
         read([path], trial_columns())
 
 
-def quoted(text: str, delimiter: str) -> str:
-    """A table in which every cell is in quotes, as some spreadsheets save it."""
+def in_quotes(text: str, delimiter: str) -> str:
+    """Return a table in which every cell is in quotes, as some spreadsheets save it."""
     out = io.StringIO()
     csv.writer(out, delimiter=delimiter, quoting=csv.QUOTE_ALL).writerows(csv.reader(io.StringIO(text)))
     return out.getvalue()
@@ -117,9 +117,9 @@ def test_the_error_of_a_shortened_time_has_a_remedy(tmp_path: Path) -> None:
     path = tmp_path / "saved.csv"
     table = as_csv([replace(ROW, started_utc_ns=1_795_309_790_492_337_123)])
     path.write_text(table.replace("1795309790492337123", "1.79531E+18"), encoding="utf-8")
-    with pytest.raises(EvidenceError, match="not a whole number") as caught:
+    with pytest.raises(EvidenceError, match="not a whole number") as error_info:
         read([path], trial_columns())
-    assert "a spreadsheet has removed digits" in caught.value.remedy
+    assert "a spreadsheet has removed digits" in error_info.value.remedy
 
 
 def test_a_time_keeps_its_nanoseconds_next_to_a_missing_value(tmp_path: Path) -> None:
@@ -140,8 +140,8 @@ def test_a_share_without_its_counts_is_missing(tmp_path: Path, capsys: pytest.Ca
     assert (cell["n_valid"], cell["estimates"]["ip_loss"]["n"], cell["estimates"]["ip_loss"]["trials"]) == (4, 3, 648)
 
 
-def likely(column: Column) -> st.SearchStrategy[str]:
-    """Cells of a column: empty, possible values, its bounds, and errors of other programs or people."""
+def cells_of(column: Column) -> st.SearchStrategy[str]:
+    """Return a strategy for cells of a column: empty, possible values, bounds, and errors of programs and people."""
     low, high = column.possible
     hostile = st.sampled_from(
         ["nan", "NaN", "inf", "-1", "2.5", "1e308", "-38460", "true", "TRUE", "NA", "9" * 400, "\x1b[31m<b>|&%", "0"]
@@ -155,12 +155,12 @@ def likely(column: Column) -> st.SearchStrategy[str]:
     return st.sampled_from(["", f"{low:.9g}", f"{high:.9g}", "0.1", "1e-300"]) | st.floats(0, 1).map(repr) | hostile
 
 
-def holed(column: Column) -> st.SearchStrategy[str]:
-    """Possible or empty cells of a column."""
-    return likely(column).filter(lambda text: column.invalid_value_reason(text) is None)
+def valid_cells_of(column: Column) -> st.SearchStrategy[str]:
+    """Return a strategy for possible or empty cells of a column."""
+    return cells_of(column).filter(lambda text: column.invalid_value_reason(text) is None)
 
 
-CHOSEN = (
+HOSTILE_COLUMNS = (
     "trial", "procedure", "scenario", "topology", "backend", "distance", "distance_m", "protocol", "repeat",
     "attempt", "started_utc_ns", "seed", "reason", "sender", "sent_bytes", "file_loss", "hash_match", "bag_messages",
     "tcp_byte_loss", "datagrams_sent", "tcp_superframes", "rtt_median_s", "transfer_s", "goodput_bit_s",
@@ -172,13 +172,13 @@ CHOSEN = (
 
 @st.composite
 def hostile_tables(draw: st.DrawFn) -> str:
-    """A table of repeats in which some cells are empty, and a few impossible."""
+    """Return a table of repeats in which some cells are empty, and a few are impossible."""
     lines = [
         dict(csv_row) for csv_row in csv.DictReader(io.StringIO(as_csv(repeats(COMPARABLE, draw(st.integers(1, 8))))))
     ]
-    cells = holed if draw(st.booleans()) else likely
+    cells = valid_cells_of if draw(st.booleans()) else cells_of
     for line in lines:
-        for name in draw(st.lists(st.sampled_from(CHOSEN), max_size=6)):
+        for name in draw(st.lists(st.sampled_from(HOSTILE_COLUMNS), max_size=6)):
             line[name] = draw(cells(COLUMNS[name]))
         line["status"] = draw(st.sampled_from(["valid", "valid", "valid", "void", "failed"]))
     return _text(lines)
@@ -192,25 +192,25 @@ def _text(lines: list[dict[str, str]]) -> str:
     return out.getvalue()
 
 
-NO_NUMBER = re.compile(r"(?<![\w<])(nan|-?inf|NaN|Infinity|-9223372036854775808)(?![\w>])")
+NOT_A_NUMBER = re.compile(r"(?<![\w<])(nan|-?inf|NaN|Infinity|-9223372036854775808)(?![\w>])")
 
 
-def _strict(text: str) -> Any:  # noqa: ANN401 (any JSON)
+def _parse_strict_json(text: str) -> Any:  # noqa: ANN401 (any JSON)
     def refuse(word: str) -> float:
         raise AssertionError(word)
 
     return json.loads(text, parse_constant=refuse)
 
 
-def _numbers_are_numbers(text: str) -> None:
+def _check_numbers_are_finite(text: str) -> None:
     """Check that no number column of a CSV contains nan or inf."""
     for line in csv.DictReader(io.StringIO(text)):
         for name, cell in line.items():
-            if cell and (name not in COLUMNS or COLUMNS[name].type is not str) and name not in WORDS:
+            if cell and (name not in COLUMNS or COLUMNS[name].type is not str) and name not in TEXT_COLUMNS:
                 assert cell in {"true", "false"} or math.isfinite(float(cell)), (name, cell)
 
 
-WORDS = frozenset(("quantity", "unit", "estimate", "missing_in", "verdict"))
+TEXT_COLUMNS = frozenset(("quantity", "unit", "estimate", "missing_in", "verdict"))
 
 
 @given(hostile_tables(), hostile_tables())
@@ -222,10 +222,10 @@ def test_commands_only_exit_with_documented_codes(
     a.write_text(first, encoding="utf-8")
     b.write_text(second, encoding="utf-8")
 
-    def run(*words: str) -> str:
-        code = main(list(words))
+    def run(*argv: str) -> str:
+        code = main(list(argv))
         out = capsys.readouterr().out
-        assert code in {0, 1, 2, 4}, (words, code)
+        assert code in {0, 1, 2, 4}, (argv, code)
         return out if code in {0, 1} else ""
 
     for form in ("json", "csv", "table", "markdown", "latex"):
@@ -233,12 +233,12 @@ def test_commands_only_exit_with_documented_codes(
         compared = run("compare", str(a), str(b), "--force", "--format", form) if form != "latex" else ""
         for text in filter(None, (aggregated, compared)):
             if form == "json":
-                _strict(text)
+                _parse_strict_json(text)
             elif form == "csv":
-                _numbers_are_numbers(text)
+                _check_numbers_are_finite(text)
     (tmp_path / "out.csv").unlink(missing_ok=True)
     if run("export", str(a), "--format", "csv", "-o", str(tmp_path / "out.csv")):
-        _numbers_are_numbers((tmp_path / "out.csv").read_text(encoding="utf-8"))
+        _check_numbers_are_finite((tmp_path / "out.csv").read_text(encoding="utf-8"))
     (tmp_path / "out.parquet").unlink(missing_ok=True)
     if run("export", str(a), "--format", "parquet", "-o", str(tmp_path / "out.parquet")):
         for name, column in zip(*_columns(tmp_path / "out.parquet"), strict=True):
@@ -259,7 +259,7 @@ def test_a_report_of_any_table_is_written_or_refused(tmp_path: Path, first: str)
     code = main(["report", str(table), "-o", str(page)])
     assert code in {0, 2, 4}
     if code == 0:
-        assert not NO_NUMBER.search(
+        assert not NOT_A_NUMBER.search(
             re.sub(r"<(style|script)>.*?</\1>", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
         )
 
@@ -267,18 +267,18 @@ def test_a_report_of_any_table_is_written_or_refused(tmp_path: Path, first: str)
 NUMBERS = [column for column in trial_columns() if column.type is not str]
 
 
-@given(st.sampled_from(NUMBERS).flatmap(lambda column: st.tuples(st.just(column), likely(column))))
+@given(st.sampled_from(NUMBERS).flatmap(lambda column: st.tuples(st.just(column), cells_of(column))))
 @settings(max_examples=examples(60))
 def test_every_column_accepts_exactly_its_possible_values(column_and_cell: tuple[Column, str]) -> None:
     column, text = column_and_cell
     line = dict.fromkeys(COLUMNS, "") | {"status": "valid", column.name: text}
     content = _text([line]).encode()
-    problem = column.invalid_value_reason(text)
-    if column.name == "schema_version" and not problem and float(text or "nan") > SCHEMA_VERSION:
-        problem = "newer"
-    if problem is None:
+    invalid_reason = column.invalid_value_reason(text)
+    if column.name == "schema_version" and not invalid_reason and float(text or "nan") > SCHEMA_VERSION:
+        invalid_reason = "newer"
+    if invalid_reason is None:
         table_read = read([Path("a.csv")], trial_columns(), content=lambda _: content)
         assert not np.isinf(table_read.numbers[column.name]).any()
     else:
-        with pytest.raises((EvidenceError, ConfigurationError), match=re.escape(problem)):
+        with pytest.raises((EvidenceError, ConfigurationError), match=re.escape(invalid_reason)):
             read([Path("a.csv")], trial_columns(), content=lambda _: content)

@@ -33,11 +33,11 @@ def cells_of(table: Sequence[RepeatRow]) -> tuple[Cell, ...]:
     return aggregate(repeats.parse(rows.to_csv(table, trial_columns()).encode(), trial_columns()))
 
 
-def texts_by_label(cells: Sequence[Cell], chosen: Sequence[table_lines.TableLine]) -> dict[str, list[str]]:
-    return {line.label: [line.amount(cell, line.scale(cells)) for cell in cells] for line in chosen}
+def texts_by_label(cells: Sequence[Cell], lines: Sequence[table_lines.TableLine]) -> dict[str, list[str]]:
+    return {line.label: [line.amount(cell, line.scale(cells)) for cell in cells] for line in lines}
 
 
-def test_a_round_trip_time_has_the_payload_size() -> None:
+def test_the_label_of_a_round_trip_time_has_the_payload_size() -> None:
     figures = texts_by_label(cells := cells_of([TCP, PINGED]), table_lines.lines(cells))
     assert figures["RTT, 502-byte ping, median"] == ["10.00 ms", ""]
     assert figures["RTT, 8192-byte ping, median"] == ["", "10.00 ms"]
@@ -78,8 +78,10 @@ def test_radio_losses_of_tcp_and_udp_are_one_line_unless_a_condition_has_both() 
     cells = cells_of([TCP, PINGED])
     figures = texts_by_label(cells, table_lines.with_radio_loss(table_lines.operator_lines(cells), cells))
     assert figures["radio loss"] == ["1.00 %", "4.63 %"]
-    together = cells_of([replace(PINGED, tcp_byte_loss=0.01)])
-    labels = texts_by_label(together, table_lines.with_radio_loss(table_lines.operator_lines(together), together))
+    cells_with_both = cells_of([replace(PINGED, tcp_byte_loss=0.01)])
+    labels = texts_by_label(
+        cells_with_both, table_lines.with_radio_loss(table_lines.operator_lines(cells_with_both), cells_with_both)
+    )
     assert {"IP packet loss", "TCP byte loss before retransmission"} <= labels.keys()
     assert "radio loss" not in labels
 
@@ -93,12 +95,12 @@ def test_lines_for_an_operator_include_expected_and_additional_quantities() -> N
     cells = aggregate(repeats.parse(content, columns))
     labels = [line.label for line in table_lines.operator_lines(cells)]
     assert "probe: level, median" in labels
-    others = {
+    hidden_labels = {
         "jitter_s": "last jitter value (RFC 3550), median",
         "transfer_stall_s": "longest stall of the transfer, median",
         "transfer_stalls": "stalls of the transfer",
     }
-    for name, label in others.items():
+    for name, label in hidden_labels.items():
         assert label not in labels
         assert label in [line.label for line in table_lines.operator_lines(cells, {name})]
     assert labels.index("file loss") < labels.index("ping loss") < labels.index("RTT, 8192-byte ping, median")
@@ -113,7 +115,7 @@ def test_figures_of_equal_rank_are_in_the_order_of_columns() -> None:
     assert [label for label in labels if label.startswith("m")] == [f"m{n}, median" for n in range(12)]
 
 
-def test_all_lines_are_shown_if_none_is_for_an_operator() -> None:
+def test_all_lines_are_shown_if_there_are_no_lines_for_an_operator() -> None:
     without_metrics = replace(ROW, file_loss=None, ip_loss=None, rtt_median_s=None, ip_packets_sent=None)
     assert [line.label for line in table_lines.operator_lines(cells_of([without_metrics]))] == [
         "transfer time, median"

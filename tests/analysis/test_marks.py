@@ -18,7 +18,7 @@ def run(name: str, *marks: str) -> Repeats:
 
 
 @pytest.mark.parametrize(
-    ("a", "b", "refused", "noted"),
+    ("a", "b", "refusals", "notes"),
     [
         (("none", "none"), ("none", "none"), (), ()),
         (("wrong clock",), ("wrong clock", "wrong clock"), (), ()),
@@ -28,13 +28,13 @@ def run(name: str, *marks: str) -> Repeats:
         (("",), ("wrong clock",), (), ("marks, wrong clock",)),
     ],
 )
-def test_a_mark_in_another_share_of_the_repeats_is_a_concern(
-    a: tuple[str, ...], b: tuple[str, ...], refused: tuple[str, ...], noted: tuple[str, ...]
+def test_a_mark_in_a_different_share_of_the_repeats_is_a_concern(
+    a: tuple[str, ...], b: tuple[str, ...], refusals: tuple[str, ...], notes: tuple[str, ...]
 ) -> None:
     comparison = compare(run("a", *a), run("b", *b))
-    of_marks = [concern for concern in comparison.concerns if concern.what.startswith("marks")]
-    assert tuple(concern.what for concern in of_marks if concern.refuses) == refused
-    assert tuple(concern.what for concern in of_marks if not concern.refuses) == noted
+    mark_concerns = [concern for concern in comparison.concerns if concern.what.startswith("marks")]
+    assert tuple(concern.what for concern in mark_concerns if concern.refuses) == refusals
+    assert tuple(concern.what for concern in mark_concerns if not concern.refuses) == notes
 
 
 def test_the_names_of_both_packages_are_equal() -> None:

@@ -1,4 +1,4 @@
-"""Filters of rows: against an interpreter of three-valued logic, and their errors."""
+"""Filters of rows, compared with an interpreter of three-valued logic, and their errors."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -48,11 +48,11 @@ LEAVES: dict[str, Any] = {
 }
 
 
-def negated(value: bool | None) -> bool | None:
+def negate(value: bool | None) -> bool | None:
     return None if value is None else not value
 
 
-def joined(kind: str, values: list[bool | None]) -> bool | None:
+def combine(kind: str, values: list[bool | None]) -> bool | None:
     decisive = kind == "or"
     if decisive in values:
         return decisive
@@ -62,11 +62,11 @@ def joined(kind: str, values: list[bool | None]) -> bool | None:
 CONDITIONS = st.recursive(
     st.sampled_from(sorted(LEAVES)).map(lambda text: (text, LEAVES[text])),
     lambda children: st.one_of(
-        children.map(lambda child: (f"not ({child[0]})", lambda row: negated(child[1](row)))),
+        children.map(lambda child: (f"not ({child[0]})", lambda row: negate(child[1](row)))),
         st.tuples(st.sampled_from(["and", "or"]), st.lists(children, min_size=2, max_size=3)).map(
             lambda pair: (
                 f" {pair[0]} ".join(f"({text})" for text, _ in pair[1]),
-                lambda row: joined(pair[0], [decide(row) for _, decide in pair[1]]),
+                lambda row: combine(pair[0], [decide(row) for _, decide in pair[1]]),
             )
         ),
     ),
@@ -103,11 +103,11 @@ def test_any_text_is_a_condition_or_a_configuration_error(text: str) -> None:
         ("(" * 500 + "distance_m < 1" + ")" * 500, "is not an expression", "write for example"),
     ],
 )
-def test_a_wrong_expression_is_refused(text: str, message: str, remedy: str) -> None:
-    with pytest.raises(ConfigurationError) as caught:
+def test_an_invalid_expression_is_refused(text: str, message: str, remedy: str) -> None:
+    with pytest.raises(ConfigurationError) as error_info:
         parse_filter(text, COLUMNS)
-    assert message in caught.value.what
-    assert remedy in caught.value.remedy
+    assert message in error_info.value.what
+    assert remedy in error_info.value.remedy
 
 
 def test_commands_use_only_the_chosen_rows(tmp_path: Path) -> None:
@@ -115,11 +115,11 @@ def test_commands_use_only_the_chosen_rows(tmp_path: Path) -> None:
         replace(COMPARABLE, repeat=number, distance=f"{5 * number}m", distance_m=5.0 * number) for number in (1, 2, 3)
     ]
     write(tmp_path / "trial", rows)
-    chosen = run_here(
+    filtered = run_here(
         tmp_path, "aggregate", "trial", "--where", "distance_m > 5", "--format", "csv", "--by", "distance"
     )
-    assert chosen.code == 0, chosen.err
-    assert {line.split(",")[0] for line in chosen.out.splitlines()[1:]} == {"10m", "15m"}
-    none = run_here(tmp_path, "aggregate", "trial", "--where", "distance_m > 50")
-    assert none.code == 4
-    assert "none of 3 attempts satisfies --where distance_m > 50" in none.err
+    assert filtered.code == 0, filtered.err
+    assert {line.split(",")[0] for line in filtered.out.splitlines()[1:]} == {"10m", "15m"}
+    no_rows = run_here(tmp_path, "aggregate", "trial", "--where", "distance_m > 50")
+    assert no_rows.code == 4
+    assert "none of 3 attempts satisfies --where distance_m > 50" in no_rows.err

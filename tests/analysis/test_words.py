@@ -17,13 +17,13 @@ from fieldkit.core.columns import Column, Figure, Kind, csv_text
 from fieldkit.trial.columns import trial_columns
 from tests.helpers.tables import COMPARABLE, replace
 
-GRASS = Column("grass", "text", "How it is.", figure=Figure("the grass", Kind.WORDS))
+GRASS = Column("grass", "text", "The state of the grass.", figure=Figure("the grass", Kind.WORDS))
 PLAIN = Column("plain", "text", "Words that are not counted.")
 COLUMNS = (*trial_columns(), GRASS, PLAIN)
 
 
 def table(words: Sequence[str], protocols: Sequence[str] = ("udp",), status: str = "valid") -> Repeats:
-    """Repeats with one word each and alternating protocols; the column `plain` is not counted."""
+    """Return repeats with one word each and alternating protocols. The column `plain` is not counted."""
     result = [
         {
             **replace(COMPARABLE, repeat=1 + number, protocol=protocols[number % len(protocols)], status=status),
@@ -33,7 +33,7 @@ def table(words: Sequence[str], protocols: Sequence[str] = ("udp",), status: str
         for number, word in enumerate(words)
     ]
     names = [column.name for column in COLUMNS]
-    return repeats.parse(csv_text(names, ([entry.get(name) for name in names] for entry in result)).encode(), COLUMNS)
+    return repeats.parse(csv_text(names, ([row.get(name) for name in names] for row in result)).encode(), COLUMNS)
 
 
 def cell(*words: str) -> Cell:
@@ -44,22 +44,22 @@ def cell(*words: str) -> Cell:
 @given(st.lists(st.tuples(st.sampled_from(("tcp", "udp")), st.sampled_from(("", "wet", "dry", "a=b"))), min_size=1))
 def test_each_word_is_counted_in_its_condition(words_by_protocol: list[tuple[str, str]]) -> None:
     expected = {
-        protocol: Counter(word for entry, word in words_by_protocol if entry == protocol and word)
+        protocol: Counter(word for row, word in words_by_protocol if row == protocol and word)
         for protocol, _ in words_by_protocol
     }
     names = [column.name for column in COLUMNS]
-    rows_of = [
+    rows = [
         {**replace(COMPARABLE, repeat=1 + number, protocol=protocol), "grass": word}
         for number, (protocol, word) in enumerate(words_by_protocol)
     ]
-    text = csv_text(names, ([entry.get(name) for name in names] for entry in rows_of))
-    for entry in aggregate(repeats.parse(text.encode(), COLUMNS)):
-        tally = entry.tallies.get("grass")
-        counted = expected[str(entry.key["protocol"])]
-        assert (tally is None) == (not counted)
+    text = csv_text(names, ([row.get(name) for name in names] for row in rows))
+    for row in aggregate(repeats.parse(text.encode(), COLUMNS)):
+        tally = row.tallies.get("grass")
+        expected_counts = expected[str(row.key["protocol"])]
+        assert (tally is None) == (not expected_counts)
         if tally is not None:
-            assert list(tally.counts.items()) == sorted(counted.items(), key=lambda pair: (-pair[1], pair[0]))
-            assert tally.n == counted.total()
+            assert list(tally.counts.items()) == sorted(expected_counts.items(), key=lambda pair: (-pair[1], pair[0]))
+            assert tally.n == expected_counts.total()
 
 
 def test_only_valid_repeats_and_declared_columns_are_counted() -> None:
@@ -70,12 +70,12 @@ def test_only_valid_repeats_and_declared_columns_are_counted() -> None:
 def test_a_table_has_a_row_per_word_without_an_interval() -> None:
     (result,) = aggregate(table(["wet", "dry", "wet", ""]), ("protocol",), quantities=())
     rows = list(csv.DictReader(io.StringIO(result_tables.to_csv(("protocol",), [result]))))
-    assert [(entry["quantity"], entry["estimate"], entry["n"], entry["events"]) for entry in rows] == [
+    assert [(row["quantity"], row["estimate"], row["n"], row["events"]) for row in rows] == [
         ("grass=wet", "words", "3", "2"),
         ("grass=dry", "words", "3", "1"),
     ]
-    assert [float(entry["value"]) for entry in rows] == pytest.approx([2 / 3, 1 / 3])
-    assert {entry["low"] + entry["high"] + entry["wilson_low"] for entry in rows} == {""}
+    assert [float(row["value"]) for row in rows] == pytest.approx([2 / 3, 1 / 3])
+    assert {row["low"] + row["high"] + row["wilson_low"] for row in rows} == {""}
     assert "| the grass |\n" in paper_tables.to_markdown(("protocol",), [result], ())
     assert "| wet 2, dry 1, 1 without |\n" in paper_tables.to_markdown(("protocol",), [result], ())
 
@@ -98,8 +98,8 @@ def test_the_most_frequent_words_are_listed(words: tuple[str, ...], expected_tex
 def test_words_of_two_runs_are_listed_but_not_compared() -> None:
     a, b = table(["wet", "wet", "dry"]), table(["dry", "dry", ""])
     result = compare(a, b)
-    without = compare(table(["", "", ""]), table(["", "", ""]))
-    assert result.n_compared == without.n_compared, "words are not in the number of comparisons"
+    without_words = compare(table(["", "", ""]), table(["", "", ""]))
+    assert result.n_compared == without_words.n_compared, "words do not count as comparisons"
     rows = {row.quantity: row for _, row in comparison_results.difference_rows(result) if row.estimate == Kind.WORDS}
     assert set(rows) == {"grass=wet", "grass=dry"}
     wet = rows["grass=wet"]

@@ -13,7 +13,7 @@ NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 LIMIT_S = 120
 
 
-def notebook(path: Path) -> Any:  # noqa: ANN401 (as nbformat has it)
+def notebook(path: Path) -> Any:  # noqa: ANN401 (nbformat has no type hints)
     return nbformat.read(path, as_version=4)  # type: ignore[no-untyped-call]
 
 
@@ -26,7 +26,7 @@ def test_a_notebook_runs(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
-def test_a_notebook_is_kept_without_outputs(path: Path) -> None:
+def test_a_notebook_is_stored_without_outputs(path: Path) -> None:
     code = [cell for cell in notebook(path).cells if cell.cell_type == "code"]
     assert code
     assert all((cell.outputs, cell.execution_count) == ([], None) for cell in code)

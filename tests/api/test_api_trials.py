@@ -29,8 +29,8 @@ LOSSY = next(path for path in STORED if path.name.startswith("20261122T013134"))
 
 
 @pytest.fixture
-def named(tmp_path: Path) -> Path:
-    """Two trials with named steps and a vendor's columns."""
+def named_step_trials(tmp_path: Path) -> Path:
+    """Return a folder with two trials that have named steps and columns of a vendor."""
     for number, columns in enumerate(
         (vendor_trials.NAMED_STEP_COLUMNS, (*vendor_trials.NAMED_STEP_COLUMNS, *vendor_trials.VENDOR_COLUMNS))
     ):
@@ -41,13 +41,13 @@ def named(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A trial that tests must not change."""
+    """Return a trial that tests must not change."""
     return recorded.make(tmp_path_factory.mktemp("trials"))
 
 
 @pytest.fixture
 def recorded_trial(original: Path, tmp_path: Path) -> Path:
-    """A copy of that trial, which the test may change."""
+    """Return a copy of that trial, which a test may change."""
     return Path(shutil.copytree(original, tmp_path / original.name))
 
 
@@ -66,8 +66,8 @@ def test_repeats_and_cells_equal_the_trial_tables(folder: Path) -> None:
     assert as_csv(trials.cells()) == (folder / store.SUMMARY_CSV).read_text(encoding="utf-8")
 
 
-def test_repeats_equal_the_export(named: Path, tmp_path: Path) -> None:
-    for paths in ([TRIALS], [named], [TRIALS, named]):
+def test_repeats_equal_the_export(named_step_trials: Path, tmp_path: Path) -> None:
+    for paths in ([TRIALS], [named_step_trials], [TRIALS, named_step_trials]):
         out = tmp_path / "out.parquet"
         assert main(["export", *map(str, paths), "--format", "parquet", "-o", str(out)]) == 0
         written = pyarrow.parquet.read_table(out)
@@ -76,10 +76,10 @@ def test_repeats_equal_the_export(named: Path, tmp_path: Path) -> None:
         out.unlink()
 
 
-def test_cells_of_named_steps_equal_aggregate(named: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["aggregate", str(named), "--by", "trial,protocol", "--format", "csv"]) == 0
+def test_cells_of_named_steps_equal_aggregate(named_step_trials: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["aggregate", str(named_step_trials), "--by", "trial,protocol", "--format", "csv"]) == 0
     with pytest.warns(UserWarning, match="echo requests of different sizes"):
-        cells = fieldkit.load(named).cells(by=["trial", "protocol"])
+        cells = fieldkit.load(named_step_trials).cells(by=["trial", "protocol"])
     assert as_csv(cells) == capsys.readouterr().out
     units = {row["quantity"]: row["unit"] for row in cells.to_pylist()}
     assert (units["up.file_loss"], units["probe.level"]) == ("share", "dBm")
@@ -99,16 +99,16 @@ def test_cells_can_be_grouped_by_source() -> None:
 
 @pytest.mark.motion  # a stored trial has a step `move`
 @pytest.mark.parametrize("folder", STORED, ids=lambda path: path.name)
-def test_packets_count_as_the_trial_does(folder: Path) -> None:
-    """The measures of a trial follow from its packets."""
+def test_packet_counts_equal_those_of_the_trial(folder: Path) -> None:
+    """The measurements of a trial can be calculated from its packets."""
     trials = fieldkit.load(folder)
     valid = [row for row in trials.repeats.to_pylist() if row["status"] == "valid"]
     assert valid
     for row in valid:
-        compare(row, trials.packets(f"{row['protocol']}-{row['repeat']:02}"))
+        check_packets(row, trials.packets(f"{row['protocol']}-{row['repeat']:02}"))
 
 
-def compare(row: dict[str, Any], packets: Table) -> None:
+def check_packets(row: dict[str, Any], packets: Table) -> None:
     columns = packets.to_pydict()
     if row["protocol"] == "udp":
         assert packets.num_rows == row["ip_packets_sent"]
@@ -129,12 +129,12 @@ def compare(row: dict[str, Any], packets: Table) -> None:
 
 def test_each_packet_has_the_times_at_which_it_was_captured(recorded_trial: Path) -> None:
     packets = fieldkit.load(recorded_trial).packets("udp-01").to_pydict()
-    begin_ns = START_NS + 12 * SECOND_NS
-    assert packets["sent_ns"] == [begin_ns + 1_000_000 * number for number in range(PACKETS)]
+    start_ns = START_NS + 12 * SECOND_NS
+    assert packets["sent_ns"] == [start_ns + 1_000_000 * number for number in range(PACKETS)]
     assert packets["received_ns"] == [
         None if number in LOST else sent_ns + AHEAD_NS for number, sent_ns in enumerate(packets["sent_ns"])
     ]
-    assert [number for number, lost in enumerate(packets["lost"]) if lost] == list(LOST)
+    assert [number for number, is_lost in enumerate(packets["lost"]) if is_lost] == list(LOST)
     assert set(packets["wire_bytes"]) == {1042}
     assert set(packets["payload_bytes"]) == {1008}
     assert set(packets["delay_s"]) == {None}, "without packets in the other direction the clock offset is unknown"
@@ -143,16 +143,16 @@ def test_each_packet_has_the_times_at_which_it_was_captured(recorded_trial: Path
 def test_packets_of_a_step_are_selected_by_its_name(recorded_trial: Path) -> None:
     path = recorded_trial / "trial.yaml"
     before, step, after = path.read_text(encoding="utf-8").partition("- transfer:\n")
-    keys, ping, rest = after.partition("      - ping:\n")
+    keys, ping, remaining = after.partition("      - ping:\n")
     up, down = (f"{step}          name: {name}\n{keys}" for name in ("up", "down"))
-    path.write_text(f"{before}{up}      {down.replace('1234', '4321')}{ping}{rest}", encoding="utf-8")
+    path.write_text(f"{before}{up}      {down.replace('1234', '4321')}{ping}{remaining}", encoding="utf-8")
     (recorded_trial / store.MANIFEST_FILE).unlink(missing_ok=True)
     trials = fieldkit.load(recorded_trial)
     assert (trials.packets("udp-01", "up").num_rows, trials.packets("udp-01", "down").num_rows) == (PACKETS, 0)
     assert trials.packets("udp-01")["step"].to_pylist() == ["up"] * PACKETS
-    with pytest.raises(ConfigurationError, match="no transfer of los is named 'across'") as caught:
+    with pytest.raises(ConfigurationError, match="no transfer of los is named 'across'") as error_info:
         trials.packets("udp-01", "across")
-    assert caught.value.remedy == "its transfers: 'up', 'down'"
+    assert error_info.value.remedy == "its transfers: 'up', 'down'"
 
 
 def test_a_missing_value_of_a_grouping_column_is_null() -> None:
@@ -175,7 +175,7 @@ def test_tables_become_data_frames(recorded_trial: Path) -> None:
 
 
 def test_only_data_frames_need_pandas(recorded_trial: Path) -> None:
-    output_text = """
+    program = """
 import sys, fieldkit
 class WithoutPandas:
     def find_spec(self, name, path=None, target=None):
@@ -186,11 +186,11 @@ trials = fieldkit.load(sys.argv[1])
 print(len(trials.repeats), len(trials.cells()) > 0, len(trials.packets("udp-01")))
 trials.repeats.to_pandas()
 """
-    done = subprocess.run(
-        (sys.executable, "-c", output_text, str(recorded_trial)), capture_output=True, text=True, check=False
+    completed = subprocess.run(
+        (sys.executable, "-c", program, str(recorded_trial)), capture_output=True, text=True, check=False
     )
-    assert done.stdout == f"2 True {PACKETS}\n"
-    assert "ModuleNotFoundError: No module named 'pandas'" in done.stderr
+    assert completed.stdout == f"2 True {PACKETS}\n"
+    assert "ModuleNotFoundError: No module named 'pandas'" in completed.stderr
 
 
 @pytest.mark.parametrize(
@@ -209,9 +209,9 @@ def test_unknown_attempts_and_transfers_are_rejected(
 
 def test_a_repeat_of_several_trials_needs_its_trial() -> None:
     trials = fieldkit.load(TRIALS)
-    with pytest.raises(ConfigurationError, match="2 trials have a repeat 'udp-01'") as caught:
+    with pytest.raises(ConfigurationError, match="2 trials have a repeat 'udp-01'") as error_info:
         trials.packets("udp-01")
-    assert f"{LOSSY.name}/udp-01" in caught.value.remedy
+    assert f"{LOSSY.name}/udp-01" in error_info.value.remedy
 
 
 def test_packets_without_unchanged_evidence_are_rejected(tmp_path: Path) -> None:
@@ -254,9 +254,9 @@ def test_a_damaged_table_is_rejected_with_its_line(tmp_path: Path) -> None:
     ("by", "quantities", "message"), [("protocl", None, "by: "), ("protocol", ["ip_los"], "quant")]
 )
 def test_a_mistyped_column_is_rejected(by: str, quantities: list[str] | None, message: str) -> None:
-    with pytest.raises(ConfigurationError, match=message) as caught:
+    with pytest.raises(ConfigurationError, match=message) as error_info:
         fieldkit.load(TRIALS).cells(by, quantities)
-    assert caught.value.remedy.startswith("did you mean")
+    assert error_info.value.remedy.startswith("did you mean")
 
 
 def test_notes_of_commands_are_warnings(tmp_path: Path) -> None:
@@ -271,21 +271,21 @@ def test_notes_of_commands_are_warnings(tmp_path: Path) -> None:
 
 
 def test_rebuild_measures_the_evidence_again(recorded_trial: Path) -> None:
-    stored = fieldkit.load(recorded_trial).repeats
+    stored_repeats = fieldkit.load(recorded_trial).repeats
     (recorded_trial / store.TRIAL_CSV).unlink()
-    assert fieldkit.load(recorded_trial, rebuild=True).repeats.equals(stored)
+    assert fieldkit.load(recorded_trial, rebuild=True).repeats.equals(stored_repeats)
 
 
 def test_the_package_imports_its_readers_lazily() -> None:
-    output_text = "import sys; before = set(sys.modules); import fieldkit; print(*sorted(set(sys.modules) - before))"
-    done = subprocess.run((sys.executable, "-c", output_text), capture_output=True, text=True, check=True)
-    assert done.stdout == "fieldkit\n"
+    program = "import sys; before = set(sys.modules); import fieldkit; print(*sorted(set(sys.modules) - before))"
+    completed = subprocess.run((sys.executable, "-c", program), capture_output=True, text=True, check=True)
+    assert completed.stdout == "fieldkit\n"
     assert fieldkit.load is api.load
     with pytest.raises(AttributeError, match="has no attribute 'lod'"):
         fieldkit.lod  # type: ignore[attr-defined]  # noqa: B018
 
 
-def test_a_cell_has_its_figures_by_name(named: Path) -> None:
+def test_a_cell_has_its_figures_by_name(named_step_trials: Path) -> None:
     trials = fieldkit.load(LOSSY)
     cell = trials.cell(protocol="udp")
     row = next(
@@ -303,7 +303,7 @@ def test_a_cell_has_its_figures_by_name(named: Path) -> None:
     )
     assert figure in list(cell)
     with pytest.warns(UserWarning, match="echo requests of different sizes"):
-        up = fieldkit.load(named).cell(trial="named-0", protocol="udp")["up.file_loss"]
+        up = fieldkit.load(named_step_trials).cell(trial="named-0", protocol="udp")["up.file_loss"]
     assert (up.n, up.unit) == (8, "share")
 
 
@@ -325,14 +325,14 @@ def test_the_interval_of_a_single_repeat_is_infinite(recorded_trial: Path) -> No
     ],
 )
 def test_an_ambiguous_cell_is_rejected(condition: dict[str, str], message: str, remedy: str) -> None:
-    with pytest.raises(ConfigurationError, match=message) as caught:
+    with pytest.raises(ConfigurationError, match=message) as error_info:
         fieldkit.load(TRIALS).cell(**condition)
-    assert remedy in caught.value.remedy
+    assert remedy in error_info.value.remedy
 
 
-def test_a_figure_of_no_repeat_is_rejected() -> None:
+def test_a_figure_without_repeats_is_rejected() -> None:
     cell = fieldkit.load(LOSSY).cell(protocol="udp")
-    with pytest.raises(ConfigurationError, match="valid repeats has a figure 'file_los'") as caught:
+    with pytest.raises(ConfigurationError, match="valid repeats has a figure 'file_los'") as error_info:
         cell.file_los  # noqa: B018
-    assert caught.value.remedy == "did you mean 'file_loss'?"
+    assert error_info.value.remedy == "did you mean 'file_loss'?"
     assert not hasattr(cell, "__deepcopy__")

@@ -13,9 +13,9 @@ from tests.helpers.outside_packages import write_package
 def test_missing_site_file_and_unknown_backend_are_errors() -> None:
     with pytest.raises(ConfigurationError, match="needs a site file"):
         load_backend("field", None, None)
-    with pytest.raises(ConfigurationError, match="no backend 'gazebo'") as caught:
+    with pytest.raises(ConfigurationError, match="no backend 'gazebo'") as error_info:
         load_backend("gazebo", None, None)
-    assert "emulated" in caught.value.remedy
+    assert "emulated" in error_info.value.remedy
 
 
 def test_error_of_backend_that_cannot_be_loaded_names_entry_point(
@@ -23,6 +23,6 @@ def test_error_of_backend_that_cannot_be_loaded_names_entry_point(
 ) -> None:
     write_package(tmp_path, "bench", f"[{plugins.BACKENDS}]\nbench = no_such_package:Bench\n")
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(ConfigurationError, match="No module named 'no_such_package'") as caught:
+    with pytest.raises(ConfigurationError, match="No module named 'no_such_package'") as error_info:
         load_backend("bench", None, None)
-    assert caught.value.where == "entry point bench = no_such_package:Bench of bench 1.0"
+    assert error_info.value.where == "entry point bench = no_such_package:Bench of bench 1.0"

@@ -26,7 +26,7 @@ class RecordingOperator:
 
 
 @pytest.mark.parametrize(
-    ("fault", "requests", "lasted_s"),
+    ("fault", "requests", "duration_s"),
     [
         (Fault(FaultKind.REBOOT, Role.RECEIVER), ["reboot turtlebot-2"], 0.0),
         (Fault(FaultKind.KILL, Role.SENDER, process="nc"), ["kill nc on turtlebot-1"], 0.0),
@@ -37,9 +37,9 @@ class RecordingOperator:
         ),
     ],
 )
-def test_request_and_duration_of_each_fault(fault: Fault, requests: list[str], lasted_s: float | None) -> None:
+def test_request_and_duration_of_each_fault(fault: Fault, requests: list[str], duration_s: float | None) -> None:
     operator = RecordingOperator()
-    assert FieldTestbed(CAST, {}, operator).inject(fault) == lasted_s
+    assert FieldTestbed(CAST, {}, operator).inject(fault) == duration_s
     assert operator.prompts == requests
 
 
@@ -84,11 +84,11 @@ def test_operator_moves_robot_and_brings_it_back() -> None:
 @pytest.mark.parametrize("error", [RobotError("x", remedy="y"), KeyboardInterrupt()])
 def test_robot_is_brought_back_after_error_but_not_after_ctrl_c(error: BaseException) -> None:
     operator = RecordingOperator()
-    direct: dict[Role, Robot] = {role: CAST[role] for role in (Role.SENDER, Role.RECEIVER)}
-    with pytest.raises(type(error)), FieldTestbed(direct, {}, operator).moving(MOVE):
+    robots_without_relay: dict[Role, Robot] = {role: CAST[role] for role in (Role.SENDER, Role.RECEIVER)}
+    with pytest.raises(type(error)), FieldTestbed(robots_without_relay, {}, operator).moving(MOVE):
         raise error
-    back = ["bring turtlebot-1 back to its place"] if isinstance(error, Exception) else []
-    assert operator.prompts == [START_REQUEST.format("turtlebot-2"), *back]
+    last_requests = ["bring turtlebot-1 back to its place"] if isinstance(error, Exception) else []
+    assert operator.prompts == [START_REQUEST.format("turtlebot-2"), *last_requests]
 
 
 def test_a_failed_move_is_reported_even_if_the_operator_does_not_bring_the_robot_back() -> None:
@@ -98,9 +98,9 @@ def test_a_failed_move_is_reported_even_if_the_operator_does_not_bring_the_robot
                 raise ConfigurationError(f"no answer left to: {request}")
             return super().ask(request, may_skip=may_skip)
 
-    with pytest.raises(ConfigurationError) as caught, FieldTestbed(CAST, {}, Leaving()).moving(MOVE):
+    with pytest.raises(ConfigurationError) as error_info, FieldTestbed(CAST, {}, Leaving()).moving(MOVE):
         raise RobotError("its wheel is blocked", remedy="y")
-    assert caught.value.what.startswith(
+    assert error_info.value.what.startswith(
         "no answer left to: bring turtlebot-1 back to its place; before, the move failed"
     )
-    assert "its wheel is blocked" in caught.value.what
+    assert "its wheel is blocked" in error_info.value.what

@@ -1,4 +1,4 @@
-"""fieldkit's minstrel_ht beside recordings of Linux's, on the same frames."""
+"""The minstrel_ht of fieldkit compared with recordings of minstrel_ht in Linux, on the same frames."""
 
 import gzip
 from collections import Counter
@@ -19,30 +19,32 @@ SEEDS = range(2)
 
 @pytest.fixture(scope="module", params=study.TRACES)
 def case(request: pytest.FixtureRequest) -> tuple[dict[str, Any], str]:
-    """A trace, and the recording of it."""
+    """Return a trace, and the recording of the kernel with this trace."""
     name = str(request.param)
     text = gzip.decompress(study.recording(name).read_bytes()).decode()
     return study.trace(study.FRAMES, fading=study.TRACES[name]), text
 
 
-def test_tries_in_a_recording_follow_from_trace_and_chains(case: tuple[dict[str, Any], str]) -> None:
+def test_tries_in_a_recording_follow_from_the_trace_and_the_rate_chains(case: tuple[dict[str, Any], str]) -> None:
     trace, text = case
     frames = study.read(text)
     assert len(frames) == study.FRAMES
     for number, (_, stages, tries, is_received) in enumerate(frames):
-        made, succeeded = tries_of(trace, number, stages)
-        assert (sum(made), succeeded) == (tries, is_received)
+        expected_tries, expected_success = tries_of(trace, number, stages)
+        assert (sum(expected_tries), expected_success) == (tries, is_received)
 
 
-def own(case: tuple[dict[str, Any], str]) -> tuple[list[SelectedFrame], list[list[SelectedFrame]]]:
+def kernel_and_model_frames(
+    case: tuple[dict[str, Any], str],
+) -> tuple[list[SelectedFrame], list[list[SelectedFrame]]]:
     trace, text = case
     kernel = study.kernel_frames(text)
     return kernel, [study.fieldkit_frames(trace, [frame.time_ns for frame in kernel], seed) for seed in SEEDS]
 
 
-def test_rates_and_goodput_are_those_of_the_kernel(case: tuple[dict[str, Any], str]) -> None:
-    """Kernel and model draw other samples, so they differ by more with fading: the bounds are for the worse trace."""
-    kernel, runs = own(case)
+def test_rates_and_goodput_are_close_to_those_of_the_kernel(case: tuple[dict[str, Any], str]) -> None:
+    """Kernel and model draw different samples and differ more with fading. The bounds are for this trace."""
+    kernel, runs = kernel_and_model_frames(case)
     for frames in runs:
         assert study.goodput_bit_s(frames) == pytest.approx(study.goodput_bit_s(kernel), rel=0.1)
         assert study.difference(study.frames_per_mcs(kernel), study.frames_per_mcs(frames)) < 0.2
@@ -55,7 +57,7 @@ def test_a_model_with_other_rules_is_detected(
     case: tuple[dict[str, Any], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(minstrel_ht, "_UPDATE_NS", 1_000_000_000)
-    kernel, runs = own(case)
+    kernel, runs = kernel_and_model_frames(case)
     assert study.difference(study.frames_per_mcs(kernel), study.frames_per_mcs(runs[0])) > 0.2
 
 
@@ -72,5 +74,5 @@ def test_the_kernel_of_a_virtual_machine_is_recorded(monkeypatch: pytest.MonkeyP
     frames = study.read(study.record(trace))
     assert len(frames) == 100
     for number, (_, stages, tries, is_received) in enumerate(frames):
-        made, succeeded = tries_of(trace, number, stages)
-        assert (sum(made), succeeded) == (tries, is_received)
+        expected_tries, expected_success = tries_of(trace, number, stages)
+        assert (sum(expected_tries), expected_success) == (tries, is_received)

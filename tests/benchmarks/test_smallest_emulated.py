@@ -1,4 +1,4 @@
-"""Every benchmark on namespaces or emulated robots runs at its smallest size, some only in `make nightly`."""
+"""Every benchmark on namespaces or emulated robots runs at its smallest size; some run only in `make nightly`."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ ON_ROBOTS = (
 )
 ON_LOOPBACK = ("bridge",)
 ONLY_NIGHTLY = {"medium", "studies.mesh", "studies.middleware", "studies.zenoh_images", "trial_overhead"}
-"""CI runs similar ones: `medium_cost`, `studies.mesh_losses`, `studies.field_shape` and `stop`."""
+"""CI runs similar benchmarks: `medium_cost`, `studies.mesh_losses`, `studies.field_shape` and `stop`."""
 IN_CI = {*ON_NAMESPACES, *ON_LOOPBACK, *ON_ROBOTS} - ONLY_NIGHTLY
 
 

@@ -15,9 +15,9 @@ Files = dict[str, str | bytes]
 ABORT = Item(ItemKind.COMMAND_LINES, ("abort",), succeeds=False)
 
 
-def trees(tmp_path: Path, *outputs: Files) -> list[Tree]:
+def write_trees(tmp_path: Path, *outputs_of_trees: Files) -> list[Tree]:
     recorded_trees = []
-    for name, files in zip(("base", "head"), outputs, strict=True):
+    for name, files in zip(("base", "head"), outputs_of_trees, strict=True):
         tree = Tree(tmp_path / name, "0" * 40)
         folder = tree.results / "0"
         defaults: Files = {"exit_code": "0\n", "stdout": "", "stderr": ""}
@@ -32,7 +32,7 @@ def trees(tmp_path: Path, *outputs: Files) -> list[Tree]:
 
 
 def compare_outputs(tmp_path: Path, item: Item, before: Files, after: Files) -> Differences:
-    return comparison.compare(item, 0, *trees(tmp_path, before, after))
+    return comparison.compare(item, 0, *write_trees(tmp_path, before, after))
 
 
 def command(name: str, text: str) -> str:
@@ -109,9 +109,9 @@ def test_everything_else_is_a_difference(tmp_path: Path, item: Item, before: Fil
     assert not differences.labels
 
 
-def test_failure_at_the_base_commit_is_no_proof(tmp_path: Path) -> None:
-    failed: Files = {"exit_code": "3\n", "stderr": "error: no namespaces"}
-    (difference,) = compare_outputs(tmp_path, Item(ItemKind.TRIALS), failed, failed).real
+def test_failure_at_the_base_commit_proves_nothing(tmp_path: Path) -> None:
+    failed_output: Files = {"exit_code": "3\n", "stderr": "error: no namespaces"}
+    (difference,) = compare_outputs(tmp_path, Item(ItemKind.TRIALS), failed_output, failed_output).real
     assert difference.startswith("nothing is proved: exit code 3")
 
 
@@ -124,5 +124,5 @@ def test_emulated_trials_may_differ_in_numbers_but_not_in_fields_files_and_colum
 
     item = Item(ItemKind.TRIALS)
     assert compare_outputs(tmp_path / "same", item, trial(), trial(left_s=None, repeat="udp-02")) == Differences()
-    for number, other in enumerate((trial(field="left"), trial(header="a,c"), trial(repeat="tcp-01"))):
-        assert compare_outputs(tmp_path / str(number), item, trial(), other).real
+    for number, different_trial in enumerate((trial(field="left"), trial(header="a,c"), trial(repeat="tcp-01"))):
+        assert compare_outputs(tmp_path / str(number), item, trial(), different_trial).real

@@ -1,4 +1,4 @@
-"""The check of unchanged behaviour detects changes in a modified clone, and covers all that ships."""
+"""The check of unchanged behaviour detects changes in a modified clone, and covers all shipped steps."""
 
 import os
 import subprocess
@@ -14,9 +14,9 @@ from fieldkit.steps import kinds
 from tests.helpers.paths import ROOT
 
 
-def git(folder: Path, *words: str) -> str:
+def git(folder: Path, *arguments: str) -> str:
     return subprocess.run(
-        ("git", "-c", "user.name=test", "-c", "user.email=test@example.org", *words),
+        ("git", "-c", "user.name=test", "-c", "user.email=test@example.org", *arguments),
         cwd=folder,
         check=True,
         capture_output=True,
@@ -24,15 +24,15 @@ def git(folder: Path, *words: str) -> str:
     ).stdout
 
 
-def prove(clone: Path, *words: str) -> "subprocess.CompletedProcess[str]":
+def prove(clone: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
     environment = os.environ | {"PYTHONPATH": str(clone)}
-    command = (sys.executable, "-P", "-m", "benchmarks.unchanged", *words)
+    command = (sys.executable, "-P", "-m", "benchmarks.unchanged", *arguments)
     return subprocess.run(command, cwd=clone, env=environment, capture_output=True, text=True, check=False)
 
 
 @pytest.fixture
 def clone(tmp_path: Path) -> Path:
-    """A repository with the current files of this one and one commit."""
+    """Return a repository with one commit, which contains the current files of this repository."""
     names = git(ROOT, "ls-files", "-z", "--cached", "--others", "--exclude-standard").split("\0")
     folder = tmp_path / "clone"
     folder.mkdir()
@@ -56,50 +56,50 @@ def edit(clone: Path, name: str, old: str, new: str) -> None:
 def test_a_number_is_a_difference_and_a_word_is_a_label(clone: Path) -> None:
     edit(clone, "fieldkit/cli/commands/abort.py", "do not ask; required", "no question; required")
     edit(clone, "fieldkit/cli/__init__.py", "130 interrupted", "131 interrupted")
-    done = prove(clone, "HEAD", "--only", "help")
-    assert done.returncode == 1
-    assert "DIFFERENT help texts: .: fieldkit --help" in done.stdout
-    assert " 1 different" in done.stdout
-    assert " 1 with other labels" in done.stdout
-    assert "CHANGED" in done.stdout
+    completed = prove(clone, "HEAD", "--only", "help")
+    assert completed.returncode == 1
+    assert "DIFFERENT help texts: .: fieldkit --help" in completed.stdout
+    assert " 1 different" in completed.stdout
+    assert " 1 with other labels" in completed.stdout
+    assert "CHANGED" in completed.stdout
 
 
 @pytest.mark.nightly
 def test_a_label_passes_and_a_number_does_not(clone: Path) -> None:
-    only = ("--only", "help")
+    only_help = ("--only", "help")
     edit(clone, "fieldkit/cli/__init__.py", "Field trials of robots", "Outdoor trials of robots")
-    done = prove(clone, "HEAD", *only)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "Field  ->  Outdoor" in done.stdout
-    assert " 0 different" in done.stdout
+    completed = prove(clone, "HEAD", *only_help)
+    assert completed.returncode == 0, completed.stdout + completed.stderr
+    assert "Field  ->  Outdoor" in completed.stdout
+    assert " 0 different" in completed.stdout
     edit(clone, "fieldkit/cli/__init__.py", "130 interrupted", "131 interrupted")
-    done = prove(clone, "HEAD", *only)
-    assert done.returncode == 1
-    assert "DIFFERENT help texts: .: fieldkit --help" in done.stdout
-    assert "CHANGED" in done.stdout
+    completed = prove(clone, "HEAD", *only_help)
+    assert completed.returncode == 1
+    assert "DIFFERENT help texts: .: fieldkit --help" in completed.stdout
+    assert "CHANGED" in completed.stdout
 
 
 def test_an_unknown_commit_is_a_wrong_command_line(clone: Path) -> None:
-    done = prove(clone, "no-such-commit")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert "cannot resolve 'no-such-commit' to a commit" in done.stderr
+    completed = prove(clone, "no-such-commit")
+    assert (completed.returncode, completed.stdout) == (2, "")
+    assert "cannot resolve 'no-such-commit' to a commit" in completed.stderr
 
 
 def test_every_kind_of_step_is_in_a_dry_run() -> None:
     paths = [*(ROOT / "procedures").glob("*.yaml"), *(LAB / "procedures").glob("*.yaml")]
-    used = {kind for path in paths for kind in steps(yaml.safe_load(path.read_text(encoding="utf-8"))["steps"])}
-    assert kinds.shipped_names() <= used
+    used_kinds = {kind for path in paths for kind in steps(yaml.safe_load(path.read_text(encoding="utf-8"))["steps"])}
+    assert kinds.shipped_names() <= used_kinds
 
 
-def steps(listing: list[dict[str, dict[str, object]]]) -> set[str]:
+def steps(step_list: list[dict[str, dict[str, object]]]) -> set[str]:
     """Return the kinds of steps in a list, including nested ones."""
-    kinds_found: set[str] = set()
-    for step in listing:
+    kinds_of_steps: set[str] = set()
+    for step in step_list:
         for kind, keys in step.items():
-            inside = keys.get("during", [])
-            assert isinstance(inside, list)
-            kinds_found |= {kind} | steps(inside)
-    return kinds_found
+            nested_steps = keys.get("during", [])
+            assert isinstance(nested_steps, list)
+            kinds_of_steps |= {kind} | steps(nested_steps)
+    return kinds_of_steps
 
 
 def test_structure_is_counted(tmp_path: Path) -> None:

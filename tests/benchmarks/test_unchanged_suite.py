@@ -57,7 +57,7 @@ def test_order() -> None:
 '''
 
 
-def changes(tmp_path: Path, after: str, name: str = "test_a.py", before: str = BEFORE) -> suite.Changes:
+def compare_versions(tmp_path: Path, after: str, name: str = "test_a.py", before: str = BEFORE) -> suite.Changes:
     for folder, file, text in (("before", "test_a.py", before), ("after", name, after)):
         path = tmp_path / folder / file
         path.parent.mkdir(parents=True)
@@ -67,8 +67,8 @@ def changes(tmp_path: Path, after: str, name: str = "test_a.py", before: str = B
 
 @pytest.mark.parametrize("name", ["test_a.py", "motion/test_b.py"])
 def test_names_imports_labels_and_files_may_change(tmp_path: Path, name: str) -> None:
-    changed = changes(tmp_path, RENAMED, name)
-    assert (changed.has_differences, changed.same, list(changed.lines())) == (False, 2, [])
+    result = compare_versions(tmp_path, RENAMED, name)
+    assert (result.has_differences, result.same, list(result.lines())) == (False, 2, [])
 
 
 @pytest.mark.parametrize(
@@ -94,13 +94,13 @@ def test_names_imports_labels_and_files_may_change(tmp_path: Path, name: str) ->
 )
 def test_a_changed_check_is_listed(tmp_path: Path, old: str, new: str, expected: str) -> None:
     assert old in BEFORE
-    changed = changes(tmp_path, BEFORE.replace(old, new, 1))
-    assert changed.has_differences
-    assert any(line.startswith(expected) for line in changed.lines()), list(changed.lines())
+    result = compare_versions(tmp_path, BEFORE.replace(old, new, 1))
+    assert result.has_differences
+    assert any(line.startswith(expected) for line in result.lines()), list(result.lines())
 
 
 def test_removed_copy_is_the_one_that_is_listed(tmp_path: Path) -> None:
     copy = "def test_copy() -> None:\n    one, other = 1, 2\n    assert one < other\n"
-    result = changes(tmp_path, BEFORE, before=f"{BEFORE}\n\n{copy}")
+    result = compare_versions(tmp_path, BEFORE, before=f"{BEFORE}\n\n{copy}")
     assert list(result.lines()) == ["removed: test_a.py::test_copy"]
-    assert changes(tmp_path / "added", f"{BEFORE}\n\n{copy}").added == 1
+    assert compare_versions(tmp_path / "added", f"{BEFORE}\n\n{copy}").added == 1

@@ -1,4 +1,4 @@
-"""The order of a campaign compared with brute force: complete, in blocks, within the walk, and random."""
+"""The order of a campaign compared with brute force: complete, in blocks, within the walking limit, and random."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -32,7 +32,7 @@ seeds = st.integers(min_value=0, max_value=2**40)
 
 
 @given(trials, seeds, st.floats(min_value=1.0, max_value=6.0))
-def test_every_trial_occurs_once_in_blocks_within_the_walk(
+def test_every_trial_occurs_once_in_blocks_within_the_walking_limit(
     planned: set[PlannedTrial], seed: int, factor: float
 ) -> None:
     limit_m = factor * order.walk_m(order.shortest(sorted(planned, key=str)))
@@ -52,14 +52,15 @@ def test_every_trial_occurs_once_in_blocks_within_the_walk(
 
 @given(trials, seeds)
 def test_equal_seeds_give_equal_orders_for_any_input_order(planned: set[PlannedTrial], seed: int) -> None:
-    forwards = sorted(planned, key=str)
+    sorted_trials = sorted(planned, key=str)
     orders = {
-        order.shuffle(input_order, seed=seed, limit_m=1e9) for input_order in (forwards, tuple(reversed(forwards)))
+        order.shuffle(input_order, seed=seed, limit_m=1e9)
+        for input_order in (sorted_trials, tuple(reversed(sorted_trials)))
     }
     assert len(orders) == 1
 
 
-def lone_blocks(planned_order: tuple[PlannedTrial, ...]) -> bool:
+def has_contiguous_blocks(planned_order: tuple[PlannedTrial, ...]) -> bool:
     runs = [[key for key, _ in groupby(map(name, planned_order))] for name in (lambda t: t.topology, scenario_of)]
     return all(len(run) == len(set(run)) for run in runs)
 
@@ -77,39 +78,42 @@ def scenario_of(planned_trial: PlannedTrial) -> tuple[Topology, Scenario]:
     )
 )
 def test_no_order_in_blocks_is_shorter_than_the_shortest(planned: set[PlannedTrial]) -> None:
-    every = (planned_trial for planned_trial in permutations(planned) if lone_blocks(planned_trial))
-    assert order.walk_m(order.shortest(list(planned))) == pytest.approx(min(map(order.walk_m, every)))
+    block_orders = (trial_order for trial_order in permutations(planned) if has_contiguous_blocks(trial_order))
+    assert order.walk_m(order.shortest(list(planned))) == pytest.approx(min(map(order.walk_m, block_orders)))
 
 
 def test_the_walk_counts_every_carried_robot() -> None:
     los, master, masterless = Scenario.LOS, Topology.MASTER, Topology.MASTERLESS
-    there_and_back = [trial(10, los, master), trial(30, los, master), trial(20, los, master)]
-    assert order.walk_m(there_and_back) == pytest.approx(2 * (10 + 20 + 10) * 0.3048), "two stations"
+    outward_and_back = [trial(10, los, master), trial(30, los, master), trial(20, los, master)]
+    assert order.walk_m(outward_and_back) == pytest.approx(2 * (10 + 20 + 10) * 0.3048), "two stations are carried"
     assert order.walk_m([trial(10, los, masterless), trial(30, los, masterless)]) == pytest.approx(30 * 0.3048)
     assert order.walk_m([trial(30, los, master), trial(30, los, masterless)]) == pytest.approx((60 + 30) * 0.3048)
     assert order.walk_m([trial(9, los, master, procedure) for procedure in ("a", "b")]) == pytest.approx(
         18 * 0.3048
-    ), "one way"
+    ), "the stations are carried one way"
 
 
-def every_first(limit: float) -> Iterator[PlannedTrial]:
+def first_trials(factor: float) -> Iterator[PlannedTrial]:
     planned = [
         trial(feet, scenario, topology) for feet in (10, 20, 30, 40) for scenario in Scenario for topology in Topology
     ]
-    limit_m = limit * order.walk_m(order.shortest(planned))
+    limit_m = factor * order.walk_m(order.shortest(planned))
     return (order.shuffle(planned, seed=seed, limit_m=limit_m)[0] for seed in range(320))
 
 
 def test_without_a_limit_each_of_16_trials_is_first_equally_often() -> None:
-    counts = Counter(every_first(100.0))
+    counts = Counter(first_trials(100.0))
     assert len(counts) == 16
-    # 20 are expected of each; a binomial count of 320 with p = 1/16 is outside 5..40 once in 10,000 times.
+    # The expected count is 20; a binomial count of 320 with p = 1/16 is outside 5..40 in 1 of 10,000 cases.
     assert all(5 <= count <= 40 for count in counts.values()), counts
 
 
-def test_within_three_times_the_shortest_walk_each_trial_is_first_sometimes() -> None:
-    firsts: set[PlannedTrial] = set()
-    assert any(len(firsts := {*firsts, first}) == 16 for first in every_first(order.DEFAULT_WALK))
+def test_each_trial_is_first_for_some_seed_within_the_default_limit() -> None:
+    distinct_first_trials: set[PlannedTrial] = set()
+    assert any(
+        len(distinct_first_trials := {*distinct_first_trials, first}) == 16
+        for first in first_trials(order.DEFAULT_WALK)
+    )
 
 
 def test_the_shortest_walk_allows_only_sweeps() -> None:

@@ -36,7 +36,7 @@ def test_a_campaign_combines_distances_procedures_and_topologies(tmp_path: Path)
 
 
 @pytest.mark.ros
-def test_exclusions_match_by_all_given_keys(tmp_path: Path) -> None:
+def test_exclusions_match_trials_by_all_their_keys(tmp_path: Path) -> None:
     trial_names = names(tmp_path, f"{LAWN}except: [{{topology: master, distance: 240 cm}}]\n".replace("20ft", "2.4m"))
     assert len(trial_names) == 6
     assert not [name for name in trial_names if name.endswith("2.4m master")]
@@ -45,7 +45,7 @@ def test_exclusions_match_by_all_given_keys(tmp_path: Path) -> None:
 
 @pytest.mark.ros
 @pytest.mark.parametrize(
-    ("old", "new", "line", "output_text"),
+    ("old", "new", "line", "message"),
     [
         ("seed: 7", "sed: 7", 5, "did you mean 'seed'?"),
         ("seed: 7", "", 1, "required key 'seed' is missing"),
@@ -67,15 +67,15 @@ def test_exclusions_match_by_all_given_keys(tmp_path: Path) -> None:
         ("seed: 7", "seed: 7\nexcept: [{}]", 6, "excludes every trial"),
     ],
 )
-def test_a_wrong_file_is_reported_with_its_line(
-    tmp_path: Path, old: str, new: str, line: int, output_text: str
+def test_an_invalid_file_is_reported_with_its_line(
+    tmp_path: Path, old: str, new: str, line: int, message: str
 ) -> None:
     assert old in LAWN
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(ConfigurationError) as error_info:
         names(tmp_path, LAWN.replace(old, new))
-    assert caught.value.where == f"{tmp_path / 'lawn.yaml'}:{line}"
-    assert output_text in f"{caught.value.what} {caught.value.remedy}"
-    assert caught.value.remedy
+    assert error_info.value.where == f"{tmp_path / 'lawn.yaml'}:{line}"
+    assert message in f"{error_info.value.what} {error_info.value.remedy}"
+    assert error_info.value.remedy
 
 
 ROVERS = """\
@@ -87,7 +87,7 @@ roles:
   masterless: {sender: turtlebot-1, receiver: turtlebot-2}
 """
 KEY = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIJcfoHM2b/TjeUycyd/kMkG5id0whvOnW10xYBLAo4SR"
-SHORTER = "turtlebot-2 moves 29.5 m away, at 0.22 m/s; 60 m away, at 2 m/s is beyond its limits"
+REDUCED_MOTION = "turtlebot-2 moves 29.5 m away, at 0.22 m/s; 60 m away, at 2 m/s is beyond its limits"
 
 
 @pytest.mark.motion
@@ -101,4 +101,4 @@ def test_reduced_values_are_reported_once_before_the_first_trial(
     assert main(["campaign", "lawn.yaml", "--dry-run", "--allow-motion"]) == 0
     output = capsys.readouterr().out
     assert "driveaway 20ft masterless" in output
-    assert output.count(SHORTER) == 1
+    assert output.count(REDUCED_MOTION) == 1

@@ -1,4 +1,4 @@
-"""The stored state of a campaign: its frozen inputs, and the progress of each trial, also after a torn journal."""
+"""The stored state of a campaign: its frozen inputs and the progress of each trial, also with a truncated journal."""
 
 from pathlib import Path
 
@@ -47,13 +47,13 @@ def lawn(tmp_path: Path) -> Path:
     return path
 
 
-def begin(lawn: Path) -> tuple[CampaignPlan, CampaignJournal]:
+def plan_and_journal(lawn: Path) -> tuple[CampaignPlan, CampaignJournal]:
     campaign_plan, _ = plan.make_plan(lawn, "field")
     return campaign_plan, CampaignJournal(lawn.parent / "campaign_lawn")
 
 
-def test_the_frozen_plan_is_read_back_and_a_comment_changes_nothing(lawn: Path) -> None:
-    campaign_plan, journal = begin(lawn)
+def test_the_frozen_plan_is_read_again_and_a_new_comment_is_no_change(lawn: Path) -> None:
+    campaign_plan, journal = plan_and_journal(lawn)
     with journal.locked(campaign_plan):
         lawn.write_text(f"# dry grass\n{LAWN}", encoding="utf-8")
     new_plan, document = plan.make_plan(lawn, "field")
@@ -64,7 +64,7 @@ def test_the_frozen_plan_is_read_back_and_a_comment_changes_nothing(lawn: Path) 
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "line", "named"),
+    ("old", "new", "line", "changed_key"),
     [
         ("20ft", "25ft", 3, "distances"),
         ("seed: 7", "seed: 8", 7, "seed"),
@@ -73,43 +73,43 @@ def test_the_frozen_plan_is_read_back_and_a_comment_changes_nothing(lawn: Path) 
         ("name: lawn", "name: lawn", 1, "backend"),
     ],
 )
-def test_a_changed_file_is_rejected_with_the_key(lawn: Path, old: str, new: str, line: int, named: str) -> None:
-    campaign_plan, journal = begin(lawn)
+def test_a_changed_file_is_rejected_with_the_key(lawn: Path, old: str, new: str, line: int, changed_key: str) -> None:
+    campaign_plan, journal = plan_and_journal(lawn)
     with journal.locked(campaign_plan):
         lawn.write_text(LAWN.replace(old, new), encoding="utf-8")
-    new_plan, document = plan.make_plan(lawn, "emulated" if named == "backend" else "field")
-    with pytest.raises(ConfigurationError) as caught:
+    new_plan, document = plan.make_plan(lawn, "emulated" if changed_key == "backend" else "field")
+    with pytest.raises(ConfigurationError) as error_info:
         plan.started_plan(journal.folder, new_plan, document)
-    assert caught.value.what == f"changed since the campaign started: {named}"
-    assert caught.value.where == f"{lawn}:{line}"
-    assert "campaign.yaml" in caught.value.remedy
+    assert error_info.value.what == f"changed since the campaign started: {changed_key}"
+    assert error_info.value.where == f"{lawn}:{line}"
+    assert "campaign.yaml" in error_info.value.remedy
 
 
 def test_a_changed_procedure_is_rejected(lawn: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(lawn.parent)
-    campaign_plan, journal = begin(lawn)
+    campaign_plan, journal = plan_and_journal(lawn)
     with journal.locked(campaign_plan):
         Path("procedures").mkdir()
     shipped = ROOT / "procedures" / "los.yaml"
-    changed = shipped.read_text(encoding="utf-8").replace("count: 10", "count: 11")
-    Path("procedures/los.yaml").write_text(changed, encoding="utf-8")
+    changed_procedure = shipped.read_text(encoding="utf-8").replace("count: 10", "count: 11")
+    Path("procedures/los.yaml").write_text(changed_procedure, encoding="utf-8")
     with pytest.raises(ConfigurationError, match="a file of its procedures"):
         plan.started_plan(journal.folder, *plan.make_plan(lawn, "field"))
 
 
 def test_an_impossible_walk_is_rejected_with_the_minimum(lawn: Path) -> None:
     lawn.write_text(LAWN.replace("333ft", "5m"), encoding="utf-8")
-    with pytest.raises(ConfigurationError, match="the shortest path") as caught:
+    with pytest.raises(ConfigurationError, match="the shortest path") as error_info:
         plan.make_plan(lawn, "field")
-    assert caught.value.where == f"{lawn}:8"
-    walk = caught.value.remedy.split("m ")[0].removeprefix("walk: ")
-    lawn.write_text(LAWN.replace("333ft", f"{walk}m"), encoding="utf-8")
+    assert error_info.value.where == f"{lawn}:8"
+    minimum_m = error_info.value.remedy.split("m ")[0].removeprefix("walk: ")
+    lawn.write_text(LAWN.replace("333ft", f"{minimum_m}m"), encoding="utf-8")
     campaign_plan, _ = plan.make_plan(lawn, "field")
-    assert walk_m(campaign_plan.trials()) <= float(walk)
+    assert walk_m(campaign_plan.trials()) <= float(minimum_m)
 
 
-def test_trials_start_are_placed_skipped_and_end(lawn: Path) -> None:
-    campaign_plan, journal = begin(lawn)
+def test_progress_of_trials_is_stored_and_read_again(lawn: Path) -> None:
+    campaign_plan, journal = plan_and_journal(lawn)
     first, second, third, *_ = campaign_plan.trials()
     with journal.locked(campaign_plan):
         for trial in (first, second, third):
@@ -117,53 +117,55 @@ def test_trials_start_are_placed_skipped_and_end(lawn: Path) -> None:
         journal.add(first, TrialProgress.PLACED, took_s=30.0, note="windy")
         journal.add(first, TrialProgress.ENDED, trial=f"trial of {first}", valid=3)
         journal.add(second, TrialProgress.SKIPPED)
-        started_plan = journal.folder / f"trial of {third}"
-        started_plan.mkdir()
-        (started_plan / "trial.yaml").touch()
-    for opened in (journal, CampaignJournal(journal.folder)):
-        assert list(opened.end_entries()) == [str(first)]
-        assert opened.interrupted_folder(second) is None, "it has no folder"
-        assert opened.interrupted_folder(third) == started_plan
-        assert opened.placing_s(99.0) == 30.0
+        interrupted_trial = journal.folder / f"trial of {third}"
+        interrupted_trial.mkdir()
+        (interrupted_trial / "trial.yaml").touch()
+    for journal_view in (journal, CampaignJournal(journal.folder)):
+        assert list(journal_view.end_entries()) == [str(first)]
+        assert journal_view.interrupted_folder(second) is None, "the trial has no folder"
+        assert journal_view.interrupted_folder(third) == interrupted_trial
+        assert journal_view.placing_s(99.0) == 30.0
     assert CampaignJournal(journal.folder / "none").placing_s(99.0) == 99.0
 
 
 @settings(max_examples=30)
 @given(st.integers(min_value=0, max_value=2000))
-def test_a_campaign_continues_after_a_torn_journal(tmp_path_factory: pytest.TempPathFactory, cut: int) -> None:
+def test_a_campaign_continues_with_a_truncated_journal(
+    tmp_path_factory: pytest.TempPathFactory, n_removed_bytes: int
+) -> None:
     folder = tmp_path_factory.mktemp("lab")
     lawn = folder / "lawn.yaml"
     lawn.write_text(LAWN, encoding="utf-8")
-    campaign_plan, journal = begin(lawn)
+    campaign_plan, journal = plan_and_journal(lawn)
     trials = campaign_plan.trials()
     with journal.locked(campaign_plan):
         for trial in trials[:-1]:
             journal.add(trial, TrialProgress.ENDED, valid=1)
     path = journal.folder / JOURNAL_FILE
     content = path.read_bytes()
-    path.write_bytes(content[: max(0, len(content) - cut)])
-    reopened = CampaignJournal(journal.folder)
-    complete = len(reopened.end_entries())
-    assert complete >= path.read_bytes().count(b"\n")
-    with reopened.locked(campaign_plan):
-        reopened.add(trials[-1], TrialProgress.ENDED, valid=1)
-    assert list(CampaignJournal(journal.folder).end_entries()) == [*map(str, trials[:complete]), str(trials[-1])]
+    path.write_bytes(content[: max(0, len(content) - n_removed_bytes)])
+    reopened_journal = CampaignJournal(journal.folder)
+    n_complete = len(reopened_journal.end_entries())
+    assert n_complete >= path.read_bytes().count(b"\n")
+    with reopened_journal.locked(campaign_plan):
+        reopened_journal.add(trials[-1], TrialProgress.ENDED, valid=1)
+    assert list(CampaignJournal(journal.folder).end_entries()) == [*map(str, trials[:n_complete]), str(trials[-1])]
 
 
 def test_a_damaged_journal_and_a_second_process_are_rejected(lawn: Path) -> None:
-    campaign_plan, journal = begin(lawn)
+    campaign_plan, journal = plan_and_journal(lawn)
     with (
         journal.locked(campaign_plan),
         pytest.raises(ConfigurationError, match="another fieldkit process runs this campaign"),
         CampaignJournal(journal.folder).locked(campaign_plan),
     ):
-        raise AssertionError("two at once")
+        raise AssertionError("two processes have locked the journal")
     (journal.folder / JOURNAL_FILE).write_text('{"what": "lost"}\n{}\n', encoding="utf-8")
     with pytest.raises(EvidenceError, match="not a journal entry"):
         CampaignJournal(journal.folder)
 
 
-def planned(campaign_plan: CampaignPlan, journal: CampaignJournal, backend: Backend) -> CampaignPlanned:
+def announced_plan(campaign_plan: CampaignPlan, journal: CampaignJournal, backend: Backend) -> CampaignPlanned:
     events: list[Event] = []
     CampaignRun(campaign_plan, journal, backend, events.append).announce()
     (event,) = events
@@ -172,19 +174,19 @@ def planned(campaign_plan: CampaignPlan, journal: CampaignJournal, backend: Back
 
 
 def test_the_estimate_uses_measured_placing_times(lawn: Path) -> None:
-    campaign_plan, journal = begin(lawn)
+    campaign_plan, journal = plan_and_journal(lawn)
     (lawn.parent / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
-    by_hand = load_backend("field", *load_site(lawn.parent / "fieldkit.yaml"))
+    field_backend = load_backend("field", *load_site(lawn.parent / "fieldkit.yaml"))
     emulated_backend = load_backend("emulated", *load_site(lawn.parent / "fieldkit.yaml"))
-    work_s = planned(campaign_plan, journal, emulated_backend).left_s
+    work_s = announced_plan(campaign_plan, journal, emulated_backend).left_s
     assert work_s > 8 * 3 * 2 * 66, "8 trials, 3 repeats of 2 protocols, recordings of 66 s"
-    assert planned(campaign_plan, journal, by_hand).left_s == pytest.approx(work_s + 8 * PLACING_S)
+    assert announced_plan(campaign_plan, journal, field_backend).left_s == pytest.approx(work_s + 8 * PLACING_S)
     first, second, *_ = campaign_plan.trials()
     with journal.locked(campaign_plan):
         journal.add(first, TrialProgress.PLACED, took_s=10.0)
         journal.add(second, TrialProgress.PLACED, took_s=30.0)
         journal.add(first, TrialProgress.ENDED, valid=6)
-    event = planned(campaign_plan, journal, by_hand)
+    event = announced_plan(campaign_plan, journal, field_backend)
     assert len(event.trials) == 7
     assert event.total == 8
     assert event.left_s == pytest.approx(work_s * 7 / 8 + 7 * 20.0)
@@ -192,24 +194,24 @@ def test_the_estimate_uses_measured_placing_times(lawn: Path) -> None:
 
 def test_a_disk_too_small_for_the_evidence_is_reported_before_robots_are_placed(lawn: Path) -> None:
     lawn.write_text(LAWN.replace("repeats: 3", "repeats: 100000"), encoding="utf-8")
-    campaign_plan, journal = begin(lawn)
+    campaign_plan, journal = plan_and_journal(lawn)
     events: list[Event] = []
     campaign = CampaignRun(campaign_plan, journal, load_backend("emulated", None, None), events.append)
     with pytest.raises(ConfigurationError, match="GB are free"):
         campaign.run(Unattended(), Stop())
     assert [type(event) for event in events] == [CampaignEnded], "no robot was started"
-    assert journal.folder.is_dir(), "the order is unchanged"
+    assert journal.folder.is_dir(), "the order is stored"
 
 
-def test_trials_with_failed_repeats_remain_if_these_are_repeated(lawn: Path) -> None:
-    campaign_plan, journal = begin(lawn)
+def test_trials_with_failed_repeats_are_planned_again_with_option_failed(lawn: Path) -> None:
+    campaign_plan, journal = plan_and_journal(lawn)
     backend = load_backend("emulated", None, None)
     complete, failed, *_ = campaign_plan.trials()
     with journal.locked(campaign_plan):
         for trial, count in ((complete, 0), (failed, 2)):
             journal.add(trial, TrialProgress.STARTED, trial=str(count))
             journal.add(trial, TrialProgress.ENDED, trial=str(count), failed=count)
-    assert str(failed) not in planned(campaign_plan, journal, backend).trials
+    assert str(failed) not in announced_plan(campaign_plan, journal, backend).trials
     events: list[Event] = []
     campaign = CampaignRun(campaign_plan, journal, backend, events.append, failed=True)
     campaign.announce()
@@ -221,6 +223,6 @@ def test_trials_with_failed_repeats_remain_if_these_are_repeated(lawn: Path) -> 
         campaign._restart_failed()
     (journal.folder / "2").mkdir()
     (journal.folder / "2" / "trial.yaml").touch()
-    for reopened in (journal, CampaignJournal(journal.folder)):
-        assert set(reopened.end_entries()) == {str(complete)}
-        assert reopened.interrupted_folder(failed) == journal.folder / "2"
+    for current_journal in (journal, CampaignJournal(journal.folder)):
+        assert set(current_journal.end_entries()) == {str(complete)}
+        assert current_journal.interrupted_folder(failed) == journal.folder / "2"

@@ -29,7 +29,7 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("command_line", "message"),
     [
         ("trial los 30", "distance '30' has no unit"),
         ("trial los 30feet", "unknown unit 'feet'"),
@@ -47,8 +47,10 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("rebuild .", "there is no trial.yaml"),
     ],
 )
-def test_a_wrong_word_is_exit_2_with_a_remedy(words: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(words.split()) == 2
+def test_an_invalid_argument_is_exit_2_with_a_remedy(
+    command_line: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(command_line.split()) == 2
     output = capsys.readouterr()
     assert message in output.err
     assert "remedy:" in output.err
@@ -61,13 +63,13 @@ def test_a_definition_that_cannot_be_read_is_exit_2(
 ) -> None:
     if content is not None:
         (lab / "Radio.msg").write_bytes(content)
-    words = ("--from", "ros1", "--to", "dds", "/radio:lab_msgs/Radio", "--type", "lab_msgs/Radio=Radio.msg")
-    assert main(["bridge", *words]) == 2
+    command_line = ("--from", "ros1", "--to", "dds", "/radio:lab_msgs/Radio", "--type", "lab_msgs/Radio=Radio.msg")
+    assert main(["bridge", *command_line]) == 2
     assert capsys.readouterr().err.startswith(f"error: Radio.msg: cannot be read: {message}")
 
 
 @pytest.mark.parametrize(
-    "words",
+    "command_line",
     [
         "trail los 30ft",
         "trial los",
@@ -79,8 +81,10 @@ def test_a_definition_that_cannot_be_read_is_exit_2(
         "robots shwo x",
     ],
 )
-def test_a_wrong_option_is_exit_2_with_a_remedy(words: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(words.split()) == 2
+def test_an_invalid_command_line_is_exit_2_with_a_remedy(
+    command_line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(command_line.split()) == 2
     assert re.fullmatch(r"error: .+\n  remedy: .+\n", capsys.readouterr().err)
 
 
@@ -93,7 +97,7 @@ def test_mistyped_command_suggests_the_right_one(capsys: pytest.CaptureFixture[s
     assert capsys.readouterr().err.endswith("\n  remedy: fieldkit trial --help\n")
 
 
-def test_messages_about_arguments_name_the_smallest_number_and_only_what_is_required(
+def test_messages_about_arguments_name_the_minimum_and_only_required_arguments(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert main(["trial", "los", "30ft", "--repeats", "-2"]) == 2
@@ -110,23 +114,30 @@ def test_two_robots_with_one_address_are_an_error(lab: Path, capsys: pytest.Capt
     )
     site = f"robots:\n{robots}roles:\n  masterless: {{sender: a, receiver: b}}\n"
     (lab / "fieldkit.yaml").write_text(site, encoding="utf-8")
-    words = ["trial", "los", "30ft", "--dry-run", "--topology", "masterless", "--backend"]
-    assert main([*words, "field"]) == 2
+    command_line = ["trial", "los", "30ft", "--dry-run", "--topology", "masterless", "--backend"]
+    assert main([*command_line, "field"]) == 2
     message = "fieldkit.yaml:2: robots 'a' and 'b' have the same address on the radio, 192.0.2.1"
     assert message in capsys.readouterr().err
-    assert main([*words, "emulated"]) == 0, "which has addresses of its own"
+    assert main([*command_line, "emulated"]) == 0, "the emulated backend assigns other addresses"
 
 
 def test_full_output_device_has_a_remedy() -> None:
-    with Path("/dev/full").open("w", encoding="ascii") as full:
-        run = subprocess.run(
-            (sys.executable, "-m", "fieldkit", "columns"), stdout=full, stderr=subprocess.PIPE, text=True, check=False
+    with Path("/dev/full").open("w", encoding="ascii") as full_device:
+        completed = subprocess.run(
+            (sys.executable, "-m", "fieldkit", "columns"),
+            stdout=full_device,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
         )
     message = "remedy: free some space, then run the command again; finished repeats are saved"
-    assert (run.returncode, run.stderr) == (2, f"error: its output: No space left on device\n  {message}\n")
+    assert (completed.returncode, completed.stderr) == (
+        2,
+        f"error: its output: No space left on device\n  {message}\n",
+    )
 
 
-def test_verify_of_no_trial_is_exit_4(capsys: pytest.CaptureFixture[str]) -> None:
+def test_verify_of_a_folder_without_a_trial_is_exit_4(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["verify", "."]) == 4
     assert "no readable manifest" in capsys.readouterr().err
 
@@ -150,14 +161,14 @@ def test_a_topology_without_roles_names_the_line_of_the_roles(
 
 
 def test_a_question_without_a_terminal_suggests_an_option() -> None:
-    with pytest.raises(ConfigurationError, match="a person must put a and b 5m apart") as caught:
+    with pytest.raises(ConfigurationError, match="a person must put a and b 5m apart") as error_info:
         Terminal(lambda event: None).ask("put a and b 5m apart")
-    assert "--yes" in caught.value.remedy
+    assert "--yes" in error_info.value.remedy
 
 
 def test_version_option_prints_the_version() -> None:
-    run = fieldkit(Path.cwd(), "--version")
-    assert (run.code, run.out) == (0, f"fieldkit {__version__}\n")
+    completed = fieldkit(Path.cwd(), "--version")
+    assert (completed.code, completed.out) == (0, f"fieldkit {__version__}\n")
 
 
 def test_error_in_a_site_file_has_its_line(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,4 @@
-"""Commands in hints and remedies are valid, and include the options that the operator gave."""
+"""Commands in hints and remedies are valid, and include the options of the operator."""
 
 import ast
 import json
@@ -38,22 +38,22 @@ def messages() -> Iterator[tuple[str, str, bool]]:
 
 
 def test_every_command_in_a_message_exists_and_accepts_its_options() -> None:
-    top, n_subcommands = parser(), 0
-    for path, text, to_type in messages():
+    top_parser, n_subcommands = parser(), 0
+    for path, text, is_command in messages():
         for match in COMMAND.finditer(text):
-            inner = top
+            command_parser = top_parser
             for word in match["words"].split():
-                inner = inner.command(word) or inner
-                inner.complete()
-            assert inner is not top or not to_type, f"{path}: {text}"
-            n_subcommands += inner is not top
-            options = [] if inner is top else re.findall(r" (--[a-z-]+)", match["rest"])
-            assert all(inner.accepts(option, "x") for option in options), f"{path}: {text}"
+                command_parser = command_parser.command(word) or command_parser
+                command_parser.complete()
+            assert command_parser is not top_parser or not is_command, f"{path}: {text}"
+            n_subcommands += command_parser is not top_parser
+            options = [] if command_parser is top_parser else re.findall(r" (--[a-z-]+)", match["rest"])
+            assert all(command_parser.accepts(option, "x") for option in options), f"{path}: {text}"
     assert n_subcommands > 30
 
 
 @pytest.mark.parametrize(
-    ("typed_before", "hint", "expected"),
+    ("typed_command", "hint", "expected"),
     [
         ("check los", "fieldkit abort", "fieldkit abort --site 'my lab.yaml' --backend field"),
         ("check los", "fieldkit enroll a --replace", "fieldkit enroll --site 'my lab.yaml' a --replace"),
@@ -78,22 +78,24 @@ def test_every_command_in_a_message_exists_and_accepts_its_options() -> None:
         ("lab up", "fieldkit lab down", "fieldkit lab down"),
     ],
 )
-def test_hints_include_the_options_given(typed_before: str, hint: str, expected: str) -> None:
-    top = parser()
-    with hints.adding_options(top) as options:
-        options.read(top.parse_args((*typed_before.split(), *OPTIONS)))
-        completed = hints.add_options(hint)
-    assert completed == expected.format(given=shlex.join(OPTIONS))
-    if completed.split()[0] == "fieldkit" and not any(mark in completed for mark in (" lists", ",", ";")):
-        parsed = top.parse_args(shlex.split(completed)[1:])
-        assert getattr(parsed, "site", None) is None or str(parsed.site) == "my lab.yaml"
+def test_hints_include_the_options_given(typed_command: str, hint: str, expected: str) -> None:
+    top_parser = parser()
+    with hints.adding_options(top_parser) as options:
+        options.read(top_parser.parse_args((*typed_command.split(), *OPTIONS)))
+        hint_with_options = hints.add_options(hint)
+    assert hint_with_options == expected.format(given=shlex.join(OPTIONS))
+    if hint_with_options.split()[0] == "fieldkit" and not any(
+        mark in hint_with_options for mark in (" lists", ",", ";")
+    ):
+        parsed_hint = top_parser.parse_args(shlex.split(hint_with_options)[1:])
+        assert getattr(parsed_hint, "site", None) is None or str(parsed_hint.site) == "my lab.yaml"
 
 
 def test_every_output_adds_the_options_to_commands(capsys: pytest.CaptureFixture[str]) -> None:
     finding = Finding("a", "lock", Verdict.FAIL, "held", "wait, or end it: fieldkit abort")
-    top = parser()
-    with hints.adding_options(top) as options:
-        options.read(top.parse_args(("check", "--site", "x.yaml")))
+    top_parser = parser()
+    with hints.adding_options(top_parser) as options:
+        options.read(top_parser.parse_args(("check", "--site", "x.yaml")))
         show_error("held\n  remedy: fieldkit abort")
         show_findings([finding])
         for as_json in (False, True):
@@ -112,9 +114,7 @@ def test_without_options_hints_are_unchanged() -> None:
     assert hints.add_options(text).endswith("to continue: fieldkit resume trials/a")
 
 
-@pytest.mark.parametrize(("words", "begin"), [([], "usage: fieldkit [-h]"), (["lab"], "usage: fieldkit lab [-h]")])
-def test_without_a_command_the_help_is_shown(
-    words: list[str], begin: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(words) == 0
-    assert capsys.readouterr().out.startswith(begin)
+@pytest.mark.parametrize(("argv", "usage"), [([], "usage: fieldkit [-h]"), (["lab"], "usage: fieldkit lab [-h]")])
+def test_without_a_command_the_help_is_shown(argv: list[str], usage: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(argv) == 0
+    assert capsys.readouterr().out.startswith(usage)

@@ -1,4 +1,4 @@
-"""The progress line of a terminal: it fits the width and keeps the most important values if space is short."""
+"""The progress line of a terminal: it fits the width, and keeps the most important values in a narrow terminal."""
 
 import time
 
@@ -28,7 +28,7 @@ STARTED = (
 )
 
 
-def line(width: int, *events: Event) -> str:
+def progress_line(width: int, *events: Event) -> str:
     progress = ProgressBar()
     for event in events:
         progress.update(event)
@@ -53,17 +53,17 @@ def stopped_clock(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_line_fits_and_keeps_the_current_phase(width: int, expected: str) -> None:
-    assert line(width, *STARTED) == expected
+    assert progress_line(width, *STARTED) == expected
 
 
 def test_the_line_is_never_wider_than_the_terminal() -> None:
     for width in range(1, 130):
-        assert len(line(width, *STARTED)) <= width
-        assert len(line(width, *STARTED[1:])) <= width
+        assert len(progress_line(width, *STARTED)) <= width
+        assert len(progress_line(width, *STARTED[1:])) <= width
 
 
 def test_no_estimate_before_the_first_repeat_ends() -> None:
-    assert line(80, *STARTED[1:2], PhaseStarted("check")) == f"{'─' * 12}  0/40  check  for 0.0 s"
+    assert progress_line(80, *STARTED[1:2], PhaseStarted("check")) == f"{'─' * 12}  0/40  check  for 0.0 s"
 
 
 def test_no_line_during_a_question_and_after_the_end() -> None:
@@ -81,24 +81,24 @@ def test_no_line_during_a_question_and_after_the_end() -> None:
 
 
 def test_line_of_a_valid_repeat_is_complete_and_wraps_in_narrow_terminals() -> None:
-    def repeat(width: int | None) -> str:
+    def repeat_line(width: int | None) -> str:
         return "".join(text for text, _ in event_words(VALID, width))
 
-    assert repeat(None) == "  7/40  udp-07  valid  IP loss 3.2 %, file loss 18 %, RTT 1.3 ms  (3 min 20 s left)"
-    assert repeat(80) == "  7/40  udp-07  valid  IP loss 3.2 %, file loss 18 %, RTT 1.3 ms"
-    assert repeat(40) == "  7/40  udp-07  valid  IP loss 3.2 %,\n        file loss 18 %, RTT 1.3 ms"
+    assert repeat_line(None) == "  7/40  udp-07  valid  IP loss 3.2 %, file loss 18 %, RTT 1.3 ms  (3 min 20 s left)"
+    assert repeat_line(80) == "  7/40  udp-07  valid  IP loss 3.2 %, file loss 18 %, RTT 1.3 ms"
+    assert repeat_line(40) == "  7/40  udp-07  valid  IP loss 3.2 %,\n        file loss 18 %, RTT 1.3 ms"
 
 
 def test_reason_of_a_void_repeat_wraps_below_it_and_is_not_cut() -> None:
     reason = "turtlebot-1: the link is lost; the sender's capture dropped 12 packets, its interface none"
-    void = RepeatEnded("udp-07", 1, Status.VOID, reason, "RTT 1.3 ms", 6, 40, 200.0)
-    first, *below = "".join(text for text, _ in event_words(void, 60)).splitlines()
-    assert first == "  6/40  udp-07  void   "
-    assert all(text.startswith(" " * 8) and len(text) <= 60 for text in below)
-    assert " ".join(text.strip() for text in below) == f"{reason}; measured: RTT 1.3 ms"
+    void_repeat = RepeatEnded("udp-07", 1, Status.VOID, reason, "RTT 1.3 ms", 6, 40, 200.0)
+    first_line, *following_lines = "".join(text for text, _ in event_words(void_repeat, 60)).splitlines()
+    assert first_line == "  6/40  udp-07  void   "
+    assert all(text.startswith(" " * 8) and len(text) <= 60 for text in following_lines)
+    assert " ".join(text.strip() for text in following_lines) == f"{reason}; measured: RTT 1.3 ms"
 
 
 def test_progress_of_a_computation_with_its_remaining_time() -> None:
-    half = Progress("simulate", 15.0, 30.0, "s", 42.0)
-    assert line(80, half) == f"{'━' * 6}{'─' * 6}  15/30 s  42 s left  simulate  for 0.0 s"
-    assert line(80, Progress("simulate", 0, 20, "runs")) == f"{'─' * 12}  0/20 runs  simulate  for 0.0 s"
+    half_done = Progress("simulate", 15.0, 30.0, "s", 42.0)
+    assert progress_line(80, half_done) == f"{'━' * 6}{'─' * 6}  15/30 s  42 s left  simulate  for 0.0 s"
+    assert progress_line(80, Progress("simulate", 0, 20, "runs")) == f"{'─' * 12}  0/20 runs  simulate  for 0.0 s"

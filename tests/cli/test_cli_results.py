@@ -12,10 +12,10 @@ from tests.analysis.test_lines import PINGED, cells_of
 from tests.helpers.tables import RepeatRow, replace
 
 
-def commands(capsys: pytest.CaptureFixture[str], *rows: RepeatRow, every: bool = False) -> list[str]:
+def commands(capsys: pytest.CaptureFixture[str], *rows: RepeatRow, all_quantities: bool = False) -> list[str]:
     """Return the commands suggested after trials of one row each."""
     outcomes = [Outcome(Path(f"trials/{number}"), cells_of([row]), 1, 0) for number, row in enumerate(rows)]
-    assert results.report(outcomes, argparse.Namespace(json=False, all=every, junit=None)) == 0
+    assert results.report(outcomes, argparse.Namespace(json=False, all=all_quantities, junit=None)) == 0
     text = capsys.readouterr().out
     return [line.strip() for line in text[text.index("next: ") :].removeprefix("next: ").splitlines()]
 
@@ -24,15 +24,18 @@ def test_suggested_commands_are_valid(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    report, every, farther = commands(capsys, PINGED)
-    assert (report, every) == ("fieldkit report trials/0", "fieldkit aggregate trials/0 --all  # 2 more quantities")
-    assert farther == "fieldkit trial los 60ft  # another distance"
-    _, *words = shlex.split(farther, comments=True)
-    assert main([*words, "--dry-run"]) == 0
+    report, all_quantities, next_distance = commands(capsys, PINGED)
+    assert (report, all_quantities) == (
+        "fieldkit report trials/0",
+        "fieldkit aggregate trials/0 --all  # 2 more quantities",
+    )
+    assert next_distance == "fieldkit trial los 60ft  # another distance"
+    _, *argv = shlex.split(next_distance, comments=True)
+    assert main([*argv, "--dry-run"]) == 0
 
 
 @pytest.mark.parametrize(
-    ("distances", "farther"),
+    ("distances", "next_distance"),
     [
         (["10m", "15m"], "20m"),
         (["2.5m"], "5m"),
@@ -42,12 +45,16 @@ def test_suggested_commands_are_valid(
     ],
 )
 def test_suggested_distance_continues_the_series(
-    capsys: pytest.CaptureFixture[str], distances: list[str], farther: str | None
+    capsys: pytest.CaptureFixture[str], distances: list[str], next_distance: str | None
 ) -> None:
-    suggested = commands(capsys, *(replace(PINGED, distance=distance) for distance in distances), every=True)
-    assert suggested[1:] == ([f"fieldkit trial los {farther}  # another distance"] if farther else [])
+    suggested_commands = commands(
+        capsys, *(replace(PINGED, distance=distance) for distance in distances), all_quantities=True
+    )
+    assert suggested_commands[1:] == (
+        [f"fieldkit trial los {next_distance}  # another distance"] if next_distance else []
+    )
 
 
 def test_no_larger_distance_is_suggested_if_no_ping_was_answered(capsys: pytest.CaptureFixture[str]) -> None:
     without_reply = replace(PINGED, rtt_received=0, rtt_loss=1.0, rtt_median_s=None)
-    assert commands(capsys, without_reply, every=True) == ["fieldkit report trials/0"]
+    assert commands(capsys, without_reply, all_quantities=True) == ["fieldkit report trials/0"]

@@ -1,4 +1,4 @@
-"""Imports of each command: no unneeded library; texts that stand in for a library's values equal them."""
+"""Commands import no unneeded library, and copies of values of libraries equal these values."""
 
 import os
 import pkgutil
@@ -32,11 +32,11 @@ def modules(package: ModuleType) -> set[str]:
     return {module.name for module in pkgutil.iter_modules(package.__path__)}
 
 
-def imported(lab: Path, words: str, variables: Mapping[str, str] | None = None) -> set[str]:
+def imported_packages(lab: Path, command_line: str, variables: Mapping[str, str] | None = None) -> set[str]:
     """Return the libraries and the packages of fieldkit that a command imports."""
     environment = os.environ | {"PYTHONPROFILEIMPORTTIME": "1", "PYTHONPATH": str(ROOT)} | dict(variables or {})
-    done = subprocess.run(
-        (sys.executable, "-m", "fieldkit", *words.split()),
+    completed = subprocess.run(
+        (sys.executable, "-m", "fieldkit", *command_line.split()),
         cwd=lab,
         env=environment,
         stdin=subprocess.DEVNULL,
@@ -45,16 +45,16 @@ def imported(lab: Path, words: str, variables: Mapping[str, str] | None = None) 
         timeout=LIMIT_S,
         check=False,
     )
-    lines = (line for line in done.stderr.splitlines() if line.startswith("import time:"))
+    lines = (line for line in completed.stderr.splitlines() if line.startswith("import time:"))
     names = {line.rpartition("|")[2].strip() for line in lines}
-    assert "fieldkit.cli.commands" in names, done.stderr
+    assert "fieldkit.cli.commands" in names, completed.stderr
     packages = {package for package in PACKAGES if f"fieldkit.{package}" in names}
     return packages | {name.partition(".")[0] for name in names} & LIBRARIES
 
 
 DRY_RUN, EMULATED = "--dry-run", "--repeats 1 --record 1s --yes"
 MAX_LINES = {DRY_RUN: (18_800, 3_200), EMULATED: (27_700, 10_200)}
-"""Maximum of own lines of `fieldkit` and `sim_backends` that a trial of the paper's procedure imports, by options."""
+"""Maximum number of lines of `fieldkit` and `sim_backends` that a trial of `los` imports, by options."""
 
 MOTION = {"fieldkit.motion", "fieldkit.motion.permissions", "fieldkit.motion.profile_sections"}
 
@@ -63,15 +63,15 @@ import sys
 from pathlib import Path
 from fieldkit.cli import main
 code = main(["trial", "los", "30ft", *sys.argv[1:]])
-own = {n: m.__file__ for n, m in sys.modules.items() if n.split(".")[0] in {"fieldkit", "sim_backends"}}
-print(*(f"{n}={Path(path).read_text(encoding='utf-8').count(chr(10))}" for n, path in own.items() if path))
+modules = {n: m.__file__ for n, m in sys.modules.items() if n.split(".")[0] in {"fieldkit", "sim_backends"}}
+print(*(f"{n}={Path(path).read_text(encoding='utf-8').count(chr(10))}" for n, path in modules.items() if path))
 sys.exit(code)
 """
 
 
 @pytest.mark.parametrize("options", [DRY_RUN, pytest.param(EMULATED, marks=pytest.mark.emulated)])
 def test_a_trial_imports_only_the_kinds_of_step_that_it_uses(tmp_path: Path, options: str) -> None:
-    done = subprocess.run(
+    completed = subprocess.run(
         (sys.executable, "-c", COUNT_LINES, *options.split()),
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
@@ -81,7 +81,8 @@ def test_a_trial_imports_only_the_kinds_of_step_that_it_uses(tmp_path: Path, opt
         check=True,
     )
     lines = {
-        name: int(count) for name, _, count in (word.partition("=") for word in done.stdout.splitlines()[-1].split())
+        name: int(count)
+        for name, _, count in (word.partition("=") for word in completed.stdout.splitlines()[-1].split())
     }
     names = lines.keys()
     kinds = {name for name in names if name.startswith("fieldkit.steps.kinds.")}
@@ -89,21 +90,23 @@ def test_a_trial_imports_only_the_kinds_of_step_that_it_uses(tmp_path: Path, opt
     assert {name for name in names if name.startswith("fieldkit.ros.steps.")} <= {
         f"fieldkit.ros.steps.{name}" for name in ("record", "ros_master", "topic_check")
     }
-    assert {name for name in names if name.startswith("fieldkit.motion")} == MOTION, "sections of the profiles"
+    assert {name for name in names if name.startswith("fieldkit.motion")} == MOTION, (
+        "only the sections of the profiles are imported"
+    )
     for package, limit in zip(("fieldkit", "sim_backends"), MAX_LINES[options], strict=True):
         assert sum(count for name, count in lines.items() if name.partition(".")[0] == package) <= limit, package
 
 
-@pytest.mark.parametrize("words", ["--version", "--help"])
-def test_the_list_of_commands_imports_no_library(tmp_path: Path, words: str) -> None:
-    assert imported(tmp_path, words) == set()
+@pytest.mark.parametrize("command_line", ["--version", "--help"])
+def test_the_list_of_commands_imports_no_library(tmp_path: Path, command_line: str) -> None:
+    assert imported_packages(tmp_path, command_line) == set()
 
 
 # `stop` is urgent, so its module imports at the top.
 @pytest.mark.parametrize("name", [name for name in commands.COMMANDS if name != "stop"])
 def test_help_imports_no_slow_library(tmp_path: Path, name: str) -> None:
     """Importing the type names of `rosbags` takes 10 ms."""
-    assert imported(tmp_path, f"{name} --help") & LIBRARIES <= {"rich", "rosbags"}
+    assert imported_packages(tmp_path, f"{name} --help") & LIBRARIES <= {"rich", "rosbags"}
 
 
 @pytest.mark.parametrize(
@@ -111,15 +114,17 @@ def test_help_imports_no_slow_library(tmp_path: Path, name: str) -> None:
 )
 def test_completion_imports_no_library_but_rich(tmp_path: Path, line: str) -> None:
     variables = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line))}
-    assert imported(tmp_path, "", variables | {"_ARGCOMPLETE_STDOUT_FILENAME": os.devnull}) & LIBRARIES <= {"rich"}
+    assert imported_packages(tmp_path, "", variables | {"_ARGCOMPLETE_STDOUT_FILENAME": os.devnull}) & LIBRARIES <= {
+        "rich"
+    }
 
 
 def test_mistyped_command_imports_only_rich(tmp_path: Path) -> None:
-    assert imported(tmp_path, "trail los 30ft") == {"rich"}
+    assert imported_packages(tmp_path, "trail los 30ft") == {"rich"}
 
 
 @pytest.mark.parametrize(
-    ("words", "unneeded"),
+    ("command_line", "unneeded_libraries"),
     [
         ("columns", {"paramiko", "matplotlib", "rosbags", "ruamel", "sim_backends"}),
         (
@@ -131,21 +136,21 @@ def test_mistyped_command_imports_only_rich(tmp_path: Path) -> None:
         ("completion bash", LIBRARIES),
     ],
 )
-def test_command_imports_no_unneeded_library(tmp_path: Path, words: str, unneeded: set[str]) -> None:
-    assert not imported(tmp_path, words) & unneeded
+def test_command_imports_no_unneeded_library(tmp_path: Path, command_line: str, unneeded_libraries: set[str]) -> None:
+    assert not imported_packages(tmp_path, command_line) & unneeded_libraries
 
 
-def test_stop_imports_only_what_connects_to_robots(tmp_path: Path) -> None:
+def test_stop_imports_only_the_packages_that_connect_to_robots(tmp_path: Path) -> None:
     access = "profile: box, host: 127.0.0.1, port: 1, user: u, host_key: ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIA=="
     (tmp_path / "fieldkit.yaml").write_text(f"robots: {{a: {{{access}}}}}\nroles: {{}}\n", encoding="utf-8")
-    needed = {"cryptography", "paramiko", "yaml"}
-    assert imported(tmp_path, "stop --all") == needed | {"lab", "remote"}
+    required_libraries = {"cryptography", "paramiko", "yaml"}
+    assert imported_packages(tmp_path, "stop --all") == required_libraries | {"lab", "remote"}
 
 
 def test_commands_start_no_openblas_threads(tmp_path: Path) -> None:
     """By default numpy's OpenBLAS starts one thread per core, which spins while idle."""
     script = "import os; from fieldkit.cli import main; main(['columns']); print(*os.listdir('/proc/self/task'))"
-    done = subprocess.run(
+    completed = subprocess.run(
         (sys.executable, "-c", script),
         cwd=tmp_path,
         env={name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"},
@@ -154,7 +159,7 @@ def test_commands_start_no_openblas_threads(tmp_path: Path) -> None:
         timeout=LIMIT_S,
         check=True,
     )
-    assert len(done.stdout.splitlines()[-1].split()) == 1
+    assert len(completed.stdout.splitlines()[-1].split()) == 1
 
 
 def test_help_lists_the_default_grouping_columns() -> None:
@@ -167,22 +172,24 @@ def test_the_help_names_the_installed_backends() -> None:
 
 
 def test_every_command_has_its_module_and_run_function() -> None:
-    top = parser()
-    own_commands = commands.COMMANDS.keys() - commands.FROM_ENTRY_POINTS
-    for name in own_commands:
-        command = top.command(name)
+    top_parser = parser()
+    commands_of_fieldkit = commands.COMMANDS.keys() - commands.FROM_ENTRY_POINTS
+    for name in commands_of_fieldkit:
+        command = top_parser.command(name)
         assert command is not None
-        for leaf in map(command.command, command.subcommands()) if command.subcommands() else (command,):
-            assert leaf is not None
-            run = leaf.get_default("run") or command.get_default("run")  # `show` of a listing runs as its listing
-            assert isfunction(run), leaf.prog
+        for leaf_parser in map(command.command, command.subcommands()) if command.subcommands() else (command,):
+            assert leaf_parser is not None
+            run = leaf_parser.get_default("run") or command.get_default(
+                "run"
+            )  # `show` of a listing has the function of the listing
+            assert isfunction(run), leaf_parser.prog
             module = "listings" if name in commands.LISTINGS else name
             assert run.__module__ == f"fieldkit.cli.commands.{module}"
-    assert modules(commands) == own_commands - set(commands.LISTINGS) | {"listings"}
+    assert modules(commands) == commands_of_fieldkit - set(commands.LISTINGS) | {"listings"}
 
 
 @pytest.mark.parametrize(
-    ("words", "message", "remedy"),
+    ("command_line", "message", "remedy"),
     [
         ("--toplogy", "fieldkit has no option or argument '--toplogy'", "did you mean 'fieldkit check --topology'?"),
         ("--versoin", "fieldkit has no option or argument '--versoin'", "did you mean '--version'?"),
@@ -203,9 +210,9 @@ def test_every_command_has_its_module_and_run_function() -> None:
     ],
 )
 def test_mistyped_word_suggests_the_right_one(
-    words: str, message: str, remedy: str, capsys: pytest.CaptureFixture[str]
+    command_line: str, message: str, remedy: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(words.split()) == 2
+    assert main(command_line.split()) == 2
     error_text = capsys.readouterr().err
     assert error_text.startswith(f"error: {message}")
     assert f"\n  remedy: {remedy}" in error_text

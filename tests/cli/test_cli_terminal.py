@@ -1,4 +1,4 @@
-"""Questions at a terminal: not redrawn, repeated after an invalid answer, and ended by Ctrl-C."""
+"""Questions at a terminal are not redrawn, are repeated after an invalid answer, and are ended by Ctrl-C."""
 
 import codecs
 import os
@@ -19,7 +19,7 @@ from tests.helpers.sshd import free_port, make_key, wait_until
 
 WITHIN_S = 60.0
 
-ASK = """
+ASK_PROGRAM = """
 import sys
 from threading import Thread
 from fieldkit.cli import INTERRUPTED
@@ -43,38 +43,38 @@ print(answer)
 
 
 class Operator:
-    """The operator's side of a pseudo-terminal."""
+    """The operator at the other side of a pseudo-terminal."""
 
     def __init__(self, terminal: int) -> None:
         self._terminal = terminal
         self._decode = codecs.getincrementaldecoder("utf-8")().decode  # a character may be split between two reads
-        self.read = ""
+        self.output = ""
 
     def wait_for(self, *texts: str) -> None:
-        ends = time.monotonic() + WITHIN_S
-        start = len(self.read)
-        while not all(text in self.read[start:] for text in texts):
-            assert time.monotonic() < ends, self.read
+        deadline_s = time.monotonic() + WITHIN_S
+        start_index = len(self.output)
+        while not all(text in self.output[start_index:] for text in texts):
+            assert time.monotonic() < deadline_s, self.output
             self.read_new(WITHIN_S)
 
     def read_new(self, within_s: float) -> str:
         """Return the next output, empty after a timeout."""
         if not select.select([self._terminal], [], [], within_s)[0]:
             return ""
-        new = self._decode(os.read(self._terminal, 4096))
-        self.read += new
-        return new
+        new_output = self._decode(os.read(self._terminal, 4096))
+        self.output += new_output
+        return new_output
 
     def type(self, text: str) -> None:
         os.write(self._terminal, text.encode())
 
 
 @contextmanager
-def run_at_terminal(*words: str, lab: Path | None = None) -> Iterator[tuple[Operator, "subprocess.Popen[bytes]"]]:
-    """Run `ASK`, or python with `words` in the folder `lab`, at a pseudo-terminal."""
+def run_at_terminal(*arguments: str, lab: Path | None = None) -> Iterator[tuple[Operator, "subprocess.Popen[bytes]"]]:
+    """Run `ASK_PROGRAM`, or Python with `arguments` in the folder `lab`, at a pseudo-terminal."""
     controller, terminal = pty.openpty()
     process = subprocess.Popen(
-        (sys.executable, *(words or ("-c", ASK))),
+        (sys.executable, *(arguments or ("-c", ASK_PROGRAM))),
         cwd=lab,
         stdin=terminal,
         stdout=terminal,
@@ -93,9 +93,9 @@ def run_at_terminal(*words: str, lab: Path | None = None) -> Iterator[tuple[Oper
 def test_nothing_is_drawn_during_a_question() -> None:
     with run_at_terminal() as (operator, _):
         operator.wait_for("\n> ", "link lost\r\n")
-        assert "work" in operator.read
-        assert "move a" in operator.read
-        assert "s to leave it for later" in operator.read
+        assert "work" in operator.output
+        assert "move a" in operator.output
+        assert "s to leave it for later" in operator.output
         # The progress line is drawn 8 times per second.
         assert operator.read_new(0.6) == ""
 
@@ -107,7 +107,7 @@ def test_question_repeats_after_an_invalid_answer_and_keeps_a_note() -> None:
         operator.wait_for("\n> ")
         operator.type("n wet grass\n")
         operator.wait_for("Answer(skip=False, note='wet grass')")
-        assert "go on" in operator.read
+        assert "go on" in operator.output
         assert process.wait(WITHIN_S) == 0
 
 
@@ -132,7 +132,7 @@ def test_abort_that_is_not_confirmed_terminates_nothing(tmp_path: Path) -> None:
 
 
 def reads_standard_input(process: "subprocess.Popen[bytes]") -> bool:
-    """Return whether the process waits in a system call whose first argument is descriptor 0."""
+    """Return True if the process waits in a system call whose first argument is descriptor 0."""
     return Path(f"/proc/{process.pid}/syscall").read_text(encoding="ascii").split()[1:2] == ["0x0"]
 
 

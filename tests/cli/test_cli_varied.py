@@ -1,4 +1,4 @@
-"""Command output for trials of different procedures, with columns that fieldkit does not declare itself."""
+"""Command output for trials of different procedures, with columns that are not declared by fieldkit."""
 
 import csv
 import io
@@ -18,12 +18,19 @@ from tests.helpers import vendor_trials
 DISTANCES = {"10ft": 3.048, "30ft": 9.144}
 
 
-CHOSEN = {"ip_loss", "ip_packets_sent", "ip_packets_received", "jitter_s", "rtt_payload_bytes", "rtt_median_s"}
-"""Columns of the named steps in the trials for reports; a report draws a panel for each quantity of each step."""
+REPORTED_COLUMNS = {
+    "ip_loss",
+    "ip_packets_sent",
+    "ip_packets_received",
+    "jitter_s",
+    "rtt_payload_bytes",
+    "rtt_median_s",
+}
+"""Columns of the named steps in the trials for reports. A report draws a panel for each quantity of each step."""
 
 
 def write_trials(folder: Path, named_step_columns: Sequence[Column]) -> Path:
-    """For each distance, a trial with two transfers, two pings and a vendor's meter, and one with only the meter."""
+    """Write two trials per distance: with two transfers, two pings and a vendor's meter, and with the meter only."""
     for index, (distance, metres) in enumerate(DISTANCES.items()):
         for name, columns in (
             ("all", (*named_step_columns, *vendor_trials.VENDOR_COLUMNS)),
@@ -41,12 +48,12 @@ def all_trials(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def trials(all_trials: Path, tmp_path: Path) -> Path:
-    """A copy of the trials with all columns of the named steps."""
+    """Return a copy of the trials with all columns of the named steps."""
     return shutil.copytree(all_trials, tmp_path, dirs_exist_ok=True)
 
 
-def output_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:
-    assert main([*words]) == 0, capsys.readouterr().err
+def output_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert main([*arguments]) == 0, capsys.readouterr().err
     return capsys.readouterr().out
 
 
@@ -64,7 +71,7 @@ def test_aggregate_includes_all_declared_quantities_with_unit_and_interval(
     assert -60 < float(level["low"]) < float(level["value"]) < float(level["high"]) < -40
     assert (locked["unit"], locked["estimate"]) == ("share", "flag")
     assert (loss["unit"], loss["n"], loss["trials"]) == ("share", "16", str(16 * 40)), (
-        "of the trials that have the column"
+        "only trials that have the column are counted"
     )
     assert not [name for _, name in by_quantity if name in {"probe.firmware", "wind"}]
 
@@ -80,30 +87,32 @@ def test_conditions_can_be_grouped_by_an_operators_answer(trials: Path, capsys: 
 
 
 def test_tables_have_units_and_rounded_values(trials: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    chosen = [word for name in ("probe.level", "probe.resets", "up.ip_loss") for word in ("--quantity", name)]
-    words = ("aggregate", str(trials), "--by", "distance", *chosen)
-    table = output_of(capsys, *words)
+    quantity_options = [
+        word for name in ("probe.level", "probe.resets", "up.ip_loss") for word in ("--quantity", name)
+    ]
+    arguments = ("aggregate", str(trials), "--by", "distance", *quantity_options)
+    table = output_of(capsys, *arguments)
     assert re.search(r"^probe: level \(dBm\)\n.*\n.*\n *10ft +32 +-4\d\.\d\d +\[-", table, re.MULTILINE)
     assert re.search(r"^probe: resets\n", table, re.MULTILINE)
     assert (
         "| distance | repeats | probe: level, median (dBm) | probe: resets | up: IP packet loss (%) |"
-        in output_of(capsys, *words, "--format", "markdown")
+        in output_of(capsys, *arguments, "--format", "markdown")
     )
-    assert r"probe: level, median (dBm)" in output_of(capsys, *words, "--format", "latex")
-    document = json.loads(output_of(capsys, *words, "--format", "json"))
+    assert r"probe: level, median (dBm)" in output_of(capsys, *arguments, "--format", "latex")
+    document = json.loads(output_of(capsys, *arguments, "--format", "json"))
     assert document["cells"][0]["estimates"]["probe.level"]["unit"] == "dBm"
 
 
 def test_width_in_any_unit_gives_the_number_of_repeats_needed(
     trials: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ("aggregate", str(trials), "--by", "protocol", "--format", "csv", "--quantity", "probe.level")
+    arguments = ("aggregate", str(trials), "--by", "protocol", "--format", "csv", "--quantity", "probe.level")
     for width in ("0.5dBm", "0.5 dB"):
-        (tcp, udp) = records(output_of(capsys, *words, "--width", width))
+        (tcp, udp) = records(output_of(capsys, *arguments, "--width", width))
         for line in (tcp, udp):
-            wide = float(line["high"]) - float(line["low"])
-            assert (int(line["more_wanted"]) > 0) is (wide > 1)
-    assert main([*words, "--width", "1V"]) == 2
+            width_of_interval = float(line["high"]) - float(line["low"])
+            assert (int(line["more_wanted"]) > 0) is (width_of_interval > 1)
+    assert main([*arguments, "--width", "1V"]) == 2
     assert "units are" in capsys.readouterr().err
 
 
@@ -111,25 +120,25 @@ def test_two_runs_are_compared_in_any_unit(tmp_path: Path, capsys: pytest.Captur
     for name, level_dbm in (("a", -40.0), ("b", -46.0)):
         plan = vendor_trials.plan(name, distance="30ft", metres=9.144, columns=vendor_trials.VENDOR_COLUMNS)
         vendor_trials.write(tmp_path, plan, vendor_trials.valid_rows(plan, repeats=20, seed=3, level_dbm=level_dbm))
-    words = ("compare", str(tmp_path / "a"), str(tmp_path / "b"), "--force")
-    text = output_of(capsys, *words, "--format", "csv")
+    arguments = ("compare", str(tmp_path / "a"), str(tmp_path / "b"), "--force")
+    text = output_of(capsys, *arguments, "--format", "csv")
     level = next(line for line in records(text) if line["quantity"] == "probe.level")
     assert level["unit"] == "dBm"
     assert float(level["difference"]) == pytest.approx(-6)
     assert level["verdict"].startswith("B 6.00 dB less [")
-    assert main([*words, "--threshold", "probe.level=1dB"]) == 1
+    assert main([*arguments, "--threshold", "probe.level=1dB"]) == 1
     assert "may exceed 1 dB" in capsys.readouterr().out
-    assert main([*words, "--threshold", "probe.level=20 dBm", "--threshold", "probe.volt=9V"]) == 0
+    assert main([*arguments, "--threshold", "probe.level=20 dBm", "--threshold", "probe.volt=9V"]) == 0
     capsys.readouterr()
-    assert main([*words, "--threshold", "probe.level=20m"]) == 2
+    assert main([*arguments, "--threshold", "probe.level=20m"]) == 2
     assert "'20m' is not a threshold\n  remedy: write for example 15dBm" in capsys.readouterr().err
 
 
 def test_runs_with_different_definitions_of_a_column_are_not_compared(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    other = Column("probe.level", "mW", "In another unit.", figure=Figure("level", Kind.MEDIAN))
-    for name, column in (("a", vendor_trials.VENDOR_COLUMNS[0]), ("b", other)):
+    other_column = Column("probe.level", "mW", "In another unit.", figure=Figure("level", Kind.MEDIAN))
+    for name, column in (("a", vendor_trials.VENDOR_COLUMNS[0]), ("b", other_column)):
         plan = vendor_trials.plan(name, distance="30ft", metres=9.144, columns=[column])
         vendor_trials.write(tmp_path, plan, vendor_trials.valid_rows(plan))
     assert main(["compare", str(tmp_path / "a"), str(tmp_path / "b"), "--force"]) == 2
@@ -153,13 +162,13 @@ def test_exports_have_types_units_and_meanings_of_all_columns(
     )
     assert second_output == output_of(
         capsys, "aggregate", ".", "--by", "distance", "--format", "csv", "--quantity", "up.ip_loss"
-    ), "by the column name after the step name, without a plan"
+    ), "without a plan, the meaning follows from the column name after the step name"
 
 
 def test_report_draws_all_steps_together(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    columns = [column for column in vendor_trials.NAMED_STEP_COLUMNS if plain_name(column.name) in CHOSEN]
+    columns = [column for column in vendor_trials.NAMED_STEP_COLUMNS if plain_name(column.name) in REPORTED_COLUMNS]
     trials = write_trials(tmp_path, columns)
     monkeypatch.chdir(trials)
     output_of(capsys, "report", ".", "-o", "page.html", "--quantity", "up.jitter_s")
@@ -174,7 +183,7 @@ def test_report_draws_all_steps_together(
         assert f"<caption>{caption}</caption>" in page
     assert '<figure id="ip-loss-of-steps"' in page
     assert "p8192, UDP, master, 8192 bytes" in page
-    assert "--quantity up.jitter_s" in page, "the command that reproduces the page"
+    assert "--quantity up.jitter_s" in page, "the page shows the command that reproduces it"
     assert main(["report", ".", "-o", "page.html", "--quantity", "up.jiter_s"]) == 2
     assert "did you mean 'up.jitter_s'" in capsys.readouterr().err
 
@@ -228,18 +237,18 @@ def test_texts_of_a_plan_are_escaped_in_all_formats(
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "<script" not in page
     assert "javascript:alert)</a>" not in page
-    words = ("aggregate", ".", *(word for column in columns for word in ("--quantity", column.name)))
-    latex = output_of(capsys, *words, "--format", "latex")
+    arguments = ("aggregate", ".", *(word for column in columns for word in ("--quantity", column.name)))
+    latex = output_of(capsys, *arguments, "--format", "latex")
     for text in ("alert(1)", "etc/passwd", "javascript:alert"):
-        assert text in latex, "each of them is in the table"
+        assert text in latex, "the table contains each text"
     assert r"\input{" not in latex
     assert not re.search(r"(?<!\\)[$#_~^]", re.sub(r"\\textasci\w+\{\}", "", latex.split(r"\toprule")[1]))
-    (row,) = {
+    (n_cells,) = {
         line.count("|") - line.count(r"\|")
-        for line in output_of(capsys, *words, "--format", "markdown").splitlines()[2:-1]
+        for line in output_of(capsys, *arguments, "--format", "markdown").splitlines()[2:-1]
         if line
     }
-    assert row > 0
+    assert n_cells > 0
 
 
 def test_columns_of_a_procedure_are_those_of_its_steps(
@@ -253,12 +262,12 @@ def test_columns_of_a_procedure_are_those_of_its_steps(
         "  - ask: {column: wind, question: How strong is the wind, unit: m/s}\n",
         encoding="utf-8",
     )
-    listed = output_of(capsys, "columns", "two")
-    assert re.search(r"^ small\.rtt_median_s +s +median +Median round-trip time\.$", listed, re.MULTILINE)
-    assert re.search(r"^ wind +m/s +median +Answer of the operator", listed, re.MULTILINE)
-    assert "rtt_loss" in listed
-    assert "ip_loss" not in listed.replace("small.", "")
-    assert output_of(capsys, "columns", "procedures/two.yaml") == listed
+    listed_columns = output_of(capsys, "columns", "two")
+    assert re.search(r"^ small\.rtt_median_s +s +median +Median round-trip time\.$", listed_columns, re.MULTILINE)
+    assert re.search(r"^ wind +m/s +median +Answer of the operator", listed_columns, re.MULTILINE)
+    assert "rtt_loss" in listed_columns
+    assert "ip_loss" not in listed_columns.replace("small.", "")
+    assert output_of(capsys, "columns", "procedures/two.yaml") == listed_columns
     assert main(["columns", "procedures/too.yaml"]) == 2
     assert "procedures/too.yaml: " in capsys.readouterr().err
     assert main(["columns", "too"]) == 2

@@ -27,11 +27,11 @@ class Terminal(io.StringIO):
         return True
 
 
-def printed(width: int, head: list[str], rows: list[tuple[str, ...]], right: list[int]) -> str:
+def print_table(width: int, headers: list[str], rows: list[tuple[str, ...]], right_aligned: list[int]) -> str:
     out = Terminal()
     with redirect_stdout(out), patch.dict("os.environ", COLUMNS=str(width), TERM="xterm"):
         assert sys.stdout.isatty()
-        table(head, rows, right=right)
+        table(headers, rows, right=right_aligned)
     return re.sub("\x1b[^m]*m", "", out.getvalue())
 
 
@@ -39,27 +39,27 @@ def printed(width: int, head: list[str], rows: list[tuple[str, ...]], right: lis
 @given(st.data(), WIDTHS)
 def test_a_table_keeps_every_word_and_is_no_wider_than_the_terminal(data: st.DataObject, width: int) -> None:
     size = data.draw(st.integers(1, 6))
-    head = data.draw(st.lists(st.from_regex(r"[a-z]{1,12}", fullmatch=True), min_size=size, max_size=size))
+    headers = data.draw(st.lists(st.from_regex(r"[a-z]{1,12}", fullmatch=True), min_size=size, max_size=size))
     rows = data.draw(st.lists(st.tuples(*[CELL] * size), min_size=1, max_size=4))
-    right = data.draw(st.lists(st.integers(0, size - 1), max_size=2))
-    text = printed(width, head, rows, right)
+    right_aligned = data.draw(st.lists(st.integers(0, size - 1), max_size=2))
+    text = print_table(width, headers, rows, right_aligned)
     words = [word for row in rows for cell in row for word in cell.split()]
     printed_words = text.split()
     assert all(printed_words.count(word) >= words.count(word) for word in words)
-    longest = max([cell_len(word) for word in words], default=0) + max(map(len, head)) + 4
+    longest = max([cell_len(word) for word in words], default=0) + max(map(len, headers)) + 4
     assert all(cell_len(line) <= max(width, longest) for line in text.splitlines())
 
 
-PARTS = st.lists(st.from_regex(r"[a-zA-Z]{1,15} (loss|RTT) [0-9]{1,4}\.[0-9] (%|ms)", fullmatch=True), min_size=1)
+FIGURES = st.lists(st.from_regex(r"[a-zA-Z]{1,15} (loss|RTT) [0-9]{1,4}\.[0-9] (%|ms)", fullmatch=True), min_size=1)
 
 
-@given(PARTS, st.integers(40, 200), st.sampled_from(FINAL_STATUSES), st.text("ab ", max_size=60))
+@given(FIGURES, st.integers(40, 200), st.sampled_from(FINAL_STATUSES), st.text("ab ", max_size=60))
 def test_line_of_a_repeat_is_complete_at_any_width(parts: list[str], width: int, status: Status, reason: str) -> None:
     event = RepeatEnded("udp-07", 1, status, reason.strip(), ", ".join(parts), 7, 40, 0.0)
     text = "".join(part for part, _ in event_words(event, width))
     assert all(len(line) <= width for line in text.splitlines())
-    wide = "".join(part for part, _ in event_words(event))
-    assert text.split() == wide.split()
+    wide_text = "".join(part for part, _ in event_words(event))
+    assert text.split() == wide_text.split()
 
 
 def test_a_repeat_in_which_nothing_arrived_is_red() -> None:

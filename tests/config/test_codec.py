@@ -1,4 +1,4 @@
-"""Records as JSON values: parsed values equal the written ones, and no type is converted."""
+"""Records as JSON values: parsed records equal the dumped records, and no type is converted."""
 
 import json
 from dataclasses import dataclass
@@ -36,8 +36,8 @@ class Record:
 CODEC = Codec(Record)
 COMPLETE = {"number": 1, "paint": "red"}
 
-numbers = st.floats(allow_nan=False, allow_infinity=False)
-parts = st.builds(Part, st.tuples(numbers, numbers), st.lists(st.text(), max_size=3).map(tuple))
+finite_floats = st.floats(allow_nan=False, allow_infinity=False)
+parts = st.builds(Part, st.tuples(finite_floats, finite_floats), st.lists(st.text(), max_size=3).map(tuple))
 records = st.builds(
     Record,
     st.integers(),
@@ -71,6 +71,6 @@ def test_fields_are_dumped_with_their_alias() -> None:
     ],
 )
 def test_invalid_record_is_rejected_with_the_field_path(data: object, message: str) -> None:
-    with pytest.raises(ValueError, match=message) as caught:
+    with pytest.raises(ValueError, match=message) as error_info:
         CODEC.parse(data)
-    assert type(caught.value) is ValueError
+    assert type(error_info.value) is ValueError

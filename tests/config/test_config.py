@@ -66,15 +66,15 @@ def test_error_in_a_profile_has_file_line_and_suggestion(tmp_path: Path, old: st
     assert old in PROFILE
     path = tmp_path / "robot.yaml"
     path.write_text(PROFILE.replace(old, new, 1), encoding="utf-8")
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(ConfigurationError) as error_info:
         schema.load(path, RobotProfile)
-    assert message in caught.value.what
-    assert caught.value.where.startswith(f"{path}:")
-    assert caught.value.remedy
+    assert message in error_info.value.what
+    assert error_info.value.where.startswith(f"{path}:")
+    assert error_info.value.remedy
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "others"),
+    ("old", "new", "n_other_errors"),
     [
         ("rate: 5Hz", "rate: 5", 0),  # the missing item of the list is not a second error
         ("max_speed_m_s: 0.22", "max_speed_m_s: fast", 0),  # neither an integer nor a float
@@ -82,21 +82,21 @@ def test_error_in_a_profile_has_file_line_and_suggestion(tmp_path: Path, old: st
         ("name: turtlebot3_burger\nsummary: ROBOTIS", "# summary: ROBOTIS", 1),
     ],
 )
-def test_each_error_is_counted_once(tmp_path: Path, old: str, new: str, others: int) -> None:
+def test_each_error_is_counted_once(tmp_path: Path, old: str, new: str, n_other_errors: int) -> None:
     assert old in PROFILE
     path = tmp_path / "robot.yaml"
     path.write_text(PROFILE.replace(old, new, 1), encoding="utf-8")
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(ConfigurationError) as error_info:
         schema.load(path, RobotProfile)
-    assert ("(and 1 more problem)" in caught.value.what) == bool(others), caught.value.what
+    assert ("(and 1 more problem)" in error_info.value.what) == bool(n_other_errors), error_info.value.what
 
 
 def test_error_has_the_line_of_the_key(tmp_path: Path) -> None:
     path = tmp_path / "robot.yaml"
     path.write_text(PROFILE.replace("points: 360", "pionts: 360"), encoding="utf-8")
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(ConfigurationError) as error_info:
         schema.load(path, RobotProfile)
-    assert caught.value.where == f"{path}:{line_of(PROFILE, 'points: 360')}"
+    assert error_info.value.where == f"{path}:{line_of(PROFILE, 'points: 360')}"
 
 
 @pytest.mark.parametrize(
@@ -138,28 +138,28 @@ def test_error_in_a_procedure_has_line_and_suggestion(tmp_path: Path, old: str, 
     assert old in PROCEDURE
     path = tmp_path / "los.yaml"
     path.write_text(PROCEDURE.replace(old, new, 1), encoding="utf-8")
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(ConfigurationError) as error_info:
         schema.load(path, Procedure)
-    assert message in caught.value.what
-    line = int(caught.value.where.rsplit(":", 1)[1])
+    assert message in error_info.value.what
+    line = int(error_info.value.where.rsplit(":", 1)[1])
     assert abs(line - line_of(PROCEDURE, old.splitlines()[0])) <= 1
 
 
 def test_bags_of_two_robots_need_different_names() -> None:
-    other = "\nsteps:\n  - record: {robot: relay, topics: [/scan], duration: 1s, name: NAME}"
-    two = PROCEDURE.replace("\nsteps:", other.replace("NAME", "theirs"), 1)
-    procedure = schema.validate(schema.parse(two, source="los.yaml"), Procedure)
+    other_recording = "\nsteps:\n  - record: {robot: relay, topics: [/scan], duration: 1s, name: NAME}"
+    two_recordings = PROCEDURE.replace("\nsteps:", other_recording.replace("NAME", "theirs"), 1)
+    procedure = schema.validate(schema.parse(two_recordings, source="los.yaml"), Procedure)
     recorders = [placed.step for placed in procedure.walk() if isinstance(placed.step, Records)]
     assert {role for step in recorders for role in step.records_on()} == {Role.SENDER, Role.RELAY}
-    text = PROCEDURE.replace("\nsteps:", other.replace("NAME", "scan"), 1)
+    text = PROCEDURE.replace("\nsteps:", other_recording.replace("NAME", "scan"), 1)
     with pytest.raises(ConfigurationError, match=r"another step has a file scan\.bag"):
         schema.validate(schema.parse(text, source="los.yaml"), Procedure)
 
 
 def test_a_transfer_without_a_file_needs_a_bag_of_its_sender() -> None:
     document = schema.parse(PROCEDURE.replace("robot: sender", "robot: receiver", 1), source="los.yaml")
-    output_text = "the transfer from sender names no file, but no step before it records on sender"
-    with pytest.raises(ConfigurationError, match=output_text):
+    message = "the transfer from sender names no file, but no step before it records on sender"
+    with pytest.raises(ConfigurationError, match=message):
         schema.validate(document, Procedure)
 
 
@@ -174,9 +174,9 @@ def test_a_transfer_without_a_file_needs_a_bag_of_its_sender() -> None:
     ],
 )
 def test_error_in_a_site_file(old: str, new: str, message: str) -> None:
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(ConfigurationError) as error_info:
         schema.validate(schema.parse(SITE.replace(old, new, 1), source="fieldkit.yaml"), Site)
-    assert message in caught.value.what
+    assert message in error_info.value.what
 
 
 @pytest.mark.parametrize(
@@ -190,13 +190,13 @@ def test_error_in_a_site_file(old: str, new: str, message: str) -> None:
         ("tx_power_dbm: 17", "tx_power_dbm: [17]", "[17] is not a number"),
     ],
 )
-def test_a_number_of_the_wrong_kind_is_named(old: str, new: str, message: str) -> None:
+def test_a_value_that_is_not_a_number_is_named(old: str, new: str, message: str) -> None:
     assert old in PROFILE
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(ConfigurationError) as error_info:
         schema.validate(
             schema.parse(PROFILE.replace(old, new, 1), source="robots/turtlebot3_burger.yaml"), RobotProfile
         )
-    assert message in caught.value.what
+    assert message in error_info.value.what
 
 
 def test_part_of_a_document_keeps_lines_and_path() -> None:
@@ -225,9 +225,9 @@ def test_on_and_off_stay_text_as_in_yaml_1_2() -> None:
 
 
 def test_unknown_name_suggests_the_nearest() -> None:
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(ConfigurationError) as error_info:
         load_profile("turtlebot3_burgr")
-    assert "turtlebot3_burger" in caught.value.remedy
+    assert "turtlebot3_burger" in error_info.value.remedy
 
 
 @pytest.mark.parametrize(
@@ -272,9 +272,9 @@ class Text(schema.Strict):
 @example("on")
 @example("a\N{NEXT LINE}0")
 @example("a\N{LINE SEPARATOR}0\r")
-def test_text_round_trips_even_if_it_looks_like_another_type(text: str) -> None:
-    written = Text(text=text)
-    assert schema.validate(schema.parse(schema.dump(written), source="x"), Text) == written
+def test_text_round_trips_even_if_it_resembles_another_type(text: str) -> None:
+    model = Text(text=text)
+    assert schema.validate(schema.parse(schema.dump(model), source="x"), Text) == model
 
 
 class Quantities(schema.Strict):
@@ -285,10 +285,10 @@ class Quantities(schema.Strict):
 
 @pytest.mark.parametrize("step", ["50us", "0.000000001s", "0s", "99999999999s"])
 def test_quantities_of_any_size_round_trip(step: str) -> None:
-    written = Quantities.model_validate({"step": step, "rate": "3bit/s", "size": "99GB"})
-    read = schema.validate(schema.parse(schema.dump(written), source="x"), Quantities)
-    assert read.model_dump_json() == written.model_dump_json()
-    assert read.step == pytest.approx(written.step)
+    model = Quantities.model_validate({"step": step, "rate": "3bit/s", "size": "99GB"})
+    parsed = schema.validate(schema.parse(schema.dump(model), source="x"), Quantities)
+    assert parsed.model_dump_json() == model.model_dump_json()
+    assert parsed.step == pytest.approx(model.step)
 
 
 @pytest.mark.parametrize("model", [Tools, Payloads, RadioOptions, PhysicsOptions, PolicyChoice, EmulatedOptions])

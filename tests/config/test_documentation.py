@@ -10,8 +10,8 @@ from tests.helpers.paths import ROOT
 
 
 @pytest.fixture
-def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of the pages in an installed package."""
+def installed_docs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the folder of the pages in an installed package."""
     docs = tmp_path / "fieldkit" / "data" / "docs"
     for name in ("index", "404", "field", "reference/index", "reference/commands", "studies/mesh"):
         page = docs / f"{name}.html"
@@ -21,13 +21,13 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return docs
 
 
-def test_topics_are_pages_of_all_folders(installed: Path) -> None:
+def test_topics_are_pages_of_all_folders(installed_docs: Path) -> None:
     assert documentation.topics() == {
-        "commands": installed / "reference" / "commands.html",
-        "field": installed / "field.html",
-        "index": installed / "index.html",
-        "mesh": installed / "studies" / "mesh.html",
-        "reference": installed / "reference" / "index.html",
+        "commands": installed_docs / "reference" / "commands.html",
+        "field": installed_docs / "field.html",
+        "index": installed_docs / "index.html",
+        "mesh": installed_docs / "studies" / "mesh.html",
+        "reference": installed_docs / "reference" / "index.html",
     }
 
 
@@ -36,16 +36,16 @@ def test_a_checkout_has_its_markdown_pages() -> None:
     assert documentation.find("steps").path == ROOT / "docs" / "reference" / "steps.md"
 
 
-def test_command_is_a_section_of_the_command_reference(installed: Path) -> None:
+def test_command_is_a_section_of_the_command_reference(installed_docs: Path) -> None:
     page = documentation.find("trial")
-    assert page.uri == (installed / "reference" / "commands.html").as_uri() + "#fieldkit-trial"
+    assert page.uri == (installed_docs / "reference" / "commands.html").as_uri() + "#fieldkit-trial"
 
 
-@pytest.mark.usefixtures("installed")
+@pytest.mark.usefixtures("installed_docs")
 def test_unknown_topic_suggests_the_nearest() -> None:
-    with pytest.raises(ConfigurationError, match="no topic 'fields'") as caught:
+    with pytest.raises(ConfigurationError, match="no topic 'fields'") as error_info:
         documentation.find("fields")
-    assert caught.value.remedy == "did you mean 'field'?"
+    assert error_info.value.remedy == "did you mean 'field'?"
 
 
 def test_package_without_pages_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,19 +26,23 @@ def document(steps: str) -> schema.Document:
     return schema.parse(HEAD + steps, source="x.yaml")
 
 
-def loaded(steps: str) -> Procedure:
+def load(steps: str) -> Procedure:
     return schema.validate(document(steps), Procedure)
 
 
 def error_of(steps: str) -> tuple[str, int, str]:
     """Return the error message of a procedure, its line after the header, and the remedy."""
-    with pytest.raises(ConfigurationError) as caught:
-        loaded(steps)
-    return caught.value.what, int(caught.value.where.removeprefix("x.yaml:")) - HEAD.count("\n"), caught.value.remedy
+    with pytest.raises(ConfigurationError) as error_info:
+        load(steps)
+    return (
+        error_info.value.what,
+        int(error_info.value.where.removeprefix("x.yaml:")) - HEAD.count("\n"),
+        error_info.value.remedy,
+    )
 
 
 def test_step_is_expanded_for_each_value_with_its_type() -> None:
-    pings = list(steps_of(loaded(SWEEP), PingStep))
+    pings = list(steps_of(load(SWEEP), PingStep))
     assert [(ping.name, ping.payload_bytes.tcp, ping.payload_bytes.udp) for ping in pings] == [
         ("p502", 502, 502),
         ("p1400", 1400, 1400),
@@ -118,34 +122,39 @@ def test_error_in_a_loop_has_its_line_and_a_remedy(old: str, new: str, message: 
 
 
 def test_variable_of_an_enclosing_loop_cannot_be_reused() -> None:
-    inner = SWEEP.replace("- ping", "- for: {each: {bytes: [1]}, during: [ping").replace('"}', '"}]}')
-    assert error_of(inner)[:2] == ("bytes is a variable of an enclosing for:", 4)
+    nested_loop = SWEEP.replace("- ping", "- for: {each: {bytes: [1]}, during: [ping").replace('"}', '"}]}')
+    assert error_of(nested_loop)[:2] == ("bytes is a variable of an enclosing for:", 4)
 
 
 def test_number_of_steps_is_limited() -> None:
     values = ", ".join(map(str, range(32)))
-    twice = f"{{each: {{a: [{values}], b: [{values}]}}, during: [a: {{}}]}}"
-    assert error_of(f"  - for: {twice}")[:2] == ("for: has 1024 combinations, more than 1000", 1)
-    nested = f"{{each: {{a: [{values}]}}, during: [for: {{each: {{b: [{values}]}}, during: [a: {{}}]}}]}}"
-    assert error_of(f"  - for: {nested}")[:2] == ("there are more than 1000 steps after for: is expanded", 1)
+    two_variables = f"{{each: {{a: [{values}], b: [{values}]}}, during: [a: {{}}]}}"
+    assert error_of(f"  - for: {two_variables}")[:2] == ("for: has 1024 combinations, more than 1000", 1)
+    nested_loops = f"{{each: {{a: [{values}]}}, during: [for: {{each: {{b: [{values}]}}, during: [a: {{}}]}}]}}"
+    assert error_of(f"  - for: {nested_loops}")[:2] == ("there are more than 1000 steps after for: is expanded", 1)
 
 
 SCALARS = st.one_of(st.integers(-9, 9), st.booleans(), st.text("abc", min_size=1, max_size=3))
 
 
 @given(
-    lists=st.dictionaries(
+    values_by_variable=st.dictionaries(
         st.text("abc", min_size=1, max_size=2), st.lists(SCALARS, min_size=1, max_size=3), min_size=1, max_size=3
     )
 )
-def test_order_equals_itertools_product_and_lines_are_those_of_the_loop(lists: dict[str, list[Any]]) -> None:
-    step = {"step": {name: f"{{{name}}}" for name in lists}}
+def test_order_equals_itertools_product_and_steps_have_the_line_of_the_loop_body(
+    values_by_variable: dict[str, list[Any]],
+) -> None:
+    step = {"step": {name: f"{{{name}}}" for name in values_by_variable}}
     before = schema.Document(
-        {"steps": [{"for": {"each": lists, "during": [step]}}, step]},
+        {"steps": [{"for": {"each": values_by_variable, "during": [step]}}, step]},
         "x.yaml",
         {(): 1, ("steps",): 1, ("steps", 0, "for", "during", 0): 7, ("steps", 1): 9},
     )
     after = loops.expand_loops(before, "steps")
-    combinations = [dict(zip(lists, chosen, strict=True)) for chosen in itertools.product(*lists.values())]
+    combinations = [
+        dict(zip(values_by_variable, combination, strict=True))
+        for combination in itertools.product(*values_by_variable.values())
+    ]
     assert after.data["steps"] == [*({"step": values} for values in combinations), step]
     assert [after.lines["steps", index] for index in range(len(combinations) + 1)] == [7] * len(combinations) + [9]

@@ -43,9 +43,9 @@ steps:
 
 
 def error_of(text: str, model: type[schema.Strict]) -> ConfigurationError:
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(ConfigurationError) as error_info:
         schema.validate(schema.parse(text, source="f.yaml"), model)
-    return caught.value
+    return error_info.value
 
 
 @pytest.mark.parametrize(
@@ -118,20 +118,20 @@ def test_every_key_outside_its_section_is_reported_with_the_section(path: Path) 
     document = documents.read(path).data
     fields = {field.alias or name: field.annotation for name, field in RobotProfile.model_fields.items()}
     sections = {**fields, **RobotProfile.section_types()}
-    moved = [
+    misplaced_keys = [
         (section, key)
-        for section, value in document.items()
-        if isinstance(value, dict) and hasattr(sections[section], "model_fields")
-        for key in value
+        for section, section_data in document.items()
+        if isinstance(section_data, dict) and hasattr(sections[section], "model_fields")
+        for key in section_data
         if key not in sections
     ]
-    assert moved
-    for section, key in moved:
+    assert misplaced_keys
+    for section, key in misplaced_keys:
         data = copy.deepcopy(document)
-        slipped = data[section].pop(key)
-        at = list(data).index(section) + 1
+        value = data[section].pop(key)
+        index = list(data).index(section) + 1
         items = list(data.items())
-        text = documents.to_text(dict([*items[:at], (key, slipped), *items[at:]]))
+        text = documents.to_text(dict([*items[:index], (key, value), *items[index:]]))
         assert (
             f"unknown key {key}; it is a key of {section}: indent it below {section}:"
             in error_of(text, RobotProfile).what

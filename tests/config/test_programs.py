@@ -22,14 +22,14 @@ class Holder(Strict):
 
 @pytest.fixture(autouse=True)
 def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A lab with a folder of procedures as the current directory."""
+    """Return a lab with a folder of procedures, which is the current directory."""
     folder = tmp_path / "lab"
     (folder / "procedures").mkdir(parents=True)
     monkeypatch.chdir(folder)
     return folder
 
 
-def put(name: str, source: str = "procedures/p.yaml") -> LabProgram:
+def load_program(name: str, source: str = "procedures/p.yaml") -> LabProgram:
     value = schema.validate(schema.parse(f"# a comment\nput: {name}", source=source), Holder).put
     assert value is not None
     return value
@@ -44,7 +44,7 @@ def write_program(path: str, content: bytes = SCRIPT, mode: int = 0o644) -> None
 @pytest.mark.parametrize(("mode", "executable"), [(0o755, True), (0o744, True), (0o644, False)])
 def test_plan_stores_hash_size_and_executable_flag(mode: int, executable: bool) -> None:
     write_program("tools/probe", mode=mode)
-    program = put("tools/probe")
+    program = load_program("tools/probe")
     assert program == LabProgram(
         file="tools/probe", sha256=hashlib.sha256(SCRIPT).hexdigest(), size_bytes=len(SCRIPT), executable=executable
     )
@@ -53,28 +53,28 @@ def test_plan_stores_hash_size_and_executable_flag(mode: int, executable: bool) 
 
 def test_stored_program_is_parsed_without_a_search() -> None:
     write_program("tools/probe")
-    frozen = schema.dump(Holder(put=put("tools/probe")))
+    stored_text = schema.dump(Holder(put=load_program("tools/probe")))
     Path("tools/probe").unlink()
-    assert schema.dump(schema.validate(schema.parse(frozen, source="trial.yaml"), Holder)) == frozen
+    assert schema.dump(schema.validate(schema.parse(stored_text, source="trial.yaml"), Holder)) == stored_text
 
 
 def test_folder_of_the_procedure_takes_precedence_over_that_of_the_lab(tmp_path: Path) -> None:
     write_program("probe")
-    assert put("probe").file == "probe"
+    assert load_program("probe").file == "probe"
     write_program("procedures/probe", b"other")
-    assert (put("probe").file, put("probe").content()) == ("procedures/probe", b"other")
+    assert (load_program("probe").file, load_program("probe").content()) == ("procedures/probe", b"other")
     write_program(str(tmp_path / "elsewhere" / "probe"), b"third")
-    assert put("probe", str(tmp_path / "elsewhere" / "p.yaml")).content() == b"third"
+    assert load_program("probe", str(tmp_path / "elsewhere" / "p.yaml")).content() == b"third"
 
 
 def test_a_link_inside_of_the_lab_is_followed() -> None:
     write_program("tools/probe")
     Path("procedures/probe").symlink_to("../tools/probe")
-    assert put("probe").file == "tools/probe"
+    assert load_program("probe").file == "tools/probe"
 
 
 @pytest.mark.parametrize(
-    ("name", "make", "message"),
+    ("name", "create_file", "message"),
     [
         ("absent", lambda: None, "there is no file 'absent'; searched in .*procedures and .*lab"),
         ("/etc/passwd", lambda: None, "not the relative path"),
@@ -97,26 +97,26 @@ def test_a_link_inside_of_the_lab_is_followed() -> None:
         ),
     ],
 )
-def test_invalid_program_is_rejected_with_its_line(name: str, make: Callable[[], None], message: str) -> None:
-    make()
-    with pytest.raises(ConfigurationError, match=message) as caught:
-        put(name)
-    assert caught.value.where == "procedures/p.yaml:2"
+def test_invalid_program_is_rejected_with_its_line(name: str, create_file: Callable[[], None], message: str) -> None:
+    create_file()
+    with pytest.raises(ConfigurationError, match=message) as error_info:
+        load_program(name)
+    assert error_info.value.where == "procedures/p.yaml:2"
 
 
 def test_program_of_the_maximum_size_is_accepted() -> None:
     write_program("large", bytes(program_files.MAX_BYTES))
-    assert put("large").size_bytes == program_files.MAX_BYTES
+    assert load_program("large").size_bytes == program_files.MAX_BYTES
 
 
 def test_changed_or_missing_program_is_rejected() -> None:
     write_program("probe")
-    program = put("probe")
+    program = load_program("probe")
     write_program("probe", SCRIPT + b"#")
-    with pytest.raises(ConfigurationError, match="has changed since the procedure was read") as caught:
+    with pytest.raises(ConfigurationError, match="has changed since the procedure was read") as error_info:
         program.content()
-    assert caught.value.where == "probe"
-    assert program.sha256 in caught.value.remedy
+    assert error_info.value.where == "probe"
+    assert program.sha256 in error_info.value.remedy
     Path("probe").unlink()
     with pytest.raises(ConfigurationError, match="cannot be read: No such file"):
         program.content()

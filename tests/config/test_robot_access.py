@@ -1,4 +1,4 @@
-"""Robot access as `fieldkit stop` reads it: equal to the full site file, and tolerant of other errors there."""
+"""Robot access as read by `fieldkit stop` equals that of the full site file; other errors are tolerated."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The site file: the template is valid, and pinning a key changes nothing else."""
+"""The site file: the template is valid, and pinning a host key changes nothing else."""
 
 import difflib
 import itertools
@@ -37,18 +37,22 @@ LAYOUTS = {
 def test_pinning_changes_nothing_else(text: str, tmp_path: Path) -> None:
     path = tmp_path / "site.yaml"
     path.write_bytes(text.encode())
-    before = yaml.safe_load(text)
+    expected = yaml.safe_load(text)
     pin_host_key(path, "a", KEY)
     after = path.read_bytes().decode()
-    before["robots"]["a"]["host_key"] = KEY
-    assert yaml.safe_load(after) == before
-    without_key, old = after.replace(KEY, ""), text.replace(f'"{OTHER}"', "").replace(OTHER, "")
-    changes = [change for change in difflib.ndiff(list(old), list(without_key)) if not change.startswith("  ")]
+    expected["robots"]["a"]["host_key"] = KEY
+    assert yaml.safe_load(after) == expected
+    without_key, text_without_old_key = after.replace(KEY, ""), text.replace(f'"{OTHER}"', "").replace(OTHER, "")
+    changes = [
+        change
+        for change in difflib.ndiff(list(text_without_old_key), list(without_key))
+        if not change.startswith("  ")
+    ]
     assert all(change.startswith("+ ") for change in changes), "nothing is removed"
     assert "".join(change[2:] for change in changes).strip(' ,:\r\n"') in {"", "host_key"}
 
 
-def blocks(name: str, comment: str, blank: int, indent: int) -> str:
+def robot_block(name: str, comment: str, blank: int, indent: int) -> str:
     lines = [f"{name}:  # {comment}", f"{' ' * indent}# {comment}", f"{' ' * indent}profile:  x"]
     return "\n".join(f"  {line}" for line in lines) + "\n" * (blank + 1)
 
@@ -68,48 +72,48 @@ def blocks(name: str, comment: str, blank: int, indent: int) -> str:
 def test_pinning_adds_one_line_to_a_robot_in_block_style(
     names: list[str], comment: str, blank: int, indent: int, data: st.DataObject
 ) -> None:
-    text = f"# {comment}\nrobots:\n" + "".join(blocks(name, comment, blank, indent) for name in names)
+    text = f"# {comment}\nrobots:\n" + "".join(robot_block(name, comment, blank, indent) for name in names)
     robot = data.draw(st.sampled_from(names))
-    old, new = text.splitlines(), _with_value(text, ("robots", robot, "host_key"), KEY).splitlines()
-    (added,) = [line for line in new if KEY in line]
-    assert added == f"{' ' * (indent + 2)}host_key: {KEY}"
-    new.remove(added)
-    assert new == old
+    old_lines, new_lines = text.splitlines(), _with_value(text, ("robots", robot, "host_key"), KEY).splitlines()
+    (added_line,) = [line for line in new_lines if KEY in line]
+    assert added_line == f"{' ' * (indent + 2)}host_key: {KEY}"
+    new_lines.remove(added_line)
+    assert new_lines == old_lines
     # `BaseLoader` reads all scalars as text: a robot may be named `on`, a boolean in YAML 1.1.
-    read = yaml.load(_with_value(text, ("robots", robot, "host_key"), KEY), Loader=yaml.BaseLoader)
-    assert read["robots"][robot] == {"profile": "x", "host_key": KEY}
+    parsed = yaml.load(_with_value(text, ("robots", robot, "host_key"), KEY), Loader=yaml.BaseLoader)
+    assert parsed["robots"][robot] == {"profile": "x", "host_key": KEY}
 
 
 def test_file_that_cannot_be_edited_is_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "site.yaml"
     text = "robots:\n  a:\n    profile: |\n      x\n  b: {profile: y}\n"
     path.write_text(text, encoding="utf-8")
-    with pytest.raises(ConfigurationError, match="cannot be inserted") as caught:
+    with pytest.raises(ConfigurationError, match="cannot be inserted") as error_info:
         pin_host_key(path, "a", KEY)
-    assert caught.value.remedy == f"add it in an editor: host_key: {KEY}"
+    assert error_info.value.remedy == f"add it in an editor: host_key: {KEY}"
     assert path.read_text(encoding="utf-8") == text
 
 
 def test_permissions_and_symbolic_links_are_kept(tmp_path: Path) -> None:
-    real, link = tmp_path / "real.yaml", tmp_path / "site.yaml"
-    real.write_text(LAYOUTS["block"], encoding="utf-8")
-    real.chmod(0o640)
-    link.symlink_to(real)
+    target, link = tmp_path / "real.yaml", tmp_path / "site.yaml"
+    target.write_text(LAYOUTS["block"], encoding="utf-8")
+    target.chmod(0o640)
+    link.symlink_to(target)
     pin_host_key(link, "a", KEY)
     assert link.is_symlink()
-    assert KEY in real.read_text(encoding="utf-8")
-    assert stat.S_IMODE(real.stat().st_mode) == 0o640
-    assert sorted(tmp_path.iterdir()) == [real, link]
+    assert KEY in target.read_text(encoding="utf-8")
+    assert stat.S_IMODE(target.stat().st_mode) == 0o640
+    assert sorted(tmp_path.iterdir()) == [target, link]
 
 
 def test_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "site.yaml"
     path.write_text(LAYOUTS["block"], encoding="utf-8")
 
-    def disk_full(descriptor: int) -> None:
+    def raise_disk_full(descriptor: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("fieldkit.core.files.os.fsync", disk_full)
+    monkeypatch.setattr("fieldkit.core.files.os.fsync", raise_disk_full)
     with pytest.raises(ConfigurationError, match="No space left"):
         pin_host_key(path, "a", KEY)
     assert path.read_text(encoding="utf-8") == LAYOUTS["block"]
@@ -122,10 +126,10 @@ def test_template_is_valid_and_every_line_has_a_comment(tmp_path: Path) -> None:
     site, _ = load_site(path)
     for robot in site.robots.values():
         profiles.load_profile(robot.profile)
-    first = path.read_text(encoding="utf-8").partition("  turtlebot-2:")[0].splitlines()
-    for above, line in itertools.pairwise(first):
+    lines_of_first_robot = path.read_text(encoding="utf-8").partition("  turtlebot-2:")[0].splitlines()
+    for previous_line, line in itertools.pairwise(lines_of_first_robot):
         if line and not line.lstrip().startswith("#") and line != "robots:":
-            assert above.lstrip().startswith("#"), line
+            assert previous_line.lstrip().startswith("#"), line
 
 
 def test_a_site_file_is_never_overwritten(tmp_path: Path) -> None:

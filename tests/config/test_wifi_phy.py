@@ -1,4 +1,4 @@
-"""Keys of a radio's physical layer in robot profiles: combinations that exist, and the errors of others."""
+"""Keys of the physical layer of a radio in robot profiles: valid combinations, and errors for other combinations."""
 
 import re
 
@@ -36,15 +36,19 @@ def test_impossible_combinations_are_rejected(standard: str, phy: dict[str, int]
         radio(standard, **phy)
 
 
-def test_possible_combinations_reach_the_model() -> None:
+def test_possible_combinations_are_passed_to_the_model() -> None:
     for standard, width_mhz in (("802.11n 5 GHz", 40), ("802.11ac 5 GHz", 80), ("802.11ax 6 GHz", 80)):
         phy = antenna_of(radio(standard, width_mhz=width_mhz, streams=2)).phy
         assert phy is not None
         assert (f"802.11{phy.amendment} {phy.band_name}", phy.width_mhz, phy.streams) == (standard, width_mhz, 2)
 
 
-def test_a_radio_without_phy_is_modelled_as_before() -> None:
+def test_a_radio_without_phy_has_the_standard_of_its_text_or_802_11g() -> None:
     fields = {"interface": "wlan0", "tx_power_dbm": 17, "sensitivity_dbm": -82}
-    for standard, modelled in (("802.11n 2.4 GHz", "802.11n"), ("802.11ac", "802.11g"), ("any text", "802.11g")):
+    for standard, expected_standard in (
+        ("802.11n 2.4 GHz", "802.11n"),
+        ("802.11ac", "802.11g"),
+        ("any text", "802.11g"),
+    ):
         antenna = antenna_of(Radio.model_validate({**fields, "standard": standard}))
-        assert (antenna.standard, antenna.phy) == (modelled, None)
+        assert (antenna.standard, antenna.phy) == (expected_standard, None)

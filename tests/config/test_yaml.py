@@ -19,12 +19,12 @@ from sim_backends.world.world import World
 from tests.helpers.paths import DATA, ROOT
 
 
-@pytest.mark.parametrize("first", ["ip_loss < 2 %", "[a, b]", "x: 1", "'a'"])
-def test_an_item_that_is_indented_too_far_is_refused_with_its_line(first: str) -> None:
-    with pytest.raises(ConfigurationError) as caught:
-        documents.parse(f"expect:\n  - {first}\n   - rtt_loss < 5 %\n", source="p.yaml")
-    assert caught.value.where == "p.yaml:3"
-    assert "indent" in caught.value.remedy
+@pytest.mark.parametrize("first_item", ["ip_loss < 2 %", "[a, b]", "x: 1", "'a'"])
+def test_an_item_that_is_indented_too_far_is_refused_with_its_line(first_item: str) -> None:
+    with pytest.raises(ConfigurationError) as error_info:
+        documents.parse(f"expect:\n  - {first_item}\n   - rtt_loss < 5 %\n", source="p.yaml")
+    assert error_info.value.where == "p.yaml:3"
+    assert "indent" in error_info.value.remedy
 
 
 @pytest.mark.parametrize("text", ["- a\n  -b\n", "- a - b\n", "- |\n  a\n  - b\n", "- 'a\n  - b'\n", "x: a\n  - b\n"])
@@ -57,8 +57,8 @@ def test_texts_with_dashes_are_accepted(text: str) -> None:
     ],
 )
 def test_scalars_are_parsed_as_in_yaml_1_2(text: str, expected: object) -> None:
-    read = schema.parse(f"a: {text}", source="x").data["a"]
-    assert (read, type(read)) == (expected, type(expected))
+    value = schema.parse(f"a: {text}", source="x").data["a"]
+    assert (value, type(value)) == (expected, type(expected))
 
 
 @pytest.mark.parametrize(
@@ -92,11 +92,11 @@ def test_scalars_are_parsed_as_in_yaml_1_2(text: str, expected: object) -> None:
     ],
 )
 def test_invalid_yaml_is_rejected_with_its_line(text: str, message: str) -> None:
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(ConfigurationError) as error_info:
         schema.parse(f"# one\n\na: {text}", source="x")
-    assert message in caught.value.what
-    assert caught.value.where == "x:3"
-    assert caught.value.remedy
+    assert message in error_info.value.what
+    assert error_info.value.where == "x:3"
+    assert error_info.value.remedy
 
 
 @pytest.mark.parametrize(
@@ -109,16 +109,16 @@ def test_invalid_yaml_is_rejected_with_its_line(text: str, message: str) -> None
 def test_other_encoding_is_rejected_with_its_line(data: bytes, line: int, message: str, tmp_path: Path) -> None:
     path = tmp_path / "x.yaml"
     path.write_bytes(data)
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(ConfigurationError) as error_info:
         schema.read(path)
-    assert (caught.value.where, message in caught.value.remedy) == (f"{path}:{line}", True)
+    assert (error_info.value.where, message in error_info.value.remedy) == (f"{path}:{line}", True)
 
 
 def test_a_byte_order_mark_and_windows_lines_are_read(tmp_path: Path) -> None:
     path = tmp_path / "x.yaml"
     path.write_bytes(b"\xef\xbb\xbfa: 1\r\nb: 2\r\n")
-    read = schema.read(path)
-    assert (read.data, read.where(("b",))) == ({"a": 1, "b": 2}, f"{path}:2")
+    document = schema.read(path)
+    assert (document.data, document.where(("b",))) == ({"a": 1, "b": 2}, f"{path}:2")
 
 
 @pytest.mark.parametrize("path", ["/dev/zero", "/"])
@@ -140,9 +140,9 @@ def test_devices_and_folders_are_rejected(path: str) -> None:
     ],
 )
 def test_error_in_a_site_file_has_message_and_line(text: str, location: str, message: str) -> None:
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(ConfigurationError) as error_info:
         schema.validate(schema.parse(text, source="x"), Site)
-    assert (caught.value.where, message in caught.value.what) == (location, True), caught.value
+    assert (error_info.value.where, message in error_info.value.what) == (location, True), error_info.value
 
 
 CAMPAIGN = """\
@@ -209,8 +209,8 @@ def check_text(text: str, model: type[schema.Strict]) -> None:
 
 
 @st.composite
-def damaged(draw: st.DrawFn) -> tuple[str, type[schema.Strict]]:
-    """A shipped file with up to three changes, and its model."""
+def damaged_files(draw: st.DrawFn) -> tuple[str, type[schema.Strict]]:
+    """Return a shipped file with up to three changes, and its model."""
     text, model = draw(st.sampled_from(FILES))
     lines = text.splitlines()
     changes: tuple[Callable[[str], str], ...] = (
@@ -223,15 +223,15 @@ def damaged(draw: st.DrawFn) -> tuple[str, type[schema.Strict]]:
         lambda line: draw(st.text(st.sampled_from("\0\t\r\x1b\u2028\ud800:\"'[]{}-?!&*%|>#"), max_size=3)) + line,
     )
     for _ in range(draw(st.integers(1, 3))):
-        at = draw(st.integers(0, len(lines) - 1))
-        lines[at] = draw(st.sampled_from(changes))(lines[at])
+        index = draw(st.integers(0, len(lines) - 1))
+        lines[index] = draw(st.sampled_from(changes))(lines[index])
     return "\n".join(lines), model
 
 
 TEXTS = st.text(st.characters(), max_size=40) | st.text(st.sampled_from(CHARACTERS), max_size=40)
 
 
-@given(damaged())
+@given(damaged_files())
 def test_damaged_files_cause_only_configuration_errors(file: tuple[str, type[schema.Strict]]) -> None:
     check_text(*file)
 

@@ -31,7 +31,7 @@ def test_the_first_missing_reason_is_kept() -> None:
 
 
 @given(measured, measured)
-def test_a_union_keeps_all_columns_and_each_is_either_measured_or_missing(first: Measured, second: Measured) -> None:
+def test_a_union_keeps_all_columns_as_either_measured_or_missing(first: Measured, second: Measured) -> None:
     if first.values.keys() & second.values.keys():
         with pytest.raises(ValueError, match="measured twice"):
             first | second
@@ -63,14 +63,14 @@ def test_the_unit_determines_the_type_of_values() -> None:
 
 
 def test_a_rounded_value_at_a_bound_is_still_possible() -> None:
-    ends = 1.0000000004, 2.0000000006
-    column = Column("level", "dBm", "x", bounds=ends)
-    assert [cell(end) for end in ends] == ["1", "2"]
-    assert [column.invalid_value_reason(cell(end)) for end in ends] == [None, None]
+    bounds = 1.0000000004, 2.0000000006
+    column = Column("level", "dBm", "x", bounds=bounds)
+    assert [cell(bound) for bound in bounds] == ["1", "2"]
+    assert [column.invalid_value_reason(cell(bound)) for bound in bounds] == [None, None]
     assert column.invalid_value_reason("0.999999999") == "not from 1 to 2"
     assert column.invalid_value_reason("2.00000001") is not None
 
 
-def test_columns_without_a_rank_are_refused_because_the_first_one_would_be_lost() -> None:
+def test_columns_without_a_rank_are_refused_because_the_first_column_would_be_lost() -> None:
     with pytest.raises(TypeError, match="the first argument of columns is the rank"):
         columns(("hops", "count", "Hops."))  # type: ignore[arg-type]

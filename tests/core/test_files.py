@@ -16,20 +16,20 @@ def test_write_keeps_the_old_file_and_its_mode_on_error(tmp_path: Path, monkeypa
     path.chmod(0o640)
     files.write(path, b"old")
 
-    def full(descriptor: int) -> None:
+    def raise_disk_full(descriptor: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("fieldkit.core.files.os.fsync", full)
-    with pytest.raises(OSError, match="No space") as caught:
+    monkeypatch.setattr("fieldkit.core.files.os.fsync", raise_disk_full)
+    with pytest.raises(OSError, match="No space") as error_info:
         files.write(path, b"new")
-    assert caught.value.filename == str(path)
+    assert error_info.value.filename == str(path)
     assert path.read_bytes() == b"old"
     assert path.stat().st_mode & 0o7777 == 0o640
     assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)], ids=["first ends first", "last ends first"])
-def test_each_of_two_writers_replaces_a_file_by_complete_content(tmp_path: Path, order: tuple[int, int]) -> None:
+def test_each_of_two_writers_replaces_a_file_with_complete_content(tmp_path: Path, order: tuple[int, int]) -> None:
     path = tmp_path / "report.html"
     path.write_bytes(b"old")
     stacks = [ExitStack() for _ in order]
@@ -48,11 +48,11 @@ def test_the_temporary_file_of_a_killed_process_is_removed(tmp_path: Path) -> No
     path = tmp_path / "report.html"
     script = "import os, signal, sys; from pathlib import Path; from fieldkit.core import files\n"
     script += "with files.replacing(Path(sys.argv[1])) as file: file.flush(); os.kill(os.getpid(), signal.SIGKILL)"
-    killed = subprocess.run([sys.executable, "-c", script, str(path)], check=False, timeout=60)
-    assert killed.returncode == -signal.SIGKILL
-    (left,) = tmp_path.iterdir()
+    completed = subprocess.run([sys.executable, "-c", script, str(path)], check=False, timeout=60)
+    assert completed.returncode == -signal.SIGKILL
+    (temporary_file,) = tmp_path.iterdir()
     files.write(path, b"page")
-    assert not left.exists()
+    assert not temporary_file.exists()
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -65,7 +65,7 @@ def test_a_pipe_is_not_replaced(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_free_bytes_of_a_missing_folder_are_those_of_its_parent_s_disk(
+def test_free_bytes_of_a_missing_folder_are_those_of_the_disk_of_its_parent(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -7,7 +7,7 @@ RIVAL = Role("rival")
 
 
 @pytest.mark.parametrize(
-    ("topology", "near", "leg", "position_m"),
+    ("topology", "reference", "leg", "position_m"),
     [
         # East is the direction from the sender to the receiver, north is to the left of it.
         (Topology.MASTERLESS, Role.RECEIVER, Leg(away_m=2.0), (12.0, 0.0, 0.0)),
@@ -20,7 +20,7 @@ RIVAL = Role("rival")
     ],
 )
 def test_a_post_is_relative_to_its_reference_robot(
-    topology: Topology, near: Role, leg: Leg, position_m: Vector
+    topology: Topology, reference: Role, leg: Leg, position_m: Vector
 ) -> None:
-    placement = Placement(Scenario.LOS, topology, Distance(10.0, "10m"), (Post(RIVAL, near, leg),))
+    placement = Placement(Scenario.LOS, topology, Distance(10.0, "10m"), (Post(RIVAL, reference, leg),))
     assert geometry.positions_m(placement)[RIVAL] == position_m

@@ -26,7 +26,9 @@ def test_the_first_of_two_versions_of_a_package_is_used(tmp_path: Path, monkeypa
     assert plugins.version("Bench.Tools") == "2.0"
 
 
-def test_versions_are_of_packages_that_add_backends_or_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_versions_include_packages_that_add_backends_or_steps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write_package(tmp_path, "more-steps", f"[{plugins.STEPS}]\nload = more_steps:Load\n", "1.5")
     write_package(tmp_path, "more-commands", f"[{plugins.COMMANDS}]\nplay = more_commands:play\n", "3.0")
     monkeypatch.syspath_prepend(tmp_path)
@@ -39,9 +41,9 @@ def test_a_package_that_is_not_installed_has_an_unknown_version() -> None:
 
 @pytest.mark.parametrize("value", ["fieldkit.core.no_such_module:x", "fieldkit.core.plugins:x", "not a module"])
 def test_an_entry_point_that_cannot_be_loaded_is_named(value: str) -> None:
-    with pytest.raises(ConfigurationError, match="it cannot be loaded") as caught:
+    with pytest.raises(ConfigurationError, match="it cannot be loaded") as error_info:
         plugins.load(EntryPoint("broken", value, "bench"))
-    assert caught.value.where == f"entry point broken = {value}"
+    assert error_info.value.where == f"entry point broken = {value}"
 
 
 def test_an_entry_point_names_a_module_or_an_attribute_in_one() -> None:

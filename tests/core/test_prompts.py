@@ -13,7 +13,7 @@ from fieldkit.core.prompts import DONE, Answer, parse
 
 
 @pytest.mark.parametrize(
-    ("line", "meaning"),
+    ("line", "expected"),
     [
         ("", DONE),
         ("  \n", DONE),
@@ -25,11 +25,11 @@ from fieldkit.core.prompts import DONE, Answer, parse
         ("yes", None),
     ],
 )
-def test_a_line_is_one_answer_or_none(line: str, meaning: Answer | None) -> None:
-    assert parse(line, may_skip=True) == meaning
+def test_a_line_is_an_answer_or_none(line: str, expected: Answer | None) -> None:
+    assert parse(line, may_skip=True) == expected
 
 
-def test_skip_is_no_answer_if_it_is_not_allowed() -> None:
+def test_skip_is_not_an_answer_if_skipping_is_not_allowed() -> None:
     assert parse("s", may_skip=False) is None
 
 
@@ -63,10 +63,10 @@ def test_a_script_reads_a_line_only_after_its_request_was_reported() -> None:
 def test_an_error_of_a_script_names_its_line(line: str, message: str) -> None:
     script = Script(iter(["", line] if line else [""]), "answers.txt", lambda event: None)
     script.ask("move z")
-    with pytest.raises(ConfigurationError, match=message) as caught:
+    with pytest.raises(ConfigurationError, match=message) as error_info:
         script.ask("move a")
-    assert caught.value.where == "answers.txt:2"
-    assert caught.value.remedy
+    assert error_info.value.where == "answers.txt:2"
+    assert error_info.value.remedy
 
 
 def _text(event: Event) -> str:

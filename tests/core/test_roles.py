@@ -18,7 +18,7 @@ def test_equal_names_give_the_same_role_object(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["", "Rival", "1st", "a-b", "a.b", "a/b", "x" * 32, "a\n"])
-def test_an_invalid_name_of_a_role_is_an_error(name: str) -> None:
+def test_an_invalid_role_name_is_an_error(name: str) -> None:
     with pytest.raises(ValueError, match="the name of a role"):
         Role(name)
 

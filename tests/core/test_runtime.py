@@ -1,4 +1,4 @@
-"""Named locks: exactly one process holds a lock, and no file is left, despite other users, crashes and contention."""
+"""Named locks: exactly one process holds a lock and no files remain, despite other users, crashes and contention."""
 
 import os
 import signal
@@ -20,23 +20,23 @@ NAME = "trial-0123abcd"
 
 @pytest.fixture(autouse=True)
 def base(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A temporary base folder with a short path, as `base_folder` requires."""
+    """Return a temporary base folder with a short path, as `base_folder` requires."""
     with tempfile.TemporaryDirectory(dir="/tmp", prefix="rt") as folder:
         monkeypatch.setenv("XDG_RUNTIME_DIR", folder)
         yield Path(folder)
 
 
-def private(base: Path) -> Path:
+def private_folder(base: Path) -> Path:
     return base / f"fieldkit-{os.geteuid()}"
 
 
 def test_a_lock_is_exclusive_and_leaves_no_file(base: Path) -> None:
     with runtime.hold_lock(NAME):
-        assert private(base).stat().st_mode & 0o777 == 0o700
+        assert private_folder(base).stat().st_mode & 0o777 == 0o700
         with runtime.hold_lock("another"):
-            assert len(list(private(base).iterdir())) == 2
+            assert len(list(private_folder(base).iterdir())) == 2
         with pytest.raises(NameHeldError), runtime.hold_lock(NAME):
-            raise AssertionError("held twice")
+            raise AssertionError("the lock is held twice")
     assert list(base.iterdir()) == []
     with runtime.hold_lock(NAME):
         pass
@@ -56,47 +56,47 @@ def test_a_file_left_by_kill_9_is_not_locked_and_is_removed(base: Path) -> None:
     os.waitpid(pid, 0)
     os.close(reader)
     os.close(writer)
-    assert len(list(private(base).iterdir())) == 2, "this is what a kill leaves"
+    assert len(list(private_folder(base).iterdir())) == 2, "a killed process leaves its files"
     with runtime.hold_lock(NAME):
-        assert [path.name for path in private(base).iterdir()] == [f"{NAME}.lock"]
+        assert [path.name for path in private_folder(base).iterdir()] == [f"{NAME}.lock"]
     assert list(base.iterdir()) == []
 
 
 def test_one_of_many_processes_gets_the_lock(base: Path) -> None:
-    go, stay = os.pipe(), os.pipe()
+    start_pipe, hold_pipe = os.pipe(), os.pipe()
     children = []
     for _ in range(12):
         pid = os.fork()
         if pid == 0:
-            code = 2
+            exit_code = 2
             try:
-                os.close(go[1])
-                os.close(stay[1])
-                os.read(go[0], 1)  # until the pipe is closed
+                os.close(start_pipe[1])
+                os.close(hold_pipe[1])
+                os.read(start_pipe[0], 1)  # blocks until the pipe is closed
                 with runtime.hold_lock(NAME):
-                    os.read(stay[0], 1)
-                code = 0
+                    os.read(hold_pipe[0], 1)
+                exit_code = 0
             except NameHeldError:
-                code = 1
+                exit_code = 1
             finally:
-                os._exit(code)
+                os._exit(exit_code)
         children.append(pid)
-    os.close(go[1])
-    codes: dict[int, int] = {}
+    os.close(start_pipe[1])
+    exit_codes: dict[int, int] = {}
 
     def are_all_but_one_refused() -> bool:
-        for pid in set(children) - codes.keys():
+        for pid in set(children) - exit_codes.keys():
             ended_pid, status = os.waitpid(pid, os.WNOHANG)
-            codes.update({pid: os.waitstatus_to_exitcode(status)} if ended_pid else {})
-        return len(codes) >= len(children) - 1
+            exit_codes.update({pid: os.waitstatus_to_exitcode(status)} if ended_pid else {})
+        return len(exit_codes) >= len(children) - 1
 
     wait_until(are_all_but_one_refused, Deadline.after(60))
-    assert list(codes.values()) == [1] * 11
-    os.close(stay[1])
-    (holder,) = set(children) - codes.keys()
+    assert list(exit_codes.values()) == [1] * 11
+    os.close(hold_pipe[1])
+    (holder,) = set(children) - exit_codes.keys()
     assert os.waitstatus_to_exitcode(os.waitpid(holder, 0)[1]) == 0
-    os.close(go[0])
-    os.close(stay[0])
+    os.close(start_pipe[0])
+    os.close(hold_pipe[0])
     assert list(base.iterdir()) == []
 
 
@@ -105,14 +105,14 @@ def test_concurrent_processes_can_lock_while_others_remove_stale_files(base: Pat
     for number in range(4):
         pid = os.fork()
         if pid == 0:
-            code = 1
+            exit_code = 1
             try:
                 for _ in range(100):
                     with runtime.hold_lock(f"own-{number}"):
                         pass
-                code = 0
+                exit_code = 0
             finally:
-                os._exit(code)
+                os._exit(exit_code)
         children.append(pid)
     assert [os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) for pid in children] == [0] * 4
     assert list(base.iterdir()) == []
@@ -120,7 +120,7 @@ def test_concurrent_processes_can_lock_while_others_remove_stale_files(base: Pat
 
 @pytest.mark.parametrize("kind", ["open to others", "of another user", "link", "file", "link to nothing"])
 def test_a_path_that_another_user_controls_is_refused_and_unchanged(base: Path, tmp_path: Path, kind: str) -> None:
-    path, victim = private(base), tmp_path / "victim"
+    path, victim = private_folder(base), tmp_path / "victim"
     victim.mkdir(mode=0o700)
     match kind:
         case "open to others":
@@ -138,31 +138,31 @@ def test_a_path_that_another_user_controls_is_refused_and_unchanged(base: Path, 
             path.touch(mode=0o600)
         case _:
             path.symlink_to(tmp_path / "nothing")
-    with pytest.raises(ConfigurationError) as caught, runtime.hold_lock(NAME):
-        raise AssertionError("held where others can write")
-    assert not isinstance(caught.value, NameHeldError)
-    assert "XDG_RUNTIME_DIR" in caught.value.remedy
+    with pytest.raises(ConfigurationError) as error_info, runtime.hold_lock(NAME):
+        raise AssertionError("a lock is held in a folder where others can write")
+    assert not isinstance(error_info.value, NameHeldError)
+    assert "XDG_RUNTIME_DIR" in error_info.value.remedy
     assert list(victim.iterdir()) == []
     assert not (tmp_path / "nothing").exists()
 
 
 def test_a_link_in_place_of_the_lock_file_is_not_followed(base: Path, tmp_path: Path) -> None:
-    private(base).mkdir(mode=0o700)
-    (private(base) / f"{NAME}.lock").symlink_to(tmp_path / "made")
+    private_folder(base).mkdir(mode=0o700)
+    (private_folder(base) / f"{NAME}.lock").symlink_to(tmp_path / "made")
     with pytest.raises(ConfigurationError), runtime.hold_lock(NAME):
-        raise AssertionError("held by a link")
+        raise AssertionError("a lock is held through a link")
     assert not (tmp_path / "made").exists()
 
 
-@pytest.mark.parametrize("spoil", ["is not there", "others write there", "is relative", "is too long"])
+@pytest.mark.parametrize("fault", ["is not there", "others write there", "is relative", "is too long"])
 def test_a_runtime_folder_that_is_not_private_is_not_used(
-    base: Path, monkeypatch: pytest.MonkeyPatch, spoil: str
+    base: Path, monkeypatch: pytest.MonkeyPatch, fault: str
 ) -> None:
     assert runtime.base_folder() == base
-    folder = {"is not there": base / "none", "is relative": Path(), "is too long": base / ("x" * 60)}.get(spoil, base)
-    if spoil == "is too long":
+    folder = {"is not there": base / "none", "is relative": Path(), "is too long": base / ("x" * 60)}.get(fault, base)
+    if fault == "is too long":
         folder.mkdir(mode=0o700)
-    if spoil == "others write there":
+    if fault == "others write there":
         base.chmod(0o777)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
     assert runtime.base_folder() != folder

@@ -23,15 +23,15 @@ def test_terminal_control_characters_are_replaced(text: str, expected: str) -> N
     assert sanitized(text) == expected
 
 
-def is_shown(text: str) -> bool:
+def is_printable(text: str) -> bool:
     return all(char.isprintable() or char in "\n\N{NO-BREAK SPACE}" for char in text)
 
 
 @given(st.text())
 def test_any_text_is_printable_in_every_form(text: str) -> None:
-    assert is_shown(sanitized(text))
-    assert is_shown(json_text({"a": text}))
-    assert is_shown(one_line(text))
+    assert is_printable(sanitized(text))
+    assert is_printable(json_text({"a": text}))
+    assert is_printable(one_line(text))
     assert "\n" not in one_line(text)
     assert sanitized(sanitized(text)) == sanitized(text)
 
@@ -61,7 +61,7 @@ CELLS = st.text() | st.from_regex(r"'{0,2}[=+@-][0-9a-z|!'\"]{0,5}", fullmatch=T
 
 
 @given(CELLS)
-def test_a_guarded_cell_is_no_formula_and_can_be_restored(text: str) -> None:
+def test_an_escaped_cell_is_not_a_formula_and_can_be_restored(text: str) -> None:
     cell = escape_formula(text)
     assert unescape_formula(cell) == text
     if cell[:1] in {"=", "+", "-", "@"} and len(cell) > 1:

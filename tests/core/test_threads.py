@@ -1,4 +1,4 @@
-"""Concurrent calls: which error is raised if several calls fail."""
+"""Concurrent calls: the error that is raised if several calls fail."""
 
 from threading import Event
 
@@ -11,16 +11,19 @@ TIMEOUT_S = 60.0
 
 
 @pytest.mark.parametrize(
-    ("consequence", "raised"), [(RobotError("it was stopped"), "exited with 7"), (KeyError("hops"), "hops")]
+    ("second_error", "expected_message"),
+    [(RobotError("it was stopped"), "exited with 7"), (KeyError("hops"), "hops")],
 )
-def test_a_mistake_in_a_call_is_not_hidden_by_the_first_error(consequence: Exception, raised: str) -> None:
-    ended = Event()
+def test_a_programming_error_in_a_call_is_not_hidden_by_the_first_error(
+    second_error: Exception, expected_message: str
+) -> None:
+    is_ended = Event()
 
     def call(is_first: bool) -> None:
         if is_first:
             raise RobotError("exited with 7")
-        assert ended.wait(TIMEOUT_S)
-        raise consequence
+        assert is_ended.wait(TIMEOUT_S)
+        raise second_error
 
-    with pytest.raises((RobotError, KeyError), match=raised):
-        run_parallel(call, (True, False), end_others=ended.set)
+    with pytest.raises((RobotError, KeyError), match=expected_message):
+        run_parallel(call, (True, False), end_others=is_ended.set)

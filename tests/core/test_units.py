@@ -20,7 +20,7 @@ from fieldkit.core.units import (
     ("text", "metres", "label"),
     [("30ft", 9.144, "30ft"), ("9.1m", 9.1, "9.1m"), ("30 ft", 9.144, "30ft"), (".5km", 500.0, ".5km")],
 )
-def test_distances_are_metres_and_keep_their_label(text: str, metres: float, label: str) -> None:
+def test_distances_are_converted_to_metres_and_keep_their_label(text: str, metres: float, label: str) -> None:
     distance = parse_distance(text)
     assert math.isclose(distance.metres, metres)
     assert distance.label == label
@@ -39,14 +39,14 @@ def test_distances_are_metres_and_keep_their_label(text: str, metres: float, lab
         ("3m\n", ""),
     ],
 )
-def test_an_error_of_a_distance_has_a_remedy(text: str, message: str) -> None:
+def test_an_error_in_a_distance_has_a_remedy(text: str, message: str) -> None:
     if not message:
         assert parse_distance(text).label == "3m"
         return
-    with pytest.raises(ConfigurationError, match=message) as caught:
+    with pytest.raises(ConfigurationError, match=message) as error_info:
         parse_distance(text)
-    assert caught.value.exit_code == 2
-    assert caught.value.remedy
+    assert error_info.value.exit_code == 2
+    assert error_info.value.remedy
 
 
 @given(st.floats(min_value=0.001, max_value=1e6))
@@ -56,13 +56,13 @@ def test_durations_scale_with_their_unit(value: float) -> None:
 
 
 @given(st.decimals(min_value=0, max_value=10**9, places=6), st.sampled_from([("s", 0), ("ms", 3), ("us", 6)]))
-def test_a_duration_is_the_float_nearest_to_its_decimal(number: Decimal, unit: tuple[str, int]) -> None:
+def test_a_duration_is_the_nearest_float_to_its_decimal_text(number: Decimal, unit: tuple[str, int]) -> None:
     symbol, places = unit
     assert parse_duration_s(f"{number:f}{symbol}") == float(f"{number:f}e-{places}")
 
 
 @given(st.text(max_size=12))
-def test_the_parser_raises_no_other_error(text: str) -> None:
+def test_the_distance_parser_raises_only_configuration_errors(text: str) -> None:
     try:
         distance = parse_distance(text)
     except ConfigurationError:
@@ -82,7 +82,7 @@ def test_durations_are_formatted_for_people(seconds: float, text: str) -> None:
     ("label", "text"),
     [("40ft", "40 ft (12.19 m)"), ("9.1m", "9.1 m"), (".5 km", ".5 km (500.00 m)"), ("80cm", "80 cm (0.80 m)")],
 )
-def test_a_distance_is_formatted_in_the_operator_s_unit(label: str, text: str) -> None:
+def test_a_distance_is_formatted_in_the_unit_of_the_operator(label: str, text: str) -> None:
     assert format_distance(parse_distance(label)) == text
 
 

@@ -17,12 +17,12 @@ LOSSY = next(TRIALS.glob("20261122T013134*"))
 FORMATS = ("csv", "parquet", "mcap", "junit")
 
 
-def _pipe(path: Path) -> None:
+def _replace_by_pipe(path: Path) -> None:
     path.unlink()
     os.mkfifo(path)
 
 
-def _folder(path: Path) -> None:
+def _replace_by_folder(path: Path) -> None:
     path.unlink()
     path.mkdir()
 
@@ -33,18 +33,18 @@ DAMAGES: dict[str, Callable[[Path], object]] = {
     "text": lambda path: path.write_bytes(b"a: [1, {"),
     "binary": lambda path: path.write_bytes(bytes(range(256))),
     "cut": lambda path: path.write_bytes(path.read_bytes()[:-200]),
-    "pipe": _pipe,
-    "folder": _folder,
+    "pipe": _replace_by_pipe,
+    "folder": _replace_by_folder,
 }
 
 
-def exported(path: Path, form: str, capsys: pytest.CaptureFixture[str]) -> int:
+def export_and_check(path: Path, form: str, capsys: pytest.CaptureFixture[str]) -> int:
     out = path.parent / f"out.{form}"
     code = main(["export", str(path), "--format", form, "-o", str(out)])
-    output_text = capsys.readouterr().err
+    error_text = capsys.readouterr().err
     assert code in {0, 2, 4}
     assert out.exists() is (code == 0), "an incomplete file is removed"
-    assert code == 0 or ("error: " in output_text and "remedy: " in output_text)
+    assert code == 0 or ("error: " in error_text and "remedy: " in error_text)
     return code
 
 
@@ -59,7 +59,7 @@ def test_a_damaged_trial_gives_an_error_with_a_remedy_or_a_complete_file(
     for file_name in (PLAN_FILE, JOURNAL_FILE, store.TRIAL_CSV, store.MANIFEST_FILE):
         shutil.copy(LOSSY / file_name, trial)
     DAMAGES[damage](trial / name)
-    exported(trial, form, capsys)
+    export_and_check(trial, form, capsys)
 
 
 @pytest.mark.parametrize("form", FORMATS)
@@ -68,4 +68,4 @@ def test_a_path_without_a_trial_is_an_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str, missing: str
 ) -> None:
     (tmp_path / "folder").mkdir()
-    assert exported(tmp_path / missing, form, capsys) == 2
+    assert export_and_check(tmp_path / missing, form, capsys) == 2

@@ -1,4 +1,4 @@
-"""Messages of the lab's process: packed messages are read unchanged, and invalid ones are refused."""
+"""Messages of the lab process: packed messages are unpacked unchanged, and invalid messages are refused."""
 
 from collections.abc import Callable
 
@@ -23,7 +23,7 @@ OVERVIEW = Overview(
     robots={"a": (1.0, 2.0), "b": (4.0, 2.0)},
     links=[LabLink(("a", "b"), 31.5, True, ("tree",))],
 )
-READERS = [requests.unpack_state, requests.unpack_overview, requests.unpack_place_m]
+UNPACK_FUNCTIONS = [requests.unpack_state, requests.unpack_overview, requests.unpack_place_m]
 
 
 def test_packed_answers_are_read_unchanged() -> None:
@@ -33,32 +33,32 @@ def test_packed_answers_are_read_unchanged() -> None:
 
 
 @pytest.mark.parametrize("up_m", [None, 1.5])
-def test_destination_is_one_line(up_m: float | None) -> None:
-    to = Destination(east_m=3.0, north_m=-1.0, up_m=up_m, relative=True)
-    request = requests.pack_destination(to)
+def test_packed_destination_is_a_single_line(up_m: float | None) -> None:
+    destination = Destination(east_m=3.0, north_m=-1.0, up_m=up_m, relative=True)
+    request = requests.pack_destination(destination)
     assert "\n" not in request
-    assert requests.unpack_destination(request) == to
+    assert requests.unpack_destination(request) == destination
 
 
-@pytest.mark.parametrize("read", READERS)
+@pytest.mark.parametrize("unpack", UNPACK_FUNCTIONS)
 @pytest.mark.parametrize(
-    ("packed", "raised"),
+    ("packed_error", "expected_error"),
     [(ConfigurationError, ConfigurationError), (LinkError, LinkError), (RobotError, LinkError)],
 )
-def test_packed_error_is_raised_by_reader(
-    read: Callable[[bytes], object], packed: type[FieldkitError], raised: type[FieldkitError]
+def test_packed_error_is_raised_when_unpacked(
+    unpack: Callable[[bytes], object], packed_error: type[FieldkitError], expected_error: type[FieldkitError]
 ) -> None:
-    with pytest.raises(raised, match="no such place") as caught:
-        read(requests.pack_error(packed("no such place", remedy="look at the map")))
-    assert type(caught.value) is raised
-    assert caught.value.remedy == "look at the map"
+    with pytest.raises(expected_error, match="no such place") as error_info:
+        unpack(requests.pack_error(packed_error("no such place", remedy="look at the map")))
+    assert type(error_info.value) is expected_error
+    assert error_info.value.remedy == "look at the map"
 
 
-@pytest.mark.parametrize("read", READERS)
+@pytest.mark.parametrize("unpack", UNPACK_FUNCTIONS)
 @pytest.mark.parametrize("answer", [b"", b"{", b"[]", b"null", b"{}", b'{"error": 3}', b'{"place_m": ["1", 2, 3]}'])
-def test_invalid_answer_is_value_error(read: Callable[[bytes], object], answer: bytes) -> None:
+def test_invalid_answer_is_value_error(unpack: Callable[[bytes], object], answer: bytes) -> None:
     with pytest.raises(ValueError, match=r"\S"):
-        read(answer)
+        unpack(answer)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The columns measured from the folder of one repeat, and the figures of the paper."""
+"""The columns measured from the folder of a repeat, and the figures of the paper."""
 
 import random
 import struct
@@ -33,36 +33,40 @@ COUNTERS = "{0} packets captured\n{0} packets received by filter\n{1} packets dr
 BAG = bytes(range(256)) * 40
 
 
-def _ping(payload_bytes: int, times_ms: list[float], sent: int) -> str:
+def _ping(payload_bytes: int, times_ms: list[float], n_sent: int) -> str:
     lines = [f"PING 10.9.0.2 (10.9.0.2) {payload_bytes}({payload_bytes + 28}) bytes of data."]
     lines += [f"64 bytes from 10.9.0.2: icmp_seq={n} ttl=64 time={time} ms" for n, time in enumerate(times_ms, 1)]
-    return "\n".join([*lines, f"{sent} packets transmitted, {len(times_ms)} received, 0% packet loss, time 1ms"])
+    return "\n".join([*lines, f"{n_sent} packets transmitted, {len(times_ms)} received, 0% packet loss, time 1ms"])
 
 
-def _folder(folder: Path, sent: list[Frame], received: list[Frame], ping: str, bag: bytes = BAG) -> Path:
-    """A repeat with all its evidence; the sent file is not a bag."""
+def _write_repeat(
+    folder: Path, sent_frames: list[Frame], received_frames: list[Frame], ping: str, bag: bytes = BAG
+) -> Path:
+    """Write the evidence of a repeat to a folder, and return the folder. The sent file is not a bag."""
     (folder / "scan.bag").write_bytes(BAG)
     (folder / "recv.bag").write_bytes(bag)
-    (folder / "sender.pcap").write_bytes(file_bytes(sent))
-    (folder / "receiver.pcap").write_bytes(file_bytes(received))
-    (folder / "sender-capture.log").write_text(LISTENING + COUNTERS.format(len(sent), 0), encoding="utf-8")
-    (folder / "receiver-capture.log").write_text(LISTENING + COUNTERS.format(len(received), 2), encoding="utf-8")
+    (folder / "sender.pcap").write_bytes(file_bytes(sent_frames))
+    (folder / "receiver.pcap").write_bytes(file_bytes(received_frames))
+    (folder / "sender-capture.log").write_text(LISTENING + COUNTERS.format(len(sent_frames), 0), encoding="utf-8")
+    (folder / "receiver-capture.log").write_text(
+        LISTENING + COUNTERS.format(len(received_frames), 2), encoding="utf-8"
+    )
     (folder / "ping.txt").write_text(ping, encoding="utf-8")
     (folder / "receiver-before.txt").write_text(SNMP.format(1, 5), encoding="utf-8")
     (folder / "receiver-after.txt").write_text(SNMP.format(2, 9), encoding="utf-8")
     return folder
 
 
-def _udp_folder(folder: Path) -> Path:
+def _write_udp_repeat(folder: Path) -> Path:
     """36 datagrams of six fragments; the receiver lacks the first fragment of one and the last of another."""
-    sent = timed([packet for number in range(36) for packet in datagram(number, 8192)])
-    received = [frame for index, frame in enumerate(sent) if index not in {6, 17}]
+    sent_frames = timed([packet for number in range(36) for packet in datagram(number, 8192)])
+    received_frames = [frame for index, frame in enumerate(sent_frames) if index not in {6, 17}]
     times_ms = [14.0, 15.0, 16.0, 17.0, 18.0]
-    return _folder(folder, sent, received, _ping(8192, times_ms, sent=10), bag=BAG[:-2560])
+    return _write_repeat(folder, sent_frames, received_frames, _ping(8192, times_ms, n_sent=10), bag=BAG[:-2560])
 
 
 def test_a_udp_repeat(tmp_path: Path) -> None:
-    assert measure(_udp_folder(tmp_path), transfer(Protocol.UDP)) == Measures(
+    assert measure(_write_udp_repeat(tmp_path), transfer(Protocol.UDP)) == Measures(
         sent_bytes=10240,
         received_bytes=7680,
         file_loss=0.25,
@@ -110,21 +114,25 @@ def test_a_udp_repeat(tmp_path: Path) -> None:
         throughput_bit_s=pytest.approx(8 * (36 * 8320 - 1500 - 820 - 1500) / 0.215),
         completion_s=0.215,
         goodput_bit_s=pytest.approx(8 * (7680 - 1472) / 0.215),
-        transfer_stall_s=pytest.approx(0.018),  # two datagrams in a row lack a fragment
+        transfer_stall_s=pytest.approx(0.018),  # two consecutive datagrams lack a fragment
         transfer_stalls=0,
     )
 
 
 def test_a_tcp_repeat(tmp_path: Path) -> None:
     isn = 2**32 - 2000
-    sent = timed([segment(isn, 0, flags=2, mss=900), *(segment(isn + 1 + at, 1000) for at in (0, 1000, 2000, 1000))])
-    received = [frame for index, frame in enumerate(sent) if index != 2]
-    measures = measure(_folder(tmp_path, sent, received, _ping(502, [5.0], sent=1)), transfer(Protocol.TCP))
+    sent_frames = timed(
+        [segment(isn, 0, flags=2, mss=900), *(segment(isn + 1 + offset, 1000) for offset in (0, 1000, 2000, 1000))]
+    )
+    received_frames = [frame for index, frame in enumerate(sent_frames) if index != 2]
+    measures = measure(
+        _write_repeat(tmp_path, sent_frames, received_frames, _ping(502, [5.0], n_sent=1)), transfer(Protocol.TCP)
+    )
     assert measures.hash_match is True
     assert (measures.ip_packets_sent, measures.ip_packets_received) == (5, 4)
     assert (measures.tcp_sent_bytes, measures.tcp_unique_bytes, measures.tcp_received_bytes) == (4000, 3000, 3000)
     assert (measures.tcp_byte_loss, measures.byte_loss, measures.tcp_retransmitted_segments) == (0.25, 0.0, 1)
-    # Sent twice within 2 ms and received once: it is ambiguous which of the two arrived.
+    # A segment was sent twice within 2 ms and received once: it is ambiguous which of the two arrived.
     assert (measures.tcp_spurious_segments, measures.tcp_duplicated_bytes, measures.tcp_reordered_segments) == (
         None,
         0,
@@ -139,12 +147,12 @@ def test_a_tcp_repeat(tmp_path: Path) -> None:
 
 
 def test_the_papers_delay_needs_the_papers_payload(tmp_path: Path) -> None:
-    folder = _folder(tmp_path, [], [], _ping(56, [5.0], sent=1))
+    folder = _write_repeat(tmp_path, [], [], _ping(56, [5.0], n_sent=1))
     measures = measure(folder, transfer(Protocol.TCP))
     assert (measures.rtt_mean_s, measures.paper_delay_s, measures.paper_transfer_s) == (0.005, None, None)
 
 
-PIECES = {
+COLUMNS_BY_FILE = {
     "scan.bag": {"sent_bytes", "file_loss", "hash_match"},
     "recv.bag": {"received_bytes", "file_loss", "hash_match", "goodput_bit_s"},
     "sender-capture.log": {"sender_capture_dropped"},
@@ -153,50 +161,56 @@ PIECES = {
     "receiver-after.txt": {"receiver_udp_buffer_errors", "receiver_reassembly_failures"},
 }
 RATES = ("throughput_bit_s", "completion_s", "goodput_bit_s")
-FROM_BOTH = ("ip_", "datagram", "byte_", "transfer", "one_way_withheld", "delay_variation", "jitter", *RATES)
+FROM_BOTH_CAPTURES = ("ip_", "datagram", "byte_", "transfer", "one_way_withheld", "delay_variation", "jitter", *RATES)
 # The pings here have no time stamps, so only the transfer has distances from the track.
 FROM_TRACK = {name for name in COLUMNS if "_distance_" in name or "_speed_" in name}
-PIECES["track.csv"] = {name for name in FROM_TRACK if name.startswith("transfer_")}
-# Every stall of this transfer ended.
-LAYERS = {name for name in COLUMNS if name.startswith(FROM_BOTH)} - FROM_TRACK - {"transfer_stall_at_least_s"}
-PIECES["sender.pcap"] = (
-    LAYERS | PIECES["track.csv"] | {"paper_packets", "paper_transfer_s", "paper_loss", "sender_captured"}
+COLUMNS_BY_FILE["track.csv"] = {name for name in FROM_TRACK if name.startswith("transfer_")}
+# All stalls of this transfer have ended.
+CAPTURE_COLUMNS = (
+    {name for name in COLUMNS if name.startswith(FROM_BOTH_CAPTURES)} - FROM_TRACK - {"transfer_stall_at_least_s"}
 )
-PIECES["receiver.pcap"] = LAYERS | {"paper_received", "paper_loss", "receiver_captured"}
-HALF_LOST = {"rtt_median_sent_s"}  # as the pings here
-PIECES["ping.txt"] = {
+COLUMNS_BY_FILE["sender.pcap"] = (
+    CAPTURE_COLUMNS
+    | COLUMNS_BY_FILE["track.csv"]
+    | {"paper_packets", "paper_transfer_s", "paper_loss", "sender_captured"}
+)
+COLUMNS_BY_FILE["receiver.pcap"] = CAPTURE_COLUMNS | {"paper_received", "paper_loss", "receiver_captured"}
+HALF_LOST = {"rtt_median_sent_s"}  # as in the pings of this module
+COLUMNS_BY_FILE["ping.txt"] = {
     name for name in COLUMNS if name.startswith("rtt_") or name in {"paper_delay_s", "paper_transfer_s"}
 } - (FROM_TRACK | HALF_LOST)
 
 
-@pytest.mark.parametrize("missing", PIECES)
+@pytest.mark.parametrize("missing", COLUMNS_BY_FILE)
 def test_missing_evidence_empties_only_the_columns_that_depend_on_it(tmp_path: Path, missing: str) -> None:
-    folder = _udp_folder(tmp_path)
+    folder = _write_udp_repeat(tmp_path)
     track_text = track.text(TrackPoint(0, role, (1.0, 2.0, 0.2)) for role in (Role.SENDER, Role.RECEIVER))
     (folder / "track.csv").write_text(track_text, encoding="ascii")
-    complete = all_columns(measure(folder, transfer(Protocol.UDP)))
+    columns_before = all_columns(measure(folder, transfer(Protocol.UDP)))
     (folder / missing).unlink()
-    remaining = all_columns(measure(folder, transfer(Protocol.UDP)))
-    assert {name for name in complete if complete[name] != remaining[name]} == PIECES[missing]
-    assert all(remaining[name] is None for name in PIECES[missing])
+    columns_after = all_columns(measure(folder, transfer(Protocol.UDP)))
+    assert {name for name in columns_before if columns_before[name] != columns_after[name]} == COLUMNS_BY_FILE[
+        missing
+    ]
+    assert all(columns_after[name] is None for name in COLUMNS_BY_FILE[missing])
 
 
 @pytest.mark.parametrize("protocol", Protocol)
 def test_captures_around_another_step_are_not_used_for_a_transfer(tmp_path: Path, protocol: Protocol) -> None:
     """The captures belong to a ping after the transfer, so their content shows nothing about the transfer."""
-    _udp_folder(tmp_path)
+    _write_udp_repeat(tmp_path)
     (tmp_path / "receiver.pcap").write_bytes(file_bytes([]))
     measures = transfer_measures.measure(
         AttemptEvidence(tmp_path), replace(transfer(protocol), captures=(None, None))
     )
-    of_captures = {name for name in LAYERS if name in measures.missing}
-    assert measures.values.keys().isdisjoint(LAYERS | {"paper_packets", "paper_received"})
-    assert {measures.missing[name] for name in of_captures} == {"there are no complete captures of both ends"}
+    missing_names = {name for name in CAPTURE_COLUMNS if name in measures.missing}
+    assert measures.values.keys().isdisjoint(CAPTURE_COLUMNS | {"paper_packets", "paper_received"})
+    assert {measures.missing[name] for name in missing_names} == {"there are no complete captures of both ends"}
     assert (measures.values["sent_bytes"], measures.values["received_bytes"]) == (10240, 7680)
 
 
 def test_a_damaged_capture_is_not_counted(tmp_path: Path) -> None:
-    folder = _udp_folder(tmp_path)
+    folder = _write_udp_repeat(tmp_path)
     path = folder / "receiver.pcap"
     path.write_bytes(path.read_bytes()[:-1])
     measures = measure(folder, transfer(Protocol.UDP))
@@ -214,7 +228,7 @@ def test_an_empty_folder_gives_only_the_papers_window(tmp_path: Path) -> None:
 
 
 def test_an_interrupted_ping_gives_times_but_no_loss(tmp_path: Path) -> None:
-    folder = _udp_folder(tmp_path)
+    folder = _write_udp_repeat(tmp_path)
     path = folder / "ping.txt"
     path.write_text("\n".join(path.read_text(encoding="utf-8").split("\n")[:-1]), encoding="utf-8")
     measures = measure(folder, transfer(Protocol.UDP))
@@ -232,24 +246,24 @@ def test_figures_printed_in_the_paper(packets: int, delay_s: float, transfer_s: 
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("seed", range(3))
-def test_the_papers_filters_count_as_tcpdump(tmp_path: Path, seed: int) -> None:
-    draw = random.Random(seed)
+def test_filters_of_the_paper_count_the_same_packets_as_tcpdump(tmp_path: Path, seed: int) -> None:
+    random_generator = random.Random(seed)
     data = [packet for number in range(5) for packet in datagram(number, 8192)]
     data += [
         segment(0, size, sport=sport, port=port) for size, sport, port in ((0, 9, PORT), (5, PORT, 9), (5, 9, 9))
     ]
     mirrored = [packet[:12] + packet[16:20] + packet[12:16] + packet[20:] for packet in data]
-    frames = timed(draw.sample([*data, *mirrored], 50))
+    frames = timed(random_generator.sample([*data, *mirrored], 50))
     path = tmp_path / "x.pcap"
     path.write_bytes(file_bytes(frames))
-    measures = measure(_folder(tmp_path, frames, frames, ""), transfer(Protocol.UDP))
+    measures = measure(_write_repeat(tmp_path, frames, frames, ""), transfer(Protocol.UDP))
     for count, expression in (
         (measures.paper_packets, f"src {SENDER} and port {PORT}"),
         (measures.paper_received, f"dst {RECEIVER} and port {PORT}"),
     ):
         command = ["tcpdump", "-n", "-r", str(path), expression]
-        printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-        assert count == len(printed.splitlines()) > 0
+        output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        assert count == len(output.splitlines()) > 0
 
 
 def test_real_captures_of_the_papers_file_without_loss(tmp_path: Path) -> None:
@@ -271,26 +285,42 @@ def test_real_captures_of_the_papers_file_without_loss(tmp_path: Path) -> None:
 
 
 def test_a_forged_capture_empties_only_the_columns_of_the_transfer(tmp_path: Path) -> None:
-    forged = timed([segment(index, 60_000 * (index > 0), flags=0x02 * (index == 0)) for index in range(3000)])
-    measures = measure(_folder(tmp_path, forged, forged[:1], _ping(502, [5.0], sent=1)), transfer(Protocol.TCP))
+    forged_packets = timed([segment(index, 60_000 * (index > 0), flags=0x02 * (index == 0)) for index in range(3000)])
+    measures = measure(
+        _write_repeat(tmp_path, forged_packets, forged_packets[:1], _ping(502, [5.0], n_sent=1)),
+        transfer(Protocol.TCP),
+    )
     assert (measures.tcp_sent_bytes, measures.ip_packets_sent) == (None, None)
     assert (measures.rtt_received, measures.sender_captured) == (1, 3000)
 
 
 def test_a_clock_that_was_set_empties_all_times(tmp_path: Path) -> None:
-    """The receiver's clock is set ahead by an hour in the middle: a transfer of 30 ms would take 3600 s."""
-    sent = timed([segment(0, 0, flags=2), *(segment(1 + 1000 * at, 1000, ip_id=at) for at in range(20))])
+    """The receiver's clock is set forward by an hour during the transfer: 30 ms would appear as 3600 s."""
+    sent_frames = timed(
+        [segment(0, 0, flags=2), *(segment(1 + 1000 * index, 1000, ip_id=index) for index in range(20))]
+    )
     ack = struct.pack(">HHIIBBHHH", PORT, 40000, 1, 1, 5 << 4, 0x10, 502, 0, 0)
     answers = [
         Frame(frame.time_ns + 500_000, ipv4(ack, protocol=6, ip_id=number, src=RECEIVER, dst=SENDER))
-        for number, frame in enumerate(sent)
+        for number, frame in enumerate(sent_frames)
     ]
-    frames = sorted([*sent, *answers], key=lambda frame: frame.time_ns)
+    frames = sorted([*sent_frames, *answers], key=lambda frame: frame.time_ns)
     hour_ns = 3600 * 10**9
-    received = [replace(frame, time_ns=frame.time_ns + hour_ns * (index > 20)) for index, frame in enumerate(frames)]
-    steady = measure(_folder(tmp_path, frames, frames, _ping(502, [5.0], sent=1)), transfer(Protocol.TCP))
-    assert steady.transfer_s == pytest.approx(0.02)
-    set_ahead = measure(_folder(tmp_path, frames, received, _ping(502, [5.0], sent=1)), transfer(Protocol.TCP))
-    assert set_ahead.one_way_withheld == delay.UNSTEADY
-    assert set_ahead.transfer_s is set_ahead.transfer_from is set_ahead.jitter_s is None
-    assert set_ahead.tcp_byte_loss == 0
+    received_frames = [
+        replace(frame, time_ns=frame.time_ns + hour_ns * (index > 20)) for index, frame in enumerate(frames)
+    ]
+    measures_of_steady_clock = measure(
+        _write_repeat(tmp_path, frames, frames, _ping(502, [5.0], n_sent=1)), transfer(Protocol.TCP)
+    )
+    assert measures_of_steady_clock.transfer_s == pytest.approx(0.02)
+    measures_of_set_clock = measure(
+        _write_repeat(tmp_path, frames, received_frames, _ping(502, [5.0], n_sent=1)), transfer(Protocol.TCP)
+    )
+    assert measures_of_set_clock.one_way_withheld == delay.UNSTEADY
+    assert (
+        measures_of_set_clock.transfer_s
+        is measures_of_set_clock.transfer_from
+        is measures_of_set_clock.jitter_s
+        is None
+    )
+    assert measures_of_set_clock.tcp_byte_loss == 0

@@ -1,4 +1,4 @@
-"""Stopping programs that move robots: the script of the robot, run in a folder of this machine in each userland."""
+"""Stop of programs that move robots: the script of the robot runs in a folder of this machine in each userland."""
 
 from pathlib import Path
 
@@ -20,12 +20,14 @@ pytestmark = pytest.mark.emulated
 FOLDER = jobs.work_folder("trial-a", "tcp-01-1")
 ANNA = Holder("trial-a", "anna@one", "trial-a")
 DRIVE_SCRIPT = "trap 'touch .jobs/drive/stationary; exit' INT; echo up; while :; do sleep 0.05; done"
-LANDS = "trap 'echo 1.0 land: x >&2; sleep 4; echo 5.0 landed >&2; exit' INT; echo up; while :; do sleep 0.05; done"
-WARNS = (
+LANDING_SCRIPT = (
+    "trap 'echo 1.0 land: x >&2; sleep 4; echo 5.0 landed >&2; exit' INT; echo up; while :; do sleep 0.05; done"
+)
+ALARM_SCRIPT = (
     "trap 'touch .jobs/fly/unhurried; echo 1.0 land: x >&2; echo 1.2 ALARM: IT MAY FALL >&2; trap : INT' INT; "
     "echo up; while :; do sleep 0.05; done"
 )
-HANGS = "trap '' INT; echo up; while :; do sleep 0.05; done"
+HANGING_SCRIPT = "trap '' INT; echo up; while :; do sleep 0.05; done"
 
 
 @pytest.fixture(params=USERLANDS)
@@ -43,28 +45,28 @@ def start(robot: LocalShell, name: str, verb: str, script: str) -> None:
     jobs.start(robot, Job(FOLDER, name, argv, 60.0, f"{name}.log", ready="log:up"))
 
 
-def runs(robot: LocalShell) -> list[str]:
+def running_jobs(robot: LocalShell) -> list[str]:
     return [line.split()[0].rpartition("/")[2] for line in jobs.list_running(robot, Deadline.after(30))]
 
 
 def test_all_moving_programs_are_stopped_and_report_their_state(robot: LocalShell) -> None:
     evidence.begin(robot, FOLDER, "sender", "lo")
     start(robot, "drive", "drive", DRIVE_SCRIPT)
-    start(robot, "fly", "fly", LANDS)
-    start(robot, "record", "mavlink", HANGS)
+    start(robot, "fly", "fly", LANDING_SCRIPT)
+    start(robot, "record", "mavlink", HANGING_SCRIPT)
     halted = halting.halt(robot, "bert@two", Deadline.after(60))
     assert halted.error is None
     assert dict(halted.programs) == {
         f"{FOLDER}/.jobs/drive": MotionState.STATIONARY,
         f"{FOLDER}/.jobs/fly": MotionState.LAND,
     }
-    assert halted.state is MotionState.LAND, "the worst"
+    assert halted.state is MotionState.LAND, "the most dangerous state is reported"
     names = [name for name, _ in halted.programs]
     (robot.home / FOLDER / "ground").touch()
     wait_until(
         lambda: halting.poll_states(robot, names, Deadline.after(30)).state is MotionState.LANDED, Deadline.after(60)
     )
-    assert "record" in runs(robot), "it does not move the robot"
+    assert "record" in running_jobs(robot), "the recorder does not move the robot"
     second_result = halting.halt(robot, "bert@two", Deadline.after(60))
     assert (second_result.programs, second_result.state) == ((), MotionState.NOTHING)
     with pytest.raises(RobotError, match=r"the jobs of .* were ended by bert@two"):
@@ -74,20 +76,20 @@ def test_all_moving_programs_are_stopped_and_report_their_state(robot: LocalShel
 
 def test_alarm_is_the_state_of_a_drone_that_does_not_land(robot: LocalShell) -> None:
     evidence.begin(robot, FOLDER, "sender", "lo")
-    start(robot, "fly", "fly", WARNS)
-    start(robot, "record", "mavlink", HANGS)
+    start(robot, "fly", "fly", ALARM_SCRIPT)
+    start(robot, "record", "mavlink", HANGING_SCRIPT)
     halted = halting.halt(robot, "bert@two", Deadline.after(60))
     assert halted.programs == ((f"{FOLDER}/.jobs/fly", MotionState.ALARM),)
     aborted = jobs.abort(robot, "bert@two", Deadline.after(60))
-    assert aborted.landing == ((f"{FOLDER}/.jobs/fly", "alarm"),), "it is not killed"
+    assert aborted.landing == ((f"{FOLDER}/.jobs/fly", "alarm"),), "the landing pilot is not killed"
     assert [line.split()[0] for line in aborted.jobs] == [f"{FOLDER}/fly", f"{FOLDER}/record"]
-    assert runs(robot) == ["fly"]
+    assert running_jobs(robot) == ["fly"]
     (robot.home / FOLDER / ".jobs/fly/unhurried").unlink()
     assert jobs.abort(robot, "bert@two", Deadline.after(60)).landing == ()
-    assert runs(robot) == []
+    assert running_jobs(robot) == []
 
 
-def test_liveness_file_and_time_since_boot(robot: LocalShell) -> None:
+def test_liveness_file_and_time_since_boot_are_read(robot: LocalShell) -> None:
     content = bytes(range(64))
     (robot.home / FOLDER).mkdir(parents=True)
     (robot.home / FOLDER / "liveness").write_bytes(content)
@@ -98,26 +100,28 @@ def test_liveness_file_and_time_since_boot(robot: LocalShell) -> None:
         halting.read_liveness(robot, f"{FOLDER}/missing", Deadline.after(60))
 
 
-def test_program_that_confirms_nothing_is_killed_and_reported(robot: LocalShell) -> None:
+def test_program_that_does_not_confirm_is_killed_and_reported(robot: LocalShell) -> None:
     evidence.begin(robot, FOLDER, "sender", "lo")
-    start(robot, "drive", "drive", HANGS)
+    start(robot, "drive", "drive", HANGING_SCRIPT)
     (halted,) = halting.halt_all({"turtlebot-1": robot}, "bert@two", 60.0).values()
     assert halted.programs == ((f"{FOLDER}/.jobs/drive", MotionState.SILENT),)
-    wait_until(lambda: not runs(robot), Deadline.after(60))
+    wait_until(lambda: not running_jobs(robot), Deadline.after(60))
 
 
-def test_trial_with_the_lock_is_informed_and_starts_nothing(robot: LocalShell) -> None:
+def test_trial_with_the_lock_is_reported_and_cannot_start_programs(robot: LocalShell) -> None:
     with locked({Role.SENDER: robot}, ANNA, sink=lambda _: None):
         evidence.begin(robot, FOLDER, "sender", "lo", token=ANNA.token)
         start(robot, "drive", "drive", DRIVE_SCRIPT)
         result = halting.halt_attempt(robot, FOLDER, "the-operator", Deadline.after(60))
         assert result.state is MotionState.STATIONARY
-        other = jobs.work_folder("trial-a", "tcp-01-2")
-        evidence.begin(robot, other, "sender", "lo", token=ANNA.token)  # an order for one attempt keeps the lock
+        other_attempt = jobs.work_folder("trial-a", "tcp-01-2")
+        evidence.begin(
+            robot, other_attempt, "sender", "lo", token=ANNA.token
+        )  # the stop of an attempt does not release the lock
         halting.halt(robot, "bert@two", Deadline.after(60))
         with pytest.raises(LockLostError, match=r"bert@two stopped the robots at \d\d:\d\d:\d\d UTC"):
             evidence.begin(robot, jobs.work_folder("trial-a", "tcp-01-3"), "sender", "lo", token=ANNA.token)
-    with locked({Role.SENDER: robot}, ANNA, sink=lambda _: None):  # resumed
+    with locked({Role.SENDER: robot}, ANNA, sink=lambda _: None):  # the trial is resumed
         evidence.begin(robot, jobs.work_folder("trial-a", "tcp-01-4"), "sender", "lo", token=ANNA.token)
 
 

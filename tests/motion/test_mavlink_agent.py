@@ -1,4 +1,4 @@
-"""The MAVLink recorder: frames compared with pymavlink, and the program with a drone at each kind of connection."""
+"""The MAVLink recorder: frames compared with pymavlink, and recordings over all kinds of connections."""
 
 import json
 import select
@@ -33,19 +33,19 @@ from tests.helpers.drones import Sender
 
 ConnectionKind = Callable[[], AbstractContextManager[str]]
 REQUESTED = {"32": 20_000, "30": -1}
-"""LOCAL_POSITION_NED at 50 Hz, no ATTITUDE; requested by the recorder."""
+"""The recorder requests LOCAL_POSITION_NED at 50 Hz, and no ATTITUDE."""
 
 
 def real_frames() -> list[bytes]:
-    """Frames of MAVLink 1 and 2, and a signed one."""
-    old, new, signed = v1.MAVLink(None, srcSystem=3), Sender(), Sender()
+    """Return frames of MAVLink 1 and 2, with and without signatures."""
+    mavlink1, mavlink2, signed = v1.MAVLink(None, srcSystem=3), Sender(), Sender()
     signed.link.signing.secret_key = b"k" * 32
     signed.link.signing.sign_outgoing = True
     attitude = d.MAVLink_attitude_message(1, 0.1, 0.2, 0.3, 0, 0, 0)
     text = d.MAVLink_statustext_message(4, b"\xfe\xfd" * 20)
     return [
-        bytes(v1.MAVLink_attitude_message(1, 0.1, 0.2, 0.3, 0, 0, 0).pack(old)),
-        *(encoder.frame(message) for encoder in (new, signed) for message in (attitude, text, drones.beat())),
+        bytes(v1.MAVLink_attitude_message(1, 0.1, 0.2, 0.3, 0, 0, 0).pack(mavlink1)),
+        *(encoder.frame(message) for encoder in (mavlink2, signed) for message in (attitude, text, drones.beat())),
     ]
 
 
@@ -53,58 +53,58 @@ FRAMES = real_frames()
 
 
 @given(st.lists(st.sampled_from(FRAMES), max_size=8), st.lists(st.integers(0, 400), max_size=5))
-def test_frames_are_complete_for_any_cut_of_the_stream(sent: list[bytes], cuts: list[int]) -> None:
-    stream = b"".join(sent)
+def test_frames_are_complete_for_any_division_of_the_stream(sent_frames: list[bytes], cuts: list[int]) -> None:
+    stream = b"".join(sent_frames)
     edges = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
-    buffer, received = bytearray(), list[bytes]()
-    for begin, end in pairwise(edges):
-        buffer += stream[begin:end]
-        received += mavlink_frames.frames(buffer)
-    assert received == sent
+    buffer, received_frames = bytearray(), list[bytes]()
+    for start, end in pairwise(edges):
+        buffer += stream[start:end]
+        received_frames += mavlink_frames.frames(buffer)
+    assert received_frames == sent_frames
     assert not buffer
 
 
 @given(st.binary(max_size=700))
-def test_frames_of_any_bytes_are_parts_of_them_in_order(noise: bytes) -> None:
-    at = 0
-    for frame in mavlink_frames.frames(bytearray(noise)):
+def test_frames_in_any_bytes_are_parts_of_these_bytes_in_order(data: bytes) -> None:
+    offset = 0
+    for frame in mavlink_frames.frames(bytearray(data)):
         assert mavlink_frames.frame_bytes(frame) == len(frame)
         mavlink_frames.parse_frame(frame)
-        at = noise.index(frame, at) + len(frame)
+        offset = data.index(frame, offset) + len(frame)
 
 
-def test_reception_from_the_middle_of_a_frame_recovers() -> None:
-    rest = FRAMES[1][7:] + b"".join(FRAMES)
-    assert list(mavlink_frames.frames(bytearray(rest)))[-len(FRAMES) :] == FRAMES
+def test_frames_are_received_after_an_incomplete_frame() -> None:
+    partial_stream = FRAMES[1][7:] + b"".join(FRAMES)
+    assert list(mavlink_frames.frames(bytearray(partial_stream)))[-len(FRAMES) :] == FRAMES
 
 
 def test_created_frames_are_read_by_pymavlink() -> None:
     writer, reader = mavlink_frames.FrameWriter(), d.MAVLink(None)
     reader.robust_parsing = False
-    beat, command, other = reader.parse_buffer(
+    heartbeat, command, second_command = reader.parse_buffer(
         writer.heartbeat() + writer.command((7, 1), 511, 32, 100_000) + writer.command((7, 1), 511, 0, 0)
     )
-    assert (beat.type, beat.autopilot, beat.get_srcComponent()) == (
+    assert (heartbeat.type, heartbeat.autopilot, heartbeat.get_srcComponent()) == (
         d.MAV_TYPE_LOG,
         d.MAV_AUTOPILOT_INVALID,
         d.MAV_COMP_ID_LOG,
     )
     assert (command.command, command.param1, command.param2) == (d.MAV_CMD_SET_MESSAGE_INTERVAL, 32, 100_000)
     assert (command.target_system, command.target_component) == (7, 1)
-    assert [frame.get_seq() for frame in (beat, command, other)] == [0, 1, 2]
+    assert [frame.get_seq() for frame in (heartbeat, command, second_command)] == [0, 1, 2]
 
 
-@pytest.mark.parametrize("old", [False, True])
-def test_checksums_are_those_of_pymavlink(old: bool) -> None:
+@pytest.mark.parametrize("is_mavlink1", [False, True])
+def test_checksums_equal_those_of_pymavlink(is_mavlink1: bool) -> None:
     link = d.MAVLink(None, srcSystem=7)
     for message in (drones.beat(), d.MAVLink_command_ack_message(511, 2)):
-        frame = bytes(message.pack(link, force_mavlink1=old))
+        frame = bytes(message.pack(link, force_mavlink1=is_mavlink1))
         assert mavlink_frames.is_intact(frame)
-        for at in range(1 if old else 3, len(frame)):
-            changed = bytes((*frame[:at], frame[at] ^ 1, *frame[at + 1 :]))
-            assert not mavlink_frames.is_intact(changed)
-    other = bytes(d.MAVLink_system_time_message(1, 2).pack(link, force_mavlink1=old))
-    assert not mavlink_frames.is_intact(other), "the CRC_EXTRA of another message is unknown"
+        for offset in range(1 if is_mavlink1 else 3, len(frame)):
+            changed_frame = bytes((*frame[:offset], frame[offset] ^ 1, *frame[offset + 1 :]))
+            assert not mavlink_frames.is_intact(changed_frame)
+    unknown_message = bytes(d.MAVLink_system_time_message(1, 2).pack(link, force_mavlink1=is_mavlink1))
+    assert not mavlink_frames.is_intact(unknown_message), "the CRC_EXTRA of another message is unknown"
 
 
 @dataclass
@@ -112,7 +112,7 @@ class RecorderResult:
     """The result of a recorder."""
 
     code: int
-    output_text: dict[str, Any]
+    summary: dict[str, Any]
     log: Path
 
 
@@ -125,7 +125,7 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextmanager
 def recording(program: Path, log: Path, connection: str, **arguments: object) -> Iterator[RecorderResult]:
-    """Record while the body runs, after the recorder is ready; then stop it as a job is stopped."""
+    """Run a recorder while the body runs. It is ready when the body starts, and is stopped like a job."""
     request = json.dumps({"connection": connection, "intervals_us": {}, **arguments})
     argv = (sys.executable, str(program), "mavlink", request, str(log))
     with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
@@ -136,9 +136,9 @@ def recording(program: Path, log: Path, connection: str, **arguments: object) ->
             assert process.stderr.readline() == b"up, MAVLink\n"
             yield result
             process.send_signal(signal.SIGINT)
-            output_text, errors = process.communicate(timeout=60)
+            output, errors = process.communicate(timeout=60)
             assert errors == b""
-            result.code, result.output_text = process.returncode, json.loads(output_text)
+            result.code, result.summary = process.returncode, json.loads(output)
         finally:
             process.kill()
 
@@ -152,7 +152,7 @@ def wait_until_size(log: Path, size_bytes: int) -> None:
     raise AssertionError(f"{log} does not grow")
 
 
-def kinds(path: Path) -> list[str]:
+def message_types(path: Path) -> list[str]:
     """Return the message types of a log, read by pymavlink."""
     reader = mavutil.mavlink_connection(str(path))
     types = []
@@ -165,11 +165,11 @@ def kinds(path: Path) -> list[str]:
 def over_tcp() -> Iterator[str]:
     with socket.create_server(("127.0.0.1", 0)) as server:
         streams: list[socket.socket] = []
-        accepted = threading.Thread(target=lambda: streams.append(server.accept()[0]))
-        accepted.start()
+        acceptor = threading.Thread(target=lambda: streams.append(server.accept()[0]))
+        acceptor.start()
 
         def stream() -> socket.socket:
-            accepted.join()
+            acceptor.join()
             return streams[0]
 
         with _drone_answering(stream):
@@ -202,7 +202,7 @@ def over_udp() -> Iterator[str]:
 
 
 @contextmanager
-def over_udp_that_speaks_first() -> Iterator[str]:
+def over_udp_with_autopilot_that_sends_first() -> Iterator[str]:
     address = ("127.9.9.9", 14_550)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
         endpoint.bind(("127.0.0.1", 0))
@@ -221,7 +221,7 @@ def over_a_serial_line() -> Iterator[str]:
 
 @pytest.mark.parametrize(
     "connection_kind",
-    [over_udp, over_udp_that_speaks_first, over_tcp, over_a_serial_line],
+    [over_udp, over_udp_with_autopilot_that_sends_first, over_tcp, over_a_serial_line],
     ids=lambda connection_kind: connection_kind.__name__,
 )
 def test_log_is_read_by_pymavlink(connection_kind: ConnectionKind, program: Path, tmp_path: Path) -> None:
@@ -229,18 +229,18 @@ def test_log_is_read_by_pymavlink(connection_kind: ConnectionKind, program: Path
         connection_kind() as connection,
         recording(program, tmp_path / "x.tlog", connection, intervals_us=REQUESTED) as result,
     ):
-        wait_until_size(result.log, 15_000)  # a PX4 sends ATTITUDE unasked before it is switched off
+        wait_until_size(result.log, 15_000)  # a PX4 sends ATTITUDE without a request until it is switched off
     assert result.code == 0
-    types = kinds(result.log)
-    read = tlog.read(result.log, 0, result.output_text["ended_us"])
-    assert result.output_text["frames"] == read.frames == len(types)
-    assert (result.output_text["refused"], result.output_text["left_out"]) == ({}, 0)
-    assert read.kinds == {kind: types.count(kind) for kind in set(types) - {"BAD_DATA"}}
-    assert read.values["mavlink_loss"] == 0
+    types = message_types(result.log)
+    log_content = tlog.read(result.log, 0, result.summary["ended_us"])
+    assert result.summary["frames"] == log_content.frames == len(types)
+    assert (result.summary["refused"], result.summary["left_out"]) == ({}, 0)
+    assert log_content.kinds == {kind: types.count(kind) for kind in set(types) - {"BAD_DATA"}}
+    assert log_content.values["mavlink_loss"] == 0
     assert types.count("LOCAL_POSITION_NED") > 3 * types.count("ATTITUDE")
 
 
-def test_peer_that_restarts_at_another_port_is_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_device_sends_to_a_peer_that_restarted_at_another_port(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -248,32 +248,32 @@ def test_peer_that_restarts_at_another_port_is_answered(monkeypatch: pytest.Monk
     with socket.socket(type=socket.SOCK_DGRAM) as first, socket.socket(type=socket.SOCK_DGRAM) as second:
         first.settimeout(60)
         second.settimeout(60)
-        for source, heard_by in ((first, first), (second, first), (second, second)):
-            if heard_by is second:
+        for sending_socket, receiving_socket in ((first, first), (second, first), (second, second)):
+            if receiving_socket is second:
                 monkeypatch.setattr(devices, "_PEER_TIMEOUT_S", 0.0)
-            source.sendto(Sender().frame(drones.beat()), ("127.0.0.1", port))
+            sending_socket.sendto(Sender().frame(drones.beat()), ("127.0.0.1", port))
             select.select([device], [], [], 60)
             assert device.read()
-            device.write(b"to whom it may concern")
-            assert heard_by.recv(100) == b"to whom it may concern"
+            device.write(b"a message to the peer")
+            assert receiving_socket.recv(100) == b"a message to the peer"
     device.close()
 
 
 def test_refused_rate_is_reported(program: Path, tmp_path: Path) -> None:
     with (
         over_udp() as connection,
-        recording(program, tmp_path / "x.tlog", connection, intervals_us={"12345": 1, "1": 500_000}) as ended,
+        recording(program, tmp_path / "x.tlog", connection, intervals_us={"12345": 1, "1": 500_000}) as result,
     ):
         pass
-    assert ended.output_text["refused"] == {"12345": d.MAV_RESULT_FAILED}
+    assert result.summary["refused"] == {"12345": d.MAV_RESULT_FAILED}
 
 
-def test_waits_for_the_given_system_and_reports_it(program: Path, tmp_path: Path) -> None:
+def test_recorder_waits_for_the_configured_system_and_reports_it(program: Path, tmp_path: Path) -> None:
     with over_udp() as connection:
         arguments = json.dumps({"connection": connection, "intervals_us": {}, "system": 9})
         argv = (sys.executable, str(program), "mavlink", arguments, str(tmp_path / "x.tlog"))
         with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-            until_there(tmp_path / "x.tlog")
+            wait_until_created(tmp_path / "x.tlog")
             wait_until_size(tmp_path / "x.tlog", 500)
             process.send_signal(signal.SIGTERM)
             _, errors = process.communicate(timeout=60)
@@ -321,33 +321,33 @@ def test_requested_message_must_arrive_60_s_after_the_first_heartbeat(
     arguments = mavlink.FlightRecording("udpout:127.0.0.1:1", {"30": 100_000, "32": 100_000})
     recorder = mavlink.FlightRecorder(arguments, link, str(tmp_path / "x.tlog"))  # type: ignore[arg-type]
 
-    def turn(at_s: float, *messages: d.MAVLink_message) -> None:
+    def iterate(at_s: float, *messages: d.MAVLink_message) -> None:
         clock.now_s = 100.0 + at_s
         link.frames = [sender.frame(message) for message in messages]
         recorder.send()
         recorder.receive(0.1, link)  # type: ignore[arg-type]
         recorder.check()
 
-    turn(500.0)  # the autopilot is switched on late
-    turn(500.0, drones.beat(), d.MAVLink_attitude_message(1, 0, 0, 0, 0, 0, 0))
-    turn(559.9, drones.beat())
+    iterate(500.0)  # the autopilot is switched on late
+    iterate(500.0, drones.beat(), d.MAVLink_attitude_message(1, 0, 0, 0, 0, 0, 0))
+    iterate(559.9, drones.beat())
     assert not recorder.ready
     if arrives:
-        turn(559.95, d.MAVLink_local_position_ned_message(1, 0, 0, 0, 0, 0, 0))
+        iterate(559.95, d.MAVLink_local_position_ned_message(1, 0, 0, 0, 0, 0, 0))
     if is_refused:
         link.messages = {32: MessageRate(100_000, d.MAV_RESULT_DENIED, 0.0)}
     if arrives or is_refused:
-        turn(560.1, drones.beat())
+        iterate(560.1, drones.beat())
         assert recorder.ready
-        turn(2000.0)
+        iterate(2000.0)
     else:
         with pytest.raises(mavlink.MissingMessageError, match="requested message 32 in 60 s"):
-            turn(560.1, drones.beat())
+            iterate(560.1, drones.beat())
     recorder.end()
 
 
 def test_recorder_stops_after_the_timeout_of_first_messages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """An autopilot whose boot takes longer has no position before."""
+    """An autopilot has no position during its boot, which takes longer than the timeout here."""
     monkeypatch.setattr(mavlink, "_TIMEOUT_S", 2.0)
     with drones.autopilot_at_udp(firmware=ARDUCOPTER, boot_s=3600.0) as (port, _):
         arguments = mavlink.FlightRecording(f"udpout:127.0.0.1:{port}", {"32": 100_000})
@@ -355,7 +355,7 @@ def test_recorder_stops_after_the_timeout_of_first_messages(monkeypatch: pytest.
             mavlink.record(arguments, str(tmp_path / "x.tlog"), threading.Event())
 
 
-def until_there(path: Path) -> None:
+def wait_until_created(path: Path) -> None:
     for _ in range(600):
         if path.exists():
             return
@@ -378,14 +378,14 @@ def test_connection_that_cannot_be_opened_is_reported(
 ) -> None:
     arguments = json.dumps({"connection": connection, "intervals_us": {}})
     argv = (sys.executable, str(program), "mavlink", arguments, str(tmp_path / "x.tlog"))
-    done = subprocess.run(argv, capture_output=True, text=True, check=False, timeout=60)
-    assert done.returncode == 3
-    assert f"error: MAVLink over {connection}: " in done.stderr
-    assert message in done.stderr
+    completed = subprocess.run(argv, capture_output=True, text=True, check=False, timeout=60)
+    assert completed.returncode == 3
+    assert f"error: MAVLink over {connection}: " in completed.stderr
+    assert message in completed.stderr
 
 
 @pytest.mark.parametrize("serial", [False, True], ids=["udp", "serial"])
-def test_hostile_bytes_neither_stop_the_recorder_nor_damage_the_log(
+def test_hostile_bytes_do_not_stop_the_recorder_or_damage_the_log(
     serial: bool, program: Path, tmp_path: Path
 ) -> None:
     damage = drones.damage_randomly(1)
@@ -395,7 +395,7 @@ def test_hostile_bytes_neither_stop_the_recorder_nor_damage_the_log(
         with recording(program, tmp_path / "x.tlog", connection, intervals_us=REQUESTED) as result:
             wait_until_size(result.log, 12_000)
     assert result.code == 0
-    read = tlog.read(result.log, drones.SYSTEM, result.output_text["ended_us"])
-    assert read.frames == result.output_text["frames"]
-    assert int(read.values["mavlink_damaged"]) > 10
-    assert read.kinds["LOCAL_POSITION_NED"] > 5
+    log_content = tlog.read(result.log, drones.SYSTEM, result.summary["ended_us"])
+    assert log_content.frames == result.summary["frames"]
+    assert int(log_content.values["mavlink_damaged"]) > 10
+    assert log_content.kinds["LOCAL_POSITION_NED"] > 5

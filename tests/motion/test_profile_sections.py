@@ -1,4 +1,4 @@
-"""Conflicts of ROS topics between robots that share a ROS master or a domain, and between those that do not."""
+"""Conflicts of ROS topics between robots with the same or different ROS masters or domains."""
 
 from collections.abc import Iterable
 
@@ -53,7 +53,7 @@ def turtlebot(*, topic: str = "/cmd_vel", odometry: str = "/odom", domain: str |
         (robot("one", master=MASTER), None),
     ],
 )
-def test_conflicts_of_robots_with_one_master(other: Robot, expected_reason: str | None) -> None:
+def test_conflicts_of_robots_with_the_same_master_are_reported(other: Robot, expected_reason: str | None) -> None:
     reason = conflict(robot("one", master=MASTER), [other])
     assert (
         reason == expected_reason
@@ -63,7 +63,7 @@ def test_conflicts_of_robots_with_one_master(other: Robot, expected_reason: str 
 
 
 @pytest.mark.parametrize(("domain", "is_valid"), [("", False), ("0", False), ("7", True)])
-def test_conflicts_of_robots_with_ros2_domains(domain: str, is_valid: bool) -> None:
+def test_conflicts_of_robots_with_the_same_ros2_domain_are_reported(domain: str, is_valid: bool) -> None:
     reason = conflict(robot("one", turtlebot(domain="")), [robot("other", turtlebot(domain=domain))])
     assert (reason is None) is is_valid
     assert is_valid or reason == "other also subscribes to /cmd_vel of ROS domain 0 and would drive, too"

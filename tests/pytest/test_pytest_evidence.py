@@ -1,4 +1,4 @@
-"""Evidence folders of tests: created on first use, removed unless kept, never overwritten."""
+"""Evidence folders of tests are created on first use, removed unless they are kept, and never overwritten."""
 
 from pathlib import Path
 
@@ -13,13 +13,13 @@ from fieldkit.pytest.plugin_options import Keep
 def test_a_folder_is_created_on_first_use(tmp_path: Path) -> None:
     folder = EvidenceFolder(tmp_path / "run" / "test_a")
     assert (folder.exists, list(tmp_path.iterdir())) == (False, [])
-    folder.add("heard")
+    folder.add("received")
     assert folder.path == tmp_path / "run" / "test_a"
     assert (folder.path / LOG).read_text(encoding="utf-8").endswith(" heard\n")
 
 
 @pytest.mark.parametrize(
-    ("keep", "failed", "remains"),
+    ("keep", "has_failed", "is_kept"),
     [
         (Keep.FAILED, True, True),
         (Keep.FAILED, False, False),
@@ -27,24 +27,24 @@ def test_a_folder_is_created_on_first_use(tmp_path: Path) -> None:
         (Keep.NONE, True, False),
     ],
 )
-def test_a_folder_remains_if_it_must_be_kept(tmp_path: Path, *, keep: Keep, failed: bool, remains: bool) -> None:
+def test_a_folder_remains_if_it_must_be_kept(tmp_path: Path, *, keep: Keep, has_failed: bool, is_kept: bool) -> None:
     folder = EvidenceFolder(tmp_path / "run" / "test_a")
-    folder.add("heard")
-    folder.has_failed = failed
+    folder.add("received")
+    folder.has_failed = has_failed
     folder.remove_unless_kept(keep)
-    assert (folder.exists, (tmp_path / "run").exists()) == (remains, remains)
+    assert (folder.exists, (tmp_path / "run").exists()) == (is_kept, is_kept)
 
 
 def test_a_rerun_of_a_test_has_a_separate_folder(tmp_path: Path) -> None:
-    tries = [EvidenceFolder(tmp_path / "test_a") for _ in range(3)]
-    assert [folder.path.name for folder in tries] == ["test_a", "test_a-2", "test_a-3"]
+    folders = [EvidenceFolder(tmp_path / "test_a") for _ in range(3)]
+    assert [folder.path.name for folder in folders] == ["test_a", "test_a-2", "test_a-3"]
 
 
 def test_a_folder_that_cannot_be_created_is_reported_with_the_option(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigurationError, match="cannot create the folder for evidence") as caught:
-        EvidenceFolder(tmp_path / "file" / "run" / "test_a").add("heard")
-    assert "--fieldkit-output" in caught.value.remedy
+    with pytest.raises(ConfigurationError, match="cannot create the folder for evidence") as error_info:
+        EvidenceFolder(tmp_path / "file" / "run" / "test_a").add("received")
+    assert "--fieldkit-output" in error_info.value.remedy
 
 
 def test_a_run_without_kept_evidence_leaves_no_folder(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from tests.helpers import suites
 from tests.helpers.sshd import free_port, make_key
 
 TEST_WITH_ROBOTS = "def test_uses_robots(robots):\n    pass\n"
-SHOWS_OPTIONS = """
+PRINT_OPTIONS = """
 def test_shows_options(lab_options, pytestconfig):
     from fieldkit.pytest import plugin_options
     values = lab_options, plugin_options.output(pytestconfig), plugin_options.keep(pytestconfig)
@@ -46,7 +46,7 @@ def trial(): return 3
 """
 
 
-CHOSEN_BACKEND = """
+MODULE_BACKEND = """
 import pytest
 from dataclasses import replace
 
@@ -74,12 +74,12 @@ def test_operator(pytestconfig):
 """
 
 
-def run(pytester: pytest.Pytester, *words: str) -> pytest.RunResult:
+def run(pytester: pytest.Pytester, *arguments: str) -> pytest.RunResult:
     """Run the tests of the current folder in this process, which has already imported fieldkit."""
-    return pytester.runpytest_inprocess("-p", "no:cacheprovider", *words)
+    return pytester.runpytest_inprocess("-p", "no:cacheprovider", *arguments)
 
 
-def field(folder: Path) -> str:
+def field_site(folder: Path) -> str:
     """Return a site file with two robots that are switched off."""
     host_key = " ".join(make_key(folder / "host_key").split()[:2])
     make_key(folder / "key")
@@ -92,11 +92,11 @@ def field(folder: Path) -> str:
     return "\n".join(["backend: field", "patience: 1s", "robots:", *lines, roles, ""])
 
 
-def test_tests_without_its_fixtures_import_no_other_module(tmp_path: Path) -> None:
+def test_tests_without_fixtures_of_the_plugin_import_no_other_module(tmp_path: Path) -> None:
     """Other fixtures with the same names are not affected."""
     suites.write(tmp_path, site="robots: [", test_modules=LOADED_MODULES, conftest=REPLACED_FIXTURES)
-    done = suites.run(tmp_path)
-    assert (done.code, set(done.results.values())) == (0, {"passed"}), done.output
+    result = suites.run(tmp_path)
+    assert (result.code, set(result.results.values())) == (0, {"passed"}), result.output
     assert not (tmp_path / "fieldkit-results").exists()
 
 
@@ -105,18 +105,18 @@ def test_the_configuration_is_used_without_command_line_options(pytester: pytest
         "[pytest]\nfieldkit_site = ours.yaml\nfieldkit_topology = masterless\nfieldkit_output = out\n"
         "fieldkit_keep = all\nfieldkit_backend = emulated\n"
     )
-    below = pytester.mkdir("below")
-    suites.write(below, site=None, test_shows_options=SHOWS_OPTIONS)
-    os.chdir(below)
+    subfolder = pytester.mkdir("subfolder")
+    suites.write(subfolder, site=None, test_shows_options=PRINT_OPTIONS)
+    os.chdir(subfolder)
     output_text = run(pytester, "-s", "--fieldkit-backend", "field", "--fieldkit-output", "mine").stdout.str()
     assert f"site=PosixPath('{pytester.path}/ours.yaml')" in output_text
     assert "LabOptions(backend='field'" in output_text
     assert "topology='masterless'" in output_text
-    assert f"[{below}/mine]\n[all]" in output_text
+    assert f"[{subfolder}/mine]\n[all]" in output_text
 
 
 @pytest.mark.parametrize(
-    ("words", "message", "remedy"),
+    ("arguments", "message", "remedy"),
     [
         (("--fieldkit-backend", "emulatd"), "there is no backend 'emulatd'", "did you mean 'emulated'?"),
         (("--fieldkit-site", "gone.yaml"), "gone.yaml", "remedy: "),
@@ -124,12 +124,12 @@ def test_the_configuration_is_used_without_command_line_options(pytester: pytest
     ],
 )
 def test_an_invalid_lab_is_an_error_of_set_up(
-    pytester: pytest.Pytester, words: tuple[str, ...], message: str, remedy: str
+    pytester: pytest.Pytester, arguments: tuple[str, ...], message: str, remedy: str
 ) -> None:
     suites.write(pytester.path, test_uses_robots=TEST_WITH_ROBOTS)
-    done = run(pytester, *words)
-    assert (done.ret, done.parseoutcomes()) == (1, {"errors": 1})
-    output_text = done.stdout.str()
+    result = run(pytester, *arguments)
+    assert (result.ret, result.parseoutcomes()) == (1, {"errors": 1})
+    output_text = result.stdout.str()
     assert "ERROR at setup of test_uses_robots" in output_text
     assert message in output_text
     assert remedy in output_text
@@ -143,41 +143,41 @@ def test_a_full_traceback_is_shown_on_request(pytester: pytest.Pytester) -> None
 
 
 @pytest.mark.parametrize(
-    "words", [("--fieldkit-keep", "som"), ("--fieldkit-topology", "mesh"), ("-o", "fieldkit_keep=som")]
+    "arguments", [("--fieldkit-keep", "som"), ("--fieldkit-topology", "mesh"), ("-o", "fieldkit_keep=som")]
 )
-def test_an_invalid_value_is_rejected_before_any_test(pytester: pytest.Pytester, words: tuple[str, ...]) -> None:
+def test_an_invalid_value_is_rejected_before_any_test(pytester: pytest.Pytester, arguments: tuple[str, ...]) -> None:
     suites.write(pytester.path, test_uses_robots=TEST_WITH_ROBOTS)
-    done = run(pytester, *words)
-    assert done.ret == pytest.ExitCode.USAGE_ERROR
-    assert "choose from" in done.stderr.str()
+    result = run(pytester, *arguments)
+    assert result.ret == pytest.ExitCode.USAGE_ERROR
+    assert "choose from" in result.stderr.str()
 
 
 def test_a_test_module_chooses_its_lab(pytester: pytest.Pytester) -> None:
-    suites.write(pytester.path, test_uses_robots=CHOSEN_BACKEND + TEST_WITH_ROBOTS)
+    suites.write(pytester.path, test_uses_robots=MODULE_BACKEND + TEST_WITH_ROBOTS)
     assert "there is no backend 'mars'" in run(pytester).stdout.str()
 
 
 def test_an_unreachable_robot_is_an_error_with_a_remedy(tmp_path: Path) -> None:
-    suites.write(tmp_path, site=field(tmp_path), test_uses_robots=TEST_WITH_ROBOTS)
-    done = suites.run(tmp_path)
-    assert (done.code, done.results) == (1, {"test_uses_robots": "error"}), done.output
-    assert "robot-1: connection: 127.0.0.1 cannot be reached for SSH" in done.output
-    assert "robot-2: connection: 127.0.0.2 cannot be reached for SSH" in done.output
-    assert "start its SSH server" in done.output
-    (_, folder) = done.properties["test_uses_robots"][0]
+    suites.write(tmp_path, site=field_site(tmp_path), test_uses_robots=TEST_WITH_ROBOTS)
+    result = suites.run(tmp_path)
+    assert (result.code, result.results) == (1, {"test_uses_robots": "error"}), result.output
+    assert "robot-1: connection: 127.0.0.1 cannot be reached for SSH" in result.output
+    assert "robot-2: connection: 127.0.0.2 cannot be reached for SSH" in result.output
+    assert "start its SSH server" in result.output
+    (_, folder) = result.properties["test_uses_robots"][0]
     assert "open field, masterless" in Path(folder, LOG).read_text(encoding="utf-8")
 
 
-def test_without_a_terminal_the_option_is_named(pytester: pytest.Pytester) -> None:
+def test_error_without_a_terminal_names_the_option(pytester: pytest.Pytester) -> None:
     suites.write(pytester.path, test_operator=OPERATOR)
     run(pytester).assert_outcomes(passed=1)
 
 
 def test_workers_do_not_share_real_robots(tmp_path: Path) -> None:
     site = tmp_path / "fieldkit.yaml"
-    site.write_text(field(tmp_path), encoding="utf-8")
+    site.write_text(field_site(tmp_path), encoding="utf-8")
     keeper = EvidenceKeeper(tmp_path / "results" / "run", Keep.FAILED)
     lab = OpenedLab(LabOptions(site=site), keeper, UNATTENDED, workers=2)
-    with pytest.raises(ConfigurationError, match="2 workers of pytest-xdist cannot share the robots") as caught:
+    with pytest.raises(ConfigurationError, match="2 workers of pytest-xdist cannot share the robots") as error_info:
         lab.open()
-    assert caught.value.remedy.endswith("pytest -n 0")
+    assert error_info.value.remedy.endswith("pytest -n 0")

@@ -1,4 +1,4 @@
-"""A control link that is cut while a job runs and nothing is sent."""
+"""A control link is cut while a job runs and neither side sends data."""
 
 import re
 import subprocess
@@ -27,7 +27,7 @@ from tests.helpers.sshd import wait_until
 pytestmark = pytest.mark.emulated
 
 FOLDER = jobs.work_folder("dead", "link-1")
-NOTICED_S = 10.0
+DETECTION_LIMIT_S = 10.0
 ESTABLISHED = "01"
 SOON = 60.0
 
@@ -39,27 +39,27 @@ class Robot:
         self.shell = emulation.shells[Role.SENDER]
         self.notices = notices
         self.pid = emulation.robots[Role.SENDER].pid
-        self.inside = f"/proc/{min(descendants(self.pid))}"
+        self.proc_folder = f"/proc/{min(descendants(self.pid))}"
 
     def set_link(self, state: str) -> None:
-        subprocess.run(("nsenter", f"--net={self.inside}/ns/net", "ip", "link", "set", "lo", state), check=True)
+        subprocess.run(("nsenter", f"--net={self.proc_folder}/ns/net", "ip", "link", "set", "lo", state), check=True)
 
     def is_silent(self) -> bool:
         """Return True if no byte of any connection waits for its acknowledgement."""
-        lines = Path(f"{self.inside}/net/tcp").read_text(encoding="ascii").splitlines()[1:]
+        lines = Path(f"{self.proc_folder}/net/tcp").read_text(encoding="ascii").splitlines()[1:]
         return all(line.split()[4].startswith("00000000:") for line in lines if line.split()[3] == ESTABLISHED)
 
-    def runs(self, words: str) -> bool:
-        """Return True if a process of the robot has these words in its command line."""
+    def runs(self, text: str) -> bool:
+        """Return True if a process of the robot has this text in its command line."""
         for pid in descendants(self.pid):
             with suppress(FileNotFoundError, ProcessLookupError):
                 line = Path(f"/proc/{pid}/cmdline").read_bytes()
-                if words in line.replace(b"\0", b" ").decode(errors="replace"):
+                if text in line.replace(b"\0", b" ").decode(errors="replace"):
                     return True
         return False
 
     def has(self, name: str) -> bool:
-        return Path(f"{self.inside}/root/root/{FOLDER}/{name}").exists()
+        return Path(f"{self.proc_folder}/root/root/{FOLDER}/{name}").exists()
 
 
 @contextmanager
@@ -81,39 +81,39 @@ def robot(reconnect_timeout_s: float) -> Iterator[Robot]:
         yield robot_under_test
 
 
-def silent(script: str) -> Job:
+def silent_job(script: str) -> Job:
     return Job(folder=FOLDER, name="silent", argv=("sh", "-c", script), limit_s=120, log="silent.log")
 
 
 @pytest.mark.quiet
-def test_silent_link_that_dies_is_detected_within_10_s() -> None:
+def test_loss_of_a_silent_link_is_detected_within_10_s() -> None:
     with robot(reconnect_timeout_s=0.0) as emulated, ThreadPoolExecutor(1) as pool:
-        # Standard input has ended and is acknowledged: neither side has anything to send from here on.
+        # Standard input has ended and is acknowledged, so neither side sends anything afterwards.
         argv = ("sh", "-c", f"cat; touch {FOLDER}/up; sleep 60")
-        done = pool.submit(emulated.shell.run, argv, deadline=Deadline.after(SOON))
+        future = pool.submit(emulated.shell.run, argv, deadline=Deadline.after(SOON))
         wait_until(lambda: emulated.has("up") and emulated.is_silent(), Deadline.after(SOON))
         emulated.set_link("down")
-        cut_s = time.monotonic()
+        cut_time_s = time.monotonic()
         with pytest.raises(LinkLostError, match="the connection broke during"):
-            done.result(SOON)
-        assert time.monotonic() - cut_s < NOTICED_S
+            future.result(SOON)
+        assert time.monotonic() - cut_time_s < DETECTION_LIMIT_S
 
 
 def test_result_of_a_job_that_outlives_its_link_is_collected_once() -> None:
     with robot(reconnect_timeout_s=SOON) as emulated, ThreadPoolExecutor(1) as pool:
-        done = pool.submit(
+        future = pool.submit(
             jobs.run,
             emulated.shell,
-            silent("touch up; until [ -e go ]; do sleep 0.05; done; echo end >>ends; exit 7"),
+            silent_job("touch up; until [ -e go ]; do sleep 0.05; done; echo end >>ends; exit 7"),
         )
         wait_until(lambda: emulated.has("up"), Deadline.after(SOON))
         emulated.set_link("down")
         wait_until(lambda: len(emulated.notices) == 1, Deadline.after(SOON))
-        Path(f"{emulated.inside}/root/root/{FOLDER}/go").touch()
+        Path(f"{emulated.proc_folder}/root/root/{FOLDER}/go").touch()
         wait_until(lambda: emulated.has("ends"), Deadline.after(SOON))
-        assert not done.done()
+        assert not future.done()
         emulated.set_link("up")
-        assert done.result(SOON) == 7
+        assert future.result(SOON) == 7
         assert emulated.shell.run(("cat", f"{FOLDER}/ends"), deadline=Deadline.after(30)).stdout == b"end\n"
         assert [re.split(";| after", notice)[0] for notice in emulated.notices] == [
             "turtlebot-1: the link is lost",
@@ -121,12 +121,12 @@ def test_result_of_a_job_that_outlives_its_link_is_collected_once() -> None:
         ]
 
 
-def test_wait_on_the_robot_for_a_cut_link_ends() -> None:
+def test_wait_of_the_robot_for_a_cut_link_has_a_timeout() -> None:
     """The SSH server does not detect the loss, and keeps standard input open for hours."""
     with robot(reconnect_timeout_s=0.0) as emulated:
-        pending = jobs.begin(emulated.shell, replace(silent("touch up"), limit_s=1, ready_s=1))
+        pending = jobs.begin(emulated.shell, replace(silent_job("touch up"), limit_s=1, ready_s=1))
         wait_until(lambda: emulated.has("up"), Deadline.after(SOON))
         emulated.set_link("down")
-        assert pending.session is not None, "kept: an unreferenced session would be closed"
+        assert pending.session is not None, "the reference keeps the session open"
         assert emulated.runs(f"run {FOLDER} silent")
         wait_until(lambda: not emulated.runs(FOLDER), Deadline.after(SOON))

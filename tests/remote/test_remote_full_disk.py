@@ -1,4 +1,4 @@
-"""A full disk of a robot is detected before, and reported when it occurs. The home is a small file system."""
+"""A full disk of a robot is rejected before an attempt, or reported later. The home is a small file system."""
 
 import os
 import subprocess
@@ -62,9 +62,9 @@ def job(*argv: str) -> Job:
 
 
 def test_disk_too_small_for_the_evidence_is_rejected_first(shell: SmallShell) -> None:
-    with pytest.raises(RobotError, match=r"\d{4} KiB of disk are free, 102400 KiB are needed") as caught:
+    with pytest.raises(RobotError, match=r"\d{4} KiB of disk are free, 102400 KiB are needed") as error_info:
         evidence.begin(shell, FOLDER, "sender", "lo")
-    assert "remove old trials" in caught.value.remedy
+    assert "remove old trials" in error_info.value.remedy
     assert shell.run(("ls", ".fieldkit/trial"), deadline=Deadline.after(30), check=False).exit_code != 0
 
 
@@ -101,25 +101,25 @@ def test_evidence_that_does_not_fit_is_reported(shell: SmallShell, tmp_path: Pat
 def test_lock_that_does_not_fit_is_reported(shell: SmallShell) -> None:
     fill(shell)
     with pytest.raises(RobotError, match=NO_SPACE), locked({Role.SENDER: shell}, Holder("a", "b", "c"), sink=print):
-        raise AssertionError("taken")
+        raise AssertionError("the lock is held")
 
 
 def test_lock_that_cannot_be_renewed_is_reported_and_kept(shell: SmallShell) -> None:
     anna, bert = Holder("a", "anna@one", "a"), Holder("b", "bert@two", "b")
     with locked({Role.SENDER: shell}, anna, sink=print):
         evidence.begin(shell, FOLDER, "sender", "lo", need_kib=100, token="a")
-        shell.run(("sh", "-c", HALF_OVER), deadline=Deadline.after(30))
+        shell.run(("sh", "-c", ADVANCE_LOCK_TIMES), deadline=Deadline.after(30))
         fill(shell)
         with pytest.raises(RobotError, match=NO_SPACE):
             evidence.begin(shell, FOLDER, "sender", "lo", need_kib=0, token="a")
         shell.run(("rm", ".fieldkit/fill"), deadline=Deadline.after(30))
         with pytest.raises(RobotError, match="anna@one locked it"), locked({Role.SENDER: shell}, bert, sink=print):
-            raise AssertionError("taken twice")
+            raise AssertionError("the lock is held twice")
         evidence.begin(shell, FOLDER, "sender", "lo", need_kib=0, token="a")
 
 
-# Computed from the boot: the machine may have booted less than half of the lock's time ago.
-HALF_OVER = """read -r kind token boot from to since until who what <.fieldkit/lock.1
+# The lock starts at boot, because the machine may have booted less than half of the duration of the lock ago.
+ADVANCE_LOCK_TIMES = """read -r kind token boot from to since until who what <.fieldkit/lock.1
 times="0 $((2 * from)) $since $until"
 echo "$kind $token $boot $times $who $what" >.fieldkit/lock.1"""
 

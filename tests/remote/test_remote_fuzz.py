@@ -1,4 +1,4 @@
-"""Any data from a robot stay in its folder, raise only errors of fieldkit, and damage no terminal and no table."""
+"""Any data from a robot remain in the folder, raise only errors of fieldkit, and damage no terminal or table."""
 
 import csv
 import hashlib
@@ -31,7 +31,7 @@ from fieldkit.trial.columns import trial_columns
 from tests.helpers.tables import RepeatRow
 from tests.helpers.userlands import LocalShell
 
-CONTROL = [
+CONTROL_CHARACTERS = [
     "\n",
     "\r",
     "\0",
@@ -44,8 +44,27 @@ CONTROL = [
     "\u2066",
     "\u2028",
 ]
-MARKS = ["..", ".", "/", "//", "\\", "-", "~", "*", " ", "[bold]", "[/]", "=1+1", '"', ",", "a", "B", "0", ".sums-1"]
-TEXT = st.lists(st.sampled_from(CONTROL + MARKS) | st.text(max_size=3), max_size=8).map("".join)
+PATH_PARTS = [
+    "..",
+    ".",
+    "/",
+    "//",
+    "\\",
+    "-",
+    "~",
+    "*",
+    " ",
+    "[bold]",
+    "[/]",
+    "=1+1",
+    '"',
+    ",",
+    "a",
+    "B",
+    "0",
+    ".sums-1",
+]
+TEXT = st.lists(st.sampled_from(CONTROL_CHARACTERS + PATH_PARTS) | st.text(max_size=3), max_size=8).map("".join)
 BYTES = st.lists(TEXT.map(str.encode) | st.binary(max_size=8), max_size=8).map(b"".join)
 NAMES = st.sampled_from(["scan.bag", "scan/a", "scan", "../x", "/tmp/x", "scan/../../x", "a//b", "./a"]) | TEXT
 FIELD = st.binary(min_size=12, max_size=12) | st.integers(0, 8**11 - 1).map(lambda size: b"%011o\0" % size)
@@ -69,7 +88,7 @@ class AnsweringRobot(LocalShell):
 
 
 def header(name: bytes, size: bytes, kind: bytes, prefix: bytes = b"", *, magic: bytes = b"ustar\x0000") -> bytes:
-    """Return a tar header, composed by fields (POSIX.1-2017, ustar), with a correct checksum."""
+    """Return a tar header with these fields (POSIX.1-2017, ustar) and a correct checksum."""
     block = bytearray(512)
     block[0:100] = name[:100].ljust(100, b"\0")
     block[100:124] = b"0000644\0" + b"0000000\0" * 2
@@ -95,66 +114,66 @@ ENTRIES = st.builds(
     st.just(b"") | st.binary(max_size=155),
     st.binary(max_size=1100),
 )
-WHOLE = st.builds(entry, NAMES.map(str.encode), st.binary(max_size=1100))
+COMPLETE_ENTRIES = st.builds(entry, NAMES.map(str.encode), st.binary(max_size=1100))
 
 
-def harmless(error: FieldkitError) -> bool:
+def is_printable(error: FieldkitError) -> bool:
     return str(error).replace("\n  remedy: ", "").isprintable()
 
 
-def fetched(content: bytes) -> dict[str, bytes] | None:
-    """Return the files that a fetch accepted; it must have no other effect, and raise only errors of fieldkit."""
+def fetch_archive(content: bytes) -> dict[str, bytes] | None:
+    """Return the files that a fetch accepted, or None after an error. Other effects and errors are failures."""
     with tempfile.TemporaryDirectory() as folder:
         into = Path(folder, "outer", "into")
         into.mkdir(parents=True)
-        output_text: FieldkitError | None = None
+        raised_error: FieldkitError | None = None
         try:
             fetching.fetch(AnsweringRobot(Path(folder), content), "x", "sender", "lo", into)
         except FieldkitError as error:
-            output_text = error
-        assert output_text is None or harmless(output_text)
+            raised_error = error
+        assert raised_error is None or is_printable(raised_error)
         assert [path.name for path in Path(folder).iterdir()] == ["outer"]
         assert [path.name for path in Path(folder, "outer").iterdir()] == ["into"]
-        everything = list(into.rglob("*"))
-        assert not [path for path in everything if path.is_symlink() or not (path.is_file() or path.is_dir())]
-        assert not [path for path in everything if path.name.startswith(".")]
-        files = {str(path.relative_to(into)): path.read_bytes() for path in everything if path.is_file()}
-        return files if output_text is None else None
+        paths = list(into.rglob("*"))
+        assert not [path for path in paths if path.is_symlink() or not (path.is_file() or path.is_dir())]
+        assert not [path for path in paths if path.name.startswith(".")]
+        files = {str(path.relative_to(into)): path.read_bytes() for path in paths if path.is_file()}
+        return files if raised_error is None else None
 
 
-@given(st.lists(ENTRIES | WHOLE, max_size=5), st.binary(max_size=30))
+@given(st.lists(ENTRIES | COMPLETE_ENTRIES, max_size=5), st.binary(max_size=30))
 def test_any_archive_stays_in_its_folder(entries: list[bytes], tail: bytes) -> None:
-    fetched(b"".join(entries) + tail)
-    fetched(b"".join(entries) + bytes(1024))
+    fetch_archive(b"".join(entries) + tail)
+    fetch_archive(b"".join(entries) + bytes(1024))
 
 
 @given(st.dictionaries(st.sampled_from(["scan.bag", "scan/a.db3", "b"]), st.binary(max_size=3000)), st.data())
-def test_archive_arrives_completely_or_not_at_all(files: dict[str, bytes], data: st.DataObject) -> None:
+def test_archive_is_accepted_completely_or_rejected(files: dict[str, bytes], data: st.DataObject) -> None:
     sums = "".join(f"{hashlib.sha256(content).hexdigest()}  {name}\n" for name, content in files.items())
-    sent = [(".sums-1", sums.encode()), *files.items()]
-    archive = b"".join(entry(name.encode(), content) for name, content in sent) + bytes(1024)
+    members = [(".sums-1", sums.encode()), *files.items()]
+    archive = b"".join(entry(name.encode(), content) for name, content in members) + bytes(1024)
     if files:
         with tempfile.TemporaryDirectory() as folder:
             fetching.fetch(AnsweringRobot(Path(folder), archive), "x", "sender", "lo", Path(folder))
             assert {name: Path(folder, name).read_bytes() for name in files} == files
-    hurt = bytearray(archive)
-    place = data.draw(st.integers(0, len(archive) - 1))
-    hurt[place] ^= data.draw(st.integers(1, 255))
-    for sent_instead in (bytes(hurt), archive[:place]):
-        assert fetched(sent_instead) in (None, files)
+    damaged = bytearray(archive)
+    position = data.draw(st.integers(0, len(archive) - 1))
+    damaged[position] ^= data.draw(st.integers(1, 255))
+    for damaged_archive in (bytes(damaged), archive[:position]):
+        assert fetch_archive(damaged_archive) in (None, files)
 
 
 @pytest.mark.parametrize("kind", [tarfile.GNU_FORMAT, tarfile.USTAR_FORMAT, tarfile.PAX_FORMAT])
-def test_archives_of_another_tar_writer(kind: int, tmp_path: Path) -> None:
-    packed = io.BytesIO()
-    with tarfile.open(fileobj=packed, mode="w", format=kind) as tar:
+def test_archives_of_another_tar_writer_are_read(kind: int, tmp_path: Path) -> None:
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w", format=kind) as tar:
         for name, content in (("scan.bag", b"x" * 700), ("scan/a.db3", b"")):
             member = tarfile.TarInfo(name)
             member.size = len(content)
             tar.addfile(member, io.BytesIO(content))
-    packed.seek(0)
-    read = [(member.name, b"".join(member.chunks)) for member in archive.members(packed, "robot")]
-    assert read == [("scan.bag", b"x" * 700), ("scan/a.db3", b"")]
+    buffer.seek(0)
+    members_read = [(member.name, b"".join(member.chunks)) for member in archive.members(buffer, "robot")]
+    assert members_read == [("scan.bag", b"x" * 700), ("scan/a.db3", b"")]
 
 
 @pytest.mark.parametrize(
@@ -194,28 +213,28 @@ def test_damaged_header_is_reported(tmp_path: Path) -> None:
 
 
 @given(BYTES)
-def test_output_of_a_robot_is_one_printable_line(data: bytes) -> None:
+def test_output_of_a_robot_is_shown_as_a_printable_line(data: bytes) -> None:
     text = printable(data, limit=60)
     assert len(text) <= 60
     assert not [char for char in text if unicodedata.category(char) in {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}]
 
 
 @given(BYTES, st.integers(0, 255), st.sampled_from([b"", b"job.sh: ", b"job.sh: held ", b"job.sh: aborted 1 "]))
-def test_any_answer_of_the_script_raises_an_error_of_fieldkit(output_text: bytes, code: int, start: bytes) -> None:
+def test_any_answer_of_the_script_raises_an_error_of_fieldkit(output: bytes, code: int, start: bytes) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        shell = AnsweringRobot(Path(folder), output_text, code=code, stderr=start + output_text)
-        said_then: FieldkitError | None = None
+        shell = AnsweringRobot(Path(folder), output, code=code, stderr=start + output)
+        raised_error: FieldkitError | None = None
         try:
             script.call(shell, "left", deadline=Deadline.after(1))
         except FieldkitError as error:
-            said_then = error
-        assert said_then is None if code == 0 else said_then is not None and harmless(said_then)
+            raised_error = error
+        assert raised_error is None if code == 0 else raised_error is not None and is_printable(raised_error)
         if code == 0:
             assert all(line.isprintable() for line in jobs.list_running(shell, Deadline.after(1)))
 
 
 @pytest.mark.parametrize(
-    ("code", "output_text", "kind"),
+    ("code", "stderr", "kind"),
     [
         (75, b"job.sh: held 99999999999 99999999999 99999999999 \x1b[2J x", RobotError),
         (76, b"job.sh: aborted 99999999999 \xe2\x80\xae x", LockLostError),
@@ -224,12 +243,12 @@ def test_any_answer_of_the_script_raises_an_error_of_fieldkit(output_text: bytes
         (76, b"", RobotError),
     ],
 )
-def test_invented_lock_of_a_robot_is_reported(
-    code: int, output_text: bytes, kind: type[RobotError], tmp_path: Path
+def test_any_lock_message_of_a_robot_is_reported(
+    code: int, stderr: bytes, kind: type[RobotError], tmp_path: Path
 ) -> None:
-    with pytest.raises(kind) as caught:
-        script.call(AnsweringRobot(tmp_path, code=code, stderr=output_text), "begin", deadline=Deadline.after(1))
-    assert caught.value.what.isprintable()
+    with pytest.raises(kind) as error_info:
+        script.call(AnsweringRobot(tmp_path, code=code, stderr=stderr), "begin", deadline=Deadline.after(1))
+    assert error_info.value.what.isprintable()
 
 
 WORDS = st.lists(TEXT.filter(lambda text: "\0" not in text), max_size=5)
@@ -237,10 +256,10 @@ WORDS = st.lists(TEXT.filter(lambda text: "\0" not in text), max_size=5)
 
 @settings(max_examples=40)
 @given(WORDS, st.sampled_from(["sh", "bash", "busybox"]))
-def test_any_argument_arrives_through_any_shell(words: list[str], shell: str) -> None:
+def test_any_argument_arrives_through_any_shell(arguments: list[str], shell: str) -> None:
     argv = (shell, "sh", "-c") if shell == "busybox" else (shell, "-c")
-    done = subprocess.run((*argv, quote(("printf", "%s\\0", *words))), stdout=subprocess.PIPE, check=True)
-    assert done.stdout.decode("utf-8", "surrogateescape").split("\0")[:-1] == (words or [""])
+    completed = subprocess.run((*argv, quote(("printf", "%s\\0", *arguments))), stdout=subprocess.PIPE, check=True)
+    assert completed.stdout.decode("utf-8", "surrogateescape").split("\0")[:-1] == (arguments or [""])
 
 
 def is_visible(char: str) -> bool:
@@ -249,13 +268,13 @@ def is_visible(char: str) -> bool:
 
 
 @given(TEXT)
-def test_reason_is_one_cell_and_one_line(reason: str) -> None:
+def test_reason_is_a_single_cell_and_a_single_line(reason: str) -> None:
     table = rows.to_csv([RepeatRow(reason=reason or None)], trial_columns())
     assert len(table.splitlines()) == 2
-    head, cells = csv.reader(io.StringIO(table, newline=""))
+    header_cells, cells = csv.reader(io.StringIO(table, newline=""))
     expected = "".join(char if is_visible(char) else "?" for char in " ".join(reason.splitlines()))
-    assert unescape_formula(cells[head.index("reason")]) == expected
-    del cells[head.index("reason")]
+    assert unescape_formula(cells[header_cells.index("reason")]) == expected
+    del cells[header_cells.index("reason")]
     assert not any(cells)
 
 
@@ -266,9 +285,9 @@ def test_events_write_only_printable_characters_to_the_terminal(text: str) -> No
         RepeatEnded("udp-01", 1, Status.VOID, reason=text, summary=text, done=1, total=2, left_s=1),
     ]
     for event in events:
-        printed = display.event_text(event)
-        assert printed is not None
-        assert printed.plain.replace("\n", "").replace("\N{NO-BREAK SPACE}", "").isprintable()
+        text_of_event = display.event_text(event)
+        assert text_of_event is not None
+        assert text_of_event.plain.replace("\n", "").replace("\N{NO-BREAK SPACE}", "").isprintable()
 
 
 @pytest.mark.parametrize("show", [display.show_error, lambda text: display.table(["x"], [[text]])])

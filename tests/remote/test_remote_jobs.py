@@ -36,7 +36,7 @@ FOLDER = jobs.work_folder("trial", "udp-01-1")
 LINK_JOB = "link"
 SNAPSHOTS = ("sender-sources-after.txt", "sender-sources-before.txt")
 LINK_FILES = {"sender-link.txt.gz"} if shutil.which("iw", path=f"{os.environ['PATH']}:/usr/sbin:/sbin") else set()
-"""Samples of the link, which fieldkit/remote/telemetry.sh takes if iw is installed."""
+"""Samples of the link, which fieldkit/remote/telemetry.sh records if iw is installed."""
 
 
 @pytest.fixture(params=USERLANDS_OF_LONG_TESTS)
@@ -63,19 +63,19 @@ def job(*argv: str, name: str = "job", limit_s: float = 30.0) -> Job:
 
 
 def replace_program(shell: LocalShell, name: str, body: str) -> None:
-    """Replace a program of the robot by a script; `{program}` in its body is the command line of the real program."""
-    place = Path(shell.path.partition(":")[0]) / name
-    real = f"busybox {name}" if place.exists() else shutil.which(name)
-    place.unlink(missing_ok=True)
-    place.write_text(f"#!/bin/sh\n{body.format(program=real)}\n", encoding="ascii")
-    place.chmod(0o755)
+    """Replace a program of the robot by a script. `{program}` in `body` is the command line of the real program."""
+    program_path = Path(shell.path.partition(":")[0]) / name
+    real_command = f"busybox {name}" if program_path.exists() else shutil.which(name)
+    program_path.unlink(missing_ok=True)
+    program_path.write_text(f"#!/bin/sh\n{body.format(program=real_command)}\n", encoding="ascii")
+    program_path.chmod(0o755)
 
 
 def leader(shell: LocalShell, name: str = "job") -> int:
     return int((shell.home / FOLDER / ".jobs" / name / "pid").read_text(encoding="ascii").split()[0])
 
 
-def group_is_gone(pid: int) -> bool:
+def has_group_exited(pid: int) -> bool:
     """Return True if no process of the group runs."""
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -104,8 +104,8 @@ def test_start_returns_when_the_log_contains_the_text(shell: LocalShell) -> None
 
 
 def test_start_has_no_output(shell: LocalShell) -> None:
-    done = shell.run(jobs.command("start", job("sh", "-c", "exit 0")), deadline=Deadline.after(30))
-    assert (done.stdout, done.stderr) == (b"", b"")
+    completed = shell.run(jobs.command("start", job("sh", "-c", "exit 0")), deadline=Deadline.after(30))
+    assert (completed.stdout, completed.stderr) == (b"", b"")
 
 
 @pytest.mark.parametrize("protocol", Protocol)
@@ -142,14 +142,14 @@ def test_job_that_ignores_its_signal_is_killed_with_its_children(shell: LocalShe
     jobs.start(shell, job_spec)
     pid = leader(shell)
     assert jobs.stop(shell, job_spec, signal="INT", grace_s=1) == jobs.KILLED
-    wait_until(lambda: group_is_gone(pid), Deadline.after(30))
+    wait_until(lambda: has_group_exited(pid), Deadline.after(30))
 
 
 def test_remaining_processes_of_a_command_are_terminated(shell: LocalShell) -> None:
     job_spec = job("sh", "-c", "sleep 300 & exit 0")
     assert jobs.run(shell, job_spec) == 0
     pid = leader(shell)
-    wait_until(lambda: group_is_gone(pid), Deadline.after(30))
+    wait_until(lambda: has_group_exited(pid), Deadline.after(30))
 
 
 def test_robot_stops_a_job_at_its_limit(shell: LocalShell) -> None:
@@ -158,13 +158,13 @@ def test_robot_stops_a_job_at_its_limit(shell: LocalShell) -> None:
 
 
 def test_limit_starts_when_the_job_is_ready(shell: LocalShell) -> None:
-    # The file `go` is created when a job whose limit started with the job would have been stopped long before.
+    # The file `go` is created after the time limit, which would stop the job if it started with the job.
     script = (
         "trap 'echo early; exit 1' INT; until [ -e go ]; do sleep 0.02; done; trap 'exit 9' INT; echo up; sleep 60"
     )
     pending = jobs.begin(shell, replace(job("sh", "-c", script, limit_s=0.1), ready="log:up"))
-    other = job("true", name="other", limit_s=0.5)
-    assert jobs.run(shell, replace(other, argv=("sleep", "60"))) == 128 + signal.SIGINT
+    other_job = job("true", name="other", limit_s=0.5)
+    assert jobs.run(shell, replace(other_job, argv=("sleep", "60"))) == 128 + signal.SIGINT
     (shell.home / FOLDER / "go").touch()
     assert pending.end(30) == 9
 
@@ -228,12 +228,12 @@ def test_repeated_run_joins_the_job_and_returns_its_exit_code(shell: LocalShell)
 def test_repeated_start_waits_until_the_job_is_ready(shell: LocalShell) -> None:
     job_spec = replace(job("sh", "-c", "echo once >>out; sleep 0.3; echo up; sleep 60"), ready="log:up")
     with ThreadPoolExecutor(2) as pool:
-        for done in [pool.submit(jobs.start, shell, job_spec) for _ in range(2)]:
-            done.result()
+        for start_call in [pool.submit(jobs.start, shell, job_spec) for _ in range(2)]:
+            start_call.result()
             assert "up" in (shell.home / FOLDER / "job.log").read_text(encoding="ascii")
     assert (shell.home / FOLDER / "out").read_text(encoding="ascii") == "once\n"
     jobs.stop(shell, job_spec, signal="TERM")
-    jobs.start(shell, job_spec)  # its log shows that it was ready
+    jobs.start(shell, job_spec)  # the log shows that the job was ready
     assert jobs.stop(shell, job_spec) == 128 + signal.SIGTERM
 
 
@@ -247,17 +247,17 @@ def test_repeated_start_reports_that_the_job_ended_before_it_was_ready(shell: Lo
 def test_job_that_is_not_ready_in_time_is_killed_and_its_log_reported(shell: LocalShell) -> None:
     ignoring_signals = job("sh", "-c", "trap '' INT TERM; echo still looking; while :; do sleep 0.05; done")
     job_spec = replace(ignoring_signals, ready="log:up", ready_s=3)
-    with pytest.raises(RobotError, match="job job was not ready within 3 s: still looking") as caught:
+    with pytest.raises(RobotError, match="job job was not ready within 3 s: still looking") as error_info:
         jobs.start(shell, job_spec)
-    assert FOLDER in caught.value.remedy
+    assert FOLDER in error_info.value.remedy
     assert jobs.stop(shell, job_spec) == jobs.KILLED
     pid = leader(shell)
-    wait_until(lambda: group_is_gone(pid), Deadline.after(30))
+    wait_until(lambda: has_group_exited(pid), Deadline.after(30))
 
 
 def test_serve_reports_readiness_and_exit_code(shell: LocalShell) -> None:
-    wait = "echo up; until [ -e go ]; do sleep 0.05; done; exit 6"
-    job_spec = replace(job("sh", "-c", f"echo once >>out; {wait}"), ready="log:up")
+    wait_script = "echo up; until [ -e go ]; do sleep 0.05; done; exit 6"
+    job_spec = replace(job("sh", "-c", f"echo once >>out; {wait_script}"), ready="log:up")
     first, second = jobs.serve(shell, job_spec), jobs.serve(shell, job_spec)
     assert "up" in (shell.home / FOLDER / "job.log").read_text(encoding="ascii")
     (shell.home / FOLDER / "go").touch()
@@ -272,15 +272,15 @@ def test_ended_listener_counts_as_ready_after_a_lost_link(shell: LocalShell) -> 
     first = jobs.serve(shell, job_spec)
     (shell.home / FOLDER / "go").touch()
     assert first.end(30) == 6
-    assert jobs.serve(shell, job_spec).end(30) == 6, "although no process listens any more"
+    assert jobs.serve(shell, job_spec).end(30) == 6, "although no process listens now"
 
 
 def test_serve_reports_a_job_that_was_not_ready(shell: LocalShell) -> None:
     job_spec = replace(job("sh", "-c", "echo no such port >&2; exit 1"), ready="log:listening on")
     for _ in range(2):
-        with pytest.raises(RobotError, match="job job ended before it was ready: no such port") as caught:
+        with pytest.raises(RobotError, match="job job ended before it was ready: no such port") as error_info:
             jobs.serve(shell, job_spec)
-        assert FOLDER in caught.value.remedy
+        assert FOLDER in error_info.value.remedy
 
 
 PRINT_END_TEXT = "trap 'echo counted; sleep 0.3; echo gone; exit {code}' INT; echo up; while :; do sleep 0.05; done"
@@ -345,23 +345,27 @@ def test_no_job_starts_in_a_folder_whose_jobs_were_stopped(shell: LocalShell) ->
 
 
 def wrap_with_pause(shell: LocalShell, name: str) -> tuple[Path, Path]:
-    """Replace the robot's program `name`: it creates a file when it is called, and waits for another file."""
-    called, go = shell.home / "called", shell.home / "go"
-    replace_program(shell, name, f'touch "{called}"; until [ -e "{go}" ]; do sleep 0.01; done; exec {{program}} "$@"')
-    return called, go
+    """Replace the robot's program `name` by one that creates a file when it is called, and waits for another file."""
+    called_file, go_file = shell.home / "called", shell.home / "go"
+    replace_program(
+        shell, name, f'touch "{called_file}"; until [ -e "{go_file}" ]; do sleep 0.01; done; exec {{program}} "$@"'
+    )
+    return called_file, go_file
 
 
 @pytest.mark.parametrize("call", [jobs.start, jobs.run])
 def test_job_that_starts_during_an_abort_does_not_run(
     shell: LocalShell, call: Callable[[LocalShell, Job], object]
 ) -> None:
-    called, go = wrap_with_pause(shell, "mkfifo")  # after the job's folder is created, before its identity is written
+    called_file, go_file = wrap_with_pause(
+        shell, "mkfifo"
+    )  # called after the folder of the job is created, and before its identity is written
     job_spec = job("sh", "-c", "touch started; exec sleep 60")
     with ThreadPoolExecutor(1) as pool:
         starting = pool.submit(call, shell, job_spec)
-        wait_until(called.exists, Deadline.after(30))
+        wait_until(called_file.exists, Deadline.after(30))
         assert jobs.abort(shell, "bert@two", Deadline.after(30)).jobs == ()
-        go.touch()
+        go_file.touch()
         with pytest.raises(RobotError, match=f"cannot start: the jobs of {FOLDER} were stopped by bert@two"):
             starting.result(30)
     # `start` returns as soon as the leader has an identity; the leader may then still be about to exit.
@@ -369,7 +373,7 @@ def test_job_that_starts_during_an_abort_does_not_run(
     assert not (shell.home / FOLDER / "started").exists()
 
 
-def test_lost_caller_that_requested_the_end_is_not_awaited_forever(shell: LocalShell) -> None:
+def test_wait_for_a_lost_caller_has_a_timeout(shell: LocalShell) -> None:
     """The link was cut while the job ran: the SSH server has not detected it, and keeps standard input open."""
     query_log = shell.home / "queries"
     replace_program(shell, "timeout", f'echo "$1" >>"{query_log}"; shift; exec {{program}} 1 "$@"')
@@ -390,18 +394,18 @@ def test_process_whose_folder_was_deleted_is_listed_and_stopped(shell: LocalShel
     jobs_ended = jobs.abort(shell, "anna@one", Deadline.after(30)).jobs
     assert any(line.startswith(FOLDER) and line.endswith("sleep 60") for line in jobs_ended)
     assert pending.session.process.wait(30) == -signal.SIGKILL
-    wait_until(lambda: group_is_gone(pid), Deadline.after(30))
+    wait_until(lambda: has_group_exited(pid), Deadline.after(30))
 
 
-@pytest.mark.parametrize("lost", ["the identity", "the folder"])
-def test_records_lost_in_a_power_failure_are_reported(shell: LocalShell, lost: str) -> None:
+@pytest.mark.parametrize("lost_record", ["the identity", "the folder"])
+def test_records_lost_in_a_power_failure_are_reported(shell: LocalShell, lost_record: str) -> None:
     job_spec = job("true")
     jobs.run(shell, job_spec)
-    began = shell.home / FOLDER / ".began"
-    token, _ = began.read_text(encoding="ascii").split()
-    began.write_text(f"{token} another-boot\n", encoding="ascii")
+    began_file = shell.home / FOLDER / ".began"
+    token, _ = began_file.read_text(encoding="ascii").split()
+    began_file.write_text(f"{token} another-boot\n", encoding="ascii")
     shutil.rmtree(shell.home / FOLDER / ".jobs" / "job")
-    if lost == "the identity":
+    if lost_record == "the identity":
         (shell.home / FOLDER / ".jobs" / "job").mkdir()
     calls: list[Callable[[], int]] = [
         lambda: jobs.stop(shell, job_spec),
@@ -417,11 +421,11 @@ def test_files_of_root_can_be_deleted_by_the_user(shell: LocalShell) -> None:
         os.chown(path, 65534, 65534, follow_symlinks=False)
     jobs.run(shell, job("true"))
     assert (shell.home / FOLDER / ".jobs" / "job").stat().st_uid == 65534
-    as_user = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
-    subprocess.run((*as_user, "rm", "-r", "udp-01-1"), cwd=(shell.home / FOLDER).parent, check=True)
+    user_command = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
+    subprocess.run((*user_command, "rm", "-r", "udp-01-1"), cwd=(shell.home / FOLDER).parent, check=True)
 
 
-def test_exit_code_of_a_job_is_not_mistaken_for_one_of_the_script(shell: LocalShell) -> None:
+def test_exit_code_of_a_job_is_not_mistaken_for_an_exit_code_of_the_script(shell: LocalShell) -> None:
     for code in (28, 75, 76, 124, 125):
         assert jobs.run(shell, job("sh", "-c", f"echo job.sh: lies >&2; exit {code}", name=f"exit-{code}")) == code
 
@@ -437,9 +441,9 @@ def test_repeated_begin_keeps_the_first_state_and_running_jobs(shell: LocalShell
 
 
 def test_begin_rejects_a_disk_with_less_space_than_needed(shell: LocalShell) -> None:
-    with pytest.raises(RobotError, match=r"\d+ KiB of disk are free, 10{15} KiB are needed") as caught:
+    with pytest.raises(RobotError, match=r"\d+ KiB of disk are free, 10{15} KiB are needed") as error_info:
         evidence.begin(shell, jobs.work_folder("trial", "udp-02-1"), "sender", "lo", need_kib=10**15)
-    assert "du -sh ~/.fieldkit/*" in caught.value.remedy
+    assert "du -sh ~/.fieldkit/*" in error_info.value.remedy
     assert not (shell.home / jobs.work_folder("trial", "udp-02-1")).exists()
 
 
@@ -448,9 +452,9 @@ def test_missing_program_is_reported_at_the_installation(tmp_path: Path) -> None
     path = userland_path("busybox", folder)
     (folder / "setsid").unlink()
     shell = LocalShell(tmp_path, str(folder))
-    with pytest.raises(RobotError, match="it lacks setsid") as caught:
+    with pytest.raises(RobotError, match="it lacks setsid") as error_info:
         jobs.install(shell, Deadline.after(30))
-    assert "apt-get install util-linux" in caught.value.remedy
+    assert "apt-get install util-linux" in error_info.value.remedy
     assert path
 
 
@@ -469,8 +473,8 @@ def test_remaining_jobs_are_listed_and_stopped(shell: LocalShell) -> None:
 
 def test_stop_waits_until_a_file_has_stopped_growing(shell: LocalShell) -> None:
     # The file grows whenever the script sleeps between two checks, so that the load of this machine has no effect.
-    grow = 'case $1 in 0.02) [ "$(wc -l <out)" -ge 20 ] || echo >>out ;; esac'
-    replace_program(shell, "sleep", f'cd "{shell.home / FOLDER}" && {grow}\nexec {{program}} "$@"')
+    append_lines = 'case $1 in 0.02) [ "$(wc -l <out)" -ge 20 ] || echo >>out ;; esac'
+    replace_program(shell, "sleep", f'cd "{shell.home / FOLDER}" && {append_lines}\nexec {{program}} "$@"')
     script = "trap 'wc -l <out >seen; exit 0' TERM; : >out; echo up; while :; do sleep 0.05; done"
     job_spec = replace(job("sh", "-c", script), ready="log:up")
     jobs.start(shell, job_spec)
@@ -479,17 +483,17 @@ def test_stop_waits_until_a_file_has_stopped_growing(shell: LocalShell) -> None:
 
 
 @pytest.mark.parametrize(
-    ("state", "runs"), [("R", True), ("S", True), ("D", True), ("T", True), ("Z", False), ("X", False)]
+    ("state", "is_running"), [("R", True), ("S", True), ("D", True), ("T", True), ("Z", False), ("X", False)]
 )
 def test_zombie_and_dead_process_do_not_count_as_running(
-    shell: LocalShell, tmp_path: Path, state: str, runs: bool
+    shell: LocalShell, tmp_path: Path, state: str, is_running: bool
 ) -> None:
-    """Its state is Z until its parent waits for it, and X for a moment after that."""
+    """The state of a process is Z until its parent waits for it, and X briefly afterwards."""
     (tmp_path / "stat").write_text(f"7 (a) b) {state} {' '.join(map(str, range(4, 53)))}\n", encoding="ascii")
-    common = Path(script.__file__).with_name("common.sh")
-    argv = ("sh", "-c", '. "$1"; identify "../$2"; echo $? "$identity"', "sh", str(common), str(tmp_path))
+    common_script = Path(script.__file__).with_name("common.sh")
+    argv = ("sh", "-c", '. "$1"; identify "../$2"; echo $? "$identity"', "sh", str(common_script), str(tmp_path))
     code, *identity = shell.run(argv, deadline=Deadline.after(30)).stdout.split()
-    assert (code == b"0", len(identity)) == ((True, 3) if runs else (False, 0))
+    assert (code == b"0", len(identity)) == ((True, 3) if is_running else (False, 0))
 
 
 def test_folder_is_fetched_completely_with_the_host_state_before_and_after(shell: LocalShell, tmp_path: Path) -> None:
@@ -505,47 +509,47 @@ def test_folder_is_fetched_completely_with_the_host_state_before_and_after(shell
 
 def test_end_of_each_job_is_recorded_with_boot_id_and_clock(shell: LocalShell, tmp_path: Path) -> None:
     waiting = ("sh", "-c", "trap 'exit 0' INT; echo up; while :; do sleep 0.02; done")
-    stopped, broken, lost, slow = (
+    stopped, broken, lost_record, slow = (
         replace(job(*waiting, name=name), ready="log:up") for name in ("stopped", "broken", "lost", "slow")
     )
-    for job_spec in (stopped, broken, lost):
+    for job_spec in (stopped, broken, lost_record):
         jobs.start(shell, job_spec)
     assert jobs.run(shell, job("sh", "-c", "sleep 0.3; exit 3")) == 3
     assert jobs.run(shell, replace(slow, limit_s=0.1)) == 0
     os.killpg(leader(shell, "broken"), signal.SIGINT)
     assert jobs.begin_wait(shell, broken, 20).end(30) == 0
     os.killpg(leader(shell, "lost"), signal.SIGKILL)
-    assert jobs.begin_wait(shell, lost, 20).end(30) == jobs.KILLED
+    assert jobs.begin_wait(shell, lost_record, 20).end(30) == jobs.KILLED
     for job_spec in (stopped, broken):
-        assert stop(shell, job_spec) == 0, "as if it had not been stopped"
+        assert stop(shell, job_spec) == 0, "the exit code is the same as without a stop"
     into = tmp_path / "local"
     into.mkdir()
     fetching.fetch(shell, FOLDER, "sender", "lo", into)
-    before, after = (host.state(into / f"sender-{when}.txt") for when in ("before", "after"))
+    before, after = (host.state(into / f"sender-{moment}.txt") for moment in ("before", "after"))
     assert after.endings is not None
     assert before.endings is None
-    ends = {name: (ending.cause, ending.code) for name, ending in after.endings.items() if name != LINK_JOB}
-    assert ends == {
+    endings = {name: (ending.cause, ending.code) for name, ending in after.endings.items() if name != LINK_JOB}
+    assert endings == {
         "stopped": (Cause.STOPPED, 0),
         "broken": (Cause.EXITED, 0),
         "lost": (Cause.EXITED, None),
         "job": (Cause.EXITED, 3),
         "slow": (Cause.LIMIT, 0),
     }
-    lasted_s = after.endings["job"].duration_s
-    assert lasted_s is not None
-    assert lasted_s >= 0.28
+    duration_s = after.endings["job"].duration_s
+    assert duration_s is not None
+    assert duration_s >= 0.28
     assert before.boot == after.boot == evidence.boot_id(shell) == evidence.begin(shell, FOLDER, "sender", "lo")
     assert before.clock is not None
     assert after.clock is not None
     assert clock.step_description(before.clock, after.clock) is None
-    assert clock.clock_step(before.clock, after.clock).error_s < 1, "busybox has fractions of a second, too"
+    assert clock.clock_step(before.clock, after.clock).error_s < 1, "busybox also reports fractions of a second"
 
 
 def test_state_of_the_radio_is_recorded_before_and_after(shell: LocalShell, tmp_path: Path) -> None:
     into = tmp_path / "local"
     into.mkdir()
-    # This machine has no radio: the outputs are those of a real one.
+    # This machine has no radio, so the outputs are from a real robot.
     answers = {"info": "info-station", "station": "stations-ap", "get": "power-save-on"}
     files = {verb: shlex.quote(str(DATA / "iw" / f"{name}.txt")) for verb, name in answers.items()}
     cases = "\n".join(f"{verb}) exec cat {file} ;;" for verb, file in files.items())
@@ -583,12 +587,15 @@ def test_regular_files_in_one_level_of_folders_are_fetched(shell: LocalShell, tm
     assert (into / "scan" / "scan_0.db3").read_text(encoding="ascii") == "b\n"
 
 
-def test_userland_without_fractions_of_seconds(tmp_path: Path) -> None:
-    """As old and small versions of busybox: no fractions in sleep, and another timeout."""
+def test_jobs_run_in_a_userland_without_fractions_of_seconds(tmp_path: Path) -> None:
+    """As in old and small versions of busybox, sleep accepts no fractions, and timeout has another syntax."""
     shell = LocalShell(tmp_path, userland_path("busybox", tmp_path / "bin"))
-    refusals = {"sleep": "case $1 in *.*) exit 1 ;; esac", "timeout": "case $1 in -t) shift ;; *) exit 127 ;; esac"}
-    for name, refusal in refusals.items():
-        replace_program(shell, name, f'{refusal}\nexec {{program}} "$@"')
+    restrictions = {
+        "sleep": "case $1 in *.*) exit 1 ;; esac",
+        "timeout": "case $1 in -t) shift ;; *) exit 127 ;; esac",
+    }
+    for name, restriction in restrictions.items():
+        replace_program(shell, name, f'{restriction}\nexec {{program}} "$@"')
     jobs.install(shell, Deadline.after(30))
     evidence.begin(shell, FOLDER, "sender", "lo")
     job_spec = replace(job("sh", "-c", "echo up; exec sleep 60"), ready="log:up")
@@ -645,7 +652,7 @@ EMPTY_SUM = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
 
 
 @pytest.mark.parametrize(
-    ("members", "link", "output_text"),
+    ("members", "link", "message"),
     [
         ({"../evil": b""}, "", "not a regular file"),
         ({"//etc/evil": b""}, "", "hash differs or file missing: etc/evil"),
@@ -663,12 +670,12 @@ EMPTY_SUM = "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
     ],
 )
 def test_archive_cannot_leave_the_folder_or_skip_checks(
-    tmp_path: Path, members: dict[str, bytes], link: str, output_text: str
+    tmp_path: Path, members: dict[str, bytes], link: str, message: str
 ) -> None:
     home, into = tmp_path / "home", tmp_path / "into"
     home.mkdir()
     into.mkdir()
-    with pytest.raises(EvidenceError, match=output_text):
+    with pytest.raises(EvidenceError, match=message):
         fetching.fetch(HostileShell(home, members, link=link), FOLDER, "sender", "lo", into)
     assert {path.name for path in tmp_path.iterdir()} == {"home", "into"}
     assert not list(into.glob(".*"))
@@ -715,31 +722,31 @@ class GreetingRobot(LocalShell):
 
 
 def test_login_shell_with_a_greeting_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(RobotError, match="its login shell answers every command with 'ROS noetic'") as caught:
+    with pytest.raises(RobotError, match="its login shell answers every command with 'ROS noetic'") as error_info:
         jobs.install(GreetingRobot(tmp_path), Deadline.after(30))
-    assert "case $- in" in caught.value.remedy
+    assert "case $- in" in error_info.value.remedy
 
 
 def test_read_only_robot_is_reported_and_can_be_aborted(shell: LocalShell) -> None:
     jobs.start(shell, job("sleep", "60"))
     script_file = shell.home / jobs.SCRIPT_PATH
     script_file.unlink()
-    read_only = ("/bin/mount", "--bind", "-o", "ro", str(shell.home), str(shell.home))
-    inside = ("unshare", "--mount", "--propagation", "private", "sh", "-c", 'exec "$@"', "sh")
+    mount_command = ("/bin/mount", "--bind", "-o", "ro", str(shell.home), str(shell.home))
+    namespace_command = ("unshare", "--mount", "--propagation", "private", "sh", "-c", 'exec "$@"', "sh")
 
     class ReadOnly(LocalShell):
         def begin(self, argv: Sequence[str], *, deadline: Deadline, until: bytes | None = None) -> LocalSession:
-            mounted = ("sh", "-c", f'{shlex.join(read_only)} && cd "$HOME" && exec "$@"', "sh")
-            return super().begin((*inside, *mounted, *argv), deadline=deadline, until=until)
+            command = ("sh", "-c", f'{shlex.join(mount_command)} && cd "$HOME" && exec "$@"', "sh")
+            return super().begin((*namespace_command, *command, *argv), deadline=deadline, until=until)
 
     robot = ReadOnly(shell.home, shell.path)
-    with pytest.raises(RobotError, match="Read-only file system") as caught:
+    with pytest.raises(RobotError, match="Read-only file system") as error_info:
         jobs.install(robot, Deadline.after(30))
-    assert "touch ~/.fieldkit/x" in caught.value.remedy
+    assert "touch ~/.fieldkit/x" in error_info.value.remedy
     jobs.install(shell, Deadline.after(30))
-    with pytest.raises(RobotError, match="Read-only file system") as caught:
+    with pytest.raises(RobotError, match="Read-only file system") as error_info:
         evidence.begin(robot, f"{FOLDER}-2", "sender", "lo", need_kib=0)
-    assert "a failing SD card" in caught.value.remedy
+    assert "a failing SD card" in error_info.value.remedy
     (job_ended,) = jobs.abort(robot, "anna@one", Deadline.after(30)).jobs
     assert job_ended.endswith("sleep 60")
     jobs.install(shell, Deadline.after(30))

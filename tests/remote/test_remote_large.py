@@ -1,4 +1,4 @@
-"""Evidence that is too large for one archive: fetched in pieces, continued after an interruption, limited in size."""
+"""Evidence too large for an archive is fetched in pieces. The fetch can be continued, and its size is limited."""
 
 import hashlib
 import os
@@ -44,15 +44,15 @@ class LossyRobot(LocalShell):
 def robot(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[LossyRobot]:
     home = tmp_path / "home"
     home.mkdir()
-    flaky_shell = LossyRobot(home, userland_path(request.param, tmp_path / "bin"))
-    jobs.install(flaky_shell, Deadline.after(30))
-    evidence.begin(flaky_shell, FOLDER, "sender", "lo", need_kib=0)
+    lossy_robot = LossyRobot(home, userland_path(request.param, tmp_path / "bin"))
+    jobs.install(lossy_robot, Deadline.after(30))
+    evidence.begin(lossy_robot, FOLDER, "sender", "lo", need_kib=0)
     (home / FOLDER / "scan").mkdir()
     (home / FOLDER / "scan" / "scan_0.db3").write_bytes(LARGE)
     (home / FOLDER / "camera.bag").write_bytes(LARGE[::-1])
     (home / FOLDER / "small.bag").write_bytes(SMALL)
-    yield flaky_shell
-    flaky_shell.close()
+    yield lossy_robot
+    lossy_robot.close()
 
 
 @pytest.fixture
@@ -70,16 +70,16 @@ def names(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
-WHOLE = {
+ALL_FILES = {
     *("camera.bag", "scan/scan_0.db3", "small.bag", "sender-before.txt", "sender-after.txt"),
     *("sender-sources-before.txt", "sender-sources-after.txt"),
 }
 
 
-def test_large_files_are_fetched_in_pieces_and_small_ones_in_an_archive(robot: LossyRobot, into: Path) -> None:
-    output_text: list[tuple[str, float]] = []
-    fetch(robot, into, progress=FetchProgress(lambda text, left_s: output_text.append((text, left_s))))
-    assert names(into) == WHOLE
+def test_large_files_are_fetched_in_pieces_and_small_files_in_an_archive(robot: LossyRobot, into: Path) -> None:
+    progress: list[tuple[str, float]] = []
+    fetch(robot, into, progress=FetchProgress(lambda text, left_s: progress.append((text, left_s))))
+    assert names(into) == ALL_FILES
     assert (into / "camera.bag").read_bytes() == LARGE[::-1]
     assert (into / "scan" / "scan_0.db3").read_bytes() == LARGE
     assert (into / "small.bag").read_bytes() == SMALL
@@ -91,14 +91,14 @@ def test_two_robots_cannot_use_the_same_file_name(
 ) -> None:
     rename = Path.rename
 
-    def late(self: Path, to: Path) -> Path:
-        with pytest.raises(FileExistsError):  # as if the other robot sent its file at this time
+    def rename_with_conflict(self: Path, to: Path) -> Path:
+        with pytest.raises(FileExistsError):  # as if the other robot sent its file now
             to.open("xb").close()
         return rename(self, to)
 
-    monkeypatch.setattr(Path, "rename", late)
+    monkeypatch.setattr(Path, "rename", rename_with_conflict)
     fetch(robot, into)
-    assert names(into) == WHOLE
+    assert names(into) == ALL_FILES
 
 
 FALSE_OUTPUTS = {
@@ -131,7 +131,7 @@ def test_wrong_output_of_tools_on_a_robot_is_detected(tmp_path: Path, tool: str,
     (tools / tool).chmod(0o755)
     with pytest.raises((EvidenceError, RobotError)):
         fetch(robot, into)
-    # Files of a truncated archive are kept, as those of any void attempt.
+    # Files of a truncated archive are kept like the files of any void attempt.
     assert not (into / "camera.bag").exists() or (into / "camera.bag").stat().st_size < len(LARGE)
     assert not [name for name in names(into) if name.endswith((".tar", ".piece"))]
     robot.close()
@@ -146,7 +146,7 @@ def test_interrupted_fetch_continues_from_its_last_piece(robot: LossyRobot, into
             path.unlink()
     robot.lost_at = lambda _: False
     fetch(robot, into)
-    assert names(into) == WHOLE
+    assert names(into) == ALL_FILES
     assert robot.pieces == [0, 1, 2, 2, 0, 1, 2]
     assert (into / "camera.bag").read_bytes() == LARGE[::-1]
 
@@ -161,7 +161,7 @@ def test_wrong_piece_of_an_earlier_fetch_is_detected_and_fetched_again(robot: Lo
     assert (into / "camera.bag").read_bytes() == LARGE[::-1]
 
 
-def test_more_than_expected_stays_on_the_robot_and_is_reported(
+def test_more_evidence_than_expected_is_not_fetched_and_is_reported(
     robot: LossyRobot, into: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fetching, "ALWAYS_ALLOWED_BYTES", 1000)
@@ -173,13 +173,13 @@ def test_more_than_expected_stays_on_the_robot_and_is_reported(
         fetch(robot, into, expected_bytes=1_000_000)
     assert robot.pieces == []
     assert (robot.home / FOLDER / "camera.bag").is_file()
-    fetch_again = into.with_name("again")
-    fetch_again.mkdir()
-    fetch(robot, fetch_again, expected_bytes=10_000_000)
-    assert names(fetch_again) == WHOLE
+    second_folder = into.with_name("again")
+    second_folder.mkdir()
+    fetch(robot, second_folder, expected_bytes=10_000_000)
+    assert names(second_folder) == ALL_FILES
 
 
-def test_more_than_the_free_space_stays_on_the_robot_and_is_reported(
+def test_more_evidence_than_the_free_space_is_not_fetched_and_is_reported(
     robot: LossyRobot, into: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(files, "free_bytes", lambda _: fetching.RESERVE_BYTES + 5_000_000)
@@ -188,12 +188,12 @@ def test_more_than_the_free_space_stays_on_the_robot_and_is_reported(
 
 
 def test_file_that_became_smaller_is_reported(robot: LossyRobot, into: Path) -> None:
-    def cut(number: int) -> bool:
+    def truncate_file(number: int) -> bool:
         if number == 1:
             os.truncate(robot.home / FOLDER / "camera.bag", PIECE_BYTES + 10)
         return False
 
-    robot.lost_at = cut
+    robot.lost_at = truncate_file
     with pytest.raises(EvidenceError, match=r"sent 10 bytes of camera\.bag from byte 4194304 on, instead of 4194304"):
         fetch(robot, into)
 
@@ -216,12 +216,12 @@ def test_unfetched_folders_are_not_deleted(robot: LossyRobot) -> None:
 class HostileShell(LocalShell):
     """A robot that sends any list of large files, and any hashes."""
 
-    def __init__(self, home: Path, large: str, hashes: bytes = b"") -> None:
+    def __init__(self, home: Path, large_list: str, hashes: bytes = b"") -> None:
         super().__init__(home)
         (home / "x").write_bytes(b"x")
         digest = hashlib.sha256(b"x").hexdigest()
         (home / ".sums-1").write_text(f"{digest}  x\n", encoding="ascii")
-        (home / ".large-1").write_text(large, encoding="utf-8")
+        (home / ".large-1").write_text(large_list, encoding="utf-8")
         self.hashes = hashes
 
     def fetch(self, argv: Sequence[str], to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
@@ -239,7 +239,7 @@ class HostileShell(LocalShell):
 
 
 @pytest.mark.parametrize(
-    ("large", "output_text"),
+    ("large_list", "message"),
     [
         ("100 ../../evil\n", "not a regular file"),
         ("100 /etc/evil\n", "not a regular file"),
@@ -253,13 +253,13 @@ class HostileShell(LocalShell):
     ],
 )
 def test_list_of_a_robot_cannot_leave_the_folder_or_fill_the_disk(
-    tmp_path: Path, large: str, output_text: str
+    tmp_path: Path, large_list: str, message: str
 ) -> None:
     home, into = tmp_path / "home", tmp_path / "outer" / "into"
     home.mkdir()
     into.mkdir(parents=True)
-    hashes = f"{hashlib.sha256(bytes(100)).hexdigest()}  {'x' if 'x' in large else 'y'}\n"
-    with pytest.raises((EvidenceError, RobotError), match=output_text):
-        fetching.fetch(HostileShell(home, large, hashes.encode()), FOLDER, "sender", "lo", into)
+    hashes = f"{hashlib.sha256(bytes(100)).hexdigest()}  {'x' if 'x' in large_list else 'y'}\n"
+    with pytest.raises((EvidenceError, RobotError), match=message):
+        fetching.fetch(HostileShell(home, large_list, hashes.encode()), FOLDER, "sender", "lo", into)
     assert [path.name for path in (tmp_path / "outer").iterdir()] == ["into"]
     assert names(into) <= {"x", ".sender.x.part"}

@@ -1,4 +1,4 @@
-"""Login by password: a real sshd with a password, a keyring, a person at a terminal; it is stored nowhere."""
+"""Login by password with a real sshd: the password is from a keyring or a person, and is stored nowhere."""
 
 import logging
 import shlex
@@ -33,7 +33,7 @@ roles:
 
 
 def site(access: str) -> str:
-    """Return a site of two robots, which are one server with two names."""
+    """Return a site file with two robots, which are the same server under two host names."""
     return SITE.format(access=access, same=f"{access.replace('127.0.0.1', 'localhost')}, address: 127.0.0.2")
 
 
@@ -54,16 +54,16 @@ class MemoryKeyring(KeyringBackend):
 
 
 @pytest.fixture
-def memory() -> Iterator[MemoryKeyring]:
-    before, keyring_in_memory = keyring.get_keyring(), MemoryKeyring()
+def memory_keyring() -> Iterator[MemoryKeyring]:
+    previous_keyring, keyring_in_memory = keyring.get_keyring(), MemoryKeyring()
     keyring.set_keyring(keyring_in_memory)
     yield keyring_in_memory
-    keyring.set_keyring(before)
+    keyring.set_keyring(previous_keyring)
 
 
 @pytest.fixture(scope="module")
 def password_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """A server with the root password `SECRET`, in a mount namespace with a separate shadow file."""
+    """Run a server with the root password `SECRET` in a mount namespace with a separate shadow file."""
     folder = tmp_path_factory.mktemp("passwords")
     crypt = subprocess.run(
         ("openssl", "passwd", "-6", "-stdin"), input=SECRET, capture_output=True, text=True, check=True
@@ -91,10 +91,10 @@ def test_password_logs_in_and_is_stored_nowhere(
 @pytest.mark.emulated
 def test_wrong_password_is_refused_and_not_shown(password_server: Server) -> None:
     shell = password_server.shell(private_key=None, password="wrong horse", host="10.1.2.3", port=2222)
-    with pytest.raises(RobotError, match="refused the login of 'root' with the password") as caught:
+    with pytest.raises(RobotError, match="refused the login of 'root' with the password") as error_info:
         shell.run(("true",), deadline=Deadline.after(20))
-    assert "ssh -p 2222 root@10.1.2.3" in caught.value.remedy
-    assert "wrong horse" not in str(caught.value)
+    assert "ssh -p 2222 root@10.1.2.3" in error_info.value.remedy
+    assert "wrong horse" not in str(error_info.value)
 
 
 @pytest.mark.emulated
@@ -118,49 +118,49 @@ def test_field_backend_prompts_once_per_robot_and_run(password_server: Server, t
     assert prompts == [("root", "localhost", "turtlebot-1"), ("root", "127.0.0.1", "duckiedrone-1")]
 
 
-def test_keyring_entry_is_user_at_host(memory: MemoryKeyring) -> None:
-    memory.set_password("fieldkit", "duckie@192.168.4.1", SECRET)
+def test_keyring_entry_is_user_at_host(memory_keyring: MemoryKeyring) -> None:
+    memory_keyring.set_password("fieldkit", "duckie@192.168.4.1", SECRET)
     assert passwords.read_from_keyring("duckie", "192.168.4.1", "duckiedrone-1") == SECRET
 
 
 @pytest.mark.parametrize("path", ["with", "without"])
 def test_missing_keyring_entry_is_reported_with_a_command(
-    memory: MemoryKeyring, path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    memory_keyring: MemoryKeyring, path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     program = tmp_path / "keyring"
     if path == "with":
         program.touch(mode=0o755)
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(ConfigurationError, match=r"no password for duckie@192\.168\.4\.1") as caught:
+    with pytest.raises(ConfigurationError, match=r"no password for duckie@192\.168\.4\.1") as error_info:
         passwords.read_from_keyring("duckie", "192.168.4.1", "duckiedrone-1")
-    keyring_of = "keyring" if path == "with" else f"{shlex.quote(sys.executable)} -m keyring"
-    assert caught.value.remedy == f"{keyring_of} set fieldkit duckie@192.168.4.1"
+    keyring_command = "keyring" if path == "with" else f"{shlex.quote(sys.executable)} -m keyring"
+    assert error_info.value.remedy == f"{keyring_command} set fieldkit duckie@192.168.4.1"
 
 
 def test_missing_keyring_is_reported() -> None:
-    before = keyring.get_keyring()
+    previous_keyring = keyring.get_keyring()
     keyring.set_keyring(keyring.backends.fail.Keyring())  # type: ignore[no-untyped-call]
     try:
         with pytest.raises(ConfigurationError, match="the keyring cannot be read"):
             passwords.read_from_keyring("duckie", "192.168.4.1", "duckiedrone-1")
     finally:
-        keyring.set_keyring(before)
+        keyring.set_keyring(previous_keyring)
 
 
 def test_missing_terminal_is_reported() -> None:
-    with pytest.raises(ConfigurationError, match="standard input is not a terminal") as caught:
+    with pytest.raises(ConfigurationError, match="standard input is not a terminal") as error_info:
         passwords.read_from_terminal("duckie", "192.168.4.1", "duckiedrone-1")
-    assert "keyring set fieldkit duckie@192.168.4.1" in caught.value.remedy
+    assert "keyring set fieldkit duckie@192.168.4.1" in error_info.value.remedy
 
 
-@pytest.mark.parametrize("written", [SECRET, "'ASK'", "71828182", "[s3same]"])
-def test_password_in_the_site_file_is_rejected_and_not_shown(tmp_path: Path, written: str) -> None:
+@pytest.mark.parametrize("password_text", [SECRET, "'ASK'", "71828182", "[s3same]"])
+def test_password_in_the_site_file_is_rejected_and_not_shown(tmp_path: Path, password_text: str) -> None:
     path = tmp_path / "fieldkit.yaml"
-    path.write_text(site(f"password: {written}"), encoding="utf-8")
-    with pytest.raises(ConfigurationError, match="a password must not be in a file") as caught:
+    path.write_text(site(f"password: {password_text}"), encoding="utf-8")
+    with pytest.raises(ConfigurationError, match="a password must not be in a file") as error_info:
         load_site(path)
-    message = f"{caught.value} {caught.value.__cause__}".replace(str(tmp_path), "")
-    assert written.strip("'[]") not in message
+    message = f"{error_info.value} {error_info.value.__cause__}".replace(str(tmp_path), "")
+    assert password_text.strip("'[]") not in message
 
 
 def test_key_and_password_together_are_rejected(tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ from tests.helpers.userlands import USERLANDS_OF_LONG_TESTS, userland_path
 SOON: Final = 60.0
 
 # The job script with a verb that runs the code of a test.
-OBEYS: Final = SCRIPT.replace(b'\nmain "$@"\n', b'\nleft() { eval "$1"; }\nmain "$@"\n')
+SCRIPT_WITH_EVAL: Final = SCRIPT.replace(b'\nmain "$@"\n', b'\nleft() { eval "$1"; }\nmain "$@"\n')
 
 
 def soon() -> Deadline:
@@ -74,15 +74,17 @@ class Robot:
 
 
 @contextmanager
-def robot(folder: Path, userland: str = "debian", *, script: bytes = OBEYS, **options: str) -> Iterator[Robot]:
+def robot(
+    folder: Path, userland: str = "debian", *, script: bytes = SCRIPT_WITH_EVAL, **options: str
+) -> Iterator[Robot]:
     """Run an SSH server whose sessions have this userland and a home in `folder`."""
     home = folder / "home"
     path = userland_path(userland, folder / "bin")
     (home / SCRIPT_PATH).parent.mkdir(parents=True)
     (home / SCRIPT_PATH).write_bytes(script)
     before = options.pop("before", ":")
-    words = f'{before}; cd {shlex.quote(str(home))} && PATH={path} && eval "$SSH_ORIGINAL_COMMAND"'
-    with sshd(folder, ForceCommand=words, **options) as server, ExitStack() as stack:
+    forced_command = f'{before}; cd {shlex.quote(str(home))} && PATH={path} && eval "$SSH_ORIGINAL_COMMAND"'
+    with sshd(folder, ForceCommand=forced_command, **options) as server, ExitStack() as stack:
         shell = server.shell()
         stack.callback(shell.close)
         yield Robot(shell, server, home)
@@ -116,12 +118,12 @@ COMMANDS: Final = [
 
 
 @pytest.mark.emulated
-def test_streams_and_exit_code_are_those_of_the_command(userland_robot: Robot) -> None:
+def test_streams_and_exit_code_of_commands_are_returned(userland_robot: Robot) -> None:
     pid = userland_robot.shell_pid()
     for code, exit_code, stdout, stderr in COMMANDS:
-        done = userland_robot.run(code, check=False)
-        assert (done.exit_code, done.stdout) == (exit_code, stdout), code
-        assert stderr is None or done.stderr == stderr, code
+        completed = userland_robot.run(code, check=False)
+        assert (completed.exit_code, completed.stdout) == (exit_code, stdout), code
+        assert stderr is None or completed.stderr == stderr, code
     assert userland_robot.pid() == pid, "the same shell continues"
 
 
@@ -133,8 +135,8 @@ def test_later_output_of_a_remaining_process_is_dropped(userland_robot: Robot) -
     )
     (userland_robot.home / "go").touch()
     wait_until((userland_robot.home / "went").exists, soon())
-    done = userland_robot.run("echo $$")
-    assert (done.stdout, done.stderr) == (f"{pid}\n".encode(), b"")
+    completed = userland_robot.run("echo $$")
+    assert (completed.stdout, completed.stderr) == (f"{pid}\n".encode(), b"")
 
 
 @pytest.mark.emulated
@@ -145,8 +147,8 @@ def test_long_command_does_not_block_others(debian_robot: Robot) -> None:
     assert session.is_ready
     assert debian_robot.pid() != pid
     (debian_robot.home / "go").touch()
-    done = session.end(deadline=soon(), check=False)
-    assert (done.exit_code, done.stdout) == (5, f"{pid}\n".encode())
+    completed = session.end(deadline=soon(), check=False)
+    assert (completed.exit_code, completed.stdout) == (5, f"{pid}\n".encode())
     assert debian_robot.pid() == pid
 
 
@@ -155,7 +157,7 @@ def test_held_command_reports_its_end_on_request(userland_robot: Robot) -> None:
     pid = userland_robot.shell_pid()
     session = userland_robot.shell.begin((*CALL, "left", ": >done; exit 5"), deadline=soon())
     wait_until((userland_robot.home / "done").exists, soon())
-    # It reads, or polls before it reads: proc_pid_syscall(5).
+    # The shell waits in read or poll, see proc_pid_syscall(5).
     wait_until(lambda: Path(f"/proc/{pid}/syscall").read_text().split()[0] in {"0", "7"}, soon())
     assert isinstance(session, SshSession)
     assert session._link_and_channel is not None
@@ -247,17 +249,17 @@ def test_command_whose_link_breaks_is_sent_again(debian_robot: Robot) -> None:
         streams.append(debian_robot.server.connect(timeout_s))
         return streams[-1]
 
-    again = Robot(debian_robot.server.shell(connect=connect), debian_robot.server, debian_robot.home)
-    again.shell_pid()
+    reconnecting_robot = Robot(debian_robot.server.shell(connect=connect), debian_robot.server, debian_robot.home)
+    reconnecting_robot.shell_pid()
     code = "echo >>starts; until [ -e go ] || [ ! -d $PWD ]; do sleep 0.01; done; echo over"
     with ThreadPoolExecutor(1) as pool:
-        done = pool.submit(again.run, code)
+        future = pool.submit(reconnecting_robot.run, code)
         wait_until((debian_robot.home / "starts").exists, soon())
         streams[-1].shutdown(socket.SHUT_RDWR)
         wait_until(lambda: (debian_robot.home / "starts").read_text() == "\n\n", soon())
         (debian_robot.home / "go").touch()
-        assert done.result(SOON).stdout == b"over\n"
-    again.shell.close()
+        assert future.result(SOON).stdout == b"over\n"
+    reconnecting_robot.shell.close()
     assert len(streams) == 2
 
 
@@ -266,34 +268,34 @@ def test_command_whose_link_breaks_is_sent_again(debian_robot: Robot) -> None:
 def test_opening_channels_are_awaited_before_a_measurement(
     debian_robot: Robot, monkeypatch: pytest.MonkeyPatch, owner: type, name: str
 ) -> None:
-    go, opened, opens = threading.Event(), threading.Event(), getattr(owner, name)
+    go, is_opened, original_open = threading.Event(), threading.Event(), getattr(owner, name)
 
-    def slowly(*args: object) -> object:
+    def open_after_go(*args: object) -> object:
         go.wait(SOON)
-        result = opens(*args)
-        opened.set()
+        result = original_open(*args)
+        is_opened.set()
         return result
 
     def measure() -> bool:
         with shell.silence(SOON):
-            return opened.is_set()
+            return is_opened.is_set()
 
     shell = debian_robot.server.shell(crosses_radio=True)
     shell.run(("true",), deadline=soon())
     shell._connection._link.wait_until_open(soon())  # type: ignore[union-attr]
-    monkeypatch.setattr(owner, name, slowly)
+    monkeypatch.setattr(owner, name, open_after_go)
     shell.run((*CALL, "left", ":"), deadline=soon())
     with ThreadPoolExecutor(1) as pool:
-        measured = pool.submit(measure)
-        wait_until(lambda: measured.done() or bool(shell._connection._silence_s()), soon())
+        measurement = pool.submit(measure)
+        wait_until(lambda: measurement.done() or bool(shell._connection._silence_s()), soon())
         go.set()
-        assert measured.result(SOON)
+        assert measurement.result(SOON)
     shell.close()
 
 
 @pytest.mark.emulated
 def test_nothing_is_opened_over_the_radio_during_a_measurement(debian_robot: Robot) -> None:
-    def opens_or_has() -> int:
+    def open_channels() -> int:
         link = shell._connection._link
         assert link is not None
         return len(link._spares)
@@ -301,14 +303,14 @@ def test_nothing_is_opened_over_the_radio_during_a_measurement(debian_robot: Rob
     shell = debian_robot.server.shell(crosses_radio=True)
     shell.run(("true",), deadline=soon())
     with shell.silence(SOON):
-        assert opens_or_has() == SPARE_CHANNELS
+        assert open_channels() == SPARE_CHANNELS
         shell.run(("true",), deadline=soon())
-        assert opens_or_has() == SPARE_CHANNELS - 1
+        assert open_channels() == SPARE_CHANNELS - 1
         shell.run((*CALL, "left", ":"), deadline=soon())
-        assert opens_or_has() == SPARE_CHANNELS - 2
+        assert open_channels() == SPARE_CHANNELS - 2
         assert shell._connection.shells._opener is None
     shell.run((*CALL, "left", ":"), deadline=soon())
-    assert opens_or_has() == SPARE_CHANNELS
+    assert open_channels() == SPARE_CHANNELS
     assert shell._connection.shells._opener is not None
     shell.close()
 
@@ -316,10 +318,10 @@ def test_nothing_is_opened_over_the_radio_during_a_measurement(debian_robot: Rob
 @pytest.mark.emulated
 @pytest.mark.parametrize("sessions", [1, 2, 3])
 def test_server_with_few_sessions_runs_commands_in_sequence(tmp_path: Path, sessions: int) -> None:
-    with robot(tmp_path, MaxSessions=str(sessions)) as few:
+    with robot(tmp_path, MaxSessions=str(sessions)) as limited_robot:
         for _ in range(3):
-            few.pid()
-            assert few.shell.run(("echo", "own"), deadline=soon()).stdout == b"own\n"
+            limited_robot.pid()
+            assert limited_robot.shell.run(("echo", "own"), deadline=soon()).stdout == b"own\n"
 
 
 @pytest.mark.emulated
@@ -330,8 +332,8 @@ def test_command_of_several_lines_uses_a_separate_session(debian_robot: Robot) -
 
 @pytest.mark.emulated
 def test_login_shell_with_a_greeting_uses_separate_sessions(tmp_path: Path) -> None:
-    with robot(tmp_path, before="echo welcome") as greeting:
-        answers = [greeting.run("echo $$").stdout.split() for _ in range(4)]
+    with robot(tmp_path, before="echo welcome") as greeting_robot:
+        answers = [greeting_robot.run("echo $$").stdout.split() for _ in range(4)]
     assert {answer[0] for answer in answers} == {b"welcome"}
     assert len({answer[1] for answer in answers}) == len(answers)
 
@@ -384,9 +386,9 @@ NONCE: Final = b"0123456789abcdef"
 OUTPUTS = st.lists(st.one_of(st.binary(), st.integers(1, 15).map(lambda n: NONCE[:n]))).map(b"".join)
 
 
-def split(data: bytes, at: Sequence[int]) -> list[bytes]:
-    edges = [0, *sorted(n % (len(data) + 1) for n in at), len(data)]
-    return [data[a:b] for a, b in pairwise(edges) if b > a]
+def split_at(data: bytes, positions: Sequence[int]) -> list[bytes]:
+    edges = [0, *sorted(n % (len(data) + 1) for n in positions), len(data)]
+    return [data[start:end_marker] for start, end_marker in pairwise(edges) if end_marker > start]
 
 
 CUTS = st.lists(st.integers(0, 1 << 16), max_size=6)
@@ -394,29 +396,32 @@ CUTS = st.lists(st.integers(0, 1 << 16), max_size=6)
 
 @given(st.tuples(OUTPUTS, CUTS), st.tuples(OUTPUTS, CUTS), st.integers(0, 255), st.binary(max_size=9))
 def test_output_and_exit_code_are_separated_for_any_pieces(
-    out: tuple[bytes, list[int]], err: tuple[bytes, list[int]], code: int, stray: bytes
+    out: tuple[bytes, list[int]], err: tuple[bytes, list[int]], code: int, stray_output: bytes
 ) -> None:
-    end = NONCE + f" {code}\n".encode()
-    begin = stray + NONCE + b"\n"
-    channel = ReceivedChannel(split(begin + out[0] + end + stray, out[1]), split(begin + err[0] + end, err[1]))
+    end_marker = NONCE + f" {code}\n".encode()
+    start_marker = stray_output + NONCE + b"\n"
+    channel = ReceivedChannel(
+        split_at(start_marker + out[0] + end_marker + stray_output, out[1]),
+        split_at(start_marker + err[0] + end_marker, err[1]),
+    )
     lock = threading.Lock()
     lock.acquire()
     try:
         running_command = wait_for_start(cast("Channel", channel), NONCE, lock)
-        into = BytesIO()
+        output = BytesIO()
         assert running_command is not None
         assert wait_for_output(running_command, out[0][:3], deadline=soon(), robot="robot")
-        done = drain(running_command, into, stdin=None, deadline=soon(), limit_bytes=1 << 20, robot="robot")
+        completed = drain(running_command, output, stdin=None, deadline=soon(), limit_bytes=1 << 20, robot="robot")
         running_command.close()
     finally:
         os.close(channel.event)
-    assert (into.getvalue(), done) == (out[0][3:], (code, err[0]))
+    assert (output.getvalue(), completed) == (out[0][3:], (code, err[0]))
     assert not lock.locked()
     assert not channel.closed
 
 
-@pytest.mark.parametrize("end", [b"\n", b" \n", b" 1234\n", b" -1\n", b" x\n", b"x 1\n", b" 1  \n"])
-def test_end_without_an_exit_code_is_an_error(end: bytes) -> None:
-    channel = ReceivedChannel([NONCE + b"\n" + NONCE + end + b"...."], [])
+@pytest.mark.parametrize("end_marker", [b"\n", b" \n", b" 1234\n", b" -1\n", b" x\n", b"x 1\n", b" 1  \n"])
+def test_end_without_an_exit_code_is_an_error(end_marker: bytes) -> None:
+    channel = ReceivedChannel([NONCE + b"\n" + NONCE + end_marker + b"...."], [])
     with pytest.raises(UnfitServerError, match="exit code"):
         wait_for_start(cast("Channel", channel), NONCE, threading.Lock())

@@ -1,4 +1,4 @@
-"""A robot loses its power right after a command: its confirmed records are on the disk."""
+"""A robot loses power immediately after a command: its confirmed records are on the disk."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,8 +21,8 @@ FOLDER = jobs.work_folder("trial-a", "tcp-01-1")
 
 
 @pytest.fixture
-def place(tmp_path: Path, untouched: NamespaceComparison) -> Iterator[Path]:
-    """A folder in memory, in separate mounts of the test."""
+def workspace(tmp_path: Path, untouched: NamespaceComparison) -> Iterator[Path]:
+    """Return a folder in memory, in a separate mount namespace."""
     with mount_workspace(tmp_path) as folder:
         yield folder
 
@@ -32,17 +32,17 @@ def place(tmp_path: Path, untouched: NamespaceComparison) -> Iterator[Path]:
     [*((file_system, "debian") for file_system in FILE_SYSTEMS), (STRICTEST, "busybox"), (STRICTEST, "bash")],
     ids=lambda value: value.name if isinstance(value, FileSystem) else value,
 )
-def test_robot_is_locked_after_a_power_failure(place: Path, file_system: FileSystem, userland: str) -> None:
-    path = userland_path(userland, place / "bin")
-    disk = Disk.make(file_system, place / "disk.img")
-    with disk.mounted(place / "disk") as mounted:
+def test_robot_is_locked_after_a_power_failure(workspace: Path, file_system: FileSystem, userland: str) -> None:
+    path = userland_path(userland, workspace / "bin")
+    disk = Disk.make(file_system, workspace / "disk.img")
+    with disk.mounted(workspace / "disk") as mounted:
         robot = LocalShell(mounted, path, "turtlebot-1")
         with locked({Role.SENDER: robot}, ANNA, sink=lambda _: None):
-            images = [disk.image(mounted, place / "locked.img")]
+            images = [disk.image(mounted, workspace / "locked.img")]
             evidence.begin(robot, FOLDER, "sender", "lo", token=ANNA.token)
-            images.append(disk.image(mounted, place / "begun.img"))
+            images.append(disk.image(mounted, workspace / "begun.img"))
     for image in images:
-        with image.repair().mounted(place / "disk") as mounted:
+        with image.repair().mounted(workspace / "disk") as mounted:
             robot = LocalShell(mounted, path, "turtlebot-1")
             with (
                 pytest.raises(RobotError, match="anna@one locked it"),

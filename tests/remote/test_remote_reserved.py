@@ -1,4 +1,4 @@
-"""Files that a robot must not send: those that only the laptop, its testbed or another robot writes."""
+"""Files that a robot must not send, because only the laptop, its testbed or another robot writes them."""
 
 import hashlib
 from itertools import product
@@ -19,7 +19,7 @@ from tests.remote.test_remote_fuzz import AnsweringRobot, entry
 
 PLAN = los_plan()
 OWNERS = FileOwners.of_procedure(PLAN.procedure, PLAN.scene(RepeatId(Protocol.UDP, 1), ""))
-OF_THE_LAPTOP = (
+LAPTOP_FILES = (
     *("medium.txt", "track.csv", "link.csv", "lateness.txt", "MANIFEST.sha256", "air.pcap", "air.csv"),
     *("answer-grass.txt", "receiver-unfetched.txt", "positions.json", "trial.yaml", "trial.csv", "journal.jsonl"),
     *(recoveries.fault_times_file(kind) for kind in FaultKind),
@@ -43,15 +43,15 @@ def test_files_of_the_robot_are_accepted(tmp_path: Path) -> None:
     assert (tmp_path / "ping.txt").exists()
 
 
-@pytest.mark.parametrize("name", OF_THE_LAPTOP)
+@pytest.mark.parametrize("name", LAPTOP_FILES)
 def test_files_of_the_laptop_are_rejected(name: str, tmp_path: Path) -> None:
     forms = product(("{}", "up.{}", "scan/{}", "scan/up.{}"), (name, name.upper(), name.title()))
     for number, (form, spelling) in enumerate(forms):
-        folder, wrong = tmp_path / str(number), form.format(spelling)
+        folder, forbidden_name = tmp_path / str(number), form.format(spelling)
         folder.mkdir()
         with pytest.raises(EvidenceError, match="only the laptop writes a file of this name"):
-            fetch(archive("ping.txt", wrong), folder)
-        assert not (folder / wrong).exists()
+            fetch(archive("ping.txt", forbidden_name), folder)
+        assert not (folder / forbidden_name).exists()
 
 
 def test_large_file_of_the_laptop_is_rejected(tmp_path: Path) -> None:
@@ -83,10 +83,12 @@ def test_files_of_another_robot_are_rejected(role: Role, name: str, tmp_path: Pa
         fetch(archive(name), tmp_path, role)
 
 
-@given(st.sampled_from(OF_THE_LAPTOP), st.lists(st.booleans(), min_size=30, max_size=30))
-def test_name_is_reserved_in_any_case(name: str, upper: list[bool]) -> None:
-    mixed = "".join(letter.upper() if up else letter for letter, up in zip(name, upper, strict=False))
-    assert laptop_files.is_reserved(mixed)
+@given(st.sampled_from(LAPTOP_FILES), st.lists(st.booleans(), min_size=30, max_size=30))
+def test_name_is_reserved_in_any_case(name: str, is_upper: list[bool]) -> None:
+    mixed_case = "".join(
+        letter.upper() if is_upper_letter else letter for letter, is_upper_letter in zip(name, is_upper, strict=False)
+    )
+    assert laptop_files.is_reserved(mixed_case)
 
 
 @pytest.mark.parametrize("name", ["sender-link.txt", "ping.txt", "my-track.csv.gz", "answers.txt", "x.trial.csv.bak"])

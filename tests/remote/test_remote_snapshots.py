@@ -1,6 +1,6 @@
-"""Snapshots of a robot's sources in each userland: outputs, failures, time limits and sizes.
+"""Snapshots of the state of a robot in each userland: outputs, failures, time limits and sizes.
 
-The sources are scripts that print real outputs.
+The programs that report the state are scripts that print real outputs.
 """
 
 import shlex
@@ -33,14 +33,14 @@ def shell(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[LocalShell
     wait_until(lambda: jobs.list_running(local_shell, Deadline.after(30)) == (), Deadline.after(60))
 
 
-def give(tmp_path: Path, name: str, text: str) -> None:
+def add_program(tmp_path: Path, name: str, text: str) -> None:
     """Add a program to the robot."""
     path = tmp_path / "bin" / name
     path.write_text(f"#!/bin/sh\n{text}\n", encoding="utf-8")
     path.chmod(0o755)
 
 
-def take(shell: LocalShell) -> snapshots.Snapshot:
+def take_snapshot(shell: LocalShell) -> snapshots.Snapshot:
     text = script.call(shell, "snapshot", deadline=Deadline.after(60)).decode()
     assert not [path for path in (shell.home / ".fieldkit").iterdir() if path.name.startswith(".sources")]
     return snapshots.parse(text)
@@ -48,7 +48,7 @@ def take(shell: LocalShell) -> snapshots.Snapshot:
 
 def test_snapshots_of_an_attempt_are_fetched(shell: LocalShell, tmp_path: Path) -> None:
     calls = tmp_path / "calls"
-    give(
+    add_program(
         tmp_path,
         "chronyc",
         f'echo "$*" >>{shlex.quote(str(calls))}; cat {shlex.quote(str(DATA))}/chrony/none-4.3.csv',
@@ -63,23 +63,25 @@ def test_snapshots_of_an_attempt_are_fetched(shell: LocalShell, tmp_path: Path) 
     assert calls.read_text().splitlines() == ["-n -c tracking"] * 2, "no names are resolved, and no call is repeated"
 
 
-def test_programs_that_hang_fail_or_flood_give_no_value_and_delay_little(shell: LocalShell, tmp_path: Path) -> None:
-    give(tmp_path, "chronyc", "sleep 600")
-    give(tmp_path, "pmc", "yes 'offset 0'")
+def test_programs_that_hang_or_flood_give_no_value_and_hardly_delay_a_snapshot(
+    shell: LocalShell, tmp_path: Path
+) -> None:
+    add_program(tmp_path, "chronyc", "sleep 600")
+    add_program(tmp_path, "pmc", "yes 'offset 0'")
     started_s = time.monotonic()
-    taken = take(shell)
+    snapshot = take_snapshot(shell)
     assert time.monotonic() - started_s < 20, "the limit is 2 s; this machine may be busy"
-    assert taken["chrony"].failure == "did not answer in time"
-    assert taken["ptp"].failure is not None
-    assert len(taken["ptp"].text) <= 64 * 1024
-    assert all(report.offset_s is None for report in clock_states.reports(taken))
+    assert snapshot["chrony"].failure == "did not answer in time"
+    assert snapshot["ptp"].failure is not None
+    assert len(snapshot["ptp"].text) <= 64 * 1024
+    assert all(report.offset_s is None for report in clock_states.reports(snapshot))
 
 
 def test_a_source_that_hung_is_not_started_again_in_the_trial(shell: LocalShell, tmp_path: Path) -> None:
     calls = tmp_path / "calls"
-    give(tmp_path, "chronyc", f"echo chronyc >>{shlex.quote(str(calls))}; exec sleep 600")
-    give(tmp_path, "iw", "exec sleep 600")
-    give(tmp_path, "pmc", f"echo pmc >>{shlex.quote(str(calls))}; echo 'code 137'")
+    add_program(tmp_path, "chronyc", f"echo chronyc >>{shlex.quote(str(calls))}; exec sleep 600")
+    add_program(tmp_path, "iw", "exec sleep 600")
+    add_program(tmp_path, "pmc", f"echo pmc >>{shlex.quote(str(calls))}; echo 'code 137'")
     folders = [FOLDER, jobs.work_folder("trial", "udp-02-1")]
     for number, folder in enumerate(folders):
         evidence.begin(shell, folder, "sender", "wlan0")
@@ -100,12 +102,12 @@ def test_a_source_that_hung_is_not_started_again_in_the_trial(shell: LocalShell,
     assert [path.name for path in (shell.home / ".fieldkit" / "trial").iterdir()] == [folders[1].rpartition("/")[2]]
 
 
-def test_a_robot_without_these_programs_reports_its_computer(shell: LocalShell, tmp_path: Path) -> None:
-    give(tmp_path, "chronyc", "exit 3")
+def test_a_robot_without_these_programs_reports_the_state_of_its_computer(shell: LocalShell, tmp_path: Path) -> None:
+    add_program(tmp_path, "chronyc", "exit 3")
     (tmp_path / "bin" / "chronyc").chmod(0o644)
-    taken = take(shell)
-    assert "chrony" not in taken
-    state = health.parse(taken)
+    snapshot = take_snapshot(shell)
+    assert "chrony" not in snapshot
+    state = health.parse(snapshot)
     assert state.all_ticks is not None
     assert state.busy_ticks is not None
     assert 0 < state.busy_ticks < state.all_ticks

@@ -1,4 +1,4 @@
-"""The SSH shell with a real OpenSSH server: faults that occur in the field, and the required reaction to each."""
+"""The SSH shell with a real OpenSSH server: faults that occur in the field, and the required reactions."""
 
 import hashlib
 import resource
@@ -35,19 +35,19 @@ def soon() -> Deadline:
     return Deadline.after(SOON)
 
 
-def test_output_streams_and_exit_code(shell: SshShell) -> None:
-    done = shell.run(("sh", "-c", "echo out; echo err >&2; exit 3"), deadline=soon(), check=False)
-    assert (done.exit_code, done.stdout, done.stderr) == (3, b"out\n", b"err\n")
+def test_output_streams_and_exit_code_are_returned(shell: SshShell) -> None:
+    completed = shell.run(("sh", "-c", "echo out; echo err >&2; exit 3"), deadline=soon(), check=False)
+    assert (completed.exit_code, completed.stdout, completed.stderr) == (3, b"out\n", b"err\n")
 
 
 def test_begin_returns_after_the_expected_output(shell: SshShell, tmp_path: Path) -> None:
     go = tmp_path / "go"
-    words = 'cat; sleep 0.2; echo up; until [ -e "$0" ]; do sleep 0.02; done; echo over; exit 4'
-    session = shell.begin(("sh", "-c", words, str(go)), deadline=soon(), until=b"up\n")
+    script = 'cat; sleep 0.2; echo up; until [ -e "$0" ]; do sleep 0.02; done; echo over; exit 4'
+    session = shell.begin(("sh", "-c", script, str(go)), deadline=soon(), until=b"up\n")
     assert session.is_ready
     go.touch()
-    done = session.end(deadline=soon(), check=False)
-    assert (done.exit_code, done.stdout) == (4, b"over\n")
+    completed = session.end(deadline=soon(), check=False)
+    assert (completed.exit_code, completed.stdout) == (4, b"over\n")
 
 
 def test_begin_returns_when_the_command_ended_without_the_output(shell: SshShell) -> None:
@@ -69,9 +69,9 @@ class CountingDeadline(Deadline):
 
 def test_wait_for_output_does_not_poll_because_of_standard_error(shell: SshShell, tmp_path: Path) -> None:
     go = tmp_path / "go"
-    words = 'echo why >&2; until [ -e "$0" ]; do sleep 0.02; done; echo up'
+    script = 'echo why >&2; until [ -e "$0" ]; do sleep 0.02; done; echo up'
     threading.Timer(0.5, go.touch).start()
-    session = shell.begin(("sh", "-c", words, str(go)), deadline=CountingDeadline.after(SOON), until=b"up\n")
+    session = shell.begin(("sh", "-c", script, str(go)), deadline=CountingDeadline.after(SOON), until=b"up\n")
     assert session.end(deadline=soon()).stderr == b"why\n"
     assert CountingDeadline.count < SOON
 
@@ -83,8 +83,8 @@ def test_command_without_output_causes_a_timeout(shell: SshShell) -> None:
 
 @pytest.mark.parametrize("sessions", [1, 2])
 def test_server_with_few_channels_runs_commands_in_sequence(tmp_path: Path, sessions: int) -> None:
-    with sshd(tmp_path, MaxSessions=str(sessions)) as few:
-        shell = few.shell()
+    with sshd(tmp_path, MaxSessions=str(sessions)) as limited_server:
+        shell = limited_server.shell()
         for number in range(5):
             assert shell.run(("echo", str(number)), deadline=soon()).stdout == f"{number}\n".encode()
         shell.close()
@@ -92,13 +92,13 @@ def test_server_with_few_channels_runs_commands_in_sequence(tmp_path: Path, sess
 
 def test_server_without_sessions_is_reported_and_not_polled(tmp_path: Path) -> None:
     notices: list[str] = []
-    with sshd(tmp_path, MaxSessions="0") as closed:
-        shell = closed.shell(reconnect_timeout_s=4.0, on_notice=notices.append)
-        with pytest.raises(LinkError, match="its SSH server opens no session") as caught:
+    with sshd(tmp_path, MaxSessions="0") as server_without_sessions:
+        shell = server_without_sessions.shell(reconnect_timeout_s=4.0, on_notice=notices.append)
+        with pytest.raises(LinkError, match="its SSH server opens no session") as error_info:
             shell.run(("true",), deadline=Deadline.after(4))
         shell.close()
-    assert "MaxSessions" in caught.value.remedy
-    assert len(notices) < 12, "two for each link that lasted, which takes 2 s"
+    assert "MaxSessions" in error_info.value.remedy
+    assert len(notices) < 12, "a link lasts 2 s and causes two notices"
 
 
 def test_failed_command_is_reported_with_its_output(shell: SshShell) -> None:
@@ -111,33 +111,33 @@ def test_failed_command_is_reported_with_its_output(shell: SshShell) -> None:
 def test_both_streams_may_exceed_all_windows(shell: SshShell) -> None:
     # Reading one stream while the other one fills up deadlocks paramiko (paramiko/paramiko#1778).
     script = "head -c 6000000 /dev/zero >&2; head -c 6000000 /dev/zero"
-    done = shell.run(("sh", "-c", script), deadline=soon())
-    assert len(done.stdout) == 6_000_000
-    assert done.stderr.strip(b"\0") == b""
+    completed = shell.run(("sh", "-c", script), deadline=soon())
+    assert len(completed.stdout) == 6_000_000
+    assert completed.stderr.strip(b"\0") == b""
 
 
 def test_standard_input_may_exceed_all_windows(shell: SshShell) -> None:
     data = bytes(range(256)) * 40_000
-    done = shell.run(("sha256sum",), stdin=data, deadline=soon())
-    assert done.stdout.split()[0].decode() == hashlib.sha256(data).hexdigest()
+    completed = shell.run(("sha256sum",), stdin=data, deadline=soon())
+    assert completed.stdout.split()[0].decode() == hashlib.sha256(data).hexdigest()
 
 
 def test_endless_command_causes_a_timeout(shell: SshShell, tmp_path: Path) -> None:
-    began = time.monotonic()
+    start_s = time.monotonic()
     with pytest.raises(LinkError, match="did not end in time"):
         shell.run(("sh", "-c", 'while [ -e "$0" ]; do sleep 0.1; done', str(tmp_path)), deadline=Deadline.after(0.5))
-    assert time.monotonic() - began < SOON
+    assert time.monotonic() - start_s < SOON
     tmp_path.rmdir()  # sshd does not terminate the command of a lost client
     assert shell.run(("echo", "again"), deadline=soon()).stdout == b"again\n"
 
 
 def test_wait_continues_after_this_process_was_suspended(shell: SshShell, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The clock of its deadline advances meanwhile, and the robot continues."""
+    """The clock of the deadline advances during the suspension, and the robot continues."""
     monotonic, wait = time.monotonic, select.select
     stopped_s: list[float] = []
 
-    def stop_once(read: list[int], write: list[int], other: list[int], wait_s: float) -> object:
-        ready = wait(read, write, other, wait_s)
+    def stop_once(read: list[int], write: list[int], exceptional: list[int], wait_s: float) -> object:
+        ready = wait(read, write, exceptional, wait_s)
         if not stopped_s:
             stopped_s.append(1000.0)
         return ready
@@ -160,10 +160,10 @@ def test_silent_server_causes_a_timeout(server: Server) -> None:
 def test_closed_port_is_a_link_error_with_a_remedy(server: Server) -> None:
     port = free_port()
     shell = server.shell(connect=lambda timeout_s: socket.create_connection(("127.0.0.1", port), timeout_s))
-    with pytest.raises(LinkError, match="cannot be reached for SSH: nothing listens") as caught:
+    with pytest.raises(LinkError, match="cannot be reached for SSH: nothing listens") as error_info:
         shell.run(("true",), deadline=soon())
-    assert caught.value.exit_code == 3
-    assert caught.value.remedy
+    assert error_info.value.exit_code == 3
+    assert error_info.value.remedy
 
 
 def test_changed_host_key_is_reported_with_both_fingerprints(server: Server, tmp_path: Path) -> None:
@@ -173,11 +173,11 @@ def test_changed_host_key_is_reported_with_both_fingerprints(server: Server, tmp
 
 
 def test_unauthorized_key_is_refused(server: Server, tmp_path: Path) -> None:
-    make_key(tmp_path / "stranger")
-    shell = server.shell(private_key=(tmp_path / "stranger").read_text(encoding="ascii"))
-    with pytest.raises(RobotError, match=r"refused the login of 'root' with 1 key") as caught:
+    make_key(tmp_path / "unauthorized")
+    shell = server.shell(private_key=(tmp_path / "unauthorized").read_text(encoding="ascii"))
+    with pytest.raises(RobotError, match=r"refused the login of 'root' with 1 key") as error_info:
         shell.run(("true",), deadline=soon())
-    assert "ssh-copy-id root@robot" in caught.value.remedy
+    assert "ssh-copy-id root@robot" in error_info.value.remedy
 
 
 @pytest.mark.parametrize("text", ["", "ssh-ed25519", "ssh-ed25519 !!!", "nonsense AAAA", "ssh-rsa AAAAC3NzaC1lZDI1"])
@@ -220,8 +220,8 @@ def test_fetch_writes_to_a_file_and_limits_its_size(shell: SshShell, tmp_path: P
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.text(st.characters(exclude_characters="\0", codec="utf-8"), max_size=20), min_size=1, max_size=5))
 def test_any_argument_arrives_unchanged(shell: SshShell, words: list[str]) -> None:
-    done = shell.run(("printf", "%s\\0", *words), deadline=soon())
-    assert done.stdout.decode().split("\0")[:-1] == words
+    completed = shell.run(("printf", "%s\\0", *words), deadline=soon())
+    assert completed.stdout.decode().split("\0")[:-1] == words
 
 
 def test_setup_files_and_variables_reach_the_command(shell: SshShell, tmp_path: Path) -> None:
@@ -236,20 +236,20 @@ def test_quote_keeps_plain_words() -> None:
 
 
 def test_quote_escapes_backslashes_for_fish() -> None:
-    """In single quotes of fish two backslashes are one, and one before the closing quote escapes it."""
+    """In single quotes of fish, two backslashes are one, and a backslash before the closing quote escapes it."""
     assert quote(("a\\b", "\\")) == """'a'"\\\\"'b' ''"\\\\"''"""
 
 
 @pytest.mark.parametrize(
-    ("output_text", "text"),
+    ("output", "text"),
     [
         (b"Subscribing to /scan\nRecording", "to /scan Recording"),
         (b"x" * 21, "x" * 20),
         (b"all of it is here", "all of it is here"),
     ],
 )
-def test_long_output_is_shortened_between_words(output_text: bytes, text: str) -> None:
-    assert printable(output_text, limit=20) == text
+def test_long_output_is_shortened_between_words(output: bytes, text: str) -> None:
+    assert printable(output, limit=20) == text
 
 
 @given(st.binary(max_size=200))

@@ -23,12 +23,12 @@ from tests.helpers.stored_trials import TRIALS
 from tests.helpers.tables import ROW, RepeatRow, parsed, repeats, replace, write
 
 LOSSY = next(TRIALS.glob("20261122T013134*"))
-OLD = DATA / "fieldkit" / "1" / "trial.csv"
+SCHEMA_1_TABLE = DATA / "fieldkit" / "1" / "trial.csv"
 
 
 @pytest.fixture
 def campaign(tmp_path: Path) -> Path:
-    """Eight trials: two distances, with and without a wall, both topologies."""
+    """Return a folder with eight trials: two distances, with and without a wall, in both topologies."""
     for distance, metres in (("30ft", 9.144), ("5m", 5.0)):
         for scenario in ("los", "nlos"):
             for topology in ("master", "masterless"):
@@ -45,8 +45,8 @@ def tcp_repeats(row: RepeatRow, count: int) -> list[RepeatRow]:
     return [replace(repeat, ip_loss=None) for repeat in repeats(row, count)]
 
 
-def output_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:
-    assert main(["aggregate", *words]) == 0
+def output_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert main(["aggregate", *arguments]) == 0
     return capsys.readouterr().out
 
 
@@ -95,9 +95,11 @@ def test_quantity_missing_in_some_repeats_has_its_count(
         assert "7 of 10" in output
 
 
-def test_different_procedures_of_one_name_cause_a_note(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_different_procedures_with_the_same_name_cause_a_note(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     identity = {"profiles_sha256": "aaaa", "code_sha256": "cccc"}
-    for name, procedure in (("one", "bbbb"), ("two", "dddd")):  # as for --record 1s and --record 15s
+    for name, procedure in (("one", "bbbb"), ("two", "dddd")):  # as after --record 1s and --record 15s
         write(tmp_path / name, repeats(replace(ROW, trial=name, procedure_sha256=procedure, **identity), 3))
     assert main(["aggregate", str(tmp_path), "--quantity", "ip_loss"]) == 0
     assert capsys.readouterr().err == "note: A procedure differs between its trials\n"
@@ -139,8 +141,8 @@ def test_json_and_csv_agree(campaign: Path, capsys: pytest.CaptureFixture[str]) 
 
 
 def test_cells_are_grouped_by_the_given_columns(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ("--by", "distance, scenario", "--quantity", "ip_loss", "--format", "csv")
-    lines = records(output_of(capsys, str(campaign), *words))
+    arguments = ("--by", "distance, scenario", "--quantity", "ip_loss", "--format", "csv")
+    lines = records(output_of(capsys, str(campaign), *arguments))
     keys = [(line["distance"], line["scenario"], line["n"], line["n_void"]) for line in lines]
     assert keys == [(distance, scenario, "8", "2") for distance in ("5m", "30ft") for scenario in ("los", "nlos")]
     assert {line["quantity"] for line in lines} == {"ip_loss"}
@@ -164,28 +166,30 @@ def test_table_shows_common_values_in_the_title_and_differences_in_columns(
 
 
 def test_width_gives_the_number_of_repeats_needed(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = (str(campaign), "--by", "protocol", "--width", "1%", "--width", "5 ms")
-    lines = records(output_of(capsys, *words, "--format", "csv"))
+    arguments = (str(campaign), "--by", "protocol", "--width", "1%", "--width", "5 ms")
+    lines = records(output_of(capsys, *arguments, "--format", "csv"))
     for line in lines:
         interval = Interval(*(float(line[name]) for name in ("value", "low", "high")))
         width = 0.01 if line["unit"] == "share" else 0.005
         assert line["more_wanted"] == str(additional_repeats(interval, int(line["n"]), width, Kind(line["estimate"])))
     assert {line["more_wanted"] == "0" for line in lines} == {True, False}
-    document = json.loads(output_of(capsys, *words, "--format", "json"))
+    document = json.loads(output_of(capsys, *arguments, "--format", "json"))
     counts = [estimate["more_wanted"] for cell in document["cells"] for estimate in cell["estimates"].values()]
     assert [str(count) for count in counts] == [line["more_wanted"] for line in lines]
     (loss,) = (line for line in lines if line["quantity"] == "ip_loss")
     assert re.search(
-        rf"\bmore\n.*\n *\d+ .* {loss['more_wanted']}\n", output_of(capsys, *words, "--quantity", "ip_loss")
+        rf"\bmore\n.*\n *\d+ .* {loss['more_wanted']}\n", output_of(capsys, *arguments, "--quantity", "ip_loss")
     )
 
 
-def test_trials_of_schema_1_are_aggregated_with_new_ones(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    new = write(tmp_path, repeats(ROW, 3))
-    lines = records(output_of(capsys, str(OLD), str(new), "--by", "protocol", "--format", "csv"))
+def test_trials_of_schema_1_are_aggregated_with_new_trials(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    new_table = write(tmp_path, repeats(ROW, 3))
+    lines = records(output_of(capsys, str(SCHEMA_1_TABLE), str(new_table), "--by", "protocol", "--format", "csv"))
     (loss,) = (line for line in lines if (line["protocol"], line["quantity"]) == ("udp", "ip_loss"))
-    lost, sent = 1 + 2 + 2 + 10 + 11 + 12, 3 * 16 + 3 * 216
-    assert (loss["n"], loss["events"], loss["trials"]) == ("6", str(lost), str(sent))
+    n_lost, n_sent = 1 + 2 + 2 + 10 + 11 + 12, 3 * 16 + 3 * 216
+    assert (loss["n"], loss["events"], loss["trials"]) == ("6", str(n_lost), str(n_sent))
 
 
 def markdown(text: str) -> list[list[str]]:
@@ -197,9 +201,9 @@ def test_markdown_table_has_equal_columns_in_all_lines(campaign: Path, capsys: p
     text = output_of(
         capsys, str(campaign), "--format", "markdown", "--quantity", "ip_loss", "--quantity", "rtt_median_s"
     )
-    head, rule, *body = markdown(text)
+    header, separator, *body = markdown(text)
     assert text.startswith("backend field; each value with its 95 % interval.\n\n| ")
-    assert head == [
+    assert header == [
         "scenario",
         "topology",
         "distance",
@@ -208,7 +212,7 @@ def test_markdown_table_has_equal_columns_in_all_lines(campaign: Path, capsys: p
         "IP packet loss (%)",
         "RTT, median (ms)",
     ]
-    assert rule == ["---"] * 5 + ["---:"] * 2
+    assert separator == ["---"] * 5 + ["---:"] * 2
     assert len(body) == 16
     assert {len(line) for line in body} == {7}
     assert body[1][:5] == ["los", "master", "5m", "udp", "4 valid, 1 void"]
@@ -219,10 +223,12 @@ def latex(text: str) -> tuple[str, list[list[str]]]:
     match = re.search(r"\\begin\{tabular\}\{(\w+)\}\n(.*)\\end\{tabular\}", text, re.DOTALL)
     assert match
     lines = [line.removesuffix(r" \\") for line in match[2].splitlines() if line.endswith(r" \\")]
-    return match[1], [[part for cell in re.split(r"(?<!\\) & ", line) for part in spanned(cell)] for line in lines]
+    return match[1], [
+        [part for cell in re.split(r"(?<!\\) & ", line) for part in spanned_cells(cell)] for line in lines
+    ]
 
 
-def spanned(cell: str) -> Sequence[str]:
+def spanned_cells(cell: str) -> Sequence[str]:
     match = re.fullmatch(r"\\multicolumn\{(\d+)\}\{c\}\{(.*)\}", cell)
     return [match[2]] * int(match[1]) if match else [cell]
 
@@ -242,8 +248,17 @@ def test_latex_has_rows_of_distances_and_columns_of_scenarios(
     ]
     assert [line[0] for line in lines[3:]] == ["5m", "30ft"]
     assert all(re.fullmatch(r"[\d.]+ \[[\d.]+, [\d.]+\]", figure) for line in lines[3:] for figure in line[1:])
-    ruled = re.findall(r"\\cmidrule\(lr\)\{(\d)-(\d)\}", text)
-    assert ["".join(ends) for ends in ruled] == ["25", "69", "23", "44", "55", "67", "88", "99"]
+    ruled_columns = re.findall(r"\\cmidrule\(lr\)\{(\d)-(\d)\}", text)
+    assert ["".join(column_range) for column_range in ruled_columns] == [
+        "25",
+        "69",
+        "23",
+        "44",
+        "55",
+        "67",
+        "88",
+        "99",
+    ]
     assert text.count("{") == text.count("}")
     assert text.count(r"\begin{") == text.count(r"\end{") == 2
     assert r"\caption{backend field, 8 valid repeats each; in brackets 95 \% intervals.}" in text
@@ -262,11 +277,11 @@ def test_latex_escapes_special_characters(tmp_path: Path, capsys: pytest.Capture
 def test_quantities_without_values_are_omitted_but_counts_remain(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    failed = str(write(tmp_path, [replace(ROW, status="failed")]))
-    assert re.search(r"^ *0 +0 +1$", output_of(capsys, failed), re.MULTILINE)
-    assert "| 1 failed |" in output_of(capsys, failed, "--format", "markdown")
-    assert json.loads(output_of(capsys, failed, "--format", "json"))["cells"][0]["n_failed"] == 1
-    assert main(["aggregate", failed, "--format", "latex"]) == 4
+    failed_trial = str(write(tmp_path, [replace(ROW, status="failed")]))
+    assert re.search(r"^ *0 +0 +1$", output_of(capsys, failed_trial), re.MULTILINE)
+    assert "| 1 failed |" in output_of(capsys, failed_trial, "--format", "markdown")
+    assert json.loads(output_of(capsys, failed_trial, "--format", "json"))["cells"][0]["n_failed"] == 1
+    assert main(["aggregate", failed_trial, "--format", "latex"]) == 4
     assert "no valid repeat has a value of rtt_median_s" in capsys.readouterr().err
-    assert main(["aggregate", failed, "--quantity", "jitter_s", "--format", "csv"]) == 0
+    assert main(["aggregate", failed_trial, "--quantity", "jitter_s", "--format", "csv"]) == 0
     assert "note: no valid repeat has jitter_s" in capsys.readouterr().err

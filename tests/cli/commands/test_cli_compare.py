@@ -19,8 +19,8 @@ from tests.helpers.tables import COMPARABLE, RepeatRow, bursty, replace, write
 TCP = replace(COMPARABLE, protocol="tcp")
 
 
-def compare(words: str) -> int:
-    return main(["compare", *words.split()])
+def compare(command_line: str) -> int:
+    return main(["compare", *command_line.split()])
 
 
 @pytest.fixture(autouse=True)
@@ -30,11 +30,11 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def field(lab: Path) -> list[RepeatRow]:
-    """Write a field trial and an emulated one with more loss and equal delay; return the rows of the first."""
+def field_rows(lab: Path) -> list[RepeatRow]:
+    """Write a field trial and an emulated trial with more loss and equal delay; return the rows of the former."""
     rows = bursty(COMPARABLE, 20, seed=1)
     write(lab / "field", rows)
-    worse = [
+    lossier_rows = [
         replace(
             row,
             backend="emulated",
@@ -45,7 +45,7 @@ def field(lab: Path) -> list[RepeatRow]:
         for row in rows
         for packets_received in ((row.ip_packets_received or 0) - 40,)
     ]
-    write(lab / "sim", worse)
+    write(lab / "sim", lossier_rows)
     return rows
 
 
@@ -83,9 +83,9 @@ def test_a_threshold_decides_the_exit_code(thresholds: str, code: int, capsys: p
 
 
 def test_condition_of_only_one_run_is_listed(
-    lab: Path, field: list[RepeatRow], capsys: pytest.CaptureFixture[str]
+    lab: Path, field_rows: list[RepeatRow], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write(lab / "more", [*field, *bursty(TCP, 20, seed=3)])
+    write(lab / "more", [*field_rows, *bursty(TCP, 20, seed=3)])
     assert compare("field more") == 0
     assert "not compared, because A has no such condition: los, master, 9.144 m, tcp" in capsys.readouterr().out
     assert compare("field more --format csv") == 0
@@ -95,9 +95,9 @@ def test_condition_of_only_one_run_is_listed(
 
 
 def test_runs_that_are_not_comparable_are_rejected_without_force(
-    lab: Path, field: list[RepeatRow], capsys: pytest.CaptureFixture[str]
+    lab: Path, field_rows: list[RepeatRow], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write(lab / "other", [replace(row, procedure_sha256="ffff", sent_bytes=293_797) for row in field])
+    write(lab / "other", [replace(row, procedure_sha256="ffff", sent_bytes=293_797) for row in field_rows])
     assert compare("field other") == 2
     output = capsys.readouterr()
     assert output.out == ""
@@ -119,15 +119,15 @@ def test_all_formats_agree(capsys: pytest.CaptureFixture[str]) -> None:
     for form in ("csv", "json", "markdown", "table"):
         assert compare(f"field sim --threshold ip_loss=2% --format {form}") == 1
         outputs[form] = capsys.readouterr().out
-    (loss,) = (row for row in csv.DictReader(outputs["csv"].splitlines()) if row["quantity"] == "ip_loss")
+    (csv_row,) = (row for row in csv.DictReader(outputs["csv"].splitlines()) if row["quantity"] == "ip_loss")
     document = json.loads(outputs["json"])
-    (same,) = (row for row in document["differences"] if row["quantity"] == "ip_loss")
+    (json_row,) = (row for row in document["differences"] if row["quantity"] == "ip_loss")
     assert document["missed"] is True
-    assert float(loss["difference"]) == pytest.approx(same["difference"]) == pytest.approx(40 / 216)
-    assert loss["within"] == "false"
-    assert loss["verdict"] == same["verdict"]
-    assert same["verdict"] in outputs["markdown"]
-    assert same["verdict"] in outputs["table"]
+    assert float(csv_row["difference"]) == pytest.approx(json_row["difference"]) == pytest.approx(40 / 216)
+    assert csv_row["within"] == "false"
+    assert csv_row["verdict"] == json_row["verdict"]
+    assert json_row["verdict"] in outputs["markdown"]
+    assert json_row["verdict"] in outputs["table"]
     for line in document["conclusions"]:
         assert line in outputs["markdown"]
         assert line in outputs["table"]
@@ -150,10 +150,10 @@ def test_a_lab_has_the_same_hashes_in_the_field_and_emulated(lab: Path) -> None:
     for name in ("field", "emulated"):
         cast = load_backend(name, site, document).cast(Topology.MASTERLESS)
         plans.append(make_plan(request, backend=name, cast=cast, now=datetime.now(UTC)))
-    field, emulated = plans
-    assert field.cast != emulated.cast
-    assert field.profiles_sha256 == emulated.profiles_sha256
-    assert field.procedure_sha256 == emulated.procedure_sha256
+    field_plan, emulated_plan = plans
+    assert field_plan.cast != emulated_plan.cast
+    assert field_plan.profiles_sha256 == emulated_plan.profiles_sha256
+    assert field_plan.procedure_sha256 == emulated_plan.procedure_sha256
 
 
 def test_more_than_two_runs_suggest_aggregate(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -167,7 +167,7 @@ def test_more_than_two_runs_suggest_aggregate(lab: Path, capsys: pytest.CaptureF
     capsys.readouterr()
     with pytest.raises(SystemExit):
         main(["compare", "--help"])
-    assert "A [B]\n" in capsys.readouterr().out, "it accepts two runs"
+    assert "A [B]\n" in capsys.readouterr().out, "the help shows two runs"
 
 
 def test_equal_inputs_give_equal_bytes(capsys: pytest.CaptureFixture[str]) -> None:
@@ -178,16 +178,16 @@ def test_equal_inputs_give_equal_bytes(capsys: pytest.CaptureFixture[str]) -> No
     assert outputs[0] == outputs[1]
 
 
-def far_away(lab: Path, field: list[RepeatRow], *names: str) -> None:
-    """Write the field trial at other distances, each into its folder."""
+def write_farther_trials(lab: Path, field_rows: list[RepeatRow], *names: str) -> None:
+    """Write the field trial at other distances into one folder per distance."""
     for number, name in enumerate(names, start=2):
-        write(lab / name, [replace(row, distance_m=9.144 * number, trial=name) for row in field])
+        write(lab / name, [replace(row, distance_m=9.144 * number, trial=name) for row in field_rows])
 
 
 def test_runs_that_differ_only_in_distance_compare_by_protocol(
-    lab: Path, field: list[RepeatRow], capsys: pytest.CaptureFixture[str]
+    lab: Path, field_rows: list[RepeatRow], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    far_away(lab, field, "far")
+    write_farther_trials(lab, field_rows, "far")
     assert compare("field far") == 2
     error_text = capsys.readouterr().err
     assert (
@@ -208,16 +208,18 @@ def test_runs_that_differ_only_in_distance_compare_by_protocol(
 
 
 def test_run_with_several_distances_does_not_compare(
-    lab: Path, field: list[RepeatRow], capsys: pytest.CaptureFixture[str]
+    lab: Path, field_rows: list[RepeatRow], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    far_away(lab, field, "far/two", "far/three")
+    write_farther_trials(lab, field_rows, "far/two", "far/three")
     assert compare("field far --by protocol") == 2
     assert "distance_m: A has 9.144, B has 18.288, 27.432" in capsys.readouterr().err
     assert compare("field far") == 2
     assert "or, to compare these: fieldkit compare field far --by protocol --force" in capsys.readouterr().err
 
 
-def test_different_distance_does_not_allow_other_differences(lab: Path, field: list[RepeatRow]) -> None:
-    write(lab / "other", [replace(row, distance_m=20.0, procedure_sha256="cccc", trial="other") for row in field])
+def test_different_distance_does_not_allow_other_differences(lab: Path, field_rows: list[RepeatRow]) -> None:
+    write(
+        lab / "other", [replace(row, distance_m=20.0, procedure_sha256="cccc", trial="other") for row in field_rows]
+    )
     assert compare("field other --by protocol") == 2
     assert compare("field other --by protocol --force") == 0

@@ -18,7 +18,7 @@ from tests.helpers.paths import ROOT
 LIMIT_S = 60.0
 BIN = Path(sys.executable).parent
 
-# The line typed, and the line after Tab.
+# The typed line, and the line after the Tab key.
 LINES = {
     "fieldkit tria": "fieldkit trial ",
     "fieldkit trial driv": "fieldkit trial driveaway ",
@@ -45,7 +45,7 @@ def environment(lab: Path) -> dict[str, str]:
 
 
 def completions(lab: Path, line: str) -> list[str]:
-    """Return the completions of a line, by the protocol of argcomplete."""
+    """Return the completions of a line, obtained by the protocol of argcomplete."""
     out = lab / "answer"
     variables = {"_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "COMP_LINE": line, "COMP_POINT": str(len(line))}
     variables |= {"_ARGCOMPLETE_STDOUT_FILENAME": str(out), "_ARGCOMPLETE_SUPPRESS_SPACE": "1"}
@@ -54,7 +54,7 @@ def completions(lab: Path, line: str) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("line", "words"),
+    ("line", "expected"),
     [
         ("fieldkit re", ["resume", "report", "rebuild"]),
         ("fieldkit lab s", ["shell", "sdf", "ssh-config"]),
@@ -76,8 +76,8 @@ def completions(lab: Path, line: str) -> list[str]:
         ("fieldkit campaign n", ["notes.txt"]),
     ],
 )
-def test_values_of_arguments_are_completed(lab: Path, line: str, words: list[str]) -> None:
-    assert completions(lab, line) == words
+def test_values_of_arguments_are_completed(lab: Path, line: str, expected: list[str]) -> None:
+    assert completions(lab, line) == expected
 
 
 def test_a_damaged_site_file_completes_nothing(lab: Path) -> None:
@@ -85,7 +85,7 @@ def test_a_damaged_site_file_completes_nothing(lab: Path) -> None:
     assert completions(lab, "fieldkit enroll ") == [""]
 
 
-def test_plan_file_name_equals_that_of_trials() -> None:
+def test_name_of_the_plan_file_equals_that_of_trials() -> None:
     assert completion.PLAN_FILE == PLAN_FILE
 
 
@@ -94,7 +94,7 @@ def test_unsupported_shell_is_rejected(capsys: pytest.CaptureFixture[str]) -> No
     assert "SHELL cannot be 'tcsh'; it is one of: bash, zsh, fish" in capsys.readouterr().err
 
 
-def after_tab(lab: Path, shell: list[str], setup: str, line: str) -> str:
+def output_after_tab(lab: Path, shell: list[str], setup: str, line: str) -> str:
     """Type a line and the Tab key into a shell at a pseudo-terminal; return the shell's output."""
     pid, terminal = pty.fork()
     if pid == 0:
@@ -134,14 +134,14 @@ def after_tab(lab: Path, shell: list[str], setup: str, line: str) -> str:
     ids=["bash", "zsh"],
 )
 def test_the_tab_key_completes_a_line(lab: Path, shell: list[str], setup: str, line: str) -> None:
-    assert LINES[line].removeprefix(line) in after_tab(lab, shell, setup, line)
+    assert LINES[line].removeprefix(line) in output_after_tab(lab, shell, setup, line)
 
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("line", LINES)
 def test_fish_completes_a_line(lab: Path, line: str) -> None:
     script = f"fieldkit completion fish | source; complete --do-complete '{line}'"
-    done = subprocess.run(
+    completed = subprocess.run(
         ["fish", "--no-config", "--command", script],
         cwd=lab,
         env=environment(lab),
@@ -150,4 +150,4 @@ def test_fish_completes_a_line(lab: Path, line: str) -> None:
         check=True,
         timeout=LIMIT_S,
     )
-    assert [word.split("\t")[0] for word in done.stdout.splitlines()] == [LINES[line].split()[-1]]
+    assert [word.split("\t")[0] for word in completed.stdout.splitlines()] == [LINES[line].split()[-1]]

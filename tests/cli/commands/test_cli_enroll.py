@@ -39,7 +39,7 @@ def fingerprint(folder: Path, name: str = "host") -> str:
     return subprocess.run(argv, capture_output=True, text=True, check=True).stdout.split()[1]
 
 
-def typing(monkeypatch: pytest.MonkeyPatch, *lines: str) -> None:
+def type_answers(monkeypatch: pytest.MonkeyPatch, *lines: str) -> None:
     answers = list(lines)
     monkeypatch.setattr("sys.stdin.isatty", lambda: True)
     monkeypatch.setattr("builtins.input", lambda: answers.pop(0))
@@ -49,7 +49,7 @@ def test_key_is_shown_and_pinned_after_confirmation(
     lab: Path, server: Server, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = lab.read_text(encoding="utf-8")
-    typing(monkeypatch, "maybe", "yes")
+    type_answers(monkeypatch, "maybe", "yes")
     assert main(["enroll", "turtlebot-1"]) == 0
     output = capsys.readouterr().out
     assert f"turtlebot-1 at 127.0.0.1 port {server.port} offers: ssh-ed25519 {fingerprint(server.folder)}" in output
@@ -62,7 +62,7 @@ def test_key_is_shown_and_pinned_after_confirmation(
 
 def test_answer_no_pins_nothing(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = lab.read_text(encoding="utf-8")
-    typing(monkeypatch, "no")
+    type_answers(monkeypatch, "no")
     assert main(["enroll", "turtlebot-1"]) == 1
     assert lab.read_text(encoding="utf-8") == before
 
@@ -80,8 +80,8 @@ def test_without_a_terminal_option_yes_is_required(
 def test_changed_key_is_an_error_with_both_fingerprints_without_replace(
     lab: Path, server: Server, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    other = " ".join(make_key(tmp_path / "other").split()[:2])
-    text = lab.read_text(encoding="utf-8").replace("    port:", f"    host_key: {other}  # of May\n    port:")
+    other_key = " ".join(make_key(tmp_path / "other").split()[:2])
+    text = lab.read_text(encoding="utf-8").replace("    port:", f"    host_key: {other_key}  # of May\n    port:")
     lab.write_text(text, encoding="utf-8")
     assert main(["enroll", "turtlebot-1", "--yes"]) == 3
     message = capsys.readouterr().err
@@ -90,7 +90,7 @@ def test_changed_key_is_an_error_with_both_fingerprints_without_replace(
     assert "fieldkit enroll turtlebot-1 --replace" in message
     assert lab.read_text(encoding="utf-8") == text
     assert main(["enroll", "turtlebot-1", "--yes", "--replace"]) == 0
-    assert lab.read_text(encoding="utf-8") == text.replace(other, key_of(server))
+    assert lab.read_text(encoding="utf-8") == text.replace(other_key, key_of(server))
 
 
 def test_invalid_pinned_key_is_only_replaced_with_option_replace(lab: Path, server: Server) -> None:

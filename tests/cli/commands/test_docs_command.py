@@ -1,4 +1,4 @@
-"""The command `fieldkit docs`: open a page, print its path, list all pages."""
+"""The command `fieldkit docs`: it opens a page, prints its path, or lists all pages."""
 
 import webbrowser
 
@@ -12,7 +12,7 @@ FIELD = ROOT / "docs" / "field.md"
 
 @pytest.fixture
 def opened_addresses(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The addresses passed to the browser."""
+    """Return the list of addresses passed to the browser."""
     addresses: list[str] = []
 
     def open_address(address: str) -> bool:
@@ -42,8 +42,8 @@ def test_the_path_is_printed_and_no_browser_opened(
 
 def test_topics_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["docs", "--list"]) == 0
-    listed = {line.split()[0] for line in capsys.readouterr().out.splitlines() if line.split()}
-    assert {"field", "errors", "reference", "steps"} <= listed
+    listed_topics = {line.split()[0] for line in capsys.readouterr().out.splitlines() if line.split()}
+    assert {"field", "errors", "reference", "steps"} <= listed_topics
 
 
 def test_path_is_shown_if_no_browser_is_available(

@@ -33,10 +33,10 @@ def test_a_capture_without_packets_is_undamaged(link_type: int) -> None:
     ],
 )
 def test_a_file_that_is_not_a_capture_is_rejected_with_a_remedy(data: bytes, message: str) -> None:
-    with pytest.raises(EvidenceError, match=message) as caught:
+    with pytest.raises(EvidenceError, match=message) as error_info:
         pcap.parse(data, where="sender.pcap")
-    assert caught.value.remedy
-    assert caught.value.where == "sender.pcap"
+    assert error_info.value.remedy
+    assert error_info.value.where == "sender.pcap"
 
 
 def test_each_format_has_the_first_bytes_that_its_module_reads() -> None:
@@ -59,46 +59,46 @@ RECORD = 16 + 40
 def test_a_truncated_file_gives_the_packets_before_the_cut() -> None:
     for size in range(24, len(VALID)):
         capture = pcap.parse(VALID[:size], where="x")
-        whole, rest = divmod(size - 24, RECORD)
-        assert capture.packets.tcp_seq.tolist() == [index * 100 for index in range(whole)]
-        inside = f"ends inside the packet at byte {24 + whole * RECORD}, after packet {whole}"
-        assert capture.damage == (inside if rest else None)
+        n_packets, n_remaining_bytes = divmod(size - 24, RECORD)
+        assert capture.packets.tcp_seq.tolist() == [index * 100 for index in range(n_packets)]
+        damage = f"ends inside the packet at byte {24 + n_packets * RECORD}, after packet {n_packets}"
+        assert capture.damage == (damage if n_remaining_bytes else None)
 
 
 @pytest.mark.parametrize(
-    ("at", "value"),
+    ("offset", "value"),
     [
         (4, b"\x00\xca\x9a\x3b"),  # 10^9 nanoseconds in a second
-        (8, b"\x01\x00\x04\x00" * 2),  # 262,145 bytes kept
-        (0, bytes(16)),  # zeros, as a power cut leaves them
-        (12, b"\x27\x00\x00\x00"),  # 39 bytes on the wire of which 40 were kept
+        (8, b"\x01\x00\x04\x00" * 2),  # 262,145 captured bytes
+        (0, bytes(16)),  # zeros, as after a power cut
+        (12, b"\x27\x00\x00\x00"),  # 39 bytes on the wire, but 40 captured bytes
     ],
 )
-def test_packets_before_a_broken_record_header_are_read_and_it_is_reported(at: int, value: bytes) -> None:
+def test_packets_before_a_broken_record_header_are_read_and_the_damage_is_reported(offset: int, value: bytes) -> None:
     start = 24 + 2 * RECORD
-    data = VALID[: start + at] + value + VALID[start + at + len(value) :]
+    data = VALID[: start + offset] + value + VALID[start + offset + len(value) :]
     capture = pcap.parse(data, where="x")
     assert capture.packets.tcp_seq.tolist() == [0, 100]
     assert capture.damage == f"no packet header at byte {start}, after packet 2"
 
 
 @given(st.integers(24, len(VALID) - 1), st.integers(0, 7))
-def test_a_flipped_bit_never_raises_and_keeps_the_packets_before_it(at: int, bit: int) -> None:
+def test_a_flipped_bit_raises_no_error_and_does_not_change_earlier_packets(offset: int, bit: int) -> None:
     data = bytearray(VALID)
-    data[at] ^= 1 << bit
+    data[offset] ^= 1 << bit
     capture = pcap.parse(bytes(data), where="x")
-    before = (at - 24) // RECORD
+    before = (offset - 24) // RECORD
     assert capture.packets.tcp_seq.tolist()[:before] == [index * 100 for index in range(before)]
 
 
 @given(st.binary(max_size=400))
-def test_arbitrary_records_never_raise(data: bytes) -> None:
+def test_arbitrary_records_raise_no_error(data: bytes) -> None:
     for link_type in LINK_TYPES:
         pcap.parse(file_bytes([], link_type=link_type) + data, where="x")
 
 
 def test_a_real_capture_of_the_papers_file_over_udp() -> None:
-    # 293,797 bytes through nc.traditional -u: 36 datagrams of 8,192 bytes, 215 fragments (field notes).
+    # Field notes: 293,797 bytes through nc.traditional -u are 36 datagrams of at most 8,192 bytes in 215 fragments.
     packets = pcap.read(TCPDUMP / "nc-udp.pcap").packets
     assert len(packets) == 215
     assert (packets.dport == 1234).sum() == 36
@@ -113,21 +113,21 @@ def test_a_real_capture_of_any_interface() -> None:
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("name", ["nc-udp", "nc-tcp"])
-def test_sizes_and_times_equal_what_tcpdump_prints(name: str) -> None:
+def test_sizes_and_times_equal_the_output_of_tcpdump(name: str) -> None:
     path = TCPDUMP / f"{name}.pcap"
-    printed = subprocess.run(
+    output_lines = subprocess.run(
         ["tcpdump", "-n", "-tt", "-v", "-r", str(path)], capture_output=True, text=True, check=True
     ).stdout.splitlines()
-    heads = [line for line in printed if "length" in line and line[0].isdigit()]
+    header_lines = [line for line in output_lines if "length" in line and line[0].isdigit()]
     packets = pcap.read(path).packets
-    lengths = [int(line.rsplit("length ", 1)[1].rstrip(")")) for line in heads]
+    lengths = [int(line.rsplit("length ", 1)[1].rstrip(")")) for line in header_lines]
     assert lengths == (packets.wire_bytes - 14).tolist()
-    stamps = [line.split()[0].replace(".", "") + "000" for line in heads]
+    stamps = [line.split()[0].replace(".", "") + "000" for line in header_lines]
     assert np.array(stamps).astype(np.int64).tolist() == packets.time_ns.tolist()
 
 
 def _checksum(header: bytes) -> int:
-    """The Internet checksum of RFC 1071, section 4.1, word by word; the header's own is 0."""
+    """Return the Internet checksum of RFC 1071, section 4.1. The checksum field of the header is 0."""
     total: int = sum(struct.unpack(f">{len(header) // 2}H", header))
     while total >> 16:
         total = (total & 0xFFFF) + (total >> 16)
@@ -153,14 +153,14 @@ def test_any_changed_bit_of_an_ipv4_header_makes_its_checksum_wrong(
     *numbers, addresses, options = fields
     words = 5 + len(options) // 4
     start = struct.pack(">BBHHHBB", 0x40 | words, *numbers)
-    right = _checksum(start + bytes(2) + addresses + options)
-    header = bytearray(start + struct.pack(">H", right) + addresses + options)
-    # The first byte has the version and the length of the header, which decide where the checksum and its words are.
+    correct_checksum = _checksum(start + bytes(2) + addresses + options)
+    header = bytearray(start + struct.pack(">H", correct_checksum) + addresses + options)
+    # The first byte is excluded: the version and the header length determine which bytes the checksum covers.
     bit = data.draw(st.integers(8, 8 * len(header) - 1))
     changed = header.copy()
     changed[bit // 8] ^= 1 << bit % 8
-    not_computed = header[:10] + bytes(2) + header[12:]
-    frames = timed([bytes(head) + bytes(20) for head in (header, changed, not_computed)])
+    without_checksum = header[:10] + bytes(2) + header[12:]
+    frames = timed([bytes(head) + bytes(20) for head in (header, changed, without_checksum)])
     packets = pcap.parse(file_bytes(frames, link_type=101), where="x").packets
     is_computed, is_decoded = any(changed[10:12]), int.from_bytes(changed[2:4]) >= len(header)
     expected = [False, *([is_computed] if is_decoded else []), False]

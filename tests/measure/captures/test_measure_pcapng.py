@@ -1,4 +1,4 @@
-"""pcapng: every block type with a packet, sections, interfaces, clocks, and damage at any position."""
+"""pcapng: all block types with packets, sections, interfaces, clocks, and damage at any position."""
 
 import struct
 from contextlib import suppress
@@ -47,17 +47,17 @@ def test_every_block_type_that_contains_a_packet(order: str) -> None:
 
 def test_a_simple_packet_has_the_snap_length_of_its_interface() -> None:
     packet = segment(7, 100)
-    for snap, captured, ported in ((0, 40, True), (40, 40, True), (24, 24, True), (23, 23, False)):
+    for snap, captured, has_ports in ((0, 40, True), (40, 40, True), (24, 24, True), (23, 23, False)):
         data = section() + interface(snap=snap) + simple(Frame(0, packet[:captured], wire_bytes=40))
         packets = pcap.parse(data, where="x").packets
-        assert (packets.dport == 1234).tolist() == [ported]
+        assert (packets.dport == 1234).tolist() == [has_ports]
         assert packets.tcp_seq.tolist() == [7 if captured == 40 else 0]
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
 def test_each_section_and_interface_has_its_own_byte_order_and_clock(order: str) -> None:
     ethernet = Frame(0, bytes(12) + b"\x08\x00" + segment(2, 100))
-    other = "<" if order == ">" else ">"
+    other_order = "<" if order == ">" else ">"
     data = b"".join([
         section(order=order),
         interface(order=order, resolution=9),
@@ -67,9 +67,9 @@ def test_each_section_and_interface_has_its_own_byte_order_and_clock(order: str)
         interface(147, order=order),
         enhanced(Frame(0, b"unknown"), ticks=5, number=2, order=order),
         obsolete(ethernet, ticks=6, number=1, order=order),
-        section(order=other),
-        interface(1, order=other, resolution=0),
-        enhanced(ethernet, ticks=7, order=other),
+        section(order=other_order),
+        interface(1, order=other_order, resolution=0),
+        enhanced(ethernet, ticks=7, order=other_order),
     ])  # fmt: skip
     capture = pcap.parse(data, where="x")
     assert (capture.frames, capture.frames - len(capture.packets), capture.damage) == (5, 1, None)
@@ -84,20 +84,20 @@ def test_each_section_and_interface_has_its_own_byte_order_and_clock(order: str)
 @example(9, T_NS, 3)
 def test_times_equal_exact_fractions(resolution: int, ticks: int, offset_s: int) -> None:
     base = 2 if resolution & 0x80 else 10
-    exact = Fraction(ticks, base ** (resolution & 0x7F)) + offset_s
-    expected = int(exact * 10**9 // 1)
-    # Times that do not fit into 64 bits may be wrong, but do not raise.
+    exact_s = Fraction(ticks, base ** (resolution & 0x7F)) + offset_s
+    expected = int(exact_s * 10**9 // 1)
+    # Times that do not fit into 64 bits may be wrong, but raise no error.
     data = section() + interface(resolution=resolution, offset_s=offset_s) + enhanced(_frame(1), ticks=ticks)
     times_ns = pcap.parse(data, where="x").packets.time_ns.tolist()
     assert times_ns == [expected] or abs(expected) >= 2**63
 
 
-def test_packets_of_unsupported_link_types_alone_are_rejected() -> None:
+def test_a_file_with_only_unsupported_link_types_is_rejected() -> None:
     data = section() + interface(147) + interface(148)
     assert pcap.parse(data, where="x").frames == 0
-    with pytest.raises(EvidenceError, match="link type 147, 148") as caught:
+    with pytest.raises(EvidenceError, match="link type 147, 148") as error_info:
         pcap.parse(data + enhanced(_frame(1), ticks=1), where="x")
-    assert caught.value.remedy
+    assert error_info.value.remedy
 
 
 BLOCKS = [
@@ -120,63 +120,63 @@ PACKET_ENDS = [ENDS[index] for index in (2, 3, 4, 8, 9, 11)]
 def test_a_truncated_file_gives_the_packets_before_the_cut() -> None:
     for size in range(28, len(VALID) + 1):
         capture = pcap.parse(VALID[:size], where="x")
-        complete = sum(end <= size for end in PACKET_ENDS)
-        assert capture.packets.tcp_seq.tolist() == list(range(complete))
+        n_complete = sum(end <= size for end in PACKET_ENDS)
+        assert capture.packets.tcp_seq.tolist() == list(range(n_complete))
         start = max(end for end in ENDS if end <= size)
-        inside = f"ends inside the block at byte {start}, after packet {complete}"
-        assert capture.damage == (None if size == start else inside)
+        damage = f"ends inside the block at byte {start}, after packet {n_complete}"
+        assert capture.damage == (None if size == start else damage)
 
 
-def _damaged(index: int, at: int, value: bytes) -> bytes:
+def _damage_block(index: int, offset: int, value: bytes) -> bytes:
     start = ENDS[index] - len(BLOCKS[index])
-    return VALID[: start + at] + value + VALID[start + at + len(value) :]
+    return VALID[: start + offset] + value + VALID[start + offset + len(value) :]
 
 
 @pytest.mark.parametrize(
-    ("index", "at", "value", "damage"),
+    ("index", "offset", "value", "damage"),
     [
         (3, 4, b"\x00\x00\x00\x00", "no block"),
         (3, 4, b"\x0b\x00\x00\x00", "no block"),
         (3, 4, b"\xff\xff\xff\xff", "ends inside the block"),
         (3, len(BLOCKS[3]) - 4, b"\x00", "no packet block"),
-        (3, 8, b"\x01\x00\x00\x00", "no packet block"),  # an interface that is not there
-        (3, 20, b"\xf0\x00\x00\x00", "no packet block"),  # more kept than there was
-        (3, 20, b"\x2d\x00\x00\x00", "no packet block"),  # more kept than is in the block
+        (3, 8, b"\x01\x00\x00\x00", "no packet block"),  # an interface that is not defined
+        (3, 20, b"\xf0\x00\x00\x00", "no packet block"),  # more captured than wire bytes
+        (3, 20, b"\x2d\x00\x00\x00", "no packet block"),  # more captured bytes than the block contains
         (5, len(BLOCKS[5]) - 4, b"\x00", "no block"),
         (6, 8, b"\x00", "no block"),
         (7, 4, b"\x00\x00\x00\x0c", "no block"),
         (7, 18, b"\xff\xff", "no block"),  # an option that is longer than its block
     ],
 )
-def test_packets_before_a_broken_block_are_read_and_it_is_reported(
-    index: int, at: int, value: bytes, damage: str
+def test_packets_before_a_broken_block_are_read_and_the_damage_is_reported(
+    index: int, offset: int, value: bytes, damage: str
 ) -> None:
-    capture = pcap.parse(_damaged(index, at, value), where="x")
+    capture = pcap.parse(_damage_block(index, offset, value), where="x")
     start = ENDS[index] - len(BLOCKS[index])
-    before = sum(end <= start for end in PACKET_ENDS)
-    assert capture.packets.tcp_seq.tolist() == list(range(before))
-    assert capture.damage == f"{damage} at byte {start}, after packet {before}"
+    n_before = sum(end <= start for end in PACKET_ENDS)
+    assert capture.packets.tcp_seq.tolist() == list(range(n_before))
+    assert capture.damage == f"{damage} at byte {start}, after packet {n_before}"
 
 
 @pytest.mark.parametrize(
-    "head", [b"\x0a\x0d\x0d\x0a", b"\x0a\x0d\x0d\x0a" + bytes(100), section()[:27], section()[:-1] + b"\x01"]
+    "header", [b"\x0a\x0d\x0d\x0a", b"\x0a\x0d\x0d\x0a" + bytes(100), section()[:27], section()[:-1] + b"\x01"]
 )
-def test_a_file_without_a_section_header_is_rejected(head: bytes) -> None:
-    with pytest.raises(EvidenceError, match="no complete section header") as caught:
-        pcap.parse(head, where="x.pcapng")
-    assert caught.value.remedy
+def test_a_file_without_a_section_header_is_rejected(header: bytes) -> None:
+    with pytest.raises(EvidenceError, match="no complete section header") as error_info:
+        pcap.parse(header, where="x.pcapng")
+    assert error_info.value.remedy
 
 
 @given(st.integers(0, len(VALID) - 1), st.integers(1, 255))
-def test_a_changed_byte_raises_only_evidence_error(at: int, change: int) -> None:
+def test_a_changed_byte_raises_only_evidence_error(offset: int, change: int) -> None:
     data = bytearray(VALID)
-    data[at] ^= change
+    data[offset] ^= change
     try:
         capture = pcap.parse(bytes(data), where="x")
     except EvidenceError:
         return
-    before = sum(end <= at for end in PACKET_ENDS)
-    assert capture.packets.tcp_seq.tolist()[:before] == list(range(before))
+    n_before = sum(end <= offset for end in PACKET_ENDS)
+    assert capture.packets.tcp_seq.tolist()[:n_before] == list(range(n_before))
 
 
 @given(st.binary(max_size=400))
@@ -187,10 +187,10 @@ def test_arbitrary_bytes_after_a_section_raise_only_evidence_error(data: bytes) 
 
 @pytest.mark.parametrize("definition", [interface(), section() + interface()])
 def test_a_file_with_too_many_definitions_is_rejected(definition: bytes) -> None:
-    few = section() + definition * 400 + enhanced(_frame(1), ticks=1)
-    assert pcap.parse(few, where="x").frames == 1
+    data = section() + definition * 400 + enhanced(_frame(1), ticks=1)
+    assert pcap.parse(data, where="x").frames == 1
     with pytest.raises(EvidenceError, match="more than 1000 sections and interfaces"):
-        pcap.parse(few + definition * 1000, where="x")
+        pcap.parse(data + definition * 1000, where="x")
 
 
 def test_a_packet_longer_than_any_snap_length_is_damage() -> None:
@@ -213,8 +213,8 @@ def test_both_formats_give_the_same_columns(records: list[tuple[int, int, int]])
         for index, (time_ns, size, captured) in enumerate(records)
     ]
     for order in ("<", ">"):
-        classic, blocks = (make(frames, order=order) for make in (file_bytes, file_bytes_of))
-        assert rows(pcap.parse(classic, where="x").packets) == rows(pcap.parse(blocks, where="x").packets)
+        classic, pcapng = (make(frames, order=order) for make in (file_bytes, file_bytes_of))
+        assert rows(pcap.parse(classic, where="x").packets) == rows(pcap.parse(pcapng, where="x").packets)
 
 
 @pytest.mark.parametrize("name", ["nc-udp", "nc-tcp", "any"])

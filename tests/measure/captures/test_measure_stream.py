@@ -1,4 +1,4 @@
-"""Captures read in chunks: equal to the whole file for every chunk size, with bounded memory."""
+"""Captures that are read in chunks equal the whole file for every chunk size, and need bounded memory."""
 
 import os
 import resource
@@ -36,25 +36,29 @@ def test_chunks_of_every_size_equal_the_whole_file(tmp_path: Path, name: str, st
     """CI uses every fifth size; 5 has no common divisor with the sizes of headers and the alignment of blocks."""
     path = tmp_path / "x"
     path.write_bytes(FILES[name])
-    frames = pcap.parse(FILES[name], where=str(path))
-    assert len(frames.packets) == frames.frames == {"empty": 0, "classic, broken": 6}.get(name, frames.frames)
+    whole_capture = pcap.parse(FILES[name], where=str(path))
+    assert (
+        len(whole_capture.packets)
+        == whole_capture.frames
+        == {"empty": 0, "classic, broken": 6}.get(name, whole_capture.frames)
+    )
     for chunk_bytes in range(1, len(FILES[name]) + 2, step):
         chunks = list(pcap.stream(path, chunk_bytes=chunk_bytes))
-        assert rows(Packets.concatenated(chunk.packets for chunk in chunks)) == rows(frames.packets)
-        assert sum(chunk.frames for chunk in chunks) == frames.frames
-        assert [chunk.damage for chunk in chunks] == [None] * (len(chunks) - 1) + [frames.damage]
-        assert chunk_bytes > 1 or name == "empty" or len(chunks) >= frames.frames
+        assert rows(Packets.concatenated(chunk.packets for chunk in chunks)) == rows(whole_capture.packets)
+        assert sum(chunk.frames for chunk in chunks) == whole_capture.frames
+        assert [chunk.damage for chunk in chunks] == [None] * (len(chunks) - 1) + [whole_capture.damage]
+        assert chunk_bytes > 1 or name == "empty" or len(chunks) >= whole_capture.frames
 
 
 @pytest.mark.parametrize("name", FILES)
 def test_concatenated_chunks_equal_the_whole_file(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """The number of packets per chunk is constant, or larger or smaller than in the first chunk."""
-    frames = pcap.parse(FILES[name], where="x")
+    whole_capture = pcap.parse(FILES[name], where="x")
     for chunk_bytes in (1, 100, 200, 1000):
         monkeypatch.setattr(pcap, "CHUNK_BYTES", chunk_bytes)
-        joined = pcap.parse(FILES[name], where="x")
-        assert rows(joined.packets) == rows(frames.packets)
-        assert (joined.frames, joined.damage) == (frames.frames, frames.damage)
+        joined_capture = pcap.parse(FILES[name], where="x")
+        assert rows(joined_capture.packets) == rows(whole_capture.packets)
+        assert (joined_capture.frames, joined_capture.damage) == (whole_capture.frames, whole_capture.damage)
 
 
 @pytest.mark.parametrize("name", ["nc-udp", "nc-tcp"])
@@ -81,7 +85,7 @@ def test_a_missing_or_empty_file_is_rejected(tmp_path: Path) -> None:
             next(pcap.stream(tmp_path / name))
 
 
-def test_columns_outlive_the_file(tmp_path: Path) -> None:
+def test_columns_remain_available_after_the_file_is_deleted(tmp_path: Path) -> None:
     path = tmp_path / "x.pcap"
     path.write_bytes(FILES["classic"])
     packets = pcap.read(path).packets
@@ -89,16 +93,16 @@ def test_columns_outlive_the_file(tmp_path: Path) -> None:
     assert len(packets) == 9
 
 
-SUM = """
+SUM_FRAMES = """
 import sys
 from pathlib import Path
 from fieldkit.measure.captures import pcap
 before = int(open("/proc/self/statm").read().split()[1])
-frames, most = 0, 0
+frames, max_pages = 0, 0
 for chunk in pcap.stream(Path(sys.argv[1]), chunk_bytes=1 << 20):
     frames += chunk.frames
-    most = max(most, int(open("/proc/self/statm").read().split()[1]))
-print(frames, most - before)
+    max_pages = max(max_pages, int(open("/proc/self/statm").read().split()[1]))
+print(frames, max_pages - before)
 """
 
 
@@ -106,10 +110,10 @@ def test_memory_does_not_grow_with_the_file(tmp_path: Path) -> None:
     path = tmp_path / "x.pcap"
     header, record = file_bytes([]), file_bytes(timed([segment(1, 0) + bytes(4000)]))[24:]
     path.write_bytes(header + record * 16_000)
-    printed = subprocess.run(
-        [sys.executable, "-c", SUM, str(path)], capture_output=True, text=True, check=True
+    output = subprocess.run(
+        [sys.executable, "-c", SUM_FRAMES, str(path)], capture_output=True, text=True, check=True
     ).stdout
-    frames, grown_pages = map(int, printed.split())
+    frames, grown_pages = map(int, output.split())
     assert frames == 16_000
     assert path.stat().st_size > 64e6
     assert grown_pages * resource.getpagesize() < 16e6

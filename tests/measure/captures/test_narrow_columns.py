@@ -1,4 +1,4 @@
-"""Columns of packets that are stored in few bytes and read as 64-bit integers."""
+"""Columns of packets are stored in few bytes, and read as 64-bit integers."""
 
 import numpy as np
 
@@ -9,8 +9,8 @@ from tests.helpers.captures import file_bytes, segment, timed
 PACKETS = pcap.parse(file_bytes(timed([segment(index, 100) for index in range(5)])), where="x").packets
 BYTES_PER_PACKET = 115
 EIGHT_BYTES = {"time_ns", "src", "dst", "tcp_stamp", "content"}
-"""Columns that need eight bytes: nanoseconds, halves of addresses, 32 bits and a special value, a hash."""
-WIDE = [np.dtype(kind) for kind in (np.int64, np.uint64, np.bool_)]
+"""Columns that need eight bytes: nanoseconds, halves of addresses, 32-bit values with a special value, and a hash."""
+WIDE_TYPES = [np.dtype(kind) for kind in (np.int64, np.uint64, np.bool_)]
 
 
 def test_a_packet_needs_few_bytes_and_is_read_as_64_bit_integers() -> None:
@@ -18,7 +18,7 @@ def test_a_packet_needs_few_bytes_and_is_read_as_64_bit_integers() -> None:
     assert bytes_per_packet < BYTES_PER_PACKET
     assert {name for name, column in vars(PACKETS).items() if column.dtype.itemsize == 8} == EIGHT_BYTES
     for name in vars(PACKETS):
-        assert getattr(PACKETS, name).dtype in WIDE, name
+        assert getattr(PACKETS, name).dtype in WIDE_TYPES, name
 
 
 def test_every_sequence_number_of_an_echo_is_stored() -> None:
@@ -35,7 +35,7 @@ def test_sums_of_columns_do_not_overflow() -> None:
     assert (largest.where(slice(0, 2)).tcp_seq == 2**32 - 1).all()
 
 
-def test_concatenated_rows_are_those_of_the_parts() -> None:
-    joined = Packets.concatenated([PACKETS, PACKETS.where(slice(1, 3))])
-    assert joined.sport.tolist() == [*PACKETS.sport.tolist(), *PACKETS.sport.tolist()[1:3]]
-    assert joined.echo.tolist() == [*PACKETS.echo.tolist(), *PACKETS.echo.tolist()[1:3]]
+def test_concatenated_packets_have_the_rows_of_all_parts() -> None:
+    all_packets = Packets.concatenated([PACKETS, PACKETS.where(slice(1, 3))])
+    assert all_packets.sport.tolist() == [*PACKETS.sport.tolist(), *PACKETS.sport.tolist()[1:3]]
+    assert all_packets.echo.tolist() == [*PACKETS.echo.tolist(), *PACKETS.echo.tolist()[1:3]]

@@ -1,4 +1,4 @@
-"""JSON of both ends of real tests has no contradiction in any version; one changed number is a contradiction."""
+"""JSON of both ends of real iperf3 tests has no contradiction in any version, but a changed number is one."""
 
 import copy
 import json
@@ -22,11 +22,11 @@ TESTS = ("tcp", "udp", "udp-reverse")
 NUMBERS = ("bytes", "seconds", "packets", "lost_packets", "retransmits")
 
 
-def document(version: str, test: str, end: str) -> Any:  # noqa: ANN401 (of JSON)
+def document(version: str, test: str, end: str) -> Any:  # noqa: ANN401 (any JSON)
     return json.loads((DATA / "iperf3" / version / f"{test}-{end}.json").read_text(encoding="utf-8"))
 
 
-def order(test: str) -> IperfSettings:
+def settings_of(test: str) -> IperfSettings:
     tcp = test == "tcp"
     protocol = Protocol.TCP if tcp else Protocol.UDP
     return IperfSettings(
@@ -34,13 +34,13 @@ def order(test: str) -> IperfSettings:
     )
 
 
-def contradictions(client: Any, server: Any, test: str) -> list[str]:  # noqa: ANN401 (of JSON)
+def contradictions(client: Any, server: Any, test: str) -> list[str]:  # noqa: ANN401 (any JSON)
     ends = [iperf3.parse(json.dumps(end)) for end in (client, server)]
     reverse = test.endswith("reverse")
-    local_ports = (
+    contradictions_of_ends = (
         iperf3_checks.check_one_end(end, sends=sends) for end, sends in zip(ends, (not reverse, reverse), strict=True)
     )
-    return [*chain(*local_ports), *iperf3_checks.compare_ends(ends[0], ends[1], order(test))]
+    return [*chain(*contradictions_of_ends), *iperf3_checks.compare_ends(ends[0], ends[1], settings_of(test))]
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -58,7 +58,7 @@ def test_both_ends_of_a_real_test_have_no_contradiction(version: str, test: str)
 def test_a_changed_number_in_an_interval_is_a_contradiction(
     version: str, test: str, end: str, change: tuple[int, str, float]
 ) -> None:
-    """The changed number is one from which columns are computed."""
+    """Columns are computed from the changed numbers."""
     number, key, factor = change
     ends = {name: document(version, test, name) for name in ("client", "server")}
     intervals = ends[end]["intervals"]
@@ -66,9 +66,9 @@ def test_a_changed_number_in_an_interval_is_a_contradiction(
     sends = (end == "client") != test.endswith("reverse")
     if key not in total or (sends and key in {"packets", "lost_packets"}):
         return
-    old = total[key]
-    total[key] = type(old)(old * factor)
-    if abs(total[key] - old) > (0.002 if key == "seconds" else 0):
+    old_value = total[key]
+    total[key] = type(old_value)(old_value * factor)
+    if abs(total[key] - old_value) > (0.002 if key == "seconds" else 0):
         assert (
             contradictions(ends["client"], ends["server"], test) or total[key] == 0 == intervals[-1]["sum"]["bytes"]
         )
@@ -78,9 +78,9 @@ def test_a_changed_number_in_an_interval_is_a_contradiction(
 def test_a_missing_interval_is_a_contradiction(version: str, test: str, number: int) -> None:
     ends = {name: document(version, test, name) for name in ("client", "server")}
     receiver = ends["client" if test.endswith("reverse") else "server"]
-    removed = receiver["intervals"].pop(number % len(receiver["intervals"]))
+    removed_interval = receiver["intervals"].pop(number % len(receiver["intervals"]))
     reasons = contradictions(ends["client"], ends["server"], test)
-    assert reasons or removed["sum"]["bytes"] == 0, "an interval without data changes no column"
+    assert reasons or removed_interval["sum"]["bytes"] == 0, "an interval without data changes no column"
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -92,14 +92,14 @@ def test_the_json_of_another_test_is_a_contradiction(version: str, test: str, en
     assert "they are different tests" in " ".join(contradictions(ends["client"], ends["server"], test))
 
 
-def changes_of_start() -> Iterator[tuple[str, Any, str]]:
+def changed_settings() -> Iterator[tuple[str, Any, str]]:
     yield "protocol", "SCTP", "another protocol"
     yield "num_streams", 7, "another streams"
     yield "reverse", 2, "another direction"
     yield "blksize", 64, "another datagram size"
 
 
-@pytest.mark.parametrize(("key", "value", "reason"), list(changes_of_start()))
+@pytest.mark.parametrize(("key", "value", "reason"), list(changed_settings()))
 @pytest.mark.parametrize("version", VERSIONS)
 def test_a_test_with_other_settings_is_a_contradiction(version: str, key: str, value: object, reason: str) -> None:
     ends = {name: document(version, "udp", name) for name in ("client", "server")}
@@ -108,13 +108,13 @@ def test_a_test_with_other_settings_is_a_contradiction(version: str, key: str, v
     assert reason in " ".join(contradictions(ends["client"], ends["server"], "udp"))
 
 
-def test_a_test_that_ended_too_early_or_is_from_another_time() -> None:
+def test_a_test_that_ended_early_or_started_at_another_time_is_reported() -> None:
     client, server = (iperf3.parse(json.dumps(document("3.12", "tcp", end))) for end in ("client", "server"))
-    (reason,) = iperf3_checks.compare_ends(client, server, replace(order("tcp"), duration_s=10.0))
+    (reason,) = iperf3_checks.compare_ends(client, server, replace(settings_of("tcp"), duration_s=10.0))
     assert reason == "the client's intervals last 3.0 s in total instead of 10 s"
-    began_ns = 10**9 * (client.start.start_utc_s or 0)
-    assert iperf3_checks.date_problem(client, (began_ns - 10**9, began_ns + 5 * 10**9)) is None
+    start_ns = 10**9 * (client.start.start_utc_s or 0)
+    assert iperf3_checks.date_problem(client, (start_ns - 10**9, start_ns + 5 * 10**9)) is None
     assert iperf3_checks.date_problem(client, None) is None
     hour_ns = 3600 * 10**9
-    late = iperf3_checks.date_problem(client, (began_ns - hour_ns, began_ns - hour_ns + 10**10))
-    assert late == "it began 3590 s after the attempt"
+    problem = iperf3_checks.date_problem(client, (start_ns - hour_ns, start_ns - hour_ns + 10**10))
+    assert problem == "it began 3590 s after the attempt"

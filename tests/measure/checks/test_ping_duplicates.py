@@ -40,7 +40,7 @@ class Echo:
         return Frame(START_NS + round(1e9 * INTERVAL_S) * self.seq + self.at_ns, cooked + packet)
 
 
-def captured(*echoes: Echo, more: bool = False) -> PingEchoes:
+def capture_echoes(*echoes: Echo, more: bool = False) -> PingEchoes:
     """Return the echoes in a capture on all interfaces."""
     frames = [echo.frame(more=more) for echo in echoes]
     return echoes_of(pcap.parse(file_bytes(frames, link_type=COOKED_V2), where="x"))
@@ -52,7 +52,7 @@ def echoes_of(capture: pcap.Capture) -> PingEchoes:
     return echoes
 
 
-def printed(*replies: tuple[int, bool]) -> Ping:
+def ping_output(*replies: tuple[int, bool]) -> Ping:
     lines = tuple(Reply(seq, 0.01, None, duplicate, damaged=False) for seq, duplicate in replies)
     return Ping(PAYLOAD_BYTES, lines, (), 10, len({seq for seq, _ in replies}), ())
 
@@ -63,7 +63,7 @@ def exchange(seqs: Sequence[int]) -> list[Echo]:
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.sampled_from([WIFI, CELL, 1 << 20])), max_size=30))
 def test_each_further_interface_of_a_packet_is_a_copy(arrivals: list[tuple[int, int]]) -> None:
-    requests = captured(*(Echo(REQUEST, seq, interface) for seq, interface in arrivals)).requests
+    requests = capture_echoes(*(Echo(REQUEST, seq, interface) for seq, interface in arrivals)).requests
     interfaces: dict[int, set[int]] = {}
     for seq, interface in arrivals:
         interfaces.setdefault(seq, set()).add(interface)
@@ -72,23 +72,29 @@ def test_each_further_interface_of_a_packet_is_a_copy(arrivals: list[tuple[int, 
 
 
 def test_copies_of_received_requests_and_replies_are_added() -> None:
-    receiver = captured(*exchange([1, 2]), Echo(REQUEST, 2, CELL), Echo(REQUEST, 1, WIFI), Echo(REPLY, 1, CELL))
-    sender = captured(*exchange([1, 2]), Echo(REPLY, 2, CELL), Echo(REPLY, 1, CELL), Echo(REQUEST, 1, CELL))
+    receiver = capture_echoes(*exchange([1, 2]), Echo(REQUEST, 2, CELL), Echo(REQUEST, 1, WIFI), Echo(REPLY, 1, CELL))
+    sender = capture_echoes(*exchange([1, 2]), Echo(REPLY, 2, CELL), Echo(REPLY, 1, CELL), Echo(REQUEST, 1, CELL))
     assert dict(ping_duplicates.measure(sender, receiver).values) == {"rtt_duplicates": 1 + 2}
 
 
 def test_captures_without_interfaces_or_with_fragments_give_no_number() -> None:
-    whole = captured(*exchange([1]))
-    bare = [Frame(frame.time_ns, frame.data[20:]) for frame in (echo.frame() for echo in exchange([1]))]
+    complete_capture = capture_echoes(*exchange([1]))
+    frames_without_interfaces = [
+        Frame(frame.time_ns, frame.data[20:]) for frame in (echo.frame() for echo in exchange([1]))
+    ]
     for sender, receiver, reason in (
-        (None, whole, "no complete capture"),
-        (whole, None, "no complete capture"),
-        (echoes_of(pcap.parse(file_bytes(bare), where="x")), whole, "does not contain interfaces"),
-        (whole, captured(Echo(REQUEST, 1, WIFI), more=True), "fragmented"),
+        (None, complete_capture, "no complete capture"),
+        (complete_capture, None, "no complete capture"),
+        (
+            echoes_of(pcap.parse(file_bytes(frames_without_interfaces), where="x")),
+            complete_capture,
+            "does not contain interfaces",
+        ),
+        (complete_capture, capture_echoes(Echo(REQUEST, 1, WIFI), more=True), "fragmented"),
     ):
-        measured = ping_duplicates.measure(sender, receiver)
-        assert not measured.values
-        assert reason in measured.missing["rtt_duplicates"]
+        measures = ping_duplicates.measure(sender, receiver)
+        assert not measures.values
+        assert reason in measures.missing["rtt_duplicates"]
     assert ping_duplicates.captured_echoes(None, SENDER, RECEIVER, PAYLOAD_BYTES + 8) is None
 
 
@@ -106,7 +112,7 @@ def test_captures_without_interfaces_or_with_fragments_give_no_number() -> None:
 def test_copies_are_compared_with_the_output_of_ping_and_with_the_answers(
     copies: list[Echo], lines: list[tuple[int, bool]], answers: list[Echo], reasons: list[str]
 ) -> None:
-    sender, receiver = captured(*exchange([1, 2]), *copies), captured(*exchange([1, 2]), *answers)
-    found = list(ping_duplicates.contradictions(printed(*lines), INTERVAL_S, sender, receiver))
-    assert len(found) == len(reasons)
-    assert all(reason in text for reason, text in zip(reasons, found, strict=True))
+    sender, receiver = capture_echoes(*exchange([1, 2]), *copies), capture_echoes(*exchange([1, 2]), *answers)
+    problems = list(ping_duplicates.contradictions(ping_output(*lines), INTERVAL_S, sender, receiver))
+    assert len(problems) == len(reasons)
+    assert all(reason in problem for reason, problem in zip(reasons, problems, strict=True))

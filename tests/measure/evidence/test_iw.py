@@ -35,17 +35,19 @@ def test_a_station_is_parsed_from_the_output_of_each_driver(name: str) -> None:
 
 
 def test_several_stations_are_parsed() -> None:
-    both = robot_link_samples.parse_stations(output("station-iwlwifi-6") + output("station-mt7603-6"))
-    assert both == (STATIONS["station-iwlwifi-6"], STATIONS["station-mt7603-6"])
+    stations = robot_link_samples.parse_stations(output("station-iwlwifi-6") + output("station-mt7603-6"))
+    assert stations == (STATIONS["station-iwlwifi-6"], STATIONS["station-mt7603-6"])
     assert [peer.signal_dbm for peer in robot_link_samples.parse_stations(output("stations-ap"))] == [-57.0]
-    other, peer = robot_link_samples.parse_stations(output("stations-hwsim-ap-6"))
-    assert (other.tx_packets, other.tx_failures, peer.tx_packets, peer.tx_failures) == (13, 7, 6, 0)
+    first_peer, peer = robot_link_samples.parse_stations(output("stations-hwsim-ap-6"))
+    assert (first_peer.tx_packets, first_peer.tx_failures, peer.tx_packets, peer.tx_failures) == (13, 7, 6, 0)
 
 
-def test_the_associated_access_point() -> None:
+def test_the_associated_access_point_is_parsed() -> None:
     assert robot_link_samples.parse_cell(output("link-rtl8812au")) == StationSample("xx:xx", -45.0, 216.7e6)
-    pi = robot_link_samples.parse_cell(output("link-station"))
-    assert pi == StationSample("f0:99:bf:0e:86:98", -65.0, 65e6, None, 1263, 25943), "a Raspberry Pi's brcmfmac"
+    raspberry_pi = robot_link_samples.parse_cell(output("link-station"))
+    assert raspberry_pi == StationSample("f0:99:bf:0e:86:98", -65.0, 65e6, None, 1263, 25943), (
+        "the driver brcmfmac of a Raspberry Pi"
+    )
     assert (
         robot_link_samples.parse_cell(output("link-none"))
         is robot_link_samples.parse_cell(output("link-ibss"))
@@ -80,21 +82,21 @@ def test_only_the_channel_in_use_is_parsed() -> None:
     )
 
 
-def test_a_line_of_proc_net_wireless_has_powers_if_they_are_valid() -> None:
-    def behind(name: str) -> str:
+def test_valid_powers_of_proc_net_wireless_are_parsed() -> None:
+    def values_of_last_line(name: str) -> str:
         return output(name).splitlines()[-1].partition(":")[2].lstrip()
 
-    assert robot_link_samples.parse_wireless(behind("wireless-iwlwifi")) == (-42.0, None)
-    assert robot_link_samples.parse_wireless(behind("wireless-hwsim")) == (-30.0, None)
-    assert robot_link_samples.parse_wireless(behind("wireless-percent")) == (None, None)
+    assert robot_link_samples.parse_wireless(values_of_last_line("wireless-iwlwifi")) == (-42.0, None)
+    assert robot_link_samples.parse_wireless(values_of_last_line("wireless-hwsim")) == (-30.0, None)
+    assert robot_link_samples.parse_wireless(values_of_last_line("wireless-percent")) == (None, None)
     assert robot_link_samples.parse_wireless("0000   54.  -56.  -91.        0") == (-56.0, -91.0)
 
 
 @given(st.sampled_from([*STATIONS, "link-station", "survey-mt7996-6"]), st.integers(0), st.binary(max_size=20))
-def test_a_changed_output_raises_no_error(name: str, at: int, with_: bytes) -> None:
+def test_a_changed_output_raises_no_error(name: str, offset: int, replacement: bytes) -> None:
     complete = output(name).encode()
-    at %= len(complete)
-    text = (complete[:at] + with_ + complete[at + len(with_) :]).decode(errors="replace")
+    offset %= len(complete)
+    text = (complete[:offset] + replacement + complete[offset + len(replacement) :]).decode(errors="replace")
     for peer in robot_link_samples.parse_stations(text):
         assert peer.signal_dbm is None or -1000 < peer.signal_dbm < 0
     robot_link_samples.parse_cell(text)

@@ -21,7 +21,7 @@ def output(name: str) -> str:
     return (DATA / "iw" / f"{name}.txt").read_text(encoding="utf-8")
 
 
-OWN_FRAMES = (
+SAMPLER_OUTPUT = (
     f"==> 101.00 link <==\n{output('link-station')}\n==> 101.00 survey <==\n{output('survey-mt7996-6')}"
     f"==> 101.00 station <==\n{output('station-iwlwifi-6')}"
     "==> 101.20 wireless <==\n0000   54.  -56.  -256        0      0      0      0      0        0\n"
@@ -58,7 +58,7 @@ SAMPLES = st.lists(
 
 
 @given(samples=st.dictionaries(st.sampled_from(FIXED_ROLES), SAMPLES.filter(bool)))
-def test_samples_of_a_testbed_are_read_as_written(
+def test_samples_of_a_testbed_are_written_and_read(
     samples: dict[Role, list[LinkSample]], tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     path = tmp_path_factory.mktemp("links") / link_samples.FILE
@@ -86,17 +86,17 @@ def test_a_truncated_file_of_a_testbed_is_an_error_and_an_earlier_format_is_read
     assert link_samples.read(path) == samples
 
 
-@pytest.mark.parametrize("packed", [False, True])
-def test_a_robots_file_is_read_with_its_clock_and_host_states(tmp_path: Path, packed: bool) -> None:
+@pytest.mark.parametrize("compressed", [False, True])
+def test_a_robots_file_is_read_with_its_clock_and_host_states(tmp_path: Path, compressed: bool) -> None:
     (tmp_path / "sender-before.txt").write_text(STATE + output("station-iwlwifi-6").replace("3441", "3431"))
     (tmp_path / "sender-after.txt").write_text(
         STATE.replace("100.00 ", "102.00 ").replace(f"{BOOTED_S + 100}", f"{BOOTED_S + 102}")
         + output("station-iwlwifi-6").replace("3441", "3461")
     )
-    if packed:
-        (tmp_path / "sender-link.txt.gz").write_bytes(gzip.compress(OWN_FRAMES.encode()))
+    if compressed:
+        (tmp_path / "sender-link.txt.gz").write_bytes(gzip.compress(SAMPLER_OUTPUT.encode()))
     else:
-        (tmp_path / "sender-link.txt").write_text(OWN_FRAMES, encoding="utf-8")
+        (tmp_path / "sender-link.txt").write_text(SAMPLER_OUTPUT, encoding="utf-8")
     samples_read = robot_link_samples.read(tmp_path, Role.SENDER)
     at_s = [item.utc_ns / S - BOOTED_S for item in samples_read]
     assert at_s == pytest.approx([100.0, 101.0, 101.2, 101.4, 102.0], abs=0.02)
@@ -111,23 +111,37 @@ def test_a_robots_file_is_read_with_its_clock_and_host_states(tmp_path: Path, pa
     assert samples_read[2].stations == (StationSample("", -56.0),)
 
 
-@given(st.integers(0, len(OWN_FRAMES)))
-def test_a_truncated_file_of_a_sampler_has_the_earlier_samples(at: int) -> None:
-    complete, cut = robot_link_samples.parse(OWN_FRAMES), robot_link_samples.parse(OWN_FRAMES[:at])
-    assert [item.utc_ns for item in cut] == [item.utc_ns for item in complete][: len(cut)]
-    for item, other in zip(cut, complete, strict=False):
+@given(st.integers(0, len(SAMPLER_OUTPUT)))
+def test_a_truncated_file_of_a_sampler_has_the_earlier_samples(end: int) -> None:
+    complete_samples, truncated = (
+        robot_link_samples.parse(SAMPLER_OUTPUT),
+        robot_link_samples.parse(SAMPLER_OUTPUT[:end]),
+    )
+    assert [item.utc_ns for item in truncated] == [item.utc_ns for item in complete_samples][: len(truncated)]
+    for item, complete_sample in zip(truncated, complete_samples, strict=False):
         for station in item.stations:
-            (same,) = (candidate for candidate in other.stations if candidate.station == station.station)
-            present = {name: value for name, value in vars(station).items() if value is not None}
-            later = {"tx_packets", "rx_packets", "signal_dbm", "tx_rate_bit_s"}  # `link` reports these first
-            assert all(value == getattr(same, name) for name, value in present.items() if name not in later)
+            (complete_station,) = (
+                candidate for candidate in complete_sample.stations if candidate.station == station.station
+            )
+            known_values = {name: value for name, value in vars(station).items() if value is not None}
+            changed_later = {
+                "tx_packets",
+                "rx_packets",
+                "signal_dbm",
+                "tx_rate_bit_s",
+            }  # `link` reports these values first
+            assert all(
+                value == getattr(complete_station, name)
+                for name, value in known_values.items()
+                if name not in changed_later
+            )
 
 
-def test_without_a_clock_or_a_file_there_are_no_samples(tmp_path: Path) -> None:
+def test_a_missing_clock_is_an_error_and_a_missing_file_has_no_samples(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="does not contain the clock"):
         robot_link_samples.read(tmp_path, Role.SENDER)
     (tmp_path / "sender-before.txt").write_text(STATE, encoding="utf-8")
     assert robot_link_samples.read(tmp_path, Role.SENDER) == ()
-    (tmp_path / "sender-link.txt.gz").write_bytes(gzip.compress(OWN_FRAMES.encode())[:-20])
+    (tmp_path / "sender-link.txt.gz").write_bytes(gzip.compress(SAMPLER_OUTPUT.encode())[:-20])
     with pytest.raises(EvidenceError, match="cannot be read"):
         robot_link_samples.read(tmp_path, Role.SENDER)

@@ -1,4 +1,4 @@
-"""Terminations of jobs recorded by a robot, and whether they are acceptable."""
+"""Recorded terminations of jobs on robots, and the terminations that are errors."""
 
 from collections.abc import Collection
 
@@ -7,7 +7,7 @@ import pytest
 from fieldkit.measure.evidence import endings
 from fieldkit.measure.evidence.endings import Cause, Ending
 
-NOTED = """\
+RECORDED = """\
 capture asked 0 1286133 12863.58
 ping itself 0 1286162 12863.48
 killed itself - 1285843 -
@@ -17,7 +17,7 @@ send limit 130 1286154 12981.58
 
 
 def test_recorded_terminations_are_parsed() -> None:
-    by_name = endings.parse(NOTED.splitlines())
+    by_name = endings.parse(RECORDED.splitlines())
     assert (by_name["capture"].cause, by_name["capture"].code) == (Cause.STOPPED, 0)
     assert by_name["capture"].duration_s == pytest.approx(2.25)
     assert by_name["killed"] == Ending(Cause.EXITED, None, None)
@@ -30,7 +30,7 @@ def test_other_lines_are_ignored(line: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "allowed", "least_s", "problem"),
+    ("line", "allowed_causes", "min_duration_s", "problem"),
     [
         ("job asked 0 100 9.00", {Cause.STOPPED}, 0.0, None),
         ("job itself 0 100 9.00", {Cause.STOPPED}, 0.0, "exited before fieldkit stopped it, with exit code 0"),
@@ -49,7 +49,7 @@ def test_other_lines_are_ignored(line: str) -> None:
         ("job running - 100 -", {Cause.EXITED}, 0.0, "was still running when the evidence was collected"),
     ],
 )
-def test_terminations_that_are_not_acceptable(
-    line: str, allowed: Collection[Cause], least_s: float, problem: str | None
+def test_a_termination_that_is_not_allowed_is_an_error(
+    line: str, allowed_causes: Collection[Cause], min_duration_s: float, problem: str | None
 ) -> None:
-    assert endings.termination_error(endings.parse([line])["job"], allowed, least_s) == problem
+    assert endings.termination_error(endings.parse([line])["job"], allowed_causes, min_duration_s) == problem

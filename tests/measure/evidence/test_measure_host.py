@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from fieldkit.measure.evidence import host
 from fieldkit.measure.evidence.host import Counters
 
-# Verbatim from a Linux 6.1 host, without other groups.
+# Output of a Linux 6.1 host, without other groups.
 STATE = """\
 ==> /proc/net/dev <==
 Udp: RcvbufErrors
@@ -31,10 +31,10 @@ def test_counters_are_read_from_their_section_and_group() -> None:
     assert (counters.udp_buffer_errors, counters.reassembly_failures) == (17, 3)
 
 
-def test_the_difference_is_after_minus_before() -> None:
+def test_the_difference_of_counters_is_after_minus_before() -> None:
     before, after = (host.parse(STATE.format(reassembly=n, buffer=10 * n)) for n in (3, 5))
-    moved = host.difference(before, after)
-    assert (moved.udp_buffer_errors, moved.reassembly_failures) == (20, 2)
+    change = host.difference(before, after)
+    assert (change.udp_buffer_errors, change.reassembly_failures) == (20, 2)
 
 
 def test_a_counter_that_is_missing_or_decreased_has_no_difference() -> None:
@@ -50,7 +50,7 @@ def test_a_state_without_counters_has_none(text: str) -> None:
 
 
 @given(st.text(), st.text(st.sampled_from("= \n/:UdpIp019RcvbufErrors"), max_size=80))
-def test_garbage_never_raises(text: str, snmp: str) -> None:
+def test_any_text_raises_no_error(text: str, snmp: str) -> None:
     host.parse(text)
     host.parse("==> /proc/net/snmp <==\n" + snmp)
 
@@ -65,7 +65,7 @@ def test_garbage_never_raises(text: str, snmp: str) -> None:
         ("==> /proc/net/snmp <==\ncubic\n", None),
     ],
 )
-def test_the_congestion_control_of_a_robot(text: str, name: str | None, tmp_path: Path) -> None:
+def test_the_congestion_control_of_a_robot_is_parsed(text: str, name: str | None, tmp_path: Path) -> None:
     file = tmp_path / "sender-before.txt"
     file.write_text(text, encoding="utf-8")
     assert host.congestion_control(file) == name

@@ -22,7 +22,7 @@ def output(version: str, test: str, end: str) -> str:
     return (DATA / "iperf3" / version / f"{test}-{end}.json").read_text(encoding="utf-8")
 
 
-def measured(version: str, test: str) -> dict[str, Any]:
+def measure_values(version: str, test: str) -> dict[str, Any]:
     sends, receives = ("server", "client") if test.endswith("reverse") else ("client", "server")
     sender, receiver = (iperf3.parse(output(version, test, end)) for end in (sends, receives))
     result = iperf3.measure(Protocol(test[:3]), sender, receiver)
@@ -33,10 +33,10 @@ def measured(version: str, test: str) -> dict[str, Any]:
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("test", ["udp", "udp-reverse"])
 def test_the_counts_of_a_udp_test_agree_in_all_versions(version: str, test: str) -> None:
-    values = measured(version, test)
+    values = measure_values(version, test)
     assert values["iperf3_received_bytes"] == PAYLOAD_BYTES * values["iperf3_datagrams_received"]
     assert values["iperf3_datagrams_sent"] == pytest.approx(values["iperf3_sent_bytes"] / PAYLOAD_BYTES, rel=0.02)
-    assert 0.01 < values["iperf3_loss"] < 0.1, "of 5 % on the radio"
+    assert 0.01 < values["iperf3_loss"] < 0.1, "the radio loses 5 %"
     assert values["iperf3_loss"] == 1 - values["iperf3_datagrams_received"] / values["iperf3_datagrams_sent"]
     assert values["iperf3_throughput_bit_s"] == pytest.approx(2e6 * (1 - values["iperf3_loss"]), rel=0.06)
     assert values["iperf3_interval_min_bit_s"] <= values["iperf3_interval_median_bit_s"]
@@ -46,12 +46,12 @@ def test_the_counts_of_a_udp_test_agree_in_all_versions(version: str, test: str)
 
 @pytest.mark.parametrize("version", VERSIONS)
 @pytest.mark.parametrize("test", ["udp", "udp-reverse"])
-def test_its_figures_equal_the_totals_of_the_receiver(version: str, test: str) -> None:
+def test_figures_equal_the_totals_of_the_receiver(version: str, test: str) -> None:
     """The totals are in the output of the client, where all versions report the receiver correctly."""
     end = json.loads(output(version, test, "client"))["end"]
-    values = measured(version, test)
-    lost = values["iperf3_datagrams_sent"] - values["iperf3_datagrams_received"]
-    assert lost == end["sum"]["lost_packets"]
+    values = measure_values(version, test)
+    n_lost = values["iperf3_datagrams_sent"] - values["iperf3_datagrams_received"]
+    assert n_lost == end["sum"]["lost_packets"]
     if "sum_received" in end:
         assert values["iperf3_received_bytes"] == pytest.approx(end["sum_received"]["bytes"], rel=0.07)
     assert values["iperf3_jitter_s"] == pytest.approx(end["sum"]["jitter_ms"] / 1e3, rel=1e-3)
@@ -59,7 +59,7 @@ def test_its_figures_equal_the_totals_of_the_receiver(version: str, test: str) -
 
 @pytest.mark.parametrize("version", VERSIONS)
 def test_the_counts_of_a_tcp_test_with_two_streams_agree(version: str) -> None:
-    values = measured(version, "tcp")
+    values = measure_values(version, "tcp")
     end = json.loads(output(version, "tcp", "client"))["end"]
     assert values["iperf3_sent_bytes"] == end["sum_sent"]["bytes"]
     assert values["iperf3_retransmits"] == end["sum_sent"]["retransmits"]
@@ -68,7 +68,7 @@ def test_the_counts_of_a_tcp_test_with_two_streams_agree(version: str) -> None:
     assert not {"iperf3_loss", "iperf3_datagrams_sent", "iperf3_jitter_s"} & values.keys()
     ports = [iperf3.parse(output(version, "tcp", end_name)).ports for end_name in ("client", "server")]
     assert len(ports[0]) == 2
-    assert ports[0] == tuple((own_port, other) for other, own_port in ports[1])
+    assert ports[0] == tuple((client_port, server_port) for server_port, client_port in ports[1])
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -108,7 +108,7 @@ def test_omitted_intervals_are_not_counted() -> None:
     assert iperf3.parse(json.dumps(data)).intervals == intervals[1:]
 
 
-def test_with_one_end_only_its_columns_have_values() -> None:
+def test_the_output_of_one_end_gives_only_its_columns() -> None:
     sender = iperf3.parse(output("3.12", "udp", "client"))
     result = iperf3.measure(Protocol.UDP, sender, None)
     assert set(result.values) == {"iperf3_sent_bytes"}
@@ -137,7 +137,7 @@ VALUES = st.recursive(
     connected=VALUES,
     protocol=st.sampled_from(Protocol),
 )
-def test_no_output_gives_an_impossible_value(
+def test_any_output_gives_only_possible_values(
     intervals: object, end: object, connected: object, protocol: Protocol
 ) -> None:
     text = json.dumps({"start": {"connected": connected}, "intervals": intervals, "end": end})

@@ -25,7 +25,7 @@ def test_all_lines_of_real_outputs_are_parsed() -> None:
         assert ping.read(path).unknown_lines == (), path.name
 
 
-def test_outputs_of_other_pings_are_parsed_except_foreign_lines() -> None:
+def test_outputs_of_other_ping_programs_are_parsed_except_for_messages_of_others() -> None:
     unknown = {
         path.name: ping.read(path).unknown_lines
         for path in (*(DATA / "busybox/1.35.0").glob("ping-[!a]*.txt"), *(DATA / "ping/20101006").iterdir())
@@ -37,7 +37,7 @@ def test_outputs_of_other_pings_are_parsed_except_foreign_lines() -> None:
     }
 
 
-def test_busyboxs_duplicate_counts_once_and_its_times_are_milliseconds() -> None:
+def test_a_duplicate_of_busybox_counts_once_and_its_times_are_in_milliseconds() -> None:
     result = ping.read(DATA / "busybox/1.35.0/ping-duplicates.txt")
     assert [(reply.seq, reply.duplicate) for reply in result.replies] == [
         (0, False),
@@ -54,14 +54,14 @@ def test_gaps_of_an_interrupted_busybox_run_start_from_0() -> None:
     assert ping.parse("\n".join(lines)).gaps == (0, 1)
 
 
-def test_a_normal_run() -> None:
-    moments = (1_795_206_644_916_480_000, 1_795_206_645_119_498_000, 1_795_206_645_323_428_000)
+def test_a_normal_output_is_parsed() -> None:
+    reply_times_ns = (1_795_206_644_916_480_000, 1_795_206_645_119_498_000, 1_795_206_645_323_428_000)
     times_s = (0.159 / 1e3, 0.054 / 1e3, 0.052 / 1e3)
     assert ping.read(OUTPUTS / "normal.txt") == Ping(
         payload_bytes=56,
         replies=tuple(
             Reply(seq, rtt_s, at_utc_ns, duplicate=False, damaged=False)
-            for seq, rtt_s, at_utc_ns in zip((1, 2, 3), times_s, moments, strict=True)
+            for seq, rtt_s, at_utc_ns in zip((1, 2, 3), times_s, reply_times_ns, strict=True)
         ),
         problems=(),
         transmitted=3,
@@ -97,7 +97,7 @@ def test_a_normal_run() -> None:
         ("unreachable", 56, 0, (4, 0), (1, 2, 3, 4)),
     ],
 )
-def test_real_outputs(
+def test_answers_and_gaps_of_real_outputs(
     name: str, payload_bytes: int, answers: int, summary: tuple[int | None, int | None], gaps: tuple[int, ...]
 ) -> None:
     result = ping.read(OUTPUTS / f"{name}.txt")
@@ -134,9 +134,9 @@ def test_gaps_of_an_interrupted_run_end_at_the_last_known_number() -> None:
     assert ping.parse("\n".join(lines)).gaps == (1, 3, 4)
 
 
-def test_a_truncated_line_is_kept_unchanged() -> None:
-    cut = "[1795206656.303416] 64 bytes from 127.0.0.1: icmp_seq=4 tt"
-    assert ping.parse(cut).unknown_lines == (cut,)
+def test_a_truncated_line_is_reported_unchanged() -> None:
+    truncated_line = "[1795206656.303416] 64 bytes from 127.0.0.1: icmp_seq=4 tt"
+    assert ping.parse(truncated_line).unknown_lines == (truncated_line,)
 
 
 def test_a_missing_output_is_an_evidence_error(tmp_path: Path) -> None:
@@ -144,7 +144,7 @@ def test_a_missing_output_is_an_evidence_error(tmp_path: Path) -> None:
         ping.read(tmp_path / "ping.txt")
 
 
-words = st.sampled_from([
+fragments = st.sampled_from([
     "PING ", "64 bytes from ", "10.0.0.1", ": icmp_seq=", ": icmp_req=", ": seq=", "icmp_seq=", "1",
     "9" * 5000, "٣", " ttl=", " time=", "1.0",
     " ms", " (DUP!)", "[", "]", "\n", "\r", "From ", " packets transmitted, ", " received, ", "\x00", "56(84)",
@@ -152,80 +152,92 @@ words = st.sampled_from([
 ])  # fmt: skip
 
 
-@given(st.one_of(st.text(), st.lists(words, max_size=30).map("".join)))
+@given(st.one_of(st.text(), st.lists(fragments, max_size=30).map("".join)))
 @example("64 bytes from 1: icmp_seq=" + "9" * 5000)
-def test_garbage_never_raises(text: str) -> None:
+def test_any_text_raises_no_error(text: str) -> None:
     result = ping.parse(text)
     assert len(result.answers) <= len(result.replies) <= text.count("\n") + 1
     assert len(result.gaps) <= 65536
 
 
 @given(st.binary())
-def test_bytes_that_are_not_text_never_raise(data: bytes) -> None:
+def test_bytes_that_are_not_text_raise_no_error(data: bytes) -> None:
     ping.parse(data.decode(errors="replace"))
 
 
 @given(st.data())
-def test_garbage_between_the_lines_of_a_real_run_changes_nothing(data: st.DataObject) -> None:
-    real = (OUTPUTS / "duplicates.txt").read_text(encoding="utf-8")
-    lines = real.split("\n")
+def test_other_lines_in_a_real_output_do_not_change_the_result(data: st.DataObject) -> None:
+    text = (OUTPUTS / "duplicates.txt").read_text(encoding="utf-8")
+    lines = text.split("\n")
     noise = st.text(st.characters(exclude_characters="\n"), min_size=1).filter(lambda line: "e" not in line)
-    at = data.draw(st.integers(0, len(lines)))
-    result = ping.parse("\n".join([*lines[:at], data.draw(noise), *lines[at:]]))
-    assert (result.replies, result.transmitted) == (ping.parse(real).replies, 3)
+    index = data.draw(st.integers(0, len(lines)))
+    result = ping.parse("\n".join([*lines[:index], data.draw(noise), *lines[index:]]))
+    assert (result.replies, result.transmitted) == (ping.parse(text).replies, 3)
 
 
-def answered(*seqs_ms: tuple[int, int], sent: int) -> Ping:
-    """A ping of `sent` requests with the times of its answers in ms."""
+def ping_with_answers(*seqs_ms: tuple[int, int], n_sent: int) -> Ping:
+    """Return a ping of `n_sent` requests with the times of its answers in ms."""
     replies = tuple(Reply(seq, 1e-3, at_ms * 1_000_000, duplicate=False, damaged=False) for seq, at_ms in seqs_ms)
-    return Ping(56, replies, (), sent, len(replies), ())
+    return Ping(56, replies, (), n_sent, len(replies), ())
 
 
 INTERVAL_S = 0.1
 
 
 def test_the_longest_gap_has_the_number_of_lost_requests() -> None:
-    gap = ping_gaps.longest_gap(answered((1, 100), (2, 201), (6, 640), (7, 700), (9, 900), sent=10), INTERVAL_S)
+    gap = ping_gaps.longest_gap(
+        ping_with_answers((1, 100), (2, 201), (6, 640), (7, 700), (9, 900), n_sent=10), INTERVAL_S
+    )
     assert gap == AnswerGap(0.439, 3, is_open=False)
-    assert ping_gaps.longest_gap(answered((1, 100), (2, 200), (3, 350), sent=3), INTERVAL_S) == AnswerGap(
+    assert ping_gaps.longest_gap(ping_with_answers((1, 100), (2, 200), (3, 350), n_sent=3), INTERVAL_S) == AnswerGap(
         0.15, 0, is_open=False
     )
     # A late answer creates no additional gap: the answer to 2 arrived after that to 3.
-    assert ping_gaps.longest_gap(answered((1, 100), (3, 300), (2, 310), sent=3), INTERVAL_S) == AnswerGap(
+    assert ping_gaps.longest_gap(ping_with_answers((1, 100), (3, 300), (2, 310), n_sent=3), INTERVAL_S) == AnswerGap(
         0.21, 0, is_open=False
     )
 
 
 @pytest.mark.parametrize(
-    ("ping_", "lasted_s", "lost", "is_open"),
+    ("ping_", "duration_s", "n_lost", "is_open"),
     [
-        pytest.param(answered((1, 100), (3, 300), sent=5), 0.2, 2, True, id="as long at the end as within"),
-        pytest.param(answered((1, 100), (4, 400), sent=5), 0.3, 2, False, id="a lost echo at the end"),
-        pytest.param(answered((1, 100), (2, 200), (3, 300), sent=26), 2.3, 23, True, id="down at the end"),
-        pytest.param(answered((24, 100), (25, 200), sent=25), 2.3, 23, True, id="down at the start"),
-        pytest.param(answered(sent=30), 3.0, 30, True, id="no answer at all"),
-        pytest.param(answered((1, 100), sent=12), 1.1, 11, True, id="a single answer"),
-        pytest.param(answered((1, 100), (31, 3100), sent=42), 3.0, 29, True, id="1 s down at the end, longer within"),
-        pytest.param(answered((65535, 100), (0, 200), (1, 300), sent=65537), 6553.4, 65534, True, id="16 bits"),
+        pytest.param(
+            ping_with_answers((1, 100), (3, 300), n_sent=5), 0.2, 2, True, id="as long at the end as within"
+        ),
+        pytest.param(ping_with_answers((1, 100), (4, 400), n_sent=5), 0.3, 2, False, id="a lost echo at the end"),
+        pytest.param(ping_with_answers((1, 100), (2, 200), (3, 300), n_sent=26), 2.3, 23, True, id="down at the end"),
+        pytest.param(ping_with_answers((24, 100), (25, 200), n_sent=25), 2.3, 23, True, id="down at the start"),
+        pytest.param(ping_with_answers(n_sent=30), 3.0, 30, True, id="no answer at all"),
+        pytest.param(ping_with_answers((1, 100), n_sent=12), 1.1, 11, True, id="a single answer"),
+        pytest.param(
+            ping_with_answers((1, 100), (31, 3100), n_sent=42), 3.0, 29, True, id="1 s down at the end, longer within"
+        ),
+        pytest.param(
+            ping_with_answers((65535, 100), (0, 200), (1, 300), n_sent=65537), 6553.4, 65534, True, id="16 bits"
+        ),
     ],
 )
-def test_a_gap_at_the_start_or_end_is_a_lower_bound(ping_: Ping, lasted_s: float, lost: int, is_open: bool) -> None:
+def test_a_gap_at_the_start_or_end_is_a_lower_bound(
+    ping_: Ping, duration_s: float, n_lost: int, is_open: bool
+) -> None:
     result = ping_gaps.longest_gap(ping_, INTERVAL_S)
-    assert result == AnswerGap(pytest.approx(lasted_s), lost, is_open)  # type: ignore[arg-type]
+    assert result == AnswerGap(pytest.approx(duration_s), n_lost, is_open)  # type: ignore[arg-type]
     values = ping_gaps.measure_gap(ping_, INTERVAL_S).values
     suffix = ("_at_least_s", "_lost_at_least") if is_open else ("_s", "_lost")
     assert values == {
-        f"rtt_gap{name}": pytest.approx(value) for name, value in zip(suffix, (lasted_s, lost), strict=True)
+        f"rtt_gap{name}": pytest.approx(value) for name, value in zip(suffix, (duration_s, n_lost), strict=True)
     }
 
 
-def test_the_numbers_of_a_long_ping_wrap() -> None:
+def test_sequence_numbers_of_a_long_ping_may_wrap() -> None:
     answers = [(seq & 0xFFFF, 100 * seq) for seq in range(1, 70_001) if not 66_000 < seq <= 66_010]
-    assert ping_gaps.longest_gap(answered(*answers, sent=70_000), INTERVAL_S) == AnswerGap(1.1, 10, is_open=False)
+    assert ping_gaps.longest_gap(ping_with_answers(*answers, n_sent=70_000), INTERVAL_S) == AnswerGap(
+        1.1, 10, is_open=False
+    )
 
 
 def test_without_time_stamps_there_is_no_gap() -> None:
-    assert ping_gaps.longest_gap(answered((1, 100), sent=1), INTERVAL_S) is None
+    assert ping_gaps.longest_gap(ping_with_answers((1, 100), n_sent=1), INTERVAL_S) is None
     assert ping_gaps.longest_gap(ping.read(DATA / "busybox/1.35.0/ping-duplicates.txt"), INTERVAL_S) is None
     columns = {column.name for column in (*ping_gaps.GAP_COLUMNS, *ping_gaps.OPEN_GAP_COLUMNS)}
     assert ping_gaps.measure_gap(None, INTERVAL_S).missing.keys() == columns
@@ -233,29 +245,31 @@ def test_without_time_stamps_there_is_no_gap() -> None:
 
 @given(st.lists(st.booleans(), min_size=1, max_size=60))
 def test_every_ping_has_either_a_gap_or_its_lower_bound(replies: list[bool]) -> None:
-    result = answered(*((seq, 100 * seq) for seq, arrived in enumerate(replies, 1) if arrived), sent=len(replies))
+    result = ping_with_answers(
+        *((seq, 100 * seq) for seq, is_answered in enumerate(replies, 1) if is_answered), n_sent=len(replies)
+    )
     measured = ping_gaps.measure_gap(result, INTERVAL_S)
-    longest_run = max((len(list(run)) for arrived, run in groupby(replies) if not arrived), default=0)
+    longest_run = max((len(list(run)) for is_answered, run in groupby(replies) if not is_answered), default=0)
     if len(replies) == 1 and replies[0]:
         assert not measured.values
     else:
-        (lost,) = (value for name, value in measured.values.items() if "lost" in name)
+        (n_lost,) = (value for name, value in measured.values.items() if "lost" in name)
         assert len(measured.values) == 2
-        assert lost == longest_run
+        assert n_lost == longest_run
 
 
 @given(st.lists(st.floats(0, 1, width=32), max_size=30), st.integers(0, 30))
-def test_the_median_of_all_requests_counts_a_lost_one_as_later_than_all(rtt_s: list[float], lost: int) -> None:
-    padded = sorted([*rtt_s, *[math.inf] * lost])
-    middle = padded[(len(padded) - 1) // 2 : len(padded) // 2 + 1]
-    expected = fmean(middle) if middle and math.inf not in middle else None
+def test_the_median_of_all_requests_counts_a_lost_request_as_infinitely_late(rtt_s: list[float], n_lost: int) -> None:
+    padded = sorted([*rtt_s, *[math.inf] * n_lost])
+    middle_values = padded[(len(padded) - 1) // 2 : len(padded) // 2 + 1]
+    expected = fmean(middle_values) if middle_values and math.inf not in middle_values else None
     assert quantile_of_sent(rtt_s, len(padded), 0.5) == (expected if expected is None else pytest.approx(expected))
 
 
 def test_a_ping_with_half_of_its_echoes_lost_has_no_median_of_all_requests() -> None:
-    def measured(sent: int) -> Measured:
-        return ping.measure(answered((1, 100), (2, 200), (3, 300), sent=sent))
+    def measure_values(n_sent: int) -> Measured:
+        return ping.measure(ping_with_answers((1, 100), (2, 200), (3, 300), n_sent=n_sent))
 
-    assert measured(3).values["rtt_median_sent_s"] == measured(3).values["rtt_median_s"]
-    assert measured(5).values["rtt_median_sent_s"] == 1e-3
-    assert "rtt_median_sent_s" in measured(6).missing
+    assert measure_values(3).values["rtt_median_sent_s"] == measure_values(3).values["rtt_median_s"]
+    assert measure_values(5).values["rtt_median_sent_s"] == 1e-3
+    assert "rtt_median_sent_s" in measure_values(6).missing

@@ -36,7 +36,7 @@ def output(tmp_path: Path) -> Path:
         ("mode", "text", "auto"),
     ],
 )
-def test_a_path_finds_a_value_of_its_column(output: Path, path: str, unit: str, value: object) -> None:
+def test_a_path_extracts_a_value_of_its_column(output: Path, path: str, unit: str, value: object) -> None:
     extracted = program_output.value(column(unit), program_output.at_path(output, path))
     assert (extracted, type(extracted)) == (value, type(value))
 
@@ -63,14 +63,14 @@ def test_an_invalid_value_is_an_error(extracted: object, unit: str, reason: str)
         program_output.value(column(unit), extracted)
 
 
-def test_a_number_as_text_is_accepted_and_words_are_sanitized() -> None:
+def test_a_number_as_text_is_accepted_and_texts_are_sanitized() -> None:
     assert program_output.value(column("V"), " 12.5\n") == 12.5
     assert program_output.value(column("count"), "1e3") == 1000
     assert program_output.value(column("text"), "a\x1b[31m\u202eb\r\nc" + 500 * "d").startswith("a?[31m?b c")  # type: ignore[union-attr]
     assert len(str(program_output.value(column("text"), 500 * "d"))) == 200
 
 
-def test_an_expression_finds_the_first_match_of_its_group(output: Path) -> None:
+def test_an_expression_extracts_the_first_match_of_its_group(output: Path) -> None:
     output.write_text("signal: -61 dBm\nnoise: -95 dBm\nsignal: -70 dBm\n", encoding="utf-8")
     assert program_output.by_expression(output, r"^signal: (-?[0-9]+)") == "-61"
     assert program_output.by_expression(output, r"(?s).*signal: (-?[0-9]+)") == "-70"
@@ -78,7 +78,7 @@ def test_an_expression_finds_the_first_match_of_its_group(output: Path) -> None:
 
 
 def test_an_expression_with_catastrophic_backtracking_is_fast(output: Path) -> None:
-    """Python's `re` needs 2^100000 steps for this expression."""
+    """The module `re` of Python would need 2^100000 steps for this expression."""
     output.write_text(100_000 * "a" + "b", encoding="utf-8")
     assert program_output.by_expression(output, r"^(a+)+$") is None
 

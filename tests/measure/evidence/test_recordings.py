@@ -1,4 +1,4 @@
-"""Recordings: their readers are found by the suffix of the file."""
+"""Recordings: the suffix of a file selects its reader."""
 
 from collections.abc import Iterator
 from pathlib import Path

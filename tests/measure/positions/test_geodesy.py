@@ -1,4 +1,4 @@
-"""Conversion of coordinates compared with PROJ, which uses other formulas."""
+"""Conversion of coordinates compared with PROJ, which uses different formulas."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ LONGITUDES = st.floats(-180, 180)
 
 
 @given(LATITUDES, LONGITUDES, st.floats(0, 360), st.floats(0, 1000))
-def test_up_to_a_kilometre_the_distance_equals_the_geodesic_within_a_millimetre(
+def test_distances_up_to_a_kilometre_equal_the_geodesic_within_a_millimetre(
     latitude: float, longitude: float, azimuth: float, distance_m: float
 ) -> None:
     to_longitude, to_latitude, _ = EARTH.fwd(longitude, latitude, azimuth, distance_m)
@@ -25,5 +25,5 @@ def test_up_to_a_kilometre_the_distance_equals_the_geodesic_within_a_millimetre(
 
 @given(LATITUDES, LONGITUDES, st.floats(-500, 10_000))
 def test_coordinates_with_heights_equal_those_of_proj(latitude: float, longitude: float, height_m: float) -> None:
-    (place_m,) = ecef_m(np.array([latitude]), np.array([longitude]), np.array([height_m]))
-    assert place_m == pytest.approx(TO_CENTRE.transform(longitude, latitude, height_m), abs=1e-6)
+    (position_m,) = ecef_m(np.array([latitude]), np.array([longitude]), np.array([height_m]))
+    assert position_m == pytest.approx(TO_CENTRE.transform(longitude, latitude, height_m), abs=1e-6)

@@ -1,4 +1,4 @@
-"""Sources of positions and their precedence; clocks, frames and heights; damaged files of sources."""
+"""Sources of positions: their precedence, clocks, frames and heights, and damaged files of sources."""
 
 import json
 import math
@@ -26,7 +26,7 @@ ORACLE = (
     TrackPoint(BEGAN_NS, SENDER, (0.0, 0.0, 0.2)),
     TrackPoint(BEGAN_NS, RECEIVER, (100.0, 0.0, 0.2)),
 )
-AWAY = [odometry(BEGAN_NS + n * S, float(n), 0.0) for n in range(5)]
+MOVING_AWAY = [odometry(BEGAN_NS + n * S, float(n), 0.0) for n in range(5)]
 """Odometry of a robot that moves away at 1 m/s for 4 s."""
 ODOMETRY = PositionSource(
     file="track.bag", topic="/where", start=(10.0, 0.0, 0.0), heading_rad=0.0, began_utc_ns=BEGAN_NS, gap_s=1.5
@@ -64,7 +64,7 @@ def test_sources_of_the_trial_precede_those_of_the_attempt_and_of_the_testbed(at
     assert mean_m(attempt) == "the positions of the robots are unknown"
     (attempt / track.FILE).write_text(track.text(ORACLE), encoding="ascii")
     assert mean_m(attempt) == pytest.approx(100)
-    write_bag(attempt, AWAY)
+    write_bag(attempt, MOVING_AWAY)
     write_sources(attempt, {SENDER: ORIGIN_SOURCE, RECEIVER: ODOMETRY})
     assert mean_m(attempt) == pytest.approx(12)
     assert recorded_positions.sources_text(AttemptEvidence(attempt)) == "sender as placed, receiver /where"
@@ -76,7 +76,7 @@ def test_sources_of_the_trial_precede_those_of_the_attempt_and_of_the_testbed(at
     assert mean_m(attempt) == pytest.approx(32)
     later = PositionSource(file="positions-receiver.csv", offset_s=-1.0)
     write_sources(trial, {SENDER: local, RECEIVER: later})
-    assert mean_m(attempt) == pytest.approx(33), "each line was so a second before"
+    assert mean_m(attempt) == pytest.approx(33), "each position was recorded a second earlier"
     write_sources(trial, {RECEIVER: later})
     assert (
         mean_m(attempt)
@@ -96,17 +96,21 @@ def test_sources_of_the_trial_precede_those_of_the_attempt_and_of_the_testbed(at
 def test_times_of_robots_are_converted_to_one_clock(
     attempt: Path, clocks: Mapping[Role, float], metres: float
 ) -> None:
-    wrong_ns = round(1e9 * clocks.get(RECEIVER, 0.0)) if clocks.get(RECEIVER) == -3600 else 0
-    write_bag(attempt, [odometry(BEGAN_NS + wrong_ns + n * S, float(n), 0.0) for n in range(-1, 6)], late_ns=wrong_ns)
+    clock_error_ns = round(1e9 * clocks.get(RECEIVER, 0.0)) if clocks.get(RECEIVER) == -3600 else 0
+    write_bag(
+        attempt,
+        [odometry(BEGAN_NS + clock_error_ns + n * S, float(n), 0.0) for n in range(-1, 6)],
+        late_ns=clock_error_ns,
+    )
     start = PositionSource(
         file="track.bag",
         topic="/where",
         start=(10.0, 0.0, 0.0),
         heading_rad=0.0,
-        began_utc_ns=BEGAN_NS - round(1e9 * clocks.get(RECEIVER, 0.0)) * (not wrong_ns),
+        began_utc_ns=BEGAN_NS - round(1e9 * clocks.get(RECEIVER, 0.0)) * (not clock_error_ns),
     )
     write_sources(attempt, {SENDER: ORIGIN_SOURCE, RECEIVER: start}, clocks)
-    begin_s, end_s = (1.0 + wrong_ns / 1e9, 3.0 + wrong_ns / 1e9)
+    begin_s, end_s = (1.0 + clock_error_ns / 1e9, 3.0 + clock_error_ns / 1e9)
     assert mean_m(attempt, begin_s, end_s) == pytest.approx(metres)
     assert recorded_positions.clock_error_s(AttemptEvidence(attempt)) == (
         pytest.approx(0.01 * len(clocks)) if clocks else None
@@ -123,31 +127,37 @@ def test_times_of_robots_are_converted_to_one_clock(
 def test_times_that_are_not_covered_are_missing_with_a_reason(
     attempt: Path, begin_s: float, end_s: float, reason: str
 ) -> None:
-    write_bag(attempt, AWAY)
+    write_bag(attempt, MOVING_AWAY)
     write_sources(attempt, {SENDER: ORIGIN_SOURCE, RECEIVER: ODOMETRY})
     assert mean_m(attempt, begin_s, end_s) == reason
 
 
 def test_positions_in_a_gap_are_not_interpolated(attempt: Path) -> None:
-    write_bag(attempt, AWAY[:2] + AWAY[3:])
+    write_bag(attempt, MOVING_AWAY[:2] + MOVING_AWAY[3:])
     write_sources(attempt, {SENDER: ORIGIN_SOURCE, RECEIVER: ODOMETRY})
     reason = "the positions of the receiver from /where have a gap of 2.0 s, but at most 1.5 s are allowed"
     assert mean_m(attempt) == reason
 
 
 def test_distances_over_time_use_the_senders_clock_and_are_none_in_a_gap(attempt: Path) -> None:
-    write_bag(attempt, AWAY[:2] + AWAY[3:])
+    write_bag(attempt, MOVING_AWAY[:2] + MOVING_AWAY[3:])
     write_sources(attempt, {SENDER: ORIGIN_SOURCE, RECEIVER: ODOMETRY}, {SENDER: 0.25})
     distances = position_columns.distances_m(AttemptEvidence(attempt), ENDS)
     begin_ns = BEGAN_NS + S // 4
-    in_gap = (begin_ns + S + 1, None)
-    assert distances == [(begin_ns, 10), (begin_ns + S, 11), in_gap, (begin_ns + 3 * S, 13), (begin_ns + 4 * S, 14)]
+    gap_entry = (begin_ns + S + 1, None)
+    assert distances == [
+        (begin_ns, 10),
+        (begin_ns + S, 11),
+        gap_entry,
+        (begin_ns + 3 * S, 13),
+        (begin_ns + 4 * S, 14),
+    ]
     (attempt / "track.bag").unlink()
     assert position_columns.distances_m(AttemptEvidence(attempt), ENDS) == ()
 
 
 def test_a_robot_without_a_source_has_no_distance(attempt: Path) -> None:
-    write_bag(attempt, AWAY)
+    write_bag(attempt, MOVING_AWAY)
     write_sources(attempt, {RECEIVER: ODOMETRY})
     assert mean_m(attempt) == "there is no source for the position of the sender"
     (attempt / "track.bag").unlink()
@@ -155,7 +165,7 @@ def test_a_robot_without_a_source_has_no_distance(attempt: Path) -> None:
     assert "cannot be read" in str(mean_m(attempt))
 
 
-def test_a_tracker_and_a_fixed_place_in_its_frame(attempt: Path) -> None:
+def test_a_tracker_and_a_fixed_position_in_its_frame_give_a_distance(attempt: Path) -> None:
     write_bag(attempt, [pose_stamped(BEGAN_NS + n * S, 3.0, float(n)) for n in range(5)])
     tracker = PositionSource(file="track.bag", topic="/where")
     write_sources(attempt, {SENDER: PositionSource(place=(0.0, 2.0, 0.0), frame="frame map"), RECEIVER: tracker})
@@ -168,17 +178,17 @@ def test_a_tracker_and_a_fixed_place_in_its_frame(attempt: Path) -> None:
 
 
 def test_wgs84_heights_are_used_only_if_requested(attempt: Path) -> None:
-    latitude, longitude = 39.74, -104.99  # 1600 m high: the same angle is 0.25 mm per metre longer than at sea level
+    latitude, longitude = 39.74, -104.99  # at 1600 m, the same angle is 0.25 mm per metre longer than at sea level
     to_longitude, to_latitude, _ = Geod(ellps="WGS84").fwd(longitude, latitude, 60.0, 1000.0)
     high, low = (latitude, longitude, 1650.0), (to_latitude, to_longitude, 1600.0)
     robots = {SENDER: PositionSource(place=high, frame=WGS84), RECEIVER: PositionSource(place=low, frame=WGS84)}
     write_sources(attempt, robots)
-    level_m = 1000 * (1 + 1625 / 6_371_000)
-    assert mean_m(attempt) == pytest.approx(level_m, abs=0.002)
+    horizontal_m = 1000 * (1 + 1625 / 6_371_000)
+    assert mean_m(attempt) == pytest.approx(horizontal_m, abs=0.002)
     (attempt / position_sources.FILE).write_text(
         position_sources.text(PositionSources(robots, heights=True)), encoding="utf-8"
     )
-    assert mean_m(attempt) == pytest.approx(math.hypot(level_m, 50), abs=0.002)
+    assert mean_m(attempt) == pytest.approx(math.hypot(horizontal_m, 50), abs=0.002)
     without_height = robots | {SENDER: PositionSource(place=(latitude, longitude, None), frame=WGS84)}
     (attempt / position_sources.FILE).write_text(
         position_sources.text(PositionSources(without_height, heights=True)), encoding="utf-8"
@@ -188,7 +198,7 @@ def test_wgs84_heights_are_used_only_if_requested(attempt: Path) -> None:
 
 FLOATS = st.floats(-1e9, 1e9)
 PLACES = st.tuples(FLOATS, FLOATS, st.none() | FLOATS)
-ACCOUNTS = st.builds(
+SOURCES = st.builds(
     PositionSource,
     place=st.none() | PLACES,
     frame=st.text(max_size=10),
@@ -199,21 +209,21 @@ ACCOUNTS = st.builds(
     heading_rad=st.none() | FLOATS,
     began_utc_ns=st.integers(0, 2**62 - 1),
 )
-ANY_ACCOUNTS = st.builds(
+ANY_SOURCES = st.builds(
     PositionSources,
-    st.dictionaries(st.sampled_from(FIXED_ROLES), ACCOUNTS),
+    st.dictionaries(st.sampled_from(FIXED_ROLES), SOURCES),
     st.dictionaries(st.sampled_from(FIXED_ROLES), st.builds(Offset, FLOATS, FLOATS)),
     st.booleans(),
 )
 
 
-@given(ANY_ACCOUNTS)
-def test_sources_are_read_as_they_were_written(
-    tmp_path_factory: pytest.TempPathFactory, written_accounts: PositionSources
+@given(ANY_SOURCES)
+def test_sources_are_written_and_read(
+    tmp_path_factory: pytest.TempPathFactory, written_sources: PositionSources
 ) -> None:
     path = tmp_path_factory.getbasetemp() / position_sources.FILE
-    path.write_text(position_sources.text(written_accounts), encoding="utf-8")
-    assert position_sources.read(path) == written_accounts
+    path.write_text(position_sources.text(written_sources), encoding="utf-8")
+    assert position_sources.read(path) == written_sources
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""CSV and GPX files with positions: reading, and errors that name file and line."""
+"""Reading of CSV and GPX files with positions; errors name the file and the line."""
 
 import math
 from pathlib import Path
@@ -35,7 +35,7 @@ def write_file(folder: Path, text: str, name: str = "walk.csv") -> Path:
     return path
 
 
-def test_lengths_in_any_unit_and_order(tmp_path: Path) -> None:
+def test_lengths_are_read_in_any_unit_and_column_order(tmp_path: Path) -> None:
     text = "\ufeffy_ft,note,t,x_cm\n10,begin,2026-11-22T12:00:00Z,-50\n20,,2026-11-22T14:00:00.000001+02:00,50\n"
     samples = read_csv(write_file(tmp_path, text))
     assert samples.frame == LOCAL
@@ -139,11 +139,11 @@ def test_gpx_without_valid_positions_and_times_is_rejected(tmp_path: Path, old: 
 
 def test_gpx_that_expands_while_it_is_read_is_rejected(tmp_path: Path) -> None:
     entities = "".join(f'<!ENTITY e{n} "{f"&e{n - 1};" * 10}">' for n in range(1, 10))
-    bomb = (
+    entity_expansion = (
         f'<?xml version="1.0"?><!DOCTYPE gpx [<!ENTITY e0 "boom">{entities}]><gpx><trk><name>&e9;</name></trk></gpx>'
     )
     with pytest.raises(EvidenceError, match="cannot be read as GPX"):
-        position_files.read_file(write_file(tmp_path, bomb, "walk.gpx"))
+        position_files.read_file(write_file(tmp_path, entity_expansion, "walk.gpx"))
 
 
 def test_other_file_types_are_rejected(tmp_path: Path) -> None:

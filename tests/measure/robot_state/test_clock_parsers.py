@@ -43,7 +43,7 @@ def test_a_slow_clock_is_behind_even_if_its_leap_status_is_normal() -> None:
     ("name", "problem"),
     [("none", "chrony has no source"), ("local", "chrony has no source and serves its own clock")],
 )
-def test_the_0_that_chrony_prints_without_a_source_is_no_offset(name: str, problem: str, suffix: str) -> None:
+def test_the_0_that_chrony_prints_without_a_source_is_not_an_offset(name: str, problem: str, suffix: str) -> None:
     report = chrony.parse(output(f"chrony/{name}-4.3.{suffix}"))
     assert (report.offset_s, report.error_s, report.problem) == (None, None, problem)
 
@@ -69,7 +69,7 @@ def test_chrony_without_a_usable_output_has_no_value(result: SourceOutput, probl
 def test_timesyncd_reports_the_correction_at_the_last_poll() -> None:
     report = timesyncd.parse(output("timedatectl/status-245.txt"), None)
     assert report is not None
-    assert report.reference == "3.debian.pool.ntp.org", "its address was lost"
+    assert report.reference == "3.debian.pool.ntp.org", "the output has no address"
     assert report.offset_s == 1.087495, "the server is behind the clock"
     assert report.error_s == pytest.approx(0.040580 + 2.156880 / 2 + 1.087495)
     report = timesyncd.parse(output("timedatectl/status-jitter.txt"), None)
@@ -96,25 +96,25 @@ def test_timesyncd_reports_the_correction_at_the_last_poll() -> None:
         ("1s " * 50, None),
     ],
 )
-def test_time_spans_of_systemd(text: str, seconds: float | None) -> None:
+def test_time_spans_of_systemd_are_parsed(text: str, seconds: float | None) -> None:
     assert timesyncd.span_s(text) == (None if seconds is None else pytest.approx(seconds))
 
 
 def test_timesyncd_that_is_disabled_or_unsynchronized_gives_no_value() -> None:
-    failed = SourceOutput("Failed to query server: The name org.freedesktop.timesync1 was not provided", 1)
-    shown = "Timezone=UTC\nLocalRTC=no\nCanNTP=yes\nNTP={}\nNTPSynchronized={}\n"
-    assert timesyncd.parse(failed, SourceOutput(shown.format("no", "yes"), 0)) is None
-    report = timesyncd.parse(failed, SourceOutput(shown.format("yes", "no"), 0))
+    failed_query = SourceOutput("Failed to query server: The name org.freedesktop.timesync1 was not provided", 1)
+    properties = "Timezone=UTC\nLocalRTC=no\nCanNTP=yes\nNTP={}\nNTPSynchronized={}\n"
+    assert timesyncd.parse(failed_query, SourceOutput(properties.format("no", "yes"), 0)) is None
+    report = timesyncd.parse(failed_query, SourceOutput(properties.format("yes", "no"), 0))
     assert report is not None
     assert report.problem == "timedatectl failed with exit code 1"
     status = output("timedatectl/status-jitter.txt")
-    report = timesyncd.parse(status, SourceOutput(shown.format("yes", "no"), 0))
+    report = timesyncd.parse(status, SourceOutput(properties.format("yes", "no"), 0))
     assert report is not None
     assert (report.offset_s, report.problem) == (None, "systemd-timesyncd has not synchronized the clock")
-    unanswered = SourceOutput(
+    unanswered_status = SourceOutput(
         "       Server: 10.0.0.1 (ntp)\nPoll interval: 32s (min: 32s; max 34min 8s)\n Packet count: 0", 0
     )
-    report = timesyncd.parse(unanswered, None)
+    report = timesyncd.parse(unanswered_status, None)
     assert report is not None
     assert report.problem == "systemd-timesyncd has no answer from its server"
 
@@ -129,24 +129,24 @@ def test_ptp_reports_the_local_clock() -> None:
     ):
         report = ptp.parse(output(f"linuxptp/{name}.txt"))
         assert (report.offset_s, report.problem) == (None, problem)
-    slave = output("linuxptp/uncalibrated-3.1.txt")
-    report = ptp.parse(SourceOutput(slave.text.replace("UNCALIBRATED", "SLAVE"), 0))
+    uncalibrated = output("linuxptp/uncalibrated-3.1.txt")
+    report = ptp.parse(SourceOutput(uncalibrated.text.replace("UNCALIBRATED", "SLAVE"), 0))
     assert (report.offset_s, report.error_s) == (125e-9, 2138e-9)
 
 
 def test_the_program_with_a_source_is_chosen() -> None:
-    found = clock_states.reports(
+    reports = clock_states.reports(
         {"chrony": output("chrony/none-4.3.csv"), "ptp": output("linuxptp/current-1.2.txt")},
     )
-    assert [report.program for report in found] == ["chrony", "ptp4l"]
-    report = clock_states.choose_report(found)
+    assert [report.program for report in reports] == ["chrony", "ptp4l"]
+    report = clock_states.choose_report(reports)
     assert report is not None
     assert report.program == "ptp4l"
-    none = clock_states.choose_report(
+    unsynchronized = clock_states.choose_report(
         clock_states.reports({"timedatectl": SourceOutput("NTP=no\nNTPSynchronized=no", 0)})
     )
-    assert none is not None
-    assert none.problem == "no program synchronizes the clock"
+    assert unsynchronized is not None
+    assert unsynchronized.problem == "no program synchronizes the clock"
     assert clock_states.choose_report(clock_states.reports({})) is None
 
 
@@ -155,25 +155,27 @@ def test_a_source_cannot_print_the_output_of_another(tmp_path: Path) -> None:
         "==> chrony <==\n ==> ptp <==\n  fake\n code 0\n \n code 1\n==> chrony <==\n second\n code 0\n",
         encoding="utf-8",
     )
-    found = snapshots.read(tmp_path / "file")
-    assert set(found) == {"chrony"}
-    assert found["chrony"] == SourceOutput("==> ptp <==\n fake\ncode 0", 1), "the first, with its last code"
+    outputs = snapshots.read(tmp_path / "file")
+    assert set(outputs) == {"chrony"}
+    assert outputs["chrony"] == SourceOutput("==> ptp <==\n fake\ncode 0", 1), (
+        "the first section is used, with its last exit code"
+    )
     assert snapshots.parse("==> chrony <==\n half of a li")["chrony"].failure == "was interrupted"
 
 
-def test_the_script_has_the_command_of_each_parser() -> None:
+def test_the_script_has_a_command_for_each_parser() -> None:
     script = (Path(snapshots.__file__).parents[2] / "remote" / "snapshot.sh").read_text(encoding="ascii")
-    names = set(re.findall(r"source_of ([a-z-]+) ", script))
+    names = set(re.findall(r"start_source ([a-z-]+) ", script))
     assert names == attempt_states.CLOCK_SOURCES | attempt_states.RADIO_SOURCES | {health.NAME, health.THROTTLED_NAME}
 
 
 def test_the_names_of_sources_that_need_a_parser_are_complete() -> None:
-    of_clocks = {chrony.NAME, timesyncd.NAME, timesyncd.STATE_NAME, ptp.NAME}
-    assert of_clocks == attempt_states.CLOCK_SOURCES
-    of_radio = (
+    clock_sources = {chrony.NAME, timesyncd.NAME, timesyncd.STATE_NAME, ptp.NAME}
+    assert clock_sources == attempt_states.CLOCK_SOURCES
+    radio_sources = (
         neighbourhood.INFO_NAME,
         neighbourhood.REGULATORY_NAME,
         neighbourhood.SCAN_NAME,
         neighbourhood.SURVEY_NAME,
     )
-    assert set(of_radio) == attempt_states.RADIO_SOURCES
+    assert set(radio_sources) == attempt_states.RADIO_SOURCES

@@ -1,4 +1,4 @@
-"""State of a robot's computer: real outputs of `vcgencmd`, values of /proc and /sys, and outputs without a value."""
+"""State of the computer of a robot: real outputs of `vcgencmd`, values of /proc and /sys, and invalid outputs."""
 
 from pathlib import Path
 
@@ -39,16 +39,16 @@ def test_values_before_and_after_a_repeat_give_columns() -> None:
     ("before", "after", "flags"),
     [
         ("throttled=0x0", "throttled=0x0", set()),
-        ("throttled=0x50000", "throttled=0x50000", set()),  # before this repeat, since boot
+        ("throttled=0x50000", "throttled=0x50000", set()),  # set before this repeat
         ("throttled=0x50005", "throttled=0x50000", {"under-voltage", "throttled"}),
-        ("throttled=0x0", "throttled=0x10000", {"under-voltage"}),  # in between
+        ("throttled=0x0", "throttled=0x10000", {"under-voltage"}),  # during the repeat
         ("throttled=0x80000", "throttled=0xE0008", {"frequency capped", "throttled", "soft temperature limit"}),
         ("throttled=0x0", "VCHI initialization failed", None),
         ("throttled=0xZZ", "throttled=0x0", None),
         ('error=1 error_msg="Command not registered"', "throttled=0x0", None),
     ],
 )
-def test_flags_of_a_raspberry_pi(before: str, after: str, flags: set[str] | None) -> None:
+def test_flags_of_a_raspberry_pi_during_a_repeat(before: str, after: str, flags: set[str] | None) -> None:
     assert health.flags_during(state("", before), state("", after)) == flags
 
 
@@ -72,7 +72,7 @@ def test_a_kernel_reports_under_voltage_without_vcgencmd() -> None:
         "disk",
     ],
 )
-def test_impossible_values_are_missing_and_not_0(text: str) -> None:
+def test_impossible_values_are_missing(text: str) -> None:
     measured = health.measure(Role.SENDER, state(text), state(text))
     assert not measured.values
     assert set(measured.missing.values()) == {"the robot does not report it"}
@@ -80,13 +80,15 @@ def test_impossible_values_are_missing_and_not_0(text: str) -> None:
 
 def test_counters_that_decrease_or_a_source_that_failed_give_no_value() -> None:
     assert "sender_cpu_share" not in health.measure(Role.SENDER, state(AFTER), state(BEFORE)).values
-    failed = health.parse({"health": SourceOutput(BEFORE, 137), "vcgencmd": SourceOutput("throttled=0x1", 137)})
-    assert failed == Health()
+    failed_state = health.parse({"health": SourceOutput(BEFORE, 137), "vcgencmd": SourceOutput("throttled=0x1", 137)})
+    assert failed_state == Health()
 
 
 def test_a_throttled_computer_marks_the_repeat(tmp_path: Path) -> None:
-    for when, flags in (("before", "0x0"), ("after", "0x50005")):
-        (tmp_path / f"sender-sources-{when}.txt").write_text(f"==> vcgencmd <==\n throttled={flags}\n \n code 0\n")
+    for snapshot, flags in (("before", "0x0"), ("after", "0x50005")):
+        (tmp_path / f"sender-sources-{snapshot}.txt").write_text(
+            f"==> vcgencmd <==\n throttled={flags}\n \n code 0\n"
+        )
     measured = attempt_states.measure(AttemptEvidence(tmp_path), {Role.SENDER: "rover-1"}, Measured())
     assert measured.values["marks"] == "under-voltage and throttled"
     assert measured.values["marks_reason"] == (

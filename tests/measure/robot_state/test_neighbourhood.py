@@ -1,4 +1,4 @@
-"""Networks and airtime of others on a channel: real outputs of several versions of `iw`, and useless ones."""
+"""Other networks and their airtime on a channel: real outputs of several versions of `iw`, and invalid outputs."""
 
 from datetime import UTC, datetime
 from pathlib import Path
@@ -34,7 +34,7 @@ def parse(info: str = "", scan: str | None = None, survey: str = "", reg: str = 
 
 
 def survey(*times: tuple[int, int, int | None]) -> str:
-    """Two or more outputs of a survey with active, busy and transmit time in ms."""
+    """Return outputs of a survey with active, busy and transmit times in ms."""
     return "\n==\n".join(
         "Survey data from wlan0\n\tfrequency:\t\t\t2412 MHz\n\tchannel active time:\t\t9 ms\n"
         "\tchannel busy time:\t\t9 ms\n"
@@ -56,7 +56,7 @@ def survey(*times: tuple[int, int, int | None]) -> str:
         (text("no-wifi"), None),
     ],
 )
-def test_the_channel_of_a_radio(info: str, channel: WifiChannel | None) -> None:
+def test_the_channel_of_a_radio_is_parsed(info: str, channel: WifiChannel | None) -> None:
     assert parse(info).channel == channel
 
 
@@ -67,14 +67,14 @@ def test_the_channel_of_a_radio(info: str, channel: WifiChannel | None) -> None:
         (CHANNEL_6, "scan-qca9377", ()),
         (CHANNEL_6, "scan-hwsim-5", (-30.0,)),
         (CHANNEL_6, "scan-6", (-31.0,)),
-        ("11 (2462 MHz), width: 20 MHz, center1: 2462 MHz", "scan-station", ()),  # its own network
+        ("11 (2462 MHz), width: 20 MHz, center1: 2462 MHz", "scan-station", ()),  # its network
     ],
 )
-def test_networks_of_others_on_the_channel(channel: str, scan: str, signals_dbm: tuple[float, ...]) -> None:
+def test_other_networks_on_the_channel_are_counted(channel: str, scan: str, signals_dbm: tuple[float, ...]) -> None:
     assert parse(INFO.format(channel), text(scan)).signals_dbm == signals_dbm
 
 
-def test_own_networks_and_those_not_received_by_this_scan_are_left_out() -> None:
+def test_networks_of_the_lab_and_old_scan_results_are_omitted() -> None:
     network = "BSS {0}(on wlan0){1}\n\tfreq: 2412\n\tsignal: {2} dBm\n\tlast seen: {3} ms ago"
     scan = "\n".join(
         (
@@ -89,7 +89,7 @@ def test_own_networks_and_those_not_received_by_this_scan_are_left_out() -> None
     assert parse(INFO.format(CHANNEL_1), scan).signals_dbm == (None, -50.0)
 
 
-def test_a_scan_that_failed_is_unknown_and_an_empty_one_is_no_network() -> None:
+def test_a_failed_scan_is_unknown_and_an_empty_scan_has_no_networks() -> None:
     info = SourceOutput(INFO.format(CHANNEL_1), 0)
     for scan in (SourceOutput("command failed: Operation not permitted (-1)", 255), SourceOutput("", 137)):
         assert neighbourhood.parse({"iw-info": info, "iw-scan": scan}).signals_dbm is None
@@ -103,7 +103,7 @@ def test_a_scan_that_failed_is_unknown_and_an_empty_one_is_no_network() -> None:
         (survey((1000, 500, 100), (1500, 800, 150)), 0.5),
         (survey((1000, 500, None), (1500, 600, None)), 0.2),
         (survey((0, 0, 0), (500, 0, 0)), 0.0),
-        (survey((1000, 500, 100), (1000, 500, 100)), None),  # counters that stand still
+        (survey((1000, 500, 100), (1000, 500, 100)), None),  # counters that do not change
         (survey((1000, 500, 100), (400, 300, 50)), None),  # counters that were reset
         (survey((1000, 500, 100), (1500, 520, 150)), None),  # more own transmissions than busy time
         (survey((1000, 500, 100)), None),
@@ -111,31 +111,31 @@ def test_a_scan_that_failed_is_unknown_and_an_empty_one_is_no_network() -> None:
         ("", None),
     ],
 )
-def test_airtime_of_others(outputs: str, share: float | None) -> None:
+def test_airtime_of_other_networks(outputs: str, share: float | None) -> None:
     assert parse(survey=outputs).others_share == (None if share is None else pytest.approx(share))
 
 
-def test_the_regulatory_domain() -> None:
+def test_the_regulatory_domain_is_parsed() -> None:
     assert parse(reg=text("reg-ath10k-ct")).country == "HR"
     assert parse(reg=text("reg-balena")).country == "00"
     assert parse(reg="command failed: No such file or directory (-2)").country is None
 
 
-def write(folder: Path, when: str, channel: str, busy_ms: int, *, role: str = "sender") -> None:
+def write(folder: Path, snapshot: str, channel: str, busy_ms: int, *, role: str = "sender") -> None:
     outputs = {"iw-info": INFO.format(channel), "iw-survey": survey((0, 0, 0), (500, busy_ms, 0))}
     outputs |= {"iw-scan": text("scan-hwsim-5"), "iw-reg": text("reg-ath10k-ct")}
     lines = "".join(
         f"==> {name} <==\n" + "".join(f" {line}\n" for line in (*output.split("\n"), "code 0"))
         for name, output in outputs.items()
     )
-    (folder / f"{role}-sources-{when}.txt").write_text(lines, encoding="utf-8")
+    (folder / f"{role}-sources-{snapshot}.txt").write_text(lines, encoding="utf-8")
 
 
 def test_a_busy_channel_marks_the_repeat(tmp_path: Path) -> None:
     write(tmp_path, "before", CHANNEL_6, 50)
     write(tmp_path, "after", CHANNEL_6, 300)
-    names = {Role.SENDER: "rover-1"}
-    measured = attempt_states.measure(AttemptEvidence(tmp_path), names, Measured())
+    robot_names = {Role.SENDER: "rover-1"}
+    measured = attempt_states.measure(AttemptEvidence(tmp_path), robot_names, Measured())
     assert measured.values == {
         "marks": "busy channel",
         "marks_reason": "rover-1: others use 60 % of the airtime on channel 6",
@@ -145,7 +145,7 @@ def test_a_busy_channel_marks_the_repeat(tmp_path: Path) -> None:
         "sender_other_networks_max_dbm": -30.0,
         "sender_others_airtime_share": pytest.approx(0.6),
     }
-    assert list(attempt_states.problems(AttemptEvidence(tmp_path), names, {})) == []
+    assert list(attempt_states.problems(AttemptEvidence(tmp_path), robot_names, {})) == []
 
 
 def test_a_changed_channel_is_a_problem(tmp_path: Path) -> None:
@@ -161,10 +161,10 @@ def test_a_changed_channel_is_a_problem(tmp_path: Path) -> None:
 def test_another_channel_than_at_the_start_of_the_trial_is_a_problem(tmp_path: Path) -> None:
     write(tmp_path, "before", CHANNEL_6, 0)
     write(tmp_path, "after", CHANNEL_6, 0)
-    names = {Role.SENDER: "rover-1"}
-    same, other = {"regulatory_domain": "HR"}, {"channel": "1 (2412 MHz), width 20 MHz"}
-    assert list(attempt_states.problems(AttemptEvidence(tmp_path), names, {Role.SENDER: same})) == []
-    (problem,) = attempt_states.problems(AttemptEvidence(tmp_path), names, {Role.SENDER: other})
+    robot_names = {Role.SENDER: "rover-1"}
+    same_state, other_state = {"regulatory_domain": "HR"}, {"channel": "1 (2412 MHz), width 20 MHz"}
+    assert list(attempt_states.problems(AttemptEvidence(tmp_path), robot_names, {Role.SENDER: same_state})) == []
+    (problem,) = attempt_states.problems(AttemptEvidence(tmp_path), robot_names, {Role.SENDER: other_state})
     assert problem == (
         "rover-1: the channel of its radio is 6 (2437 MHz), width 40 MHz, but it was 1 (2412 MHz), width 20 MHz at "
         "the start of the trial"

@@ -24,18 +24,18 @@ SECOND_NS = 1_000_000_000
 
 @dataclass
 class Flow:
-    """A UDP transfer as netcat sends it: datagrams of 8,192 bytes, the last one shorter."""
+    """A UDP transfer of netcat: datagrams of 8,192 bytes, of which the last is shorter."""
 
     name: str
     port: int
     size_bytes: int
     first_id: int
     is_reverse: bool = False
-    sent: int = 0
-    arrived: int = 0
-    datagrams: int = 0
-    whole: int = 0
-    received: bytearray = field(default_factory=bytearray)
+    sent_packets: int = 0
+    arrived_packets: int = 0
+    sent_datagrams: int = 0
+    complete_datagrams: int = 0
+    received_bytes: bytearray = field(default_factory=bytearray)
 
     @property
     def content(self) -> bytes:
@@ -62,46 +62,46 @@ class Flow:
         for number, start in enumerate(range(0, len(content), 8192)):
             payload = content[start : start + 8192]
             datagram = struct.pack(">HHHH", 30_000 + self.port, self.port, len(payload) + 8, 0) + payload
-            ends = {"src": RECEIVER, "dst": SENDER} if self.is_reverse else {}
-            cuts = range(0, len(datagram), MTU_BYTES)
+            addresses = {"src": RECEIVER, "dst": SENDER} if self.is_reverse else {}
+            offsets = range(0, len(datagram), MTU_BYTES)
             yield [
                 ipv4(
-                    datagram[at : at + MTU_BYTES][:100],
+                    datagram[offset : offset + MTU_BYTES][:100],
                     protocol=17,
-                    size=len(datagram[at : at + MTU_BYTES]),
+                    size=len(datagram[offset : offset + MTU_BYTES]),
                     ip_id=self.first_id + number,
-                    offset=at,
-                    more=at + MTU_BYTES < len(datagram),
-                    **ends,
+                    offset=offset,
+                    more=offset + MTU_BYTES < len(datagram),
+                    **addresses,
                 )
-                for at in cuts
+                for offset in offsets
             ]
 
 
-def air(folder: Path, flows: list[Flow], chance: random.Random, loss: float) -> None:
+def send_all(folder: Path, flows: list[Flow], random_generator: random.Random, loss: float) -> None:
     """Send datagrams of all flows in random order, and write the captures and received files of both robots."""
     at_sender, at_receiver, now_ns = list[Frame](), list[Frame](), 1_700_000_000 * SECOND_NS
     waiting = [list(flow.packets()) for flow in flows]
     while any(waiting):
-        index = chance.choice([index for index, left in enumerate(waiting) if left])
+        index = random_generator.choice([index for index, remaining in enumerate(waiting) if remaining])
         flow, fragments = flows[index], waiting[index].pop(0)
-        start = flow.datagrams * 8192
-        lost = [chance.random() < loss for _ in fragments]
-        for data, is_lost in zip(fragments, lost, strict=True):
+        start = flow.sent_datagrams * 8192
+        lost_flags = [random_generator.random() < loss for _ in fragments]
+        for data, is_lost in zip(fragments, lost_flags, strict=True):
             now_ns += 100_000
             (at_receiver if flow.is_reverse else at_sender).append(Frame(now_ns, data, wire_bytes=1500))
             if not is_lost:
                 (at_sender if flow.is_reverse else at_receiver).append(
                     Frame(now_ns + 2_000_000, data, wire_bytes=1500)
                 )
-        flow.sent += len(fragments)
-        flow.arrived += len(fragments) - sum(lost)
-        flow.datagrams += 1
-        flow.whole += not any(lost)
-        flow.received += b"" if any(lost) else flow.content[start : start + 8192]
+        flow.sent_packets += len(fragments)
+        flow.arrived_packets += len(fragments) - sum(lost_flags)
+        flow.sent_datagrams += 1
+        flow.complete_datagrams += not any(lost_flags)
+        flow.received_bytes += b"" if any(lost_flags) else flow.content[start : start + 8192]
     for flow in flows:
         (folder / f"{flow.name}.bag").write_bytes(flow.content)
-        (folder / f"{flow.name}.recv.bag").write_bytes(flow.received)
+        (folder / f"{flow.name}.recv.bag").write_bytes(flow.received_bytes)
     for name, frames in (("sender.pcap", at_sender), ("receiver.pcap", at_receiver)):
         (folder / name).write_bytes(file_bytes(sorted(frames, key=lambda frame: frame.time_ns)))
 
@@ -122,14 +122,19 @@ def test_each_transfer_counts_its_own_packets_even_with_equal_ids(
         Flow(f"flow{number}", 1234 + number, size, 100 + number * id_offset, is_reverse=is_reverse and number == 1)
         for number, size in enumerate(sizes)
     ]
-    with tempfile.TemporaryDirectory() as place:
-        air(Path(place), flows, random.Random(seed), loss)
-        evidence = AttemptEvidence(Path(place))
+    with tempfile.TemporaryDirectory() as temporary_folder:
+        send_all(Path(temporary_folder), flows, random.Random(seed), loss)
+        evidence = AttemptEvidence(Path(temporary_folder))
         for flow in flows:
             assert transfer_measures.incomparability_reason(evidence, flow.transfer) is None
             assert not list(transfer_checks.find_contradictions(evidence, flow.transfer, finished=True))
             values = transfer_measures.measure(evidence, flow.transfer).values
-            counted = ("ip_packets_sent", "ip_packets_received", "datagrams_sent", "datagrams_received")
-            assert [values[name] for name in counted] == [flow.sent, flow.arrived, flow.datagrams, flow.whole]
-            assert values["file_loss"] == 1 - len(flow.received) / flow.size_bytes
-            assert values["paper_packets"] == flow.datagrams
+            count_names = ("ip_packets_sent", "ip_packets_received", "datagrams_sent", "datagrams_received")
+            assert [values[name] for name in count_names] == [
+                flow.sent_packets,
+                flow.arrived_packets,
+                flow.sent_datagrams,
+                flow.complete_datagrams,
+            ]
+            assert values["file_loss"] == 1 - len(flow.received_bytes) / flow.size_bytes
+            assert values["paper_packets"] == flow.sent_datagrams

@@ -1,4 +1,4 @@
-"""A real transfer with segmentation offload at the sender and none at the receiver, through a router."""
+"""A real transfer through a router, with segmentation offload at the sender and without it at the receiver."""
 
 import subprocess
 from pathlib import Path
@@ -53,7 +53,7 @@ done
 """
 
 
-def test_offload_at_one_end_alone_changes_no_count(tmp_path: Path) -> None:
+def test_offload_at_one_end_does_not_change_counts(tmp_path: Path) -> None:
     (tmp_path / "sent").write_bytes(bytes(range(250)) * (FILE_BYTES // 250))
     sandbox_command = (
         "unshare",
@@ -68,42 +68,45 @@ def test_offload_at_one_end_alone_changes_no_count(tmp_path: Path) -> None:
     subprocess.run((*sandbox_command, "sh", "-c", IN_NAMESPACES), cwd=tmp_path, check=True, timeout=60)
     assert (tmp_path / "received").read_bytes() == (tmp_path / "sent").read_bytes()
     sender, receiver = (pcap.read(tmp_path / f"{name}.pcap").packets for name in ("sender", "receiver"))
-    joined, single = (int(packets.tcp_payload_bytes.max()) for packets in (sender, receiver))
-    assert joined > 2 * 1460 >= 2 * single > 0
+    max_sent_payload, max_received_payload = (int(packets.tcp_payload_bytes.max()) for packets in (sender, receiver))
+    assert max_sent_payload > 2 * 1460 >= 2 * max_received_payload > 0
 
     counts = tcp.count(tcp.match_transfer(sender, receiver, TRANSFER))
 
-    # Veth with several cores reorders sometimes, and TCP then retransmits: the kernel's counters show whether it did.
-    repeated, late = counted(tmp_path / "sent.nstat"), counted(tmp_path / "received.nstat")
+    # Veth with several cores sometimes reorders packets, and TCP then retransmits, as counted by the kernel.
+    kernel_retransmissions, kernel_out_of_order = (
+        counter_value(tmp_path / "sent.nstat"),
+        counter_value(tmp_path / "received.nstat"),
+    )
     assert (counts.unique_bytes, counts.lost_bytes) == (FILE_BYTES, 0)
     assert counts.sent_bytes == counts.received_bytes
-    assert (counts.retransmitted_frames > 0) == (counts.sent_bytes > FILE_BYTES) == (repeated > 0)
-    assert counts.sent_bytes - FILE_BYTES <= repeated * single
+    assert (counts.retransmitted_frames > 0) == (counts.sent_bytes > FILE_BYTES) == (kernel_retransmissions > 0)
+    assert counts.sent_bytes - FILE_BYTES <= kernel_retransmissions * max_received_payload
     assert counts.superframes == int((sender.tcp_payload_bytes > 1460).sum()) > 0
-    sent = TRANSFER.forward(sender)
-    matched = match(sent, TRANSFER.forward(receiver))
-    assert matched.arrived.all()
-    assert not matched.duplicates.any()
-    # Joined segments that TCP retransmits within one millisecond have equal time stamps, and the router cuts both.
-    assert set(np.flatnonzero(matched.ambiguous)) <= frames_with_repeated_bytes(sent)
-    assert (counts.ambiguous_frames > 0) == matched.ambiguous.any()
+    sent_packets = TRANSFER.forward(sender)
+    matches = match(sent_packets, TRANSFER.forward(receiver))
+    assert matches.arrived.all()
+    assert not matches.duplicates.any()
+    # Joined segments that TCP retransmits within one millisecond have equal time stamps, and the router splits both.
+    assert set(np.flatnonzero(matches.ambiguous)) <= frames_with_repeated_bytes(sent_packets)
+    assert (counts.ambiguous_frames > 0) == matches.ambiguous.any()
     if counts.ambiguous_frames:
         assert counts.spurious_frames is counts.reordered_frames is None
     else:
         assert counts.spurious_frames == counts.retransmitted_frames
         assert counts.reordered_frames is not None
-        assert (counts.reordered_frames > 0) >= (late > 0)
+        assert (counts.reordered_frames > 0) >= (kernel_out_of_order > 0)
 
 
-def frames_with_repeated_bytes(sent: Packets) -> set[int]:
-    """Return the frames with a byte that is also in another frame with the same time stamp, compared pair by pair."""
-    carries = np.flatnonzero(sent.tcp_payload_bytes)
-    first, stamp = sent.tcp_seq[carries], sent.tcp_stamp[carries]
-    end = first + sent.tcp_payload_bytes[carries]
+def frames_with_repeated_bytes(sent_packets: Packets) -> set[int]:
+    """Return the frames that share a byte with another frame of the same time stamp."""
+    payload_frames = np.flatnonzero(sent_packets.tcp_payload_bytes)
+    first, stamp = sent_packets.tcp_seq[payload_frames], sent_packets.tcp_stamp[payload_frames]
+    end = first + sent_packets.tcp_payload_bytes[payload_frames]
     overlaps = (stamp == stamp[:, None]) & (first < end[:, None]) & (first[:, None] < end)
-    return set(carries[overlaps.sum(axis=1) > 1])
+    return set(payload_frames[overlaps.sum(axis=1) > 1])
 
 
-def counted(table: Path) -> int:
+def counter_value(table: Path) -> int:
     """Return the single counter in a table of nstat."""
     return int(table.read_text().splitlines()[-1].split()[1])

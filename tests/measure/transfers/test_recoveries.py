@@ -1,4 +1,4 @@
-"""Recovery of flows after faults, from known deliveries and times of faults."""
+"""Recovery of flows after faults, from given deliveries and times of faults."""
 
 from pathlib import Path
 from typing import Any
@@ -28,16 +28,16 @@ def delivery(*at_ms: int, begin_ms: int = 0, end_ms: int | None = None) -> Deliv
 
 
 def times(began_ms: int, ended_ms: int | None, ahead_s: float = 0.0, error_s: float = 0.001) -> FaultTimes:
-    """Times of a fault by the laptop's clock; the robot's clock is ahead by `ahead_s`."""
+    """Return the times of a fault by the laptop's clock. The robot's clock is ahead by `ahead_s`."""
     began_ns, ended_ns = (
-        None if moment is None else START + moment * MS - round(ahead_s * 1e9) for moment in (began_ms, ended_ms)
+        None if time_ms is None else START + time_ms * MS - round(ahead_s * 1e9) for time_ms in (began_ms, ended_ms)
     )
     assert began_ns is not None
     return FaultTimes(began_ns, ended_ns, {ROBOT: Offset(ahead_s, error_s)})
 
 
-def measured(when: FaultTimes | None, *streams: Delivery) -> dict[str, Any]:
-    result = recoveries.measure("transfer", KIND, lambda: streams, when, ROBOT)
+def measure_values(fault_times: FaultTimes | None, *streams: Delivery) -> dict[str, Any]:
+    result = recoveries.measure("transfer", KIND, lambda: streams, fault_times, ROBOT)
     recovery_names = {column.name for column in recoveries.declare_columns("transfer", KIND)}
     assert result.values.keys() | result.missing.keys() == recovery_names
     assert not result.values.keys() & result.missing.keys()
@@ -49,51 +49,51 @@ def measured(when: FaultTimes | None, *streams: Delivery) -> dict[str, Any]:
     recovery_ms=st.integers(1, 20_000),
     ahead_s=st.integers(-86_400, 86_400),
 )
-def test_recovery_starts_at_the_end_of_the_cause_for_any_clock_offset(
+def test_recovery_starts_at_the_end_of_the_fault_for_any_clock_offset(
     before_ms: list[int], recovery_ms: int, ahead_s: int
 ) -> None:
-    steady = delivery(*sorted(before_ms), 3000 + recovery_ms, 3000 + recovery_ms + 10)
-    result = measured(times(1000, 3000, float(ahead_s)), steady)
+    stream = delivery(*sorted(before_ms), 3000 + recovery_ms, 3000 + recovery_ms + 10)
+    result = measure_values(times(1000, 3000, float(ahead_s)), stream)
     assert result["recovery_s"] == pytest.approx(recovery_ms / 1e3, abs=1e-6)
     assert result["outage_s"] == pytest.approx((3000 + recovery_ms - max(before_ms)) / 1e3, abs=1e-6)
 
 
 def test_an_unaffected_flow_recovers_with_its_next_payload() -> None:
-    result = measured(times(1000, 3000), delivery(*range(0, 5000, 20)))
+    result = measure_values(times(1000, 3000), delivery(*range(0, 5000, 20)))
     assert result == {"recovery_s": pytest.approx(0.02), "outage_s": pytest.approx(0.02)}
 
 
-def test_a_flow_that_never_recovered_has_lower_bounds() -> None:
-    result = measured(times(1000, 3000), delivery(0, 500, 900, end_ms=9000))
+def test_a_flow_that_does_not_recover_has_lower_bounds() -> None:
+    result = measure_values(times(1000, 3000), delivery(0, 500, 900, end_ms=9000))
     assert result == {"recovery_at_least_s": pytest.approx(6.0), "outage_at_least_s": pytest.approx(8.1)}
 
 
 def test_a_flow_that_ended_during_the_fault_has_only_an_outage() -> None:
-    result = measured(times(1000, 3000), delivery(0, 900, end_ms=2000))
+    result = measure_values(times(1000, 3000), delivery(0, 900, end_ms=2000))
     assert result == {"outage_at_least_s": pytest.approx(1.1)}
 
 
 def test_the_last_of_several_streams_to_recover_counts() -> None:
-    back, unrecovered = delivery(0, 900, 3100), delivery(0, 900, end_ms=5000)
-    assert measured(times(1000, 3000), back, delivery(0, 950, 3900))["recovery_s"] == pytest.approx(0.9)
-    assert measured(times(1000, 3000), back, unrecovered) == {
+    recovered, unrecovered = delivery(0, 900, 3100), delivery(0, 900, end_ms=5000)
+    assert measure_values(times(1000, 3000), recovered, delivery(0, 950, 3900))["recovery_s"] == pytest.approx(0.9)
+    assert measure_values(times(1000, 3000), recovered, unrecovered) == {
         "recovery_at_least_s": pytest.approx(2.0),
         "outage_at_least_s": pytest.approx(4.1),
     }
 
 
 def test_a_flow_that_was_being_set_up_has_an_outage_from_its_start() -> None:
-    result = measured(times(1000, 3000), delivery(4000, 4010, begin_ms=500))
+    result = measure_values(times(1000, 3000), delivery(4000, 4010, begin_ms=500))
     assert result == {"recovery_s": pytest.approx(1.0), "outage_s": pytest.approx(3.5)}
 
 
-def test_if_the_end_of_the_cause_is_unknown_there_is_only_an_outage() -> None:
-    result = measured(times(1000, None), delivery(0, 990, 4000, 4010))
+def test_a_fault_with_an_unknown_end_has_only_an_outage() -> None:
+    result = measure_values(times(1000, None), delivery(0, 990, 4000, 4010))
     assert result == {"outage_s": pytest.approx(3.01)}
 
 
 @pytest.mark.parametrize(
-    ("when", "stream"),
+    ("fault_times", "stream"),
     [
         (None, delivery(0, 4000)),
         (times(1000, 3000, error_s=0.2), delivery(0, 4000)),
@@ -105,8 +105,10 @@ def test_if_the_end_of_the_cause_is_unknown_there_is_only_an_outage() -> None:
         (times(1000, 3000), delivery(0, 900, end_ms=950)),
     ],
 )
-def test_flows_outside_the_fault_or_without_times_have_no_recovery(when: FaultTimes | None, stream: Delivery) -> None:
-    assert not measured(when, stream)
+def test_flows_outside_the_fault_or_without_times_have_no_recovery(
+    fault_times: FaultTimes | None, stream: Delivery
+) -> None:
+    assert not measure_values(fault_times, stream)
 
 
 @given(
@@ -114,13 +116,15 @@ def test_flows_outside_the_fault_or_without_times_have_no_recovery(when: FaultTi
     st.none() | st.integers(0, 2**63 - 1),
     st.dictionaries(st.sampled_from([Role.SENDER, Role.RECEIVER, Role.RELAY]), st.integers(-(10**9), 10**9)),
 )
-def test_times_are_read_as_they_were_written(began_ns: int, ended_ns: int | None, ahead: dict[Role, int]) -> None:
+def test_times_of_faults_are_written_and_read(
+    began_ns: int, ended_ns: int | None, offsets_us: dict[Role, int]
+) -> None:
     written = FaultTimes(
-        began_ns, ended_ns, {role: Offset(offset_us / 1e6, 0.25) for role, offset_us in ahead.items()}
+        began_ns, ended_ns, {role: Offset(offset_us / 1e6, 0.25) for role, offset_us in offsets_us.items()}
     )
     text = recoveries.fault_times_text(written)
     parsed = recoveries.parse_fault_times(text)
-    assert (parsed.began_ns, parsed.ended_ns, parsed.clock_offsets.keys()) == (began_ns, ended_ns, ahead.keys())
+    assert (parsed.began_ns, parsed.ended_ns, parsed.clock_offsets.keys()) == (began_ns, ended_ns, offsets_us.keys())
     for role, offset in parsed.clock_offsets.items():
         assert offset.offset_s == pytest.approx(written.clock_offsets[role].offset_s, abs=1e-9)
 

@@ -1,4 +1,4 @@
-"""Columns of the log of a drive on a known path, and invalid lines."""
+"""Columns of the log of a drive on a given path, and invalid lines."""
 
 import json
 import math
@@ -29,24 +29,24 @@ LINE = {
 }
 
 
-def drive(out_s: float, speed_m_s: float, back_m_s: float) -> Iterator[dict[str, Any]]:
-    """Lines of a robot that waits for 2 s, drives straight, is stationary for 1 s, and returns, 3 cm and 4 cm off."""
+def drive(out_s: float, speed_m_s: float, return_m_s: float) -> Iterator[dict[str, Any]]:
+    """Yield lines of a robot that waits 2 s, drives straight, stops for 1 s, and returns with an error of 5 cm."""
     yield from ({**LINE, "at_s": tenth / 10} for tenth in range(20))
     for tenth in range(round(10 * out_s) + 1):
         at_s = tenth / 10
         fields = {"x_m": speed_m_s * at_s, "driven_m": speed_m_s * at_s, "forward_m_s": speed_m_s}
         yield {**LINE, "at_s": 2 + at_s, **fields}
-    long_m = speed_m_s * out_s
+    distance_m = speed_m_s * out_s
     for tenth in range(1, 11):
-        yield {**LINE, "at_s": 2 + out_s + tenth / 10, "x_m": long_m, "driven_m": long_m, "phase": "there"}
-    home_s = long_m / back_m_s
-    for tenth in range(round(10 * home_s) + 1):
-        gone_m = back_m_s * tenth / 10
-        fields = {"x_m": long_m - gone_m, "driven_m": long_m + gone_m, "forward_m_s": back_m_s}
+        yield {**LINE, "at_s": 2 + out_s + tenth / 10, "x_m": distance_m, "driven_m": distance_m, "phase": "there"}
+    return_s = distance_m / return_m_s
+    for tenth in range(round(10 * return_s) + 1):
+        returned_m = return_m_s * tenth / 10
+        fields = {"x_m": distance_m - returned_m, "driven_m": distance_m + returned_m, "forward_m_s": return_m_s}
         yield {**LINE, "at_s": 3 + out_s + tenth / 10, "phase": "back", **fields}
-    at_s = 3 + out_s + home_s
+    at_s = 3 + out_s + return_s
     end = {"x_m": 0.03, "y_m": -0.04, "yaw_rad": 0.2, "phase": "home", "ended": "home"}
-    yield {**LINE, "at_s": at_s, "driven_m": 2 * long_m, **end}
+    yield {**LINE, "at_s": at_s, "driven_m": 2 * distance_m, **end}
 
 
 def write_log(folder: Path, lines: list[dict[str, Any]], end: str = "") -> Path:
@@ -55,7 +55,7 @@ def write_log(folder: Path, lines: list[dict[str, Any]], end: str = "") -> Path:
     return path
 
 
-def test_the_columns_of_a_known_path(tmp_path: Path) -> None:
+def test_the_columns_of_a_given_path(tmp_path: Path) -> None:
     log = drive_log.read(write_log(tmp_path, list(drive(4.0, 0.5, 1.0))))
     measured = drive_log.measure(log)
     assert not measured.missing
@@ -80,21 +80,21 @@ def test_unknown_values_are_missing_with_a_reason(tmp_path: Path) -> None:
     measured = drive_log.measure(drive_log.read(write_log(tmp_path, lines, end='{"utc_ns": 1')))
     assert measured.missing.keys() == {"drive_back_off_m", "drive_back_turned_rad", "drive_ended"}
     assert measured.values["drive_out_m"] == 0.5
-    short = drive_log.measure(drive_log.read(write_log(tmp_path, lines[:22])))
-    assert "drive_speed_median_m_s" in short.missing
+    measured_short = drive_log.measure(drive_log.read(write_log(tmp_path, lines[:22])))
+    assert "drive_speed_median_m_s" in measured_short.missing
 
 
 def test_control_characters_in_the_reason_for_the_end_are_replaced(tmp_path: Path) -> None:
     lines = [LINE, {**LINE, "at_s": 1.0, "ended": "odometry\x1b[2J was silent" + "!" * 999}]
     measured = drive_log.measure(drive_log.read(write_log(tmp_path, lines)))
-    text = str(measured.values["drive_ended"])
-    assert text.startswith("odometry?[2J was silent!")
-    assert len(text) == 200
+    log_lines = str(measured.values["drive_ended"])
+    assert log_lines.startswith("odometry?[2J was silent!")
+    assert len(log_lines) == 200
     assert "drive_back_off_m" in measured.missing
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "invalid_fields",
     [
         {"x_m": None},
         {"x_m": math.nan},
@@ -110,9 +110,9 @@ def test_control_characters_in_the_reason_for_the_end_are_replaced(tmp_path: Pat
         {"ended": 3},
     ],
 )
-def test_an_invalid_line_is_refused(tmp_path: Path, wrong: dict[str, Any]) -> None:
+def test_an_invalid_line_is_refused(tmp_path: Path, invalid_fields: dict[str, Any]) -> None:
     with pytest.raises(EvidenceError, match="line 2 is not a line of a drive log"):
-        drive_log.read(write_log(tmp_path, [LINE, {**LINE, **wrong}]))
+        drive_log.read(write_log(tmp_path, [LINE, {**LINE, **invalid_fields}]))
 
 
 def test_a_missing_or_empty_log_is_refused(tmp_path: Path) -> None:
@@ -126,11 +126,11 @@ def test_a_missing_or_empty_log_is_refused(tmp_path: Path) -> None:
         drive_log.read(write_log(tmp_path, [], end="[1]\n"))
 
 
-numbers = st.floats(allow_nan=True, allow_infinity=True) | st.integers() | st.none() | st.text(max_size=3)
+any_numbers = st.floats(allow_nan=True, allow_infinity=True) | st.integers() | st.none() | st.text(max_size=3)
 NUMBERS = ("at_s", "x_m", "y_m", "yaw_rad", "driven_m", "forward_m_s")
 lines = st.fixed_dictionaries(
     {
-        **{name: st.sampled_from([0.0, 0.5]) | numbers for name in NUMBERS},
+        **{name: st.sampled_from([0.0, 0.5]) | any_numbers for name in NUMBERS},
         "phase": st.sampled_from(["out", "there", "back", "home", "else"]),
         "ended": st.sampled_from(["", "home"]) | st.text(max_size=5),
     }
@@ -139,10 +139,10 @@ lines = st.fixed_dictionaries(
 
 @given(st.lists(lines | st.just(LINE), max_size=4), st.binary(max_size=20))
 def test_any_log_is_refused_or_gives_possible_values(
-    tmp_path_factory: pytest.TempPathFactory, text: list[dict[str, Any]], end: bytes
+    tmp_path_factory: pytest.TempPathFactory, log_lines: list[dict[str, Any]], end: bytes
 ) -> None:
     path = tmp_path_factory.getbasetemp() / drive_log.FILE
-    path.write_bytes("".join(f"{json.dumps(line)}\n" for line in text).encode() + end)
+    path.write_bytes("".join(f"{json.dumps(line)}\n" for line in log_lines).encode() + end)
     try:
         measured = drive_log.measure(drive_log.read(path))
     except EvidenceError:

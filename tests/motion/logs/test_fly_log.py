@@ -1,4 +1,4 @@
-"""Columns of the log of a flight on a known path, and invalid lines."""
+"""Columns of the log of a flight on a given path, and invalid lines."""
 
 import json
 import math
@@ -19,7 +19,7 @@ from fieldkit.motion.logs.fly_log import FlightMoment
 from tests.agent.test_agent_flight import state_from
 
 NAMES = {column.name for column in fly_log.COLUMNS}
-BEGIN_M = (10.0, -4.0, -1.5)
+START_M = (10.0, -4.0, -1.5)
 LINE = {
     "utc_ns": 1,
     "at_s": 0.0,
@@ -37,19 +37,19 @@ def write_log(folder: Path, lines: list[dict[str, Any]], end: str = "") -> Path:
     return path
 
 
-def at(place_m: tuple[float, float, float] | None, speed_m_s: float) -> AutopilotState:
-    """Return the state of an autopilot that has reported this."""
-    if place_m is None:
+def state_at(position_m: tuple[float, float, float] | None, speed_m_s: float) -> AutopilotState:
+    """Return the state of an autopilot that has reported this position and speed."""
+    if position_m is None:
         return state_from()[0]
-    return state_from(d.MAVLink_local_position_ned_message(1, *place_m, speed_m_s, 0.0, 0.0))[0]
+    return state_from(d.MAVLink_local_position_ned_message(1, *position_m, speed_m_s, 0.0, 0.0))[0]
 
 
-def flown(path: Path, yaw_rad: float) -> None:
-    """Rise 3 m, fly 4 m ahead and 3 m to the left at 2 m/s, wait there, and land 0.5 m from the take-off position."""
+def write_flight(path: Path, yaw_rad: float) -> None:
+    """Write the log of a drone that climbs 3 m, flies 4 m ahead and 3 m left, and lands 0.5 m from the start."""
     log = FlightLog(str(path))
-    drone = at(BEGIN_M, 0.0)
-    log.note(drone)
-    log.begin(FlightOrigin("local", "", *BEGIN_M[:2], yaw_rad), BEGIN_M[2])
+    autopilot = state_at(START_M, 0.0)
+    log.note(autopilot)
+    log.begin(FlightOrigin("local", "", *START_M[:2], yaw_rad), START_M[2])
     phases = [("standing", 0.0, 0.0, 0.0, 0.0), ("climbing", 0.0, 0.0, 1.0, 1.0), ("up", 0.0, 0.0, 3.1, 0.1)]
     phases += [("flying", 4 * tenth / 10, 3 * tenth / 10, 3.0, 2.0) for tenth in range(11)]
     phases += [("there", 4, 3, 3.0, 0.0)] * 5 + [
@@ -60,15 +60,15 @@ def flown(path: Path, yaw_rad: float) -> None:
         log.phase = phase
         north_m = ahead_m * math.cos(yaw_rad) + left_m * math.sin(yaw_rad)
         east_m = ahead_m * math.sin(yaw_rad) - left_m * math.cos(yaw_rad)
-        log.note(at((BEGIN_M[0] + north_m, BEGIN_M[1] + east_m, BEGIN_M[2] - up_m), speed_m_s))
-        log.note(at(None, 0.0))
+        log.note(state_at((START_M[0] + north_m, START_M[1] + east_m, START_M[2] - up_m), speed_m_s))
+        log.note(state_at(None, 0.0))
 
 
 @pytest.mark.parametrize("yaw_rad", [0.0, 2.0, -3.0])
-def test_the_columns_of_a_known_flight(tmp_path: Path, yaw_rad: float) -> None:
-    flown(tmp_path / fly_log.FILE, yaw_rad)
+def test_the_columns_of_a_given_flight(tmp_path: Path, yaw_rad: float) -> None:
+    write_flight(tmp_path / fly_log.FILE, yaw_rad)
     log = fly_log.read(tmp_path / fly_log.FILE)
-    assert len(log) == 21, "before it stood, and where it does not say where it is, nothing is written"
+    assert len(log) == 21, "no line is written before the origin is set and while the position is unknown"
     assert (log[13].ahead_m, log[13].left_m) == pytest.approx((4.0, 3.0), abs=1e-3)
     measured = fly_log.measure(log)
     assert not measured.missing
@@ -92,17 +92,17 @@ def test_unknown_values_are_missing_with_a_reason(tmp_path: Path) -> None:
     assert measured.missing.keys() == {"fly_height_median_m", "fly_speed_median_m_s", "fly_back_off_m"}
 
 
-@pytest.mark.parametrize("place", ["/dev/full", "/nowhere/fly.jsonl", ""])
-def test_a_flight_continues_if_its_log_cannot_be_written(place: str) -> None:
-    log = FlightLog(place)
-    log.begin(FlightOrigin("local", "", *BEGIN_M[:2], 0.0), BEGIN_M[2])
+@pytest.mark.parametrize("path", ["/dev/full", "/nowhere/fly.jsonl", ""])
+def test_a_flight_continues_if_its_log_cannot_be_written(path: str) -> None:
+    log = FlightLog(path)
+    log.begin(FlightOrigin("local", "", *START_M[:2], 0.0), START_M[2])
     log.phase = "flying"
     for _ in range(3):
-        log.note(at(BEGIN_M, 1.0))
+        log.note(state_at(START_M, 1.0))
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "invalid_fields",
     [
         {"ahead_m": None},
         {"ahead_m": math.nan},
@@ -116,9 +116,9 @@ def test_a_flight_continues_if_its_log_cannot_be_written(place: str) -> None:
         {"phase": ["flying"]},
     ],
 )
-def test_an_invalid_line_is_refused(tmp_path: Path, wrong: dict[str, Any]) -> None:
+def test_an_invalid_line_is_refused(tmp_path: Path, invalid_fields: dict[str, Any]) -> None:
     with pytest.raises(EvidenceError, match="line 2 is not a line of a flight log"):
-        fly_log.read(write_log(tmp_path, [LINE, {**LINE, **wrong}]))
+        fly_log.read(write_log(tmp_path, [LINE, {**LINE, **invalid_fields}]))
 
 
 def test_a_missing_or_empty_log_is_refused(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Lost messages of periodic streams, compared with known losses."""
+"""Lost messages of periodic streams, compared with given losses."""
 
 import random
 from collections import Counter
@@ -19,58 +19,68 @@ def test_each_lost_message_is_counted_once_even_if_the_sender_has_a_loop_period(
     steps_ms: tuple[int, ...], share: float
 ) -> None:
     """An autopilot whose loop takes 20 ms sends 20 messages a second at intervals of 40 and 60 ms."""
-    chance = random.Random(7)
+    random_generator = random.Random(7)
     times_ms = list(accumulate(islice(cycle(steps_ms), SENT - 1), initial=0))
-    arrived = [number for number in range(SENT) if number in {0, SENT - 1} or chance.random() >= share]
-    numbers = [(times_ms[number] * 1000, number % 256) for number in arrived]
-    stream = [StreamMessage(times_ms[number] * 1000, times_ms[number], at) for at, number in enumerate(arrived)]
+    arrived_numbers = [
+        number for number in range(SENT) if number in {0, SENT - 1} or random_generator.random() >= share
+    ]
+    numbers = [(times_ms[number] * 1000, number % 256) for number in arrived_numbers]
+    stream = [
+        StreamMessage(times_ms[number] * 1000, times_ms[number], index)
+        for index, number in enumerate(arrived_numbers)
+    ]
     ended_us = times_ms[-1] * 1000
     assert periodic.count_messages(numbers, {"ATTITUDE": stream}, ended_us, REQUESTED) == (
-        len(arrived),
-        SENT - len(arrived),
+        len(arrived_numbers),
+        SENT - len(arrived_numbers),
     )
 
 
-def test_a_number_that_a_router_filtered_is_no_loss() -> None:
-    numbers = [(50_000 * at, 2 * at % 256) for at in range(100)]
-    stream = [StreamMessage(50_000 * at, 50 * at, at) for at in range(100)]
+def test_a_sequence_number_filtered_by_a_router_is_not_a_loss() -> None:
+    numbers = [(50_000 * index, 2 * index % 256) for index in range(100)]
+    stream = [StreamMessage(50_000 * index, 50 * index, index) for index in range(100)]
     assert periodic.count_messages(numbers, {"ATTITUDE": stream}, 0, REQUESTED) == (100, 0)
 
 
 def late_messages(
     lost_share: float, seed: int, rate_hz: int
 ) -> tuple[list[tuple[int, int]], dict[str, list[StreamMessage]], int]:
-    """Return the numbers and streams of an autopilot that sends late by up to 30 ms, and the number of losses.
+    """Return sequence numbers and streams of an autopilot that sends up to 30 ms late, and the number of losses.
 
-    Its schedule is exact, and a router withholds 4 answers a second.
+    The mean period is exact, and a router withholds 4 answers per second.
     """
-    rng = random.Random(seed)
+    random_generator = random.Random(seed)
     period_ms = 1000 / rate_hz
     events = [
-        (period_ms * (slot + phase) + rng.choice((0, 0, 0, 10, 20, 30)), name)
+        (period_ms * (slot + phase) + random_generator.choice((0, 0, 0, 10, 20, 30)), name)
         for slot in range(200)
         for phase, name in ((0, "ATTITUDE"), (0.15, "LOCAL_POSITION_NED"))
     ]
-    events += [(250.0 * index + rng.uniform(0, 200), "") for index in range(800 // rate_hz)]
-    numbers, streams, lost, waiting = list[tuple[int, int]](), dict[str, list[StreamMessage]](), 0, Counter[str]()
+    events += [(250.0 * index + random_generator.uniform(0, 200), "") for index in range(800 // rate_hz)]
+    numbers, streams, true_losses, lost_by_stream = (
+        list[tuple[int, int]](),
+        dict[str, list[StreamMessage]](),
+        0,
+        Counter[str](),
+    )
     for number, (at_ms, name) in enumerate(sorted(events)):
-        if name and (name not in streams or rng.random() >= lost_share):
-            lost += waiting.pop(name, 0)
+        if name and (name not in streams or random_generator.random() >= lost_share):
+            true_losses += lost_by_stream.pop(name, 0)
             numbers.append((round(at_ms * 1e3), number % 256))
             streams.setdefault(name, []).append(StreamMessage(round(at_ms * 1e3), round(at_ms), len(numbers) - 1))
         elif name:
-            waiting[name] += 1
-    return numbers, streams, lost
+            lost_by_stream[name] += 1
+    return numbers, streams, true_losses
 
 
 @pytest.mark.parametrize("rate_hz", [5, 20])
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.2])
 def test_late_messages_and_withheld_answers_are_not_counted_as_lost(share: float, rate_hz: int) -> None:
     for seed in range(20):
-        numbers, streams, lost = late_messages(share, seed, rate_hz)
-        received, counted = periodic.count_messages(numbers, streams, 0, REQUESTED if rate_hz == 20 else None)
-        assert received == len(numbers)
-        assert abs(counted - lost) <= 1 + 0.02 * lost, seed
+        numbers, streams, true_losses = late_messages(share, seed, rate_hz)
+        n_received, n_lost = periodic.count_messages(numbers, streams, 0, REQUESTED if rate_hz == 20 else None)
+        assert n_received == len(numbers)
+        assert abs(n_lost - true_losses) <= 1 + 0.02 * true_losses, seed
 
 
 def test_a_stream_whose_period_is_unknown_is_not_counted() -> None:
@@ -78,7 +88,7 @@ def test_a_stream_whose_period_is_unknown_is_not_counted() -> None:
     assert periodic.count_messages(numbers, streams, 0) == (0, 0)
 
 
-def test_the_requested_period_shows_losses_that_no_complete_interval_shows() -> None:
+def test_the_requested_period_shows_losses_in_every_interval() -> None:
     stream = [StreamMessage(100_000 * index, 100 * index, index) for index in range(50)]
     numbers = [(100_000 * index, 2 * index) for index in range(50)]
     assert periodic.count_messages(numbers, {"ATTITUDE": stream}, 0, REQUESTED) == (50, 49)

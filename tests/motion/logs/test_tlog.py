@@ -1,4 +1,4 @@
-"""Telemetry logs: values of known messages, and logs that are truncated, damaged, or of other systems."""
+"""Telemetry logs: values of given messages, and logs that are truncated, damaged, or of other systems."""
 
 import json
 import random
@@ -24,14 +24,14 @@ def write_log(tmp_path: Path, data: bytes) -> Path:
     return path
 
 
-def measured(tmp_path: Path, data: bytes, ended_us: int = 0) -> dict[str, object]:
+def measure_values(tmp_path: Path, data: bytes, ended_us: int = 0) -> dict[str, object]:
     measured_log = tlog.measure(tlog.read(write_log(tmp_path, data), 0, ended_us))
     assert measured_log.values.keys() | measured_log.missing.keys() == {column.name for column in tlog.COLUMNS}
     return dict(measured_log.values)
 
 
-def test_the_columns_of_a_flight(tmp_path: Path) -> None:
-    values = measured(tmp_path, flight(10, 1.5))
+def test_the_columns_of_a_flight_are_correct(tmp_path: Path) -> None:
+    values = measure_values(tmp_path, flight(10, 1.5))
     assert values["mavlink_messages"] == values["mavlink_sent"] == 1 + 2 * 101
     assert values["mavlink_loss"] == values["mavlink_damaged"] == 0
     assert values["mavlink_armed"] is True
@@ -43,7 +43,7 @@ def test_the_columns_of_a_flight(tmp_path: Path) -> None:
     assert "mavlink_lat_begin_deg" not in values
 
 
-def test_battery_position_and_both_links(tmp_path: Path) -> None:
+def test_battery_position_and_radio_link_are_measured(tmp_path: Path) -> None:
     sender, radio = Sender(), Sender(51, 68)
     sensors = (0, 0, 0, 200)
     messages = [
@@ -57,7 +57,7 @@ def test_battery_position_and_both_links(tmp_path: Path) -> None:
         sender.frame(d.MAVLink_sys_status_message(*sensors, 11_100, 100, 42, 250, 0, 0, 0, 0, 0)),
         sender.frame(d.MAVLink_sys_status_message(*sensors, 65_535, 100, -1, 0, 0, 0, 0, 0, 0)),
     ]
-    values = measured(tmp_path, stamped([(number, item) for number, item in enumerate(messages)]))
+    values = measure_values(tmp_path, stamped([(number, message) for number, message in enumerate(messages)]))
     assert (values["mavlink_battery_begin"], values["mavlink_battery_end"]) == (0.9, 0.42)
     assert (values["mavlink_battery_begin_v"], values["mavlink_battery_end_v"]) == (12.6, 11.1)
     assert (values["mavlink_lat_begin_deg"], values["mavlink_lon_end_deg"]) == (48.1374, 11.5755)
@@ -69,28 +69,28 @@ def test_battery_position_and_both_links(tmp_path: Path) -> None:
 
 
 def test_the_loss_is_a_share_of_the_sent_messages(tmp_path: Path) -> None:
-    values = measured(tmp_path, flight(10, lost=lambda number: number % 10 == 5))
+    values = measure_values(tmp_path, flight(10, lost=lambda number: number % 10 == 5))
     assert (values["mavlink_messages"], values["mavlink_sent"]) == (183, 203)
     assert values["mavlink_loss_most"] == pytest.approx(20 / 203)
     assert (values["mavlink_periodic"], values["mavlink_periodic_sent"]) == (182, 202)
     assert values["mavlink_loss"] == pytest.approx(20 / 202)
 
 
-def test_numbers_that_a_router_filtered_are_only_in_the_upper_bound(tmp_path: Path) -> None:
+def test_sequence_numbers_filtered_by_a_router_count_only_in_the_upper_bound(tmp_path: Path) -> None:
     sender, frames = Sender(), [(0, Sender().frame(beat()))]
     sender.link.seq = 1
     for number in range(200):
         frames.append((100_000 * number, sender.frame(d.MAVLink_attitude_message(100 * number, 0, 0, 0, 0, 0, 0))))
         if number % 20 == 10:
             sender.frame(d.MAVLink_command_ack_message(511, 0))  # to another station
-    values = measured(tmp_path, stamped(frames))
+    values = measure_values(tmp_path, stamped(frames))
     assert values["mavlink_loss"] == 0
     assert values["mavlink_loss_most"] == pytest.approx(10 / 211)
 
 
-def test_without_a_periodic_stream_only_the_bound_is_known(tmp_path: Path) -> None:
+def test_a_log_without_a_periodic_stream_has_only_the_upper_bound(tmp_path: Path) -> None:
     sender = Sender()
-    values = measured(tmp_path, stamped([(1_000_000 * number, sender.frame(beat())) for number in range(20)]))
+    values = measure_values(tmp_path, stamped([(1_000_000 * number, sender.frame(beat())) for number in range(20)]))
     assert values["mavlink_loss_most"] == 0
     assert "mavlink_loss" not in values
 
@@ -98,7 +98,7 @@ def test_without_a_periodic_stream_only_the_bound_is_known(tmp_path: Path) -> No
 def test_a_damaged_frame_is_counted_and_lost(tmp_path: Path) -> None:
     data = bytearray(flight(1))
     data[60] ^= 1
-    values = measured(tmp_path, bytes(data))
+    values = measure_values(tmp_path, bytes(data))
     assert (values["mavlink_damaged"], values["mavlink_sent"]) == (1, 23)
     assert values["mavlink_messages"] == 22
 
@@ -110,12 +110,12 @@ def test_impossible_values_are_missing(tmp_path: Path) -> None:
         d.MAVLink_local_position_ned_message(0, float("nan"), 1e30, float("inf"), 1e20, 0, float("nan")),
         d.MAVLink_attitude_message(0, 1e30, float("nan"), 0, 0, 0, 0),
     ]
-    values = measured(tmp_path, stamped([(0, sender.frame(item)) for item in messages]))
-    assert not {item for item in values if item.endswith(("_m", "_m_s", "_deg"))}
+    values = measure_values(tmp_path, stamped([(0, sender.frame(message)) for message in messages]))
+    assert not {message for message in values if message.endswith(("_m", "_m_s", "_deg"))}
 
 
 @pytest.mark.parametrize("version", ["old", "signed"])
-def test_logs_of_mavlink_1_and_of_signed_frames(version: str, tmp_path: Path) -> None:
+def test_logs_of_mavlink_1_and_of_signed_frames_are_read(version: str, tmp_path: Path) -> None:
     sender = Sender()
     if version == "signed":
         sender.link.signing.secret_key, sender.link.signing.sign_outgoing = b"k" * 32, True
@@ -124,8 +124,8 @@ def test_logs_of_mavlink_1_and_of_signed_frames(version: str, tmp_path: Path) ->
     for number, message in enumerate(messages):
         frames.append((number, bytes(message.pack(sender.link, force_mavlink1=version == "old"))))
         sender.link.seq = number + 1
-    assert {item[0] for _, item in frames} == {0xFE if version == "old" else 0xFD}
-    values = measured(tmp_path, stamped(frames))
+    assert {message[0] for _, message in frames} == {0xFE if version == "old" else 0xFD}
+    values = measure_values(tmp_path, stamped(frames))
     assert (values["mavlink_messages"], values["mavlink_sent"], values["mavlink_damaged"]) == (6, 6, 0)
     assert values["mavlink_roll_max_deg"] == pytest.approx(28.65, abs=0.01)
 
@@ -156,7 +156,7 @@ def test_an_incomplete_log_is_refused(data: bytes, message: str, tmp_path: Path)
         tlog.read(write_log(tmp_path, data), 0, 0)
 
 
-def test_a_log_that_is_missing(tmp_path: Path) -> None:
+def test_a_missing_log_is_refused(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError):
         tlog.read(tmp_path / "none.tlog", 0, 0)
 
@@ -168,34 +168,34 @@ def test_a_truncated_log_has_only_complete_frames_or_is_refused(end: int) -> Non
         frames = list(tlog_reader.frames(data))
     except ValueError:
         return
-    assert sum(8 + len(item.data) for item in frames) == end
+    assert sum(8 + len(message.data) for message in frames) == end
 
 
 @given(st.binary(max_size=300), st.integers(0, 2**40))
-def test_bytes_of_any_kind_are_refused_or_read(noise: bytes, at_us: int) -> None:
-    for data in (noise, stamped([(at_us, Sender().frame(beat()))]) + noise):
-        for question in ({"ended_us": 0, "intervals_us": {}}, {"positions": tlog.LOCAL}, {"positions": tlog.GLOBAL}):
-            with suppress(ValueError):  # no other error
-                _answered(data, question)
+def test_any_bytes_are_refused_or_read(data_after: bytes, at_us: int) -> None:
+    for data in (data_after, stamped([(at_us, Sender().frame(beat()))]) + data_after):
+        for request in ({"ended_us": 0, "intervals_us": {}}, {"positions": tlog.LOCAL}, {"positions": tlog.GLOBAL}):
+            with suppress(ValueError):  # other errors are not expected
+                _read_by_question(data, request)
 
 
-def _answered(data: bytes, question: Mapping[str, object]) -> object:
+def _read_by_question(data: bytes, request: Mapping[str, object]) -> object:
     autopilot = tlog_reader._autopilot(data, 0)
-    if "positions" in question:
-        return list(tlog_reader._positions(data, autopilot, str(question["positions"])))
+    if "positions" in request:
+        return list(tlog_reader._positions(data, autopilot, str(request["positions"])))
     return json.dumps(tlog_reader._summary(data, autopilot, 0, {}))
 
 
 COUNTERS = {"frames": 3, "bytes": 99, "left_out": 0, "ended_us": 5, "refused": {"32": 2}}
 
 
-def test_the_summary_of_a_recorder(tmp_path: Path) -> None:
+def test_the_summary_of_a_recorder_is_read(tmp_path: Path) -> None:
     path = tmp_path / "mavlink.json"
     path.write_text(json.dumps(COUNTERS), encoding="utf-8")
     assert tlog.read_summary(path) == tlog.RecorderSummary(3, 0, 5, {32: 2})
 
 
-WRONG: list[dict[str, object]] = [
+INVALID_COUNTERS: list[dict[str, object]] = [
     {"frames": -1},
     {"frames": 1.5},
     {"frames": True},
@@ -206,7 +206,14 @@ WRONG: list[dict[str, object]] = [
 
 
 @pytest.mark.parametrize(
-    "recorder_summary", ["", "[]", "7", "[" * 5000, *(json.dumps({**COUNTERS, **wrong}) for wrong in WRONG)]
+    "recorder_summary",
+    [
+        "",
+        "[]",
+        "7",
+        "[" * 5000,
+        *(json.dumps({**COUNTERS, **invalid_counters}) for invalid_counters in INVALID_COUNTERS),
+    ],
 )
 def test_an_invalid_summary_is_refused(recorder_summary: str, tmp_path: Path) -> None:
     path = tmp_path / "mavlink.json"
@@ -222,7 +229,7 @@ def test_a_log_that_contradicts_its_recorder_or_the_attempt_is_detected(tmp_path
     recorder_summary = tlog.RecorderSummary(log.frames, 0, log.last_us + 5, {}, tlog.crc32_of(path))
     window = log.first_us * 1000, log.last_us * 1000 + 999
     assert list(tlog.contradictions(log, recorder_summary, tlog.crc32_of(path), window)) == []
-    for other, total, around, expected_reason in (
+    for summary, checksum, attempt_window, expected_reason in (
         (recorder_summary, 7, window, "its checksum differs"),
         (
             replace(recorder_summary, ended_us=log.last_us - 10**6),
@@ -243,11 +250,11 @@ def test_a_log_that_contradicts_its_recorder_or_the_attempt_is_detected(tmp_path
             "from before the attempt or after it",
         ),
     ):
-        (reason,) = tlog.contradictions(log, other, total, around)
+        (reason,) = tlog.contradictions(log, summary, checksum, attempt_window)
         assert expected_reason in reason
 
 
-def test_moved_frames_are_detected(tmp_path: Path) -> None:
+def test_repeated_frames_are_detected(tmp_path: Path) -> None:
     path = tmp_path / "mavlink.tlog"
     content = flight()
     path.write_bytes(content + content)
@@ -258,16 +265,18 @@ def test_moved_frames_are_detected(tmp_path: Path) -> None:
 
 @given(st.floats(0, 0.3), st.integers(0, 2**32))
 def test_random_loss_is_measured_even_if_a_router_filters_messages(share: float, seed: int) -> None:
-    rng = random.Random(seed)
-    numbers, streams, truth = list[tuple[int, int]](), dict[str, list[StreamMessage]](), 0
-    sent = 0
+    random_generator = random.Random(seed)
+    numbers, streams, n_lost = list[tuple[int, int]](), dict[str, list[StreamMessage]](), 0
+    n_sent = 0
     for slot in range(400):
         for name in ("ATTITUDE", "LOCAL_POSITION_NED"):
-            sent += 1 + (rng.random() < 0.02)  # an answer to another station has a number too
-            if 0 < slot < 399 and rng.random() < share:
-                truth += 1
+            n_sent += 1 + (
+                random_generator.random() < 0.02
+            )  # an answer to another station also has a sequence number
+            if 0 < slot < 399 and random_generator.random() < share:
+                n_lost += 1
                 continue
-            numbers.append((100_000 * slot, sent % 256))
+            numbers.append((100_000 * slot, n_sent % 256))
             streams.setdefault(name, []).append(StreamMessage(100_000 * slot, 100 * slot, len(numbers) - 1))
-    arrived, lacking = periodic.count_messages(numbers, streams, 0)
-    assert (arrived, lacking) == (len(numbers), truth)
+    n_arrived, counted_losses = periodic.count_messages(numbers, streams, 0)
+    assert (n_arrived, counted_losses) == (len(numbers), n_lost)

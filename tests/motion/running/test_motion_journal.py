@@ -1,4 +1,4 @@
-"""The journal of motions, and the fence over random attempts, faults and resumes of a robot that brakes slowly."""
+"""The journal of motions, and the fence in random attempts, faults and resumes of a robot that brakes slowly."""
 
 import math
 from dataclasses import replace
@@ -29,9 +29,9 @@ ROBOTS = {Role.SENDER: "rover-2", Role.RECEIVER: "rover-1"}
 NEAR = Placement(Scenario.LOS, Topology.MASTERLESS, Distance(5.0, "5m"))
 FAR = Placement(Scenario.LOS, Topology.MASTERLESS, Distance(10.0, "10m"))
 TICK_S = 0.05
-BRAKES_M_S2 = 1.0
+DECELERATION_M_S2 = 1.0
 SPEED_M_S = 1.0
-MARGIN_M = SPEED_M_S * 2 * TICK_S + SPEED_M_S**2 / (2 * BRAKES_M_S2)
+MARGIN_M = SPEED_M_S * 2 * TICK_S + SPEED_M_S**2 / (2 * DECELERATION_M_S2)
 """Distance beyond the fence: two cycles of the control loop, and the braking distance v^2 / (2 a)."""
 TASK = DriveTask(
     legs=[(4.0, 0.0)],
@@ -46,11 +46,11 @@ TASK = DriveTask(
 
 
 def open_origins(folder: Path, placement: Placement = NEAR, *, may_return: bool = False) -> JournaledOrigins:
-    """Return the origins of a trial as read by another run of fieldkit."""
+    """Return the origins of a trial, read by a new run of fieldkit."""
     return JournaledOrigins(MotionJournal(folder / MOTION_FILE), folder, ROBOTS, placement, may_return=may_return)
 
 
-def test_an_origin_is_valid_over_runs_that_leave_the_robot_at_its_place(tmp_path: Path) -> None:
+def test_an_origin_is_valid_in_later_runs_while_the_robot_is_at_its_place(tmp_path: Path) -> None:
     open_origins(tmp_path).record(Role.RECEIVER, ORIGIN)
     open_origins(tmp_path).record(Role.SENDER, replace(ORIGIN, x_m=9.0))
     assert open_origins(tmp_path).get(Role.RECEIVER) == ORIGIN
@@ -58,17 +58,17 @@ def test_an_origin_is_valid_over_runs_that_leave_the_robot_at_its_place(tmp_path
     assert open_origins(tmp_path, FAR).get(Role.SENDER) is None
 
 
-def test_a_place_is_new_if_the_last_origin_is_of_another_one(tmp_path: Path) -> None:
-    assert not open_origins(tmp_path).is_new_place(Role.SENDER), "no origin yet: the first place"
+def test_a_place_is_new_if_the_last_origin_belongs_to_another_place(tmp_path: Path) -> None:
+    assert not open_origins(tmp_path).is_new_place(Role.SENDER), "there is no origin before the first motion"
     for role in ROBOTS:
         open_origins(tmp_path).record(role, ORIGIN)
     assert not open_origins(tmp_path).is_new_place(Role.SENDER)
     assert open_origins(tmp_path, FAR).is_new_place(Role.SENDER)
-    assert not open_origins(tmp_path, FAR).is_new_place(Role.RECEIVER), "it stays"
+    assert not open_origins(tmp_path, FAR).is_new_place(Role.RECEIVER), "the receiver is not moved"
     MotionJournal(tmp_path / MOTION_FILE).add(MotionEvent.CONFIRMED, "rover-2")
-    assert open_origins(tmp_path, FAR).is_new_place(Role.SENDER), "confirmed at the former place"
+    assert open_origins(tmp_path, FAR).is_new_place(Role.SENDER), "the confirmation was for the former place"
     open_origins(tmp_path, FAR).record(Role.SENDER, ORIGIN)
-    assert open_origins(tmp_path, NEAR).is_new_place(Role.SENDER), "back at the first place without a person"
+    assert open_origins(tmp_path, NEAR).is_new_place(Role.SENDER), "no person confirmed the return to the first place"
 
 
 @pytest.mark.parametrize("at_place", [True, False])
@@ -77,16 +77,16 @@ def test_only_a_confirmation_lets_robots_move_after_a_fault(tmp_path: Path, at_p
     first.record(Role.RECEIVER, ORIGIN)
     with first.moving(Role.RECEIVER) as motion:
         motion.mark_ended(ORIGIN)
-    with pytest.raises(ValueError, match="torn"), first.moving(Role.RECEIVER):
-        raise ValueError("torn")
+    with pytest.raises(ValueError, match="fault"), first.moving(Role.RECEIVER):
+        raise ValueError("fault")
     for role in ROBOTS:
         with pytest.raises(MotionHeldError, match="rover-1"), open_origins(tmp_path).moving(role):
-            pytest.fail("it moved")
+            pytest.fail("the robot moved")
     journal = MotionJournal(tmp_path / MOTION_FILE)
     journal.confirm("how", at_place=at_place)
-    reopened = open_origins(tmp_path)
-    reopened.require()
-    assert reopened.get(Role.RECEIVER) == (None if at_place else ORIGIN)
+    reopened_origins = open_origins(tmp_path)
+    reopened_origins.require()
+    assert reopened_origins.get(Role.RECEIVER) == (None if at_place else ORIGIN)
 
 
 def test_a_stop_by_the_operator_holds_the_robots_of_a_campaign(tmp_path: Path) -> None:
@@ -96,10 +96,10 @@ def test_a_stop_by_the_operator_holds_the_robots_of_a_campaign(tmp_path: Path) -
     first.require()
     with pytest.raises(KeyboardInterrupt), first.moving(Role.RECEIVER):
         raise KeyboardInterrupt
-    later = JournaledOrigins(MotionJournal(journal_of(trials[1])), trials[1], ROBOTS, NEAR)
-    with pytest.raises(MotionHeldError, match="rover-1: stopped by the operator") as caught:
-        later.require()
-    assert "fieldkit campaign, as before" in caught.value.remedy
+    second = JournaledOrigins(MotionJournal(journal_of(trials[1])), trials[1], ROBOTS, NEAR)
+    with pytest.raises(MotionHeldError, match="rover-1: stopped by the operator") as error_info:
+        second.require()
+    assert "fieldkit campaign, as before" in error_info.value.remedy
 
 
 def test_a_kill_during_a_motion_holds_the_robots(tmp_path: Path) -> None:
@@ -110,33 +110,33 @@ def test_a_kill_during_a_motion_holds_the_robots(tmp_path: Path) -> None:
 
 def test_two_robots_move_at_the_same_time(tmp_path: Path) -> None:
     origins = open_origins(tmp_path)
-    with origins.moving(Role.SENDER) as outer, origins.moving(Role.RECEIVER) as inner:
-        inner.mark_ended()
-        outer.mark_ended()
+    with origins.moving(Role.SENDER) as sender_motion, origins.moving(Role.RECEIVER) as receiver_motion:
+        receiver_motion.mark_ended()
+        sender_motion.mark_ended()
     origins.require()
 
 
-def test_the_trials_of_a_campaign_have_one_journal(tmp_path: Path) -> None:
+def test_the_trials_of_a_campaign_share_a_journal(tmp_path: Path) -> None:
     trial = tmp_path / "trial"
     assert journal_of(trial) == trial / MOTION_FILE
     (tmp_path / "campaign.yaml").touch()
     assert journal_of(trial) == tmp_path / MOTION_FILE
 
 
-def test_a_log_may_start_as_far_from_the_origin_as_a_robot_may() -> None:
+def test_logs_and_robots_have_the_same_maximum_start_distance() -> None:
     assert drive_checks._START_M == START_M
 
 
 class BrakingBase:
-    """A base that decelerates with `BRAKES_M_S2` instead of immediately, with exact odometry."""
+    """A base that decelerates with `DECELERATION_M_S2`, and has exact odometry."""
 
     def __init__(self) -> None:
         self.pose = OdometryPose(0.0, 0.0, 0.0)
         self.forward_m_s = 0.0
 
     def drive(self, velocity: DriveVelocity) -> None:
-        slowed_m_s = max(self.forward_m_s - BRAKES_M_S2 * TICK_S, velocity.forward_m_s)
-        self.forward_m_s = slowed_m_s
+        braked_m_s = max(self.forward_m_s - DECELERATION_M_S2 * TICK_S, velocity.forward_m_s)
+        self.forward_m_s = braked_m_s
         x_m, y_m, yaw_rad = self.pose
         ahead_m = self.forward_m_s * TICK_S
         yaw_rad += velocity.turn_rad_s * TICK_S
@@ -148,12 +148,12 @@ ATTEMPTS = st.lists(st.tuples(st.integers(0, 400), st.sampled_from(["lease", "su
 
 @settings(max_examples=30, deadline=None)
 @given(ATTEMPTS)
-def test_no_sequence_of_attempts_leaves_the_fence_of_the_trial(attempts: list[tuple[int, str]]) -> None:
+def test_robot_remains_within_the_fence_in_any_sequence_of_attempts(attempts: list[tuple[int, str]]) -> None:
     """Each attempt is a new run, with the option that allows motion from the position after a fault."""
     base, now_s = BrakingBase(), 0.0
     farthest_m = 0.0
-    with TemporaryDirectory() as text:
-        folder = Path(text)
+    with TemporaryDirectory() as temporary_folder:
+        folder = Path(temporary_folder)
         for ticks, end in attempts:
             origins = open_origins(folder, may_return=True)
             MotionJournal(folder / MOTION_FILE).confirm("option", at_place=False)

@@ -22,14 +22,14 @@ class RecordingShell:
     robot = "r"
 
     def __init__(self) -> None:
-        self.words: list[Sequence[str]] = []
+        self.commands: list[Sequence[str]] = []
         self.failures_left = 0
-        self.many = Event()
+        self.has_many_calls = Event()
 
     def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
-        self.words.append(argv)
-        if len(self.words) >= 5:
-            self.many.set()
+        self.commands.append(argv)
+        if len(self.commands) >= 5:
+            self.has_many_calls.set()
         if self.failures_left > 0:
             self.failures_left -= 1
             raise LinkError("is out of range", where=self.robot, remedy="wait")
@@ -37,12 +37,12 @@ class RecordingShell:
 
     @property
     def lines(self) -> list[str]:
-        return [words[-2] for words in self.words]
+        return [command[-2] for command in self.commands]
 
 
-def keeper(link: RecordingShell, silent_lease_s: float | None = None) -> LeaseKeeper:
+def keeper(shell: RecordingShell, silent_lease_s: float | None = None) -> LeaseKeeper:
     return LeaseKeeper(
-        cast("Shell", link),
+        cast("Shell", shell),
         JOB,
         output_file="log",
         order="stay",
@@ -53,50 +53,50 @@ def keeper(link: RecordingShell, silent_lease_s: float | None = None) -> LeaseKe
 
 
 def test_order_is_renewed_over_interrupted_link_until_context_is_left() -> None:
-    link = RecordingShell()
-    with keeper(link) as lease:
+    shell = RecordingShell()
+    with keeper(shell) as lease:
         assert lease.output == b"output"
-        link.failures_left = 2
-        assert link.many.wait(60)
+        shell.failures_left = 2
+        assert shell.has_many_calls.wait(60)
         lease.give_order("go")
-    count = len(link.lines)
-    numbers, orders, seconds = zip(*(line.split() for line in link.lines), strict=True)
+    count = len(shell.lines)
+    numbers, orders, seconds = zip(*(line.split() for line in shell.lines), strict=True)
     assert sorted(map(int, numbers)) == list(range(1, count + 1))
     assert orders[:5] == ("stay",) * 5
     assert orders[-1] == "go"
     assert set(seconds) == {"0.05"}
-    assert {tuple(words[-3::2]) for words in link.words} == {("f/up.fly.orders", "f/log")}
+    assert {tuple(command[-3::2]) for command in shell.commands} == {("f/up.fly.orders", "f/log")}
     assert orders_file("up.fly") == "up.fly.orders"
 
 
 def test_silent_lease_lasts_longer_and_is_not_renewed() -> None:
-    link = RecordingShell()
-    with keeper(link, silent_lease_s=90.0) as lease:
+    shell = RecordingShell()
+    with keeper(shell, silent_lease_s=90.0) as lease:
         lease.give_order("go")
         assert not any(renewal_threads(lease))
-    assert link.lines == ["1 stay 90", "2 go 90"]
+    assert shell.lines == ["1 stay 90", "2 go 90"]
 
 
 def renewal_threads(lease: LeaseKeeper) -> list[bool]:
-    """Return whether the thread of renewals is alive."""
+    """Return a list that is True for a thread of renewals that is alive."""
     lease._thread.join(60)
     return [lease._thread.is_alive()]
 
 
 def test_order_that_cannot_be_written_is_an_error() -> None:
-    link = RecordingShell()
-    with keeper(link, silent_lease_s=90.0) as lease:
-        link.failures_left = 1
+    shell = RecordingShell()
+    with keeper(shell, silent_lease_s=90.0) as lease:
+        shell.failures_left = 1
         with pytest.raises(LinkError):
             lease.give_order("go")
         lease.renew()
-    assert link.lines[-1] == "3 go 90"
+    assert shell.lines[-1] == "3 go 90"
 
 
 def test_unreachable_robot_at_start_is_an_error() -> None:
-    link = RecordingShell()
-    link.failures_left = 1
-    with pytest.raises(LinkError), keeper(link):
+    shell = RecordingShell()
+    shell.failures_left = 1
+    with pytest.raises(LinkError), keeper(shell):
         pytest.fail("the lease was entered")
 
 
@@ -105,11 +105,11 @@ class ExitedProgram(RecordingShell):
 
     def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
         result = super().run(argv, deadline=deadline)
-        stderr = b"bash: warning: no locale\n7\n" if len(self.words) > 2 else b"bash: warning: no locale\n"
+        stderr = b"bash: warning: no locale\n7\n" if len(self.commands) > 2 else b"bash: warning: no locale\n"
         return Completed(result.argv, 0, result.stdout, stderr)
 
 
-def test_body_is_aborted_when_program_ends() -> None:
+def test_body_is_aborted_when_the_program_exits() -> None:
     stop = Event()
 
     def wait() -> None:
@@ -118,9 +118,12 @@ def test_body_is_aborted_when_program_ends() -> None:
 
     with keeper(ExitedProgram()) as lease:
         assert lease.end_reason == ""
-        with pytest.raises(RobotError, match="ended with exit code 7") as caught, lease.run_while_leased(stop.set):
+        with (
+            pytest.raises(RobotError, match="ended with exit code 7") as error_info,
+            lease.run_while_leased(stop.set),
+        ):
             wait()
-        assert "the connection broke" in str(caught.value.__cause__)
+        assert "the connection broke" in str(error_info.value.__cause__)
         with pytest.raises(RobotError, match="ended with exit code 7"), lease.run_while_leased(stop.set):
             pass
         with pytest.raises(LockLostError), lease.run_while_leased(stop.set):

@@ -9,8 +9,10 @@ from fieldkit.motion.steps.link_need import link_need
 from fieldkit.steps.scene import CommandResult
 from tests.helpers.casts import CAST
 
-GOOD = json.dumps({"error": "", "system": 7, "candidates": []})
-CLOSED = json.dumps({"error": "Connection refused", "system": 0, "candidates": ["TCP port 5760", "/dev/ttyACM0"]})
+REACHABLE = json.dumps({"error": "", "system": 7, "candidates": []})
+CONNECTION_REFUSED = json.dumps(
+    {"error": "Connection refused", "system": 0, "candidates": ["TCP port 5760", "/dev/ttyACM0"]}
+)
 NO_AUTOPILOT = json.dumps({"error": "", "system": 0, "candidates": []})
 
 
@@ -26,7 +28,7 @@ NO_AUTOPILOT = json.dumps({"error": "", "system": 0, "candidates": []})
 def test_detail_names_connection_and_programs(connection: str, kind: str) -> None:
     need = link_need(CAST[Role.RECEIVER], Role.RECEIVER, connection, ("pilot", "guard"))
     assert connection in need.argv[-1]
-    assert need.judge(CommandResult(GOOD, 0)) == (
+    assert need.judge(CommandResult(REACHABLE, 0)) == (
         Verdict.OK,
         f"{connection} ({kind}) reaches system 7; pilot and guard use it through the link server",
         "",
@@ -36,7 +38,11 @@ def test_detail_names_connection_and_programs(connection: str, kind: str) -> Non
 @pytest.mark.parametrize(
     ("text", "detail", "remedy"),
     [
-        (CLOSED, "cannot be opened: Connection refused", "this computer has TCP port 5760, /dev/ttyACM0; write"),
+        (
+            CONNECTION_REFUSED,
+            "cannot be opened: Connection refused",
+            "this computer has TCP port 5760, /dev/ttyACM0; write",
+        ),
         (NO_AUTOPILOT, "no heartbeat of an autopilot", "no other common connection"),
         ("error: MAVLink over usb: is not a connection", "is not a connection", "mavlink.connection"),
         ("", "no answer", "mavlink.connection"),

@@ -34,7 +34,7 @@ def mover(shell: ScriptedShell, name: str = "rover") -> RobotMover:
     return RobotMover(name, cast("Shell", shell), ".fieldkit/t/a", "it stops automatically within 2 s")
 
 
-def test_without_motion_no_order_is_given() -> None:
+def test_no_order_is_given_without_a_motion() -> None:
     motions = Motions()
     assert not motions.order_stop(pytest.fail)
     with motions.moving(mover(ScriptedShell(""))):
@@ -43,7 +43,7 @@ def test_without_motion_no_order_is_given() -> None:
     assert not motions.is_ordered
 
 
-def test_each_robot_is_stopped_once_and_leaving_waits_for_landing() -> None:
+def test_each_robot_is_stopped_once_and_the_context_waits_for_the_landing() -> None:
     name, reports = "t/a/.jobs/fly", list[str]()
     drive_shell = ScriptedShell("t/a/.jobs/drive stationary\n")
     fly_shell = ScriptedShell(f"{name} land\n", f"{name} land\n", f"{name} landed\n")
@@ -71,7 +71,7 @@ def test_no_robot_starts_to_move_after_the_order() -> None:
     motions.stop_notes = ("rover stops",)
     assert motions.order_stop(reports.append)
     with pytest.raises(KeyboardInterrupt), motions.moving(mover(shell)):
-        pytest.fail("it moves")
+        pytest.fail("the robot moves")
     assert not shell.prompts
     wait_until(lambda: bool(reports), Deadline.after(60))
     assert reports == ["stopping: no robot moves; stopping the programs on the robots"]
@@ -84,10 +84,10 @@ def test_unreachable_robot_is_reported_with_its_fallback() -> None:
     assert reports == ["no answer from rover: it stops automatically within 2 s (the connection broke)"]
 
 
-def test_abandoned_wait_does_not_wait_for_landing() -> None:
+def test_cancelled_wait_does_not_wait_for_the_landing() -> None:
     motions, shell = Motions(), ScriptedShell("t/a/.jobs/fly return\n")
-    coming = threading.Event()
+    has_started_landing = threading.Event()
     with motions.moving(mover(shell)):
-        motions.order_stop(lambda line: coming.set() if "coming down (return)" in line else None)
-        assert coming.wait(60)
+        motions.order_stop(lambda line: has_started_landing.set() if "coming down (return)" in line else None)
+        assert has_started_landing.wait(60)
         motions.cancel_wait()

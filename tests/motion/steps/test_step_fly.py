@@ -20,17 +20,17 @@ from fieldkit.steps.scene import CommandResult, Scene
 from fieldkit.trial.procedure import Procedure
 from tests.helpers.casts import CAST, los_plan
 
-DURING = "during: [{wait: {duration: 1s}}]"
+NESTED_STEPS = "during: [{wait: {duration: 1s}}]"
 DRONE = next(role for role, robot in CAST.items() if mavlink_of(robot.profile) is not None)
 PERMITTED = {role: robot.model_copy(update={"abilities": frozenset({"mavlink"})}) for role, robot in CAST.items()}
 SCENE = Scene(Protocol.TCP, PERMITTED, "f")
-LOW = '{"what": "its battery has 10%", "remedy": "charge it", "grave": true}'
-MODE = '{"what": "PX4 refuses to arm", "remedy": "remove the cause", "grave": false}'
+LOW_BATTERY = '{"what": "its battery has 10%", "remedy": "charge it", "grave": true}'
+WRONG_MODE = '{"what": "PX4 refuses to arm", "remedy": "remove the cause", "grave": false}'
 LIMITS = CAST[DRONE].profile.limits
 
 
 def step(text: str) -> FlyStep:
-    return schema.validate(schema.parse(f"{{{text}, {DURING}}}", source="x.yaml"), FlyStep)
+    return schema.validate(schema.parse(f"{{{text}, {NESTED_STEPS}}}", source="x.yaml"), FlyStep)
 
 
 def refusal_texts(text: str) -> list[str]:
@@ -61,7 +61,7 @@ paths = st.lists(st.tuples(metres, metres, metres), max_size=4)
 
 
 @given(metres, paths, st.floats(0.1, 6).map(lambda value: round(value, 1)))
-def test_flight_is_refused_exactly_if_it_exceeds_a_limit(
+def test_flight_is_refused_if_and_only_if_it_exceeds_a_limit(
     height_m: float, path: list[tuple[float, float, float]], speed_m_s: float
 ) -> None:
     legs = ", ".join(f"{{away: {away}m, left: {left}m, up: {up}m}}" for away, left, up in path)
@@ -70,24 +70,30 @@ def test_flight_is_refused_exactly_if_it_exceeds_a_limit(
     farthest_m = math.hypot(sum(away for away, _, _ in path), sum(left for _, left, _ in path))
     assert LIMITS.max_height_m is not None
     assert LIMITS.fence_m is not None
-    pairs = (highest_m, LIMITS.max_height_m), (farthest_m, LIMITS.fence_m), (speed_m_s, LIMITS.max_speed_m_s)
-    if all(abs(value - limit) > 1e-6 for value, limit in pairs):
-        assert len(reasons) == sum(value > limit for value, limit in pairs), reasons
+    values_and_limits = (
+        (highest_m, LIMITS.max_height_m),
+        (farthest_m, LIMITS.fence_m),
+        (speed_m_s, LIMITS.max_speed_m_s),
+    )
+    if all(abs(value - limit) > 1e-6 for value, limit in values_and_limits):
+        assert len(reasons) == sum(value > limit for value, limit in values_and_limits), reasons
 
 
 def test_robot_without_autopilot_is_refused() -> None:
-    ground = next(role for role, robot in CAST.items() if mavlink_of(robot.profile) is None)
-    reasons = refusal_texts(f"robot: {ground}, height: 1m")
+    ground_robot = next(role for role, robot in CAST.items() if mavlink_of(robot.profile) is None)
+    reasons = refusal_texts(f"robot: {ground_robot}, height: 1m")
     assert reasons[0] == "it cannot fly: its profile has no mavlink"
     assert "its profile has no limit for the height" in reasons
 
 
 def test_size_of_log_grows_with_flight_and_is_on_drone_only() -> None:
-    short, long = (step(f"robot: {DRONE}, height: 2m, path: [{{away: {far}m}}]") for far in (10, 910))
-    assert [role for role in CAST if long.stored_bytes(SCENE, role)] == [DRONE]
-    # The return takes 900 s more, and the log has ten lines per second, each of 100 to 250 bytes.
-    grown_bytes = long.stored_bytes(SCENE, DRONE) - short.stored_bytes(SCENE, DRONE)
-    assert 100 * 9000 < grown_bytes < 250 * 9000
+    short_flight, long_flight = (
+        step(f"robot: {DRONE}, height: 2m, path: [{{away: {distance_m}m}}]") for distance_m in (10, 910)
+    )
+    assert [role for role in CAST if long_flight.stored_bytes(SCENE, role)] == [DRONE]
+    # The flight takes 900 s longer, and the log has ten lines of 100 to 250 bytes per second.
+    increase_bytes = long_flight.stored_bytes(SCENE, DRONE) - short_flight.stored_bytes(SCENE, DRONE)
+    assert 100 * 9000 < increase_bytes < 250 * 9000
 
 
 def test_real_drone_needs_permission() -> None:
@@ -108,9 +114,9 @@ def test_shipped_drone_profiles_have_limits() -> None:
     [
         ('{"autopilot": "PX4", "charge": 0.97}\n', 0, Verdict.OK),
         ('{"autopilot": "PX4", "charge": null}\n', 0, Verdict.OK),
-        (f'{LOW}\n{{"autopilot": "PX4", "charge": 0.1}}\n', 0, Verdict.FAIL),
-        (f'{MODE}\n{{"autopilot": "PX4", "charge": 1}}\n', 0, Verdict.WARN),
-        (f'{MODE}\n{LOW}\n{{"autopilot": "PX4", "charge": 0.1}}\n', 0, Verdict.FAIL),
+        (f'{LOW_BATTERY}\n{{"autopilot": "PX4", "charge": 0.1}}\n', 0, Verdict.FAIL),
+        (f'{WRONG_MODE}\n{{"autopilot": "PX4", "charge": 1}}\n', 0, Verdict.WARN),
+        (f'{WRONG_MODE}\n{LOW_BATTERY}\n{{"autopilot": "PX4", "charge": 0.1}}\n', 0, Verdict.FAIL),
         ("error: no heartbeat of an autopilot at udpout:127.0.0.1:14550 in 5 s\n", 1, Verdict.FAIL),
         ("", 1, Verdict.FAIL),
         ('["PX4"]', 0, Verdict.FAIL),
@@ -160,9 +166,9 @@ repeats: 1
 on_abort: {ROLE: land}
 steps: [{ping: {from: sender, to: receiver}}]
 """
-    with pytest.raises(ConfigurationError, match="no step has the role relay") as caught:
+    with pytest.raises(ConfigurationError, match="no step has the role relay") as error_info:
         schema.validate(schema.parse(text.replace("ROLE", "relay"), source="x.yaml"), Procedure)
-    assert caught.value.where == "x.yaml:7"
+    assert error_info.value.where == "x.yaml:7"
     procedure = schema.validate(schema.parse(text.replace("ROLE", "sender"), source="x.yaml"), Procedure)
     plan = los_plan().model_copy(update={"procedure": procedure})
     assert mavlink_of(plan.cast[Role.SENDER].profile) is None
@@ -175,6 +181,8 @@ def test_abort_notes_describe_the_action() -> None:
     assert list(flight.abort_notes(SCENE)) == [
         f"{CAST[DRONE].name} lands, if it is in the air: this takes up to about 37 s, even if fieldkit has exited"
     ]
-    returns = Scene(Protocol.TCP, PERMITTED, "f", sections={ON_ABORT: AbortActions({DRONE: OnAbort.RETURN})})
-    (note,) = flight.abort_notes(returns)
+    scene_with_return = Scene(
+        Protocol.TCP, PERMITTED, "f", sections={ON_ABORT: AbortActions({DRONE: OnAbort.RETURN})}
+    )
+    (note,) = flight.abort_notes(scene_with_return)
     assert "returns automatically" in note

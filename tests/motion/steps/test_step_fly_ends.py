@@ -1,4 +1,4 @@
-"""Flights that end before their steps, with the real agent and an emulated autopilot on this machine."""
+"""Flights that end before their nested steps, with the real agent and an emulated autopilot on this machine."""
 
 import json
 import math
@@ -42,19 +42,19 @@ pytestmark = pytest.mark.emulated
 
 FOLDER = jobs.work_folder("trial", "tcp-01-1")
 FLIGHT = "robot: receiver, height: 60cm, path: [{away: 2m}], speed: 3m/s, lease: 3s"
-NOTICED_S = 5.0
-"""Maximum time until the loss is noticed on a busy machine; a quiet machine needs less than 1 s."""
+DETECTION_LIMIT_S = 5.0
+"""Maximum time until the loss is detected on a busy machine; a quiet machine needs less than 1 s."""
 NEAR_M = 0.6
-"""Maximum distance to the take-off point after the return; the drone had flown three times as far."""
+"""Maximum distance to the take-off point after the return; the drone had flown more than twice as far."""
 
 
 class Shell(LocalShell):
     """A robot with a link that can be interrupted."""
 
-    is_cut = False
+    is_interrupted = False
 
     def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
-        if self.is_cut:
+        if self.is_interrupted:
             raise LinkError("is out of range", where=self.robot, remedy="wait")
         return super().run(argv, deadline=deadline, stdin=stdin, check=check)
 
@@ -72,9 +72,9 @@ def shell(tmp_path: Path) -> Iterator[Shell]:
 
 
 def fly(
-    shell: Shell, url: int | str, waits: str, is_begun: Callable[[], object], abort: OnAbort = OnAbort.LAND
+    shell: Shell, url: int | str, wait_duration: str, on_wait: Callable[[], object], abort: OnAbort = OnAbort.LAND
 ) -> None:
-    """Fly a drone at a UDP port or a connection; call `begun` when a step inside starts."""
+    """Fly a drone at a UDP port or a connection. `on_wait` is called when a nested step starts."""
     connection = url if isinstance(url, str) else f"udpout:127.0.0.1:{url}"
     mavlink = mavlink_of(DUCKIEDRONE)
     assert mavlink is not None
@@ -88,11 +88,11 @@ def fly(
     scene = Scene(
         Protocol.TCP, {Role.RECEIVER: robot}, FOLDER, sections={ON_ABORT: AbortActions({Role.RECEIVER: abort})}
     )
-    step = f"{{{FLIGHT}, during: [{{wait: {{duration: {waits}}}}}, {{wait: {{duration: {waits}}}}}]}}"
+    step = f"{{{FLIGHT}, during: [{{wait: {{duration: {wait_duration}}}}}, {{wait: {{duration: {wait_duration}}}}}]}}"
 
     def announce(name: str, _: float | None) -> None:
         if name == "wait":
-            is_begun()
+            on_wait()
 
     schema.validate(schema.parse(step, source="x.yaml"), FlyStep).run(
         scene, IdleTestbed({Role.RECEIVER: shell}), announce
@@ -103,14 +103,14 @@ def log(shell: Shell) -> str:
     return (shell.home / FOLDER / "fly.log").read_text(encoding="utf-8")
 
 
-@pytest.mark.nightly  # CI has the takeover of an ArduCopter
-def test_takeover_by_a_person_aborts_steps_inside(shell: Shell) -> None:
+@pytest.mark.nightly  # CI tests the takeover of an ArduCopter
+def test_takeover_by_a_person_aborts_the_nested_steps(shell: Shell) -> None:
     with drones.autopilot_at_udp() as (port, autopilot):
         with pytest.raises(
             RobotError, match="here: its flight ended early: a person or another program flies it"
-        ) as caught:
+        ) as error_info:
             fly(shell, port, "60min", lambda: autopilot.vehicle.change_mode(Mode.LAND))
-        assert "the wait was interrupted" in str(caught.value.__cause__)
+        assert "the wait was interrupted" in str(error_info.value.__cause__)
         assert "landed" not in log(shell), "the pilot released the drone"
 
 
@@ -130,7 +130,7 @@ def log_lines(shell: Shell, job: str) -> list[tuple[float, str]]:
 
 @pytest.mark.quiet
 @pytest.mark.parametrize(
-    ("target", "watcher", "number"),
+    ("target_program", "watcher", "signal_number"),
     [
         ("fly", "guard", signal.SIGSTOP),
         ("guard", "fly", signal.SIGKILL),
@@ -138,41 +138,41 @@ def log_lines(shell: Shell, job: str) -> list[tuple[float, str]]:
         pytest.param("guard", "fly", signal.SIGSTOP, marks=pytest.mark.nightly),
     ],
 )
-def test_pilot_and_guard_notice_within_a_second_that_the_other_does_not_run(
-    shell: Shell, target: str, watcher: str, number: signal.Signals
+def test_pilot_and_guard_detect_within_a_second_that_the_other_does_not_run(
+    shell: Shell, target_program: str, watcher: str, signal_number: signal.Signals
 ) -> None:
     at_s: list[float] = []
 
     def send_signal() -> None:
         at_s.append(time.time())
-        os.kill(agent_of(shell, target), number)
+        os.kill(agent_of(shell, target_program), signal_number)
 
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
         with pytest.raises(RobotError):
             fly(shell, port, "60min", send_signal)
         wait_until(lambda: not autopilot.vehicle.is_armed, Deadline.after(60))
         evidence.end_jobs(shell, FOLDER)
-    (seen_s,) = (seen_s for seen_s, text in log_lines(shell, watcher) if text.startswith("land: the "))
-    assert seen_s - at_s[0] < 1.0
+    (detected_s,) = (detected_s for detected_s, text in log_lines(shell, watcher) if text.startswith("land: the "))
+    assert detected_s - at_s[0] < 1.0
 
 
-@pytest.mark.parametrize("number", mark_nightly([signal.SIGSTOP, signal.SIGKILL]))
-def test_flight_continues_without_its_link_server(shell: Shell, number: signal.Signals) -> None:
+@pytest.mark.parametrize("signal_number", mark_nightly([signal.SIGSTOP, signal.SIGKILL]))
+def test_flight_continues_without_its_link_server(shell: Shell, signal_number: signal.Signals) -> None:
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
-        connection, ended = f"udpout:127.0.0.1:{port}", list[int]()
+        connection, killed_servers = f"udpout:127.0.0.1:{port}", list[int]()
 
         def send_signal() -> None:
-            if not ended:
-                ended.extend(servers(connection))
-                os.kill(ended[0], number)
-                wait_until(lambda: bool({*servers(connection)} - {*ended}), Deadline.after(60))
+            if not killed_servers:
+                killed_servers.extend(servers(connection))
+                os.kill(killed_servers[0], signal_number)
+                wait_until(lambda: bool({*servers(connection)} - {*killed_servers}), Deadline.after(60))
                 assert autopilot.vehicle.is_armed, "the server was replaced in flight"
 
         fly(shell, port, "5s", send_signal)
-        assert len(ended) == 1
+        assert len(killed_servers) == 1
         assert autopilot.vehicle.body.on_ground
         assert not autopilot.vehicle.is_armed
-    wait_for_end(set(ended), within_s=30.0)
+    wait_for_end(set(killed_servers), within_s=30.0)
     assert [text for _, text in log_lines(shell, "fly")][-1] == "landed"
 
 
@@ -197,23 +197,23 @@ def test_flight_continues_after_restart_of_its_router(shell: Shell) -> None:
         assert autopilot.vehicle.body.on_ground
         assert not autopilot.vehicle.is_armed
         assert restarts
-        assert router.accepted == 2, "the connection of the link server, and the one after the restart"
+        assert router.accepted == 2, "the link server connected before and after the restart"
     assert silent_lines(shell) >= 3, "no positions arrived during the interruption"
     assert [text for _, text in log_lines(shell, "fly")][-1] == "landed"
 
 
 def test_flight_continues_after_serial_device_was_missing_for_two_seconds(shell: Shell, tmp_path: Path) -> None:
     with drones.autopilot_at_usb(tmp_path / "ttyUSB0") as (usb, autopilot):
-        back = threading.Timer(2.0, usb.plug_in)
+        reconnection = threading.Timer(2.0, usb.plug_in)
 
         def pull_out() -> None:
-            if not back.ident:
+            if not reconnection.ident:
                 usb.pull_out()
-                back.start()
+                reconnection.start()
                 assert autopilot.vehicle.is_armed
 
         fly(shell, f"{usb.path}:115200", "5s", pull_out)
-        back.join()
+        reconnection.join()
         assert autopilot.vehicle.body.on_ground
         assert not autopilot.vehicle.is_armed
     assert silent_lines(shell) >= 3, "no positions arrived during the interruption"
@@ -221,7 +221,7 @@ def test_flight_continues_after_serial_device_was_missing_for_two_seconds(shell:
 
 
 @pytest.mark.parametrize(
-    ("firmware", "number"),
+    ("firmware", "signal_number"),
     [
         (PX4, signal.SIGSTOP),
         pytest.param(ARDUCOPTER, signal.SIGKILL, marks=pytest.mark.nightly),
@@ -229,14 +229,16 @@ def test_flight_continues_after_serial_device_was_missing_for_two_seconds(shell:
         pytest.param(ARDUCOPTER, signal.SIGSTOP, marks=pytest.mark.nightly),
     ],
 )
-def test_guard_lands_drone_whose_pilot_does_not_run(shell: Shell, number: signal.Signals, firmware: Firmware) -> None:
-    """It kills a suspended pilot first, which could otherwise control the drone again later."""
-    target: list[tuple[int, float]] = []
+def test_guard_lands_drone_whose_pilot_does_not_run(
+    shell: Shell, signal_number: signal.Signals, firmware: Firmware
+) -> None:
+    """The guard first kills a suspended pilot, which could otherwise control the drone again later."""
+    killed_pilots: list[tuple[int, float]] = []
 
     def send_signal() -> None:
         pid = agent_of(shell, "fly")
-        os.kill(pid, number)
-        target.append((pid, time.time()))
+        os.kill(pid, signal_number)
+        killed_pilots.append((pid, time.time()))
 
     with drones.autopilot_at_udp(firmware=firmware) as (port, autopilot):
         with pytest.raises(RobotError, match="ended with exit code 137"):
@@ -244,37 +246,39 @@ def test_guard_lands_drone_whose_pilot_does_not_run(shell: Shell, number: signal
         wait_until(lambda: not autopilot.vehicle.is_armed, Deadline.after(60))
         assert autopilot.vehicle.body.on_ground
         wait_until(lambda: any(text == "landed" for _, text in log_lines(shell, "guard")), Deadline.after(60))
-    ((pid, at_s),) = target
+    ((pid, at_s),) = killed_pilots
     wait_for_end({pid}, within_s=30.0)
-    (seen_s,) = (seen_s for seen_s, text in log_lines(shell, "guard") if text.startswith("land: the pilot "))
-    assert seen_s - at_s < NOTICED_S
+    (detected_s,) = (
+        detected_s for detected_s, text in log_lines(shell, "guard") if text.startswith("land: the pilot ")
+    )
+    assert detected_s - at_s < DETECTION_LIMIT_S
 
 
-@pytest.mark.parametrize("number", mark_nightly([signal.SIGSTOP, signal.SIGKILL]))
-def test_pilot_lands_drone_whose_guard_does_not_run(shell: Shell, number: signal.Signals) -> None:
+@pytest.mark.parametrize("signal_number", mark_nightly([signal.SIGSTOP, signal.SIGKILL]))
+def test_pilot_lands_drone_whose_guard_does_not_run(shell: Shell, signal_number: signal.Signals) -> None:
     guards: list[int] = []
 
     def send_signal() -> None:
         guards.append(agent_of(shell, "guard"))
-        os.kill(guards[0], number)
+        os.kill(guards[0], signal_number)
 
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
         with pytest.raises(RobotError, match="its flight ended early: the guard "):
             fly(shell, port, "60min", send_signal)
         wait_until(lambda: not autopilot.vehicle.is_armed, Deadline.after(60))
         wait_until(lambda: "landed" in log(shell), Deadline.after(60))
-        if number == signal.SIGSTOP:
+        if signal_number == signal.SIGSTOP:
             os.kill(guards[0], signal.SIGCONT)
     evidence.end_jobs(shell, FOLDER)
 
 
 def test_no_program_commands_a_drone_after_takeover_by_a_person(shell: Shell) -> None:
-    """A person switches an ArduCopter to LOITER by remote control; then the job is stopped, as by Ctrl-C."""
+    """A person switches an ArduCopter to LOITER by remote control. Then the job is stopped, as by Ctrl-C."""
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
-        with pytest.raises(RobotError, match=r"a person or another program flies it \(mode LOITER") as caught:
+        with pytest.raises(RobotError, match=r"a person or another program flies it \(mode LOITER") as error_info:
             fly(shell, port, "60min", lambda: autopilot.vehicle.change_mode(Mode.LOITER))
-        assert "MAY STILL BE IN THE AIR" in str(caught.value)
-        assert "the wait was interrupted" in str(caught.value.__cause__)
+        assert "MAY STILL BE IN THE AIR" in str(error_info.value)
+        assert "the wait was interrupted" in str(error_info.value.__cause__)
         assert "MODE LOITER" in log(shell)
         evidence.end_jobs(shell, FOLDER)
         wait_until(lambda: jobs.list_running(shell, Deadline.after(30)) == (), Deadline.after(60))
@@ -283,21 +287,21 @@ def test_no_program_commands_a_drone_after_takeover_by_a_person(shell: Shell) ->
         assert not autopilot.vehicle.body.on_ground
 
 
-def test_arducopter_returns_after_its_lease_expired(shell: Shell) -> None:
+def test_arducopter_returns_after_its_lease_has_expired(shell: Shell) -> None:
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
         for name, centimetres in (("RTL_ALT", 100.0), ("WPNAV_RADIUS", 10.0)):
             autopilot._parameters.set(name, centimetres)
         vehicle = autopilot.vehicle
 
-        def cut() -> None:
+        def interrupt_link() -> None:
             wait_until(lambda: math.hypot(*vehicle.body.position_m[:2]) > 1.5, Deadline.after(60))
-            shell.is_cut = True
+            shell.is_interrupted = True
 
         with pytest.raises(LinkError, match="out of range"):
-            fly(shell, port, "1ms", cut, OnAbort.RETURN)
+            fly(shell, port, "1ms", interrupt_link, OnAbort.RETURN)
         wait_until(lambda: not vehicle.is_armed, Deadline.after(60))
-        assert math.hypot(*vehicle.body.position_m[:2]) < NEAR_M, "at the take-off point"
-        shell.is_cut = False
+        assert math.hypot(*vehicle.body.position_m[:2]) < NEAR_M, "the drone is at the take-off point"
+        shell.is_interrupted = False
         wait_until(lambda: "landed" in log(shell), Deadline.after(60))
         assert "return: the order was not renewed in time" in log(shell)
 

@@ -35,9 +35,9 @@ DRONE = CAST[Role.RECEIVER].model_copy(
 )
 SCENE = replace(Scene(Protocol.UDP, {**CAST, Role.RECEIVER: DRONE}, "f"), placement=PLACED)
 START_NS = START_US * 1000
-NOTHING: dict[str, object] = {}
+NO_COUNTERS: dict[str, object] = {}
 START_S = 0.1005
-"""Start of the steps inside, at the second message of each kind."""
+"""Start of the nested steps, at the second message of each kind."""
 
 
 def mavlink(extra_keys: str = "", during: str = PING) -> MavlinkStep:
@@ -71,7 +71,7 @@ def role_and_argument(step: MavlinkStep, scene: Scene = SCENE) -> tuple[Role, di
     return recording.role, json.loads(recording.job.argv[-2])
 
 
-def test_recorder_on_the_drone_and_on_another_robot() -> None:
+def test_recorder_runs_on_the_drone_or_on_another_robot() -> None:
     local = {"connection": "udpout:127.0.0.1:14550", "intervals_us": {}, "system": 0}
     assert role_and_argument(mavlink()) == (Role.RECEIVER, local)
     remote = {"connection": f"udpout:{DRONE.address}:14550", "intervals_us": {"30": 50_000}, "system": 7}
@@ -97,29 +97,33 @@ def test_invalid_connection_is_refused(connection: str) -> None:
         schema.validate(schema.parse(f"{{port: 1, connection: '{connection}'}}", source="x.yaml"), Mavlink)
 
 
-def test_step_with_positions_must_not_be_inside_a_move() -> None:
+def test_step_with_positions_must_not_be_nested_in_a_move() -> None:
     head = "name: x\nsummary: x\nscenario: los\ntopology: masterless\nprotocols: [udp]\nrepeats: 1\nsteps: "
     step = f"{{mavlink: {{robot: receiver, positions: local, facing: away, during: [{PING}]}}}}"
-    moved = f"[move: {{robot: receiver, path: [away: 1m], speed: 1m/s, during: [{step}]}}]"
+    move_steps = f"[move: {{robot: receiver, path: [away: 1m], speed: 1m/s, during: [{step}]}}]"
     with pytest.raises(ConfigurationError, match="put the move into the mavlink"):
-        schema.validate(schema.parse(head + moved, source="x.yaml"), Procedure)
-    without_positions = moved.replace("positions: local, facing: away, ", "")
+        schema.validate(schema.parse(head + move_steps, source="x.yaml"), Procedure)
+    without_positions = move_steps.replace("positions: local, facing: away, ", "")
     assert schema.validate(schema.parse(head + without_positions, source="x.yaml"), Procedure)
 
 
 def attempt(
-    tmp_path: Path, step: MavlinkStep, log: bytes, clock: Offset | None = None, counters: dict[str, object] = NOTHING
+    tmp_path: Path,
+    step: MavlinkStep,
+    log: bytes,
+    clock: Offset | None = None,
+    counters: dict[str, object] = NO_COUNTERS,
 ) -> View:
-    """Return an attempt with this log, which has 10 messages per second from `START_US` on."""
-    began = step._position_sources(SCENE, START_NS + round(1e9 * START_S), {Role.SENDER: clock} if clock else {})
-    (tmp_path / position_sources.FILE).write_text(position_sources.text(began), encoding="utf-8")
+    """Return an attempt with this log, which has 10 messages per second after `START_US`."""
+    sources = step._position_sources(SCENE, START_NS + round(1e9 * START_S), {Role.SENDER: clock} if clock else {})
+    (tmp_path / position_sources.FILE).write_text(position_sources.text(sources), encoding="utf-8")
     (tmp_path / "mavlink.tlog").write_bytes(log)
     all_counters = {"frames": 203, "left_out": 0, "ended_us": START_US + 10_000_000, "refused": {}} | counters
     (tmp_path / "mavlink.json").write_text(json.dumps(all_counters), encoding="utf-8")
     return View(SCENE, AttemptEvidence(tmp_path))
 
 
-def apart(view: View, from_s: float, to_s: float) -> Separation:
+def separation(view: View, from_s: float, to_s: float) -> Separation:
     source, destination = recorded_positions.trajectories_of_pair(view.evidence, (Role.SENDER, Role.RECEIVER))
     began_ns = START_NS + round(1e9 * START_S)
     return trajectories.separation_between(
@@ -134,7 +138,7 @@ def test_local_frame_is_rotated_into_frame_of_placement(tmp_path: Path) -> None:
     """The drone faces north, which is to the left of the link, and flies ahead from a distance of 10 m."""
     view = attempt(tmp_path, mavlink(LOCAL), flight(10, 1.0))
     assert not list(mavlink(LOCAL).check(view))
-    distances = apart(view, 1, 9)
+    distances = separation(view, 1, 9)
     assert distances.distance_start_m == pytest.approx(math.hypot(10, 1), abs=1e-3)
     assert distances.distance_max_m == pytest.approx(math.hypot(10, 9), abs=1e-3)
     measured = mavlink(LOCAL).measure(view)
@@ -148,24 +152,24 @@ def test_times_use_clock_of_the_recorder(tmp_path: Path) -> None:
     assert recorded_positions.samples_of(view.evidence, Role.RECEIVER).times_ns[0] == START_NS + 500_000 - 500_000_000
 
 
-def test_delayed_messages_count_at_time_in_header(tmp_path: Path) -> None:
-    delayed = b"".join(
+def test_delayed_messages_have_the_time_in_their_header(tmp_path: Path) -> None:
+    delayed_log = b"".join(
         struct.pack(">Q", frame.at_us + (2_000_000 if frame.at_us > START_US + 5_000_000 else 0)) + frame.data
         for frame in tlog_reader.frames(flight(10, 1.0))
     )
-    by_header = attempt(tmp_path, mavlink(LOCAL), delayed)
-    assert apart(by_header, 1, 8).distance_max_m == pytest.approx(math.hypot(10, 8), abs=1e-3)
-    received = attempt(tmp_path, mavlink(f"{LOCAL}, times: received"), delayed)
-    assert apart(received, 1, 8).distance_max_m == pytest.approx(math.hypot(10, 6), abs=1e-3)
+    view_by_header = attempt(tmp_path, mavlink(LOCAL), delayed_log)
+    assert separation(view_by_header, 1, 8).distance_max_m == pytest.approx(math.hypot(10, 8), abs=1e-3)
+    view_by_reception = attempt(tmp_path, mavlink(f"{LOCAL}, times: received"), delayed_log)
+    assert separation(view_by_reception, 1, 8).distance_max_m == pytest.approx(math.hypot(10, 6), abs=1e-3)
 
 
-def test_global_positions_with_fixed_position_on_the_earth(tmp_path: Path) -> None:
+def test_distances_of_global_positions_from_a_fixed_position(tmp_path: Path) -> None:
     sender, step = Sender(), mavlink("positions: global, heights: true")
     frames = [(0, sender.frame(beat()))]
     for at_ms in range(0, 10_001, 100):
         north = round(1e7 * at_ms / 1e3 / 110_574.3)  # 1 m/s northwards, in degrees at the equator
-        place = d.MAVLink_global_position_int_message(at_ms, north, 0, 30_000, 3_000, 100, 0, 0, 0)
-        frames.append((at_ms * 1_000, sender.frame(place)))
+        global_position = d.MAVLink_global_position_int_message(at_ms, north, 0, 30_000, 3_000, 100, 0, 0, 0)
+        frames.append((at_ms * 1_000, sender.frame(global_position)))
     view = attempt(tmp_path, step, stamped(frames), counters={"frames": 102})
     assert not list(step.check(view))
     fixed = PositionSource(place=(0.0, 0.0, 0.0), frame=WGS84)
@@ -173,7 +177,7 @@ def test_global_positions_with_fixed_position_on_the_earth(tmp_path: Path) -> No
     (tmp_path / position_sources.FILE).write_text(
         position_sources.text(PositionSources(robots, heights=True)), encoding="utf-8"
     )
-    distances = apart(View(SCENE, AttemptEvidence(tmp_path)), 2 - START_S, 8 - START_S)
+    distances = separation(View(SCENE, AttemptEvidence(tmp_path)), 2 - START_S, 8 - START_S)
     assert distances.distance_start_m == pytest.approx(math.hypot(30, 2), abs=0.02)
     assert distances.distance_max_m == pytest.approx(math.hypot(30, 8), abs=0.02)
 
@@ -197,14 +201,16 @@ def test_incomplete_log_makes_repeat_void(
     assert any(problem in text for text in problems), problems
 
 
-def test_sources_of_steps_inside_are_kept() -> None:
-    placed, topic, file = (
+def test_position_sources_of_nested_steps_take_precedence() -> None:
+    placed_source, topic, file = (
         PositionSource(place=(0.0, 0.0, 0.0)),
         PositionSource(file="a.bag", topic="/odom"),
         PositionSource(file="b.tlog"),
     )
-    inner = PositionSources({Role.SENDER: topic, Role.RECEIVER: placed})
-    outer = PositionSources({Role.SENDER: placed, Role.RECEIVER: file}, {Role.SENDER: Offset(1, 0.1)}, heights=True)
+    inner = PositionSources({Role.SENDER: topic, Role.RECEIVER: placed_source})
+    outer = PositionSources(
+        {Role.SENDER: placed_source, Role.RECEIVER: file}, {Role.SENDER: Offset(1, 0.1)}, heights=True
+    )
     merged = position_sources.merge(inner, outer)
     assert merged.robots == {Role.SENDER: topic, Role.RECEIVER: file}
     assert (merged.clocks, merged.heights) == (outer.clocks, True)

@@ -28,7 +28,7 @@ from tests.helpers.casts import CAST, los_plan
 
 SCENE = Scene(Protocol.TCP, CAST, "f")
 PING = "during: [{ping: {from: sender, to: receiver}}]"
-INSIDE = """\
+MOVE_IN_FAULT = """\
 name: inside
 summary: a move inside a fault
 scenario: los
@@ -75,15 +75,15 @@ def move(text: str) -> MoveStep:
     ],
 )
 def test_invalid_keys_are_refused(text: str, message: str) -> None:
-    with pytest.raises(ConfigurationError, match=message) as caught:
+    with pytest.raises(ConfigurationError, match=message) as error_info:
         move(text)
-    assert caught.value.where == "x.yaml:1"
+    assert error_info.value.where == "x.yaml:1"
 
 
-def test_move_inside_fault_is_refused_with_line() -> None:
-    with pytest.raises(ConfigurationError, match="put the fault into the move") as caught:
-        schema.validate(schema.parse(INSIDE, source="x.yaml"), Procedure)
-    assert caught.value.where == "x.yaml:12"
+def test_move_nested_in_a_fault_is_refused_with_its_line() -> None:
+    with pytest.raises(ConfigurationError, match="put the fault into the move") as error_info:
+        schema.validate(schema.parse(MOVE_IN_FAULT, source="x.yaml"), Procedure)
+    assert error_info.value.where == "x.yaml:12"
 
 
 def test_motion_is_in_metres_and_seconds() -> None:
@@ -101,8 +101,8 @@ def test_direction_of_path_depends_on_role() -> None:
     legs = (Leg(away_m=3.0), Leg(left_m=2.0))
     assert geometry.path_corners_m(model.Move(Role.SENDER, legs, 1.0)) == ((0.0, 0.0), (-3.0, 0.0), (-3.0, -2.0))
     assert geometry.path_corners_m(model.Move(Role.RECEIVER, legs, 1.0)) == ((0.0, 0.0), (3.0, 0.0), (3.0, 2.0))
-    ends = {role: geometry.other_end(role, Topology.MASTER) for role in FIXED_ROLES}
-    assert ends == {Role.SENDER: Role.RELAY, Role.RECEIVER: Role.RELAY, Role.RELAY: Role.SENDER}
+    other_ends = {role: geometry.other_end(role, Topology.MASTER) for role in FIXED_ROLES}
+    assert other_ends == {Role.SENDER: Role.RELAY, Role.RECEIVER: Role.RELAY, Role.RELAY: Role.SENDER}
     assert geometry.other_end(Role.SENDER, Topology.MASTERLESS) is Role.RECEIVER
 
 
@@ -113,7 +113,7 @@ def test_move_above_top_speed_is_refused() -> None:
     assert not list(move(f"robot: relay, path: [{{away: 1m}}], speed: 3m/s, {PING}").refusals(SCENE))
 
 
-def test_steps_run_during_motion_and_their_error_ends_it() -> None:
+def test_nested_steps_run_during_the_motion_and_their_error_ends_it() -> None:
     events: list[object] = []
 
     class Robots:
@@ -137,13 +137,13 @@ def test_steps_run_during_motion_and_their_error_ends_it() -> None:
 
 
 def test_dry_run_shows_moves_and_faults(capsys: pytest.CaptureFixture[str]) -> None:
-    shipped = load_procedure("driveaway")
-    print_commands(los_plan().model_copy(update={"procedure": shipped.resolved(CAST)}))
+    procedure = load_procedure("driveaway")
+    print_commands(los_plan().model_copy(update={"procedure": procedure.resolved(CAST)}))
     output = capsys.readouterr().out.splitlines()
     assert "# while steps run: turtlebot-2 moves 29.5 m away, at 0.22 m/s, for up to 134.1 s" in output
     assert not any("refused" in line for line in output)
-    healing = los_plan().model_copy(update={"procedure": load_procedure("selfheal")})
-    print_commands(healing)
+    healing_plan = los_plan().model_copy(update={"procedure": load_procedure("selfheal")})
+    print_commands(healing_plan)
     output = capsys.readouterr().out.splitlines()
     assert "# while steps run: link-down of turtlebot-1 for 2 s, after 1 s" in output
 
@@ -154,16 +154,16 @@ def resolved_move(text: str, cast: Cast = CAST) -> MoveStep:
 
 def test_move_within_limits_is_reduced_to_speed_and_fence() -> None:
     path = "path: [{away: 60m}], speed: 2m/s"
-    slow = resolved_move(f"robot: receiver, {path}, within_limits: true, {PING}")
-    assert slow.motion == model.Move(Role.RECEIVER, (Leg(29.5),), 0.22)
-    assert slow.straight_s == pytest.approx(29.5 / 0.22, abs=1e-3)
-    assert not list(slow.refusals(SCENE))
+    ground_move = resolved_move(f"robot: receiver, {path}, within_limits: true, {PING}")
+    assert ground_move.motion == model.Move(Role.RECEIVER, (Leg(29.5),), 0.22)
+    assert ground_move.straight_s == pytest.approx(29.5 / 0.22, abs=1e-3)
+    assert not list(ground_move.refusals(SCENE))
     drone = resolved_move(f"robot: relay, {path}, within_limits: true, {PING}")
     assert drone.motion == model.Move(Role.RELAY, (Leg(60.0),), 2.0), "within the limits of the drone"
-    assert not slow.within_limits, "the plan has the actual motion"
-    refusals = resolved_move(f"robot: receiver, {path}, {PING}")
-    assert refusals.motion.speed_m_s == 2.0
-    assert [refusal.what for refusal in refusals.refusals(SCENE)] == [
+    assert not ground_move.within_limits, "the plan has the actual motion"
+    unreduced_move = resolved_move(f"robot: receiver, {path}, {PING}")
+    assert unreduced_move.motion.speed_m_s == 2.0
+    assert [refusal.what for refusal in unreduced_move.refusals(SCENE)] == [
         "its top speed is 0.22 m/s, but the move needs 2 m/s"
     ]
 
@@ -183,8 +183,8 @@ def test_move_within_limits_is_reduced_to_speed_and_fence() -> None:
 def test_shipped_procedure_with_shipped_profiles(
     profile: str, note: str, pings: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    loaded = load_profile(profile)
-    update = {"profile": loaded, "abilities": frozenset(loaded.sections) & {"drive"}}
+    loaded_profile = load_profile(profile)
+    update = {"profile": loaded_profile, "abilities": frozenset(loaded_profile.sections) & {"drive"}}
     cast = {role: robot.model_copy(update=update) for role, robot in CAST.items()}
     request = TrialRequest(load_procedure("driveaway"), parse_distance("5m"))
     plan = make_plan(request, backend="field", cast=cast, now=datetime(2026, 11, 20, tzinfo=UTC))
@@ -194,7 +194,7 @@ def test_shipped_procedure_with_shipped_profiles(
     assert f"-c {pings} -i 0.2" in out
     assert "refused" not in out
     measured = {column.name for column in plan.columns or ()} & {column.name for column in drive_log.COLUMNS}
-    assert bool(measured) == ("drive" in loaded.sections), "columns of the drive"
+    assert bool(measured) == ("drive" in loaded_profile.sections), "only a driving robot has columns of a drive"
 
 
 def test_top_speed_is_the_default() -> None:
@@ -213,12 +213,12 @@ def test_adjustments_describe_the_reduction() -> None:
     assert not list(move(text.replace("within_limits: true, ", "")).adjustments(CAST))
 
 
-def test_written_plan_is_read_unchanged() -> None:
+def test_procedure_of_a_plan_is_written_and_read() -> None:
     plan = los_plan().model_copy(update={"procedure": load_procedure("driveaway").resolved(CAST)})
-    reread = schema.validate(schema.parse(schema.dump(plan.procedure), source="trial.yaml"), Procedure)
-    assert reread == plan.procedure
-    assert "within_limits" not in schema.dump(reread)
-    assert "along" not in schema.dump(reread)
+    parsed = schema.validate(schema.parse(schema.dump(plan.procedure), source="trial.yaml"), Procedure)
+    assert parsed == plan.procedure
+    assert "within_limits" not in schema.dump(parsed)
+    assert "along" not in schema.dump(parsed)
 
 
 lengths = st.floats(-30, 30).map(lambda metres: round(metres, 2))
@@ -232,13 +232,15 @@ def test_path_is_shortened_at_the_fence(path: list[Leg], fence_m: float) -> None
     if geometry.farthest_m(path) <= fence_m:
         assert list(shortened) == path
         return
-    complete = len(shortened) - 1
-    assert list(shortened[:complete]) == path[:complete]
+    n_complete = len(shortened) - 1
+    assert list(shortened[:n_complete]) == path[:n_complete]
     end = math.hypot(sum(leg.away_m for leg in shortened), sum(leg.left_m for leg in shortened))
     assert end == pytest.approx(fence_m, abs=1e-6)
-    cut, leg = shortened[complete], path[complete]
-    assert cut.away_m * leg.left_m == pytest.approx(cut.left_m * leg.away_m, abs=1e-6), "the same direction"
-    assert math.hypot(cut.away_m, cut.left_m) <= math.hypot(leg.away_m, leg.left_m) + 1e-6
+    last_leg, leg = shortened[n_complete], path[n_complete]
+    assert last_leg.away_m * leg.left_m == pytest.approx(last_leg.left_m * leg.away_m, abs=1e-6), (
+        "the last leg has the direction of the planned leg"
+    )
+    assert math.hypot(last_leg.away_m, last_leg.left_m) <= math.hypot(leg.away_m, leg.left_m) + 1e-6
 
 
 @given(legs, st.floats(0.5, 40))
@@ -246,11 +248,11 @@ def test_shortened_path_is_valid_in_a_procedure(path: list[Leg], fence_m: float)
     segments = [PathLeg.of(leg) for leg in geometry.clip_path(path, fence_m)]
     for segment, leg in zip(segments, path, strict=False):
         if segment is not None:
-            reread = schema.validate(schema.parse(schema.dump(segment), source="x.yaml"), PathLeg)
-            assert reread == segment
-            assert abs(reread.leg.away_m) <= abs(leg.away_m) + 1e-9
-            assert reread.leg.away_m * leg.away_m >= 0
-            assert reread.leg.left_m * leg.left_m >= 0
+            parsed = schema.validate(schema.parse(schema.dump(segment), source="x.yaml"), PathLeg)
+            assert parsed == segment
+            assert abs(parsed.leg.away_m) <= abs(leg.away_m) + 1e-9
+            assert parsed.leg.away_m * leg.away_m >= 0
+            assert parsed.leg.left_m * leg.left_m >= 0
 
 
 def test_driving_robot_has_columns_and_time_for_the_return() -> None:
@@ -258,11 +260,11 @@ def test_driving_robot_has_columns_and_time_for_the_return() -> None:
     driving_robots = {
         role: robot.model_copy(update={"abilities": frozenset({"drive"})}) for role, robot in CAST.items()
     }
-    driving, moved = resolved_move(text, driving_robots), resolved_move(text)
-    assert {column.name for column in driving.output_columns()} >= {
+    driving_step, moved_by_person = resolved_move(text, driving_robots), resolved_move(text)
+    assert {column.name for column in driving_step.output_columns()} >= {
         "drive_out_m",
         "drive_back_off_m",
         "drive_ended",
     }
-    assert not moved.output_columns()
-    assert driving.expected_s(Protocol.UDP) == moved.expected_s(Protocol.UDP) + 10.0
+    assert not moved_by_person.output_columns()
+    assert driving_step.expected_s(Protocol.UDP) == moved_by_person.expected_s(Protocol.UDP) + 10.0
