@@ -349,8 +349,8 @@ def _duplicate_resource_message(step: Step, resource: str) -> str:
             "for: to the name"
         )
     return (
-        f"{resource} is defined twice; give each of them a name:. In a loop, add the variable of for: to the name, "
-        "for example name: p{bytes}"
+        f"{resource} is defined twice; give each of them another name. In a loop, add the variable of for: to the "
+        "name, for example name: p{bytes}"
     )
 
 

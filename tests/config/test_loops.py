@@ -107,7 +107,7 @@ def test_file_without_loops_is_unchanged() -> None:
         ("      during:\n", "      during: 5\n      due:\n", "unknown key due in for:", 4, "for: {each:"),
         ("  - for:", "  - fore:", "unknown key fore", 1, "correct this line"),
         ("  - for:", "  - ping: {}\n    for:", "for: must be the only key of its entry", 1, "- for:"),
-        ('name: "p{bytes}", ', "", "a ping is defined twice; give each of them a name:. In a loop", 4, ""),
+        ('name: "p{bytes}", ', "", "a ping is defined twice; give each of them another name. In a loop", 4, ""),
         ('"p{bytes}"', "p", "a ping named p is defined twice; rename one of them", 4, ""),
         ('"{bytes}"}', '"{bytes}", cuont: 3}', "unknown key cuont; did you mean 'count'?", 4, ""),
         ("8192]", "99999]", "Input should be less than or equal to 65507", 4, ""),

@@ -107,7 +107,7 @@ def test_a_trial_is_valid_and_captures_no_ssh_packets(tmp_path: Path, radio: str
 
 
 @pytest.mark.emulated
-@pytest.mark.parametrize(("control", "word"), [("separate", "arrives at 127.0.0.1"), ("radio", "shares the radio")])
+@pytest.mark.parametrize(("control", "word"), [("separate", "connects to 127.0.0.1"), ("radio", "shares the radio")])
 def test_check_reports_the_network_of_ssh(tmp_path: Path, control: str, word: str) -> None:
     folder = make_lab(tmp_path / "lab", "{}")
     site = folder / "fieldkit.yaml"

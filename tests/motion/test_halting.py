@@ -69,7 +69,7 @@ def test_all_moving_programs_are_stopped_and_report_their_state(robot: LocalShel
     assert "record" in running_jobs(robot), "the recorder does not move the robot"
     second_result = halting.halt(robot, "bert@two", Deadline.after(60))
     assert (second_result.programs, second_result.state) == ((), MotionState.NOTHING)
-    with pytest.raises(RobotError, match=r"the jobs of .* were ended by bert@two"):
+    with pytest.raises(RobotError, match=r"the jobs of .* were stopped by bert@two"):
         start(robot, "later", "drive", DRIVE_SCRIPT)
     evidence.end_jobs(robot, FOLDER)
 

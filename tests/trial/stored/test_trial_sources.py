@@ -57,7 +57,7 @@ def test_a_trial_without_a_table_is_named(tmp_path: Path) -> None:
     (unfinished / "trial.yaml").touch()
     notes: list[str] = []
     assert len(load([tmp_path], notes)) == 2
-    assert [note for note in notes if f"to make it: fieldkit rebuild {unfinished}" in note]
+    assert [note for note in notes if f"to create it: fieldkit rebuild {unfinished}" in note]
 
 
 def test_a_table_without_its_trial_cannot_be_rebuilt(tmp_path: Path) -> None:
