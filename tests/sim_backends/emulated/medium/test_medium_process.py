@@ -364,7 +364,7 @@ def test_invalid_requests_are_rejected(routed_namespaces: tuple[MediumClient, di
     with pytest.raises(RobotError, match="nonsense"):
         medium.attach("new", "nonsense", RADIO, fd)
     os.close(fd)
-    with pytest.raises(ConfigurationError, match="place: x"):
+    with pytest.raises(ConfigurationError, match="position: x"):
         medium.place({"x": (0.0, 0.0, 0.0)})
     with pytest.raises(ConfigurationError, match="place: r"):
         medium.place({"a": PLACES["a"]}, relay="r")
