@@ -366,7 +366,7 @@ def test_invalid_requests_are_rejected(routed_namespaces: tuple[MediumClient, di
     os.close(fd)
     with pytest.raises(ConfigurationError, match="position: x"):
         medium.place({"x": (0.0, 0.0, 0.0)})
-    with pytest.raises(ConfigurationError, match="place: r"):
+    with pytest.raises(ConfigurationError, match="position: r"):
         medium.place({"a": PLACES["a"]}, relay="r")
 
 
