@@ -95,7 +95,7 @@ def _columns(name: str, factor: float) -> list[SheetColumn]:
             "verdict",
             "agrees if the printed value, with its precision, is within the interval, or equals the simulated mean",
         ),
-        SheetColumn(f"{name}_off{suffix}", "difference", "simulated value minus the printed one", factor),
+        SheetColumn(f"{name}_off{suffix}", "deviation", "simulated value minus the printed one", factor),
     ]
 
 
