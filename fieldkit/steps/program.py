@@ -21,7 +21,7 @@ from fieldkit.steps.view import View
 class ProgramStep(Step):
     """A step that runs one program on one robot and parses its output.
 
-    A kind needs the fields that are its YAML keys, `columns`, and two methods: `argv` and `parse`. The output is
+    A subclass declares its YAML keys as fields, `columns`, and two methods: `argv` and `parse`. The output is
     stored in a file of at most `program_output.MAX_OUTPUT_BYTES` bytes.
 
     Attributes:

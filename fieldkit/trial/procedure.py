@@ -262,7 +262,7 @@ class Procedure(catalog.Named, Sectioned):
         return self.model_copy(update={"steps": steps})
 
     def resolved(self, cast: Cast) -> "Procedure":
-        """Return this procedure with values of the robots in its steps, for example a maximum speed."""
+        """Return this procedure with robot-specific values filled in, for example a maximum speed."""
         steps = tuple(resolved(entry, cast) for entry in self.steps)
         return self.model_copy(update={"steps": steps})
 
@@ -301,8 +301,8 @@ class PlacedStep:
     def port_conflict(self, other: "PlacedStep") -> str | None:
         """Return the reason why an earlier step conflicts with the ports of this step, or None.
 
-        One program at a time can listen on a port of a robot. In one capture, packets are distinguished by the two
-        robots and the port.
+        Only one program at a time can listen on a port of a robot. In one capture, packets are distinguished by the
+        two robots and the port.
         """
         is_simultaneous = self.runs_at_same_time_as(other) or any(nest is other.step for nest in self.within)
         is_captured = any(nest.captures() and any(nest is around for around in other.within) for nest in self.within)

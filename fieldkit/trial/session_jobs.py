@@ -1,4 +1,4 @@
-"""Jobs that run on robots during a whole session, such as a bridge of topics.
+"""Jobs that run on robots during a whole session, such as a topic bridge.
 
 They run from before the first check until the end of the session, so that the preflight checks, operators and all
 trials of the session use the robot in the same state. They are normal jobs: `fieldkit abort` stops them, and a
@@ -24,7 +24,7 @@ SessionJobs = Callable[[Cast, str], Iterable[Planned]]
 """Function that returns the jobs of a session on the robots of a cast. The second argument is the ID of the session,
 which must be the name of the folder of each job."""
 
-_INSTALLS_S: Final = 30.0
+_INSTALL_TIMEOUT_S: Final = 30.0
 _GRACE_S: Final = 5
 
 
@@ -51,7 +51,7 @@ def running(cast: Cast, shells: Shells, session: str, *, sink: Sink) -> Iterator
 
     Args:
         cast: The robot in each role.
-        shells: The robots.
+        shells: The shell of each robot.
         session: ID of the run of fieldkit.
         sink: Receives the start of the jobs, and a note on each job that did not exit successfully.
 
@@ -80,7 +80,7 @@ def running(cast: Cast, shells: Shells, session: str, *, sink: Sink) -> Iterator
 
 def _start(cast: Cast, shell: Shell, planned_job: Planned) -> None:
     robot, job = cast[planned_job.role], planned_job.job
-    jobs.install(shell, Deadline.after(_INSTALLS_S))
+    jobs.install(shell, Deadline.after(_INSTALL_TIMEOUT_S))
     evidence.begin(shell, job.folder, planned_job.role, robot.profile.radio.interface)
     try:
         jobs.start(shell, job)
@@ -97,7 +97,7 @@ def _stop(shell: Shell, job: Job) -> str:
         code = jobs.stop(shell, job, grace_s=_GRACE_S)
         evidence.discard(shell, job.folder.split("/")[-2])
     except TestbedLostError:
-        return ""  # the job exited with its robot
+        return ""  # the job ended because its robot is gone
     except FieldkitError as error:
         return f"was not stopped: {error.what}"
     early = "" if was_running else "early, "

@@ -265,7 +265,7 @@ def load_options(document: Document | None) -> EmulatedOptions:
     """Return the options in a site file's document, or the defaults if it has no section `emulated`.
 
     Raises:
-        ConfigurationError: The section is wrong; the message has file and line.
+        ConfigurationError: The section is wrong; the message names the file and the line.
     """
     if document is None or not document.data.get("emulated"):
         return EmulatedOptions.defaults()

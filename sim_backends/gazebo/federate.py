@@ -1,4 +1,4 @@
-"""The physics federate `gazebo`, a program that couples a running Gazebo."""
+"""The physics federate `gazebo`, a program that couples a running Gazebo to the co-simulation."""
 
 import shlex
 import shutil

@@ -1,7 +1,8 @@
-"""Transports of bare IP packets: each packet of a program is one IP packet, with its own headers in its size.
+"""Transports of bare IP packets: each packet that a program sends is one IP packet, whose size includes its headers.
 
-The programs are real: their kernels have built the packets. A broadcast or multicast enters the network as one packet
-per receiver, all with the same source, number and time; the radio sends them as one frame.
+The programs are real, and the kernels of their hosts have already built the packets. A broadcast or multicast
+enters the network as one packet per receiver, all with the same source, number and time; the radio sends them as one
+frame.
 """
 
 from dataclasses import dataclass, field
@@ -52,7 +53,7 @@ class _Group:
 
     Attributes:
         packet_ids: Packet number for each receiver that has neither received nor missed the frame.
-        miss_reasons: For each receiver that missed the frame before its packet entered the network, the reason.
+        miss_reasons: Reason for each receiver that missed the frame before the packet addressed to it was sent.
     """
 
     packet_ids: dict[str, int] = field(default_factory=dict)
@@ -60,7 +61,9 @@ class _Group:
 
 
 class BareBroadcast:
-    """Carries broadcasts. The first packet of a group sends one frame, which carries all packets of the group.
+    """Carries broadcasts.
+
+    When the first packet of a group is sent, one frame is transmitted that carries all packets of the group.
 
     Args:
         wire: The network below.

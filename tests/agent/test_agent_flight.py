@@ -59,7 +59,7 @@ def test_state_from_messages_of_an_autopilot() -> None:
         d.MAVLink_local_position_ned_message(1, 1.0, -2.0, -3.0, 0.3, 0.4, 0.0),
         d.MAVLink_attitude_message(1, 0.1, 0.2, 1.5, 0, 0, 0),
         d.MAVLink_command_ack_message(400, 4),
-        d.MAVLink_statustext_message(4, b"Arming denied: it falls"),
+        d.MAVLink_statustext_message(4, b"Arming denied: vehicle is falling"),
     )
     assert state.alive
     assert state.armed
@@ -70,8 +70,8 @@ def test_state_from_messages_of_an_autopilot() -> None:
     assert state.speed_m_s == pytest.approx(0.5)
     assert state.yaw_rad == pytest.approx(1.5)
     assert state.command_results == {400: 4}
-    assert status_text(state) == "mode OFFBOARD, its last text: Arming denied: it falls"
-    assert state.texts.unread() == ["Arming denied: it falls"]
+    assert status_text(state) == "mode OFFBOARD, its last text: Arming denied: vehicle is falling"
+    assert state.texts.unread() == ["Arming denied: vehicle is falling"]
     assert state.texts.unread() == []
 
 

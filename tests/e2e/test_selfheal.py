@@ -212,7 +212,7 @@ def test_a_fault_that_cannot_be_injected_fails_the_attempt(tmp_path: Path) -> No
     assert run.code == 4, run.err + run.out
     assert not deadline.expired, "the steps inside the block were ended"
     (row,) = rows(only_trial(tmp_path))
-    assert "no process named roscore runs" in row["reason"]
+    assert "no process named roscore is running" in row["reason"]
 
 
 def summary(trial: Path) -> dict[str, dict[str, str]]:

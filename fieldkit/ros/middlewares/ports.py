@@ -2,7 +2,7 @@
 
 DDS: RTPS 2.5, section 9.6.2 (PB 7400, DG 250, PG 2, d0 0, d1 10, d2 1, d3 11). Zenoh and ROS 1 do not use their
 default ports, so that fieldkit's routers, masters and nodes can run beside those of a robot. Each domain has separate
-ports, so that several domains can be used on one robot. Only the scouting of Zenoh uses its default port.
+ports, so that several domains can be used on one robot. Only Zenoh scouting uses its default port.
 """
 
 from dataclasses import dataclass
@@ -26,8 +26,8 @@ class MiddlewarePorts:
 
     Attributes:
         data: Ports of samples and their acknowledgements.
-        discovery: Ports of the discovery.
-        group: Multicast group of the discovery; None without multicast.
+        discovery: Ports used for discovery.
+        group: Multicast group used for discovery; None without multicast.
     """
 
     data: frozenset[int]
@@ -47,7 +47,7 @@ def dds(domain: int, *, multicast: bool) -> MiddlewarePorts:
 
 
 def zenoh_listener(domain: int) -> int:
-    """Return the port on which sessions and routers of Zenoh listen in a domain."""
+    """Return the port on which Zenoh sessions and routers listen in a domain."""
     return _ZENOH_FIRST + domain
 
 
@@ -60,17 +60,17 @@ def zenoh(domain: int, *, multicast: bool) -> MiddlewarePorts:
 
 
 def ros1_master(domain: int) -> int:
-    """Return the port of ROS 1's master in a domain."""
+    """Return the port of the ROS 1 master in a domain."""
     return _ROS1_FIRST + _ROS1_PORTS * domain
 
 
 def ros1_node(domain: int) -> dict[str, int]:
-    """Return the ports of a node of ROS 1, by the names of the agent's settings."""
+    """Return the ports of a ROS 1 node of fieldkit's agent (the program that it runs on a robot), by setting name."""
     return {"xmlrpc_port": ros1_master(domain) + 1, "tcpros_port": ros1_master(domain) + 2}
 
 
 def ros1(domain: int) -> MiddlewarePorts:
-    """Return the ports of the agent's nodes of ROS 1 in a domain, and of the master."""
+    """Return the ports of the ROS 1 master and of the agent's nodes in a domain."""
     node = ros1_node(domain)
     return MiddlewarePorts(
         data=frozenset({node["tcpros_port"]}), discovery=frozenset({node["xmlrpc_port"], ros1_master(domain)})

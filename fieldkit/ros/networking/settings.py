@@ -23,8 +23,8 @@ _SERVER_PORT: Final = 11811
 _RECOMMENDED: Final = {
     # "DDS tuning information": CycloneDDS recommends 10 MB, Fast DDS and Connext recommend more.
     "net/core/rmem_max": (10_485_760, "at least", "a burst of fragments of a large sample exceeds the buffer"),
-    "net/ipv4/ipfrag_time": (3, "at most", "incomplete datagrams of a lossy link occupy the buffer of fragments"),
-    "net/ipv4/ipfrag_high_thresh": (134_217_728, "at least", "incomplete datagrams fill the buffer of fragments"),
+    "net/ipv4/ipfrag_time": (3, "at most", "incomplete datagrams of a lossy link occupy the reassembly buffer"),
+    "net/ipv4/ipfrag_high_thresh": (134_217_728, "at least", "incomplete datagrams fill the reassembly buffer"),
 }
 
 
@@ -77,7 +77,7 @@ def judge_agreement(
     Args:
         cast: The robots.
         states: State of each robot that could be read.
-        reports: Receive the findings.
+        reports: The report of each robot, to which the findings are added.
     """
     roles = [role for role in states if is_ros2(cast[role])]
     if len(roles) < 2:
@@ -100,8 +100,7 @@ def _judge_domain(robot: Robot, state: RosState, report: Report) -> None:
     if other_values:
         report.warn(
             "ROS domain",
-            f"{own_domain} by its setup files and profile, but not in all of {count} running ROS programs: "
-            f"{other_values}",
+            f"its setup files and profile result in domain {own_domain}, but {other_values}",
             f"start them in domain {own_domain}, or correct ROS_DOMAIN_ID: "
             f"{copy_profile_command(robot.profile.name)}",
         )
@@ -117,8 +116,7 @@ def _judge_domain(robot: Robot, state: RosState, report: Report) -> None:
     if other_values:
         report.warn(
             "RMW",
-            f"{own_rmw} by its setup files and profile, but not in all of {count} running ROS programs: "
-            f"{other_values}",
+            f"its setup files and profile result in {own_rmw}, but {other_values}",
             "set RMW_IMPLEMENTATION for all programs of the robot, and restart them: ros2 daemon stop",
         )
     else:
@@ -128,11 +126,14 @@ def _judge_domain(robot: Robot, state: RosState, report: Report) -> None:
 def _differing_values(
     programs: tuple[RosProgram, ...], is_equal: Callable[[Variables], bool], name: str, default: str
 ) -> str:
-    """Return the values of a variable that differ, with the number of programs; empty if no value differs."""
+    """Return how many programs use which other values of a variable; empty if no value differs."""
     values = Counter(
         program.variables.get(name) or default for program in programs if not is_equal(program.variables)
     )
-    return ", ".join(f"{count} with {value}" for value, count in values.most_common(3))
+    return ", ".join(
+        f"{count} of its {len(programs)} running ROS programs {'uses' if count == 1 else 'use'} {value}"
+        for value, count in values.most_common(3)
+    )
 
 
 def _judge_range(variables: Variables, report: Report) -> None:
@@ -164,7 +165,7 @@ def _judge_router(state: RosState, report: Report) -> None:
     elif _ZENOH_PORT not in state.tcp_ports:
         report.fail(
             "Zenoh router",
-            f"no router listens on TCP port {_ZENOH_PORT}, without which nodes do not discover each other",
+            f"no router is listening on TCP port {_ZENOH_PORT}; without one, nodes do not discover each other",
             "ros2 run rmw_zenoh_cpp rmw_zenohd",
         )
     elif not any(
@@ -207,11 +208,11 @@ def _judge_multicast_route(robot: Robot, state: RosState, report: Report) -> Non
     elif state.multicast_interface != radio:
         report.warn(
             "multicast route",
-            f"packets to 239.255.0.1 leave by {state.multicast_interface}, not by {radio}",
+            f"packets to 239.255.0.1 leave through {state.multicast_interface}, not {radio}",
             f"sudo ip route add 224.0.0.0/4 dev {radio}   # or name {radio} in the settings of the RMW",
         )
     else:
-        report.ok("multicast route", f"by {radio}")
+        report.ok("multicast route", f"through {radio}")
 
 
 def _judge_kernel(state: RosState, report: Report) -> None:
@@ -229,12 +230,12 @@ def _judge_kernel(state: RosState, report: Report) -> None:
     elif state.kernel:
         report.ok("kernel buffers", "as ROS recommends")
     else:
-        report.ok("kernel buffers", "not known: they cannot be read in its network namespace")
+        report.ok("kernel buffers", "unknown: these settings cannot be read in the robot's network namespace")
 
 
 def _judge_firewall(state: RosState, report: Report) -> None:
     if state.drop_rules is None:
-        report.ok("firewall", "rules not known: reading them needs root, nft or iptables")
+        report.ok("firewall", "unknown: reading the rules needs root and either nft or iptables")
     elif state.drop_rules:
         first_rules = "; ".join(state.drop_rules[:3])
         report.warn(
@@ -307,12 +308,13 @@ def judge_servers(
                 reports[role].ok("discovery server", f"{server} runs on none of the robots, so it is not checked")
             elif port in states[server_role].udp_ports:
                 reports[role].ok(
-                    "discovery server", f"{server}: a program of {cast[server_role].name} has this UDP port"
+                    "discovery server",
+                    f"{server}: a program on {cast[server_role].name} is listening on UDP port {port}",
                 )
             else:
                 reports[role].fail(
                     "discovery server",
-                    f"{server}: no program of {cast[server_role].name} has UDP port {port}",
+                    f"{server}: no program on {cast[server_role].name} is listening on UDP port {port}",
                     f"on {cast[server_role].name}: fastdds discovery -i 0 -l {address} -p {port}",
                 )
 

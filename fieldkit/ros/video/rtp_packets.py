@@ -26,7 +26,7 @@ class RtpPackets(Table):
         stamp: RTP time stamp, which the packets of a frame share.
         sequence: Sequence number, modulo 65536.
         at_ns: Time of capture.
-        wire_bytes: Length of the whole frame on the link.
+        wire_bytes: Length of the link-layer frame.
     """
 
     stamp: Ints
@@ -36,7 +36,7 @@ class RtpPackets(Table):
 
     @property
     def keys(self) -> Ints:
-        """A number for each packet that copies of it share, and no other packet."""
+        """A key for each packet, shared only by copies of that packet."""
         keys: Ints = (self.stamp << 16) | self.sequence
         return keys
 

@@ -122,4 +122,4 @@ class Observer:
         """Time between two requests; old iputils allow less than 200 ms only for root."""
         tools = self.scene.tools(self.role)
         is_slow = not self._is_kill and tools.ping is PingTool.IPUTILS_OLD and not tools.root
-        return ping.OLD_INTERVAL_S if is_slow else _INTERVAL_S
+        return ping.OLD_IPUTILS_MIN_INTERVAL_S if is_slow else _INTERVAL_S

@@ -34,11 +34,13 @@ from fieldkit.steps.view import View, capture_around
 if TYPE_CHECKING:
     from fieldkit.measure.checks.ping_duplicates import PingEchoes
 
-LAST_REPLY_S: Final = 2
+REPLY_TIMEOUT_S: Final = 2
+"""Time that ping waits for the reply to its last request (option `-W`)."""
 MAX_SEQUENCE_COUNT: Final = 0xFFFF
 """Number of requests after which sequence numbers repeat."""
 _HEADER_BYTES: Final = 8
-OLD_INTERVAL_S: Final = 0.2
+OLD_IPUTILS_MIN_INTERVAL_S: Final = 0.2
+"""Shortest interval that iputils before 20210722 allows without root."""
 MAX_COUNT: Final = 1_000_000
 _ROUNDING: Final = 1e-6
 
@@ -53,11 +55,13 @@ def command_line(scene: Scene, role: Role, options: Iterable[str], address: str)
 
 
 class Payloads(Strict):
-    """ICMP payload in bytes per protocol; the defaults are the windows of the protocols in the paper (docs/index.md).
+    """ICMP payload in bytes per protocol.
+
+    The defaults are the window sizes in bytes that the paper (cited in docs/index.md) uses for TCP and UDP.
 
     Attributes:
-        tcp: In TCP repeats.
-        udp: In UDP repeats.
+        tcp: Payload in repeats that use TCP.
+        udp: Payload in repeats that use UDP.
     """
 
     tcp: Payload = 502
@@ -126,14 +130,14 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
         requests = ("-c", str(self.count), "-i", f"{self.interval:g}", "-s", str(self.payload_of(scene.protocol)))
-        options = (*requests, "-W", str(LAST_REPLY_S))
+        options = (*requests, "-W", str(REPLY_TIMEOUT_S))
         yield Planned(
             self.sender,
             Job(
                 folder=scene.folder,
                 name=self.prefixed_name("ping"),
                 argv=command_line(scene, self.sender, options, scene.link(self.receiver, self.over).address),
-                limit_s=self.count * self.interval + LAST_REPLY_S + 10.0,
+                limit_s=self.count * self.interval + REPLY_TIMEOUT_S + 10.0,
                 log=self._log,
                 stdout=self._file,
             ),
@@ -148,7 +152,7 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
     @override
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
         tools = scene.tools(self.sender)
-        if tools.ping is PingTool.IPUTILS_OLD and not tools.root and self.interval < OLD_INTERVAL_S:
+        if tools.ping is PingTool.IPUTILS_OLD and not tools.root and self.interval < OLD_IPUTILS_MIN_INTERVAL_S:
             yield Refusal(
                 self.sender,
                 f"its ping allows an interval of {1e3 * self.interval:g} ms only for root (iputils before 20210722)",
@@ -265,8 +269,8 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
     def _packets_missing_in_capture(self, result: Ping, role: Role, view: View) -> Iterator[str]:
         """Yield a reason if ping printed more answers, or more answered requests, than a capture contains.
 
-        The capture may contain other pings, with other identifiers or sizes. The number of packets is compared with
-        the identifier that has the most packets, so that the check is valid for any of them.
+        The capture may contain other pings, with other identifiers or sizes. The printed number is compared with
+        the packet count of the most frequent identifier, so the check holds whichever identifier is this ping's.
         """
         capture = view.capture(role)
         if capture is None:
@@ -287,8 +291,10 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
     def _earlier_packets(self, view: View) -> int:
         """Return the number of received packets of pings that sent no request during the captures.
 
-        Packets of another ping of this attempt do not count, because its requests were captured. Fragments without
-        their first fragment count only if they belong to requests, because the captures end after the ping.
+        Packets of another ping of this attempt do not count, because its requests were captured. Later fragments
+        whose first fragment is missing are counted only for requests: the sender's capture contains all requests of
+        this attempt, because it ends after the ping. The receiver's capture may lack late replies, so fragments of
+        replies cannot be attributed.
         """
         sender, receiver = (view.capture(role) for role in (self.sender, self.receiver))
         if sender is None or receiver is None:

@@ -1,4 +1,4 @@
-"""Log in on a robot and check its clock."""
+"""Log in to a robot and check its clock."""
 
 from typing import Final
 
@@ -16,7 +16,7 @@ time zone and a board without a battery."""
 
 
 def log_in(shell: Shell) -> None:
-    """Log in on a robot.
+    """Log in to a robot.
 
     Raises:
         FieldkitError: The robot cannot be reached, has another host key, or refuses the login.

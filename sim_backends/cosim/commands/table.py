@@ -23,9 +23,9 @@ _TITLES: Final = {
     "emane": "EMANE, before and after node 10 moved",
 }
 _LABELS: Final = {
-    "line": SheetColumn("line", "line", ""),
+    "line": SheetColumn("line", "sight", "with or without line of sight"),
     "distance_m": SheetColumn("distance_m", "m", ""),
-    "protocol": SheetColumn("protocol", "by", ""),
+    "protocol": SheetColumn("protocol", "protocol", ""),
     "radio": SheetColumn("radio", "radio", ""),
     "when": SheetColumn("when", "when", ""),
 }
@@ -95,7 +95,7 @@ def _columns(name: str, factor: float) -> list[SheetColumn]:
             "verdict",
             "agrees if the printed value, with its precision, is within the interval, or equals the simulated mean",
         ),
-        SheetColumn(f"{name}_off{suffix}", "off", "simulated value minus the printed one", factor),
+        SheetColumn(f"{name}_off{suffix}", "deviation", "simulated value minus the printed one", factor),
     ]
 
 
@@ -132,9 +132,9 @@ def claim_sheet(title: str, claims: Sequence[Claim]) -> Sheet:
         claims: The claims with their results.
     """
     columns = (
-        SheetColumn("than", "against", ""),
-        SheetColumn("lines", "rows", "with line of sight, without, or all"),
-        SheetColumn("quantity", "of", ""),
+        SheetColumn("than", "compared with", ""),
+        SheetColumn("lines", "sight", "with line of sight, without, or all"),
+        SheetColumn("quantity", "quantity", ""),
         SheetColumn("paper", "paper", "as stated in the paper", 100, digits=6),
         SheetColumn("tables", "tables", "from its tables 1 and 3", 100),
         SheetColumn(

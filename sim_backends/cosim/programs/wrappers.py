@@ -129,9 +129,9 @@ class AgentClock:
         # After n ns in the interval it has advanced by floor(n (1 + rate)): find the smallest sufficient n.
         missing_ns = reading_ns - self.begin_ns - self.offset_ns
         since_ns = max(-(-missing_ns * _BILLION // (_BILLION + self.rate_ppb)), 0)
-        wrong_until_ns = self.begin_ns + since_ns
-        if self.end_ns is None or wrong_until_ns < self.end_ns:
-            return wrong_until_ns
+        time_in_interval_ns = self.begin_ns + since_ns
+        if self.end_ns is None or time_in_interval_ns < self.end_ns:
+            return time_in_interval_ns
         return max(reading_ns, self.end_ns)
 
 

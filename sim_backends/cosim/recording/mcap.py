@@ -62,12 +62,13 @@ _PACKET: Final = _object(
         "size_bytes": {"type": "integer"},
         "arrived": {
             "type": "boolean",
-            "description": "True if it arrived; absent if its fate was not decided at the end.",
+            "description": "True if it arrived; absent if the packet was still under way at the end of the run.",
         },
         "reason": {"type": "string", "description": "Reason why it never arrived; absent otherwise."},
         "delay_s": {
             "type": "number",
-            "description": "Time from sending to the arrival that counts for its receiver.",
+            "description": "Time from sending until the packet is available to its receiver; this includes the delay "
+            "that the sync policy added.",
         },
         "added_s": {
             "type": "number",

@@ -180,7 +180,7 @@ class Mission:
             yield from islice(self._repeated_reports, 1)
             self._next_repeat_ns = now_ns + REPEAT_NS
 
-    def fly(self, body: Airframe, home_m: Vector, near_m: float) -> Vector | str:
+    def next_goal_or_mode(self, body: Airframe, home_m: Vector, near_m: float) -> Vector | str:
         """Return the point to fly to, or the name of the mode to change to.
 
         The point is relative to home. A point below home means landing.

@@ -46,7 +46,7 @@ class Vehicle(VehicleBase):
             self.report(_CRITICAL, self.firmware.prearm_prefixes[0] + reason)
 
     def arm(self) -> None:
-        """Start the motors; does nothing if they run.
+        """Start the motors; does nothing if they are already running.
 
         Raises:
             Refused: The vehicle is falling, or cannot be armed now.
@@ -54,7 +54,7 @@ class Vehicle(VehicleBase):
         if self.is_armed:
             return
         if not self.body.on_ground:
-            raise self._refusal("Arming denied: it falls")
+            raise self._refusal("Arming denied: vehicle is falling")
         reasons = self.arming_errors
         if self.mode in self.firmware.modes_without_arming:
             reasons.append(f"{self.firmware.names[reported_mode(self.mode)]} mode not armable")
@@ -73,7 +73,7 @@ class Vehicle(VehicleBase):
         """Stop the motors.
 
         Args:
-            force: True to stop them also in the air, so that it falls.
+            force: True to stop them even in the air, which makes the vehicle fall.
 
         Raises:
             Refused: It is flying.
@@ -140,7 +140,8 @@ class Vehicle(VehicleBase):
         """Change the mode at the request of a client; the current mode is kept if it is requested again.
 
         Raises:
-            Refused: The mission, the set-points or the flight that the mode requires is missing.
+            Refused: The mode requires a mission, recent set-points, or that the vehicle is flying, and this is not
+                the case.
         """
         self._switch(mode)
         self.failsafes.on_mode_change(self.body.now_ns)
@@ -170,7 +171,7 @@ class Vehicle(VehicleBase):
         self._run_failsafes()
 
     def _update_boot_state(self) -> None:
-        """Set the origin once the position estimate is good; until then report the reasons against arming."""
+        """Set the origin once the position estimate is good; until then, report why the vehicle cannot be armed."""
         now_ns, estimate = self.body.now_ns, self.estimate
         if self.firmware.is_ardupilot and not self.is_armed and now_ns >= self._prearm_ns:
             self._prearm_ns = now_ns + _PREARM_NS
@@ -198,7 +199,7 @@ class Vehicle(VehicleBase):
             self._switch_automatically(reaction.mode)
 
     def _switch_automatically(self, mode: Mode) -> None:
-        """Change the mode without a client's request; if that is refused, it keeps the mode."""
+        """Change the mode without a client's request; if the change is refused, the mode is kept."""
         with suppress(Refused):
             self._switch(mode)
 
@@ -258,7 +259,7 @@ class Vehicle(VehicleBase):
     def _idle_s(self) -> float:
         """Return the time on the ground after which the motors stop.
 
-        It is shorter after a landing; with ArduCopter only in MISSION and the landing modes.
+        The time is shorter after a landing. With ArduCopter, this applies only in MISSION and in the landing modes.
         """
         stops_after_landing = self.mode is Mode.MISSION or not self.firmware.is_ardupilot
         has_landed = (self.land_detector.has_flown and stops_after_landing) or self.mode in LANDING
@@ -279,7 +280,10 @@ class Vehicle(VehicleBase):
             self._switch_automatically(Mode.LOITER)
 
     def _cannot_lift_off(self) -> bool:
-        """Return True if it cannot lift off now: its motors spool up, or its mode has no take-off."""
+        """Return True if it cannot lift off now.
+
+        Its motors are still spooling up, or it cannot take off in its current mode.
+        """
         spools_up = self.body.now_ns - self.land_detector.armed_ns < self.firmware.spool_s * 1e9
         follows_set_points = self.mode is Mode.OFFBOARD and not self.firmware.set_points_lift_off
         return self.body.on_ground and (spools_up or follows_set_points or self.mode in PILOTED)
@@ -298,7 +302,7 @@ class Vehicle(VehicleBase):
     def _advance_mode(self) -> None:
         """Proceed to the next item of a mission, and to the mode after a take-off, a mission or a return."""
         if self.mode is Mode.MISSION:
-            action = self.mission.fly(self.body, self.home_m, self._parameters["NAV_ACC_RAD"])
+            action = self.mission.next_goal_or_mode(self.body, self.home_m, self._parameters["NAV_ACC_RAD"])
             if isinstance(action, str):
                 self._switch_automatically(Mode[action])
             else:

@@ -13,7 +13,8 @@ from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.world.motion import State
 
 _KEPT_PACKETS: Final = 5000
-"""Number of recent packets whose contents are kept for recordings of the air; larger than the queues of 3 radios."""
+"""Number of recent packets whose contents are kept for the recording of radio frames (`air.pcap`); more than the send
+queues of three radios can hold."""
 
 
 class RealPacket(NamedTuple):
@@ -40,11 +41,11 @@ class Devices(Protocol):
     """The devices of all robots, in simulated time."""
 
     def wait(self, until_ns: int) -> None:
-        """Wait until this time; meanwhile packets are read, and requests are answered."""
+        """Wait until this time; meanwhile read packets and answer the lab's requests on the control socket."""
         ...
 
     def wait_for_packet(self, until_ns: int) -> None:
-        """Wait until a packet has been read, at most until this time; meanwhile no request is answered."""
+        """Wait until a packet has been read, at most until this time; meanwhile answer no requests of the lab."""
         ...
 
     def first_ns(self) -> int | None:
@@ -61,7 +62,7 @@ class Devices(Protocol):
 
 
 class RealAgents(Agents):
-    """Robots with real programs. A window ends when its end is reached in real time.
+    """Robots with real programs. A synchronization window lasts until the wall clock reaches its end.
 
     The next event of a program is unknown until it happens. Policies that need its time wait for the event for at
     most one physics step. If there is no event, they get the time of that step.
@@ -112,7 +113,7 @@ class RealAgents(Agents):
         return ([sent for packet in packets for sent in self._datagrams(packet, states)] if packets else []), states
 
     def content(self, identity: PacketIdentity) -> bytes:
-        """Return the content of a packet by the key of its random draws; empty if the packet is not recent."""
+        """Return the content of the packet with this identity (flow and number); empty if it is no longer kept."""
         return self._contents.get(identity, b"")
 
     def _store_content(self, identity: PacketIdentity, content: bytes) -> None:

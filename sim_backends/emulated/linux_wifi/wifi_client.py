@@ -31,7 +31,7 @@ class WifiClient(MediumClient):
         station: Wi-Fi settings of the robots that are stations of these access points.
 
     Raises:
-        ConfigurationError: The kernel has no hwsim, or a program of util-linux is missing.
+        ConfigurationError: The kernel has no mac80211_hwsim, or a program of util-linux is missing.
         RobotError: An access point did not start.
     """
 

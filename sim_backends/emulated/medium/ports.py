@@ -61,7 +61,8 @@ class FlowDelays:
         """Add the delay of a packet that crossed the radio, if its flow was requested.
 
         The packet is counted if `receiver`, an address, is its destination. Any other receiver forwards it: the delay
-        of that hop is added, even if the packet is lost on a later hop.
+        of that hop is added, even if the packet is lost on a later hop. A `Delay` contains the packet count;
+        subtracting `PACKET` adds the delay without counting the packet.
         """
         is_later_fragment = packet[6] & _OFFSET or packet[7]
         key = self._datagrams.get(_datagram(packet)) if is_later_fragment else _key(packet)

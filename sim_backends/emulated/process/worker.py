@@ -22,7 +22,7 @@ PROJECT: Final = Path(__file__).resolve().parents[3]
 
 
 def command(module: str) -> list[str]:
-    """Return the command that runs a module of this package, with `PYTHONPATH` set to `PROJECT`.
+    """Return the command that runs a module of this package. The caller must set `PYTHONPATH` to `PROJECT`.
 
     Neither the working directory nor the user's site-packages can shadow modules of this package.
     """
@@ -94,7 +94,7 @@ class Worker:
     Args:
         name: Name for messages.
         module: The module; its arguments are the descriptor number of its socket, then `words`.
-        words: More arguments.
+        words: Further arguments.
         descriptors: Descriptors of this process that the process inherits, with the same numbers.
         command_prefix: Command prefix that runs the interpreter, for example `unshare ... --`.
         home: Value of `HOME`.

@@ -1,8 +1,8 @@
 """Init process of an emulated robot, or of the laptop: PID 1 in its namespaces, with the supervisor of its services.
 
 It executes the lab's requests from the control socket that it inherits: one JSON line per request and one per reply,
-in strict alternation. When the lab exits, the socket reaches its end, this process exits, and the kernel kills all
-processes in the namespaces.
+in strict alternation. When the lab exits, the socket reaches end-of-file, this process exits, and the kernel kills
+all processes in the namespaces.
 """
 
 import contextlib
@@ -222,7 +222,7 @@ class Init:
             self._supervisor.wait_ready(service, deadline)
 
     def _halt(self, interfaces: Sequence[str]) -> None:
-        # The robot's links are switched off first, because a robot that loses power closes no connection.
+        # The robot's links are switched off first, because a robot that loses power does not close its connections.
         for interface in interfaces:
             network.switch_off(interface)
         self._supervisor.halt()
@@ -262,7 +262,11 @@ class Init:
 
 
 def _open_devices(request: Message) -> list[int]:
-    """Bring up a link, and the routing daemon of a mesh guest; return the descriptor of its device, if it has one."""
+    """Bring up a link and return the descriptor of its device, if it has one.
+
+    If the request has a `guest_hello_s`, also start the routing daemon of a node that uses the robots' mesh routes
+    but forwards no packets, such as the laptop.
+    """
     interface, address = request["interface"], request["address"]
     if request["do"] == "open link":
         if interface == LOOPBACK_INTERFACE:
@@ -318,7 +322,9 @@ def kill_processes(process: str) -> None:
     """
     pids = [pid for pid in _pids() if pid != os.getpid() and _process_name(pid) == process]
     if not pids:
-        raise RobotError(f"no process named {process} runs", remedy="on the robot: cat /proc/[0-9]*/comm | sort -u")
+        raise RobotError(
+            f"no process named {process} is running", remedy="on the robot: cat /proc/[0-9]*/comm | sort -u"
+        )
     for pid in pids:
         os.kill(pid, signal.SIGKILL)
 

@@ -1,4 +1,4 @@
-"""Decides when a station scans and whether it roams, as `bgscan="simple"` of wpa_supplicant.
+"""Decides when a station scans and whether it roams, like `bgscan="simple"` of wpa_supplicant.
 
 The model follows bgscan_simple.c and events.c of wpa_supplicant 2.10, and the signal events of mac80211 (mlme.c).
 """
@@ -56,7 +56,7 @@ class BackgroundScan:
     def start(
         cls, now_ns: int, signal_dbm: float, *, threshold_dbm: float, short_ns: int, long_ns: int
     ) -> "BackgroundScan":
-        """Return the schedule after an association; the arguments are described at the class."""
+        """Return the schedule after an association; for the arguments, see the class."""
         interval_ns = long_ns if signal_dbm >= threshold_dbm else short_ns
         return cls(threshold_dbm, short_ns, long_ns, signal_dbm, now_ns + interval_ns, interval_ns, now_ns)
 
@@ -91,7 +91,10 @@ class BackgroundScan:
         return self.long_ns // self.short_ns + 1
 
     def on_scan(self, now_ns: int) -> None:
-        """Record that a scan starts. After many consecutive scans with the short interval, the interval is long."""
+        """Record that a scan starts.
+
+        After many consecutive scans at the short interval, it switches to the long interval.
+        """
         if self._interval_ns == self.short_ns:
             self._short_scans += 1
             if self._short_scans >= self._max_short_scans:

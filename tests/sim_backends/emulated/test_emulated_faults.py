@@ -165,7 +165,7 @@ def test_a_killed_server_restarts_with_another_process_id(emulation: EmulatedTes
 
 
 def test_a_process_that_does_not_run_cannot_be_killed(emulation: EmulatedTestbed) -> None:
-    with pytest.raises(RobotError, match="no process named roscore runs") as error_info:
+    with pytest.raises(RobotError, match="no process named roscore is running") as error_info:
         emulation.inject(Fault(FaultKind.KILL, Role.SENDER, process="roscore"))
     assert "/proc/[0-9]*/comm" in error_info.value.remedy
 
