@@ -1,4 +1,7 @@
-"""Aggregation without fieldkit, as a researcher writes it: `python -m benchmarks.pandas_peer FOLDER` prints JSON."""
+"""Aggregation without fieldkit, as a researcher would write it.
+
+`python -m benchmarks.pandas_peer FOLDER` prints the result as JSON.
+"""
 
 import json
 import sys

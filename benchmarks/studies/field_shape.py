@@ -50,7 +50,7 @@ LOSS: Final = (
     ("UDP: IP packets", "udp", "ip_loss"),
     ("UDP: datagrams of 8,192 bytes", "udp", "datagram_loss"),
     ("UDP: bytes of the file", "udp", "file_loss"),
-    ("TCP: bytes, before TCP repaired it", "tcp", "tcp_byte_loss"),
+    ("TCP: bytes lost, then retransmitted", "tcp", "tcp_byte_loss"),
 )
 DELAY: Final = (
     ("TCP: 502 bytes there and back", "tcp", PAPER_DELAY.name),
@@ -60,7 +60,7 @@ SHOWN: Final = (
     ("IP packets", "udp", "ip_loss"),
     ("datagrams", "udp", "datagram_loss"),
     ("file, UDP", "udp", "file_loss"),
-    ("TCP bytes, repaired", "tcp", "tcp_byte_loss"),
+    ("TCP bytes lost, then retransmitted", "tcp", "tcp_byte_loss"),
     ("RTT, 502 bytes", "tcp", PAPER_DELAY.name),
     ("RTT, 8,192 bytes", "udp", PAPER_DELAY.name),
 )
@@ -136,7 +136,10 @@ def _panel(cells: Sequence[Cell], title: str, protocol: str, quantity: str) -> P
 
 
 def _end(source: Estimate, end: float | None, factor: float) -> float | None:
-    """Return an end of an interval to draw, or None without a loss: it would only depend on the number of repeats."""
+    """Return an end of an interval to draw.
+
+    None if the value is 0, because the interval would then depend only on the number of repeats.
+    """
     return None if end is None or source.value == 0 else factor * end
 
 

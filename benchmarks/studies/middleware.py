@@ -6,7 +6,7 @@ command continues the campaigns. At the end it prints the conditions of the runs
 writes the table docs/studies/middleware.csv, and draws the figures.
 
 Two repeats, as in the campaigns, show only large differences. On a quiet machine `--repeats 12` measures each place
-twelve times, in about two and a half hours. Then the intervals treat the repeat as the independent unit.
+twelve times, in about two and a half hours. The intervals then treat repeats as the independent samples.
 `--from-table docs/studies/middleware.csv --figures docs/studies` only draws the figures, from the table.
 """
 
@@ -44,7 +44,7 @@ STYLES: Final[dict[str, Style]] = {
     "ROS 1": Style("green", "^"),
     "ROS 1, tuned": Style("green", "^", "dashed"),
 }
-KINDS: Final = {"best effort": "best effort", "reliable": "reliable"}
+KINDS: Final = ("best effort", "reliable")
 SIZES: Final = {100: "100 B", 1_000: "1 kB", 10_000: "10 kB", 100_000: "100 kB", 1_000_000: "1 MB"}
 DODGE_M: Final = 1.1
 """Offset between series at the same distance, so that they do not overlap."""
@@ -112,21 +112,24 @@ def run(folder: Path, names: Sequence[str]) -> None:
             print(f"{name}: exit code {process.returncode}, see {folder / name}.log", file=sys.stderr)
 
 
-def by_distance(findings: MiddlewareFindings, name: str, drawn: "DrawnFigure") -> Chart:
-    """Return a chart of two robots: a row of panels per size, best effort on the left and reliable on the right."""
+def by_distance(findings: MiddlewareFindings, name: str, quantity: "PlottedQuantity") -> Chart:
+    """Return a chart of the measurements with two robots: one row of panels per message size.
+
+    Best effort is on the left, and reliable on the right.
+    """
     pairs = [cell for cell in findings.cells if cell.robots == 2]
     distances_m = [cell.distance_m for cell in pairs] or [0.0]
     panels = []
     for size in BYTES:
-        for kind, quality in KINDS.items():
+        for kind in KINDS:
             series = []
             for rank, label in enumerate(STYLES):
                 series_cells = [
                     cell for cell in pairs if (cell.kind, cell.middleware, cell.size_bytes) == (kind, label, size)
                 ]
                 shift_m = (rank - (len(STYLES) - 1) / 2) * DODGE_M
-                series.append(_series(label, [(cell.distance_m + shift_m, cell) for cell in series_cells], drawn))
-            panel = drawn.panel(f"{SIZES[size]}, {quality}{_sample_count_text(pairs, size)}", "distance (m)", series)
+                series.append(_series(label, [(cell.distance_m + shift_m, cell) for cell in series_cells], quantity))
+            panel = quantity.panel(f"{SIZES[size]}, {kind}{_sample_count_text(pairs, size)}", "distance (m)", series)
             panels.append(replace(panel, left=min(distances_m) - MARGIN_M, right=max(distances_m) + MARGIN_M))
     return Chart(name=name, title=name, caption="", panels=panels)
 
@@ -134,7 +137,7 @@ def by_distance(findings: MiddlewareFindings, name: str, drawn: "DrawnFigure") -
 def by_robots(findings: MiddlewareFindings) -> Chart:
     """Return a chart of loss and delay by the number of robots that publish to one."""
     panels = []
-    for drawn in (LOSS_FIGURE, DELAY_FIGURE):
+    for quantity in (LOSS, DELAY):
         for metres in sorted({cell.distance_m for cell in findings.cells if cell.robots > 2}):
             for size in sorted({cell.size_bytes for cell in _comparable(findings, metres)}):
                 size_cells = [cell for cell in _comparable(findings, metres) if cell.size_bytes == size]
@@ -147,24 +150,27 @@ def by_robots(findings: MiddlewareFindings) -> Chart:
                             for cell in size_cells
                             if cell.middleware == label
                         ],
-                        drawn,
+                        quantity,
                     )
                     for rank, label in enumerate(STYLES)
                 ]
-                panel = drawn.panel(f"{SIZES[size]} each at {metres:g} m, reliable", "robots", series)
+                panel = quantity.panel(f"{SIZES[size]} each at {metres:g} m, reliable", "robots", series)
                 panels.append(replace(panel, x_ticks=[(number, str(number)) for number in numbers]))
     return Chart(name="middleware-robots", title="", caption="", panels=panels)
 
 
-def _series(label: str, points: Sequence[tuple[float, MiddlewareCell]], drawn: "DrawnFigure") -> Series:
-    """Return the points of a middleware with their intervals, without a line, because intervals are too wide."""
-    measured = sorted(((x, cell) for x, cell in points if drawn.value(cell) is not None), key=lambda pair: pair[0])
-    ends = [drawn.interval(cell) for _, cell in measured]
+def _series(label: str, points: Sequence[tuple[float, MiddlewareCell]], quantity: "PlottedQuantity") -> Series:
+    """Return the points of a middleware with their intervals.
+
+    They are not connected by a line, which would suggest a trend that the wide intervals do not support.
+    """
+    measured = sorted(((x, cell) for x, cell in points if quantity.value(cell) is not None), key=lambda pair: pair[0])
+    ends = [quantity.interval(cell) for _, cell in measured]
     return Series(
         label,
         STYLES[label],
         [x for x, _ in measured],
-        [drawn.value(cell) or 0.0 for _, cell in measured],
+        [quantity.value(cell) or 0.0 for _, cell in measured],
         low=[low for low, _ in ends],
         high=[high for _, high in ends],
         join="none",
@@ -206,15 +212,15 @@ def _delay_p95_ms(cell: MiddlewareCell) -> float | None:
 
 
 @dataclass(frozen=True)
-class DrawnFigure:
-    """A figure of cells for panels.
+class PlottedQuantity:
+    """A quantity that panels show on the y axis.
 
     Attributes:
-        y_label: Its name and unit.
-        value: Returns its value of a cell.
-        interval: Returns its 95 % interval of a cell, if there is one.
-        bottom: Lower end of its axis.
-        top: Upper end of its axis.
+        y_label: Name and unit of the quantity.
+        value: Function that returns the quantity of a cell.
+        interval: Function that returns its 95 % confidence interval for a cell, or (None, None).
+        bottom: Lower end of the axis.
+        top: Upper end of the axis.
         log: True for a logarithmic axis.
     """
 
@@ -226,12 +232,12 @@ class DrawnFigure:
     log: bool = False
 
     def panel(self, title: str, x_label: str, series: Sequence[Series]) -> Panel:
-        """Return a panel of series of this figure."""
+        """Return a panel that shows these series of the quantity."""
         return Panel(title, x_label, self.y_label, series, "", bottom=self.bottom, top=self.top, log=self.log)
 
 
-LOSS_FIGURE: Final = DrawnFigure("samples lost (%)", _loss_percent, _loss_interval_percent, 0.0, 100.0)
-DELAY_FIGURE: Final = DrawnFigure("delay, 95 % (ms)", _delay_p95_ms, _no_interval, 1.0, 10_000.0, log=True)
+LOSS: Final = PlottedQuantity("samples lost (%)", _loss_percent, _loss_interval_percent, 0.0, 100.0)
+DELAY: Final = PlottedQuantity("delay, 95th percentile (ms)", _delay_p95_ms, _no_interval, 1.0, 10_000.0, log=True)
 
 
 def main() -> None:
@@ -271,8 +277,8 @@ def main() -> None:
 def draw(findings: MiddlewareFindings, folder: Path) -> None:
     """Write the figures of docs/studies/middleware.md into a folder."""
     for chart in (
-        by_distance(findings, "middleware-loss", LOSS_FIGURE),
-        by_distance(findings, "middleware-delay", DELAY_FIGURE),
+        by_distance(findings, "middleware-loss", LOSS),
+        by_distance(findings, "middleware-delay", DELAY),
         by_robots(findings),
     ):
         files.write(folder / f"{chart.name}.svg", figures.paper(chart, "svg"))

@@ -84,7 +84,7 @@ class Pair:
 
     @property
     def words(self) -> tuple[tuple[Tally, Tally], ...]:
-        """Word counts of A and B for each column of words in either cell; a cell without words has empty counts."""
+        """Word counts of A and B for each column with categorical text in either cell; counts may be empty."""
         a, b = (cell.tallies if cell else {} for cell in (self.a, self.b))
         empty = {name: replace(tally, counts={}) for name, tally in (*a.items(), *b.items())}
         return tuple((a.get(name, tally), b.get(name, tally)) for name, tally in empty.items())

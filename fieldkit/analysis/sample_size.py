@@ -1,4 +1,4 @@
-"""Sample sizes: the number of repeats or packets that expectations need, and of additional repeats for a cell.
+"""Sample sizes: how many repeats or packets an expectation needs, and how many additional repeats a cell needs.
 
 Expectations are checked before the trial runs. Additional repeats narrow the interval of a cell to a requested width.
 """
@@ -19,61 +19,62 @@ from fieldkit.core.columns import Kind
 if TYPE_CHECKING:  # not imported at run time: a plan needs no tables, and the import is slow
     from fieldkit.analysis.cells import Cell
 
-_USUAL_SHARE = 0.9
-"""Example of a share of all repeats, for the message that `every` refers only to the repeats of a trial."""
+_EXAMPLE_SHARE = 0.9
+"""Share of all repeats that the message about `every` uses as an example."""
 
 
 def unmet_requirements(
-    expectations: Iterable[Expectation], figures: Iterable[Quantity], repeats: int
+    expectations: Iterable[Expectation], measured_quantities: Iterable[Quantity], repeats: int
 ) -> Iterator[str]:
     """Yield a sentence for each expectation that may need more repeats or packets than a trial has.
 
     Args:
         expectations: Expectations of the trial.
-        figures: Quantities that the repeats measure, including the quantities of the expectations.
+        measured_quantities: Quantities that the repeats measure, including the quantities of the expectations.
         repeats: Number of repeats per protocol.
     """
-    figures_by_name = {quantity.name: quantity for quantity in figures}
+    quantities_by_name = {quantity.name: quantity for quantity in measured_quantities}
     for expectation in expectations:
-        if needs := _needs(expectation, figures_by_name[expectation.quantity], repeats):
+        if needs := _needs(expectation, quantities_by_name[expectation.quantity], repeats):
             yield f"expected {expectation.text}: {needs}"
 
 
 def _needs(expectation: Expectation, quantity: Quantity, repeats: int) -> str:
-    has = f"this trial has {repeats}"
+    available_text = f"this trial has {repeats}"
     if expectation.scope is Scope.PACKETS:
         packets = one_sided_bounds.packets_for(expectation.bound)
         return f"needs at least {packets} packets per condition for 95 % confidence, even if no packet is lost"
     if expectation.scope is Scope.SHARE and expectation.share is not None:
         needed = one_sided_bounds.repeats_for(expectation.share)
-        text = f"needs at least {needed} repeats for 95 % confidence, if all meet it; {has}"
+        text = f"needs at least {needed} repeats for 95 % confidence, if all meet it; {available_text}"
         return text if repeats < needed else ""
     if expectation.scope is Scope.EVERY:
-        needed, shown = one_sided_bounds.repeats_for(_USUAL_SHARE), one_sided_bounds.share_low(repeats, repeats)
+        needed = one_sided_bounds.repeats_for(_EXAMPLE_SHARE)
+        proven_share = one_sided_bounds.share_low(repeats, repeats)
         return (
-            f"applies to the repeats of this trial; for {100 * _USUAL_SHARE:.0f} % of all repeats it needs at least "
-            f"{needed} for 95 % confidence, and {repeats} show it for {math.floor(100 * shown)} %"
+            "applies only to the repeats of this trial; to show with 95 % confidence that at least "
+            f"{100 * _EXAMPLE_SHARE:.0f} % of all repeats meet it, at least {needed} repeats are needed; "
+            f"with {repeats}, it can be shown only for {math.floor(100 * proven_share)} %"
             if repeats < needed
             else ""
         )
     needed = _for_interval(expectation, quantity)
     if repeats < needed:
-        alternative = f"; for these packets alone: {expectation.text} of all packets"
+        alternative = f"; to check only the packets of this trial, write: {expectation.text} of all packets"
         has_alternative = quantity.kind is Kind.COUNTED and expectation.is_below
-        return f"needs at least {needed} repeats for 95 % confidence, {_best_case(quantity)}; {has}" + (
-            alternative if has_alternative else ""
-        )
+        return f"{_repeats_text(needed, quantity)}; {available_text}{alternative if has_alternative else ''}"
     if quantity.kind is Kind.MEDIAN and repeats < MIN_FOR_ORDER_STATISTICS:
         coverage = f"{100 * CONFIDENCE:.0f} % confidence for any distribution of the repeats"
-        return f"needs at least {MIN_FOR_ORDER_STATISTICS} repeats for {coverage}; {has}"
+        return f"needs at least {MIN_FOR_ORDER_STATISTICS} repeats for {coverage}; {available_text}"
     return ""
 
 
-def _best_case(quantity: Quantity) -> str:
-    """Return a description of the results for which this number of repeats is sufficient."""
-    if quantity.kind is Kind.FLAG:
-        return "if it is true in all of them"
-    return "even if nothing is lost" if quantity.unit == "share" else "which give an interval"
+def _repeats_text(needed: int, quantity: Quantity) -> str:
+    """Return the number of repeats that the interval of a quantity needs, with the reason or the best case."""
+    if quantity.kind is not Kind.FLAG and quantity.unit != "share":
+        return f"needs at least {needed} repeats, because fewer give no interval"
+    best_case = "if it is true in all of them" if quantity.kind is Kind.FLAG else "even if nothing is lost"
+    return f"needs at least {needed} repeats for 95 % confidence, {best_case}"
 
 
 def _for_interval(expectation: Expectation, quantity: Quantity) -> int:

@@ -24,14 +24,14 @@ _CLEAR_LINE: Final = "\r\x1b[K"
 def interruptible() -> Iterator[Stop]:
     """Turn Ctrl-C into a request to stop while the body runs.
 
-    While a robot moves without a person, or may start to move, the first SIGINT, SIGTERM or SIGHUP orders all robots
+    While a robot moves automatically, or may start to move, the first SIGINT, SIGTERM or SIGHUP orders all robots
     to stop and raises `KeyboardInterrupt`. At the end of the body the function waits for their confirmations; the
     next signal cancels that wait. Otherwise the first SIGINT lets the repeat finish, and the second raises
     `KeyboardInterrupt`. SIGTERM and SIGHUP raise it immediately, because a closed terminal does not wait. Later
     signals are ignored, since the clean-up that follows has its own deadlines.
 
-    A thread gives the order. It receives signals by a descriptor (`signal.set_wakeup_fd`), also while the main thread
-    cannot run a handler.
+    A thread gives the order. It receives signals through a file descriptor (`signal.set_wakeup_fd`), even while the
+    main thread cannot run a handler.
     """
     stop = Stop()
     stopping = False

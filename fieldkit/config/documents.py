@@ -178,7 +178,10 @@ class Document:
         return f"{self.source}:{self.lines.get(self.existing_part(location), 1)}"
 
     def existing_part(self, location: Location) -> Location:
-        """Return a location without the parts that do not exist in the file: a missing key, or a union's tag."""
+        """Return a location without the parts that do not exist in the file.
+
+        Such a part is a missing key, or the tag that pydantic inserts for a tagged union.
+        """
         existing: Location = ()
         for part in location:
             existing = (*existing, part) if (*existing, part) in self.lines else existing
@@ -276,7 +279,7 @@ _REMEDIES: Final = {
     "cannot start any token": "put this text in quotes",
     "part of the text before it": "indent this item with as many spaces as the other items of its list",
     "expected <block end>": "indent this line with as many spaces as the other lines of its list or mapping",
-    "mapping values are not allowed": "put text that has a colon in quotes; indent all keys of a mapping equally",
+    "mapping values are not allowed": "quote text that contains a colon; indent all keys of a mapping equally",
 }
 """Remedy for each error message of PyYAML."""
 

@@ -40,7 +40,7 @@ class Mavlink(ProfileSection):
         system: System id of an emulated autopilot after power-on, 1 to 250.
         boot_s: Time from power-on until the position estimate of an emulated autopilot has an origin, 0 to 120 s; a
             real one takes about 30 s.
-        least_charge: Minimum battery charge before a step flies it.
+        least_charge: Minimum battery charge required before a flight.
     """
 
     permission = permissions.MOVE

@@ -53,7 +53,7 @@ class EvidenceFolder:
                 raise ConfigurationError(
                     f"cannot create the folder for evidence: {error.strerror}",
                     where=str(self._requested_path),
-                    remedy="choose another folder by --fieldkit-output",
+                    remedy="choose another folder with --fieldkit-output",
                 ) from error
         return self._created_path
 
@@ -88,7 +88,7 @@ class EvidenceKeeper:
     def __init__(self, run: Path, keep: Keep) -> None:
         self._run = run
         self._keep = keep
-        self._is_set_up = True
+        self._in_set_up = True
         self._file: Path | None = None
         self._set_up_folder = EvidenceFolder(self._run)
         self._test_folder = EvidenceFolder(self._run)
@@ -97,7 +97,7 @@ class EvidenceKeeper:
     @property
     def folder(self) -> EvidenceFolder:
         """The folder for evidence of the current phase."""
-        return self._set_up_folder if self._is_set_up else self._test_folder
+        return self._set_up_folder if self._in_set_up else self._test_folder
 
     def add_event(self, event: Event) -> None:
         """Add an event of the lab to the log."""
@@ -112,12 +112,12 @@ class EvidenceKeeper:
             self._set_up_folder.remove_unless_kept(self._keep)
             self._file, self._set_up_folder = item.path, EvidenceFolder(file_folder / _SHARED)
         self._test_folder = EvidenceFolder(file_folder / _folder_name(name))
-        self._item, self._is_set_up = item, True
+        self._item, self._in_set_up = item, True
 
     def begin_test(self, item: pytest.Item) -> None:
         """Assign later evidence to the test instead of the set-up, which several tests may share."""
         if item is self._item:
-            self._is_set_up = False
+            self._in_set_up = False
 
     def process_report(self, item: pytest.Item, call: pytest.CallInfo[None], report: pytest.TestReport) -> None:
         """Process the report of a phase of a test: add the evidence folders of a failure, clean up after the test."""
@@ -132,7 +132,7 @@ class EvidenceKeeper:
                 (PROPERTY, path) for path in self._kept_folders() if self._test_folder.has_failed
             ]
             self._test_folder.remove_unless_kept(self._keep)
-            self._item, self._is_set_up = None, True
+            self._item, self._in_set_up = None, True
 
     def end(self) -> None:
         """Clean up the evidence of the last module, and remove empty folders."""

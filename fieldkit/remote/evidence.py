@@ -16,15 +16,15 @@ def begin_command(
     role: str,
     interface: str,
     *,
-    old: str | None = None,
+    old_folder: str | None = None,
     token: str | None = None,
-    need_kib: int = MIN_FREE_KIB,
+    required_kib: int = MIN_FREE_KIB,
     sources: Sequence[Sequence[str]] = (),
 ) -> tuple[str, ...]:
     """Return the command that creates `folder` and records the state of the host in it; see `begin`."""
     lock = "-" if token is None else word(token)
-    optional_words = (old or "", *map(quote, sources)) if sources else ((old,) if old else ())
-    return (*CALL, "begin", folder, role, interface, str(need_kib), lock, *optional_words)
+    optional_words = (old_folder or "", *map(quote, sources)) if sources else ((old_folder,) if old_folder else ())
+    return (*CALL, "begin", folder, role, interface, str(required_kib), lock, *optional_words)
 
 
 def begin(
@@ -33,9 +33,9 @@ def begin(
     role: str,
     interface: str,
     *,
-    old: str | None = None,
+    old_folder: str | None = None,
     token: str | None = None,
-    need_kib: int = MIN_FREE_KIB,
+    required_kib: int = MIN_FREE_KIB,
     sources: Sequence[Sequence[str]] = (),
 ) -> str:
     """Create the attempt's folder and record the state of the host in it; idempotent.
@@ -45,21 +45,23 @@ def begin(
         folder: The folder, from `jobs.work_folder`.
         role: Role of the robot, the prefix of the files with the state.
         interface: Network interface of the radio.
-        old: A folder to delete.
+        old_folder: Folder of an earlier attempt, which is deleted; None to delete nothing.
         token: Token of the trial's lock, which is renewed.
-        need_kib: Free disk space that the evidence needs.
-        sources: Telemetry sources that the robot queries until its evidence is fetched: each the name and the words
-            of `poll` in telemetry.sh.
+        required_kib: Required free disk space in KiB.
+        sources: Telemetry sources that the robot queries until its evidence is fetched. Each is a sequence: the name
+            of the source, then the arguments of the shell function `poll` (telemetry.sh), starting with ADDRESS.
 
     Returns:
-        The boot ID of the robot, as `boot` returns it.
+        The boot ID of the robot, as returned by `boot_id`.
 
     Raises:
         LinkError: The robot did not answer.
         LockLostError: The lock was broken, or taken over after it had expired.
-        RobotError: Its disk has less free space than needed, or cannot be written.
+        RobotError: The robot's disk has too little free space or is not writable.
     """
-    command = begin_command(folder, role, interface, old=old, token=token, need_kib=need_kib, sources=sources)
+    command = begin_command(
+        folder, role, interface, old_folder=old_folder, token=token, required_kib=required_kib, sources=sources
+    )
     result = shell.run(command, deadline=Deadline.after(REPLY_S), check=False)
     require_success(shell, result)
     return printable(result.stdout)

@@ -48,7 +48,7 @@ _ALWAYS_VISIBLE: Final = frozenset(
 
 
 _FIRST: Final = "expected and lab-defined figures"
-"""Heading of charts and tables of quantities with an expectation, and of quantities that a lab declares."""
+"""Heading of charts and tables of quantities with an expectation, and of user-defined quantities."""
 _SECTIONS: Final = (("loss", distance.LOSS), ("delay", distance.DELAY), ("rate", distance.RATE))
 _MAX_FURTHER: Final = 12
 """Maximum number of charts of quantities that are not defined by fieldkit."""
@@ -343,14 +343,16 @@ def _missing_reasons(table: CellTable, evidence: Evidence) -> dict[tuple[int, st
 def _tables_of_protocol(
     title: str, cells: Sequence[Cell], differing: Collection[str], evidence: Evidence, ranking: Ranking
 ) -> Iterator[CellTable]:
-    """Yield the tables of one protocol: expected and lab-declared quantities, built-in ones, steps, words."""
+    """Yield the tables of one protocol: expected and user-defined quantities, built-in ones, steps, words."""
     lines = [(wording.place(cell, differing=differing), cell) for cell in cells]
     words = word_labels(cells)
     first = ranking.first_quantities(measured_in(cells))
-    if lab_words := {name: label for name, label in words.items() if ranking.is_lab_declared(name)}:
-        words = {name: label for name, label in words.items() if name not in lab_words}
-    if first or lab_words:
-        yield CellTable(f"{title}, {_FIRST}", first, (), lines, _ping_sizes(first, cells, evidence), lab_words)
+    if user_defined_words := {name: label for name, label in words.items() if ranking.is_user_defined(name)}:
+        words = {name: label for name, label in words.items() if name not in user_defined_words}
+    if first or user_defined_words:
+        yield CellTable(
+            f"{title}, {_FIRST}", first, (), lines, _ping_sizes(first, cells, evidence), user_defined_words
+        )
     remaining = [quantity for quantity in measured_in(cells) if quantity not in first]
     for step in dict.fromkeys(("", *(quantity.step for quantity in remaining))):
         builtin = [quantity for quantity in remaining if quantity.step == step and quantity.is_builtin]

@@ -43,14 +43,14 @@ class RepeatCounts:
         valid: Repeats with a valid attempt.
         void: Repeats whose last attempt is void.
         failed: Repeats whose last attempt failed.
-        silent: Valid repeats in which nothing arrived.
+        all_lost: Valid repeats in which nothing arrived.
     """
 
     planned: int
     valid: int
     void: int
     failed: int
-    silent: int
+    all_lost: int
 
     @property
     def missing(self) -> int:
@@ -93,8 +93,8 @@ class Absence:
         return f"{self.reason}: {self.share}"
 
 
-def repeat_counts(cell: Cell, evidence: Evidence, silent: Rows) -> RepeatCounts:
-    """Return the numbers of repeats under one condition by outcome; `silent` as returned by `everything_lost`."""
+def repeat_counts(cell: Cell, evidence: Evidence, all_lost: Rows) -> RepeatCounts:
+    """Return the numbers of repeats under one condition by outcome; `all_lost` as returned by `everything_lost`."""
     texts, rows = evidence.repeats.texts, evidence.rows(cell)
     last_statuses: dict[tuple[str, str, float], str] = {}
     for row in rows.tolist():  # in order of time
@@ -108,8 +108,8 @@ def repeat_counts(cell: Cell, evidence: Evidence, silent: Rows) -> RepeatCounts:
         started_count = sum(key[0] == source for key in last_statuses)
         planned += max(started_count, plan.repeats) if plan else started_count
     valid, void, failed = (statuses.count(status) for status in FINAL_STATUSES)
-    is_silent = silent[rows] & (texts["status"][rows] == Status.VALID)
-    return RepeatCounts(planned, valid, void, failed, int(is_silent.sum()))
+    is_all_lost = all_lost[rows] & (texts["status"][rows] == Status.VALID)
+    return RepeatCounts(planned, valid, void, failed, int(is_all_lost.sum()))
 
 
 def everything_lost(repeats: Repeats) -> Rows:

@@ -15,17 +15,17 @@ from fieldkit.report.coverage import Absence
 from fieldkit.report.trial_folders import Evidence
 from fieldkit.trial.plan import Plan
 
-_LAB_KINDS: Final = frozenset(("ask", "run"))
-"""Kinds of step whose columns a lab declares."""
+_USER_DEFINED_KINDS: Final = frozenset(("ask", "run"))
+"""Kinds of step whose columns are defined by the user in the procedure."""
 _MORE_IS_BETTER: Final = frozenset(("bit/s", "dBm", "dB"))
 _LOSSES: Final = frozenset((*LOSSES, "topic_loss", "video_loss", "iperf3_loss", "iperf3_captured_loss"))
 
 
 class Ranking:
-    """The order of quantities: quantities with an expectation, then quantities that a lab declares, then the others.
+    """The order of quantities: quantities with an expectation, then user-defined quantities, then the others.
 
     Args:
-        evidence: The available plans, which contain the expectations and the columns of a lab.
+        evidence: The available plans, which contain the expectations and the user-defined columns.
     """
 
     def __init__(self, evidence: Evidence) -> None:
@@ -34,42 +34,47 @@ class Ranking:
         self._expected: dict[str, Expectation] = {}
         for expectation in expectations:
             self._expected.setdefault(expectation.quantity, expectation)
-        self._lab_columns = dict.fromkeys(name for plan in plans for name in _lab_columns(plan))
+        self._user_defined_columns = dict.fromkeys(name for plan in plans for name in _user_defined_columns(plan))
 
     def first_quantities(self, quantities: Iterable[Quantity]) -> list[Quantity]:
-        """Return the expected quantities, then the quantities that a lab declares; others are omitted."""
+        """Return the expected quantities, then user-defined quantities; others are omitted."""
         by_name = {quantity.name: quantity for quantity in quantities}
-        return [by_name[name] for name in dict.fromkeys((*self._expected, *self._lab_columns)) if name in by_name]
+        return [
+            by_name[name] for name in dict.fromkeys((*self._expected, *self._user_defined_columns)) if name in by_name
+        ]
 
-    def is_lab_declared(self, name: str) -> bool:
-        """Return True if a lab declares this column."""
-        return name in self._lab_columns
+    def is_user_defined(self, name: str) -> bool:
+        """Return True if the user defined this column in a step `ask` or `run`."""
+        return name in self._user_defined_columns
 
     def more_is_worse(self, quantity: Quantity) -> bool | None:
         """Return True if larger values are worse, by the expectation or otherwise by the unit; None if unknown."""
         if (expectation := self._expected.get(quantity.name)) is not None:
             return expectation.is_below
-        if quantity.name in self._lab_columns or quantity.kind is Kind.FLAG:
+        if quantity.name in self._user_defined_columns or quantity.kind is Kind.FLAG:
             return None
         if quantity.unit in _MORE_IS_BETTER:
             return False
         return True if quantity.unit == "s" or plain_name(quantity.name) in _LOSSES else None
 
 
-def _lab_columns(plan: Plan) -> Iterator[str]:
+def _user_defined_columns(plan: Plan) -> Iterator[str]:
     for placed in plan.procedure.walk():
-        if placed.kind in _LAB_KINDS:
+        if placed.kind in _USER_DEFINED_KINDS:
             yield from (column.name for column in placed.step.output_columns())
 
 
 _PROTOCOL_QUANTITIES: Final = {"udp": ("datagram_loss", "rtt_median_s"), "tcp": ("tcp_byte_loss", "rtt_median_s")}
 _TOPIC_QUANTITIES: Final = ("topic_loss", "topic_delay_median_s", "video_loss", "used_age_p95_s", "seen_age_p95_s")
-"""Quantities of trials that stream topics or video, in which pings and transfers only give clock offset and load."""
+"""Quantities of trials that stream topics or video.
+
+In these trials pings serve only to measure the clock offset, and transfers only to generate load.
+"""
 _MAX_FIRST: Final = 6
-"""Maximum number of headlines of expected quantities and of a lab's quantities."""
+"""Maximum number of headlines of expected and user-defined quantities."""
 _MAX_PLACES: Final = 3
 _COUNT_TEXTS: Final = {
-    "silent": "nothing arrived in {}",
+    "all_lost": "nothing arrived in {}",
     "failed": "{} failed",
     "void": "{} void",
     "missing": "{} not run",
@@ -112,8 +117,8 @@ class Headline:
 def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[str] = ()) -> Iterator[Headline]:
     """Yield the headline of the outcomes of repeats, then headlines of quantities.
 
-    Quantities with an expectation and quantities that a lab declares come first, then the quantities of each
-    protocol. Steps that differ only in their names share a headline, in which the step is part of the condition.
+    Quantities with an expectation and user-defined quantities come first, then the quantities of each protocol. Steps
+    that differ only in their names share a headline, in which the step is part of the condition.
 
     Args:
         cells: Conditions.
@@ -161,8 +166,8 @@ class _HeadlineWriter:
 
     def repeats_headline(self, cells: Sequence[Cell], unmeasured: Sequence[str]) -> Headline:
         """Return the number of valid repeats, and the conditions of the other repeats, the worst first."""
-        silent = coverage.everything_lost(self.evidence.repeats)
-        cell_counts = [(cell, coverage.repeat_counts(cell, self.evidence, silent)) for cell in cells]
+        all_lost = coverage.everything_lost(self.evidence.repeats)
+        cell_counts = [(cell, coverage.repeat_counts(cell, self.evidence, all_lost)) for cell in cells]
         planned, valid = (sum(getattr(counts, name) for _, counts in cell_counts) for name in ("planned", "valid"))
         is_missing = valid < planned or bool(unmeasured)
         lines = [HeadlineLine("", wording.without_breaks(f"{valid} of {planned} valid"), "", "", is_missing)]
@@ -264,7 +269,10 @@ def _worst_and_best(
 def _line_of_value(
     values: Sequence[tuple[Cell, Estimate]], text: str, place: Callable[[Cell, Quantity], str]
 ) -> HeadlineLine:
-    """Return a value with all conditions that have it, and its interval if only one condition has it."""
+    """Return the line for a value, with all conditions that have this value.
+
+    It contains the interval if there is only one such condition.
+    """
     matching = [(cell, estimate) for cell, estimate in values if wording.value(estimate) == text]
     interval = wording.interval(matching[0][1]) if len(matching) == 1 else ""
     return HeadlineLine(
@@ -281,8 +289,8 @@ def _first_places(places: Sequence[str]) -> str:
 def _subject(variants: Sequence[Quantity], protocol: str, has_topics: bool) -> str:
     first_variant = variants[0]
     label = first_variant.label if len(variants) == 1 else first_variant.plain_label
-    names_protocol = has_topics or first_variant.plain_label.startswith(protocol.upper())
-    return label if names_protocol else f"{label} with {protocol.upper()}"
+    omit_protocol = has_topics or first_variant.plain_label.startswith(protocol.upper())
+    return label if omit_protocol else f"{label} with {protocol.upper()}"
 
 
 def _existing_quantities(quantities: Sequence[Quantity], names: Sequence[str]) -> list[list[Quantity]]:

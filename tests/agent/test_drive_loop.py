@@ -238,7 +238,7 @@ def test_missing_subscription_and_odometry_are_reported(monkeypatch: pytest.Monk
         run(world, monkeypatch, tmp_path)
     world.types = {STAMPED}
     with pytest.raises(
-        MiddlewareError, match=f"of geometry_msgs/msg/Twist, but endpoints of {STAMPED}: correct type"
+        MiddlewareError, match=f"of geometry_msgs/msg/Twist, but it has endpoints of type {STAMPED}: change"
     ):
         run(world, monkeypatch, tmp_path)
     world = World(tmp_path / "orders")

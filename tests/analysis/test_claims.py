@@ -34,8 +34,8 @@ def warning(text: str, repeats: int) -> str:
             "max rtt_gap_s < 300 ms",
             20,
             (
-                "applies to the repeats of this trial; for 90 % of all repeats it needs at least 29 for 95 % "
-                "confidence, and 20 show it for 86 %"
+                "applies only to the repeats of this trial; to show with 95 % confidence that at least 90 % of all "
+                "repeats meet it, at least 29 repeats are needed; with 20, it can be shown only for 86 %"
             ),
         ),
         ("max rtt_gap_s < 300 ms", 29, ""),
@@ -43,8 +43,8 @@ def warning(text: str, repeats: int) -> str:
             "ip_loss < 2 %",
             20,
             (
-                "needs at least 189 repeats for 95 % confidence, even if nothing is lost; this trial has 20; for "
-                "these packets alone: ip_loss < 2 % of all packets"
+                "needs at least 189 repeats for 95 % confidence, even if nothing is lost; this trial has 20; to "
+                "check only the packets of this trial, write: ip_loss < 2 % of all packets"
             ),
         ),
         (
@@ -69,7 +69,7 @@ def warning(text: str, repeats: int) -> str:
         (
             "goodput_bit_s > 1 Mbit/s",
             1,
-            "needs at least 2 repeats for 95 % confidence, which give an interval; this trial has 1",
+            "needs at least 2 repeats, because fewer give no interval; this trial has 1",
         ),
         ("retries < 3", 2, ""),
     ],

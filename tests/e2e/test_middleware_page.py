@@ -15,7 +15,7 @@ TABLE = PAGE.with_suffix(".csv")
 
 def test_every_point_of_the_loss_figure_has_its_interval_and_its_number_of_samples() -> None:
     cells = middleware_table.cells(TABLE)
-    chart = middleware.by_distance(MiddlewareFindings(cells, "", 0.0, 0.0), "middleware-loss", middleware.LOSS_FIGURE)
+    chart = middleware.by_distance(MiddlewareFindings(cells, "", 0.0, 0.0), "middleware-loss", middleware.LOSS)
     points = [
         point
         for panel in chart.panels

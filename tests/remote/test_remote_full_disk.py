@@ -72,15 +72,15 @@ def test_host_state_that_does_not_fit_is_reported_and_can_be_repeated(shell: Sma
     shell.run(("mkdir", "-p", f"{FOLDER}/.jobs"), deadline=Deadline.after(30))
     fill(shell)
     with pytest.raises(RobotError, match=NO_SPACE):
-        evidence.begin(shell, FOLDER, "sender", "lo", need_kib=0)
+        evidence.begin(shell, FOLDER, "sender", "lo", required_kib=0)
     shell.run(("rm", ".fieldkit/fill"), deadline=Deadline.after(30))
-    evidence.begin(shell, FOLDER, "sender", "lo", need_kib=100)
+    evidence.begin(shell, FOLDER, "sender", "lo", required_kib=100)
     state = shell.run(("cat", f"{FOLDER}/sender-before.txt"), deadline=Deadline.after(30)).stdout
     assert b"==> /proc/net/snmp <==" in state
 
 
 def test_job_whose_identity_cannot_be_recorded_does_not_start(shell: SmallShell) -> None:
-    evidence.begin(shell, FOLDER, "sender", "lo", need_kib=100)
+    evidence.begin(shell, FOLDER, "sender", "lo", required_kib=100)
     fill(shell)
     for call in (jobs.run, jobs.start):
         with pytest.raises(RobotError, match=NO_SPACE):
@@ -89,7 +89,7 @@ def test_job_whose_identity_cannot_be_recorded_does_not_start(shell: SmallShell)
 
 
 def test_evidence_that_does_not_fit_is_reported(shell: SmallShell, tmp_path: Path) -> None:
-    evidence.begin(shell, FOLDER, "sender", "lo", need_kib=100)
+    evidence.begin(shell, FOLDER, "sender", "lo", required_kib=100)
     jobs.run(shell, replace(job("cat", "/dev/zero"), stdout="recv.bag"))
     into = tmp_path / "local"
     into.mkdir()
@@ -107,15 +107,15 @@ def test_lock_that_does_not_fit_is_reported(shell: SmallShell) -> None:
 def test_lock_that_cannot_be_renewed_is_reported_and_kept(shell: SmallShell) -> None:
     anna, bert = Holder("a", "anna@one", "a"), Holder("b", "bert@two", "b")
     with locked({Role.SENDER: shell}, anna, sink=print):
-        evidence.begin(shell, FOLDER, "sender", "lo", need_kib=100, token="a")
+        evidence.begin(shell, FOLDER, "sender", "lo", required_kib=100, token="a")
         shell.run(("sh", "-c", ADVANCE_LOCK_TIMES), deadline=Deadline.after(30))
         fill(shell)
         with pytest.raises(RobotError, match=NO_SPACE):
-            evidence.begin(shell, FOLDER, "sender", "lo", need_kib=0, token="a")
+            evidence.begin(shell, FOLDER, "sender", "lo", required_kib=0, token="a")
         shell.run(("rm", ".fieldkit/fill"), deadline=Deadline.after(30))
         with pytest.raises(RobotError, match="anna@one locked it"), locked({Role.SENDER: shell}, bert, sink=print):
             raise AssertionError("the lock is held twice")
-        evidence.begin(shell, FOLDER, "sender", "lo", need_kib=0, token="a")
+        evidence.begin(shell, FOLDER, "sender", "lo", required_kib=0, token="a")
 
 
 # The lock starts at boot, because the machine may have booted less than half of the duration of the lock ago.
@@ -132,7 +132,7 @@ def is_full(shell: SmallShell) -> bool:
 def test_job_that_fills_the_disk_is_stopped_by_abort_of_any_version(shell: SmallShell) -> None:
     anna = Holder("a", "anna@one", "a")
     with locked({Role.SENDER: shell}, anna, sink=print):
-        evidence.begin(shell, FOLDER, "sender", "lo", need_kib=100, token="a")
+        evidence.begin(shell, FOLDER, "sender", "lo", required_kib=100, token="a")
         jobs.start(shell, job("sh", "-c", "cat /dev/zero >hole; exec sleep 100"))
         wait_until(lambda: is_full(shell), Deadline.after(30))
         fill(shell)
@@ -147,7 +147,7 @@ def test_job_that_fills_the_disk_is_stopped_by_abort_of_any_version(shell: Small
         assert (aborted.locked, aborted.jobs, aborted.error) == (True, (), None)
         jobs.install(shell, Deadline.after(30))
         with pytest.raises(LockLostError, match="aborted by bert@two"):
-            evidence.begin(shell, FOLDER, "sender", "lo", need_kib=0, token="a")
+            evidence.begin(shell, FOLDER, "sender", "lo", required_kib=0, token="a")
 
 
 def test_lock_that_cannot_be_released_is_reported_and_not_awaited(shell: SmallShell) -> None:

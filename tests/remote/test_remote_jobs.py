@@ -442,7 +442,7 @@ def test_repeated_begin_keeps_the_first_state_and_running_jobs(shell: LocalShell
 
 def test_begin_rejects_a_disk_with_less_space_than_needed(shell: LocalShell) -> None:
     with pytest.raises(RobotError, match=r"\d+ KiB of disk are free, 10{15} KiB are needed") as error_info:
-        evidence.begin(shell, jobs.work_folder("trial", "udp-02-1"), "sender", "lo", need_kib=10**15)
+        evidence.begin(shell, jobs.work_folder("trial", "udp-02-1"), "sender", "lo", required_kib=10**15)
     assert "du -sh ~/.fieldkit/*" in error_info.value.remedy
     assert not (shell.home / jobs.work_folder("trial", "udp-02-1")).exists()
 
@@ -745,7 +745,7 @@ def test_read_only_robot_is_reported_and_can_be_aborted(shell: LocalShell) -> No
     assert "touch ~/.fieldkit/x" in error_info.value.remedy
     jobs.install(shell, Deadline.after(30))
     with pytest.raises(RobotError, match="Read-only file system") as error_info:
-        evidence.begin(robot, f"{FOLDER}-2", "sender", "lo", need_kib=0)
+        evidence.begin(robot, f"{FOLDER}-2", "sender", "lo", required_kib=0)
     assert "a failing SD card" in error_info.value.remedy
     (job_ended,) = jobs.abort(robot, "anna@one", Deadline.after(30)).jobs
     assert job_ended.endswith("sleep 60")

@@ -46,7 +46,7 @@ def robot(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[LossyRobot
     home.mkdir()
     lossy_robot = LossyRobot(home, userland_path(request.param, tmp_path / "bin"))
     jobs.install(lossy_robot, Deadline.after(30))
-    evidence.begin(lossy_robot, FOLDER, "sender", "lo", need_kib=0)
+    evidence.begin(lossy_robot, FOLDER, "sender", "lo", required_kib=0)
     (home / FOLDER / "scan").mkdir()
     (home / FOLDER / "scan" / "scan_0.db3").write_bytes(LARGE)
     (home / FOLDER / "camera.bag").write_bytes(LARGE[::-1])
@@ -125,7 +125,7 @@ def test_wrong_output_of_tools_on_a_robot_is_detected(tmp_path: Path, tool: str,
         folder.mkdir()
     robot = LossyRobot(home, f"{tools}:{os.environ['PATH']}")
     jobs.install(robot, Deadline.after(30))
-    evidence.begin(robot, FOLDER, "sender", "lo", need_kib=0)
+    evidence.begin(robot, FOLDER, "sender", "lo", required_kib=0)
     (home / FOLDER / "camera.bag").write_bytes(LARGE)
     (tools / tool).write_text(f"#!/bin/sh\n{false_output}\n", encoding="ascii")
     (tools / tool).chmod(0o755)
@@ -206,7 +206,7 @@ def test_missing_folder_is_reported(robot: LossyRobot, into: Path) -> None:
 
 def test_unfetched_folders_are_not_deleted(robot: LossyRobot) -> None:
     for number in (2, 3):
-        evidence.begin(robot, jobs.work_folder("trial", f"udp-0{number}-1"), "sender", "lo", need_kib=0)
+        evidence.begin(robot, jobs.work_folder("trial", f"udp-0{number}-1"), "sender", "lo", required_kib=0)
     evidence.discard(robot, "trial", kept_folders=[FOLDER, jobs.work_folder("trial", "udp-03-1")])
     assert sorted(path.name for path in (robot.home / ".fieldkit/trial").iterdir()) == ["udp-01-1", "udp-03-1"]
     evidence.discard(robot, "trial")

@@ -120,12 +120,14 @@ def _wait_for_subscription(
     """Wait until the base of the robot has subscribed to the velocity topic.
 
     Raises:
-        MiddlewareError: It has not; the text contains the types of other endpoints of the topic.
+        MiddlewareError: The base has not subscribed; the message lists the types of the topic's other endpoints.
     """
     if _wait_until(lambda: publisher.matched() > 0, stop_event):
         return
     other_types = set() if stop_event.is_set() else middleware.other_types(command)
-    hint = f", but endpoints of {', '.join(sorted(other_types))}: correct type of drive in its profile"
+    hint = (
+        f", but it has endpoints of type {', '.join(sorted(other_types))}: change drive.type in the robot's profile"
+    )
     raise MiddlewareError(f"{command.name} has no subscription of {command.type}{hint if other_types else ''}")
 
 
@@ -168,8 +170,9 @@ def _report(
 ) -> None:
     """Write the state of the drive to the status file for the laptop, and to the log while the robot is on its path.
 
-    The status also contains `pose` in the frame of the odometry; `frame_id`; `ready`, whether the robot is
-    stationary and may start; `refused`, whether it did not start because it is not at the required place.
+    The status also contains `pose` in the frame of the odometry; `frame_id`, which identifies this frame: the boot
+    ID, because the frame starts anew at each boot; `ready`, whether the robot is stationary and may start; `refused`,
+    whether it did not start because it is not at the required place.
     """
     relative_pose, pose = driver.relative_pose, driver.pose
     if relative_pose is None or pose is None:

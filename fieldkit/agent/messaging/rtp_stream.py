@@ -1,4 +1,4 @@
-"""Video of a synthetic camera over RTP: frames into a GStreamer pipeline, and frames from one, with a log of each.
+"""Send and receive the video of a synthetic camera over RTP with GStreamer pipelines, and log each frame.
 
 The pipelines are arguments, so this module contains no element of GStreamer. A frame is in the format I420: its luma
 (`fieldkit.agent.video.frame_code`), then grey chroma of half its size.
@@ -98,7 +98,7 @@ def send(video: Video, log: Log, stop_event: threading.Event) -> None:
 def receive(video: Video, log: Log, stop_event: threading.Event) -> None:
     """Log each frame from a pipeline, and each refresh of a display, until `stop_event` is set.
 
-    Writes `up` to standard error when the pipeline is playing.
+    Writes `up, RTP` to standard error when the pipeline is playing.
 
     Raises:
         LogError: For the same reasons as `Log.note`.

@@ -26,7 +26,7 @@ def _after_ethertype(integers: Integers, frames: Frames, type_at: Ints, network:
     """Return the positions of the IP headers after the EtherTypes; VLAN tags are skipped.
 
     Args:
-        integers: The file.
+        integers: Reader of integers in the file.
         frames: Its frames.
         type_at: Positions of the EtherTypes.
         network: Positions of the payloads whose type the EtherTypes state.
@@ -90,7 +90,7 @@ def _after_mac_header(integers: Integers, frames: Frames, mac: Ints, *, padded: 
     """Return the positions of the IP headers in data frames of IEEE 802.11.
 
     Args:
-        integers: The file.
+        integers: Reader of integers in the file.
         frames: Its frames.
         mac: Positions of the MAC headers.
         padded: Mask of the frames whose MAC header is padded to a multiple of four bytes.

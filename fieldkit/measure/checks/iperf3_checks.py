@@ -146,14 +146,16 @@ def _interval_problems(interval: IperfInterval) -> Iterator[str]:
     if interval.start_s is not None and interval.end_s is not None:
         duration_s = interval.end_s - interval.start_s
         if abs(duration_s - interval.duration_s) > _ROUNDING_S:
-            yield f"lasts {duration_s:.3f} s by its start and end, but {interval.duration_s:.3f} s by its length"
+            reported = f"{interval.duration_s:.3f} s by its reported duration"
+            yield f"lasts {duration_s:.3f} s by its start and end, but {reported}"
     if interval.stream_bytes is not None and interval.stream_bytes != interval.payload_bytes:
         yield f"has {interval.payload_bytes} bytes, but its streams have {interval.stream_bytes}"
     rate = interval.rate_bit_s
     if rate is not None and not math.isclose(rate, interval.bit_s, rel_tol=_ROUNDING, abs_tol=8):
         yield f"has {interval.bit_s:.0f} bit/s by its bytes, but reports {rate:.0f} bit/s"
+    # A negative loss is no contradiction: a datagram that arrives late is counted as lost in one interval, and
+    # subtracted from the losses of the next.
     if interval.lost is not None and interval.datagrams is not None and interval.lost > interval.datagrams:
-        # A datagram that arrives late is counted as lost in one interval, and subtracted from the losses of the next.
         yield f"has {interval.lost} of {interval.datagrams} datagrams lost"
 
 
@@ -192,14 +194,14 @@ def _differences(test: IperfTest, settings: IperfSettings) -> Iterator[str]:
     start = test.start
     comparisons = {
         "protocol": (start.protocol or None, str(settings.protocol)),
-        "streams": (start.streams, settings.streams),
+        "number of streams": (start.streams, settings.streams),
         "direction": (start.reverse, settings.reverse),
         "datagram size": (start.block_bytes, settings.payload_bytes if settings.protocol is Protocol.UDP else None),
         "number of connections": (len(test.ports), settings.streams),
     }
     for setting, (actual, required) in comparisons.items():
         if actual is not None and required is not None and actual != required:
-            yield f"had another {setting} than the procedure requires"
+            yield f"used a different {setting} from the one that the procedure requires"
 
 
 def _totals(client: IperfTest, sender: IperfTest, receiver: IperfTest, settings: IperfSettings) -> Iterator[str]:
@@ -239,8 +241,8 @@ def date_problem(test: IperfTest, window: tuple[int, int] | None) -> str | None:
     start_s = test.start.start_utc_s
     if first_s - _TIMESTAMP_S <= start_s <= last_s + _TIMESTAMP_S:
         return None
-    distance_s = first_s - start_s if start_s < first_s else start_s - last_s
-    return f"it began {distance_s:.0f} s {'before' if start_s < first_s else 'after'} the attempt"
+    difference_s = first_s - start_s if start_s < first_s else start_s - last_s
+    return f"it began {difference_s:.0f} s {'before' if start_s < first_s else 'after'} the attempt"
 
 
 def _sum(intervals: tuple[IperfInterval, ...], name: str) -> int | None:

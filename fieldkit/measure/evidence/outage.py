@@ -2,6 +2,9 @@
 
 All times are of the observer's clock, and the resolution is the observer's interval: if the time G is between two
 consecutive answers, the outage was at most G and at least G minus two intervals.
+
+The cause of a fault is the injected action, such as a link that is taken down; its duration is recorded in a note
+file. The outage is what the observer sees.
 """
 
 import re
@@ -20,7 +23,7 @@ from fieldkit.measure.evidence.outage_columns import fault_columns
 MIN_SILENCE_S: Final = 1.0
 """A robot has not recovered if its last answer is at least this old at the end of the observation."""
 
-# Gaps up to this length also occur without a fault. A reboot or a time out of range takes longer.
+# Gaps up to this length also occur without a fault. A reboot, or an excursion out of radio range, takes longer.
 _MAX_NORMAL_GAP_INTERVALS: Final = 3
 
 _NUMBER: Final = r"[0-9]{1,9}(?:\.[0-9]{1,9})?"
@@ -75,7 +78,10 @@ class _Note:
 
 @dataclass(frozen=True)
 class _Answers:
-    """Times of the answers and end of the observation by the observer's clock; process IDs that did not change."""
+    """Times of the answers and end of the observation by the observer's clock; process IDs that did not change.
+
+    For a killed process, the answers are the observations in which it was running.
+    """
 
     at_s: Sequence[float]
     end_s: float
@@ -119,7 +125,11 @@ def cause_duration_s(path: Path) -> float | None:
 
 
 def _min_outage_s(note: _Note) -> float:
-    """Return the shortest plausible outage in seconds. An operator may be late by half of the cause's duration."""
+    """Return the shortest plausible outage in seconds.
+
+    An operator who causes the fault by hand may act late, so the outage may be as short as half of the recorded
+    duration of the cause.
+    """
     return max((note.cause_s or 0.0) / 2, _MAX_NORMAL_GAP_INTERVALS * note.interval_s)
 
 

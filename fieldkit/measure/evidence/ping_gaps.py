@@ -1,4 +1,4 @@
-"""Longest time without an answer in the output of ping."""
+"""Longest time without an answer (an echo reply) in the output of ping."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -107,7 +107,7 @@ class DriveLease(LeaseKeeper):
     def wait(self, condition: Callable[[], object], deadline: Deadline) -> None:
         """Wait until a condition is true or the deadline has passed."""
         while not condition() and not deadline.expired:
-            self.pause()
+            self.wait_for_next_poll()
             # Without the link the robot stops automatically and its driver reports why; the link may be restored.
             with suppress(LinkError, RobotError):
                 self.renew()

@@ -59,7 +59,7 @@ def _alarm_text(flight: FlightLease, guard: Planned, rescue: FlightRescue, log: 
         have_exited = flight.exit_code and guard_code and (rescue_code or not rescue.may_land)
         if deadline.expired or has_alarm or have_exited:
             break
-        flight.pause()
+        flight.wait_for_next_poll()
     if not flight.is_aloft:
         return ""
     position_lines, guard_lines, rescue_lines, *_ = tails

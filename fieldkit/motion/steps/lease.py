@@ -38,9 +38,9 @@ def orders_file(name: str) -> str:
 
 @contextmanager
 def start_program(shell: Shell, job: Job) -> Iterator[None]:
-    """Install the agent on a robot and start one of its programs, which the body stops.
+    """Install the agent on a robot and start one of its programs.
 
-    Raises the same errors as `jobs.start`.
+    The program is not stopped here: the body must stop it. Raises the same errors as `jobs.start`.
     """
     agent.install(shell)
     jobs.start(shell, job)
@@ -57,7 +57,8 @@ class LeaseKeeper:
         order: The first order.
         lease_s: Time in seconds until an order expires.
         renewals: Number of renewals in that time.
-        silent_lease_s: Time until an order expires if nothing may be sent meanwhile; None if orders are renewed.
+        silent_lease_s: Lease used instead of `lease_s` while the radio must stay silent, so that orders cannot be
+            renewed; None if orders are renewed.
 
     Attributes:
         output: Content of the output file at the last renewal.
@@ -116,8 +117,8 @@ class LeaseKeeper:
         """Renew the last order, and return the content of the output file. Raises the same errors as `give_order`."""
         return self._send(jobs.REPLY_S)
 
-    def pause(self) -> None:
-        """Wait for the interval between two polls."""
+    def wait_for_next_poll(self) -> None:
+        """Sleep for the interval at which callers poll the output."""
         time.sleep(_POLL_S)
 
     @property
@@ -140,7 +141,9 @@ class LeaseKeeper:
 
     @contextmanager
     def run_while_leased(self, end: Callable[[], None]) -> Iterator[None]:
-        """Run the body; abort it if the program ends. Without renewals, the end is detected only after the body.
+        """Run the body; abort it if the program ends.
+
+        If orders are not renewed, the end of the program is noticed only after the body has finished.
 
         Args:
             end: Aborts the operations that the body waits for. It is called at each renewal, because the body may
@@ -187,6 +190,13 @@ class LeaseKeeper:
 
 def run_inside(nest: Nest, keeper: LeaseKeeper, scene: Scene, testbed: Testbed, announce: Announce) -> None:
     """Run the steps inside `nest`; abort them if its leased program ends.
+
+    Args:
+        nest: The step whose inner steps are run.
+        keeper: Keeper of the lease of the program.
+        scene: The attempt; all running steps share it.
+        testbed: The robots.
+        announce: Called with the name and the expected duration of each phase.
 
     Raises the same errors as `run_while_leased`.
     """

@@ -262,7 +262,7 @@ class FlightLease(LeaseKeeper):
             if deadline.expired:
                 last_line = shorten(self._lines[-1].partition(" ")[2]) if self._lines else "nothing"
                 raise self.failure(f"it did not report {mark!r} in {within_s:.0f} s; its last line: {last_line}")
-            self.pause()
+            self.wait_for_next_poll()
 
 
 def _motion_origin(values: Mapping[str, Any]) -> MotionOrigin:

@@ -89,9 +89,9 @@ class Robots:
                 remote,
                 role,
                 self._interface(role),
-                old=None if old in self.unfetched.folders[role] else old,
+                old_folder=None if old in self.unfetched.folders[role] else old,
                 token=plan.session,
-                need_kib=(size.evidence_bytes(plan, role) + size.reserve_bytes(plan, role)) // 1024,
+                required_kib=(size.evidence_bytes(plan, role) + size.reserve_bytes(plan, role)) // 1024,
                 sources=sources.get(role, ()),
             )
             times_ns[role] = request_ns, time.time_ns()

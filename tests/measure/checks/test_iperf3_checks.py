@@ -93,10 +93,10 @@ def test_the_json_of_another_test_is_a_contradiction(version: str, test: str, en
 
 
 def changed_settings() -> Iterator[tuple[str, Any, str]]:
-    yield "protocol", "SCTP", "another protocol"
-    yield "num_streams", 7, "another streams"
-    yield "reverse", 2, "another direction"
-    yield "blksize", 64, "another datagram size"
+    yield "protocol", "SCTP", "a different protocol"
+    yield "num_streams", 7, "a different number of streams"
+    yield "reverse", 2, "a different direction"
+    yield "blksize", 64, "a different datagram size"
 
 
 @pytest.mark.parametrize(("key", "value", "reason"), list(changed_settings()))

@@ -336,7 +336,7 @@ def test_fetched_evidence_is_deleted_after_a_broken_lock(robot: LocalShell) -> N
         begin(robot, ANNA)
         locks.abort({"turtlebot-1": robot}, "bert@two")
         with pytest.raises(LockLostError):
-            evidence.begin(robot, f"{FOLDER}-2", "sender", "lo", token=ANNA.token, old=FOLDER)
+            evidence.begin(robot, f"{FOLDER}-2", "sender", "lo", token=ANNA.token, old_folder=FOLDER)
     assert not (robot.home / FOLDER).exists()
 
 

@@ -77,7 +77,7 @@ def test_evidence_that_cannot_be_fetched_is_not_deleted_from_the_robot(tmp_path:
         shells[role] = kind(home)
         jobs.install(shells[role], Deadline.after(60))
         for remote in attempts.values():
-            evidence.begin(shells[role], remote, role, "lo", need_kib=0)
+            evidence.begin(shells[role], remote, role, "lo", required_kib=0)
     robots = Robots(plan, IdleTestbed(shells))
     destination = tmp_path / "into"
     destination.mkdir()
@@ -151,7 +151,7 @@ def test_no_segment_is_requested_after_the_connection_was_closed(tmp_path: Path)
         (home := tmp_path / role).mkdir()
         shells[role] = InterruptedRobot(home)
         jobs.install(shells[role], Deadline.after(60))
-        evidence.begin(shells[role], remote, role, "lo", need_kib=0)
+        evidence.begin(shells[role], remote, role, "lo", required_kib=0)
     (tmp_path / Role.SENDER / remote / "scan.bag").write_bytes(bytes(3 * fetching.PIECE_BYTES))
     robots = Robots(plan, IdleTestbed(shells))
     shells[Role.SENDER].on_command = robots.close_connections
@@ -174,7 +174,7 @@ def test_completely_fetched_evidence_is_deleted_even_if_a_job_failed(tmp_path: P
         (home := tmp_path / role).mkdir()
         shells[role] = LocalShell(home)
         jobs.install(shells[role], Deadline.after(60))
-        evidence.begin(shells[role], remote, role, "lo", need_kib=0)
+        evidence.begin(shells[role], remote, role, "lo", required_kib=0)
     job = tmp_path / Role.SENDER / remote / ".jobs" / "capture"
     job.mkdir()
     for name, text in {"leaves": "", "pid": "1 1 x", "exit": "3"}.items():
