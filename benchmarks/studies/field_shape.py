@@ -60,7 +60,7 @@ SHOWN: Final = (
     ("IP packets", "udp", "ip_loss"),
     ("datagrams", "udp", "datagram_loss"),
     ("file, UDP", "udp", "file_loss"),
-    ("TCP bytes, repaired", "tcp", "tcp_byte_loss"),
+    ("TCP bytes, before retransmission", "tcp", "tcp_byte_loss"),
     ("RTT, 502 bytes", "tcp", PAPER_DELAY.name),
     ("RTT, 8,192 bytes", "udp", PAPER_DELAY.name),
 )
