@@ -211,7 +211,9 @@ CROSS_CHECKS: Final = (
         columns=("topic_delay_*", "topic_age_*", "topic_jitter_s", "topic_deadline_misses"),
         source="`ROLE-topic.bin` of the subscriber: time of the log entry",
         against=("the subscriber's capture: time of the packet with the sample",),
-        tolerance="20 ms, or a tenth of the withheld delay, because a busy robot delays single samples",
+        tolerance=(
+            "20 ms, or a tenth of the delay, age or jitter in the column, because a busy robot delays single samples"
+        ),
         outcome=CheckOutcome.WITHHELD,
     ),
     CrossCheck(
