@@ -37,7 +37,11 @@ def add_site(parser: Parser) -> None:
 def add_operator(parser: Parser) -> None:
     """Add the options for questions to the operator, and one for each permission."""
     answers = parser.add_mutually_exclusive_group()
-    answers.add_argument("--yes", action="store_true", help="request nothing: the robots are at their positions")
+    answers.add_argument(
+        "--yes",
+        action="store_true",
+        help="do not ask the operator for anything; assume that the robots are in position",
+    )
     answers.add_argument("--answers", metavar="FILE", help="answers, a line per request; -: read from standard input")
     for name, permission in permissions.installed().items():
         parser.add_argument(permissions.option(name), action="store_true", help=permission.help_line)

@@ -35,7 +35,7 @@ ATTEMPT_CHECKS: Final = (
         columns=("*_channel", "*_regulatory_domain"),
         source="`ROLE-sources-after.txt`: iw-info, iw-reg",
         against=("the same values in `ROLE-sources-before.txt`",),
-        tolerance="none; it is unknown if a file is missing",
+        tolerance="none; if a file is missing, changes cannot be detected",
     ),
     CrossCheck(
         quantity="computers, and the neighbourhood of radios",

@@ -15,7 +15,7 @@ def test_a_folder_is_created_on_first_use(tmp_path: Path) -> None:
     assert (folder.exists, list(tmp_path.iterdir())) == (False, [])
     folder.add("received")
     assert folder.path == tmp_path / "run" / "test_a"
-    assert (folder.path / LOG).read_text(encoding="utf-8").endswith(" heard\n")
+    assert (folder.path / LOG).read_text(encoding="utf-8").endswith(" received\n")
 
 
 @pytest.mark.parametrize(

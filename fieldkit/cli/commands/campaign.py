@@ -25,7 +25,7 @@ def add(parser: Parser) -> None:
     shared.add_site(parser)
     shared.add_out(parser, "the folder of the campaign")
     parser.add_argument(
-        "--dry-run", action="store_true", help="print order, path, time and disk space; change nothing"
+        "--dry-run", action="store_true", help="print order, route, time and disk space; change nothing"
     )
     parser.add_argument("--failed", action="store_true", help="also repeat the failed repeats")
     shared.add_json(parser)

@@ -17,7 +17,7 @@ smaller value in B. +1 or -1: no overlap; 0: both shares are equal. `cliffs_delt
 
 exit codes with --threshold: 0 if, in every condition in which A or B has the quantity,
 the whole 95 % interval of B - A is within the threshold; 1 if it is not, or if A or
-B has no such cell, no value of the quantity or no interval. Without --threshold: 0.
+B has no such condition, no value of the quantity or no interval. Without --threshold: 0.
 
 example: fieldkit compare field/ trials/ --threshold ip_loss=2% --threshold rtt_median_s=5ms"""
 

@@ -27,7 +27,7 @@ def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit completion`."""
     parser.description = (
         "Print a script with which the Tab key completes commands, options, robots, procedures, backends and trial "
-        "folders. In zsh, compinit must have run before."
+        "folders. In zsh, run compinit first."
     )
     parser.epilog = (
         'in ~/.bashrc or ~/.zshrc: eval "$(fieldkit completion bash)", or zsh; '

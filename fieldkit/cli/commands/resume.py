@@ -11,10 +11,10 @@ from fieldkit.cli.parser import Parser
 def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit resume`."""
     parser.description = (
-        "Continue a trial that stopped: by Ctrl-C, a kill, a lost robot or emulator, a full disk. Finished repeats "
-        "are not repeated. Files that differ from their checksums are reported; if rows of trial.csv must be rebuilt "
-        "from them, the trial does not continue (exit code 4). The backend and the robots in their roles "
-        "must be those with which the trial started."
+        "Continue a trial that was stopped by Ctrl-C or a kill, or because a robot or the emulator was lost or the "
+        "disk was full. Finished repeats are not repeated. Files that differ from their checksums are reported; if "
+        "rows of trial.csv must be rebuilt from them, the trial does not continue (exit code 4). The backend and "
+        "the robots in their roles must be those with which the trial started."
     )
     shared.add_trial(parser, "folder of the trial")
     parser.add_argument(

@@ -243,9 +243,8 @@ CROSS_CHECKS: Final = (
         source="times in `sender.pcap` and `receiver.pcap`",
         against=("packets in both directions: offset and skew of the clocks", "each robot's clock before and after"),
         tolerance=(
-            "the error of the clock offset, computed with one wrong time stamp, may be a tenth of the delay; the "
-            "clocks "
-            "must advance at constant rates"
+            "the error bound of the clock offset (valid even if one time stamp is wrong) may be at most a tenth of "
+            "the delay; the clocks must advance at constant rates"
         ),
         outcome=CheckOutcome.WITHHELD,
     ),

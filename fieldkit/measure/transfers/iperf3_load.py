@@ -156,8 +156,8 @@ JITTER_CROSS_CHECKS: Final = (
         source="both captures: times of sending and arrival of each datagram",
         against=("both captures: packets of the other direction, and the clock offset that fits all packets",),
         tolerance=(
-            "two quartz clocks may drift by 0.1 ms per second relative to each other; no other source has the time "
-            "of a single datagram, which the order of packets bounds to 0.1 s"
+            "0.1 ms per second of clock drift; no other source records the time of a single datagram, but the order "
+            "of the packets limits an error in it to 0.1 s"
         ),
         outcome=CheckOutcome.WITHHELD,
     ),

@@ -46,7 +46,11 @@ def add(parser: Parser) -> None:
     action.add_argument(
         "--max-loss", default="1%", metavar="SHARE", help="largest loss of samples in each repeat (default 1%%)"
     )
-    action.add_argument("--max-delay", metavar="TIME", help="largest delay of 95 %% of the sent samples: 200ms")
+    action.add_argument(
+        "--max-delay",
+        metavar="TIME",
+        help="largest delay of 95 %% of the sent samples, for example 200ms (default: none)",
+    )
     action.add_argument("--size", metavar="BYTES", help="only samples of this size: 100kB (default: all)")
     action.add_argument("--repeats", type=int, default=5, metavar="N", help="valid repeats needed (default 5)")
     action.add_argument(

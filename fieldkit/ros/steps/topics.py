@@ -77,8 +77,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
     cross_checks = (
         *topic_checks.CROSS_CHECKS,
         *stalls.cross_checks("topic"),
-        *read_checks.cross_checks("seen", "topic"),
-        *read_checks.cross_checks("used", "topic"),
+        *read_checks.cross_checks("seen", "used", stream="topic"),
     )
     kept_bytes = KEPT_BYTES
     capture_buffer_kib = BUFFER_KIB

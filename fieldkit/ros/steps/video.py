@@ -64,7 +64,7 @@ class VideoStep(AlongStep, Prepares, HasNeeds, UsesSpace, Listens, SendsTraffic,
         port: UDP port of the receiver.
     """
 
-    cross_checks = (*video_checks.CROSS_CHECKS, *read_checks.cross_checks("seen", _STREAM))
+    cross_checks = (*video_checks.CROSS_CHECKS, *read_checks.cross_checks("seen", stream=_STREAM))
     kept_bytes = _KEPT_BYTES
     capture_buffer_kib = _BUFFER_KIB
 

@@ -38,30 +38,35 @@ def check_reads(received: TopicLog) -> Iterator[str]:
         yield "a read in the subscriber's log has another time of sending than the sample"
 
 
-def cross_checks(prefix: str, stream: str) -> tuple[CrossCheck, ...]:
+def cross_checks(*prefixes: str, stream: str) -> tuple[CrossCheck, ...]:
     """Return the sources of the columns of reads, and the checks between them.
 
     Args:
-        prefix: Prefix of the columns.
+        prefixes: Prefixes of the columns.
         stream: `topic`, or `video` for a stream over RTP.
     """
-    columns = tuple(
-        f"{prefix}_{name}" for name in ("age_*", "withheld", "blank", "repeated", "distinct", "never", "gap*")
+    sample, sender, receiver = (
+        ("frame", "sender", "receiver") if stream == "video" else ("sample", "publisher", "subscriber")
     )
-    log = f"`ROLE-{stream}.bin` of the subscriber"
+    log = f"`ROLE-{stream}.bin` of the {receiver}"
+
+    def columns(*names: str) -> tuple[str, ...]:
+        return tuple(f"{prefix}_{name}" for prefix in prefixes for name in names)
+
     return (
         CrossCheck(
-            quantity=f"newest {'frame' if prefix == 'seen' else 'sample'} at each read of a {stream}",
-            columns=columns,
+            quantity=f"newest {sample} at each read of a {stream}",
+            columns=columns("age_*", "withheld", "blank", "repeated", "distinct", "never", "gap*"),
             source=f"{log}: reads",
-            against=(f"{log}: arrivals", "the log of the publisher: times of sending"),
+            against=(f"{log}: arrivals", f"the log of the {sender}: times of sending"),
             tolerance=(
-                "a sample may arrive up to 0.2 s before its first read on a busy robot; no read is before the arrival"
+                f"a {sample} may arrive up to 0.2 s before its first read on a busy robot; no read is before the "
+                "arrival"
             ),
         ),
         CrossCheck(
-            quantity=f"clocks of the age at a read of a {stream}",
-            columns=(f"{prefix}_age_*", f"{prefix}_late"),
+            quantity=f"clock offset used for the age of a {sample} when it is read",
+            columns=columns("age_*", "late"),
             source=f"{log}: reads and times of sending",
             against=("the captures: packets in both directions, which limit the clock offset",),
             tolerance="the clock error is at most a tenth of the age",
@@ -69,7 +74,7 @@ def cross_checks(prefix: str, stream: str) -> tuple[CrossCheck, ...]:
         ),
         CrossCheck(
             quantity=f"number of reads of a {stream}",
-            columns=(f"{prefix}_reads", f"{prefix}_age_*", f"{prefix}_gap*", f"{prefix}_repeated", f"{prefix}_blank"),
+            columns=columns("reads", "age_*", "gap*", "repeated", "blank"),
             source=f"{log}: reads",
             against=("the rate of reads in the procedure",),
             tolerance="at least 90 %: a busy robot misses single ticks",

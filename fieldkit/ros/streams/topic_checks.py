@@ -162,7 +162,7 @@ CROSS_CHECKS: Final = (
         quantity="samples sent",
         columns=("topic_sent", "topic_refused", "topic_skipped", "topic_loss"),
         source="`ROLE-topic.bin` of the publisher: samples",
-        against=("the rate and duration of the procedure", "the publisher's capture: heads of samples", _SAME_FILE),
+        against=("the rate and duration of the procedure", "the publisher's capture: sample headers", _SAME_FILE),
         tolerance=(
             "none; every number from 0 on is sent, refused or skipped, and a sample in the capture is in the log"
         ),
@@ -173,7 +173,7 @@ CROSS_CHECKS: Final = (
         source="`ROLE-topic.bin` of the subscriber: samples",
         against=(
             "the publisher's log: numbers, sizes and times of sending",
-            "the subscriber's capture: heads, packets and bytes of samples",
+            "the subscriber's capture: sample headers, packets and bytes of samples",
             _SAME_FILE,
         ),
         tolerance=(
@@ -196,22 +196,24 @@ CROSS_CHECKS: Final = (
     CrossCheck(
         quantity="time of arrival of each sample",
         columns=("topic_delay_*", "topic_age_*", "topic_jitter_s"),
-        source="`ROLE-topic.bin` of the subscriber: time of the record",
+        source="`ROLE-topic.bin` of the subscriber: time of the log entry",
         against=(
             "the subscriber's capture: time of the packet with the sample",
             "the robot's clock before and after the attempt",
         ),
         tolerance=(
-            "a record must not be earlier than its packet; the fastest one may be 5 ms later (20 ms if there are "
-            "fewer than 20)"
+            "a log entry must not be earlier than its packet; the fastest one may be 5 ms later (20 ms if there "
+            "are fewer than 20)"
         ),
     ),
     CrossCheck(
         quantity="delay added by the subscriber's program",
         columns=("topic_delay_*", "topic_age_*", "topic_jitter_s", "topic_deadline_misses"),
-        source="`ROLE-topic.bin` of the subscriber: time of the record",
+        source="`ROLE-topic.bin` of the subscriber: time of the log entry",
         against=("the subscriber's capture: time of the packet with the sample",),
-        tolerance="20 ms, or a tenth of the value in the column, because a busy robot delays single samples",
+        tolerance=(
+            "20 ms, or a tenth of the delay, age or jitter in the column, because a busy robot delays single samples"
+        ),
         outcome=CheckOutcome.WITHHELD,
     ),
     CrossCheck(

@@ -67,8 +67,9 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
     steps (a port filter matches only first fragments). The columns on losses and delays of a transfer are empty
     unless the transfer is inside a capture on both of its robots. With a `ping` inside, after the transfer, the
     captures give the offset between the two clocks, which [one-way delay](method-delay.md#one-way-delay) needs: a UDP
-    transfer has no answer, and the offset needs packets in both directions. On a link with the interface `lo`, whose
-    packets use any interface, it captures on all interfaces; a bridge or bond shows each packet twice.
+    transfer has no answer, and the offset needs packets in both directions. A link with the interface `lo` is an
+    address that a routing daemon reaches over any interface ([links](links.md)). For such a link, tcpdump captures on
+    all interfaces; do not use it on a robot with a bridge or bond, where each packet appears twice.
     Writes `ROLE.pcap` and `ROLE-capture.log`.
 
     Attributes:

@@ -144,7 +144,8 @@ class RunStep(Step, UsesSpace, Summarizes):
     Variables in `command` and `argv`: `{address.ROLE}` is the address of a robot on the radio, `{distance}` the
     distance as typed (`30ft`), `{repeat}` the number of the repeat of its protocol, from 1, and `{put}` the path of
     the copied program. `{{distance}}` is the text `{distance}`; other braces, and `${distance}`, are not changed, but
-    a name that resembles one of these is refused. Inside `for`, write `{{distance}}`.
+    a name that resembles one of these is refused. Inside a [`for:` loop](reference/procedure.md#for), which
+    replaces its own variables first, write `{{distance}}` for the variable `{distance}`.
 
     Attributes:
         robot: Role of the robot on which it runs.

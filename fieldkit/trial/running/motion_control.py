@@ -99,5 +99,5 @@ def _motion_support() -> MotionSupport:
         return support
     raise ConfigurationError(
         "robots that move automatically need a package that is not installed",
-        remedy=f"the entry point of the group {plugins.MOTION} is missing: install fieldkit again",
+        remedy=f"the entry point of the group {plugins.MOTION} is missing: install its package again",
     )

@@ -58,7 +58,7 @@ def test_the_class_receives_commands_and_forks_do_not_change_it(carts: Any) -> N
 
 
 INCOMPLETE = [
-    ({"step_ns": None}, r"the physics \w+ has no step_ns, an integer above 0 \(it is None\)"),
+    ({"step_ns": None}, r"the physics federate \w+ has no step_ns, an integer above 0 \(it is None\)"),
     ({"step_ns": 1e6}, r"no step_ns, an integer above 0 \(it is 1000000.0\)"),
     ({"step_ns": 0}, "no step_ns, an integer above 0"),
     ({"limits_m_s2": None}, "no limits_m_s2, a mapping from each agent to a number"),
