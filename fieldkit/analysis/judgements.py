@@ -165,7 +165,7 @@ def _decide_share(expectation: Expectation, n: int, met: int, violated: int) -> 
     """Decide by the one-sided 95 % bound of the share of all repeats that meet the expectation."""
     share = expectation.share or 1.0
     low = one_sided_bounds.share_low(met, n)
-    if low >= share:
+    if low >= share * (1 - one_sided_bounds.ROUNDING):
         return _Decision(Ruling.HOLDS, met=met, limit=low)
     if one_sided_bounds.share_high(n - violated, n) < share:
         return _Decision(Ruling.FAILS, met=met, limit=low)

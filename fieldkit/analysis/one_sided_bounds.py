@@ -16,6 +16,9 @@ This is a convention, because data without losses contain no information about b
 bursts that are too rare to occur during the run, the true loss can be above the bound.
 """
 
+ROUNDING: Final = 1e-12
+"""Relative rounding error up to which a bound equals a required share."""
+
 _BISECTIONS: Final = 60
 
 
@@ -40,7 +43,7 @@ def repeats_for(share: float) -> int:
 
     All of these repeats must meet the requirement. By `share_low`, it is the smallest n with share^n <= 5 %.
     """
-    return math.ceil(math.log(1 - CONFIDENCE) / math.log(share) * (1 - 1e-12))
+    return math.ceil(math.log(1 - CONFIDENCE) / math.log(share) * (1 - ROUNDING))
 
 
 def loss_high(lost: ArrayLike, sent: ArrayLike) -> float:

@@ -1,7 +1,7 @@
 """Repeats and packets that expectations require, compared with judgements of trials with perfect results."""
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fieldkit.analysis import expectations, judgements, sample_size
@@ -81,6 +81,7 @@ def test_unmet_requirements_of_an_expectation_are_reported_before_a_trial(
 
 
 @given(st.integers(1, 60), st.integers(1, 60))
+@example(5, 1)  # the bound equals the share except for rounding
 def test_an_expectation_holds_in_a_perfect_trial_unless_there_is_a_warning(percent: int, repeats: int) -> None:
     for text in (f"ip_loss < {percent} %", f"{percent} % of ip_loss < 1 %"):
         (judgement,) = judgements.judge([expectations.parse(text, QUANTITIES)], [losses(*[0] * repeats)])
