@@ -126,7 +126,7 @@ def _judge_domain(robot: Robot, state: RosState, report: Report) -> None:
 def _differing_values(
     programs: tuple[RosProgram, ...], is_equal: Callable[[Variables], bool], name: str, default: str
 ) -> str:
-    """Return how many programs use which other values of a variable; empty if no value differs."""
+    """Return the number of programs for each other value of a variable as text; empty if no value differs."""
     values = Counter(
         program.variables.get(name) or default for program in programs if not is_equal(program.variables)
     )
