@@ -95,7 +95,7 @@ def open_tun(name: str, *, ethernet: bool = False) -> int:
     """Create the TUN interface `name` in this process's network namespace; return its non-blocking descriptor.
 
     The interface carries bare IP packets, or Ethernet frames (TAP), and exists as long as a process has the
-    descriptor open. Its queue holds 4096 packets, so that a pause of the medium loses none.
+    descriptor open. Its queue holds 4096 packets, so that no packet is lost while the medium process pauses.
 
     Raises:
         ConfigurationError: The device is missing, or this user may not open it or create an interface.
@@ -214,7 +214,7 @@ def add_link(interface: str, address: str, *, mesh: bool = False) -> int:
 
 
 def add_loopback_address(address: str) -> None:
-    """Give the robot an address that belongs to no link. Raises the errors of `run_ip`."""
+    """Add an address to the loopback interface. Raises the errors of `run_ip`."""
     run_ip(f"address add {address} dev {LOOPBACK_INTERFACE}")
 
 
