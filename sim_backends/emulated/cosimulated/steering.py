@@ -32,7 +32,8 @@ class TimedCommand(NamedTuple):
     Attributes:
         time_ns: Its time, from the monotonic clock.
         command: The command.
-        is_idle: True if it is the command `Steering.idle`, which need not be repeated.
+        is_idle: True if it switches the rotors off. Such a command need not be repeated, and is ignored if it is the
+            first one after the lab has placed the robot.
     """
 
     time_ns: int

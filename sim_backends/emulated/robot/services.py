@@ -169,8 +169,8 @@ def _network_services(spec: RobotSpec) -> Iterator[Service]:
         argv = wireless.prepare_command(spec.interface, wifi)
         yield _program(wireless.PROGRAMS[wifi.mode], argv, {}, partial(wireless.is_connected, wifi))
     if spec.mesh_hello_s is not None:
-        argv = network.command(spec.interface, spec.address, spec.mesh_hello_s, dict(spec.links.values()))
-        yield _program("babeld", argv, {}, network.PID.exists)
+        argv = network.babeld_command(spec.interface, spec.address, spec.mesh_hello_s, dict(spec.links.values()))
+        yield _program("babeld", argv, {}, network.PID_FILE.exists)
 
 
 def _motion_service(name: str, serve: Callable[..., None]) -> Service:
