@@ -1,4 +1,4 @@
-"""Recovery of data flows from faults: a flow inside the step of the fault, or a fault inside the step of the flow."""
+"""Measure how data flows recover from faults, if the step of one of them contains the step of the other."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class SendsFlow(Protocol):
-    """A step that sends payload, with evidence of its times of arrival.
+    """A step that sends payload, and whose evidence contains the times at which the payload arrived.
 
     Attributes:
         flow_kind: Prefix of its columns.
@@ -62,7 +62,7 @@ class _Pair:
     Attributes:
         fault: The step of the fault.
         flow: The step of the flow.
-        within: The steps around the flow, from the fault inwards; empty if the fault is inside the flow.
+        within: The steps that contain the flow, from the fault inwards; empty if the flow contains the fault.
     """
 
     fault: Step

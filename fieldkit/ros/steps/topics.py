@@ -48,8 +48,8 @@ MASTER: Final = "rosmaster"
 """Program of the ROS master."""
 
 KEPT_BYTES: Final = 256
-"""Captured bytes of each frame, so that they contain the head of a sample. With an Ethernet header, the head ends at
-byte 138 for DDS, at 154 if the message names the DDS reader, and at about 190 for Zenoh, after attachment and key
+"""Captured bytes of each frame, enough for the head of a sample. With an Ethernet header, the head ends at byte 138
+for DDS, at 154 if the DDS message names its reader, and at about 190 for Zenoh, after attachment and key
 expression."""
 
 BUFFER_KIB: Final = 32_768
@@ -180,7 +180,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
 
     @override
     def listens(self) -> tuple[ListeningPort, ...]:
-        """Return the ports of the domain, which no other domain uses."""
+        """Return the listening ports, which differ between domains."""
         if not self.listening_port:  # DDS, whose participants use the next free ports
             return (ListeningPort(self.receiver, min(self.wire_ports.data), self.sender, by="domain", shared=True),)
         listeners = {(self.receiver, self.sender), (self.sender, self.receiver)}

@@ -13,6 +13,7 @@ from fieldkit.measure.transfers.deliveries import FlowSchedule, StreamDeliveries
 from fieldkit.ros.streams.topic_columns import TopicTraffic
 from fieldkit.ros.streams.topic_samples import TopicLog
 
+# The columns of transfers need captures; those of topics need the logs.
 COLUMNS = tuple(
     replace(column, meaning=column.meaning.replace("complete captures", "complete logs"))
     for column in stalls.declare_columns("topic", "the topic", 83)

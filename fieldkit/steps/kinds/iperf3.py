@@ -42,15 +42,15 @@ _DEFAULT_S: Final = 10.0
 _INTERVAL_BYTES: Final = 600
 """Size of iperf3's report on one second of one stream."""
 
-_STALLS: Final = stalls.declare_columns("iperf3", "iperf3", 67)
+_STALLS: Final = stalls.declare_columns("iperf3", "iperf3", rank=67)
 
 
 class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraffic, Summarizes):
     """Measures with iperf3. Both robots need iperf3 3.1 or later: `sudo apt-get install iperf3`.
 
-    The server exits after the test. Writes `ROLE-iperf3.json`, the reports of both ends second by second. Inside a
-    `capture`, figures of the same packets are also computed from the captures: [columns](method-loss.md#iperf3),
-    [stalls](method-delay.md#stalls-of-a-flow).
+    The server exits after the test. Writes `ROLE-iperf3.json`, a report of each end with an entry per second. Inside
+    a `capture`, figures of the same packets are also computed from the captures:
+    [columns](method-loss.md#iperf3), [stalls](method-delay.md#stalls-of-a-flow).
 
     Attributes:
         duration: Duration of the test in whole seconds; 10 s without `size`.
