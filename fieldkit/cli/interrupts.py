@@ -42,7 +42,7 @@ def interruptible() -> Iterator[Stop]:
     def handle(number: int, _frame: FrameType | None) -> None:
         nonlocal stopping
         if stopping:
-            if stop.motions.is_ordered:
+            if stop.motions.stop_ordered:
                 stop.motions.cancel_wait()
                 _write_message(_WAIT_CANCELLED)
             return

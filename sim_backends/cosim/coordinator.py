@@ -27,6 +27,7 @@ from sim_backends.cosim.policies.sync_policy import (
     PolicyError,
     Situation,
     SyncPolicy,
+    looks_ahead,
     missing_members,
 )
 from sim_backends.cosim.run_record import EventDigest, Fate, Run, Window, WindowObserver
@@ -35,7 +36,7 @@ from sim_backends.network.packets import Arrival, Drop, Packet, ReceivedDatagram
 from sim_backends.world.motion import DeadReckoned, State
 
 _NOTHING: Final[tuple[Sequence[Fate], Sequence[Packet], Sequence[Fate], Sequence[Fate]]] = (), (), (), ()
-"""The results of `Coordinator._enter` for a window without packets, and the fates decided in the window."""
+"""Values for a window without packets: the three results of `Coordinator._enter`, and the decided fates."""
 
 
 class Coordinator:
@@ -61,9 +62,9 @@ class Coordinator:
         is_interrupted: True if `KeyboardInterrupt` must be raised as soon as `is_committing` is False.
 
     Raises:
-        ConfigurationError: The physics federate does not move an agent that may send or receive, or it lacks a member
-            of a physics federate.
-        FederateError: The physics federate failed, or does not move an agent that runs a program.
+        ConfigurationError: The physics federate or the policy lacks a required member, or the physics federate has no
+            state of an agent that may send, receive or interfere.
+        FederateError: The physics federate failed, or has no state of an agent that runs a program.
     """
 
     def __init__(
@@ -90,7 +91,7 @@ class Coordinator:
         self.is_committing = self.is_interrupted = False
         other_agents, emitters_m = transmitters(network), fixed_emitters_m(network)
         in_pairs = {name for pair in pairs for name in pair}
-        # With only two agents, every packet is between these two.
+        # With only two agents, every packet is between these two, and the ledger always includes its two ends.
         measured_agents = {*other_agents, *(in_pairs if measures_all and len(in_pairs) > 2 else ())}
         self._ledger = PacketLedger(
             self.run.fates, agents.physics.step_ns, measured_agents, has_fixed_emitters=bool(emitters_m)
@@ -120,8 +121,8 @@ class Coordinator:
         unmoved_agents = self._active - self.situation.states.keys() - agents.absent.keys()
         if unmoved_agents:
             raise ConfigurationError(
-                f"{', '.join(sorted(unmoved_agents))} may send, receive or interfere, but the "
-                "physics federate does not move this agent"
+                f"the physics federate has no state of {', '.join(sorted(unmoved_agents))}, but agents that send, "
+                "receive or interfere need one"
             )
         self._select_present()
         if observer is not None:
@@ -136,7 +137,7 @@ class Coordinator:
             max_windows: Number of windows after which to stop in any case, or None for no limit.
 
         Raises:
-            PolicyError: The policy has no window, or time does not advance; `run` has the record so far.
+            PolicyError: The policy cannot determine a window, or time does not advance; `run` has the record so far.
             FederateError: Physics, network or a program failed, did not answer in time, or returned an impossible
                 answer.
         """
@@ -166,13 +167,13 @@ class Coordinator:
     def _run_windows(self, to_ns: int, max_windows: int | None, report: Callable[[int], None] | None) -> None:
         """Advance window by window.
 
-        The time of this loop is the cost of coordination. It therefore uses local names, and work that can be done
-        for many windows together is not done in windows without packets. Unless the run is observed, the time that a
-        window takes after the answer of the network is part of the first lap of the next window.
+        This loop is the overhead of the coordinator. To keep it fast, it uses local names, and does nothing for a
+        window without packets that can be done later for many windows together. Unless the run is observed, the wall
+        time after the answer of the network is counted in the first lap of the next window.
         """
         policy, agents, network, situation = self.policy, self._agents, self._network, self.situation
         windows_ns, quiet_ends_ns = self.run.windows_ns, self._digest.quiet_ends_ns
-        looking_ahead = policy if isinstance(policy, LookingAhead) else None
+        looking_ahead = policy if looks_ahead(policy) else None
         uses_end_states, lap = policy.uses_end_states, self._wall_time.lap
         is_observed = self._observer is not None or report is not None
         self._wall_time.start()
@@ -353,7 +354,7 @@ class Coordinator:
     ) -> list[Fate]:
         """Record the arrivals and drops of a window, and deliver the datagrams that arrived.
 
-        Packets from and to agents that are absent at the end of the window are dropped.
+        Packets from or to agents that are absent at the end of the window are dropped.
         """
         decided_fates, agents, ledger = [], self._agents, self._ledger
         for arrival in arrivals:

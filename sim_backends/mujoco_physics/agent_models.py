@@ -7,7 +7,7 @@ from typing import Any
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.federates.handshake import AgentStart
 from sim_backends.mujoco_physics.chassis import chassis
-from sim_backends.mujoco_physics.mjcf import Model, quaternion
+from sim_backends.mujoco_physics.mjcf import RobotModel, quaternion
 from sim_backends.physics.ground import Ground
 from sim_backends.physics.robot_limits import BODIES, TURTLEBOT3_BURGER, DriveLimits, QuadrotorLimits, quadrotor
 from sim_backends.world.world import World
@@ -35,15 +35,15 @@ def agent_limits(agent: AgentStart, body: Mapping[str, Any] | None) -> DriveLimi
     return built_in_limits if isinstance(built_in_limits, DriveLimits) else TURTLEBOT3_BURGER
 
 
-def agent_model(agent: AgentStart, limits: DriveLimits | QuadrotorLimits, world: World | None) -> Model:
-    """Return the model of an agent at its start; a robot on wheels has the slope of the ground below it."""
+def agent_model(agent: AgentStart, limits: DriveLimits | QuadrotorLimits, world: World | None) -> RobotModel:
+    """Return the model of an agent at its start; a robot on wheels is tilted like the ground below it."""
     e, n, u = agent.start.position_m
     place_m, heading_rad = (e, n, u - agent.antenna_m), agent.start.heading_rad or 0.0
     if isinstance(limits, QuadrotorLimits):
-        return Model(place_m, quaternion(heading_rad), agent.antenna_m, 0.0, limits)
+        return RobotModel(place_m, quaternion(heading_rad), agent.antenna_m, 0.0, limits)
     cos, sin = math.cos(heading_rad), math.sin(heading_rad)
     east, north = Ground(world, math.inf).surface(e, n).grade
     forward, left = east * cos + north * sin, north * cos - east * sin
     roll_rad = math.asin(left / math.hypot(1.0, forward, left))
     orientation = quaternion(heading_rad, -math.atan(forward), roll_rad)
-    return Model(place_m, orientation, agent.antenna_m, limits.friction, chassis(agent.profile, limits))
+    return RobotModel(place_m, orientation, agent.antenna_m, limits.friction, chassis(agent.profile, limits))

@@ -131,7 +131,7 @@ CASTER_RADIUS_M: Final = 0.01
 
 
 def chassis(profile: str, limits: DriveLimits) -> Chassis:
-    """Return the chassis of a profile; an unknown profile has that of a TurtleBot3 Burger, scaled to its size."""
+    """Return the chassis of a profile; for an unknown profile, a TurtleBot3 Burger scaled to the robot's size."""
     if profile == "husky":
         return HUSKY
     factor = limits.radius_m / TURTLEBOT3_BURGER.radius_m

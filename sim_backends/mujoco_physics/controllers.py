@@ -106,9 +106,9 @@ class FlightController:
     Args:
         limits: Limits of the quadrotor.
         body: Index of its body.
-        mocap: Index of its target attitude.
-        dof: Index of its velocity.
-        motor: Index of its thrust.
+        mocap: Index of the body without mass that has its target attitude.
+        dof: Index of its first velocity component in `Registers.qvel`.
+        motor: Index of the motor that exerts its thrust.
     """
 
     def __init__(self, limits: QuadrotorLimits, body: int, mocap: int, dof: int, motor: int) -> None:

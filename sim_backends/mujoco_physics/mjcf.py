@@ -19,10 +19,11 @@ from sim_backends.world.shapes import Box, Shape
 from sim_backends.world.world import World
 
 SENSED_NUMBERS: Final = 9
-WHEEL_PER_S: Final = 40.0
-"""Natural frequency of the speed control of a wheel, which is critically damped, and lags its set-point by 0.05 s."""
-ATTITUDE_RATE_PER_S: Final = 30.0
-"""Bandwidth of the control of a quadrotor's turning rates."""
+WHEEL_CONTROL_PER_S: Final = 40.0
+"""Natural frequency of the speed control of a wheel. The control is critically damped, and lags its set-point by 0.05
+s."""
+BODY_RATE_CONTROL_PER_S: Final = 30.0
+"""Bandwidth of the control of a quadrotor's roll, pitch and yaw rates."""
 _CONTACT: Final = {"solref": "0.01 1", "solimp": "0.9 0.95 0.001"}
 """Softness of contacts of bodies, which have no friction, as in the built-in physics."""
 _GRIP: Final = {"solref": "0.003 1.6", "solimp": "0.1 0.1 0.001"}
@@ -39,8 +40,8 @@ to 0.02 mm/s."""
 
 
 @dataclass(frozen=True)
-class Model:
-    """A robot in the model.
+class RobotModel:
+    """A robot in the model of a run.
 
     Attributes:
         place_m: Position of its lowest point at time 0, metres east, north, up.
@@ -70,8 +71,8 @@ def quaternion(yaw_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0) ->
     )
 
 
-def model_xml(robots: Sequence[Model], world: World | None, timestep_s: float) -> str:
-    """Return the model.
+def model_xml(robots: Sequence[RobotModel], world: World | None, timestep_s: float) -> str:
+    """Return the model of a run in MJCF.
 
     Args:
         robots: The robots, by number.
@@ -133,7 +134,7 @@ class _Document:
                 name = {"name": self._new_ground()} if isinstance(obstacle, Raised) else {}
                 _add_shape(self._bodies, part.shape, **name)
 
-    def add_robot(self, number: int, robot: Model) -> None:
+    def add_robot(self, number: int, robot: RobotModel) -> None:
         """Add a robot, with its motors and sensors."""
         name = f"a{number}"
         body = _add(self._bodies, "body", name=name, pos=_text(robot.place_m), quat=_text(robot.quaternion))
@@ -188,7 +189,7 @@ class _Document:
         # The motor also accelerates the robot. Its share of the robot's mass acts at the radius of the wheel.
         count = 2 * len(wheels.axles_m)
         inertia_kg_m2 = (chassis.mass_kg / count + wheels.mass_kg) * wheels.radius_m**2
-        stiffness, damping = inertia_kg_m2 * WHEEL_PER_S**2, 2 * inertia_kg_m2 * WHEEL_PER_S
+        stiffness, damping = inertia_kg_m2 * WHEEL_CONTROL_PER_S**2, 2 * inertia_kg_m2 * WHEEL_CONTROL_PER_S
         # The activation is the integral of the set-point of the speed, so the motor also controls the wheel's angle.
         _add(
             self._motors,
@@ -217,7 +218,7 @@ class _Document:
             )
 
     def _add_quadrotor(self, body: ET.Element, name: str, limits: QuadrotorLimits) -> None:
-        """Add a quadrotor: a thrust along its axis, and torques towards the attitude of a body without mass."""
+        """Add a quadrotor: thrust along its axis, and torques that turn it to the attitude of a body without mass."""
         inertia_kg_m2, centre_m = quadrotor_inertia_kg_m2(limits), (0.0, 0.0, limits.height_m / 2)
         _add_inertia(body, limits.mass_kg, centre_m, inertia_kg_m2)
         # A cylinder that turns on a plane has wrong contacts, 0.4 m deep, in MuJoCo 4.0.1.
@@ -229,10 +230,10 @@ class _Document:
         _add(body, "site", name=centre, pos=_text(centre_m))
         attitude = _add(self._bodies, "body", name=target, mocap="true", quat=body.attrib["quat"])
         _add(attitude, "site", name=target)
-        thrust = _text((0.0, limits.thrust_n[1]))  # the controller's minimum is higher while the rotors turn
+        thrust = _text((0.0, limits.thrust_n[1]))  # 0 while the rotors are off
         _add(self._motors, "general", name=name, site=centre, gear="0 0 1 0 0 0", ctrlrange=thrust)
         for axis, moment_kg_m2 in enumerate(inertia_kg_m2, start=3):
-            damping = moment_kg_m2 * ATTITUDE_RATE_PER_S
+            damping = moment_kg_m2 * BODY_RATE_CONTROL_PER_S
             _add(
                 self._motors,
                 "general",

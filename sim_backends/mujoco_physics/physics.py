@@ -1,4 +1,4 @@
-"""The physics federate in MuJoCo; the only module that imports MuJoCo."""
+"""The physics federate that simulates robots with MuJoCo; no other module imports MuJoCo."""
 
 import copy
 import json
@@ -25,7 +25,7 @@ from sim_backends.mujoco_physics.controllers import (
     Registers,
     WheelController,
 )
-from sim_backends.mujoco_physics.mjcf import SENSED_NUMBERS, Model, model_xml
+from sim_backends.mujoco_physics.mjcf import SENSED_NUMBERS, RobotModel, model_xml
 from sim_backends.physics.body import Twist, Velocity
 from sim_backends.physics.quadrotor import FlightStatus
 from sim_backends.physics.robot_limits import DriveLimits, QuadrotorLimits
@@ -48,8 +48,8 @@ class SensedStates(Mapping[str, State]):
     """The states of all agents at a step, each created on request.
 
     Args:
-        rows: Number of each agent.
-        numbers: The numbers of all sensors.
+        rows: Position of each agent in the order of the sensors.
+        numbers: The values of all sensors, `SENSED_NUMBERS` for each agent.
     """
 
     def __init__(self, rows: Mapping[str, int], numbers: Sequence[float]) -> None:
@@ -90,7 +90,8 @@ class MujocoPhysics:
 
     Attributes:
         step_ns: Time step; MuJoCo divides it if it is longer than 1 ms.
-        limits_m_s2: Infinity for each agent, because a contact may change a velocity within a step.
+        limits_m_s2: Maximum acceleration of each agent: infinity, because a contact may change a velocity within a
+            step.
         model: The model, for example for MuJoCo's viewer.
         data: Its current state.
 
@@ -264,15 +265,15 @@ class MujocoPhysics:
         other._use_data(data)
         return other
 
-    def _use_data(self, data: Any) -> None:  # noqa: ANN401 (of MuJoCo)
-        """Use a state of the simulation. Views of its arrays are created once, because reading attributes is slow."""
+    def _use_data(self, data: Any) -> None:  # noqa: ANN401 (MuJoCo has no type)
+        """Set the simulation's state, and create views of its arrays; reading its attributes each time is slow."""
         self.data = data
         self._sensors = memoryview(data.sensordata)
         arrays = data.ctrl, data.qvel, data.xmat, data.xquat, data.mocap_quat, data.xfrc_applied
         views: list[Any] = [memoryview(array.reshape(-1)) for array in arrays]
         self._registers = Registers(*views)
 
-    def _controller(self, row: int, robot: Model, limits: DriveLimits | QuadrotorLimits) -> Controller:
+    def _controller(self, row: int, robot: RobotModel, limits: DriveLimits | QuadrotorLimits) -> Controller:
         model = self.model
         if isinstance(limits, DriveLimits):
             assert isinstance(robot.body, Chassis)
@@ -338,8 +339,8 @@ class MujocoPhysics:
             root = self.model.body_rootid[self.model.dof_bodyid[int(joint.group(1))]]
             name = next(name for name, row in self._rows.items() if self.model.body(f"a{row}").id == root)
         raise FederateError(
-            f"mujoco became unstable until {seconds_text(self._step * self.step_ns)}, first at {name or 'no agent'}: "
-            f"{' '.join(text.split())}",
+            f"mujoco became unstable before {seconds_text(self._step * self.step_ns)} "
+            f"({f'first agent: {name}' if name else 'agent unknown'}): {' '.join(text.split())}",
             remedy="start robots apart from each other and from obstacles, or use a shorter step",
         )
 
@@ -362,7 +363,7 @@ def _changes(lifetimes: Mapping[int, Lifetime], step_ns: int) -> Iterator[_Prese
 
 
 _MUJOCO_MEMBERS: Final = {"model", "data", "_sensors", "_registers"}
-
+"""Members that `__deepcopy__` does not copy: copies share the model, and have new data and new views of it."""
 
 _WARNINGS: Final[list[str]] = []
 """Warnings of MuJoCo, which it would otherwise write to `MUJOCO_LOG.TXT` in the current folder."""
