@@ -59,7 +59,8 @@ class FederateSession:
     Attributes:
         name: The federate's role, its name if it has sent one, and its command or address.
         reached_ns: Last simulated time to which the federate has advanced, or None.
-        observer: Called with each request and answer, in bytes, or None.
+        observer: If it is not None, it is called when a request is sent, with the request and None, and when the
+            answer arrives, with the request and the answer.
         exchange_context: Context of each request and its answer.
     """
 
@@ -101,19 +102,19 @@ class FederateSession:
         Raises:
             FederateError: The federate failed, did not answer, or is not compatible; the message names it.
         """
-        describe = f"begin a run as {ROLES[self._role]}"
+        request_text = f"begin a run as {ROLES[self._role]}"
         welcome = self.request(
             MessageKind.HELLO,
             0,
             hello.encode(),
             MessageKind.WELCOME,
             decode=Welcome.decode,
-            describe=lambda: describe,
+            describe=lambda: request_text,
         )
         if welcome.name:
             self.name = f"{ROLES[self._role]} {printable(welcome.name)} ({self._endpoint})"
         if welcome.role != self._role:
-            self.fail(f"{self.name} is a {ROLES[welcome.role]}")
+            self.fail(f"{self.name} is a {ROLES[welcome.role]} federate")
         if welcome.configuration_hash != hello.configuration_hash:
             self.fail(f"{self.name} answered with the hash of another configuration")
         for note in self._child.first_notes() if self._child else ():

@@ -557,7 +557,7 @@ NETWORK_CASES = [
     BrokenFederate("dead_reckoning", physics(ReckoningNetwork), "extrapolation at a velocity of 0 changed"),
     BrokenFederate("fork", physics(SharedNet), "the copy and the original"),
     BrokenFederate("next_event", physics(AnnouncesTooLate), "before the announced next event"),
-    BrokenFederate("next_event", physics(AnnouncesDropsTooLate), "packet 2 was dropped until 4000000 ns"),
+    BrokenFederate("next_event", physics(AnnouncesDropsTooLate), "packet 2 was dropped by 4000000 ns"),
     BrokenFederate("next_event", physics(AnnouncesNothing), "it has no next event, but packets [1, 2, 3] neither"),
     BrokenFederate("seed", physics(IgnoresSeed), "4 seeds gave the same arrivals and drops"),
 ]

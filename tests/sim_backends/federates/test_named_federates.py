@@ -71,8 +71,13 @@ def test_the_name_builtin_means_the_built_in_federates() -> None:
     ("role", "name", "message", "remedy"),
     [
         (NETWORK, "airwaves", "airwaves needs libair", "apt-get install libair"),
-        (PHYSICS, "airwaves", "airwaves is a network, not a physics", "use --network airwaves"),
-        (PHYSICS, "cart", "there is no physics and no program with the name 'cart'", "did you mean 'carts'?"),
+        (PHYSICS, "airwaves", "airwaves is a network federate, not a physics federate", "use --network airwaves"),
+        (
+            PHYSICS,
+            "cart",
+            "there is no physics federate and no program with the name 'cart'",
+            "did you mean 'carts'?",
+        ),
         (PHYSICS, "wrong", "it is not a ProgramFederate or PythonFederate", plugins.REMEDY),
     ],
 )

@@ -339,7 +339,7 @@ def test_no_connection_within_the_deadline_is_an_error() -> None:
 
 
 def test_a_federate_of_the_other_role_is_named() -> None:
-    with pytest.raises(FederateError, match="it is a physics, but a network was requested"):
+    with pytest.raises(FederateError, match="it is a physics federate, but a network federate was requested"):
         open_network(CARTS, replace(HELLO, role=NETWORK), 20.0)
     assert HELLO.role == PHYSICS
 
