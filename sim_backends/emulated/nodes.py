@@ -230,7 +230,7 @@ class EmulatedRobot(Node):
         self._worker.request({"do": "kill", "process": process})
 
     def move(self, path: AssignedPath) -> None:
-        """Send the robot's sensors the path on which the lab moves it. Raises the errors of `open_radio`."""
+        """Send the robot the path on which the lab moves it. Raises the errors of `open_radio`."""
         self._worker.request({"do": "move", "path": asdict(path)})
 
     def halt(self) -> None:
@@ -247,7 +247,7 @@ class EmulatedRobot(Node):
         if self._record is not None:
             self._record.close()
             self._record = None
-        for fd in (*self.physics_fds[1:], *self.link_fds.values()):  # the first one belongs to the record
+        for fd in (*self.physics_fds[1:], *self.link_fds.values()):  # the motion record has closed the first one
             os.close(fd)
         self.physics_fds = ()
         self.link_fds = {}
@@ -279,7 +279,7 @@ class Laptop(Node):
 
 
 _MAX_PARALLEL_STARTS: Final = 16
-"""Number of robots that are built and started at the same time; each needs a thread here and processor time."""
+"""Maximum number of robots that are built and started at the same time; each needs a thread and processor time."""
 
 
 @dataclass(frozen=True)
@@ -328,7 +328,7 @@ def running_robots(
         wifi: Mapping[RobotKey, WifiSpec] = {}
         radios: Mapping[str, HwsimRadio] = {}
         if options.has_linux_wifi:
-            from sim_backends.emulated.linux_wifi import lab  # noqa: PLC0415 (other labs need none of it)
+            from sim_backends.emulated.linux_wifi import lab  # noqa: PLC0415 (only some labs use it)
 
             wifi = lab.wifi_specs(robots, options.linux_wifi, options.radio)
             radios = lab.radios_of(robots.values(), options.radio)

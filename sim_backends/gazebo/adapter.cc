@@ -37,8 +37,7 @@ class Federate
     {
         if (m_world)
         {
-            m_world->Stop();
-            m_world->RestoreModels();
+            m_world->End();
         }
         return true;
     }

@@ -4,10 +4,9 @@
 #define FIELDKIT_GAZEBO_LOCK_STEP_H
 
 #include "connection.h"
-#include "model_journal.h"
+#include "world_models.h"
 
 #include <deque>
-#include <optional>
 
 namespace fieldkit
 {
@@ -19,7 +18,8 @@ class LockStep
         : m_options(std::move(options)),
           m_agents(std::move(agents)),
           m_monitor(m_options, m_agents, heartbeat),
-          m_connection(m_options, m_agents, m_monitor)
+          m_connection(m_options, m_agents, m_monitor),
+          m_models(m_options, m_connection)
     {
     }
 
@@ -40,12 +40,10 @@ class LockStep
     {
         m_connection.Open();
         Pause();
-        ModelJournal journal(m_connection.ProcessId(), m_options.world);
-        RestoreAfterKilledRun(journal);
+        m_models.RestoreAfterKilledRun();
         MeasureStep();
         m_connection.FindModels();
-        WriteJournal(journal);
-        m_journal = journal;
+        m_models.WriteJournal(m_agents);
         int64_t settle_steps = StepsOf(m_options.settle_s);
         SendCommands();
         ComeToRest(settle_steps);
@@ -61,10 +59,10 @@ class LockStep
             {
                 is_present ? Create(agent) : Remove(agent);
             }
-        }
-        if (m_options.place)
-        {
-            Place();
+            if (agent.is_present && m_options.place)
+            {
+                m_models.Place(agent);
+            }
         }
         SendCommands();
         Step(settle_steps);
@@ -116,8 +114,8 @@ class LockStep
         m_connection.Acknowledge();
     }
 
-    // Stop all robots, without waiting; the world stays paused.
-    void Stop()
+    // Stop all robots, without waiting, and restore the models; the world stays paused.
+    void End()
     {
         for (size_t i = 0; i < m_agents.size(); i++)
         {
@@ -127,26 +125,7 @@ class LockStep
                 m_connection.Publish(i, TwistOf(m_agents[i], m_options, m_stepNs));
             }
         }
-    }
-
-    // Remove the models that the run has created, and create those that it has removed.
-    void RestoreModels()
-    {
-        for (Agent& agent : m_agents)
-        {
-            if (agent.is_present && !agent.had_model)
-            {
-                Remove(agent);
-            }
-            else if (agent.had_model && !agent.is_present)
-            {
-                RequestModel(InitialModelOf(agent));
-            }
-        }
-        if (m_journal)
-        {
-            m_journal->Delete();
-        }
+        m_models.Restore(m_agents);
     }
 
   private:
@@ -206,84 +185,9 @@ class LockStep
         m_windowEndStep = step;
     }
 
-    // Restore the models if the last run in this world was killed. Gazebo ignores a request to remove a model that
-    // does not exist, or to create one that exists.
-    void RestoreAfterKilledRun(const ModelJournal& journal)
-    {
-        Restoration restoration = journal.Read();
-        for (const std::string& name : restoration.created)
-        {
-            RequestRemoval(name);
-            std::fprintf(stderr, "the model %s of a killed run is removed\n", name.c_str());
-        }
-        for (const InitialModel& model : restoration.initial)
-        {
-            RequestModel(model);
-            std::fprintf(stderr, "the model %s is created if a killed run has removed it\n", model.name.c_str());
-        }
-    }
-
-    void WriteJournal(const ModelJournal& journal)
-    {
-        Restoration restoration;
-        for (const Agent& agent : m_agents)
-        {
-            if (agent.HasLifetime() && !agent.had_model)
-            {
-                restoration.created.push_back(agent.model);
-            }
-            else if (agent.HasLifetime())
-            {
-                restoration.initial.push_back(InitialModelOf(agent));
-            }
-        }
-        if (restoration.created.empty() && restoration.initial.empty())
-        {
-            journal.Delete();
-            return;
-        }
-        journal.Write(restoration);
-    }
-
-    InitialModel InitialModelOf(const Agent& agent) const
-    {
-        InitialModel model;
-        model.name = agent.model;
-        auto file = m_options.model_files.find(agent.name);
-        if (file != m_options.model_files.end())
-        {
-            model.file = file->second;
-        }
-        else
-        {
-            model.sdf = m_options.sdf.at(agent.name);
-        }
-        model.position = agent.start;
-        model.yaw = agent.start_yaw;
-        return model;
-    }
-
-    // The service answers before it creates the model, but the model is created before the next step. A request that
-    // arrives twice creates one model, because the name must be new.
-    void RequestModel(const InitialModel& model)
-    {
-        msgs::EntityFactory request;
-        if (!model.file.empty())
-        {
-            request.set_sdf_filename(model.file);
-        }
-        else
-        {
-            request.set_sdf(model.sdf);
-        }
-        request.set_name(model.name);
-        *request.mutable_pose() = PoseOf(model.name, model.position, model.yaw);
-        m_connection.Call(m_options.Name(m_options.create_service), request);
-    }
-
     void Create(Agent& agent)
     {
-        RequestModel(InitialModelOf(agent));
+        m_models.Create(agent);
         agent.is_present = agent.is_new = true;
         size_t number = static_cast<size_t>(&agent - m_agents.data());
         agent.pose = agent.Start();
@@ -298,20 +202,11 @@ class LockStep
         SendCommands();
     }
 
-    // The service answers before it removes the model, but the model is removed before the next step.
     void Remove(Agent& agent)
     {
-        RequestRemoval(agent.model);
+        m_models.Remove(agent.model);
         agent.is_present = agent.is_new = false;
         agent.Stop();
-    }
-
-    void RequestRemoval(const std::string& name)
-    {
-        msgs::Entity request;
-        request.set_name(name);
-        request.set_type(msgs::Entity::MODEL);
-        m_connection.Call(m_options.Name(m_options.remove_service), request);
     }
 
     int64_t StepsOf(double seconds) const
@@ -477,31 +372,6 @@ class LockStep
         m_connection.WaitForSubscribers(lock);
     }
 
-    // The service answers before it places the model, but the model is placed before the next step.
-    void Place()
-    {
-        for (const Agent& agent : m_agents)
-        {
-            if (agent.is_present)
-            {
-                m_connection.Call(m_options.Name(m_options.pose_service), PoseOf(agent.model, agent.start, agent.start_yaw));
-            }
-        }
-    }
-
-    static msgs::Pose PoseOf(const std::string& name, const Vector& position, double yaw)
-    {
-        Pose rotation = Pose::WithYaw(yaw);
-        msgs::Pose pose;
-        pose.set_name(name);
-        pose.mutable_position()->set_x(position.x);
-        pose.mutable_position()->set_y(position.y);
-        pose.mutable_position()->set_z(position.z);
-        pose.mutable_orientation()->set_w(rotation.w);
-        pose.mutable_orientation()->set_z(rotation.z);
-        return pose;
-    }
-
     void CheckStart() const
     {
         for (const Agent& agent : m_agents)
@@ -532,7 +402,7 @@ class LockStep
     std::vector<Agent> m_agents;
     WorldMonitor m_monitor;
     Connection m_connection;
-    std::optional<ModelJournal> m_journal; // of this run
+    WorldModels m_models;
     int64_t m_stepNs = 0;
     int64_t m_nowNs = -1; // Gazebo's time
     int64_t m_startNs = 0;

@@ -191,7 +191,7 @@ class Attempts:
             is_fetched_later = self._progress is Status.MEASURED and not self._robots.is_transient
             if is_fetched_later and isinstance(error, KeyboardInterrupt):
                 raise  # the attempt is complete: `resume` fetches the evidence
-            reason = STOPPED if self._motions.is_ordered else _interruption_reason(error)
+            reason = STOPPED if self._motions.stop_ordered else _interruption_reason(error)
             if self._progress:
                 self._robots.unfetched.mark_all(
                     running_attempt.remote_folder(self._plan.trial), partial_folder, reason

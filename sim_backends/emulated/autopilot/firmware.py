@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from sim_backends.emulated.autopilot.failsafes import Failsafes
+from sim_backends.emulated.autopilot.mavlink_frames import dialect
 from sim_backends.emulated.autopilot.modes import Mode
 from sim_backends.emulated.autopilot.onboard_estimates import Battery
 from sim_backends.emulated.autopilot.parameters import FlightLimits, Parameter, Parameters
@@ -122,7 +123,7 @@ class Firmware:
     @property
     def is_ardupilot(self) -> bool:
         """True if it is ArduPilot."""
-        return self.holds_without_set_points
+        return bool(self.autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA)
 
     def mode_of(self, custom_mode: int) -> Mode | None:
         """Return the mode with a custom mode number, or None if the firmware has no such mode."""

@@ -170,7 +170,7 @@ class MavlinkPort:
         self._writer = Writer(system)
         self._clients: dict[Address, _Client] = {}
 
-    def identify(self, system: int) -> None:
+    def set_system(self, system: int) -> None:
         """Set the system id of later frames."""
         self._writer = Writer(system)
 
@@ -180,7 +180,7 @@ class MavlinkPort:
         return bool(self._clients)
 
     def register(self, sender: Address, message: Message, now_ns: int) -> bool:
-        """Register a message of a client; return False if there are `MAX_CLIENTS` other clients, so it is ignored."""
+        """Register the sender of a message as a client; return False if there are `MAX_CLIENTS` other clients."""
         client = self._clients.get(sender)
         if client is None:
             if len(self._clients) == MAX_CLIENTS:

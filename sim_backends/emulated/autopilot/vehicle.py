@@ -279,8 +279,8 @@ class Vehicle(VehicleBase):
             self.report(_CRITICAL, "Geofence: hold")
             self._switch_automatically(Mode.LOITER)
 
-    def _cannot_lift_off(self) -> bool:
-        """Return True if it cannot lift off now.
+    def _must_stay_on_ground(self) -> bool:
+        """Return True if it is on the ground and cannot lift off now.
 
         Its motors are still spooling up, or it cannot take off in its current mode.
         """
@@ -290,9 +290,9 @@ class Vehicle(VehicleBase):
 
     def _target_m_s(self) -> Vector:
         """Make the changes of mode that are due, and return the target velocity."""
-        if not self._cannot_lift_off():
+        if not self._must_stay_on_ground():
             self._advance_mode()
-        if self._cannot_lift_off():
+        if self._must_stay_on_ground():
             return 0.0, 0.0, 0.0
         limits = self.limits
         if self.mode is Mode.MISSION:

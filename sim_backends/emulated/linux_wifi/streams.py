@@ -1,7 +1,7 @@
 """Multiplexing: the connections of a lab to a virtual machine, as many byte streams over the machine's only channel.
 
 A frame has the number of its stream, its kind and its length, then data. The host opens streams; a stream ends when
-both sides have sent END. Frames with an invalid header end the channel: the other side is not trusted.
+both sides have sent END. A frame with an invalid header ends the channel, because the other side is not trusted.
 """
 
 import contextlib

@@ -88,7 +88,7 @@ def _types(kind: str, definition: str) -> "Typestore":
 
     The definition has the fields of the type, then `MSG: package/Name` and the fields of each type in it.
     """
-    from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore  # noqa: PLC0415 (50 ms)
+    from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore  # noqa: PLC0415 (slow)
 
     from fieldkit.ros.interfaces.definitions import EXTRA_DEFINITIONS  # noqa: PLC0415 (as above)
 

@@ -158,7 +158,7 @@ def test_a_multicast_reaches_neighbours_and_is_not_forwarded(first_shell: SshShe
 
 
 def test_the_laptop_announces_only_its_address() -> None:
-    settings = network.guest_command("wlan0", "10.42.0.254/24", HELLO_S)
+    settings = network.guest_babeld_command("wlan0", "10.42.0.254/24", HELLO_S)
     assert [word for word in settings if word.startswith("out ")] == ["out ip 10.42.0.254/32 allow", "out deny"]
 
 
