@@ -58,7 +58,7 @@ def commands() -> str:
     for name in names:
         parser = top.command(name)
         assert parser is not None
-        parser.complete()
+        parser.declare_arguments()
         blocks += [f"## fieldkit {name}", *_command(parser)]
         if name in GUIDES:
             blocks.append(f"Guide: [{_title(GUIDES[name])}](../{GUIDES[name]}).")
@@ -70,7 +70,7 @@ def _entry_point_summary(top: Parser, name: str) -> str:
     """Return the description of a command that an entry point adds."""
     parser = top.command(name)
     assert parser is not None
-    parser.complete()
+    parser.declare_arguments()
     return (parser.description or "").rstrip(".")
 
 
