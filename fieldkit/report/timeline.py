@@ -162,7 +162,7 @@ def _round_trips(name: str, role: Role, output: ping.Ping, times: AttemptTimes, 
         for reply in output.answers
         if reply.at_utc_ns is not None and reply.rtt_s is not None
     ]
-    lost_numbers = np.array(output.gaps)
+    lost_numbers = np.array(output.unanswered_seqs)
     seq, at_ns, rtt_s = np.array(answered_requests).T if answered_requests else np.empty((3, 0))
     series = [Series("round trip", _ROUND_TRIP, at_ns / 1e9, 1e3 * rtt_s)]
     if len(lost_numbers):

@@ -14,7 +14,7 @@ from fieldkit.steps.nest import Nest
 from fieldkit.steps.view import View
 
 if TYPE_CHECKING:
-    from fieldkit.measure.transfers.deliveries import Delivery
+    from fieldkit.measure.transfers.deliveries import StreamDeliveries
 
 
 @runtime_checkable
@@ -32,7 +32,7 @@ class SendsFlow(Protocol):
         """Role of the receiving robot."""
         ...
 
-    def deliveries(self, view: View) -> "Sequence[Delivery]":
+    def deliveries(self, view: View) -> "Sequence[StreamDeliveries]":
         """Return the deliveries of each of its streams.
 
         Raises:

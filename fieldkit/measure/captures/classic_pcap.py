@@ -39,7 +39,7 @@ def chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
     if size < _FILE_HEADER_BYTES:
         raise EvidenceError("ends inside its header", where=where, remedy="repeat the measurement")
     order, ticks_per_s = MAGIC[bytes(data[:4])]
-    # The upper bits of this field are the length of the frame check sequence.
+    # The upper bits of this field contain the length of the frame check sequence.
     link_type = struct.unpack_from(f"{order}I", data, 20)[0] & 0xFFFF
     check_link_type(link_type, where=where)
     integers = Integers(data, order)
@@ -63,7 +63,7 @@ def chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
 
 
 def _scan(data: Buffer, order: Order, at: int, stop: int) -> tuple[Ints, int]:
-    """Return the positions of the records that start from `at` on and before `stop`, and of the record after them.
+    """Return the positions of the records that start from `at` to `stop` (exclusive), and the end of the last one.
 
     If the packets were truncated to a snap length, most records have the same length. Such records are checked
     together, in groups of growing size.

@@ -23,7 +23,7 @@ def ipv6_headers(integers: Integers, frame: Ints, at: Ints, captured: Ints, wire
     """Return the IPv6 headers of some frames.
 
     Args:
-        integers: The file.
+        integers: Reader of integers in the file.
         frame: Indices of the frames.
         at: Positions of the headers in the file.
         captured: Number of captured bytes from each position to the end of the frame.

@@ -27,7 +27,7 @@ def _after_ethertype(integers: Integers, frames: Frames, type_at: Ints, network:
 
     Args:
         integers: Reader of integers in the file.
-        frames: Its frames.
+        frames: Frames of the file.
         type_at: Positions of the EtherTypes.
         network: Positions of the payloads whose type the EtherTypes state.
     """
@@ -56,7 +56,10 @@ def _cooked_v2(integers: Integers, frames: Frames) -> Ints:
 
 
 def _null(integers: Integers, frames: Frames) -> Ints:
-    """Return the positions after the address family, which may have another byte order than the file."""
+    """Return the positions after the address family.
+
+    The address family has the byte order of the capturing machine, so both orders are accepted.
+    """
     family = integers.u32(frames.start)
     is_ip = _is_in(family, _IP_FAMILIES) | _is_in(family, [number << 24 for number in _IP_FAMILIES])
     return np.where(is_ip, frames.start + 4, NO_HEADER)
@@ -91,7 +94,7 @@ def _after_mac_header(integers: Integers, frames: Frames, mac: Ints, *, padded: 
 
     Args:
         integers: Reader of integers in the file.
-        frames: Its frames.
+        frames: Frames of the file.
         mac: Positions of the MAC headers.
         padded: Mask of the frames whose MAC header is padded to a multiple of four bytes.
     """

@@ -65,7 +65,8 @@ CONTENT_BYTES: Final = 32
 least this many bytes after the headers."""
 
 _CONTENT: Final = layout(LITTLE, CONTENT_BYTES, **{str(at): (at, 8) for at in range(0, CONTENT_BYTES, 8)})
-_FIRST_BYTES: Final = np.array([(1 << 8 * count) - 1 for count in range(9)], dtype=np.uint64).astype(np.int64)
+# Masks of the first 0 to 8 bytes of a little-endian word, by the number of bytes.
+_FIRST_BYTES_MASKS: Final = np.array([(1 << 8 * count) - 1 for count in range(9)], dtype=np.uint64).astype(np.int64)
 _REPLY: Final = 0
 _REQUEST: Final = 8
 _MSS_OPTION: Final = 2
@@ -231,7 +232,7 @@ def _option(integers: Integers, rows: Ints, transport: Ints, end: Ints, option: 
     """Return the value of a TCP option (RFC 9293, section 3.2; RFC 7323, section 3.2), or `missing`.
 
     Args:
-        integers: The file.
+        integers: Reader of integers in the file.
         rows: Indices of the packets to read.
         transport: Position of each packet's TCP header.
         end: Position of the end of each packet's captured options.
@@ -270,7 +271,7 @@ def _content_hashes(integers: Integers, at: Ints, captured: Ints, content_bytes:
     columns = [words[str(start)] for start in range(0, CONTENT_BYTES, 8)]
     for number, word in enumerate(columns):
         # Set the bytes after the end of a short packet to 0. The first byte of a little-endian word is the lowest.
-        word[short] &= _FIRST_BYTES[np.clip(hashed_bytes[short] - 8 * number, 0, 8)]
+        word[short] &= _FIRST_BYTES_MASKS[np.clip(hashed_bytes[short] - 8 * number, 0, 8)]
     hashes = (row_hashes(*columns) >> np.uint64(1)).astype(np.int64)
     hashes[captured < hashed_bytes] = NOT_CAPTURED
     return hashes

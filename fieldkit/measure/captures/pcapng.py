@@ -137,9 +137,11 @@ def _snap_bytes(section: _Section) -> int:
 
 
 def _next_definition(section: _Section, data: Buffer, at: int) -> tuple[_Section, int] | None:
-    """Return the section after the section header or interface description at `at`, and the end of that block.
+    """Read a section header or an interface description at `at`.
 
-    Return None if the block at `at` is neither of the two, incomplete or invalid.
+    Returns:
+        The new section, or the current one with the interface added, and the end of the block. None if the block at
+        `at` has another type, is incomplete or is invalid.
     """
     order = section.order
     kind = bytes(data[at : at + 4])

@@ -119,7 +119,7 @@ def _udp_contradictions(
     first, first_received = sent.dport == transfer.port, received.dport == transfer.port
     keys, keys_received = _packet_keys(sent), _packet_keys(received)
     if unsent := int((~np.isin(keys_received[first_received], keys[first])).sum()):
-        yield f"{format_count(unsent, 'datagram')} arrived without being in the {transfer.source}'s capture"
+        yield f"the {transfer.source}'s capture lacks {format_count(unsent, 'datagram')} that arrived"
     if files is None:
         return
     # The number of arrived bytes is at most the sum of the UDP lengths in the first fragments, and at most the sum of
@@ -175,7 +175,7 @@ def _tcp_contradictions(
             return
     connections = connections_by_role[transfer.source]
     if unsent := connections.payload(received).bytes_not_in(connections.payload(sent)):
-        yield f"{format_count(unsent, 'byte')} arrived without being in the {transfer.source}'s capture"
+        yield f"the {transfer.source}'s capture lacks {format_count(unsent, 'byte')} that arrived"
     answers = Packets.concatenated((answers_received, answers_sent))
     acknowledged = connections.acknowledged(answers)
     for packets, role in ((sent, transfer.source), (received, transfer.destination)):

@@ -27,10 +27,11 @@ CPU_S: Final = 10
 """Base limits for reading a file of any size."""
 MEMORY_PER_BYTE: Final = 16
 DISK_PER_BYTE: Final = 1
-ANSWER_BYTES: Final = 16 << 20
-ANSWER_PER_BYTE: Final = 4
 BYTES_PER_CPU_S: Final = 1 << 20
 """Additional limits per byte of the file; an index entry of 12 bytes in a bag becomes an object of 170 bytes."""
+ANSWER_BYTES: Final = 16 << 20
+ANSWER_PER_BYTE: Final = 4
+"""Limit of an answer's length: a base, and an addition per byte of the file."""
 MEMORY_SHARE: Final = 0.5
 MAX_CPU_S: Final = 3600
 """Upper limits for a file of any size: share of this machine's memory, and CPU time."""
@@ -42,8 +43,8 @@ _EXIT_WAIT_S: Final = 5.0
 ERROR_KEY: Final = "unanswered"
 """Key of the error message in the answer to a query that failed."""
 _TIMED_OUT: Final = -signal.SIGXCPU
-# Exit codes that the file did not cause: the idle time, the kernel's out-of-memory killer, a person, a service
-# manager.
+# Exit codes that the file did not cause: 0 after the idle time; signals of the kernel's out-of-memory killer, a
+# service manager or a person.
 _EXTERNAL_EXIT_CODES: Final = {0, -signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP, -signal.SIGINT}
 
 Json = dict[str, Any]

@@ -169,13 +169,13 @@ def _layers(
         if transfer.protocol is Protocol.UDP:
             udp_packets = udp.match_transfer(sender.packets, receiver.packets, transfer)
             udp_counts = udp.count(udp_packets)
-            pairs, counts, sent = delay.udp_packets(udp_packets), _udp_values(udp_counts), udp_counts.packets_sent
+            pairs, counts, sent = delay.udp_pairs(udp_packets), _udp_values(udp_counts), udp_counts.packets_sent
             transfer_rates = rates.udp_rates(udp_packets)
             stall_columns = stalls.measure("transfer", lambda: stalls.udp_deliveries(udp_packets, schedule))
         else:
             frames = tcp.match_transfer(sender.packets, receiver.packets, transfer)
             tcp_counts = tcp.count(frames)
-            pairs, counts, sent = delay.tcp_frames(frames), _tcp_values(tcp_counts), delay.tcp_sent(frames)
+            pairs, counts, sent = delay.tcp_pairs(frames), _tcp_values(tcp_counts), delay.count_tcp_sent(frames)
             transfer_rates = rates.tcp_rates(frames, receiver.packets, transfer, tcp_counts)
             reverse = transfer.backward(sender.packets)
             stall_columns = stalls.measure("transfer", lambda: stalls.tcp_deliveries(frames, reverse, schedule))

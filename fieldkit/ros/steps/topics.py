@@ -37,7 +37,7 @@ from fieldkit.steps.view import View
 if TYPE_CHECKING:
     from fieldkit.measure.attempt import AttemptEvidence
     from fieldkit.measure.captures.packets import Packets
-    from fieldkit.measure.transfers.deliveries import Delivery, FlowSchedule
+    from fieldkit.measure.transfers.deliveries import FlowSchedule, StreamDeliveries
     from fieldkit.report.attempt_timing import AttemptTimes
     from fieldkit.report.charts import Panel
     from fieldkit.ros.streams.topic_columns import TopicTraffic
@@ -293,7 +293,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
         """Prefix of the columns of reads."""
         return "seen" if self.image else "used"
 
-    def deliveries(self, view: View) -> "Sequence[Delivery]":
+    def deliveries(self, view: View) -> "Sequence[StreamDeliveries]":
         """Return the deliveries of the stream; see `SendsFlow.deliveries`."""
         from fieldkit.ros.streams import topic_stalls  # noqa: PLC0415 (as above)
 

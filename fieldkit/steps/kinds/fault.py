@@ -19,7 +19,7 @@ from fieldkit.core.crosschecks import CrossCheck
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, RobotError
 from fieldkit.core.model import FaultKind, Protocol, Role
-from fieldkit.core.threads import is_mistake, run_parallel
+from fieldkit.core.threads import is_bug, run_parallel
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import outage, outage_columns
 from fieldkit.measure.robot_clock import Offset, offset
@@ -171,7 +171,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
                 end_inside(self, scene, testbed)
             wait([steps])
             mistake = steps.exception()
-            if mistake is not None and mistake is not error and is_mistake(mistake):
+            if mistake is not None and mistake is not error and is_bug(mistake):
                 raise mistake from error
             raise
         finally:

@@ -23,7 +23,7 @@ from fieldkit.measure.checks.load_checks import LoadEvidence
 from fieldkit.measure.evidence import iperf3
 from fieldkit.measure.evidence.iperf3 import IperfTest
 from fieldkit.measure.transfers import iperf3_load, stalls
-from fieldkit.measure.transfers.deliveries import Delivery
+from fieldkit.measure.transfers.deliveries import StreamDeliveries
 from fieldkit.measure.transfers.iperf3_load import LoadFlow, LoadStreams
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
@@ -269,7 +269,7 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
             | iperf3_load.measure_stalls("iperf3", data, *packets)
         )
 
-    def deliveries(self, view: View) -> Sequence[Delivery]:
+    def deliveries(self, view: View) -> Sequence[StreamDeliveries]:
         """Return the deliveries of each stream; see `SendsFlow.deliveries`."""
         return iperf3_load.read_deliveries(self._data_streams(view), *self._packets(view))
 

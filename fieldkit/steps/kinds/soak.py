@@ -12,7 +12,7 @@ from fieldkit.core.columns import Column, Measured
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.transfers import iperf3_load, recoveries, stalls
-from fieldkit.measure.transfers.deliveries import Delivery
+from fieldkit.measure.transfers.deliveries import StreamDeliveries
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import across
@@ -128,7 +128,7 @@ class SoakStep(LoadOptions, Nest, Listens, SendsTraffic):
         """Role of the receiving robot."""
         return self.receiver
 
-    def deliveries(self, view: View) -> Sequence[Delivery]:
+    def deliveries(self, view: View) -> Sequence[StreamDeliveries]:
         """Return the deliveries of each stream; see `SendsFlow.deliveries`."""
         source, destination = (view.capture(role) for role in (self.sender, self.receiver))
         load = self.data_streams(view.scene)

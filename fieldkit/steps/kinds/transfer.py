@@ -21,7 +21,7 @@ from fieldkit.measure.checks.transfer_checks import CROSS_CHECKS
 from fieldkit.measure.evidence import host, oracle_delays, reading
 from fieldkit.measure.evidence.endings import Cause, Ending
 from fieldkit.measure.transfers import stalls, transfer_measures
-from fieldkit.measure.transfers.deliveries import Delivery
+from fieldkit.measure.transfers.deliveries import StreamDeliveries
 from fieldkit.measure.transfers.transfer_columns import COLUMNS
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.remote import jobs
@@ -373,7 +373,7 @@ class TransferStep(
         """Role of the receiving robot."""
         return self.receiver
 
-    def deliveries(self, view: View) -> Sequence[Delivery]:
+    def deliveries(self, view: View) -> Sequence[StreamDeliveries]:
         """Return the deliveries of the transfer; see `SendsFlow.deliveries`."""
         return stalls.read_transfer_deliveries(
             view.evidence, self.transfer(view.scene, view.within), self.prefixed_name(_LISTEN)

@@ -96,6 +96,7 @@ class LabPhysics:
         self._bodies = bodies
         self._clock = clock
         self._physics: PhysicsFederate | None = None
+        # Simulated time at which the time of the physics simulator was 0. It increases while the simulator is paused.
         self._started_ns = 0
         self._advanced_ns = 0
         self._now_ns = 0
@@ -139,8 +140,8 @@ class LabPhysics:
             return 0.0
         return self._physics.limits_m_s2.get(name, math.inf)
 
-    def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:  # noqa: ARG002 (read here)
-        """Implement `PhysicsFederate.advance`; the commands are those of the robots' programs."""
+    def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:  # noqa: ARG002 (see below)
+        """Implement `PhysicsFederate.advance`; instead of `commands`, those of the robots' programs are applied."""
         if (now_ns := self._clock.now_ns()) - self._polled_ns >= _POLL_NS:
             self._poll_placements(now_ns)
         if self._physics is not None:

@@ -31,7 +31,7 @@ _RADIO_BIT: Final = 0x40
 
 @dataclass
 class LinkTotals:
-    """Totals of frames with an acknowledgement, of one directed link, for comparison with `iw station dump`.
+    """Totals of the unicast frames on one directed link, for comparison with `iw station dump`.
 
     Attributes:
         frames: Frames whose status was reported.

@@ -90,6 +90,7 @@ class MediumServer(ABC):
         self._sample_ns: int | None = None
         self._samples: deque[Mapping[str, LinkSample]] = deque(maxlen=_MAX_SAMPLES)
         self._layout = Layout()
+        # The robots on the air and the number of ports, for which the routes of the ports were computed.
         self._routing_state: tuple[Set[str], int] = frozenset(), 0
         self._on_air_robots: set[str] = set()
         self._polled_ns = 0
