@@ -16,9 +16,10 @@ from sim_backends.federates.channels import StreamChannel
 _EXIT_S: Final = 1.0
 """Time for a process to exit after its input was closed, and again after SIGTERM."""
 _POLL_S: Final = 0.005
-_TAIL_BYTES: Final = 4096
-_TAIL_LINES: Final = 10
-"""Number of last lines that are shown: enough for the cause of an error in a stack trace."""
+_SHOWN_BYTES: Final = 4096
+_SHOWN_LINES: Final = 10
+"""Largest number of lines that are shown: enough for the cause of an error in a stack trace."""
+_NOTE: Final = "note: "
 
 
 class Child:
@@ -74,8 +75,14 @@ class Child:
         if self._stderr.closed:
             return []
         size = os.fstat(self._stderr.fileno()).st_size
-        tail = os.pread(self._stderr.fileno(), _TAIL_BYTES, max(size - _TAIL_BYTES, 0)).decode(errors="replace")
-        return [line.rstrip() for line in tail.splitlines() if line.strip()][-_TAIL_LINES:]
+        tail = os.pread(self._stderr.fileno(), _SHOWN_BYTES, max(size - _SHOWN_BYTES, 0)).decode(errors="replace")
+        return [line.rstrip() for line in tail.splitlines() if line.strip()][-_SHOWN_LINES:]
+
+    def first_notes(self) -> list[str]:
+        """Return the lines `note: TEXT` at the start of its standard error, without `note: `; at most ten."""
+        head = os.pread(self._stderr.fileno(), _SHOWN_BYTES, 0).decode(errors="replace")
+        notes = [line.removeprefix(_NOTE) for line in head.splitlines() if line.startswith(_NOTE)]
+        return notes[:_SHOWN_LINES]
 
     def exit_text(self, wait_s: float = 0.5) -> str:
         """Return a text about its exit, such as `it has exited with code 1`; empty if it does not exit in time."""

@@ -1,6 +1,7 @@
 """The coordinator's side of a connection to an external federate: handshake, requests, deadlines, errors."""
 
 import re
+import sys
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext, suppress
@@ -96,6 +97,8 @@ class FederateSession:
     def welcome(self, hello: Hello) -> Welcome:
         """Send hello, and return the federate's welcome.
 
+        The notes that a child process has written to its standard error until then are shown.
+
         Raises:
             FederateError: The federate failed, did not answer, or is not compatible; the message names it.
         """
@@ -114,6 +117,8 @@ class FederateSession:
             self.fail(f"{self.name} is a {ROLES[welcome.role]} federate")
         if welcome.configuration_hash != hello.configuration_hash:
             self.fail(f"{self.name} answered with the hash of another configuration")
+        for note in self._child.first_notes() if self._child else ():
+            sys.stderr.write(f"note: {self.name}: {printable(note)}\n")
         return welcome
 
     def request(
