@@ -38,6 +38,7 @@ _SIGNALS: Final = (
 """Access technologies, their key in the output of `mmcli --signal-get -J`, and the keys of signal and SINR."""
 
 _CHANNELS: Final = ("earfcn", "nrarfcn", "uarfcn", "arfcn")
+"""Names of channel numbers in mmcli's `cell-info`."""
 
 # Lines of batctl's table of neighbours. Lines of BATMAN IV start with the interface, lines of BATMAN V with the node.
 _MESH_LINE: Final = re.compile(

@@ -72,6 +72,7 @@ ICMP: Final = 1
 TCP: Final = 6
 UDP: Final = 17
 SCTP: Final = 132
+"""IP protocol numbers."""
 
 Addresses = NDArray[np.uint64]
 """Shape (n, 2): upper and lower half of each IPv6 address. IPv4 addresses are IPv4-mapped (RFC 4291, 2.5.5.2)."""
@@ -93,6 +94,7 @@ _IPV4: Final = layout(
 IPV6_HEADER_BYTES: Final = 40
 """Length of the fixed header of IPv6."""
 _MAPPED: Final = 0xFFFF << 32
+"""Lower half of the prefix of IPv4-mapped addresses, `::ffff:0:0/96`."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -95,6 +95,7 @@ SINGLE_PACKET: Final = "one direction has a single packet in both captures, and 
 _JITTER_GAIN: Final = 1 / 16
 """Weight of the newest step in the interarrival jitter of RFC 3550."""
 _WEIGHTED_STEPS: Final = 1000
+"""Number of steps that are used; the weight of older steps is below 1e-29."""
 
 
 def udp_pairs(packets: udp.UdpPackets) -> StampPairs:
