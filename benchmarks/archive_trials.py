@@ -79,6 +79,7 @@ def write_archive(folder: Path, trials: int, repeats: int) -> None:
 def _rows(
     generator: np.random.Generator, original: StoredTrial, fixed: Mapping[str, str], number: int, repeats: int
 ) -> Iterator[dict[str, str]]:
+    """Yield the rows of a trial: copies of stored rows, in which times are scaled and ping losses are drawn."""
     protocols = list(dict.fromkeys(row["protocol"] for row in original.rows))
     by_protocol = {name: next(row for row in original.rows if row["protocol"] == name) for name in protocols}
     for repeat in range(repeats):

@@ -171,6 +171,7 @@ def modem_values(output: str) -> Values:
 
 
 def _modem_signal(signal: object, technologies: list[str]) -> dict[str, float | str]:
+    """Return signal and SINR of the first technology in use that has a signal."""
     for names, key, power, ratio in _SIGNALS:
         # Values of another technology are from an earlier connection, and have another meaning.
         if technologies and not names & set(technologies):

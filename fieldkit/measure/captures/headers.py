@@ -168,6 +168,7 @@ def ip_headers(integers: Integers, frames: Frames, at: Ints) -> Headers:
 
 
 def _ipv4_headers(integers: Integers, frame: Ints, at: Ints, captured: Ints, wire: Ints) -> Headers:
+    """Return the valid IPv4 headers at the positions `at`."""
     head = integers.fields(_IPV4, at)
     header = (head["length"] & 0xF) * 4
     # Segmentation offload leaves the total length 0 in frames above 64 KiB; the wire length is used instead.

@@ -214,6 +214,7 @@ def parse(text: str) -> IperfTest:
 
 
 def _intervals(document: Mapping[str, Any]) -> Iterator[IperfInterval]:
+    """Yield the intervals of a test, without omitted and incomplete ones."""
     for interval in items(document, "intervals"):
         total = mapping(interval, "sum")
         duration_s, payload_bytes = number(total, "seconds"), count(total, "bytes")

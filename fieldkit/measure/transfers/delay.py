@@ -283,6 +283,7 @@ def _clock(clocks: Clocks) -> Measured:
 
 
 def _one_way(delay_s: Floats, error_s: float, sent: int) -> Measured:
+    """Return the columns of the one-way delay; a column whose error is too large is empty."""
     figures = {
         "one_way_min_s": float(delay_s.min()),
         "one_way_median_s": float(np.median(delay_s)),
