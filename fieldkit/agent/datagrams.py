@@ -24,9 +24,9 @@ SIZES = {MULTICAST: 200, UNICAST: 200, FRAGMENTED: 8000}
 _POLL_S = 0.2
 _DRAIN_S = 0.2
 """Maximum time after a stop for counting the datagrams that arrived before it."""
-_MAX_BYTES = 65_536
+_MAX_DATAGRAM_BYTES = 65_536
 _MAX_SENDERS = 64
-"""Number of sender addresses that are counted; others are ignored."""
+"""Maximum number of sender addresses that are counted; datagrams of further senders are ignored."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def _count(
         if time.monotonic() >= end_s or (stop_event.is_set() and not readable):
             break
         for endpoint in readable:
-            data, (address, _port) = endpoint.recvfrom(_MAX_BYTES)
+            data, (address, _port) = endpoint.recvfrom(_MAX_DATAGRAM_BYTES)
             words = data[:128].split(b" ")
             if len(words) < 4 or words[:2] != [b"fieldkit", token.encode("ascii")]:
                 continue

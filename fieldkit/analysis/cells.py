@@ -74,8 +74,8 @@ class Estimate:
         n_censored: Number of repeats among `n` with a right-censored value.
         is_lower_bound: True if `value` is a lower bound because of censored values.
         missing: Number of valid repeats of the cell without a value.
-        high_of_sent: Upper end of the interval if lost items have an infinite value; None if this end is open. It
-            equals `high`, except for quantities that are computed only from received items.
+        high_of_sent: Upper end of the interval if each lost item counts as an infinite value; None if this end is
+            open. It equals `high`, except for quantities that are computed only from received items.
         sample: Values of the repeats; None for an estimate that was not computed from repeats.
     """
 

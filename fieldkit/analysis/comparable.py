@@ -111,8 +111,8 @@ def concerns(
 ) -> tuple[Concern, ...]:
     """Return the concerns about comparing two runs, refusals first.
 
-    A column of `varied`, or one of `VARIED` that is not in `by`, is the variable of the comparison if it has a single
-    value in each run; it then causes no refusal.
+    A column in `varied`, or in `VARIED` but not in `by`, causes no refusal if it has a single value in each run,
+    because it is then the variable of the comparison.
 
     Args:
         pairs: Name of each condition, and its valid repeats in A and in B; at least one in each run.
@@ -161,8 +161,8 @@ def _attempts(rows: Repeats) -> set[Key]:
 def _pair_concerns(a: Repeats, b: Repeats, varied: Collection[str]) -> Iterator[Concern]:
     for name in SAME:
         is_varied = name in varied and all(len(set(rows.column(name))) == 1 for rows in (a, b))
-        is_of_backends = name in _KERNEL_COLUMNS and not set(a.column("backend")) & set(b.column("backend"))
-        yield from _compare_column(name, a, b, refuses=not (is_varied or is_of_backends))
+        depends_on_backend = name in _KERNEL_COLUMNS and not set(a.column("backend")) & set(b.column("backend"))
+        yield from _compare_column(name, a, b, refuses=not (is_varied or depends_on_backend))
     yield from _file_sizes(a, b)
     yield from _datagram_sizes(a, b)
     yield from _offload_state(a, b)

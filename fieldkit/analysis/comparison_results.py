@@ -150,6 +150,7 @@ def conclusions(comparison: Comparison) -> Iterator[str]:
         yield f"not shown to be within {_limit(difference)}: {difference.quantity.name} in {name}"
     sides = (("A", [pair.a for pair in comparison.pairs]), ("B", [pair.b for pair in comparison.pairs]))
     for side, cells in sides:
+        # The texts of a comparison have no marks, so the mark at the start of each caution is omitted.
         yield from (
             f"{side}: {caution[2:]}" for caution in wording.cautions([cell for cell in cells if cell is not None])
         )

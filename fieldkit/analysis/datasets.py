@@ -39,12 +39,12 @@ def _metadata(folder: Path, key: str) -> object:
 
 
 def condition(folder: Path) -> dict[str, str]:
-    """Return the columns that identify a condition, the flow and the factors of the sweep.
+    """Return the columns that identify a condition: the flow, and the factors of the sweep.
 
     Raises the same errors as `read`.
 
     Returns:
-        The columns in order. The value is the column with the same values as written in the command of the sweep.
+        For each column, in order, the name of the column that has the same values as the user typed them.
     """
     by, partitions = ([*map(str, _metadata(folder, key))] for key in ("by", "partitions"))  # type: ignore[call-overload]
     return dict(zip(by, (*by[:1], *partitions), strict=True))

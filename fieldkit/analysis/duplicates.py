@@ -1,4 +1,4 @@
-"""Removal of duplicate attempts from the combined rows of several tables. Contradictory tables are an error."""
+"""Remove duplicate attempts from the combined rows of several tables. Contradictory tables are an error."""
 
 from collections import Counter
 

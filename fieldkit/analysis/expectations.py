@@ -21,6 +21,7 @@ _FORMS: Final = "ip_loss < 2 %; every rtt_gap_s < 300 ms; 90 % of rtt_gap_s < 30
 MAX_SHARE: Final = 0.9999
 """Maximum share of all repeats that an expectation may require."""
 _MIN_LOSS: Final = 1e-9
+"""Minimum bound of a loss of all packets. No trial sends enough packets to show a smaller loss."""
 
 
 class Scope(StrEnum):
@@ -129,7 +130,7 @@ def _scope(match: re.Match[str], quantity: Quantity, *, is_below: bool) -> tuple
         return Scope.SHARE, share
     if match["repeats"] in {"max", "min"} and (match["repeats"] == "max") is not is_below:
         raise ConfigurationError(
-            f"{match[0][:60]!r}: a single repeat would be sufficient",
+            f"{match[0][:60]!r} would be met by a single repeat",
             remedy="write max with <, min with >, or every",
         )
     return (Scope.EVERY if match["repeats"] else Scope.FIGURE), None

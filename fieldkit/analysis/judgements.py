@@ -1,4 +1,4 @@
-"""Judgements of expectations by measured figures. Missing or censored repeats never cause the ruling `holds`."""
+"""Judgements of expectations by measured figures. If repeats are missing or censored, the ruling is never `holds`."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -105,9 +105,9 @@ def _judge_cells(expectation: Expectation, cells: Sequence[Cell]) -> Iterator[Ju
         yield Judgement(expectation, None, Ruling.OPEN, None, "no repeat has ended")
 
 
-def _limitations(expectation: Expectation, estimate: Estimate, valid: int) -> Iterator[str]:
+def _limitations(expectation: Expectation, estimate: Estimate, n_valid: int) -> Iterator[str]:
     """Yield the reasons why the ruling cannot be `holds`, even if the repeats with a value meet the expectation."""
-    if missing := max(valid - estimate.n, estimate.missing):
+    if missing := max(n_valid - estimate.n, estimate.missing):
         yield f"{missing} of {estimate.n + missing} repeats have no value"
     if estimate.n_censored:
         share = f"{estimate.n_censored} of {estimate.n}"
@@ -135,8 +135,8 @@ def _decide(expectation: Expectation, estimate: Estimate) -> _Decision:
 def _decide_figure(expectation: Expectation, estimate: Estimate) -> _Decision:
     """Decide by the interval: both ends must satisfy the bound.
 
-    For a figure of received items, the upper end is that of the statistic over all sent items. An open end is
-    infinite.
+    For a figure that is computed only from received items, the upper end counts each lost item as an infinite value.
+    An open end is infinite.
     """
     if estimate.low is None:
         return _Decision(Ruling.OPEN, "a single repeat has no interval" if estimate.n == 1 else "it has no interval")

@@ -13,7 +13,9 @@ from fieldkit.analysis.table_lines import TableLine, lines
 from fieldkit.core.text import one_line
 
 _MARKUP: Final = re.compile(r"[\\|`*]|<(?=[A-Za-z/!?])|(?<=\])[(\[:]")
+"""Characters that Markdown would interpret in a table cell."""
 _ACROSS_COLUMNS: Final = ("scenario", "protocol")
+"""Conditions whose values are heads of columns in a LaTeX table. The values of other conditions identify rows."""
 _LATEX_AT_LEAST: Final = r"$\geq$ "
 _LATEX_SPECIAL: Final = {
     "\\": r"\textbackslash{}",
@@ -78,7 +80,7 @@ def to_latex(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quan
     columns = [
         column
         for column in (
-            _Column(scenario, line, other) for scenario in scenarios for line in scales for other in protocols
+            _Column(scenario, line, protocol) for scenario in scenarios for line in scales for protocol in protocols
         )
         if any(column.has(cell) for cell in cells)
     ]

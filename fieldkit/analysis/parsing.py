@@ -25,7 +25,7 @@ def columns(
     Args:
         names: Names of all columns of the table, in order.
         body: Lines of the table without the header, with their line ends.
-        declared: The requested columns. Columns that the table does not have are missing in all rows.
+        declared: The requested columns. A column that the table does not have has no value in any row.
 
     Raises:
         ValueError: A line or a value is invalid.
@@ -39,7 +39,7 @@ def csv_columns(
 ) -> tuple[Mapping[str, pa.ChunkedArray], int]:
     """Return the declared columns of a table, with the types of `arrow_type`, and the number of rows.
 
-    The arguments and errors are those of `columns`.
+    Takes the same arguments and raises the same errors as `columns`.
     """
     present = [name for name in declared if name in names]
     if not body or not present:
@@ -60,11 +60,11 @@ def csv_columns(
 def arrow_columns(
     by_name: Mapping[str, pa.ChunkedArray], declared: Mapping[str, Column], rows: int
 ) -> tuple[dict[str, Numbers], dict[str, Texts]]:
-    """Return columns of numbers and of texts, as in `repeats.Repeats`; missing columns are missing in all rows.
+    """Return columns of numbers and of texts, as in `repeats.Repeats`.
 
     Args:
         by_name: Arrow columns with the types of `arrow_type`.
-        declared: The requested columns.
+        declared: The requested columns. A column that is not in `by_name` has no value in any row.
         rows: Number of rows.
     """
     numbers: dict[str, Numbers] = {}
@@ -94,7 +94,7 @@ def arrow_type(column: Column) -> pa.DataType:
 
 
 def _numpy_type(column: Column) -> type[np.float64] | type[np.longdouble]:
-    """Return the type of a column's numbers. Nanoseconds since 1970 need 61 bits, which is more than a double has."""
+    """Return the type of a column's numbers. Nanoseconds since 1970 need 61 bits; a double has 53."""
     return np.longdouble if column.unit == "ns" else np.float64
 
 

@@ -16,6 +16,7 @@ _NUMBER: Final = re.compile(r"\d{1,15}(?:\.\d{1,30})?|\.\d{1,30}", re.ASCII)
 _IMPLIED_BY: Final = MappingProxyType(
     {"rtt_median_s": "rtt_loss", "goodput_bit_s": "file_loss", "topic_delay_median_s": "topic_loss"}
 )
+"""For quantities that have no value if nothing arrives, the column whose value implies that they were measured."""
 
 
 @dataclass(frozen=True)

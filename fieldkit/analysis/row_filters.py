@@ -68,7 +68,8 @@ def parse_filter(text: str, columns: Mapping[str, Column]) -> RowFilter:
         columns: The columns of the table by name; `source` is also allowed.
 
     Raises:
-        ConfigurationError: The expression has another form, or a column in it does not exist or has another type.
+        ConfigurationError: The text is not an allowed expression, a column in it does not exist, or it compares a
+            text with a number.
     """
     try:
         body = ast.parse(text.strip(), mode="eval").body

@@ -22,9 +22,10 @@ CONFIDENCE: Final = 0.95
 NORMAL: Final = NormalDist().inv_cdf((1 + CONFIDENCE) / 2)
 """97.5 % quantile of the normal distribution, for a two-sided 95 % interval."""
 
+# 97.5 % quantiles of Student's t with 1 and 2 degrees of freedom, in closed form.
 _QUANTILE_1: Final = math.tan(math.pi * CONFIDENCE / 2)
 _QUANTILE_2: Final = CONFIDENCE * math.sqrt(2 / (1 - CONFIDENCE**2))
-# Abramowitz and Stegun 1964, 26.7.5.
+# Coefficients of the expansion in `student`: Abramowitz and Stegun 1964, 26.7.5.
 _SERIES: Final = (
     (NORMAL**3 + NORMAL) / 4,
     (5 * NORMAL**5 + 16 * NORMAL**3 + 3 * NORMAL) / 96,
@@ -32,6 +33,7 @@ _SERIES: Final = (
     (79 * NORMAL**9 + 776 * NORMAL**7 + 1482 * NORMAL**5 - 1920 * NORMAL**3 - 945 * NORMAL) / 92160,
 )
 _LAST_TERM: Final = 32 * (_QUANTILE_2 - NORMAL - sum(term / 2**power for power, term in enumerate(_SERIES, 1)))
+"""Coefficient of the fifth term, which makes the expansion exact for 2 degrees of freedom."""
 MIN_FOR_INDEPENDENCE_TESTS: Final = 10
 """Minimum number of repeats. With fewer repeats, p-values cannot be small enough after correction for many tests."""
 MIN_FOR_ORDER_STATISTICS: Final = 6  # the range of five values contains the median with a probability of only 93.75 %

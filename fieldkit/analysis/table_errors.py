@@ -108,7 +108,7 @@ def _quoted_cell(text: str) -> str:
 def _newer_schema_error(where: str, version: float) -> FieldkitError:
     """Return the error of a table that a newer version of fieldkit wrote."""
     return ConfigurationError(
-        f"a newer fieldkit wrote it: its schema version is {version:.0f}, but this one reads up to {SCHEMA_VERSION}",
+        f"its schema version is {version:.0f}, but this version of fieldkit supports at most {SCHEMA_VERSION}",
         where=where,
         remedy="upgrade fieldkit",
     )

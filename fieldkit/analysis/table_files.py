@@ -1,4 +1,4 @@
-"""Reading of tables of repeats: the trial.csv of one trial or of thousands of trials."""
+"""Read tables of repeats: the trial.csv of one trial or of thousands of trials."""
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -25,6 +25,7 @@ _SPREADSHEET_MARKS: Final = {
 }
 """Problem and correct format, by the start of a header that a spreadsheet wrote in another format."""
 _BATCH_BYTES: Final = 1 << 25
+"""Number of bytes that are parsed together."""
 _MAX_HEADER_BYTES: Final = 1 << 20
 
 
@@ -41,7 +42,7 @@ def read(
     parser takes longer than parsing the 40 rows of a trial.
 
     Args:
-        paths: CSV files with the columns of trial.csv, of any schema version up to that of this version of fieldkit.
+        paths: CSV files with the columns of trial.csv. Their schema version is at most `SCHEMA_VERSION`.
         declared: The columns of trial.csv.
         columns: Names of the columns to read; None for all columns. The columns of `IDENTITY` are always read.
         content: Function that reads the bytes of a table.
@@ -106,7 +107,10 @@ class IndexedRows(Protocol):
     def read(
         self, tables: Sequence[Path], declared: Mapping[str, Column]
     ) -> tuple[dict[str, parsing.Numbers], dict[str, parsing.Texts], list[int]] | None:
-        """Return columns as `parsing.columns`, and the number of rows of each table; None if they are not usable."""
+        """Return columns as `parsing.columns` does, and the number of rows of each table.
+
+        The result is None if the stored rows cannot be used.
+        """
 
 
 def _read_indexed(
@@ -131,7 +135,7 @@ def typed_tables(
 
     Args:
         tables: Tables and their bytes.
-        declared: The columns of all tables; all values of a table must be valid.
+        declared: The columns of all tables.
 
     Yields:
         The columns, and the tables with their numbers of rows, in the order of the rows. The number is -1 for a table

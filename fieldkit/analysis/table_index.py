@@ -67,7 +67,7 @@ TableStamp = tuple[FileStamp, FileStamp | None]
 
 
 def stamp(table: Path, plan: Path) -> TableStamp | None:
-    """Return the stamps of a table and its plan, or None if one of them is not a regular file: it is not indexed."""
+    """Return the stamps of a table and its plan, or None if one is not a regular file, so that it is not indexed."""
     try:
         table_status = table.stat()
     except OSError:
@@ -133,8 +133,8 @@ class TableIndex:
     types: Mapping[str, str] = field(default_factory=dict)
 
     def has_types(self, declared: Iterable[Column]) -> bool:
-        """Return True if no column has another type than in the index."""
-        return all(self.types.get(column.name, kind) == kind for column in declared for kind in [type_name(column)])
+        """Return True if each column that is in the index has the same type there."""
+        return all(self.types.get(column.name) in {None, type_name(column)} for column in declared)
 
     def read(
         self, entries: Sequence[Entry], declared: Mapping[str, Column]

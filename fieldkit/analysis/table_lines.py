@@ -11,7 +11,7 @@ from fieldkit.analysis.quantities import Quantity, in_order
 from fieldkit.core.columns import plain_name, step_prefixed
 
 _RADIO: Final = ("ip_loss", "tcp_byte_loss")
-"""Columns of the loss on the radio: IP packets for UDP, and bytes for TCP, which TCP retransmits."""
+"""Columns of the loss on the radio: lost IP packets for UDP, and lost bytes for TCP, which retransmits them."""
 
 _OPERATOR: Final = (
     "file_loss",
@@ -43,7 +43,8 @@ _SENT: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
         "iperf3 datagrams sent": ("iperf3_loss",),
     }
 )
-"""Names of losses, by the label of the number of sent items. This number is `trials` of the first loss in a cell."""
+"""Labels of numbers of sent items, each with the losses of these items. The number is `trials` of the first of these
+losses that a cell has."""
 
 
 @dataclass(frozen=True)

@@ -152,8 +152,7 @@ def cautions(cells: Sequence[Cell], names: Collection[str] | None = None) -> Ite
         yield (
             f"! repeats are not independent in time (trend or autocorrelation): "
             f"{'; '.join(dependent[:_MAX_LISTED])}{more}. Their intervals are too narrow. Randomize the order of "
-            "conditions, as a campaign does, and measure on "
-            "several days"
+            "conditions, as a campaign does, and measure on several days"
         )
 
 

@@ -105,6 +105,7 @@ class Robot(Strict):
 
 
 Cast = Mapping[Role, Robot]
+"""The robot in each role."""
 
 
 class Oracle(Protocol):

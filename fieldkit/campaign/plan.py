@@ -211,7 +211,7 @@ def make_plan(path: Path, backend: str) -> tuple[CampaignPlan, Document]:
     limit_m = order.DEFAULT_WALK * shortest_m if campaign.walk is None else campaign.walk
     if limit_m < shortest_m:
         raise ConfigurationError(
-            f"the shortest path through all places is {shortest_m:.1f} m, walk allows {limit_m:g} m",
+            f"the shortest path through all places is {shortest_m:.1f} m, but walk allows only {limit_m:g} m",
             where=document.where(("walk",)),
             remedy=f"walk: {shortest_m + 0.05:.1f}m allows only ascending or descending distances; "
             "twice that allows a random order",
@@ -245,9 +245,10 @@ def started_plan(folder: Path, current_plan: CampaignPlan, document: Document) -
     changed_keys = [key for key in current_values if current_values[key] != frozen_values[key]]
     if changed_keys:
         raise ConfigurationError(
-            f"changed since the campaign started: {', '.join(changed_keys)}",
+            f"these have changed since the campaign started: {', '.join(changed_keys)}",
             where=document.where((changed_keys[0],)),
-            remedy=f"undo that ({folder / CAMPAIGN_FILE} has the old values), or start another campaign: change name",
+            remedy=f"undo that ({folder / CAMPAIGN_FILE} has the old values), or change name: to start another "
+            "campaign",
         )
     return plan
 
@@ -283,12 +284,12 @@ def _subfolders(path: Path) -> list[Path]:
 
 
 def _unmeasured_trials(folder: Path, sources: Collection[str]) -> Iterator[str]:
-    plans = [
+    measured_plans = [
         plans.read_plan(Path(source))
         for source in sources
         if Path(source).absolute().parent == folder.absolute() and (Path(source) / PLAN_FILE).is_file()
     ]
-    measured_conditions = {(plan.procedure.name, plan.topology, plan.distance_m) for plan in plans}
+    measured_conditions = {(plan.procedure.name, plan.topology, plan.distance_m) for plan in measured_plans}
     for trial in schema.load(folder / CAMPAIGN_FILE, CampaignPlan).trials():
         if (trial.procedure, trial.topology, trial.distance.metres) not in measured_conditions:
             yield str(trial)

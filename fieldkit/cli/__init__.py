@@ -31,15 +31,15 @@ EXIT_CODES: Final[Mapping[int, str]] = MappingProxyType(
 """Exit codes that do not belong to a subclass of `FieldkitError`."""
 
 _COLLECT_AFTER: Final = 50_000
-"""New objects between two runs of the cyclic garbage collector.
+"""Number of new objects after which the cyclic garbage collector runs.
 
-Imports create fewer objects, and a collection during imports would free none of them.
+Imports create fewer objects, so it does not run during imports, when it would free nothing.
 """
 
 _ONE_THREAD: Final = ("OPENBLAS_NUM_THREADS", "1")
 """Setting of OpenBLAS, which numpy uses. By default it starts a thread per core, and each thread spins for 30 ms.
 
-The threads are useful only for larger matrices.
+The matrices of fieldkit are too small to be processed faster by several threads.
 """
 
 _EPILOG: Final = """\
@@ -110,7 +110,7 @@ def _run_with_error_messages(top: Parser, argv: Sequence[str] | None, options: h
         return 0
     except OSError as error:
         # Library functions wrap the errors that they expect. A full disk can make any write fail.
-        remedy = "free some space" if error.errno in {errno.ENOSPC, errno.EDQUOT} else "correct this"
+        remedy = "free some space" if error.errno in {errno.ENOSPC, errno.EDQUOT} else "remove the cause"
         location = error.filename or "its output"
         _show_error(
             f"{location}: {error.strerror}\n"

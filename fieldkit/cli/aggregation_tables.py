@@ -44,7 +44,7 @@ _UNITS: Final = MappingProxyType({"share": "a share", "s": "a time", "bit/s": "a
 
 
 def show(arguments: argparse.Namespace) -> int:
-    """Print the cells."""
+    """Aggregate the repeats, print the result in the format of `--format`, and return the exit code."""
     output_format = arguments.format
     data = sources.find(
         arguments.paths,
@@ -66,7 +66,7 @@ def show(arguments: argparse.Namespace) -> int:
         )
     quantities = _default_quantities(output_format, data.quantities) if selected is None else selected
     text_columns = list(data.words.values()) if words is None else words
-    widths = dict(_width(text, quantities) for text in arguments.width)
+    widths = dict(_parse_width(text, quantities) for text in arguments.width)
     _require_units(widths, quantities)
     needed_names = {name for quantity in quantities for name in quantity.needed_columns} | {
         quantity.name for quantity in text_columns
@@ -81,7 +81,7 @@ def show(arguments: argparse.Namespace) -> int:
         print_text(_FOR_PROGRAMS[output_format](condition_columns, cells, additional), end="")
     elif output_format in _FOR_PAPERS:
         if output_format == "latex":
-            _require_figures(cells, quantities)
+            _require_values(cells, quantities)
         print_text(_FOR_PAPERS[output_format](condition_columns, cells, quantities), end="")
     else:
         judgements = _shown_judgements(data, repeats, cells, quantities)
@@ -90,8 +90,8 @@ def show(arguments: argparse.Namespace) -> int:
         shown_lines = (
             table_lines.lines(cells, quantities) if show_all else table_lines.operator_lines(cells, expected)
         )
-        _show(condition_columns, cells, shown_lines, additional)
-        _show_expected(condition_columns, cells, judgements)
+        _print_tables(condition_columns, cells, shown_lines, additional)
+        _print_judgements(condition_columns, cells, judgements)
         _note_omitted(cells, shown_lines)
     available = {name for cell in cells for name in (*cell.estimates, *cell.tallies)}
     if missing := [name for name in arguments.quantity if name not in available]:
@@ -117,7 +117,7 @@ def _require_units(widths: Mapping[str, float], quantities: Sequence[Quantity]) 
         )
 
 
-def _require_figures(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> None:
+def _require_values(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> None:
     if not wording.with_estimates(cells, quantities):
         names = " or ".join(quantity.name for quantity in quantities)
         raise EvidenceError(
@@ -126,7 +126,7 @@ def _require_figures(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> N
         )
 
 
-def _width(text: str, quantities: Sequence[Quantity]) -> tuple[str, float]:
+def _parse_width(text: str, quantities: Sequence[Quantity]) -> tuple[str, float]:
     """Return the unit of the quantities that `--width` applies to, and the half-width in this unit."""
     units = dict.fromkeys(quantity.unit for quantity in quantities)
     symbol = text.strip().lstrip("0123456789. ")
@@ -148,7 +148,7 @@ def _note_omitted(cells: Sequence[Cell], shown_lines: Sequence[TableLine]) -> No
         print_folded(f"{results.more_rows_note(omitted_count)}: add --all")
 
 
-def _show(
+def _print_tables(
     condition_columns: Sequence[str],
     cells: Sequence[Cell],
     shown_lines: Sequence[TableLine],
@@ -156,7 +156,7 @@ def _show(
 ) -> None:
     """Print a table of the repeats, and a table for each line of `shown_lines`."""
     counts = [{"valid": str(cell.n_valid), "void": str(cell.n_void), "failed": str(cell.n_failed)} for cell in cells]
-    _show_table("repeats", condition_columns, cells, counts)
+    _print_table("repeats", condition_columns, cells, counts)
     differing_columns, _ = wording.varying_and_common(condition_columns, cells)
     for line in shown_lines:
         measured_cells = [cell for cell in cells if line.estimate(cell) or line.is_lacking(cell)]
@@ -168,14 +168,14 @@ def _show(
                 for figure, cell in zip(figures, measured_cells, strict=True)
             ]
         if measured_cells:
-            _show_table(scale.head(line.label.removesuffix(", median")), differing_columns, measured_cells, figures)
+            _print_table(scale.head(line.label.removesuffix(", median")), differing_columns, measured_cells, figures)
     for name, label in wording.word_labels(cells).items():
         measured_cells = [cell for cell in cells if name in cell.tallies]
         figures = [
             {"n": _repeat_count(cell.tallies[name].n, cell), "repeats with each": wording.tally(cell, name)}
             for cell in measured_cells
         ]
-        _show_table(label, differing_columns, measured_cells, figures, words=1)
+        _print_table(label, differing_columns, measured_cells, figures, words=1)
     for caution in wording.cautions(cells, {quantity.name for line in shown_lines for quantity in line.quantities}):
         print_folded(caution)
 
@@ -196,7 +196,9 @@ def _shown_judgements(
     return judge_by_trial((cell, expectations_of(cell)) for cell in cells)
 
 
-def _show_expected(condition_columns: Sequence[str], cells: Sequence[Cell], judgements: Sequence[Judgement]) -> None:
+def _print_judgements(
+    condition_columns: Sequence[str], cells: Sequence[Cell], judgements: Sequence[Judgement]
+) -> None:
     """Print for each condition whether its expectations are met; without expectations, print nothing."""
     differing_columns, _ = wording.varying_and_common(condition_columns, cells)
     rows = []
@@ -214,7 +216,7 @@ def _show_expected(condition_columns: Sequence[str], cells: Sequence[Cell], judg
         table(head, rows, fold=(0, len(head) - 1))
 
 
-def _show_table(
+def _print_table(
     title: str,
     condition_columns: Sequence[str],
     cells: Sequence[Cell],
@@ -245,9 +247,9 @@ def _repeat_count(n: int, cell: Cell) -> str:
 
 
 def _figures(line: TableLine, cell: Cell, scale: wording.Scale) -> dict[str, str]:
-    """Return the figures of a cell by column head.
+    """Return the texts of a cell by column head.
 
-    A cell without values has empty figures and the number of its repeats.
+    If the cell has no value, only the text of column `n` is not empty.
     """
     estimate, quantity = line.estimate(cell), line.quantities[0]
     kind = quantity.kind

@@ -75,7 +75,10 @@ def _open_answers(path: str) -> TextIO:
 
 
 def run_elsewhere(selected_backend: Backend, arguments: argparse.Namespace, results: Path) -> int | None:
-    """Run this command line where the backend requires it. Return its exit code; None if it must run here.
+    """Run this command line in a virtual machine if the backend requires one.
+
+    Returns:
+        The exit code, or None if the command must run in this process.
 
     Args:
         selected_backend: The backend.
@@ -83,7 +86,7 @@ def run_elsewhere(selected_backend: Backend, arguments: argparse.Namespace, resu
         results: Folder of the results.
 
     Raises:
-        ConfigurationError: The command would write a file outside of that folder.
+        ConfigurationError: The command would write a file outside of the folder of the results.
     """
     if not isinstance(selected_backend, Relocating) or not selected_backend.must_relocate:
         return None

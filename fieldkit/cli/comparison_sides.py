@@ -18,7 +18,7 @@ from fieldkit.trial.stored.sources import Sources
 
 _DISTANCE: Final = frozenset({"distance", "distance_m"})
 _SETTINGS_HASHES: Final = frozenset({"procedure_sha256", "profiles_sha256"})
-"""Hashes that contain the settings of a sweep."""
+"""Columns with hashes that depend on the settings of a sweep."""
 _EXAMPLE: Final = "write for example --between policy=sliding_window,scheduled"
 
 
@@ -57,13 +57,13 @@ def read(arguments: argparse.Namespace) -> Sides:
     a, b = (run.with_filter(arguments.where) for run in runs)
     by = a.condition(arguments.by)
     is_default = arguments.by == ",".join(PAIRED_BY)
-    if is_default and a.sweep_condition:  # only sweeps have common factors
+    if is_default and a.sweep_condition:  # two sweeps are paired by the factors that both have
         by = tuple(name for name in a.sweep_condition if name in b.sweep_condition) or by
     if not arguments.between:
         return Sides(a.read(also=by), b.read(also=by), by, a, frozenset())
     column, _, values = arguments.between.partition("=")
     (name,) = a.condition(column, option="--between")
-    varied = next((names for names in (_DISTANCE, *_same_factor(a)) if name in names), frozenset({name}))
+    varied = next((names for names in (_DISTANCE, *_columns_by_factor(a)) if name in names), frozenset({name}))
     if is_default:
         by = tuple(other for other in by if other not in varied)
     rows = [run.read(also=(*by, name)) for run in (a, b)]
@@ -78,7 +78,7 @@ def read(arguments: argparse.Namespace) -> Sides:
     )
 
 
-def _same_factor(run: Sources) -> list[frozenset[str]]:
+def _columns_by_factor(run: Sources) -> list[frozenset[str]]:
     """Return the columns of each factor of a sweep: its values as in the command, and its values as numbers."""
     return [frozenset(names) for names in run.sweep_columns.items()]
 
@@ -106,7 +106,7 @@ def _two_values(sides: Sequence[Repeats], name: str, text: str) -> tuple[str, st
     """Return the values of A and B; a value may contain commas.
 
     Raises:
-        ConfigurationError: There are not two different values in the data.
+        ConfigurationError: The text does not contain two different values that occur in the data.
     """
     values_a, values_b = (dict.fromkeys(_texts(side, name)) for side in sides)
     parts = text.split(",")

@@ -17,7 +17,7 @@ from fieldkit.trial.plan import Plan, telemetry_cast
 def print_commands(plan: Plan) -> None:
     """Print the commands of one repeat per protocol, in order, grouped by robot.
 
-    Jobs are shown as they are typed on the robot. In a trial `job.sh` starts them detached.
+    Jobs are shown as a person would type them on the robot. In a trial `job.sh` starts them detached.
     """
     repeats_text = f"{format_count(plan.repeats, 'repeat')} per protocol"
     print_text(f"# procedure {plan.procedure.name}, {plan.distance}, {plan.topology}; {repeats_text}")
@@ -95,7 +95,7 @@ def _telemetry_sources(plan: Plan, role: Role) -> Sequence[Sequence[str]]:
 
 
 def _copy_command(put: PutProgram, robot: Robot, folder: str) -> str:
-    """Return the command that copies a program of the lab into the folder of the repeat on a robot."""
+    """Return the command that copies a program from this machine into the folder of the repeat on a robot."""
     argv = ("scp", "-p", put.program.file, f"{robot.address}:{folder}/{put.at}")
     return f"{quote(argv)}  # SHA-256 {put.program.sha256}"
 

@@ -26,9 +26,12 @@ def interruptible() -> Iterator[Stop]:
 
     While a robot moves automatically, or may start to move, the first SIGINT, SIGTERM or SIGHUP orders all robots
     to stop and raises `KeyboardInterrupt`. At the end of the body the function waits for their confirmations; the
-    next signal cancels that wait. Otherwise the first SIGINT lets the repeat finish, and the second raises
-    `KeyboardInterrupt`. SIGTERM and SIGHUP raise it immediately, because a closed terminal does not wait. Later
-    signals are ignored, since the clean-up that follows has its own deadlines.
+    next signal cancels that wait.
+
+    While no robot moves, the first SIGINT during a repeat lets the repeat finish, and the second raises
+    `KeyboardInterrupt`. SIGINT between repeats, SIGTERM and SIGHUP raise it immediately, the latter two because the
+    system may kill this process before the repeat has finished. Later signals are ignored, because the clean-up that
+    follows has deadlines.
 
     A thread gives the order. It receives signals through a file descriptor (`signal.set_wakeup_fd`), even while the
     main thread cannot run a handler.
@@ -39,7 +42,7 @@ def interruptible() -> Iterator[Stop]:
     def handle(number: int, _frame: FrameType | None) -> None:
         nonlocal stopping
         if stopping:
-            if stop.motions.is_ordered:
+            if stop.motions.stop_ordered:
                 stop.motions.cancel_wait()
                 _write_message(_WAIT_CANCELLED)
             return

@@ -30,7 +30,7 @@ class Parser(argparse.ArgumentParser):
     Attributes:
         takes_lengths: True if `-5m` is a length. Otherwise argparse parses a word that begins with a dash as an
             option, unless it is a number without a unit.
-        declare: Declares the arguments, called at first use. None if they are declared already.
+        declare: Function that declares the arguments at first use; None if they are declared already.
         is_foreign: True if another package declares the arguments. They are declared only when this command is used,
             so that other commands neither load the package nor fail with it.
     """
@@ -53,8 +53,8 @@ class Parser(argparse.ArgumentParser):
         self.set_defaults(run=None, parser=self)
         return self._commands
 
-    def complete(self) -> None:
-        """Declare the arguments unless this is done already.
+    def declare_arguments(self) -> None:
+        """Declare the arguments unless they are declared already.
 
         Raises:
             FieldkitError: A package cannot declare them.
@@ -74,7 +74,7 @@ class Parser(argparse.ArgumentParser):
         """
         parser: Parser | None = self._commands.choices.get(name) if self._commands else None
         if parser is not None and not parser.is_foreign:
-            parser.complete()
+            parser.declare_arguments()
         return parser
 
     def accepts(self, option: str, value: str) -> bool:
@@ -88,7 +88,7 @@ class Parser(argparse.ArgumentParser):
         Raises:
             ConfigurationError: There is no such subcommand or option.
         """
-        self.complete()
+        self.declare_arguments()
         words = list(sys.argv[1:] if args is None else args)
         self._words = words
         if self._commands is not None:

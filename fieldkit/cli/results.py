@@ -92,7 +92,7 @@ def report(outcomes: Sequence[Outcome | None], arguments: argparse.Namespace) ->
     Args:
         outcomes: The outcomes of trials, None for each skipped one.
         arguments: The arguments of the command: `json` prints no table, `all` prints all quantities, and `junit` is a
-            file that gets the results, too.
+            file to which the results are also written.
     """
     outcomes_run, is_json = [outcome for outcome in outcomes if outcome is not None], arguments.json
     omitted_count = 0
@@ -151,12 +151,11 @@ def print_expectations(judgements: "Sequence[Judgement]") -> None:
 
 
 def _show_next(outcomes_run: Sequence[Outcome], omitted_count: int) -> None:
-    """Print likely next commands, unless all trials are without a valid repeat."""
+    """Print likely next commands if at least one repeat is valid."""
     if any(outcome.valid for outcome in outcomes_run):
         for index, command in enumerate(_next_commands(outcomes_run, omitted_count)):
-            print_text(
-                f"{'      ' if index else 'next: '}{add_options(command)}"
-            )  # not folded, so that it can be copied
+            # The command is not folded, so that it can be copied.
+            print_text(f"{'      ' if index else 'next: '}{add_options(command)}")
 
 
 def _next_commands(outcomes_run: Sequence[Outcome], omitted_count: int) -> Iterator[str]:

@@ -184,7 +184,10 @@ def file_to_write(text: str) -> Path:
 
 
 def natural(text: str, minimum: int = 0) -> int:
-    """Return a whole number with at most 15 digits; argparse reports other texts, with the smallest number."""
+    """Return a whole number with at most 15 digits; argparse reports other texts as errors.
+
+    `minimum` is only named in the message; the caller must check it.
+    """
     if not text.isascii() or not text.isdigit():
         raise argparse.ArgumentTypeError(f"{text.strip()!r} is not a whole number of at least {minimum}")
     if len(text) > _MAX_DIGITS:

@@ -255,7 +255,7 @@ def parse(text: str, *, source: str) -> Document:
     """Return the one YAML document in `text`.
 
     Raises:
-        ConfigurationError: Not YAML, an alias, a tag, a duplicate key, or a key that is not text.
+        ConfigurationError: The text is not YAML, or has an alias, a tag, a duplicate key, or a key that is not text.
     """
     loader = None
     try:

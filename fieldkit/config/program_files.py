@@ -10,10 +10,7 @@ from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError
 
 MAX_BYTES: Final = 8 << 20
-"""Largest size of a program.
-
-It is sent over the control connection before each attempt, perhaps over a slow radio.
-"""
+"""Maximum size of a program, which is sent before each attempt over the control connection, perhaps a slow radio."""
 
 
 class LabProgram(Strict):

@@ -68,7 +68,7 @@ class WifiPhy(Strict):
     power_save_timeout: Annotated[Duration, Field(ge=0.001, le=10)] = 0.1
 
     @schema.model_validator(mode="after")
-    def _check(self) -> "WifiPhy":
+    def _require_modelled_values(self) -> "WifiPhy":
         if self.width_mhz not in _MODELLED_WIDTHS_MHZ:
             raise schema.validation_error(
                 f"a width of {self.width_mhz} MHz is not modelled; write 20, 40 or 80", "width_mhz"

@@ -37,6 +37,7 @@ class ClusterExecutor(WorkerExecutor):
         address: Address of the scheduler, `tcp://HOST:PORT`, or its scheduler file, which ends in `.json`.
 
     Raises:
+        ConfigurationError: The scheduler file does not exist.
         LinkError: The scheduler does not answer.
     """
 

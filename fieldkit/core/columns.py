@@ -39,8 +39,10 @@ _UNIT_BOUNDS: Final[Mapping[str, tuple[float, float]]] = {
 """Smallest and largest possible value by unit; values of other units can be any finite number."""
 
 NEGATIVE_LOSS_BOUNDS: Final = (-1000.0, 1.0)
-"""Bounds of a loss that may be negative. The received count can exceed the sent count because of duplicated
-datagrams, or because of the segments of one super-frame (at most about a hundred).
+"""Bounds of a loss that may be negative.
+
+The received count can exceed the sent count if datagrams are duplicated, or if the sender's capture has one large
+frame that the network card divides into segments (at most about a hundred).
 """
 CLOCK_DIFFERENCE_BOUNDS_S: Final = (-_MAX_TIME_S, _MAX_TIME_S)
 """Bounds of the difference between two clocks."""
@@ -183,6 +185,7 @@ class Column:
         # Nanoseconds since 1970 need more digits than a float has, so short integers are read as int.
         is_integer = stripped.removeprefix("-").isdigit()
         value: float = int(stripped) if is_integer and len(stripped) <= _MAX_INT_DIGITS else float(stripped)
+        # A whole number equals `value // 1`. Infinity does not, but its error is that it is out of range.
         if self.type is int and not (is_integer if self.unit == "ns" else value in {math.inf, value // 1}):
             return "not a whole number"
         low, high = self.possible

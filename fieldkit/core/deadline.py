@@ -10,7 +10,7 @@ T = TypeVar("T")
 
 _POLL_INTERVAL_S: Final = 0.1
 _MIN_SUSPENDED_S: Final = 5.0
-"""A wait that exceeds its time-out by this much means that this process was suspended, for example by Ctrl-Z."""
+"""A wait that exceeds its timeout by this much means that this process was suspended, for example by Ctrl-Z."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class ExpiredError(TimeoutError):
 def call_with_deadline(
     call: Callable[[], T], deadline: Deadline, cancelled: threading.Event, *, what: str = "answer"
 ) -> T:
-    """Call a function that has no time-out parameter, such as a name look-up; return its result or raise its error.
+    """Call a function that has no timeout parameter, such as a name look-up; return its result or raise its error.
 
     Args:
         call: The function. It runs in a daemon thread, which continues if the deadline passes.

@@ -1,4 +1,4 @@
-"""Names of the files in an attempt's folder that only the laptop writes, for itself or for its testbed.
+"""Names of files that only the laptop writes, most of them into the folder of an attempt.
 
 The modules that write these files import the names. An archive from a robot that contains one of them is refused,
 because a robot must not provide the data of the operator or of a modelled radio (`backends.protocols.Oracle`).

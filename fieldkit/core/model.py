@@ -32,7 +32,9 @@ class Role(str):
         """Return the object of this name."""
         if (role := cls._instances.get(name)) is None:
             if not re.fullmatch(cls.PATTERN, name):
-                raise ValueError("the name of a role consists of lower-case letters, digits and _, a letter first")
+                raise ValueError(
+                    "the name of a role consists of lower-case letters, digits and _, and begins with a letter"
+                )
             role = cls._instances.setdefault(str(name), super().__new__(cls, name))
         return role
 
@@ -253,7 +255,9 @@ class TrackPoint:
 
 @dataclass(frozen=True)
 class StationSample:
-    """Statistics that a radio reports about one peer station; None if not reported. Counters start at any number.
+    """Statistics that a radio reports about one peer station; None if not reported.
+
+    Counters may start at any number.
 
     Attributes:
         station: MAC address of the station, or its name if the sample is of an emulator.

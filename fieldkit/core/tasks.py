@@ -29,7 +29,7 @@ _POLL_S: Final = 1.0
 
 
 class WorkerDiedError(FieldkitError):
-    """The worker of a task died each time."""
+    """The worker of a task died `MAX_DEATHS` times."""
 
 
 @dataclass(frozen=True)

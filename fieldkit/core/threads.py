@@ -63,9 +63,9 @@ def run_parallel(
             have 10 s to return, so that they no longer write to files. Without this function, Ctrl-C does not wait
             for the threads.
         end_others: Ends the waits of all calls after one has failed. It is called repeatedly until all threads have
-            returned. Their `FieldkitError`s are consequences and are ignored. Another exception is a bug in the code
-            of a call, and is raised instead of the first error. Without this function, all calls run to their
-            end.
+            returned. A `FieldkitError` of a call that is ended in this way is ignored. Any other exception is a bug
+            in the code of a call, and is raised instead of the first error. Without this function, all calls run to
+            their end.
     """
     from concurrent.futures import ALL_COMPLETED, FIRST_EXCEPTION, Future, wait  # noqa: PLC0415 (it imports logging, which takes 5 ms)
 
@@ -92,11 +92,11 @@ def run_parallel(
             wait(running, _INTERRUPT_WAIT_S)
         raise
     if failed_future is not None:
-        failed_future = next((future for future in futures if is_mistake(future.exception())), failed_future)
+        failed_future = next((future for future in futures if is_bug(future.exception())), failed_future)
     return [future.result() for future in ([failed_future] if failed_future else futures)]
 
 
-def is_mistake(error: BaseException | None) -> bool:
+def is_bug(error: BaseException | None) -> bool:
     """Return True if an exception shows a bug in the code. Another error must not hide it."""
     return isinstance(error, Exception) and not isinstance(error, FieldkitError)
 

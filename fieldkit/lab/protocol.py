@@ -82,7 +82,7 @@ class Overview:
 
 @dataclass(frozen=True)
 class LabLateness:
-    """Lateness of the co-simulation of a lab since the lab was up.
+    """Lateness of the co-simulation of a lab since its start was complete.
 
     Attributes:
         bound_s: Maximum lateness; if a packet or a window was later, results that were measured then are not valid.
@@ -150,7 +150,7 @@ class Lab(Protocol):
         ...
 
     def lateness(self) -> LabLateness | None:
-        """Return the lateness of the co-simulation since the lab was up, or None without a co-simulation.
+        """Return the lateness of the co-simulation since the start was complete, or None without a co-simulation.
 
         Raises:
             LinkError: The radio does not answer.

@@ -22,7 +22,7 @@ LOG: Final = "lab.log"
 PROPERTY: Final = "fieldkit_evidence"
 """Property of a failed test in JUnit XML with the path of its folder."""
 
-_SHARED: Final = "set-up"
+_SET_UP_NAME: Final = "set-up"
 _MAX_NAME_LENGTH: Final = 100
 _SECTION: Final = "fieldkit evidence"
 
@@ -31,7 +31,7 @@ class EvidenceFolder:
     """The evidence folder of one test, or of several that share a set-up; created when it is first used.
 
     Attributes:
-        has_failed: Whether a test that it belongs to failed.
+        has_failed: Whether one of its tests failed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -110,7 +110,7 @@ class EvidenceKeeper:
         file_folder = self._run / _folder_name(file)
         if item.path != self._file:
             self._set_up_folder.remove_unless_kept(self._keep)
-            self._file, self._set_up_folder = item.path, EvidenceFolder(file_folder / _SHARED)
+            self._file, self._set_up_folder = item.path, EvidenceFolder(file_folder / _SET_UP_NAME)
         self._test_folder = EvidenceFolder(file_folder / _folder_name(name))
         self._item, self._in_set_up = item, True
 

@@ -88,7 +88,7 @@ class OpenedLab:
     Args:
         options: Options of the lab.
         keeper: Receives events and log lines as evidence.
-        operator: The person who does what the backend cannot do.
+        operator: The person for actions that the backend cannot perform.
         workers: Number of processes that run tests in parallel.
 
     Attributes:
@@ -123,12 +123,12 @@ class OpenedLab:
     @property
     def backend_name(self) -> str:
         """Name of the backend."""
-        return self._source[0]
+        return self._named_backend[0]
 
     @property
     def backend(self) -> Backend:
         """The backend."""
-        return self._source[1]
+        return self._named_backend[1]
 
     @property
     def testbed(self) -> Testbed:
@@ -235,7 +235,7 @@ class OpenedLab:
         self.keeper.folder.add(text)
 
     @cached_property
-    def _source(self) -> tuple[str, Backend]:
+    def _named_backend(self) -> tuple[str, Backend]:
         arguments = argparse.Namespace(backend=self.options.backend, site=self.options.site)
         return command_line.backend(arguments, self.keeper.add_event)
 

@@ -14,7 +14,8 @@ _INSTALL_S: Final = 30.0
 """Timeout of the copy: about 140 kB over a radio that may be slow."""
 
 _ROOT: Final = Path(__file__).parents[1]
-_EPOCH: Final = (1980, 1, 1, 0, 0, 0)
+_FILE_TIME: Final = (1980, 1, 1, 0, 0, 0)
+"""Modification time of all files in the archive, so that it depends only on their content."""
 _CHECK_SCRIPT: Final = '[ -O "$1" ] && [ ! -L "$1" ] && actual=$(sha256sum <"$1") && [ "${actual%% *}" = "$2" ]'
 _COPY_SCRIPT: Final = 'umask 077 && cat >"$1.$$" && mv "$1.$$" "$1"'
 _START: Final = "import sys\nfrom fieldkit.agent.__main__ import main\nsys.exit(main(sys.argv[1:]))\n"
@@ -30,8 +31,8 @@ def content() -> bytes:
         content_by_name[f"fieldkit/{path.relative_to(_ROOT).as_posix()}"] = path.read_bytes()
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
-        for name, text in content_by_name.items():
-            archive.writestr(zipfile.ZipInfo(name, _EPOCH), text)
+        for name, data in content_by_name.items():
+            archive.writestr(zipfile.ZipInfo(name, _FILE_TIME), data)
     return buffer.getvalue()
 
 
@@ -54,7 +55,9 @@ def _file_name() -> str:
 
 
 def install(shell: Shell) -> None:
-    """Copy the agent to the robot if it is missing there; the installed job script has created the folder.
+    """Copy the agent to the robot if it is missing there.
+
+    The job script must be installed before, because its installation creates the folder of the agent.
 
     Raises:
         LinkError: The robot did not answer.

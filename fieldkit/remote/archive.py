@@ -68,8 +68,8 @@ def _parse(header: bytes, robot: str) -> tuple[str, int]:
     raw = header[_NAME].rstrip(b"\0")
     name = printable(raw)
     size = _octal(header[_SIZE])
-    is_plain = header[_TYPE] in {b"0", b"\0"} and not any(header[_PREFIX])
-    if not is_plain or size is None or name.encode() != raw:
+    is_regular_file = header[_TYPE] in {b"0", b"\0"} and not any(header[_PREFIX])
+    if not is_regular_file or size is None or name.encode() != raw:
         raise EvidenceError(f"sent {name!r}, which is not a regular file of a repeat", where=robot)
     return name, size
 

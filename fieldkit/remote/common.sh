@@ -1,6 +1,7 @@
 #!/bin/sh
-# Detached jobs on a robot. fieldkit installs this file once and calls it for each long command, so that a job continues
-# after a lost connection, and each process can be stopped by its recorded identity.
+# The job script, which runs detached jobs on a robot. fieldkit installs it once, as one file that is joined from the .sh
+# files of this folder (script.py), and calls it for each long command. A job therefore continues after a lost connection,
+# and can be stopped by the recorded identity of its process.
 #
 #   job.sh start DIR NAME LIMIT READY WITHIN IN OUT LOG ARGV...
 #                                        start a job in DIR, return when it is READY; kill it if it is not ready after
@@ -28,6 +29,7 @@
 #   job.sh piece DIR FILE NUMBER BYTES   send a piece of FILE; pieces are counted from 0
 #   job.sh sum   DIR FILE                print the hash of FILE
 #   job.sh end   DIR                     stop all running jobs of DIR; no other job can start there
+#   job.sh halt  DIR                     stop all running jobs in all folders in DIR
 #   job.sh drop  DIR                     delete DIR, and its parent folder if it is empty
 #   job.sh tidy  DIR NAME...             delete all folders in DIR except the folders NAME...
 #   job.sh left                          list running jobs of all trials: DIR/NAME PID COMMAND, DIR below the home; and
@@ -47,6 +49,7 @@
 #                                        `silent`, or `alarm` (a drone may be in the air)
 #   job.sh life_signs FILE               print FILE and the time since boot
 #   job.sh snapshot                      print the outputs of all sources of the robot's state, see `snapshot.sh`
+#   job.sh sample INTERFACE TOKEN        print the state of the Wi-Fi link until it is stopped, see telemetry.sh
 #   job.sh health                        print the load, temperatures, batteries and free disk space of this computer
 #   job.sh needs                         fail if a program is missing that this script calls
 #   job.sh command_loop                  print `ready`; then run each line of standard input, `NONCE [held] VERB WORD...`, as
@@ -56,7 +59,7 @@
 # All verbs are idempotent, so that a call can be repeated if its answer was lost: an existing job is not started again.
 # READY is the condition for a job to be ready: `-` (none), `log:TEXT` (LOG contains TEXT), `tcp:PORT` or `udp:PORT` (a
 # socket is bound to PORT, in hex). LIMIT starts when the job is ready, or WITHIN seconds after its start.
-# DIR is below the home; IN, OUT and LOG are files in it.
+# DIR is below the home; IN, OUT and LOG are files in it. WHO is the user, as USER@HOST; WHAT is the trial.
 # The files of a job are in DIR/.jobs/NAME: command, pid ("PID STARTTIME BOOT"), exit. DIR/.began has TOKEN and boot ID.
 # `start`, `run` and `serve` renew the lock for the maximum duration of the job. Error messages begin with `job.sh: `.
 set -u
@@ -64,6 +67,7 @@ umask 022
 case $0 in /*) self=$0 ;; *) self=$PWD/$0 ;; esac
 base=${self%/*}
 
+# Exit codes: other error, disk full, locked by another trial, own lock lost, robot rebooted.
 GENERAL=125 DISK=28 HELD=75 LOST=76 REBOOTED=77
 
 fail() { # print message $1 and exit with code $2
@@ -83,11 +87,11 @@ read_uptime() { # set now to the seconds since boot
     read -r now _ </proc/uptime && now=${now%.*}
 }
 
-sleep_for() { # sleep for $1 seconds; rounded up if `sleep` supports whole seconds only
+sleep_for() { # sleep for $1 seconds; rounded up if `sleep` supports whole seconds only; above 128 a signal has ended it
     sleep "$1" 2>/dev/null || [ $? -gt 128 ] || sleep $((${1%.*} + 1))
 }
 
-sleep_before_poll() { # sleep before poll number $polls + 1: 2 ms, then 20 ms, because polling uses the processor
+sleep_before_poll() { # sleep for 2 ms before each of the first 10 polls, and for 20 ms later, to save processor time
     polls=$((polls + 1))
     if [ "$polls" -le 10 ]; then sleep_for 0.002; else sleep_for 0.02; fi
 }
@@ -132,6 +136,7 @@ rebooted() { # true if the robot has rebooted since the start of the job in $1 o
 enter() { # change to folder $1
     cd "$1" 2>/dev/null && return
     read_uptime
+    # Soon after a boot, the reboot is the probable cause.
     [ "$now" -gt "$TTL" ] || fail "no folder $1: the robot booted $now s ago" "$REBOOTED"
     fail "no folder $1"
 }

@@ -144,7 +144,7 @@ class Connection:
             if is_first:
                 self._register_loss()
             lost_at_s = self._lost_at_s = self._lost_at_s or time.monotonic()
-        silence_s = self._wait_for_silence(error, close_event, notify=is_first)
+        silence_s = self._wait_for_end_of_silence(error, close_event, notify=is_first)
         end = Deadline(min(final_deadline.at_s, lost_at_s + silence_s + self._reconnect_timeout_s))
         if is_first and not silence_s and not self._suppress_notices:
             self._notify_lost(end)
@@ -179,8 +179,8 @@ class Connection:
             duration = format_duration(end.remaining_s)
             self._on_notice(f"{self.address.robot}: the link is lost; trying again for {duration}")
 
-    def _wait_for_silence(self, error: Exception, close_event: threading.Event, *, notify: bool) -> float:
-        """Wait until the radio is no longer measured; return the expected maximum of this time, in seconds."""
+    def _wait_for_end_of_silence(self, error: Exception, close_event: threading.Event, *, notify: bool) -> float:
+        """Wait until packets may be sent again; return the maximum of this time that was expected, in seconds."""
         initial_s = self._silence_s()
         if initial_s and notify:
             wait = format_duration(initial_s)

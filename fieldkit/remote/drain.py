@@ -35,7 +35,7 @@ def wait_for_output(channel: Execution, expected: bytes, *, deadline: Deadline, 
         if not chunk:
             if not channel.status_event.wait(deadline.remaining_s):
                 break
-            _exit_code(channel, b"", robot)  # raises an error if not only the command, but also the link has ended
+            _exit_code(channel, b"", robot)  # raises an error if the link has ended, too
             return False
     if remaining_bytes:
         raise ExpiredError("report")

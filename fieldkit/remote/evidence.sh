@@ -1,4 +1,4 @@
-# The folder of an attempt: it is created before the attempt and sent after it, with the state of the host at both times.
+# The folder of an attempt: `begin` creates it, and `pack` sends its files. Both write the state of the host to it.
 
 PIECE=4194304 # as PIECE_BYTES of fetching.py
 
@@ -41,7 +41,9 @@ print_clock() { # print the boot ID, then three times the clock between two read
     echo "$time"
 }
 
-read_clock() { # set time to the clock with the fraction of a second; busybox provides the fraction only through adjtimex
+# Set time to the clock with the fraction of a second. busybox provides the fraction only through adjtimex; if its status
+# has the bit STA_NANO (8192), tv_usec is in nanoseconds.
+read_clock() {
     time=$(date -u +%s.%N)
     case $time in '' | *[!0-9.]* | *.) ;; *) return ;; esac
     time=$(adjtimex 2>/dev/null | awk '
@@ -49,7 +51,9 @@ read_clock() { # set time to the clock with the fraction of a second; busybox pr
         END { if (s == "" || u == "") exit 1; printf "%d.%09d\n", s, nano ? u : u * 1000 }')
 }
 
-print_job_ends() { # print the end of each job: NAME HOW CODE STARTED ENDED; STARTED in clock ticks, ENDED in seconds since boot
+# Print the end of each job: NAME HOW CODE STARTED ENDED. HOW is `itself`, `asked` (fieldkit stopped it), `limit` (its time
+# limit) or `running`; STARTED is in clock ticks and ENDED in seconds since boot.
+print_job_ends() {
     for meta in .jobs/*; do
         [ -s "$meta/pid" ] || continue
         how=itself code=- ended=-
@@ -73,6 +77,7 @@ read_free_space() { # set free to the free disk space in KiB
 fail_to_write() { # fail with the reason why file $1 cannot be written
     read_free_space
     rm -f -- "$1"
+    # On a full disk, df may still report a few KiB.
     [ "$free" -gt 64 ] || fail "cannot write $1: No space left on device" "$DISK"
     reason=$({ printf '' >"$1"; } 2>&1) && rm -f -- "$1"
     fail "cannot write $1${reason:+: ${reason##*: }}"
@@ -116,6 +121,7 @@ pack() {
     wc -c -- "$@" >".sizes-$$" || fail_to_write ".sizes-$$"
     printf '' >".large-$$" || fail_to_write ".large-$$"
     exec 6<".sizes-$$"
+    # Each iteration removes the first argument, and appends it again if the file is small.
     left=$# small=0
     while [ "$left" -gt 0 ]; do
         file=$1 left=$((left - 1))

@@ -35,16 +35,18 @@ _PIECE_S: Final = 300.0
 _MIN_HASH_BYTES_PER_S: Final = 2e6
 """Minimum rate of sha256sum on a robot: a tenth of the rate on a Raspberry Pi Zero."""
 
-_PACKED_BYTES: Final = 2 * PIECE_BYTES
+_MAX_ARCHIVE_BYTES: Final = 2 * PIECE_BYTES
+"""Maximum size of the archive: the small files with their headers, and the lists."""
 _CHUNK_BYTES: Final = 1 << 20
 _LIST_CHUNKS: Final = 2
 """Maximum length of the lists of hashes and of sizes, in chunks of 64 KiB."""
 _REPORT_S: Final = 5.0
 
+# First words of two error messages of `pack` in the job script.
 _NO_FOLDER: Final = "no folder "
 _LATE_JOB: Final = "job "
 _HASH_LIST: Final = re.compile(r"\.sums-[0-9]{1,10}\Z", re.ASCII)
-_LARGE: Final = re.compile(r"\.large-[0-9]{1,10}\Z", re.ASCII)
+_SIZE_LIST: Final = re.compile(r"\.large-[0-9]{1,10}\Z", re.ASCII)
 _SIZE: Final = re.compile(r"[0-9]{1,15}\Z", re.ASCII)
 # At most 97 characters in total, which every tar writes without an extension.
 _PART: Final = r"[A-Za-z0-9][A-Za-z0-9._-]{0,47}"
@@ -176,7 +178,7 @@ def _fetch_small(
     """
     job_error: RobotError | None = None
     try:
-        shell.fetch(command, archive_path, deadline=Deadline.after(_PIECE_S), limit_bytes=_PACKED_BYTES)
+        shell.fetch(command, archive_path, deadline=Deadline.after(_PIECE_S), limit_bytes=_MAX_ARCHIVE_BYTES)
     except RobotError as error:
         job_error = _pack_error(error, folder)
     try:
@@ -282,7 +284,7 @@ def _unpack(
         for member in archive.members(file, robot):
             if _HASH_LIST.match(member.name) and not hashes:
                 hashes = _parse_hashes(b"".join(islice(member.chunks, _LIST_CHUNKS)))
-            elif _LARGE.match(member.name) and not large_sizes:
+            elif _SIZE_LIST.match(member.name) and not large_sizes:
                 large_sizes = _parse_sizes(b"".join(islice(member.chunks, _LIST_CHUNKS)), robot)
                 for name in large_sizes:
                     _require_allowed_name(name, robot, forbidden_reason)

@@ -20,6 +20,7 @@ launch() { # start a job; $1 is start, run or serve
         is_new=
         [ -d "$meta" ] || fail "cannot start job $name: $reason"
     fi
+    # is_new is 1 if this call has created the job, and empty if an earlier call has.
     case $how$is_new in
         run1)
             setsid sh "$self" supervise - "$@" </dev/null
@@ -168,7 +169,9 @@ stop() {
     result "$meta"
 }
 
-reports_end() { # true if $log contains $end_text within $1 seconds, which shows that the job in $meta has finished its work
+# True if $log contains $end_text within $1 seconds. The job in $meta has then finished its work, and the file `leaves` lets
+# `pack` wait for its end.
+reports_end() {
     read_uptime
     until_s=$((now + $1)) polls=0
     until has_line_with "$log" "$end_text"; do
@@ -191,7 +194,9 @@ await_leaving_jobs() { # wait for the jobs of this folder for which `stop` did n
     done
 }
 
-end() { # stop and list all jobs in the folders $@: SIGINT to all, SIGKILL after 2 s; see `jobs.landing_marker_file`
+# Stop and list all jobs in the folders $@: SIGINT to all, SIGKILL after 2 s. A job with the file `unhurried`, such as a
+# program that lands a drone, is not killed (`jobs.landing_marker_file`).
+end() {
     for dir do
         [ -d "$dir/.jobs" ] && { printf '%s\n' "${by-}" >"$dir/.ended"; } 2>/dev/null
         for meta in "$dir"/.jobs/*; do
@@ -211,7 +216,7 @@ end() { # stop and list all jobs in the folders $@: SIGINT to all, SIGKILL after
     [ -z "$stuck" ] || fail "cannot stop$stuck"
 }
 
-print_job() { # print a line about the job in $meta, after `alive`
+print_job() { # print a line about the job in $meta, whose pid `alive` has set
     line=
     read -r line <"$meta/command"
     line="${meta%/.jobs/*}/${meta##*/} $pid $line"

@@ -57,7 +57,9 @@ _READY_OUTPUT: Final = b"up\n"
 """Output of `job.sh serve` when a job is ready."""
 
 STILL_RUNNING: Final = 124
+"""Exit code of a wait for a job that was still running at the timeout."""
 KILLED: Final = 137
+"""Exit code of a job that SIGKILL terminated."""
 
 _HELD_LINE: Final = re.compile(rb"^held \S+ \S", re.MULTILINE)
 _JOB_LINE: Final = re.compile(rb"\S+/\S+ [0-9]{1,10} ")
@@ -66,7 +68,8 @@ _LANDING_LINE: Final = re.compile(
     rb"^lands (?P<program>[!-~]+/\.jobs/[!-~]+) (?P<state>land|return|alarm|landed|silent)$", re.MULTILINE
 )
 
-_LINE_BYTES: Final = 300
+_MAX_LINE_BYTES: Final = 300
+"""Length to which a line about a job is shortened."""
 
 # Forwards at most $1 bytes of each output of the program. The exit code is the program's.
 _LIMITED: Final = (
@@ -329,8 +332,8 @@ def abort(shell: Shell, user: str, deadline: Deadline) -> AbortResult:
 
 
 def _lines(output: bytes) -> tuple[str, ...]:
-    # A line starts with the identification of the job, and a command may be long.
-    return tuple(printable(line[:_LINE_BYTES]) for line in output.splitlines() if _JOB_LINE.match(line))
+    # Only the end of the command is lost, because a line starts with the identification of the job.
+    return tuple(printable(line[:_MAX_LINE_BYTES]) for line in output.splitlines() if _JOB_LINE.match(line))
 
 
 def _script(job: Job) -> Sequence[str]:

@@ -1,5 +1,5 @@
-# The leader of the session and process group of a job. This part comes before the larger parts and exits the shell: parsing
-# the rest would take half a millisecond for each of the up to eight jobs of a repeat.
+# The leader of the session and process group of a job. This part is before the larger parts of the script, and exits after
+# the job: parsing the other parts would take half a millisecond for each of up to eight jobs of a repeat.
 
 is_bound() { # true if a socket is bound; $1 protocol, $2 port in hex; a TCP listener has state 0A
     if [ "$1" = tcp ] && listening=$(ss -tn state listening "sport = :$((0x$2))" 2>/dev/null); then
@@ -35,8 +35,8 @@ supervise() { # run a job as the leader of its session and process group; $1 is 
     { identify $$ && echo "$identity" >"$meta/pid"; } || exit "$GENERAL" # without a record it could not be stopped
     # `end` writes .ended before it lists the jobs, and this job has written its pid, so one of the two detects the other.
     [ ! -e "${meta%/.jobs/*}/.ended" ] || exit "$GENERAL"
-    # The watchdog may lose the final signal if it arrives before its traps are reset. Then the exit code exists already
-    # or, if the folder was deleted, the leader has exited.
+    # The watchdog does not receive the final SIGTERM if it arrives before the watchdog has reset its traps. It therefore
+    # ends if the exit code was written already or, because the folder may have been deleted, if the leader has exited.
     (trap - INT TERM HUP
         [ -s "$meta/exit" ] || ! kill -0 $$ 2>/dev/null || { await_ready; sleep_for "$limit"; printf '' >"$meta/limit"; kill -INT 0; sleep 5; kill -KILL 0; }) \
         </dev/null >/dev/null 2>&1 9>&- &

@@ -23,8 +23,8 @@ Channel = paramiko.Channel
 Transport = paramiko.Transport
 
 SPARE_CHANNELS: Final = 2
-"""Number of channels that are opened in advance: one for the next command, and one for the time in which a further
-channel is opened."""
+"""Number of channels that are opened in advance: one for the next command, and one for a second command that starts
+before another channel has been opened."""
 
 BROKEN: Final = (paramiko.SSHException, OSError, EOFError)
 """Exceptions of a broken connection."""
@@ -65,7 +65,7 @@ class NoSessionError(paramiko.SSHException):
 
 
 class _Packetizer(paramiko.packet.Packetizer):
-    """Limits the length of packets and of the banner, because paramiko does not limit it.
+    """Limits the length of packets and of the banner, because paramiko does not.
 
     Attributes:
         acknowledges: Whether answers of the server are acknowledged immediately. OpenSSH's server uses Nagle's

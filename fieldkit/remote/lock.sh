@@ -1,14 +1,14 @@
 # The lock of this robot.
 #
 # The lock is the complete file lock.N with the highest number in the folder of this script. It contains KIND TOKEN BOOT
-# FROM TO SINCE UNTIL WHO WHAT: KIND is held, free, aborted or stopped, FROM and TO are seconds since boot, SINCE and UNTIL
-# seconds of the clock.
+# FROM TO SINCE UNTIL WHO WHAT. KIND is held, free, aborted or stopped. FROM and TO are the start and the expiry of the lock in
+# seconds since boot; SINCE and UNTIL are the same times in seconds of the clock.
 #
 # Two laptops may change the lock at the same time, and flock may be missing. Therefore each change creates a new file with
 # the next number, which only one process can create. The highest number is never deleted, so a process that creates a
 # number which was used and deleted before detects a higher one. A record is flushed to the disk before it gets its number,
 # and the previous record exists until then: neither a full disk nor a power failure leaves a robot without a valid record.
-TTL=3600
+TTL=3600 # lifetime of a lock that is not renewed, in seconds; as TTL_S in locks.py
 
 read_newest() { # read the newest complete record; set n to the highest number (0: none), incomplete to the number of incomplete ones
     n=0 best=0 incomplete=0 kind=free holder=- record_boot=- from=0 to=0 since=0 until=0 who=- what=-
@@ -100,7 +100,7 @@ renew() { # extend the lock of token $1 to at least $2 s + 30 min, if half of it
             ;;
         held:*) fail "held $since $who $what" "$LOST" ;;
         aborted:"$1" | stopped:"$1") fail "$kind $since $who $what" "$LOST" ;;
-        free:-) lock "$1" "$TTL" unknown-user "$1" ;; # the robot has lost its files
+        free:-) lock "$1" "$TTL" unknown-user "$1" ;; # no record exists: the files of the robot were lost
         *) fail "gone $since $who $what" "$LOST" ;;
     esac
 }
@@ -120,17 +120,19 @@ holder() {
     return 0
 }
 
-abort() { # break the lock in the name of $1, and stop all jobs
+abort() { # break the lock in the name of $1, and stop all jobs; on a full disk the lock may be broken only after that
     by=$1
-    record_break aborted && full= || full=1
+    record_break aborted && has_failed= || has_failed=1
     [ "$kind" = held ] && echo "held $who $what" || echo free
     list_strays KILL
     end "$base"/*/*
     list_landing
-    [ -z "$full" ] || record_break aborted || [ "$kind" != held ] || fail_to_write "$base/lock"
+    [ -z "$has_failed" ] || record_break aborted || [ "$kind" != held ] || fail_to_write "$base/lock"
 }
 
-record_break() { # write a record of kind $1 (aborted or stopped) by $by, but set kind, who and what to the previous ones; false on an error
+# Write a record of kind $1 (aborted or stopped) by $by. Set kind, who and what to those of the previous record; false on an
+# error.
+record_break() {
     how=$1
     for try in 1 2 3 4 5 6 7 8; do
         read_newest

@@ -20,7 +20,7 @@ halt_motion() { # stop the programs in the name of $1; only those of folder $2 i
         signal_strays
         read_newest
         # After this the trial that has the lock starts no program, and `renew` reports the reason to it.
-        [ "$kind" != held ] || record_break stopped || full=1
+        [ "$kind" != held ] || record_break stopped || has_failed=1
         signal_programs "$base"/*/* # programs that were started in the meantime
     fi
     tries=0
@@ -29,7 +29,7 @@ halt_motion() { # stop the programs in the name of $1; only those of folder $2 i
         sleep_for 0.02
     done
     case $tries$(motion_states $programs) in
-        0*) ;;
+        0*) ;; # there is no program, or each had reported its state before
         *" land"* | *" return"*) sleep_for 0.05 ;; # a drone on the ground reports `landed` within this time
     esac
     motion_states $programs
@@ -39,12 +39,13 @@ halt_motion() { # stop the programs in the name of $1; only those of folder $2 i
         # A driving program that does not react is killed. A program of a drone is not: it may still land the drone.
         [ "$state:$program" != silent:drive ] || { alive "$meta" && signal KILL; }
     done
-    [ -z "${full-}" ] || fail_to_write "$base/lock"
+    [ -z "${has_failed-}" ] || fail_to_write "$base/lock"
 }
 
 signal_programs() { # signal each motion program in folders $@, and add it to programs: TRIAL/ATTEMPT/.jobs/NAME below the home
     for dir do
-        # A starting program writes its pid and then checks for this file. Either this function finds it, or it finds the file.
+        # A starting program writes its pid and then checks for this file. Therefore this function detects the program, or
+        # the program detects the file.
         [ -d "$dir/.jobs" ] && { printf '%s\n' "$by" >"$dir/.ended"; } 2>/dev/null
         for meta in "$dir"/.jobs/*; do
             name=${meta#"${base%/*}"/}

@@ -20,7 +20,8 @@ _READY: Final = b"ready\n"
 _CHUNK: Final = 1 << 15
 _NONCE_BYTES: Final = 16
 _END: Final = re.compile(rb" [0-9]{1,3}\n")
-_MIN_END_BYTES: Final = 5
+_MAX_END_BYTES: Final = 5
+"""Length of the longest text that `_END` matches."""
 _SHELL_COUNT: Final = 2
 """Number of shells per robot: a capture and a listener start at the same time."""
 
@@ -66,7 +67,10 @@ class ShellPool:
         return command
 
     def restore(self, link: Link, command: str) -> None:
-        """Start to open a shell with `command` if `link` has too few, unless an earlier attempt on it failed."""
+        """Start to open a shell with `command` if `link` has too few shells.
+
+        Nothing is done while another shell is being opened, or if an earlier attempt on this link has failed.
+        """
         with self._lock:
             if self._link is not link:
                 self._link, self._shells, self._opening = link, [], False
@@ -237,6 +241,7 @@ class RunningCommand:
         """
         while self._out.is_waiting and (chunk := self._channel.recv(_CHUNK)):
             self._out.feed(chunk)
+        # At the end of standard output, the end mark on standard error has not necessarily arrived.
         while not self._out.output and self._err.code is None and (chunk := self._channel.recv_stderr(_CHUNK)):
             self._err.feed(chunk)
         return self._out.read(size_bytes)
@@ -331,7 +336,7 @@ class _Stream:
             self._incomplete = nonce + rest
             if _END.match(rest):
                 self.code = int(rest.partition(b"\n")[0])
-            elif len(rest) >= _MIN_END_BYTES:
+            elif len(rest) >= _MAX_END_BYTES:
                 raise UnfitServerError("the answer to a command has no valid exit code")
         else:
             # Only a possible start of the nonce is kept, because a caller may wait for the output before it.

@@ -121,18 +121,18 @@ def require_success(shell: Shell, completed: Completed, *, remedy: str = "") -> 
         or f"`{completed.argv[0]}` ended with exit code {completed.exit_code}: {output}"
     )
     match completed.exit_code:
-        case 75 if match := _HELD.match(what):  # exit codes of the script, see common.sh
+        case 75 if match := _HELD.match(what):  # HELD; the script's exit codes are defined in common.sh
             age, remaining = (format_duration(float(match[name])) for name in ("age", "rest"))
             holder = f"{match['user']} locked it at {_start_time(match)}, {age} ago, for {match['purpose']}"
             what = f"{holder}; the lock expires in {remaining}"
             remedy = HELD_REMEDY
-        case 76 if loss := _LOST.match(what):
+        case 76 if loss := _LOST.match(what):  # LOST
             raise LockLostError(
                 _LOSS_MESSAGES[loss["kind"]].format(at=_start_time(loss), **loss.groupdict()), where=shell.robot
             )
-        case 77:
+        case 77:  # REBOOTED
             remedy = "check its battery and power supply; on the robot: uptime -s"
-        case 28:
+        case 28:  # DISK
             remedy = f"find what fills its disk: df -h; du -sh ~/{HOME}/*; then remove old trials and bags"
     default_remedy = _READ_ONLY_REMEDY if "Read-only file system" in what else "run the command on the robot by hand"
     raise RobotError(what, where=shell.robot, remedy=remedy or default_remedy)

@@ -75,7 +75,8 @@ start_radio_sources() { # $1 interface
         *) rm -f -- "$folder/iw-info" && return 0 ;; # it has no such interface
     esac
     start_source iw-reg iw reg get
-    # The channel is read twice while the robots send nothing for an attempt, in which the scan only receives.
+    # The counters of the channel are read twice. Between the readings the robots send nothing for an attempt, and the scan
+    # is passive, so the difference shows the load by other transmitters.
     start_source iw-survey sh -c 'iw dev "$1" survey dump && { sleep 0.5 || sleep 1; } && echo == && iw dev "$1" survey dump' sh "$1"
     case $info in *"channel "*" ("*" MHz"*) ;; *) return 0 ;; esac
     info=${info#*channel *" ("}

@@ -81,7 +81,7 @@ poll() {
         child=$!
         wait "$child"
         code=$? child=
-        # Errors of queries with credentials may contain these.
+        # The error message of a query with an ADDRESS may contain its credentials, so it is not printed.
         if [ "$code" -ne 0 ] && [ "$address" = - ]; then
             dd if="$output-errors" of="$output" bs=300 count=1
         fi
@@ -115,7 +115,8 @@ uses_tested_interface() { # true if packets to $address leave by the interface u
 sample() { # $1 interface, $2 token of the lock, or -: until it is stopped, the folder is deleted, or the lock is lost
     interface=$1 token=$2 next_check=0 next_query=0 wifi=
     ulimit -f "$BLOCKS"
-    exec 8<>.jobs/link/end # no process writes to it: only used to wait
+    exec 8<>.jobs/link/end # no process writes to this FIFO: `read` from it is a sleep without a fork
+    # A shell whose `read` has no timeout prints an error message.
     [ -z "$({ read -r -t 0.01 _ <&8; } 2>&1)" ] && has_read_timeout=1 || has_read_timeout=
     read_time first
     read_cpu_time
@@ -164,7 +165,7 @@ print_heading() { # print the heading of section $1
     echo "==> $up $1 <=="
 }
 
-print_quality() { # print the link quality from /proc/net/wireless; set has_quality if there is any, as for a station
+print_quality() { # print the link quality from /proc/net/wireless; set has_quality if the kernel reports one, as for a station
     has_quality=
     [ -r /proc/net/wireless ] || return 0
     while read -r name line; do

@@ -1,4 +1,4 @@
-"""Recovery of data flows from faults: a flow inside the step of the fault, or a fault inside the step of the flow."""
+"""Measure how data flows recover from faults, if the step of one of them contains the step of the other."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,12 +14,12 @@ from fieldkit.steps.nest import Nest
 from fieldkit.steps.view import View
 
 if TYPE_CHECKING:
-    from fieldkit.measure.transfers.deliveries import Delivery
+    from fieldkit.measure.transfers.deliveries import StreamDeliveries
 
 
 @runtime_checkable
 class SendsFlow(Protocol):
-    """A step that sends payload, with evidence of its times of arrival.
+    """A step that sends payload, and whose evidence contains the times at which the payload arrived.
 
     Attributes:
         flow_kind: Prefix of its columns.
@@ -32,7 +32,7 @@ class SendsFlow(Protocol):
         """Role of the receiving robot."""
         ...
 
-    def deliveries(self, view: View) -> "Sequence[Delivery]":
+    def deliveries(self, view: View) -> "Sequence[StreamDeliveries]":
         """Return the deliveries of each of its streams.
 
         Raises:
@@ -62,7 +62,7 @@ class _Pair:
     Attributes:
         fault: The step of the fault.
         flow: The step of the flow.
-        within: The steps around the flow, from the fault inwards; empty if the fault is inside the flow.
+        within: The steps that contain the flow, from the fault inwards; empty if the flow contains the fault.
     """
 
     fault: Step

@@ -54,5 +54,8 @@ class AlongStep(Step, DependsOnCast, ChecksPlacement):
     @override
     def placement_error(self, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
         if self.along and not any(nest.has_path for nest in within):
-            return f"along: true needs a move around it; put it into a move, or write {self.duration_key}"
+            return (
+                "along: true is allowed only inside a move: "
+                f"put the step into the move, or replace along by {self.duration_key}"
+            )
         return None

@@ -55,8 +55,8 @@ class Step(Strict, ABC):
         cross_checks: Sources of these columns, and the checks between them.
         kept_bytes: Bytes of each frame that a capture must keep for the step; 0 if headers are enough.
         capture_buffer_kib: Kernel buffer that a capture needs for the step's packets; 0 if the default is enough.
-        needs_complete_capture: Whether packets that a capture dropped make the step's figures wrong. If not, the step
-            withholds the columns that depend on captures.
+        needs_complete_capture: Whether a repeat is void if a capture around the step dropped packets. If not, the
+            step leaves the columns that depend on the capture empty.
         name: Letters, digits and `_`, a lower-case letter first; distinguishes the step from others of its kind.
             The names of its jobs, files and columns start with it.
     """
@@ -80,7 +80,7 @@ class Step(Strict, ABC):
 
     @classmethod
     def kind_name(cls) -> str:
-        """Return the class name in lower case without `Step`, a part of names of jobs and files."""
+        """Return the kind as it occurs in names of jobs and files: the class name in lower case, without `Step`."""
         return cls.__name__.removesuffix("Step").lower()
 
     def jobs(self, scene: Scene) -> Iterator[Planned]:  # noqa: ARG002 (some steps need no robot)
@@ -137,7 +137,7 @@ class Step(Strict, ABC):
 
 
 def _roles_in(value: object) -> Iterator[Role]:
-    """Yield the roles in the value of a field; steps inside a step are left out."""
+    """Yield the roles in the value of a field, without the roles of steps inside the step."""
     if isinstance(value, Role):
         yield value
     elif isinstance(value, Mapping):

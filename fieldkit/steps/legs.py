@@ -1,4 +1,4 @@
-"""Directions in a procedure: a segment of a path, or the position of a robot relative to another."""
+"""Displacements in a procedure, such as `away: 5m`: segments of a path, and positions relative to another robot."""
 
 import math
 from typing import Annotated
@@ -40,7 +40,7 @@ class PathLeg(Strict):
 
     @classmethod
     def of(cls, leg: model.Leg) -> "PathLeg | None":
-        """Return a leg as a segment of a procedure, rounded down to centimetres; None if its length is then 0."""
+        """Convert a testbed's leg to a segment, rounded down to centimetres; return None if its length is then 0."""
         keys = (("away", "towards", leg.away_m), ("left", "right", leg.left_m))
         lengths = {
             (key if metres > 0 else opposite): math.floor(100 * abs(metres)) / 100 for key, opposite, metres in keys

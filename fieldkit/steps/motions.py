@@ -13,7 +13,8 @@ STOPPED: Final = "stopped by the operator"
 """Reason that is stored after the order to stop. The repeat is void for this reason, and no robot may move until a
 person permits it."""
 
-_SIGNAL_S: Final = 0.5
+_WAIT_S: Final = 0.5
+"""Duration of one wait for confirmations, after which Python can run signal handlers."""
 
 Report = Callable[[str], None]
 """Shows a line to the operator, from any thread."""
@@ -43,12 +44,12 @@ class Motions:
     Attributes:
         stop_notes: While steps run in which robots move automatically, a line for each robot about its behaviour when
             it is stopped; empty at other times.
-        is_ordered: Whether the order to stop was given; it cannot be withdrawn.
+        stop_ordered: Whether the order to stop was given; it cannot be withdrawn.
     """
 
     def __init__(self) -> None:
         self.stop_notes: tuple[str, ...] = ()
-        self.is_ordered = False
+        self.stop_ordered = False
         self._movers: list[Mover] = []
         self._first_order_lock = threading.Lock()  # acquired once, by the first order
         self._cancel_event = threading.Event()
@@ -61,16 +62,16 @@ class Motions:
         Raises:
             KeyboardInterrupt: The order was given before; the robot must not start to move.
         """
-        # The robot is added before `is_ordered` is read, because `order_stop` sets `is_ordered` before it reads the
-        # list.
+        # The robot is added before `stop_ordered` is read, because `order_stop` sets `stop_ordered` before it reads
+        # the list.
         self._movers.append(mover)
         try:
-            if self.is_ordered:
+            if self.stop_ordered:
                 raise KeyboardInterrupt
             yield
         finally:
-            while self.is_ordered and not self._done_event.wait(_SIGNAL_S):
-                # Python handles a signal that arrived just before a wait only after the wait.
+            # Each wait is short, because Python handles a signal that arrived just before a wait only after the wait.
+            while self.stop_ordered and not self._done_event.wait(_WAIT_S):
                 pass
             self._movers.remove(mover)
 
@@ -82,7 +83,7 @@ class Motions:
         """
         if not (self._movers or self.stop_notes):
             return False
-        self.is_ordered = True
+        self.stop_ordered = True
         if self._first_order_lock.acquire(blocking=False):
             movers = {mover.robot: mover for mover in reversed(self._movers)}
             threading.Thread(

@@ -13,10 +13,10 @@ from fieldkit.core.model import Role, Verdict
 from fieldkit.steps.scene import CommandResult, Need, Scene
 
 LOOPBACK: Final = "lo"
-"""Interface of a link whose address is reached over any link of the robot that its routes select."""
+"""Interface of a link whose address belongs to no radio; routes select the radio that carries packets to it."""
 
 ANY: Final = "any"
-"""tcpdump's name of all interfaces."""
+"""tcpdump's name for all interfaces together."""
 
 _DEVICE: Final = re.compile(r"\bdev (?P<interface>\S{1,30})", re.ASCII)
 
@@ -32,14 +32,14 @@ class OverLink(Strict):
     over: LinkName = Field(default="", exclude_if=schema.is_empty)
 
     def capture_interface(self, scene: Scene, role: Role) -> str:
-        """Return the interface on which a capture of the link runs; `any` for a link that uses any interface."""
+        """Return the interface on which the link is captured; `any` if its packets may use any interface."""
         interface = scene.link(role, self.over).interface
         return ANY if interface == LOOPBACK else interface
 
     def route_need(self, scene: Scene, source: Role, destination: Role) -> Iterator[Need]:
         """Yield the check that the route from a robot to another uses this link.
 
-        There is no check for the radio under test, and for a link that may use any interface.
+        There is no check for the radio under test, nor for a link whose packets may use any interface.
         """
         source_link, destination_link = scene.link(source, self.over), scene.link(destination, self.over)
         if self.over and source_link.interface != LOOPBACK:

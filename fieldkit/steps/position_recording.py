@@ -26,8 +26,11 @@ from fieldkit.steps.view import View
 LIMIT_S: Final = 900.0
 """Time limit of a recording in addition to the limits of the steps inside."""
 CLOSE_S: Final = 10.0
+"""Time that a stopped recorder has to close its file."""
 _QUERY_S: Final = 15.0
+"""Timeout of a query of a robot's clock."""
 _ROUNDING_M: Final = 1e-3
+"""Maximum difference between the recorded and the planned position that rounding causes."""
 
 COLUMNS: Final = columns(
     100,
@@ -115,17 +118,17 @@ def stationary_robots(nest: Nest, scene: Scene) -> Mapping[Role, PositionSource]
     return {role: PositionSource(place=places_m[role]) for role in nest.roles() if role in places_m}
 
 
-def placement_error(what: str, within: Sequence[EnclosingStep]) -> str | None:
-    """Return the reason why a step that records positions must not be inside other steps; None if it may.
+def placement_error(kind: str, within: Sequence[EnclosingStep]) -> str | None:
+    """Return the reason why a step that records positions must not be inside the steps around it; None if it may.
 
     Args:
-        what: The step, for the message.
-        within: The steps around it.
+        kind: The kind of the step, for the message.
+        within: The steps that contain it.
     """
     if any(nest.has_path for nest in within):
-        return f"a {what} starts where robots were placed: put the move into the {what}"
+        return f"a {kind} must start before robots move: put the move into the {kind}"
     if any(nest.disturbs or nest.parallel for nest in within):
-        return f"a {what} must not be inside a fault or a together: put them into the {what}"
+        return f"a {kind} must not be inside a fault or a together: put them into the {kind}"
     return None
 
 
@@ -144,7 +147,10 @@ def problems(view: View, roles: Sequence[Role]) -> Iterator[str]:
 
 
 def _place_problems(view: View, sources: PositionSources) -> Iterator[str]:
-    """Yield a reason for each robot whose fixed position or start differs from its placement."""
+    """Yield a reason for each robot whose fixed position or start differs from its placement.
+
+    Positions in another frame, and positions with times from another clock, are not compared.
+    """
     for role, position_source in sources.robots.items():
         planned_m = view.scene.places_m.get(role)
         recorded_m = position_source.place if position_source.place is not None else position_source.start
@@ -157,7 +163,7 @@ def _place_problems(view: View, sources: PositionSources) -> Iterator[str]:
             continue
         deviation_m = math.dist(planned_m, [metres or 0.0 for metres in recorded_m])
         if deviation_m > _ROUNDING_M:
-            yield f"{position_sources.FILE} has the {role} {deviation_m:.1f} m from its placement"
+            yield f"in {position_sources.FILE}, the {role} is {deviation_m:.1f} m away from its placement"
 
 
 def measure(view: View) -> Measured:

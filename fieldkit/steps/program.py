@@ -1,4 +1,4 @@
-"""Base class of steps that run one program on one robot and parse its output: the simplest new kind of step."""
+"""Base class of steps that run one program on one robot and parse its output: the simplest way to add a kind."""
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
@@ -96,10 +96,10 @@ class ProgramStep(Step):
         ending = (after.endings or {}).get(self.prefixed_name(self.kind_name())) if after else None
         if ending is not None and ending.code is not None and ending.code not in self.exit_codes:
             yield f"{view.scene.robot(self.robot).name}: {self.kind_name()} ended with exit code {ending.code}"
-        names: dict[str, list[str]] = {}
+        names_by_reason: dict[str, list[str]] = {}
         for name, reason in self.measure(view).missing.items():
-            names.setdefault(reason, []).append(name)
-        yield from (f"{self._output}: no {', '.join(missing)}: {reason}" for reason, missing in names.items())
+            names_by_reason.setdefault(reason, []).append(name)
+        yield from (f"{self._output}: no {', '.join(names)}: {reason}" for reason, names in names_by_reason.items())
 
     @override
     def measure(self, view: View) -> Measured:

@@ -35,5 +35,5 @@ def judge(answer: CommandResult) -> tuple[Verdict, str, str]:
     protocols = list(dict.fromkeys(answer.text.split()))
     if answer.ok and protocols:
         return Verdict.OK, ", ".join(protocols), ""
-    what = "no routing protocol runs on it: no daemon such as babeld, no batman-adv, no 802.11s"
-    return Verdict.FAIL, what, "start one on each robot, see: fieldkit docs mesh"
+    problem = "no routing protocol runs on it: no daemon such as babeld, no batman-adv, no 802.11s"
+    return Verdict.FAIL, problem, "start one on each robot, see: fieldkit docs mesh"

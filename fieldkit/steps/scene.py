@@ -33,6 +33,8 @@ GOOD_BIT_S: Final = 25e6
 """Approximate TCP throughput on a good 802.11n link with one stream in 20 MHz."""
 
 _HEADER_BYTES: Final = 8
+"""Size of a UDP header, and of the ICMP header of an echo request."""
+
 _FRAGMENT_BYTES: Final = 1480
 """Payload of an IPv4 packet in an Ethernet frame, including the UDP or ICMP header."""
 
@@ -40,6 +42,7 @@ BY_EXIT: Final = frozenset({Cause.EXITED})
 BY_LIMIT: Final = frozenset({Cause.LIMIT})
 BY_EXIT_OR_LIMIT: Final = BY_EXIT | BY_LIMIT
 BY_FIELDKIT: Final = frozenset({Cause.STOPPED})
+"""Values of `Planned.permitted_causes`: the job exits, is stopped at its time limit, or is stopped by fieldkit."""
 
 
 @dataclass(frozen=True)
@@ -287,7 +290,7 @@ class ListeningPort:
         peer: Role of the robot that connects or sends to it.
         source: Role of the robot (one of these two) that sends the data, if the step identifies its connections by
             the ports of both ends; None if it identifies them by this port alone.
-        by: Key of the step that changes the port.
+        by: YAML key of the step that sets the port.
         shared: Whether several programs can listen on the port at the same time.
     """
 

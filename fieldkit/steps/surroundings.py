@@ -1,4 +1,4 @@
-"""The information that a step has about the steps before it and around it."""
+"""Interfaces of the steps that start before a step and of the steps that contain it."""
 
 from collections.abc import Mapping
 from typing import ClassVar, Protocol
@@ -14,7 +14,7 @@ class EarlierStep(Protocol):
 
 
 class EnclosingStep(Protocol):
-    """A step around another one, see `Nest`.
+    """A step that contains another one, see `Nest`.
 
     Attributes:
         disturbs: Whether it may make the steps inside fail.

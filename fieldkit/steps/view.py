@@ -18,7 +18,7 @@ class View:
     Attributes:
         scene: The attempt.
         evidence: The files of the attempt.
-        within: The steps around the measured step, the outermost first.
+        within: The steps that contain the measured step, the outermost first.
     """
 
     scene: Scene
@@ -26,15 +26,15 @@ class View:
     within: Sequence[EnclosingStep] = ()
 
     def capture(self, role: Role) -> Capture | None:
-        """Return the capture of a robot around the step; None if there is none or it is incomplete."""
+        """Return the robot's capture that contains the step; None if there is none, or if it is incomplete."""
         name = capture_around(self.within, role)
         return None if name is None or self.dropped_packets(role) else self.evidence.undamaged_capture(name)
 
     def dropped_packets(self, role: Role) -> int:
         """Return the number of packets that a robot's kernel and interface dropped before tcpdump.
 
-        It is 0 without a capture around the step, and without counters of tcpdump; another check reports missing
-        counters.
+        The number is 0 if no capture contains the step, and if tcpdump's counters are missing. Another check reports
+        missing counters.
         """
         name = capture_around(self.within, role)
         log = (
@@ -57,10 +57,10 @@ class View:
 
 
 def capture_around(within: Sequence[EnclosingStep], role: Role) -> str | None:
-    """Return the file of the innermost capture of a robot around a step; None if the robot does not capture.
+    """Return the file of the innermost capture around a step on one robot; None if the robot does not capture.
 
     Args:
-        within: The steps around the step, the outermost first.
+        within: The steps that contain the step, the outermost first.
         role: Role of the robot.
     """
     files = (step.captures().get(role) for step in reversed(within))

@@ -38,7 +38,7 @@ ATTEMPT_CHECKS: Final = (
         tolerance="none; if a file is missing, changes cannot be detected",
     ),
     CrossCheck(
-        quantity="computers, and the neighbourhood of radios",
+        quantity="state of computers, and other Wi-Fi networks",
         columns=("*_cpu_share", "*_temperature_c", "*_power_state", "*_battery_*", "*_disk_free_bytes", "*_other*"),
         source="`ROLE-sources-before.txt`, `ROLE-sources-after.txt`",
         against=(),

@@ -1,4 +1,4 @@
-"""The columns in `trial.yaml`: the columns of the trial's table that not every trial has."""
+"""The columns that `trial.yaml` lists: the columns of the trial's table that are not in the table of every trial."""
 
 import json
 import sys
@@ -12,7 +12,7 @@ from fieldkit.config.schema import AfterValidator, Field, Int, Number, Strict
 from fieldkit.core.columns import Column, Figure, Kind
 
 MAX_COLUMNS: Final = 3000
-"""Maximum number of columns of a trial that not every trial has."""
+"""Maximum number of columns that a trial's table has in addition to the columns of every trial."""
 _MAX_FLOAT: Final = sys.float_info.max  # the YAML reader rejects infinity, and no column has such a value
 
 

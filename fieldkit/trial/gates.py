@@ -23,7 +23,9 @@ from fieldkit.trial.procedure import PlacedStep, Procedure
 from fieldkit.trial.step_errors import StepErrors
 
 _TIME_UNITS: Final = frozenset(("s", "bit/s", "m/s", "ppm"))
-_NO_TIMES: Final = "its clock counts the instructions of a processor in software"
+_NO_TIMES: Final = (
+    "the backend's clock counts instructions of an emulated processor, so it measures no real durations"
+)
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
     fixed = {role: name for role, name in names.items() if role not in roaming}
     problems += attempt_states.problems(evidence, fixed, plan.radios)
     measured = attempt_states.measure(evidence, names, measured)
-    # Without this, an optional file would be treated as missing, and the error of its reader would not be reported.
+    # If the reader of an optional file raises an exception, the file counts as missing. This reports the exception.
     problems += (
         step_errors.add(f"{name} cannot be read", error) for name, error in tuple(evidence.unexpected_errors)
     )

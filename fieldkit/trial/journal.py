@@ -53,13 +53,13 @@ _CODEC: Final = Codec(JournalEntry)
 
 @dataclass(frozen=True)
 class Attempt:
-    """An attempt that ended.
+    """One attempt at a repeat.
 
     Attributes:
         repeat: The repeat.
         number: Number of the attempt.
         started_utc_ns: Start, nanoseconds since 1970 UTC.
-        status: Final status.
+        status: Final status, or `running` or `measured` if the attempt has not ended.
         reason: Reason why the attempt is not valid.
         excused: True if the attempt is not one of the allowed attempts, because it was interrupted from outside or
             its repeat was reopened later.
@@ -79,7 +79,7 @@ class Attempt:
         """Name of the attempt's folder in `repeats/`: `udp-07`, or `udp-07.void1` if the attempt was repeated."""
         return self.repeat.folder(self.status, self.number)
 
-    def remote(self, trial: str) -> str:
+    def remote_folder(self, trial: str) -> str:
         """Return the attempt's folder on each robot."""
         return jobs.work_folder(trial, f"{self.repeat}-{self.number}")
 
@@ -90,7 +90,7 @@ class Attempt:
 
 
 def locked(folder: Path) -> AbstractContextManager[None]:
-    """Return a context that locks a trial against other processes of fieldkit.
+    """Return a context manager that locks a trial against other processes of fieldkit.
 
     Raises the same errors as `jsonl.locked`.
     """

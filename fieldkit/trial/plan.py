@@ -43,7 +43,7 @@ class Plan(Strict):
         profiles_sha256: Hash of the profiles of the cast.
         procedure_sha256: Hash of the procedure.
         backend: Name of the backend.
-        session: ID of the run of fieldkit in the robots' locks; a resumed trial uses the same value.
+        session: ID of the run of fieldkit, which the robots' locks contain; a resumed trial uses the same value.
         seed: Seed of all random numbers.
         notes: Notes of the operator.
         topology: Topology.
@@ -58,8 +58,8 @@ class Plan(Strict):
         step_packages: The package of each kind of step that does not ship with fieldkit.
         radios: Channel and regulatory domain of each robot's radio at the start, which must not change during the
             trial; empty if they are unknown.
-        columns: Columns of its steps that not every trial has; None if there are none, or if an earlier fieldkit
-            planned the trial.
+        columns: Columns of the trial's table that not every trial has; None if the trial was planned by an earlier
+            version of fieldkit, which did not store them.
     """
 
     schema_version: Int

@@ -1,4 +1,4 @@
-"""Sections of procedures: keys that installed packages add, and the methods with which they take part in a trial."""
+"""Sections of procedures: keys that installed packages add, with methods that are called during a trial."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext

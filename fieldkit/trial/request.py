@@ -1,4 +1,4 @@
-"""The operator's request for a trial, and the plan that follows from it."""
+"""The operator's request for a trial, and the plan that is made from it."""
 
 import platform
 from collections.abc import Iterator, Mapping
@@ -140,7 +140,7 @@ def _telemetry_columns(cast: Cast) -> Iterator[Column]:
 
 def _robot_data(cast: Cast) -> dict[str, object]:
     """Return the data that distinguishes the robots of this trial from the robots of other trials."""
-    # Earlier versions hashed the key "mavlink" even without this section, and equal robots must have equal hashes.
+    # Equal robots must have the same hash as in earlier versions, which included the key "mavlink" in every profile.
     data: dict[str, object] = {
         role: {"mavlink": None, **robot.profile.model_dump(mode="json")} for role, robot in cast.items()
     }

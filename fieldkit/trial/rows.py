@@ -1,4 +1,4 @@
-"""Rows of trial.csv and summary.csv. The rows of a repeat are the same during the trial and when it is read later."""
+"""Rows of trial.csv and summary.csv. Measuring an attempt again after the trial gives the same row."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import filterfalse
@@ -105,7 +105,7 @@ def _is_loss(part: str) -> bool:
 
 
 def _lost_all(row: Row) -> bool:
-    """Return True if the repeat has columns of losses and all of them are 1."""
+    """Return True if the row has loss columns and all of them are 1."""
     losses = [value for name, value in row.items() if columns.plain_name(name) in LOSSES]
     return bool(losses) and all(isinstance(loss, float | int) and loss >= 1 for loss in losses)
 

@@ -1,7 +1,7 @@
-"""Trials that a simulation reproduces. The steps that measure the evidence of robots also measure its evidence.
+"""Trials that a simulation reproduces. Their evidence is measured by the same steps as the evidence of robots.
 
-The simulation writes captures of both ends and the output of ping as files of an attempt. Columns that need other
-evidence are missing.
+The simulation provides captures of both ends and the output of ping, which are written to the files of an attempt.
+Columns that need other evidence are missing.
 """
 
 import math
@@ -28,7 +28,7 @@ from fieldkit.trial.procedure import load_procedure
 from fieldkit.trial.request import TrialRequest, make_plan
 
 KINDS: Final = ("capture", "ping", "record", "transfer")
-"""Kinds of step that a simulation can reproduce. Of a recording, it reproduces only the size."""
+"""Kinds of step that a simulation can reproduce. Only the size of a recording is reproduced."""
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,7 @@ def _goodput(row: Mapping[str, Value]) -> dict[str, Value]:
         return {}
     head_bytes, datagrams = 0, row.get("datagrams_received")
     if isinstance(datagrams, int) and datagrams and row.get("datagrams_sent") == row.get("ip_packets_sent"):
-        head_bytes = -(-received_bytes // datagrams)
+        head_bytes = math.ceil(received_bytes / datagrams)
     return {"goodput_bit_s": 8 * max(received_bytes - head_bytes, 0) / completion_s}
 
 

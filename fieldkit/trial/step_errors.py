@@ -1,4 +1,4 @@
-"""Errors in the code of a step kind: a message for the operator, and a log with the traceback, which it names."""
+"""Errors in the code of a step kind. The operator gets a message, which names a log file with the traceback."""
 
 import errno
 import tempfile

@@ -27,6 +27,7 @@ from sim_backends.cosim.policies.sync_policy import (
     PolicyError,
     Situation,
     SyncPolicy,
+    looks_ahead,
     missing_members,
 )
 from sim_backends.cosim.run_record import EventDigest, Fate, Run, Window, WindowObserver
@@ -172,7 +173,7 @@ class Coordinator:
         """
         policy, agents, network, situation = self.policy, self._agents, self._network, self.situation
         windows_ns, quiet_ends_ns = self.run.windows_ns, self._digest.quiet_ends_ns
-        looking_ahead = policy if isinstance(policy, LookingAhead) else None
+        looking_ahead = policy if looks_ahead(policy) else None
         uses_end_states, lap = policy.uses_end_states, self._wall_time.lap
         is_observed = self._observer is not None or report is not None
         self._wall_time.start()

@@ -104,7 +104,7 @@ class EmulatedBackend:
     def simulators(self) -> Mapping[str, str]:
         """Implement `Simulating.simulators`."""
         if self._options.has_linux_wifi:
-            from sim_backends.emulated.linux_wifi import virtual_machine  # noqa: PLC0415 (other labs need none of it)
+            from sim_backends.emulated.linux_wifi import virtual_machine  # noqa: PLC0415 (only some labs use it)
 
             clock = {CLOCK: INSTRUCTIONS} if virtual_machine.clock_counts_instructions() else {}
             return {"wifi": "linux", **clock}
@@ -119,7 +119,7 @@ class EmulatedBackend:
         """Implement `Relocating.must_relocate`: Linux Wi-Fi needs hwsim radios in this kernel."""
         if not self._options.has_linux_wifi:
             return False
-        from sim_backends.emulated.linux_wifi import radios  # noqa: PLC0415 (other labs need none of it)
+        from sim_backends.emulated.linux_wifi import radios  # noqa: PLC0415 (only some labs use it)
 
         return not radios.can_use_radios()
 
@@ -151,7 +151,7 @@ class EmulatedBackend:
         """Implement `Backend.lab_bytes`: fixed links have no transmission attempts to record."""
         if not self._options.record_air or self._options.radio.is_fixed:
             return 0
-        from sim_backends.emulated.medium.air_log import LIMIT_BYTES  # noqa: PLC0415 (random streams of numpy: 20 ms)
+        from sim_backends.emulated.medium.air_log import LIMIT_BYTES  # noqa: PLC0415 (it imports numpy, which is slow)
 
         return LIMIT_BYTES
 
@@ -232,7 +232,7 @@ class EmulatedBackend:
             sink(Note("control: radio applies to trials; in a lab SSH bypasses the radio and reaches every robot"))
         members = self._members()
         if self.must_relocate:
-            from sim_backends.emulated.linux_wifi import guest_lab  # noqa: PLC0415 (other labs need none of it)
+            from sim_backends.emulated.linux_wifi import guest_lab  # noqa: PLC0415 (only some labs use it)
 
             sink(Note("starting a virtual machine, because this kernel has no mac80211_hwsim"))
             draw = partial(interactive_lab.overview, members, options=self._options, world=self._world)
@@ -280,7 +280,7 @@ class EmulatedBackend:
     def _check_infrastructure(self, names: Iterable[str], *, has_relay: bool) -> None:
         if not self._options.radio.has_infrastructure:
             return
-        from sim_backends.radio.infrastructure import infrastructure  # noqa: PLC0415 (other labs need none of it)
+        from sim_backends.radio.infrastructure import infrastructure  # noqa: PLC0415 (only some labs use it)
 
         if problem := infrastructure.conflict(self._options.radio, [*names], has_relay=has_relay):
             raise ConfigurationError(
@@ -307,9 +307,9 @@ class EmulatedBackend:
 
     def _note_simulators(self, sink: Sink) -> None:
         if self.simulators:
-            purposes = "the robots have:" if self._options.has_linux_wifi else "the robots run on the co-simulation:"
+            subject = "the robots have:" if self._options.has_linux_wifi else "the robots run on the co-simulation:"
             texts = (f"{purpose} {simulator}" for purpose, simulator in self.simulators.items())
-            sink(Note(f"{purposes} {', '.join(texts)}"))
+            sink(Note(f"{subject} {', '.join(texts)}"))
 
     def _find_ros(self, names: Iterable[str]) -> RosChoice:
         """Check that this machine has the programs that these robots need, and return the source of their ROS."""

@@ -213,14 +213,16 @@ class EmulatedOptions(Strict):
     def _network_supports_options(self) -> "EmulatedOptions":
         if self.network in {None, "builtin"}:
             return self
-        for key, is_used, what in (
+        for key, is_used, feature in (
             ("radio", self.radio.is_fixed, "fixed links (`loss`, `delay`, `rate` or `jitter`)"),
             ("radio", self.radio.has_infrastructure, ", ".join(f"`{name}`" for name in INFRASTRUCTURE)),
             ("record_air", self.record_air, "`record_air`"),
             ("mesh", self.mesh is not None, "`mesh`"),
         ):
             if is_used:
-                cause = f"the network {self.network} does not support {what}; remove it, or write `network: builtin`"
+                cause = (
+                    f"the network {self.network} does not support {feature}; remove it, or write `network: builtin`"
+                )
                 raise schema.validation_error(cause, key)
         return self
 

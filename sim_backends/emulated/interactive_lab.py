@@ -41,7 +41,7 @@ class EmulatedLab:
         world: The world around the robots.
 
     Raises:
-        LinkError: The medium ended or did not answer.
+        LinkError: The medium process exited or did not answer.
     """
 
     def __init__(

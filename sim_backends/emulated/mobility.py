@@ -23,15 +23,17 @@ from sim_backends.world.world import World
 STEP_M: Final = 0.1
 """Distance that a robot may move between two updates of the medium.
 
-The loss grows by 10 n / (ln 10 d) dB per metre: at 10 m with n = 3 by 1.3 dB/m, so a step changes it by 0.13 dB.
-Fading, which changes within a wavelength of 0.12 m, continues between the updates.
+At the distance d, the path loss increases by 10 n / (ln 10 d) dB per metre, with the path-loss exponent n. At 10 m
+and n = 3 this is 1.3 dB/m, so a step changes it by 0.13 dB. Fading, which changes within a wavelength (0.12 m),
+continues between the updates.
 """
 
 _MIN_PERIOD_S: Final = 0.02
 _MAX_PERIOD_S: Final = 0.1
 
 WATCH_S: Final = 0.05
-"""Polling interval for robots that steer themselves, while they are at rest: at 0.2 m/s an error of 1 cm."""
+"""Polling interval for robots that steer themselves, while they are at rest; a robot that starts to drive at 0.2 m/s
+moves 1 cm within it."""
 
 
 class MotionThread:
@@ -151,7 +153,7 @@ class Mobility:
         """Move all robots to their positions, immediately.
 
         Raises:
-            LinkError: The medium ended or did not answer.
+            LinkError: The medium process exited or did not answer.
         """
         with self._lock:
             self._placement = placement
@@ -172,7 +174,7 @@ class Mobility:
         If the relay is out of range, no robot receives packets of another robot.
 
         Raises:
-            LinkError: The medium ended or did not answer.
+            LinkError: The medium process exited or did not answer.
             RobotError: The robots have not been placed yet.
         """
         with self._lock:
@@ -182,10 +184,10 @@ class Mobility:
 
     @contextmanager
     def moving(self, move: Move) -> Iterator[None]:
-        """Move a robot while the body runs; then move it back to its position, also after an error.
+        """Move a robot while the body runs; then move it back to its position, even after an error.
 
         Raises:
-            LinkError: The medium ended or did not answer.
+            LinkError: The medium process exited or did not answer.
             RobotError: The robots have not been placed yet.
         """
         motion = positions.motion(self._cast, self._require_placement(), move, self._world)
@@ -223,10 +225,14 @@ class Mobility:
         return self_steered_motions(self._robots, self._path_starts_ns)
 
     def track(self, since_utc_ns: int) -> tuple[TrackPoint, ...]:
-        """Return the positions of all robots from a time on; earlier ones are discarded."""
+        """Return the track points after a time, and the last point of each robot before it; discard older points."""
         with self._lock:
-            last = {point.role: number for number, point in enumerate(self._track) if point.utc_ns <= since_utc_ns}
-            self._track = [point for number, point in enumerate(self._track) if number >= last.get(point.role, 0)]
+            first_kept = {
+                point.role: number for number, point in enumerate(self._track) if point.utc_ns <= since_utc_ns
+            }
+            self._track = [
+                point for number, point in enumerate(self._track) if number >= first_kept.get(point.role, 0)
+            ]
             return tuple(self._track)
 
     def _send_path(self, move: Move, start_ns: int) -> None:

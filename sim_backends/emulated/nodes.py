@@ -80,8 +80,8 @@ class Node:
 
         Args:
             mesh: True if robots forward packets for each other.
-            guest_hello_s: Hello interval of a node that uses the robots' routes and forwards nothing itself; None if
-                the node is a robot with a complete routing daemon, or needs none.
+            guest_hello_s: Hello interval of the routing daemon of the laptop, which uses the robots' routes but
+                forwards no packets. None for a robot, or without a mesh.
 
         Raises:
             LinkError: The node has exited or did not answer.
@@ -182,7 +182,7 @@ class EmulatedRobot(Node):
         self.physics_fds = (fd, *others) if others else ()
 
     def open_wifi(self, device: str) -> None:
-        """Bring up the Wi-Fi interface `device`, which was moved to the robot. Raises the errors of `open_radio`."""
+        """Bring up the Wi-Fi interface `device` in the robot's namespace. Raises the errors of `open_radio`."""
         if self.spec.wifi is None:
             raise RobotError("it has no Linux Wi-Fi", where=self.name)
         link = {"device": device, "interface": self.interface, "address": self.address}
@@ -230,15 +230,21 @@ class EmulatedRobot(Node):
         self._worker.request({"do": "kill", "process": process})
 
     def move(self, path: AssignedPath) -> None:
-        """Send the robot's sensors the path on which the lab moves it. Raises the errors of `open_radio`."""
+        """Send the robot the path on which the lab moves it. Raises the errors of `open_radio`."""
         self._worker.request({"do": "move", "path": asdict(path)})
 
     def halt(self) -> None:
-        """Cut the power: kill all processes but init, and discard the memory. Raises the errors of `open_radio`."""
+        """Emulate a loss of power: kill all processes except init, and clear the folders that are in memory.
+
+        Raises the errors of `open_radio`.
+        """
         self._worker.request({"do": "halt", "interfaces": self._interfaces})
 
     def boot(self) -> None:
-        """Boot after `halt`: the interface is up and the programs are starting. Raises the errors of `open_radio`."""
+        """Boot after `halt`: bring up the interfaces and start the programs, without waiting until they are ready.
+
+        Raises the errors of `open_radio`.
+        """
         self._worker.request({"do": "boot", "interfaces": self._interfaces, "robot": asdict(self.spec)})
 
     @override
@@ -247,7 +253,7 @@ class EmulatedRobot(Node):
         if self._record is not None:
             self._record.close()
             self._record = None
-        for fd in (*self.physics_fds[1:], *self.link_fds.values()):  # the first one belongs to the record
+        for fd in (*self.physics_fds[1:], *self.link_fds.values()):  # the motion record has closed the first one
             os.close(fd)
         self.physics_fds = ()
         self.link_fds = {}
@@ -279,7 +285,7 @@ class Laptop(Node):
 
 
 _MAX_PARALLEL_STARTS: Final = 16
-"""Number of robots that are built and started at the same time; each needs a thread here and processor time."""
+"""Maximum number of robots that are built and started at the same time; each needs a thread and processor time."""
 
 
 @dataclass(frozen=True)
@@ -328,7 +334,7 @@ def running_robots(
         wifi: Mapping[RobotKey, WifiSpec] = {}
         radios: Mapping[str, HwsimRadio] = {}
         if options.has_linux_wifi:
-            from sim_backends.emulated.linux_wifi import lab  # noqa: PLC0415 (other labs need none of it)
+            from sim_backends.emulated.linux_wifi import lab  # noqa: PLC0415 (only some labs use it)
 
             wifi = lab.wifi_specs(robots, options.linux_wifi, options.radio)
             radios = lab.radios_of(robots.values(), options.radio)

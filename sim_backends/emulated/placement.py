@@ -15,17 +15,19 @@ from sim_backends.world.motion import Motion, OnGround, State, WayPoints
 from sim_backends.world.world import Line, World
 
 _OPERATOR_M: Final = 2.0
+"""Distance of the operator's laptop from the robot that does not move."""
 _SPACING_M: Final = 5.0
+"""Maximum distance of neighbouring robots in an interactive lab."""
 
 _CEILING_M: Final = 100_000.0
-"""Maximum height of a flying robot: space begins there (FAI)."""
+"""Maximum height of a flying robot: the boundary of space by the definition of the FAI."""
 
 
 def positions_m(cast: Cast, placement: Placement, world: World) -> dict[str, Vector]:
     """Return the position of each antenna, metres east, north, up, on the world's line for the scenario.
 
-    The sender is at the end of the line, where an obstacle blocks the line of sight if the scenario has one (paper,
-    section VI-A); `geometry.positions_m` determines the distances of the other robots from it.
+    The line starts at the sender. If the scenario has an obstacle, it is at that end of the line (paper, section
+    VI-A). `geometry.positions_m` determines the distances of the other robots from the sender.
 
     Raises:
         ConfigurationError: The world has no line for the scenario.
@@ -94,7 +96,7 @@ def antenna_m(world: World, point_m: tuple[float, float]) -> Vector:
 
 
 def below_antenna_m(antenna_m: Vector) -> Vector:
-    """Return the lowest point of a robot with its antenna at a position."""
+    """Return the lowest point of a robot whose antenna is at `antenna_m`."""
     east_m, north_m, up_m = antenna_m
     return east_m, north_m, up_m - ANTENNA_M
 

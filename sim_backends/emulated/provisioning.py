@@ -44,13 +44,11 @@ NETWORK: Final = IPv4Network("10.42.0.0/24")
 LAPTOP_ADDRESS: Final = NETWORK[-2]
 """Address of the laptop; robots have lower addresses."""
 LAPTOP_NAME: Final = "laptop"
-MAX_LINKS: Final = 200
-"""Number of further links that have addresses: 10.42.N.0/24 is the network of the Nth."""
 
 _DEFAULTS: Final = EmulatedOptions.defaults()
 
-BRIDGE_PATIENCE_S: Final = 20
-"""Time that a bridge waits for the ROS master, which starts at the same time."""
+BRIDGE_TIMEOUT_S: Final = 20
+"""Time limit for the connection of a bridge to the ROS master, which is started at the same time."""
 
 RobotKey = TypeVar("RobotKey")
 """Type of the keys that identify robots: a role in a trial, a name in an interactive lab."""
@@ -87,20 +85,23 @@ class KeyPair:
 def definition(kind: str, text: str = "") -> Definition:
     """Return the definition of the ROS 1 message type `package/Name`; `text` is used if ROS has no such type.
 
-    Raises the errors of `template_of`.
+    Raises the errors of `templates.template_of`.
     """
-    from sim_backends.emulated.ros import templates  # noqa: PLC0415 (rosbags takes 50 ms, as above)
+    from sim_backends.emulated.ros import templates  # noqa: PLC0415 (it imports rosbags, which takes 50 ms)
 
     return templates.definition_of(kind, text)
 
 
 def sensors_of(robot: "Robot | LabRobot") -> tuple[Sensor, ...]:
-    """Return the sensors of a robot, one per published topic. Raises the errors of `template_of`."""
+    """Return the sensors of a robot, one per published topic. Raises the errors of `templates.template_of`."""
     return tuple(_sensor(topic) for topic in robot.profile.topics)
 
 
 def _definitions(robot: "Robot | LabRobot") -> dict[str, Definition]:
-    """Return the definitions of the message types that a robot publishes. Raises the errors of `template_of`."""
+    """Return the definitions of the message types that a robot publishes.
+
+    Raises the errors of `templates.template_of`.
+    """
     definitions = {topic.type: definition(topic.type, topic.definition) for topic in robot.profile.topics}
     if static_frames.links(sensors_of(robot)):
         definitions[static_frames.TYPE] = definition(static_frames.TYPE)
@@ -138,7 +139,7 @@ def _neighbours(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) ->
 def neighbour(number: int, profile: RobotProfile) -> Neighbour:
     """Return the body of a robot from the ground up to its antenna, or to its top if that is higher.
 
-    A profile whose body is not in the table has the body of the paper's robot of its kind.
+    A robot whose body is unknown has the body of the paper's ground robot or of the paper's drone.
     """
     from sim_backends.physics.robot_limits import (  # noqa: PLC0415 (a dry run makes no robots)
         BODIES,
@@ -175,7 +176,8 @@ def _registered_topics(robots: "Mapping[RobotKey, Robot | LabRobot]", key: Robot
 def drives_by_topic(profile: RobotProfile, options: EmulatedOptions) -> bool:
     """Return True if robots of a profile can be driven by a topic of Debian's ROS 1, or of ROS 2 over the radio.
 
-    The result is False with a Zenoh router on another robot, because the driver discovers only the base of its robot.
+    The result is False in a lab with a Zenoh router, because the program that drives a robot connects only to ROS
+    nodes on the same robot.
     """
     ros = profile.ros
     if drive_of(profile) is None or ros is None:
@@ -209,6 +211,7 @@ def link_addresses(profile: RobotProfile, address: str, options: EmulatedOptions
         ConfigurationError: The lab does not emulate a link of the profile.
     """
     last_byte = int(IPv4Address(address)) - int(NETWORK.network_address)
+    # The Nth link in alphabetical order has the network 10.42.N.0/24.
     networks = {name: NETWORK.network_address + 256 * number for number, name in enumerate(sorted(options.links), 1)}
     for name, interface in profile.further_links.items():
         if interface == LOOPBACK_INTERFACE and options.mesh is not None:
@@ -279,7 +282,7 @@ def _bridge(robot: "Robot | LabRobot") -> tuple[str, ...]:
     ros = robot.profile.ros
     if ros is None or ros.bridge is None or isinstance(robot, Robot):
         return ()
-    return ros.bridge.command(robot.address, "", BRIDGE_PATIENCE_S)
+    return ros.bridge.command(robot.address, "", BRIDGE_TIMEOUT_S)
 
 
 def robot_spec(

@@ -26,13 +26,15 @@ from sim_backends.federates.named import (
 from sim_backends.physics.robot_limits import BODIES, TURTLEBOT3_BURGER, DriveLimits, quadrotor
 
 _EXTERNAL_NETWORK = SyncOptions.model_validate({"name": "sliding_window", "window": "2ms"})
-"""Default for a network in another process, because an exchange at each of its events would take too long for real
-time: ns-3 has about 14 events per packet, and an exchange takes 0.2 ms."""
+"""Default sync policy for a network simulator in another process.
 
+An exchange at every event of the network would be too slow for real time, because ns-3 has about 14 events per packet
+and an exchange takes 0.2 ms.
+"""
 
 GAZEBO: Final = "gazebo"
 _EXTERNAL_PHYSICS = SyncOptions.model_validate({"name": "sliding_window", "window": "10ms"})
-"""Default for Gazebo, because an exchange at each step of 1 ms would take too long for real time."""
+"""Default sync policy for Gazebo. An exchange at every physics step (1 ms) would be too slow for real time."""
 
 
 def sync_of(options: EmulatedOptions) -> SyncOptions:
@@ -78,8 +80,8 @@ def _physics(options: EmulatedOptions) -> str:
 def _gazebo_options() -> dict[str, Any]:
     """Return the options of Gazebo, with its partition and address from the environment.
 
-    They are options because the medium does not inherit the environment. Velocities are means over a window, because
-    velocities over its last step would need a second request per window.
+    The medium process does not inherit these environment variables, so it receives them as options. Velocities are
+    means over a window, because the velocities over its last step would need a second request per window.
     """
     set_options = {
         option: os.environ.get(f"GZ_{variable}") or os.environ.get(f"IGN_{variable}")
@@ -105,9 +107,10 @@ def bodies_of(robots: Iterable[Robot | LabRobot]) -> dict[str, RobotBody]:
 
 
 def _body(profile: RobotProfile) -> RobotBody:
-    """Return the body of a profile, or of a TurtleBot3 if there is none, with the limits of its base.
+    """Return the body of a robot with this profile, and its limits of motion.
 
-    A drone has the limits of its airframe, because its autopilot enforces the limits of the profile.
+    A ground robot whose body is unknown has the body of a TurtleBot3; its limits are those in the profile. A drone
+    has the limits of its airframe, because its autopilot enforces the limits in the profile.
     """
     if mavlink_of(profile) is not None:
         return RobotBody(profile.name, quadrotor(profile.name))
@@ -123,10 +126,11 @@ def summary(options: EmulatedOptions) -> Mapping[str, str]:
     """Return texts for `physics`, `network`, `sync` (the policy) and `step` (of the physics simulator) of a lab."""
     sync = sync_of(options)
     policy = make_policy(sync.name, **sync.parameters)
-    defaults = {name: parameter.default for name, parameter in inspect.signature(type(policy)).parameters.items()}
     values = sync.parameters
+    # A name ends with its unit: `window_s` is shown as `window 0.002 s`.
+    names_and_units = {name: name.rsplit("_", 1) for name in inspect.signature(type(policy)).parameters}
     parameter_texts = [
-        f"{name.rpartition('_')[0]} {values[name]:g} {name.rpartition('_')[2]}" for name in defaults if name in values
+        f"{text} {values[name]:g} {unit}" for name, (text, unit) in names_and_units.items() if name in values
     ]
     return {
         "physics": options.physics or KINEMATIC,

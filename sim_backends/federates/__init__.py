@@ -1,1 +1,1 @@
-"""Federates outside the coordinator's process: their protocols, the wire protocol, both of its sides, conformance."""
+"""External federates (simulators in other processes), their wire protocol, and conformance checks."""

@@ -15,11 +15,11 @@ def main(role_name: str, name: str, address: str | None = None) -> None:
 
     Args:
         role_name: `physics` or `network`.
-        name: Its name.
+        name: Name of the federate.
         address: Address of a transport; None for standard input and output.
 
     Raises:
-        SystemExit: There is no such federate.
+        SystemExit: The federate with this name is not a Python class.
     """
     (role,) = (number for number, text in ROLES.items() if text == role_name)
     federate = named_federate(name, role)

@@ -195,7 +195,7 @@ def states_bytes(states: Mapping[str, State], agents: AgentTable, limits_m_s2: M
     Args:
         states: The states.
         agents: The agents.
-        limits_m_s2: Acceleration limits of the agents; None if the message contains no limits.
+        limits_m_s2: Acceleration limits of the agents; None if the receiver ignores them.
     """
     count = len(states)
     if limits_m_s2 is None and isinstance(states, ReceivedStates) and states.has_indices(agents):

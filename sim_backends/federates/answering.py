@@ -48,7 +48,7 @@ class FederateService:
     """A federate and its properties.
 
     Attributes:
-        make: Returns a physics or network federate for a run.
+        make: Creates the physics or network federate of a run.
         name: Its name in messages.
         software: Name and version of its software.
         is_deterministic: True if equal requests give equal answers.
@@ -77,7 +77,7 @@ class FederateService:
         """
         role = PHYSICS if hasattr(federate, "step_ns") else NETWORK
         if role != hello.role:
-            raise ValueError(f"it is a {ROLES[role]}, but a {ROLES[hello.role]} was requested")
+            raise ValueError(f"it is a {ROLES[role]} federate, but a {ROLES[hello.role]} federate was requested")
         flags = {
             FederateCapability.DETERMINISTIC: self.is_deterministic,
             FederateCapability.FORK: self.forks,
@@ -162,7 +162,16 @@ class _Heartbeat:
 
 @dataclass
 class _Run:
-    """One run of a coordinator with a federate."""
+    """One run of a coordinator with a federate.
+
+    Attributes:
+        service: The federate.
+        channel: The channel to the coordinator.
+        token: Token that the coordinator must send.
+        hello_s: Timeout of the first message of the coordinator, in seconds; None for no limit.
+        copies: The federate (number 0) and its copies, by number.
+        heartbeat: Sends `busy`; None before the first message.
+    """
 
     service: FederateService
     channel: FrameChannel
@@ -191,6 +200,7 @@ class _Run:
         return True
 
     def _handle(self, frame: ProtocolFrame) -> bool:
+        """Handle a message, and send the answer; return False if the session must end because of an error."""
         _, kind, request, copy_number = frame.header
         if kind is MessageKind.RELEASE:
             self.copies.pop(copy_number, None)

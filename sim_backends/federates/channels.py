@@ -77,18 +77,18 @@ class StreamChannel:
 
     def send(self, frame: bytes, deadline_s: float | None) -> None:
         """Implement `FrameChannel.send`."""
-        position_text: bytes | memoryview = frame
+        unsent: bytes | memoryview = frame
         while True:
             try:
-                written_bytes = os.write(self._write_fd, position_text)
+                written_bytes = os.write(self._write_fd, unsent)
             except BlockingIOError:
                 _wait(self._writable, deadline_s)
                 continue
             except OSError as error:
                 raise ClosedError("the connection was closed") from error
-            if written_bytes == len(position_text):
+            if written_bytes == len(unsent):
                 return
-            position_text = memoryview(position_text)[written_bytes:]
+            unsent = memoryview(unsent)[written_bytes:]
 
     def receive(self, deadline_s: float | None, max_bytes: int = MAX_FRAME_BYTES) -> ProtocolFrame:
         """Implement `FrameChannel.receive`."""
@@ -102,11 +102,11 @@ class StreamChannel:
         self._data = data[end:]
         return ProtocolFrame(header, data[HEADER_BYTES:end])
 
-    def _read_until(self, begin: bytes, end: int, deadline_s: float | None) -> bytes:
-        """Return `begin` and the bytes that are received after it, at least `end` bytes in total."""
-        data = bytearray(begin)
+    def _read_until(self, first_bytes: bytes, min_bytes: int, deadline_s: float | None) -> bytes:
+        """Return `first_bytes` and the bytes that are received after them, at least `min_bytes` in total."""
+        data = bytearray(first_bytes)
         try:
-            while len(data) < end:
+            while len(data) < min_bytes:
                 data += self._read(deadline_s, len(data))
         finally:
             self._data = bytes(data)
@@ -123,7 +123,7 @@ class StreamChannel:
 
         Args:
             deadline_s: Time of `time.monotonic` until which to wait; None for no deadline.
-            bytes_before: Number of bytes of the same frame that were read before, for the error.
+            bytes_before: Number of bytes of the same frame that were already read, for the error message.
         """
         if not self._fds:
             raise ClosedError("the connection was closed")

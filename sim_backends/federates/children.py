@@ -16,16 +16,17 @@ from sim_backends.federates.channels import StreamChannel
 _EXIT_S: Final = 1.0
 """Time for a process to exit after its input was closed, and again after SIGTERM."""
 _POLL_S: Final = 0.005
-_TAIL_BYTES: Final = 4096
-_TAIL_LINES: Final = 10
-"""Number of last lines that are shown: enough for the cause of an error in a stack trace."""
+_SHOWN_BYTES: Final = 4096
+_SHOWN_LINES: Final = 10
+"""Largest number of lines that are shown: enough for the cause of an error in a stack trace."""
+_NOTE: Final = "note: "
 
 
 class Child:
     """A federate that is a child process.
 
-    It has a separate session, so that Ctrl-C does not terminate it during a request. It is terminated when `close` is
-    called, when this object is garbage collected, or when this process exits.
+    It runs in a separate session, so that Ctrl-C does not terminate it during a request. It is terminated when
+    `close` is called, when this object is garbage collected, or when this process exits.
 
     Args:
         command: Its command line; it is split as by a shell, but no shell runs.
@@ -45,7 +46,7 @@ class Child:
             raise ConfigurationError(f"{command!r} is not a command: {error}") from error
         if not words:
             raise ConfigurationError("the command of a federate is empty")
-        # Standard error is a file, because a federate that writes much would block on a pipe without a reader.
+        # Standard error is a file. A pipe that is not read would block a federate that writes much.
         self._stderr: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 (closed with the process)
         try:
             process = subprocess.Popen(
@@ -61,7 +62,8 @@ class Child:
         assert process.stdout is not None
         self._process = process
         self.pid = process.pid
-        # The channel has duplicates, because the process object would later close descriptors that may be reused.
+        # The channel gets duplicates, so that only the channel closes its descriptors. If the process object closed
+        # them later, the same numbers might already be in use for other files.
         self.channel = StreamChannel(os.dup(process.stdout.fileno()), os.dup(process.stdin.fileno()))
         process.stdin.close()
         process.stdout.close()
@@ -73,11 +75,17 @@ class Child:
         if self._stderr.closed:
             return []
         size = os.fstat(self._stderr.fileno()).st_size
-        tail = os.pread(self._stderr.fileno(), _TAIL_BYTES, max(size - _TAIL_BYTES, 0)).decode(errors="replace")
-        return [line.rstrip() for line in tail.splitlines() if line.strip()][-_TAIL_LINES:]
+        tail = os.pread(self._stderr.fileno(), _SHOWN_BYTES, max(size - _SHOWN_BYTES, 0)).decode(errors="replace")
+        return [line.rstrip() for line in tail.splitlines() if line.strip()][-_SHOWN_LINES:]
+
+    def first_notes(self) -> list[str]:
+        """Return the lines `note: TEXT` at the start of its standard error, without `note: `; at most ten."""
+        head = os.pread(self._stderr.fileno(), _SHOWN_BYTES, 0).decode(errors="replace")
+        notes = [line.removeprefix(_NOTE) for line in head.splitlines() if line.startswith(_NOTE)]
+        return notes[:_SHOWN_LINES]
 
     def exit_text(self, wait_s: float = 0.5) -> str:
-        """Return a text about its exit, such as `it has exited with code 1`; empty if it has not exited in time."""
+        """Return a text about its exit, such as `it has exited with code 1`; empty if it does not exit in time."""
         deadline_s = time.monotonic() + wait_s
         while not _has_exited(self._process.pid):
             if time.monotonic() > deadline_s:
@@ -115,9 +123,10 @@ def _has_exited(pid: int) -> bool:
 
 def _terminate(process: "subprocess.Popen[bytes]", channel: StreamChannel, stderr: IO[bytes]) -> None:
     channel.close()
-    for number in (None, signal.SIGTERM):
-        if number is not None:
-            _signal_group(process.pid, number)
+    # A federate must exit when its standard input is closed; SIGTERM is sent only if it does not.
+    for signal_number in (None, signal.SIGTERM):
+        if signal_number is not None:
+            _signal_group(process.pid, signal_number)
         deadline_s = time.monotonic() + _EXIT_S
         while time.monotonic() < deadline_s and not _has_exited(process.pid):
             time.sleep(_POLL_S)
@@ -129,6 +138,6 @@ def _terminate(process: "subprocess.Popen[bytes]", channel: StreamChannel, stder
     stderr.close()
 
 
-def _signal_group(pid: int, number: signal.Signals) -> None:
+def _signal_group(pid: int, signal_number: signal.Signals) -> None:
     with suppress(ProcessLookupError, PermissionError):  # only the zombie remains
-        os.killpg(pid, number)
+        os.killpg(pid, signal_number)

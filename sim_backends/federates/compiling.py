@@ -21,7 +21,7 @@ _LIMIT_S: Final = 900.0
 """Timeout of a compilation, and of the wait for another process that compiles the same program."""
 _POLL_S: Final = 0.1
 _SHOWN_LINES: Final = 15
-_LIBRARY: Final = Path(__file__).parent / "cpp"
+_HEADERS: Final = Path(__file__).parent / "cpp"
 """Include path of the headers for federates in C++: `#include "fieldkit/frames.h"`."""
 _INCLUDE: Final = re.compile(r'^\s*#\s*include\s*"([^"]+)"', re.MULTILINE)
 
@@ -50,12 +50,14 @@ class CompiledProgram:
     duration_text: str = "about 30 s"
 
     def path(self) -> Path:
-        """Return the path of the program; compile it if it does not exist yet for this source and environment.
+        """Return the path of the program, and compile it if necessary.
+
+        It is compiled if the cache has no program of this source, compiler and versions of libraries.
 
         Raises:
             ConfigurationError: The compiler or a library is not installed, or the compilation failed.
         """
-        compiler, libraries = self._environment()
+        compiler, libraries = self._versions()
         digest = hashlib.sha256()
         for file in included_files(self.source):
             digest.update(file.read_bytes())
@@ -70,7 +72,7 @@ class CompiledProgram:
                 self._compile(program)
         return program
 
-    def _environment(self) -> tuple[str, list[str]]:
+    def _versions(self) -> tuple[str, list[str]]:
         """Return the versions of the compiler and of the libraries.
 
         Raises:
@@ -90,14 +92,14 @@ class CompiledProgram:
         return _output("g++", "--version").stdout.partition("\n")[0], libraries
 
     def _compile(self, program: Path) -> None:
-        sys.stderr.write(f"note: compiling {self.name}, once for these libraries: {self.duration_text}\n")
+        sys.stderr.write(f"note: compiling {self.name}; this takes {self.duration_text}, once for these libraries\n")
         options = self.libraries
         if options is None:
             arguments = ("--cflags", "--libs", *self.packages)
             options = _output("pkg-config", *arguments).stdout.split() if self.packages else []
         with tempfile.TemporaryDirectory(dir=program.parent, prefix=f".{self.name}-") as folder:
             result = Path(folder) / "program"
-            words = ["g++", *self.flags, f"-I{_LIBRARY}", "-o", str(result), str(self.source), *options]
+            words = ["g++", *self.flags, f"-I{_HEADERS}", "-o", str(result), str(self.source), *options]
             try:
                 compilation = _output(*words)
             except subprocess.TimeoutExpired as error:
@@ -117,7 +119,7 @@ def included_files(source: Path) -> list[Path]:
     files = [source.resolve()]
     for file in files:  # the loop appends to the list
         for name in _INCLUDE.findall(file.read_text(encoding="utf-8")):
-            candidates = ((folder / name).resolve() for folder in (file.parent, _LIBRARY))
+            candidates = ((folder / name).resolve() for folder in (file.parent, _HEADERS))
             header = next((candidate for candidate in candidates if candidate.is_file()), None)
             if header is not None and header not in files:
                 files.append(header)

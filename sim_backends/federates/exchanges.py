@@ -1,11 +1,12 @@
 """Requests and answers of the wire protocol after the handshake, and the rules for both sides.
 
-Agents have indices from 0 in the order of their announcement, first the agents in `hello`. A later agent gets the
-next index in the first message that mentions it, for this copy and its copies.
+Agents have indices from 0 in the order of their announcement, first the agents in `hello`. An agent that appears
+later gets the next index in the first message that mentions it. The index is valid in the copy of the federate that
+the message is for, and in copies that are made of it later.
 
 - **Handshake.** The coordinator sends hello; the federate answers with welcome or error. `welcome` repeats the
-  configuration hash, the SHA-256 of the JSON. `name` names the scenario or the federate. The side that accepts a
-  connection checks the token of join or hello.
+  configuration hash, which is the SHA-256 of the JSON. `name` is the scenario's name in hello, and the federate's
+  name in welcome. The side that accepts a connection checks the token of join or hello.
 - **Transports.** Welcome lists the values of a packet's `protocol` that the network carries: `udp`, `tcp`, `topic`,
   `ros1`; an empty list means all. The network refuses others with an error. [Real programs](lab-cosim.md) send `ip`,
   whose size includes the IP header, and `ip-broadcast`: one packet per receiver, with equal source, number and time.
@@ -13,9 +14,10 @@ next index in the first message that mentions it, for this copy and its copies.
   fieldkit's UDP, TCP, topics and ROS 1 send IP packets.
 - **Configuration.** The JSON has `scenario` (keys as in [a scenario file](reference/scenario-file.md)), `world` ([a
   world file](reference/world-file.md)), `robots` (limits of each agent's body, and its radio) and `options`. A simple
-  federate ignores it and uses the agents of hello. A network declared with `writes_captures` gets `captures` if the
-  run has an output folder: the `folder` for one `AGENT.pcap` each, of raw IP; `addresses` by agent; and `flows` by
-  name: `port` of the destination (0: the network chooses it), `ping` (identifier of ICMP echo; 0: none), `reply`.
+  federate ignores it and uses the agents of hello. If the run has an output folder, a network that is declared with
+  `writes_captures` also gets `captures`: the `folder` in which it writes an `AGENT.pcap` of raw IP for each agent;
+  `addresses` by agent; and `flows` by name: `port` of the destination (0: the network chooses it), `ping` (identifier
+  of ICMP echo; 0: none), `reply`.
 - **Physics: states.** `at_ns` is `to_ns` rounded down to a multiple of the `step_ns` in welcome; the states are valid
   at this time. Positions are of the antenna. `heading_rad` is from east towards north, NaN if undefined. `limit_m_s2`
   is the largest change of velocity per second after this time, infinity if unknown; in requests to a network it has
@@ -27,7 +29,7 @@ next index in the first message that mentions it, for this copy and its copies.
 - **Network.** It simulates up to and including `to_ns`, and returns each packet exactly once: as an arrival with
   `enters_ns` <= `at_ns` <= `to_ns`, and `at_ns` not before the previous `to_ns`; or as a drop with its reason. Both
   lists are in order of time. `at_ns` of outcomes is `to_ns`. Packets are in order of `enters_ns`, which may equal the
-  previous `to_ns`. In a window of length 0 at the start `to_ns` is -1. Random draws depend on the seed; derive each
+  previous `to_ns`. In a window of length 0 at the start, `to_ns` is -1. Random draws depend on the seed; derive each
   draw from the seed, `flow` and `number`, so that runs can be compared.
 - **Dead reckoning.** If `reckoning_ns` is above 0, which needs the capability *extrapolates*, the position at t is
   `position_m` + n `reckoning_ns` `velocity_m_s`, where n is (t - `since_ns`) / `reckoning_ns`, rounded down.
@@ -37,7 +39,8 @@ next index in the first message that mentions it, for this copy and its copies.
   With the scenario's keys `appears` and `disappears` the coordinator ignores states of absent agents, sends them no
   commands, and drops their packets as `agent absent`; the network still reports the fates of those that it already
   carries. A network without the capability 32 receives the last states of absent agents, or their start states.
-- **Transmitters and emitters** in welcome are agents that forward or interfere, and other sources of interference.
+- **Interference.** Transmitters in welcome are agents that forward or interfere; emitters are sources of interference
+  that are not agents.
 - **Deadlines.** A federate that computes for longer than `heartbeat_ms` sends busy. The coordinator waits 30 s for a
   frame (`--deadline`), and at most 20 times as long for an answer.
 - **Malformed frames** end the session; the side that receives one reports the position of the wrong byte.

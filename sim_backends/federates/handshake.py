@@ -171,12 +171,12 @@ class Hello:
             raise ValueError(f"a number of the run is too large for an external federate: {error}") from error
         parts += [text_bytes(self.token), text_bytes(self.name), count_bytes(len(self.agents))]
         for agent in self.agents:
-            start = states_bytes({agent.name: agent.start}, table, {agent.name: agent.limit_m_s2})[4:]
+            start = states_bytes({agent.name: agent.start}, table, {agent.name: agent.limit_m_s2})
             parts += [
                 text_bytes(agent.name),
                 text_bytes(agent.profile),
                 _AGENT.pack(agent.flies, agent.antenna_m),
-                start,
+                start[_U32.size :],  # without the count of states
             ]
         body = b"".join([*parts, count_bytes(len(self.configuration)), self.configuration])
         if len(body) > MAX_HELLO_BYTES or len(self.agents) > MAX_AGENTS:
@@ -284,6 +284,7 @@ class Welcome:
         reader.end()
         if not all(math.isfinite(sum(position)) for position in emitters_m):
             raise MalformedFrameError(reader.position, "the position of an emitter is not finite")
+        # Bits of capabilities that this version does not have are ignored.
         known_capabilities = FederateCapability(bits & int(~FederateCapability(0)))
         return Welcome(
             role,

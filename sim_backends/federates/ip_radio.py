@@ -41,7 +41,7 @@ class IpRadio:
         self._names = tuple(names)
         self._entering_packets: list[Packet] = []
         self._in_flight: dict[int, tuple[Fragment, str]] = {}
-        self._packets = 0
+        self._last_packet_id = 0
         self._broadcasts = 0
         self._states: dict[str, State] = {}
         self._stations_off: Set[str] = frozenset()
@@ -81,10 +81,10 @@ class IpRadio:
             identity = broadcast_flow(source), self._broadcasts
             self._broadcasts += 1
         for receiver in receivers:
-            self._packets += 1
-            self._in_flight[self._packets] = payload, receiver
+            self._last_packet_id += 1
+            self._in_flight[self._last_packet_id] = payload, receiver
             self._entering_packets.append(
-                Packet(self._packets, source, receiver, size_bytes, identity, now_ns, now_ns, protocol)
+                Packet(self._last_packet_id, source, receiver, size_bytes, identity, now_ns, now_ns, protocol)
             )
 
     def next_event_ns(self) -> int | None:
@@ -120,7 +120,7 @@ class IpRadio:
         return {}
 
     def use_meter(self) -> None:
-        """Implement `RadioModel.use_meter`; the federate counts itself."""
+        """Implement `RadioModel.use_meter`; nothing to do, because the federate measures the use of its channel."""
 
     def sample(self, now_ns: int, utc_ns: int) -> dict[str, LinkSample]:  # noqa: ARG002 (see RadioModel)
         """Implement `RadioModel.sample`; samples are requested directly from the federate."""
@@ -135,7 +135,7 @@ class IpRadio:
         self._stations_off = off
 
     def jam(self, now_ns: int, emitters: Sequence[Emitter]) -> None:
-        """Implement `RadioModel.jam`; the federate has the jammers of the scenario."""
+        """Implement `RadioModel.jam`; nothing to do, because the federate simulates the scenario's jammers."""
 
     def log_attempts(self, log: Callable[[TransmissionAttempt], None] | None) -> None:
         """Implement `RadioModel.log_attempts`; the federate reports no attempts."""

@@ -27,7 +27,7 @@ class ProgramFederate:
         command: Returns its command line; it builds the program first if necessary. It raises `ConfigurationError` if
             required software is not installed; the remedy is the command that installs it.
         summary: Description in one line.
-        options: Model of its options in a scenario; None if it has any options, which are not validated.
+        options: Model of its options in a scenario; None to accept any options without validation.
         writes_captures: True for a network that writes captures with the settings `captures` of its configuration.
         is_single_threaded: True if it has only one thread, and computes only during requests. It then shares the
             processor of the coordinator (`ProcessorSharing`).
@@ -50,7 +50,7 @@ class PythonFederate:
         load: Imports the simulator, and returns the class with its properties. It raises `ConfigurationError` if
             required software is not installed; the remedy is the command that installs it.
         summary: Description in one line.
-        options: Model of its options in a scenario; None if it has any options, which are not validated.
+        options: Model of its options in a scenario; None to accept any options without validation.
     """
 
     role: int
@@ -88,7 +88,7 @@ def named_federate(endpoint: str, role: int) -> NamedFederate | None:
     federate = _load(point)
     if federate.role != role:
         raise ConfigurationError(
-            f"{endpoint} is a {ROLES[federate.role]}, not a {ROLES[role]}",
+            f"{endpoint} is a {ROLES[federate.role]} federate, not a {ROLES[role]} federate",
             remedy=f"use --{ROLES[federate.role]} {endpoint}",
         )
     return federate
@@ -139,7 +139,7 @@ def command_line(endpoint: str, role: int) -> str:
         names = [point.name for point in plugins.entry_points(plugins.FEDERATES)]
         choices = f"simulators: {', '.join(names)}; or a command, or an address: fieldkit docs federates"
         raise ConfigurationError(
-            f"there is no {ROLES[role]} and no program with the name {endpoint!r}",
+            f"there is no {ROLES[role]} federate and no program with the name {endpoint!r}",
             remedy=did_you_mean(endpoint, names, choices),
         )
     return endpoint

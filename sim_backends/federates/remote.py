@@ -30,7 +30,7 @@ ArrivalDelayLog = Callable[[Arrival, ArrivalDelay], None]
 
 
 class _RemoteFederate:
-    """Common part of both roles.
+    """Base class of the proxies of physics and network federates.
 
     Attributes:
         session: The session.
@@ -48,7 +48,7 @@ class _RemoteFederate:
         self.session.close()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Any:  # noqa: ANN401 (of the subclass)
-        """Copy the federate in its process, in its current state, and return the object that represents the copy.
+        """Copy the federate in its process, in its current state, and return the proxy of the copy.
 
         Raises:
             FederateError: The federate does not support copies, or failed.
@@ -134,7 +134,8 @@ class RemotePhysics(_RemoteFederate):
 class RemoteNetwork(_RemoteFederate):
     """A network federate in another process.
 
-    A network that does not support absent agents receives their last states, or their start states.
+    If the network does not support absent agents, it receives the last position of an absent agent, or its start
+    position if the agent has not appeared yet.
 
     Args:
         session: The session.

@@ -20,7 +20,8 @@ def serve(make: Make, *, address: str | None = None, runs: int | None = None, **
     """Serve a physics or network class.
 
     Args:
-        make: Called with the `Hello` of each run; returns the federate, for example its class.
+        make: The class of the federate, or a function that returns a federate. It is called with the `Hello` of each
+            run.
         address: None for standard input and output, which then carry only frames; everything that the federate prints
             goes to standard error. Otherwise an address of a transport (`transports.transport_table`).
         runs: Number of runs after which to return; None means one run if this side does not listen, otherwise no
@@ -62,7 +63,7 @@ def _listen(address: TransportAddress, service: FederateService, runs: int | Non
                 with closing(listener.accept(None)) as channel:
                     succeeded = serve_channel(channel, service, token, _HELLO_S)
                 finished_runs += 1
-    except DeadlineError as error:  # the ROS master does not answer
+    except DeadlineError as error:  # of the transport over ROS 1, if the master does not answer
         raise SystemExit(str(error)) from error
     return succeeded
 

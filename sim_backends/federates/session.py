@@ -1,6 +1,7 @@
 """The coordinator's side of a connection to an external federate: handshake, requests, deadlines, errors."""
 
 import re
+import sys
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext, suppress
@@ -58,7 +59,8 @@ class FederateSession:
     Attributes:
         name: The federate's role, its name if it has sent one, and its command or address.
         reached_ns: Last simulated time to which the federate has advanced, or None.
-        observer: Called with each request and answer, in bytes, or None.
+        observer: If it is not None, it is called when a request is sent, with the request and None, and when the
+            answer arrives, with the request and the answer.
         exchange_context: Context of each request and its answer.
     """
 
@@ -95,24 +97,28 @@ class FederateSession:
     def welcome(self, hello: Hello) -> Welcome:
         """Send hello, and return the federate's welcome.
 
+        The notes that a child process has written to its standard error until then are shown.
+
         Raises:
             FederateError: The federate failed, did not answer, or is not compatible; the message names it.
         """
-        describe = f"begin a run as {ROLES[self._role]}"
+        request_text = f"begin a run as {ROLES[self._role]}"
         welcome = self.request(
             MessageKind.HELLO,
             0,
             hello.encode(),
             MessageKind.WELCOME,
             decode=Welcome.decode,
-            describe=lambda: describe,
+            describe=lambda: request_text,
         )
         if welcome.name:
             self.name = f"{ROLES[self._role]} {printable(welcome.name)} ({self._endpoint})"
         if welcome.role != self._role:
-            self.fail(f"{self.name} is a {ROLES[welcome.role]}")
+            self.fail(f"{self.name} is a {ROLES[welcome.role]} federate")
         if welcome.configuration_hash != hello.configuration_hash:
             self.fail(f"{self.name} answered with the hash of another configuration")
+        for note in self._child.first_notes() if self._child else ():
+            sys.stderr.write(f"note: {self.name}: {printable(note)}\n")
         return welcome
 
     def request(

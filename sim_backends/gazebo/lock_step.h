@@ -4,10 +4,9 @@
 #define FIELDKIT_GAZEBO_LOCK_STEP_H
 
 #include "connection.h"
-#include "model_journal.h"
+#include "world_models.h"
 
 #include <deque>
-#include <optional>
 
 namespace fieldkit
 {
@@ -19,7 +18,8 @@ class LockStep
         : m_options(std::move(options)),
           m_agents(std::move(agents)),
           m_monitor(m_options, m_agents, heartbeat),
-          m_connection(m_options, m_agents, m_monitor)
+          m_connection(m_options, m_agents, m_monitor),
+          m_models(m_options, m_connection)
     {
     }
 
@@ -40,12 +40,10 @@ class LockStep
     {
         m_connection.Open();
         Pause();
-        ModelJournal journal(m_connection.ProcessId(), m_options.world);
-        RestoreAfterKilledRun(journal);
+        m_models.RestoreAfterKilledRun();
         MeasureStep();
         m_connection.FindModels();
-        WriteJournal(journal);
-        m_journal = journal;
+        m_models.WriteJournal(m_agents);
         int64_t settle_steps = StepsOf(m_options.settle_s);
         SendCommands();
         ComeToRest(settle_steps);
@@ -55,15 +53,16 @@ class LockStep
         }
         for (Agent& agent : m_agents)
         {
+            // An agent that appears in the first step must exist at the start.
             bool is_present = agent.appears_ns < m_stepNs;
             if (is_present != agent.is_present)
             {
                 is_present ? Create(agent) : Remove(agent);
             }
-        }
-        if (m_options.place)
-        {
-            Place();
+            if (agent.is_present && m_options.place)
+            {
+                m_models.Place(agent);
+            }
         }
         SendCommands();
         Step(settle_steps);
@@ -75,7 +74,7 @@ class LockStep
         {
             if (agent.appears_ns >= m_stepNs)
             {
-                // It is created before the step, which publishes its first pose.
+                // The model is created one step earlier, because the next step publishes its first pose.
                 m_changes.push_back({agent.appears_ns / m_stepNs - 1, agent, true});
             }
             if (agent.disappears_ns >= 0)
@@ -90,8 +89,8 @@ class LockStep
     // Advance to a number of steps after the start.
     void Advance(int64_t to_step)
     {
-        // An agent that appears at a step has been created before it.
-        while (!m_changes.empty() && m_changes.front().step + m_changes.front().appears <= to_step)
+        // A model that is created after step n has a pose at step n + 1, so it is created only if that step is made.
+        while (!m_changes.empty() && m_changes.front().step + (m_changes.front().appears ? 1 : 0) <= to_step)
         {
             Change change = m_changes.front();
             m_changes.pop_front();
@@ -115,8 +114,8 @@ class LockStep
         m_connection.Acknowledge();
     }
 
-    // Stop all robots, without waiting; the world stays paused.
-    void Stop()
+    // Stop all robots, without waiting, and restore the models; the world stays paused.
+    void End()
     {
         for (size_t i = 0; i < m_agents.size(); i++)
         {
@@ -126,26 +125,7 @@ class LockStep
                 m_connection.Publish(i, TwistOf(m_agents[i], m_options, m_stepNs));
             }
         }
-    }
-
-    // Remove the models that the run has created, and create those that it has removed.
-    void RestoreModels()
-    {
-        for (Agent& agent : m_agents)
-        {
-            if (agent.is_present && !agent.had_model)
-            {
-                Remove(agent);
-            }
-            else if (agent.had_model && !agent.is_present)
-            {
-                RequestModel(InitialModelOf(agent));
-            }
-        }
-        if (m_journal)
-        {
-            m_journal->Delete();
-        }
+        m_models.Restore(m_agents);
     }
 
   private:
@@ -172,13 +152,13 @@ class LockStep
             int64_t next = to_step;
             bool is_turning =
                 std::any_of(m_agents.begin(), m_agents.end(), [](const Agent& agent) { return agent.Turns(); });
-            if (is_turning)
+            if (is_turning) // the command depends on the heading, so it is sent again after each control period
             {
                 next = std::min(next, (step / period + 1) * period);
             }
             if (m_options.velocity == "step" && next == to_step && next - step > 1)
             {
-                next--;
+                next--; // the last step is made separately, because the velocity is the motion in this step
             }
             before = Poses();
             before_step = step;
@@ -205,84 +185,9 @@ class LockStep
         m_windowEndStep = step;
     }
 
-    // Restore the models if the last run in this world was killed. Gazebo ignores a request to remove a model that
-    // does not exist, or to create one that exists.
-    void RestoreAfterKilledRun(const ModelJournal& journal)
-    {
-        Restoration restoration = journal.Read();
-        for (const std::string& name : restoration.created)
-        {
-            RequestRemoval(name);
-            std::fprintf(stderr, "the model %s of a killed run is removed\n", name.c_str());
-        }
-        for (const InitialModel& model : restoration.initial)
-        {
-            RequestModel(model);
-            std::fprintf(stderr, "the model %s is created if a killed run has removed it\n", model.name.c_str());
-        }
-    }
-
-    void WriteJournal(const ModelJournal& journal)
-    {
-        Restoration restoration;
-        for (const Agent& agent : m_agents)
-        {
-            if (agent.HasLifetime() && !agent.had_model)
-            {
-                restoration.created.push_back(agent.model);
-            }
-            else if (agent.HasLifetime())
-            {
-                restoration.initial.push_back(InitialModelOf(agent));
-            }
-        }
-        if (restoration.created.empty() && restoration.initial.empty())
-        {
-            journal.Delete();
-            return;
-        }
-        journal.Write(restoration);
-    }
-
-    InitialModel InitialModelOf(const Agent& agent) const
-    {
-        InitialModel model;
-        model.name = agent.model;
-        auto file = m_options.model_files.find(agent.name);
-        if (file != m_options.model_files.end())
-        {
-            model.file = file->second;
-        }
-        else
-        {
-            model.sdf = m_options.sdf.at(agent.name);
-        }
-        model.position = agent.start;
-        model.yaw = agent.start_yaw;
-        return model;
-    }
-
-    // The service answers before it creates the model, which happens at the latest before the next step. A request that
-    // arrives twice creates it once, because its name must be new.
-    void RequestModel(const InitialModel& model)
-    {
-        msgs::EntityFactory request;
-        if (!model.file.empty())
-        {
-            request.set_sdf_filename(model.file);
-        }
-        else
-        {
-            request.set_sdf(model.sdf);
-        }
-        request.set_name(model.name);
-        *request.mutable_pose() = PoseOf(model.name, model.position, model.yaw);
-        m_connection.Call(m_options.Name(m_options.create_service), request);
-    }
-
     void Create(Agent& agent)
     {
-        RequestModel(InitialModelOf(agent));
+        m_models.Create(agent);
         agent.is_present = agent.is_new = true;
         size_t number = static_cast<size_t>(&agent - m_agents.data());
         agent.pose = agent.Start();
@@ -297,20 +202,11 @@ class LockStep
         SendCommands();
     }
 
-    // As with Create, the model is removed at the latest before the next step.
     void Remove(Agent& agent)
     {
-        RequestRemoval(agent.model);
+        m_models.Remove(agent.model);
         agent.is_present = agent.is_new = false;
         agent.Stop();
-    }
-
-    void RequestRemoval(const std::string& name)
-    {
-        msgs::Entity request;
-        request.set_name(name);
-        request.set_type(msgs::Entity::MODEL);
-        m_connection.Call(m_options.Name(m_options.remove_service), request);
     }
 
     int64_t StepsOf(double seconds) const
@@ -375,7 +271,7 @@ class LockStep
         m_monitor.awaited_ns = time_ns;
     }
 
-    // The clock of a step is published before the step is made, so only poses with its time stamp are valid.
+    // Gazebo publishes the time of a step before it makes the step, so this waits for poses with that time stamp.
     void WaitForPoses(WorldMonitor::Lock& lock, int64_t target_ns, int64_t before_ns, const Connection::Answer& answer)
     {
         auto have_arrived = [&] {
@@ -420,7 +316,7 @@ class LockStep
         }
     }
 
-    // The agents whose models have been requested and have no pose yet, for messages.
+    // The names, for messages, of the agents whose models have been requested but have not published a pose.
     std::string NewAgents() const
     {
         std::string names;
@@ -434,7 +330,8 @@ class LockStep
         return names;
     }
 
-    // Robots may still move because of an earlier run, and setting a position does not stop them.
+    // Advance until the robots are at rest (0.1 mm, 0.1 mrad), at most 20 times. They may still move because of an
+    // earlier run, and setting a position does not stop them.
     void ComeToRest(int64_t steps)
     {
         Step(steps);
@@ -475,31 +372,6 @@ class LockStep
         m_connection.WaitForSubscribers(lock);
     }
 
-    // The service answers before it places the model, which happens at the latest before the next step.
-    void Place()
-    {
-        for (const Agent& agent : m_agents)
-        {
-            if (agent.is_present)
-            {
-                m_connection.Call(m_options.Name(m_options.pose_service), PoseOf(agent.model, agent.start, agent.start_yaw));
-            }
-        }
-    }
-
-    static msgs::Pose PoseOf(const std::string& name, const Vector& position, double yaw)
-    {
-        Pose rotation = Pose::WithYaw(yaw);
-        msgs::Pose pose;
-        pose.set_name(name);
-        pose.mutable_position()->set_x(position.x);
-        pose.mutable_position()->set_y(position.y);
-        pose.mutable_position()->set_z(position.z);
-        pose.mutable_orientation()->set_w(rotation.w);
-        pose.mutable_orientation()->set_z(rotation.z);
-        return pose;
-    }
-
     void CheckStart() const
     {
         for (const Agent& agent : m_agents)
@@ -530,7 +402,7 @@ class LockStep
     std::vector<Agent> m_agents;
     WorldMonitor m_monitor;
     Connection m_connection;
-    std::optional<ModelJournal> m_journal; // of this run
+    WorldModels m_models;
     int64_t m_stepNs = 0;
     int64_t m_nowNs = -1; // Gazebo's time
     int64_t m_startNs = 0;

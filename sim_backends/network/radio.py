@@ -230,6 +230,7 @@ class RadioNetwork:
         except KeyError:
             absent_stations = frozenset(name for name in self._names if name not in states)
             present_m = {name: states[name].position_m for name in self._names if name not in absent_stations}
+            # The radio of an absent station is off; the station keeps its last position.
             self._positions_m = dict.fromkeys(self._names, STILL) | self._positions_m | present_m
         self._radio.place(self.now_ns, self._positions_m, self._relay)
         if absent_stations != self._absent_stations:

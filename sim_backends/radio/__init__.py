@@ -1,1 +1,1 @@
-"""Radio models between robots: pure, on integer nanoseconds, for a virtual clock or the monotonic clock."""
+"""Radio models. They use no clock and no socket: the caller passes the time, virtual or monotonic, in nanoseconds."""

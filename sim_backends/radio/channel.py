@@ -1,4 +1,4 @@
-"""Protocol of a radio channel, as Wi-Fi needs it: the power of each station at each other station; and jammers."""
+"""The interface of a radio channel, which gives the received power of each station at all others; and jammers."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -38,7 +38,7 @@ class ChannelAccess(Protocol):
         """
 
     def defer_until(self, until_ns: int) -> None:
-        """Suspend the countdown until `until_ns`: EIFS, the time of the ACK, after a frame that was not decoded."""
+        """Count no backoff slots before `until_ns`: the end of EIFS after a frame that the station did not decode."""
 
     def set_busy_until(self, until_ns: int) -> None:
         """Record that the channel is busy until `until_ns`."""
@@ -111,7 +111,7 @@ class Contention:
         return self.count_from_ns + self.slots * SLOT_NS
 
     def defer_until(self, until_ns: int) -> None:
-        """Suspend the countdown until `until_ns`: EIFS, the time of the ACK, after a frame that was not decoded."""
+        """Count no backoff slots before `until_ns`: the end of EIFS after a frame that the station did not decode."""
         self.count_from_ns = max(self.count_from_ns, until_ns)
 
     def set_busy_until(self, until_ns: int) -> None:

@@ -1,7 +1,7 @@
 """EDCA: four access categories with their own queue and contention in each station (IEEE 802.11-2020, 10.23.2).
 
 The parameters are the defaults of Linux's mac80211: table 9-155 with the TXOP limits of IEEE 802.11-2012 for voice
-and video. The other categories have no TXOPs of more than one exchange.
+and video. In the other categories a TXOP has one exchange.
 """
 
 from collections import deque

@@ -40,7 +40,8 @@ _HIGHEST_DB: Final = 40.0
 def bit_error(mode: WifiMode, snr: float) -> float:
     """Return the share of coded bits in error at the signal-to-noise power ratio `snr` in the signal's bandwidth.
 
-    Proakis, Digital Communications, 4th ed., 5.2: Gray-coded, per subcarrier, nearest neighbours only.
+    The formula (Proakis, Digital Communications, 4th ed., 5.2) is for one subcarrier with Gray code, and for errors
+    between nearest neighbours.
     """
     if mode.modulation == "BPSK":
         return 0.5 * math.erfc(math.sqrt(snr))

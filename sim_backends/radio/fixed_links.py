@@ -82,7 +82,7 @@ class FixedLink:
             lost.
         """
         parameters = self._parameters
-        transmission_ns, delay_sum = self._by_size.get(size_bytes) or self._compute_size(size_bytes)
+        transmission_ns, delay_sum = self._by_size.get(size_bytes) or self._compute_delays(size_bytes)
         arrival_ns = now_ns + transmission_ns + parameters.delay_ns
         if parameters.rate_bit_s is not None:
             queuing_ns = self._enqueue(now_ns, transmission_ns)
@@ -120,7 +120,7 @@ class FixedLink:
         """Count one of the sent packets as lost."""
         self._lost += 1
 
-    def _compute_size(self, size_bytes: int) -> tuple[int, Delay]:
+    def _compute_delays(self, size_bytes: int) -> tuple[int, Delay]:
         """Return the transmission time in ns and the delay without queuing for a packet size; cache them."""
         parameters = self._parameters
         transmission_ns = parameters.serialization_ns(size_bytes)

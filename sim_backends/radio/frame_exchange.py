@@ -96,7 +96,7 @@ class FrameExchange(Generic[Payload]):
         """End the exchange of a station whose radio is switched off, and cancel its next one."""
         self.reception.abort(station.index, now_ns)
         self.events.cancel_start(station.index)
-        station.exchange_id += station.exchange_id & 1
+        station.exchange_id += station.exchange_id & 1  # even: the station is not in an exchange
         station.aggregate = None
 
     def retry_when_idle(self, now_ns: int, station: Station[Payload]) -> None:

@@ -104,12 +104,13 @@ class PhyCapability:
     def supports(self, mode: WifiMode) -> bool:
         """Return True if the station can send and receive frames in this mode of HT, VHT or HE."""
         formats = [_FORMATS[amendment] for amendment in _ORDER[: _ORDER.index(self.amendment) + 1]]
-        is_he = self.amendment == "ax" and mode.phy_format != "HE"
+        # The guard interval of a station of 802.11ax limits only its HE modes.
+        allows_all_intervals = self.amendment == "ax" and mode.phy_format != "HE"
         return (
             mode.phy_format in formats
             and mode.width_mhz <= self.width_mhz
             and mode.streams <= self.streams
-            and (is_he or mode.guard_interval_ns >= self.guard_interval_ns)
+            and (allows_all_intervals or mode.guard_interval_ns >= self.guard_interval_ns)
         )
 
 

@@ -2,13 +2,15 @@
 
 The algorithm is from `net/mac80211/rc80211_minstrel_ht.c` in Linux 5.14 and later. Modes form groups with equal
 width, guard interval and number of streams. Each mode has a smoothed share of acknowledged frames, updated
-every 50 ms. Three modes form the chain of a frame: the two with the highest expected throughput, and a robust one. At
-most every 20 ms a frame is tried once in another mode before the second mode of the chain.
+every 50 ms. A frame has a retry chain, which is the sequence of modes in which it is tried: the two modes with the
+highest expected throughput, and a robust one. At most every 20 ms a frame is tried once in another mode before the
+second mode of the chain.
 
 The model differs from Linux in four ways. It does not use the rates of 802.11a/b/g. It applies the same rules to
 groups of 802.11ax, which Linux does not have. After its chain, a frame is tried in the robust mode up to the retry
-limit; Linux gives up a single frame at the end of its chain. For drivers that permit four modes, Linux adds the third
-fastest mode to the chain.
+limit; Linux gives up a single frame at the end of its chain. The chain always has three modes; for drivers that
+permit four, Linux adds the third fastest mode.
+
 `benchmarks.minstrel_vs_kernel` compares the selected modes with those of Linux 6.1.
 """
 
@@ -30,10 +32,13 @@ _OVERHEAD_NS: Final = 108_000
 """Time of an exchange besides the data, as mac80211 computes it: SIFS with signal extension (16 us), preamble and
 header (20 us) and 3 symbols of 6 Mbit/s for an empty frame; the same and 6 symbols for its ACK."""
 _SEGMENT_NS: Final = 6_000_000
+"""Time into which all tries of one mode must fit: `segment_size` of mac80211."""
 _RANKED: Final = 4
+"""Number of modes in a ranking: `MAX_THR_RATES` of mac80211."""
 _SAMPLES_PER_TYPE: Final = 5
 _UNUSABLE_SHARE, _CAPPED_SHARE, _UNRELIABLE_SHARE = 0.1, 0.9, 0.2
 _ROBUST_SHARE, _RELIABLE_SHARE = 0.75, 0.95
+# If fewer than 25 % of more than 30 frames were acknowledged, a mode is replaced before the next update.
 _FAILING_FRAMES, _FAILING_SHARE = 30, 0.25
 _LENGTH_OLD_WEIGHT: Final = 96 / 128
 
@@ -143,8 +148,8 @@ class MinstrelHt(RateControl):
         self._aggregate_frames += attempts
         self._aggregates += 1
         is_failing = False
-        for rank, leader in enumerate((self._best, self._second)):
-            statistics = self._statistics[leader]
+        for rank, chain_mode in enumerate((self._best, self._second)):
+            statistics = self._statistics[chain_mode]
             if (
                 statistics.frames > _FAILING_FRAMES
                 and statistics.acknowledged < _FAILING_SHARE * statistics.frames

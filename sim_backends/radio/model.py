@@ -1,4 +1,4 @@
-"""Radio models behind one interface."""
+"""The interface of radio models, and Wi-Fi stations in a world."""
 
 from collections.abc import Callable, Mapping, Sequence, Set
 from functools import partial
@@ -68,7 +68,7 @@ class RadioModel(Protocol[Payload]):
             destination: Name of the receiver; None for a broadcast.
             packet: Identity from which its random numbers are derived; None to number the packets of the source in
                 order.
-            before: Delay of the packet until now.
+            before: Delay that the packet already has, for example from an earlier hop.
             dscp: Its DSCP, for stations with access categories.
 
         Raises:

@@ -217,7 +217,7 @@ def basic_mode(band: Band) -> WifiMode:
 
 @cache
 def control_mode(mode: WifiMode) -> WifiMode:
-    """Return the mode of the ACK to a frame in `mode`: the fastest mandatory rate that is no faster (10.6.6.5).
+    """Return the mode of the ACK to a frame in `mode`: the fastest mandatory rate up to the frame's rate (10.6.6.5).
 
     The reference rate of an HT, VHT or HE mode is the rate of the clause 17 mode with the same modulation and code
     rate (10.6.11).

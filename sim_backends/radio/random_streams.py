@@ -64,7 +64,10 @@ class RandomStream:
 
 
 def first_draws(seed: int, names: Sequence[Sequence[str]], count: int) -> NDArray[np.float64]:
-    """Return the first draws of `RandomStream(seed, *name)` for many names, shape (names, count); 3 times faster."""
+    """Return the first draws of `RandomStream(seed, *name)` for many names, shape (names, count).
+
+    This is 3 times faster than separate streams.
+    """
     generator = Philox(key=0)
     initial_state = generator.state
     words = np.empty((len(names), count), dtype=np.uint64)

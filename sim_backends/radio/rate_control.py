@@ -56,6 +56,7 @@ _OLD_WEIGHT: Final = 0.75
 _SAMPLE_SHARE: Final = 0.1
 _REFERENCE_BYTES: Final = 1200
 _SEGMENT_NS: Final = 6_000_000
+"""Time into which all attempts in one mode must fit: `segment_size` of mac80211."""
 _LOW_SHARE, _HIGH_SHARE = 0.1, 0.95
 _SAMPLES: Final = 4
 _STALE_UPDATES: Final = 20

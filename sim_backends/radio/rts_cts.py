@@ -99,6 +99,7 @@ class RtsCts(Generic[Payload]):
     ) -> None:
         is_decoded = self._reception.decodes(frame.receiver, rts, "rts")
         cts_ns = rts.mode.airtime_ns(CTS_BYTES)
+        # NAVTimeout of 10.3.2.4.
         self._reception.reserve(now_ns, rts, now_ns + 2 * (self._sifs_ns + SLOT_NS) + cts_ns + _PHY_START_DELAY_NS)
         self._reception.end(now_ns, rts)
         self._log(rts, frame.receiver, "RTS", is_decoded=is_decoded)
@@ -132,8 +133,12 @@ class RtsCts(Generic[Payload]):
         self._events.schedule(now_ns + self._sifs_ns, self._finish, frame, exchange_id, is_decoded)
 
     def _finish(self, now_ns: int, frame: ProtectedFrame[Payload], exchange_id: int, is_protected: bool) -> None:
-        if exchange_id == frame.station.exchange_id:
-            (frame.send if is_protected else frame.fail)(now_ns)
+        if exchange_id != frame.station.exchange_id:
+            return
+        if is_protected:
+            frame.send(now_ns)
+        else:
+            frame.fail(now_ns)
 
     def _log(self, transmission: Transmission, receiver: int, kind: ControlFrame, *, is_decoded: bool) -> None:
         if self.log is not None:

@@ -75,7 +75,7 @@ class Station(Generic[Payload]):
         self.queue = self.categories.active.frames
 
     def _backoff(self, queue: deque[Frame[Payload]]) -> float:
-        """Return the next random draw for the first frame in a queue after its current number of attempts."""
+        """Return the random draw of the backoff for the next attempt at the first frame in a queue."""
         frame = queue[0]
         attempt = frame.packet, frame.attempts
         # A station that drew 0 slots and finds the channel busy draws again.

@@ -2,8 +2,8 @@
 
 The engine is event-driven, computes with integer nanoseconds, and uses no clock and no socket. It implements
 `model.RadioModel`. Frames between stations with `phy` are aggregated, and may have RTS and CTS and access categories.
-Power save delays frames to stations of an access point. Only beacons of `access_points` have airtime; fragmentation
-is not modelled.
+Power save delays frames to stations of an access point. Beacons have airtime only if the option
+`access_points` is used; fragmentation is not modelled.
 """
 
 from collections.abc import Callable, Mapping, Sequence, Set
@@ -61,7 +61,7 @@ class Wifi(Generic[Payload]):
         self._stations, self._events = self._exchange.stations, self._exchange.events
         self._delivery = self._exchange.delivery
         self._queue_packets = queue_packets
-        # Time per packet, and the end of the last packet's time, of stations with a slow bus.
+        # Stations with a slow bus: the time that the bus needs per packet, and the time from which the bus is free.
         indices = range(len(channel.names))
         self._packet_times_ns = {index: time_ns for index in indices if (time_ns := channel.packet_time_ns(index))}
         self._bus_free_ns: dict[int, int] = {}

@@ -32,7 +32,7 @@ from sim_backends.world.world import World
 
 # A gain is used for this share of the shortest period of an echo's phase.
 _GAIN_VALID_PERIODS: Final = 0.02
-_SLOWEST_M_S: Final = 1e-6
+_SLOWEST_M_S: Final = 1e-6  # avoids a division by 0 if nothing moves
 
 # Number of links that are computed together. This takes little longer than one link (about 0.3 ms among trees), and
 # the next sender may need the other links.
@@ -218,10 +218,10 @@ class WorldChannel(RadioChannel):
         cache = self._gain_caches[station]
         if cache is None:
             # An ACK needs the same gain as its data frame, so if there are few links they are computed together.
-            all_links = self._ends.shape[1] <= _BATCH_LINKS
-            links = np.arange(self._ends.shape[1]) if all_links else self._own_links[station]
+            has_few_links = self._ends.shape[1] <= _BATCH_LINKS
+            links = np.arange(self._ends.shape[1]) if has_few_links else self._own_links[station]
             cache = GainCache(links, self._ends[:, links], self._fading.echoes(links))
-            if all_links:
+            if has_few_links:
                 self._gain_caches = [cache] * len(self.names)
             else:
                 self._gain_caches[station] = cache

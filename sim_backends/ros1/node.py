@@ -19,7 +19,7 @@ from sim_backends.ros1.framing import PacketSplitter, pack, pack_header, unpack_
 from sim_backends.ros1.node_calls import CALL_S, SUCCESS, MasterError, RosNodeRequests, RosNodeServer, call
 
 _RETRY_S: Final = 0.1
-_CHUNK: Final = 1 << 16
+_CHUNK_BYTES: Final = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ class RosSubscriber:
         stream.sendall(pack(pack_header(fields)))
         packets, has_header = PacketSplitter(), False
         try:
-            while data := stream.recv(_CHUNK):
+            while data := stream.recv(_CHUNK_BYTES):
                 packets.feed(data)
                 for packet in packets:
                     if has_header:
@@ -262,7 +262,8 @@ class RosNode:
         Args:
             topic: The topic.
             kind: Its type.
-            deadline_s: Time until which this waits for the master, on the clock of `time.monotonic`.
+            deadline_s: Time on the clock of `time.monotonic` until which calls of a master that does not answer are
+                repeated.
 
         Raises:
             TimeoutError: No master answers.
@@ -273,7 +274,7 @@ class RosNode:
         return publisher
 
     def subscribe(self, topic: str, kind: RosMessageType, deadline_s: float) -> RosSubscriber:
-        """Return a subscriber to a topic. Arguments and errors are those of `publish`."""
+        """Return a subscriber to a topic; see `publish` for the arguments and errors."""
         subscriber = self._subscribers[topic] = RosSubscriber(topic, kind, self._name)
         subscriber.update(self._register("registerSubscriber", topic, kind, deadline_s))
         return subscriber
@@ -305,7 +306,7 @@ class RosNode:
             stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             stream.settimeout(CALL_S)
             packets = PacketSplitter()
-            while data := stream.recv(_CHUNK):
+            while data := stream.recv(_CHUNK_BYTES):
                 packets.feed(data)
                 for packet in packets:
                     header = unpack_header(packet)

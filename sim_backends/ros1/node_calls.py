@@ -57,7 +57,7 @@ def call(uri: str, method: str, *arguments: object) -> Any:  # noqa: ANN401 (a v
 
     Raises:
         OSError: The master or node cannot be reached.
-        MasterError: It refused the call, or its answer is not a valid answer in ROS.
+        MasterError: It refused the call, or its answer is not valid in ROS 1.
     """
     try:
         answer = getattr(ServerProxy(uri, transport=_TimedTransport()), method)(*arguments)

@@ -32,17 +32,17 @@ class Solid:
     d: float
 
     def permittivity(self, frequency_hz: float) -> complex:
-        """Return the relative permittivity; its imaginary part is not above 0: ITU-R P.2040-1, eq. 9."""
+        """Return the relative permittivity; its imaginary part is 0 or negative (ITU-R P.2040-1, eq. 9)."""
         ghz = frequency_hz / 1e9
         return complex(self.a * ghz**self.b, -_LOSS_FACTOR * self.c * ghz**self.d / ghz)
 
     def loss_db_per_m(self, frequency_hz: float) -> float:
-        """Return the attenuation of a plane wave inside, in dB/m: ITU-R P.2040-1, eqs. 22 to 24."""
+        """Return the attenuation of a plane wave in the material, in dB/m (ITU-R P.2040-1, eqs. 22 to 24)."""
         wave_number = 2 * math.pi * frequency_hz / SPEED_OF_LIGHT_M_S
         return -_DB_PER_NEPER * wave_number * cmath.sqrt(self.permittivity(frequency_hz)).imag
 
     def face_loss_db(self, frequency_hz: float) -> float:
-        """Return the reflection loss of one face at normal incidence, in dB: ITU-R P.2040-1, eq. 31, theta 0."""
+        """Return the reflection loss of one face at normal incidence, in dB (ITU-R P.2040-1, eq. 31, theta = 0)."""
         root = cmath.sqrt(self.permittivity(frequency_hz))
         reflected = abs((1 - root) / (1 + root)) ** 2
         return -10 * math.log10(1 - reflected)
@@ -53,7 +53,8 @@ class Foliage:
     """Leaves and branches; the loss depends on their total depth along a path.
 
     Weissberger's modified exponential decay (1982, ESD-TR-81-101), for 0.23 to 95 GHz, trees in leaf: with f in GHz
-    and d in m, 0.45 f^0.284 d below 14 m, 1.33 f^0.284 d^0.588 above. It is also used beyond its range of 400 m.
+    and d in m, the loss is 0.45 f^0.284 d dB below 14 m and 1.33 f^0.284 d^0.588 dB above. The formula is also used
+    beyond its range of 400 m.
     """
 
     def loss_db(self, depth_m: float, frequency_hz: float) -> float:

@@ -68,8 +68,8 @@ class Motion(Protocol):
 class WayPoints:
     """One robot moves straight from point to point at one speed, and stops at the last point.
 
-    It has no mutable state: a state depends only on the time. Corners are passed at times rounded from their distance
-    along the path, so that rounding errors do not add up.
+    It has no mutable state: a state depends only on the time. The time at each corner is computed from the distance
+    along the whole path, so that rounding errors do not add up.
 
     Args:
         name: The robot.
@@ -103,10 +103,11 @@ class WayPoints:
         return {self.name: self._state(time_ns)}
 
     def limit_m_s2(self, time_ns: int) -> float:
-        """Return an acceleration a such that extrapolation at the current velocity is wrong by at most a t^2 / 2.
+        """Return an acceleration a for which an extrapolation by the time t has an error of at most a t^2 / 2.
 
-        Up to the next corner, c from now, there is no error; after it two velocities of speed v differ by at most 2
-        v. The error is therefore at most 2 v (t - c), which is at most (v / c) t^2 / 2.
+        The extrapolation uses the current velocity, so it has no error until the robot is at the next corner, after
+        the time c. From then on, the true and the extrapolated velocity have the same speed v and differ by at most
+        2 v. The error is therefore at most 2 v (t - c), which is at most (v / c) t^2 / 2.
         """
         corner = bisect_right(self._times_ns, time_ns)
         if corner == len(self._times_ns):
@@ -128,7 +129,7 @@ def _leg(start: Vector, end: Vector, start_ns: int, end_ns: int) -> tuple[int, i
     """Return start time, duration, start, displacement and velocity of a leg."""
     e, n, u = (last - first for first, last in zip(start, end, strict=True))
     duration_ns = end_ns - start_ns
-    per_s = 1e9 / max(duration_ns, 1)  # a leg without length is never used
+    per_s = 1e9 / max(duration_ns, 1)  # a leg without length would divide by 0; `_state` never uses it
     return start_ns, duration_ns, start, (e, n, u), (per_s * e, per_s * n, per_s * u)
 
 

@@ -81,7 +81,10 @@ class _Rectangular(_Obstacle):
     yaw_deg: Real = 0
 
     def _box(self, size_m: Vector, *, along_m: float = 0.0, across_m: float = 0.0, base_m: float = 0.0) -> Box:
-        """Return a box with parallel edges, shifted from the centre along them, with its underside at `base_m`."""
+        """Return a box with edges parallel to the edges of the base, and with its underside at `base_m`.
+
+        Its centre is shifted from the centre of the base along these edges.
+        """
         yaw = math.radians(self.yaw_deg)
         east_m = self.centre_m[0] + along_m * math.cos(yaw) - across_m * math.sin(yaw)
         north_m = self.centre_m[1] + along_m * math.sin(yaw) + across_m * math.cos(yaw)
@@ -219,7 +222,7 @@ class _HigherGround(_Rectangular):
 
 
 class Raised(_HigherGround):
-    """Raised ground with upright sides, on which robots can be.
+    """Raised ground with upright sides, on which robots can drive.
 
     Attributes:
         kind: `raised`.
@@ -245,7 +248,7 @@ class Raised(_HigherGround):
 class Ramp(_HigherGround):
     """Ground that rises evenly along its first edge, from 0 to its height, with upright sides.
 
-    For radio waves and robots that fly it has eight steps.
+    For radio waves and flying robots, the slope has eight steps.
 
     Attributes:
         kind: `ramp`.

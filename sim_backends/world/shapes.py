@@ -168,7 +168,10 @@ def _vectors(points: Iterable[Vector]) -> Floats:
 
 
 def _slab(start: Floats, end: Floats, half: Floats) -> tuple[Floats, Floats]:
-    """Return the positions, within 0..1, where each path enters and leaves -half..half; 1 and 0 if it never does."""
+    """Return the fractions of each path, from 0 to 1, at which the path enters and leaves the range -half to half.
+
+    The fractions are 1 and 0 if the path does not enter the range.
+    """
     step = end - start
     level = step == 0
     step = np.where(level, 1.0, step)
@@ -185,12 +188,12 @@ def _disc(start: Floats, end: Floats, radius: Floats) -> tuple[Floats, Floats]:
     a = (step * step).sum(axis=-1)
     half_b = (start * step).sum(axis=-1)
     c = (start * start).sum(axis=-1) - radius**2
-    root = half_b**2 - a * c
-    level = a == 0
-    crosses = (root > 0) & ~level
-    square = np.sqrt(np.where(crosses, root, 0.0))
-    divisor = np.where(level, 1.0, a)
-    entry = np.clip((-half_b - square) / divisor, 0, 1)
-    exit_ = np.clip((-half_b + square) / divisor, 0, 1)
-    always = level & (c < 0)
+    discriminant = half_b**2 - a * c
+    is_vertical = a == 0
+    crosses = (discriminant > 0) & ~is_vertical
+    root = np.sqrt(np.where(crosses, discriminant, 0.0))
+    divisor = np.where(is_vertical, 1.0, a)
+    entry = np.clip((-half_b - root) / divisor, 0, 1)
+    exit_ = np.clip((-half_b + root) / divisor, 0, 1)
+    always = is_vertical & (c < 0)
     return np.where(crosses, entry, np.where(always, 0.0, 1.0)), np.where(crosses, exit_, np.where(always, 1.0, 0.0))

@@ -129,7 +129,11 @@ class World(Named):
 
 @cache
 def _material_losses(names: tuple[str, ...], frequency_hz: float) -> tuple[Floats, Floats, Floats]:
-    """Return an item per material: loss per metre and by two faces in dB (0 for foliage); 1 for foliage, else 0."""
+    """Return three arrays with an item per material.
+
+    They contain the loss per metre in dB and the loss of two faces in dB, which are 0 for foliage, and a flag, which
+    is 1 for foliage and 0 for a solid.
+    """
     materials = [MATERIALS[name] for name in names]
     solids = [material if isinstance(material, Solid) else None for material in materials]
     return (

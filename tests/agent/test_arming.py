@@ -134,6 +134,6 @@ def test_emulated_autopilots(firmware: Firmware, capsys: pytest.CaptureFixture[s
 
 
 def test_missing_heartbeat_is_reported(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(arming, "_HEARTBEAT_S", 0.3)
+    monkeypatch.setattr(arming, "_HEARTBEAT_TIMEOUT_S", 0.3)
     assert arming.check_arming(f"udpin:127.0.0.1:{free_port()}", NEEDS, threading.Event()) == 1
     assert "no heartbeat" in capsys.readouterr().err

@@ -13,12 +13,14 @@ from fieldkit.campaign.journal import JOURNAL_FILE, CampaignJournal, TrialProgre
 from fieldkit.campaign.order import walk_m
 from fieldkit.campaign.plan import CampaignPlan
 from fieldkit.campaign.runner import PLACING_S, CampaignRun
+from fieldkit.config import schema
 from fieldkit.config.site import load_site
 from fieldkit.core.campaign_events import CampaignEnded, CampaignPlanned
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.events import Event
 from fieldkit.core.prompts import Unattended
 from fieldkit.trial.running.stop import Stop
+from tests.helpers.casts import los_plan
 from tests.helpers.paths import ROOT
 
 LAWN = """\
@@ -80,7 +82,7 @@ def test_a_changed_file_is_rejected_with_the_key(lawn: Path, old: str, new: str,
     new_plan, document = plan.make_plan(lawn, "emulated" if changed_key == "backend" else "field")
     with pytest.raises(ConfigurationError) as error_info:
         plan.started_plan(journal.folder, new_plan, document)
-    assert error_info.value.what == f"changed since the campaign started: {changed_key}"
+    assert error_info.value.what == f"these have changed since the campaign started: {changed_key}"
     assert error_info.value.where == f"{lawn}:{line}"
     assert "campaign.yaml" in error_info.value.remedy
 
@@ -226,3 +228,19 @@ def test_trials_with_failed_repeats_are_planned_again_with_option_failed(lawn: P
     for current_journal in (journal, CampaignJournal(journal.folder)):
         assert set(current_journal.end_entries()) == {str(complete)}
         assert current_journal.interrupted_folder(failed) == journal.folder / "2"
+
+
+def test_planned_trials_without_an_attempt_are_named(tmp_path: Path) -> None:
+    file = tmp_path / "yard.yaml"
+    file.write_text(LAWN.replace("20ft", "30ft").replace("name: lawn", "name: yard"), encoding="utf-8")
+    campaign_plan, _ = plan.make_plan(file, "field")
+    journal = CampaignJournal(tmp_path / "campaign_yard")
+    with journal.locked(campaign_plan):
+        trial = journal.folder / "measured"
+        trial.mkdir()
+        (trial / "trial.yaml").write_text(schema.dump(los_plan()), encoding="utf-8")
+    notes: list[str] = []
+    unmeasured = list(plan.unmeasured([tmp_path], {str(trial)}, notes.append))
+    assert set(unmeasured) == {*map(str, campaign_plan.trials())} - {"los 30ft master"}
+    assert len(unmeasured) == 7
+    assert not notes

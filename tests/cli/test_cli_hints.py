@@ -44,7 +44,7 @@ def test_every_command_in_a_message_exists_and_accepts_its_options() -> None:
             command_parser = top_parser
             for word in match["words"].split():
                 command_parser = command_parser.command(word) or command_parser
-                command_parser.complete()
+                command_parser.declare_arguments()
             assert command_parser is not top_parser or not is_command, f"{path}: {text}"
             n_subcommands += command_parser is not top_parser
             options = [] if command_parser is top_parser else re.findall(r" (--[a-z-]+)", match["rest"])

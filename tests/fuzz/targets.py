@@ -306,7 +306,7 @@ def _read_host(path: Path) -> None:
 def _measure_ping(text: str) -> None:
     result = ping.parse(text)
     ping.measure(result)
-    assert len(result.gaps) <= 1 << 16
+    assert len(result.unanswered_seqs) <= 1 << 16
 
 
 def _measure_track(path: Path) -> None:

@@ -101,7 +101,7 @@ def test_a_second_duration_is_rejected(kind: str, keys: str, message: str) -> No
 
 def test_along_without_move_is_rejected() -> None:
     text = TEXT[: TEXT.index("  - move")] + f"  - ping: {{{ENDS}, along: true}}\n"
-    with pytest.raises(ConfigurationError, match="needs a move around it") as caught:
+    with pytest.raises(ConfigurationError, match="is allowed only inside a move") as caught:
         schema.validate(schema.parse(text, source="x.yaml"), Procedure)
     assert caught.value.where == "x.yaml:8"
 

@@ -78,7 +78,7 @@ def test_missing_positions_do_not_contradict_the_placement(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("error_m", "expected_reason"), [(0.0, None), (200.0, "has the receiver 200.0 m from its placement")]
+    ("error_m", "expected_reason"), [(0.0, None), (200.0, "the receiver is 200.0 m away from its placement")]
 )
 def test_a_position_recorded_by_the_laptop_is_compared_with_the_plan(
     error_m: float, expected_reason: str | None, tmp_path: Path

@@ -132,7 +132,7 @@ static const char *hello(Reader *reader, Writer *answer)
     if (memcmp(get_bytes(reader, 8), "FIELDKIT", 8) != 0 || get(reader, 2) != VERSION)
         return "this is not version 1 of the protocol";
     if (get(reader, 1) != PHYSICS)
-        return "this federate is a physics";
+        return "this federate is a physics federate";
     get_bytes(reader, 1 + 4 + 8); /* reserved, heartbeat_ms, seed */
     step_ns = (int64_t)get(reader, 8);
     get_bytes(reader, 8); /* end_ns */

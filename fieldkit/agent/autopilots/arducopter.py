@@ -8,6 +8,7 @@ from fieldkit.agent.autopilots.dialect import CHANGE_SPEED, CUSTOM_MODE, SET_MOD
 from fieldkit.agent.autopilots.mavlink_frames import EKF_STATUS_REPORT
 
 _ARDUPILOT = 3
+"""MAV_AUTOPILOT_ARDUPILOTMEGA."""
 _COPTERS = frozenset((2, 3, 4, 13, 14, 15, 29, 35))
 """MAV_TYPE: quadrotor, coaxial, helicopter, hexarotor, octorotor, tricopter, dodecarotor, decarotor."""
 _AUTO, _GUIDED, _RTL, _LAND, _SMART_RTL, _AUTO_RTL = 3, 4, 6, 9, 21, 27
@@ -39,9 +40,11 @@ _MODES = {
     _AUTO_RTL: "AUTO_RTL",
     28: "TURTLE",
 }
-"""Names of its modes by number (ArduCopter/mode.h; https://ardupilot.org/copter/docs/parameters.html#fltmode1)."""
+"""Names of the modes by number (ArduCopter/mode.h; https://ardupilot.org/copter/docs/parameters.html#fltmode1)."""
 _CLIMB_SPEED = 2
+"""SPEED_TYPE_CLIMB_SPEED."""
 _FENCE_TOP, _FENCE_CIRCLE = 1, 2
+"""Bits of the parameter FENCE_TYPE: maximum altitude, and a circle around home."""
 
 
 class ArduCopter:
@@ -91,7 +94,10 @@ class ArduCopter:
         return (SET_MODE, CUSTOM_MODE, _GUIDED)
 
     def take_off_commands(self, height_m: float, climb_m_s: float) -> Sequence[Command]:
-        """Return the commands for climb speed and take-off; versions before 4.1 use WPNAV_SPEED_UP as climb speed."""
+        """Return the commands for climb speed and take-off.
+
+        ArduCopter before 4.1 ignores the climb speed of the command and uses its parameter WPNAV_SPEED_UP.
+        """
         return (CHANGE_SPEED, _CLIMB_SPEED, climb_m_s), (TAKE_OFF, 0, 0, 0, 0, 0, 0, height_m)
 
     def bring_down_command(self, action: str) -> Command:
@@ -99,7 +105,7 @@ class ArduCopter:
         return (SET_MODE, CUSTOM_MODE, _RTL if action == "return" else _LAND)
 
     def limits(self, values: Mapping[str, float]) -> AutopilotLimits:
-        """Return its limits; RTL_ALT is in cm, and RTL_ALT_M replaced it in 4.7."""
+        """Return the limits; RTL_ALT is in cm, and RTL_ALT_M, in m, replaced it in ArduCopter 4.7."""
         fences = int(values.get("FENCE_TYPE", 0)) if values.get("FENCE_ENABLE") else 0
         return_m = values["RTL_ALT"] / 100 if "RTL_ALT" in values else values.get("RTL_ALT_M")
         return AutopilotLimits(

@@ -36,13 +36,13 @@ MAX_BYTES = 256 << 20
 """Maximum size of a log, for example if another program floods the recorder."""
 
 _STAMP = struct.Struct(">Q")
-_HEARTBEAT_S = 1.0
-_REQUEST_S = 0.4
+_HEARTBEAT_INTERVAL_S = 1.0
+_REQUEST_INTERVAL_S = 0.4
 _TIMEOUT_S = 60.0
 """Timeout for requested messages. ArduCopter sends LOCAL_POSITION_NED about 30 s after its boot, when its position
 estimate has an origin."""
 _MIN_FRACTION = 0.7
-"""Minimum fraction of a requested rate, as for the link server."""
+"""A message with less than this fraction of its requested rate is too slow. The link server uses the same value."""
 _POLL_S = 0.1
 
 
@@ -52,7 +52,7 @@ class FlightRecording:
 
     Attributes:
         connection: Name of the connection to the autopilot; see `mavlink_links.open_link`.
-        intervals_us: Requested interval by message id, which is a text because keys of JSON are texts.
+        intervals_us: Requested interval by message id, which is a string because keys of JSON objects are strings.
         system: System id of the autopilot; 0 for the first one whose heartbeat arrives.
     """
 
@@ -142,10 +142,10 @@ class FlightRecorder:
         """Send heartbeats, and repeat each request for a message until the link server has registered it."""
         now_s = time.monotonic()
         if now_s >= self._next_heartbeat_s:
-            self._next_heartbeat_s = now_s + _HEARTBEAT_S
+            self._next_heartbeat_s = now_s + _HEARTBEAT_INTERVAL_S
             self._link.send(self._writer.heartbeat())
         if self._autopilot and now_s >= self._next_request_s:
-            self._next_request_s = now_s + _REQUEST_S
+            self._next_request_s = now_s + _REQUEST_INTERVAL_S
             for kind, interval_us in self._requested_us.items():
                 if kind not in self._link.messages:
                     self._link.send(self._writer.command(self._autopilot, SET_MESSAGE_INTERVAL, kind, interval_us))

@@ -8,6 +8,7 @@ from fieldkit.agent.autopilots.dialect import CUSTOM_MODE, LAND, RETURN, SET_MOD
 from fieldkit.agent.autopilots.mavlink_frames import ESTIMATOR_STATUS
 
 _PX4 = 12
+"""MAV_AUTOPILOT_PX4."""
 _OFFBOARD, _AUTO = 6, 4
 _TAKEOFF, _LOITER, _MISSION, _RTL, _LAND, _PRECLAND = 2, 3, 4, 5, 6, 9
 _MAIN = {
@@ -37,7 +38,7 @@ _SUB = {
 
 
 class Px4:
-    """Dialect of PX4. PX4 takes off by set-points too, and holds its position if they are missing (COM_OF_LOSS_T)."""
+    """Dialect of PX4, which takes off by set-points and holds its position if they are missing (COM_OF_LOSS_T)."""
 
     name = "PX4"
     guided_mode = "OFFBOARD"
@@ -54,7 +55,10 @@ class Px4:
         return _mode_parts(mode)[0] == _OFFBOARD
 
     def is_program_controlled(self, mode: int) -> bool:
-        """Return True in OFFBOARD and in AUTO modes for programs; AUTO.LOITER follows each take-off and each move."""
+        """Return True in OFFBOARD, AUTO.TAKEOFF, AUTO.MISSION and AUTO.LOITER.
+
+        PX4 selects AUTO.LOITER after each take-off and each move.
+        """
         main, sub = _mode_parts(mode)
         return main == _OFFBOARD or (main == _AUTO and sub in (_TAKEOFF, _LOITER, _MISSION))
 
@@ -87,7 +91,7 @@ class Px4:
         return (RETURN,) if action == "return" else (LAND,)
 
     def limits(self, values: Mapping[str, float]) -> AutopilotLimits:
-        """Return its limits; a value of 0 means no fence (parameter reference, Geofence)."""
+        """Return the limits; a value of 0 means no fence (PX4 parameter reference, Geofence)."""
         return AutopilotLimits(
             height_m=values.get("GF_MAX_VER_DIST") or None,
             radius_m=values.get("GF_MAX_HOR_DIST") or None,

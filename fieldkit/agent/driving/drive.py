@@ -1,8 +1,8 @@
 """Drive a ground robot along its path through its velocity topic, in a closed loop with its odometry.
 
-The laptop renews its order repeatedly (`orders`). If no order arrives within the lease of the task, the laptop or the
-link to it is lost, and the robot stops. Velocities are published `RATE_HZ` times per second; the base of a robot
-stops when no more velocities arrive.
+The laptop renews its order repeatedly (`orders`). If no order arrives within the lease of the task, the robot stops,
+because the laptop or the link to it is probably lost. Velocities are published `RATE_HZ` times per second; the base
+of a robot stops if no more velocities arrive.
 """
 
 from __future__ import annotations
@@ -170,9 +170,9 @@ def _report(
 ) -> None:
     """Write the state of the drive to the status file for the laptop, and to the log while the robot is on its path.
 
-    The status also contains `pose` in the frame of the odometry; `frame_id`, which identifies this frame: the boot
-    ID, because the frame starts anew at each boot; `ready`, whether the robot is stationary and may start; `refused`,
-    whether it did not start because it is not at the required place.
+    The status also contains `pose`, the pose in the frame of the odometry; `frame_id`, the boot ID, which identifies
+    this frame because odometry restarts at each boot; `ready`, True if the robot is stationary and may start; and
+    `refused`, True if it did not start because it is not at the required place.
     """
     relative_pose, pose = driver.relative_pose, driver.pose
     if relative_pose is None or pose is None:

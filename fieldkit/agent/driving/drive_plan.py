@@ -30,7 +30,9 @@ HEADING_TOLERANCE_RAD = 0.05
 TURN_RAMP_S = 0.5
 """Time in which the turn rate rises from 0 to its limit."""
 _TURN_GAIN_PER_S = 2.0
+"""Turn rate per remaining angle near the end of a turn."""
 _STEP_S = 0.01
+"""Time step of the simulation in `_turn_duration_s`."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ def path_duration_s(task: DriveTask) -> float:
 
 
 def _turn_duration_s(angle_rad: float, turn_rad_s: float) -> float:
-    """Return the duration of a turn in place, by a simulation of the `Driver`."""
+    """Return the duration of a turn in place. The turn rates of `Driver` are simulated."""
     remaining_rad, rate_rad_s, duration_s = abs(angle_rad), 0.0, 0.0
     while remaining_rad > HEADING_TOLERANCE_RAD:
         rate_rad_s = min(
@@ -95,8 +97,12 @@ def _turn_duration_s(angle_rad: float, turn_rad_s: float) -> float:
 
 
 def _leg_duration_s(length_m: float, task: DriveTask) -> float:
-    """Return the duration of a leg: acceleration, constant speed, and braking with half of the acceleration."""
+    """Return the duration of a leg: acceleration, constant speed, and braking with half of the acceleration.
+
+    The leg ends at the distance `ARRIVAL_TOLERANCE_M` from its corner, so the robot does not brake to zero.
+    """
     acceleration = task.acceleration_m_s2
+    # Acceleration needs the distance v^2 / 2a, and braking needs v^2 / a: together 1.5 v^2 / a.
     speed_m_s = min(task.speed_m_s, math.sqrt(acceleration * length_m / 1.5))
     final_m_s = min(speed_m_s, math.sqrt(acceleration * ARRIVAL_TOLERANCE_M))
     constant_speed_m = length_m - 1.5 * speed_m_s**2 / acceleration
@@ -104,7 +110,7 @@ def _leg_duration_s(length_m: float, task: DriveTask) -> float:
 
 
 def turn_rate_rad_s(remaining_rad: float, turn_rad_s: float) -> float:
-    """Return the turn rate for a remaining angle: half of the angular acceleration must suffice to stop there."""
+    """Return the turn rate for a remaining angle, at which half of the angular acceleration suffices to stop."""
     return min(_TURN_GAIN_PER_S * remaining_rad, math.sqrt(turn_rad_s / TURN_RAMP_S * remaining_rad))
 
 

@@ -30,6 +30,7 @@ from fieldkit.agent.driving.drive_plan import (
 _TURN_IN_PLACE_RAD = 0.6
 """Heading error above which a robot stops and turns in place; it drives again below `HEADING_TOLERANCE_RAD`."""
 _LOOKAHEAD_M = 0.5
+"""Look-ahead distance of pure pursuit: the robot steers to the point of the leg at this distance ahead of it."""
 _MIN_SPEED_M_S = 0.03
 """Minimum speed at which the motors of a robot turn."""
 _MAX_JUMP_M = 0.5
@@ -86,7 +87,7 @@ class Driver:
         self._task = task
         self._created_s = now_s
         self._now_s = self._order_s = self._odometry_s = self._phase_s = now_s
-        self._start = None if task.origin is None else OdometryPose(*task.origin)
+        self._origin = None if task.origin is None else OdometryPose(*task.origin)
         self._reference: OdometryPose | None = None
         self._reference_s = now_s
         self._pose: OdometryPose | None = None
@@ -106,7 +107,7 @@ class Driver:
     @property
     def relative_pose(self) -> OdometryPose | None:
         """The robot's pose relative to its origin; None before the first odometry."""
-        return None if self._start is None or self._pose is None else _relative_pose(self._start, self._pose)
+        return None if self._origin is None or self._pose is None else _relative_pose(self._origin, self._pose)
 
     @property
     def pose(self) -> OdometryPose | None:
@@ -116,7 +117,7 @@ class Driver:
     @property
     def ready(self) -> bool:
         """Whether the robot is stationary at a place where it may start."""
-        return self._start is not None and self._pose is not None and not self.is_finished and self._is_still
+        return self._origin is not None and self._pose is not None and not self.is_finished and self._is_still
 
     @property
     def _is_still(self) -> bool:
@@ -161,7 +162,10 @@ class Driver:
         self._stop(reason)
 
     def _check_start(self, now_s: float, pose: OdometryPose) -> None:
-        """Check that the robot is stationary and at the required place; the first such pose is its origin."""
+        """Check that the robot is stationary and at the required place.
+
+        If the task has no origin, the pose of the stationary robot becomes the origin.
+        """
         reference = self._reference
         if (
             reference is None
@@ -172,8 +176,8 @@ class Driver:
         if not self._is_still:
             return
         task = self._task
-        if self._start is None:
-            self._start = pose  # the laptop records it
+        if self._origin is None:
+            self._origin = pose  # the laptop records it
         relative_pose, last = self.relative_pose, task.last
         assert relative_pose is not None
         distance_m, angle_rad = math.hypot(relative_pose.x_m, relative_pose.y_m), abs(relative_pose.yaw_rad)
@@ -375,8 +379,8 @@ def _clamp(value: float, limit: float) -> float:
     return max(-limit, min(value, limit))
 
 
-def _relative_pose(start: OdometryPose, pose: OdometryPose) -> OdometryPose:
-    """Return a pose relative to another one, whose heading is the x axis."""
-    cos, sin = math.cos(start.yaw_rad), math.sin(start.yaw_rad)
-    x_m, y_m = pose.x_m - start.x_m, pose.y_m - start.y_m
-    return OdometryPose(cos * x_m + sin * y_m, cos * y_m - sin * x_m, wrap_angle(pose.yaw_rad - start.yaw_rad))
+def _relative_pose(origin: OdometryPose, pose: OdometryPose) -> OdometryPose:
+    """Return a pose relative to an origin, whose heading is the x axis."""
+    cos, sin = math.cos(origin.yaw_rad), math.sin(origin.yaw_rad)
+    x_m, y_m = pose.x_m - origin.x_m, pose.y_m - origin.y_m
+    return OdometryPose(cos * x_m + sin * y_m, cos * y_m - sin * x_m, wrap_angle(pose.yaw_rad - origin.yaw_rad))

@@ -19,7 +19,7 @@ from fieldkit.agent.flying.session import AutopilotSession
 _POLL_S = 0.1
 _RETRY_S = 0.4
 """Retry interval of a request without an answer."""
-_HEARTBEAT_S = 5.0
+_HEARTBEAT_TIMEOUT_S = 5.0
 _TIMEOUT_S = 5.0
 """Timeout for reports that every autopilot sends."""
 _OPTIONAL_TIMEOUT_S = 1.5
@@ -31,6 +31,7 @@ _NO_ESTIMATE = "Need Position Estimate"
 _RESULT_DELAY_S = 0.3
 """Delay after the arming checks until SYS_STATUS contains their result."""
 _RATE_HZ = 5.0
+"""Rate at which reports are requested."""
 
 _PREARM = 0x10000000
 """MAV_SYS_STATUS_PREARM_CHECK."""
@@ -122,7 +123,7 @@ class ArmingCheck:
     def is_starting(self) -> bool:
         """Whether the position estimate is not ready yet; this takes about 30 s after power-on."""
         reports_no_estimate = any(_NO_ESTIMATE in text for text in self._drone.texts.warnings)
-        return self._drone.dialect is not None and (reports_no_estimate or any(True for _ in self._position()))
+        return self._drone.dialect is not None and (reports_no_estimate or any(self._position_faults()))
 
     @property
     def is_complete(self) -> bool:
@@ -153,12 +154,12 @@ class ArmingCheck:
             return
         if drone.armed:
             yield ArmingFault("its motors are running", "land it first")
-        yield from self._position()
-        yield from self._battery()
-        yield from self._prearm_checks()
-        yield from self._limits()
+        yield from self._position_faults()
+        yield from self._battery_faults()
+        yield from self._prearm_faults()
+        yield from self._limit_faults()
 
-    def _position(self) -> Iterator[ArmingFault]:
+    def _position_faults(self) -> Iterator[ArmingFault]:
         drone = self._drone
         if drone.position_m is None:
             remedy = "wait for its GPS, or check that its camera or flow sensor runs and faces the ground"
@@ -173,7 +174,7 @@ class ArmingCheck:
             what = "it has no home position, but it must return home if the trial is aborted"
             yield ArmingFault(what, "wait for its GPS, or write on_abort: land in the procedure")
 
-    def _battery(self) -> Iterator[ArmingFault]:
+    def _battery_faults(self) -> Iterator[ArmingFault]:
         status, minimum = self._drone.status, self._needs.least_charge
         if status is None:
             yield ArmingFault("it does not report its status (SYS_STATUS)", "check which messages its link forwards")
@@ -183,7 +184,7 @@ class ArmingCheck:
                 what, "charge or replace the battery; mavlink.least_charge in its profile sets the minimum"
             )
 
-    def _prearm_checks(self) -> Iterator[ArmingFault]:
+    def _prearm_faults(self) -> Iterator[ArmingFault]:
         drone = self._drone
         assert drone.dialect is not None
         reasons = [
@@ -201,7 +202,7 @@ class ArmingCheck:
         remedy = "remove the cause; a ground station (QGroundControl, MAVProxy) shows the same messages"
         yield ArmingFault(what, remedy, prevents_flight=drone.guided or not drone.dialect.checks_current_mode)
 
-    def _limits(self) -> Iterator[ArmingFault]:
+    def _limit_faults(self) -> Iterator[ArmingFault]:
         drone, needs = self._drone, self._needs
         assert drone.dialect is not None
         limits = drone.dialect.limits(drone.parameters)
@@ -229,10 +230,12 @@ def check_arming(connection: str, needs: FlightNeeds, stop_event: threading.Even
         ValueError: The name of the connection is invalid.
     """
     with closing(AutopilotSession(connection, component=PREFLIGHT)) as session:
-        heartbeat_deadline_s = time.monotonic() + _HEARTBEAT_S
+        heartbeat_deadline_s = time.monotonic() + _HEARTBEAT_TIMEOUT_S
         while not session.drone.alive and not stop_event.is_set():
             if time.monotonic() > heartbeat_deadline_s:
-                sys.stderr.write(f"error: no heartbeat of an autopilot at {connection} in {_HEARTBEAT_S:g} s\n")
+                sys.stderr.write(
+                    f"error: no heartbeat of an autopilot at {connection} in {_HEARTBEAT_TIMEOUT_S:g} s\n"
+                )
                 return 1
             session.exchange(_POLL_S)
         check, estimate_deadline_s = ArmingCheck(session.drone, needs), time.monotonic() + _ESTIMATE_TIMEOUT_S

@@ -1,10 +1,10 @@
 """Fly a drone for a trial by set-points, and land it if the flight is aborted.
 
-The laptop writes orders to a file. Each order has a lease, the number of seconds for which it is valid. If an order
-is not renewed in time, the laptop or its link is lost; a signal cancels the job. In both cases the drone lands or
-returns, as its plan requires. The same happens if the guard, a second program on the drone (`flying.guard`), stops;
-the guard lands the drone if this program stops. The autopilot has failsafes in addition: PX4 has one for missing
-set-points (COM_OF_LOSS_T, COM_OBL_RC_ACT); ArduCopter holds its position.
+The laptop writes orders to a file. Each order has a lease, the number of seconds for which it is valid. The drone
+lands or returns, as its plan requires, if an order is not renewed in time because the laptop or its link is lost, if
+a signal cancels the job, or if the guard, a second program on the drone (`flying.guard`), stops. The guard lands the
+drone if this program stops. If set-points are missing, the autopilot itself reacts: PX4 has a failsafe
+(COM_OF_LOSS_T, COM_OBL_RC_ACT); ArduCopter holds its position.
 """
 
 from __future__ import annotations
@@ -52,7 +52,9 @@ from fieldkit.agent.flying.loop import FlightLoop
 from fieldkit.agent.flying.origin import FRAME, FlightOrigin, OriginError, Position, frame_id, resolve_origin
 
 _NEAR_M = 0.3
+"""A drone within this distance of a point has reached the point."""
 _SLOW_M_S = 0.2
+"""A slower drone is considered to hover."""
 _LIFTED_M = 0.3
 """A drone that is higher than this above the ground has taken off."""
 _RISEN_FRACTION = 0.9

@@ -1,9 +1,9 @@
 """The guard of a drone: a program that lands the drone if the program that flies it has stopped.
 
 The guard of a step `fly` acts only during a flight of its pilot, and only in the mode that the pilot has set. The
-guard of a drone that other programs fly acts in modes in which programs control a drone, and in the mode that a
-flying drone had when the guard started, until this mode changes for the first time. In all other modes a person or a
-failsafe of the autopilot controls the drone, and the guard sends nothing.
+guard of a drone that other programs fly acts in all modes in which programs control a drone. If the drone is already
+flying when the guard starts, the guard also acts in the current mode, until the mode changes for the first time. In
+all other modes a person or a failsafe of the autopilot controls the drone, and the guard sends nothing.
 """
 
 from __future__ import annotations

@@ -64,20 +64,20 @@ class LivenessFile:
 
     Args:
         path: The file; it is created if it is missing.
-        party: `PILOT` or `GUARD`: the entry of this program.
+        own_index: Index of the entry of this program: `PILOT` or `GUARD`.
 
     Raises:
         OSError: It cannot be created or allocated.
     """
 
-    def __init__(self, path: str, party: int) -> None:
+    def __init__(self, path: str, own_index: int) -> None:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
             os.posix_fallocate(descriptor, 0, SIZE)
             self._map = mmap.mmap(descriptor, SIZE)
         finally:
             os.close(descriptor)
-        self._party = party
+        self._own_index = own_index
         self._count = self._other_count = 0
         self._silent_s, self._polled_s = 0.0, time.monotonic()
 
@@ -85,7 +85,7 @@ class LivenessFile:
         """Increment the counter of this program, and write its state."""
         self._count += 1
         entry = os.getpid(), _process_state(os.getpid())[1], self._count, state
-        _ENTRY.pack_into(self._map, self._party * _ENTRY.size, *entry)
+        _ENTRY.pack_into(self._map, self._own_index * _ENTRY.size, *entry)
 
     @property
     def other_state(self) -> int:
@@ -118,7 +118,7 @@ class LivenessFile:
                 os.kill(pid, signal.SIGKILL)
 
     def _other_entry(self) -> LifeEntry:
-        return entries(self._map[:])[1 - self._party]
+        return entries(self._map[:])[1 - self._own_index]
 
 
 def _process_state(pid: int) -> tuple[str, int]:

@@ -131,7 +131,7 @@ class FlightLoop:
             yield
 
     def run_until(self, condition: Callable[[], bool], set_point: Callable[[], Position] | None = None) -> None:
-        """Iterate until `condition` returns True; arguments and errors are those of `iterate`."""
+        """Iterate until `condition` returns True; see `iterate` for `set_point` and the errors."""
         for _ in self.iterate(set_point):
             if condition():
                 return

@@ -2,7 +2,8 @@
 
 All directions and distances of a plan are relative to the origin, so that each repeat flies the same path, regardless
 of the drone's initial heading. The origin is a position in LOCAL_POSITION_NED, whose frame is valid until the
-autopilot reboots. Latitude and longitude, if known, give its position in the frame of a later start.
+autopilot reboots. With latitude and longitude, if they are known, the position is converted to the frame of a later
+start.
 """
 
 from __future__ import annotations
@@ -99,8 +100,9 @@ def is_same_frame(identifier: str, other_identifier: str) -> bool:
 def resolve_origin(recorded_origin: FlightOrigin | None, start: FlightOrigin) -> FlightOrigin:
     """Return the origin of a flight in the frame of its start.
 
-    The heading is that of the recorded origin. If latitude and longitude of both positions are known, they give its
-    position in the frame of the start; otherwise the frame must be the same as at the first start.
+    The heading of the recorded origin is kept. If latitude and longitude of both positions are known, the position of
+    the origin in the frame of the start is computed from them. Otherwise, the frame must be the same as at the first
+    start.
 
     Args:
         recorded_origin: The origin of the trial; None for its first start, which becomes the origin.

@@ -38,8 +38,8 @@ def rescue(plan: FlightPlan) -> None:
         OSError: The liveness file cannot be opened.
         ValueError: The name of the connection is invalid.
     """
-    for party in (liveness.PILOT, liveness.GUARD):
-        LivenessFile(plan.liveness, party).kill_other()
+    for index in (liveness.PILOT, liveness.GUARD):
+        LivenessFile(plan.liveness, own_index=index).kill_other()  # kills the program with the other entry
     log_line(f"{plan.abort}: neither the pilot nor the guard runs")
     deadline_s = time.monotonic() + NO_HEARTBEAT_S
     with landing_marker(plan.landing_marker):

@@ -33,6 +33,7 @@ _START_TIMEOUT_S = 15.0
 _RETRY_S = 0.1
 _BUFFER_BYTES = 1 << 20
 _COMMAND_OFFSET, _TARGET_OFFSET = 28, 30
+"""Offsets in the payload of COMMAND_LONG: command, and target system and component."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,7 @@ class SharedLink:
 
     Attributes:
         lost_since_s: Monotonic time since which the connection is closed; None while it is open.
+        error: Number and text of the last error.
         dropped_frames: Number of frames from the autopilot that were dropped because this program was too slow.
         restarts: Number of replaced servers.
         messages: State of this program's requests for messages, by message id.
@@ -79,7 +81,6 @@ class SharedLink:
         self._dropped_by_client = self._dropped_by_server = self._dropped_by_earlier_servers = 0
         self.lost_since_s: float | None = time.monotonic()
         self.error = (0, "")
-        self.failure: OSError | None = None
         self.restarts = 0
         self.messages: Mapping[int, MessageRate] = {}
         self._thread = threading.Thread(target=self._run, daemon=True)

@@ -16,6 +16,7 @@ from fieldkit.agent.autopilots.mavlink_frames import ACCEPTED
 DEFAULT = 0
 """Interval that selects the default rate of the autopilot; it also cancels a request."""
 _OFF = -1
+"""Interval that disables a message."""
 RETRY_RESULTS = (1, 5)
 """MAV_RESULT_TEMPORARILY_REJECTED and MAV_RESULT_IN_PROGRESS: the request may be accepted later."""
 _ANSWER_TIMEOUT_S = 0.4
@@ -25,9 +26,12 @@ _MIN_FRACTION = 0.7
 """A message with less than this fraction of the requested rate is requested again: 4 Hz instead of 5 Hz may be jitter
 or loss, but 4 Hz instead of 10 Hz is not."""
 _SILENT_INTERVALS = 3
+"""A message that does not arrive for this number of its intervals is requested again."""
 _WINDOW_INTERVALS = 10
 _WINDOW_S = 1.0
+"""The rate of a message is measured in a window of `_WINDOW_INTERVALS` intervals, but at least `_WINDOW_S`."""
 _MAX_RESETS = 3
+"""Maximum number of requests that reset a message to its default rate if the autopilot does not answer."""
 
 Target = Tuple[int, int]
 """System and component of an autopilot."""

@@ -98,8 +98,9 @@ class Network:
         transport: `tcp` or `udp`, for Zenoh.
         gid_bytes: Length of a GID in the node information of DDS participants: 16 since ROS 2 Iron, 24 before.
         settings: Settings of the middleware by their path: for example `Discovery/SPDPInterval` of CycloneDDS,
-            `transport/link/tx/queue/size/data` of Zenoh; `xmlrpc_port`, `tcpros_port` and `tcp_nodelay` (`1` disables
-            Nagle's algorithm) of ROS 1. None for ROS 2, which uses the environment.
+            `transport/link/tx/queue/size/data` of Zenoh; `xmlrpc_port`, `tcpros_port`, `tcp_nodelay` (`1` disables
+            Nagle's algorithm) and `patience_s` (timeout for the master) of ROS 1. ROS 2 has no such settings, because
+            its environment configures it.
     """
 
     address: str

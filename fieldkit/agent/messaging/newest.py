@@ -1,4 +1,4 @@
-"""The newest sample, which a program reads periodically, like the control loop of a robot or a display."""
+"""The newest sample. A program such as the control loop of a robot, or a display, reads it periodically."""
 
 from __future__ import annotations
 

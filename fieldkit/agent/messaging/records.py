@@ -1,13 +1,11 @@
 """The log of a publisher or subscriber: a magic number and records of fixed size.
 
-No record is lost if the program is killed.
+The log is mapped into memory. No record is lost if the program is killed, because the kernel writes the mapped pages
+to the file. A store needs no system call, so that logging does not delay samples. The file grows in pieces. A piece
+is allocated on disk before it is mapped, so that a full disk causes an error at that time, instead of SIGBUS at a
+later store. (A failing disk still causes SIGBUS.) If a log was not closed, zeros follow its last record.
 
-The log is mapped into memory. Data in the mapping survive the process, like data passed to `write`, but a store needs
-no system call, so that logging does not delay samples. The file grows in pieces. A piece is allocated on disk before
-it is mapped, so that a full disk causes an error at that time, instead of SIGBUS at a later store. (A failing disk
-still causes SIGBUS.) If a log was not closed, zeros follow its last record.
-
-`fieldkit.ros.streams.topic_samples` reads it.
+`fieldkit.ros.streams.topic_samples` reads these logs.
 """
 
 from __future__ import annotations
@@ -35,7 +33,7 @@ MATCHED = 3
 REFUSED = 4
 """A sample that the middleware did not accept."""
 SKIPPED = 5
-"""Samples that were not sent, because writing the previous one took too long. `sequence` is how many were skipped."""
+"""Samples that were not sent, because writing the previous one took too long. `sequence` is their number."""
 FOREIGN = 6
 """A received sample that does not belong to this stream."""
 END = 7

@@ -92,7 +92,7 @@ def send(video: Video, log: Log, stop_event: threading.Event) -> None:
             stop_event.wait(SETTLING_S)
             return
     if not stop_event.is_set():
-        raise _early_end(process)
+        raise _early_end_error(process)
 
 
 def receive(video: Video, log: Log, stop_event: threading.Event) -> None:
@@ -119,7 +119,7 @@ def receive(video: Video, log: Log, stop_event: threading.Event) -> None:
                     newest.offer(*content)
                     log.note(records.SAMPLE, at_ns, size=len(data), sequence=content[0], sent_ns=content[1])
     if not stop_event.is_set():
-        raise _early_end(process)
+        raise _early_end_error(process)
 
 
 def _frames(file: IO[bytes], size: int) -> Iterator[bytes]:
@@ -174,12 +174,12 @@ def _playing(video: Video, fd: int, log: Log, stop_event: threading.Event) -> It
     is_playing = threading.Event()
     copier = threading.Thread(target=_copy_messages, args=(process, is_playing))
     copier.start()
-    threading.Thread(target=_stop_with, args=(process, stop_event), daemon=True).start()
+    threading.Thread(target=_stop_on_event, args=(process, stop_event), daemon=True).start()
     try:
         deadline_s = time.monotonic() + video.patience_s
         while not is_playing.wait(WAIT_S) and not stop_event.is_set():
             if process.poll() is not None:
-                raise _early_end(process)
+                raise _early_end_error(process)
             if time.monotonic() > deadline_s:
                 raise MiddlewareError(f"{command[0]} is not playing after {video.patience_s:g} s")
         log.note(records.MATCHED, time.time_ns())
@@ -197,7 +197,7 @@ def _copy_messages(process: subprocess.Popen[str], is_playing: threading.Event) 
             is_playing.set()
 
 
-def _stop_with(process: subprocess.Popen[str], stop_event: threading.Event) -> None:
+def _stop_on_event(process: subprocess.Popen[str], stop_event: threading.Event) -> None:
     stop_event.wait()
     _stop(process)
 
@@ -213,5 +213,5 @@ def _stop(process: subprocess.Popen[str]) -> None:
         process.wait()
 
 
-def _early_end(process: subprocess.Popen[str]) -> MiddlewareError:
+def _early_end_error(process: subprocess.Popen[str]) -> MiddlewareError:
     return MiddlewareError(f"the pipeline ended early with exit code {process.wait()}: see its messages above")

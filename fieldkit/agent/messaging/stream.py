@@ -1,8 +1,9 @@
-"""Stream samples with sequence numbers and times from one robot to another, and log them at both.
+"""Stream samples with sequence numbers and times from one robot to another, and log them on both robots.
 
-A sample is a `std_msgs/UInt8MultiArray` with an empty layout, which all ROS tools can read. Its data start with a
-magic number, the sequence number and the time. Random bytes follow, so that compression does not change its size. Or
-it is a `sensor_msgs/Image` of a synthetic camera, with number and time in its pixels.
+By default, a sample is a `std_msgs/UInt8MultiArray` with an empty layout, which all ROS tools can read. Its data
+start with a magic number, the sequence number and the time. Random bytes follow, so that compression does not change
+the size. In an image stream, a sample is a `sensor_msgs/Image` of a synthetic camera, with number and time in its
+pixels.
 """
 
 from __future__ import annotations
@@ -133,7 +134,8 @@ def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, stop
 def scheduled(rate_hz: float, duration_s: float, log: Log, stop_event: threading.Event) -> Iterator[int]:
     """Yield the number of each sample when it is due, until `stop_event` is set; log how many are skipped.
 
-    A sample whose time has passed before the next value is requested is skipped, as timers of robots do.
+    If the caller requests the next value too late, the samples whose times have passed are skipped, as a ROS timer
+    skips missed periods.
 
     Raises:
         LogError: For the same reasons as `Log.note`.
@@ -154,7 +156,7 @@ def scheduled(rate_hz: float, duration_s: float, log: Log, stop_event: threading
 def subscribe(middleware: Middleware, topic: Topic, stream: Stream, log: Log, stop_event: threading.Event) -> None:
     """Log each received sample, and each read of the newest sample, until `stop_event` is set.
 
-    The arguments are those of `publish`.
+    See `publish` for the arguments.
 
     Raises:
         LogError: For the same reasons as `Log.note`; `stop_event` is set then.

@@ -13,7 +13,7 @@ import zlib
 
 COLUMNS, ROWS = 16, 8
 BLACK, WHITE = 16, 235
-"""Luma of the cells: the limits of ITU-R BT.601, which no conversion of colours clips."""
+"""Luma of the cells: the limits of the range in ITU-R BT.601, so that no colour conversion clips them."""
 MAX_NUMBER = 2**32 - 1
 
 _CONTENT = struct.Struct(">IQ")
@@ -35,6 +35,7 @@ class FrameCode:
         self._width, self._size = width, width * height
         self._cell_width, self._cell_height = width // COLUMNS, (height - noise_rows) // ROWS
         noise_bytes = width * (height - ROWS * self._cell_height)
+        # Twice as many random bytes as needed, so that each frame can use another part of them.
         noise = random.Random(width).getrandbits(16 * noise_bytes or 1).to_bytes(2 * noise_bytes + 1, "little")  # noqa: S311
         self._noise, self._noise_bytes = noise, noise_bytes
         # Offsets of 3 x 3 pixels around the centre of a cell, from its upper left pixel.
@@ -57,7 +58,8 @@ class FrameCode:
             (bits,) = struct.unpack_from(">H", code, 2 * row)
             line = b"".join(cells[bits >> (COLUMNS - 1 - column) & 1] for column in range(COLUMNS))
             parts.append(line * self._cell_height)
-        # Other pixels in each frame, because encoders of video transmit only changes.
+        # The random pixels differ in each frame, because video encoders transmit only changes. The factor is a prime
+        # number, so that consecutive frames start at different offsets.
         start = number * 7919 % (self._noise_bytes + 1)
         return b"".join(parts) + self._noise[start : start + self._noise_bytes]
 

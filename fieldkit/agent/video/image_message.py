@@ -1,7 +1,7 @@
 """Frames as messages `sensor_msgs/Image`, serialized for ROS 1 and in CDR.
 
-The first pixels of a frame are replaced by the head of a sample (`fieldkit.agent.messaging.stream`), so that captures
-show it. A receiver reads the cells of the frame, not the head.
+The first pixels of a frame are replaced by the head of a sample (`fieldkit.agent.messaging.stream`), so that the head
+is found in captures. A receiver reads the cells of the frame, not the head.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class ImageCodec:
     def decode(self, data: bytes) -> tuple[int, int] | None:
         """Return the number and the time in the pixels, or None if it is not a message of this camera."""
         padding_bytes = len(data) - self._envelope_bytes - self._width * self._height
-        # Some implementations pad CDR to a multiple of 4 bytes without a note in the header.
+        # Some implementations pad CDR to a multiple of 4 bytes and do not indicate this in the header.
         return self._code.read(data[self._envelope_bytes :]) if 0 <= padding_bytes < 4 else None
 
     def _envelope(self, sequence: int, at_ns: int) -> bytes:

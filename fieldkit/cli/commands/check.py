@@ -23,8 +23,8 @@ def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit check`."""
     parser.description = (
         "Check everything that a trial of the procedure needs from the robots and from this machine; change nothing, "
-        "and do not ask for robots to be placed. `fieldkit trial` does this too, without a test recording. --repeats "
-        "and --record are those of the planned trial, for the estimate of disk space."
+        "and do not ask for robots to be placed. `fieldkit trial` does this too, without a test recording. For "
+        "the estimate of disk space, give --repeats and --record of the planned trial."
     )
     parser.takes_lengths = True
     parser.epilog = "example: fieldkit check los --topology masterless"
@@ -46,8 +46,8 @@ def add(parser: Parser) -> None:
     parser.set_defaults(run=run)
 
 
-# No person places robots for a check. Robots that fieldkit places are put 1 m apart.
-_CLOSE = Distance(metres=1.0, label="check")
+_CHECK_DISTANCE = Distance(metres=1.0, label="check")
+"""Distance of the robots if fieldkit places them, as in an emulation. A person does not place robots for a check."""
 
 
 def _fleet_checks(names: Sequence[str]) -> "list[FleetCheck]":
@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
     from fieldkit.trial.request import make_plan
     from fieldkit.trial.running import preflight
 
-    request = cli_options.request(arguments, _CLOSE)
+    request = cli_options.request(arguments, _CHECK_DISTANCE)
     with showing_events(as_json=arguments.json) as sink:
         name, backend = cli_options.backend(arguments, sink)
         if (code := cli_options.run_elsewhere(backend, arguments, Path("trials"))) is not None:

@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
                 report.fail("connection", error.what, error.remedy)
                 return
             contact.judge_clock(times[name].offset, shell.ssh_destination, report)
-            time_sources.judge(times[name].reports, report, all_robots=True)
+            time_sources.judge(times[name].reports, report, is_required=True)
 
         run_parallel(check, list(robots))
         laptop = Report(LAPTOP)

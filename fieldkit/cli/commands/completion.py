@@ -61,11 +61,14 @@ def _declare_command(parser: Parser) -> None:
     command = parser.command(words[1]) if len(words) > 1 else None
     if command is not None:
         with suppress(FieldkitError):  # running the command reports the error of its package
-            command.complete()
+            command.declare_arguments()
 
 
 class _Values(BaseCompleter):
-    """Completes values of arguments by their names in the namespace of argparse. Free text has no values."""
+    """Completes the value of an argument by the argument's name in argparse's namespace.
+
+    Arguments with free text are not completed.
+    """
 
     def __call__(
         self, *, prefix: str, action: argparse.Action, parser: argparse.ArgumentParser, **_: object
@@ -146,7 +149,7 @@ _VALUES: Final[Mapping[str, Callable[[str], Iterable[str]]]] = MappingProxyType(
         "b": _tables,
         "backend": _backends,
         "quantity": _quantities,
-        "filled": lambda _: ("show", *locations.names("procedures")),
+        "procedure_or_show": lambda _: ("show", *locations.names("procedures")),
         "column": _columns,
         **dict.fromkeys(("site", "out", "answers", "file", "figures"), _FILES),
     }

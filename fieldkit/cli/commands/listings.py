@@ -43,7 +43,7 @@ def add_procedures(parser: Parser) -> None:
 
 
 def run_procedures(arguments: argparse.Namespace) -> int:
-    """List procedures, or show the one named."""
+    """List procedures, or show one."""
     from fieldkit.trial.procedure import load_procedure
 
     return _list_or_show("procedures", lambda name: load_procedure(name).summary, arguments.procedure)
@@ -66,7 +66,12 @@ def add_columns(parser: Parser) -> None:
     parser.description = (
         "Explain the columns of the CSV files: all, those that the steps of a procedure fill, or one."
     )
-    parser.add_argument("filled", metavar="PROCEDURE", nargs="?", help="a procedure, or its file, or the word show")
+    parser.add_argument(
+        "procedure_or_show",
+        metavar="PROCEDURE",
+        nargs="?",
+        help="a procedure, or its file, or the word show",
+    )
     parser.add_argument("column", metavar="NAME", nargs="?", help="after the word show: name of a column")
     parser.set_defaults(run=run_columns)
 
@@ -76,14 +81,14 @@ _SHOW: Final = "show"
 
 def run_columns(arguments: argparse.Namespace) -> int:
     """List all columns or the columns of a procedure, or show one."""
-    if arguments.filled not in {None, _SHOW}:
+    if arguments.procedure_or_show not in {None, _SHOW}:
         if arguments.column is not None:
             raise ConfigurationError(
                 f"columns takes one procedure; {arguments.column!r} is one argument too many",
                 remedy="fieldkit columns PROCEDURE, or: fieldkit columns show NAME",
             )
-        return _columns_of(arguments.filled)
-    if arguments.filled == _SHOW and arguments.column is None:
+        return _columns_of(arguments.procedure_or_show)
+    if arguments.procedure_or_show == _SHOW and arguments.column is None:
         raise ConfigurationError("columns show: no column is given", remedy="fieldkit columns lists them")
     return _columns(arguments.column)
 
@@ -116,9 +121,8 @@ def _columns(name: str | None) -> int:
         "compare": declared(DifferenceRow),
     }
     column_names = {column.name for columns in columns_by_file.values() for column in columns}
-    selected_name = (
-        name if name is None or name in column_names else plain_name(name)
-    )  # a named step adds its name to the column's name
+    # A step with a name adds its name to the names of its columns.
+    selected_name = name if name is None or name in column_names else plain_name(name)
     rows = [
         (file, column.name, column.unit, column.meaning)
         for file, columns in columns_by_file.items()

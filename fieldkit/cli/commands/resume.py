@@ -11,7 +11,7 @@ from fieldkit.cli.parser import Parser
 def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit resume`."""
     parser.description = (
-        "Continue a trial that was stopped by Ctrl-C or a kill, or because a robot or the emulator was lost or the "
+        "Continue a trial that was stopped by Ctrl-C or a signal, or because a robot or the emulator was lost or the "
         "disk was full. Finished repeats are not repeated. Files that differ from their checksums are reported; if "
         "rows of trial.csv must be rebuilt from them, the trial does not continue (exit code 4). The backend and "
         "the robots in their roles must be those with which the trial started."

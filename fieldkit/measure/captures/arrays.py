@@ -21,7 +21,7 @@ Order = Literal["<", ">"]
 """Byte order in the notation of `struct` and numpy."""
 
 
-# Multiplication by an odd number is invertible modulo 2**64; this one is 2**64 divided by the golden ratio.
+# Multiplier of `row_hashes`: 2**64 divided by the golden ratio. It is odd, so that the multiplication is invertible.
 _MULTIPLIER: Final = np.uint64(0x9E3779B97F4A7C15)
 
 
@@ -107,7 +107,8 @@ class NarrowColumn:
         """Return a copy of the column.
 
         Raises:
-            AttributeError: The column was read from the class instead of a table: the field has no default.
+            AttributeError: The column was read from the class instead of a table. `dataclass` reads it in this way,
+                and regards the field as one without a default.
         """
         if table is None:
             raise AttributeError(self._name)
@@ -174,7 +175,10 @@ class Integers:
 
 
 def row_hashes(*columns: Ints | Keys) -> Keys:
-    """Return a hash for each row. Equal rows have equal hashes; two other rows collide with probability 2**-64."""
+    """Return a hash for each row.
+
+    Equal rows have equal hashes. Two different rows have equal hashes with a probability of 2**-64.
+    """
     hashes = np.zeros(len(columns[0]), dtype=np.uint64)
     for column in columns:
         hashes ^= column.view(np.uint64)

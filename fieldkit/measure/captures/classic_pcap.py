@@ -39,7 +39,7 @@ def chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
     if size < _FILE_HEADER_BYTES:
         raise EvidenceError("ends inside its header", where=where, remedy="repeat the measurement")
     order, ticks_per_s = MAGIC[bytes(data[:4])]
-    # The upper bits of this field are the length of the frame check sequence.
+    # The upper bits of this field contain the length of the frame check sequence.
     link_type = struct.unpack_from(f"{order}I", data, 20)[0] & 0xFFFF
     check_link_type(link_type, where=where)
     integers = Integers(data, order)
@@ -51,10 +51,10 @@ def chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
         if not valid.all():
             frames = frames.where(slice(0, int(valid.argmin())))
             damage = f"no packet header at byte {starts[len(frames)]}, after packet {count + len(frames)}"
-        elif at > size:
+        elif at > size:  # the last record extends beyond the end of the file
             frames = frames.where(slice(0, len(frames) - 1))
             damage = f"ends inside the packet at byte {starts[-1]}, after packet {count + len(frames)}"
-        elif size - _RECORD_HEADER_BYTES < at < size:
+        elif size - _RECORD_HEADER_BYTES < at < size:  # the file ends inside a record header
             damage = f"ends inside the packet at byte {at}, after packet {count + len(frames)}"
         count += len(frames)
         yield Chunk(frames, damage)
@@ -63,7 +63,7 @@ def chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
 
 
 def _scan(data: Buffer, order: Order, at: int, stop: int) -> tuple[Ints, int]:
-    """Return the positions of the records that start from `at` on and before `stop`, and of the record after them.
+    """Return the positions of the records that start from `at` to `stop` (exclusive), and the end of the last one.
 
     If the packets were truncated to a snap length, most records have the same length. Such records are checked
     together, in groups of growing size.

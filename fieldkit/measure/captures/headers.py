@@ -72,6 +72,7 @@ ICMP: Final = 1
 TCP: Final = 6
 UDP: Final = 17
 SCTP: Final = 132
+"""IP protocol numbers."""
 
 Addresses = NDArray[np.uint64]
 """Shape (n, 2): upper and lower half of each IPv6 address. IPv4 addresses are IPv4-mapped (RFC 4291, 2.5.5.2)."""
@@ -93,6 +94,7 @@ _IPV4: Final = layout(
 IPV6_HEADER_BYTES: Final = 40
 """Length of the fixed header of IPv6."""
 _MAPPED: Final = 0xFFFF << 32
+"""Lower half of the prefix of IPv4-mapped addresses, `::ffff:0:0/96`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +144,13 @@ def address_text(upper: int, lower: int) -> str:
 
 
 def ip_headers(integers: Integers, frames: Frames, at: Ints) -> Headers:
-    """Return the complete and valid IP headers of `frames` at the positions `at`, which are negative without one."""
+    """Return the complete and valid IP headers of `frames`.
+
+    Args:
+        integers: Reader of integers in the file.
+        frames: The frames.
+        at: Position of each frame's IP header; negative for a frame without one.
+    """
     captured = np.where(at < 0, 0, frames.start + frames.captured_bytes - at)
     version = integers.u8(np.maximum(at, 0)) >> 4
     ipv4_frames = np.flatnonzero((version == 4) & (captured >= _IPV4_HEADER_BYTES))
@@ -160,6 +168,7 @@ def ip_headers(integers: Integers, frames: Frames, at: Ints) -> Headers:
 
 
 def _ipv4_headers(integers: Integers, frame: Ints, at: Ints, captured: Ints, wire: Ints) -> Headers:
+    """Return the valid IPv4 headers at the positions `at`."""
     head = integers.fields(_IPV4, at)
     header = (head["length"] & 0xF) * 4
     # Segmentation offload leaves the total length 0 in frames above 64 KiB; the wire length is used instead.
@@ -183,13 +192,15 @@ def _ipv4_headers(integers: Integers, frame: Ints, at: Ints, captured: Ints, wir
 
 
 def _has_wrong_checksum(integers: Integers, head: Fields, at: Ints, header: Ints) -> Mask:
-    """Return a mask of the headers with a wrong checksum (RFC 1071: the words of a valid header add up to -0).
+    """Return a mask of the headers with a wrong checksum (RFC 1071).
+
+    The one's complement sum of the words of a valid header is 0xFFFF (-0).
 
     A checksum of 0 is not wrong: on some systems the network adapter computes it after the capture. Linux computes
     it before the capture, even with offload, and drops received packets with a wrong one.
 
     Args:
-        integers: The file.
+        integers: Reader of integers in the file.
         head: The headers without options.
         at: Position of each header.
         header: Captured length of each header including its options, in bytes.

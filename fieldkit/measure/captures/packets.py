@@ -65,9 +65,11 @@ CONTENT_BYTES: Final = 32
 least this many bytes after the headers."""
 
 _CONTENT: Final = layout(LITTLE, CONTENT_BYTES, **{str(at): (at, 8) for at in range(0, CONTENT_BYTES, 8)})
-_FIRST_BYTES: Final = np.array([(1 << 8 * count) - 1 for count in range(9)], dtype=np.uint64).astype(np.int64)
-_REPLY: Final = 0
-_REQUEST: Final = 8
+# Masks of the first 0 to 8 bytes of a little-endian word, by the number of bytes.
+_FIRST_BYTES_MASKS: Final = np.array([(1 << 8 * count) - 1 for count in range(9)], dtype=np.uint64).astype(np.int64)
+_ICMP_ECHO_REPLY: Final = 0
+_ICMP_ECHO_REQUEST: Final = 8
+# Kinds of TCP options.
 _MSS_OPTION: Final = 2
 _STAMP_OPTION: Final = 8
 # Two no-operation options before the time stamp: most systems align it this way (RFC 7323, appendix A).
@@ -231,7 +233,7 @@ def _option(integers: Integers, rows: Ints, transport: Ints, end: Ints, option: 
     """Return the value of a TCP option (RFC 9293, section 3.2; RFC 7323, section 3.2), or `missing`.
 
     Args:
-        integers: The file.
+        integers: Reader of integers in the file.
         rows: Indices of the packets to read.
         transport: Position of each packet's TCP header.
         end: Position of the end of each packet's captured options.
@@ -258,7 +260,9 @@ def _echo_identifiers(integers: Integers, icmp: Mask, transport: Ints) -> Ints:
     identifiers = np.full_like(transport, NO_ECHO)
     at = transport[icmp]
     kind, identifier = integers.u8(at), integers.u16(at + 4)
-    identifiers[icmp] = np.select([kind == _REQUEST, kind == _REPLY], [identifier, identifier + ECHO_REPLY], NO_ECHO)
+    identifiers[icmp] = np.select(
+        [kind == _ICMP_ECHO_REQUEST, kind == _ICMP_ECHO_REPLY], [identifier, identifier + ECHO_REPLY], NO_ECHO
+    )
     return identifiers
 
 
@@ -270,7 +274,7 @@ def _content_hashes(integers: Integers, at: Ints, captured: Ints, content_bytes:
     columns = [words[str(start)] for start in range(0, CONTENT_BYTES, 8)]
     for number, word in enumerate(columns):
         # Set the bytes after the end of a short packet to 0. The first byte of a little-endian word is the lowest.
-        word[short] &= _FIRST_BYTES[np.clip(hashed_bytes[short] - 8 * number, 0, 8)]
+        word[short] &= _FIRST_BYTES_MASKS[np.clip(hashed_bytes[short] - 8 * number, 0, 8)]
     hashes = (row_hashes(*columns) >> np.uint64(1)).astype(np.int64)
     hashes[captured < hashed_bytes] = NOT_CAPTURED
     return hashes

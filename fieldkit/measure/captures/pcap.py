@@ -95,8 +95,8 @@ def stream(path: Path, *, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Capture]:
         chunk_bytes: Size of a chunk in the file, in bytes; the packet that crosses the boundary is the chunk's last.
 
     Raises:
-        EvidenceError: For the same reasons as `read`. An unknown link type in a later section is detected after the
-            earlier chunks.
+        EvidenceError: For the same reasons as `read`. An unknown link type in a later section is detected only after
+            the earlier chunks were yielded.
     """
     data = reading.mapped(path)
     for capture in _captures(data, str(path), chunk_bytes):
@@ -107,6 +107,7 @@ def stream(path: Path, *, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Capture]:
 
 
 def _captures(data: Buffer, where: str, chunk_bytes: int) -> Iterator[Capture]:
+    """Yield the decoded packets of each chunk of a file."""
     reader = frame_reader(data)
     if reader is None:
         raise EvidenceError(

@@ -19,10 +19,11 @@ _SUMMARY_DELAY_S: Final = 0.02
 _MAX_OMITTED_S: Final = 1.1
 """Maximum length of a last interval without data, which version 3.17 omits."""
 _ROUNDING: Final = 1e-3
+"""Relative tolerance for rounding of rates and jitter values."""
 _EARLY_S: Final = 0.1
 """A timer of the client may end a test earlier than its full duration by up to this time."""
 _TIMESTAMP_S: Final = 2
-"""`timesecs` has a resolution of whole seconds."""
+"""Tolerance for start times, because `timesecs` has a resolution of whole seconds."""
 
 CROSS_CHECKS: Final = (
     CrossCheck(
@@ -37,8 +38,7 @@ CROSS_CHECKS: Final = (
         ),
         tolerance=(
             "no difference within a file; compared with the captures, 0.5 s of traffic plus the socket buffers, "
-            "because "
-            "iperf3 counts bytes when it reads them"
+            "because iperf3 counts bytes when it reads them"
         ),
     ),
     CrossCheck(
@@ -55,7 +55,12 @@ CROSS_CHECKS: Final = (
         quantity="identity of the test",
         columns=("iperf3_*",),
         source="`ROLE-iperf3.json`: `cookie`, `connected`, `test_start`, `timestamp`",
-        against=("the other end's", "the procedure", "ports in both captures", "the robot's clock before and after"),
+        against=(
+            "the same keys of the other end",
+            "the procedure",
+            "ports in both captures",
+            "the robot's clock before and after",
+        ),
         tolerance="start times may differ by 2 s, because the time stamp is in whole seconds",
     ),
     CrossCheck(
@@ -143,6 +148,7 @@ def _gaps(intervals: tuple[IperfInterval, ...]) -> Iterator[str]:
 
 
 def _interval_problems(interval: IperfInterval) -> Iterator[str]:
+    """Yield the contradictions within an interval, as predicates: `has 100 bytes, but its streams have 90`."""
     if interval.start_s is not None and interval.end_s is not None:
         duration_s = interval.end_s - interval.start_s
         if abs(duration_s - interval.duration_s) > _ROUNDING_S:
@@ -191,6 +197,7 @@ def compare_ends(client: IperfTest, server: IperfTest, settings: IperfSettings) 
 
 
 def _differences(test: IperfTest, settings: IperfSettings) -> Iterator[str]:
+    """Yield the differences between a test and the procedure's settings, as predicates."""
     start = test.start
     comparisons = {
         "protocol": (start.protocol or None, str(settings.protocol)),

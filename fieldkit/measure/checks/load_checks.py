@@ -29,16 +29,24 @@ LATE_NS: Final = 500_000_000
 
 _BUFFERED_BYTES: Final = 256 << 10
 _BUFFERED_WINDOWS: Final = 3
-"""Maximum payload in the buffer of a sending socket. Linux expands this buffer to at most 3 congestion windows
-(tcp_sndbuf_expand). A window is at most the number of acknowledged bytes, and the initial buffer is 87 kB."""
+"""Maximum payload in the buffer of a sending socket: `_BUFFERED_BYTES` plus this factor times the bytes in the
+capture. Linux expands this buffer to at most 3 congestion windows (tcp_sndbuf_expand). A window is at most the number
+of acknowledged bytes, and the initial buffer is 87 kB."""
 
 _BLOCK_BYTES: Final = 128 << 10
+"""iperf3's default size of a write over TCP."""
 _RACE_DATAGRAMS: Final = 2
 _RACE_SHARE: Final = 0.001
+"""Tolerance for datagrams that a thread of iperf3 sends while the other streams are counted: a number per stream,
+plus a share of all datagrams."""
 _RESENT_FACTOR: Final = 2
 _RESENT_SEGMENTS: Final = 20
+"""Tolerance for retransmissions: the counts may differ by this factor plus this number of segments, because offload
+joins segments and the kernel counts handshakes too."""
 _TAIL_SHARE: Final = 0.05
 _TAIL_DATAGRAMS: Final = 10
+"""Tolerance for datagrams that iperf3 sent after the last one that its receiver expected: a share of all datagrams,
+plus a number."""
 
 
 @dataclass(frozen=True)
@@ -196,6 +204,7 @@ def _first_seq(stream: Packets) -> int | None:
 
 
 def _acknowledgments(flow: LoadFlow, packets: Packets, sport: int, dport: int) -> Packets:
+    """Return the packets that acknowledge data of a stream."""
     ends = packets.are_from(flow.destination_address) & packets.are_to(flow.source_address)
     return packets.where(
         ends
@@ -247,6 +256,7 @@ def _check_datagrams(
     received_streams: list[Packets],
     evidence: LoadEvidence,
 ) -> Iterator[str]:
+    """Yield the contradictions between the datagrams that iperf3 counted at both ends and those in the captures."""
     counts = [
         [getattr(interval, name) for interval in test.intervals]
         for test, name in ((sent, "datagrams"), (received, "datagrams"), (received, "lost"))
@@ -260,6 +270,7 @@ def _check_datagrams(
     if sent_count + race < captured:
         yield f"iperf3 sent {sent_count} datagrams, but {captured} are in the sender's capture"
     refused = evidence.sender_counters.udp_send_errors or 0
+    # `tail` are the datagrams after the last one that iperf3's receiver expected; `missed` those lost on the way.
     tail, missed = max(sent_count - expected, 0), max(captured - arrived, 0)
     # If the sender's queue drops datagrams before the capture, the sequence numbers at the receiver have gaps.
     is_plausible = captured + refused >= sent_count or tail <= missed + _TAIL_SHARE * sent_count + _TAIL_DATAGRAMS
@@ -277,7 +288,10 @@ def _check_datagrams(
 
 
 def _distinct_datagrams(stream: Packets) -> int:
-    """Return the number of datagrams without duplicates. Each starts with a unique number and time."""
+    """Return the number of datagrams without duplicates.
+
+    Each datagram of iperf3 starts with a unique number and time.
+    """
     if (stream.content == NOT_CAPTURED).any():
         return len(stream)
     return len(np.unique(stream.content))

@@ -87,6 +87,7 @@ def _complete_ns(packets: Packets, first: Packets, size_bytes: int) -> Ints:
 
 def _earliest_by_number(numbers: Ints, times_ns: Ints) -> dict[int, int]:
     """Return the earliest time of each number."""
+    # The latest times are first, because a dictionary keeps the last value of a key.
     order = np.argsort(-times_ns, kind="stable")
     return dict(zip(numbers[order].tolist(), times_ns[order].tolist(), strict=True))
 
@@ -94,19 +95,25 @@ def _earliest_by_number(numbers: Ints, times_ns: Ints) -> dict[int, int]:
 _ROUNDING: Final = 0.006
 """Relative rounding error of a round-trip time: ping prints three digits."""
 _MAX_EARLIER_S: Final = 0.000_2
+"""Maximum of a captured time minus the printed one."""
 _MAX_LATER_S: Final = 0.020
 """Maximum of a printed round-trip time minus the captured one: the process of ping may be delayed."""
 _MAX_MEDIAN_LATER_S: Final = 0.001
+"""Maximum of the median of these differences."""
 _BUSYBOX_FACTOR: Final = 5
 """Factor by which the limits are larger for busybox's ping, which may print later."""
 _MAX_PRINT_DELAY_S: Final = 1.0
+"""Maximum of the time stamp of a printed line minus the captured time of the reply."""
 _MAX_MEDIAN_PRINT_DELAY_S: Final = 0.05
+"""Maximum of the median of these delays."""
 _MAX_SEQUENCE: Final = 0xFFFF
+"""Largest ICMP sequence number; the numbers of a longer ping wrap."""
 _WAIT_SHARE: Final = 0.9
 """Minimum share of the interval that ping waits after its last request; below 1, because a timer may fire early."""
 _UNREAD_S: Final = 0.1
 """ping may exit before it reads a reply that arrived less than this time before."""
 _CLOCK_SLACK_S: Final = 1.0
+"""Tolerance for time stamps before the first or after the last reading of the robot's clock."""
 
 CROSS_CHECKS: Final = (
     CrossCheck(
@@ -130,8 +137,7 @@ CROSS_CHECKS: Final = (
         against=("sender's capture: request to complete reply", "the same file: min/avg/max"),
         tolerance=(
             "0.6 %, because ping prints 3 digits, plus 20 ms for one reply or 1 ms for the median (5 times as much "
-            "for "
-            "busybox), because a busy robot delays ping"
+            "for busybox), because a busy robot delays ping"
         ),
     ),
     CrossCheck(
@@ -192,6 +198,7 @@ def check_output(output: Ping, count: int, payload_bytes: int, window: tuple[int
 
 
 def _check_summary(output: Ping) -> Iterator[str]:
+    """Yield a contradiction for each time in ping's summary that differs from its reply lines."""
     times_s = [reply.rtt_s for reply in output.replies if reply.rtt_s is not None and not reply.damaged]
     if output.summary_s is None or not times_s:
         return
@@ -245,13 +252,14 @@ def _unprinted_replies(output: Ping, captured: CapturedPing, interval_s: float, 
         if seq not in printed and seq in captured.requested_ns and at_ns <= until_ns
     ]
     if missing:
-        replies = format_count(len(missing), "answer")
-        yield f"the {role}'s capture has {replies} that ping did not print, the first to request {min(missing)}"
+        answers = format_count(len(missing), "answer")
+        yield f"the {role}'s capture has {answers} that ping did not print, the first to request {min(missing)}"
 
 
 def _time_problems(output: Ping, answers: list[Reply], captured: CapturedPing, role: str) -> Iterator[str]:
+    """Yield the contradictions between the printed times and the times in the requester's capture."""
     excess_s, print_delay_s = [], []
-    factor = _BUSYBOX_FACTOR if output.first_seq == 0 else 1
+    factor = _BUSYBOX_FACTOR if output.first_seq == 0 else 1  # only busybox numbers the requests from 0
     for reply in answers:
         replied_ns = captured.replied_ns[reply.seq]
         if reply.rtt_s is not None:

@@ -33,11 +33,12 @@ COLUMNS: Final = columns(
 
 _UNREAD_S: Final = 0.1
 _WAIT_SHARE: Final = 0.9
-"""As in `ping_checks`: the part of the last interval in which ping certainly prints replies."""
+"""ping certainly prints the replies that arrive in this share of the last interval, minus `_UNREAD_S`; as in
+`ping_checks`."""
 
 
 class PingEchoes(NamedTuple):
-    """PingEchoes of a ping in one capture.
+    """ICMP echoes of one ping in one capture.
 
     Attributes:
         requests: Its requests.
@@ -49,7 +50,7 @@ class PingEchoes(NamedTuple):
 
     @property
     def are_fragmented(self) -> bool:
-        """Whether an echo is fragmented."""
+        """True if any echo is fragmented."""
         return bool(self.requests.more_fragments.any() or self.replies.more_fragments.any())
 
 
@@ -76,11 +77,11 @@ def _sized(echoes: Packets, size_bytes: int) -> Packets:
 
 
 def measure(sender: PingEchoes | None, receiver: PingEchoes | None) -> Measured:
-    """Return the column of the copies.
+    """Return the column `rtt_duplicates`.
 
     Args:
-        sender: PingEchoes in the sender's capture; None if it is missing or incomplete.
-        receiver: PingEchoes in the receiver's capture; None as above.
+        sender: Echoes in the sender's capture; None if the capture is missing or incomplete.
+        receiver: Echoes in the receiver's capture; None if the capture is missing or incomplete.
     """
     if sender is None or receiver is None:
         return Measured.all_missing(COLUMNS, "a robot has no complete capture around the ping")
@@ -102,13 +103,13 @@ def count_copies(echoes: Packets) -> int:
 def contradictions(
     output: Ping, interval_s: float, sender: PingEchoes | None, receiver: PingEchoes | None
 ) -> Iterator[str]:
-    """Yield the contradictions between the copies in the captures, the output of ping, and the answers.
+    """Yield the contradictions between the captured copies and the output of ping, and between requests and answers.
 
     Args:
         output: The output.
         interval_s: Time between requests.
-        sender: PingEchoes in the sender's capture; None if it is missing or incomplete.
-        receiver: PingEchoes in the receiver's capture; None as above.
+        sender: Echoes in the sender's capture; None if the capture is missing or incomplete.
+        receiver: Echoes in the receiver's capture; None if the capture is missing or incomplete.
     """
     if sender is None or receiver is None or sender.are_fragmented or receiver.are_fragmented:
         return  # a copy of a fragmented echo may be incomplete
@@ -126,7 +127,7 @@ def contradictions(
     unrequested = Counter((_keys(answers) - (ECHO_REPLY << 16)).tolist()) - Counter(_keys(requests).tolist())
     if unrequested:
         answers_text = format_count(unrequested.total(), "answer")
-        yield f"the receiver's capture has {answers_text} to requests that it lacks"
+        yield f"the receiver's capture has {answers_text} to requests that it does not contain"
 
 
 def _keys(echoes: Packets) -> Ints:

@@ -109,6 +109,7 @@ def _byte_count_contradictions(
 def _udp_contradictions(
     sender: Packets, receiver: Packets, files: _Files | None, transfer: Transfer
 ) -> Iterator[str]:
+    """Yield contradictions between the datagrams in both captures and the files' sizes."""
     both = transfer.forward(sender), transfer.forward(receiver)
     # A capture also contains later fragments of other programs' datagrams.
     ids = np.concatenate([packets.ip_id[packets.dport == transfer.port] for packets in both])
@@ -119,7 +120,7 @@ def _udp_contradictions(
     first, first_received = sent.dport == transfer.port, received.dport == transfer.port
     keys, keys_received = _packet_keys(sent), _packet_keys(received)
     if unsent := int((~np.isin(keys_received[first_received], keys[first])).sum()):
-        yield f"{format_count(unsent, 'datagram')} arrived without being in the {transfer.source}'s capture"
+        yield f"the {transfer.source}'s capture lacks {format_count(unsent, 'datagram')} that arrived"
     if files is None:
         return
     # The number of arrived bytes is at most the sum of the UDP lengths in the first fragments, and at most the sum of
@@ -150,6 +151,7 @@ def _packet_keys(packets: Packets) -> Keys:
 def _tcp_contradictions(
     sender: Packets, receiver: Packets, files: _Files | None, transfer: Transfer, *, finished: bool
 ) -> Iterator[str]:
+    """Yield contradictions between the bytes in both captures, TCP's acknowledgments and the files' sizes."""
     sent, received = (
         packets.where(packets.dport == transfer.port)
         for packets in (transfer.forward(sender), transfer.forward(receiver))
@@ -175,7 +177,7 @@ def _tcp_contradictions(
             return
     connections = connections_by_role[transfer.source]
     if unsent := connections.payload(received).bytes_not_in(connections.payload(sent)):
-        yield f"{format_count(unsent, 'byte')} arrived without being in the {transfer.source}'s capture"
+        yield f"the {transfer.source}'s capture lacks {format_count(unsent, 'byte')} that arrived"
     answers = Packets.concatenated((answers_received, answers_sent))
     acknowledged = connections.acknowledged(answers)
     for packets, role in ((sent, transfer.source), (received, transfer.destination)):

@@ -78,7 +78,9 @@ def _ending(match: re.Match[str]) -> Ending:
 
 
 def termination_error(ending: Ending, allowed: Collection[Cause], min_duration_s: float = 0.0) -> str | None:
-    """Return the reason why the termination of a job is not acceptable, or None if it is; without the job's name.
+    """Return the reason why the termination of a job is not acceptable, or None if it is.
+
+    The reason does not contain the job's name.
 
     Args:
         ending: The termination.

@@ -1,10 +1,10 @@
-"""Handovers of a station between access points, and the time without answers of ping that each of them causes.
+"""Handovers of a station between access points, and the time without answers to ping that each handover causes.
 
 Handovers are detected in samples of the station's link. Only samples taken while ping runs are used, because a robot
-may roam again while it is brought back to its place. A handover happens between the last sample with the old access
+may roam again while it is moved back to its start. A handover happens between the last sample with the old access
 point and the first sample with the new one. The gap of a handover is the longest time between two consecutive answers
-that overlaps this interval. Its resolution is therefore the interval of the ping, not of the samples. Samples and
-answers must have times of the same clock, that of the robot that roams.
+that overlaps this interval. Its resolution is therefore the interval of the ping, not of the samples. The times of
+samples and answers must be from the clock of the robot that roams.
 """
 
 import math
@@ -36,7 +36,7 @@ COLUMNS: Final = columns(
     (
         "roam_ping_pongs",
         "count",
-        "Handovers back to an access point that the robot had left at most the time `ping_pong` earlier.",
+        "Handovers back to an access point at most `ping_pong` after the handover from it to another one.",
         Figure("ping-pong handovers", Kind.MEDIAN),
     ),
     (
@@ -88,7 +88,8 @@ class HandoverGap:
     """The time without answers around a handover.
 
     Attributes:
-        duration_s: Time in seconds between the answers before and after the gap; the observed time if it is open.
+        duration_s: Time in seconds between the answers before and after the gap. For an open gap, the number of
+            requests without an answer times the interval.
         first_lost: Sequence number of the first request without an answer.
         lost: Number of requests without an answer.
         is_open: True if ping started or ended in the gap.
@@ -113,7 +114,7 @@ def find_handovers(samples: Sequence[LinkSample]) -> list[Handover]:
 
 
 def count_ping_pongs(handovers: Sequence[Handover], within_s: float) -> int:
-    """Return the number of handovers back to an access point at most `within_s` after the robot had left it."""
+    """Return the number of handovers back to an access point at most `within_s` after the handover from it."""
     return sum(
         later.new == earlier.old and later.joined_ns - earlier.joined_ns <= within_s * 1e9
         for earlier, later in pairwise(handovers)
@@ -183,14 +184,17 @@ def _window_ns(output: Ping | None, interval_s: float) -> tuple[float, float]:
 
 
 def _measure_gaps(handovers: Sequence[Handover], output: Ping | None, interval_s: float) -> Measured:
+    """Return the columns of the gaps that the handovers caused."""
     candidates = [] if output is None else [gap_around(handover, output, interval_s) for handover in handovers]
     gaps = [gap for gap in candidates if gap is not None]
     if not gaps:
         reason = _NO_STAMPS if handovers else _NO_HANDOVER
         return Measured({}, dict.fromkeys(("roam_gap_s", "roam_gap_at_least_s", "roam_lost"), reason))
     longest = max(gaps, key=lambda gap: gap.duration_s)
-    filled, empty = ("roam_gap_s", "roam_gap_at_least_s")[:: -1 if longest.is_open else 1]
-    reason = f"ping {'started or ended' if longest.is_open else 'neither started nor ended'} in the gap"
+    if longest.is_open:
+        filled, empty, reason = "roam_gap_at_least_s", "roam_gap_s", "ping started or ended in the gap"
+    else:
+        filled, empty, reason = "roam_gap_s", "roam_gap_at_least_s", "ping neither started nor ended in the gap"
     # Two handovers may share a gap, whose requests are counted once.
     lost = sum({gap.first_lost: gap.lost for gap in gaps}.values())
     return Measured({filled: longest.duration_s, "roam_lost": lost}, {empty: reason})

@@ -100,7 +100,8 @@ class HostState:
 def before_file(role: Role) -> str:
     """Return the name of the file with a robot's state before an attempt.
 
-    The file has sections. Each section has a line `==> FILE <==` and the text of this file.
+    The file has sections. Each section has a line `==> NAME <==`, and the content of the file or the output of the
+    command with this name.
     """
     return f"{role}-before.txt"
 
@@ -126,8 +127,8 @@ def state(path: Path) -> HostState:
 def incomplete_sections(before: HostState, after: HostState) -> Iterator[str]:
     """Yield the names of sections that are in only one of the two states of an attempt.
 
-    A section that the host does not support is in neither state. Files of versions without the boot ID contain no
-    section of jobs.
+    A section that the host does not support is in neither state. Files of fieldkit versions that did not record the
+    boot ID have no section of jobs.
     """
     for name in _REQUIRED_SECTIONS:
         if name in before.sections ^ after.sections:
@@ -211,7 +212,7 @@ def received_bytes(path: Path, interface: str) -> int | None:
 
 
 def difference(before: Counters, after: Counters) -> Counters:
-    """Return the increments of the counters; None for a counter that is missing, or decreased by a restart."""
+    """Return the increments of the counters; None for a counter that is missing, or decreased because of a reboot."""
     return Counters(
         udp_buffer_errors=_increment(before.udp_buffer_errors, after.udp_buffer_errors),
         reassembly_failures=_increment(before.reassembly_failures, after.reassembly_failures),

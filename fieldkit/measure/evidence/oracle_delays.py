@@ -65,8 +65,8 @@ WINDOW_COLUMNS: Final = columns(
     ),
 )
 
-# 18 digits of nanoseconds are 31 years.
 _MAX_PACKETS: Final = 10**18
+# Times have at most 18 digits of nanoseconds, which are 31 years.
 _LATENESS_TEXT: Final = re.compile(
     r"bound ([0-9]{1,18})(?: lines ([0-9]{1,9}))?\n((?:late [0-9]{1,18} [0-9]{1,18}\n)*)"
     r"(?:windows ([0-9]{1,9})\n((?:window [0-9]{1,18} [0-9]{1,18}\n)*))?\Z"
@@ -198,7 +198,7 @@ POLICY_COLUMNS: Final = columns(
 
 _COSIM_NAMES: Final = ("undivided_ns", "policy_ns")
 _NAMES: Final = tuple(item.name for item in fields(DelayParts) if item.name not in _COSIM_NAMES)
-# 18 digits of nanoseconds are 31 years.
+# Times have at most 18 digits of nanoseconds, which are 31 years.
 _NUMBER: Final = "([0-9]{1,18})"
 _AIR_DELAY_TEXT: Final = re.compile(
     "".join(rf"{name} {_NUMBER}\n" for name in _NAMES)
@@ -227,7 +227,11 @@ def read_air_delay(path: Path) -> DelayParts:
 
 
 def air_delay_ns(parts: DelayParts) -> int:
-    """Return the sum of the four components in ns: the paper's eq. 2, summed over all packets."""
+    """Return the delay in ns, summed over all packets.
+
+    It is the sum of the four components (the paper's eq. 2) and, if the network does not report these, the undivided
+    delay.
+    """
     components_ns = parts.processing_ns + parts.transmission_ns + parts.propagation_ns + parts.queuing_ns
     return components_ns + parts.undivided_ns
 

@@ -1,10 +1,10 @@
 """Outage of a robot caused by an injected fault, computed from the file of an observer.
 
-All times are of the observer's clock, and the resolution is the observer's interval: if the time G is between two
-consecutive answers, the outage was at most G and at least G minus two intervals.
+All times are of the observer's clock, and the resolution is the observer's interval: if two consecutive answers are a
+time G apart, the outage lasted at most G, and at least G minus two intervals.
 
 The cause of a fault is the injected action, such as a link that is taken down; its duration is recorded in a note
-file. The outage is what the observer sees.
+file. The outage is the time in which the observer receives no answer.
 """
 
 import re
@@ -142,6 +142,7 @@ def _read_note(path: Path) -> _Note:
 
 
 def _ping_answers(path: Path, note: _Note) -> _Answers:
+    """Return the answers in the output of the observer's ping."""
     output = ping.read(path)
     if output.transmitted is None:
         raise EvidenceError("ping was stopped before its summary", where=path.name)

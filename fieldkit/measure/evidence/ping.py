@@ -165,12 +165,12 @@ class Ping:
         return tuple(reply.rtt_s for reply in self.answers if reply.rtt_s is not None)
 
     @property
-    def gaps(self) -> tuple[int, ...]:
-        """Sequence numbers without an answer, from the first request to the last request in the output."""
+    def unanswered_seqs(self) -> tuple[int, ...]:
+        """Sequence numbers of the requests without an answer, up to the last request in the output."""
         answered_seqs = {reply.seq for reply in self.answers}
         printed_seqs = answered_seqs | {problem.seq for problem in self.problems}
         end = max(printed_seqs, default=-1) + 1 if self.transmitted is None else self.first_seq + self.transmitted
-        # The number has 16 bits and wraps to 0 in a longer run.
+        # A sequence number has 16 bits and wraps to 0 in a longer run.
         return tuple(seq for seq in range(self.first_seq, min(end, 0x10000)) if seq not in answered_seqs)
 
 
@@ -184,7 +184,7 @@ def read(path: Path) -> Ping:
 
 
 def parse(text: str) -> Ping:
-    """Return the parsed output of a run of ping. No text causes an error."""
+    """Return the parsed output of a run of ping. Any text is accepted."""
     payload_bytes = transmitted = received = None
     first_seq = 1
     summary_s = None

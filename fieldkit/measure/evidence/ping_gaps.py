@@ -15,7 +15,7 @@ GAP_COLUMNS: Final = columns(
         "s",
         (
             "Longest time between consecutive replies; empty if ping printed no time stamps, or if the time without "
-            "replies at its start or end was longer than this time, or at least 1 s."
+            "a reply at its start or end was at least as long, or at least 1 s."
         ),
         Figure("longest gap between answers", Kind.MEDIAN, at_least="rtt_gap_at_least_s"),
     ),
@@ -52,7 +52,8 @@ class AnswerGap:
     """The longest time without an answer in a run of ping.
 
     Attributes:
-        duration_s: Time in seconds between the answers before and after the gap; the observed time if it is open.
+        duration_s: Time in seconds between the answers before and after the gap; the observed part of it if the gap
+            is open.
         lost: Number of unanswered requests in the gap.
         is_open: True if ping started or ended in the gap, so that both numbers are lower bounds.
     """

@@ -1,9 +1,9 @@
 """Sandboxed reading of untrusted files, in a process with limits for memory, CPU time and disk.
 
-A library without precautions decompresses a whole file, runs queries that the file's database schema can change, and
-follows every reference. A check of the file in advance cannot detect all of this. The reader is a process because a
-process can be killed, unlike a thread. It is started by the first query, which takes 0.1 s, and also answers later
-queries. It exits if it is idle for some time, and if it runs out of memory.
+An untrusted file can make a library decompress any amount of data, run queries that the file's database schema
+defines, or follow references without end. A check of the file in advance cannot detect all of this. The reader is a
+process, because a process can be killed, unlike a thread. The first query starts it, which takes 0.1 s; the process
+also answers later queries. It exits if it is idle for some time, and if it runs out of memory.
 """
 
 import json
@@ -27,10 +27,11 @@ CPU_S: Final = 10
 """Base limits for reading a file of any size."""
 MEMORY_PER_BYTE: Final = 16
 DISK_PER_BYTE: Final = 1
-ANSWER_BYTES: Final = 16 << 20
-ANSWER_PER_BYTE: Final = 4
 BYTES_PER_CPU_S: Final = 1 << 20
 """Additional limits per byte of the file; an index entry of 12 bytes in a bag becomes an object of 170 bytes."""
+ANSWER_BYTES: Final = 16 << 20
+ANSWER_PER_BYTE: Final = 4
+"""Limit of an answer's length: a base, and an addition per byte of the file."""
 MEMORY_SHARE: Final = 0.5
 MAX_CPU_S: Final = 3600
 """Upper limits for a file of any size: share of this machine's memory, and CPU time."""
@@ -39,11 +40,13 @@ MAX_CPU_S: Final = 3600
 # limit is larger than the CPU time, because other processes may use the CPU.
 _WALL_PER_CPU_S: Final = 6
 _EXIT_WAIT_S: Final = 5.0
+"""Time within which a process that has closed its output must exit; then it is killed."""
 ERROR_KEY: Final = "unanswered"
 """Key of the error message in the answer to a query that failed."""
 _TIMED_OUT: Final = -signal.SIGXCPU
-# Exit codes that the file did not cause: the idle time, the kernel's out-of-memory killer, a person, a service
-# manager.
+"""Exit code after a limit of time: the kernel sends SIGXCPU at the limit of CPU time."""
+# Exit codes that the file did not cause: 0 after the idle time; signals of the kernel's out-of-memory killer, a
+# service manager or a person.
 _EXTERNAL_EXIT_CODES: Final = {0, -signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP, -signal.SIGINT}
 
 Json = dict[str, Any]

@@ -138,7 +138,7 @@ def _joint_states(
 ) -> Iterator[tuple[int, TrackPoint, TrackPoint]]:
     """Yield the time in ns and the latest entries of both robots for each entry of either robot.
 
-    The first time is the one from which both robots have an entry.
+    Entries before both robots have an entry are omitted.
     """
     latest: dict[Role, TrackPoint] = {}
     for entry in track:

@@ -219,8 +219,8 @@ def _ecef_m(source: Samples, destination: Samples, *, heights: bool) -> tuple[Fl
     median_m = float(np.median(known_heights_m)) if len(known_heights_m) else 0.0
 
     def place_m(samples: Samples) -> Floats:
-        north, east, up_m = samples.values.T
-        return ecef_m(north, east, up_m if heights else np.full(len(up_m), median_m))
+        latitude_deg, longitude_deg, height_m = samples.values.T
+        return ecef_m(latitude_deg, longitude_deg, height_m if heights else np.full(len(height_m), median_m))
 
     return place_m(source), place_m(destination)
 
@@ -231,7 +231,8 @@ PLACE_M: Final = 0.5
 SATELLITE_M: Final = 10.0
 """Maximum errors of a distance: `PLACE_M` with local positions, `SATELLITE_M` with a satellite receiver (5 m at each
 end of the path)."""
-_MARGIN_NS: Final = 1_000_000_000
+_MARGIN_S: Final = 1.0
+"""Time before and after a robot's log in which positions of the testbed are also used."""
 
 
 def travel_contradiction(
@@ -253,10 +254,10 @@ def travel_contradiction(
             for sample in track_samples
             if sample.role is role
             and sample.position_m is not None
-            and log_span_ns[0] - _MARGIN_NS <= sample.utc_ns <= log_span_ns[1] + _MARGIN_NS
+            and log_span_ns[0] - _MARGIN_S * 1e9 <= sample.utc_ns <= log_span_ns[1] + _MARGIN_S * 1e9
         ]
         other_m = _max_distance_m(np.array(places_m, dtype=float)) if len(places_m) > 1 else None
-        tolerance_m = PLACE_M + DRIFT * farthest_m + speed_m_s
+        tolerance_m = PLACE_M + DRIFT * farthest_m + speed_m_s * _MARGIN_S
         if other_m is not None and abs(other_m - farthest_m) > tolerance_m:
             other_text = f"{other_m:.1f} m according to {track.FILE}"
             return f"it was {farthest_m:.1f} m from its start according to its odometry, but {other_text}"
@@ -277,8 +278,10 @@ def _recorded_contradiction(evidence: AttemptEvidence, role: Role, farthest_m: f
     except EvidenceError:
         return None
     is_geodetic = samples.frame == WGS84
-    north, east, up_m = samples.values.T
-    places_m = ecef_m(north, east, np.zeros(len(up_m))) if is_geodetic else samples.values
+    places_m = samples.values
+    if is_geodetic:
+        latitude_deg, longitude_deg, height_m = samples.values.T
+        places_m = ecef_m(latitude_deg, longitude_deg, np.zeros(len(height_m)))
     other_m = _max_distance_m(places_m)
     if farthest_m - other_m > (SATELLITE_M if is_geodetic else PLACE_M) + DRIFT * farthest_m:
         other_text = f"{other_m:.1f} m according to {position_source.description}"

@@ -13,7 +13,9 @@ SPEED_SPAN_NS: Final = 200_000_000
 """Shortest time over which a speed is computed. Over a shorter time, noise of the positions would appear as speed."""
 
 _ALWAYS: Final = np.array([0, 2**62])
-_STRAIGHT: Final = 1e-6
+"""Times of a trajectory that covers every time span, in ns since 1970."""
+_NEGLIGIBLE_PATH: Final = 1e-6
+"""A path is regarded as a point if it is shorter than this share of its distance from the origin."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +117,7 @@ def _mean_m(begin: Floats, end: Floats) -> float:
     """
     path = end - begin
     length_m, first_m = float(np.linalg.norm(path)), float(np.linalg.norm(begin))
-    if length_m <= _STRAIGHT * max(first_m, 1e-3):
+    if length_m <= _NEGLIGIBLE_PATH * max(first_m, 1e-3):
         return (first_m + float(np.linalg.norm(end))) / 2
     start_m = float(begin @ path) / length_m
     offset_m = float(np.linalg.norm(begin - start_m * path / length_m))

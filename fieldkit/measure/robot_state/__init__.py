@@ -1,1 +1,1 @@
-"""State of a robot before and after an attempt, as its programs report it: its clock, with columns and marks."""
+"""State of a robot's clock, computer and radio before and after an attempt, as reported by the robot's programs."""

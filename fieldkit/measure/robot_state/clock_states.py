@@ -26,7 +26,8 @@ class RobotClock:
 
     Attributes:
         name: Name of the robot.
-        reports: Reports before and after the attempt (`choose_report`), without those that no program gave.
+        reports: Reports before and after the attempt (`choose_report`). A report is missing if no program returned
+            one.
         laptop: Offset from the laptop's clock; None if unknown.
     """
 

@@ -20,7 +20,8 @@ from fieldkit.measure.robot_clock import Offset
 FILE: Final = laptop_files.EXCHANGES
 
 WRONG_S: Final = 0.1
-"""Offset above which a clock is wrong. It is far above the errors of NTP, and visible in time stamps of topics."""
+"""A clock with a larger offset is wrong. Such an offset is far above the errors of NTP, and visible in time stamps of
+topics."""
 
 _LINE: Final = re.compile(rf"({Role.PATTERN}) ([0-9]{{1,19}}) ([0-9]{{1,19}})", re.ASCII)
 
@@ -61,7 +62,7 @@ def laptop_offset(evidence: AttemptEvidence, role: Role) -> Offset | None:
 
 
 def is_wrong(clock_offset: Offset) -> bool:
-    """Return True if an offset is above `WRONG_S`, whatever its error within the bounds is."""
+    """Return True if an offset is certainly above `WRONG_S`, even with its maximum error."""
     return abs(clock_offset.offset_s) - clock_offset.error_s > WRONG_S
 
 

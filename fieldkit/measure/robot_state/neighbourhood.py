@@ -1,10 +1,10 @@
 """Channel of a robot's radio before and after an attempt, and the networks and the airtime of others on this channel.
 
 `iw dev INTERFACE scan freq MHZ passive` lists the networks that the radio receives on its channel (scan.c of iw),
-without sending packets. The robots' networks have the state `associated` or `joined`, or the address of the radio.
-`iw dev INTERFACE survey dump` is run twice, 0.5 s apart, while the robots send nothing for the attempt. The time in
-which the channel was busy, minus the radio's transmissions, is the airtime of others; it includes beacons of the
-robots' network. If a driver resets its counters, there is no value.
+without sending packets. A network with the state `associated` or `joined`, or with the address of the radio, is the
+robots' network, and is not counted. `iw dev INTERFACE survey dump` is run twice, 0.5 s apart, while the robots send
+nothing for the attempt. The time in which the channel was busy, minus the radio's transmissions, is the airtime of
+others; it includes beacons of the robots' network. If a driver resets its counters, there is no value.
 """
 
 import re

@@ -1,9 +1,9 @@
 """Parser of the output of `pmc -u -b 0 'GET CURRENT_DATA_SET' 'GET TIME_STATUS_NP' 'GET PORT_DATA_SET'` of linuxptp.
 
 Offsets and delays are in nanoseconds (pmc(8)). The error of the offset is at most the mean path delay; it has this
-value if the whole delay is in one direction. With hardware time stamps, the offset is that of the network adapter's
-clock, with which phc2sys synchronizes the system clock. Only the first response of each kind is used, which is that
-of the local clock.
+value if the whole delay is in one direction. With hardware time stamps, ptp4l reports the offset of the network
+adapter's clock, with which phc2sys synchronizes the system clock. Only the first response of each kind is used,
+because it is from the local clock.
 """
 
 import re

@@ -1,8 +1,9 @@
 """Parsers of the output of `timedatectl timesync-status` and `timedatectl show` (systemd 239 and later).
 
 `Offset` is the time of the server minus the clock at the last poll; timesyncd then corrects the clock by this amount.
-The current offset of the clock is therefore between `-Offset` and 0. Its maximum error is the sum of `Root distance`,
-the maximum error of the server, half of the round trip (`Delay`; RFC 5905, section 11.2), and the correction itself.
+The current offset of the clock is therefore between `-Offset` and 0. Its maximum error is the sum of three values:
+the maximum error of the server (`Root distance`), half of the round-trip time (`Delay`; RFC 5905, section 11.2), and
+the correction itself.
 """
 
 import re

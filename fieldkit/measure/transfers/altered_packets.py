@@ -63,7 +63,7 @@ def incomparability_reason(sender: Packets, receiver: Packets, transfer: Transfe
     is_earlier_traffic = matches_sent.sum() <= MAX_ALTERED_SHARE * len(from_other_ports)
     if is_earlier_traffic and len(from_other_ports) > _MAX_LATE_PACKETS and not len(from_same_port):
         return (
-            f"none of its {len(sent)} packets reached the receiver, but {len(from_other_ports)} other packets did"
+            f"none of its {len(sent)} packets reached the receiver, but {len(from_other_ports)} other packets did,"
             f" {_most_common_ends(from_other_ports)}: packets of an earlier attempt were still in transit,"
             " or a router changed the port and other fields"
         )
@@ -135,10 +135,10 @@ def _with_other_address(
     if not len(candidates):
         return candidates
     candidates = candidates.where(~np.isin(connection_keys(candidates), connection_keys(sender)))
-    sent_keys, expected_keys, candidate_keys = (
+    sent_keys, unaltered_keys, candidate_keys = (
         _address_free_keys(packets) for packets in (sent, from_same_port, candidates)
     )
-    return candidates.where(np.isin(candidate_keys, sent_keys) & ~np.isin(candidate_keys, expected_keys))
+    return candidates.where(np.isin(candidate_keys, sent_keys) & ~np.isin(candidate_keys, unaltered_keys))
 
 
 def _were_sent(sent: Packets, received: Packets) -> Mask:

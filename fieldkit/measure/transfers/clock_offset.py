@@ -39,6 +39,7 @@ STAMP_S: Final = 1e-6
 """Maximum error of the difference of two times: tcpdump truncates times to microseconds."""
 
 _HULL_POINTS: Final = 1024
+"""Maximum number of points from which a convex hull is computed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +116,8 @@ def estimate(forward: StampPairs, reverse: StampPairs) -> Clocks | None:
     smallest possible skew is used. The offset is the middle of the range that is possible with this skew.
 
     Args:
-        forward: Packets from sender to receiver, at least one. A frame is in one pair only.
-        reverse: Packets from receiver to sender, under the same conditions.
+        forward: Packets from sender to receiver; at least one. Each frame may be in one pair only.
+        reverse: Packets from receiver to sender; at least one. Each frame may be in one pair only.
     """
     times = np.concatenate((forward.receiver_ns, reverse.receiver_ns))
     middle_ns = (int(times.min()) + int(times.max())) // 2
@@ -138,22 +139,22 @@ def estimate(forward: StampPairs, reverse: StampPairs) -> Clocks | None:
     return Clocks(middle_ns, base_ns, offset_s, skew, skews[order], lowest_s[order], highest_s[order])
 
 
-def _best_skew(ceilings: Sequence["_Hull"], floors: Sequence["_Hull"], first: float, last: float) -> float:
+def _best_skew(ceilings: Sequence["_Hull"], floors: Sequence["_Hull"], lowest: float, highest: float) -> float:
     """Return the estimated skew.
 
     Args:
         ceilings: Hulls of packets from sender to receiver, from `_Hull.of_all_but_one`.
         floors: Hulls of packets from receiver to sender.
-        first: Lowest possible skew.
-        last: Highest possible skew.
+        lowest: Lowest possible skew.
+        highest: Highest possible skew.
     """
     slopes = np.concatenate([hull.slopes() for hull in ceilings] + [-hull.slopes() for hull in floors])
-    skews = np.clip(np.append(slopes, (0.0, -MAX_SKEW, MAX_SKEW)), first, last)
+    skews = np.clip(np.append(slopes, (0.0, -MAX_SKEW, MAX_SKEW)), lowest, highest)
     lowest_s, highest_s = _range_without_fastest(ceilings, floors, skews)
     width_s = highest_s - lowest_s
     best = skews[width_s >= width_s.max() - STAMP_S]
     skew = float(best[np.abs(best).argmin()])
-    return float(np.clip(0.0, first, last)) if max(last - skew, skew - first) > QUARTZ_SKEW else skew
+    return float(np.clip(0.0, lowest, highest)) if max(highest - skew, skew - lowest) > QUARTZ_SKEW else skew
 
 
 def _range(ceiling: "_Hull", floor: "_Hull", skews: Floats) -> tuple[Floats, Floats]:

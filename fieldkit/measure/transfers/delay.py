@@ -85,36 +85,38 @@ LARGEST_ERROR: Final = 0.1
 UNSTEADY: Final = (
     "no offset and drift fit all times: a clock was set during the attempt, or drifts by more than 500 ppm"
 )
-"""Reason why no times of a transfer are known. Times by a single clock are also unknown, because any of the two
-clocks may be wrong.
+"""Reason why no times of a transfer are known. Times by a single clock are also unknown, because either clock may be
+the wrong one.
 """
 
 SINGLE_PACKET: Final = "one direction has a single packet in both captures, and no other packet confirms its time"
 """Reason why the error of the clock offset is unlimited."""
 
 _JITTER_GAIN: Final = 1 / 16
+"""Weight of the newest step in the interarrival jitter of RFC 3550."""
 _WEIGHTED_STEPS: Final = 1000
+"""Number of steps that are used; the weight of older steps is below 1e-29."""
 
 
-def udp_packets(packets: udp.UdpPackets) -> StampPairs:
-    """Return the times of a UDP transfer's packets that are in both captures; fragments are separate packets."""
-    sent, received = udp_copies(packets)
+def udp_pairs(packets: udp.UdpPackets) -> StampPairs:
+    """Return the times of a UDP transfer's packets that are in both captures. Each fragment is a packet."""
+    sent, received = udp_pair_indices(packets)
     return StampPairs(packets.sent.time_ns[sent], packets.received.time_ns[received])
 
 
-def udp_copies(packets: udp.UdpPackets) -> tuple[Ints, Ints]:
-    """Return the indices of the packets of `udp_packets` among the sent and among the received packets."""
-    return _copies(packets.match, packets.is_transfer_packet)
+def udp_pair_indices(packets: udp.UdpPackets) -> tuple[Ints, Ints]:
+    """Return, for each pair of `udp_pairs`, its index among the sent and among the received packets."""
+    return _pair_indices(packets.match, packets.is_transfer_packet)
 
 
-def tcp_frames(frames: tcp.TcpFrames) -> StampPairs:
+def tcp_pairs(frames: tcp.TcpFrames) -> StampPairs:
     """Return the times of a TCP transfer's frames with payload that are in both captures."""
-    sent, received = tcp_copies(frames)
+    sent, received = tcp_pair_indices(frames)
     return StampPairs(frames.sent.time_ns[sent], frames.received.time_ns[received])
 
 
-def tcp_copies(frames: tcp.TcpFrames) -> tuple[Ints, Ints]:
-    """Return the indices of the frames of `tcp_frames` among the sent and among the received frames.
+def tcp_pair_indices(frames: tcp.TcpFrames) -> tuple[Ints, Ints]:
+    """Return, for each pair of `tcp_pairs`, its index among the sent and among the received frames.
 
     A frame arrives with its last byte. If offload joined several frames, the joined frame matches the last of them.
     """
@@ -124,7 +126,7 @@ def tcp_copies(frames: tcp.TcpFrames) -> tuple[Ints, Ints]:
     return sent_pieces.frame[is_certain], received_pieces.frame[matched.received_index[is_certain]]
 
 
-def tcp_sent(frames: tcp.TcpFrames) -> int:
+def count_tcp_sent(frames: tcp.TcpFrames) -> int:
     """Return the number of frames with payload that were sent, including frames that did not arrive."""
     return int(_is_last_piece(frames.payload.sent).sum())
 
@@ -141,7 +143,7 @@ def measure(
     """Return the columns of the transfer's delay and of the clock offset.
 
     Args:
-        pairs: The transfer's packets, from `udp_packets` or `tcp_frames`.
+        pairs: The transfer's packets, from `udp_pairs` or `tcp_pairs`.
         sender: Packets of the sender's capture.
         receiver: Packets of the receiver's capture.
         transfer: Identifies the transfer's packets.
@@ -245,7 +247,7 @@ def jitter_s(transit_ns: Ints) -> float | None:
 def mean_jitter_s(transit_ns: Ints) -> float | None:
     """Return the mean of the values that `jitter_s` has after each packet from the second on.
 
-    The argument is that of `jitter_s`.
+    The argument is the same as for `jitter_s`.
     """
     if len(transit_ns) < 2:
         return None
@@ -281,6 +283,7 @@ def _clock(clocks: Clocks) -> Measured:
 
 
 def _one_way(delay_s: Floats, error_s: float, sent: int) -> Measured:
+    """Return the columns of the one-way delay; a column whose error is too large is empty."""
     figures = {
         "one_way_min_s": float(delay_s.min()),
         "one_way_median_s": float(np.median(delay_s)),
@@ -345,13 +348,13 @@ def _matched_pairs(sent: Packets, received: Packets) -> StampPairs:
     several sent frames into a received frame, the pair contains the last sent frame, which gives the strictest bound
     of the clock offset.
     """
-    sent_index, received_index = _copies(match(sent, received))
+    sent_index, received_index = _pair_indices(match(sent, received))
     received_index, last = np.unique(received_index[::-1], return_index=True)
     sent_index = sent_index[::-1][last]
     return StampPairs(sent.time_ns[sent_index], received.time_ns[received_index])
 
 
-def _copies(matched: Match, selection: Mask | None = None) -> tuple[Ints, Ints]:
+def _pair_indices(matched: Match, selection: Mask | None = None) -> tuple[Ints, Ints]:
     """Return the indices of matched packets among the sent and among the received packets, without ambiguous ones.
 
     Args:

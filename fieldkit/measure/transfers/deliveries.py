@@ -63,8 +63,8 @@ class FlowSchedule:
 
 
 @dataclass(frozen=True, eq=False)
-class Delivery:
-    """Deliveries of one stream; times in nanoseconds since 1970 UTC by the receiver's clock.
+class StreamDeliveries:
+    """Deliveries of new payload of one stream; times in nanoseconds since 1970 UTC by the receiver's clock.
 
     If nothing arrived, `begin_ns` and `end_ns` are by the sender's clock.
 
@@ -83,7 +83,7 @@ class Delivery:
     min_stall_s: float
 
 
-def udp_delivery(packets: UdpPackets, in_stream: Mask, expected: FlowSchedule) -> Delivery:
+def udp_stream_deliveries(packets: UdpPackets, in_stream: Mask, expected: FlowSchedule) -> StreamDeliveries:
     """Return the deliveries of datagrams.
 
     Args:
@@ -105,7 +105,7 @@ def udp_delivery(packets: UdpPackets, in_stream: Mask, expected: FlowSchedule) -
     at_ns = np.sort(complete_ns[complete_ns != NO_TIME])
     index = np.flatnonzero(stream_packets & matched.arrived)
     pairs = StampPairs(packets.sent.time_ns[index], packets.received.time_ns[matched.received_index[index]])
-    return stream_delivery(at_ns, (int(sent_ns.min()), int(sent_ns.min()), int(sent_ns.max())), pairs, expected)
+    return stream_deliveries(at_ns, (int(sent_ns.min()), int(sent_ns.min()), int(sent_ns.max())), pairs, expected)
 
 
 def arrivals_ns(packets: UdpPackets) -> Ints:
@@ -116,7 +116,7 @@ def arrivals_ns(packets: UdpPackets) -> Ints:
     return np.where(udp.complete(packets)[:-1], last_ns, NO_TIME)
 
 
-def tcp_delivery(frames: TcpFrames, answers: Packets, expected: FlowSchedule) -> Delivery:
+def tcp_stream_deliveries(frames: TcpFrames, answers: Packets, expected: FlowSchedule) -> StreamDeliveries:
     """Return the deliveries of one TCP connection in one direction.
 
     Args:
@@ -143,18 +143,18 @@ def tcp_delivery(frames: TcpFrames, answers: Packets, expected: FlowSchedule) ->
     first_ns = int(sent.time_ns.min())
     data_ns = int(sent.time_ns[data].min()) if data.any() else first_ns
     last_ns = max(int(sent.time_ns[sent.tcp_payload_bytes > 0].max(initial=first_ns)), _last_syn_ns(sent, first_ns))
-    sent_index, received_index = delay.tcp_copies(frames)
+    sent_index, received_index = delay.tcp_pair_indices(frames)
     pairs = StampPairs(sent.time_ns[sent_index], received.time_ns[received_index])
-    delivery = stream_delivery(at_ns, (first_ns, data_ns, last_ns), pairs, expected, rtt_s=_rtt_s(sent, answers))
+    stream = stream_deliveries(at_ns, (first_ns, data_ns, last_ns), pairs, expected, rtt_s=_rtt_s(sent, answers))
     if expected.duration_s is not None or not len(at_ns):
-        return delivery
+        return stream
     if is_complete:
-        return replace(delivery, end_ns=None)
+        return replace(stream, end_ns=None)
     # A receiver of a known number of bytes waits for the missing bytes until it is terminated.
     return (
-        delivery
+        stream
         if expected.size_bytes is None or expected.receiver_end_ns is None
-        else replace(delivery, end_ns=expected.receiver_end_ns)
+        else replace(stream, end_ns=expected.receiver_end_ns)
     )
 
 
@@ -186,13 +186,13 @@ def advancing_frames(frames: Packets) -> tuple[Ints, Ints]:
     return relevant[completed_by[last_of_frame]], np.cumsum(size_bytes[: len(completed_by)])[last_of_frame]
 
 
-def stream_delivery(
+def stream_deliveries(
     at_ns: Ints, sent_ns: tuple[int, int, int], pairs: StampPairs, expected: FlowSchedule, *, rtt_s: float = 0.0
-) -> Delivery:
+) -> StreamDeliveries:
     """Return the deliveries of a stream whose payload was due until the last payload was sent, or for its duration.
 
     Args:
-        at_ns: Times of delivery.
+        at_ns: Times of stream.
         sent_ns: Times at which the sender sent the first packet, the first payload and the last payload.
         pairs: Packets of the stream that are in both captures.
         expected: Known properties of the stream.
@@ -203,12 +203,12 @@ def stream_delivery(
     if expected.duration_s is not None:
         last_ns = data_ns + round(1e9 * expected.duration_s)
     if not len(at_ns):
-        return Delivery(at_ns, first_ns, last_ns, expected.interval_s, min_stall_s)
+        return StreamDeliveries(at_ns, first_ns, last_ns, expected.interval_s, min_stall_s)
     start_offset_ns, end_offset_ns = _sender_to_receiver_ns(pairs)
     end_ns = last_ns + end_offset_ns
     if expected.duration_s is not None and expected.receiver_end_ns is not None:
         end_ns = min(end_ns, expected.receiver_end_ns)
-    return Delivery(at_ns, first_ns + start_offset_ns, end_ns, expected.interval_s, min_stall_s)
+    return StreamDeliveries(at_ns, first_ns + start_offset_ns, end_ns, expected.interval_s, min_stall_s)
 
 
 def _sender_to_receiver_ns(pairs: StampPairs) -> tuple[int, int]:

@@ -37,7 +37,7 @@ class Fates:
     received_bytes: NDArray[np.int64]
 
 
-def both_packets(evidence: AttemptEvidence, transfer: Transfer) -> tuple[Packets, Packets]:
+def packets_of_both_ends(evidence: AttemptEvidence, transfer: Transfer) -> tuple[Packets, Packets]:
     """Return the packets of the sender's and the receiver's capture; raises if these cannot be compared.
 
     Args:
@@ -69,7 +69,7 @@ def read(evidence: AttemptEvidence, transfer: Transfer) -> Fates | None:
         transfer: Identifies the packets of the transfer.
     """
     try:
-        sender, receiver = both_packets(evidence, transfer)
+        sender, receiver = packets_of_both_ends(evidence, transfer)
         fates = {Protocol.UDP: _udp_fates, Protocol.TCP: _tcp_fates}[transfer.protocol](sender, receiver, transfer)
     except EvidenceError:
         return None
@@ -77,6 +77,7 @@ def read(evidence: AttemptEvidence, transfer: Transfer) -> Fates | None:
 
 
 def _udp_fates(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates | None:
+    """Return the fates of UDP packets, or None if it is ambiguous which packets were lost."""
     packets = udp.match_transfer(sender, receiver, transfer)
     is_transfer_packet, sent_index = packets.is_transfer_packet, packets.match.sent_index
     if (is_transfer_packet & packets.match.ambiguous).any():
@@ -176,9 +177,10 @@ class _MatchedPackets:
         sent: Packets in the sender's capture.
         received: Packets in the receiver's capture.
         is_transfer_packet: Mask of the sent packets that belong to the transfer.
-        lost: Whether each packet was lost; see `SentPackets.lost`.
-        sent_again: Whether the data of each packet was sent again; see `SentPackets.sent_again`.
-        copies: Indices of the matched sent packets, and indices of their copies among the received packets.
+        lost: True for each packet that was lost; see `SentPackets.lost`.
+        sent_again: True for each frame with bytes that had been sent before; see `SentPackets.sent_again`.
+        pair_indices: Indices of the matched sent packets, and indices of their first copies among the received
+            packets.
     """
 
     sent: Packets
@@ -186,7 +188,7 @@ class _MatchedPackets:
     is_transfer_packet: Mask
     lost: MaskedArray
     sent_again: MaskedArray
-    copies: tuple[Ints, Ints]
+    pair_indices: tuple[Ints, Ints]
 
 
 def read_sent_packets(evidence: AttemptEvidence, transfer: Transfer) -> SentPackets:
@@ -197,11 +199,11 @@ def read_sent_packets(evidence: AttemptEvidence, transfer: Transfer) -> SentPack
         transfer: Identifies the packets of the transfer.
 
     Raises:
-        EvidenceError: For the same reasons as `both_packets` and `tcp_streams.cut`.
+        EvidenceError: For the same reasons as `packets_of_both_ends` and `tcp_streams.cut`.
     """
-    sender, receiver = both_packets(evidence, transfer)
+    sender, receiver = packets_of_both_ends(evidence, transfer)
     packets = {Protocol.UDP: _match_udp, Protocol.TCP: _match_tcp}[transfer.protocol](sender, receiver, transfer)
-    sent_index, received_index = packets.copies
+    sent_index, received_index = packets.pair_indices
     pairs = StampPairs(packets.sent.time_ns[sent_index], packets.received.time_ns[received_index])
     received_ns = _all_masked(len(packets.sent), np.int64)
     delay_s, error_s = (_all_masked(len(packets.sent), np.float64) for _ in range(2))
@@ -236,7 +238,7 @@ def _match_udp(sender: Packets, receiver: Packets, transfer: Transfer) -> _Match
         is_transfer_packet=matched.is_transfer_packet,
         lost=np.ma.array(~matched.match.arrived, mask=matched.match.ambiguous | may_hide_loss.any()),
         sent_again=_all_masked(len(matched.sent), np.bool_),
-        copies=delay.udp_copies(matched),
+        pair_indices=delay.udp_pair_indices(matched),
     )
 
 
@@ -252,5 +254,5 @@ def _match_tcp(sender: Packets, receiver: Packets, transfer: Transfer) -> _Match
         is_transfer_packet=matched.sent.tcp_payload_bytes > 0,
         lost=np.ma.array(lost, mask=ambiguous | match.possible_copy.any()),
         sent_again=np.ma.array(tcp.sent_again(matched)),
-        copies=delay.tcp_copies(matched),
+        pair_indices=delay.tcp_pair_indices(matched),
     )

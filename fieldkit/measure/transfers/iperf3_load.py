@@ -15,7 +15,7 @@ from fieldkit.measure.captures.headers import TCP, UDP
 from fieldkit.measure.captures.packets import UDP_HEADER_BYTES, Packets
 from fieldkit.measure.transfers import delay, deliveries, stalls, tcp
 from fieldkit.measure.transfers.clock_offset import Clocks
-from fieldkit.measure.transfers.deliveries import Delivery, FlowSchedule
+from fieldkit.measure.transfers.deliveries import FlowSchedule, StreamDeliveries
 from fieldkit.measure.transfers.match import match
 from fieldkit.measure.transfers.tcp_streams import Connections
 from fieldkit.measure.transfers.udp import UdpPackets, datagrams
@@ -156,8 +156,8 @@ JITTER_CROSS_CHECKS: Final = (
         source="both captures: times of sending and arrival of each datagram",
         against=("both captures: packets of the other direction, and the clock offset that fits all packets",),
         tolerance=(
-            "0.1 ms per second of clock drift; no other source records the time of a single datagram, but the order "
-            "of the packets limits an error in it to 0.1 s"
+            "an unknown clock drift of 0.1 ms per second; no other source records the time of a single datagram, but "
+            "because packets are captured in order, it can be wrong by at most 0.1 s"
         ),
         outcome=CheckOutcome.WITHHELD,
     ),
@@ -247,7 +247,7 @@ def measure_stalls(flow: str, load: LoadStreams, sender: Packets | None, receive
     return stalls.measure(flow, lambda: read_deliveries(load, sender, receiver))
 
 
-def read_deliveries(load: LoadStreams, sender: Packets | None, receiver: Packets | None) -> list[Delivery]:
+def read_deliveries(load: LoadStreams, sender: Packets | None, receiver: Packets | None) -> list[StreamDeliveries]:
     """Return the deliveries of each stream of a load. The arguments are those of `measure_stalls`.
 
     Raises:
@@ -259,10 +259,10 @@ def read_deliveries(load: LoadStreams, sender: Packets | None, receiver: Packets
     if load.protocol is Protocol.UDP:
         packets = _udp_packets(load, sender, receiver)
         masks = load.datagram_masks(packets.sent.where(packets.first))
-        return [deliveries.udp_delivery(packets, mask, load.expected) for mask in masks]
+        return [deliveries.udp_stream_deliveries(packets, mask, load.expected) for mask in masks]
     sent, received, reverse = load.forward(sender), load.forward(receiver), load.backward(sender)
     return [
-        deliveries.tcp_delivery(
+        deliveries.tcp_stream_deliveries(
             tcp.match_frames(
                 *(
                     frames.where((frames.sport == source_port) & (frames.dport == destination_port))

@@ -27,8 +27,8 @@ It is the minimum retransmission timeout of Linux (TCP_RTO_MIN), after which TCP
 """
 
 _CLEAR_FACTOR: Final = 4
-"""An arrival is clearly nearest to a sent packet if the time between them, multiplied by this factor, is at most the
-time between this sent packet and the sent packet that is nearest to it.
+"""An arrival is clearly nearest to a sent packet if the time between them is at most D divided by this factor. D is
+the time between this sent packet and the nearest other sent packet with the same key.
 """
 
 
@@ -43,8 +43,8 @@ class Match:
             has no such packet. Shape (m,).
         duplicates: Mask of received packets that are further copies of a packet that had arrived. Shape (m,).
         ambiguous: Mask of sent packets that cannot be distinguished: others are equal and were sent at nearly the
-            same time, so the order of their arrival is unknown. They are matched in the order of sending: if a
-            packets were sent and b received, min(a, b) arrived. Shape (n,).
+            same time, so the order of their arrival is unknown. They are matched in the order of sending; the number
+            that arrived is the number sent or the number received, whichever is smaller. Shape (n,).
         possible_copy: Mask of received packets that are counted as arrived, but may be copies of another packet,
             because packets with the same key arrived at shorter intervals than they were sent. Shape (m,).
     """
@@ -223,6 +223,7 @@ def _match_frames(sent: Packets, received: Packets) -> Match:
 
 
 def _match_pieces(sent: Packets, received: Packets, frames: Match) -> Payload:
+    """Match the pieces of payload, given the match of whole frames."""
     sent_pieces, received_pieces = tcp_streams.cut(sent, received)
     stamp, received_stamp = usable_stamps(sent, received)
     key = row_hashes(sent_pieces.range_id, stamp[sent_pieces.frame])
@@ -263,7 +264,7 @@ def _equal_frames(sent: Packets, received: Packets, frames: Match) -> tuple[Ints
 def _key(packets: Packets, stamp: Ints) -> Keys:
     """Return a key of each packet, which is equal for packets with equal fields.
 
-    Two other packets have equal keys with a probability of 2**-48.
+    Two different packets have equal keys with a probability of 2**-48.
     """
     ip = (packets.ip_id << 16 | packets.fragment_offset, packets.ip_payload_bytes << 8 | packets.protocol)
     tcp = (packets.tcp_seq << 32 | packets.tcp_ack, packets.tcp_flags << 33 | stamp + 1)

@@ -20,7 +20,7 @@ from fieldkit.core.model import FaultKind, Role
 from fieldkit.measure.evidence import reading
 from fieldkit.measure.robot_clock import Offset
 from fieldkit.measure.transfers import stalls
-from fieldkit.measure.transfers.deliveries import Delivery
+from fieldkit.measure.transfers.deliveries import StreamDeliveries
 
 _SECONDS: Final = r"-?[0-9]{1,12}\.[0-9]{9}"
 _FAULT_FILE: Final = re.compile(
@@ -152,26 +152,26 @@ def declare_columns(flow: str, kind: FaultKind) -> tuple[Column, ...]:
     )
 
 
-def find_recovery(delivery: Delivery, began_ns: int, ended_ns: int | None) -> FaultRecovery:
+def find_recovery(stream: StreamDeliveries, began_ns: int, ended_ns: int | None) -> FaultRecovery:
     """Return the effect of a fault on a stream; times are by the receiver's clock.
 
     Raises:
         EvidenceError: The stream was not active during the fault, or no packet of it arrived.
     """
-    at_ns, cause_end_ns = delivery.at_ns, began_ns if ended_ns is None else max(began_ns, ended_ns)
+    at_ns, cause_end_ns = stream.at_ns, began_ns if ended_ns is None else max(began_ns, ended_ns)
     if not len(at_ns):
         raise EvidenceError("no packet of the flow arrived")
-    if delivery.begin_ns > cause_end_ns:
+    if stream.begin_ns > cause_end_ns:
         raise EvidenceError("the flow started after the fault")
-    last_ns = int(at_ns[-1]) if delivery.end_ns is None else max(delivery.end_ns, int(at_ns[-1]))
+    last_ns = int(at_ns[-1]) if stream.end_ns is None else max(stream.end_ns, int(at_ns[-1]))
     if last_ns <= began_ns:
         raise EvidenceError("the flow ended before the fault")
     before, after = (int(np.searchsorted(at_ns, time_ns, side="right")) for time_ns in (began_ns, cause_end_ns))
     has_recovered = after < len(at_ns)
-    if not has_recovered and delivery.end_ns is None:
+    if not has_recovered and stream.end_ns is None:
         raise EvidenceError("all payload of the flow arrived before the end of the cause")
     longest_gap_s = float(np.diff(at_ns[max(before - 1, 0) : after + 1]).max(initial=0)) / 1e9
-    before_first_s = 0.0 if before else (int(at_ns[0]) - delivery.begin_ns) / 1e9
+    before_first_s = 0.0 if before else (int(at_ns[0]) - stream.begin_ns) / 1e9
     after_last_s = 0.0 if has_recovered else (last_ns - int(at_ns[-1])) / 1e9
     recovery_ns = int(at_ns[after]) - cause_end_ns if has_recovered else last_ns - cause_end_ns
     is_observed = ended_ns is not None and (has_recovered or recovery_ns > 0)
@@ -184,7 +184,11 @@ def find_recovery(delivery: Delivery, began_ns: int, ended_ns: int | None) -> Fa
 
 
 def measure(
-    flow: str, kind: FaultKind, deliveries: Callable[[], Sequence[Delivery]], times: FaultTimes | None, role: Role
+    flow: str,
+    kind: FaultKind,
+    deliveries: Callable[[], Sequence[StreamDeliveries]],
+    times: FaultTimes | None,
+    role: Role,
 ) -> Measured:
     """Return the columns for a flow and a fault.
 
@@ -198,7 +202,7 @@ def measure(
     declared_columns = declare_columns(flow, kind)
     try:
         began_ns, ended_ns = _fault_times_at(times, role)
-        streams = [find_recovery(delivery, began_ns, ended_ns) for delivery in deliveries()]
+        streams = [find_recovery(stream, began_ns, ended_ns) for stream in deliveries()]
     except EvidenceError as error:
         return Measured.all_missing(declared_columns, error.what)
     if not streams:

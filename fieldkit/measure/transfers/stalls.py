@@ -2,9 +2,9 @@
 
 Payload is overdue from the previous delivery on; in a flow with a fixed rate, from one sending interval after the
 previous delivery on. Time in which the sender has nothing to send is therefore not part of a stall. A stall is a time
-longer than `Delivery.min_stall_s` during which payload is overdue. The time before the first payload, in which a
-connection is established, and the time after the last payload are included only if they are longer than this. A stall
-after the last payload is right-censored: it had not ended when the flow ended.
+longer than `StreamDeliveries.min_stall_s` during which payload is overdue. The time before the first payload, when a
+connection is established, and the time after the last payload are included only if they are longer than this. A
+stall after the last payload is right-censored: it had not ended when the flow ended.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.evidence import reading
 from fieldkit.measure.transfers import deliveries, tcp, udp
-from fieldkit.measure.transfers.deliveries import Delivery, FlowSchedule
+from fieldkit.measure.transfers.deliveries import FlowSchedule, StreamDeliveries
 from fieldkit.measure.transfers.tcp import TcpFrames
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.measure.transfers.udp import UdpPackets
@@ -70,8 +70,8 @@ def declare_columns(flow: str, label: str, rank: int) -> tuple[Column, ...]:
             f"{flow}_stalls",
             "count",
             (
-                "Number of times that new payload of any stream was overdue for longer than 0.2 s, 2 round trips of "
-                "TCP's handshake and 3 sending intervals."
+                "Number of times that new payload of any stream was overdue for longer than the largest of 0.2 s, "
+                "2 round trips of TCP's handshake, and 3 sending intervals."
             ),
             Figure(f"stalls of {label}", Kind.MEAN, rank=rank),
         ),
@@ -96,20 +96,20 @@ def cross_checks(flow: str) -> tuple[CrossCheck, ...]:
     )
 
 
-def find_stalls(delivery: Delivery) -> Stalls:
+def find_stalls(stream: StreamDeliveries) -> Stalls:
     """Return the stalls of a stream.
 
     Raises:
         EvidenceError: Only a single packet arrived, so no time can be computed.
     """
-    at_ns, min_stall_s = delivery.at_ns, delivery.min_stall_s
+    at_ns, min_stall_s = stream.at_ns, stream.min_stall_s
     if not len(at_ns):
-        return _stall_without_arrivals(delivery)
-    overdue_s = np.maximum(np.diff(at_ns) / 1e9 - delivery.interval_s, 0.0)
-    before_s = (int(at_ns[0]) - delivery.begin_ns) / 1e9
+        return _stall_without_arrivals(stream)
+    overdue_s = np.maximum(np.diff(at_ns) / 1e9 - stream.interval_s, 0.0)
+    before_s = (int(at_ns[0]) - stream.begin_ns) / 1e9
     after_s = 0.0
-    if delivery.end_ns is not None:
-        after_s = (delivery.end_ns - int(at_ns[-1])) / 1e9 - delivery.interval_s
+    if stream.end_ns is not None:
+        after_s = (stream.end_ns - int(at_ns[-1])) / 1e9 - stream.interval_s
     edge_stalls_s = [seconds for seconds in (before_s, after_s) if seconds > min_stall_s]
     if not len(overdue_s) and not edge_stalls_s:
         raise EvidenceError("only one packet of the flow arrived, so no time can be computed")
@@ -120,15 +120,15 @@ def find_stalls(delivery: Delivery) -> Stalls:
     )
 
 
-def _stall_without_arrivals(delivery: Delivery) -> Stalls:
+def _stall_without_arrivals(stream: StreamDeliveries) -> Stalls:
     """Return the stall of a stream of which nothing arrived: its whole duration."""
-    duration_s = ((delivery.end_ns or delivery.begin_ns) - delivery.begin_ns) / 1e9
+    duration_s = ((stream.end_ns or stream.begin_ns) - stream.begin_ns) / 1e9
     if duration_s <= 0:
         raise EvidenceError("no packet of the flow arrived, and only one was sent")
     return Stalls(duration_s, 1, is_open=True)
 
 
-def measure(flow: str, deliveries: Callable[[], Sequence[Delivery]]) -> Measured:
+def measure(flow: str, deliveries: Callable[[], Sequence[StreamDeliveries]]) -> Measured:
     """Return the columns for a flow.
 
     Args:
@@ -137,7 +137,7 @@ def measure(flow: str, deliveries: Callable[[], Sequence[Delivery]]) -> Measured
     """
     declared_columns = declare_columns(flow, flow, 0)
     try:
-        streams = [find_stalls(delivery) for delivery in deliveries()]
+        streams = [find_stalls(stream) for stream in deliveries()]
     except EvidenceError as error:
         return Measured.all_missing(declared_columns, error.what)
     if not streams:
@@ -164,7 +164,7 @@ def flow_schedule(evidence: AttemptEvidence, transfer: Transfer, listener: str) 
     )
 
 
-def read_transfer_deliveries(evidence: AttemptEvidence, transfer: Transfer, listener: str) -> list[Delivery]:
+def read_transfer_deliveries(evidence: AttemptEvidence, transfer: Transfer, listener: str) -> list[StreamDeliveries]:
     """Return the deliveries of each connection. The arguments are those of `flow_schedule`.
 
     Raises:
@@ -180,15 +180,15 @@ def read_transfer_deliveries(evidence: AttemptEvidence, transfer: Transfer, list
     return tcp_deliveries(frames, transfer.backward(sender.packets), schedule)
 
 
-def udp_deliveries(packets: UdpPackets, schedule: FlowSchedule) -> list[Delivery]:
-    """Return the deliveries of a UDP transfer. Raises the same errors as `deliveries.udp_delivery`."""
-    return [deliveries.udp_delivery(packets, packets.is_transfer_datagram[:-1], schedule)]
+def udp_deliveries(packets: UdpPackets, schedule: FlowSchedule) -> list[StreamDeliveries]:
+    """Return the deliveries of a UDP transfer. Raises the same errors as `deliveries.udp_stream_deliveries`."""
+    return [deliveries.udp_stream_deliveries(packets, packets.is_transfer_datagram[:-1], schedule)]
 
 
-def tcp_deliveries(frames: TcpFrames, answers: Packets, schedule: FlowSchedule) -> list[Delivery]:
+def tcp_deliveries(frames: TcpFrames, answers: Packets, schedule: FlowSchedule) -> list[StreamDeliveries]:
     """Return the deliveries of each connection of a TCP transfer.
 
-    Raises the same errors as `deliveries.tcp_delivery`.
+    Raises the same errors as `deliveries.tcp_stream_deliveries`.
 
     Args:
         frames: Frames of the connections in both captures.
@@ -197,9 +197,9 @@ def tcp_deliveries(frames: TcpFrames, answers: Packets, schedule: FlowSchedule) 
     """
     ports = np.unique(frames.sent.sport)
     if len(ports) == 1:
-        return [deliveries.tcp_delivery(frames, answers.where(answers.dport == ports[0]), schedule)]
+        return [deliveries.tcp_stream_deliveries(frames, answers.where(answers.dport == ports[0]), schedule)]
     return [
-        deliveries.tcp_delivery(
+        deliveries.tcp_stream_deliveries(
             tcp.match_frames(
                 frames.sent.where(frames.sent.sport == port), frames.received.where(frames.received.sport == port)
             ),

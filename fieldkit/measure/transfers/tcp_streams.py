@@ -115,10 +115,8 @@ class ByteIntervals:
 
     def bytes_not_in(self, other: "ByteIntervals") -> int:
         """Return the number of bytes that these intervals cover, but `other` does not cover."""
-        all_frames = ByteIntervals(
-            np.concatenate((self.starts, other.starts)), np.concatenate((self.stops, other.stops))
-        )
-        return all_frames.size_bytes - other.size_bytes
+        union = ByteIntervals(np.concatenate((self.starts, other.starts)), np.concatenate((self.stops, other.stops)))
+        return union.size_bytes - other.size_bytes
 
 
 @dataclass(frozen=True, eq=False)

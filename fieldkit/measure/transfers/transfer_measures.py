@@ -133,6 +133,7 @@ def loss(arrived: int | None, sent: int | None) -> float | None:
 
 
 def _files(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
+    """Return the columns of the sent and the received file."""
     sent_bytes = evidence.read_or_none(reading.size, transfer.sent_file)
     received_bytes = evidence.read_or_none(reading.size, transfer.received_file)
     contents = evidence.read_or_none(recordings.read, transfer.sent_file)
@@ -169,13 +170,13 @@ def _layers(
         if transfer.protocol is Protocol.UDP:
             udp_packets = udp.match_transfer(sender.packets, receiver.packets, transfer)
             udp_counts = udp.count(udp_packets)
-            pairs, counts, sent = delay.udp_packets(udp_packets), _udp_values(udp_counts), udp_counts.packets_sent
+            pairs, counts, sent = delay.udp_pairs(udp_packets), _udp_values(udp_counts), udp_counts.packets_sent
             transfer_rates = rates.udp_rates(udp_packets)
             stall_columns = stalls.measure("transfer", lambda: stalls.udp_deliveries(udp_packets, schedule))
         else:
             frames = tcp.match_transfer(sender.packets, receiver.packets, transfer)
             tcp_counts = tcp.count(frames)
-            pairs, counts, sent = delay.tcp_frames(frames), _tcp_values(tcp_counts), delay.tcp_sent(frames)
+            pairs, counts, sent = delay.tcp_pairs(frames), _tcp_values(tcp_counts), delay.count_tcp_sent(frames)
             transfer_rates = rates.tcp_rates(frames, receiver.packets, transfer, tcp_counts)
             reverse = transfer.backward(sender.packets)
             stall_columns = stalls.measure("transfer", lambda: stalls.tcp_deliveries(frames, reverse, schedule))
@@ -258,6 +259,7 @@ def _sent_ns(sender: Capture | None, transfer: Transfer) -> list[int]:
 def _paper(
     sender: Capture | None, receiver: Capture | None, ping_output: ping.Ping | None, transfer: Transfer
 ) -> Measured:
+    """Return the columns `paper_*`."""
     window_bytes = PAPER_WINDOW_BYTES[transfer.protocol]
     sent = paper_frames_from(sender.packets, transfer.sender_address, transfer.port) if sender else None
     received = paper_frames_to(receiver.packets, transfer.receiver_address, transfer.port) if receiver else None

@@ -1,8 +1,8 @@
 """Workaround that lets rosbags open SQLite databases at any path.
 
-rosbags puts the path into a URI without encoding it, although `?`, `#` and `%` are special in a URI
-(sqlite.org/uri.html) and bytes that are not UTF-8 are not allowed. `allow_any` makes its storage plugins encode the
-path first.
+rosbags inserts the path into a URI without percent-encoding, although `?`, `#` and `%` have a special meaning in a
+URI (sqlite.org/uri.html) and bytes that are not UTF-8 are not allowed. `allow_any` replaces the storage plugins of
+rosbags by subclasses that encode the path.
 """
 
 import os
@@ -15,7 +15,7 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader, Sqlite3Writer
 
 
 class _UriPath(PosixPath):
-    """A path whose text is percent-encoded for a URI."""
+    """A path whose `str()` is percent-encoded for a URI."""
 
     def __str__(self) -> str:
         return quote(os.fsencode(super().__str__()))

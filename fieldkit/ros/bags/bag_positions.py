@@ -17,8 +17,8 @@ def read_bag(path: Path, position_source: PositionSource) -> Samples:
     If several messages have the same time, the first is used.
 
     Raises:
-        EvidenceError: The bag cannot be read; the topic has no positions, or several frames or types; or its stamps
-            are from another clock.
+        EvidenceError: The bag cannot be read; the topic has no positions, or several frames or types; or the stamps
+            in its headers are from another clock than the times of reception.
     """
     topic = position_source.topic
     topic_data = bag.positions(path, topic, position_source.child)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 _BATTERY: Final = "sensor_msgs/msg/BatteryState"
 _TF_MESSAGE: Final = "tf2_msgs/msg/TFMessage"
-# Limit for times and counts of a bag; rosbags does not check the values that it reads from text or a database.
+# Limits of valid bags: rosbags does not check the times and counts that it reads from text or a database.
 _MAX_COUNT: Final = 1 << 63
 _MAX_TOPICS: Final = 10_000
 
@@ -47,9 +47,10 @@ def answer(request: Json) -> Json:
 
 
 def _open_ros2(path: Path) -> "rosbag2.Reader":
-    from rosbags import rosbag2  # noqa: PLC0415 (SQLite, YAML and MCAP take a third of the start-up time)
+    # The readers of SQLite, YAML and MCAP take a third of the start-up time, and ROS 1 bags do not need them.
+    from rosbags import rosbag2  # noqa: PLC0415
 
-    from fieldkit.ros.bags import bag_paths  # noqa: PLC0415 (as above)
+    from fieldkit.ros.bags import bag_paths  # noqa: PLC0415
 
     bag_paths.allow_any()
     return rosbag2.Reader(path)
@@ -165,7 +166,7 @@ def _pose(msgtype: str, message: Any, child: str) -> tuple[float, float, float, 
         case _:
             raise TypeError(f"{msgtype} contains no position")
     x, y, z, w = (float(getattr(orientation, axis)) for axis in "xyzw")
-    # Yaw of a unit quaternion: the angle about the axis that points up (REP 103).
+    # Yaw from a unit quaternion: the rotation about the vertical z axis (REP 103).
     yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     pose = (float(position.x), float(position.y), float(position.z), yaw)
     return pose if all(map(math.isfinite, pose)) else None
@@ -173,7 +174,7 @@ def _pose(msgtype: str, message: Any, child: str) -> tuple[float, float, float, 
 
 def _check_database(path: Path) -> None:
     """Check every page, because the message count can be correct even if messages are truncated."""
-    import sqlite3  # noqa: PLC0415 (as above)
+    import sqlite3  # noqa: PLC0415 (needed only for bags in SQLite)
 
     with closing(sqlite3.connect(f"{path.absolute().as_uri()}?immutable=1", uri=True)) as database:
         ((result, *_), *_) = database.execute("PRAGMA quick_check(1)")

@@ -1,4 +1,4 @@
-"""Discovery time and gaps of recorded topics, from the recorder's log and its bag; both use the robot's clock.
+"""Discovery time and gaps of recorded topics, from the recorder's log and its bag, which both use the robot's clock.
 
 rosbag of ROS 1 logs `[ INFO] [1795208123.219164628]: Subscribing to /scan` before it queries the master for the
 publishers. The recorder of ROS 2 logs `[INFO] [1795208123.219164628] [rosbag2_recorder]: Listening for topics...`
@@ -133,10 +133,10 @@ def read(folder: Path, log: str, file: str, topics: Sequence[str], duration_s: f
     messages = sum(by_topic[topic].messages for topic in topics if topic in by_topic)
     if not (discovered and is_subscribed_to_all):
         return RecordingReception(discovered, messages, None, None)
-    first_ns = (by_topic[topic].first_utc_ns - start_ns[topic] for topic in topics)
+    discovery_times_ns = (by_topic[topic].first_utc_ns - start_ns[topic] for topic in topics)
     ends_ns = {topic: start_ns[topic] + round(duration_s * _NS) for topic in topics}
-    gap_ns = (max(by_topic[topic].gap_ns, ends_ns[topic] - by_topic[topic].last_utc_ns) for topic in topics)
-    return RecordingReception(discovered, messages, max(0, *first_ns) / _NS, max(gap_ns) / _NS)
+    gaps_ns = (max(by_topic[topic].gap_ns, ends_ns[topic] - by_topic[topic].last_utc_ns) for topic in topics)
+    return RecordingReception(discovered, messages, max(0, *discovery_times_ns) / _NS, max(gaps_ns) / _NS)
 
 
 def subscription_ns(log: str, topics: Sequence[str]) -> dict[str, int]:

@@ -1,7 +1,8 @@
 """Read the messages of damaged bags without their index, up to the point where a file is truncated or corrupt.
 
-The tools of ROS recover complete chunks only; here the start of a truncated chunk is read, too. A ROS 1 recorder that
-is killed leaves an open chunk without its length; if it is not compressed, its records are in the file and are read.
+The tools of ROS recover only complete chunks. This module also reads the start of a truncated chunk. If a ROS 1
+recorder is killed, the last chunk of its bag is open: it has no length. The records in an open chunk are read, too,
+unless the chunk is compressed.
 """
 
 import bz2
@@ -72,6 +73,7 @@ _LENGTH: Final = struct.Struct("<I")
 _TIME: Final = struct.Struct("<II")
 _MESSAGE, _CHUNK, _CONNECTION = 2, 5, 7
 _KNOWN_KINDS: Final = range(2, 8)
+"""Values of the field `op` in the header of a record."""
 _MAX_CHUNK_BYTES: Final = 1 << 30
 
 
@@ -89,8 +91,8 @@ def _records(data: memoryview, connections: dict[int, BagConnection]) -> Iterato
         (kind,) = fields.get("op", b"\0")
         if kind not in _KNOWN_KINDS:
             raise DamagedError(f"a record has the unknown kind {kind}, {len(data) - offset} bytes before the end")
-        if kind == _CHUNK and bytes(data[offset : offset + 4]) == b"\0\0\0\0":
-            offset += 4  # the chunk was open when its recorder was killed; its records follow
+        if kind == _CHUNK and bytes(data[offset : offset + _LENGTH.size]) == b"\0\0\0\0":
+            offset += _LENGTH.size  # the chunk was open when its recorder was killed; its records follow
             if fields.get("compression") != b"none":
                 raise DamagedError("the recorder was killed while it wrote a compressed chunk")
             continue
@@ -248,7 +250,7 @@ class _ExactReader:
         self._size_bytes = os.fstat(file.fileno()).st_size
 
     def read(self, length: int) -> bytes:
-        if length > self._size_bytes:  # a corrupt length may be above what `read` accepts
+        if length > self._size_bytes:  # a corrupt length may be too large an argument for `file.read`
             raise EOFError(f"a record states a length of {length} bytes, but the file has {self._size_bytes}")
         data = self._file.read(length)
         if len(data) < length:
@@ -271,7 +273,7 @@ def _mcap(file: Path) -> Iterator[RecoveredMessage]:
                     connections[record.id] = _channel_connection(record, schemas.get(record.schema_id))
                 elif isinstance(record, Message):
                     yield connections[record.channel_id], record.log_time, record.data
-        # OverflowError: a record inside a chunk states a length above what `read` accepts.
+        # OverflowError: a record inside a chunk states a length that is too large an argument for `read`.
         except (McapError, KeyError, ValueError, RuntimeError, OverflowError, struct.error, EOFError) as error:
             raise DamagedError(f"{type(error).__name__}: {error}".strip(": ")) from error
 

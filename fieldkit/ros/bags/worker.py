@@ -29,7 +29,7 @@ from fieldkit.ros.bags.salvage import BagConnection, DamagedError
 
 _MAX_PROBLEMS: Final = 20
 _METADATA_VERSION: Final = 9
-"""Version of ROS 2 Jazzy and later; older distributions can read it except for the QoS."""
+"""Version of metadata.yaml in ROS 2 Jazzy and later. Older distributions can read it, except for the QoS profiles."""
 
 _UNKNOWN_HASH: Final = "RIHS01_" + 64 * "0"
 """Hash of a type whose definition is neither in the bag nor known to fieldkit."""
@@ -67,14 +67,14 @@ def inspect(bag: BagFiles, *, read_all: bool) -> Json:
     if problems:
         recoverable = _count_recoverable(bag)
         result |= {"saved": recoverable}
-        if not bag.closed and recoverable["why"]:  # no other function has read the files of an unclosed bag
+        if not bag.closed and recoverable["why"]:  # the files of an unclosed bag were not read above
             problems.append(recoverable["why"])
     return result | {"problems": problems[:_MAX_PROBLEMS]}
 
 
 def _unclosed_problems(bag: BagFiles) -> Iterator[str]:
     if not bag.closed:
-        yield "there is no metadata.yaml: the recorder was stopped before it closed the bag, or it was not copied"
+        yield "there is no metadata.yaml: the recorder was killed before it closed the bag, or this file was lost"
 
 
 def _reader(bag: BagFiles) -> rosbag1.Reader | rosbag2.Reader:
@@ -136,7 +136,7 @@ def _any_reader(bag: BagFiles) -> AnyReader:
 
 
 def _count_recoverable(bag: BagFiles) -> Json:
-    """Return the number of messages that can be recovered, and the reason why it is not higher."""
+    """Return the number of messages that can be recovered, and the damage at which reading stops; empty if none."""
     count, reason = 0, ""
     try:
         for file in bag.files:
@@ -205,7 +205,7 @@ def message_types(distribution: str) -> Typestore:
 
 
 def convert_bag(bag: BagFiles, to: Path, storage: str, distribution: str) -> Json:
-    """Write a bag in another format with the message types of a distribution; return the remarks of the converter."""
+    """Write a bag in another format with the message types of a distribution; return the output lines of rosbags."""
     output = io.StringIO()
     with contextlib.redirect_stdout(output):  # standard output is reserved for the answers
         convert(

@@ -91,15 +91,18 @@ class Forwarder:
             else:
                 self._tally.refused += 1
 
-    def end(self) -> None:
-        """Stop forwarding samples, after the one that is being forwarded."""
+    def stop(self) -> None:
+        """Wait until the current sample is forwarded; later samples are not forwarded."""
         with self._lock:
             self._is_stopped = True
 
     def other_types(self) -> Sequence[str]:
-        """Return a sentence for each other type of the topic on either side; its messages are not forwarded."""
+        """Return an error message for each other type with which a node on either side uses the topic.
+
+        Messages of these types are not forwarded.
+        """
         sides = zip((self._source, self._target), self._topic_pair, strict=True)
-        return [sentence for side, topic in sides for sentence in side.other_types(topic)]
+        return [message for side, topic in sides for message in side.other_types(topic)]
 
     def counts(self) -> CrossingCounts:
         """Return the counters of the forwarded samples."""
@@ -116,7 +119,7 @@ class _RunningSide:
     middleware: Middleware
 
     def other_types(self, topic: Topic) -> Sequence[str]:
-        """Return a sentence for each other type of the topic on this side."""
+        """Return an error message for each other type with which a node on this side uses the topic."""
         types = sorted(self.middleware.other_types(topic))
         return [
             f"{topic.name} is of type {other_type} in {self.middleware_name}, not {topic.type}"
@@ -131,8 +134,8 @@ def bridge_topics(
     """Bridge topics between two sides while the body runs.
 
     Args:
-        near: The source of topics, but the target of topics with `Crossing.back`.
-        far: The other side.
+        near: The first side. It is the source of topics, except for those with `Crossing.back`, whose target it is.
+        far: The second side.
         crossings: The topics.
         types: The message types.
 
@@ -141,7 +144,7 @@ def bridge_topics(
 
     Raises:
         ConfigurationError: A topic cannot be bridged, or has a different type on one side.
-        LinkError: A middleware does not start: no ROS master answers, or it is not installed.
+        LinkError: A middleware does not start, because no ROS master answers or the middleware is not installed.
     """
     check(near, far, crossings, types)
     with ExitStack() as stack:
@@ -150,7 +153,7 @@ def bridge_topics(
         for number, crossing in enumerate(crossings, 1):
             source, target = reversed(sides) if crossing.back else sides
             forwarders.append(_create_forwarder(crossing, source, target, types, number))
-            stack.callback(forwarders[-1].end)
+            stack.callback(forwarders[-1].stop)
         yield forwarders
 
 
@@ -161,7 +164,7 @@ def check(near: Side, far: Side, crossings: Sequence[Crossing], types: MessageTy
         ConfigurationError: A topic cannot be bridged.
     """
     if near.middleware_name == far.middleware_name:
-        # Forwarded samples could not be recognized, because both sides are the same node, or share a network.
+        # Both sides would be the same node, or share a network, so forwarded samples could not be recognized.
         raise ConfigurationError(
             f"a bridge cannot connect {near.middleware_name} with {far.middleware_name}",
             remedy="name two different middlewares",
@@ -171,10 +174,11 @@ def check(near: Side, far: Side, crossings: Sequence[Crossing], types: MessageTy
         topic, type_name = crossing.topic, crossing.type_name
         if directions.count((topic, crossing.back)) > 1:
             raise ConfigurationError(f"{topic} is named twice for the same direction", remedy="name it once")
-        has_same_content = (
-            counterparts.of_type(types, type_name) if _uses_ros1(near, far) else types.get(type_name).rihs01
-        )
-        if not has_same_content:
+        if _uses_ros1(near, far):
+            can_be_bridged = counterparts.of_type(types, type_name) is not None
+        else:
+            can_be_bridged = bool(types.get(type_name).rihs01)  # the type exists in ROS 2
+        if not can_be_bridged:
             raise ConfigurationError(
                 f"{topic}: {type_name} differs between ROS 1 and ROS 2, or exists in one of them only",
                 remedy="bridge a topic of another type",
@@ -220,9 +224,9 @@ def _create_forwarder(
         for side in sides
     ]
     for side, topic in zip(sides, topic_pair, strict=True):
-        # With gradual discovery, endpoints with another type may be discovered only later.
-        for sentence in side.other_types(topic):
-            raise ConfigurationError(sentence, remedy="name the topic with that type")
+        # This finds only the endpoints that are already discovered; `Forwarder.other_types` reports later ones.
+        for message in side.other_types(topic):
+            raise ConfigurationError(message, remedy="name the topic with that type")
     convert = _conversion(_uses_ros1(source), pair, types)
     return Forwarder(crossing, source, target, (topic_pair[0], topic_pair[1]), convert)
 

@@ -30,9 +30,8 @@ from fieldkit.ros.interfaces.types import Distribution, MessageTypes
 from fieldkit.ros.middlewares.ports import MAX_DOMAIN
 
 MIDDLEWARES: Final = ("ros1", "dds", "zenoh")
-"""The adapters of `agent.messaging.middleware` without `ros2`, which needs the Python of a robot's ROS 2; a test
-compares them.
-"""
+"""The adapters of `agent.messaging.middleware` except `ros2`, which needs the Python of a robot's ROS 2. A test
+compares the two lists."""
 
 
 def add(parser: Parser) -> None:
@@ -212,11 +211,11 @@ def _watch(forwarders: Sequence[Forwarder], stop_event: threading.Event) -> None
     """Wait for `stop_event`. If other nodes use a topic with another type, report this once."""
     reported: set[str] = set()
     while not stop_event.wait(_POLL_S):
-        for sentence in chain.from_iterable(forwarder.other_types() for forwarder in forwarders):
-            if sentence not in reported:
-                reported.add(sentence)
+        for message in chain.from_iterable(forwarder.other_types() for forwarder in forwarders):
+            if message not in reported:
+                reported.add(message)
                 show_error(
-                    f"{sentence}\n  remedy: give the topic with the type of its publishers; messages of another type "
+                    f"{message}\n  remedy: give the topic with the type of its publishers; messages of another type "
                     "are not forwarded"
                 )
 

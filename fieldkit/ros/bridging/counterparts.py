@@ -71,7 +71,10 @@ class Counterparts:
 
 @contextmanager
 def _any_error_as_serde_error(kind: str) -> Iterator[None]:
-    """Convert exceptions for truncated messages to `SerdeError`, which rosbags raises for other invalid messages."""
+    """Convert the exceptions that rosbags raises for truncated messages to `SerdeError`.
+
+    rosbags raises `SerdeError` itself only for other invalid messages.
+    """
     try:
         yield
     except (ValueError, IndexError, AssertionError, struct.error) as error:
@@ -79,7 +82,7 @@ def _any_error_as_serde_error(kind: str) -> Iterator[None]:
 
 
 def of_type(types: MessageTypes, name: str) -> Counterparts | None:
-    """Return the pair of types with a name in ROS 1 or ROS 2, or None if their contents differ.
+    """Return the pair of types for a type name of ROS 1 or ROS 2; None if one is missing or their contents differ.
 
     Raises:
         ConfigurationError: Neither ROS 1 nor ROS 2 has such a type.

@@ -16,6 +16,7 @@ LIMIT_S: Final = 12 * 3600.0
 """Maximum duration of a bridge that is not stopped."""
 
 _MASTER_S: Final = 5
+"""Time for which the bridge waits for the ROS master, in seconds."""
 _READY_S: Final = 40
 """Timeout for the start: a small computer needs many seconds to load Python, rospy and a middleware."""
 _LOG: Final = "bridge.log"

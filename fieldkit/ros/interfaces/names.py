@@ -33,7 +33,7 @@ def dds_topic(topic: str) -> str:
 
 
 def user_data(rihs01: str) -> str:
-    """Return the user data of a DDS endpoint with the type hash, used since ROS 2 Iron (rmw_dds_common, qos.cpp)."""
+    """Return the user data of a DDS endpoint: the type hash, since ROS 2 Iron (rmw_dds_common, qos.cpp)."""
     return f"typehash={rihs01};" if rihs01 else ""
 
 

@@ -1,4 +1,4 @@
-"""Qualities of service of ROS 2, and their encoding in liveliness tokens of rmw_zenoh.
+"""Quality-of-service (QoS) profiles of ROS 2, and their encoding in liveliness tokens of rmw_zenoh.
 
 Names and values: rmw/qos_profiles.h and rmw/types.h of ROS 2 (the same from Foxy to Jazzy).
 """
@@ -48,12 +48,12 @@ class Liveliness(Policy):
 
 @dataclass(frozen=True)
 class QosProfile:
-    """A quality of service.
+    """A QoS profile.
 
     Attributes:
         reliability: Whether lost samples are sent again.
         history: Whether the last samples or all samples are kept.
-        depth: Number of kept samples with `KEEP_LAST`; 0 leaves it to the middleware.
+        depth: Number of kept samples with `KEEP_LAST`; 0 for the middleware's default.
         durability: Whether late readers receive earlier samples.
         deadline_ns: Maximum expected time between two samples; None for no deadline.
         lifespan_ns: Time after which a sample expires; None for no limit.
@@ -86,7 +86,7 @@ PROFILES: Final[Mapping[str, QosProfile]] = MappingProxyType(
 """The profiles of ROS 2 by name: `rmw_qos_profile_NAME`."""
 
 _ZENOH: Final = QosProfile(depth=42, liveliness=Liveliness.AUTOMATIC)
-"""Default profile of rmw_zenoh (its qos.cpp); a token omits values that equal it."""
+"""Default profile of rmw_zenoh (its qos.cpp). A token omits values that are equal to these."""
 
 _SECOND_NS: Final = 10**9
 _INFINITE_NS: Final = 2**63 - 1  # RMW_DURATION_INFINITE

@@ -203,8 +203,8 @@ def _member_types(store: Typestore, name: str) -> list[Any]:
     return [description for _, description in store.fielddefs[name][1]]
 
 
-def _char_as_uint8(node: Any) -> Any:  # noqa: ANN401 (of rosbags, whose own type is recursive)
-    """Return a description of members (nested lists and tuples) in which `char` is replaced by `uint8`."""
+def _char_as_uint8(node: Any) -> Any:  # noqa: ANN401 (a recursive type of rosbags)
+    """Return rosbags' description of members (nested lists and tuples) with `char` replaced by `uint8`."""
     if isinstance(node, list):
         return [_char_as_uint8(part) for part in node]
     if not isinstance(node, tuple):
@@ -212,8 +212,8 @@ def _char_as_uint8(node: Any) -> Any:  # noqa: ANN401 (of rosbags, whose own typ
     return ("uint8", 0) if node == ("char", 0) else tuple(map(_char_as_uint8, node))
 
 
-def _field(name: str, description: Any) -> MessageField:  # noqa: ANN401 (of rosbags, whose own type is recursive)
-    """Convert a description of rosbags, a node type with its content, to a member."""
+def _field(name: str, description: Any) -> MessageField:  # noqa: ANN401 (a recursive type of rosbags)
+    """Return the member that rosbags describes as a tuple of node type and content."""
     kind, content = description
     if kind == Nodetype.BASE:
         return MessageField(name, content[0], None)

@@ -1,8 +1,8 @@
-"""Settings of middlewares that their developers or ROS 2 recommend as a first step on a lossy radio.
+"""Settings that the developers of a middleware or the documentation of ROS 2 recommend for a lossy radio.
 
-Comments contain the default and the source of each setting. Kernel settings (`net.core.rmem_max`,
-`net.ipv4.ipfrag_time`) are not included, because they apply to the whole machine, need root and remain after a trial;
-see docs/studies/middleware.md.
+The comments state the default and the source of each setting. Kernel settings (`net.core.rmem_max`,
+`net.ipv4.ipfrag_time`) are not included, because they apply to the whole machine, need root privileges and remain
+after a trial. The results are in docs/studies/middleware.md.
 """
 
 import json
@@ -17,14 +17,15 @@ _DDS: Final = {
     "General/MaxMessageSize": "1400 B",
     "General/FragmentSize": "1300 B",
 }
-"""Faster retransmission requests of readers (Internal/NackDelay, 100 ms) and a larger writer cache
-(Internal/Watermarks/WhcHigh, 500 kB) were also measured: see docs/studies/middleware.md."""
+"""Faster retransmission requests of readers (Internal/NackDelay, 10 or 30 ms instead of 100 ms) and a larger writer
+cache (Internal/Watermarks/WhcHigh, 4 MB instead of 500 kB) are not included: with them, more images were lost."""
 
 _ZENOH: Final = {
     # Default `drop`: a sample is dropped if the queue has no space for its fragments for 50 ms, which affects all
-    # large samples on a radio. `block_first` waits with the first sample, and drops samples that follow in the
-    # meantime (ROSCon 2025 workshop on rmw_zenoh, exercise 7; Zenoh, DEFAULT_CONFIG.json5, qos/publication).
-    # `express` does not wait for more samples to fill a batch.
+    # large samples on a radio. With `block_first` the first sample that does not fit waits for space in the queue,
+    # and samples that follow in the meantime are dropped (ROSCon 2025 workshop on rmw_zenoh, exercise 7; Zenoh,
+    # DEFAULT_CONFIG.json5, qos/publication). With `express` a sample is sent without waiting for others that fill its
+    # batch.
     "qos/publication": json.dumps(
         [{"key_exprs": ["**"], "config": {"congestion_control": "block_first", "express": True}}]
     ),
@@ -48,8 +49,8 @@ _FAST_DDS: Final = {
     # (fast-dds.docs.eprosima.com, Use-cases, "Large Data mode": large samples over lossy networks).
     "FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA",
 }
-"""Datagrams of one packet (`UDPv4?max_msg_size=1400B`) and later answers were measured, too: see
-docs/studies/middleware.md."""
+"""Datagrams of one packet (`UDPv4?max_msg_size=1400B`) and longer response delays (`nack_response_delay` and
+`heartbeat_response_delay` of 100 ms) are not included: with them, half or more of the images were lost."""
 
 _TUNED: Final[Mapping[tuple[str, str], Mapping[str, str]]] = MappingProxyType(
     {

@@ -20,11 +20,12 @@ from fieldkit.steps import agent_commands
 from fieldkit.steps.scene import Shells
 
 COUNT: Final = 20
-"""Datagrams of each kind from each robot."""
+"""Number of datagrams of each kind that a robot sends."""
 INTERVAL_S: Final = 0.05
 
 _PARTICIPANT: Final = 119
-"""The last participant of a domain (RTPS 2.5, section 9.6.2.3): no participant of a robot uses its port."""
+"""Highest participant ID of a domain (RTPS 2.5, section 9.6.2.3). No ROS program on a robot has an ID that high, so
+its port is free."""
 _GROUP: Final = "239.255.0.1"
 _SEND_S: Final = 30.0
 _READ_S: Final = 10.0
@@ -62,7 +63,7 @@ def exchange(cast: Cast, shells: Shells, domain: int, trial: str) -> dict[tuple[
         cast: The robots.
         shells: Their shells.
         domain: ROS domain whose ports are used.
-        trial: Name of a folder on the robots, which is deleted afterwards.
+        trial: Name of the trial; the folder of that name on the robots is deleted afterwards.
 
     Returns:
         The arrivals by source and destination. They contain the error if a robot failed.
@@ -83,7 +84,7 @@ def exchange(cast: Cast, shells: Shells, domain: int, trial: str) -> dict[tuple[
 
 
 class _Exchange:
-    """A running exchange; the arguments are those of `exchange`."""
+    """The steps of an exchange on each robot; the arguments are those of `exchange`."""
 
     def __init__(self, cast: Cast, shells: Shells, domain: int, trial: str) -> None:
         self._cast = cast
@@ -155,7 +156,7 @@ class _Exchange:
 
     @contextmanager
     def _store_error(self, role: Role) -> Iterator[None]:
-        """Store the first error of a robot, which `arrivals` returns."""
+        """Catch errors in the body. The first error of a robot is stored for `arrivals`."""
         try:
             yield
         except FieldkitError as error:

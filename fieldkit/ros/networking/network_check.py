@@ -26,8 +26,8 @@ def check_network(plan: Plan, shells: Shells, reports: Mapping[Role, Report]) ->
 
     Args:
         plan: The plan of a trial.
-        shells: The robots that answer.
-        reports: Receive the findings.
+        shells: Connections to the robots that answer.
+        reports: The report of each robot, to which the findings are added.
     """
     cast = {role: robot for role, robot in plan.cast.items() if role in shells and robot.profile.ros is not None}
     for role in shells:

@@ -21,6 +21,7 @@ MIN_ARRIVED: Final = 18
 _RESOLVE_S: Final = 15.0
 _LOOPBACK: Final = {None, "localhost", "127.0.0.1", "::1"}
 _FRAGMENTS: Final = -(-SIZES[FRAGMENTED] // 1480)
+"""Number of IP fragments, rounded up, if each has 1480 bytes of payload (MTU 1500 without the IPv4 header)."""
 
 
 def judge_arrivals(
@@ -33,7 +34,7 @@ def judge_arrivals(
         arrivals: The datagrams that arrived.
         state: State of the receiver.
         domain: ROS domain of the test.
-        report: Receives the findings.
+        report: Report of the receiver, to which the findings are added.
         ros2: Whether both robots run ROS 2, for which multicast and fragments matter.
     """
     if arrivals.error:
@@ -48,15 +49,13 @@ def judge_arrivals(
     if not ros2:
         return
     if settings.needs_multicast(state.variables):
-        check, peers = f"multicast from {source.name}", f"export ROS_STATIC_PEERS={source.address}"
         if unicast:
-            none_reason, advice = (
-                f"no multicast arrives, unicast does{firewall_note}",
-                f"{peers}   # or a discovery server",
-            )
+            none_reason = f"no multicast arrives, unicast does{firewall_note}"
+            multicast_remedy = f"export ROS_STATIC_PEERS={source.address}   # or a discovery server"
         else:
-            none_reason, advice = f"no multicast arrives{firewall_note}", remedy
-        _judge_count(check, multicast, report, none_reason=none_reason, remedy=advice)
+            none_reason, multicast_remedy = f"no multicast arrives{firewall_note}", remedy
+        check = f"multicast from {source.name}"
+        _judge_count(check, multicast, report, none_reason=none_reason, remedy=multicast_remedy)
     if unicast:
         _judge_count(
             f"fragments from {source.name}",

@@ -45,7 +45,7 @@ def rmw(variables: Variables) -> str:
 
 
 def uses_zenoh(variables: Variables) -> bool:
-    """Return True if the RMW is that of Zenoh, which has no multicast by default and needs a router."""
+    """Return True if the RMW is rmw_zenoh, which uses no multicast by default and needs a router."""
     return "zenoh" in rmw(variables)
 
 
@@ -58,7 +58,7 @@ def needs_multicast(variables: Variables) -> bool:
 def judge_robot(robot: Robot, state: RosState, report: Report) -> None:
     """Add the findings on one robot."""
     if is_ros2(robot):
-        _judge_domain(robot, state, report)
+        _judge_domain_and_rmw(robot, state, report)
         _judge_range(state.variables, report)
         if uses_zenoh(state.variables):
             _judge_router(state, report)
@@ -88,7 +88,7 @@ def judge_agreement(
             compare(cast[first_role], states[first_role].variables, states[role].variables, reports[role])
 
 
-def _judge_domain(robot: Robot, state: RosState, report: Report) -> None:
+def _judge_domain_and_rmw(robot: Robot, state: RosState, report: Report) -> None:
     own_domain = domain(state.variables)
     if own_domain is None:
         report.fail("ROS domain", f"ROS_DOMAIN_ID is {state.variables['ROS_DOMAIN_ID']!r}", "use a number, 0 to 101")
@@ -322,5 +322,5 @@ def judge_servers(
 def ports_remedy(domain_number: int) -> str:
     """Return a command that opens a firewall for a domain."""
     first_port = multicast_port(domain_number)
-    port_range = f"{first_port}:{first_port + 249}"
+    port_range = f"{first_port}:{first_port + 249}"  # RTPS assigns 250 ports to each domain
     return f"sudo ufw allow proto udp to any port {port_range}   # the ports of ROS domain {domain_number}"

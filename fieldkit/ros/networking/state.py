@@ -20,6 +20,7 @@ MAX_PROGRAMS: Final = 500
 
 SCRIPT: Final = resources.files("fieldkit.ros.networking").joinpath("state.sh").read_text(encoding="ascii")
 _ROUTE: Final = re.compile(r"\bdev (?P<interface>\S{1,30})")
+# A line of /proc/net/tcp or /proc/net/udp: the state 0A is a listening TCP socket, 07 a bound UDP socket.
 _SOCKET: Final = re.compile(r"^ *[0-9]+: [0-9A-F]{8,32}:(?P<port>[0-9A-F]{4}) \S+ (?P<state>0A|07) ", re.MULTILINE)
 # CycloneDDS, configuration reference, General/Interfaces and the former General/NetworkInterfaceAddress; Fast DDS,
 # XML profiles, interfaceWhiteList.
@@ -57,7 +58,7 @@ class RosProgram:
 
 @dataclass(frozen=True)
 class RosState:
-    """State of a robot. An attribute that it did not report is None or empty.
+    """Network state of a robot. Attributes that the robot did not report are None or empty.
 
     Attributes:
         variables: Variables of the network in the environment of its setup files and its profile.

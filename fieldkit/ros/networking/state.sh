@@ -9,7 +9,7 @@ section() { # NAME COMMAND...
     printf '==> %s: %s <==\n%s\n' "$name" "$?" "$output"
 }
 
-admin() ( # PATH of a session without a terminal often lacks the folders of administration programs
+admin() ( # COMMAND...: run as root; PATH of a session without a terminal often lacks the sbin folders
     PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
     [ "$(id -u)" = 0 ] || set -- sudo -n "$@"
     timeout 5 "$@"
@@ -26,7 +26,7 @@ own_environment() {
 
 ros_programs() { # the variables of each running program that has a ROS distribution in its environment
     for folder in /proc/[0-9]*; do
-        # A program can end while it is read; another user's environment cannot be read.
+        # Skip a program that exits during this command, or whose environment belongs to another user.
         variables=$(tr '\0' '\n' <"$folder/environ" | ros_variables) 2>/dev/null || continue
         case $variables in
         *ROS_DISTRO=*) printf 'program %s\n%s\n' "$(tr -d '\n' <"$folder/comm")" "$variables" ;;
@@ -34,7 +34,7 @@ ros_programs() { # the variables of each running program that has a ROS distribu
     done 2>/dev/null | head -c 100000
 }
 
-settings_of() { # URI: a file with settings of the RMW, or the settings themselves
+settings_of() { # VALUE of a variable: the URI or path of a file with settings of the RMW, or the settings themselves
     case $1 in
     file://*) head -c 20000 "${1#file://}" ;;
     /*) head -c 20000 "$1" ;;

@@ -172,12 +172,12 @@ def assess_candidate(
 
 def _reason(judgement: Judgement) -> str:
     """Return the reason why an expectation is not met, with the measured values."""
-    unknown, expectation_text = judgement.why or "undecided", judgement.expectation.text
+    expectation_text = judgement.expectation.text
     if judgement.estimate is None or judgement.met is None:
-        return f"{expectation_text}: {unknown}"
+        return f"{expectation_text}: {judgement.why or 'undecided'}"
     note = f"; {judgement.why}" if judgement.why else ""
-    figures = f"in {judgement.met} of {judgement.estimate.n} repeats, up to {judgement.estimate.maximum:.3g}"
-    return f"{expectation_text} {figures}{note}"
+    counts = f"in {judgement.met} of {judgement.estimate.n} repeats, up to {judgement.estimate.maximum:.3g}"
+    return f"{expectation_text} {counts}{note}"
 
 
 def evidence(assessment: Assessment, criterion: LinkCriterion) -> Iterator[str]:

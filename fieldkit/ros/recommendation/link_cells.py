@@ -18,8 +18,8 @@ MIN_REPEATS: Final = 5
 """Default number of valid repeats that a cell needs. Losses over TCP may be bimodal
 (docs/studies/middleware-link.md): a smaller number of repeats may all be in the same mode."""
 _DECIMALS: Final = 12
-"""Decimals to which a bound is rounded: 2.9 % is stored as slightly less than 0.029, but a loss of 29 of 1,000 must
-not exceed it."""
+"""Decimals to which a bound is rounded. In binary floating point 2.9 % is slightly less than 0.029; without rounding,
+a loss of 29 of 1,000 samples would exceed it."""
 _INTENDED: Final = "topic_intended"
 _CELL: Final = "cell"
 _LOSS: Final = Quantity(

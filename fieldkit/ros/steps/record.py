@@ -49,8 +49,8 @@ DEFAULT_BAG: Final = "scan"
 # Measured: rosbag took 0.6 to 0.8 s longer than its duration, and 3.2 s longer on a lossy interface.
 START_AND_CLOSE_S: Final = 20.0
 
-# A recorder needs up to a second to subscribe, and more on a small computer under load. A recording has failed if its
-# bag, plus this time, spans less than half of the duration.
+# A recorder needs up to a second to subscribe, and more on a small computer under load. A recording has failed if the
+# duration of its bag plus `SUBSCRIBE_S` is less than half of the planned duration.
 SUBSCRIBE_S: Final = 1.0
 MIN_RECORDED_SHARE: Final = 0.5
 

@@ -30,9 +30,10 @@ MESSAGES: Final = 2
 TOLERANCE: Final = 0.5
 """Allowed deviation of a topic's rate, as a fraction of the rate."""
 
-# A recorder that is stopped from outside also needs time to start: ros2 takes 3 s to load on a small computer.
+# Added for a recorder that has no option for the duration, because its start counts as recording time: ros2 takes 3 s
+# to load on a small computer.
 _START_S: Final = 4.0
-# Limit of a recording that is needed only for the battery, because a recorder waits for a missing ROS master.
+# Limit of a recording that is needed only for the battery. A recorder would wait longer if its ROS master is missing.
 _SHORT_LIMIT_S: Final = 6.0
 _END_BYTES: Final = 4096
 _BATTERY: Final = "sensor_msgs/BatteryState"
@@ -72,7 +73,7 @@ def check_topics(plan: Plan, role: Role, shell: Shell, probe_result: ProbeResult
 
 
 def can_record(plan: Plan, role: Role, probe_result: ProbeResult) -> bool:
-    """Return False if a program that a recording needs is missing on the robot."""
+    """Return False if the robot lacks the record program that the procedure requires."""
     ros = plan.cast[role].profile.ros
     if ros is None or not required_topics(plan, role):
         return True
@@ -128,6 +129,8 @@ def _record(
     scene: Scene, step: RecordStep, shell: Shell, into: Path, *, waits_full_time: bool
 ) -> tuple[Path, RecordingContents]:
     """Run a recording; return the path and the content of the fetched bag.
+
+    Without `waits_full_time` the recording ends after at most `_SHORT_LIMIT_S`.
 
     Raises:
         EvidenceError: There is no bag, or no message in it; the error includes the end of the recorder's log.

@@ -37,7 +37,7 @@ from fieldkit.steps.view import View
 if TYPE_CHECKING:
     from fieldkit.measure.attempt import AttemptEvidence
     from fieldkit.measure.captures.packets import Packets
-    from fieldkit.measure.transfers.deliveries import Delivery, FlowSchedule
+    from fieldkit.measure.transfers.deliveries import FlowSchedule, StreamDeliveries
     from fieldkit.report.attempt_timing import AttemptTimes
     from fieldkit.report.charts import Panel
     from fieldkit.ros.streams.topic_columns import TopicTraffic
@@ -48,8 +48,8 @@ MASTER: Final = "rosmaster"
 """Program of the ROS master."""
 
 KEPT_BYTES: Final = 256
-"""Captured bytes of each frame, so that they contain the head of a sample. With an Ethernet header, the head ends at
-byte 138 for DDS, at 154 if the message names the DDS reader, and at about 190 for Zenoh, after attachment and key
+"""Captured bytes of each frame, enough for the head of a sample. With an Ethernet header, the head ends at byte 138
+for DDS, at 154 if the DDS message names its reader, and at about 190 for Zenoh, after attachment and key
 expression."""
 
 BUFFER_KIB: Final = 32_768
@@ -180,7 +180,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
 
     @override
     def listens(self) -> tuple[ListeningPort, ...]:
-        """Return the ports of the domain, which no other domain uses."""
+        """Return the listening ports, which differ between domains."""
         if not self.listening_port:  # DDS, whose participants use the next free ports
             return (ListeningPort(self.receiver, min(self.wire_ports.data), self.sender, by="domain", shared=True),)
         listeners = {(self.receiver, self.sender), (self.sender, self.receiver)}
@@ -293,7 +293,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
         """Prefix of the columns of reads."""
         return "seen" if self.image else "used"
 
-    def deliveries(self, view: View) -> "Sequence[Delivery]":
+    def deliveries(self, view: View) -> "Sequence[StreamDeliveries]":
         """Return the deliveries of the stream; see `SendsFlow.deliveries`."""
         from fieldkit.ros.streams import topic_stalls  # noqa: PLC0415 (as above)
 

@@ -39,10 +39,10 @@ _PERIODS: Final = 1.5
 """Recording time after the last step, in periods of the topic."""
 ODOMETRY: Final = "nav_msgs/Odometry"
 
-# Runs the command that follows $1 and $2, and prints "recording" $2 s after the bag $1 has been opened, because
-# rosbag prints its messages only when its output buffer is full. The waiting subshell is not a child of the command,
-# because the command may wait for all its children.
-_RECORDS: Final = (
+# Shell script that runs the command after $1 and $2, and prints "recording" $2 s after the bag $1 has been opened,
+# because rosbag prints its messages only when its output buffer is full. The waiting subshell is not a child of the
+# command, because the command may wait for all its children.
+_RECORD_SCRIPT: Final = (
     '( (until [ -e "$1" ] || [ -e "$1.active" ]; do sleep 0.1; done; sleep "$2"; echo recording >&2) & ); '
     'shift 2; exec "$@"'
 )
@@ -125,9 +125,10 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
 
     The distance and speed columns of the transfers and pings inside use these positions
     ([method](method-radio.md#where-robots-were)). Robots that are not listed are assumed to stay at their placement,
-    unless they move. A repeat has at most one `track`; moves, faults and `together` are inside it. Adds the columns
-    `positions_from` and `positions_clock_error_s`. Writes `track_ROLE.bag` (ROS 2: a folder) and `positions.json`,
-    which records the source of each position, and the offset of each robot's clock from the laptop's clock.
+    unless a step moves them. A repeat has at most one `track`; moves, faults and `together` are inside it. Adds the
+    columns `positions_from` and `positions_clock_error_s`. Writes `track_ROLE.bag` (ROS 2: a folder) and
+    `positions.json`, which records the source of each position, and the offset of each robot's clock from the
+    laptop's clock.
 
     Attributes:
         robots: Source of each robot's position, by role.
@@ -157,14 +158,17 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
         job = replace(
             planned.job,
             name=self.prefixed_name("track"),
-            argv=("sh", "-c", _RECORDS, "sh", *arguments, *planned.job.argv),
+            argv=("sh", "-c", _RECORD_SCRIPT, "sh", *arguments, *planned.job.argv),
             limit_s=recorder.duration,
             ready="log:recording",
         )
         return replace(planned, job=job, permitted_causes=BY_FIELDKIT, least_s=0.0)
 
-    def _recorders(self, duration_s: float) -> Mapping[Role, RecordStep]:
-        """Return a `record` step with this duration for each robot with a topic."""
+    def _recorders(self, duration_s: float = 1.0) -> Mapping[Role, RecordStep]:
+        """Return a `record` step for each robot with a topic.
+
+        Only the job of the step and the size of its bag depend on `duration_s`.
+        """
         return {
             role: RecordStep.model_validate(
                 {
@@ -180,7 +184,10 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
 
     @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """Run the steps inside while the topics are recorded; `check` reads the bags, so exit codes are ignored."""
+        """Run the steps inside while the topics are recorded.
+
+        The exit codes of the recorders are ignored, because `check` reads the bags.
+        """
         announce("record positions", None)
         position_recording.run_while_recording(
             self,
@@ -193,7 +200,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
         )
 
     def _period_s(self, scene: Scene, role: Role) -> int:
-        """Return the time in whole seconds in which a topic publishes at least one message."""
+        """Return a time, in whole seconds, in which the robot's topic has at least one message."""
         ros = scene.robot(role).profile.ros
         rates_hz = (
             [topic.rate for topic in ros.topics if topic.name == self.robots[role].topic and topic.rate]
@@ -211,7 +218,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
                 sources[role] = tracked.at.position_source
             elif tracked.topic is not None:
                 sources[role] = PositionSource(
-                    file=self._recorders(1.0)[role].bag(scene.robot(role)),
+                    file=self._recorders()[role].bag(scene.robot(role)),
                     topic=tracked.topic,
                     child=tracked.child or "",
                     stamps=tracked.times,
@@ -225,7 +232,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
     @override
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
         """Yield the refusals of the recorders, and a reason for odometry without `facing`."""
-        for role, recorder in self._recorders(1.0).items():
+        for role, recorder in self._recorders().items():
             yield from recorder.refusals(scene)
             ros = scene.robot(role).profile.ros
             kinds = {topic.name: topic.type for topic in ros.topics} if ros else {}
@@ -235,12 +242,12 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
 
     @override
     def needs(self, scene: Scene) -> Iterator[Need]:
-        for recorder in self._recorders(1.0).values():
+        for recorder in self._recorders().values():
             yield from recorder.needs(scene)
 
     @override
     def live_topics(self, role: Role) -> tuple[str, ...]:
-        recorder = self._recorders(1.0).get(role)
+        recorder = self._recorders().get(role)
         return recorder.topics if recorder else ()
 
     @override
@@ -250,14 +257,14 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
 
     @override
     def reserve_bytes(self, scene: Scene, role: Role) -> int:
-        recorder = self._recorders(1.0).get(role)
+        recorder = self._recorders().get(role)
         return recorder.reserve_bytes(scene, role) if recorder else 0
 
     @override
     def files(self) -> tuple[str, ...]:
         return (
             position_sources.FILE,
-            *(name for recorder in self._recorders(1.0).values() for name in recorder.files()),
+            *(name for recorder in self._recorders().values() for name in recorder.files()),
         )
 
     @override
@@ -273,7 +280,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
     @override
     def check(self, view: View) -> Iterator[str]:
         """Yield the reasons why the recorded positions cannot be used."""
-        yield from position_recording.problems(view, list(self._recorders(1.0)))
+        yield from position_recording.problems(view, list(self._recorders()))
 
     @override
     def output_columns(self) -> tuple[Column, ...]:

@@ -32,7 +32,7 @@ LONGEST_S: Final = 3600.0
 _STREAM: Final = "video"
 """Name of the stream in its logs (`fieldkit.agent.messaging.rtp_stream.NAME`)."""
 _KEPT_BYTES: Final = 128
-"""Bytes of a frame on the link that contain the headers of Ethernet or radio, IPv6, UDP and RTP."""
+"""Captured bytes of each packet, enough for the headers of Ethernet or radio, IPv6, UDP and RTP."""
 _BUFFER_KIB: Final = 32_768
 """Kernel buffer of a capture: the packets of a frame leave in one burst."""
 _PATIENCE_S: Final = 20.0
@@ -98,11 +98,11 @@ class VideoStep(AlongStep, Prepares, HasNeeds, UsesSpace, Listens, SendsTraffic,
         address = scene.robot(self.receiver).address
         receive = gstreamer.receiver(address, self.port, self.buffer)
         send = gstreamer.sender(self.size, self.rate, self.quality, address, self.port)
-        yield self._end(scene, self.receiver, "receive-video", receive)
-        yield self._end(scene, self.sender, "send-video", send)
+        yield self._endpoint(scene, self.receiver, "receive-video", receive)
+        yield self._endpoint(scene, self.sender, "send-video", send)
 
-    def _end(self, scene: Scene, role: Role, verb: str, pipeline: list[str]) -> Planned:
-        """Return the job of the agent at one end."""
+    def _endpoint(self, scene: Scene, role: Role, verb: str, pipeline: list[str]) -> Planned:
+        """Return the job of the agent that sends or receives."""
         robot, sends = scene.robot(role), role == self.sender
         width, height = dimensions(self.size)
         arguments = agent_commands.compact(
@@ -225,7 +225,7 @@ class VideoStep(AlongStep, Prepares, HasNeeds, UsesSpace, Listens, SendsTraffic,
         return topic_checks.TopicPlan(
             topic=_STREAM,
             samples=round(self.rate * self.duration),
-            size_bytes=width * height * 3 // 2,
+            size_bytes=width * height * 3 // 2,  # the format I420 has 12 bits per pixel
             envelope_bytes=0,
             reliable=False,
             depth=None,

@@ -12,9 +12,9 @@ from fieldkit.ros.streams.topic_checks import MAX_SLEW_NS
 from fieldkit.ros.streams.topic_samples import TopicLog
 
 SEEN: Final = "frames that are seen"
-"""Exclusive resource of steps with the columns of frames that are seen."""
+"""Exclusive resource of the steps that have the columns `seen_*`."""
 _HANDOVER_NS: Final = 200_000_000
-"""On a busy robot, this much time may pass between the time of arrival of a sample and its first possible read."""
+"""Maximum time on a busy robot from the arrival of a sample until a read can return the sample."""
 
 
 def check_reads(received: TopicLog) -> Iterator[str]:
@@ -25,6 +25,7 @@ def check_reads(received: TopicLog) -> Iterator[str]:
     newest = np.append(-1, np.maximum.accumulate(samples.sequence[order]))
 
     def newest_at(at_ns: Ints) -> Ints:
+        """Return the number of the newest sample that had arrived at each time; -1 if none had."""
         number: Ints = newest[np.searchsorted(arrival_ns, at_ns, side="right")]
         return number
 

@@ -8,7 +8,9 @@ from fieldkit.config.schema import AfterValidator, Duration, Field, Hertz, Stric
 _MULTIPLE: Final = 16
 _WIDTHS: Final = (128, 2032)
 _HEIGHTS: Final = (64, 2032)
-"""Limits in pixels: cells of 8 x 8 pixels at least, and the largest size of JPEG over RTP (RFC 2435)."""
+"""Limits in pixels. At the lower limits, each of the 16 x 8 cells with the number and time of a frame has 8 x 8
+pixels (`fieldkit.agent.video.frame_code`). The upper limit is the largest multiple of 16 for JPEG over RTP (RFC
+2435)."""
 
 
 class Reads(Strict):
@@ -16,8 +18,8 @@ class Reads(Strict):
 
     Attributes:
         rate: Reads per second: the rate of the control loop, or the refresh rate of the display.
-        limit: An older sample counts as late, and a longer time without a newer sample as a gap: for commands, the
-            time after which the robot stops.
+        limit: Maximum age: an older sample counts as late, and a longer time without a newer sample counts as a gap.
+            For commands, use the time after which the robot stops.
     """
 
     rate: Annotated[Hertz, Field(gt=0, le=1000)] = 60.0

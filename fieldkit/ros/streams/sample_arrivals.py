@@ -15,10 +15,12 @@ STAMP_NS: Final = 2_000
 MAX_LATENCY_NS: Final = 5_000_000
 MAX_LATENCY_FEW_NS: Final = 20_000_000
 MIN_SAMPLES: Final = 20
-"""Maximum time between the packet of a sample and its record, for the fastest sample; the larger value is for fewer
-than `MIN_SAMPLES` samples. A program on a busy robot delays single samples for longer, but not all of them."""
+"""Maximum time from a sample's packet to its record in the log, for the sample with the shortest such time. The
+larger value is for fewer than `MIN_SAMPLES` samples. A program on a busy robot delays single samples for longer, but
+not all of them."""
 _MAX_RELEASE_WAIT_NS: Final = 600_000_000
-"""If a sample is permanently lost, the next samples may wait for this time until the loss is reported."""
+"""If a sample is permanently lost, a reliable middleware may withhold the next samples for this time, until it
+detects the loss."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,8 +29,8 @@ class SampleArrivals:
 
     Attributes:
         record_delay_ns: Time of the sample's record in the log minus time of the first packet with the sample's head.
-        latency_s: Time of the record minus time of the packet that completed the sample and all earlier ones. Only
-            for samples for which this packet is known; None if it is known for no sample.
+        latency_s: Time of the record minus time of the packet that completed the sample and all earlier ones, for the
+            samples for which this packet is known. None if it is not known for any sample.
     """
 
     record_delay_ns: Ints
@@ -36,7 +38,14 @@ class SampleArrivals:
 
     @classmethod
     def of(cls, samples: TopicSamples, subscriber: SampleFlow, *, complete: bool, reliable: bool) -> "SampleArrivals":
-        """Return the arrivals of samples that occur once; `CapturedTopic` and `TopicPlan` describe the flags."""
+        """Return the arrivals.
+
+        Args:
+            samples: Samples in the log, each once.
+            subscriber: The topic in the subscriber's capture.
+            complete: See `CapturedTopic`.
+            reliable: See `TopicPlan`.
+        """
         heads = subscriber.heads.first()
         _, log_index, capture_index = np.intersect1d(samples.sequence, heads.sequence, return_indices=True)
         at_ns, head_ns = samples.at_ns[log_index], heads.at_ns[capture_index]

@@ -4,8 +4,9 @@ The age is the age of information (Kaul, Yates and Gruteser, "Real-time status: 
 2012), sampled at the reads. With a constant delay D and a sending interval T its mean is D + T/2, and its 95th
 percentile is D + 0.95 T, if the reads are not synchronized with the samples.
 
-A stream is expected at the subscriber from the first sample on, for its duration, shifted by the smallest difference
-between the time of arrival and the time of sending of a sample. This needs no common clock.
+Reads and gaps are counted while samples are expected at the subscriber: from the time of sending of the first sample
+until one interval after the last one, both shifted by the smallest difference between a sample's times of arrival and
+sending. This needs no common clock.
 """
 
 import math
@@ -39,7 +40,7 @@ class ReadPlan:
     Attributes:
         prefix: Prefix of the columns: `seen` for frames, `used` for other samples.
         rate_hz: Planned reads per second.
-        limit_s: An older sample is late, and a longer time without a newer sample is a gap.
+        limit_s: Maximum age: an older sample is late, and a longer time without a newer sample is a gap.
         interval_s: Sending interval.
     """
 
@@ -146,15 +147,15 @@ def measure(
     }
     if not len(arrived):
         return _named(plan, values | {"withheld": "no sample arrived"}, names)
-    window = _expected(sent.samples, arrived, plan.interval_s)
+    window = _expected_window(sent.samples, arrived, plan.interval_s)
     is_expected = (received.reads.at_ns >= window[0]) & (received.reads.at_ns < window[1])
     reads = received.reads.where(is_expected)
     is_repeated = np.append(False, np.diff(received.reads.sequence) == 0)[is_expected] & (reads.sequence >= 0)
     values["reads"] = len(reads)
     planned = int((window[1] - window[0]) / 1e9 * plan.rate_hz)
     if len(reads) < MIN_READS * planned:
-        missed = f"the program read {format_count(len(reads), 'time')} instead of {planned}: the robot was busy"
-        return _named(plan, values | {"withheld": missed}, names)
+        reason = f"the program read {format_count(len(reads), 'time')} instead of {planned}: the robot was busy"
+        return _named(plan, values | {"withheld": reason}, names)
     gaps_s = _gaps_s(reads, window)
     values |= {
         "blank": float((reads.sequence < 0).mean()),
@@ -184,20 +185,23 @@ def read_clocks(
 
 
 def _named(plan: ReadPlan, values: Mapping[str, Value | None], names: list[str]) -> Measured:
-    """Return the values with the prefix of the columns; the other columns are missing."""
+    """Return the columns with the prefix of `plan`; columns in `names` without a value are missing."""
     withheld = values.get("withheld")
     all_values = {f"{plan.prefix}_{name}": values.get(name) for name in names}
     return Measured.from_optional(all_values, str(withheld) if withheld else "nothing is withheld")
 
 
-def _expected(sent: TopicSamples, arrived: TopicSamples, interval_s: float) -> tuple[int, int]:
+def _expected_window(sent: TopicSamples, arrived: TopicSamples, interval_s: float) -> tuple[int, int]:
     """Return the start and the end of the time in which the subscriber expects the stream, by its clock."""
     shift_ns = int((arrived.at_ns - arrived.sent_ns).min())
     return int(sent.sent_ns.min()) + shift_ns, int(sent.sent_ns.max()) + shift_ns + round(1e9 * interval_s)
 
 
 def _gaps_s(reads: SampleReads, window: tuple[int, int]) -> Floats:
-    """Return the times between consecutive reads with a newer sample, with those at the start and at the end."""
+    """Return the times between consecutive reads that returned a newer sample.
+
+    The first time is from the start of `window`, and the last is to its end.
+    """
     is_newer = reads.sequence > np.maximum.accumulate(np.append(-1, reads.sequence[:-1]))
     gaps_s: Floats = np.diff(np.concatenate(([window[0]], reads.at_ns[is_newer], [window[1]]))) / 1e9
     return gaps_s
@@ -205,24 +209,24 @@ def _gaps_s(reads: SampleReads, window: tuple[int, int]) -> Floats:
 
 def _ages(reads: SampleReads, clocks: Clocks | None, unknown_clocks: str) -> dict[str, Value | None]:
     """Return the ages whose clock error is small enough."""
-    of_samples = reads.where(reads.sequence >= 0)
-    if not len(of_samples):
+    sample_reads = reads.where(reads.sequence >= 0)
+    if not len(sample_reads):
         return {"withheld": "no sample arrived before a read"}
-    if clocks is None or not math.isfinite(error_s := clocks.error_s(of_samples.at_ns)):
+    if clocks is None or not math.isfinite(error_s := clocks.error_s(sample_reads.at_ns)):
         return {"withheld": unknown_clocks}
-    age_s = clocks.delays_s(of_samples.sent_ns, of_samples.at_ns)
+    age_s = clocks.delays_s(sample_reads.sent_ns, sample_reads.at_ns)
     ages = {
         "age_p95_s": quantile_of_sent(age_s, len(reads), _TAIL),
         "age_mean_s": float(age_s.mean()),
         "age_max_s": float(age_s.max()),
     }
-    small = {name: age for name, age in ages.items() if age is not None and error_s <= LARGEST_ERROR * age}
+    accurate_ages = {name: age for name, age in ages.items() if age is not None and error_s <= LARGEST_ERROR * age}
     reasons = []
     if ages["age_p95_s"] is None:
         reasons.append("5 % or more of the reads were before the first sample")
-    if any(age is not None and name not in small for name, age in ages.items()):
+    if any(age is not None and name not in accurate_ages for name, age in ages.items()):
         reasons.append("the clock error is above a tenth of an age")
-    return {"age_error_s": error_s, "withheld": " and ".join(reasons) or None, **small}
+    return {"age_error_s": error_s, "withheld": " and ".join(reasons) or None, **accurate_ages}
 
 
 def _late(arrived: TopicSamples, clocks: Clocks | None, limit_s: float) -> float | None:

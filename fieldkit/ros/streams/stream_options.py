@@ -36,7 +36,7 @@ _DEFAULT_BYTES: Final = 1000.0
 LONGEST_S: Final = 3600.0
 
 
-def _is_profile(name: str) -> str:
+def _validate_profile(name: str) -> str:
     # `qos` and the message types take 50 ms to import, so only procedures with topics import them.
     from fieldkit.ros.interfaces.qos import PROFILES  # noqa: PLC0415
 
@@ -58,7 +58,7 @@ class StreamQos(Strict):
         deadline: Maximum expected time between two samples.
     """
 
-    profile: Annotated[str, AfterValidator(_is_profile)] = "default"
+    profile: Annotated[str, AfterValidator(_validate_profile)] = "default"
     reliability: Annotated[str, Field(pattern="^(reliable|best_effort)$")] | None = None
     history: Annotated[str, Field(pattern="^(keep_last|keep_all)$")] | None = None
     depth: Annotated[Int, Field(gt=0, le=100_000)] | None = None
@@ -66,7 +66,7 @@ class StreamQos(Strict):
     deadline: Annotated[Duration, Field(gt=0)] | None = None
 
     def resolved(self) -> "QosProfile":
-        """Return the complete quality of service."""
+        """Return the profile with the values that override it."""
         from fieldkit.ros.interfaces.qos import PROFILES, Durability, History, QosProfile, Reliability  # noqa: PLC0415
 
         base = PROFILES[self.profile]

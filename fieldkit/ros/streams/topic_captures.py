@@ -1,8 +1,8 @@
 """Contradictions between the logs of a topic and the captures of its ends.
 
 A capture contains the head of most samples: number and time of sending (`topic_samples`). Therefore, each sample in a
-log is compared with its packet. Their times are comparable, because both are from one robot's clock. If TCP or a
-middleware put several samples into one packet, so that the capture shows no heads, counts and bytes are compared.
+log is compared with its packet. Their times are comparable, because both are from one robot's clock. If the capture
+contains no heads, because TCP or a middleware put several samples into one packet, counts and bytes are compared.
 """
 
 from collections.abc import Iterator, Mapping
@@ -32,8 +32,8 @@ from fieldkit.ros.streams.topic_samples import SampleFlow, SampleHeads, TopicLog
 
 SLOW_S: Final = 0.02
 """A delay is not reported if the subscriber's program caused more than this time and more than a tenth of the delay,
-because such a program cannot be distinguished from a log with wrong times. On two idle hosts the maximum of 100
-delays was 0.3 to 13 ms."""
+because a slow program cannot be distinguished from a log with wrong times. On two idle hosts the maximum of 100
+delays caused by the program was 0.3 to 13 ms."""
 
 PROGRAM_DELAY_FIGURES: Final = {
     "topic_delay_median_s": "median",
@@ -52,7 +52,8 @@ PROGRAM_DELAY_FIGURES: Final = {
 """Columns of times. Each is compared with this statistic of the delay in the subscriber's program."""
 
 _GRACE_NS: Final = 300_000_000
-"""The subscriber's log may lack a captured sample that is within this time of the match or of the end of the log."""
+"""The subscriber's log may lack samples that were captured within this time of the discovery of the publisher, or of
+the end of the log."""
 
 
 _READ_BURST_NS: Final = 1_000_000
@@ -133,7 +134,7 @@ def withheld_columns(
     reliable: bool,
     deadline_s: float | None,
 ) -> dict[str, str]:
-    """Return the time columns that the delay of the subscriber's program distorts too much, with the reason.
+    """Return a reason for each time column that the delay of the subscriber's program distorts too much.
 
     Args:
         values: Columns of the topic from the logs.
@@ -311,7 +312,8 @@ def _may_have_overflowed(
     queue_length = np.searchsorted(arrived_ns, next_ns, side="right") - np.searchsorted(
         arrived_ns, lost_ns, side="right"
     )
-    # A missing sample that arrives releases all waiting samples together; the capture may lack heads of some of them.
+    # When a missing sample arrives, all samples that waited for it are read together. Some of their heads may be
+    # missing in the capture, so the reads are counted, too.
     read_together = np.searchsorted(read_ns[:-1], next_ns + _READ_BURST_NS, side="right") - np.searchsorted(
         read_ns[:-1], next_ns
     )

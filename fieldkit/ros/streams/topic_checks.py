@@ -17,7 +17,7 @@ from fieldkit.ros.streams import topic_samples
 from fieldkit.ros.streams.topic_samples import TopicLog
 
 MAX_SLEW_NS: Final = 1_000_000
-"""A slewed clock may reverse the order of two consecutive times of one program by at most this time."""
+"""Maximum time by which a slewed clock may make a program's later time stamp smaller than the previous one."""
 
 SETTLING_NS: Final = 500_000_000
 """Minimum time between the record of the match and the first sample
@@ -62,8 +62,8 @@ def check_logs(plan: TopicPlan, publisher_log: TopicLog, subscriber_log: TopicLo
         publisher_log: Complete log of the publisher.
         subscriber_log: Complete log of the subscriber.
     """
-    yield from _end_contradictions(plan, publisher_log, topic_samples.PUBLISHER)
-    yield from _end_contradictions(plan, subscriber_log, topic_samples.SUBSCRIBER)
+    yield from _log_contradictions(plan, publisher_log, topic_samples.PUBLISHER)
+    yield from _log_contradictions(plan, subscriber_log, topic_samples.SUBSCRIBER)
     yield from _publisher_problems(plan, publisher_log)
     yield from _wrong_sizes(plan, subscriber_log, PADDING_BYTES, "subscriber")
     if plan.in_order and (backward_s := _backward_s(subscriber_log)):
@@ -97,23 +97,22 @@ def check_times(logs: Mapping[Role, TopicLog], windows: Mapping[Role, tuple[int,
             yield f"the {role}'s topic log has a record from {late_s:.3f} s after the attempt, by the robot's clock"
 
 
-def _end_contradictions(plan: TopicPlan, log: TopicLog, role: int) -> Iterator[str]:
-    """Yield the contradictions if a log is from the other end of the topic, or from another topic."""
+def _log_contradictions(plan: TopicPlan, log: TopicLog, role: int) -> Iterator[str]:
+    """Yield the contradictions of a log with its role, its topic, and its start and end records."""
     name = _NAMES[role]
     if log.role is not None and log.role != role:
         yield f"the {name}'s log was written by the {_NAMES.get(log.role, 'unknown end')} of the topic"
     if log.topic_sum is not None and log.topic_sum != zlib.crc32(plan.topic.encode()):
         yield f"the {name}'s log is of another topic than {plan.topic}"
-    has_valid_count = (
-        log.kinds.get(topic_samples.DISCOVERY_STARTED) == 1,
-        log.kinds.get(topic_samples.MATCHED, 0) <= 1,
+    has_valid_counts = (
+        log.kinds.get(topic_samples.DISCOVERY_STARTED) == 1 and log.kinds.get(topic_samples.MATCHED, 0) <= 1
     )
     unexpected_kinds = (
         (topic_samples.FOREIGN, topic_samples.READ, topic_samples.UNREADABLE)
         if role == topic_samples.PUBLISHER
         else (topic_samples.REFUSED, topic_samples.SKIPPED)
     )
-    if not all(has_valid_count) or any(log.kinds.get(kind) for kind in unexpected_kinds):
+    if not has_valid_counts or any(log.kinds.get(kind) for kind in unexpected_kinds):
         yield f"the {name}'s log has records that no {name} writes"
     times_ns = log.times_ns
     if len(times_ns) and (times_ns.min() < times_ns[0] - MAX_SLEW_NS or times_ns.max() > times_ns[-1] + MAX_SLEW_NS):
@@ -123,7 +122,7 @@ def _end_contradictions(plan: TopicPlan, log: TopicLog, role: int) -> Iterator[s
 
 
 def _publisher_problems(plan: TopicPlan, publisher_log: TopicLog) -> Iterator[str]:
-    """Yield the properties of a log that no publisher can produce."""
+    """Yield the properties of a publisher's log that contradict the plan or cannot occur."""
     samples, numbers = publisher_log.samples, publisher_log.numbers
     if (numbers != np.arange(len(numbers))).any():
         yield "the sample numbers in the publisher's log do not start at 0, or have a gap"

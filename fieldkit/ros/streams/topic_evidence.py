@@ -21,13 +21,13 @@ from fieldkit.steps.view import View, capture_around
 _ENVELOPE_BYTES: Final = MappingProxyType(
     {(False, True): 12, (False, False): 16, (True, True): 48, (True, False): 52}
 )
-"""Bytes that serialization adds to the data: by whether the samples are images, and whether it is ROS 1's, else CDR.
-"""
+"""Bytes that serialization adds to the data. The first element of a key is True for images, the second is True for
+the serialization of ROS 1 and False for CDR."""
 _ROS1_QUEUE: Final = 1000
 """Queue size in samples that the agent sets in ROS 1 for the history `keep_all` (`fieldkit.agent.messaging.ros1`)."""
 _LATE_S: Final = 0.1
-"""If the first sample after discovery and the publisher's wait is later than this, the column of the discovery time
-is empty."""
+"""If the first sample is sent more than this time after the end of the publisher's wait, which follows the discovery,
+the column of the discovery time is empty."""
 
 
 def plan(step: StreamOptions) -> TopicPlan:

@@ -36,7 +36,7 @@ def panels(step: Step, evidence: AttemptEvidence, times: AttemptTimes, zero_ns: 
         return
     is_lost = ~np.isin(sent_samples.sequence, received_samples.sequence)
     lost_s = (sent_samples.at_ns[is_lost] - times.clock_offset_ns[publisher] - zero_ns) / 1e9
-    # The delays are measured with two clocks, so only their differences are meaningful.
+    # The times of sending and arrival are from two clocks, so only differences between the delays are meaningful.
     delay_ms = (received_samples.at_ns - received_samples.sent_ns) / 1e6
     excess_ms = delay_ms - delay_ms.min(initial=math.inf) if len(delay_ms) else delay_ms
     received_s = (received_samples.sent_ns - times.clock_offset_ns[publisher] - zero_ns) / 1e9
@@ -53,7 +53,7 @@ def panels(step: Step, evidence: AttemptEvidence, times: AttemptTimes, zero_ns: 
         x_label=TIME_LABEL,
         y_label="[ms]",
         series=series,
-        words=(
+        description=(
             f"{len(sent_samples.sequence)} samples sent, {int(is_lost.sum())} lost, "
             f"{len(received_samples.sequence)} received"
         ),

@@ -1,12 +1,13 @@
 """Samples of topics, read from logs that the agent writes on a robot and from captures, by the heads of samples.
 
-Logs (`fieldkit.agent.messaging.records`) are fixed-size records after a magic number. If the writer of a log was
-killed, the log ends with zeros, because the file grows by blocks.
+A log (`fieldkit.agent.messaging.records`) is a magic number followed by fixed-size records. If the writer of a log
+was killed, the log ends with zeros, because the file grows by blocks.
 
 The agent starts each sample with the empty layout of `std_msgs/UInt8MultiArray` and the length of its data, followed
 by the head (`fieldkit.agent.messaging.stream`): magic number, sequence number and time of sending. The head is in a
-capture if that part of the packet was captured. This is always true for the first sample of a packet, but TCP or a
-middleware may put further samples after it in the same packet. An image has the same head in its first pixels.
+capture if the snap length of the capture includes that part of the packet. This is always true for the first sample
+of a packet, but TCP or a middleware may add more samples to the same packet. An image has the same head in its first
+pixels.
 """
 
 import struct
@@ -39,8 +40,10 @@ _SAMPLE, DISCOVERY_STARTED, MATCHED, REFUSED, SKIPPED, FOREIGN, _END, _WRITER, R
 PUBLISHER: Final = 1
 SUBSCRIBER: Final = 2
 _HAS_CHECKSUM: Final = 1
-"""Marks an end record whose size field is a checksum. Older logs, without writer records, have no checksum."""
+"""Value of `sent_ns` in an end record whose size field is a checksum. Older logs, without writer records, have
+none."""
 _SIZE_AT: Final = 4
+"""Offset of the size field in a record."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,10 +98,10 @@ class TopicLog:
         kinds: Number of records of each kind.
         times_ns: Time of every record in the order of the log, by the writer's clock.
         numbers: Sequence number of each sample that was passed to the middleware or arrived, including refused ones.
-        role: `PUBLISHER` or `SUBSCRIBER`; None in a log of a version without writer records.
-        topic_sum: CRC-32 of the topic's name; None in a log of a version without writer records.
+        role: `PUBLISHER` or `SUBSCRIBER`; None in a log without a writer record (older versions).
+        topic_sum: CRC-32 of the topic's name; None in a log without a writer record (older versions).
         reads: Reads of the newest sample by the subscriber's program.
-        unreadable: Number of received frames of a camera whose pixels have no number and time.
+        unreadable: Number of received camera frames whose pixels do not contain a valid number and time.
     """
 
     samples: TopicSamples
@@ -121,8 +124,8 @@ def read_log(path: Path) -> TopicLog:
     """Read a log. A record that is truncated or has no time is ignored.
 
     Raises:
-        EvidenceError: The file is missing or not such a log, the number of samples in its end record is wrong, or it
-            was changed after the end record was written.
+        EvidenceError: The file is missing or not such a log, the number of samples in its end record is wrong, or its
+            checksum is wrong.
     """
     content = reading.mapped(path)
     if content[: len(LOG_MAGIC)] != LOG_MAGIC:

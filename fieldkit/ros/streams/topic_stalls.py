@@ -9,10 +9,11 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.transfers import delay, deliveries, stalls
 from fieldkit.measure.transfers.clock_offset import StampPairs
-from fieldkit.measure.transfers.deliveries import Delivery, FlowSchedule
+from fieldkit.measure.transfers.deliveries import FlowSchedule, StreamDeliveries
 from fieldkit.ros.streams.topic_columns import TopicTraffic
 from fieldkit.ros.streams.topic_samples import TopicLog
 
+# The columns of transfers need captures; those of topics need the logs.
 COLUMNS = tuple(
     replace(column, meaning=column.meaning.replace("complete captures", "complete logs"))
     for column in stalls.declare_columns("topic", "the topic", 83)
@@ -33,7 +34,9 @@ def require_steady_clocks(flow: TopicTraffic, sender: Packets | None, receiver: 
         raise EvidenceError(delay.UNSTEADY)
 
 
-def delivery(publisher_log: TopicLog | None, subscriber_log: TopicLog | None, schedule: FlowSchedule) -> Delivery:
+def topic_deliveries(
+    publisher_log: TopicLog | None, subscriber_log: TopicLog | None, schedule: FlowSchedule
+) -> StreamDeliveries:
     """Return the deliveries of a topic.
 
     Args:
@@ -57,7 +60,7 @@ def delivery(publisher_log: TopicLog | None, subscriber_log: TopicLog | None, sc
         raise EvidenceError("a sample is earlier than the one before it: a clock was set back")
     pairs = StampPairs(samples.sent_ns[sent_index], subscriber_log.samples.at_ns[received_index])
     first_ns, last_ns = int(samples.sent_ns.min()), int(samples.sent_ns.max())
-    return deliveries.stream_delivery(np.sort(at_ns), (first_ns, first_ns, last_ns), pairs, schedule)
+    return deliveries.stream_deliveries(np.sort(at_ns), (first_ns, first_ns, last_ns), pairs, schedule)
 
 
 def measure(
@@ -70,7 +73,7 @@ def measure(
 
     Args:
         flow: Identifies its packets.
-        logs: Logs of publisher and subscriber; see `delivery`.
+        logs: Logs of publisher and subscriber; see `topic_deliveries`.
         captures: Packets that their robots captured; None without a complete capture.
         schedule: Interval and duration of the stream.
     """
@@ -82,10 +85,10 @@ def read_deliveries(
     logs: tuple[TopicLog | None, TopicLog | None],
     captures: tuple[Packets | None, Packets | None],
     schedule: FlowSchedule,
-) -> list[Delivery]:
+) -> list[StreamDeliveries]:
     """Return the deliveries of a topic.
 
-    The arguments are those of `measure`; the errors are those of `delivery` and `require_steady_clocks`.
+    The arguments are those of `measure`; the errors are those of `topic_deliveries` and `require_steady_clocks`.
     """
     require_steady_clocks(flow, *captures)
-    return [delivery(*logs, schedule)]
+    return [topic_deliveries(*logs, schedule)]

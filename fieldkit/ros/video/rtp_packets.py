@@ -15,7 +15,7 @@ from fieldkit.measure.evidence import reading
 _RTP_BYTES: Final = 12
 _VERSION: Final = 2
 NO_PACKET: Final = -1
-"""Time of a frame of which no packet was captured."""
+"""Value of `first_ns` and `last_ns` of a frame without a captured packet."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class RtpPackets(Table):
 
     @property
     def keys(self) -> Ints:
-        """A key for each packet, shared only by copies of that packet."""
+        """An integer for each packet, which is equal only for copies of the same packet."""
         keys: Ints = (self.stamp << 16) | self.sequence
         return keys
 

@@ -28,23 +28,25 @@ def check_captures(sent: TopicLog, received: TopicLog, sender: RtpPackets, recei
     frames = match_frames(sender, receiver)
     if len(frames) != len(sent.samples):
         in_capture = f"the sender's capture has {format_count(len(frames), 'frame')}"
-        yield f"{in_capture} of the video, its log {len(sent.samples)}"
+        yield f"{in_capture} of the video, but its log has {len(sent.samples)}"
         return
     if early := int((frames.sent_ns < sent.samples.sent_ns - STAMP_NS).sum()):
-        yield f"{format_count(early, 'frame')} in the sender's capture were sent before they were taken, by its log"
+        early_text = f"{format_count(early, 'frame')} in the sender's capture"
+        yield f"{early_text} were sent before the time of the frame in the sender's log"
     arrived = first_arrivals(received)
-    known = arrived.where(np.isin(arrived.sequence, np.arange(len(frames))))
-    first_ns, last_ns = frames.first_ns[known.sequence], frames.last_ns[known.sequence]
+    sent_arrivals = arrived.where(np.isin(arrived.sequence, np.arange(len(frames))))
+    numbers, arrived_ns = sent_arrivals.sequence, sent_arrivals.at_ns
+    first_ns, last_ns = frames.first_ns[numbers], frames.last_ns[numbers]
     if lacking := int((first_ns == NO_PACKET).sum()):
         yield f"{format_count(lacking, 'frame')} in the receiver's log have no packet in its capture"
-    if early := int(((first_ns != NO_PACKET) & (known.at_ns < first_ns - STAMP_NS)).sum()):
+    if early := int(((first_ns != NO_PACKET) & (arrived_ns < first_ns - STAMP_NS)).sum()):
         yield f"{format_count(early, 'frame')} in the receiver's log arrived before their packets in its capture"
-    is_complete = frames.arrived[known.sequence] == frames.packets[known.sequence]
-    if early := int((is_complete & (known.at_ns < last_ns - STAMP_NS)).sum()):
+    is_complete = frames.arrived[numbers] == frames.packets[numbers]
+    if early := int((is_complete & (arrived_ns < last_ns - STAMP_NS)).sum()):
         yield f"{format_count(early, 'frame')} in the receiver's log arrived before their last packet in its capture"
     returned, captured = len(received.samples) + received.unreadable, int((frames.arrived > 0).sum())
     if returned > captured:
-        yield f"the receiver's log has {format_count(returned, 'frame')}, its capture has packets of {captured}"
+        yield f"the receiver's log has {format_count(returned, 'frame')}, but its capture has packets of {captured}"
 
 
 CROSS_CHECKS: Final = (
@@ -56,7 +58,7 @@ CROSS_CHECKS: Final = (
             "the rate and duration of the procedure",
             "the sender's capture: RTP time stamps and times of packets",
         ),
-        tolerance="none: every frame is sent or skipped, and each has packets, none before the time in its pixels",
+        tolerance="none: every frame is sent or skipped; its packets are not earlier than the time in its pixels",
     ),
     CrossCheck(
         quantity="frames received",

@@ -1,4 +1,4 @@
-"""Columns of a video over RTP: frames by the logs of both ends, packets by the captures."""
+"""Columns of a video over RTP: frames from the logs of both ends, packets from the captures."""
 
 from typing import Final
 

@@ -25,15 +25,15 @@ from fieldkit.steps.capabilities import AsksOperator, DescribesActions, Summariz
 from fieldkit.steps.scene import Announce, Planned, Scene
 from fieldkit.steps.view import View
 
-_MAX_LETTERS: Final = 31
+_MAX_CHARACTERS: Final = 31
 
 
 def _checked_choice(word: str) -> str:
-    """Return a word after a check: a choice must not be a number or the answer that means *unknown*."""
-    has_valid_form = 0 < len(word) <= _MAX_LETTERS and word.isprintable() and word == word.strip()
+    """Return `word` if it is a valid choice; a number, or the answer that means *unknown*, is not valid."""
+    has_valid_form = 0 < len(word) <= _MAX_CHARACTERS and word.isprintable() and word == word.strip()
     if not has_valid_form or word.isdigit() or word in {UNKNOWN, *MISSING}:
         raise schema.validation_error(
-            f"{word[:40]!r} cannot be a choice: write words of at most {_MAX_LETTERS} characters"
+            f"{word[:40]!r} cannot be a choice: write words of at most {_MAX_CHARACTERS} characters"
         )
     return word
 

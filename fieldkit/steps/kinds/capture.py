@@ -42,6 +42,7 @@ SNAP_BYTES: Final = 128
 BUFFER_KIB: Final = 4096
 
 LIMIT_S: Final = 900.0
+"""Time limit of a capture in addition to the limits of the steps inside."""
 
 # Size of the header of each captured frame in the file.
 _RECORD_BYTES: Final = 16
@@ -102,8 +103,7 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
             tolerance=(
                 "a packet may be 0.1 s earlier than the previous one, because two processors receive them; if only "
                 "topics and pings run inside, packets may be dropped before tcpdump, and the columns that depend on "
-                "them "
-                "are empty"
+                "them are empty"
             ),
         ),
     )
@@ -201,13 +201,13 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
         """Yield the check of the permission to capture."""
         for role in self.robots:
             profile = scene.robot(role).profile
-            names = profile.tools
+            tools = profile.tools
             # A capture with sudo runs the job script as root, so that the script can signal its children.
-            prefix = ("sudo", "-n", "sh", "-c", 'exec "$@"', "sh") if names.capture_right == "sudo" else ()
+            prefix = ("sudo", "-n", "sh", "-c", 'exec "$@"', "sh") if tools.capture_right == "sudo" else ()
             # The list of link types needs the same permission as a capture, because it opens the interface.
-            argv = (*prefix, names.capture, "-L", "-i", self.capture_interface(scene, role))
+            argv = (*prefix, tools.capture, "-L", "-i", self.capture_interface(scene, role))
             name = f"right to capture{f' on {self.over}' if self.over else ''}"
-            yield Need(role, name, argv, partial(_judge, profile), required_program=names.capture)
+            yield Need(role, name, argv, partial(_judge, profile), required_program=tools.capture)
 
     @override
     def stored_bytes(self, scene: Scene, role: Role) -> float:
@@ -335,7 +335,10 @@ def _problems(role: Role, file: str, log_file: str, view: View, *, needs_all: bo
 
 
 def _time_problems(role: Role, capture: Capture, view: View) -> Iterator[str]:
-    """Yield contradictions of the packets' times with each other and with the robot's clock before and after it."""
+    """Yield a reason for packet times that run backwards, or that the robot's clock excludes.
+
+    The clock is read before and after the attempt, so no packet can be earlier or later.
+    """
     times_ns = capture.packets.time_ns[capture.packets.time_ns != NO_TIME]
     if not len(times_ns):
         return
@@ -355,11 +358,11 @@ def _time_problems(role: Role, capture: Capture, view: View) -> Iterator[str]:
 
 def _judge(profile: RobotProfile, answer: CommandResult) -> tuple[Verdict, str, str]:
     """Return verdict, detail and remedy for the permission of a robot's user to capture."""
-    names = profile.tools
+    tools = profile.tools
     if answer.ok:
-        return Verdict.OK, "by sudo -n" if names.capture_right == "sudo" else "permission of the user", ""
-    if names.capture_right == "direct":
-        remedy = f"sudo setcap cap_net_raw,cap_net_admin+eip $(command -v {quote((names.capture,))})"
+        return Verdict.OK, "by sudo -n" if tools.capture_right == "sudo" else "permission of the user", ""
+    if tools.capture_right == "direct":
+        remedy = f"sudo setcap cap_net_raw,cap_net_admin+eip $(command -v {quote((tools.capture,))})"
     elif answer.code == CommandResult.MISSING:
         return Verdict.FAIL, "there is no sudo", f"write capture_right: direct in profile {profile.name}"
     else:

@@ -19,7 +19,7 @@ from fieldkit.core.crosschecks import CrossCheck
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, RobotError
 from fieldkit.core.model import FaultKind, Protocol, Role
-from fieldkit.core.threads import is_mistake, run_parallel
+from fieldkit.core.threads import is_bug, run_parallel
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import outage, outage_columns
 from fieldkit.measure.robot_clock import Offset, offset
@@ -43,11 +43,11 @@ PATIENCE_S: Final = 600.0
 _CLOCK_S: Final = 5.0
 """Timeout of a time query."""
 
-_LASTING: Final = frozenset({FaultKind.LINK_DOWN, FaultKind.OUT_OF_RANGE})
+_KINDS_WITH_DURATION: Final = frozenset({FaultKind.LINK_DOWN, FaultKind.OUT_OF_RANGE})
 
 
 class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
-    """Causes a fault of a robot while the steps in `during` run; their losses are a result, not an error.
+    """Causes a fault of a robot while the steps in `during` run. Their losses are a result, not an error.
 
     The backend of simulated robots causes the fault. In the field the operator is asked to cause it; with `--yes` no
     operator is asked, and the attempts are void.
@@ -107,7 +107,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     @schema.model_validator(mode="after")
     def _has_the_keys_of_its_kind(self) -> "FaultStep":
         for key, is_given, is_required in (
-            ("for", self.lasts is not None, self.kind in _LASTING),
+            ("for", self.lasts is not None, self.kind in _KINDS_WITH_DURATION),
             ("process", self.process is not None, self.kind is FaultKind.KILL),
         ):
             if is_given != is_required:
@@ -150,7 +150,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
         shell = testbed.shells[observer.role]
         announce(f"watch {scene.robot(self.robot).name}", None)
         jobs.start(shell, watch.job)
-        clock_offsets = {} if scene.laptop_folder is None else self._clocks(testbed)
+        clock_offsets = {} if scene.laptop_folder is None else self._query_clock_offsets(testbed)
         inner_scene = replace(scene, halt=scene.halt.child())
         pool = ThreadPoolExecutor(max_workers=1)
         steps = pool.submit(self._run_inside, inner_scene, testbed, announce)
@@ -171,14 +171,14 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
                 end_inside(self, scene, testbed)
             wait([steps])
             mistake = steps.exception()
-            if mistake is not None and mistake is not error and is_mistake(mistake):
+            if mistake is not None and mistake is not error and is_bug(mistake):
                 raise mistake from error
             raise
         finally:
             inner_scene.halt.set()
             pool.shutdown(wait=False)  # after Ctrl-C the signal handler stops the jobs for which the steps wait
 
-    def _clocks(self, testbed: Testbed) -> dict[Role, Offset]:
+    def _query_clock_offsets(self, testbed: Testbed) -> dict[Role, Offset]:
         """Return the offset of each robot's clock.
 
         A robot that does not answer is omitted; its columns on the recovery of flows are then empty.
@@ -222,7 +222,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
                 entry.step.run(scene, testbed, announce)
 
     def _run_before_fault(self, steps: "Future[None]") -> None:
-        """Run the steps inside before the fault. An error in this time is not caused by the fault and is raised."""
+        """Wait until the fault is due. If a step inside fails before, raise its error: the fault is not the cause."""
         from concurrent.futures import wait  # noqa: PLC0415 (as above)
 
         deadline = Deadline.after(self.after)

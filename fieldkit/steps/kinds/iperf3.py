@@ -23,7 +23,7 @@ from fieldkit.measure.checks.load_checks import LoadEvidence
 from fieldkit.measure.evidence import iperf3
 from fieldkit.measure.evidence.iperf3 import IperfTest
 from fieldkit.measure.transfers import iperf3_load, stalls
-from fieldkit.measure.transfers.deliveries import Delivery
+from fieldkit.measure.transfers.deliveries import StreamDeliveries
 from fieldkit.measure.transfers.iperf3_load import LoadFlow, LoadStreams
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
@@ -42,15 +42,15 @@ _DEFAULT_S: Final = 10.0
 _INTERVAL_BYTES: Final = 600
 """Size of iperf3's report on one second of one stream."""
 
-_STALLS: Final = stalls.declare_columns("iperf3", "iperf3", 67)
+_STALLS: Final = stalls.declare_columns("iperf3", "iperf3", rank=67)
 
 
 class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraffic, Summarizes):
     """Measures with iperf3. Both robots need iperf3 3.1 or later: `sudo apt-get install iperf3`.
 
-    The server exits after the test. Writes `ROLE-iperf3.json`, the reports of both ends second by second. Inside a
-    `capture`, figures of the same packets are also computed from the captures: [columns](method-loss.md#iperf3),
-    [stalls](method-delay.md#stalls-of-a-flow).
+    The server exits after the test. Writes `ROLE-iperf3.json`, a report of each end with an entry per second. Inside
+    a `capture`, figures of the same packets are also computed from the captures:
+    [columns](method-loss.md#iperf3), [stalls](method-delay.md#stalls-of-a-flow).
 
     Attributes:
         duration: Duration of the test in whole seconds; 10 s without `size`.
@@ -269,7 +269,7 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
             | iperf3_load.measure_stalls("iperf3", data, *packets)
         )
 
-    def deliveries(self, view: View) -> Sequence[Delivery]:
+    def deliveries(self, view: View) -> Sequence[StreamDeliveries]:
         """Return the deliveries of each stream; see `SendsFlow.deliveries`."""
         return iperf3_load.read_deliveries(self._data_streams(view), *self._packets(view))
 

@@ -16,8 +16,8 @@ RECOVERED_S: Final = 1.0
 
 _INTERVAL_S: Final = 0.1
 
-# Prints every $2 s the seconds since boot, followed by `up` and the process ids while processes named $1 run (zombies
-# do not count).
+# Every $2 seconds, prints the seconds since boot. While processes named $1 run, also prints `up` and their process
+# IDs. Zombies do not count.
 _WATCH: Final = (
     'echo "watching $1"; while :; do pids=; for file in /proc/[0-9]*/comm; do '
     'read -r name <"$file" && [ "$name" = "$1" ] && read -r stat <"${file%comm}stat" || continue; '
@@ -25,7 +25,8 @@ _WATCH: Final = (
     'read -r now _ </proc/uptime; echo "$now${pids:+ up}$pids"; sleep "$2"; done'
 )
 
-# Prints the duration of the cause ($1) and the interval ($2), then waits for $5 more lines with text $4 in file $3.
+# Prints the duration of the cause ($1) and the interval ($2), then waits until file $3 has $5 more lines that contain
+# $4.
 _WAIT_FOR_RECOVERY: Final = (
     'echo "lasted_s $1"; echo "interval_s $2"; enough=$(($(grep -c "$4" "$3") + $5)); '
     'until [ "$(grep -c "$4" "$3")" -ge "$enough" ]; do sleep 0.1; done'
@@ -65,7 +66,8 @@ class Observer:
             argv: tuple[str, ...] = ("sh", "-c", _WATCH, "sh", self.fault.process, interval)
         else:
             link = self.fault.link
-            # Another link of a robot also answers for the address of this link, unless the interface is given.
+            # Without `-I`, the requests could use another link, because a robot answers on any link for all of its
+            # addresses.
             interface_options = (
                 ("-I", self.scene.link(self.role, link).interface) if self.scene.robot(self.role).links else ()
             )

@@ -39,16 +39,18 @@ REPLY_TIMEOUT_S: Final = 2
 MAX_SEQUENCE_COUNT: Final = 0xFFFF
 """Number of requests after which sequence numbers repeat."""
 _HEADER_BYTES: Final = 8
+"""Size of the ICMP header of an echo request."""
 OLD_IPUTILS_MIN_INTERVAL_S: Final = 0.2
 """Shortest interval that iputils before 20210722 allows without root."""
 MAX_COUNT: Final = 1_000_000
 _ROUNDING: Final = 1e-6
+"""Rounding error that must not add a request when a duration is divided by the interval."""
 
 Payload = Annotated[Int, Field(ge=0, le=65507)]
 
 
 def command_line(scene: Scene, role: Role, options: Iterable[str], address: str) -> tuple[str, ...]:
-    """Return the ping command of a robot, with output that can be parsed: addresses, time stamps, in English."""
+    """Return the ping command of a robot. Its output is English, with numeric addresses and with time stamps."""
     # busybox has no time stamps and never resolves names.
     stamp_options = () if scene.tools(role).ping is PingTool.BUSYBOX else ("-n", "-D")
     return ("env", "LC_ALL=C", scene.robot(role).profile.tools.ping, *stamp_options, *options, address)
@@ -80,7 +82,7 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
     Attributes:
         sender: Role that sends the requests.
         receiver: Role that answers.
-        count: Echo requests.
+        count: Number of echo requests.
         interval: Time between requests; below `200ms` iputils before 20210722 needs root.
         payload_bytes: ICMP payload per protocol; one number sets both.
         gap: Whether columns report the longest time without an answer, `rtt_gap_s`, and the requests lost in it,
@@ -250,15 +252,15 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
             if capture is None or result.payload_bytes is None or (capture.packets.time_ns == NO_TIME).any():
                 continue
             candidates = ping_checks.captured_pings(capture.packets, source, destination, result.payload_bytes)
-            on_sender = role == self.sender
+            is_sender = role == self.sender
             reasons = [
-                list(ping_checks.compare_with_capture(result, candidate, self.interval, role, is_requester=on_sender))
+                list(ping_checks.compare_with_capture(result, candidate, self.interval, role, is_requester=is_sender))
                 for candidate in candidates
             ]
             yield from (f"{self._file}: {reason}" for reason in min(reasons, key=len, default=[]))
 
     def _captured_echoes(self, view: View) -> "tuple[PingEchoes | None, ...]":
-        """Return the echoes in the captures of sender and receiver; None if one is missing or incomplete."""
+        """Return the echoes in the captures of sender and receiver, with None for a missing or incomplete capture."""
         from fieldkit.measure.checks.ping_duplicates import captured_echoes  # noqa: PLC0415 (only if needed)
 
         source, destination = (view.scene.link(end, self.over).address for end in (self.sender, self.receiver))
@@ -270,7 +272,7 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
         """Yield a reason if ping printed more answers, or more answered requests, than a capture contains.
 
         The capture may contain other pings, with other identifiers or sizes. The printed number is compared with
-        the packet count of the most frequent identifier, so the check holds whichever identifier is this ping's.
+        the packet count of the most frequent identifier, so the identifier of this ping need not be known.
         """
         capture = view.capture(role)
         if capture is None:

@@ -79,7 +79,7 @@ class SendStep(TransferStep):
         yield from super().jobs(scene)
 
     def _creation_job(self, scene: Scene) -> Planned:
-        """Return the job that creates the file to send in the attempt's folder, from which it is also fetched."""
+        """Return the job that creates the file to send. It is in the attempt's folder, so the laptop can fetch it."""
         sent_file = self._file_to_send(scene).name
         if self.file is None:
             argv = ("awk", "-v", f"seed={self.seed}", "-v", f"bytes={self.size:.0f}", _GENERATE)
@@ -112,7 +112,7 @@ class SendStep(TransferStep):
     def _judge(self, answer: CommandResult) -> tuple[Verdict, str, str]:
         """Return verdict, detail and remedy for the existence and the size of the file."""
         if not answer.ok or not _SIZE.fullmatch(answer.text.strip()):
-            remedy = f"scp {quote((self.file or '',))} to it, or correct file: in the procedure"
+            remedy = f"copy {quote((self.file or '',))} to the robot with scp, or correct file: in the procedure"
             return Verdict.FAIL, answer.text, remedy
         size_bytes = int(answer.text)
         if not size_bytes:

@@ -12,7 +12,7 @@ from fieldkit.core.columns import Column, Measured
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.transfers import iperf3_load, recoveries, stalls
-from fieldkit.measure.transfers.deliveries import Delivery
+from fieldkit.measure.transfers.deliveries import StreamDeliveries
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import across
@@ -29,10 +29,10 @@ LIMIT_S: Final = 900.0
 _FOREVER_S: Final = 86_400
 """Maximum duration that iperf3 accepts."""
 
-_STALLS: Final = stalls.declare_columns("soak", "the load", 69)
+_STALLS: Final = stalls.declare_columns("soak", "the load", rank=69)
 
-# Prints "flows" when 10 kB have been sent by interface $1, and executes the command after it. iperf3 itself reports
-# its packets only after a second, and old versions report nothing until they exit if their output is a file.
+# Executes the command in $2 and later arguments, and prints "flows" when interface $1 has sent 10 kB. iperf3 itself
+# reports its packets only after a second. If its output is a file, old versions report nothing until they exit.
 _FLOWS: Final = (
     'sent() { awk -v i="$1" \'{ sub(":", " ") } $1 == i { print $10 }\' /proc/net/dev; }; '
     '(from=$(sent "$1"); until [ "$(sent "$1")" -gt $((from + 10000)) ]; do sleep 0.1; done; echo flows >&2) & '
@@ -43,7 +43,7 @@ _FLOWS: Final = (
 class SoakStep(LoadOptions, Nest, Listens, SendsTraffic):
     """Loads the radio while the steps in `during` run: iperf3 sends until the last of them has ended.
 
-    Only the [stalls](method-delay.md#stalls-of-a-flow) of the load are measured. Its robots need iperf3, 3.1 or
+    Only the [stalls](method-delay.md#stalls-of-a-flow) of the load are measured. Both robots need iperf3 3.1 or
     later. A load that ends early makes the repeat void. Writes `ROLE-soak.log`.
 
     Attributes:
@@ -128,7 +128,7 @@ class SoakStep(LoadOptions, Nest, Listens, SendsTraffic):
         """Role of the receiving robot."""
         return self.receiver
 
-    def deliveries(self, view: View) -> Sequence[Delivery]:
+    def deliveries(self, view: View) -> Sequence[StreamDeliveries]:
         """Return the deliveries of each stream; see `SendsFlow.deliveries`."""
         source, destination = (view.capture(role) for role in (self.sender, self.receiver))
         load = self.data_streams(view.scene)

@@ -21,7 +21,7 @@ from fieldkit.measure.checks.transfer_checks import CROSS_CHECKS
 from fieldkit.measure.evidence import host, oracle_delays, reading
 from fieldkit.measure.evidence.endings import Cause, Ending
 from fieldkit.measure.transfers import stalls, transfer_measures
-from fieldkit.measure.transfers.deliveries import Delivery
+from fieldkit.measure.transfers.deliveries import StreamDeliveries
 from fieldkit.measure.transfers.transfer_columns import COLUMNS
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.remote import jobs
@@ -73,7 +73,9 @@ MAX_LATE_SHARE: Final = 0.1
 """Maximum time between the start of a listener and the start of its sender, as a share of the listener's limit. It
 applies if the listener was stopped at its limit."""
 
-_TRADITIONAL: Final = "sudo apt-get install netcat-traditional, and netcat: nc.traditional in its profile"
+_TRADITIONAL_REMEDY: Final = (
+    "sudo apt-get install netcat-traditional, and write netcat: nc.traditional in its profile"
+)
 
 
 class TransferStep(
@@ -197,14 +199,13 @@ class TransferStep(
         ends = {role: scene.tools(role).netcat for role in (self.sender, self.receiver)}
         for role, kind in ends.items():
             if kind is Netcat.BUSYBOX:
-                yield Refusal(role, "busybox nc has no UDP", _TRADITIONAL)
+                yield Refusal(role, "busybox nc has no UDP", _TRADITIONAL_REMEDY)
         version = scene.tools(self.receiver).versions.get(Tool.NETCAT, "")
         if netcat.truncates_datagrams(ends[self.sender], ends[self.receiver], version):
             size = netcat.DATAGRAM_BYTES[ends[self.sender]]
             reason = f"its netcat truncates the datagrams of {size} bytes from the sender's netcat"
-            yield Refusal(
-                self.receiver, reason, "sudo apt-get install netcat-openbsd, and netcat: nc.openbsd in its profile"
-            )
+            remedy = "sudo apt-get install netcat-openbsd, and write netcat: nc.openbsd in its profile"
+            yield Refusal(self.receiver, reason, remedy)
 
     def _file_refusals(self, scene: Scene) -> Iterator[Refusal]:
         """Yield a reason if no recording has the name of the file to send."""
@@ -248,8 +249,8 @@ class TransferStep(
             waited_s = time.monotonic() - start_s
             if scene.protocol is Protocol.UDP and waited_s >= self.idle:
                 raise self._late_start(waited_s, f"the listener exits after {self.idle:g} s of silence", scene)
-            # This time exceeds the time in which the robot stops the listener at its limit, so the listener ends
-            # before the step.
+            # This wait is longer than the robot needs to stop the listener at its limit, so the listener has ended
+            # when the step ends.
             code = listener.end(self.limit + 2 * jobs.REPLY_S)
         if scene.protocol is Protocol.TCP and code != 0 and waited_s > MAX_LATE_SHARE * self.limit:
             raise self._late_start(waited_s, f"the listener was stopped after {self.limit:g} s", scene)
@@ -261,10 +262,10 @@ class TransferStep(
                 oracle_delays.air_delay_text(before, after), encoding="ascii"
             )
 
-    def _late_start(self, waited_s: float, listener: str, scene: Scene) -> RobotError:
-        """Return the error if a sender started so late that the radio is not the cause of its loss."""
+    def _late_start(self, waited_s: float, reason: str, scene: Scene) -> RobotError:
+        """Return the error for a sender that started so late that the radio is not the cause of its loss."""
         return RobotError(
-            f"the sender started up to {waited_s:.1f} s after the listener, but {listener}",
+            f"the sender started up to {waited_s:.1f} s after the listener, but {reason}",
             where=scene.robot(self.sender).name,
             remedy="check the control link, or increase `idle` or `limit` in the procedure",
         )
@@ -372,7 +373,7 @@ class TransferStep(
         """Role of the receiving robot."""
         return self.receiver
 
-    def deliveries(self, view: View) -> Sequence[Delivery]:
+    def deliveries(self, view: View) -> Sequence[StreamDeliveries]:
         """Return the deliveries of the transfer; see `SendsFlow.deliveries`."""
         return stalls.read_transfer_deliveries(
             view.evidence, self.transfer(view.scene, view.within), self.prefixed_name(_LISTEN)

@@ -9,7 +9,9 @@ from fieldkit.steps import clocks
 from fieldkit.trial.check.report import Report
 
 CONTACT_S: Final = 15.0
+"""Timeout of a login, and of reading a robot's clock."""
 WARN_S: Final = 1.0
+"""A warning is given if the clock's offset is certainly larger than this."""
 WRONG_CLOCK_S: Final = 1800.0
 """From this offset on, the clock is considered to be set incorrectly, not only to drift. Typical causes are a wrong
 time zone and a board without a battery."""

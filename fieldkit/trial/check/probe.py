@@ -19,6 +19,7 @@ _SCRIPT: Final = resources.files("fieldkit.trial.check").joinpath("probe.sh").re
 _HEAD: Final = re.compile(r"^==> (.+): ([0-9]{1,3}) <==$", re.MULTILINE)
 
 Sections = Mapping[str, CommandResult]
+"""Results of the probe's commands, by section name. Each command writes one section of the probe's output."""
 
 MISSING_SECTION: Final = CommandResult(text="", code=CommandResult.MISSING)
 """Result of a section that the robot did not send."""
@@ -30,7 +31,7 @@ def run_probe(shell: Shell, interface: str, commands: Mapping[str, Sequence[str]
     Args:
         shell: The robot.
         interface: Interface under test.
-        commands: Further commands, by the names of their sections.
+        commands: Further commands, by section name.
 
     Raises:
         LinkError: The robot did not answer within `PROBE_S`.

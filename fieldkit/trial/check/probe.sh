@@ -35,7 +35,7 @@ batteries() { # prints the robot's batteries; the battery of a connected device,
 
 section system system
 section user id -u
-section means have sudo apt-get setcap ss netstat
+section user-tools have sudo apt-get setcap ss netstat
 section control echo "${SSH_CONNECTION-}"
 section disk df -Pk .
 section listeners grep -h ":0000 0[7A] " /proc/net/tcp /proc/net/tcp6 /proc/net/udp /proc/net/udp6

@@ -12,7 +12,7 @@ from fieldkit.trial.check.probe import MISSING_SECTION, Sections
 from fieldkit.trial.check.report import Report
 
 MARGIN_DB: Final = 10
-"""A signal is reported as weak if it is less than this above the sensitivity in the profile."""
+"""A signal is reported as weak if it is below the sensitivity in the profile plus this margin."""
 
 _FLAGS: Final = re.compile(r"^[0-9]+: \S+ <(?P<flags>[A-Z0-9_,-]*)>", re.MULTILINE)
 # Uses `[ \t]` instead of `\s`, which also matches line breaks and would backtrack over empty lines.
@@ -22,7 +22,7 @@ _OFFLOADS: Final = {
     "TSO": "tcp-segmentation-offload",
     "GRO": "generic-receive-offload",
 }
-# The lines of iw 5.19 (link.c, interface.c and station.c).
+# Lines in the output of iw 5.19 (see its source files link.c, interface.c and station.c).
 _FACTS: Final = {
     "type": r"^[ \t]*type (.{1,30})$",
     "channel": r"^[ \t]*channel ([0-9]{1,3}) \(",
@@ -60,7 +60,7 @@ def _judge_interface(robot: Robot, sections: Sections, report: Report) -> None:
     addresses = _ADDRESS.findall(section.text)
     if section.code == CommandResult.MISSING:
         report.fail(check, "ip is not installed", "sudo apt-get install iproute2")
-    elif flags is None or is_missing(sections):
+    elif flags is None or is_interface_missing(sections):
         report.fail(
             check,
             section.text,
@@ -82,7 +82,7 @@ def _judge_interface(robot: Robot, sections: Sections, report: Report) -> None:
         report.ok(check, f"up, {', '.join(addresses)}")
 
 
-def is_missing(sections: Sections) -> bool:
+def is_interface_missing(sections: Sections) -> bool:
     """Return True if the robot has no interface with the name in its profile."""
     section = sections.get("interface", MISSING_SECTION)
     return section.code != CommandResult.MISSING and _FLAGS.search(section.text) is None

@@ -14,7 +14,7 @@ LAPTOP: Final = "laptop"
 
 @dataclass(frozen=True)
 class UserTools:
-    """Permissions and programs that a robot's user has to fix problems.
+    """Permissions and programs with which a robot's user can fix problems.
 
     Attributes:
         root: True if the user is root.
@@ -52,10 +52,10 @@ class Report:
         """Add a problem that prevents a trial."""
         self.add(check, Verdict.FAIL, detail, remedy)
 
-    def add(self, check: str, status: Verdict, detail: str, remedy: str) -> None:
+    def add(self, check: str, verdict: Verdict, detail: str, remedy: str) -> None:
         """Add a check with its verdict. The remedy is empty if the check passed."""
         check, detail, remedy = (printable(text.encode()) for text in (check, detail, self._adapted_remedy(remedy)))
-        self.findings.append(Finding(self.robot, check, status, detail or "no answer", remedy))
+        self.findings.append(Finding(self.robot, check, verdict, detail or "no answer", remedy))
 
     def _adapted_remedy(self, remedy: str) -> str:
         """Adapt a remedy to this robot's user. Remedies of steps are written for Debian and a user with sudo."""

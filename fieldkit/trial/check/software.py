@@ -1,4 +1,4 @@
-"""Checks of a robot's programs with the output of the probe: programs that steps start, other needs of steps."""
+"""Check, with the output of the probe, that a robot has the programs that steps start, and their other needs."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -104,7 +104,7 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> Variant
                 f"correct its name in profile {profile.name}: {locations.copy_profile_command(profile.name)}"
             )
             report.fail(program, "not found", f"sudo apt-get install {package}" if package else profile_remedy)
-    interface = profile.radio.interface if radio.is_missing(sections) else None
+    interface = profile.radio.interface if radio.is_interface_missing(sections) else None
     for need in needs:
         # A need that uses a missing interface is skipped, because the missing interface is reported separately.
         if (not need.required_program or need.required_program in present) and interface not in need.argv:
@@ -115,7 +115,7 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> Variant
 
 
 def check_agent(plan: Plan, role: Role, sections: Sections, shell: Shell, report: Report) -> None:
-    """Report the agent's findings about needs of steps. The agent is installed if its Python interpreter exists.
+    """Report the agent's findings about needs of steps. The agent is installed if the robot has its interpreter.
 
     Raises:
         LinkError: The robot did not answer.

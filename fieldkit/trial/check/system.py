@@ -16,6 +16,7 @@ from fieldkit.trial.plan import Plan
 
 MIN_BATTERY_PERCENT: Final = 20
 LONG_FETCH_S: Final = 60.0
+"""A warning is given if fetching the evidence of one attempt takes longer than this."""
 
 # Columns of `df -P` (POSIX): file system, blocks of 1024 bytes, used, available. With -P, long names do not wrap
 # lines.
@@ -25,7 +26,7 @@ _BATTERY: Final = re.compile(r"^(?P<name>\S{1,60}) (?P<percent>[0-9]{1,3})$", re
 
 def user_tools(sections: Sections) -> UserTools:
     """Return the permissions and programs of a robot's user."""
-    programs = sections.get("means", MISSING_SECTION).text.split()
+    programs = sections.get("user-tools", MISSING_SECTION).text.split()
     return UserTools(sections.get("user", MISSING_SECTION).text.strip() == "0", frozenset(programs))
 
 

@@ -1,4 +1,4 @@
-"""Check of a robot's telemetry sources, each of which is queried once; an entry point of `fieldkit.checks`."""
+"""Query each telemetry source of a robot once, as a check; an entry point of the group `fieldkit.checks`."""
 
 import os
 

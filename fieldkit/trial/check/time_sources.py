@@ -56,19 +56,19 @@ def read_reports(shell: Shell) -> tuple[ClockReport, ...]:
 
 
 def read(shell: Shell) -> RobotTime:
-    """Log in on a robot and return the state of its clock. Raises the same errors as `read_reports`."""
+    """Log in to a robot and return the state of its clock. Raises the same errors as `read_reports`."""
     jobs.install(shell, Deadline.after(contact.CONTACT_S))
     exchanges = clock_exchanges.exchanges(shell, contact.CONTACT_S)
     return RobotTime(offset(exchanges) if exchanges else None, read_reports(shell))
 
 
-def judge(reports: Sequence[ClockReport], report: Report, *, all_robots: bool = False) -> None:
+def judge(reports: Sequence[ClockReport], report: Report, *, is_required: bool = False) -> None:
     """Add a finding for each program that sets a robot's clock.
 
     Args:
         reports: Reports of the robot's programs.
         report: Receives the findings.
-        all_robots: True to add a finding for a robot without such a program.
+        is_required: True to add a warning if the robot has no such program.
     """
     for clock_report in reports:
         if clock_report.problem:
@@ -78,7 +78,7 @@ def judge(reports: Sequence[ClockReport], report: Report, *, all_robots: bool = 
             error = "" if clock_report.error_s is None else f" \N{PLUS-MINUS SIGN} {clock_report.error_s:.6f} s"
             detail = f"{clock_report.program} follows {clock_report.reference}, {clock_report.offset_s:+.6f} s{error}"
             report.ok(CHECK, detail)
-    if not reports and all_robots:
+    if not reports and is_required:
         report.warn(CHECK, _NO_PROGRAM, _INSTALL)
 
 

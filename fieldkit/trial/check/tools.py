@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import PurePosixPath
 from types import MappingProxyType
 from typing import Final
@@ -13,7 +14,8 @@ from fieldkit.remote.command import printable, quote, with_environment
 from fieldkit.steps.variants import Netcat, PingTool, Recorder, Tool, Variants, expected
 
 PROBE_S: Final = 40.0
-"""Maximum duration of `probe`. Each tool has 6 s; on a small computer, Python needs 3 s to start ros2."""
+"""Maximum duration of the command that `probe` returns. Each tool has 6 s, because ros2, a Python program, needs 3 s
+to start on a small computer."""
 
 # Runs in POSIX sh: dash, bash, busybox ash. Standard input is empty, and a tool that does not exit is killed.
 _PROBE_FUNCTION: Final = r"""run_tool() {
@@ -64,8 +66,8 @@ def probe(profile: RobotProfile, tools: Iterable[Tool] = Tool) -> tuple[str, ...
         Tool.CAPTURE: ((Tool.CAPTURE, (names.capture, "--help")),),
     }
     if ros is not None:
-        help_of = with_environment((*_record_command(profile), "--help"), setup=ros.command.setup)
-        commands_by_tool[Tool.RECORDER] = ((Tool.RECORDER, help_of),)
+        help_command = with_environment((*_record_command(profile), "--help"), setup=ros.command.setup)
+        commands_by_tool[Tool.RECORDER] = ((Tool.RECORDER, help_command),)
     probed_tools = [
         tool
         for tool in commands_by_tool
@@ -97,18 +99,18 @@ def parse(output: bytes, profile: RobotProfile) -> Variants:
     variants = replace(expected(profile), root=outputs[_USER][0].strip() == "0")
     versions: dict[Tool, str] = {}
     if Tool.NETCAT in outputs:
-        kind, versions[Tool.NETCAT] = _netcat(*outputs[Tool.NETCAT], profile.tools.netcat)
+        kind, versions[Tool.NETCAT] = _parse_netcat(*outputs[Tool.NETCAT], profile.tools.netcat)
         variants = replace(variants, netcat=kind)
     if Tool.PING in outputs:
-        ping, versions[Tool.PING] = _ping(*outputs[Tool.PING], profile.tools.ping)
+        ping, versions[Tool.PING] = _parse_ping(*outputs[Tool.PING], profile.tools.ping)
         variants = replace(variants, ping=ping)
     if _ECHO in outputs:
         _require_ping(outputs[_ECHO][0], profile.tools.ping, variants.ping)
     if Tool.CAPTURE in outputs:
-        has_immediate_mode, versions[Tool.CAPTURE] = _capture(*outputs[Tool.CAPTURE], profile.tools.capture)
+        has_immediate_mode, versions[Tool.CAPTURE] = _parse_capture(*outputs[Tool.CAPTURE], profile.tools.capture)
         variants = replace(variants, immediate_mode=has_immediate_mode)
     if Tool.RECORDER in outputs:
-        variants = replace(variants, recorder=_recorder(*outputs[Tool.RECORDER], profile))
+        variants = replace(variants, recorder=_parse_recorder(*outputs[Tool.RECORDER], profile))
     return replace(variants, versions=MappingProxyType(versions))
 
 
@@ -125,14 +127,14 @@ def _sections(output: bytes) -> Iterator[tuple[str, tuple[str, int]]]:
 
 
 def _record_command(profile: RobotProfile) -> tuple[str, ...]:
-    """Return the record command without its options, or an empty tuple if the program may not support `--help`."""
+    """Return the record command without its options; empty if it is a program whose `--help` is unknown."""
     words = profile.ros.command.record if profile.ros else ("",)
     verbs = {"rosbag": ("record",), "ros2": ("bag", "record")}
     verb = verbs.get(PurePosixPath(words[0]).name)
     return () if verb is None or words[1 : 1 + len(verb)] != verb else (words[0], *verb)
 
 
-def _netcat(text: str, code: int, program: str) -> tuple[Netcat, str]:
+def _parse_netcat(text: str, code: int, program: str) -> tuple[Netcat, str]:
     for kind, pattern in _NETCATS:
         if match := pattern.search(text):
             return kind, printable(match[0].encode())
@@ -141,7 +143,7 @@ def _netcat(text: str, code: int, program: str) -> tuple[Netcat, str]:
     )
 
 
-def _ping(text: str, code: int, program: str) -> tuple[PingTool, str]:
+def _parse_ping(text: str, code: int, program: str) -> tuple[PingTool, str]:
     if match := _IPUTILS.search(text):
         is_new = int(match["date"]) >= _NEW_IPUTILS
         return PingTool.IPUTILS if is_new else PingTool.IPUTILS_OLD, printable(match[0].encode())
@@ -160,13 +162,13 @@ def _require_ping(text: str, program: str, kind: PingTool) -> None:
         )
 
 
-def _capture(text: str, code: int, program: str) -> tuple[bool, str]:
+def _parse_capture(text: str, code: int, program: str) -> tuple[bool, str]:
     if match := _TCPDUMP.search(text):
         return "--immediate-mode" in text, printable(match[0].encode())
     raise _unknown_tool_error(text, code, program, "sudo apt-get install tcpdump, and capture: tcpdump in")
 
 
-def _recorder(text: str, code: int, profile: RobotProfile) -> Recorder:
+def _parse_recorder(text: str, code: int, profile: RobotProfile) -> Recorder:
     if profile.ros is None:
         return Recorder.NONE
     is_ros1 = profile.ros.variant == "ros1"
@@ -177,7 +179,7 @@ def _recorder(text: str, code: int, profile: RobotProfile) -> Recorder:
     if is_ros1:
         return Recorder.ROSBAG
     words = profile.ros.command.record
-    storage_options = [words[at + 1] for at, word in enumerate(words[:-1]) if word in {"-s", "--storage"}]
+    storage_options = [value for option, value in pairwise(words) if option in {"-s", "--storage"}]
     default = _STORAGE.search(text)
     storage = (
         storage_options[-1]

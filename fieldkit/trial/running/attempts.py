@@ -1,4 +1,7 @@
-"""Attempts at a repeat: run the steps, fetch and check the evidence, and store the attempt, even if interrupted."""
+"""Make attempts at a repeat: run the steps, fetch and check the evidence, and store the attempt.
+
+An interrupted attempt is stored as well.
+"""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -83,7 +86,7 @@ class Attempts:
         store.require_space(self._folder, size.attempt_bytes(self._plan))
         running_attempt = self._ledger.begin(repeat)
         partial_folder = store.open_attempt(self._folder, repeat)
-        remote_folder = running_attempt.remote(self._plan.trial)
+        remote_folder = running_attempt.remote_folder(self._plan.trial)
         self._progress = None
         with self._storing_interrupted(running_attempt, partial_folder):
             times_ns = self._robots.begin(remote_folder, old=self._last_remote or None)
@@ -124,7 +127,7 @@ class Attempts:
         """Complete an attempt during which fieldkit was killed. Raises the same errors as `make`."""
         self._sink(PhaseStarted("recover", str(interrupted_attempt.repeat)))
         remote_folder, was_measured = (
-            interrupted_attempt.remote(self._plan.trial),
+            interrupted_attempt.remote_folder(self._plan.trial),
             interrupted_attempt.status is Status.MEASURED,
         )
         committed_folder = store.find_committed_attempt(self._folder, interrupted_attempt.folders)
@@ -182,15 +185,17 @@ class Attempts:
             if not isinstance(error, Exception) or isinstance(error, TestbedLostError):
                 self._robots.close_connections()  # unblocks threads that wait for an answer
             with suppress(FieldkitError):  # on a robot that cannot be reached, jobs are stopped at their time limits
-                self._robots.stop_jobs(running_attempt.remote(self._plan.trial))
+                self._robots.stop_jobs(running_attempt.remote_folder(self._plan.trial))
             if isinstance(error, OSError):
                 raise  # nothing can be written; `resume` continues from the started attempt
             is_fetched_later = self._progress is Status.MEASURED and not self._robots.is_transient
             if is_fetched_later and isinstance(error, KeyboardInterrupt):
                 raise  # the attempt is complete: `resume` fetches the evidence
-            reason = STOPPED if self._motions.is_ordered else _interruption_reason(error)
+            reason = STOPPED if self._motions.stop_ordered else _interruption_reason(error)
             if self._progress:
-                self._robots.unfetched.mark_all(running_attempt.remote(self._plan.trial), partial_folder, reason)
+                self._robots.unfetched.mark_all(
+                    running_attempt.remote_folder(self._plan.trial), partial_folder, reason
+                )
             ended_attempt = replace(running_attempt, status=Status.VOID, reason=reason, excused=True)
             self._ledger.commit(partial_folder, ended_attempt, self._judge(running_attempt, partial_folder).measured)
             if isinstance(error, LockLostError) and self._last_remote:

@@ -25,7 +25,7 @@ TTL_S: Final = 3600
 """Lifetime of a lock that is not renewed. `evidence.begin` renews it after half of this time. It is longer than an
 attempt, and longer than it takes to carry robots to another place."""
 
-_HELD: Final = re.compile(rb"(?P<token>\S+) (?P<left>[0-9]{1,11}) (?P<who>\S+) (?P<what>\S+)\n")
+_LOCK_STATE: Final = re.compile(rb"(?P<token>\S+) (?P<remaining_s>[0-9]{1,11}) (?P<user>\S+) (?P<purpose>\S+)\n")
 
 
 @dataclass(frozen=True)
@@ -124,11 +124,11 @@ def read_lock(shell: Shell) -> LockState | None:
         LinkError: The robot did not answer.
         RobotError: The robot could not read its lock.
     """
-    match = _HELD.match(call(shell, "holder", deadline=Deadline.after(REPLY_S)))
+    match = _LOCK_STATE.match(call(shell, "holder", deadline=Deadline.after(REPLY_S)))
     if match is None:
         return None
-    token, user, purpose = (word(match[name].decode(errors="replace")) for name in ("token", "who", "what"))
-    return LockState(Holder(token, user, purpose), float(match["left"]))
+    token, user, purpose = (word(match[name].decode(errors="replace")) for name in ("token", "user", "purpose"))
+    return LockState(Holder(token, user, purpose), float(match["remaining_s"]))
 
 
 def require_lock(shell: Shell, token: str) -> None:
@@ -155,7 +155,7 @@ def _unlock(shell: Shell, holder: Holder, sink: Sink) -> None:
 
 
 def abort(robots: Mapping[str, Shell | FieldkitError], user: str) -> Mapping[str, AbortResult]:
-    """Break the lock of every robot and end all of its jobs, of any trial; return the result for each robot.
+    """Remove the lock of every robot and stop all of its jobs, of any trial; return the result for each robot.
 
     Args:
         robots: The robots, from `Backend.persistent_shells`.

@@ -44,9 +44,9 @@ class MotionSupport(Protocol):
     """The package that moves robots."""
 
     def require_one_place(self, plans: Sequence[Plan], backend: Backend, operator: Operator) -> None:
-        """Check that robots that move without a person are at the same place in all trials.
+        """Check that each robot that moves without a person has the same place in all trials.
 
-        A person may also bring them to their places.
+        The places may differ if a person brings the robots to them.
 
         Raises:
             ConfigurationError: A robot must be at another place in a later trial, and no person brings it there.

@@ -40,7 +40,7 @@ _CONNECTION: Final = "connection"
 
 
 def connect_all(cast: Cast, shells: Shells, sink: Sink) -> None:
-    """Log in on every robot, before a person carries any robot to its place.
+    """Log in to every robot, before a person carries any robot to its place.
 
     Raises:
         ConfigurationError: There are no credentials.

@@ -16,7 +16,8 @@ from fieldkit.trial.plan import Plan
 _READ_S: Final = 10.0
 _SEPARATOR: Final = "=="
 
-# Only the kernel is queried, so no packet is sent. A session without a terminal often lacks the folder of `iw`.
+# Only the kernel is queried, so no packet is sent. In a session without a terminal, PATH often lacks the folder of
+# `iw`.
 _SCRIPT: Final = f"""
 PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
 export LC_ALL=C
@@ -39,7 +40,7 @@ def read(plan: Plan, shells: Shells) -> dict[Role, dict[str, str]]:
 
     roles = sorted(shells.keys() - gates.roaming_roles(plan.procedure))
     settings = zip(roles, run_parallel(read_robot, roles), strict=True)
-    return {role: dict(of_robot) for role, of_robot in settings if of_robot}
+    return {role: dict(robot_settings) for role, robot_settings in settings if robot_settings}
 
 
 def _read_robot(shell: Shell, interface: str) -> Mapping[str, str]:
@@ -60,7 +61,7 @@ def require_unchanged(plan: Plan, shells: Shells) -> None:
 
     Raises:
         LinkError: A robot did not answer.
-        RobotError: A setting differs from the one at the start of the trial.
+        RobotError: A setting differs from its value at the start of the trial.
     """
     if not plan.radios:
         return

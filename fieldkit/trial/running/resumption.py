@@ -192,7 +192,7 @@ def require_cast(plan: Plan, cast: Cast) -> None:
 
 
 def _step_code_changes(planned: Mapping[str, StepPackage]) -> Iterator[str]:
-    """Yield a sentence for each kind of step whose version is that of the plan, but whose code is not."""
+    """Yield a sentence for each kind of step whose code has changed since the plan, although its version has not."""
     for kind, current in step_packages.packages_of_kinds(planned).items():
         frozen = planned[kind]
         if (frozen.package, frozen.version) == (

@@ -49,16 +49,16 @@ class UnfetchedEvidence:
         (into / unfetched_file(role)).write_text(encodable(text), encoding="utf-8")
 
     def mark_all(self, remote: str, into: Path, reason: str) -> None:
-        """Leave an attempt's folder on all robots; the arguments are those of `mark`."""
+        """Leave an attempt's folder on all robots; see `mark` for the arguments."""
         for role in self.folders:
             self.mark(role, remote, into, reason)
 
     def restore(self, ended: Attempt, stored_folder: Path) -> None:
-        """Mark the evidence of an attempt of an earlier run if its stored folder contains the file of a mark."""
+        """Mark the evidence of an attempt of an earlier run if its stored folder has a file that `mark` wrote."""
         if ended.status is not Status.VALID and not self._transient:
             for role, folders in self.folders.items():
                 if (stored_folder / unfetched_file(role)).is_file():
-                    folders.append(ended.remote(self._plan.trial))
+                    folders.append(ended.remote_folder(self._plan.trial))
 
     def by_robot(self) -> Mapping[str, Sequence[str]]:
         """Return the remote folders with evidence that was not fetched, by the robot's name."""

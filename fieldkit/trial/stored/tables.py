@@ -27,9 +27,9 @@ def no_facts(_: Path) -> None:
 def declared_columns(tables: Sequence[Path], facts: Facts = no_facts) -> tuple[Column, ...]:
     """Return all columns of the tables: first the columns of every trial, then others in the order of the tables.
 
-    A column that is not in every trial has the declaration in the `trial.yaml` next to the table. Without it, the
-    column has the declaration of an installed kind of step, if its name with or without the name of the step is
-    declared. Any other column is text (`table_files.is_undeclared`).
+    Columns that are not in every trial are declared in the `trial.yaml` next to the table. A column without such a
+    declaration has the declaration of an installed kind of step; its name may start with the name of a step. If no
+    kind declares the column either, it is read as text (`table_files.is_undeclared`).
 
     Args:
         tables: CSV files with the columns of trial.csv.
@@ -40,10 +40,7 @@ def declared_columns(tables: Sequence[Path], facts: Facts = no_facts) -> tuple[C
     """
     other_names_by_table = {table: names for table in tables if (names := _other_names_of(table, facts(table)))}
     planned_columns = merge_columns(
-        (table.parent / PLAN_FILE, columns)
-        for table in other_names_by_table
-        for known_facts in [facts(table)]
-        for columns in [frozen_columns(table) if known_facts is None else frozen.from_json(known_facts.declarations)]
+        (table.parent / PLAN_FILE, _planned_columns_of(table, facts(table))) for table in other_names_by_table
     )
     columns_by_name = {column.name: column for column in installed_columns()}
     other_names = dict.fromkeys(name for names in other_names_by_table.values() for name in names)
@@ -88,6 +85,10 @@ def merge_columns(declared: Iterable[tuple[Path, Iterable[Column]]]) -> dict[str
                 (low, high), (other_low, other_high) = first.possible, column.possible
                 merged[column.name] = first_path, replace(first, bounds=(min(low, other_low), max(high, other_high)))
     return {name: column for name, (_, column) in merged.items()}
+
+
+def _planned_columns_of(table: Path, known_facts: TableFacts | None) -> tuple[Column, ...]:
+    return frozen_columns(table) if known_facts is None else frozen.from_json(known_facts.declarations)
 
 
 def _other_names_of(table: Path, known_facts: TableFacts | None) -> tuple[str, ...]:
@@ -136,7 +137,7 @@ def _by_name(name: str, installed_columns: Mapping[str, Column]) -> Column:
 
 
 def _type_of(column: Column) -> tuple[object, ...]:
-    """Return the properties that must be equal to combine the values of two columns. They are equal for all texts."""
+    """Return the properties that must be equal to combine two columns. They are equal for all columns of text."""
     figure = None if column.type is str else column.figure
     return column.unit, figure and (figure.kind, figure.arrived, figure.sent)
 

@@ -119,7 +119,7 @@ class Autopilot:
         """Start as after power-on: parameters are kept, and the system id and the rates are read from them."""
         self._booted_ns = self.vehicle.estimate.booted_ns
         self._system = round(self._parameters["MAV_SYS_ID"])
-        self._port.identify(self._system)
+        self._port.set_system(self._system)
         self._streams = self._default_streams()
 
     def _default_streams(self) -> Streams:

@@ -175,6 +175,7 @@ class Commands:
 _SPEEDS: Final = {2: "MPC_Z_VEL_MAX_UP", 3: "MPC_Z_VEL_MAX_DN"}
 """Parameter that MAV_CMD_DO_CHANGE_SPEED sets, by SPEED_TYPE; other types set the ground speed."""
 _CURRENT_COORDINATE: Final = 0x7FFFFFFF
+"""Value of a coordinate (INT32_MAX) that keeps the current position."""
 
 
 def is_integer_up_to(value: float, maximum: int) -> bool:

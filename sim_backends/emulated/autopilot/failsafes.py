@@ -101,7 +101,9 @@ class ArduCopterFailsafes:
 
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
+        # Number of the last stage in `_STAGES` that was triggered, from 1; 0 if none was.
         self._stage = 0
+        # For each stage whose voltage limit is undershot, the time since which this is the case.
         self._below_ns: dict[str, int] = {}
         self._gcs_heartbeat_ns: int | None = None
         self._gcs_lost = False
@@ -170,6 +172,7 @@ class ArduCopterFailsafes:
     def _action_reactions(
         self, action: int, modes: dict[int, Mode], text: str, state: VehicleState
     ) -> Iterator[Reaction]:
+        """Yield the reaction of a failsafe whose parameter has the value `action`; `modes` is the mode by value."""
         mode = modes.get(action)
         if not state.is_armed or mode is None:
             yield Reaction(text)
@@ -201,8 +204,10 @@ class Px4Failsafes:
         self._parameters = parameters
         self._gcs_heartbeat_ns: int | None = None
         self._gcs_lost = False
+        # Highest battery warning so far: 0 none, 1 low, 2 critical, 3 emergency.
         self._warning = 0
         self._active = False
+        # Time and mode of the change that follows after the vehicle has held its position.
         self._pending_change: tuple[int, Mode] | None = None
 
     @property
@@ -257,7 +262,7 @@ class Px4Failsafes:
         self._warning = warning
         text = ("Low battery", "Critical battery", "Emergency battery level")[warning - 1]
         yield Reaction(text, _WARNING if warning == 1 else _CRITICAL)
-        yield from self._trigger(_BATTERY_LEVELS.get((int(parameters["COM_LOW_BAT_ACT"]), warning)), state)
+        yield from self._trigger(_LOW_BATTERY_ACTIONS.get((int(parameters["COM_LOW_BAT_ACT"]), warning)), state)
 
     def _trigger(self, mode: Mode | None, state: VehicleState) -> Iterator[Reaction]:
         if (
@@ -278,7 +283,7 @@ class Px4Failsafes:
 
 _DATA_LINK_ACTIONS: Final = {1: Mode.LOITER, 2: Mode.RTL, 3: Mode.LAND}
 """Mode by NAV_DLL_ACT; 5 and 6 (terminate, lockdown) are not emulated."""
-_BATTERY_LEVELS: Final = {
+_LOW_BATTERY_ACTIONS: Final = {
     (1, 2): Mode.RTL,
     (1, 3): Mode.RTL,
     (2, 2): Mode.LAND,

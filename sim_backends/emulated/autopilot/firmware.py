@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from sim_backends.emulated.autopilot.failsafes import Failsafes
+from sim_backends.emulated.autopilot.mavlink_frames import dialect
 from sim_backends.emulated.autopilot.modes import Mode
 from sim_backends.emulated.autopilot.onboard_estimates import Battery
 from sim_backends.emulated.autopilot.parameters import FlightLimits, Parameter, Parameters
@@ -65,7 +66,7 @@ class Firmware:
         version: AUTOPILOT_VERSION.flight_sw_version: major, minor, patch, type.
         capabilities: MAV_PROTOCOL_CAPABILITY.
         base_mode: Constant MAV_MODE_FLAG bits of its heartbeat.
-        modes: Custom mode of each mode.
+        modes: Number of each mode, as in `custom_mode` of HEARTBEAT.
         names: Name of each mode in AVAILABLE_MODES.
         starting_flags: Flags of its position estimate before the estimate has an origin.
         boot_mode: Mode after power-on.
@@ -122,7 +123,7 @@ class Firmware:
     @property
     def is_ardupilot(self) -> bool:
         """True if it is ArduPilot."""
-        return self.holds_without_set_points
+        return bool(self.autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA)
 
     def mode_of(self, custom_mode: int) -> Mode | None:
         """Return the mode with a custom mode number, or None if the firmware has no such mode."""

@@ -28,8 +28,10 @@ factor. If attitude control had no lag, the drone would overshoot by at most 4 %
 
 _MIN_COURSE_M_S: Final = 0.3
 """A slower drone does not turn to its direction of flight."""
-_REST_M: Final = 1e-3
-"""Penetration depth below which the drone is at rest."""
+_SUPPORT_GAP_M: Final = 1e-3
+"""A drone is supported if there is a surface within this distance below it."""
+_MAX_REST_CLIMB_M_S: Final = 1e-3
+"""A supported drone that climbs faster is not on the ground, because it is lifting off."""
 _SEARCH_M: Final = 2.0
 """Distance within which obstacles are considered; the search is repeated after half of that distance."""
 
@@ -65,6 +67,7 @@ class Airframe:
         self._pose = FlightPose(place_m, heading_rad=facing_rad)
         self.home_m = place_m
         self._obstacles = obstacles
+        # Obstacles near the position of the last search.
         self._obstacles_nearby: Sequence[Footprint] = ()
         self._searched_m: Vector = (math.inf, 0.0, 0.0)
         self._limits = limits
@@ -117,7 +120,7 @@ class Airframe:
             pose = body.after_contact(pose, stop, None)
         self.turn_rad_s = math.remainder(pose.heading_rad - self._pose.heading_rad, math.tau) / _STEP_S
         self._pose = pose
-        self.on_ground = pose.velocity_m_s[2] <= _REST_M and self._is_supported(obstacles)
+        self.on_ground = pose.velocity_m_s[2] <= _MAX_REST_CLIMB_M_S and self._is_supported(obstacles)
         if self.on_ground and (not self.motors_on or target_m_s[2] <= 0):
             # At rest it neither slides nor tilts nor turns.
             self._pose, self.turn_rad_s = FlightPose(pose.place_m, heading_rad=pose.heading_rad), 0.0
@@ -128,7 +131,7 @@ class Airframe:
 
     def _is_supported(self, obstacles: Sequence[Footprint]) -> bool:
         east, north, up = self._pose.place_m
-        stop = move(self._quadrotor, self._pose.place_m, (east, north, up - _REST_M), obstacles)
+        stop = move(self._quadrotor, self._pose.place_m, (east, north, up - _SUPPORT_GAP_M), obstacles)
         return stop is not None and any(contact.normal[2] > 0 for contact in stop.contacts)
 
     def _nearby_obstacles(self, place_m: Vector) -> Sequence[Footprint]:

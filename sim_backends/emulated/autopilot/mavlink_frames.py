@@ -152,7 +152,10 @@ class _Client:
         """Return True if a frame with this target is for the client; 0 is a broadcast."""
         if not system:
             return True
-        return any(system == sender and component in {0, part} for sender, part in self.senders)
+        return any(
+            system == sender_system and component in {0, sender_component}
+            for sender_system, sender_component in self.senders
+        )
 
 
 _MAX_SENDERS: Final = 64
@@ -170,7 +173,7 @@ class MavlinkPort:
         self._writer = Writer(system)
         self._clients: dict[Address, _Client] = {}
 
-    def identify(self, system: int) -> None:
+    def set_system(self, system: int) -> None:
         """Set the system id of later frames."""
         self._writer = Writer(system)
 
@@ -180,7 +183,7 @@ class MavlinkPort:
         return bool(self._clients)
 
     def register(self, sender: Address, message: Message, now_ns: int) -> bool:
-        """Register a message of a client; return False if there are `MAX_CLIENTS` other clients, so it is ignored."""
+        """Register the sender of a message as a client; return False if there are `MAX_CLIENTS` other clients."""
         client = self._clients.get(sender)
         if client is None:
             if len(self._clients) == MAX_CLIENTS:

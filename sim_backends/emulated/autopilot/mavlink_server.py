@@ -107,7 +107,7 @@ def _load(
     """
     from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER  # noqa: PLC0415
     from sim_backends.emulated.autopilot.autopilot import Autopilot  # noqa: PLC0415
-    from sim_backends.emulated.autopilot.parameters import DEFAULT_M, FlightLimits  # noqa: PLC0415
+    from sim_backends.emulated.autopilot.parameters import DEFAULT_LIMITS_M, FlightLimits  # noqa: PLC0415
     from sim_backends.emulated.autopilot.px4 import PX4  # noqa: PLC0415
     from sim_backends.physics.ground import Ground  # noqa: PLC0415
     from sim_backends.physics.robot_limits import quadrotor  # noqa: PLC0415
@@ -118,7 +118,9 @@ def _load(
     autopilot = Autopilot(
         firmware={"px4": PX4, "ardupilot": ARDUCOPTER}[drone.autopilot],
         system=drone.system,
-        limits=FlightLimits(drone.max_speed_m_s, drone.max_height_m or DEFAULT_M[0], drone.fence_m or DEFAULT_M[1]),
+        limits=FlightLimits(
+            drone.max_speed_m_s, drone.max_height_m or DEFAULT_LIMITS_M[0], drone.fence_m or DEFAULT_LIMITS_M[1]
+        ),
         airframe_limits=quadrotor(drone.profile),
         obstacles=Ground(world, None).obstacles,
         now_ns=power_on_ns,

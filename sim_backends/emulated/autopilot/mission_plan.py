@@ -118,8 +118,8 @@ REPEAT_NS: Final = 1_000_000_000
 """The report of the last completed item is repeated this many times at this interval, as in PX4, because messages may
 be lost."""
 
-_BELOW_M: Final = -1.0
-"""Height of a landing point: below the ground, which stops the descent."""
+_LANDING_HEIGHT_M: Final = -1.0
+"""Height of the goal of a landing. It is below the ground, so that the drone descends until the ground stops it."""
 
 _CLIMB_TOLERANCE_M: Final = 0.2
 """The climb to the first item ends this far below its height."""
@@ -162,7 +162,7 @@ class Mission:
         self._reset_item_state()
 
     def set_current(self, number: int) -> None:
-        """Make the item with this number the current item, or the nearest one if no item has this number."""
+        """Make an item the current item: the item with this number, or the first item if the number is lower."""
         self.current, self._is_finished = max(number, min(self._first, len(self.items) - 1), 0), False
         self._reached_items, self._repeated_reports = [], iter(())
         self._reset_item_state()
@@ -216,7 +216,7 @@ class Mission:
             goal = start_m  # a landing without a position; `fault` rejects all other items without one
         if item.command == dialect.MAV_CMD_NAV_LAND:
             is_above = math.dist(goal[:2], here_m[:2]) < near_m or body.on_ground
-            return *goal[:2], _BELOW_M if is_above else start_m[2]
+            return *goal[:2], _LANDING_HEIGHT_M if is_above else start_m[2]
         self._is_climbing = self._is_climbing and here_m[2] < goal[2] - _CLIMB_TOLERANCE_M
         if self._is_climbing or item.command == dialect.MAV_CMD_NAV_TAKEOFF:
             return *start_m[:2], goal[2]

@@ -33,7 +33,7 @@ class Parameter:
     integer: bool = False
 
 
-DEFAULT_M: Final = 30.0, 100.0
+DEFAULT_LIMITS_M: Final = 30.0, 100.0
 """Height and distance limits of a drone whose profile has none."""
 
 

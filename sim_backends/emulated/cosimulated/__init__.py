@@ -5,7 +5,7 @@
 | `client` | the lab's client: starts the process, and passes it bodies, devices and positions | medium client |
 | `cosim_process` | the process: requests of the lab, reading and delivery of packets | medium server, all below |
 | `cosim_session` | one run of the coordinator, with its physics and network | cosim, all below |
-| `clock` | simulated time as real time | nothing |
+| `clock` | conversion between simulated time and the monotonic clock | nothing |
 | `real_agents` | the agents of the coordinator: packets read from devices, in windows that end in real time | cosim |
 | `lab_physics` | the physics simulator, with robots that the lab has placed | steering, federates |
 | `steering` | commanded velocities of one robot, and the record of its motion | records in the robot |

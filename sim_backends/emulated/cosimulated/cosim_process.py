@@ -51,12 +51,12 @@ _MAX_LAG_NS: Final = 1_000_000_000
 """A simulation that lags behind real time by more than this does not catch up, so that its later results are usable.
 Packets that wait during the lag are delivered late, so their repeat is void."""
 
-_START_NS: Final = 5_000_000
-"""If a request to place robots takes longer, it has started a simulator."""
+_MIN_START_NS: Final = 5_000_000
+"""A request to place robots that takes longer has started a simulator."""
 
 
 class _NewSession(BaseException):
-    """Raised to end the coordinator of an old session."""
+    """Raised to leave the coordinator of a session that another session has replaced."""
 
 
 class CosimulatedMedium(MediumServer):
@@ -74,9 +74,12 @@ class CosimulatedMedium(MediumServer):
         self._steerings: dict[str, Steering] = {}
         self._session: CosimSession | None = None
         self._clock = RealTime()
+        # Packets that were read and have not entered the network.
         self._queue: deque[RealPacket] = deque()
+        # As in `Medium`: a device that has packets now was still empty at `_arrived_after_ns`.
         self._arrived_after_ns = self._previous_poll_ns = time.monotonic_ns()
         self._window_lateness_counts: Counter[int] = Counter()
+        # Delays that the sync policy adds. Their transmission part contains the undivided delay of the network.
         self._added_delays = FlowDelays()
 
     def run(self) -> None:
@@ -141,7 +144,7 @@ class CosimulatedMedium(MediumServer):
     def _poll(self, due_ns: int | None, *, answers: bool = True) -> None:
         """Wait until a time of the monotonic clock, a packet or a request; read the packets and answer the request.
 
-        The earliest time at which packets can have arrived is determined as in the medium of a radio model.
+        `Medium._wait` explains the earliest time at which the packets can have arrived.
         """
         polled_ns = time.monotonic_ns()
         ready = self._epoll.poll(0)
@@ -245,8 +248,8 @@ class CosimulatedMedium(MediumServer):
         if self._flows.delays_by_flow and (inner := self._framing.ipv4(packet.content)) is not None:
             added_ns = end_ns - fate.arrived_ns + fate.packet.enters_ns - fate.packet.sent_ns
             self._flows.count(inner, delay, port.address.packed)
-            extra = PACKET + added_ns * PROCESSING_NS + undivided_ns * TRANSMISSION_NS
-            self._added_delays.count(inner, extra, port.address.packed)
+            added_delay = PACKET + added_ns * PROCESSING_NS + undivided_ns * TRANSMISSION_NS
+            self._added_delays.count(inner, added_delay, port.address.packed)
         self._packet_lateness_counts[round_up(late_ns)] += 1
 
     # Requests of the lab.
@@ -288,7 +291,7 @@ class CosimulatedMedium(MediumServer):
 
     @override
     def _place_stations(self, positions_m: dict[str, Vector], relay: str | None) -> None:
-        """Place the robots that are on the air. If there are none, the session continues with all out of range."""
+        """Place the robots that are on the air; the others are out of range of all stations."""
         start_ns = time.monotonic_ns()
         session, stations = self._session, tuple(self._ports)
         if session is None or session.stations != stations or (positions_m and session.settings.relay != relay):
@@ -309,7 +312,7 @@ class CosimulatedMedium(MediumServer):
         }
         session.physics.place(states, frozenset(positions_m))
         self._session = session
-        if (spent_ns := time.monotonic_ns() - start_ns) > _START_NS:
+        if (spent_ns := time.monotonic_ns() - start_ns) > _MIN_START_NS:
             # A simulator was started. The lab waits for this, so no measurement is in progress.
             self._skip_lag(spent_ns)
 

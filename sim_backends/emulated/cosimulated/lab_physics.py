@@ -96,13 +96,17 @@ class LabPhysics:
         self._bodies = bodies
         self._clock = clock
         self._physics: PhysicsFederate | None = None
+        # Simulated time at which the time of the physics simulator was 0. It increases while the simulator is paused.
         self._started_ns = 0
         self._advanced_ns = 0
         self._now_ns = 0
+        # Commands that the physics simulator receives when it advances next, and the last command of each robot.
         self._pending_commands: dict[str, Command] = {}
         self._active_commands: dict[str, Command] = {}
+        # States that the lab has assigned, and the stations that it has put out of range of all others.
         self._assigned_states = dict.fromkeys(stations, State(OFF_AIR_M))
         self._hidden_stations: frozenset[str] = frozenset()
+        # Position and heading with which each robot was last placed in the physics simulator.
         self._poses_in_physics: dict[str, tuple[Vector, float]] = {}
         self._physics_states: Mapping[str, State] = {}
         self._states: Mapping[str, State] = self._assigned_states
@@ -139,8 +143,8 @@ class LabPhysics:
             return 0.0
         return self._physics.limits_m_s2.get(name, math.inf)
 
-    def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:  # noqa: ARG002 (read here)
-        """Implement `PhysicsFederate.advance`; the commands are those of the robots' programs."""
+    def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:  # noqa: ARG002 (see below)
+        """Implement `PhysicsFederate.advance`; instead of `commands`, those of the robots' programs are applied."""
         if (now_ns := self._clock.now_ns()) - self._polled_ns >= _POLL_NS:
             self._poll_placements(now_ns)
         if self._physics is not None:
@@ -188,6 +192,7 @@ class LabPhysics:
             self._physics_states, self._has_changed = states, True
 
     def _report(self, to_ns: int) -> None:
+        # The states are those after the last whole step.
         at_ns = self._clock.monotonic_ns(to_ns - (to_ns - self._started_ns) % self.step_ns)
         for name, steering in self._steerings.items():
             if steering.is_driven and steering.is_report_due(at_ns):
@@ -281,7 +286,7 @@ def _differs(pose: tuple[Vector, float], other: tuple[Vector, float] | None) -> 
 
 
 class _Limits(Mapping[str, float]):
-    """The acceleration limits of all stations, which change with their commands."""
+    """The acceleration limits of all stations; a limit changes when a robot receives its first command."""
 
     def __init__(self, physics: LabPhysics, stations: tuple[str, ...]) -> None:
         self._physics = physics

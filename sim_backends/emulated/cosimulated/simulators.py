@@ -33,10 +33,10 @@ KINEMATIC: Final = "kinematic"
 BUILTIN: Final = "builtin"
 
 DEADLINE_S: Final = 10.0
-"""Longest wait for an answer of a simulator. The lab waits for 15 s for an answer of the medium."""
+"""Longest wait for an answer of a simulator; shorter than the 15 s for which the lab waits for the medium process."""
 
 _END_NS: Final = 10**9 * 10**8
-"""End of a run that is announced to the simulators; at three years, no run reaches it."""
+"""End of the run that is announced to the simulators: three years, because the real end is not known in advance."""
 
 
 class Simulators(NamedTuple):

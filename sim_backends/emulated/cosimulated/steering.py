@@ -32,7 +32,8 @@ class TimedCommand(NamedTuple):
     Attributes:
         time_ns: Its time, from the monotonic clock.
         command: The command.
-        is_idle: True if it need not be repeated, because a robot without commands is in the state that it causes.
+        is_idle: True if it switches the rotors off. Such a command need not be repeated, and is ignored if it is the
+            first one after the lab has placed the robot.
     """
 
     time_ns: int
@@ -41,7 +42,7 @@ class TimedCommand(NamedTuple):
 
 
 class Steering(ABC):
-    """Commands and record of one robot. Times are those of the monotonic clock.
+    """Reads the commands of one robot and records its motion. Times are those of the monotonic clock.
 
     Args:
         motion_record: Descriptor of the record of the robot's motion.
@@ -52,7 +53,7 @@ class Steering(ABC):
         idle: The command that is applied if the last command has not been repeated for `TIMEOUT_NS`.
         is_driven: True if the robot has received a command since the lab last placed it.
         is_placed: True if the lab has placed it.
-        is_at_rest: True if it is at rest, no command is active, and this is recorded.
+        is_at_rest: True if its last record states that it is at rest, and no command is active.
     """
 
     idle: Command
@@ -62,9 +63,12 @@ class Steering(ABC):
         self._pending: deque[TimedCommand] = deque(maxlen=_PENDING_COMMANDS)
         self._reporter = MotionReporter(_path(paths), _path(motion_record), now_ns)
         self.is_driven = False
+        # Motion of the robot when the lab last placed it.
         self._start: RobotMotionState = AT_REST
         self.is_placed = False
+        # Time at which `idle` is applied unless another command arrives; None if no command is active.
         self._stop_due_ns: int | None = None
+        # Time and heading of the last record.
         self._last_report: tuple[int, float] | None = None
         self.is_at_rest = True
 
@@ -91,14 +95,15 @@ class Steering(ABC):
         return self._start.heading_rad
 
     def commands(self, until_ns: int) -> Iterator[tuple[int, Command]]:
-        """Yield the commands until a time, each with its time, and `idle` when a command is not repeated.
+        """Yield the commands up to a time, each with its time.
 
-        A simulation that lags behind may read commands with later times; they are kept until it reaches them.
+        `idle` is yielded at the time at which the last command has not been repeated for `TIMEOUT_NS`. If the
+        simulation lags behind real time, it may read commands with later times, which are kept for later calls.
         """
-        last = self._read_command()
-        if last is not None and self._last_command_ns < last.time_ns and self.is_placed:
-            self._last_command_ns = last.time_ns
-            self._pending.append(last)
+        newest = self._read_command()
+        if newest is not None and self._last_command_ns < newest.time_ns and self.is_placed:
+            self._last_command_ns = newest.time_ns
+            self._pending.append(newest)
         while self._pending and self._pending[0].time_ns <= until_ns:
             time_ns, command, is_idle = self._pending.popleft()
             yield from self._stop_until(time_ns)
@@ -235,7 +240,8 @@ class FlightSteering(Steering):
 
 _STILL_M_S: Final = 1e-3
 _NO_TURN_RAD_S: Final = 1e-3
-"""Slower motions come from simulated contacts: in MuJoCo a stationary robot is never exactly at rest."""
+"""A robot that moves and turns more slowly counts as at rest, because contacts in MuJoCo never keep it exactly
+still."""
 
 
 def _path(fd: int) -> Path:

@@ -26,6 +26,7 @@ nft -f rules || exit
 ip link add name {bridge} type bridge && ip link set {bridge} up || exit
 exec hostapd {files}
 """
+"""Shell script of the process; it waits for an input line, which is sent when the radios are in its namespace."""
 _RULES: Final = """\
 table netdev fieldkit {{
     chain output {{

@@ -77,7 +77,7 @@ class FrameReception:
 
 @dataclass
 class AirEvents:
-    """Events since the last call.
+    """Events on the air since the last call of `Air.pop_events`.
 
     Attributes:
         receptions: Frames that arrived, in order.
@@ -233,6 +233,7 @@ class Air:
             raise ValueError("the air needs at least one radio, each with a name")
         self._channel_arguments = seed, options, antennas, world
         self._channels: dict[int, _Channel] = {}
+        # Channel of the last frame of each radio.
         self._tuned_mhz: dict[str, int] = {}
         self._positions_m: Mapping[str, Vector] = {}
         self._velocities_m_s: Mapping[str, Vector] = {}
@@ -265,10 +266,11 @@ class Air:
             changed_mhz = self._channels if previous_mhz is None else (previous_mhz, frequency_mhz)
             for channel_mhz in changed_mhz:
                 self._place(now_ns, channel_mhz)
-        destination = None if sent_frame.is_group else receiver if receiver not in {None, source} else _ABSENT
+        destination: str | None
         if sent_frame.is_group:
-            chain = rate_chain((), frequency_mhz)
+            destination, chain = None, rate_chain((), frequency_mhz)
         else:
+            destination = _ABSENT if receiver is None or receiver == source else receiver
             max_tries = 1 if sent_frame.flags & FLAG_NO_ACK else SHORT_RETRY_LIMIT
             chain = rate_chain(sent_frame.stages, frequency_mhz, max_tries=max_tries)
         self._channels[frequency_mhz].transmit(now_ns, FrameOnAir(sent_frame, source, destination, chain))

@@ -20,7 +20,7 @@ from sim_backends.emulated.linux_wifi.virtual_machine import (
 )
 from sim_backends.emulated.process import worker
 
-_LONGEST_S: Final = 7 * 24 * 3600.0
+_MAX_DURATION_S: Final = 7 * 24 * 3600.0
 _PROLOGUE: Final = """\
 mkdir -p /usr/local/sbin
 {links}
@@ -30,6 +30,7 @@ export {variables}
 _COMMAND: Final = f"""\
 ( while sleep 1; do if [ -e {INTERRUPT} ]; then rm {INTERRUPT}; kill -INT $$; fi; done ) &
 exec """
+"""Beginning of the line that runs the command: when the file `INTERRUPT` appears, a loop sends the command SIGINT."""
 
 
 def run_command(argv: Sequence[str], results: Path, *, radios: int) -> int:
@@ -55,7 +56,7 @@ def run_command(argv: Sequence[str], results: Path, *, radios: int) -> int:
         result = run_in_machine(
             kernel,
             prologue(Path.cwd()) + _COMMAND + shlex.join((*worker.command("fieldkit"), *argv)),
-            Deadline.after(_LONGEST_S),
+            Deadline.after(_MAX_DURATION_S),
             radios=radios,
             results=results.resolve(),
             on_output=_write,

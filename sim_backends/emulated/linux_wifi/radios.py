@@ -16,10 +16,11 @@ _FOLDER: Final = Path("/sys/class/ieee80211")
 _CLASS: Final = "mac80211_hwsim"
 _MODULE: Final = Path("/sys/module/mac80211_hwsim")
 _RADIO_BIT: Final = 0x40
+"""Bit in the first byte of an address by which a radio's address in hwsim differs from that of its interface."""
 _ARPHRD_IEEE80211_RADIOTAP: Final = "803"
 """Type of a monitor interface: linux/if_arp.h."""
 _RETURN_S: Final = 5.0
-"""The kernel returns the radios of a network namespace some time after its last process has exited."""
+"""Maximum time in which the kernel returns the radios of a network namespace, after its last process has exited."""
 _POLL_S: Final = 0.05
 _TIMEOUT_S: Final = 60.0
 
@@ -91,7 +92,7 @@ def require_radios(count: int, wait_s: float = _RETURN_S) -> list[HwsimRadio]:
         wait_s: Maximum time to wait for radios of a lab that has just ended.
 
     Raises:
-        ConfigurationError: There are fewer.
+        ConfigurationError: There are fewer radios.
     """
     deadline = Deadline.after(wait_s)
     while len(radios := find_radios()) < count and not deadline.expired:

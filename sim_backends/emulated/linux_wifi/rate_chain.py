@@ -25,7 +25,8 @@ from sim_backends.radio.modes import G_MODES, N_MODES, SHORT_RETRY_LIMIT, WifiMo
 
 _DSSS_RATES: Final = 4
 """Number of DSSS and CCK rates (1, 2, 5.5 and 11 Mbit/s) at the beginning of the list of the 2.4 GHz band."""
-_FIRST_5_GHZ_MHZ: Final = 3_000
+_BAND_LIMIT_MHZ: Final = 3_000
+"""Frequencies below this are in the 2.4 GHz band; the others are in bands whose rate lists have no DSSS and CCK."""
 _WIDE: Final = RATE_40_MHZ | RATE_80_MHZ | RATE_160_MHZ
 
 
@@ -78,9 +79,10 @@ def mode_of(stage: RateStage, frequency_mhz: int) -> WifiMode | None:
     if stage.flags & _WIDE:
         return None
     if stage.flags & (RATE_MCS | RATE_VHT):
-        # VHT: the MCS is in the four lower bits, the number of streams minus one above; HT: MCS 8 has two streams.
+        # In VHT, the index has the MCS in its four lower bits, and the number of streams minus one in the bits above.
+        # In HT, MCS 8 and above have two or more streams. So all supported modes have an index below 8.
         return N_MODES[stage.index] if 0 <= stage.index < len(N_MODES) else None
-    index = stage.index if frequency_mhz >= _FIRST_5_GHZ_MHZ else stage.index - _DSSS_RATES
+    index = stage.index if frequency_mhz >= _BAND_LIMIT_MHZ else stage.index - _DSSS_RATES
     if index < 0:
         return G_MODES[0]
     return G_MODES[index] if index < len(G_MODES) else None
@@ -89,9 +91,10 @@ def mode_of(stage: RateStage, frequency_mhz: int) -> WifiMode | None:
 def legacy_index(mode: WifiMode, frequency_mhz: int) -> int:
     """Return the index of a mode in the rate list of the band.
 
-    For an MCS this is the index of the rate with the same modulation and code rate.
+    For an MCS this is the index of the rate with the same modulation and code rate, or of the fastest rate if no rate
+    has them.
     """
     coding = (mode.modulation, mode.code_rate)
     indices = [index for index, g_mode in enumerate(G_MODES) if (g_mode.modulation, g_mode.code_rate) == coding]
     index = indices[0] if indices else len(G_MODES) - 1
-    return index if frequency_mhz >= _FIRST_5_GHZ_MHZ else index + _DSSS_RATES
+    return index if frequency_mhz >= _BAND_LIMIT_MHZ else index + _DSSS_RATES

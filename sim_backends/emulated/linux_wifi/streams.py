@@ -1,7 +1,7 @@
 """Multiplexing: the connections of a lab to a virtual machine, as many byte streams over the machine's only channel.
 
 A frame has the number of its stream, its kind and its length, then data. The host opens streams; a stream ends when
-both sides have sent END. Frames with an invalid header end the channel: the other side is not trusted.
+both sides have sent END. A frame with an invalid header ends the channel, because the other side is not trusted.
 """
 
 import contextlib
@@ -24,7 +24,10 @@ _MAX_PENDING: Final = 2048
 
 
 class _ChannelStream:
-    """One stream: a socket pair, whose near end belongs to the user of the stream, and received frames."""
+    """One stream: a socket pair and received frames.
+
+    The user of the stream reads and writes the near end, and the threads of the channel the far end.
+    """
 
     def __init__(self) -> None:
         self.near, self.far = socket.socketpair()

@@ -51,8 +51,8 @@ class WifiClient(MediumClient):
         self._radios = dict(radios)
         self._setups: dict[str, dict[str, Any]] = {}
         self._access_points_m = {
-            name: station_place_m(station.at_m, station.height, world)
-            for name, station in options.access_points.items()
+            name: station_place_m(access_point.at_m, access_point.height, world)
+            for name, access_point in options.access_points.items()
         }
         self._access_points: AccessPoints | None = None
         super().__init__(options, world, seed=seed)
@@ -95,10 +95,11 @@ class WifiClient(MediumClient):
 
     @override
     def _configure(self) -> None:
-        first = next(iter(self._setups.values()))
-        for name, station in self._options.access_points.items():
-            power_dbm = float(station.tx_power_dbm)
-            self._setups[name] = {**first, "address": self._radios[name].address, "tx_power_dbm": power_dbm}
+        # Access points have the radio of the first robot, except for the transmit power.
+        robot_setup = next(iter(self._setups.values()))
+        for name, access_point in self._options.access_points.items():
+            power_dbm = float(access_point.tx_power_dbm)
+            self._setups[name] = {**robot_setup, "address": self._radios[name].address, "tx_power_dbm": power_dbm}
         world = None if self._world is None else self._world.model_dump(mode="json")
         options = self._options.model_dump(mode="json")
         self._worker.request({"seed": self._seed, "radios": self._setups, "options": options, "world": world})

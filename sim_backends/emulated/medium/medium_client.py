@@ -89,7 +89,7 @@ class MediumClient:
             physics_fds: `EmulatedRobot.physics_fds`, for a medium with a physics simulator; other media ignore them.
 
         Raises:
-            LinkError: The medium ended or did not answer.
+            LinkError: The medium process exited or did not answer.
             RobotError: A robot with this name or address is already attached.
         """
         antenna = asdict(antenna_of(radio))
@@ -118,7 +118,7 @@ class MediumClient:
 
         Raises:
             ConfigurationError: A named robot is not attached, or the relay has no position.
-            LinkError: The medium ended or did not answer.
+            LinkError: The medium process exited or did not answer.
         """
         invalid_names = (positions_m.keys() - self._robots) | ({relay} - {None} - positions_m.keys())
         if invalid_names:
@@ -140,7 +140,7 @@ class MediumClient:
         """Record later transmissions in files in `folder` (`air_log`), or stop recording if it is None.
 
         Raises:
-            LinkError: The medium ended or did not answer.
+            LinkError: The medium process exited or did not answer.
             OSError: The files cannot be created.
         """
         with ExitStack() as stack:
@@ -152,7 +152,7 @@ class MediumClient:
         """Return the statistics of the medium.
 
         Raises:
-            LinkError: The medium ended or did not answer.
+            LinkError: The medium process exited or did not answer.
         """
         reply, _ = self._worker.request({"do": "stats"})
         return unpack_stats(reply)
@@ -167,7 +167,7 @@ class MediumClient:
             port: Port of `destination`.
 
         Raises:
-            LinkError: The medium ended or did not answer.
+            LinkError: The medium process exited or did not answer.
             RobotError: No robot with this name is attached.
         """
         request = {"do": "delays", "source": source, "destination": destination, "protocol": protocol, "port": port}
@@ -181,7 +181,7 @@ class MediumClient:
             continue_sampling: True to continue sampling.
 
         Raises:
-            LinkError: The medium ended or did not answer.
+            LinkError: The medium process exited or did not answer.
         """
         reply, _ = self._worker.request({"do": "links", "continue_sampling": continue_sampling})
         return unpack_links(reply)

@@ -90,7 +90,9 @@ class MediumServer(ABC):
         self._sample_ns: int | None = None
         self._samples: deque[Mapping[str, LinkSample]] = deque(maxlen=_MAX_SAMPLES)
         self._layout = Layout()
+        # The robots on the air and the number of ports, for which the routes of the ports were computed.
         self._routing_state: tuple[Set[str], int] = frozenset(), 0
+        # Robots whose interface was up in the last poll, and the time of this poll.
         self._on_air_robots: set[str] = set()
         self._polled_ns = 0
         self._ports: dict[str, Port] = {}

@@ -15,8 +15,8 @@ _NAMESPACES: Final = ("--net", "--mount", "--propagation", "private", "--pid", "
 # Outside of the namespaces, their root has the id of this user, and their other accounts (of sshd and tcpdump) have
 # subordinate ids.
 _AS_ROOT_INSIDE: Final = ("--user", "--map-root-user", "--map-auto")
-# The first attempt uses no subordinate ids, because `unshare --map-auto` does not end all its processes if
-# the kernel refuses.
+# The first probe uses no subordinate ids, because `unshare --map-auto` leaves processes running if the kernel
+# refuses.
 _PROBES: Final = (("--user", "--map-root-user"), _AS_ROOT_INSIDE)
 
 _SUBORDINATES: Final = 65534

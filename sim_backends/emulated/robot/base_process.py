@@ -1,7 +1,7 @@
 """Process of the base of an emulated ground robot: receives velocities at a socket and drives the robot.
 
-The velocities are datagrams of six doubles, those of ROS's `Twist`. Relays that run under Debian's Python import this
-module, so it imports only the standard library and modules that do the same.
+Each datagram contains six doubles, the fields of ROS's `Twist`. A relay that runs under Debian's Python imports this
+module, so the module imports only the standard library and modules that do the same.
 """
 
 import contextlib
@@ -94,9 +94,8 @@ CHANNEL: Final = Path(STATE, "velocities")
 _TWIST: Final = struct.Struct("<6d")
 BYTES: Final = _TWIST.size
 
-
 STAMPED: Final = "geometry_msgs/TwistStamped"
-"""Type of velocities with a header."""
+"""Type of velocity messages with a time stamp."""
 
 _MAX_AGE_NS: Final = 500_000_000
 """ROS's default `cmd_vel_timeout`."""

@@ -275,7 +275,7 @@ def _open_devices(request: Message) -> list[int]:
         return [network.add_link(interface, address, mesh=request["mesh"])]
     fd, hello_s = network.bring_up(interface, address, mesh=request["mesh"]), request["guest_hello_s"]
     if hello_s is not None:
-        services.spawn(network.guest_command(interface, address, hello_s), {}, Path(os.devnull))
+        services.spawn(network.guest_babeld_command(interface, address, hello_s), {}, Path(os.devnull))
     return [fd]
 
 

@@ -16,7 +16,7 @@ from fieldkit.core.errors import ConfigurationError, FieldkitError, RobotError
 from sim_backends.emulated.medium.framing import mac_of
 from sim_backends.emulated.robot.spec import LOOPBACK_INTERFACE, SHARED_NETWORK, STATE
 
-PID: Final = Path(STATE, "babeld.pid")
+PID_FILE: Final = Path(STATE, "babeld.pid")
 """File that the daemon writes when it has its socket and its interface, before its first hello."""
 
 LINK_COST: Final = 1024
@@ -25,7 +25,7 @@ LINK_COST: Final = 1024
 _LONG_TERM_STATE: Final = f"{STATE}/babel-state"
 
 
-def command(interface: str, address: str, hello_s: float, links: Mapping[str, str]) -> tuple[str, ...]:
+def babeld_command(interface: str, address: str, hello_s: float, links: Mapping[str, str]) -> tuple[str, ...]:
     """Return the command of a robot's routing daemon. Other settings have babeld's defaults.
 
     Args:
@@ -44,13 +44,13 @@ def command(interface: str, address: str, hello_s: float, links: Mapping[str, st
         ip = IPv4Interface(shared_address).ip
         rules += [f"redistribute local ip {ip}/32 allow", f"install ip {SHARED_NETWORK} pref-src {ip}"]
     settings = _settings(interface, address, hello_s, *rules)
-    return (*_program(str(PID), _LONG_TERM_STATE), *settings, interface, *tunnels)
+    return (*_program(str(PID_FILE), _LONG_TERM_STATE), *settings, interface, *tunnels)
 
 
-def guest_command(interface: str, address: str, hello_s: float) -> tuple[str, ...]:
+def guest_babeld_command(interface: str, address: str, hello_s: float) -> tuple[str, ...]:
     """Return the command of a node that uses the robots' routes, and announces only the route to itself.
 
-    The daemon writes no files. The arguments are those of `command`.
+    The daemon writes no files. The arguments are those of `babeld_command`.
     """
     filters = (f"out ip {IPv4Interface(address).ip}/32 allow", "out deny")
     return (*_program("", ""), *_settings(interface, address, hello_s, *filters), interface)
@@ -95,7 +95,7 @@ def open_tun(name: str, *, ethernet: bool = False) -> int:
     """Create the TUN interface `name` in this process's network namespace; return its non-blocking descriptor.
 
     The interface carries bare IP packets, or Ethernet frames (TAP), and exists as long as a process has the
-    descriptor open. Its queue holds 4096 packets, so that a pause of the medium loses none.
+    descriptor open. Its queue holds 4096 packets, so that no packet is lost while the medium process pauses.
 
     Raises:
         ConfigurationError: The device is missing, or this user may not open it or create an interface.
@@ -214,7 +214,7 @@ def add_link(interface: str, address: str, *, mesh: bool = False) -> int:
 
 
 def add_loopback_address(address: str) -> None:
-    """Give the robot an address that belongs to no link. Raises the errors of `run_ip`."""
+    """Add an address to the loopback interface. Raises the errors of `run_ip`."""
     run_ip(f"address add {address} dev {LOOPBACK_INTERFACE}")
 
 

@@ -3,8 +3,8 @@
 Arguments: `route` and the robot's address; or `relay`, the address, the node's name, the topic of velocities for the
 base and its type (may be empty), and as JSON the ROS 2 settings (`Ros2Spec`) and the type of each topic. The sensors
 process creates each message. The relay converts it to CDR as the robot's distribution defines the type, and publishes
-it while the topic has subscribers anywhere on the radio. It always publishes `/tf_static`, for late subscribers.
-Velocities go in the other direction. The node logs on `/rosout`.
+it while a robot or another node on the radio subscribes to the topic. It always publishes `/tf_static`, for late
+subscribers. It also sends received velocities to the base. The node logs on `/rosout`.
 """
 
 import contextlib
@@ -30,8 +30,7 @@ from sim_backends.emulated.ros import offered_qos, static_frames
 from sim_backends.emulated.ros.tcpros import Listener
 
 _POLL_S: Final = 0.1
-"""Polling interval for subscribers; the recorder of ROS 2 polls for new publishers as often."""
-
+"""Polling interval for subscribers, the same as that of ROS 2's recorder for new publishers."""
 
 _LOG: Final = "rcl_interfaces/msg/Log"
 _INFO: Final = 20

@@ -44,7 +44,7 @@ _RELAY: Final = Path(__file__).with_name("ros_relay.py")
 BRIDGE: Final = "bridge"
 ROS2_RELAY: Final = "ros2_relay"
 ZENOH_ROUTER: Final = "zenoh_router"
-_ROS2: Final = "sim_backends.emulated.robot.ros2_relay"
+_ROS2_MODULE: Final = "sim_backends.emulated.robot.ros2_relay"
 
 
 def spawn(argv: tuple[str, ...], environment: Mapping[str, str], log: Path) -> int:
@@ -169,8 +169,8 @@ def _network_services(spec: RobotSpec) -> Iterator[Service]:
         argv = wireless.prepare_command(spec.interface, wifi)
         yield _program(wireless.PROGRAMS[wifi.mode], argv, {}, partial(wireless.is_connected, wifi))
     if spec.mesh_hello_s is not None:
-        argv = network.command(spec.interface, spec.address, spec.mesh_hello_s, dict(spec.links.values()))
-        yield _program("babeld", argv, {}, network.PID.exists)
+        argv = network.babeld_command(spec.interface, spec.address, spec.mesh_hello_s, dict(spec.links.values()))
+        yield _program("babeld", argv, {}, network.PID_FILE.exists)
 
 
 def _motion_service(name: str, serve: Callable[..., None]) -> Service:
@@ -214,7 +214,8 @@ def _drone(spec: RobotSpec, port: int) -> autopilot.Drone:
 def ros_node(spec: RobotSpec) -> str:
     """Return the name of the node that publishes the sensors.
 
-    A ROS master shuts down the older of two nodes of one name, and ROS 2 cannot distinguish them.
+    The name contains the robot's name if nodes of several robots share a network. Of two nodes with the same name, a
+    ROS master shuts down the older one, and ROS 2 cannot distinguish them.
     """
     name = tcpros.CALLER.strip("/")
     return f"{name}_{spec.name.replace('-', '_')}" if spec.shares_master or spec.ros2 is not None else name
@@ -238,7 +239,7 @@ def _bridge_is_up() -> bool:
 
 
 def _ros2_program(name: str, *words: str) -> Service:
-    argv = (*worker.command(_ROS2), *words)
+    argv = (*worker.command(_ROS2_MODULE), *words)
     return _program(name, argv, {"PYTHONPATH": str(worker.PROJECT)}, ready_file(name).exists)
 
 

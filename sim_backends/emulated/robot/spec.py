@@ -27,7 +27,7 @@ STATE: Final = "/run/robot"
 """Folder in the robot that its init process writes to: files mounted over `/etc`, logs, readiness files."""
 
 LOOPBACK_INTERFACE: Final = "lo"
-"""Interface of the link whose address can be reached over every other link of the robots."""
+"""Interface of a further link that is only an address: the routing daemon announces it over every other link."""
 SHARED_NETWORK: Final = IPv4Network("10.42.255.0/24")
 """Addresses of the robots on that link."""
 LOOPBACK: Final = "127.0.0.1"
@@ -65,7 +65,7 @@ class Base:
 
 @dataclass(frozen=True)
 class Ros2Spec:
-    """ROS 2 of a robot over the radio.
+    """Settings of a robot's ROS 2 nodes, which communicate over the radio.
 
     Attributes:
         middleware: `dds` or `zenoh`.
@@ -149,8 +149,8 @@ class RobotSpec:
         netcat: Its only netcat, as `nc` and by its full name; None for the netcat of this machine or of the userland.
         scripts: Programs that only this robot has: shell scripts by name.
         ping: Its `ping`; None for the `ping` of this machine or of the userland.
-        mesh_hello_s: Hello interval of its routing daemon; None for a robot that does not forward.
-        ros2: Its ROS 2 over the radio; None if it has none.
+        mesh_hello_s: Hello interval of its routing daemon; None for a robot that does not forward packets.
+        ros2: Settings of its ROS 2 nodes; None if no ROS 2 node communicates over the radio.
         routes_zenoh: True if it runs the Zenoh router.
         wifi: Settings of its Linux Wi-Fi; None for a robot whose radio is a TUN or TAP device.
         links: Interface and address with the prefix length of each further link, by its name.

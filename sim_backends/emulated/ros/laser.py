@@ -58,12 +58,15 @@ class _Scan:
         self._reach_m = reach_m
 
     def add_edge(self, start: tuple[float, float], end: tuple[float, float]) -> None:
-        """Add a straight surface: beam t u hits the line p + s q at t = (p x q) / (u x q)."""
+        """Add a straight surface.
+
+        The beam t u, with the unit vector u, hits the line p + s q from `start` to `end` at t = (p x q) / (u x q).
+        """
         x, y = start[0] - self._east_m, start[1] - self._north_m
         along_x, along_y = end[0] - start[0], end[1] - start[1]
         length_m = math.hypot(along_x, along_y)
-        across = x * along_y - y * along_x
-        if across == 0.0 or abs(across) > self._reach_m * length_m:
+        cross_product = x * along_y - y * along_x
+        if cross_product == 0.0 or abs(cross_product) > self._reach_m * length_m:
             return  # The scanner is on the line, or the whole line is out of range.
         if (x * x + y * y) ** 0.5 > self._reach_m + length_m:
             return
@@ -73,7 +76,7 @@ class _Scan:
         for beam, angle_rad in self._beams(min(first_rad, first_rad + arc_rad), abs(arc_rad)):
             divisor = math.cos(angle_rad) * along_y - math.sin(angle_rad) * along_x
             if divisor:
-                self._record_hit(beam, across / divisor)
+                self._record_hit(beam, cross_product / divisor)
 
     def add_circle(self, centre: tuple[float, float], radius_m: float) -> None:
         """Add an upright cylinder: t = m - sqrt(r^2 - d^2); its centre is m along the beam and d beside it."""

@@ -25,15 +25,16 @@ from sim_backends.world.motion import GRAVITY_M_S2
 
 LASER_RANGE_M: Final = (0.12, 3.5)  # LDS-01, ROBOTIS e-Manual
 LASER_NOISE_M: Final = 0.015  # LDS-01 from 0.12 to 0.499 m, ROBOTIS e-Manual
-# Variances of x, y, z (m^2) and of rotations about them (rad^2), for pose and, per second, twist, from the controller
-# of a Husky (husky_control/config/control.yaml of github.com/husky/husky).
+# Variances of x, y, z (m^2) and of the rotations about these axes (rad^2), from the controller of a Husky
+# (husky_control/config/control.yaml of github.com/husky/husky). The twist has the same numbers, in m^2/s^2 and
+# rad^2/s^2.
 ODOMETRY_VARIANCES: Final = (0.001, 0.001, 0.001, 0.001, 0.001, 0.03)
 # Variances of orientation (rad^2), angular velocity (rad^2/s^2) and acceleration (m^2/s^4) that a TurtleBot3 reports:
 # constants, far above its noise (ROBOTIS OpenCR, turtlebot3_sensor.cpp).
 IMU_VARIANCES: Final = (0.0025, 0.02, 0.04)
 LASER_INTENSITIES: Final = range(1_000, 12_000)
 
-STANDING_M: Final = 0.1
+ON_GROUND_RANGE_M: Final = 0.1
 """Reading of a downward range sensor on a robot that is on the ground."""
 
 FIELD_T: Final = (20e-6, -44e-6)
@@ -46,7 +47,7 @@ FIX_NOISE_M: Final = (0.1, 0.5)
 EAST_RADIUS_M: Final = 6_378_137.0
 NORTH_RADIUS_M: Final = 6_335_439.327
 
-_FLOATS_BYTES: Final = 16  # the size of a point, so that the fields of points stay aligned
+_POINT_BYTES: Final = 16  # noise is read from multiples of this offset, so that the fields of points stay aligned
 _ONE_TRANSFORM: Final = struct.pack("<I", 1)
 
 
@@ -106,7 +107,7 @@ def _template_generator(template: Template) -> Generator:
             return head + noise.randbytes(size_bytes) + tail
         if not pool:  # drawn once and read from varying offsets, because a large cloud takes longer than its period
             pool = 2 * struct.pack(f"<{size_bytes // 4}f", *_gaussian(noise, 1.0, *[0.0] * (size_bytes // 4)))
-        start = _FLOATS_BYTES * noise.randrange(max(1, size_bytes // _FLOATS_BYTES))
+        start = _POINT_BYTES * noise.randrange(max(1, size_bytes // _POINT_BYTES))
         return head + pool[start : start + size_bytes] + tail
 
     return generate
@@ -117,7 +118,7 @@ def _float32s(values: Sequence[float]) -> bytes:
 
 
 def _float64s(*parts: Sequence[float]) -> bytes:
-    """Return fields of fixed length, which have no length before them."""
+    """Return doubles as fields of fixed length, which are serialized without their length."""
     return b"".join(struct.pack(f"<{len(part)}d", *part) for part in parts)
 
 
@@ -206,7 +207,7 @@ def _battery_state(_: Sensor, noise: Random, _motion: RobotMotionState) -> bytes
 def _range(_: Sensor, noise: Random, motion: RobotMotionState) -> bytes:
     infrared = 1  # sensor_msgs/Range.INFRARED
     low_m, high_m = 0.02, 4.0
-    down_m = max(STANDING_M, motion.position_m[2]) + abs(noise.gauss(0.0, 0.005))
+    down_m = max(ON_GROUND_RANGE_M, motion.position_m[2]) + abs(noise.gauss(0.0, 0.005))
     return struct.pack("<B4f", infrared, math.radians(25.0), low_m, high_m, _reported_range_m(down_m, low_m, high_m))
 
 
@@ -214,10 +215,10 @@ def _nav_sat_fix(_: Sensor, noise: Random, motion: RobotMotionState) -> bytes:
     fix, gps, diagonal_known = 0, 1, 2  # NavSatStatus.STATUS_FIX, .SERVICE_GPS; COVARIANCE_TYPE_DIAGONAL_KNOWN
     east_m, north_m, up_m = motion.position_m
     latitude, longitude = math.degrees(north_m / NORTH_RADIUS_M), math.degrees(east_m / EAST_RADIUS_M)
-    across, up = FIX_NOISE_M
-    across_deg = math.degrees(across / EAST_RADIUS_M)
-    fix_position = (*_gaussian(noise, across_deg, latitude, longitude), noise.gauss(up_m, up))
-    covariance = _diagonal(across**2, across**2, up**2)
+    horizontal_m, vertical_m = FIX_NOISE_M
+    horizontal_deg = math.degrees(horizontal_m / EAST_RADIUS_M)
+    fix_position = (*_gaussian(noise, horizontal_deg, latitude, longitude), noise.gauss(up_m, vertical_m))
+    covariance = _diagonal(horizontal_m**2, horizontal_m**2, vertical_m**2)
     return struct.pack("<bH", fix, gps) + _float64s(fix_position, covariance) + struct.pack("<B", diagonal_known)
 
 
@@ -238,9 +239,8 @@ def _temperature(_: Sensor, noise: Random, _motion: RobotMotionState) -> bytes:
 
 
 def _pose_stamped(_: Sensor, __: Random, motion: RobotMotionState) -> bytes:
-    return _float64s(
-        motion.position_m, _heading_quaternion(motion.heading_rad)
-    )  # in the world's frame, `map` of REP 105
+    # In the world's frame, which REP 105 calls `map`.
+    return _float64s(motion.position_m, _heading_quaternion(motion.heading_rad))
 
 
 GENERATORS: Final[dict[str, Generator]] = {

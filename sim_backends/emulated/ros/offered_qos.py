@@ -16,7 +16,6 @@ BY_TYPE: Final[Mapping[str, QosProfile]] = {
 LATCHED: Final = replace(PROFILES["default"], depth=1, durability=Durability.TRANSIENT_LOCAL)
 """QoS of `/tf_static` (tf2_ros, qos.hpp, StaticBroadcasterQoS)."""
 
-
 ROSOUT: Final = replace(
     PROFILES["default"], depth=1000, durability=Durability.TRANSIENT_LOCAL, lifespan_ns=10_000_000_000
 )

@@ -27,7 +27,7 @@ from sim_backends.world.motion import STILL, WayPoints
 class AssignedPath:
     """Path on which the lab moves a robot, which stops at its end.
 
-    A path of one point means that the robot stands there.
+    On a path of one point, the robot stays at this point.
 
     Attributes:
         start_ns: Start of the motion, as a time of the monotonic clock, which is common to all robots on one machine.
@@ -78,13 +78,13 @@ class Odometer:
     """Odometry of a robot, which starts at 0 when the object is created.
 
     Args:
-        path: The file of assigned paths, which may be missing.
+        paths_file: The file of assigned paths, which may be missing.
         now_ns: Time of the start, from the monotonic clock.
         motion_record: The file with the recorded motion of a robot that steers itself; None for other robots.
     """
 
-    def __init__(self, path: Path, now_ns: int, motion_record: Path | None = None) -> None:
-        self._file_path = path
+    def __init__(self, paths_file: Path, now_ns: int, motion_record: Path | None = None) -> None:
+        self._paths_file = paths_file
         self._record = None if motion_record is None else MotionRecord.open(motion_record)
         self._read_bytes = 0
         self._path: AssignedPath | None = None
@@ -92,6 +92,7 @@ class Odometer:
         self._base = AT_REST
         self._read_paths(now_ns)
         self._base = AT_REST
+        # If the robot is already on a path, the odometry starts at 0 at its current position on the path.
         if self._path is not None:
             motion = _motion_on(self._path, AT_REST, now_ns)
             yaw_rad = -motion.yaw_rad
@@ -114,7 +115,7 @@ class Odometer:
         if last is None or last.path_start_ns != self.path_start_ns:
             return None
         current = last.at(now_ns)
-        # `RecordedMotion.at` changes the heading, but not the velocity, so the speed is that of the record.
+        # `RecordedMotion.at` turns the heading but not the velocity, so the speed is computed from the record.
         speed_m_s = last.speed_m_s if current.is_moving else 0.0
         return RobotMotionState(
             *current.odometry, speed_m_s, current.position_m, current.heading_rad, current.turn_rad_s
@@ -127,9 +128,9 @@ class Odometer:
     def _read_paths(self, now_ns: int) -> None:
         """Read the paths that the lab has appended since the last call."""
         try:
-            if self._file_path.stat().st_size == self._read_bytes:
+            if self._paths_file.stat().st_size == self._read_bytes:
                 return
-            with self._file_path.open("rb") as file:
+            with self._paths_file.open("rb") as file:
                 file.seek(self._read_bytes)
                 data = file.read()
         except FileNotFoundError:
@@ -146,7 +147,7 @@ class Odometer:
 def _motion_on(path: AssignedPath, base: RobotMotionState, now_ns: int) -> RobotMotionState:
     """Return a robot's motion on a path at a time; `base` is its motion when the path started."""
     elapsed_ns = now_ns - path.start_ns
-    points_m = [(point_m[0], point_m[1], 0.0) for point_m in path.points_m]  # the speed is horizontal
+    points_m = [(point_m[0], point_m[1], 0.0) for point_m in path.points_m]  # the speed is that over the ground
     (east_m, north_m, _), velocity_m_s, _ = WayPoints("", points_m, path.speed_m_s).at(elapsed_ns)[""]
     heading_rad = path.facing_rad
     if velocity_m_s != STILL:
@@ -208,7 +209,7 @@ class MotionReporter:
     def poll_placement(self, now_ns: int) -> RobotMotionState | None:
         """Return the motion at the position where the lab has placed the robot since the last call, or None.
 
-        The first call returns the current motion of the robot, also after the process has been restarted.
+        The first call returns the current motion of the robot, even if the process has been restarted.
 
         Args:
             now_ns: Time from the monotonic clock; must not decrease from call to call.

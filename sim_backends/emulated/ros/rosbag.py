@@ -1,7 +1,8 @@
 """The `rosbag` command of an emulated robot without ROS: `record` and `info`, with the behaviour of ROS's own (1.15).
 
-Like the original, it is a wrapper around a recorder process. The wrapper rejects wrong options with exit code 2,
-forwards SIGINT and SIGTERM, and always returns 0. If only the wrapper is killed with SIGKILL, the recorder continues.
+Like the original, `record` is a wrapper around a recorder process. The wrapper rejects wrong options with exit code
+2. Otherwise it forwards SIGINT and SIGTERM, and always returns 0. If only the wrapper is killed with SIGKILL, the
+recorder continues.
 Options of the original that no trial uses are rejected as unknown.
 """
 

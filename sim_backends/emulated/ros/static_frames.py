@@ -1,6 +1,7 @@
 """Static transforms of an emulated robot: the content of `/tf_static` (REP 105, tf2_ros.StaticTransformBroadcaster).
 
-All its sensors measure at the robot's position, whatever the name of their frame, so every transform is the identity.
+All its sensors measure at the robot's position, independently of their frame's name, so every transform is the
+identity.
 """
 
 import struct
@@ -12,7 +13,7 @@ from sim_backends.emulated.ros.sensor_specs import Sensor, packed_string
 TOPIC: Final = "/tf_static"
 TYPE: Final = "tf2_msgs/TFMessage"
 BASE: Final = "base_link"
-_WORLDS: Final = frozenset({"", "map", "odom", "earth"})
+_FRAMES_OUTSIDE_ROBOT: Final = frozenset({"", "map", "odom", "earth"})
 """Frames of REP 105 that are fixed to the world, and the empty frame of a battery."""
 
 Link = tuple[str, str]
@@ -31,7 +32,8 @@ def links(sensors: Iterable[Sensor]) -> tuple[Link, ...]:
         return ()
     child_frames = [sensor.child_frame for sensor in sensors if sensor.child_frame]
     base = child_frames[0] if child_frames else BASE
-    excluded_frames = {base, BASE, *_WORLDS, *(sensor.frame for sensor in sensors if sensor.child_frame)}
+    odometry_frames = (sensor.frame for sensor in sensors if sensor.child_frame)
+    excluded_frames = {base, BASE, *_FRAMES_OUTSIDE_ROBOT, *odometry_frames}
     frames = dict.fromkeys(sensor.frame for sensor in sensors if sensor.frame not in excluded_frames)
     base_links = [(base, BASE)] if base != BASE else []
     return (*base_links, *((BASE, frame) for frame in frames))

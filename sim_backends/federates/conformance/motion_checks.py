@@ -1,6 +1,7 @@
 """Conformance checks of the motion of a physics federate: signs, axes and units.
 
-Agents accelerate within limits, and wheels slip: the tolerances accept half of the commanded motion.
+Agents need time to accelerate, and wheels slip. The tolerances are therefore wide: for example, a robot that drives
+30 % of the commanded distance passes.
 """
 
 import json

@@ -22,11 +22,12 @@ _MAX_EVENTS: Final = 500
 _SEEDS: Final = 4
 _DISTANCES_M: Final = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0)
 """Distances at which packets are sent, because a network may lose packets at only some of the distances."""
-_GROUP: Final = 32
-"""Packets at each distance."""
+_GROUP_SIZE: Final = 32
+"""Number of packets at each distance."""
 _SPACING_NS: Final = 20 * _MS
 _RANDOM_CHANGES: Final = 4
-"""Minimum number of changes between arrivals and losses if losses are random; a new route causes fewer changes."""
+"""Minimum number of changes between arrivals and losses if losses are random. A network that
+only changes a route has fewer."""
 
 
 def _states(probe: FederateProbe) -> dict[str, State]:
@@ -49,9 +50,8 @@ def _packets(probe: FederateProbe, times_ns: Sequence[int]) -> list[Packet]:
 
 
 def _times_ns() -> list[int]:
-    """Return times of packets: at ends and beginnings of windows, and within them."""
-    times_ns = [number * _WINDOW_NS + offset_ns for number in range(0, 60, 4) for offset_ns in (0, 1, 500_000)]
-    return sorted(at_ns for at_ns in times_ns)
+    """Return times of packets: in some windows at the start, 1 ns later, and 0.5 ms later."""
+    return [number * _WINDOW_NS + offset_ns for number in range(0, 60, 4) for offset_ns in (0, 1, 500_000)]
 
 
 class _FateAccount:
@@ -126,7 +126,7 @@ class _FateAccount:
         for drop in outcomes.drops:
             if announced_ns == NO_EVENT or to_ns < announced_ns:
                 raise CheckError(
-                    f"packet {drop.packet_id} was dropped until {to_ns} ns, before the announced next event "
+                    f"packet {drop.packet_id} was dropped by {to_ns} ns, before the announced next event "
                     f"({announced_ns} ns)"
                 )
 
@@ -244,30 +244,39 @@ def check_determinism(target: Target) -> None:
 
 
 def _arrivals_ns(probe: FederateProbe, every: int = 1) -> dict[int, int]:
-    """Return the arrival times of packets that are sent at several distances; `every` = n sends each n-th packet."""
+    """Return the arrival times of packets that are sent at several distances.
+
+    Args:
+        probe: The network.
+        every: n to send only every n-th packet.
+    """
     account, states = _FateAccount(probe), _states(probe)
-    packets = _packets(probe, [_MS + number * _SPACING_NS for number in range(len(_DISTANCES_M) * _GROUP)])
+    packets = _packets(probe, [_MS + number * _SPACING_NS for number in range(len(_DISTANCES_M) * _GROUP_SIZE)])
     first, second = (agent.name for agent in probe.hello.agents[:2])
     east_m, north_m, up_m = states[first].position_m
     for group, distance_m in enumerate(_DISTANCES_M):
         states[second] = State((east_m + distance_m, north_m, up_m))
-        entering_packets = packets[group * _GROUP : (group + 1) * _GROUP : every]
-        account.advance((group + 1) * _GROUP * _SPACING_NS, states, entering_packets)
+        entering_packets = packets[group * _GROUP_SIZE : (group + 1) * _GROUP_SIZE : every]
+        account.advance((group + 1) * _GROUP_SIZE * _SPACING_NS, states, entering_packets)
     account.advance(2 * _END_NS, states)
     return {arrival.packet_id: arrival.at_ns for arrival in account.arrivals}
 
 
 def _is_random(arrivals_ns: Mapping[int, int]) -> bool:
-    """Return True if equal packets have different fates, without contention or a pattern in time."""
+    """Return True if losses seem to be random.
+
+    The fates of equal packets must differ without a periodic pattern. Packets must not contend: each one arrives
+    before the next one enters.
+    """
     for packet_id, at_ns in arrivals_ns.items():
         if at_ns >= _MS + packet_id * _SPACING_NS:  # when the next packet enters
             return False
-    for first in range(1, len(_DISTANCES_M) * _GROUP, _GROUP):
+    for first in range(1, len(_DISTANCES_M) * _GROUP_SIZE, _GROUP_SIZE):
         for direction in range(2):
-            fates = [packet_id in arrivals_ns for packet_id in range(first + direction, first + _GROUP, 2)]
+            fates = [packet_id in arrivals_ns for packet_id in range(first + direction, first + _GROUP_SIZE, 2)]
             changes = sum(fate != other for fate, other in pairwise(fates))
-            repeats = any(fates[period:] == fates[:-period] for period in range(1, len(fates) // 2 + 1))
-            if changes >= _RANDOM_CHANGES and not repeats:
+            is_periodic = any(fates[period:] == fates[:-period] for period in range(1, len(fates) // 2 + 1))
+            if changes >= _RANDOM_CHANGES and not is_periodic:
                 return True
     return False
 
@@ -294,7 +303,7 @@ def check_removed_packets(target: Target) -> None:
         probe.require(FederateCapability.DETERMINISTIC)
         results.append(_arrivals_ns(probe, every))
     arrivals_of_all, arrivals_of_half = results
-    for packet_id in range(1, len(_DISTANCES_M) * _GROUP, 2):
+    for packet_id in range(1, len(_DISTANCES_M) * _GROUP_SIZE, 2):
         if (packet_id in arrivals_of_all) != (packet_id in arrivals_of_half):
             raise NotDeclaredError(
                 f"packet {packet_id} had another fate without other packets: its draws depend on the order of "

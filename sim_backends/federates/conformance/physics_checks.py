@@ -2,6 +2,7 @@
 
 import json
 import math
+import struct
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
@@ -14,7 +15,7 @@ from sim_backends.federates.conformance.probe import (
     Target,
 )
 from sim_backends.federates.exchanges import encode_number
-from sim_backends.federates.frames import MessageKind
+from sim_backends.federates.frames import MessageKind, count_bytes
 from sim_backends.federates.handshake import AgentStart, FederateCapability
 from sim_backends.federates.records import TWIST, VELOCITY
 from sim_backends.physics.body import Twist, Velocity
@@ -23,8 +24,9 @@ from sim_backends.world.motion import State, extrapolate
 _START_M: Final = 0.5
 """Largest distance of an agent from its requested start."""
 _SAME_M: Final = 1e-6
-"""Largest difference between positions that must be equal; results may depend on the order of additions."""
+"""Largest difference between positions that must be equal; rounding depends on the order of additions."""
 _MOVED_M: Final = 0.02
+"""An agent that has moved by less than this length is regarded as not moving."""
 _JUMP_M: Final = 0.05
 """In a step, a body moves at most by this length plus its motion at twice its speed."""
 _UNKNOWN_TYPE: Final = 32767
@@ -42,9 +44,11 @@ def _command(agent: AgentStart) -> Twist | Velocity:
 
 def _commands(probe: FederateProbe) -> Mapping[str, Twist | Velocity]:
     """Return commands to all agents that the federate can command."""
-    supported = {TWIST: False, VELOCITY: True}
-    flying = {flies for number, flies in supported.items() if number in probe.welcome.commands}
-    commands = {agent.name: _command(agent) for agent in probe.hello.agents if agent.flies in flying}
+    commands = {
+        agent.name: _command(agent)
+        for agent in probe.hello.agents
+        if (VELOCITY if agent.flies else TWIST) in probe.welcome.commands
+    }
     if not commands:
         raise NotDeclaredError("it supports no type of command for these agents")
     return commands
@@ -110,7 +114,7 @@ def check_drift(target: Target) -> None:
 
 
 def check_repeated_time(target: Target) -> None:
-    """A second request for the same time gives the same states."""
+    """A second request for the same time returns the same states."""
     probe = target.open()
     probe.advance_physics(0)
     to_ns = 20 * probe.welcome.step_ns
@@ -145,7 +149,8 @@ def check_limits(target: Target) -> None:
     before = probe.advance_physics(0)
     step_ns, commands = probe.welcome.step_ns, _commands(probe)
     window_s = _LIMIT_STEPS * step_ns / 1e9
-    # The error is larger by one step for a simulator that moves bodies at the velocity at the end of a step.
+    # A simulator may move a body in each step at the velocity at the end of the step (semi-implicit Euler). Its error
+    # is larger by a t h, where h is the step.
     per_limit_s2 = window_s**2 / 2 + window_s * step_ns / 1e9
     for window in range(1, 40):
         answer = probe.advance_physics(window * _LIMIT_STEPS * step_ns, commands if window == 1 else None)
@@ -182,9 +187,8 @@ def check_unknown_command(target: Target) -> None:
     """A command of an unknown type is refused with an error."""
     probe = target.open()
     probe.advance_physics(0)
-    body = (
-        encode_number(probe.welcome.step_ns) + encode_number(0) + b"\1\0\0\0" + b"\0\0\0\0\xff\x7f\x08\0" + bytes(8)
-    )
+    command = struct.pack("<IHH8x", 0, _UNKNOWN_TYPE, 8)
+    body = encode_number(probe.welcome.step_ns) + encode_number(0) + count_bytes(1) + command
     probe.expect_error(MessageKind.ADVANCE_PHYSICS, body, MessageKind.STATES, "a command of an unknown type")
 
 
@@ -220,7 +224,7 @@ def check_lifetimes(target: Target) -> None:
     probe = target.open(replace(target.hello, configuration=json.dumps(configuration).encode()))
     probe.require(FederateCapability.AGENTS_DISAPPEAR)
     if probe.welcome.step_ns != step_ns:
-        raise NotDeclaredError(f"its step of {probe.welcome.step_ns} ns is not that of the scenario")
+        raise NotDeclaredError(f"its step of {probe.welcome.step_ns} ns differs from the scenario's step")
     if name in probe.advance_physics(0).states:
         raise NotDeclaredError("it moves agents before they appear, and the coordinator ignores their states")
     for step in (appears_steps - 1, appears_steps, disappears_steps - 1, disappears_steps, 2 * disappears_steps):

@@ -1,4 +1,4 @@
-"""Helpers of the conformance checks: connections to new federates, and the last request and answer of each."""
+"""Helpers of the conformance checks: they connect to new federates, and record the last request and its answer."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -68,7 +68,7 @@ def frame_text(frame: bytes) -> str:
 
 
 class FederateProbe:
-    """A new federate, which is used without the safeguards of the coordinator.
+    """A connection to a new federate, without the coordinator's checks of requests and answers.
 
     Args:
         opener: Starts or connects to it.
@@ -79,6 +79,7 @@ class FederateProbe:
         hello: The hello that it received.
         welcome: Its answer.
         agents: The agents that were announced.
+        last_ns: Time of the last request to advance.
     """
 
     def __init__(self, opener: Opener, hello: Hello, exchange: dict[str, str]) -> None:

@@ -3,14 +3,14 @@
 A datagram has at most 1,200 bytes: a header of 40 bytes, `FKUD`, `version` u8 (1), `kind` u8, `reserved` u16,
 `connection` u64, `cookie` u64, `number` u64, `expected` u64, then, in data (kind 3), a part of the stream.
 
-- The side that connects draws `connection`, and sends open (1) with `cookie` 0. It sends open again after 50 ms and
-  then at intervals that double up to 1 s, until it receives cookie (2). That datagram has the `cookie` that the other
-  side has drawn for this number and address. All later datagrams have both numbers. Other datagrams are ignored, also
-  if they come from another address. The side that connects sends the first data.
+- The side that connects draws a random `connection`, and sends open (1) with `cookie` 0. It sends open again after
+  50 ms and then at intervals that double up to 1 s, until it receives cookie (2). That datagram has the `cookie` that
+  the other side has computed for this number and address. All later datagrams have both numbers. A datagram with
+  other numbers or from another address is ignored. The side that connects sends the first data.
 - Data are numbered from 0 in each direction. In a datagram of another kind, `number` is the number of the next data.
   `expected` acknowledges all data before this number. At most 64 are unacknowledged.
-- A side that waits sends an acknowledgement (4) of new data before it waits, and another every 2 s. Unacknowledged
-  data are sent again after the time-out of RFC 6298, between 20 ms and 2 s.
+- Before a side waits, it sends an acknowledgement (4) of new data. While it waits, it sends one every 2 s.
+  Unacknowledged data are sent again after the time-out of RFC 6298, between 20 ms and 2 s.
 - A side that ends sends one close datagram (5), when all its data are acknowledged or after 0.5 s. The receiver ends
   the connection if `number` is the expected one. If the datagram is lost, the connection ends with an ICMP message
   that the port is unreachable, or after 3,600 s of silence.
@@ -57,8 +57,8 @@ class DatagramHeader(NamedTuple):
 
     Attributes:
         kind: Its kind.
-        connection: Number that the connecting side has drawn.
-        cookie: Number that the listening side has drawn for this connection and the address of the connecting side.
+        connection: Random number that the connecting side has drawn.
+        cookie: Number that the listening side has computed for this connection and the peer's address.
         number: Number of the datagram, counting only datagrams with data; in a datagram without data, the number of
             the next datagram with data.
         expected: The next number that its sender expects.
@@ -126,8 +126,8 @@ class DatagramChannel:
 
     Args:
         endpoint: The socket; the channel closes it.
-        connection: Number that the connecting side has drawn.
-        cookie: Number that the listening side has drawn for this connection and the address of the connecting side.
+        connection: Random number that the connecting side has drawn.
+        cookie: Number that the listening side has computed for this connection and the peer's address.
     """
 
     def __init__(self, endpoint: socket.socket, connection: int, cookie: int) -> None:

@@ -2,8 +2,8 @@
 
 The two sides discover each other at different times. A writer may thus send the first sample before the reader has
 discovered it; a volatile reader never receives this sample. The topics are therefore transient local: a reader
-receives the last two samples of a writer that it discovers later. Two are needed if the federate refuses a run,
-because the end of the run follows the error. All other samples follow an answer, which proves that the reader has
+receives the last two samples of a writer that it discovers later. Two are needed because a federate that refuses a
+run sends an error and then the end of the run. All other samples follow an answer, which proves that the reader has
 discovered the writer.
 
 The topics are `fieldkit/NAME/requests` and `fieldkit/NAME/answers`, their type is `fieldkit::Frame` with one member,
@@ -138,7 +138,7 @@ class DdsBus:
         return self._writer.matched() > 0 and self._matched_writers() > 0
 
     def close(self) -> None:
-        """Implement `SampleBus.close`; wait up to half a second until the last samples have been acknowledged."""
+        """Implement `SampleBus.close`; wait up to half a second for acknowledgements of the last samples."""
         self._writer.drain(0.5)
         _PARTICIPANTS.close(self._address)
 

@@ -1,4 +1,4 @@
-"""The first message of a federate that connects, with the token by which a listening coordinator accepts it."""
+"""The message `join`: the first message of a federate that connects to a listening coordinator. It has the token."""
 
 import time
 from typing import Final

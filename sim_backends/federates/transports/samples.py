@@ -1,7 +1,8 @@
 """Channels over a sample bus: a pair of DDS or ROS 1 topics.
 
 The coordinator writes `requests` and reads `answers`; the federate does the reverse. A sample consists of the `run`,
-a u64 that the coordinator draws, and one frame. The first is `hello`; a sample without a frame ends the run.
+a random u64 that the coordinator draws, and one frame. The first frame is `hello`; a sample without a frame ends the
+run.
 
 DDS: topics `fieldkit/NAME/requests` and `fieldkit/NAME/answers`, final type
 `fieldkit::Frame { sequence<octet> data; }` in plain CDR, reliable, keep all, transient local; the durability service
@@ -36,7 +37,7 @@ _KIND_OFFSET: Final = _RUN.size + 4
 _CHECK_S: Final = 0.5
 """Interval at which a channel that waits checks that the other side exists."""
 _PEER_S: Final = 10.0
-"""Longest wait of the accepting side for the discovery of its peer; an answer before the discovery may be lost."""
+"""Longest time for which the accepting side waits until its peer is discovered. An earlier answer may be lost."""
 _MAX_WAITING: Final = 16
 _POLL_S: Final = 0.01
 

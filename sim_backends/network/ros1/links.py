@@ -134,7 +134,7 @@ class TcprosLink:
             self._retry_ns = self._options.reconnect.first_ns
             self._reset_silence_timer()
 
-    def _reconnect_later(self, connection: int, reason: str) -> None:  # noqa: ARG002 (see Lost)
+    def _reconnect_later(self, connection: int, reason: str) -> None:  # noqa: ARG002 (see LossCallback)
         """Give up the connection at the subscriber and open another one later, unless it was already given up."""
         if connection != self._subscriber_connection:
             return
@@ -143,7 +143,7 @@ class TcprosLink:
         retry_ns, self._retry_ns = self._retry_ns, min(2 * self._retry_ns, self._options.reconnect.longest_ns)
         self._wire.at(self._wire.now_ns + retry_ns, self._flow.subscriber, self.connect)
 
-    def _close(self, connection: int, reason: str) -> None:  # noqa: ARG002 (see Lost)
+    def _close(self, connection: int, reason: str) -> None:  # noqa: ARG002 (see LossCallback)
         """Close a connection at the publisher after its TCP has given up the connection."""
         if connection == self._publisher_connection:
             self._publisher_connection = 0
@@ -215,7 +215,8 @@ class UdprosLink:
         # The message that the subscriber is reassembling, and the index of the next block.
         self._current_packet_id = -1
         self._next_block = 0
-        self._open: set[int] = set()
+        # Messages that have neither been delivered nor lost.
+        self._pending_ids: set[int] = set()
         self.is_connected = False
 
     def connect(self) -> None:
@@ -234,7 +235,7 @@ class UdprosLink:
         packet_id, (_, number) = packet.packet_id, packet.identity
         remaining_bytes = LENGTH_BYTES + packet.size_bytes
         block_count = -(-remaining_bytes // self._payload_bytes)
-        self._open.add(packet_id)
+        self._pending_ids.add(packet_id)
         for index in range(block_count):
             payload_bytes = min(remaining_bytes, self._payload_bytes)
             remaining_bytes -= payload_bytes
@@ -255,8 +256,8 @@ class UdprosLink:
         if self._next_block == block.block_count:
             self._next_block = 0
             self._current_packet_id = -1
-            if block.packet_id in self._open:
-                self._open.remove(block.packet_id)
+            if block.packet_id in self._pending_ids:
+                self._pending_ids.remove(block.packet_id)
                 self._wire.deliver(block.packet_id)
 
     def record_loss(self, packet: IpPacket, reason: str) -> None:
@@ -264,6 +265,6 @@ class UdprosLink:
         self._drop(packet.body.packet_id, reason)
 
     def _drop(self, packet_id: int, reason: str) -> None:
-        if packet_id in self._open:
-            self._open.remove(packet_id)
+        if packet_id in self._pending_ids:
+            self._pending_ids.remove(packet_id)
             self._wire.drop(packet_id, reason)

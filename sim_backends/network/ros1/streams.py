@@ -169,7 +169,7 @@ class RemoteCalls:
         """
         connection = f"xmlrpc {caller} {callee} {topic}".rstrip()
 
-        def on_lost(reason: str) -> None:  # noqa: ARG001 (see Lost)
+        def on_lost(reason: str) -> None:  # noqa: ARG001 (see LossCallback)
             if retry is not None:
                 next_retry = CallRetry(min(2 * retry.first_ns, retry.longest_ns), retry.longest_ns)
                 call_again = partial(self.call, caller, callee, size_bytes, serve, next_retry, topic=topic)

@@ -220,5 +220,5 @@ class Cubic(NewReno):
         self._reno_bytes += growth_bytes
 
     def _reduced_threshold(self, flight_bytes: int) -> int:
-        """Return the window multiplied by beta (equation of 4.6)."""
+        """Return the bytes in flight multiplied by beta, at least two segments (4.6)."""
         return max(flight_bytes * _BETA[0] // _BETA[1], 2 * self._segment_bytes)

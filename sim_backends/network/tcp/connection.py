@@ -1,4 +1,4 @@
-"""TCP as a transport: messages of programs over one connection per flow, its two ends, and its IP packets.
+"""TCP as a transport: each flow has a connection that carries the messages of programs.
 
 A program's messages are written to the stream of its flow's connection, which is opened by the first message and
 stays open. A message is delivered when its last byte has been read, in order, at its destination. When a connection

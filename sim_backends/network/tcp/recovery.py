@@ -51,8 +51,8 @@ class RoundTrips:
         self.timeout_ns = min(2 * self.timeout_ns, self._options.max_timeout_ns)
 
 
-_REORDERING_SHARE = 4
-"""The reordering window is the minimum round trip divided by this (RFC 8985, 6.2, step 4)."""
+_REORDERING_DIVISOR = 4
+"""The reordering window is the minimum round trip divided by this number (RFC 8985, 6.2, step 4)."""
 
 
 class RackScoreboard(Scoreboard):
@@ -131,7 +131,7 @@ class RackScoreboard(Scoreboard):
         )
         if is_recovering or threshold_reached:
             return 0
-        return (self._min_round_trip_ns or 0) // _REORDERING_SHARE
+        return (self._min_round_trip_ns or 0) // _REORDERING_DIVISOR
 
 
 class ProportionalReduction:

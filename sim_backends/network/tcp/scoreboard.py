@@ -68,6 +68,7 @@ class Scoreboard:
         self._arrived_ranges = Ranges()
         # Indices, counted over the whole stream, of the last three segments that arrived by SACK.
         self._latest_sacked: list[int] = []
+        # Index, counted over the whole stream, before which the segments were already examined for losses.
         self._examined = 0
         self._to_resend: deque[SentSegment] = deque()
 

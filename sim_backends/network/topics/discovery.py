@@ -2,12 +2,13 @@
 
 No master is needed. A participant announces itself by multicast. A participant that receives an announcement for the
 first time responds by unicast, and sends its publications and subscriptions over reliable built-in topics. CycloneDDS
-packs the data of these topics for one participant into one message; here they are one flow, with heartbeats and
-acknowledgements for all topics in each message. If nothing is received from a participant for the duration of a
-lease, it is removed with all its endpoints, and may be discovered again. Times are taken from CycloneDDS
-(`ddsi_spdp_schedule.c`, `ddsi_discovery_spdp.c`); sizes were measured on version 11.0.1 from PyPI. Its participants
-respond to a new participant immediately and three more times at intervals of a second; no random delay separates the
-responses of different participants (`SPDPResponseMaxDelay` is 0 ms). The traffic of n participants grows with n^2.
+packs the data of these topics for one participant into one message. Here the topics are one flow, and each of its
+messages has the heartbeats and acknowledgements of all topics. If nothing is received from a participant for the
+duration of a lease, it is removed with all its endpoints, and may be discovered again. Times are taken from
+CycloneDDS (`ddsi_spdp_schedule.c`, `ddsi_discovery_spdp.c`); sizes were measured on version 11.0.1 from PyPI. Its
+participants respond to a new participant immediately and three more times at intervals of a second; no random delay
+separates the responses of different participants (`SPDPResponseMaxDelay` is 0 ms). The traffic of n participants
+grows with n^2.
 """
 
 from collections.abc import Mapping
@@ -23,8 +24,8 @@ from sim_backends.network.wire import IpPacket, Wire, WireTimer
 SPDP_BYTES: Final = 436
 """Size of an announcement with the IP header: INFO_DST, INFO_TS, and DATA of 360 bytes."""
 _BUILTIN_TOPICS: Final = 5
-"""Number of built-in topics with heartbeats and acknowledgements in a message: two kinds of endpoints, liveliness,
-and type lookup.
+"""Number of built-in topics with heartbeats and acknowledgements in a message: publications, subscriptions,
+liveliness, and the requests and replies of type lookup.
 """
 _LIVELINESS_BYTES: Final = 28
 _WRITER_BYTES: Final = 200

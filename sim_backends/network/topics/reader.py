@@ -1,8 +1,8 @@
 """The reader of a flow: reassembles and orders samples, and requests missing ones from its writer.
 
-The reader responds at the same times as CycloneDDS (`ddsi_acknack.c`, `ddsi_receive.c`), and does not respond in the
-same cases, so that data in flight is not requested twice. It responds to heartbeats immediately. It requests missing
-data immediately. It requests the same data again after a delay, or when a heartbeat shows that the writer has
+The reader responds at the same times as CycloneDDS (`ddsi_acknack.c`, `ddsi_receive.c`), and omits a response if
+CycloneDDS omits it, so that data in flight is not requested twice. It responds to heartbeats immediately. It requests
+missing data immediately. It requests the same data again after a delay, or when a heartbeat shows that the writer has
 responded.
 """
 
@@ -18,9 +18,9 @@ from sim_backends.network.wire import Wire, WireTimer
 _NEVER_NS: Final = -(10**18)
 _MAX_BITS: Final = 256
 _INITIAL_BACKOFF: Final = ((10 * SECOND, 1), (60 * SECOND, 2), (120 * SECOND, 5))
-"""Upper limits of the time since the reader was matched, each with the factor of the repetition interval up to it.
+"""Upper limits of the time since the reader was matched, each with a factor.
 
-After the last limit the factor is 10.
+Up to the limit, the repetition interval is multiplied by the factor. After the last limit, the factor is 10.
 """
 
 _Kind = Literal["ack", "nack", "nack_frag", "silent_ack", "silent_nack", "suppressed_nack"]

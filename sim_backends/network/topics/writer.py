@@ -21,7 +21,7 @@ message."""
 
 EVICTED: Final = "evicted from the writer's history before it was acknowledged"
 OVERTAKEN: Final = "overtaken by a later sample"
-"""Result of a sample that is never sent again, unless it is delivered or lost."""
+"""Reason for a best-effort sample that arrives after a later one; a loss is reported with the reason of the loss."""
 BLOCKED: Final = "the writer was blocked for longer than max_blocking_time"
 _NEVER_NS: Final = -(10**18)
 _PIGGYBACK_PAUSE_NS: Final = 100_000
@@ -164,7 +164,8 @@ class TopicWriter:
 
     def _piggyback(self) -> tuple[Submessage, ...]:
         now_ns = self._wire.now_ns
-        # A response will be required soon; if it is required now, no separate message is needed.
+        # After a pause of 80 % of the interval, a separate heartbeat would soon require a response. If the heartbeat
+        # in this message requires it, the separate one is not needed.
         requires_response = (
             now_ns >= self._last_write_ns + 4 * self._timing.heartbeat_ns // 5 or self._is_above_watermark()
         )
@@ -210,7 +211,11 @@ class TopicWriter:
         self._heartbeat_timer.bring_forward(at_ns)
 
     def _interval_ns(self) -> int:
-        """Return the time to the next heartbeat; from the sixth one, it doubles after every second heartbeat."""
+        """Return the time to the next heartbeat.
+
+        It is doubled after the seventh heartbeat since the last write, and again after every second one. It is
+        divided while much data is unacknowledged or samples wait.
+        """
         interval_ns = self._timing.heartbeat_ns
         for _ in range((self._heartbeats_since_write - _HEARTBEATS_AT_FULL_RATE) // 2):
             if 2 * interval_ns >= self._timing.heartbeat_max_ns:

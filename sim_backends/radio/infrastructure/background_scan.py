@@ -29,14 +29,10 @@ def required_difference_db(current_dbm: float) -> float:
 class BackgroundScan:
     """The schedule of the scans of one association.
 
-    Args:
-        now_ns: Time of the association.
-        signal_dbm: Signal of the access point at that time.
+    Attributes:
         threshold_dbm: Signal below which scans have the short interval.
         short_ns: Short interval.
         long_ns: Long interval.
-
-    Attributes:
         average_dbm: Average signal of beacons.
         next_ns: Time of the next scan.
     """
@@ -56,7 +52,15 @@ class BackgroundScan:
     def start(
         cls, now_ns: int, signal_dbm: float, *, threshold_dbm: float, short_ns: int, long_ns: int
     ) -> "BackgroundScan":
-        """Return the schedule after an association; for the arguments, see the class."""
+        """Return the schedule after an association.
+
+        Args:
+            now_ns: Time of the association.
+            signal_dbm: Signal of the access point at that time.
+            threshold_dbm: See the class.
+            short_ns: See the class.
+            long_ns: See the class.
+        """
         interval_ns = long_ns if signal_dbm >= threshold_dbm else short_ns
         return cls(threshold_dbm, short_ns, long_ns, signal_dbm, now_ns + interval_ns, interval_ns, now_ns)
 
@@ -79,6 +83,10 @@ class BackgroundScan:
                 self.next_ns = now_ns + self.long_ns
 
     def _on_weak_signal(self, now_ns: int) -> None:
+        """Use the short interval, and scan immediately unless a scan was recent (bgscan_simple.c).
+
+        A scan is recent for 1 s if the long interval was in use, otherwise for 10 s.
+        """
         if self._interval_ns == self.long_ns and self.long_ns != self.short_ns:
             self._interval_ns = self.short_ns
             may_scan = now_ns > self._last_ns + 1_000_000_000 and self._short_scans <= self._max_short_scans

@@ -59,7 +59,7 @@ class NeighbourTraffic:
 
 
 class MicrowaveOven:
-    """Noise in one half of each mains cycle.
+    """A microwave oven, which sends noise in one half of each mains cycle.
 
     Args:
         seed: Seed of the phase of the mains.

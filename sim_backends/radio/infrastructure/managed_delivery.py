@@ -285,11 +285,13 @@ class ManagedDelivery(PacketDelivery[Payload]):
 
         Packets that the receiver has already decoded are removed and not returned.
         """
-        current = _in_exchange(station)
+        frames_in_exchange = _frames_in_exchange(station)
         withdrawn_frames: list[Frame[Payload]] = []
         for queue in _queues(station):
             remaining_frames = [
-                frame for frame in queue if frame.receiver != receiver or frame in current or _is_management(frame)
+                frame
+                for frame in queue
+                if frame.receiver != receiver or frame in frames_in_exchange or _is_management(frame)
             ]
             if len(remaining_frames) < len(queue):
                 frames_to_keep = set(remaining_frames)
@@ -326,7 +328,7 @@ def _queues(station: Station[Payload]) -> Iterable[deque[Frame[Payload]]]:
     return (station.queue,) if station.categories is None else station.categories.queues
 
 
-def _in_exchange(station: Station[Payload]) -> Collection[Frame[Payload]]:
+def _frames_in_exchange(station: Station[Payload]) -> Collection[Frame[Payload]]:
     """Return the frames of a station's current exchange; empty if there is none."""
     if not station.exchange_id & 1:
         return ()

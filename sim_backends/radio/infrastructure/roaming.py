@@ -41,7 +41,8 @@ _MAX_TRIES: Final = 3
 """IEEE80211_AUTH_TIMEOUT, IEEE80211_ASSOC_TIMEOUT and their MAX_TRIES: mlme.c."""
 
 LINK_LOSS_NS: Final = 7 * BEACON_INTERVAL_NS + 2 * 500_000_000
-"""Time without beacons after which a link is lost: 7 beacons and 2 null frames, each after 500 ms, as in mlme.c."""
+"""Time without beacons after which a link is lost: 7 beacon intervals, and 2 null frames with a timeout of 500 ms
+each, as in mlme.c."""
 
 _RESCAN_NS: Final = 5_000_000_000
 """Interval of scans without an association: the default of wpa_supplicant."""
@@ -174,10 +175,11 @@ class Roaming:
         client.levels_dbm = {}
         if client.scan is not None:
             client.scan.on_scan(now_ns)
+        # Channel 0 is the current channel. An associated robot visits only the others.
         self._visit_channel(now_ns, client, 0 if client.scan is None else 1)
 
     def _visit_channel(self, now_ns: int, client: _Association, channel: int) -> None:
-        """Scan another channel."""
+        """Scan a channel, or end the scan after the last channel."""
         if channel >= self._options.channels:
             self._finish_scan(now_ns, client)
             return

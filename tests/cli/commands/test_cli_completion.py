@@ -110,8 +110,9 @@ def output_after_tab(lab: Path, shell: list[str], setup: str, line: str) -> str:
             output += os.read(terminal, 4096).decode(errors="replace")
 
     try:
-        # The shell joins the parts of the word, so that the echo of the input does not match.
-        os.write(terminal, f"{setup}; echo re''ady\n".encode())
+        # Text that is typed before the shell has configured the terminal and printed its prompt can be lost. The
+        # shell joins the parts of the word, so that the echo of the input does not match.
+        os.write(terminal, f"{setup}; PS1=re''ady\n".encode())
         await_text("ready")
         output = ""
         os.write(terminal, f"{line}\t".encode())

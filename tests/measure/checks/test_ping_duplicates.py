@@ -105,7 +105,7 @@ def test_captures_without_interfaces_or_with_fragments_give_no_number() -> None:
         ([Echo(REPLY, 1, CELL)], [(1, False), (1, True), (2, False)], [], []),
         ([Echo(REPLY, 1, CELL)], [(1, False), (2, False)], [], ["1 duplicate of replies that ping did not print"]),
         ([Echo(REPLY, 2, CELL, 500_000_000)], [(1, False), (2, False)], [], []),  # after the end of ping
-        ([], [(1, False), (2, False)], [Echo(REPLY, 2, CELL)], ["1 answer to requests that it lacks"]),
+        ([], [(1, False), (2, False)], [Echo(REPLY, 2, CELL)], ["1 answer to requests that it does not contain"]),
         ([], [(1, False), (2, False)], [Echo(REQUEST, 2, CELL), Echo(REPLY, 2, CELL)], []),
     ],
 )

@@ -51,7 +51,7 @@ def test_a_duplicate_of_busybox_counts_once_and_its_times_are_in_milliseconds() 
 
 def test_gaps_of_an_interrupted_busybox_run_start_from_0() -> None:
     lines = ["PING 10.9.9.9 (10.9.9.9): 56 data bytes", "64 bytes from 10.9.9.9: seq=2 ttl=64 time=0.157 ms"]
-    assert ping.parse("\n".join(lines)).gaps == (0, 1)
+    assert ping.parse("\n".join(lines)).unanswered_seqs == (0, 1)
 
 
 def test_a_normal_output_is_parsed() -> None:
@@ -103,7 +103,7 @@ def test_answers_and_gaps_of_real_outputs(
     result = ping.read(OUTPUTS / f"{name}.txt")
     assert result.payload_bytes == payload_bytes
     assert len(result.answers) == answers
-    assert ((result.transmitted, result.received), result.gaps) == (summary, gaps)
+    assert ((result.transmitted, result.received), result.unanswered_seqs) == (summary, gaps)
 
 
 def test_a_duplicate_is_kept_and_marked_but_does_not_count() -> None:
@@ -126,12 +126,12 @@ def test_a_payload_too_short_for_a_time_stamp_gives_no_round_trip_times() -> Non
 
 def test_a_reply_with_a_wrong_checksum_does_not_count() -> None:
     result = ping.parse("64 bytes from 10.9.0.2: icmp_seq=1 ttl=64 time=1.00 ms (BAD CHECKSUM!)\n")
-    assert (len(result.replies), len(result.answers), result.gaps) == (1, 0, ())
+    assert (len(result.replies), len(result.answers), result.unanswered_seqs) == (1, 0, ())
 
 
 def test_gaps_of_an_interrupted_run_end_at_the_last_known_number() -> None:
     lines = [f"64 bytes from 10.9.0.2: icmp_seq={seq} ttl=64 time=1.00 ms" for seq in (2, 5)]
-    assert ping.parse("\n".join(lines)).gaps == (1, 3, 4)
+    assert ping.parse("\n".join(lines)).unanswered_seqs == (1, 3, 4)
 
 
 def test_a_truncated_line_is_reported_unchanged() -> None:
@@ -157,7 +157,7 @@ fragments = st.sampled_from([
 def test_any_text_raises_no_error(text: str) -> None:
     result = ping.parse(text)
     assert len(result.answers) <= len(result.replies) <= text.count("\n") + 1
-    assert len(result.gaps) <= 65536
+    assert len(result.unanswered_seqs) <= 65536
 
 
 @given(st.binary())

@@ -42,9 +42,9 @@ def _measure_delays(
     sender: Packets, receiver: Packets, transfer_filter: Transfer, n_sent: int | None = None
 ) -> Measures:
     if transfer_filter.protocol is Protocol.UDP:
-        pairs = delay.udp_packets(udp.match_transfer(sender, receiver, transfer_filter))
+        pairs = delay.udp_pairs(udp.match_transfer(sender, receiver, transfer_filter))
     else:
-        pairs = delay.tcp_frames(tcp.match_transfer(sender, receiver, transfer_filter))
+        pairs = delay.tcp_pairs(tcp.match_transfer(sender, receiver, transfer_filter))
     columns = delay.measure(pairs, sender, receiver, transfer_filter, sent=len(pairs) if n_sent is None else n_sent)
     assert not columns.values.keys() & columns.missing.keys(), "no column has both a value and a reason"
     assert columns.values.keys() | columns.missing.keys() == {
@@ -296,7 +296,7 @@ def test_a_lost_tcp_frame_does_not_match_a_retransmission_in_a_larger_frame() ->
         packets(Frame(START_NS + ms * MILLISECOND_NS, data) for ms, data in frames)
         for frames in (sent_frames, arrivals)
     )
-    frames = delay.tcp_frames(tcp.match_transfer(sender, receiver, transfer(Protocol.TCP)))
+    frames = delay.tcp_pairs(tcp.match_transfer(sender, receiver, transfer(Protocol.TCP)))
     assert ((frames.receiver_ns - frames.sender_ns) / MILLISECOND_NS).tolist() == [10, 10]
 
 

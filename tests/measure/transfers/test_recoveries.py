@@ -12,7 +12,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FaultKind, Role
 from fieldkit.measure.robot_clock import Offset
 from fieldkit.measure.transfers import recoveries
-from fieldkit.measure.transfers.deliveries import Delivery
+from fieldkit.measure.transfers.deliveries import StreamDeliveries
 from fieldkit.measure.transfers.recoveries import FaultTimes
 
 MS = 1_000_000
@@ -22,9 +22,9 @@ KIND = FaultKind.LINK_DOWN
 ROBOT = Role.RECEIVER
 
 
-def delivery(*at_ms: int, begin_ms: int = 0, end_ms: int | None = None) -> Delivery:
+def make_stream(*at_ms: int, begin_ms: int = 0, end_ms: int | None = None) -> StreamDeliveries:
     at_ns = START + MS * np.array(at_ms, dtype=np.int64)
-    return Delivery(at_ns, START + begin_ms * MS, None if end_ms is None else START + end_ms * MS, 0.0, 0.2)
+    return StreamDeliveries(at_ns, START + begin_ms * MS, None if end_ms is None else START + end_ms * MS, 0.0, 0.2)
 
 
 def times(began_ms: int, ended_ms: int | None, ahead_s: float = 0.0, error_s: float = 0.001) -> FaultTimes:
@@ -36,7 +36,7 @@ def times(began_ms: int, ended_ms: int | None, ahead_s: float = 0.0, error_s: fl
     return FaultTimes(began_ns, ended_ns, {ROBOT: Offset(ahead_s, error_s)})
 
 
-def measure_values(fault_times: FaultTimes | None, *streams: Delivery) -> dict[str, Any]:
+def measure_values(fault_times: FaultTimes | None, *streams: StreamDeliveries) -> dict[str, Any]:
     result = recoveries.measure("transfer", KIND, lambda: streams, fault_times, ROBOT)
     recovery_names = {column.name for column in recoveries.declare_columns("transfer", KIND)}
     assert result.values.keys() | result.missing.keys() == recovery_names
@@ -52,30 +52,30 @@ def measure_values(fault_times: FaultTimes | None, *streams: Delivery) -> dict[s
 def test_recovery_starts_at_the_end_of_the_fault_for_any_clock_offset(
     before_ms: list[int], recovery_ms: int, ahead_s: int
 ) -> None:
-    stream = delivery(*sorted(before_ms), 3000 + recovery_ms, 3000 + recovery_ms + 10)
+    stream = make_stream(*sorted(before_ms), 3000 + recovery_ms, 3000 + recovery_ms + 10)
     result = measure_values(times(1000, 3000, float(ahead_s)), stream)
     assert result["recovery_s"] == pytest.approx(recovery_ms / 1e3, abs=1e-6)
     assert result["outage_s"] == pytest.approx((3000 + recovery_ms - max(before_ms)) / 1e3, abs=1e-6)
 
 
 def test_an_unaffected_flow_recovers_with_its_next_payload() -> None:
-    result = measure_values(times(1000, 3000), delivery(*range(0, 5000, 20)))
+    result = measure_values(times(1000, 3000), make_stream(*range(0, 5000, 20)))
     assert result == {"recovery_s": pytest.approx(0.02), "outage_s": pytest.approx(0.02)}
 
 
 def test_a_flow_that_does_not_recover_has_lower_bounds() -> None:
-    result = measure_values(times(1000, 3000), delivery(0, 500, 900, end_ms=9000))
+    result = measure_values(times(1000, 3000), make_stream(0, 500, 900, end_ms=9000))
     assert result == {"recovery_at_least_s": pytest.approx(6.0), "outage_at_least_s": pytest.approx(8.1)}
 
 
 def test_a_flow_that_ended_during_the_fault_has_only_an_outage() -> None:
-    result = measure_values(times(1000, 3000), delivery(0, 900, end_ms=2000))
+    result = measure_values(times(1000, 3000), make_stream(0, 900, end_ms=2000))
     assert result == {"outage_at_least_s": pytest.approx(1.1)}
 
 
 def test_the_last_of_several_streams_to_recover_counts() -> None:
-    recovered, unrecovered = delivery(0, 900, 3100), delivery(0, 900, end_ms=5000)
-    assert measure_values(times(1000, 3000), recovered, delivery(0, 950, 3900))["recovery_s"] == pytest.approx(0.9)
+    recovered, unrecovered = make_stream(0, 900, 3100), make_stream(0, 900, end_ms=5000)
+    assert measure_values(times(1000, 3000), recovered, make_stream(0, 950, 3900))["recovery_s"] == pytest.approx(0.9)
     assert measure_values(times(1000, 3000), recovered, unrecovered) == {
         "recovery_at_least_s": pytest.approx(2.0),
         "outage_at_least_s": pytest.approx(4.1),
@@ -83,30 +83,30 @@ def test_the_last_of_several_streams_to_recover_counts() -> None:
 
 
 def test_a_flow_that_was_being_set_up_has_an_outage_from_its_start() -> None:
-    result = measure_values(times(1000, 3000), delivery(4000, 4010, begin_ms=500))
+    result = measure_values(times(1000, 3000), make_stream(4000, 4010, begin_ms=500))
     assert result == {"recovery_s": pytest.approx(1.0), "outage_s": pytest.approx(3.5)}
 
 
 def test_a_fault_with_an_unknown_end_has_only_an_outage() -> None:
-    result = measure_values(times(1000, None), delivery(0, 990, 4000, 4010))
+    result = measure_values(times(1000, None), make_stream(0, 990, 4000, 4010))
     assert result == {"outage_s": pytest.approx(3.01)}
 
 
 @pytest.mark.parametrize(
     ("fault_times", "stream"),
     [
-        (None, delivery(0, 4000)),
-        (times(1000, 3000, error_s=0.2), delivery(0, 4000)),
-        (FaultTimes(START, START, {}), delivery(0, 4000)),
-        (times(1000, 3000), delivery()),
-        (times(1000, 3000), delivery(4000, 4010, begin_ms=3900)),
-        (times(1000, 3000), delivery(0, 900)),
-        (times(1000, 3000), delivery(0, 500, 2000)),
-        (times(1000, 3000), delivery(0, 900, end_ms=950)),
+        (None, make_stream(0, 4000)),
+        (times(1000, 3000, error_s=0.2), make_stream(0, 4000)),
+        (FaultTimes(START, START, {}), make_stream(0, 4000)),
+        (times(1000, 3000), make_stream()),
+        (times(1000, 3000), make_stream(4000, 4010, begin_ms=3900)),
+        (times(1000, 3000), make_stream(0, 900)),
+        (times(1000, 3000), make_stream(0, 500, 2000)),
+        (times(1000, 3000), make_stream(0, 900, end_ms=950)),
     ],
 )
 def test_flows_outside_the_fault_or_without_times_have_no_recovery(
-    fault_times: FaultTimes | None, stream: Delivery
+    fault_times: FaultTimes | None, stream: StreamDeliveries
 ) -> None:
     assert not measure_values(fault_times, stream)
 

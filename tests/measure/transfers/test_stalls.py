@@ -13,7 +13,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol
 from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.transfers import stalls, tcp, udp
-from fieldkit.measure.transfers.deliveries import Delivery, FlowSchedule
+from fieldkit.measure.transfers.deliveries import FlowSchedule, StreamDeliveries
 from tests.helpers.captures import transfer
 from tests.helpers.streams import MS, SECOND, START, Stream, captured
 
@@ -22,15 +22,15 @@ TCP, UDP = transfer(Protocol.TCP), transfer(Protocol.UDP)
 STEP_NS = 10 * MS
 
 
-def tcp_deliveries(sender: Packets, receiver: Packets, schedule: FlowSchedule = UNKNOWN) -> list[Delivery]:
+def tcp_deliveries(sender: Packets, receiver: Packets, schedule: FlowSchedule = UNKNOWN) -> list[StreamDeliveries]:
     return stalls.tcp_deliveries(tcp.match_transfer(sender, receiver, TCP), TCP.backward(sender), schedule)
 
 
-def udp_deliveries(sender: Packets, receiver: Packets, schedule: FlowSchedule = UNKNOWN) -> list[Delivery]:
+def udp_deliveries(sender: Packets, receiver: Packets, schedule: FlowSchedule = UNKNOWN) -> list[StreamDeliveries]:
     return stalls.udp_deliveries(udp.match_transfer(sender, receiver, UDP), schedule)
 
 
-def measure_values(deliveries: list[Delivery]) -> dict[str, Any]:
+def measure_values(deliveries: list[StreamDeliveries]) -> dict[str, Any]:
     values = stalls.measure("transfer", lambda: deliveries).values
     assert ("transfer_stall_s" in values) is not ("transfer_stall_at_least_s" in values), (
         "there is a value or a lower bound"

@@ -40,7 +40,7 @@ def test_no_order_is_given_without_a_motion() -> None:
     with motions.moving(mover(ScriptedShell(""))):
         pass
     assert not motions.order_stop(pytest.fail)
-    assert not motions.is_ordered
+    assert not motions.stop_ordered
 
 
 def test_each_robot_is_stopped_once_and_the_context_waits_for_the_landing() -> None:

@@ -195,7 +195,7 @@ def test_write_ahead_log_of_a_killed_ros_2_recorder_is_recovered(tmp_path: Path)
     before = {path.name: path.read_bytes() for path in remaining.iterdir()}
     report = contents.inspect(remaining)
     assert report.problems == (
-        "there is no metadata.yaml: the recorder was stopped before it closed the bag, or it was not copied",
+        "there is no metadata.yaml: the recorder was killed before it closed the bag, or this file was lost",
     )
     assert report.recoverable_messages == 41
     contents.repair(remaining, tmp_path / "saved")

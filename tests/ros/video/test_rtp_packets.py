@@ -135,12 +135,12 @@ def test_contradictions(tmp_path: Path) -> None:
         return "; ".join(video_checks.check_captures(sent, received, *packets))
 
     fewer = changed(sent, **{name: column[:-1] for name, column in vars(sent.samples).items()})
-    assert reasons(fewer, received) == "the sender's capture has 12 frames of the video, its log 11"
+    assert reasons(fewer, received) == "the sender's capture has 12 frames of the video, but its log has 11"
     later = changed(sent, sent_ns=sent.samples.sent_ns + 2 * MS)
-    assert "12 frames in the sender's capture were sent before they were taken" in reasons(later, received)
+    assert "12 frames in the sender's capture were sent before the time of the frame" in reasons(later, received)
     assert "1 frame in the receiver's log have no packet in its capture" in reasons(sent, logs()[1])
     soon = changed(received, at_ns=received.samples.at_ns - 3 * MS)
     assert "11 frames in the receiver's log arrived before their last packet" in reasons(sent, soon)
     sooner = changed(received, at_ns=received.samples.at_ns - 6 * MS)
     assert "11 frames in the receiver's log arrived before their packets" in reasons(sent, sooner)
-    assert "has 16 frames, its capture has packets of 11" in reasons(sent, replace(received, unreadable=5))
+    assert "has 16 frames, but its capture has packets of 11" in reasons(sent, replace(received, unreadable=5))

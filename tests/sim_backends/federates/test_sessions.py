@@ -114,7 +114,7 @@ def test_a_timeout_has_the_last_time() -> None:
 
 
 class SlowPhysics:
-    """A physics that needs longer than the deadline for its third answer."""
+    """A physics federate that needs longer than the deadline for its third answer."""
 
     step_ns = MS
     limits_m_s2: Mapping[str, float] = MappingProxyType({})
@@ -339,13 +339,13 @@ def test_no_connection_within_the_deadline_is_an_error() -> None:
 
 
 def test_a_federate_of_the_other_role_is_named() -> None:
-    with pytest.raises(FederateError, match="it is a physics, but a network was requested"):
+    with pytest.raises(FederateError, match="it is a physics federate, but a network federate was requested"):
         open_network(CARTS, replace(HELLO, role=NETWORK), 20.0)
     assert HELLO.role == PHYSICS
 
 
 class StationaryPhysics:
-    """A physics whose robots do not move."""
+    """A physics federate whose robots do not move."""
 
     step_ns = MS
     limits_m_s2: Mapping[str, float] = MappingProxyType({})

@@ -1,4 +1,4 @@
-"""Options of simulators in a scenario: validated with file and line before anything starts, complete on the wire."""
+"""Options of simulators in a scenario: an error has file and line, and a simulator receives all options."""
 
 import json
 from pathlib import Path
@@ -72,7 +72,7 @@ def test_an_option_of_the_command_line_is_validated_too(tmp_path: Path) -> None:
     ) as error_info:
         load_changed(tmp_path, network__options__standard="802.11ax")
     assert "correct the option with this value" in error_info.value.remedy
-    with pytest.raises(ConfigurationError, match="gazebo is a physics, not a network"):
+    with pytest.raises(ConfigurationError, match="gazebo is a physics federate, not a network federate"):
         load_changed(tmp_path, network__federate="gazebo")
     with pytest.raises(ConfigurationError, match="unknown key gravity; no keys are valid here"):
         load_changed(tmp_path, physics__federate="mujoco", physics__options={"gravity": 1})

@@ -263,7 +263,7 @@ def test_robots_appear_and_disappear_at_their_times(reset: str, tmp_path: Path) 
             assert physics.advance(0, {}).keys() == {"leader", "follower", "drone"}
 
 
-def test_the_next_run_restores_the_models_of_a_killed_run(tmp_path: Path) -> None:
+def test_the_next_run_restores_the_models_of_a_killed_run(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """The world has no model of the leader, which the killed run creates; it removes the drone."""
     changes = {**LIFETIMES, "agents.leader.at_m": [20, 53]}
     leader = re.search(r'<model name="leader">.*?</model>', SDF, re.DOTALL)
@@ -274,7 +274,11 @@ def test_the_next_run_restores_the_models_of_a_killed_run(tmp_path: Path) -> Non
             os.kill(adapter_pid(), signal.SIGKILL)
             with pytest.raises(FederateError, match="SIGKILL"):
                 physics.advance(1_000_000_000, {})
+        assert "killed" not in capfd.readouterr().err
         with open_federate(gazebo, changes=changes) as physics:
+            notes = capfd.readouterr().err
+            assert "an earlier run was killed; the model leader, which it may have created, is removed" in notes
+            assert "an earlier run was killed; the model drone is created again if it was removed" in notes
             assert record_presence(physics)["drone"] == list(range(0, 301, 10))
         with pytest.raises(FederateError, match=r"it has no moving model leader \("), open_federate(gazebo):
             pass

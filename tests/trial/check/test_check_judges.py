@@ -437,7 +437,7 @@ def test_a_remedy_uses_the_tools_and_permissions_of_the_robot(
 ) -> None:
     report = Report("turtlebot-1")
     report.user_tools = system.user_tools(
-        {"user": CommandResult(user, 0), "means": CommandResult("\n".join(programs.split()), 0)}
+        {"user": CommandResult(user, 0), "user-tools": CommandResult("\n".join(programs.split()), 0)}
     )
     report.fail("iw", "not found", remedy)
     assert only(report.findings, "iw").remedy == expected_remedy
@@ -445,7 +445,7 @@ def test_a_remedy_uses_the_tools_and_permissions_of_the_robot(
 
 def test_the_remedy_for_a_port_uses_an_available_tool() -> None:
     report = Report(RECEIVER.name)
-    report.user_tools = system.user_tools({"user": CommandResult("0", 0), "means": CommandResult("netstat", 0)})
+    report.user_tools = system.user_tools({"user": CommandResult("0", 0), "user-tools": CommandResult("netstat", 0)})
     system.judge(PLAN, Role.RECEIVER, {"listeners": CommandResult(LISTENER, 0)}, report)
     assert only(report.findings, "port 1234").remedy == "netstat -lntup | grep :1234 # find this program and stop it"
 
@@ -457,7 +457,9 @@ def test_the_remedy_for_a_clock_uses_an_available_tool() -> None:
         ("1000", "", "ssh -t -p 2222 pi@robot \"su -c 'date -u -s @$(date +%s)'\""),
     ):
         report = Report("turtlebot-1")
-        report.user_tools = system.user_tools({"user": CommandResult(user, 0), "means": CommandResult(programs, 0)})
+        report.user_tools = system.user_tools(
+            {"user": CommandResult(user, 0), "user-tools": CommandResult(programs, 0)}
+        )
         contact.judge_clock(Offset(5.0, 0.1), "-p 2222 pi@robot", report)
         assert only(report.findings, "clock").remedy == f"{command} # on the laptop"
 

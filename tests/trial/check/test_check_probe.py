@@ -31,7 +31,7 @@ def test_every_command_has_a_section_with_its_output(shell: tuple[str, ...]) -> 
     assert "LOOPBACK" in sections["interface"].text
     assert sections["disk"].ok
     assert sections["user"].text.isdigit()
-    assert set(sections["means"].text.split()) <= {"sudo", "apt-get", "setcap", "ss", "netstat"}
+    assert set(sections["user-tools"].text.split()) <= {"sudo", "apt-get", "setcap", "ss", "netstat"}
     assert "Linux" in sections["system"].text
     assert {"offloads", "wifi-info", "wifi-link", "wifi-stations", "wifi-power-save"} < sections.keys()
     assert completed.stderr == b""

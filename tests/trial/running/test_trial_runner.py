@@ -268,7 +268,7 @@ def test_an_attempt_stopped_during_fetching_is_fetched_by_resume(
     resume_trial(folder, IdleTestbed(), lambda _: None)
     first, second = journal.ended_attempts(journal.read(folder))
     assert (first.status, first.number, second.repeat.number) == (Status.VALID, 1, 2)
-    assert fetched[0] == first.remote(folder.name)
+    assert fetched[0] == first.remote_folder(folder.name)
 
 
 def test_evidence_of_an_attempt_stopped_during_its_steps_stays_on_the_robots(

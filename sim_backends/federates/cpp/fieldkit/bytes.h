@@ -85,7 +85,7 @@ class Reader
         return Bytes(size);
     }
 
-    // A number of items, each of at least `item_bytes`.
+    // Read the number of items that follow; each item has at least `item_bytes`.
     uint32_t Count(size_t item_bytes)
     {
         size_t position = Position();

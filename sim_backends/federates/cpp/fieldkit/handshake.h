@@ -69,7 +69,8 @@ ReadHello(const std::string& body, Role role)
     }
     if (reader.Get<uint8_t>() != role)
     {
-        throw Refusal(std::string("this federate is a ") + (role == kPhysics ? "physics" : "network"));
+        throw Refusal(std::string("this federate is a ") + (role == kPhysics ? "physics" : "network") +
+                      " federate");
     }
     reader.Get<uint8_t>(); // reserved
     Hello hello;
