@@ -2,10 +2,10 @@
 
 An exchange with a physics simulator is a request without commands and an answer with the states of all agents; an
 exchange with a network simulator is a request with these states and an answer without packets. The federate does
-nothing else. The time is that of the coordinator's call; the rounds of all transports alternate. The lower bound is a
-plain socket between two Python programs, over which the same number of bytes is sent and received without further
-processing. `to C` is `docs/examples/federates/carts.c`. The peers, HELICS and mosaik, exchange the same amount of
-data in each step (`cosim_peers`).
+nothing else. The duration of the coordinator's call is measured; the rounds of all transports alternate. The lower
+bound is a plain socket between two Python programs, over which the same number of bytes is sent and received without
+further processing. `to C` is `docs/examples/federates/carts.c`. The peers, HELICS and mosaik, exchange the same
+amount of data in each step (`cosim_peers`).
 
 Both processes share the machine's processors, so other load changes the wall time: its minimum over the rounds is the
 time on an idle machine, if one round was not disturbed. The processor time is that of both processes.
@@ -41,14 +41,18 @@ from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.world.motion import State
 
 COUNTS: Final = (3, 10, 50, 200)
+"""Numbers of agents."""
 ROUNDS: Final = 15
 EXCHANGES: Final = 300
-STEPS: Final = 1000
+"""Exchanges per round."""
 PEER_ROUNDS: Final = 3
+STEPS: Final = 1000
+"""Steps per round of a peer."""
 STEP_NS: Final = 1_000_000
 CARTS: Final = Path(__file__).parents[1] / "docs" / "examples" / "federates" / "carts.c"
 _PHYSICS_REQUEST_BYTES: Final = HEADER_BYTES + 8 + 8 + 4
 _PHYSICS_ANSWER_BYTES: Final = HEADER_BYTES + 8 + 4 + 4
+"""Lengths of a request without commands, and of an answer without states."""
 
 Exchange = Callable[[int], object]
 """Makes an exchange; its argument is the simulated time in nanoseconds."""

@@ -37,6 +37,7 @@ _EVENT: Final = struct.Struct("=IIQ II")
 
 _REALTIME_PRIORITY: Final = "10"
 _REPORT_S: Final = 2.0
+"""Time within which the watcher must report an exit."""
 _INTERPRETERS: Final = (["sh"], ["bash"])
 _ROOT: Final = Path(__file__).resolve().parents[1]
 
@@ -125,7 +126,7 @@ class Watch:
         self.close()
 
     def read(self, count: int, since_ns: int) -> tuple[Lifetime, ...]:
-        """Return `count` programs that started after `since_ns`, in the order in which they exited.
+        """Return the lifetimes of `count` programs that started after `since_ns`, in the order of their exits.
 
         Raises:
             EOFError: The watcher exited.

@@ -17,7 +17,7 @@
 namespace fieldkit
 {
 
-// One pcap file per station, in nanoseconds, of packets that begin with the IP header.
+// One pcap file per station, with time stamps in nanoseconds. The packets start with the IP header.
 class IpCaptures
 {
   public:
@@ -47,7 +47,7 @@ class IpCaptures
         }
     }
 
-    // Record that a packet of the coordinator enters, as one datagram.
+    // Record that a packet of the coordinator enters the network as one datagram.
     void Enter(uint64_t id, const std::string& flow, int64_t number)
     {
         auto entry = m_flows.find(flow);
@@ -78,6 +78,8 @@ class IpCaptures
   private:
     static constexpr size_t kSnapBytes = 128;
     static constexpr size_t kIpBytes = 20;
+    static constexpr uint8_t kIcmp = 1; // IP protocol numbers
+    static constexpr uint8_t kTcp = 6;
 
     struct Flow
     {
@@ -108,7 +110,7 @@ class IpCaptures
         IdTag tag;
         auto datagram = packet->PeekPacketTag(tag) ? m_datagrams.find(tag.number) : m_datagrams.end();
         bool is_first = header.GetFragmentOffset() == 0 && bytes.size() >= kIpBytes + 8;
-        if (header.GetProtocol() == 6 && is_first)
+        if (header.GetProtocol() == kTcp && is_first)
         {
             RenamePort(bytes, {source, Word(bytes, kIpBytes)}, kIpBytes + 2);
             RenamePort(bytes, {m_addresses.at(header.GetDestination()), Word(bytes, kIpBytes + 2)}, kIpBytes);
@@ -122,7 +124,7 @@ class IpCaptures
         Write(station, bytes, packet->GetSize());
     }
 
-    // Replace the port of the listener of a connection, which is identified by its other end.
+    // Replace the listener's port, at position `at`, by the port of the flow; `end` is the other end of the connection.
     void RenamePort(std::vector<uint8_t>& bytes, std::pair<Ipv4Address, uint16_t> end, size_t at) const
     {
         auto connection = m_connections.find(end);
@@ -143,7 +145,7 @@ class IpCaptures
         {
             return;
         }
-        bytes[9] = 1; // ICMP; its header is as long as the UDP header (RFC 792)
+        bytes[9] = kIcmp; // an echo header is as long as the UDP header (RFC 792)
         if (is_first)
         {
             uint8_t* echo = &bytes[kIpBytes];
@@ -163,7 +165,7 @@ class IpCaptures
         {
             std::filesystem::create_directories(m_folder);
             file.open(m_folder + "/" + m_names[station] + ".pcap", std::ios::binary | std::ios::trunc);
-            protocol::Writer head;
+            protocol::Writer head; // pcap 2.4 with nanoseconds, and LINKTYPE_RAW (101)
             head.Put(uint32_t{0xA1B23C4D}).Put(uint16_t{2}).Put(uint16_t{4}).Put(uint64_t{0});
             head.Put(static_cast<uint32_t>(kSnapBytes)).Put(uint32_t{101});
             file.write(head.data.data(), static_cast<std::streamsize>(head.data.size()));
