@@ -139,7 +139,7 @@ def _parse_netcat(text: str, code: int, program: str) -> tuple[Netcat, str]:
         if match := pattern.search(text):
             return kind, printable(match[0].encode())
     raise _unknown_tool_error(
-        text, code, program, "sudo apt-get install netcat-traditional, and netcat: nc.traditional in"
+        text, code, program, "sudo apt-get install netcat-traditional, and write netcat: nc.traditional"
     )
 
 
@@ -149,7 +149,7 @@ def _parse_ping(text: str, code: int, program: str) -> tuple[PingTool, str]:
         return PingTool.IPUTILS if is_new else PingTool.IPUTILS_OLD, printable(match[0].encode())
     if match := _BUSYBOX.search(text):
         return PingTool.BUSYBOX, printable(match[0].encode())
-    raise _unknown_tool_error(text, code, program, "sudo apt-get install iputils-ping, and ping: ping in")
+    raise _unknown_tool_error(text, code, program, "sudo apt-get install iputils-ping, and write ping: ping")
 
 
 def _require_ping(text: str, program: str, kind: PingTool) -> None:
@@ -165,7 +165,7 @@ def _require_ping(text: str, program: str, kind: PingTool) -> None:
 def _parse_capture(text: str, code: int, program: str) -> tuple[bool, str]:
     if match := _TCPDUMP.search(text):
         return "--immediate-mode" in text, printable(match[0].encode())
-    raise _unknown_tool_error(text, code, program, "sudo apt-get install tcpdump, and capture: tcpdump in")
+    raise _unknown_tool_error(text, code, program, "sudo apt-get install tcpdump, and write capture: tcpdump")
 
 
 def _parse_recorder(text: str, code: int, profile: RobotProfile) -> Recorder:
@@ -207,4 +207,4 @@ def _unknown_tool_error(text: str, code: int, program: str, remedy: str) -> Robo
         return _timeout_error(program)
     problem = f"there is no {program}" if code in _MISSING else f"{program} is of an unknown kind"
     excerpt = printable(text.encode(), limit=100)
-    return RobotError(f"{problem}: {excerpt}" if excerpt else problem, remedy=f"{remedy} its profile")
+    return RobotError(f"{problem}: {excerpt}" if excerpt else problem, remedy=f"{remedy} in its profile")
