@@ -96,7 +96,7 @@ def _inches(panel: Panel) -> tuple[float, float]:
 def paper(chart: Chart, file_format: Format) -> bytes:
     """Return a chart with its legend, one column of a paper wide, or two columns wide if it has several panels."""
     columns = 1 if chart.is_stacked else min(2, len(chart.panels))
-    rows = -(-len(chart.panels) // columns)
+    rows = math.ceil(len(chart.panels) / columns)
     width = _COLUMN_INCHES if len(chart.panels) == 1 else _BOTH_COLUMNS_INCHES
     height = _STRIP_INCHES[1] if chart.is_stacked else _PAPER_PANEL_INCHES
     with _settings(8.0):

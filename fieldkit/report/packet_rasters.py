@@ -1,5 +1,6 @@
 """Packet rasters: the packets of each repeat in the order of sending, with losses and retransmissions marked."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -72,7 +73,8 @@ def groups(cells: Sequence[Cell], evidence: Evidence) -> Iterator[RasterGroup]:
         }
         for transfer in dict.fromkeys(name for lines in packets_by_place.values() for name in lines):
             marked_lines = {place: lines.get(transfer, []) for place, lines in packets_by_place.items()}
-            width = -(-max(len(line) for lines in marked_lines.values() for line in lines) // MAX_COLUMNS)
+            longest = max(len(line) for lines in marked_lines.values() for line in lines)
+            width = math.ceil(longest / MAX_COLUMNS)
             what = _MARK_MEANING[transfer[1]]
             yield RasterGroup(
                 title=", ".join(filter(None, (transfer[0], title))),

@@ -1,5 +1,6 @@
 """Series of figures: panels of conditions, the style of each series in all figures, and estimates as points."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
@@ -178,7 +179,7 @@ def point(cell: Cell, quantity: Quantity, factor: float, evidence: Evidence) -> 
     estimate = cell.estimates[quantity.name]
     low, high = (None if end is None else factor * end for end in (estimate.low, estimate.high))
     values, is_bound = evidence.observed(cell, quantity)
-    every_kth = slice(None, None, max(-(-len(values) // max_behind(evidence)), 1))
+    every_kth = slice(None, None, max(math.ceil(len(values) / max_behind(evidence)), 1))
     if quantity.kind is Kind.FLAG:
         values = values[:0]
     return Point(

@@ -142,7 +142,7 @@ def _packets(transfer: Transfer, fates: Fates, zero_ns: int) -> Panel:
     )
     series = []
     for label, style, at_ns, at_bytes in kinds:
-        every_kth = slice(None, None, max(1, -(-len(at_ns) // MAX_PACKETS)))
+        every_kth = slice(None, None, max(1, math.ceil(len(at_ns) / MAX_PACKETS)))
         series.append(Series(label, style, (at_ns[every_kth] - first_sent_ns) / 1e6, at_bytes[every_kth] / 1e3))
     return Panel(
         title=f"packets of {transfer.name or 'the transfer'}",

@@ -22,6 +22,7 @@ _NAME: Final = r"address\.[^{}]*|\s*[A-Za-z_][A-Za-z0-9_.-]*\s*"
 _BRACES: Final = re.compile(
     rf"(?P<shell>\$\{{+(?!address\.))|\{{\{{(?P<literal>{_NAME})\}}\}}|\{{(?P<name>{_NAME})\}}"
 )
+"""The start of a shell variable, a name in double braces, or a name in single braces."""
 
 
 def fill_in(word: str, values: Mapping[str, str], address: Callable[[str], str]) -> str:

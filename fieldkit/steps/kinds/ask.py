@@ -56,7 +56,7 @@ class AskStep(Step, DescribesActions, AsksOperator, WritesOnLaptop, Summarizes):
         least: Smallest possible number.
         most: Largest possible number.
         usual: Default answer. It is used if the operator only presses Enter, and if no operator is asked.
-        each: `trial`: asked once, before the first repeat that contains the step; `repeat`: asked in each repeat.
+        each: `trial` asks once, before the first repeat that contains the step; `repeat` asks in each repeat.
     """
 
     column: StepName

@@ -66,12 +66,12 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
 
     The filter accepts the ports of the steps inside, ICMP, and every later IP fragment between the robots of these
     steps (a port filter matches only first fragments). The columns on losses and delays of a transfer are empty
-    unless the transfer is inside a capture on both of its robots. With a `ping` inside, after the transfer, the
-    captures give the offset between the two clocks, which [one-way delay](method-delay.md#one-way-delay) needs: a UDP
-    transfer has no answer, and the offset needs packets in both directions. A link with the interface `lo` is an
-    address that a routing daemon reaches over any interface ([links](links.md)). For such a link, tcpdump captures on
-    all interfaces; do not use it on a robot with a bridge or bond, where each packet appears twice.
-    Writes `ROLE.pcap` and `ROLE-capture.log`.
+    unless the transfer is inside a capture on both of its robots. [One-way delay](method-delay.md#one-way-delay)
+    needs the offset between the two clocks, which is computed from packets in both directions. A UDP transfer has no
+    answer, so put a `ping` after it, inside the capture. A link with the interface `lo` is an address that a routing
+    daemon reaches over any interface ([links](links.md)). For such a link, tcpdump captures on all interfaces; do not
+    use it on a robot with a bridge or bond, where each packet appears twice. Writes `ROLE.pcap` and
+    `ROLE-capture.log`.
 
     Attributes:
         over: Link to capture, by its name in [the profiles of the robots](links.md); without it, the radio under

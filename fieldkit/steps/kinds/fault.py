@@ -52,9 +52,9 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     The backend of simulated robots causes the fault. In the field the operator is asked to cause it; with `--yes` no
     operator is asked, and the attempts are void.
 
-    - `link-down`: the interface of the radio, or of `link`, is down for `for`, then up again.
-    - `out-of-range`: no other robot receives packets of the robot for `for`. If it is the relay, no robot receives
-      packets of any other.
+    - `link-down`: the interface of the radio, or of `link`, is down for the time `for`, then up again.
+    - `out-of-range`: no other robot receives packets of the robot for the time `for`. If the robot is the relay, no
+      robot receives packets of another robot.
     - `reboot`: every process ends at the same moment, data in memory is lost, and the robot boots.
     - `kill`: every process named `process` ends at the same moment.
 

@@ -92,7 +92,7 @@ class TransferStep(
     WritesOnLaptop,
     Summarizes,
 ):
-    """Sends a file with netcat, by the protocol of the repeat.
+    """Sends a file with netcat over the protocol of the repeat, TCP or UDP.
 
     The receiver runs `nc -l -p PORT > recv.bag`, the sender `nc ADDRESS PORT < scan.bag`, with the options of the
     [netcat that each robot has](method-loss.md#tools-that-differ). A TCP transfer ends when its connection closes, a
