@@ -60,13 +60,13 @@ class PrintedColumn(Strict):
     name: Annotated[
         str,
         schema.pattern_field(
-            r"^[a-z][a-z0-9_]{0,40}$", "a name: at most 41 lower-case letters, digits and _, a letter first"
+            r"^[a-z][a-z0-9_]{0,40}$", "a name of at most 41 lower-case letters, digits and _, with a letter first"
         ),
     ]
     unit: Annotated[
         str,
         schema.pattern_field(
-            r"^[^\s,;\"][^,;\"\x00-\x1f]{0,15}$", "a unit: 1 to 16 characters, none of them , ; or quotes"
+            r"^[^\s,;\"][^,;\"\x00-\x1f]{0,15}$", "a unit of 1 to 16 characters, without , ; and quotes"
         ),
     ]
     meaning: Annotated[str, Field(max_length=300)] = ""
@@ -335,7 +335,7 @@ class RunStep(Step, UsesSpace, Summarizes):
     @override
     def check(self, view: View) -> Iterator[str]:
         """Yield a reason for a wrong exit code, unreadable output, and each missing value or value out of bounds."""
-        after = view.evidence.read_or_none(host.state, host.after_file(self.robot))
+        after = view.evidence.read_or_none(host.read_state, host.after_file(self.robot))
         ending = (after.endings or {}).get(self.prefixed_name("run")) if after else None
         if ending is not None and ending.code is not None and ending.code not in self.expect.code:
             yield f"{view.scene.robot(self.robot).name}: {self._program_name} ended with exit code {ending.code}"
