@@ -138,7 +138,7 @@ def _panel(cells: Sequence[Cell], title: str, protocol: str, quantity: str) -> P
 def _end(source: Estimate, end: float | None, factor: float) -> float | None:
     """Return an end of an interval to draw.
 
-    None if the value is 0, because the interval would then depend only on the number of repeats.
+    The result is None if the value is 0, because the interval would then depend only on the number of repeats.
     """
     return None if end is None or source.value == 0 else factor * end
 
@@ -173,7 +173,7 @@ def table(cells: Sequence[Cell], attempts: Repeats) -> Iterator[str]:
 
 
 LATE: Final[tuple[tuple[str, Callable[..., float]], ...]] = (("p99", np.nanmedian), ("max", np.nanmax))
-"""Statistics of the lateness: the p99 of the median repeat, and the maximum of all packets."""
+"""Statistics of the lateness: the median over the repeats of their p99, and the maximum of all packets."""
 
 
 def _place(cell: Cell) -> tuple[str, str, float]:

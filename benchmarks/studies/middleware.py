@@ -77,7 +77,7 @@ def copy_lab(folder: Path, repeats: int | None = None) -> None:
 
 
 def campaign_name(campaign: str, repeats: int | None) -> str:
-    """Return the name of a campaign with a separate number of repeats: `dds-12`."""
+    """Return the name of a campaign, with the number of repeats if it is not the number in the file: `dds-12`."""
     return f"{campaign}-{repeats}" if repeats else campaign
 
 
@@ -135,7 +135,7 @@ def by_distance(findings: MiddlewareFindings, name: str, quantity: "PlottedQuant
 
 
 def by_robots(findings: MiddlewareFindings) -> Chart:
-    """Return a chart of loss and delay by the number of robots that publish to one."""
+    """Return a chart of loss and delay by the number of robots, all but one of which publish to that one."""
     panels = []
     for quantity in (LOSS, DELAY):
         for metres in sorted({cell.distance_m for cell in findings.cells if cell.robots > 2}):

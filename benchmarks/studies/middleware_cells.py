@@ -29,16 +29,16 @@ class MiddlewareCell:
     """One middleware with its settings, at one distance with one size of samples.
 
     Attributes:
-        middleware: The middleware, with `, tuned` if its settings are.
+        middleware: Name of the middleware, with `, tuned` if its settings are tuned.
         kind: `best effort` or `reliable`.
-        size_bytes: Data of a sample.
+        size_bytes: Size of the data of a sample.
         distance_m: Distance between the robots.
         robots: Number of robots, including the subscriber.
         loss: Share of the samples of all valid repeats that did not arrive, or were not sent because the previous one
             blocked the publisher; None if the subscriber was not discovered.
         delay_p95_s: Median over repeats of the 95th percentile of the delay; None if the clocks are not comparable.
-        loss_low: Lower end of the 95 % interval of the loss over repeats; None without one.
-        loss_high: Upper end.
+        loss_low: Lower end of the 95 % interval of the loss over repeats; None if there are fewer than two repeats.
+        loss_high: Upper end of this interval.
         samples: Number of samples.
         repeats: Number of repeats.
     """

@@ -21,6 +21,7 @@ from fieldkit.telemetry.source_readings import SourceReadings
 from fieldkit.telemetry.telemetry_section import TelemetrySection, TelemetrySource
 
 _MAX_TEXTS: Final = 4
+"""Maximum number of different texts in a value; the number of further texts is appended."""
 
 
 def _role_columns(role: Role) -> tuple[Column, ...]:

@@ -148,6 +148,7 @@ def _gaps(intervals: tuple[IperfInterval, ...]) -> Iterator[str]:
 
 
 def _interval_problems(interval: IperfInterval) -> Iterator[str]:
+    """Yield the contradictions within an interval, as predicates: `has 100 bytes, but its streams have 90`."""
     if interval.start_s is not None and interval.end_s is not None:
         duration_s = interval.end_s - interval.start_s
         if abs(duration_s - interval.duration_s) > _ROUNDING_S:
@@ -196,6 +197,7 @@ def compare_ends(client: IperfTest, server: IperfTest, settings: IperfSettings) 
 
 
 def _differences(test: IperfTest, settings: IperfSettings) -> Iterator[str]:
+    """Yield the differences between a test and the procedure's settings, as predicates."""
     start = test.start
     comparisons = {
         "protocol": (start.protocol or None, str(settings.protocol)),

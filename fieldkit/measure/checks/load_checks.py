@@ -204,6 +204,7 @@ def _first_seq(stream: Packets) -> int | None:
 
 
 def _acknowledgments(flow: LoadFlow, packets: Packets, sport: int, dport: int) -> Packets:
+    """Return the packets that acknowledge data of a stream."""
     ends = packets.are_from(flow.destination_address) & packets.are_to(flow.source_address)
     return packets.where(
         ends

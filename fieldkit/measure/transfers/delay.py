@@ -95,6 +95,7 @@ SINGLE_PACKET: Final = "one direction has a single packet in both captures, and 
 _JITTER_GAIN: Final = 1 / 16
 """Weight of the newest step in the interarrival jitter of RFC 3550."""
 _WEIGHTED_STEPS: Final = 1000
+"""Number of steps that are used; the weight of older steps is below 1e-29."""
 
 
 def udp_pairs(packets: udp.UdpPackets) -> StampPairs:
@@ -282,6 +283,7 @@ def _clock(clocks: Clocks) -> Measured:
 
 
 def _one_way(delay_s: Floats, error_s: float, sent: int) -> Measured:
+    """Return the columns of the one-way delay; a column whose error is too large is empty."""
     figures = {
         "one_way_min_s": float(delay_s.min()),
         "one_way_median_s": float(np.median(delay_s)),

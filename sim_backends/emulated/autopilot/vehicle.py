@@ -173,8 +173,8 @@ class Vehicle(VehicleBase):
     def _update_boot_state(self) -> None:
         """Set the origin once the position estimate is good; until then, report why the vehicle cannot be armed."""
         now_ns, estimate = self.body.now_ns, self.estimate
-        if self.firmware.is_ardupilot and not self.is_armed and now_ns >= self._prearm_ns:
-            self._prearm_ns = now_ns + _PREARM_NS
+        if self.firmware.is_ardupilot and not self.is_armed and now_ns >= self._next_prearm_ns:
+            self._next_prearm_ns = now_ns + _PREARM_NS
             if estimate.is_starting(now_ns) or estimate.origin_m is not None:
                 self.check()
         if not estimate.advance(now_ns, self.body.place_m):
