@@ -71,7 +71,7 @@ _COLUMNS_BY_NAME: Final = {column.name: column for column in (*link.COLUMNS, *CO
 
 
 def of_role(role: Role) -> tuple[Column, ...]:
-    """Return the columns of a role in addition to those of every trial."""
+    """Return the columns of a role that a trial has only if a profile has telemetry sources."""
     return _COLUMNS[role]
 
 
