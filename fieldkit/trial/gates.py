@@ -23,9 +23,7 @@ from fieldkit.trial.procedure import PlacedStep, Procedure
 from fieldkit.trial.step_errors import StepErrors
 
 _TIME_UNITS: Final = frozenset(("s", "bit/s", "m/s", "ppm"))
-_NO_TIMES: Final = (
-    "the backend's clock counts instructions of a virtual processor, so it measures no real durations"
-)
+_NO_TIMES: Final = "the backend's clock counts instructions of a virtual processor, so it measures no real durations"
 
 
 @dataclass(frozen=True)
