@@ -215,7 +215,7 @@ def _values(rows: Repeats, quantity: Quantity) -> Numbers:
 def _interval(a: Estimate, b: Estimate) -> Interval | None:
     if a.low is None or a.high is None or b.low is None or b.high is None:
         return None
-    return significance.between(Interval(a.value, a.low, a.high), Interval(b.value, b.low, b.high))
+    return significance.difference_interval(Interval(a.value, a.low, a.high), Interval(b.value, b.low, b.high))
 
 
 def _with_holm(pairs: Sequence[Pair]) -> tuple[Pair, ...]:

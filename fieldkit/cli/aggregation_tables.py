@@ -243,7 +243,7 @@ def _additional_repeats(line: TableLine, cell: Cell, additional: Mapping[str, in
 
 def _repeat_count(n: int, cell: Cell) -> str:
     """Return the number of valid repeats with a value: `5`, or `4 of 5`."""
-    return table_lines.part_of(n, cell) or str(n)
+    return table_lines.partial_count(n, cell) or str(n)
 
 
 def _figures(line: TableLine, cell: Cell, scale: wording.Scale) -> dict[str, str]:
@@ -259,7 +259,7 @@ def _figures(line: TableLine, cell: Cell, scale: wording.Scale) -> dict[str, str
     if quantity.at_least:
         heads.append("not ended")
     if estimate is None:
-        return dict.fromkeys(heads, "") | {"n": table_lines.part_of(0, cell)}
+        return dict.fromkeys(heads, "") | {"n": table_lines.partial_count(0, cell)}
     figures = {
         "n": _repeat_count(estimate.n, cell),
         "sent": "" if estimate.trials is None else str(estimate.trials),

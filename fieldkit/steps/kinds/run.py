@@ -60,13 +60,13 @@ class PrintedColumn(Strict):
     name: Annotated[
         str,
         schema.pattern_field(
-            r"^[a-z][a-z0-9_]{0,40}$", "a name: at most 41 lower-case letters, digits and _, a letter first"
+            r"^[a-z][a-z0-9_]{0,40}$", "a name of at most 41 lower-case letters, digits and _, with a letter first"
         ),
     ]
     unit: Annotated[
         str,
         schema.pattern_field(
-            r"^[^\s,;\"][^,;\"\x00-\x1f]{0,15}$", "a unit: 1 to 16 characters, none of them , ; or quotes"
+            r"^[^\s,;\"][^,;\"\x00-\x1f]{0,15}$", "a unit of 1 to 16 characters, without , ; and quotes"
         ),
     ]
     meaning: Annotated[str, Field(max_length=300)] = ""

@@ -68,7 +68,7 @@ def run_and_view(step: AskStep, folder: Path, operator: ScriptedOperator | None 
         (f"{WIND}, usual: strong", "usual is 'strong'; permitted answers: a number in m/s from 0 to 40"),
         (f"{GRASS}, usual: high", "usual is 'high'; permitted answers: 1 dry, 2 wet; - if unknown\n"),
         ("column: a, question: b, choices: [a]", "at least 2 items"),
-        ("column: A, question: b", "'A' is not a name: at most 31 lower-case letters"),
+        ("column: A, question: b", "'A' is not a name of at most 31 lower-case letters"),
         ("column: a, question: b, unit: 2m", "'2m' is not a unit"),
         ("column: a, question: b, choices: [a, b, a]", "a choice is listed twice"),
         ("column: a, question: b, choices: [a, '2']", "choices.1: '2' cannot be a choice: write words"),
