@@ -60,7 +60,7 @@ def _contradictions(scene: Scene, evidence: AttemptEvidence) -> Iterator[str]:
 def _times_ns(evidence: AttemptEvidence, role: Role, *trajectories: Trajectory) -> Ints:
     """Return the times at which the distance of two robots is compared, by the laptop's clock."""
     times_ns = np.unique(np.concatenate([trajectory.times_ns for trajectory in trajectories]))
-    states = [evidence.read_or_none(host.state, file(role)) for file in (host.before_file, host.after_file)]
+    states = [evidence.read_or_none(host.read_state, file(role)) for file in (host.before_file, host.after_file)]
     clocks = [state.clock for state in states if state is not None and state.clock is not None]
     if len(clocks) < len(states):
         return times_ns
