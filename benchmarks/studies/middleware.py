@@ -98,7 +98,7 @@ def ros2_robot() -> str:
 def run(folder: Path, names: Sequence[str]) -> None:
     """Run or continue campaigns, each with a log file; report those that failed.
 
-    Repeats whose packets were late on a busy machine are void; the valid ones still count.
+    Repeats with late packets, on a busy machine, are void. The valid repeats of a failed campaign are still used.
     """
     environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
     running = []
@@ -265,7 +265,7 @@ def main() -> None:
         run(options.out, [f"{prefix}{campaign_name(name, options.repeats)}" for name in options.only])
     findings = read(options.out, names)
     print(
-        f"{time.strftime('%Y-%m-%d', time.gmtime(findings.ended_s))}: {findings.ended}; packets were up to "
+        f"{time.strftime('%Y-%m-%d', time.gmtime(findings.ended_s))}: {findings.status_text}; packets were up to "
         f"{1e3 * findings.late_s:.1f} ms late; load average {os.getloadavg()[2]:.1f} when this was written."
     )
     if options.table:

@@ -159,7 +159,7 @@ def _interval_problems(interval: IperfInterval) -> Iterator[str]:
     rate = interval.rate_bit_s
     if rate is not None and not math.isclose(rate, interval.bit_s, rel_tol=_ROUNDING, abs_tol=8):
         yield f"has {interval.bit_s:.0f} bit/s by its bytes, but reports {rate:.0f} bit/s"
-    # A negative loss is no contradiction: a datagram that arrives late is counted as lost in one interval, and
+    # A negative loss is possible: a datagram that arrives late is counted as lost in one interval, and
     # subtracted from the losses of the next.
     if interval.lost is not None and interval.datagrams is not None and interval.lost > interval.datagrams:
         yield f"has {interval.lost} of {interval.datagrams} datagrams lost"

@@ -117,7 +117,7 @@ def _check_arrivals(
     total_bytes = sum(interval.payload_bytes for interval in received.intervals)
     if not len(progress.times_ns):
         if total_bytes:
-            yield f"iperf3 received {total_bytes} bytes, but the receiver's capture contains none of them"
+            yield f"iperf3 received {total_bytes} bytes, but the receiver's capture contains no payload of the test"
         return
     first_ns = int(progress.times_ns[0])
     request_ns = _last_request_ns(flow, evidence, first_ns)

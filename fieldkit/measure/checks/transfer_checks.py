@@ -237,7 +237,7 @@ CROSS_CHECKS: Final = (
         ),
         source="`sender.pcap`, `receiver.pcap`",
         against=("each other", "`ROLE-capture.log`: tcpdump's counters", "TCP's acknowledgments", "both files"),
-        tolerance="none; losses, copies and reordering on the link are no contradictions",
+        tolerance="none; losses, copies and reordering on the link are not contradictions",
     ),
     CrossCheck(
         quantity="delay and its variation",
@@ -276,7 +276,7 @@ CROSS_CHECKS: Final = (
     CrossCheck(
         quantity="distance and speed during the transfer",
         columns=("transfer_distance_*", "transfer_*_speed_m_s"),
-        source="`track.csv` of the emulator, else `positions.json`",
+        source="`track.csv` of the emulator; without an emulator, `positions.json`",
         against=(),
         tolerance="the positions are compared only if steps move robots or record positions",
         outcome=CheckOutcome.UNCHECKED,

@@ -127,7 +127,7 @@ def read(folder: Path, role: Role) -> Sequence[LinkSample]:
         EvidenceError: The files are missing, or do not contain the robot's clock.
     """
     paths = [folder / name(role) for name in (host.before_file, host.after_file) if (folder / name(role)).is_file()]
-    dumps = [(state.clock, host.stations(path)) for path in paths if (state := host.state(path)).clock]
+    dumps = [(state.clock, host.station_dump(path)) for path in paths if (state := host.read_state(path)).clock]
     if not dumps or dumps[0][0] is None:
         raise EvidenceError("does not contain the clock", where=str(folder / host.before_file(role)))
     clock = dumps[0][0]

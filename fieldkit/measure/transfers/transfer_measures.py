@@ -88,7 +88,7 @@ def measure(evidence: AttemptEvidence, transfer: Transfer, listener: str = "") -
             evidence, DISTANCE, (transfer.source, transfer.destination), _sent_ns(sender, transfer)
         )
         | _paper(sender, None if contradiction else receiver, ping_output, transfer)
-        | host.measure(*(evidence.read_or_none(host.read, name) for name in states))
+        | host.measure(*(evidence.read_or_none(host.read_counters, name) for name in states))
         | _system(evidence, transfer)
     )
 

@@ -63,7 +63,7 @@ BagName = Annotated[
     str,
     schema.pattern_field(
         r"^[a-z][a-z0-9_.-]{0,40}(/[a-z][a-z0-9_.-]{0,40})?$",
-        "the name of a recording, scan, or of its file, scan.bag or scan/scan_0.db3",
+        "the name of a recording (scan), or of its file (scan.bag or scan/scan_0.db3)",
     ),
 ]
 
@@ -352,7 +352,7 @@ class TransferStep(
 
     def _ending(self, view: View, role: Role, job: str) -> Ending | None:
         """Return the recorded termination of a netcat, or None if there is no record."""
-        after = view.evidence.read_or_none(host.state, host.after_file(role))
+        after = view.evidence.read_or_none(host.read_state, host.after_file(role))
         return (after.endings or {}).get(job) if after else None
 
     @override
