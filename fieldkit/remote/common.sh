@@ -23,9 +23,9 @@
 #                                        into ROLE-link.txt, and a job for each SOURCE
 #   job.sh poll FILE TOKEN ADDRESS INTERFACE INTERVAL LIMIT ARGV...
 #                                        run ARGV at intervals and print its output, see telemetry.sh
-#   job.sh pack  DIR ROLE INTERFACE      stop these jobs, write ROLE-after.txt, ROLE-sources-after.txt and hashes, send
-#                                        small files as a tar: first the hashes and the list of large files; then fail if a
-#                                        job for which `stop` did not wait has failed
+#   job.sh pack  DIR ROLE INTERFACE      stop the jobs that `begin` started, write ROLE-after.txt, ROLE-sources-after.txt and
+#                                        hashes, send small files as a tar: first the hashes and the list of large files;
+#                                        then fail if a job for which `stop` did not wait has failed
 #   job.sh piece DIR FILE NUMBER BYTES   send a piece of FILE; pieces are counted from 0
 #   job.sh sum   DIR FILE                print the hash of FILE
 #   job.sh end   DIR                     stop all running jobs of DIR; no other job can start there

@@ -2,7 +2,7 @@
 
 PIECE=4194304 # as PIECE_BYTES of fetching.py
 
-print_state() { # print the state of the host; $1 interface
+print_state() { # print the state of the host and of interface $1
     interface=$1
     set --
     for file in /proc/net/snmp /proc/net/netstat /proc/net/dev /proc/net/wireless /proc/loadavg \

@@ -10,7 +10,7 @@ SOURCE_S=2
 KILLED=137 # exit code after SIGKILL
 SOURCE_BLOCKS=64 # limit of the output of a source, in blocks of 512 or 1,024 bytes
 
-start_source() { # NAME COMMAND...: start a source; it writes the file NAME in $folder
+start_source() { # start the source $1 with the command in the other arguments; it writes the file $1 in $folder
     [ -d "$folder" ] || mkdir "$folder" || return
     name=$folder/$1
     if has_hung "$1"; then
@@ -64,7 +64,7 @@ health() { # print values of the computer, one per line
     (read_free_space && echo "disk $free") || :
 }
 
-start_radio_sources() { # $1 interface
+start_radio_sources() { # start the sources for the radio with interface $1
     command -v iw >/dev/null || return 0
     start_source iw-info iw dev "$1" info
     has_hung iw-info || wait "$!"
@@ -86,8 +86,9 @@ start_radio_sources() { # $1 interface
     start_source iw-scan "$@"
 }
 
-snapshot() { # $1 a new folder for temporary files, $2 interface of the radio, or -, $3 file with the names of sources that
-    # hung, to which further ones are added, or -: print the outputs of all sources
+# Print the outputs of all sources. $1: new folder for temporary files; $2: interface of the radio, or -; $3: file with the
+# names of sources that hung before, to which the names of others are added, or -.
+snapshot() {
     folder=$1 hung_sources=:
     [ ! -s "$3" ] || while read -r name; do hung_sources=$hung_sources$name:; done <"$3"
     (
