@@ -96,6 +96,7 @@ snapshot() { # $1 a new folder for temporary files, $2 interface of the radio, o
         start_clock_sources
         [ "$2" = - ] || start_radio_sources "$2"
         start_source health sh "$self" health
+        ! command -v ip >/dev/null || start_source interfaces ip -o link
         ! command -v vcgencmd >/dev/null || start_source vcgencmd vcgencmd get_throttled
         wait
         [ "$3" = - ] || for source in "$folder"/*; do
