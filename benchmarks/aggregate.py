@@ -1,4 +1,4 @@
-"""Aggregate thousands of trial.csv into one table, compared with pandas: `python -m benchmarks.aggregate`.
+"""Aggregate thousands of trial.csv files into one table, compared with pandas: `python -m benchmarks.aggregate`.
 
 The tables have 40 repeats each and 160 conditions in all, with random values of a fixed seed in every column. Each
 round runs `fieldkit aggregate` as a user would, once per number of tables, to show whether the cost grows linearly.
@@ -124,7 +124,7 @@ def _condition(number: int) -> dict[str, str]:
 
 
 def run(argv: Sequence[str], out: Path) -> Run:
-    """Run a program to its end with its output in a file.
+    """Run a program until it exits, with its output in a file.
 
     Raises:
         RuntimeError: It failed.
@@ -164,19 +164,26 @@ def check(fieldkit_output: Path, peer_output: Path) -> None:
     peer_figures: Figures = {
         (tuple(key), name): tuple(values[:4]) for key, name, *values in json.loads(peer_output.read_bytes())
     }
-    close = our_figures.keys() == peer_figures.keys() and all(
+    are_close = our_figures.keys() == peer_figures.keys() and all(
         math.isclose(our_value, peer_value, rel_tol=1e-6)
         for key in our_figures
         for our_value, peer_value in zip(our_figures[key], peer_figures[key], strict=True)
     )
-    if not close:
+    if not are_close:
         raise RuntimeError("fieldkit and pandas computed different figures")
 
 
-def run_rounds(base: Path, counts: Sequence[int], number: int, rows: int) -> dict[str, list[Run]]:
-    """Return the runs of all rounds, by program and number of tables; `rows` as in `--rows`."""
+def run_rounds(base: Path, counts: Sequence[int], rounds: int, rows: int) -> dict[str, list[Run]]:
+    """Return the runs of all rounds, by program and number of tables.
+
+    Args:
+        base: Folder with the tables.
+        counts: Numbers of tables.
+        rounds: Number of rounds.
+        rows: Rows of the single table; 0 to omit it.
+    """
     runs: dict[str, list[Run]] = {}
-    for _ in range(number):
+    for _ in range(rounds):
         for count in counts:
             result = run_fieldkit(base / str(count), base / f"{count}.json")
             runs.setdefault(f"fieldkit, {count:,} tables", []).append(result)

@@ -1,10 +1,10 @@
 """Aggregate an archive of 10,000 trials, compared with pandas and DuckDB: `python -m benchmarks.archive`.
 
-Each round runs `fieldkit aggregate ARCHIVE --where ...` as a user would: without an index, the first time (which
-writes the index), and with the index. The other tools read the same tables in the same round, select the same rows,
-and compute count, mean and median of one quantity per condition without intervals: pandas concatenates all tables,
-DuckDB reads them in one query (`read_csv` with `union_by_name`), and DuckDB reads a Parquet file that was written
-before. The benchmark stops if their figures differ from those of fieldkit.
+Each round runs `fieldkit aggregate ARCHIVE --where ...` three times: with `--no-index`, then without an existing
+index (this run writes one), then with this index. The other tools read the same tables in the same round, select the
+same rows, and compute count, mean and median of one quantity per condition without intervals: pandas concatenates all
+tables, DuckDB reads them in one query (`read_csv` with `union_by_name`), and DuckDB reads a Parquet file that was
+written before. The benchmark stops if their figures differ from the figures of fieldkit.
 """
 
 import argparse

@@ -45,8 +45,10 @@ SETTLING_S: Final = 1.0
 _CDR: Final = bytes((0, 1, 0, 0)) + bytes(8) + SIZE.to_bytes(4, "little")
 
 Write = Callable[[bytes], Any]
-"""Sends data. The returned objects must stay referenced."""
+"""Function of a publisher that sends data. The function of a subscriber sends nothing, and only keeps the objects of
+the middleware alive."""
 Deliver = Callable[[bytes], None]
+"""Function of a subscriber that is called with the data of each message."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +158,7 @@ def ros1_plain(name: str, deliver: Deliver | None) -> Write:
 
 
 def endpoint(where: str) -> tuple[str, str]:
-    """Return a setting of Zenoh for `listen:PORT` or `connect:PORT`."""
+    """Return the name and value of Zenoh's setting for `listen:PORT` or `connect:PORT`."""
     verb, _, port = where.partition(":")
     return f"{verb}/endpoints", json.dumps([f"tcp/{HOST}:{port}"])
 
@@ -177,7 +179,7 @@ def agent(middleware_name: str, name: str, deliver: Deliver | None, where: str) 
     return lambda _: running
 
 
-def end(kind: str, name: str, where: str, *, is_subscriber: bool) -> int:
+def run_end(kind: str, name: str, where: str, *, is_subscriber: bool) -> int:
     """Run a publisher or subscriber, controlled by the lines of standard input.
 
     After a line `SECONDS RATE` a publisher sends; after any line a subscriber prints the messages that it received.
@@ -339,7 +341,7 @@ def main() -> int:
     options = parser.parse_args()
     if options.end:
         kind, name, where, verb = options.end
-        return end(kind, name, where, is_subscriber=verb == "subscribe")
+        return run_end(kind, name, where, is_subscriber=verb == "subscribe")
     measurements = measure(options.rounds)
     if options.json:
         print(json.dumps(measurements))

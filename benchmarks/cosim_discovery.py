@@ -33,11 +33,14 @@ STANDARD: Final = "802.11n"
 SEEDS: Final = range(1, 7)
 
 ROWS: Final = ((0.0, None), (0.1, None), (5.0, None), (0.0, "g6"), (0.1, "g6"), (1.0, "g6"))
-"""Interval in seconds in which they start, and the mode of every frame; None for the rate control of Linux."""
+"""Interval in seconds in which the participants start, and the mode of all frames; None for Linux's rate control."""
 
 
 def discover(within_s: float, mode: str | None, seed: int) -> tuple[int, float]:
-    """Return the packets of the first second, and the time until discovery was complete, in s, or infinity."""
+    """Return the number of packets in the first second, and the time until discovery was complete in seconds.
+
+    The time is infinite if discovery was not complete after `TIMEOUT_NS`.
+    """
     names = [f"r{number}" for number in range(COUNT)]
     places_m = {name: _place_m(number) for number, name in enumerate(names)}
     starts_ns = {

@@ -25,7 +25,8 @@ from sim_backends.federates.agent_states import STATE
 MESSAGE: Final = bytes(36)
 """A message with the size of a request to a physics simulator."""
 PEERS: Final = ("helics inproc", "helics zmq_ss", "mosaik inproc", "mosaik subprocess")
-"""Without the core `ipc` of HELICS: its broker has one name for the whole machine, so two runs disturb each other."""
+"""The peers. The core `ipc` of HELICS is omitted: its broker has one name for the whole machine, so two runs would
+disturb each other."""
 _STATE_NUMBERS: Final = STATE.size // 8
 _LIMIT_S: Final = 300.0
 
@@ -49,7 +50,7 @@ class HelicsFederate:
 
     Args:
         core: Type of its core.
-        name: Its name, which is also that of its publication.
+        name: Its name, which is also the name of its publication.
         other: Name of the other federate.
         options: Options of its core.
     """

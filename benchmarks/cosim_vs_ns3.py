@@ -5,8 +5,8 @@ a wall, over 802.11g with the same power, noise, path loss, queue and slots in b
 is measured; TCP sends at full rate. The loss of the wall is computed here, and ns-3 gets the total path loss.
 
 There are three variants of ns-3: unchanged in 802.11g; unchanged in 802.11a, which has no signal extension (ns-3
-models it wrongly); and the latter with a corrected TCP, because that of ns-3 deviates from the standards at the edge
-of a link (`ns3_link.cc` lists the corrections). Each link is run with enough seeds for a narrow interval of the
+models it wrongly); and the latter with a corrected TCP, because ns-3's TCP deviates from the standards at the edge of
+a link's range (`ns3_link.cc` lists the corrections). Each link is run with enough seeds for a narrow interval of the
 ratio. `--links g54` runs only the links with this text in their names.
 """
 
@@ -43,7 +43,8 @@ SECONDS: Final = 10.0
 TRACE_S: Final = 20.0
 QUEUE_PACKETS: Final = 100
 BATCH, MAX_RUNS, NARROW = 2, 48, 0.08
-"""Runs per batch, maximum number of runs, and the relative half-width of the ratio's interval at which runs end."""
+"""Runs per batch, and maximum number of runs. No further batch is run if the relative half-width of the ratio's
+interval is below the third value."""
 RATE_MBIT_S: Final = 2.0
 PAYLOAD_BYTES: Final = 1000
 MESSAGE_BYTES: Final = 14480

@@ -46,7 +46,7 @@ REFERENCES: Final = {
     "paper": {"mean": (5.377, 54.309), "loss": (0.0, 0.0)},
     "EMANE 1.5.3, RF Pipe": {"mean": (2.26, 2.26), "median": (2.12, 2.12), "loss": (0.0, 0.0)},
 }
-"""The figures of the paper, and those of EMANE measured on 2 idle cores, which a move by 100 m did not change."""
+"""Results of the paper, and of EMANE on 2 idle cores, before and after the move. The move did not change EMANE's."""
 
 Figures = dict[str, float | None]
 

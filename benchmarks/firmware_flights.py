@@ -2,9 +2,9 @@
 
     python -m benchmarks.firmware_flights --connection tcp:127.0.0.1:5760
 
-The connection is that of a simulated autopilot which the user has started, for example ArduPilot's SITL
-(`sim_vehicle.py -v ArduCopter`) or PX4's SIH (`make px4_sitl sihsim_quadx`, `udpin:0.0.0.0:14540`). Never connect a
-real drone: it takes off. The exit code is 1 if a case failed.
+Start a simulated autopilot before, for example ArduPilot's SITL (`sim_vehicle.py -v ArduCopter`) or PX4's SIH
+(`make px4_sitl sihsim_quadx`), and pass its connection (SIH: `udpin:0.0.0.0:14540`). Never connect a real drone: it
+takes off. The exit code is 1 if a case failed.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """802.11n, ac and ax compared with ns-3: `python -m benchmarks.high_throughput_vs_ns3 [--json]`.
 
-The requirements are those of `radio_vs_ns3`. For all modes, airtimes and packet errors of 1000 bytes are compared.
+It has the same requirements as `radio_vs_ns3`. For all modes, airtimes and packet errors of 1000 bytes are compared.
 Known differences of airtimes are due to ns-3: it does not end the data of short guard intervals at multiples of 4 us
 (19.4.3, 21.4.3), omits VHT-SIG-B (4 us) of frames to one station, and uses 8 us for each HE-LTF at all guard
 intervals. Then goodput with A-MPDU is compared in one mode: for one station at signal-to-noise ratios down to the
@@ -35,6 +35,7 @@ DSCPS: Final = {"background": 8, "video": 40, "voice": 48}
 QUEUED: Final = 300
 SECONDS: Final = 2.0
 HE_LTF_NS: Final = {800: 7_200, 1600: 8_000, 3200: 16_000}
+"""Duration of one HE-LTF, by guard interval in ns."""
 
 
 def mcs_of(mode: WifiMode) -> int:

@@ -125,7 +125,7 @@ class Watch:
         self.close()
 
     def read(self, count: int, since_ns: int) -> tuple[Lifetime, ...]:
-        """Return `count` programs that started after `since_ns`, in the order in which they exited.
+        """Return the lifetimes of `count` programs that started after `since_ns`, in the order of their exits.
 
         Raises:
             EOFError: The watcher exited.

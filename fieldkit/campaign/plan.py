@@ -245,9 +245,10 @@ def started_plan(folder: Path, current_plan: CampaignPlan, document: Document) -
     changed_keys = [key for key in current_values if current_values[key] != frozen_values[key]]
     if changed_keys:
         raise ConfigurationError(
-            f"changed since the campaign started: {', '.join(changed_keys)}",
+            f"these have changed since the campaign started: {', '.join(changed_keys)}",
             where=document.where((changed_keys[0],)),
-            remedy=f"undo that ({folder / CAMPAIGN_FILE} has the old values), or start another campaign: change name",
+            remedy=f"undo that ({folder / CAMPAIGN_FILE} has the old values), or change name: to start another "
+            "campaign",
         )
     return plan
 

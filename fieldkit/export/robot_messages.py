@@ -39,11 +39,8 @@ UNKNOWN_FATE: Final = -1
 _SLICE: Final = 1 << 14
 """Number of packets that are converted to Python objects at a time."""
 
-_LOST: Final[tuple[dict[str, bool], ...]] = (
-    {"lost": False},
-    {"lost": True},
-    {},
-)  # index -1 (UNKNOWN_FATE) is the last
+# Fields of a message by the values of `MarkedPackets`: index -1 (UNKNOWN_FATE) is the last, empty element.
+_LOST: Final[tuple[dict[str, bool], ...]] = ({"lost": False}, {"lost": True}, {})
 _COPY: Final[tuple[dict[str, bool], ...]] = ({"copy": False}, {"copy": True}, {})
 
 

@@ -106,9 +106,9 @@ def location(t_ns: int, robot: str, place: Vector) -> Json:
         robot: Name of the robot.
         place: Latitude and longitude in degrees, and height above the ellipsoid in metres; NaN without a height.
     """
-    north, east, up_m = place
-    fields = {"timestamp": time(t_ns), "frame_id": robot, "latitude": north, "longitude": east}
-    return fields if math.isnan(up_m) else fields | {"altitude": up_m}
+    latitude_deg, longitude_deg, height_m = place
+    fields = {"timestamp": time(t_ns), "frame_id": robot, "latitude": latitude_deg, "longitude": longitude_deg}
+    return fields if math.isnan(height_m) else fields | {"altitude": height_m}
 
 
 def _object(title: str, properties: Json, *, optional: tuple[str, ...] = ()) -> Json:

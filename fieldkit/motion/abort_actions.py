@@ -61,7 +61,7 @@ class AbortActions(ProcedureSection, RootModel[dict[Role, OnAbort]]):
         return guard_drones(actions, plan, scene, shells)
 
     def guarded_roles(self, plan: TrialOutline) -> tuple[Role, ...]:
-        """Return the roles of drones that no step flies, so that guards must monitor them."""
+        """Return the roles of drones that no step flies; each of them is monitored by a guard."""
         moved = plan.procedure.moved_roles()
         return tuple(role for role in self.root if role not in moved)
 

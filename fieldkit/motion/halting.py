@@ -37,7 +37,8 @@ class HaltResult:
 def halt(shell: Shell, operator: str, deadline: Deadline) -> HaltResult:
     """Stop all programs that move a robot, from any trial, and the trial that has locked the robot.
 
-    The job script is not installed for this, because a full disk must not prevent a stop (as in `jobs.abort`).
+    The job script is sent on standard input and not installed, because a full disk must not prevent a stop (as in
+    `jobs.abort`).
 
     Args:
         shell: The robot.

@@ -19,6 +19,7 @@ from fieldkit.telemetry import source_readings, telemetry_queries
 from fieldkit.telemetry.telemetry_section import TelemetrySource
 
 _END_S: Final = 2.0
+"""Time after SIGTERM within which a query must exit; then it is killed."""
 ONCE: Final = "0"
 """Interval of a single query."""
 

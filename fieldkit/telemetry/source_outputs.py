@@ -39,7 +39,7 @@ _SIGNALS: Final = (
 
 _CHANNELS: Final = ("earfcn", "nrarfcn", "uarfcn", "arfcn")
 
-# Lines of batctl's table of neighbours: those of BATMAN IV begin with the interface, those of BATMAN V with the node.
+# Lines of batctl's table of neighbours. Lines of BATMAN IV start with the interface, lines of BATMAN V with the node.
 _MESH_LINE: Final = re.compile(
     r"^[ \t]*(?:[A-Za-z0-9._-]{1,15}[ \t]+)?([0-9a-f]{2}(?::[0-9a-f]{2}){5})[ \t]+([0-9]{1,6}\.[0-9]{3})s",
     re.MULTILINE | re.ASCII,
@@ -134,8 +134,8 @@ def _value_at(document: object, *keys: str) -> object:
 def modem_values(output: str) -> Values:
     """Return the values in the outputs of mmcli: signal, modem, and cells or location, each a line of JSON.
 
-    The signal is that of the access technology in use: RSRP for LTE and 5G, RSCP for UMTS, otherwise RSSI. If LTE and
-    5G are in use at the same time (NSA), it is that of LTE, which has the serving cell.
+    The signal is measured in the access technology in use: RSRP for LTE and 5G, RSCP for UMTS, otherwise RSSI. If LTE
+    and 5G are in use at the same time (NSA), the signal of LTE is used, because LTE has the serving cell.
 
     Raises:
         ValueError: There is no JSON of mmcli.
@@ -151,7 +151,7 @@ def modem_values(output: str) -> Values:
             merged[key] = {**earlier_content, **content} if are_mappings else content  # type: ignore[dict-item]
     technologies = _texts(_value_at(merged, "generic", "access-technologies"))
     values_by_name = _modem_signal(_value_at(merged, "signal"), technologies)
-    cells = [dict(_cell_facts(text)) for text in _texts(_value_at(merged, "generic", "cell-info"))]
+    cells = [dict(_cell_fields(text)) for text in _texts(_value_at(merged, "generic", "cell-info"))]
     serving = next((cell for cell in cells if cell.get("serving") == "yes"), {})
     channels = (f", {key.upper()} {serving[key]}" for key in _CHANNELS if key in serving)
     channel = next(channels, "")
@@ -171,7 +171,7 @@ def modem_values(output: str) -> Values:
 
 def _modem_signal(signal: object, technologies: list[str]) -> dict[str, float | str]:
     for names, key, power, ratio in _SIGNALS:
-        # Values of another technology are of an earlier connection, and have another meaning.
+        # Values of another technology are from an earlier connection, and have another meaning.
         if technologies and not names & set(technologies):
             continue
         signal_dbm = _value("signal_dbm", _value_at(signal, key, power))
@@ -186,10 +186,10 @@ def _texts(items: object) -> list[str]:
     return [item[:500] for item in items[:100] if isinstance(item, str)] if isinstance(items, list) else []
 
 
-def _cell_facts(text: str) -> Iterator[tuple[str, str]]:
-    """Yield the facts in `cell type: lte, serving: yes, ci: 01A2D001`."""
-    for fact in text.split(", "):
-        name, separator, value = fact.partition(": ")
+def _cell_fields(text: str) -> Iterator[tuple[str, str]]:
+    """Yield the name and value of each field in a text such as `cell type: lte, serving: yes, ci: 01A2D001`."""
+    for field in text.split(", "):
+        name, separator, value = field.partition(": ")
         if separator:
             yield name, value
 

@@ -21,7 +21,6 @@ from fieldkit.telemetry.source_readings import SourceReadings
 from fieldkit.telemetry.telemetry_section import TelemetrySection, TelemetrySource
 
 _MAX_TEXTS: Final = 4
-_IMPOSSIBLE: Final = "its value is impossible"
 
 
 def _role_columns(role: Role) -> tuple[Column, ...]:
@@ -80,7 +79,7 @@ class TelemetryVerdict:
     """Columns of a robot's link, and the failures of its sources.
 
     Attributes:
-        measured: Columns of `link`, changed by the sources, and of `of_role`.
+        measured: Columns of `link` with the values of the sources, and the columns of `of_role`.
         notes: A sentence for each source that gave no value.
     """
 
@@ -124,8 +123,8 @@ def measure(role: Role, telemetry: TelemetrySection, evidence: AttemptEvidence, 
         if measured_quantities := [
             quantity for quantity, quantity_series in source_series.items() if quantity_series.values
         ]:
-            mark = f", queries on the interface under test to {source.address}" if source.wired else ""
-            source_texts.append(f"{name} ({source.kind}{mark}): {' '.join(measured_quantities)}")
+            wired_text = f", queries on the interface under test to {source.address}" if source.wired else ""
+            source_texts.append(f"{name} ({source.kind}{wired_text}): {' '.join(measured_quantities)}")
         if not readings.values:
             notes.append(f"telemetry {name} of the {role} gave no value: {reason or 'no query ended'}")
     source_columns = _measured(role, series)

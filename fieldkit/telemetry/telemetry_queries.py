@@ -31,7 +31,7 @@ def queries_by_role(cast: Cast) -> Mapping[Role, Sequence[Sequence[str]]]:
 
 
 def refusals(cast: Cast, all_robots: Cast) -> Iterator[Refusal]:
-    """Yield the sources whose address is that of a robot on the radio: queries would load the link under test.
+    """Yield the sources whose address is a robot's address on the radio: queries would load the link under test.
 
     An address that is only reached over the radio is detected on the robot before each query.
     """
@@ -50,4 +50,4 @@ def dry_run_notes(cast: Cast) -> Iterator[str]:
     """Yield a line for each source that the laptop queries."""
     for role, name, source in sources(cast, "laptop"):
         every = f"every {source.interval:.0f} s"
-        yield f"the laptop runs for telemetry {name} of the {role}, {every}: {quote(source.argv())}"
+        yield f"telemetry {name} of the {role}: the laptop runs {every}: {quote(source.argv())}"

@@ -20,7 +20,7 @@ _RECEIVE_BYTES: Final = 1 << 16
 
 
 def _membership(group: str, device: str | None) -> bytes:
-    """Return the group and the interface for socket options.
+    """Return the value of a multicast socket option: the group and the interface.
 
     Raises:
         ConfigurationError: There is no such interface.
@@ -94,7 +94,7 @@ class EventPublisher:
 
 
 class EventListener:
-    """Receives events; datagrams that are malformed or older than others of their publisher are ignored.
+    """Receives events. A datagram is ignored if it is malformed, or not newer than the last one of its publisher.
 
     Args:
         channel: Multicast group and port, `224.1.2.8:45703`.
@@ -120,10 +120,10 @@ class EventListener:
             raise
 
     def receive(self, limit_s: float) -> Sequence[SerializedEvent] | None:
-        """Return the events of the next datagram, or None if none arrives before a time.
+        """Return the events of the next valid datagram, or None if none arrives before the deadline.
 
         Args:
-            limit_s: The time, on the clock of `time.monotonic`.
+            limit_s: The deadline, a time of `time.monotonic`.
         """
         while True:
             wait_s = max(limit_s - time.monotonic(), 0.0)

@@ -1,4 +1,4 @@
-"""Conversions between positions east, north, up of a reference point and geodetic positions on WGS 84 (TR8350.2)."""
+"""Conversions between positions east, north and up of a reference point and geodetic positions (WGS 84, TR8350.2)."""
 
 import math
 from typing import Final
@@ -9,6 +9,7 @@ from sim_backends.emane_events.events import EmaneVelocity
 _A_M: Final = 6_378_137.0
 _F: Final = 1 / 298.257223563
 _E2: Final = _F * (2 - _F)
+"""Semi-major axis, flattening and squared eccentricity of the ellipsoid."""
 _CONVERGED_RAD: Final = 1e-15
 _ITERATIONS: Final = 20
 
@@ -25,10 +26,15 @@ class LocalFrame:
 
     def __init__(self, reference: Geodetic) -> None:
         latitude, longitude = math.radians(reference[0]), math.radians(reference[1])
-        sin, cos = math.sin(latitude), math.cos(latitude)
-        sin_l, cos_l = math.sin(longitude), math.cos(longitude)
+        sin_lat, cos_lat = math.sin(latitude), math.cos(latitude)
+        sin_lon, cos_lon = math.sin(longitude), math.cos(longitude)
         self._origin_m = _ecef_m(latitude, longitude, reference[2])
-        self._axes = ((-sin_l, cos_l, 0.0), (-sin * cos_l, -sin * sin_l, cos), (cos * cos_l, cos * sin_l, sin))
+        # Unit vectors east, north and up, in earth-centred, earth-fixed coordinates (ECEF).
+        self._axes = (
+            (-sin_lon, cos_lon, 0.0),
+            (-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat),
+            (cos_lat * cos_lon, cos_lat * sin_lon, sin_lat),
+        )
 
     def geodetic(self, position_m: Vector) -> Geodetic:
         """Return the geodetic position of a position east, north, up."""
@@ -37,16 +43,16 @@ class LocalFrame:
             + sum(metres * local_axis[axis] for metres, local_axis in zip(position_m, self._axes, strict=True))
             for axis in range(3)
         )
-        across_m = math.hypot(x, y)
-        latitude = math.atan2(z, across_m * (1 - _E2))
+        axis_distance_m = math.hypot(x, y)
+        latitude = math.atan2(z, axis_distance_m * (1 - _E2))
         for _ in range(_ITERATIONS):
-            radius_m = _A_M / math.sqrt(1 - _E2 * math.sin(latitude) ** 2)
-            before, latitude = latitude, math.atan2(z + _E2 * radius_m * math.sin(latitude), across_m)
-            if abs(latitude - before) < _CONVERGED_RAD:
+            radius_m = _A_M / math.sqrt(1 - _E2 * math.sin(latitude) ** 2)  # of curvature in the prime vertical
+            previous, latitude = latitude, math.atan2(z + _E2 * radius_m * math.sin(latitude), axis_distance_m)
+            if abs(latitude - previous) < _CONVERGED_RAD:
                 break
         sin, cos = math.sin(latitude), math.cos(latitude)
         # This formula is valid at the poles as well as at the equator.
-        height_m = across_m * cos + z * sin - _A_M * math.sqrt(1 - _E2 * sin * sin)
+        height_m = axis_distance_m * cos + z * sin - _A_M * math.sqrt(1 - _E2 * sin * sin)
         return math.degrees(latitude), math.degrees(math.atan2(y, x)), height_m
 
     def position_m(self, position: Geodetic) -> Vector:
@@ -61,11 +67,11 @@ class LocalFrame:
 
 def _ecef_m(latitude_rad: float, longitude_rad: float, height_m: float) -> Vector:
     sin, cos = math.sin(latitude_rad), math.cos(latitude_rad)
-    radius_m = _A_M / math.sqrt(1 - _E2 * sin * sin)
-    across_m = (radius_m + height_m) * cos
+    radius_m = _A_M / math.sqrt(1 - _E2 * sin * sin)  # of curvature in the prime vertical
+    axis_distance_m = (radius_m + height_m) * cos
     return (
-        across_m * math.cos(longitude_rad),
-        across_m * math.sin(longitude_rad),
+        axis_distance_m * math.cos(longitude_rad),
+        axis_distance_m * math.sin(longitude_rad),
         (radius_m * (1 - _E2) + height_m) * sin,
     )
 

@@ -1,4 +1,4 @@
-"""The physics federate `emane`, which takes agent locations and path losses from EMANE events, in real time."""
+"""The physics federate `emane`, which reads agent locations and path losses from EMANE events, in real time."""
 
 import math
 import time
@@ -44,7 +44,8 @@ class EmaneLocations:
         limits_m_s2: Acceleration limit of each agent: infinite, because events may contain any location.
         waited_s: Total time that it has waited, in seconds of wall time.
         path_losses_db: Path loss by transmitter and receiver. As in EMANE's receivers, this is the forward loss in
-            the events for a NEM, which is the path loss from the other NEM to this NEM. The reverse loss is ignored.
+            the events for the receiver's NEM, which is the path loss from the other NEM to this NEM. The reverse loss
+            is ignored.
 
     Raises:
         ValueError: An option is invalid.

@@ -71,7 +71,7 @@ class Federate
         protocol::Welcome welcome;
         welcome.role = protocol::kPhysics;
         welcome.capabilities = protocol::kAgentsDisappear | (options.deterministic ? protocol::kDeterministic : 0);
-        m_heartbeat.Send(0); // the first use of Gazebo Transport takes some time
+        m_heartbeat.Send(0); // now, because the first use of Gazebo Transport takes some time
         std::vector<Agent> agents = AgentsOf(hello, configuration.at("scenario").at("agents"), options);
         m_world = std::make_unique<LockStep>(std::move(options), std::move(agents), m_heartbeat);
         m_world->Start();
@@ -107,7 +107,7 @@ class Federate
         int64_t step_ns = m_world->StepNs();
         if (!request.commands.empty())
         {
-            ApplyPending(request.from_ns); // earlier commands are valid until this time
+            ApplyPending(request.from_ns); // apply the earlier commands first; they are valid until this time
             m_pending.insert(m_pending.end(), request.commands.begin(), request.commands.end());
             m_pendingStep = (request.from_ns + step_ns - 1) / step_ns;
         }
@@ -132,7 +132,7 @@ class Federate
         return protocol::StatesBody(to_ns - to_ns % step_ns, states);
     }
 
-    // Apply the pending commands, if their step starts at or before a time.
+    // Apply the pending commands if the step at which they apply starts at or before `to_ns`.
     void ApplyPending(int64_t to_ns)
     {
         if (m_pending.empty() || m_pendingStep > to_ns / m_world->StepNs())
@@ -153,8 +153,9 @@ class Federate
 
     protocol::Heartbeat& m_heartbeat;
     std::unique_ptr<LockStep> m_world;
-    std::vector<protocol::Command> m_pending;
-    int64_t m_pendingStep = 0, m_toNs = 0;
+    std::vector<protocol::Command> m_pending; // commands that have not been applied yet
+    int64_t m_pendingStep = 0;                // the step at which they apply
+    int64_t m_toNs = 0;                       // end of the last request
     double m_limit_m_s2 = 0;
 };
 

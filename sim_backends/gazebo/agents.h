@@ -16,7 +16,7 @@ struct Agent
 {
     std::string name, model;
     bool flies = false;
-    Vector antenna; // in the axes of the model, from its origin
+    Vector antenna; // position in the frame of the model
     Vector start;   // start position of the model
     double start_yaw = 0;
     protocol::Command command; // the current command
@@ -61,7 +61,8 @@ struct Agent
     }
 };
 
-// The agents of hello, with their models and the start poses of the models.
+// The agents in the message `hello`, with their models and the start poses of the models. `plans` is the section
+// `agents` of the scenario.
 inline std::vector<Agent>
 AgentsOf(const protocol::Hello& hello, const Json& plans, const Options& options)
 {
@@ -112,7 +113,7 @@ TwistOf(const Agent& agent, const Options& options, int64_t step_ns)
         twist.mutable_angular()->set_z(values[1]);
         return twist;
     }
-    // VelocityControl sets the velocity before each step, and gravity changes it in the step.
+    // VelocityControl sets the velocity before each step, and gravity reduces it within the step by this speed.
     double fall_m_s = options.gravity_m_s2 * double(step_ns) / 1e9;
     Vector velocity = agent.pose.InverseRotated({values[0], values[1], values[2] + fall_m_s});
     twist.mutable_linear()->set_x(velocity.x);

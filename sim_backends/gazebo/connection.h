@@ -118,7 +118,7 @@ class Connection
         }
     }
 
-    // The answer of a service: -1 before it arrives, else 0 or 1.
+    // The answer of a service: -1 before it arrives, 0 for a refusal, 1 for success.
     using Answer = std::shared_ptr<int>;
 
     template <typename Request> Answer Send(const std::string& service, const Request& request)
@@ -166,11 +166,11 @@ class Connection
         Check(answer, service);
     }
 
-    // A request to a paused world, which makes a number of steps.
+    // A request that makes a paused world advance by a number of steps.
     static msgs::WorldControl ControlRequest(uint32_t steps, bool resets = false)
     {
         msgs::WorldControl request;
-        request.set_pause(true); // a request without it would let the world run
+        request.set_pause(true); // otherwise the world would run freely
         request.set_multi_step(steps);
         if (resets)
         {
@@ -192,10 +192,10 @@ class Connection
 
     // Wait until Gazebo has received all commands.
     //
-    // Messages to a topic may overtake requests to a service. The plugin TriggeredPublisher answers a message that
-    // follows the commands on the same connection. Without the plugin, this sends one request more than there are
-    // agents. Gazebo's single receiving thread alternates between messages and requests, so it has probably read all
-    // commands when it has answered these requests.
+    // Requests to a service may overtake messages to a topic. Therefore, a message that follows the commands on the
+    // same connection (the fence) is answered by the plugin TriggeredPublisher. Without the plugin, this sends one
+    // request more than there are agents. Gazebo's single receiving thread alternates between messages and requests,
+    // so it has probably read all commands when it has answered these requests.
     void Acknowledge()
     {
         if (m_usesFence)
@@ -227,10 +227,11 @@ class Connection
         transport::Node::Publisher publisher;
     };
 
-    // Several runs may start at the same time, for example those of a shootout.
+    // Several runs may start at the same time, for example those of `fieldkit cosim shootout`.
     void WaitForOtherRuns()
     {
         WorldLock world_lock(m_options.world);
+        // Other runs may take much longer than the timeout for a lack of progress.
         auto limit = Clock::now() + std::chrono::duration<double>(50 * m_options.timeout_s);
         while (!world_lock.Take())
         {
@@ -322,8 +323,8 @@ class Connection
     std::vector<Agent>& m_agents;
     WorldMonitor& m_monitor;
     std::vector<CommandReceiver> m_receivers; // by agent
-    bool m_usesFence = false;
-    uint64_t m_passed = 0; // answers to messages of the fence
+    bool m_usesFence = false; // see `Acknowledge`
+    uint64_t m_passed = 0;    // number of answers to the fence
     transport::Node::Publisher m_fence;
     transport::Node m_node; // declared last, because its callbacks use the other members
 };

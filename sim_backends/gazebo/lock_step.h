@@ -53,6 +53,7 @@ class LockStep
         }
         for (Agent& agent : m_agents)
         {
+            // An agent that appears in the first step must exist at the start.
             bool is_present = agent.appears_ns < m_stepNs;
             if (is_present != agent.is_present)
             {
@@ -73,7 +74,7 @@ class LockStep
         {
             if (agent.appears_ns >= m_stepNs)
             {
-                // It is created before the step, which publishes its first pose.
+                // The model is created one step earlier, because the next step publishes its first pose.
                 m_changes.push_back({agent.appears_ns / m_stepNs - 1, agent, true});
             }
             if (agent.disappears_ns >= 0)
@@ -88,8 +89,8 @@ class LockStep
     // Advance to a number of steps after the start.
     void Advance(int64_t to_step)
     {
-        // An agent that appears at a step has been created before it.
-        while (!m_changes.empty() && m_changes.front().step + m_changes.front().appears <= to_step)
+        // A model that is created after step n has a pose at step n + 1, so it is created only if that step is made.
+        while (!m_changes.empty() && m_changes.front().step + (m_changes.front().appears ? 1 : 0) <= to_step)
         {
             Change change = m_changes.front();
             m_changes.pop_front();
@@ -151,13 +152,13 @@ class LockStep
             int64_t next = to_step;
             bool is_turning =
                 std::any_of(m_agents.begin(), m_agents.end(), [](const Agent& agent) { return agent.Turns(); });
-            if (is_turning)
+            if (is_turning) // the command depends on the heading, so it is sent again after each control period
             {
                 next = std::min(next, (step / period + 1) * period);
             }
             if (m_options.velocity == "step" && next == to_step && next - step > 1)
             {
-                next--;
+                next--; // the last step is made separately, because the velocity is the motion in this step
             }
             before = Poses();
             before_step = step;
@@ -270,7 +271,7 @@ class LockStep
         m_monitor.awaited_ns = time_ns;
     }
 
-    // The clock of a step is published before the step is made, so only poses with its time stamp are valid.
+    // Gazebo publishes the time of a step before it makes the step, so this waits for poses with that time stamp.
     void WaitForPoses(WorldMonitor::Lock& lock, int64_t target_ns, int64_t before_ns, const Connection::Answer& answer)
     {
         auto have_arrived = [&] {
@@ -315,7 +316,7 @@ class LockStep
         }
     }
 
-    // The agents whose models have been requested and have no pose yet, for messages.
+    // The names, for messages, of the agents whose models have been requested but have not published a pose.
     std::string NewAgents() const
     {
         std::string names;
@@ -329,7 +330,8 @@ class LockStep
         return names;
     }
 
-    // Robots may still move because of an earlier run, and setting a position does not stop them.
+    // Advance until the robots are at rest (0.1 mm, 0.1 mrad), at most 20 times. They may still move because of an
+    // earlier run, and setting a position does not stop them.
     void ComeToRest(int64_t steps)
     {
         Step(steps);

@@ -25,6 +25,7 @@ struct InitialModel
     double yaw = 0;
 };
 
+// The changes of a run that must be undone after it.
 struct Restoration
 {
     std::vector<std::string> created; // models that the run may have created
@@ -60,9 +61,9 @@ class ModelJournal
             json.at("created").get_to(restoration.created);
             for (const Json& model : json.at("initial"))
             {
-                const Json& place = model.at("position");
+                const Json& position = model.at("position");
                 restoration.initial.push_back({model.at("name"), model.at("sdf"), model.at("file"),
-                                               {place.at(0), place.at(1), place.at(2)}, model.at("yaw")});
+                                               {position.at(0), position.at(1), position.at(2)}, model.at("yaw")});
             }
         }
         catch (const Json::exception& error)
@@ -79,9 +80,9 @@ class ModelJournal
         Json initial = Json::array();
         for (const InitialModel& model : restoration.initial)
         {
-            const Vector& place = model.position;
+            const Vector& position = model.position;
             initial.push_back({{"name", model.name}, {"sdf", model.sdf}, {"file", model.file}, {"yaw", model.yaw},
-                               {"position", {place.x, place.y, place.z}}});
+                               {"position", {position.x, position.y, position.z}}});
         }
         std::error_code error;
         std::filesystem::create_directories(m_path.parent_path(), error);

@@ -27,6 +27,9 @@ processor time."""
 POSE_HZ: Final = 2000
 """Largest rate of poses in wall time; at the default of 60 Hz each window takes up to 17 ms."""
 _SLAB_M: Final = 0.1
+"""Thickness of the slab of a ramp."""
+_WHEEL_MASS_SHARE: Final = 0.05
+"""Mass of a wheel as a share of the robot's mass."""
 _UPRIGHT: Final = (0.0, 0.0, 0.0)
 _WHEEL_AXIS: Final = (-math.pi / 2, 0.0, 0.0)
 
@@ -164,13 +167,13 @@ def _add_obstacle(world: Element, obstacle: Obstacle) -> None:
 
 
 def _add_ramp(link: Element, ramp: Ramp) -> None:
-    """Add a ramp as a slab, because wheels need an even surface."""
+    """Add a ramp as a slab whose upper face is the slope, because wheels need an even surface."""
     (long_m, wide_m, high_m), yaw_rad = ramp.size_m, math.radians(ramp.yaw_deg)
     pitch_rad, slope_m = math.atan2(high_m, long_m), math.hypot(long_m, high_m)
-    back_m = _SLAB_M / 2 * math.sin(pitch_rad)
+    offset_m = _SLAB_M / 2 * math.sin(pitch_rad)  # horizontal, because the centre is below the upper face
     centre_m = (
-        ramp.centre_m[0] + back_m * math.cos(yaw_rad),
-        ramp.centre_m[1] + back_m * math.sin(yaw_rad),
+        ramp.centre_m[0] + offset_m * math.cos(yaw_rad),
+        ramp.centre_m[1] + offset_m * math.sin(yaw_rad),
         high_m / 2 - _SLAB_M / 2 * math.cos(pitch_rad),
     )
     _add_shape(link, "slab", Box(centre_m, (slope_m, wide_m, _SLAB_M)), centre_m, (0.0, -pitch_rad, yaw_rad))
@@ -240,13 +243,10 @@ def _add_drive(model: Element, limits: DriveLimits, version: Version) -> None:
     size_m = (chassis.length_m, chassis.width_m, limits.height_m - chassis.clearance_m)
     link = SubElement(model, "link", name="chassis")
     wheels = [(side, end) for side in (1, -1) for end in ((1, -1) if chassis.base_m else (0,))]
-    wheel_kg = 0.05 * chassis.mass_kg
-    low_m = chassis.clearance_m + size_m[2] / 2
-    # The centre of mass is low, because batteries and motors are low.
-    _add_inertia(
-        link, chassis.mass_kg - wheel_kg * len(wheels), size_m, (0.0, 0.0, chassis.clearance_m + size_m[2] / 4)
-    )
-    _add_shape(link, "box", Box(_UPRIGHT, size_m), (0.0, 0.0, low_m))
+    chassis_kg = chassis.mass_kg - _WHEEL_MASS_SHARE * chassis.mass_kg * len(wheels)
+    # The centre of mass is at a quarter of the box's height, because batteries and motors are at the bottom.
+    _add_inertia(link, chassis_kg, size_m, (0.0, 0.0, chassis.clearance_m + size_m[2] / 4))
+    _add_shape(link, "box", Box(_UPRIGHT, size_m), (0.0, 0.0, chassis.clearance_m + size_m[2] / 2))
     if not chassis.base_m:
         _add_casters(link, chassis)
     for side, end in wheels:
@@ -278,7 +278,8 @@ def _add_wheel(model: Element, chassis: _Chassis, friction: float, side: int, en
     link = SubElement(model, "link", name=f"{name}-link")
     radius_m, width_m = chassis.wheel_radius_m, chassis.wheel_width_m
     _add_pose(link, (end * chassis.base_m / 2, side * chassis.track_m / 2, radius_m), _WHEEL_AXIS)
-    _add_inertia(link, 0.05 * chassis.mass_kg, (1.7 * radius_m, 1.7 * radius_m, width_m))
+    # A box with an edge of sqrt(3) times the radius has the inertia of the cylinder.
+    _add_inertia(link, _WHEEL_MASS_SHARE * chassis.mass_kg, (1.7 * radius_m, 1.7 * radius_m, width_m))
     cylinder = Cylinder(_UPRIGHT, radius_m, width_m)
     _add_shape(link, "tire", cylinder, _UPRIGHT, frictions=(chassis.lateral_friction, friction))
     joint = SubElement(model, "joint", name=name, type="revolute")

@@ -1,4 +1,4 @@
-// A lock for a world: runs of this machine use it one after the other.
+// A lock for a world of Gazebo, so that runs on this machine use the world in sequence.
 
 #ifndef FIELDKIT_GAZEBO_WORLD_LOCK_H
 #define FIELDKIT_GAZEBO_WORLD_LOCK_H

@@ -49,7 +49,7 @@ class WorldMonitor
         }
     }
 
-    // Checks, without the lock, whether the world still exists; empty before the connection.
+    // Returns true if the world still exists; called without the lock. Empty before the connection.
     std::function<bool()> is_available;
 
     int64_t reached_ns = -1; // time that the run has reached; -1 before its start
@@ -58,9 +58,9 @@ class WorldMonitor
     std::mutex mutex;
     std::condition_variable changed;
     int64_t clock_ns = -1, pose_ns = -1;
-    // Time of the awaited poses: messages of earlier times do not notify. -1: all messages notify.
+    // Time of the awaited poses: messages with an earlier time do not notify `changed`. -1: all messages notify it.
     int64_t awaited_ns = -1;
-    int repeated_clocks = 0;
+    int repeated_clocks = 0; // number of consecutive messages with the same time, as a paused world sends them
     std::vector<Pose> poses;
     std::set<std::string> present; // models that have a pose
     std::string names;             // names of models and links, for messages
@@ -88,12 +88,12 @@ class WorldMonitor
         std::lock_guard<std::mutex> guard(mutex);
         const auto& stamp = message.header().stamp();
         int64_t time_ns = stamp.sec() * 1000000000LL + stamp.nsec();
-        if (time_ns == pose_ns && message.pose_size() == m_poses)
+        if (time_ns == pose_ns && message.pose_size() == m_poseCount)
         {
             return; // a paused world repeats its poses
         }
         pose_ns = time_ns;
-        m_poses = message.pose_size();
+        m_poseCount = message.pose_size();
         present.clear();
         names.clear();
         for (const msgs::Pose& pose : message.pose())
@@ -178,7 +178,7 @@ class WorldMonitor
         m_heartbeat.Check(std::max<int64_t>(reached_ns, 0));
     }
 
-    // The end of an error message: the last time of the clock.
+    // The end of an error message, with the last message of Gazebo's clock.
     std::string LastMessage() const
     {
         if (clock_ns < 0)
@@ -197,7 +197,7 @@ class WorldMonitor
     protocol::Heartbeat& m_heartbeat;
     std::map<std::string, size_t> m_indices; // of agents, by model
     Clock::time_point m_clockAt;
-    int m_poses = 0; // number of poses in the last message
+    int m_poseCount = 0; // in the last message
 };
 
 } // namespace fieldkit

@@ -17,7 +17,7 @@
 namespace fieldkit
 {
 
-// One pcap file per station, in nanoseconds, of packets that begin with the IP header.
+// One pcap file per station, with time stamps in nanoseconds. The packets start with the IP header.
 class IpCaptures
 {
   public:
@@ -47,7 +47,7 @@ class IpCaptures
         }
     }
 
-    // Record that a packet of the coordinator enters, as one datagram.
+    // Record that a packet of the coordinator enters the network as one datagram.
     void Enter(uint64_t id, const std::string& flow, int64_t number)
     {
         auto entry = m_flows.find(flow);
@@ -122,7 +122,7 @@ class IpCaptures
         Write(station, bytes, packet->GetSize());
     }
 
-    // Replace the port of the listener of a connection, which is identified by its other end.
+    // Replace the listener's port, at position `at`, by the port of the flow; `end` is the other end of the connection.
     void RenamePort(std::vector<uint8_t>& bytes, std::pair<Ipv4Address, uint16_t> end, size_t at) const
     {
         auto connection = m_connections.find(end);
@@ -163,7 +163,7 @@ class IpCaptures
         {
             std::filesystem::create_directories(m_folder);
             file.open(m_folder + "/" + m_names[station] + ".pcap", std::ios::binary | std::ios::trunc);
-            protocol::Writer head;
+            protocol::Writer head; // pcap 2.4 with nanoseconds, and LINKTYPE_RAW (101)
             head.Put(uint32_t{0xA1B23C4D}).Put(uint16_t{2}).Put(uint16_t{4}).Put(uint64_t{0});
             head.Put(static_cast<uint32_t>(kSnapBytes)).Put(uint32_t{101});
             file.write(head.data.data(), static_cast<std::streamsize>(head.data.size()));

@@ -1,4 +1,5 @@
-// The channel of sim_backends/radio/: mean path loss, obstacles, shadowing and fading with the same keyed draws.
+// The radio channel as in sim_backends/radio/: mean path loss, obstacles, shadowing and fading, with the same random
+// draws.
 
 #ifndef FIELDKIT_CHANNEL_H
 #define FIELDKIT_CHANNEL_H
@@ -19,7 +20,7 @@ namespace fieldkit
 class Channel
 {
   public:
-    // `radio` and `world` are sections of the configuration; `names` are the stations by index.
+    // `radio` and `world` are sections of the configuration; `names` are the names of the stations by index.
     Channel(uint64_t seed, const Json& radio, const Json& world, std::vector<std::string> names)
         : m_seed(seed),
           m_names(std::move(names)),
@@ -32,7 +33,7 @@ class Channel
           m_stir(Number(radio.at("stir_m_s"))),
           m_links(m_names.size() * m_names.size())
     {
-        // A gain is used for 2 % of an echo's period, as in WorldChannel.
+        // A fading gain is used for 2 % of an echo's period, as in WorldChannel.
         m_slotNs = std::llround(0.02 * kSpeedOfLight / kFrequencyHz / std::max(m_stir, 1e-6) * 1e9);
         if (m_shadowingDb > 0)
         {
@@ -126,6 +127,7 @@ class Channel
         link.has_gain = false;
     }
 
+    // The mean loss in dB without obstacles.
     double OpenDb(const Point& start, const Point& end) const
     {
         double length_m = Length(start, end);
@@ -167,6 +169,7 @@ class Channel
         return Friis(direct_m) - 20 * std::log10(std::max(std::abs(ratio), 0.01));
     }
 
+    // Draw the plane waves whose sum is the shadowing field; see `Shadowing` in sim_backends/radio/propagation.py.
     void DrawWaves(double decorrelation_m)
     {
         auto draws = RandomStream(m_seed, {"shadowing"}).First(3 * kWaves);
@@ -179,6 +182,7 @@ class Channel
         }
     }
 
+    // The shadowing field at a point; its mean is 0, and its variance is 1.
     double Field(const Point& point) const
     {
         double sum = 0;
@@ -203,6 +207,7 @@ class Channel
         }
     }
 
+    // The power gain of the link's fading in its current slot.
     double Gain(Link& link, size_t first, size_t second) const
     {
         if (link.echoes.empty())

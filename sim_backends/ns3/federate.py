@@ -58,7 +58,7 @@ def command() -> str:
 NS3: Final = ProgramFederate(
     NETWORK,
     command,
-    "ns-3: its Wi-Fi, TCP and UDP, over the path loss of the world",
+    "ns-3's Wi-Fi, TCP and UDP, with the path loss of the world",
     Ns3Options,
     writes_captures=True,
     is_single_threaded=True,

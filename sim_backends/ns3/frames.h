@@ -114,7 +114,7 @@ struct LinkCounters
     double rate_bit_s = NAN; // rate of the last attempt
 };
 
-// Follows the frames of all stations with ns-3's traces.
+// Tracks the frames of all stations with ns-3's traces.
 class FrameTracker
 {
   public:
@@ -135,7 +135,7 @@ class FrameTracker
         return m_mobilities.size() - 1;
     }
 
-    // Follow the Wi-Fi frames of the next station; `mobility` has its position.
+    // Add the next station, and track its Wi-Fi frames; `mobility` has its position.
     void Add(Ptr<WifiNetDevice> device, Ptr<MobilityModel> mobility)
     {
         size_t station = AddStation(mobility);

@@ -13,7 +13,7 @@
 namespace fieldkit
 {
 
-// Access to members that ns-3 reserves for its radios.
+// Gives access to protected members of ns-3's WifiPhy.
 class RadioAccess : public WifiPhy
 {
   public:
@@ -28,7 +28,8 @@ class RadioAccess : public WifiPhy
   private:
     static constexpr uint16_t kWidthMhz = 20;
 
-    // Versions after 3.37 need the range of frequencies.
+    // Versions of ns-3 after 3.37 need the range of frequencies. The argument 0 selects this overload (int) if it
+    // compiles, otherwise the next one (long).
     template <typename Helper, typename Powers, typename Phy>
     static auto AddSignal(Helper& helper, Time duration, Powers& powers, const Phy& phy, int)
         -> decltype(helper.AddForeignSignal(duration, powers, phy.GetCurrentFrequencyRange()))
@@ -50,7 +51,7 @@ class Jammers
     Jammers(const std::vector<Station>& stations, const Channel& channel, double noise_dbm)
         : m_stations(stations),
           m_channel(channel),
-          m_negligible_dbm(noise_dbm - 40)
+          m_negligible_dbm(noise_dbm - 40) // it would increase the noise by 0.0004 dB
     {
     }
 

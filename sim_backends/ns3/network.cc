@@ -24,11 +24,11 @@ namespace fieldkit
 // Size of the RTPS headers in the datagram of a sample: message header, submessages for time stamp and data.
 constexpr int64_t kRtpsHeaderBytes = 20 + 12 + 24;
 
-// Transports of bare IP packets, which have their own headers in their size.
+// Transports of bare IP packets. The size of such a packet includes its headers.
 constexpr const char* kIp = "ip";
 constexpr const char* kIpBroadcast = "ip-broadcast";
 
-// Time before 0 in which stations scan, and associate with their access point.
+// Time before the start of the co-simulation in which stations scan, and associate with their access point.
 constexpr int64_t kAssociationNs = 1'000'000'000;
 
 class Network
@@ -58,7 +58,7 @@ class Network
         }
         catch (const Json::exception& error)
         {
-            throw Refusal(std::string("the configuration is incomplete (run the program by its name, ns3): ") +
+            throw Refusal(std::string("the configuration is incomplete (select the network by its name, ns3): ") +
                           error.what());
         }
         protocol::Welcome welcome;
@@ -96,7 +96,7 @@ class Network
 
     // Prepare a request, and return its `to_ns`.
     //
-    // If `is_ahead`, the simulator has not reached the start of the window, and events set the states.
+    // If `is_ahead`, the simulator may not have reached the start of the window, so events set the states at that time.
     int64_t Schedule(const std::string& body, bool is_ahead)
     {
         protocol::NetworkRequest request = protocol::ReadNetworkRequest(body);
@@ -378,7 +378,7 @@ class Network
         return sample;
     }
 
-    // Switch the radio of a station off (1), or on again (-1).
+    // Add `by` to the number of reasons why the radio of a station is off; it is on if there are none.
     void SwitchOff(size_t station, int by)
     {
         m_stations[station].off += by;
@@ -426,7 +426,7 @@ class Network
         }
     }
 
-    // Reads `network.options` of the scenario, which `ns3_options.py` validates and completes.
+    // Read `network.options` of the scenario, which `ns3_options.py` has validated and completed.
     void ReadOptions(uint64_t seed, const Json& options, const Json& scenario)
     {
         m_setup.ampdu_bytes = options.at("ampdu_bytes");
@@ -457,10 +457,11 @@ class Network
     // A path in which {seed} is replaced by the seed.
     static std::string OutputPath(std::string path, uint64_t seed)
     {
-        auto place = path.find("{seed}");
-        if (place != std::string::npos)
+        const std::string placeholder = "{seed}";
+        auto at = path.find(placeholder);
+        if (at != std::string::npos)
         {
-            path.replace(place, 6, std::to_string(seed));
+            path.replace(at, placeholder.size(), std::to_string(seed));
         }
         return path;
     }
@@ -550,7 +551,7 @@ class Network
         }
     }
 
-    // The packet as a packet between stations; throws a refusal if ns-3 cannot carry it.
+    // Convert a packet between agents to a packet between stations; throws a refusal if ns-3 cannot carry it.
     CoordinatorPacket CheckedPacket(const protocol::Packet& entering) const
     {
         CoordinatorPacket packet;
@@ -658,9 +659,9 @@ class Network
     {
         int64_t processing_ns = delay_ns - parts.propagation_ns - parts.transmission_ns - parts.queuing_ns;
         std::string flow = packet.flow;
-        for (size_t place = 0; (place = flow.find('"', place)) != std::string::npos; place += 2)
+        for (size_t quote = 0; (quote = flow.find('"', quote)) != std::string::npos; quote += 2)
         {
-            flow.insert(place, 1, '"');
+            flow.insert(quote, 1, '"');
         }
         m_parts << '"' << flow << "\"," << packet.number << ',' << delay_ns << ',' << processing_ns << ','
                 << parts.queuing_ns << ',' << parts.transmission_ns << ',' << parts.propagation_ns << '\n';

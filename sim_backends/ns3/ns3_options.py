@@ -18,13 +18,13 @@ class Ns3Options(SimulatorOptions):
     """Options of the network simulator [ns-3](ns3.md).
 
     Attributes:
-        standard: Standard of all radios; if omitted, 802.11n if all radios have it, otherwise 802.11g.
+        standard: Standard of all radios. If omitted, it is 802.11n if all radios support it, otherwise 802.11g.
         ampdu_bytes: Largest aggregate of frames in 802.11n; 0 sends frames singly, as the built-in network does.
         topics: With `udp`, topics with `reliability: best_effort` are sent as UDP datagrams with the headers of RTPS,
             without discovery.
         delay_parts: File for the [parts of each delay](ns3.md#parts-of-the-delay); `{seed}` is replaced by the seed
             of the run.
-        pcap: Beginning of the names of captures of 802.11 frames with radiotap, one per radio, for example
+        pcap: Prefix of the names of captures of 802.11 frames with radiotap, one per radio, for example
             `air-{seed}-`; with an access point, their time stamps are 1 s later.
     """
 
@@ -64,7 +64,7 @@ class Ns3Options(SimulatorOptions):
 
     @override
     def further_configuration(self, configuration: Mapping[str, Any]) -> dict[str, Any]:
-        """Return `link` with the parameters of fixed links, or `jammers` with a position (or None) per fault."""
+        """Return the parameters of fixed links as `link`, or the position of each fault's jammer as `jammers`."""
         scenario = configuration["scenario"]
         radio = RadioOptions.model_validate(scenario["radio"])
         if radio.is_fixed:

@@ -1,4 +1,4 @@
-// Obstacles of a world file and the losses of radio paths through them: the formulas of sim_backends/world/.
+// Obstacles of a world file, and the losses of radio paths through them, computed as in sim_backends/world/.
 
 #ifndef FIELDKIT_OBSTACLES_H
 #define FIELDKIT_OBSTACLES_H
@@ -115,6 +115,7 @@ class Obstacles
         double db_per_m = 0;
         double faces_db = 0;
 
+        // The share of a straight path that is inside.
         double ShareInside(const Point& start, const Point& end) const
         {
             Point from = Local(start);
@@ -134,6 +135,7 @@ class Obstacles
             return std::max(exit - entry, 0.0);
         }
 
+        // A point in the coordinates of the part.
         Point Local(const Point& point) const
         {
             double east = point[0] - centre[0];
@@ -141,6 +143,7 @@ class Obstacles
             return {east * cos + north * sin, north * cos - east * sin, point[2] - centre[2]};
         }
 
+        // Reduce the shares [entry, exit] of the path to those between the planes at -half and half on one axis.
         static void Slab(double start, double end, double half, double& entry, double& exit)
         {
             double step = end - start;
@@ -155,6 +158,7 @@ class Obstacles
             exit = std::min(exit, std::clamp(std::max(first, second), 0.0, 1.0));
         }
 
+        // Reduce the shares [entry, exit] of the path to those within the radius of the cylinder.
         void Disc(const Point& start, const Point& end, double& entry, double& exit) const
         {
             double x = end[0] - start[0];

@@ -19,7 +19,8 @@ using protocol::Refusal;
 
 inline protocol::Heartbeat g_heartbeat;
 
-// Time of ns-3 at time 0 of the co-simulation. It is above 0, because ns-3 sends nothing before its first run.
+// Time of ns-3 at time 0 of the co-simulation. It is above 0, because a node of ns-3 can send only after the simulator
+// has run once. This first run ends just before time 0 of the co-simulation.
 inline int64_t g_start_ns = 1'000'000;
 
 inline int64_t
@@ -85,7 +86,8 @@ RunUntil(int64_t to_ns)
     {
         Simulator::Stop(NanoSeconds(to_ns - NowNs()));
         Simulator::Run();
-        // An event at `to_ns` may have scheduled others at this time, after the event that stops the simulator.
+        // An event at `to_ns` may have scheduled further events at `to_ns`, which follow the event that stops the
+        // simulator.
     } while (PeekScheduler::NextNs(next_ns) && next_ns <= to_ns);
 }
 

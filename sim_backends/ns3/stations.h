@@ -47,7 +47,7 @@ class AgentMobility : public MobilityModel
         m_stepNs = step_ns;
     }
 
-    // ns-3 3.48 requires it.
+    // ns-3 3.48 requires this function.
     virtual Ptr<MobilityModel> Copy() const
     {
         return CreateObject<AgentMobility>(*this);
@@ -120,7 +120,7 @@ struct Station
     uint32_t agent = 0;
     double tx_power_dbm = 0;
     double sensitivity_dbm = 0;
-    int off = 0; // number of reasons (faults, absence) why it is switched off
+    int off = 0; // number of reasons (faults, absence) why its radio is off
     Ptr<Node> node;
     Ptr<AgentMobility> mobility;
     Ptr<NetDevice> device;
@@ -192,7 +192,7 @@ InstallIp(std::vector<Station>& stations, FrameTracker& tracker)
                                                      ? "reassembly timed out"
                                                      : "no route");
                         }));
-        // A full queue of the MAC stops the device.
+        // If the queue of the MAC is full, ns-3 stops the device, and its traffic control layer drops the packets.
         station.node->GetObject<TrafficControlLayer>()->TraceConnectWithoutContext(
             "TcDrop",
             Callback<void, Ptr<const Packet>>([&tracker](Ptr<const Packet> packet) { tracker.Lost(packet, "queue full"); }));

@@ -22,14 +22,13 @@ struct CoordinatorPacket
     int64_t number = 0;
     uint64_t size_bytes = 0;
     int64_t enters_ns = 0;
-    size_t source = 0; // stations
-    size_t destination = 0;
+    size_t source = 0;      // index of the sending station
+    size_t destination = 0; // index of the receiving station
     std::string flow;
     std::string protocol;
 };
 
-// Functions that are called with the id of a packet that has arrived or is dropped.
-
+// Functions that are called with the id of a packet that has arrived, or was dropped for a reason.
 struct Fates
 {
     std::function<void(uint64_t)> arrive;
@@ -45,7 +44,7 @@ constexpr int64_t kBroadcastNs = 1'000'000'000;
 constexpr uint16_t kUdpPort = 7411;
 constexpr uint16_t kTcpPort = 7412;
 
-// Each packet is one datagram, which IP fragments.
+// Sends each packet as one datagram. The IP layer fragments a large datagram.
 class UdpTransport
 {
   public:
@@ -271,7 +270,7 @@ class TcpTransport
             {
                 return;
             }
-            // It is counted before Send, because Send may call this function again.
+            // The bytes are counted before Send, because Send may call this function again.
             connection->written_bytes += size;
             int sent = connection->sender->Send(Create<Packet>(static_cast<uint32_t>(size)));
             if (sent < 0 || static_cast<uint64_t>(sent) < size)
@@ -322,7 +321,7 @@ class TcpTransport
             return;
         }
         m_connections[key] = nullptr;
-        m_closed.push_back(connection); // its socket calls this function
+        m_closed.push_back(connection); // it must not be destroyed, because its socket is calling this function
         connection->is_open = false;
         for (const Message& message : connection->messages)
         {
@@ -336,7 +335,7 @@ class TcpTransport
     std::vector<Ptr<Socket>> m_listeners;
     std::vector<Ptr<Socket>> m_receivers;
     std::map<Key, ConnectionPointer> m_connections;
-    std::map<std::pair<Ipv4Address, uint16_t>, ConnectionPointer> m_byEnd;
+    std::map<std::pair<Ipv4Address, uint16_t>, ConnectionPointer> m_byEnd; // by address and port of the sender
     std::vector<ConnectionPointer> m_closed;
 };
 

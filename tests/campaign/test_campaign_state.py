@@ -82,7 +82,7 @@ def test_a_changed_file_is_rejected_with_the_key(lawn: Path, old: str, new: str,
     new_plan, document = plan.make_plan(lawn, "emulated" if changed_key == "backend" else "field")
     with pytest.raises(ConfigurationError) as error_info:
         plan.started_plan(journal.folder, new_plan, document)
-    assert error_info.value.what == f"changed since the campaign started: {changed_key}"
+    assert error_info.value.what == f"these have changed since the campaign started: {changed_key}"
     assert error_info.value.where == f"{lawn}:{line}"
     assert "campaign.yaml" in error_info.value.remedy
 

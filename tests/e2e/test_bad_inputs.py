@@ -218,7 +218,7 @@ YAML_CASES: dict[str, Setup] = {
     "an unknown kind of step": changed_copy("procedures", "los", "  - ping:", "  - pong:"),
     "a step for a role that does not exist": changed_copy("procedures", "los", "{robot: sender", "{robot: senderr"),
     "a payload that no packet can carry": changed_copy("procedures", "los", "udp: 8192", "udp: 65508"),
-    "a second step of a kind": changed_copy(
+    "a second step of the same kind and name": changed_copy(
         "procedures", "los", "during:", "during:\n        - ping: {from: sender, to: receiver}"
     ),
     "one robot that captures twice": changed_copy(
@@ -236,7 +236,7 @@ YAML_CASES: dict[str, Setup] = {
         "        # The",
         "        - transfer: {name: more, from: sender, to: receiver}\n        # The",
     ),
-    "a received file named as the bag": changed_copy("procedures", "los", "into: recv.bag", "into: scan.bag"),
+    "a received file with the name of the bag": changed_copy("procedures", "los", "into: recv.bag", "into: scan.bag"),
     "a rate without a unit": changed_copy("robots", "turtlebot3_burger", "rate: 5Hz", "rate: 5"),
     "a profile whose name differs from its file": changed_copy(
         "robots", "duckiedrone", "name: duckiedrone", "name: drone"
@@ -244,8 +244,8 @@ YAML_CASES: dict[str, Setup] = {
     "a record command without its topics": changed_copy("robots", "turtlebot3_burger", '"{topics}"]', "]"),
     "a campaign without a seed": campaign("seed: 7\n", ""),
     "one distance twice": campaign("20ft", "3.048m"),
-    "an exception that matches no trial": campaign("seed: 7", "seed: 7\nexcept: [{distance: 55ft}]"),
-    "a walk that is too short": campaign("seed: 7", "seed: 7\nwalk: 12m"),
+    "an entry of `except` that matches no trial": campaign("seed: 7", "seed: 7\nexcept: [{distance: 55ft}]"),
+    "a `walk` below the shortest path": campaign("seed: 7", "seed: 7\nwalk: 12m"),
     "a campaign file that changed": campaign("seed: 7", "seed: 8", started=True),
 }
 
@@ -308,15 +308,18 @@ def add_journal_entry(trial: Path) -> None:
 STORED_TRIAL_CASES: dict[str, Setup] = {
     "a missing path": without_files("aggregate nowhere"),
     "a folder without a trial": without_files("aggregate ."),
-    "a table of something else": lambda lab: ((lab / "a.csv").write_text("time,x\n1,2\n"), "aggregate a.csv")[1],
+    "a table without repeats": lambda lab: (
+        (lab / "a.csv").write_text("time,x\n1,2\n"),
+        "aggregate a.csv",
+    )[1],
     "a truncated line": with_trial_table(*tables.repeats(tables.ROW, 3), cut=20),
     "a cell that is not a number": with_trial_table(replace(tables.ROW, distance_m="near")),
     "a table of a newer fieldkit": with_trial_table(replace(tables.ROW, schema_version=99)),
     "two copies of a trial that differ": with_trial_table(tables.ROW, other=replace(tables.ROW, transfer_s=2.0)),
     "trials in which no repeat has ended": with_empty_trial("aggregate trials"),
     "trials whose tables were deleted": with_empty_trial("aggregate trials", with_table=False),
-    "a table without a line": lambda lab: (with_trial_table()(lab), "aggregate trials/a/trial.csv")[1],
-    "a table alone to rebuild from": with_trial_table(tables.ROW, options="--rebuild"),
+    "a table without rows": lambda lab: (with_trial_table()(lab), "aggregate trials/a/trial.csv")[1],
+    "a table without raw evidence to rebuild from": with_trial_table(tables.ROW, options="--rebuild"),
     "an unknown column in --by": with_trial_table(tables.ROW, options="--by distanse"),
     "an unknown quantity": with_trial_table(tables.ROW, options="--quantity ip_los"),
     "a width without a unit": with_trial_table(tables.ROW, options="--width 2"),

@@ -140,7 +140,7 @@ def test_with_yes_a_robot_does_not_start_at_an_unconfirmed_position(lab: RoverLa
     since_ns = time.time_ns()
     two_distances_run = run_here(lab.folder, "trial", "drive", "5m", "10m", "--out", out, *WITHOUT_QUESTIONS)
     assert two_distances_run.code == 2, two_distances_run.err
-    assert "rover-1 moves without a person and must be at another place for 10m" in two_distances_run.err
+    assert "rover-1 moves automatically and must be at another place for 10m" in two_distances_run.err
     assert set(lab.track_m(since_ns)) <= {lab.place_m}
 
     first_run = campaign(lab, out, *WITHOUT_QUESTIONS)

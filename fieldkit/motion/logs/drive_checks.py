@@ -29,7 +29,8 @@ _SPEED_M_S: Final = 0.1
 _COMMAND_M_S: Final = 1e-3
 _COAST_M: Final = 1.0
 _COAST_SHARE: Final = 0.1
-"""After a command to stop, a robot coasts, and its position shifts while it turns."""
+"""Tolerance of the distance driven at a commanded speed of 0, and its increase per driven metre. After a command to
+stop, a robot coasts, and its position shifts while it turns."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class DrivePlan:
 def contradictions(log: Sequence[DriveMoment], plan: DrivePlan) -> Iterator[str]:
     """Yield the contradictions in the log of a successful drive, one sentence each."""
     if log[-1].ended != HOME or any(moment.ended for moment in log[:-1]):
-        yield f"does not end with the robot at its starting position, but {log[-1].ended or 'on its path'}"
+        yield f"does not end at the starting position of the robot: {log[-1].ended or 'it ends on the path'}"
     yield from time_contradictions(log, plan.window)
     if not log[0].off_m - _START_M <= log[0].driven_m <= (1 + _JITTER_SHARE) * (log[0].off_m + _START_M) + _JITTER_M:
         yield f"starts {log[0].off_m:.2f} m from its origin, after {log[0].driven_m:.2f} m driven"

@@ -24,7 +24,7 @@ from fieldkit.motion.logs.motion_log import LAST_NS, LONGEST_M, LONGEST_S
 FILE: Final = "drive.jsonl"
 
 HOME: Final = "home"
-"""End of a drive that returned to its start without being stopped."""
+"""Value of `ended` for a drive that returned to its start without being stopped."""
 
 COLUMNS: Final = columns(
     100,
@@ -63,6 +63,7 @@ COLUMNS: Final = columns(
 """Columns of trials with self-driving robots."""
 
 _OUT: Final = frozenset({"out", "there"})
+"""Phases from the start of the path until the robot turns back."""
 _PHASES: Final = frozenset({"waits", "back", HOME}) | _OUT
 _SPEED_INTERVAL_S: Final = 0.5
 """Interval over which a speed is computed. One odometry message more or less changes it by 3 % at 50 Hz and by 7 %
@@ -76,7 +77,8 @@ class DriveMoment:
 
     Attributes:
         at_s: Time since the start of the program.
-        phase: Phase of the drive: `waits`, `out`, `there`, `back` or `home`.
+        phase: Phase of the drive: `waits` before the start, `out` on the path, `there` at its end, `back` on the way
+            back, or `home`.
         x_m: Position ahead of the start.
         y_m: Position to the left of the start.
         yaw_rad: Heading relative to the start, positive to the left.

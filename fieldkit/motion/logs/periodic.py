@@ -36,7 +36,7 @@ _SKIP_COST: Final = 1.0
 """Cost of a period that the autopilot skipped, in squared periods: more than the squared deviation of one late
 message, less than the sum for two."""
 _HYPOTHESES: Final = 4
-"""Maximum number of hypotheses; after late messages two or three are still possible."""
+"""Maximum number of hypotheses that are kept. After late messages two or three are still possible."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,10 @@ def _period_ms(messages: Sequence[StreamMessage], indices: Sequence[int], interv
 
 
 def _unwrap(numbers: Sequence[int]) -> list[int]:
-    """Return sequence numbers that continue after 255; a late one stays before the newest."""
+    """Return the sequence numbers without the wrap-around after 255.
+
+    The number of a message that arrives late is smaller than the newest number.
+    """
     indices, newest = list[int](), 0
     for number in numbers:
         if not indices:

@@ -33,6 +33,7 @@ def read_tlog(path: Path, position_source: PositionSource) -> Samples:
             raise EvidenceError("the autopilot restarted", where=str(path), remedy="write times: received")
         times_ns = boot_ns + (received_ns - boot_ns).min()
     times_ns, first = np.unique(times_ns, return_index=True)
+    # The times are sorted and unique, so only the range of the first and the last one must be checked.
     require_increasing([int(times_ns[0]), int(times_ns[-1])][: len(times_ns)], [str(path)] * 2)
     values = np.array([row[2:] for row in rows], dtype=float)[first]
     is_local = position_source.topic == tlog.LOCAL

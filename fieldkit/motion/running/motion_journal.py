@@ -28,7 +28,7 @@ _FIXED: Final = {Topology.MASTER: Role.RELAY, Topology.MASTERLESS: Role.RECEIVER
 
 
 class MotionEvent(StrEnum):
-    """Event of a robot that moves without a person."""
+    """Event of a robot that moves automatically."""
 
     ORIGIN = "origin"
     STARTED = "begun"
@@ -105,7 +105,7 @@ def origins(entries: Sequence[MotionEntry]) -> Mapping[str, MotionEntry]:
 
 
 def last_places(entries: Sequence[MotionEntry]) -> Mapping[str, MotionOrigin]:
-    """Return the position of each robot at the end of its last motion, by name; unknown positions are left out."""
+    """Return the position of each robot at the end of its last motion, by name; unknown positions are omitted."""
     by_robot: dict[str, MotionOrigin] = {}
     for entry in entries:
         if entry.event in {MotionEvent.ENDED, MotionEvent.HELD} and entry.origin is not None:
@@ -182,7 +182,7 @@ def read(path: Path) -> list[MotionEntry]:
 
 
 class JournaledOrigins:
-    """Implements `Origins` for robots that stay at the end of a motion, with a journal on disk.
+    """Implements `Origins` with a journal on disk, for robots that stay where a motion ended.
 
     Args:
         journal: The journal of motions.

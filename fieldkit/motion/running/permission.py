@@ -35,7 +35,7 @@ def require_one_place(plans: Sequence[Plan], backend: Backend, operator: Operato
         for role in _self_moving_roles(later):
             if motion_journal.place_of(role, earlier.placement) != motion_journal.place_of(role, later.placement):
                 raise ConfigurationError(
-                    f"{later.cast[role].name} moves without a person and must be at another place for "
+                    f"{later.cast[role].name} moves automatically and must be at another place for "
                     f"{later.distance}, and with --yes no person moves it there",
                     remedy="run it without --yes, or one distance per command",
                 )

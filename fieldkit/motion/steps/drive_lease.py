@@ -88,9 +88,10 @@ class DriveLease(LeaseKeeper):
 
     @property
     def final_state(self) -> str:
-        """State of the robot after the drive: `home` at its place, or else the reason why it stopped; empty before.
+        """State of the robot after the drive: `home` if it is at its place, otherwise the reason why it stopped.
 
-        The driver writes its status ten times a second. If there is no new one, it has exited or cannot be reached.
+        Empty before the end of the drive. The driver writes its status ten times a second. If there is no new status,
+        the driver has exited or cannot be reached.
         """
         status, silent_s = self.status, self.unchanged_s
         if isinstance(state := status.get("ended"), str) and state:

@@ -33,7 +33,9 @@ ODOMETRY_S: Final = 0.5
 _TURN_S: Final = 12.0
 """Maximum duration of a turn at a corner: half a turn at 0.3 rad/s."""
 _SLACK_S: Final = 20.0
+"""Additional time in the time limit of a move."""
 _GRACE_S: Final = 3.0
+"""Time in which a driver must stop the robot and exit; then it is killed."""
 
 _ZENOH_PORT: Final = 7447
 """Default port of Zenoh, on which the router of rmw_zenoh listens."""
@@ -201,7 +203,7 @@ def _driver_arguments(scene: Scene, move: Move, name_pattern: str) -> str:
 
 
 def _network(robot: Robot, middleware: MiddlewareName) -> dict[str, Any]:
-    """Return the settings with which the driver discovers the nodes of its robot without multicast."""
+    """Return the network settings of the driver, which discovers the nodes of its robot without multicast."""
     network = {
         "address": robot.address,
         "domain": robot.profile.ros.domain if robot.profile.ros else 0,
@@ -209,7 +211,8 @@ def _network(robot: Robot, middleware: MiddlewareName) -> dict[str, Any]:
     }
     if middleware is not MiddlewareName.ZENOH:
         return network | {"peers": [robot.address]}
-    # The router of rmw_zenoh on the robot announces all sessions there. A session without a router may use its port.
+    # The router of rmw_zenoh on the robot announces all sessions of the robot. If there is no router, another session
+    # may listen on its port.
     endpoints = [f"tcp/{address}:{_ZENOH_PORT}" for address in ("127.0.0.1", robot.address)]
     settings = {
         "connect/endpoints": agent_commands.compact(endpoints),
@@ -240,7 +243,7 @@ def drive_robot(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name_
             _wait_until_ready(scene, drive_lease, move)
             motion = stack.enter_context(origins_of(scene).moving(move.role))
         except BaseException:
-            _end(shell, plan.job)
+            _stop_driver(shell, plan.job)
             raise
         yield from _out_and_back(scene, testbed, shell, plan.job, drive_lease, move, motion)
 
@@ -290,7 +293,7 @@ def _out_and_back(  # noqa: PLR0917 (all of them belong to one motion)
             raise
         raise
     except BaseException:
-        _end(shell, job)
+        _stop_driver(shell, job)
         raise
     early_end = drive_lease.end_reason
     final_state = bring_back()
@@ -312,13 +315,13 @@ def _bring_back(
     drive_lease.turn_back()
     drive_lease.wait(lambda: drive_lease.final_state, Deadline.after(START_S + limit_s(move)))
     final_state = drive_lease.final_state
-    _end(shell, job)
+    _stop_driver(shell, job)
     if by_hand or final_state == drive_log.HOME:
         testbed.bring_back(move.role, has_returned=final_state == drive_log.HOME)
     return final_state
 
 
-def _end(shell: Shell, job: Job) -> None:
+def _stop_driver(shell: Shell, job: Job) -> None:
     """Stop the driver, which stops the robot; without the link, the robot stops when its lease expires."""
     with suppress(FieldkitError):
         jobs.stop(shell, job, grace_s=_GRACE_S)

@@ -26,7 +26,7 @@ def alarm_after_failure(
         guard: Job of the guard.
         rescue: Rescue of the same flight; it must be active until this context is left.
         log: File of the drone's positions.
-        announce: Receives the alarm.
+        announce: Called with the alarm.
         landing_s: Maximum duration of a landing.
     """
     try:

@@ -56,6 +56,7 @@ _DEFAULT_HZ: Final = 40.0
 _FRAME_BYTES: Final = 40
 _STAMP_BYTES: Final = 8
 _START_S: Final = 2.0
+"""Approximate time for the start of the recorder."""
 _READY_S: Final = 75
 """Timeout for the start of the recorder, whose own timeout is 60 s: ArduCopter sends LOCAL_POSITION_NED about 30 s
 after its boot."""
@@ -65,7 +66,7 @@ _EXTRA_S: Final = 2
 """Recording time after the last step, enough for a message of each kind at default rates."""
 
 
-def _is_message(name: str) -> str:
+def _validate_message(name: str) -> str:
     if name not in MESSAGES:
         raise schema.validation_error(f"no rate can be requested for {name!r}; possible: {', '.join(MESSAGES)}")
     return name
@@ -87,8 +88,8 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
             and `EXTENDED_SYS_STATE`: `{ATTITUDE: 20Hz}`. Every message received is recorded.
         positions: Message that fills the columns of distances and speeds: `local` for `LOCAL_POSITION_NED`, `global`
             for `GLOBAL_POSITION_INT`. Such a step must not be inside a move, a fault or a `together`.
-        facing: With `local`, direction of the robot when the step begins: `away`, `towards`, `left` or `right`, seen
-            by an observer who looks away from the other end of its link.
+        facing: With `local`, direction of the robot when the step begins: `away` from the robot at the other end of
+            its link, `towards` that robot, or to the `left` or `right` of the direction `away`.
         times: Time of a message: `header` for the autopilot's time, or `received` for the time of arrival.
         gap: If two consecutive messages are further apart than this, the position between them is unknown.
         heights: Whether heights above the sea are used, with `global`.
@@ -100,7 +101,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
     robot: Role
     at: Role | None = None
     system: Annotated[Int, Field(ge=0, le=255)] = 0
-    rates: dict[Annotated[str, AfterValidator(_is_message)], Annotated[Hertz, Field(gt=0, le=1000)]] = Field(
+    rates: dict[Annotated[str, AfterValidator(_validate_message)], Annotated[Hertz, Field(gt=0, le=1000)]] = Field(
         default_factory=dict
     )
     positions: Literal["local", "global"] | None = None
@@ -164,7 +165,10 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
 
     @override
     def needs(self, scene: Scene) -> Iterator[Need]:
-        """Yield the check of the connection to the autopilot; none over the radio, whose losses are measured."""
+        """Yield the check of the connection to the autopilot.
+
+        A connection over the radio is not checked, because its losses are part of the measurement.
+        """
         if self.recorder == self.robot:
             yield link_need(scene.robot(self.recorder), self.recorder, self._connection(scene), ("recorder",))
 

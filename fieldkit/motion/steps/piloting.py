@@ -278,7 +278,9 @@ def _motion_origin(values: Mapping[str, Any]) -> MotionOrigin:
 def leased_program(
     scene: Scene, shell: Shell, program: Planned, *, lease_s: float = LEASE_S, body_s: float, exit_s: float
 ) -> Iterator[FlightLease]:
-    """Start a flight program on a drone, yield its lease, and wait for the exit that the body has ordered.
+    """Start a flight program on a drone, yield its lease, and wait until the program exits after the body.
+
+    The body must give the order after which the program exits.
 
     If the body fails, the program continues until its lease expires or the clean-up of the attempt stops its job.
 

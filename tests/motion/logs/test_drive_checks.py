@@ -73,7 +73,7 @@ def test_a_truncated_log_is_detected(n_removed_bytes: int, tmp_path_factory: pyt
 
 def test_a_truncated_log_of_an_older_agent_is_detected(tmp_path: Path) -> None:
     path = write_log(tmp_path, drive_lines()[:40], numbered=False)
-    assert reasons(path) == ["does not end with the robot at its starting position, but on its path"]
+    assert reasons(path) == ["does not end at the starting position of the robot: it ends on the path"]
 
 
 CHANGES: Mapping[str, Any] = {

@@ -82,9 +82,9 @@ def first_shell(row: Row) -> Iterator[SshShell]:
 def routes_over_neighbours(shell: SshShell) -> bool:
     """Return True if the routes of the first robot are those over its neighbours."""
     routes = output_of(shell, "ip", "-4", "route", "show", "proto", "babel").splitlines()
-    neighbours = f"{LAPTOP_ADDRESS} via {LAPTOP_ADDRESS}"
+    route_to_laptop = f"{LAPTOP_ADDRESS} via {LAPTOP_ADDRESS}"
     routes_over_r2 = {f"{ADDRESSES[name]} via 10.42.0.2" for name in NAMES[1:]}
-    return {line.split(" dev")[0] for line in routes} == {neighbours, *routes_over_r2}
+    return {line.split(" dev")[0] for line in routes} == {route_to_laptop, *routes_over_r2}
 
 
 def reaches_last(shell: SshShell) -> bool:
@@ -150,7 +150,7 @@ def test_a_multicast_reaches_neighbours_and_is_not_forwarded(first_shell: SshShe
     neighbours = {"fe80::aff:fe2a:2", "fe80::aff:fe2a:fe"}
     receivers: set[str] = set()
     deadline = Deadline.after(LONG_S)
-    # Their answers leave at the same time, and may collide.
+    # The neighbours answer at the same time, and their answers may collide.
     while not receivers >= neighbours and not deadline.expired:
         text = output_of(first_shell, "ping", "-n", "-c", "2", "-i", "0.2", "-W", "1", "ff02::1%wlan0")
         receivers.update(re.findall(r"bytes from (\S+?)%wlan0:", text))

@@ -85,7 +85,7 @@ def test_packages_of_fieldkit_s_python_precede_debian_s(emulation: EmulatedTestb
 ONE_SCAN: Final = """
 import json, rospy
 from sensor_msgs.msg import LaserScan
-rospy.init_node("eye", anonymous=True, disable_signals=True)
+rospy.init_node("scan_reader", anonymous=True, disable_signals=True)
 print(json.dumps(rospy.wait_for_message("/scan", LaserScan, 60).ranges))
 """
 

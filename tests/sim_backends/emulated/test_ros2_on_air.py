@@ -110,9 +110,9 @@ def subscribed(
     emulation: EmulatedTestbed, middleware_name: str, topic: str, type_name: str, **network: object
 ) -> Iterator[Iterator[Any]]:
     """Yield the messages, of rosbags' types, that a node of DDS or Zenoh on the drone receives."""
-    network_settings = {"address": emulation.robots[Role.RELAY].spec.ip, "node": "ears", **network}
+    network_settings = {"address": emulation.robots[Role.RELAY].spec.ip, "node": "subscriber", **network}
     quality = offered_qos.LATCHED if topic == "/tf_static" else PROFILES["sensor_data"]
-    description = topics.describe(standard_types(), topic, type_name, quality, domain=0, node="ears")
+    description = topics.describe(standard_types(), topic, type_name, quality, domain=0, node="subscriber")
     command = (
         sys.executable,
         str(WIRE_END),

@@ -96,9 +96,9 @@ def test_every_robot_lists_all_topics_with_one_publisher_each(emulation: Emulate
 def test_subscriptions_to_another_robot_cross_the_medium(emulation: EmulatedTestbed, tmp_path: Path) -> None:
     receiver = emulation.shells[Role.RECEIVER]
     before = emulation.medium.stats().ports["turtlebot-1"].sent_packets
-    run_in_ros(emulation, Role.RECEIVER, "rosbag", "record", "--duration=3", "-O", "heard", "/scan")
-    bag = tmp_path / "heard.bag"
-    receiver.fetch(("cat", "heard.bag"), bag, deadline=Deadline.after(LONG_S), limit_bytes=1 << 20)
+    run_in_ros(emulation, Role.RECEIVER, "rosbag", "record", "--duration=3", "-O", "other_robot", "/scan")
+    bag = tmp_path / "other_robot.bag"
+    receiver.fetch(("cat", "other_robot.bag"), bag, deadline=Deadline.after(LONG_S), limit_bytes=1 << 20)
     with Reader(bag) as reader:
         count = reader.message_count
         assert {getattr(connection.ext, "callerid", None) for connection in reader.connections} == {

@@ -68,19 +68,19 @@ class IgnoresCommands(WrappedPhysics):
         return super().advance(to_ns, {})
 
 
-class HasWrongLimits(WrappedPhysics):
+class ReportsSmallLimits(WrappedPhysics):
     def __init__(self, hello: Any) -> None:  # noqa: ANN401
         super().__init__(hello)
         self.limits_m_s2 = dict.fromkeys(self.limits_m_s2, 0.1)
 
 
-class TremblingPhysics(WrappedPhysics):
+class NoisyPhysics(WrappedPhysics):
     def alter_answer(self, states: States, to_ns: int) -> States:
         return {name: shifted(state, random.random() * 1e-9) for name, state in states.items()}
 
 
-class IsShared(WrappedPhysics):
-    def __deepcopy__(self, memo: dict[int, Any]) -> "IsShared":
+class CopiesArePhysicsItself(WrappedPhysics):
+    def __deepcopy__(self, memo: dict[int, Any]) -> "CopiesArePhysicsItself":
         return self
 
 
@@ -140,7 +140,7 @@ def swapped(position_m: tuple[float, float, float]) -> tuple[float, float, float
     return north, east, up
 
 
-class StandsStill(WrappedPhysics):
+class ReportsNoVelocity(WrappedPhysics):
     def alter_answer(self, states: States, to_ns: int) -> States:
         return {name: state._replace(velocity_m_s=(0.0, 0.0, 0.0)) for name, state in states.items()}
 
@@ -196,7 +196,7 @@ class FliesForward(ChangesCommands):
         return replace(command, velocity_m_s=(-left, forward, up))
 
 
-class IgnoresFrom(_Run):
+class IgnoresFromTime(_Run):
     def _advance_physics(self, federate_copy: _FederateCopy, body: bytes) -> bytes:
         return super()._advance_physics(federate_copy, body[:8] + bytes(8) + body[16:])
 
@@ -242,12 +242,12 @@ class RefusesNegativeTimes(DelayNetwork):
         return super().advance(to_ns, packets, states)
 
 
-class ForgetsFarAway(DelayNetwork):
+class ReportsNoDrops(DelayNetwork):
     def advance(self, to_ns: int, packets: Sequence[Packet], states: States) -> Outcome:
         return super().advance(to_ns, packets, states)[0], []
 
 
-class KnowsNoNewAgents(DelayNetwork):
+class RefusesNewAgents(DelayNetwork):
     def advance(self, to_ns: int, packets: Sequence[Packet], states: States) -> Outcome:
         for packet in packets:
             if packet.destination not in {"ann", "bob", "cy"}:
@@ -260,7 +260,7 @@ class DeliversToAll(DelayNetwork):
         return super().advance(to_ns, packets, {name: State((0.0, 0.0, 0.0)) for name in ("ann", "bob", "cy")})
 
 
-class ReckoningNetwork(DelayNetwork):
+class DelaysDeadReckoning(DelayNetwork):
     def advance(self, to_ns: int, packets: Sequence[Packet], states: States) -> Outcome:
         delay_ns = MS if isinstance(states, DeadReckoned) else 0
         return super().advance(
@@ -268,8 +268,8 @@ class ReckoningNetwork(DelayNetwork):
         )
 
 
-class SharedNet(DelayNetwork):
-    def __deepcopy__(self, memo: dict[int, Any]) -> "SharedNet":
+class CopiesAreNetworkItself(DelayNetwork):
+    def __deepcopy__(self, memo: dict[int, Any]) -> "CopiesAreNetworkItself":
         return self
 
 
@@ -348,7 +348,7 @@ class UnknownTransmitter(DelayNetwork):
     transmitters = ("nobody",)
 
 
-def random_delay(self: DelayNetwork, arrivals: list[Arrival], drops: list[Drop], to_ns: int) -> Outcome:
+def lose_at_random(self: DelayNetwork, arrivals: list[Arrival], drops: list[Drop], to_ns: int) -> Outcome:
     lost_arrivals = [arrival for arrival in arrivals if random.random() < 0.5]
     remaining_arrivals = [arrival for arrival in arrivals if arrival not in lost_arrivals]
     return remaining_arrivals, [Drop(arrival.packet_id, "bad luck") for arrival in lost_arrivals]
@@ -385,118 +385,118 @@ class BrokenFederate:
     message: str
 
 
-def physics(make: Any, **settings: Any) -> Pair:  # noqa: ANN401
+def serve(make: Any, **settings: Any) -> Pair:  # noqa: ANN401 (a class of a federate)
     return Pair(FederateService(make, **settings))
 
 
 PHYSICS_CASES = [
-    BrokenFederate("handshake", physics(Carts, commands=(1, 2, 9)), "unknown types of commands: [9]"),
+    BrokenFederate("handshake", serve(Carts, commands=(1, 2, 9)), "unknown types of commands: [9]"),
     BrokenFederate(
         "ping",
-        replace(physics(Carts), alter=add_to_first_integer(MessageKind.PONG, 1)),
+        replace(serve(Carts), alter=add_to_first_integer(MessageKind.PONG, 1)),
         "the ping 0 was answered with 1",
     ),
     BrokenFederate(
         "malformed",
-        replace(physics(Carts), alter=turn_errors_into(MessageKind.STATES)),
+        replace(serve(Carts), alter=turn_errors_into(MessageKind.STATES)),
         "it must refuse a frame that ends",
     ),
     BrokenFederate(
-        "counts", replace(physics(Carts), alter=turn_errors_into(MessageKind.STATES)), "it must refuse a count"
+        "counts", replace(serve(Carts), alter=turn_errors_into(MessageKind.STATES)), "it must refuse a count"
     ),
     BrokenFederate(
         "fork_absence",
-        replace(physics(Carts, forks=False), alter=turn_errors_into(MessageKind.DONE)),
+        replace(serve(Carts, forks=False), alter=turn_errors_into(MessageKind.DONE)),
         "it must refuse fork",
     ),
-    BrokenFederate("bye", replace(physics(Carts), stays_open=True), "it has not closed the connection"),
-    BrokenFederate("start", physics(StartsElsewhere), "ann starts 1 m away"),
+    BrokenFederate("bye", replace(serve(Carts), stays_open=True), "it has not closed the connection"),
+    BrokenFederate("start", serve(StartsElsewhere), "ann starts 1 m away"),
     BrokenFederate(
-        "remainders", replace(physics(Carts), alter=add_to_first_integer(MessageKind.STATES, 1)), "instead of 0 ns"
+        "remainders", replace(serve(Carts), alter=add_to_first_integer(MessageKind.STATES, 1)), "instead of 0 ns"
     ),
-    BrokenFederate("remainders", physics(LosesAnAgent), "there is no state of bob"),
-    BrokenFederate("remainders", physics(AddsAnAgent), "the agent dan appeared"),
+    BrokenFederate("remainders", serve(LosesAnAgent), "there is no state of bob"),
+    BrokenFederate("remainders", serve(AddsAnAgent), "the agent dan appeared"),
     BrokenFederate(
-        "remainders", replace(physics(Carts), alter=drop_answers, deadline_s=0.2), "has not answered for 0.2 s"
+        "remainders", replace(serve(Carts), alter=drop_answers, deadline_s=0.2), "has not answered for 0.2 s"
     ),
-    BrokenFederate("remainders", physics(IsNotFinite), "with a malformed frame: byte 32: the state of agent 0"),
-    BrokenFederate("drift", physics(DriftingPhysics), "windows instead of one: the positions of ann differ"),
-    BrokenFederate("repeated_time", physics(DriftingPhysics), "a second request for 20000000 ns gave other states"),
-    BrokenFederate("motion", physics(JumpingPhysics), "moved by 3 m in a step"),
-    BrokenFederate("motion", physics(IgnoresCommands), "moved by 0 m in 1000 steps"),
-    BrokenFederate("limits", physics(HasWrongLimits), "its limit of 0.1 m/s^2 allows"),
+    BrokenFederate("remainders", serve(IsNotFinite), "with a malformed frame: byte 32: the state of agent 0"),
+    BrokenFederate("drift", serve(DriftingPhysics), "windows instead of one: the positions of ann differ"),
+    BrokenFederate("repeated_time", serve(DriftingPhysics), "a second request for 20000000 ns gave other states"),
+    BrokenFederate("motion", serve(JumpingPhysics), "moved by 3 m in a step"),
+    BrokenFederate("motion", serve(IgnoresCommands), "moved by 0 m in 1000 steps"),
+    BrokenFederate("limits", serve(ReportsSmallLimits), "its limit of 0.1 m/s^2 allows"),
     BrokenFederate(
-        "command_time", replace(physics(Carts), run_class=IgnoresFrom), "a command that applies from 100000000 ns"
+        "command_time", replace(serve(Carts), run_class=IgnoresFromTime), "a command that applies from 100000000 ns"
     ),
     BrokenFederate(
         "unknown_command",
-        replace(physics(Carts), alter=turn_errors_into(MessageKind.STATES)),
+        replace(serve(Carts), alter=turn_errors_into(MessageKind.STATES)),
         "it must refuse a command",
     ),
-    BrokenFederate("determinism", physics(TremblingPhysics), "gave different answers"),
+    BrokenFederate("determinism", serve(NoisyPhysics), "gave different answers"),
     BrokenFederate(
-        "lifetimes", physics(LeavesLate, agents_disappear=True), "300000000 ns, has no state at 100000000 ns"
+        "lifetimes", serve(LeavesLate, agents_disappear=True), "300000000 ns, has no state at 100000000 ns"
     ),
     BrokenFederate(
-        "lifetimes", physics(LosesAnotherAgent, agents_disappear=True), "bob, which is always present, has no"
+        "lifetimes", serve(LosesAnotherAgent, agents_disappear=True), "bob, which is always present, has no"
     ),
     BrokenFederate(
-        "lifetimes", physics(AppearsElsewhere, agents_disappear=True), "ann appears 2 m away from its requested start"
+        "lifetimes", serve(AppearsElsewhere, agents_disappear=True), "ann appears 2 m away from its requested start"
     ),
-    BrokenFederate("fork", physics(IsShared), "the original"),
-    BrokenFederate("drive_axes", physics(SwapsAxes), "0 rad, and moved by (0, 0.6, 0) m instead of 0.6 m east"),
-    BrokenFederate("drive_axes", physics(ReportsDegrees), "the heading of ann is 90 rad at the start, not 1.57 rad"),
-    BrokenFederate("turn", physics(TurnsRight), "its heading changed by -0.9 rad"),
-    BrokenFederate("turn", physics(ReportsDegrees), "its heading changed by 51.6 rad"),
-    BrokenFederate("turn", physics(ReportsWrongSide), "ann drives forward at a heading of 0.8"),
-    BrokenFederate("velocity", physics(StandsStill), "its reported velocities give (0, 0, 0) m"),
-    BrokenFederate("flight_axes", physics(FliesForward), "of 1.57 rad, and moved by (0, 2, 1) m"),
-    BrokenFederate("flight_axes", physics(ReportsDegrees), "the heading of cy is 90 rad at the start"),
+    BrokenFederate("fork", serve(CopiesArePhysicsItself), "the original"),
+    BrokenFederate("drive_axes", serve(SwapsAxes), "0 rad, and moved by (0, 0.6, 0) m instead of 0.6 m east"),
+    BrokenFederate("drive_axes", serve(ReportsDegrees), "the heading of ann is 90 rad at the start, not 1.57 rad"),
+    BrokenFederate("turn", serve(TurnsRight), "its heading changed by -0.9 rad"),
+    BrokenFederate("turn", serve(ReportsDegrees), "its heading changed by 51.6 rad"),
+    BrokenFederate("turn", serve(ReportsWrongSide), "ann drives forward at a heading of 0.8"),
+    BrokenFederate("velocity", serve(ReportsNoVelocity), "its reported velocities give (0, 0, 0) m"),
+    BrokenFederate("flight_axes", serve(FliesForward), "of 1.57 rad, and moved by (0, 2, 1) m"),
+    BrokenFederate("flight_axes", serve(ReportsDegrees), "the heading of cy is 90 rad at the start"),
     BrokenFederate(
-        "yaw", physics(IgnoresYaw), "the heading of cy is 0.5 rad 8 s after a command with this yaw, not 1.5"
+        "yaw", serve(IgnoresYaw), "the heading of cy is 0.5 rad 8 s after a command with this yaw, not 1.5"
     ),
-    BrokenFederate("yaw", physics(ZeroesYaw), "the heading of cy is 0 rad 2 s after a command without a yaw"),
+    BrokenFederate("yaw", serve(ZeroesYaw), "the heading of cy is 0 rad 2 s after a command without a yaw"),
 ]
 NETWORK_CASES = [
-    BrokenFederate("handshake", physics(UnknownTransmitter), "KeyError: 'nobody'"),
+    BrokenFederate("handshake", serve(UnknownTransmitter), "KeyError: 'nobody'"),
     BrokenFederate(
         "ping",
-        replace(physics(DelayNetwork), alter=add_to_first_integer(MessageKind.PONG, 1)),
+        replace(serve(DelayNetwork), alter=add_to_first_integer(MessageKind.PONG, 1)),
         "the ping 0 was answered with 1",
     ),
     BrokenFederate(
         "malformed",
-        replace(physics(DelayNetwork), alter=turn_errors_into(MessageKind.OUTCOMES)),
+        replace(serve(DelayNetwork), alter=turn_errors_into(MessageKind.OUTCOMES)),
         "it must refuse a frame that ends",
     ),
     BrokenFederate(
         "counts",
-        replace(physics(DelayNetwork), alter=turn_errors_into(MessageKind.OUTCOMES)),
+        replace(serve(DelayNetwork), alter=turn_errors_into(MessageKind.OUTCOMES)),
         "it must refuse a count",
     ),
     BrokenFederate(
         "fork_absence",
-        replace(physics(DelayNetwork, forks=False), alter=turn_errors_into(MessageKind.DONE)),
+        replace(serve(DelayNetwork, forks=False), alter=turn_errors_into(MessageKind.DONE)),
         "it must refuse fork",
     ),
-    BrokenFederate("bye", replace(physics(DelayNetwork), stays_open=True), "it has not closed the connection"),
-    BrokenFederate("first_request", physics(RefusesNegativeTimes), "ValueError: negative"),
+    BrokenFederate("bye", replace(serve(DelayNetwork), stays_open=True), "it has not closed the connection"),
+    BrokenFederate("first_request", serve(RefusesNegativeTimes), "ValueError: negative"),
     BrokenFederate(
         "exactly_once",
-        replace(physics(DelayNetwork), alter=add_to_first_integer(MessageKind.OUTCOMES, 1)),
+        replace(serve(DelayNetwork), alter=add_to_first_integer(MessageKind.OUTCOMES, 1)),
         "but advanced to",
     ),
     BrokenFederate(
-        "exactly_once", physics(network_class(lambda _, arrivals, drops, to_ns: ([], drops))), "neither arrived nor"
+        "exactly_once", serve(network_class(lambda _, arrivals, drops, to_ns: ([], drops))), "neither arrived nor"
     ),
     BrokenFederate(
         "exactly_once",
-        physics(network_class(lambda _, arrivals, drops, to_ns: ([*arrivals, *arrivals[-1:]], drops))),
+        serve(network_class(lambda _, arrivals, drops, to_ns: ([*arrivals, *arrivals[-1:]], drops))),
         "reported twice",
     ),
     BrokenFederate(
         "exactly_once",
-        physics(
+        serve(
             network_class(
                 lambda _, arrivals, drops, to_ns: ([], [Drop(arrival.packet_id, "") for arrival in arrivals])
             )
@@ -505,7 +505,7 @@ NETWORK_CASES = [
     ),
     BrokenFederate(
         "exactly_once",
-        physics(
+        serve(
             network_class(
                 lambda _, arrivals, drops, to_ns: ([arrival._replace(receiver="cy") for arrival in arrivals], [])
             )
@@ -514,7 +514,7 @@ NETWORK_CASES = [
     ),
     BrokenFederate(
         "exactly_once",
-        physics(
+        serve(
             network_class(
                 lambda _, arrivals, drops, to_ns: ([arrival._replace(at_ns=to_ns + 1) for arrival in arrivals], [])
             )
@@ -523,43 +523,41 @@ NETWORK_CASES = [
     ),
     BrokenFederate(
         "exactly_once",
-        physics(network_class(lambda _, arrivals, drops, to_ns: ([Arrival(99, "bob", to_ns)], []))),
+        serve(network_class(lambda _, arrivals, drops, to_ns: ([Arrival(99, "bob", to_ns)], []))),
         "the fate of packet 99 was reported, but it was not sent to the network",
     ),
     BrokenFederate(
         "exactly_once",
-        physics(network_class(lambda _, arrivals, drops, to_ns: (arrivals[::-1], drops))),
+        serve(network_class(lambda _, arrivals, drops, to_ns: (arrivals[::-1], drops))),
         "order of time",
     ),
-    BrokenFederate("exactly_once", physics(AnnouncesTooLate), "before the announced next event"),
-    BrokenFederate("exactly_once", physics(AnnouncesThePast), "its next event is at 0 ns"),
-    BrokenFederate("window_borders", physics(DropsAtBorders), "at the border of a window neither arrived"),
+    BrokenFederate("exactly_once", serve(AnnouncesTooLate), "before the announced next event"),
+    BrokenFederate("exactly_once", serve(AnnouncesThePast), "its next event is at 0 ns"),
+    BrokenFederate("window_borders", serve(DropsAtBorders), "at the border of a window neither arrived"),
     BrokenFederate(
         "window_length",
-        physics(
+        serve(
             network_class(
                 lambda _, arrivals, drops, to_ns: ([arrival._replace(at_ns=to_ns) for arrival in arrivals], [])
             )
         ),
         "windows of another length changed an arrival",
     ),
-    BrokenFederate("far_away", physics(ForgetsFarAway), "1,000 km away neither arrived nor"),
+    BrokenFederate("far_away", serve(ReportsNoDrops), "1,000 km away neither arrived nor"),
     BrokenFederate(
         "unknown_transport",
-        replace(physics(DelayNetwork, transports=("udp",)), alter=turn_errors_into(MessageKind.OUTCOMES)),
+        replace(serve(DelayNetwork, transports=("udp",)), alter=turn_errors_into(MessageKind.OUTCOMES)),
         "it must refuse a packet of a transport",
     ),
-    BrokenFederate("determinism", physics(network_class(random_delay)), "gave different arrivals or drops"),
-    BrokenFederate("new_agent", physics(KnowsNoNewAgents, agents_appear=True), "KeyError"),
-    BrokenFederate(
-        "absent_agent", physics(DeliversToAll, agents_disappear=True), "a packet arrived at bob, which has"
-    ),
-    BrokenFederate("dead_reckoning", physics(ReckoningNetwork), "extrapolation at a velocity of 0 changed"),
-    BrokenFederate("fork", physics(SharedNet), "the copy and the original"),
-    BrokenFederate("next_event", physics(AnnouncesTooLate), "before the announced next event"),
-    BrokenFederate("next_event", physics(AnnouncesDropsTooLate), "packet 2 was dropped by 4000000 ns"),
-    BrokenFederate("next_event", physics(AnnouncesNothing), "it has no next event, but packets [1, 2, 3] neither"),
-    BrokenFederate("seed", physics(IgnoresSeed), "4 seeds gave the same arrivals and drops"),
+    BrokenFederate("determinism", serve(network_class(lose_at_random)), "gave different arrivals or drops"),
+    BrokenFederate("new_agent", serve(RefusesNewAgents, agents_appear=True), "KeyError"),
+    BrokenFederate("absent_agent", serve(DeliversToAll, agents_disappear=True), "a packet arrived at bob, which has"),
+    BrokenFederate("dead_reckoning", serve(DelaysDeadReckoning), "extrapolation at a velocity of 0 changed"),
+    BrokenFederate("fork", serve(CopiesAreNetworkItself), "the copy and the original"),
+    BrokenFederate("next_event", serve(AnnouncesTooLate), "before the announced next event"),
+    BrokenFederate("next_event", serve(AnnouncesDropsTooLate), "packet 2 was dropped by 4000000 ns"),
+    BrokenFederate("next_event", serve(AnnouncesNothing), "it has no next event, but packets [1, 2, 3] neither"),
+    BrokenFederate("seed", serve(IgnoresSeed), "4 seeds gave the same arrivals and drops"),
 ]
 
 
@@ -595,7 +593,7 @@ def test_each_check_has_a_broken_federate() -> None:
     ],
 )
 def test_draws_that_cannot_be_judged_are_skipped(make: type[DelayNetwork], check: str, message: str) -> None:
-    result = run(NETWORK, BrokenFederate(check, physics(make), ""))
+    result = run(NETWORK, BrokenFederate(check, serve(make), ""))
     assert not result.failure
     assert message in result.skipped
 
@@ -606,7 +604,7 @@ def test_the_federates_conform_before_they_are_broken(role: int) -> None:
     for name in checks(is_physics=role == PHYSICS):
         settings: dict[str, Any] = {"transports": ("udp",)} if role == NETWORK else {}
         federate_class = LeavesOnTime if name == "lifetimes" else make
-        pair = physics(
+        pair = serve(
             federate_class, agents_appear=True, agents_disappear=True, forks=name != "fork_absence", **settings
         )
         result = run(role, BrokenFederate(name, pair, ""))
@@ -624,14 +622,12 @@ def test_a_check_does_not_apply_without_the_commands_or_agents_that_it_needs(
     check: str, commands: tuple[int, ...], agents: slice, message: str
 ) -> None:
     hello = replace(HELLO, agents=HELLO.agents[agents])
-    target = Target(physics(Carts, commands=commands), hello)
+    target = Target(serve(Carts, commands=commands), hello)
     assert run_check(target, check, checks(is_physics=True)[check]).skipped == message
 
 
 def test_a_check_of_a_capability_that_is_not_declared_does_not_apply() -> None:
     for name in ("determinism", "fork", "drift", "command_time"):
-        result = run(
-            PHYSICS, BrokenFederate(name, physics(TremblingPhysics, is_deterministic=False, forks=False), "")
-        )
+        result = run(PHYSICS, BrokenFederate(name, serve(NoisyPhysics, is_deterministic=False, forks=False), ""))
         assert not result.failure
         assert "does not declare" in result.skipped

@@ -29,7 +29,7 @@ def answers(program: Path, *requests: bytes) -> bytes:
     return process.stdout
 
 
-def test_frames_are_those_of_the_documentation(program: Path) -> None:
+def test_answers_equal_the_frames_in_the_documentation(program: Path) -> None:
     requests = [FRAMES[name] for name in (*REQUESTS, "sample links", "ping", "release", "bye", "ping")]
     expected = [FRAMES[name] for name in ("welcome", "states", "outcomes", "links", "pong")]
     assert answers(program, *requests) == b"".join(expected)

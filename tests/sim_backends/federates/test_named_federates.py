@@ -16,7 +16,7 @@ from tests.helpers.outside_packages import write_package
 from tests.helpers.paths import ROOT
 
 CARTS = (ROOT / "docs" / "examples" / "federates" / "carts.py").read_text(encoding="utf-8")
-KINDS = """
+MODULE = """
 import shlex
 import sys
 from fieldkit.core.errors import ConfigurationError
@@ -42,7 +42,7 @@ AIRWAVES = ProgramFederate(NETWORK, missing)
 def _package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     entries = "carts = carts_kinds:CARTS\nserved = carts_kinds:PROGRAM\nairwaves = carts_kinds:AIRWAVES\n"
     write_package(tmp_path, "fieldkit-carts", f"[{plugins.FEDERATES}]\n{entries}wrong = carts_kinds:load\n")
-    (tmp_path / "carts_kinds.py").write_text(KINDS, encoding="utf-8")
+    (tmp_path / "carts_kinds.py").write_text(MODULE, encoding="utf-8")
     (tmp_path / "carts_example.py").write_text(CARTS, encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{ROOT}")

@@ -114,7 +114,7 @@ def test_a_timeout_has_the_last_time() -> None:
 
 
 class SlowPhysics:
-    """A physics that needs longer than the deadline for its third answer."""
+    """A physics federate that needs longer than the deadline for its third answer."""
 
     step_ns = MS
     limits_m_s2: Mapping[str, float] = MappingProxyType({})
@@ -345,7 +345,7 @@ def test_a_federate_of_the_other_role_is_named() -> None:
 
 
 class StationaryPhysics:
-    """A physics whose robots do not move."""
+    """A physics federate whose robots do not move."""
 
     step_ns = MS
     limits_m_s2: Mapping[str, float] = MappingProxyType({})

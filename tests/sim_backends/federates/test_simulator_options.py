@@ -1,4 +1,4 @@
-"""Options of simulators in a scenario: validated with file and line before anything starts, complete on the wire."""
+"""Options of simulators in a scenario: an error has file and line, and a simulator receives all options."""
 
 import json
 from pathlib import Path

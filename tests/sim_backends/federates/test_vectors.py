@@ -4,6 +4,7 @@ import hashlib
 import math
 import re
 import struct
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -126,8 +127,8 @@ def body(name: str) -> bytes:
 def test_the_decoder_of_fieldkit_reads_the_vectors() -> None:
     assert decode_join(body("join")) == "s3cret"
     assert Hello.decode(body("hello")) == HELLO
-    assert Welcome.decode(body("welcome")) == WELCOME.__class__(
-        **{**WELCOME.__dict__, "commands": [1, 2], "transports": [], "transmitters": [], "emitters_m": []}
+    assert Welcome.decode(body("welcome")) == replace(
+        WELCOME, commands=[1, 2], transports=[], transmitters=[], emitters_m=[]
     )
     to_ns, from_ns, commands = exchanges.decode_advance_physics(body("advance physics"), agents())
     assert (to_ns, from_ns, set(commands)) == (11_100_000, 10_000_000, {"ugv", "uav"})
@@ -149,6 +150,6 @@ def test_the_decoder_of_fieldkit_reads_the_vectors() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(VECTORS))
-def test_the_size_in_the_header_is_that_of_the_body(name: str) -> None:
+def test_the_header_has_the_size_of_the_body(name: str) -> None:
     assert read_header(VECTORS[name]).kind is MessageKind[name.upper().replace(" ", "_")]
     assert body(name) == VECTORS[name][16:]

@@ -91,7 +91,7 @@ TOPIC = {"protocol": "topic", "from": "ann", "to": ["bob"]}
     [
         (
             {"robots": {"ann": {"radio": None}}},
-            "the configuration is incomplete (run the program by its name, ns3): ",
+            "the configuration is incomplete (select the network by its name, ns3): ",
         ),
         ({"world/obstacles": [CLOUD]}, "the world has an unknown kind of obstacle: cloud"),
         ({"scenario/faults": [LOSS]}, "there is no station eve"),

@@ -1,4 +1,4 @@
-"""The autopilot from the view of a ground station: answers, refusals, flights, and bytes that are not MAVLink."""
+"""The autopilot and a ground station: answers, refusals, flights, and bytes that are not MAVLink."""
 
 import math
 import random
@@ -19,6 +19,8 @@ OK = d.MAV_RESULT_ACCEPTED
 REJECTED = d.MAV_RESULT_TEMPORARILY_REJECTED
 CUSTOM = d.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 RELATIVE = d.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT
+POSITION_ONLY, VELOCITY_ONLY = 0b110111111000, 0b111111000111
+"""Type masks of set-points, which name the fields that are ignored (POSITION_TARGET_TYPEMASK)."""
 
 
 @pytest.fixture
@@ -149,11 +151,10 @@ class TestFlight:
 
     def test_the_drone_follows_set_points_until_they_stop(self, gcs: GroundStation) -> None:
         take_off(gcs)
-        velocity_mask = 0b111111000111
         for number in range(30):
             gcs.send_message(
                 d.MAVLink_set_position_target_local_ned_message(
-                    0, SYSTEM, 1, d.MAV_FRAME_LOCAL_NED, velocity_mask, 0, 0, 0, 1.0, 0, 0, 0, 0, 0, 0, 0
+                    0, SYSTEM, 1, d.MAV_FRAME_LOCAL_NED, VELOCITY_ONLY, 0, 0, 0, 1.0, 0, 0, 0, 0, 0, 0, 0
                 )
             )
             if number == 0:
@@ -171,7 +172,7 @@ class TestFlight:
         for number in range(100):
             gcs.send_message(
                 d.MAVLink_set_position_target_local_ned_message(
-                    0, SYSTEM, 1, d.MAV_FRAME_LOCAL_NED, 0b111111000111, 0, 0, 0, 3.0, 3.0, 0, 0, 0, 0, 0, 0
+                    0, SYSTEM, 1, d.MAV_FRAME_LOCAL_NED, VELOCITY_ONLY, 0, 0, 0, 3.0, 3.0, 0, 0, 0, 0, 0, 0
                 )
             )
             if number == 0:
@@ -246,7 +247,7 @@ class TestLimits:
                     SYSTEM, 1, RELATIVE, d.MAV_CMD_DO_REPOSITION, 0, 0, -1, 1, 0, 0, x, y, up_m
                 )
             )
-            mask = 0b111111000111 if uses_velocity else 0b110111111000
+            mask = VELOCITY_ONLY if uses_velocity else POSITION_ONLY
             for number in range(40):
                 gcs.send_message(
                     d.MAVLink_set_position_target_local_ned_message(

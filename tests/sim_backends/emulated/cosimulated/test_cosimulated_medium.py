@@ -1,4 +1,4 @@
-"""The co-simulated medium between real namespaces: every policy, delays, motion by the physics, lateness."""
+"""The co-simulated medium between real namespaces: every policy, delays, motion in physics simulators, lateness."""
 
 import math
 import os
@@ -119,7 +119,7 @@ def test_the_delay_of_the_network_and_of_the_policy_are_separate(tmp_path: Path)
 
 
 def test_a_network_that_cannot_keep_up_makes_packets_and_windows_late(tmp_path: Path) -> None:
-    """Each window of 1 ms takes 20 ms; after 1 s of lag the rest is given up, so that the lab still answers."""
+    """Each window of 1 ms takes 20 ms. A lag of more than 1 s is skipped, so that the lab still answers."""
     sync = SyncOptions.model_validate({"name": "sliding_window", "window": "1ms"})
     with cosim_bench(tmp_path, network=disc_command(tmp_path, 0.02), sync=sync) as bench:
         wait_until(

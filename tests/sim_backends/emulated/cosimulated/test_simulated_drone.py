@@ -1,4 +1,4 @@
-"""A drone whose autopilot flies it in a physics: a flight to a wall, a fall without power, and a lost autopilot."""
+"""A drone in a physics simulator: a flight to a wall, a fall without power, and a lost autopilot."""
 
 import math
 import time
@@ -40,7 +40,7 @@ HEIGHT_M = 1.0
 
 @dataclass
 class Drone:
-    """An autopilot whose drone is in a physics.
+    """An autopilot whose drone is in a physics simulator.
 
     Attributes:
         bench: The bench.
@@ -72,7 +72,7 @@ class Drone:
         self.fly(lambda: self.vehicle.mode is Mode.LOITER)
 
     def flight(self) -> FlightMotion:
-        """Return the motion that the physics recorded last."""
+        """Return the motion that the physics simulator recorded last."""
         record = FlightRecord.open(self.bench.control_files.folder / "flown")
         try:
             flight = record.read()

@@ -1,6 +1,6 @@
 """A job in the virtual machine of `test_virtual_machine.py`: runs robots on an access point, prints results as JSON.
 
-The lab has the three robots of a trial in topology `master`. Imports need most of the time.
+The lab has the three robots of a trial in topology `master`. Importing modules takes most of the time.
 """
 
 import json

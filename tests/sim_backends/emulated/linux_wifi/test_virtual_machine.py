@@ -1,4 +1,4 @@
-"""Robots with Linux's Wi-Fi in a virtual machine on our medium: one boot, several checks."""
+"""Robots with Linux's Wi-Fi on fieldkit's medium, in a virtual machine: one boot, several checks."""
 
 import importlib
 import json

@@ -1,4 +1,4 @@
-"""WPA3, monitor interfaces, an 802.11s mesh, and roaming of Linux's Wi-Fi on our medium: one boot."""
+"""WPA3, monitor interfaces, an 802.11s mesh, and roaming of Linux's Wi-Fi on fieldkit's medium: one boot."""
 
 import json
 import re

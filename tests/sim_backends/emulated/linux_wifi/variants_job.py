@@ -28,6 +28,7 @@ RADIO = {"fading": False, "shadowing_db": 0.0}
 TRIANGLE: dict[str, Vector] = {"r0": (0.0, 0.0, 1.0), "r1": (10.0, 0.0, 1.0), "r2": (5.0, 5.0, 1.0)}
 # The range of these radios is 91 m in the open.
 ROW: dict[str, Vector] = {"r0": (0.0, 0.0, 1.0), "r1": (140.0, 0.0, 1.0), "r2": (70.0, 0.0, 1.0)}
+# The robot in the middle of the row is out of range.
 GAP: dict[str, Vector] = {**ROW, "r2": (9000.0, 0.0, 1.0)}
 ACCESS_POINTS = {"left": {"at_m": (0, 0), "height": "1m"}, "right": {"at_m": (120, 0), "height": "1m"}}
 ROAMING = {"short": "2s", "threshold_dbm": -65, "long": "60s", "channels": 3}
@@ -36,7 +37,7 @@ END: dict[str, Vector] = {**START, "r0": (80.0, 0.0, 1.0)}
 JOIN_S = 60.0
 CAPTURE = ("tcpdump", "-i", "mon0", "-y", "IEEE802_11_RADIO", "-c", "20", "-e", "-n", "--immediate-mode")
 
-HANDOVER = ("tcpdump", "-i", "mon0", "-y", "IEEE802_11_RADIO", "-U", "-w", "-", "--immediate-mode")
+HANDOVER_CAPTURE = ("tcpdump", "-i", "mon0", "-y", "IEEE802_11_RADIO", "-U", "-w", "-", "--immediate-mode")
 
 Running = RunningRobots[Role]
 
@@ -144,7 +145,7 @@ def main() -> None:
             text=True,
         )
         handover = subprocess.Popen(
-            ("nsenter", "-t", str(running.robots[Role.SENDER].pid), "-n", *HANDOVER),
+            ("nsenter", "-t", str(running.robots[Role.SENDER].pid), "-n", *HANDOVER_CAPTURE),
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
         )

@@ -1,4 +1,4 @@
-"""Delays of single flows, with packets built byte by byte: each is counted for its flow, whichever are lost."""
+"""Delays of single flows: each packet is counted for its flow, whichever packets are lost."""
 
 import struct
 from collections import Counter

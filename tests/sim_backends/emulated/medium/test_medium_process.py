@@ -392,8 +392,6 @@ MEDIUM_OWNER = """
 import time
 from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.radio.radio_options import RadioOptions
-from sim_backends.radio.antennas import antenna_of
-from sim_backends.radio.world_channel import WorldChannel
 medium = MediumClient(RadioOptions(), seed=1)
 medium.stats()
 print(medium.pid, flush=True)

@@ -1,4 +1,4 @@
-"""Checks from files that an ordinary user can create namespaces."""
+"""Checks that an ordinary user can create namespaces, with other files than those of this machine."""
 
 from pathlib import Path
 

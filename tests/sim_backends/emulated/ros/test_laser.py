@@ -85,8 +85,8 @@ def test_beams_end_at_the_points_where_radio_paths_enter_a_solid(name: str) -> N
     targets = laser_targets(world)
     rng = np.random.default_rng(1)
     hit_count = missed_count = 0
-    near_target = [part.shape.centre_m[:2] for part in world.parts for _ in range(max(1, 40 // len(world.parts)))]
-    for east_m, north_m in (np.array(near_target) + rng.normal(0, 6, (len(near_target), 2))).tolist():
+    centres_m = [part.shape.centre_m[:2] for part in world.parts for _ in range(max(1, 40 // len(world.parts)))]
+    for east_m, north_m in (np.array(centres_m) + rng.normal(0, 6, (len(centres_m), 2))).tolist():
         start = np.tile((east_m, north_m, 0.2), (BEAMS, 1))
         if solids.depths_m(start[:1], np.add(start[:1], (0, 0, 1e-6))).any():
             continue  # in a solid

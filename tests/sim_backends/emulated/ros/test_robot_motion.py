@@ -5,6 +5,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -135,10 +136,11 @@ def test_messages_use_the_frames_and_units_of_ros() -> None:
         assert (orientation.x, orientation.y, orientation.z, orientation.w) == pytest.approx(
             (0, 0, half_sqrt, half_sqrt)
         )
-    across_m, up_m = FIX_NOISE_M
-    assert fix.position_covariance.tolist() == pytest.approx([across_m**2, 0, 0, 0, across_m**2, 0, 0, 0, up_m**2])
+    horizontal_m, vertical_m = FIX_NOISE_M
+    variances_m2 = horizontal_m**2, horizontal_m**2, vertical_m**2
+    assert fix.position_covariance.tolist() == pytest.approx(np.diag(variances_m2).flatten().tolist())
     assert (fix.latitude, fix.longitude) == pytest.approx((400 / 110_574.28, 300 / 111_319.49), abs=5e-6)
-    assert fix.altitude == pytest.approx(UP_M, abs=5 * up_m)
+    assert fix.altitude == pytest.approx(UP_M, abs=5 * vertical_m)
 
 
 def test_noise_of_fixes_agrees_with_their_covariance() -> None:

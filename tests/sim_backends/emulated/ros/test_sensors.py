@@ -41,8 +41,8 @@ def work():
     print(json.dumps(text))
     raise RuntimeError("no more")
 
-ours, theirs = os.pipe2(os.O_NONBLOCK)
-signal.set_wakeup_fd(theirs)
+read_end, write_end = os.pipe2(os.O_NONBLOCK)
+signal.set_wakeup_fd(write_end)
 signal.signal(signal.SIGCHLD, lambda *_: None)
 pid = services.fork("worker", work, Path(sys.argv[1]))
 _, status = os.waitpid(pid, 0)
@@ -99,7 +99,7 @@ def test_a_subscriber_is_answered_when_its_request_is_complete(peer: Peer) -> No
     peer.stream.send(REQUEST[-1:])
     peer.serve_all()
     assert peer.subscriber.is_subscribed
-    peer.stream.send(b"what it says now means nothing")
+    peer.stream.send(b"bytes after the request are ignored")
     peer.serve_all()
     assert peer.output() == [b"the header"]
 

@@ -1,4 +1,4 @@
-"""The UDP transport: lost, repeated and reordered datagrams, and those of programs without a cookie."""
+"""The UDP transport: lost, repeated and reordered datagrams, and datagrams of programs without a cookie."""
 
 import random
 import re
@@ -32,7 +32,7 @@ from tests.helpers.nightly import mark_nightly
 from tests.helpers.paths import ROOT
 
 Forward = Callable[[bytes, bool], list[bytes]]
-"""Returns the datagrams that the network delivers when it receives one; the flag is the direction."""
+"""Returns the datagrams that the network delivers for a datagram; the flag is True towards the listening side."""
 
 
 def deadline_after(duration_s: float) -> float:
@@ -43,16 +43,16 @@ class Network:
     """A UDP relay between the two sides of a connection.
 
     Args:
-        server: Port of the side that listens.
+        server_port: Port of the side that listens.
         forward: Changes the stream of datagrams.
     """
 
-    def __init__(self, server: int, forward: Forward) -> None:
+    def __init__(self, server_port: int, forward: Forward) -> None:
         self.forward = forward
         self.count = 0
         self._client_side, self._server_side = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
         self._client_side.bind(("127.0.0.1", 0))
-        self._server_side.connect(("127.0.0.1", server))
+        self._server_side.connect(("127.0.0.1", server_port))
         self.port = self._client_side.getsockname()[1]
         self._client: Any = None
         self._stopped = threading.Event()
@@ -108,7 +108,7 @@ def open_connection(forward: Forward) -> Iterator[tuple[FrameChannel, FrameChann
     """Yield the channel of the side that connected, the channel of the side that listened, and the network."""
     port = free_port()
     network = Network(port, forward)
-    hello = encode(MessageKind.PING, 0, 0, b"8 bytes.")
+    first_frame = encode(MessageKind.PING, 0, 0, b"8 bytes.")
     try:
         with UdpAddress("udp", "127.0.0.1", port, listens=True).listen() as listener:
             accepted_channels: list[FrameChannel] = []
@@ -117,7 +117,7 @@ def open_connection(forward: Forward) -> Iterator[tuple[FrameChannel, FrameChann
             )
             thread.start()
             federate_end = UdpAddress("udp", "127.0.0.1", network.port).connect(deadline_after(30))
-            federate_end.send(hello, deadline_after(30))
+            federate_end.send(first_frame, deadline_after(30))
             while thread.is_alive():
                 with suppress(DeadlineError):
                     federate_end.receive(deadline_after(0.05))
@@ -242,7 +242,7 @@ def test_the_timer_follows_rfc_6298() -> None:
     assert timer.interval_s == 0.02
 
 
-def test_the_layout_of_a_datagram_equals_that_written_by_hand() -> None:
+def test_a_datagram_has_the_documented_layout() -> None:
     frame = encode(MessageKind.BYE, 0, 0)
     datagram = pack_datagram(DatagramHeader(DatagramKind.DATA, 1, 2, 3, 4), frame)
     assert datagram == b"FKUD" + struct.pack("<BBHQQQQ", 1, 3, 0, 1, 2, 3, 4) + frame
