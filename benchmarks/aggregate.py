@@ -29,8 +29,10 @@ from fieldkit.trial.columns import trial_columns
 
 REPEATS: Final = 40
 SENT: Final = 216
+"""Packets sent in each repeat."""
 _COUNTED: Final = tuple(quantity for quantity in quantities(trial_columns()) if quantity.sent and quantity.arrived)
 START_NS: Final = 1_700_000_000 * 10**9
+"""Start of the first repeat."""
 TABLE: Final = "table.csv"
 ROOT: Final = Path(__file__).resolve().parents[1]
 

@@ -18,7 +18,9 @@ STORED: Final = ROOT / "tests" / "data" / "fieldkit"
 TRIALS_PER_FOLDER: Final = 100
 START_NS: Final = 1_700_000_000 * 10**9
 _PINGS: Final = 10
+"""Echo requests in each repeat."""
 _SCALED: Final = ("rtt_min_s", "rtt_median_s", "rtt_mean_s", "rtt_p95_s", "rtt_max_s", "rtt_jitter_s", "delay_s")
+"""Columns that are multiplied by a random factor."""
 _KINDS: Final = (*("_los_",) * 7, "evidence", "selfheal", "driveaway")
 """Seven of ten trials have the procedure los. The plan of an evidence trial declares 42 columns."""
 
@@ -77,6 +79,7 @@ def write_archive(folder: Path, trials: int, repeats: int) -> None:
 def _rows(
     generator: np.random.Generator, original: StoredTrial, fixed: Mapping[str, str], number: int, repeats: int
 ) -> Iterator[dict[str, str]]:
+    """Yield the rows of a trial: copies of stored rows, in which times are scaled and ping losses are drawn."""
     protocols = list(dict.fromkeys(row["protocol"] for row in original.rows))
     by_protocol = {name: next(row for row in original.rows if row["protocol"] == name) for name in protocols}
     for repeat in range(repeats):

@@ -122,6 +122,7 @@ def connected(testbed: EmulatedTestbed, roles: Sequence[Role], slow: SlowLinks |
 
 @contextmanager
 def _master(robot: EmulatedRobot, config: Path, role: Role, slow: SlowLinks | None) -> Iterator[None]:
+    """Open an OpenSSH master connection to a robot while the body runs."""
     ssh = ("ssh", "-F", str(config), "-o", "ProxyCommand=none", "-M", "-N")
     if slow is None:
         command_words: tuple[str, ...] = ("nsenter", f"--net=/proc/{robot.pid}/ns/net", "--", *ssh)

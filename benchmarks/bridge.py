@@ -39,10 +39,12 @@ DOMAIN: Final = 61
 TYPE: Final = "std_msgs/msg/UInt8MultiArray"
 SIZE: Final = 1000
 COUNT: Final = 200
+"""Messages in a measurement of the delay, sent at `RATE_HZ`."""
 RATE_HZ: Final = 100.0
 BURST_S: Final = 1.0
 SETTLING_S: Final = 1.0
 _CDR: Final = bytes((0, 1, 0, 0)) + bytes(8) + SIZE.to_bytes(4, "little")
+"""Bytes of a serialized message before its data: encapsulation header, empty layout, number of data bytes."""
 
 Write = Callable[[bytes], Any]
 """Function of a publisher that sends data. The function of a subscriber sends nothing, and only keeps the objects of

@@ -41,14 +41,18 @@ from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.world.motion import State
 
 COUNTS: Final = (3, 10, 50, 200)
+"""Numbers of agents."""
 ROUNDS: Final = 15
 EXCHANGES: Final = 300
-STEPS: Final = 1000
+"""Exchanges per round."""
 PEER_ROUNDS: Final = 3
+STEPS: Final = 1000
+"""Steps per round of a peer."""
 STEP_NS: Final = 1_000_000
 CARTS: Final = Path(__file__).parents[1] / "docs" / "examples" / "federates" / "carts.c"
 _PHYSICS_REQUEST_BYTES: Final = HEADER_BYTES + 8 + 8 + 4
 _PHYSICS_ANSWER_BYTES: Final = HEADER_BYTES + 8 + 4 + 4
+"""Lengths of a request without commands, and of an answer without states."""
 
 Exchange = Callable[[int], object]
 """Makes an exchange; its argument is the simulated time in nanoseconds."""

@@ -40,6 +40,7 @@ from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.motion import State, WayPoints
 
 COUNTS: Final = (3, 10, 30, 100, 200)
+"""Numbers of robots."""
 SCENARIOS: Final = ("baylands",)
 MUJOCO_COUNTS: Final = (3, 10, 30)
 WINDOW_NS: Final = 1_100_000

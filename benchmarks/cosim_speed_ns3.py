@@ -39,9 +39,11 @@ from sim_backends.world.motion import State
 from sim_backends.world.world import load_world
 
 COUNTS: Final = (3, 10, 30)
+"""Numbers of robots."""
 SPACING_M: Final = 10.0
 WINDOW: Final = "10ms"
 LONGEST_S: Final = 600.0
+"""Time limit of ns-3 alone."""
 PARTS: Final = "parts.csv"
 """File with the parts of the delays."""
 

@@ -40,7 +40,9 @@ from sim_backends.world.motion import State
 from sim_backends.world.world import World
 
 SECONDS: Final = 10.0
+"""Simulated time of a run."""
 TRACE_S: Final = 20.0
+"""Simulated time of a run whose congestion window is drawn."""
 QUEUE_PACKETS: Final = 100
 BATCH, MAX_RUNS, NARROW = 2, 48, 0.08
 """Runs per batch, and maximum number of runs. No further batch is run if the relative half-width of the ratio's

@@ -30,9 +30,11 @@ WIDTHS_MHZ: Final[dict[HighThroughput, tuple[int, ...]]] = {"HT": (20, 40), "VHT
 STREAMS: Final = (1, 2)
 HT20_7: Final = format_modes("HT", "2.4 GHz", 20, 1, 800)[7]
 RATIOS_DB: Final = (40.0, 26.0, 24.5, 24.0, 23.5, 23.0)
+"""Signal-to-noise ratios of a single station."""
 STATIONS: Final = (2, 5, 10, 20)
 DSCPS: Final = {"background": 8, "video": 40, "voice": 48}
 QUEUED: Final = 300
+"""Packets in the queue of each station; a packet that arrived is replaced by a new one."""
 SECONDS: Final = 2.0
 HE_LTF_NS: Final = {800: 7_200, 1600: 8_000, 3200: 16_000}
 """Duration of one HE-LTF, by guard interval in ns."""

@@ -29,6 +29,7 @@ from sim_backends.world.world import World, load_world
 
 PACKET_BYTES: Final = PAYLOAD_BYTES + 28
 QUEUED: Final = 10
+"""Packets in the queue of each sender; a packet that arrived is replaced by a new one."""
 PACKETS: Final = 5_000
 PINGS: Final = 300
 STATIONS: Final = (2, 10, 50)

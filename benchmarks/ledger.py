@@ -32,7 +32,9 @@ from fieldkit.trial.stored import plans
 
 REPEATS: Final = (1_000, 5_000, 10_000)
 LAST: Final = 100
+"""Number of attempts at the end of a trial whose mean time is printed."""
 NEXT: Final = 10
+"""Number of attempts after reopening."""
 SPARE: Final = 100
 """Repeats that are planned in addition, to be run after reopening."""
 

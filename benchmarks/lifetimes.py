@@ -37,6 +37,7 @@ _EVENT: Final = struct.Struct("=IIQ II")
 
 _REALTIME_PRIORITY: Final = "10"
 _REPORT_S: Final = 2.0
+"""Time within which the watcher must report an exit."""
 _INTERPRETERS: Final = (["sh"], ["bash"])
 _ROOT: Final = Path(__file__).resolve().parents[1]
 

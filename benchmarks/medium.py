@@ -1,11 +1,11 @@
 """Cost of the medium, compared with a bare veth pair: `python -m benchmarks.medium [--json]`, as root.
 
 It uses two namespaces without robots. Each round measures for each path, in this order: round-trip time at zero delay
-(ping), TCP throughput (iperf3), 64-byte UDP payloads at full rate (iperf3: packets at the receiver's interface, and
-packets received by its program, whose processor time is the first limit on two cores), and the error of a 5 ms
-delay: a sender writes its send time into a datagram every 2 ms, and the receiver's kernel records the arrival time by
-the same clock. The column of the bare timer has the part of the error that is due to the machine: the lateness of a
-5 ms sleep at the same priority.
+(ping), TCP throughput (iperf3), 64-byte UDP payloads at full rate (iperf3), and the error of a 5 ms delay. For UDP it
+counts the packets at the receiver's interface, and the packets that the receiving program reads; on two cores the
+processor time of that program is the bottleneck. For the delay, a sender writes its send time into a datagram every
+2 ms, and the receiver's kernel records the arrival time by the same clock. The column `bare timer` has the part of
+the error that is due to the machine: the lateness of a 5 ms sleep at the same priority.
 """
 
 import argparse
@@ -36,7 +36,7 @@ PROBE_PORT: Final = 9000
 START_S: Final = 60.0
 """Maximum time from the start of the receiver to the first datagram: a busy machine starts the sender late."""
 IDLE_S: Final = 5.0
-"""Time without a datagram after which the remaining ones are lost."""
+"""Time without a datagram after which the remaining ones count as lost."""
 # linux/socket.h: the kernel's receive time as struct timespec.
 SO_TIMESTAMPNS: Final = 35
 
@@ -190,7 +190,7 @@ def errors(name: str, errors_ms: Sequence[float]) -> Figures:
 
 
 def measure_round(seconds: float, probes: int, *, on_cosimulation: bool = False) -> dict[str, Figures]:
-    """Return the figures of one round per path."""
+    """Run one round, and return the figures of each path."""
     with ExitStack() as stack:
         ends = stack.enter_context(veth_path())
         veth = measure_throughput(*ends, seconds)

@@ -2,8 +2,8 @@
 
 FOLDER is a checkout of the other version, for example by `git worktree add`; the program needs root. Only the process
 of the medium is of that version: the senders are the same. Each round sends datagrams of 64 bytes at a fixed rate
-through both, first one and then the other, over fixed links and over the Wi-Fi of the default radio. Processor time
-does not include the time for which the process waited for a processor, so other load changes it little.
+through both versions in sequence, over fixed links and over the Wi-Fi of the default radio. Processor time does not
+include the time for which the process waited for a processor, so other load has little effect on it.
 """
 
 import argparse
@@ -80,7 +80,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=3.0, help="duration of each measurement")
     arguments = parser.parse_args()
     print(f"{arguments.rounds} rounds, median (lowest to highest), processor time of the medium in us per packet")
-    print(f"{'':14}{'this version':>26}{'the other':>26}{'ratio':>24}")
+    print(f"{'':14}{'this version':>26}{'other version':>26}{'ratio':>24}")
     for name, (options, rate) in RADIOS.items():
         here_us: list[float] = []
         other_us: list[float] = []

@@ -1,10 +1,10 @@
 """minstrel_ht of fieldkit compared with Linux: `python -m benchmarks.minstrel_vs_kernel [--record] [--figure FILE]`.
 
 A sender moves away from its receiver and back, on open ground, without and with fading. Both algorithms send the same
-frames at the same times; a try fails with the packet error of its mode at the signal of the frame, and has the same
-random draw for both. The kernel's choices are recordings of a virtual machine (`kernel_minstrel`), whose clock counts
-instructions, so a busy host does not change them; `--record` replaces them, as root. The choices of fieldkit are
-computed here, for several seeds of its sampling.
+frames at the same times. The probability that a try fails is the packet error rate of its mode at the signal-to-noise
+ratio of the frame; both algorithms use the same random draws. The kernel's choices were recorded in a virtual machine
+(`kernel_minstrel`). Its clock counts instructions, so a busy host does not change the choices. `--record` records
+them again, as root. The choices of fieldkit are computed here, for several seeds of its sampling.
 """
 
 import argparse
@@ -43,11 +43,13 @@ SEEDS: Final = 20
 
 FRAMES: Final = 6_000
 STEP_NS: Final = 5_000_000
+"""Time between two frames."""
 PAYLOAD_BYTES: Final = 1_000
 _FRAME_BYTES: Final = 1_036
 """Size for which packet errors are computed: the payload with the headers of 802.11 and LLC, and the FCS."""
 _NEAR_M, _FAR_M, _EXPONENT, _NEAR_DB = 5.0, 80.0, 3.0, 40.0
 _LEVEL_DB, _LOWEST_DB, _LEVELS = 0.25, -10.0, 240
+"""Step, lowest value and number of the signal-to-noise ratios for which a trace has packet errors."""
 _FADING_PATHS, _DOPPLER_HZ = 16, 8.0
 _LONGEST_S: Final = 1800.0
 _PHY: Final = PhyCapability("n", "2.4 GHz", 20, 2, 400)
@@ -89,12 +91,12 @@ def signal_to_noise_db(frames: int, *, fading: bool) -> list[float]:
     paths = [(random.uniform(0, 2 * math.pi), random.uniform(0, 2 * math.pi)) for _ in range(_FADING_PATHS)]
     ratios_db = []
     for number in range(frames):
-        part = 1 - abs(2 * number / frames - 1)
-        distance_m = _NEAR_M + (_FAR_M - _NEAR_M) * part
+        share = 1 - abs(2 * number / frames - 1)  # 0 at the ends of the trace, 1 in its middle
+        distance_m = _NEAR_M + (_FAR_M - _NEAR_M) * share
         ratio_db = _NEAR_DB - 10 * _EXPONENT * math.log10(distance_m / _NEAR_M)
         if fading:
-            turn = 2 * math.pi * _DOPPLER_HZ * number * STEP_NS / 1e9
-            field = sum(np.exp(1j * (turn * math.cos(angle) + phase)) for angle, phase in paths)
+            doppler_rad = 2 * math.pi * _DOPPLER_HZ * number * STEP_NS / 1e9
+            field = sum(np.exp(1j * (doppler_rad * math.cos(angle) + phase)) for angle, phase in paths)
             ratio_db += 10 * math.log10(max(abs(field) ** 2 / _FADING_PATHS, 1e-3))
         ratios_db.append(ratio_db)
     return ratios_db

@@ -1,8 +1,8 @@
 """Cost of a move in the medium, by the number of robots: `python -m benchmarks.moves [--json]`, as root.
 
 For each world and number of robots, it moves one robot repeatedly by 0.1 m, and measures the medium's processor time
-per move, and the time until its answer, during which it carries no packets. The reference moves all robots in each
-step, so that all links are computed.
+per move, and the time until the medium answers, during which it forwards no packets. The reference moves all robots
+in each step, so that all links are computed.
 """
 
 import argparse
@@ -78,7 +78,8 @@ def main() -> None:
                     key = f"{world}, {name}, {size} robots, {moving} moving"
                     table[key] = measure_moves(world, size, radio, move_all=moving == "all")
                     if not options.json:
-                        print(f"{key:44}" + "".join(f"{what} {value:8.3f}  " for what, value in table[key].items()))
+                        figures = (f"{name} {value:8.3f}  " for name, value in table[key].items())
+                        print(f"{key:44}" + "".join(figures))
     if options.json:
         print(json.dumps(table, indent=2))
     print(f"load after: {os.getloadavg()[0]:.2f}")

@@ -7,7 +7,7 @@ fieldkit computes all values that `fieldkit.measure.transfers.transfer_measures`
 packets, datagrams and bytes, the transfer's time, and the counts of the paper (docs/index.md). The other readers,
 dpkt, tshark and scapy, only count lost packets. scapy would take minutes, so it reads only the first packets; tshark
 is omitted if it is not installed. Times are processor times, including child processes, because other load affects
-them less.
+processor time less than wall time.
 
 At the end fieldkit streams a sparse file of 10 GB in a separate process, whose peak memory is printed. With `--whole
 MIB` another process reads a capture of this size into columns, as a trial does.
@@ -62,7 +62,7 @@ print(json.dumps([sum(len(part.packets) for part in pcap.stream(pathlib.Path(sys
 READ: Final = STREAM.replace("sum(len(part.packets) for part in pcap.stream(", "len(pcap.read(").replace(
     "sys.argv[1])))", "sys.argv[1])).packets)"
 )
-"""The same with all packets kept as columns."""
+"""The same program, but it keeps all packets in columns."""
 
 Peer = Callable[[Path, Path], int]
 Key = tuple[int, int]
@@ -80,7 +80,7 @@ def fragments() -> Iterator[bytes]:
 
 
 def record(index: int, frame: bytes, wire_bytes: int) -> bytes:
-    """Return a frame with its record header; its time is 0.1 ms after that of the previous frame."""
+    """Return a frame with its record header; frames are 0.1 ms apart."""
     seconds, nanoseconds = divmod(index * 100_000, 1_000_000_000)
     return struct.pack("<4I", 1_700_000_000 + seconds, nanoseconds, len(frame), wire_bytes) + frame
 
@@ -169,7 +169,7 @@ def first_packets(source: Path, count: int) -> Path:
 
 
 def write_big(path: Path) -> int:
-    """Write a sparse capture of 10 GB with super-frames that are not truncated; return its number of packets."""
+    """Write a sparse capture of 10 GB with frames of 256 KiB (segmentation offload); return its number of packets."""
     header = bytes(12) + b"\x08\x00" + struct.pack(">BBHHHBBH", 0x45, 0, 0, 1, 0, 64, 6, 0) + bytes((10, 0, 0, 1) * 2)
     captured_bytes = 262_144
     count = BIG_BYTES // (16 + captured_bytes)

@@ -1,7 +1,8 @@
 """The radio model compared with ns-3 on equal links: `python -m benchmarks.radio_vs_ns3 [--figure FILE] [--json]`.
 
-Needs ns-3 3.37 and a C++ compiler: `apt-get install libns3-dev g++`. Stations have the same power, noise, path loss,
-sizes and slots in both; ns-3 runs its DCF, its receiver and its NIST error model. Neither aggregates frames.
+Needs ns-3 3.37 and a C++ compiler: `apt-get install libns3-dev g++`. In both simulators the stations have the same
+transmit power, noise, path loss, packet sizes and slot times. ns-3 uses its DCF, its receiver and its NIST error
+model. Neither simulator aggregates frames.
 """
 
 import argparse
@@ -62,7 +63,7 @@ class Ns3:
 
 
 def build() -> Ns3:
-    """Return the ns-3 program, which is compiled on first use."""
+    """Compile the ns-3 program on first use, and return it."""
     program = CompiledProgram(
         "ns3-link",
         SOURCE,
@@ -88,6 +89,7 @@ def shift_db(curve: Sequence[tuple[float, float, float]]) -> float:
     """Return the largest shift between the two curves at errors of 50, 10 and 1 %, model minus ns-3."""
 
     def at(level: float, column: int) -> float:
+        """Return the lowest SNR of the curve in `column` with a smaller error than `level`."""
         return next(point[0] for point in curve if point[column] < level)
 
     return max((at(level, 2) - at(level, 1) for level in (0.5, 0.1, 0.01)), key=abs)
@@ -132,7 +134,7 @@ class _Equidistant(WorldChannel):
 
 
 def path_loss_db(distance_m: float) -> float:
-    """Return the log-distance path loss with exponent 3, used in both."""
+    """Return the log-distance path loss with exponent 3 in dB, which ns-3 and the radio model use."""
     return 20 * math.log10(4 * math.pi * CHANNEL_6_HZ / 299_792_458.0) + 30 * math.log10(distance_m)
 
 
@@ -171,9 +173,9 @@ def main() -> None:
     if arguments.json:
         json.dump({"packet_error": curves, "goodput_mbit_s": goodputs}, sys.stdout)
         return
-    print("packet error against ratio, largest shift at errors of 50, 10 and 1 % (dB):")
+    print("packet error over SNR, largest shift at errors of 50, 10 and 1 % (dB):")
     print("  " + ", ".join(f"{name} {shift_db(curve):+.2f}" for name, curve in curves.items()))
-    print(f"{'UDP goodput (Mbit/s)':32}{'ns-3':>9}{'ours':>9}{'ratio':>8}")
+    print(f"{'UDP goodput (Mbit/s)':32}{'ns-3':>9}{'fieldkit':>9}{'ratio':>8}")
     for what, ns3_mbit_s, fieldkit_mbit_s in goodputs:
         ratio = f"{fieldkit_mbit_s / ns3_mbit_s:8.3f}" if ns3_mbit_s > 0.05 else f"{'-':>8}"
         print(f"{what:32}{ns3_mbit_s:9.2f}{fieldkit_mbit_s:9.2f}{ratio}")

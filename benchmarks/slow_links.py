@@ -1,8 +1,8 @@
-"""Control links with a long round-trip time, as on bad Wi-Fi, which count sequential round trips.
+"""Control links with a long round-trip time, as on bad Wi-Fi. They count sequential round trips.
 
-One thread carries streams over loopback and delays every byte by half a round trip. Trips are counted like logical
-clocks: data from this computer has a trip number one above the highest received over any link, and data from a robot
-has the highest number that the robot received. Therefore parallel round trips count once.
+One thread forwards streams over loopback and delays every byte by half a round trip. Round trips are counted with a
+logical clock: data from this computer has a number one above the highest number received over any link, and data from
+a robot has the highest number that the robot has received. Therefore parallel round trips count once.
 """
 
 import contextlib
@@ -52,10 +52,13 @@ class _Stream:
 
 
 class SlowLinks:
-    """Carries streams with a delay; use as a context manager.
+    """Forwards streams with a delay; use as a context manager.
 
     Args:
         round_trip_s: Round-trip time in seconds.
+
+    Attributes:
+        trips: Number of sequential round trips.
     """
 
     def __init__(self, round_trip_s: float) -> None:
@@ -89,7 +92,7 @@ class SlowLinks:
         return near_end
 
     def port(self, connect: Connect) -> int:
-        """Return a loopback port whose streams are connected by `connect`."""
+        """Return a loopback port. `connect` opens the far end of each stream to this port."""
         listener = socket.create_server(("127.0.0.1", 0))
         with self._lock:
             self._listeners[listener] = connect

@@ -22,7 +22,7 @@ from typing import Final
 _ROOT: Final = Path(__file__).resolve().parents[1]
 _TABLE: Final = _ROOT / "tests" / "data" / "fieldkit" / "1" / "trial.csv"
 # Bytecode is written, so that only the first run compiles the modules of a checkout.
-_COMPILED: Final = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+_ENVIRONMENT: Final = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
 _LINE: Final = "fieldkit tr"
 _TAB: Final = {
     "_ARGCOMPLETE": "1",
@@ -87,13 +87,13 @@ class Cost:
 
 
 def measure(argv: Sequence[str], environment: Mapping[str, str]) -> Cost:
-    """Run a command in an empty folder to its end."""
+    """Run a command in an empty folder until it exits, and return its cost."""
     with tempfile.TemporaryDirectory() as folder:
         started_s = time.perf_counter()
         process = subprocess.Popen(
             argv,
             cwd=folder,
-            env={**_COMPILED, **environment},
+            env={**_ENVIRONMENT, **environment},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

@@ -47,8 +47,8 @@ PROCESSES: Final = 2
 WINDOWS: Final = "window=7ms,13ms,17ms,19ms"
 
 
-def nothing(number: int) -> int:
-    """Return the argument: an empty task."""
+def run_empty_task(number: int) -> int:
+    """Return the argument, as a task without work."""
     return number
 
 
@@ -81,7 +81,7 @@ def runs_per_s(plan: SweepPlan, folder: Path, rounds: int) -> dict[str, list[flo
     for number in range(rounds):
         for count in COUNTS:
             out = folder / f"{number}-{count}"
-            # One worker of a sweep is this process. The peer with one process must also start that process.
+            # One worker of a sweep is this process. A bare pool of one process must start that process first.
             methods: list[tuple[str, Callable[[], object]]] = [
                 ("bare", lambda count=count: run_bare(plan, count)),  # type: ignore[misc]
                 ("sweep", lambda count=count, out=out: run_sweep_in(plan, Workers(count), out)),  # type: ignore[misc]
@@ -94,16 +94,21 @@ def runs_per_s(plan: SweepPlan, folder: Path, rounds: int) -> dict[str, list[flo
 
 def empty_task_s(workers: Workers, tasks: int) -> float:
     """Return the wall time per empty task, without the start of the workers."""
-    ends = completed(nothing, range(tasks), workers)
-    next(ends)
-    return timed(lambda: sum(1 for _ in ends)) / (tasks - 1)
+    results = completed(run_empty_task, range(tasks), workers)
+    next(results)  # the workers have started
+    return timed(lambda: sum(1 for _ in results)) / (tasks - 1)
 
 
 def bare_empty_task_s(tasks: int) -> float:
     """Return the wall time per empty task of a bare pool of processes, without their start."""
     with ProcessPoolExecutor(PROCESSES, get_context("spawn")) as pool:
-        pool.submit(nothing, 0).result()
-        return timed(lambda: [future.result() for future in [pool.submit(nothing, n) for n in range(tasks)]]) / tasks
+        pool.submit(run_empty_task, 0).result()
+
+        def run_all() -> None:
+            for future in [pool.submit(run_empty_task, number) for number in range(tasks)]:
+                future.result()
+
+        return timed(run_all) / tasks
 
 
 def state_costs(plan: SweepPlan, folder: Path) -> dict[str, float]:
@@ -157,7 +162,7 @@ def show_rates(rates: Mapping[str, Sequence[float]]) -> None:
 
 def show_empty(method: str, tasks: int, cost_s: float) -> None:
     """Print the cost of an empty task."""
-    print(f"an empty task of {tasks}, {method}: {cost_s * 1e6:.0f} us", flush=True)
+    print(f"{tasks} empty tasks, {method}: {cost_s * 1e6:.0f} us each", flush=True)
 
 
 if __name__ == "__main__":

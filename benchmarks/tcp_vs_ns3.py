@@ -1,9 +1,9 @@
 """TCP of the co-simulation compared with ns-3's, with equal losses on a cable: `python -m benchmarks.tcp_vs_ns3`.
 
-It has the same requirements as `radio_vs_ns3`. One station sends to another at full rate, and packets are lost by
-their numbers, so that all differences are due to TCP. With fixed loss patterns it prints the windows after the
-losses; with random losses, which are equal for all peers, it prints the goodputs. `--events PATTERN CONTROL` prints
-the events around the first difference.
+It has the same requirements as `radio_vs_ns3`. One station sends to another at full rate. The cable loses packets
+with given numbers, so that all differences are due to TCP. With fixed loss patterns it prints the congestion windows
+after the losses; with random losses, which are equal for all peers, it prints the goodputs. `--events PATTERN
+CONTROL` prints the events around the first difference between ns-3 and fieldkit.
 """
 
 import argparse
@@ -52,8 +52,8 @@ PATTERNS: Final = {
     "burst of 20": Losses(range(100, 120)),
     "burst of 110": Losses(range(100, 210)),
 }
-"""The longest burst loses the remaining packets of a window, all packets that its ACKs release, and two series of
-retransmissions."""
+"""The longest burst includes the remaining packets of a window, all packets that the ACKs of this window release, and
+two series of retransmissions."""
 
 RANDOM_LOSSES: Final = {
     "2 % of data": (0.02, 0.0, SECONDS),
@@ -63,14 +63,15 @@ RANDOM_LOSSES: Final = {
 }
 """Loss shares of data and of ACKs, and the duration in seconds.
 
-The losses of data are like those at 20 m behind the wall of `cosim_vs_ns3`, and at 47 m in sight.
+The losses of data are similar to those at 20 m behind the wall of `cosim_vs_ns3`, and at 47 m in line of sight.
 """
 
 PEERS: Final = {"ns-3": "ns3::{}", "corrected": "Counting{}", "no clamp": "Counting{}"}
-"""Class names of congestion controls in ns-3, in the corrected variant, and in that without the clamp of CUBIC.
+"""Patterns of the class names of congestion controls: of ns-3, of the corrected variant, and of the variant without
+CUBIC's clamp.
 
-With the clamp the window grows by at least a segment per 20 acknowledged ones after a timeout. Without it this is a
-segment per 255, the largest value that can be set.
+With the clamp the window grows after a timeout by at least one segment per 20 acknowledged segments. Without the
+clamp it grows by at least one per 255 segments, the largest value that can be set.
 """
 
 
@@ -87,8 +88,8 @@ class Run:
     """A run of a sender.
 
     Attributes:
-        events: Time in ns, kind (`window`, `threshold`, `timeout`, `sent`) and value: segments, for the timeout ms,
-            and for `sent` the number of the segment from 0.
+        events: Time in ns, kind and value of each event: `window` and `threshold` in segments, `timeout` in ms, and
+            `sent` with the number of the segment, from 0.
         mbit_s: Its goodput.
     """
 

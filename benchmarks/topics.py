@@ -2,10 +2,10 @@
 
 The agent that the step starts on robots (`agent publish`, `agent subscribe`) is compared with plain pairs of
 CycloneDDS, Zenoh and rospy on loopback, one middleware after the other. Each round restarts all programs, because
-their placement on the machine has more effect than further messages. The pairs of a middleware then send at the same
-time, 1,000 bytes at nearly 200 Hz. Their rates differ slightly, so that over seconds the phases between the pairs and
-other load vary, and are exchanged between rounds. Medians are over the time in which all pairs send; a ratio is the
-geometric mean over rounds. In every third round each pair then sends for a second at full rate, in sequence.
+their placement on the processor cores has more effect than additional messages. The pairs of a middleware then send
+1,000 bytes at nearly 200 Hz, at the same time. Their rates differ slightly, so that the phases between the pairs vary
+within seconds. The rates are exchanged between rounds. Medians are over the time in which all pairs send; a ratio is
+the geometric mean over rounds. In every third round each pair then sends for a second at full rate, in sequence.
 
 A delay is the time from the creation of a sample until the subscriber's Python code has received it.
 """
@@ -32,7 +32,7 @@ from fieldkit.ros.interfaces.types import standard_types
 from fieldkit.ros.streams import topic_samples
 
 PLAIN: Final = {"dds": ("plain",), "zenoh": ("plain", "attached"), "ros1": ("plain",)}
-"""Pairs of each middleware that are compared with the agent's."""
+"""Pairs of each middleware that are compared with the agent's. `attached` adds the attachment of rmw_zenoh."""
 RATES_HZ: Final = (200.0, 197.0, 203.0)
 STREAM_S: Final = 4.0
 BURST_S: Final = 1.0
@@ -61,8 +61,8 @@ class AgentPair:
     def stream(self, duration_s: float, rate_hz: float) -> Iterator["subprocess.Popen[str]"]:
         """Stream while the body runs, until the stream ends; yield the running publisher."""
         port = free_port()
-        with self._end("subscribe", port, duration_s, rate_hz) as subscriber:
-            with self._end("publish", port, duration_s, rate_hz) as publisher:
+        with self._running_agent("subscribe", port, duration_s, rate_hz) as subscriber:
+            with self._running_agent("publish", port, duration_s, rate_hz) as publisher:
                 yield publisher
                 if publisher.wait() != 0:
                     raise RuntimeError(f"the publisher over {self._over} exited with {publisher.returncode}")
@@ -74,7 +74,9 @@ class AgentPair:
         return list(zip(samples.at_ns.tolist(), (samples.at_ns - samples.sent_ns).tolist(), strict=True))
 
     @contextmanager
-    def _end(self, verb: str, port: int, duration_s: float, rate_hz: float) -> Iterator["subprocess.Popen[str]"]:
+    def _running_agent(
+        self, verb: str, port: int, duration_s: float, rate_hz: float
+    ) -> Iterator["subprocess.Popen[str]"]:
         request = json.dumps({"network": self._network(verb, port), "topic": self._topic(verb), "stream": {
             "over": self._over, "size_bytes": SIZE, "rate_hz": rate_hz, "duration_s": duration_s, "patience_s": 20.0,
         }})  # fmt: skip
@@ -135,7 +137,7 @@ def measure_round(over: str, number: int, agent_pair: AgentPair, environment: di
     with ExitStack() as stack:
         names = [f"{over} {pair}" for pair in PLAIN[over]]
         plain = [RunningPath(stack, MessagePath(name, name, name), environment) for name in names]
-        delays = stream_together(plain, agent_pair, rates_hz)
+        arrivals = stream_together(plain, agent_pair, rates_hz)
         bursts: list[Times] = []
         if number % BURST_EVERY == 0:
             bursts = [pair.run(BURST_S, 0)[1] for pair in plain]
@@ -145,7 +147,7 @@ def measure_round(over: str, number: int, agent_pair: AgentPair, environment: di
     return {
         "round": number,
         "over": over,
-        "delay_ms": dict(zip(pairs, (median(late for _, late in times) / 1e6 for times in delays), strict=True)),
+        "delay_ms": dict(zip(pairs, (median(delay for _, delay in times) / 1e6 for times in arrivals), strict=True)),
         "per_s": dict(zip(pairs, map(_per_s, bursts), strict=False)),
     }
 
@@ -194,7 +196,8 @@ def main() -> int:
     if options.json:
         print(json.dumps(results))
         return 0
-    print(f"{'over':6}{'pair':10}{'delay, ms':>26}{'by plain':>24}{'by attached':>24}{'messages/s':>26}")
+    header = f"{'over':6}{'pair':10}{'delay, ms':>26}{'ratio to plain':>24}{'ratio to attached':>24}"
+    print(f"{header}{'messages/s':>26}")
     for over, plain in PLAIN.items():
         rows = [row for row in results if row["over"] == over]
         for pair in (*plain, "agent"):

@@ -2,7 +2,7 @@
 
 Both run the same steps on the same emulated robots, in alternating repeats: create a folder and log the host's state
 on both robots, record, capture at both ends, send the bag, drain, ping, log the state again, fetch all files and
-check their hashes. Own time is the wall time of a repeat minus the time of the tools: the recorder's process, the
+check their hashes. The overhead is the wall time of a repeat minus the time of the tools: the recorder's process, the
 time from the start of the sending nc to the end of the listening one, and the process of ping. These times are from
 kernel events (`benchmarks.lifetimes`) for both peers. Each repeat checks that both run the same command lines.
 
@@ -31,7 +31,7 @@ from typing import Final
 
 from benchmarks.bash_peer import BashPeer, connected
 from benchmarks.lifetimes import Lifetime, Watch
-from benchmarks.own_time import TOOLS, Repeat, command_lines, own_time_ms
+from benchmarks.overhead import TOOLS, Repeat, command_lines, overhead_ms
 from benchmarks.slow_links import SlowLinks, slow_control
 from fieldkit.config import schema
 from fieldkit.config.site import Site
@@ -145,7 +145,7 @@ class AlternatingPeers:
             self.untimed += 1
             return ()
         if number > 1:
-            own_ms = own_time_ms(self._start_ns, self._phases, end_ns, tools)
+            own_ms = overhead_ms(self._start_ns, self._phases, end_ns, tools)
             self.repeats.append(Repeat(peer, protocol, own_ms, trips))
         return tools
 
@@ -183,8 +183,8 @@ def measure(rounds: int, record_s: float, round_trip_s: float) -> AlternatingPee
 
 
 def show(repeats: Sequence[Repeat]) -> None:
-    """Print own time per repeat and by phase."""
-    print(f"{'own time, ms':22}{'fieldkit':>22}{'script':>22}{'fieldkit/script':>17}")
+    """Print the overhead per repeat and by phase."""
+    print(f"{'overhead, ms':22}{'fieldkit':>22}{'script':>22}{'fieldkit/script':>17}")
     for protocol in Protocol:
         totals = {peer: [repeat.total_ms for repeat in chosen(repeats, peer, protocol)] for peer in PEERS}
         ratio = statistics.median(totals["fieldkit"]) / statistics.median(totals["script"])

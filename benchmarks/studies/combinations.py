@@ -1,7 +1,7 @@
 """Every sync policy on every pair of simulators: `python -m benchmarks.studies.combinations run FILE.csv`.
 
 The program runs one scenario with each physics simulator, network simulator, sync policy and seed, and appends a row
-per run to a CSV file. It does not run combinations again that are in the file. `table FILE.csv --page
+per run to a CSV file. Combinations that are already in the file are not run again. `table FILE.csv --page
 docs/studies/simulators.md` writes the tables of the documentation. For `gazebo`, a Gazebo must be running.
 """
 
@@ -30,7 +30,7 @@ from sim_backends.cosim.studies.shootout import Outcomes, RunOutcome, delay_s, m
 REFERENCE: Final = "event_driven"
 NETWORK_OPTIONS: Final = {"ns3": {"topics": "udp"}}
 """Best-effort topics are UDP datagrams with the headers of RTPS."""
-MS: Final = 1e3
+MS_PER_S: Final = 1e3
 BEGIN: Final = "<!-- written by benchmarks.studies.combinations: from here -->"
 END: Final = "<!-- written by benchmarks.studies.combinations: to here -->"
 
@@ -167,7 +167,7 @@ def estimate_text(values: Sequence[float], scale: float, digits: int) -> str:
 def simulator_table(rows: Sequence[StudyRow]) -> Iterator[str]:
     """Yield a table of the exact reference on each pair of simulators, with the differences from the built-in pair.
 
-    Differences are those of runs with the same seed.
+    Runs with the same seed are compared.
     """
     by_pair = by_pair_and_policy(rows)
     bases = {run.seed: run for run in by_pair.get(((BUILT_IN, BUILT_IN), REFERENCE), [])}
@@ -183,10 +183,10 @@ def simulator_table(rows: Sequence[StudyRow]) -> Iterator[str]:
             cells = (
                 *pair,
                 estimate_text([run.loss for run in runs], 100, 1),
-                estimate_text([run.delay_s for run in runs], MS, 2),
-                estimate_text(delays_s, MS, 2),
+                estimate_text([run.delay_s for run in runs], MS_PER_S, 2),
+                estimate_text(delays_s, MS_PER_S, 2),
                 estimate_text([run.separation_m for run in runs], 1, 3),
-                estimate_text(distances_m, MS, 1),
+                estimate_text(distances_m, MS_PER_S, 1),
             )
             yield f"| {' | '.join(cells)} |"
 
@@ -217,13 +217,15 @@ def _cell(cell: Cell, runs: Sequence[StudyRow], reference: Sequence[StudyRow]) -
 
 
 def added_text(runs: Sequence[StudyRow], reference: Sequence[StudyRow]) -> str:
-    """Return the difference of the mean delay from that of the exact reference with the same seed."""
-    return estimate_text([run.delay_s - exact.delay_s for run, exact in zip(runs, reference, strict=True)], MS, 1)
+    """Return the mean delay that the policy adds to the delay of the exact reference with the same seed."""
+    return estimate_text(
+        [run.delay_s - exact.delay_s for run, exact in zip(runs, reference, strict=True)], MS_PER_S, 1
+    )
 
 
 def path_text(runs: Sequence[StudyRow], _: Sequence[StudyRow]) -> str:
     """Return the mean distance of agents from their positions in the exact reference."""
-    return estimate_text([run.path_error_m for run in runs], MS, 1)
+    return estimate_text([run.path_error_m for run in runs], MS_PER_S, 1)
 
 
 def cost_text(runs: Sequence[StudyRow], _: Sequence[StudyRow]) -> str:

@@ -46,6 +46,7 @@ STYLES: Final[dict[tuple[str, str], Style]] = {
     ("masterless", "los"): Style("blue", "o", "dashed"),
     ("masterless", "nlos"): Style("red", "s", "dashed"),
 }
+# Panels of the two figures, and columns of the table: title, protocol and quantity.
 LOSS: Final = (
     ("UDP: IP packets", "udp", "ip_loss"),
     ("UDP: datagrams of 8,192 bytes", "udp", "datagram_loss"),
@@ -56,7 +57,7 @@ DELAY: Final = (
     ("TCP: 502 bytes there and back", "tcp", PAPER_DELAY.name),
     ("UDP: 8,192 bytes there and back", "udp", PAPER_DELAY.name),
 )
-SHOWN: Final = (
+TABLE_COLUMNS: Final = (
     ("IP packets", "udp", "ip_loss"),
     ("datagrams", "udp", "datagram_loss"),
     ("file, UDP", "udp", "file_loss"),
@@ -123,7 +124,7 @@ def _panel(cells: Sequence[Cell], title: str, protocol: str, quantity: str) -> P
             Series(
                 label=f"{topology}, {'in sight' if scenario == 'los' else 'behind the wall'}",
                 style=style,
-                x=[distance_ft(cell) + (rank - 1.5) * DODGE_FT for cell in series_cells],
+                x=[distance_ft(cell) + (rank - (len(STYLES) - 1) / 2) * DODGE_FT for cell in series_cells],
                 y=[factor * item.value for item in estimates],
                 low=[_end(item, item.low, factor) for item in estimates],
                 high=[_end(item, item.high, factor) for item in estimates],
@@ -138,7 +139,7 @@ def _panel(cells: Sequence[Cell], title: str, protocol: str, quantity: str) -> P
 def _end(source: Estimate, end: float | None, factor: float) -> float | None:
     """Return an end of an interval to draw.
 
-    None if the value is 0, because the interval would then depend only on the number of repeats.
+    The result is None if the value is 0, because the interval would then depend only on the number of repeats.
     """
     return None if end is None or source.value == 0 else factor * end
 
@@ -152,15 +153,15 @@ def distance_ft(cell: Cell) -> float:
 
 def table(cells: Sequence[Cell], attempts: Repeats) -> Iterator[str]:
     """Yield a Markdown table with a line per condition and the lateness of the emulator."""
-    yield "| " + " | ".join(["condition", *(title for title, _, _ in SHOWN), "late, p99 / max (ms)"]) + " |"
-    yield "| " + " | ".join(["---"] * (len(SHOWN) + 2)) + " |"
+    yield "| " + " | ".join(["condition", *(title for title, _, _ in TABLE_COLUMNS), "late, p99 / max (ms)"]) + " |"
+    yield "| " + " | ".join(["---"] * (len(TABLE_COLUMNS) + 2)) + " |"
     for topology, scenario, metres in sorted({_place(cell) for cell in cells}):
         by_protocol = {
             str(cell.key["protocol"]): cell for cell in cells if _place(cell) == (topology, scenario, metres)
         }
         values = [
             _text(by_protocol[protocol].estimates[quantity]) if protocol in by_protocol else ""
-            for _, protocol, quantity in SHOWN
+            for _, protocol, quantity in TABLE_COLUMNS
         ]
         rows = (attempts.texts["topology"] == topology) & (attempts.texts["scenario"] == scenario)
         rows &= attempts.numbers["distance_m"] == metres
@@ -173,7 +174,7 @@ def table(cells: Sequence[Cell], attempts: Repeats) -> Iterator[str]:
 
 
 LATE: Final[tuple[tuple[str, Callable[..., float]], ...]] = (("p99", np.nanmedian), ("max", np.nanmax))
-"""Statistics of the lateness: the p99 of the median repeat, and the maximum of all packets."""
+"""Statistics of the lateness: the median over the repeats of their p99, and the maximum of all packets."""
 
 
 def _place(cell: Cell) -> tuple[str, str, float]:

@@ -3,7 +3,7 @@
 The program runs trials of four layouts and two hello intervals in sequence, unless FOLDER already has them, on
 emulated robots without fading, with five repeats each. This takes 2 hours. Then it prints a table of `rtt_gap_s`,
 with the bound of 13.7 hello intervals (docs/studies/mesh.md), and draws a figure. The layout `row` has no other path,
-so its time starts when the robot is on again.
+so its healing time starts when the robot is switched on again.
 """
 
 import argparse
@@ -55,7 +55,7 @@ class Layout:
 
     Attributes:
         label: Its description.
-        procedure: Name of the procedure; those that do not ship are in `benchmarks/studies/mesh`.
+        procedure: Name of the procedure, which is shipped or in `benchmarks/studies/mesh`.
         distance: Distance from sender to receiver.
         others: Further roles.
         away_s: Time for which the only path is interrupted; 0 if there is another path.

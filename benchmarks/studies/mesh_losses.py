@@ -32,11 +32,14 @@ from sim_backends.emulated.robot.spec import USER
 from sim_backends.world.world import load_world
 
 HELLO_S: Final = 0.5
+"""Hello interval of babeld."""
 SETTLE_S: Final = 10.0
 """Time after switching a robot on before its route is checked: more than babeld's history of 16 hellos."""
 
 PATIENCE_S: Final = 100.0
+"""Maximum time for which a robot stays switched off."""
 RETURN_S: Final = 600.0
+"""Time within which packets must use the robot again."""
 ANTENNA_M: Final = 0.2
 
 Places = Mapping[str, tuple[float, float]]
@@ -103,7 +106,7 @@ class DetourLab:
 def lab(detour: Detour) -> Iterator[DetourLab]:
     """Yield the robots of a detour."""
     profile = schema.load(Path(__file__).parent / "mesh" / "box.yaml", RobotProfile)
-    robots = {name: LabRobot(name, profile, f"10.42.0.{at}", ()) for at, name in enumerate(detour.places, 1)}
+    robots = {name: LabRobot(name, profile, f"10.42.0.{number}", ()) for number, name in enumerate(detour.places, 1)}
     mesh = {"daemon": "babeld", "hello": f"{HELLO_S}s"}
     options = EmulatedOptions.model_validate({"radio": {"fading": detour.fading}, "mesh": mesh})
     with running_robots(
@@ -121,7 +124,7 @@ def lab(detour: Detour) -> Iterator[DetourLab]:
             yield DetourLab(lab_robots.robots, sender)
 
 
-def healing_time_s(lab_robots: DetourLab, lost: Sequence[str]) -> float | None:
+def healing_time_s(detour_lab: DetourLab, lost: Sequence[str]) -> float | None:
     """Wait until the next hop is one of `lost`, and switch it off; return the time until the receiver answers again.
 
     Returns:
@@ -132,23 +135,23 @@ def healing_time_s(lab_robots: DetourLab, lost: Sequence[str]) -> float | None:
     """
     route_deadline = Deadline.after(RETURN_S)
     time.sleep(SETTLE_S)
-    while (hop := lab_robots.next_hop()) not in lost or not lab_robots.is_reachable(1.0):
+    while (hop := detour_lab.next_hop()) not in lost or not detour_lab.is_reachable(1.0):
         if route_deadline.expired:
             raise TimeoutError(f"packets do not use {' or '.join(lost)}, but {hop or 'no robot'}")
         time.sleep(1.0)
-    lab_robots.robots[hop].switch_off()
+    detour_lab.robots[hop].switch_off()
     started_s = time.monotonic()
     try:
-        return time.monotonic() - started_s if lab_robots.is_reachable(PATIENCE_S) else None
+        return time.monotonic() - started_s if detour_lab.is_reachable(PATIENCE_S) else None
     finally:
-        lab_robots.robots[hop].switch_on()
+        detour_lab.robots[hop].switch_on()
 
 
-def healing_times_s(lab_robots: DetourLab, detour: Detour, losses: int) -> list[float | None]:
+def healing_times_s(detour_lab: DetourLab, detour: Detour, losses: int) -> list[float | None]:
     """Return `healing_time_s` of each loss, and print each result."""
     times_s = []
     for number in range(losses):
-        times_s.append(healing_time_s(lab_robots, detour.lost))
+        times_s.append(healing_time_s(detour_lab, detour.lost))
         print(f"{detour.label}, fading {detour.fading}, {number + 1}/{losses}: {times_s[-1]}", file=sys.stderr)
     return times_s
 

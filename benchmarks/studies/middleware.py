@@ -77,7 +77,7 @@ def copy_lab(folder: Path, repeats: int | None = None) -> None:
 
 
 def campaign_name(campaign: str, repeats: int | None) -> str:
-    """Return the name of a campaign with a separate number of repeats: `dds-12`."""
+    """Return the name of a campaign, with the number of repeats if it is not the number in the file: `dds-12`."""
     return f"{campaign}-{repeats}" if repeats else campaign
 
 
@@ -98,7 +98,7 @@ def ros2_robot() -> str:
 def run(folder: Path, names: Sequence[str]) -> None:
     """Run or continue campaigns, each with a log file; report those that failed.
 
-    Repeats whose packets were late on a busy machine are void; the valid ones still count.
+    Repeats with late packets, on a busy machine, are void. The valid repeats of a failed campaign are still used.
     """
     environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
     running = []
@@ -135,7 +135,7 @@ def by_distance(findings: MiddlewareFindings, name: str, quantity: "PlottedQuant
 
 
 def by_robots(findings: MiddlewareFindings) -> Chart:
-    """Return a chart of loss and delay by the number of robots that publish to one."""
+    """Return a chart of loss and delay by the number of robots, all but one of which publish to that one."""
     panels = []
     for quantity in (LOSS, DELAY):
         for metres in sorted({cell.distance_m for cell in findings.cells if cell.robots > 2}):
@@ -265,7 +265,7 @@ def main() -> None:
         run(options.out, [f"{prefix}{campaign_name(name, options.repeats)}" for name in options.only])
     findings = read(options.out, names)
     print(
-        f"{time.strftime('%Y-%m-%d', time.gmtime(findings.ended_s))}: {findings.ended}; packets were up to "
+        f"{time.strftime('%Y-%m-%d', time.gmtime(findings.ended_s))}: {findings.status_text}; packets were up to "
         f"{1e3 * findings.late_s:.1f} ms late; load average {os.getloadavg()[2]:.1f} when this was written."
     )
     if options.table:

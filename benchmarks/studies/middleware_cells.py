@@ -29,16 +29,16 @@ class MiddlewareCell:
     """One middleware with its settings, at one distance with one size of samples.
 
     Attributes:
-        middleware: The middleware, with `, tuned` if its settings are.
+        middleware: Name of the middleware, with `, tuned` if its settings are tuned.
         kind: `best effort` or `reliable`.
-        size_bytes: Data of a sample.
+        size_bytes: Size of the data of a sample.
         distance_m: Distance between the robots.
         robots: Number of robots, including the subscriber.
         loss: Share of the samples of all valid repeats that did not arrive, or were not sent because the previous one
             blocked the publisher; None if the subscriber was not discovered.
         delay_p95_s: Median over repeats of the 95th percentile of the delay; None if the clocks are not comparable.
-        loss_low: Lower end of the 95 % interval of the loss over repeats; None without one.
-        loss_high: Upper end.
+        loss_low: Lower end of the 95 % interval of the loss over repeats; None if there are fewer than two repeats.
+        loss_high: Upper end of this interval.
         samples: Number of samples.
         repeats: Number of repeats.
     """
@@ -62,13 +62,13 @@ class MiddlewareFindings:
 
     Attributes:
         cells: Cells of valid repeats.
-        ended: Numbers of repeats by status, as text.
+        status_text: Number of repeats of each status, as text.
         ended_s: End of the last repeat, in seconds since 1970 UTC.
         late_s: Largest lateness of a packet in valid repeats.
     """
 
     cells: Sequence[MiddlewareCell]
-    ended: str
+    status_text: str
     ended_s: float
     late_s: float
 
@@ -85,15 +85,16 @@ def read(folder: Path, names: Sequence[str]) -> MiddlewareFindings:
     all_rows = [row for campaign_rows in rows.values() for row in campaign_rows]
     valid = {name: [row for row in campaign_rows if row["status"] == "valid"] for name, campaign_rows in rows.items()}
     statuses = [row["status"] for row in all_rows]
-    ended = ", ".join(f"{statuses.count(status)} repeats {status}" for status in sorted(set(statuses), reverse=True))
+    counts = (f"{statuses.count(status)} repeats {status}" for status in sorted(set(statuses), reverse=True))
+    status_text = ", ".join(counts) or "nothing"
     late_s = max(
         (row["emulator_late_max_s"] or 0.0 for campaign_rows in valid.values() for row in campaign_rows), default=0.0
     )
-    cells = [cell for name, campaign_rows in valid.items() for cell in _cells(_kind(name), campaign_rows)]
-    return MiddlewareFindings(cells, ended or "nothing", newest_s, late_s)
+    cells = [cell for name, campaign_rows in valid.items() for cell in _cells(_base_name(name), campaign_rows)]
+    return MiddlewareFindings(cells, status_text, newest_s, late_s)
 
 
-def _kind(name: str) -> str:
+def _base_name(name: str) -> str:
     """Return the entry of `CAMPAIGNS` for a campaign: `dds` for `full-dds` and `dds-12`."""
     return re.sub(r"-[0-9]+$", "", name.removeprefix("full-"))
 

@@ -1,8 +1,8 @@
 """The table docs/studies/middleware.csv: written from cells, and read back with intervals, without raw data.
 
 The table has the loss of all repeats together, so the differences between repeats are unknown. Losses occur in
-fades of some tenths of a second, so samples within `TOGETHER_S` count as one trial of Wilson's interval. It is wider
-than that of independent samples, but does not include differences between repeats.
+fades of some tenths of a second, so samples within `TOGETHER_S` count as one trial of Wilson's interval. This makes
+the interval wider than for independent samples, but it does not include differences between repeats.
 """
 
 import csv
@@ -21,7 +21,7 @@ TOGETHER_S: Final = 0.5
 REPEATS: Final = 2
 """Repeats of the campaigns in the table."""
 HEAD: Final = ("size_bytes", "kind", "middleware", "robots", "distance_m", "lost_percent", "delay_p95_ms", "loss")
-"""Columns of the table; `loss` is `bimodal` if the share of lost samples is not a rate."""
+"""Columns of the table; `loss` is `bimodal` if each repeat loses either few samples or nearly all of them."""
 BIMODAL: Final = "bimodal"
 
 IMAGE_BYTES: Final = 1_000_000
@@ -39,7 +39,7 @@ def interval(loss: float, size_bytes: int, samples: int) -> tuple[float, float]:
 
     Args:
         loss: Share of lost samples.
-        size_bytes: Data of a sample, which determines the rate.
+        size_bytes: Size of the data of a sample, which determines the rate.
         samples: Number of samples.
     """
     _, rate_hz = _SAMPLES[size_bytes >= IMAGE_BYTES]
@@ -49,7 +49,10 @@ def interval(loss: float, size_bytes: int, samples: int) -> tuple[float, float]:
 
 
 def is_bimodal(cell: MiddlewareCell) -> bool:
-    """Return True if a repeat of the cell loses few samples or nearly all: large reliable samples over Zenoh."""
+    """Return True if each repeat of the cell loses either few samples or nearly all of them.
+
+    This was observed for large reliable samples over Zenoh.
+    """
     return (cell.middleware, cell.kind) == ("Zenoh", "reliable") and cell.size_bytes >= IMAGE_BYTES
 
 

@@ -87,8 +87,8 @@ class ImageLab:
 
     def command(self, robot: str, *argv: str) -> list[str]:
         """Return the command that runs another command on a robot."""
-        placed = ("env", f"PYTHONPATH={ROOT}", *argv)
-        return ["ssh", "-F", str(self._folder / "lab.ssh"), robot, shlex.join(placed)]
+        robot_command = ("env", f"PYTHONPATH={ROOT}", *argv)
+        return ["ssh", "-F", str(self._folder / "lab.ssh"), robot, shlex.join(robot_command)]
 
     def lost_images(self, setting: ImageSetting) -> list[int]:
         """Return the numbers of the images that did not arrive in one repeat.
@@ -149,22 +149,26 @@ class ImageLab:
         return [int(number) for number in log.samples.sequence]
 
     def _stream(self, ends: Mapping[str, Sequence[str]], up: str) -> tuple[list[int], list[int]]:
-        """Run subscriber and publisher; return the numbers that they print, which are empty lists for the agent."""
-        pid = "echo pid $$; exec " + shlex.join((self._python, "-u", *ends["subscribe"])) + " 2>&1"
+        """Run the subscriber and the publisher.
+
+        Returns:
+            The numbers of the sent and of the received samples that they print. The agent prints no numbers.
+        """
+        script = "echo pid $$; exec " + shlex.join((self._python, "-u", *ends["subscribe"])) + " 2>&1"
         with subprocess.Popen(
-            self.command(SUBSCRIBER[0], "sh", "-c", pid),
+            self.command(SUBSCRIBER[0], "sh", "-c", script),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
         ) as subscriber:
             assert subscriber.stdout is not None
-            number = subscriber.stdout.readline().split()[1]
+            pid = subscriber.stdout.readline().split()[1]
             while not (line := subscriber.stdout.readline()).startswith(up):
                 if not line:
                     raise RuntimeError("the subscriber exited before it was up")
             publish = self.command(PUBLISHER[0], self._python, *ends["publish"])
             sent = subprocess.run(publish, check=True, capture_output=True, text=True, stdin=subprocess.DEVNULL)
-            subprocess.run(self.command(SUBSCRIBER[0], "kill", "-TERM", number), check=True)
+            subprocess.run(self.command(SUBSCRIBER[0], "kill", "-TERM", pid), check=True)
             received, _ = subscriber.communicate()
         return _numbers(sent.stdout), _numbers(received)
 
@@ -224,10 +228,10 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         lost_images = measure(Path(folder), options.rounds)
-    control = Path("/proc/sys/net/ipv4/tcp_congestion_control").read_text(encoding="ascii").strip()
+    congestion_control = Path("/proc/sys/net/ipv4/tcp_congestion_control").read_text(encoding="ascii").strip()
     conditions = (
         f"{time.strftime('%Y-%m-%d', time.gmtime())}: {options.rounds} repeats of each, alternating; TCP with "
-        f"{control}; load average of the last 15 minutes {os.getloadavg()[2]:.1f}."
+        f"{congestion_control}; load average of the last 15 minutes {os.getloadavg()[2]:.1f}."
     )
     if options.json:
         files.write(options.json, json.dumps(lost_images).encode())

@@ -1,8 +1,8 @@
 """A plain pair of Zenoh sessions, the reference for the agent: `python zenoh_plain.py subscribe|publish JSON`.
 
-It does not import fieldkit, so that it does not contain errors of fieldkit's adapter. Publisher and subscriber print
-a line of JSON for each sample: its number and times in nanoseconds since 1970 UTC. The subscriber exits at the end of
-its standard input.
+It does not import fieldkit, so errors of fieldkit's adapter cannot affect it. Publisher and subscriber print a line
+of JSON for each sample: its number and times in nanoseconds since 1970 UTC. The subscriber exits at the end of its
+standard input.
 """
 
 import json
@@ -15,7 +15,9 @@ import zenoh
 
 HEAD: Final = struct.Struct("<qq")
 SETTLING_S: Final = 0.5
+"""Wait from the discovery of the subscriber until the first sample, as in fieldkit's agent."""
 DRAIN_S: Final = 2.0
+"""Wait after the last sample, so that queued samples are sent before the session is closed."""
 
 
 def subscribe(session: Any, request: dict[str, Any]) -> None:  # noqa: ANN401 (Zenoh declares no types)

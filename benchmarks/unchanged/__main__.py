@@ -1,6 +1,7 @@
 """Compare the behaviour of two commits; see CONTRIBUTING.md.
 
-`python -m benchmarks.unchanged BASE [HEAD]` exits with 1 on any difference that is not a label.
+`python -m benchmarks.unchanged BASE [HEAD]` exits with 1 if the outputs differ in more than words. Differences in
+words are called labels.
 """
 
 import argparse

@@ -72,7 +72,7 @@ def compare(item: Item, number: int, base: Tree, head: Tree) -> Differences:
         differences.real.append(f"nothing is proved: exit code {code} with the base\n{error}")
     names = [{str(path.relative_to(top)) for path in top.rglob("*") if path.is_file()} for top in (before, after)]
     if item.kind is ItemKind.TRIALS:
-        differences.add(_trials(before, after))
+        differences.add(_compare_trials(before, after))
         return differences
     if names[0] != names[1]:
         differences.real.append(
@@ -86,7 +86,7 @@ def compare(item: Item, number: int, base: Tree, head: Tree) -> Differences:
         if texts[0] is None or texts[1] is None:
             differences.real.append(f"{name}: other bytes")
         else:
-            differences.add(_texts(name, texts[0], texts[1], exact=_must_be_equal(item, name)))
+            differences.add(_compare_texts(name, texts[0], texts[1], exact=_must_be_equal(item, name)))
     return differences
 
 
@@ -110,11 +110,11 @@ def _must_be_equal(item: Item, name: str) -> bool:
     return name != "stderr" and Path(name).suffix not in _TEXTS | {".svg"} and "junit" not in item.arguments
 
 
-def _texts(name: str, before: str, after: str, *, exact: bool) -> Differences:
+def _compare_texts(name: str, before: str, after: str, *, exact: bool) -> Differences:
     if not exact and (pairs := _json_lines(before, after)) is not None:
         differences = Differences()
         for old, new in pairs:
-            differences.add(_values(name, old, new))
+            differences.add(_compare_values(name, old, new))
         return differences
     if exact or _FIXED.findall(before) != _FIXED.findall(after):
         return Differences(real=[f"{name}:\n{_diff(before, after)}"])
@@ -140,7 +140,7 @@ def _json_values(text: str) -> list[Any] | None:
         return None
 
 
-def _values(where: str, old: Any, new: Any) -> Differences:  # noqa: ANN401 (any JSON value)
+def _compare_values(where: str, old: Any, new: Any) -> Differences:  # noqa: ANN401 (any JSON value)
     """Compare two JSON values: sentences may differ in words, everything else must be equal."""
     if old == new:
         return Differences()
@@ -149,12 +149,12 @@ def _values(where: str, old: Any, new: Any) -> Differences:  # noqa: ANN401 (any
         for key in old:
             if key in _WORDS_IN_EVENTS and isinstance(old[key], str) and isinstance(new[key], str):
                 if old[key] != new[key]:
-                    differences.add(_texts(f"{where}, {key}", old[key], new[key], exact=False))
+                    differences.add(_compare_texts(f"{where}, {key}", old[key], new[key], exact=False))
             else:
-                differences.add(_values(f"{where}, {key}", old[key], new[key]))
+                differences.add(_compare_values(f"{where}, {key}", old[key], new[key]))
     elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
         for old_item, new_item in zip(old, new, strict=True):
-            differences.add(_values(where, old_item, new_item))
+            differences.add(_compare_values(where, old_item, new_item))
     else:
         differences.real.append(f"{where}:\n- {_shortened(old)}\n+ {_shortened(new)}")
     return differences
@@ -165,7 +165,7 @@ def _shortened(value: object) -> str:
     return text if len(text) <= 300 else f"{text[:300]}..."
 
 
-def _trials(before: Path, after: Path) -> Differences:
+def _compare_trials(before: Path, after: Path) -> Differences:
     """Compare two runs of an emulated trial, whose numbers differ: events, their fields, files, and CSV headers."""
     differences = Differences()
     for name, shapes in {"exit code": _exit_codes, "events": _event_shapes, "files": _file_shapes}.items():

@@ -1,8 +1,8 @@
 """Run commands of one exported tree, and store their output and the files that they write.
 
 Runs as a program in an environment in which Python imports that tree: `python -P recorder.py ITEMS RESULTS`, where
-ITEMS is a JSON file of a list of items (`items.Item` as dictionaries) and RESULTS a folder, which is made. With
-`--commands` it prints the commands that the tree has. It imports only the standard library and public names of the
+ITEMS is a JSON file with a list of items (`items.Item` as dictionaries), and RESULTS is a folder, which is created.
+With `--commands` it prints the commands of the tree. It imports only the standard library and public names of the
 tree: the module `fieldkit`, and `build` and `load_scenario` of `sim_backends.cosim`.
 
 All commands run in this process in sequence, because importing the libraries takes longer than most commands.

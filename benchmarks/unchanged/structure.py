@@ -53,7 +53,10 @@ def table(base: Tree, head: Tree) -> str:
 
 
 def imported(tree: Tree) -> dict[str, str]:
-    """Return the number of own lines that a dry run imports, and by package those that an emulated trial imported."""
+    """Return the number of this project's lines imported by a dry run, and by the emulated trial per package.
+
+    The number for the emulated trial is unknown if that part of the comparison was not run.
+    """
     command = (*python(), "-c", _COUNT_IN_DRY_RUN)
     completed = subprocess.run(
         command, cwd=tree.folder, env=tree.environment(), capture_output=True, text=True, check=True
@@ -132,7 +135,7 @@ def large_classes(tree: Path) -> dict[str, int]:
 
 
 def _is_new_and_public(method: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
-    """Return False for an override too: its callers need to know only the base class, where it is counted."""
+    """Return False for private methods and for overrides, which are counted in the base class."""
     overrides = any(isinstance(mark, ast.Name) and mark.id == "override" for mark in method.decorator_list)
     return not overrides and not method.name.startswith("_")
 

@@ -1,9 +1,9 @@
 """Compare the tests of two commits, except for imports, names and labels.
 
-Functions are compared by their shape: the syntax tree without names, docstrings, annotations and imports, in which a
-string counts only by its digits. A function is matched with one of the same shape anywhere in the other tests, so it
-may move; the remaining functions are matched by name. Inside of an assertion equal names must remain equal, so that
-`assert a == b` differs from `assert a == a`. Outside of assertions, a replaced name is not detected.
+Functions are compared by their shape: the syntax tree without names, docstrings, annotations and imports. Only the
+digits of a string are compared. A function is matched with one of the same shape anywhere in the other tests, so it
+may move; the remaining functions are matched by name. Inside an assertion equal names must remain equal, so that
+`assert a == b` differs from `assert a == a`. Outside assertions, a replaced name is not detected.
 """
 
 import ast
@@ -27,8 +27,8 @@ class Unit:
         name: Its name, preceded by that of its class.
         shape: Its syntax tree without names.
         assertions: The shape of each assertion.
-        sources: The source of each assertion and its line, by its shape.
-        numbers: Its numbers, those in strings included.
+        sources: Line and source of each assertion, by the assertion's shape.
+        numbers: Its numbers, including the numbers in strings.
     """
 
     file: str

@@ -140,11 +140,11 @@ def _invocation(action: argparse.Action) -> str:
 
 def _meaning(parser: Parser, action: argparse.Action) -> str:
     words = {**vars(action), "prog": parser.prog}
-    return _plain((action.help or "") % words)
+    return _escape_markdown((action.help or "") % words)
 
 
 def _prose(parser: Parser, text: str) -> str:
-    return _plain(_expanded(parser, text))
+    return _escape_markdown(_expanded(parser, text))
 
 
 def _expanded(parser: Parser, text: str) -> str:
@@ -152,8 +152,8 @@ def _expanded(parser: Parser, text: str) -> str:
     return text % {"prog": parser.prog} if "%(prog)" in text else text
 
 
-def _plain(text: str) -> str:
-    """Return a text with escaped characters of Markdown; a text with code spans is not changed."""
+def _escape_markdown(text: str) -> str:
+    """Return a text with the special characters of Markdown escaped; a text with code spans is not changed."""
     return text.replace("<", "&lt;").replace("*", "\\*").replace("_", "\\_") if "`" not in text else text
 
 

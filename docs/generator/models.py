@@ -28,8 +28,7 @@ def keys_table(model: type[Strict], prefix: str = "", without: frozenset[str] = 
         prefix: Prefix of all keys.
         without: Prefixes of keys in another table.
     """
-    skipped = tuple(without)
-    return table(HEAD, (row for row in rows(model, prefix) if not row[0].strip("`").startswith(skipped or "\0")))
+    return table(HEAD, (row for row in rows(model, prefix) if not row[0].strip("`").startswith(tuple(without))))
 
 
 def rows(model: type[Strict], prefix: str = "") -> Iterator[tuple[str, str, str]]:

@@ -49,7 +49,7 @@ _MARKS: Final = (
 
 def pages() -> dict[str, str]:
     """Return the text of every reference page by its file name."""
-    makers: dict[str, Callable[[], str]] = {
+    builders: dict[str, Callable[[], str]] = {
         "commands.md": commands,
         "exit-codes.md": exit_codes,
         "site-file.md": site_file,
@@ -70,14 +70,16 @@ def pages() -> dict[str, str]:
         "federate-protocol.md": federate_protocol,
         "federate-vectors.md": federate_vectors,
     }
-    return {"index.md": index()} | {name: make() for name, make in makers.items()}
+    return {"index.md": index()} | {name: build() for name, build in builders.items()}
 
 
 def step_capabilities() -> str:
     """Return the page of capabilities of steps, from their classes."""
     lines = []
     for capability in CAPABILITIES:
-        methods = ", ".join(f"`{name}`" for name in sorted(capability.__abstractmethods__, key=_line_in(capability)))
+        methods = ", ".join(
+            f"`{name}`" for name in sorted(capability.__abstractmethods__, key=_position_in(capability))
+        )
         meaning = class_description(capability).partition("\n\n")[0].replace("\n", " ")
         lines.append((f"`{capability.__name__}`", meaning, methods))
     return page(
@@ -88,7 +90,7 @@ def step_capabilities() -> str:
     )
 
 
-def _line_in(capability: type) -> Callable[[str], int]:
+def _position_in(capability: type) -> Callable[[str], int]:
     """Return a function that returns the position of a method in its class."""
     return list(vars(capability)).index
 

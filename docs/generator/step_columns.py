@@ -68,7 +68,8 @@ def table_rows() -> str:
     return page(
         "Rows of tables",
         "This page lists the rows of the tables of `trial`, `aggregate`, `compare` and `report`, with their columns "
-        "in `trial.csv`. FLOW is `transfer`, `iperf3`, `soak` or `topic`. Flows have the rows of a reboot also for "
-        "other faults. The [glossary](../glossary.md) explains losses and marks.",
+        "in `trial.csv`. FLOW is `transfer`, `iperf3`, `soak` or `topic`. For flows, only the rows of the fault "
+        "`reboot` are listed; the rows of other faults contain their names instead. The [glossary](../glossary.md) "
+        "explains losses and marks.",
         table(("row", "column", "meaning"), lines),
     )

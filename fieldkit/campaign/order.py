@@ -105,6 +105,7 @@ def _blocks(trials: Sequence[PlannedTrial]) -> Iterator[list[PlannedTrial]]:
 
 
 def _sweeps(block: list[PlannedTrial]) -> Iterator[list[PlannedTrial]]:
+    """Yield the orders of a topology in which each scenario has ascending or descending distances."""
     scenarios = dict.fromkeys(trial.scenario for trial in block)
     for order in permutations(scenarios):
         for directions in product((False, True), repeat=len(order)):
@@ -117,7 +118,10 @@ def _sweeps(block: list[PlannedTrial]) -> Iterator[list[PlannedTrial]]:
 
 
 def _swap_blocks(order: Order, rng: random.Random) -> Order:
-    """Return the order after a swap of two random blocks in the same larger block, which may be the same one."""
+    """Return the order after a swap of two random blocks of the same larger block.
+
+    The two may be the same block; the order is then unchanged.
+    """
     depth = 1 + _random_index(len(_block_keys(order[0])), rng)
     blocks = [tuple(block) for _, block in groupby(order, key=lambda trial: _block_keys(trial)[:depth])]
     parents = [_block_keys(block[0])[: depth - 1] for block in blocks]

@@ -18,7 +18,7 @@ from fieldkit.trial.stored.sources import Sources
 
 _DISTANCE: Final = frozenset({"distance", "distance_m"})
 _SETTINGS_HASHES: Final = frozenset({"procedure_sha256", "profiles_sha256"})
-"""Hashes that contain the settings of a sweep."""
+"""Columns with hashes that depend on the settings of a sweep."""
 _EXAMPLE: Final = "write for example --between policy=sliding_window,scheduled"
 
 
@@ -57,7 +57,7 @@ def read(arguments: argparse.Namespace) -> Sides:
     a, b = (run.with_filter(arguments.where) for run in runs)
     by = a.condition(arguments.by)
     is_default = arguments.by == ",".join(PAIRED_BY)
-    if is_default and a.sweep_condition:  # only sweeps have common factors
+    if is_default and a.sweep_condition:  # two sweeps are paired by the factors that both have
         by = tuple(name for name in a.sweep_condition if name in b.sweep_condition) or by
     if not arguments.between:
         return Sides(a.read(also=by), b.read(also=by), by, a, frozenset())

@@ -17,7 +17,7 @@ from fieldkit.core.text import print_text
 
 THRESHOLD_MISSED: Final = 1
 
-_VARIED: Final = "A and B differ in this, which may explain differences between their figures"
+_VARIED_TEXT: Final = "A and B differ in this, which may explain differences between their figures"
 
 _EXAMPLES: Final = MappingProxyType({"share": "2%", "s": "5ms", "bit/s": "100kbit/s"})
 _DELTA: Final = (
@@ -81,11 +81,12 @@ def _concern_text(comparison: Comparison, concern: Concern) -> str:
     """Return the effect of a difference between the conditions of A and B, in words."""
     if concern.refuses:
         return "not comparable"
-    return _VARIED if concern in comparison.varied else "may matter"
+    return _VARIED_TEXT if concern in comparison.varied else "may matter"
 
 
 def _require_common_condition(comparison: Comparison, arguments: argparse.Namespace) -> None:
     if all(pair.missing_in for pair in comparison.pairs):
+        # No condition is common, so the conditions that B lacks are those of A, and vice versa.
         conditions_a, conditions_b = (
             "; ".join(pair.name for pair in comparison.pairs if pair.missing_in == other) or "nothing"
             for other in "BA"
@@ -98,6 +99,7 @@ def _require_common_condition(comparison: Comparison, arguments: argparse.Namesp
 
 def _pairing_remedy(comparison: Comparison, arguments: argparse.Namespace) -> str:
     """Return a remedy for two runs without a common condition: columns by which they can be paired."""
+    # A has the conditions that are missing in B, and vice versa.
     sides = [[pair.key for pair in comparison.pairs if pair.missing_in == other] for other in "BA"]
     values = {name: [{key[name] for key in keys} for keys in sides] for name in comparison.by}
     disjoint = [name for name, (values_a, values_b) in values.items() if values_a.isdisjoint(values_b)]

@@ -83,9 +83,11 @@ def table(
     cells = [[sanitized(cell) for cell in row] for row in (head, *rows)]
     widths = _widths(cells)
     last = len(head) - 1
-    for index in fold if fold is not None else () if last in right else (last,):
+    if fold is None:
+        fold = () if last in right else (last,)
+    for index in fold:
         words = (word for row in cells for word in row[index].split())
-        available = console.width - sum(widths) + widths[index] - 2 * len(widths) - 1
+        available = console.width - 1 - (_table_width(widths) - widths[index])
         widths[index] = min(widths[index], max([available, *map(cell_len, words)]))
     if sys.stdout.isatty() and _table_width(widths) > console.width:
         _print_blocks(cells, title, console)

@@ -30,6 +30,7 @@ _Evidence = Callable[[Attempt], AttemptEvidence]
 """Function that returns the evidence of an attempt. It returns the same object for attempts that are in use."""
 
 _OPEN_ATTEMPTS: Final = 2
+"""Number of attempts whose evidence is in memory."""
 _LAPTOP: Final = "laptop"
 _LEVELS: Final = {Status.VOID: Level.WARNING, Status.FAILED: Level.ERROR}
 

@@ -104,8 +104,10 @@ class AttemptEvidence:
 
     def counters(self, role: Role) -> Counters:
         """Return the increments of a robot's kernel counters during the attempt; None for an unknown increment."""
-        before, after = (self.read_or_none(host.read, file(role)) for file in (host.before_file, host.after_file))
-        return host.difference(before or Counters(None, None), after or Counters(None, None))
+        before, after = (
+            self.read_or_none(host.read_counters, file(role)) for file in (host.before_file, host.after_file)
+        )
+        return host.increments(before or Counters(None, None), after or Counters(None, None))
 
     def interface_bytes(self, role: Role, interface: str) -> int | None:
         """Return the number of bytes that an interface received during the attempt, or None if unknown."""

@@ -82,7 +82,9 @@ def job_end_ns(evidence: AttemptEvidence, role: Role, job: str) -> int | None:
         role: Role of the robot that ran the job.
         job: The job's name.
     """
-    before, after = (evidence.read_or_none(host.state, file(role)) for file in (host.before_file, host.after_file))
+    before, after = (
+        evidence.read_or_none(host.read_state, file(role)) for file in (host.before_file, host.after_file)
+    )
     if before is None or after is None or before.boot != after.boot:
         return None
     if before.clock is None or after.clock is None or clock.step_description(before.clock, after.clock):

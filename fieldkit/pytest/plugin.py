@@ -56,7 +56,7 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.hookimpl(optionalhook=True)
 def pytest_configure_node(node: Any) -> None:  # noqa: ANN401 (xdist declares no type)
     """Pass the name of the evidence folder to all workers of pytest-xdist, so that they use the same one."""
-    node.workerinput[_RUN] = _run(node.config)
+    node.workerinput[_RUN] = _run_name(node.config)
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -90,7 +90,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         keeper.end()
 
 
-def _run(config: pytest.Config) -> str:
+def _run_name(config: pytest.Config) -> str:
     """Return the name of this run's folder, the same in all workers."""
     if _STAMP not in config.stash:
         now = f"{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}"
@@ -103,7 +103,7 @@ def _keeper(config: pytest.Config) -> "EvidenceKeeper":
     from fieldkit.pytest.plugin_options import keep, output  # noqa: PLC0415
 
     if _KEEPER not in config.stash:
-        config.stash[_KEEPER] = EvidenceKeeper(output(config) / _run(config), keep(config))
+        config.stash[_KEEPER] = EvidenceKeeper(output(config) / _run_name(config), keep(config))
     keeper: EvidenceKeeper = config.stash[_KEEPER]
     return keeper
 

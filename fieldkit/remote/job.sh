@@ -20,6 +20,7 @@ launch() { # start a job; $1 is start, run or serve
         is_new=
         [ -d "$meta" ] || fail "cannot start job $name: $reason"
     fi
+    # is_new is 1 if this call has created the job, and empty if an earlier call has.
     case $how$is_new in
         run1)
             setsid sh "$self" supervise - "$@" </dev/null

@@ -241,6 +241,7 @@ class RunningCommand:
         """
         while self._out.is_waiting and (chunk := self._channel.recv(_CHUNK)):
             self._out.feed(chunk)
+        # At the end of standard output, the end mark on standard error has not necessarily arrived.
         while not self._out.output and self._err.code is None and (chunk := self._channel.recv_stderr(_CHUNK)):
             self._err.feed(chunk)
         return self._out.read(size_bytes)

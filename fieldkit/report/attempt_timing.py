@@ -1,7 +1,7 @@
 """Times and flows in one attempt on the clock of the first sending robot.
 
-The times are those of packets, pings, jobs, faults and moves. The flows are panels over time: the payload rate that
-iperf3 measured, and the panels that steps draw themselves (`DrawsPanels`).
+The times are of packets, pings, jobs, faults and moves. Flows are drawn as panels over time: the payload rate that
+iperf3 measured, and the panels of steps that draw their own (`DrawsPanels`).
 """
 
 import math
@@ -36,7 +36,7 @@ _SHOWN_BY_EVIDENCE: Final = frozenset(("record", "send", "listen", "ping"))
 _RECOVERY_JOB_SUFFIX: Final = "-heals"
 """Suffix of the name of the job that waits until the robot has recovered from a fault."""
 _LONGEST_PAUSE_NS: Final = 1_000_000_000
-"""Longest time between two changes of position of a moving robot."""
+"""Longest time between two samples of a moving robot. A change of position over a longer time is not a motion."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ def _clock_offset(
     )
     unknown_text = f"The offset between the clocks of {ends[0]} and {ends[1]} is not known"
     if offset_ns is None:
-        return 0, f"{unknown_text}: the times of each robot are those of its clock."
+        return 0, f"{unknown_text}: the times of each robot are from its own clock."
     return offset_ns, f"{unknown_text}: here the delay of the first packet is assumed to be 0."
 
 
@@ -320,19 +320,19 @@ def _iperf3(placed_step: PlacedStep, evidence: AttemptEvidence, times: AttemptTi
     if client is None:
         return
     start_s = (client[0] - zero_ns) / 1e9
-    series, words = [], []
+    series, ranges = [], []
     for role, style in zip((Role.SENDER, Role.RECEIVER), _ENDS, strict=True):
         test = evidence.read_or_none(iperf3.read, step.prefixed_name(iperf3.json_file(role)))
         if test and test.intervals:
             at_s = start_s + np.cumsum([0.0, *(interval.duration_s for interval in test.intervals)])
             rates = [interval.bit_s / 1e6 for interval in test.intervals]
             series.append(Series(role, style, at_s, [*rates, rates[-1]], join="steps"))
-            words.append(f"{role} {min(rates):.2f} to {max(rates):.2f}")
+            ranges.append(f"{role} {min(rates):.2f} to {max(rates):.2f}")
     if series:
         yield Panel(
             title=f"payload of {step.prefixed_name('iperf3')}",
             x_label=TIME_LABEL,
             y_label="[Mbit/s]",
             series=series,
-            words=f"Mbit/s of payload each second: {', '.join(words)}",
+            description=f"Mbit/s of payload each second: {', '.join(ranges)}",
         )

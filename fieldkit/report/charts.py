@@ -108,7 +108,7 @@ class Panel:
         x_label: Quantity of the x axis, with its unit.
         y_label: Quantity of the y axis, with its unit.
         series: The series.
-        words: Description for screen readers.
+        description: Description for screen readers.
         x_ticks: Position and text of each tick; empty for automatic ticks.
         top: Upper end of the y axis, None for an automatic one.
         bottom: Lower end of the y axis, None for an automatic one.
@@ -128,7 +128,7 @@ class Panel:
     x_label: str
     y_label: str
     series: Sequence[Series]
-    words: str
+    description: str
     x_ticks: Sequence[tuple[float, str]] = ()
     top: float | None = None
     bottom: float | None = 0.0

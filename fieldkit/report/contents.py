@@ -55,8 +55,8 @@ _MAX_FURTHER: Final = 12
 MAX_TRIALS_IN_TABLE: Final = 200
 """Maximum number of trials in the table of their provenance."""
 _CROWDED: Final = (
-    "Figures with a line or a strip per setting are left out, because there are too many settings to distinguish; "
-    "--where chooses fewer."
+    "Figures with a line or a strip per setting are left out, because there are too many settings to distinguish. "
+    "Choose fewer with --where."
 )
 _MAX_IN_TABLE: Final = 8
 """Maximum number of visible columns of quantities that are not defined by fieldkit."""
@@ -111,7 +111,7 @@ class Contents:
         paragraph: Description of the trials.
         headlines: The most important figures.
         warnings: Limitations that a reader must know before quoting a figure.
-        verdicts: Judgements by expectation, one per condition.
+        judgements: Judgements by text of the expectation, one per condition.
         against_distance: Charts against distance.
         tables: Cells, a table per protocol.
         sections: Further charts.
@@ -128,7 +128,7 @@ class Contents:
     paragraph: str
     headlines: Sequence[Headline]
     warnings: Sequence[summary.Caution]
-    verdicts: Mapping[str, Sequence[expected.JudgementRow]]
+    judgements: Mapping[str, Sequence[expected.JudgementRow]]
     against_distance: Sequence[ChartSection]
     tables: Sequence[CellTable]
     sections: Sequence[ChartSection]
@@ -172,8 +172,9 @@ def build_contents(
         paths: The paths in it.
         quantities: Names of quantities to draw in addition to the default ones.
         unmeasured: Planned conditions without any attempt, in words.
-        sweep: If the repeats are runs of sweeps: columns of the flow and of the factors, each with the column that
-            contains its values as written in the command. None or empty for other repeats.
+        sweep: If the repeats are runs of sweeps, the result of `datasets.condition`: columns of the flow and of the
+            factors, each with the column that contains its values as the user typed them. None or empty for other
+            repeats.
     """
     evidence = load_evidence(repeats, repeat)
     has_all_plans = evidence.plans.keys() == set(repeats.texts["source"].tolist())
@@ -203,7 +204,7 @@ def build_contents(
         paragraph=summary.paragraph(cells, evidence, sweep or {}),
         headlines=list(headlines(cells, evidence, unmeasured)),
         warnings=list(summary.warnings(cells, evidence)),
-        verdicts=expected.verdicts(cells, evidence),
+        judgements=expected.judgement_rows(cells, evidence),
         against_distance=[section for section in against_distance if section.charts],
         tables=_tables(cells, evidence),
         sections=[section for section in sections if section.charts],
@@ -241,7 +242,7 @@ def _further_charts(
         cells: Conditions.
         identities: Labels and styles of their series.
         evidence: The table and the available evidence.
-        requested: Names of quantities that are drawn in any case.
+        requested: Names of quantities that are always drawn.
         first: Plain names of quantities that are drawn already.
     """
     drawn_names = {*distance.LOSS, *distance.DELAY, *distance.RATE, *first}
@@ -306,7 +307,7 @@ def repeat_to_draw(cells: Sequence[Cell], evidence: Evidence, requested: str) ->
 
 def _sort_key(cell: Cell) -> tuple[object, ...]:
     names = ("protocol", "topology", "scenario")
-    procedure = wording.with_numbers(wording.text(cell, "procedure"))
+    procedure = wording.natural_sort_key(wording.text(cell, "procedure"))
     return (
         *(wording.text(cell, name) for name in names),
         procedure,

@@ -75,10 +75,10 @@ def charts(
 def is_curve(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> bool:
     """Return True if any panel has a quantity, or should have it, at more than one distance."""
     cells_without = (absence.cell for absence in absences(cells, quantity, evidence) if absence.is_total)
-    metres: dict[tuple[str, str], set[float]] = {}
+    distances_m: dict[tuple[str, str], set[float]] = {}
     for cell in (*_cells_with_distance(cells, quantity), *cells_without):
-        metres.setdefault(wording.group(cell), set()).add(wording.metres(cell))
-    return any(len(places) > 1 for places in metres.values())
+        distances_m.setdefault(wording.group(cell), set()).add(wording.metres(cell))
+    return any(len(group_m) > 1 for group_m in distances_m.values())
 
 
 def has_curve(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> bool:
@@ -111,7 +111,13 @@ def _cells_with_distance(cells: Sequence[Cell], quantity: Quantity) -> list[Cell
 
 @dataclass(frozen=True)
 class _CurvePlace:
-    """A condition in a panel: an estimate, or the reason for its absence."""
+    """A condition in a panel.
+
+    Attributes:
+        cell: The condition.
+        content: Its estimate, or the reason for the missing estimate.
+        is_high: True if the cross for a missing estimate is at the upper end of the axis.
+    """
 
     cell: Cell
     content: Point | Absence
@@ -175,10 +181,10 @@ class _CurveDrawing:
 
     def _places(self, quantity: Quantity, group: Sequence[Cell], factor: float) -> list[_CurvePlace]:
         """Return the conditions of a panel in order of distance, including conditions without a value."""
-        is_up = self.ranking.more_is_worse(quantity) is not False
+        is_high = self.ranking.more_is_worse(quantity) is not False
         places = [_CurvePlace(cell, point(cell, quantity, factor, self.evidence)) for cell in group]
         places += [
-            _CurvePlace(absence.cell, absence, is_high=is_up)
+            _CurvePlace(absence.cell, absence, is_high=is_high)
             for absence in absences(with_missing(self.cells, quantity, group), quantity, self.evidence)
             if absence.is_total and absence.cell.key["distance_m"] is not None
         ]
@@ -203,7 +209,7 @@ class _CurveDrawing:
                 _series(identity, series_places, shift, _ASIDE * span, limits)
                 for shift, (identity, series_places) in zip(shifts, ranked_series, strict=True)
             ],
-            words=_words(title, y_label, places_by_label.values()),
+            description=_describe(title, y_label, places_by_label.values()),
             x_ticks=_ticks(places, span),
             bottom=limits[0],
             top=limits[1],
@@ -235,7 +241,7 @@ _NO_LOSS_NOTE: Final = ", dotted if nothing was lost, because each repeat then c
 _CUT_NOTE: Final = "an arrow if an interval continues beyond the axis; no repeat is drawn there"
 _ABSENCE_NOTE: Final = "a cross at the edge, with the reason, if a condition has no value"
 _COUNT_NOTE: Final = "next to a point, the number of valid repeats with a value, if not all have one"
-_BOUND_NOTE: Final = "hollow, with an arrow: a lower bound, because something had not ended"
+_BOUND_NOTE: Final = "hollow, with an arrow: a lower bound, because the timed event had not ended"
 _MEANINGS: Final = {
     "counted": "Share of all that was sent",
     "mean": "Mean over repeats",
@@ -309,7 +315,7 @@ def _ticks(places: Sequence[_CurvePlace], span: float) -> list[tuple[float, str]
     return labels
 
 
-def _words(title: str, y_label: str, series: Iterable[tuple[Identity, list[_CurvePlace]]]) -> str:
+def _describe(title: str, y_label: str, series: Iterable[tuple[Identity, list[_CurvePlace]]]) -> str:
     """Return the description of a panel, one sentence per series."""
     sentences = [
         f"{identity.label or 'all'}: "

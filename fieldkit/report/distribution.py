@@ -88,7 +88,7 @@ def _chart(
     nonempty = [sample for sample in samples if len(sample.times_s)]
     if not nonempty:
         return
-    # One unit for all lines, chosen for the shortest one.
+    # All lines have the same unit, which fits the line with the smallest maximum.
     scale = time_scale(min(sample.times_s[-1] for sample in nonempty))
     chart_panels = []
     for condition, group in panels([sample.cell for sample in nonempty]).items():
@@ -96,19 +96,19 @@ def _chart(
             [sample.times_s for sample in nonempty if sample.cell.key["protocol"] == group[0].key["protocol"]]
         )
         is_log = needs_log(same_protocol_s)
-        for place in _places(group):
-            place_samples = [
-                sample for sample in nonempty if sample.cell in group and wording.distance(sample.cell) == place
+        for distance in _shown_distances(group):
+            panel_samples = [
+                sample for sample in nonempty if sample.cell in group and wording.distance(sample.cell) == distance
             ]
-            place_samples.sort(key=lambda sample: identities.of(sample.cell).rank)
-            series = [_series(identities, sample, scale.factor) for sample in place_samples]
+            panel_samples.sort(key=lambda sample: identities.of(sample.cell).rank)
+            series = [_series(identities, sample, scale.factor) for sample in panel_samples]
             chart_panels.append(
                 Panel(
-                    title=f"{condition}, {place}",
+                    title=f"{condition}, {distance}",
                     x_label=f"{title} [{scale.unit}]",
                     y_label=f"share of {unit_name}",
                     series=series,
-                    words=_words(f"{title}, {condition}, {place}", place_samples, identities, scale),
+                    description=_describe(f"{title}, {condition}, {distance}", panel_samples, identities, scale),
                     top=1.0,
                     left=scale.factor * float(same_protocol_s.min()) / _LOG_MARGIN if is_log else 0.0,
                     right=scale.factor * float(same_protocol_s.max()) * (_LOG_MARGIN if is_log else _MARGIN),
@@ -119,12 +119,12 @@ def _chart(
     yield Chart(name, f"{title}: distribution", caption, chart_panels, is_dense=True)
 
 
-def _places(cells: Sequence[Cell]) -> list[str]:
+def _shown_distances(cells: Sequence[Cell]) -> list[str]:
     """Return labels of the distances that get a panel, at most `MAX_DISTANCES`."""
-    places = [label for _, label in sorted({(wording.metres(cell), wording.distance(cell)) for cell in cells})]
-    if len(places) <= MAX_DISTANCES:
-        return places
-    return [places[0], places[(len(places) - 1) // 2], places[-1]]
+    labels = [label for _, label in sorted({(wording.metres(cell), wording.distance(cell)) for cell in cells})]
+    if len(labels) <= MAX_DISTANCES:
+        return labels
+    return [labels[0], labels[(len(labels) - 1) // 2], labels[-1]]
 
 
 def _series(identities: Identities, sample: _Sample, factor: float) -> Series:
@@ -141,7 +141,7 @@ def _steps(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.
     return np.insert(times, 0, times[0]), np.arange(len(times) + 1) / len(times)
 
 
-def _words(title: str, samples: Sequence[_Sample], identities: Identities, scale: Scale) -> str:
+def _describe(title: str, samples: Sequence[_Sample], identities: Identities, scale: Scale) -> str:
     sentences = []
     for sample in samples:
         median, p95 = (f"{scale.number(time_s)} {scale.unit}" for time_s in np.quantile(sample.times_s, (0.5, 0.95)))
@@ -155,9 +155,9 @@ def _caption(samples: Sequence[_Sample], unit_name: str, *, is_log: bool) -> str
     text = (
         f"Share of {unit_name} that took at most this time{_LOG if is_log else ''}; {count_text} {unit_name} per line"
     )
-    places = {wording.distance(sample.cell) for sample in samples}
-    if len(places) > MAX_DISTANCES:
-        text += f"; of {len(places)} distances the nearest, a middle one and the farthest"
+    distances = {wording.distance(sample.cell) for sample in samples}
+    if len(distances) > MAX_DISTANCES:
+        text += f"; of {len(distances)} distances, only the nearest, a middle one and the farthest are shown"
     if counts[-1] > MAX_STEPS:
         text += f"; a line of more than {MAX_STEPS} {unit_name} is drawn through {MAX_STEPS} quantiles"
     return f"{text}. Requests without a reply are not drawn: see ping loss." if unit_name == "replies" else f"{text}."

@@ -135,7 +135,7 @@ class _DotDrawing:
                 x_label=_axis(unit, scale, lanes),
                 y_label="",
                 series=[_series(identity, placed_points, _ASIDE * step) for identity, placed_points in ranked_series],
-                words=_words(title, lanes, scale),
+                description=_describe(title, lanes, scale),
                 lanes=[lane.label for lane in reversed(lanes)],
                 edges=edges,
             ),
@@ -183,7 +183,7 @@ def _caption(drawn_panels: Sequence[Panel]) -> str:
         "The axis is logarithmic if values differ by a factor of more than 30."
         if any(panel.x_log for panel in drawn_panels)
         else "",
-        "Hollow, with an arrow: a lower bound, because something had not ended."
+        "Hollow, with an arrow: a lower bound, because the timed event had not ended."
         if any(series.behind_bounds for panel in drawn_panels for series in panel.series)
         else "",
         "A cross marks a condition without a value." if any(panel.edges for panel in drawn_panels) else "",
@@ -191,7 +191,7 @@ def _caption(drawn_panels: Sequence[Panel]) -> str:
     return " ".join(filter(None, parts))
 
 
-def _words(title: str, lanes: Sequence[_Lane], scale: Scale) -> str:
+def _describe(title: str, lanes: Sequence[_Lane], scale: Scale) -> str:
     sentences = [
         f"{lane.label}: {', '.join(scale.amount(cell.estimates[lane.quantity.name].value) for cell in lane.cells)}"
         for lane in lanes

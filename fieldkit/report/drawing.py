@@ -27,6 +27,7 @@ _STEPS: Final = (1, 2, 5, 10)
 _TITLE: Final = 48
 _TICK: Final = 20
 _LANE: Final = 26
+"""Maximum numbers of characters of titles, tick labels and names of lanes."""
 _BOUND: Final = 4.0
 """Size of the triangles of single repeats that are lower bounds."""
 _ARROW: Final = 14.0
@@ -37,7 +38,7 @@ _DARK: Final = 0.6
 """Position on the colour scale of a heat map, 0 to 1, from which texts are light."""
 _ON_LIGHT: Final = "#111111"
 _ON_DARK: Final = "#fefefe"
-"""Both are not colours of the theme, because the colours of a heat map are the same in the dark theme."""
+"""Neither is a colour of the theme, because the colours of a heat map are the same in both themes."""
 _LEVEL_CHARACTERS: Final = 40
 """Labels below a heat map are vertical if they need more than this number of characters in total."""
 _NOTE_COLUMNS: Final = 12

@@ -20,7 +20,7 @@ class JudgementRow:
         value: The measured value.
         interval: Its 95 % interval; empty if it has none.
         ruling: The ruling on the expectation.
-        why: Reason for a failure other than the numbers, or empty.
+        why: Reason for the ruling that the numbers do not show, or empty.
     """
 
     condition: str
@@ -30,19 +30,19 @@ class JudgementRow:
     why: str = ""
 
 
-def verdicts(cells: Sequence[Cell], evidence: Evidence) -> Mapping[str, Sequence[JudgementRow]]:
+def judgement_rows(cells: Sequence[Cell], evidence: Evidence) -> Mapping[str, Sequence[JudgementRow]]:
     """Return the judgements of the trials' expectations, by the text of the expectation.
 
-    The expectations of a table without its trial are unknown.
+    The expectations of a trial are unknown if only its table is available.
     """
     differing = wording.differing(cells)
     rows: dict[str, list[JudgementRow]] = {}
     for judgement in judge_by_trial((cell, _expectations_of(cell, evidence)) for cell in cells):
-        rows.setdefault(judgement.expectation.text, []).append(_verdict(judgement, differing))
+        rows.setdefault(judgement.expectation.text, []).append(_judgement_row(judgement, differing))
     return rows
 
 
-def _verdict(judgement: Judgement, differing: Collection[str]) -> JudgementRow:
+def _judgement_row(judgement: Judgement, differing: Collection[str]) -> JudgementRow:
     condition = wording.condition(judgement.cell, differing=differing) if judgement.cell else ""
     _, _, value, interval, _ = judgement_texts(judgement)
     return JudgementRow(

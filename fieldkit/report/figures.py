@@ -37,6 +37,7 @@ _LANE_MARGINS_INCHES: Final = 1.05
 _COLUMN_INCHES: Final = 3.5
 _BOTH_COLUMNS_INCHES: Final = 7.16
 _PAPER_PANEL_INCHES: Final = 2.3
+_PAPER_LEGEND_INCHES: Final = 0.3
 
 _MATERIALS: Final[dict[str, Colour]] = {"foliage": "green", "wood": "orange", "brick": "red", "ground": "orange"}
 """Colours of obstacles that are not grey."""
@@ -93,13 +94,13 @@ def _inches(panel: Panel) -> tuple[float, float]:
 
 
 def paper(chart: Chart, file_format: Format) -> bytes:
-    """Return a whole chart with its legend, in the width of a paper's column, or of both for several panels."""
+    """Return a chart with its legend, one column of a paper wide, or two columns wide if it has several panels."""
     columns = 1 if chart.is_stacked else min(2, len(chart.panels))
     rows = -(-len(chart.panels) // columns)
     width = _COLUMN_INCHES if len(chart.panels) == 1 else _BOTH_COLUMNS_INCHES
     height = _STRIP_INCHES[1] if chart.is_stacked else _PAPER_PANEL_INCHES
     with _settings(8.0):
-        figure = _Figure(figsize=(width, height * rows + 0.3), layout="constrained")
+        figure = _Figure(figsize=(width, height * rows + _PAPER_LEGEND_INCHES), layout="constrained")
         for number, panel in enumerate(chart.panels, start=1):
             drawing.draw(figure.add_subplot(rows, columns, number), panel)
         if chart.legend:

@@ -33,7 +33,7 @@ class _Axis:
     Attributes:
         column: The column of its values.
         name: The name that is shown.
-        labels: The labels of its values, as written in the command.
+        labels: The labels of its values, as the user typed them.
     """
 
     column: str
@@ -48,8 +48,9 @@ def charts(
 
     Args:
         repeats: The runs of sweeps.
-        sweep: The columns of the flow and of the factors; for each, the column with its values as in the command.
-        requested: Names of quantities that are drawn in any case.
+        sweep: The columns of the flow and of the factors, each with the column that contains its values as the user
+            typed them; see `datasets.condition`.
+        requested: Names of quantities that are drawn even if all their values are equal.
         one_factor: Whether one factor with several values is enough: the other axis is then the flow. Otherwise two
             factors with several values are needed.
     """
@@ -109,27 +110,27 @@ def _panel(
     scale: Scale,
     limits: tuple[float, float],
 ) -> Panel:
-    across, up = (sorted({cell.key[axis.column] for cell in cells}, key=_order) for axis in axes)
-    values = [[math.nan] * len(across) for _ in up]
+    x_keys, y_keys = (sorted({cell.key[axis.column] for cell in cells}, key=_order) for axis in axes)
+    values = [[math.nan] * len(x_keys) for _ in y_keys]
     for cell in cells:
-        row, column = up.index(cell.key[axes[1].column]), across.index(cell.key[axes[0].column])
+        row, column = y_keys.index(cell.key[axes[1].column]), x_keys.index(cell.key[axes[0].column])
         values[row][column] = cell.estimates[quantity.name].value
     texts = [["" if math.isnan(value) else scale.number(value) for value in row] for row in values]
-    across_labels, up_labels = (
-        [axis.labels[key] for key in keys] for axis, keys in zip(axes, (across, up), strict=True)
+    x_labels, y_labels = (
+        [axis.labels[key] for key in keys] for axis, keys in zip(axes, (x_keys, y_keys), strict=True)
     )
-    heat = HeatMap(across_labels, up_labels, values, texts, limits)
-    words = "; ".join(
+    heat = HeatMap(x_labels, y_labels, values, texts, limits)
+    value_texts = "; ".join(
         f"{axes[0].name} {x}, {axes[1].name} {y}: {text} {scale.unit}"
         for y, row in zip(heat.rows, texts, strict=True)
         for x, text in zip(heat.columns, row, strict=True)
         if text
     )
-    return Panel(title, axes[0].name, axes[1].name, (), f"{quantity.label}, {title}. {words}", heat=heat)
+    return Panel(title, axes[0].name, axes[1].name, (), f"{quantity.label}, {title}. {value_texts}", heat=heat)
 
 
 def _order(key: str | float | None) -> tuple[bool, float, str]:
-    """Return the sort key of a factor's value: numbers and distances by their value, other texts by the alphabet."""
+    """Return the sort key of a factor's value: numbers and distances by value, other texts alphabetically."""
     if not isinstance(key, str):
         return False, key or 0.0, ""
     try:

@@ -36,7 +36,7 @@ class Raster:
         columns: Number of columns of the longest line.
         lengths: Number of columns of each line.
         runs: Runs of marked columns as (line, first column, number of columns).
-        words: Description for screen readers.
+        description: Description for screen readers.
     """
 
     place: str
@@ -44,7 +44,7 @@ class Raster:
     columns: int
     lengths: Sequence[int]
     runs: Sequence[tuple[int, int, int]]
-    words: str
+    description: str
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def _raster(place: str, lines: Sequence[Mask], width: int, what: str) -> Raster:
         columns=max(map(len, columns)),
         lengths=[len(line) for line in columns],
         runs=[(number, *run) for number, line in enumerate(columns) for run in _runs(line)],
-        words=f"{place}: {len(lines)} repeats, {marked_count} of {total} {what}, at most {longest} in a row",
+        description=f"{place}: {len(lines)} repeats, {marked_count} of {total} {what}, at most {longest} in a row",
     )
 
 

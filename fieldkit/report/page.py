@@ -50,7 +50,11 @@ def write(contents: Contents, out: Path) -> None:
 
 
 def require_writable(out: Path) -> None:
-    """Raise an error before the work if no page can be written there. Only a report may be overwritten."""
+    """Check, before a report is computed, that its page can be written to `out`. Only a report may be overwritten.
+
+    Raises:
+        ConfigurationError: The page cannot be written there.
+    """
     if not out.parent.is_dir():
         raise ConfigurationError(
             "there is no such folder", where=str(out.parent), remedy=shell_command("mkdir", "-p", out.parent)
@@ -142,10 +146,10 @@ class _Panels:
 
     def __call__(self, panel: Panel) -> str:
         self._count += 1
-        return inline_svg(figures.panel_svg(panel), f"p{self._count}-", panel.words)
+        return inline_svg(figures.panel_svg(panel), f"p{self._count}-", panel.description)
 
 
-def inline_svg(document: str, prefix: str, words: str) -> str:
+def inline_svg(document: str, prefix: str, description: str) -> str:
     """Return an SVG document as an element of a page.
 
     Its colours become variables of the page, its width is flexible, and its ids start with `prefix` to be unique.
@@ -153,7 +157,7 @@ def inline_svg(document: str, prefix: str, words: str) -> str:
     Args:
         document: An SVG document, as `figures.panel_svg` returns it.
         prefix: A prefix that is different for each document of a page.
-        words: Description for screen readers.
+        description: Description for screen readers.
     """
     root = ET.fromstring(document)  # noqa: S314 (made by matplotlib, so it is trusted)
     for parent in list(root.iter()):
@@ -166,7 +170,7 @@ def inline_svg(document: str, prefix: str, words: str) -> str:
     for name in ("width", "height"):
         del root.attrib[name]
     root.set("role", "img")
-    root.set("aria-label", sanitized(words))
+    root.set("aria-label", sanitized(description))
     return ET.tostring(root, encoding="unicode")
 
 

@@ -24,7 +24,7 @@ class Identity:
     """Label and style of a series.
 
     Attributes:
-        label: `LOS`, with the procedure if several have this scenario, and the backend if there are several.
+        label: `LOS`, with the procedure if several procedures share a scenario, and the backend if there are several.
         style: Its style.
         rank: Sort key: by scenario; within a scenario, the field backend is first.
     """
@@ -91,17 +91,21 @@ def _by_scenario(kind: tuple[str, str]) -> tuple[bool, int, str, str]:
 
 
 MAX_BEHIND: Final = 100
-"""Maximum number of single repeats behind one estimate; of more repeats, every k-th is drawn."""
-_FEWEST_BEHIND: Final = 10
-"""Maximum number of single repeats behind one estimate if there are many conditions."""
+"""Maximum number of single repeats that are drawn behind one estimate. If there are more, every k-th is drawn."""
+_MIN_BEHIND: Final = 10
+"""Number of single repeats that are drawn behind one estimate even if there are many conditions."""
 _MAX_BEHIND_IN_CHART: Final = 2000
-"""Maximum number of single repeats in the chart of a quantity, shared by its conditions."""
+"""Maximum number of single repeats in the chart of a quantity, divided equally among its conditions."""
 _MIN_TOP_PERCENT: Final = 1.0
+"""Smallest upper end of an axis of percentages."""
+_HEADROOM: Final = 1.08
+"""Ratio between the upper end of an axis that starts at 0 and the largest value."""
 _MAX_LENGTH: Final = 2.0
 """Maximum length of the axis, as a multiple of the largest value. Wider intervals are cut there."""
 _MARGIN: Final = 0.25
 """Margins of an axis that does not start at 0, as a share of the range of values."""
 _LOG_FROM_DECADES: Final = 1.5
+"""Range of values, in decades, above which an axis is logarithmic."""
 _VAGUE_FROM: Final = 0.5
 """Minimum width at which an interval is too wide for a curve, as a share of the axis."""
 
@@ -163,7 +167,7 @@ class Point:
 
 def max_behind(evidence: Evidence) -> int:
     """Return the maximum number of single repeats that are drawn behind one estimate."""
-    return min(MAX_BEHIND, max(_FEWEST_BEHIND, _MAX_BEHIND_IN_CHART // max(1, evidence.conditions)))
+    return min(MAX_BEHIND, max(_MIN_BEHIND, _MAX_BEHIND_IN_CHART // max(1, evidence.n_conditions)))
 
 
 def point(cell: Cell, quantity: Quantity, factor: float, evidence: Evidence) -> Point:
@@ -198,7 +202,7 @@ def axis_limits(points: Sequence[Point], unit: str) -> tuple[float, float]:
         return low - margin, high + margin
     largest_value, highest_top = max(point.value for point in points), max(point.top for point in points)
     top = min(highest_top, _MAX_LENGTH * largest_value) if largest_value > 0 else highest_top
-    return 0.0, max(1.08 * top, _MIN_TOP_PERCENT if unit == "%" else 0.0) or 1.0
+    return 0.0, max(_HEADROOM * top, _MIN_TOP_PERCENT if unit == "%" else 0.0) or 1.0
 
 
 def needs_log(values: Iterable[float]) -> bool:

@@ -16,11 +16,11 @@ from fieldkit.report.theme import Colour
 from fieldkit.report.trial_folders import Evidence
 
 MAX_MARKS: Final = 2000
-"""Maximum number of marks on a page, shared by its strips; more valid attempts are omitted evenly."""
+"""Maximum number of marks on a page, divided equally among its strips. Further valid attempts are left out evenly."""
 MAX_OTHER_MARKS: Final = 2000
-"""Maximum number of marks of void and failed attempts on a page, shared by its strips; more are omitted evenly."""
-FEWEST_MARKS: Final = 20
-"""Minimum number of marks of valid attempts, and of other attempts, in a strip that has more attempts."""
+"""Like `MAX_MARKS`, for void and failed attempts."""
+MIN_MARKS: Final = 20
+"""Number of valid attempts, and of other attempts, that a strip shows even if it exceeds its share of the maxima."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class StripGroup:
 def groups(cells: Sequence[Cell], identities: Identities, evidence: Evidence) -> Iterator[StripGroup]:
     """Yield the strips of all cells, grouped by protocol and topology."""
     differing = wording.differing(cells) - {"topology"}
-    limits = [max(FEWEST_MARKS, limit // max(1, len(cells))) for limit in (MAX_MARKS, MAX_OTHER_MARKS)]
+    limits = [max(MIN_MARKS, limit // max(1, len(cells))) for limit in (MAX_MARKS, MAX_OTHER_MARKS)]
     for title, group in panels(cells).items():
         heights = _heights(group, [cell for cell in cells if cell.key["protocol"] == group[0].key["protocol"]])
         strips = []
@@ -88,7 +88,7 @@ def groups(cells: Sequence[Cell], identities: Identities, evidence: Evidence) ->
             rows = evidence.rows(cell)
             is_valid = evidence.repeats.texts["status"][rows] == Status.VALID
             other_rows = _evenly(rows[~is_valid], limits[1])
-            valid_rows = _evenly(rows[is_valid], max(FEWEST_MARKS, limits[0] - len(other_rows)))
+            valid_rows = _evenly(rows[is_valid], max(MIN_MARKS, limits[0] - len(other_rows)))
             marked_rows = rows[np.isin(rows, np.concatenate((valid_rows, other_rows)))]
             strips.append(
                 Strip(
@@ -111,6 +111,7 @@ class _Heights:
     full_height_loss: float
 
     def of(self, loss: float) -> float | None:
+        """Return the height of a mark for a loss; None for NaN."""
         if np.isnan(loss):
             return None
         return min(1.0, max(0.0, loss / self.full_height_loss)) if self.full_height_loss > 0 else 0.0

@@ -44,7 +44,8 @@ def paragraph(cells: Sequence[Cell], evidence: Evidence, sweep: Mapping[str, str
     Args:
         cells: Conditions.
         evidence: The table and the available evidence.
-        sweep: Columns of the flow and the factors of a sweep, each with the column that is shown; empty for trials.
+        sweep: Columns of the flow and the factors of a sweep, each with the column that contains its values as the
+            user typed them; empty for trials.
     """
     repeats = evidence.repeats
     trials = format_count(len(set(repeats.texts["trial"].tolist())), "trial")
@@ -82,10 +83,8 @@ def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Caution]:
     withheld_reasons = [reasons for reasons in zip(*columns, strict=True) if any(reasons)]
     if withheld_reasons:
         reasons = _count_reasons([reason for row_reasons in withheld_reasons for reason in row_reasons if reason])
-        yield Caution(
-            f"One-way delay withheld, all or in part, in {format_count(len(withheld_reasons), 'valid repeat')}.",
-            reasons,
-        )
+        count = format_count(len(withheld_reasons), "valid repeat")
+        yield Caution(f"One-way delay withheld, completely or partly, in {count}.", reasons)
     if marked_reasons := [reason for reason in valid.texts.get("marks_reason", ()) if reason]:
         count = format_count(len(marked_reasons), "valid repeat")
         yield Caution(
@@ -213,7 +212,7 @@ def _provenance_of(name: str, source: Path, rows: list[int], evidence: Evidence)
         source=source,
         has_evidence=plan is not None,
         start_text=utc(float(np.nanmin(starts_ns))) if np.isfinite(starts_ns).any() else "",
-        robots=f"{texts['sender'][first]} to {texts['receiver'][first]}" + (f" by {relay}" if relay else ""),
+        robots=f"{texts['sender'][first]} to {texts['receiver'][first]}" + (f" via {relay}" if relay else ""),
         attempts=status_counts(Counter(texts["status"][rows])),
         seed="" if np.isnan(numbers["seed"][first]) else f"{numbers['seed'][first]:.0f}",
         hashes=[texts[name][first] for name in _HASHES],

@@ -83,7 +83,7 @@ SETTINGS: Final[dict[Any, Any]] = {
 }
 """Settings of matplotlib, without font sizes."""
 
-# Neither date nor version, so that equal figures are equal files.
+# The files contain neither date nor version, so that equal figures give equal files.
 METADATA: Final[dict[Format, dict[str, None]]] = {
     "svg": dict.fromkeys(("Date", "Creator", "Format", "Type")),
     "pdf": dict.fromkeys(("CreationDate", "Creator", "Producer")),
@@ -138,7 +138,8 @@ CYCLE: Final[tuple[tuple[Colour, Marker], ...]] = (
     ("orange", "v"),
     ("sky", "P"),
 )
-"""Colours and markers of procedures, in order: first with line of sight, second without."""
+"""Colours and markers of series. The first belongs to the scenario with line of sight, the second to the scenario
+without line of sight; the others are assigned to further procedures."""
 
 LINES: Final[tuple[Line, ...]] = ("solid", "dashed", "dotted", "dashdot")
 """Lines of backends, in order: the field backend is the first."""

@@ -20,7 +20,7 @@ from fieldkit.report.theme import Style
 from fieldkit.report.trial_folders import Evidence
 
 MAX_PACKETS: Final = 1500
-"""Maximum number of packets of each kind in a panel; of more packets, every k-th is drawn."""
+"""Maximum number of packets of each kind in a panel. If there are more, every k-th is drawn."""
 
 _MARKED: Final = {Protocol.UDP: "lost", Protocol.TCP: "retransmitted"}
 _SENT: Final = Style("blue", "o", "none")
@@ -30,6 +30,7 @@ _ROUND_TRIP: Final = Style("pink", "D", "none")
 _DISTANCE: Final = Style("orange", line="solid")
 _LINKS: Final = (Style("blue", line="solid"), Style("green", line="dashed"))
 """Styles of the sending robot and of the other robot."""
+_DEFAULT_PING_INTERVAL_S: Final = 1.0
 _MIN_BAR: Final = 0.004
 """Minimum length of a bar, as a share of the axis; a shorter one would be invisible."""
 _TIME: Final = "time [s]"
@@ -121,7 +122,7 @@ def _bars(times: AttemptTimes, zero_ns: int) -> Panel:
         x_label=_TIME,
         y_label="",
         series=[],
-        words="; ".join(f"{activity.name} from {start:.3f} to {stop:.3f} s" for activity, start, stop in spans),
+        description="; ".join(f"{activity.name} from {start:.3f} to {stop:.3f} s" for activity, start, stop in spans),
         spans=[
             Span(last_index - names.index(activity.name), start, max(stop, start + min_length_s), activity.colour)
             for activity, start, stop in spans
@@ -148,7 +149,7 @@ def _packets(transfer: Transfer, fates: Fates, zero_ns: int) -> Panel:
         x_label=f"time [ms] after {(first_sent_ns - zero_ns) / 1e9:.3f} s",
         y_label="offset in the payload [kB]",
         series=series,
-        words=f"{len(fates.sent_ns)} packets sent, {fates.lost_or_repeated.sum()} of them {marked_text}, "
+        description=f"{len(fates.sent_ns)} packets sent, {fates.lost_or_repeated.sum()} of them {marked_text}, "
         f"{len(fates.received_ns)} received",
     )
 
@@ -181,7 +182,7 @@ def _round_trips(name: str, role: Role, output: ping.Ping, times: AttemptTimes, 
         x_label=_TIME,
         y_label="RTT [ms]",
         series=series,
-        words=f"{len(answered_requests)} round trips{median_text}; {len(lost_numbers)} without a reply",
+        description=f"{len(answered_requests)} round trips{median_text}; {len(lost_numbers)} without a reply",
         top=None if answered_requests else 1.0,
     )
 
@@ -208,8 +209,10 @@ def estimate_send_times(
         at_s: Times of the replies to the answered requests.
     """
     step_s = (
-        (at_s[-1] - at_s[0]) / (answered_numbers[-1] - answered_numbers[0]) if len(answered_numbers) > 1 else 1.0
-    )  # default interval of ping
+        (at_s[-1] - at_s[0]) / (answered_numbers[-1] - answered_numbers[0])
+        if len(answered_numbers) > 1
+        else _DEFAULT_PING_INTERVAL_S
+    )
     interpolated: NDArray[np.float64] = np.interp(lost_numbers, answered_numbers, at_s)
     steps_outside: NDArray[np.float64] = np.minimum(lost_numbers - answered_numbers[0], 0) + np.maximum(
         lost_numbers - answered_numbers[-1], 0
@@ -220,7 +223,7 @@ def estimate_send_times(
 def _links(times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
     """Yield the signal, the PHY rate and the SINR of both radios over time.
 
-    Values of telemetry sources replace those of `iw`, as in the columns (`telemetry_columns`).
+    Values of telemetry sources replace the values of `iw`, as in the columns (`telemetry_columns`).
     """
     signals: dict[Role, Sequence[tuple[int, float | None]]] = {}
     rates: dict[Role, Sequence[tuple[int, float | None]]] = {}
@@ -245,20 +248,20 @@ def _radio_panel(
     bottom: float | None,
 ) -> Iterator[Panel]:
     """Yield a quantity of each radio over time, the sending radio first, if any radio has values."""
-    series, words = [], []
+    series, ranges = [], []
     for (role, samples), style in zip(values.items(), _LINKS, strict=True):
         points = [((at_ns - zero_ns) / 1e9, value) for at_ns, value in samples if value is not None]
         if points:
             at_s, heights = zip(*points, strict=True)
             series.append(Series(role, style, at_s, heights))
-            words.append(f"{role} {min(heights):g} to {max(heights):g}")
+            ranges.append(f"{role} {min(heights):g} to {max(heights):g}")
     if series:
         yield Panel(
             title=f"{what} of the radios",
             x_label=_TIME,
             y_label=y_label,
             series=series,
-            words=f"{what} {y_label}: {', '.join(words)}",
+            description=f"{what} {y_label}: {', '.join(ranges)}",
             bottom=bottom,
         )
 
@@ -275,5 +278,5 @@ def _distance(times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
         x_label=_TIME,
         y_label="[m]",
         series=[Series("distance", _DISTANCE, at_s, distance_m, join="steps")],
-        words=f"{min(known_distances_m):.1f} to {max(known_distances_m):.1f} m",
+        description=f"{min(known_distances_m):.1f} to {max(known_distances_m):.1f} m",
     )

@@ -50,7 +50,7 @@ class Evidence:
     verified_sources: frozenset[str]
 
     @property
-    def conditions(self) -> int:
+    def n_conditions(self) -> int:
         """Number of conditions in the table."""
         return len(self._rows)
 

@@ -15,7 +15,7 @@ def value(result: Estimate) -> str:
 
 
 def interval(result: Estimate) -> str:
-    """Return the interval of an estimate, and the count of its repeats if not all: `[1.10, 6.70] (7 of 10)`."""
+    """Return the interval of an estimate, such as `[1.10, 6.70] (7 of 10)` if 7 of 10 repeats have a value."""
     part = incomplete(result)
     return without_breaks(" ".join(filter(None, (interval_of(_scale(result), result), f"({part})" if part else ""))))
 
@@ -64,8 +64,8 @@ def scenario(cell: Cell) -> str:
 
 def procedure(cell: Cell) -> str:
     """Return the name of a cell's procedure, or an empty string if it equals the scenario."""
-    name, scene = text(cell, "procedure"), text(cell, "scenario")
-    return name if scene and name != scene else ""
+    name, scenario_name = text(cell, "procedure"), text(cell, "scenario")
+    return name if scenario_name and name != scenario_name else ""
 
 
 def place(cell: Cell, *, differing: Collection[str]) -> str:
@@ -99,10 +99,10 @@ def differing(cells: Sequence[Cell]) -> frozenset[str]:
     return frozenset(names)
 
 
-def with_numbers(words: str) -> tuple[str | float, ...]:
-    """Return a sort key of a text by which its numbers are ordered by value: `loss 2%` is before `loss 10%`."""
+def natural_sort_key(name: str) -> tuple[str | float, ...]:
+    """Return a sort key that orders numbers in texts by their value: `loss 2%` is before `loss 10%`."""
     return tuple(
-        float(part) if index % 2 else part for index, part in enumerate(re.split(r"([0-9]+(?:\.[0-9]+)?)", words))
+        float(part) if index % 2 else part for index, part in enumerate(re.split(r"([0-9]+(?:\.[0-9]+)?)", name))
     )
 
 
@@ -115,7 +115,10 @@ _MAX_NAMES: Final = 4
 
 
 def join_names(names: list[str]) -> str:
-    """Return names joined like `join_words`; of more than four, the first two and the number of others."""
+    """Return names joined like `join_words`.
+
+    If there are more than four, the result has the first two and the number of others.
+    """
     if len(names) > _MAX_NAMES:
         names = [*names[:2], f"{len(names) - 2} others"]
     return join_words(names)

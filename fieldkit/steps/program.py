@@ -92,7 +92,7 @@ class ProgramStep(Step):
     @override
     def check(self, view: View) -> Iterator[str]:
         """Yield a reason if the program failed, and a reason for each column without a value, without duplicates."""
-        after = view.evidence.read_or_none(host.state, host.after_file(self.robot))
+        after = view.evidence.read_or_none(host.read_state, host.after_file(self.robot))
         ending = (after.endings or {}).get(self.prefixed_name(self.kind_name())) if after else None
         if ending is not None and ending.code is not None and ending.code not in self.exit_codes:
             yield f"{view.scene.robot(self.robot).name}: {self.kind_name()} ended with exit code {ending.code}"

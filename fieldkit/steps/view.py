@@ -49,7 +49,7 @@ class View:
     def attempt_window(self, role: Role) -> tuple[int, int] | None:
         """Return a robot's clock before and after the attempt, in ns since 1970; None if it was not recorded."""
         before, after = (
-            self.evidence.read_or_none(host.state, file(role)) for file in (host.before_file, host.after_file)
+            self.evidence.read_or_none(host.read_state, file(role)) for file in (host.before_file, host.after_file)
         )
         if before is None or after is None or before.clock is None or after.clock is None:
             return None

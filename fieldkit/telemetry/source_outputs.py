@@ -38,6 +38,7 @@ _SIGNALS: Final = (
 """Access technologies, their key in the output of `mmcli --signal-get -J`, and the keys of signal and SINR."""
 
 _CHANNELS: Final = ("earfcn", "nrarfcn", "uarfcn", "arfcn")
+"""Names of channel numbers in mmcli's `cell-info`."""
 
 # Lines of batctl's table of neighbours. Lines of BATMAN IV start with the interface, lines of BATMAN V with the node.
 _MESH_LINE: Final = re.compile(
@@ -170,6 +171,7 @@ def modem_values(output: str) -> Values:
 
 
 def _modem_signal(signal: object, technologies: list[str]) -> dict[str, float | str]:
+    """Return signal and SINR of the first technology in use that has a signal."""
     for names, key, power, ratio in _SIGNALS:
         # Values of another technology are from an earlier connection, and have another meaning.
         if technologies and not names & set(technologies):

@@ -21,6 +21,7 @@ from fieldkit.telemetry.source_readings import SourceReadings
 from fieldkit.telemetry.telemetry_section import TelemetrySection, TelemetrySource
 
 _MAX_TEXTS: Final = 4
+"""Maximum number of different texts in a value; the number of further texts is appended."""
 
 
 def _role_columns(role: Role) -> tuple[Column, ...]:
@@ -70,7 +71,7 @@ _COLUMNS_BY_NAME: Final = {column.name: column for column in (*link.COLUMNS, *CO
 
 
 def of_role(role: Role) -> tuple[Column, ...]:
-    """Return the columns of a role in addition to those of every trial."""
+    """Return the columns of a role that a trial has only if a profile has telemetry sources."""
     return _COLUMNS[role]
 
 

@@ -34,7 +34,7 @@ def read(evidence: AttemptEvidence, role: Role, profile: RobotProfile) -> Sequen
     does not contain its time.
     """
     telemetry = telemetry_of(profile)
-    state = evidence.read_or_none(host.state, host.before_file(role))
+    state = evidence.read_or_none(host.read_state, host.before_file(role))
     if telemetry is None or state is None or state.clock is None:
         return ()
     boot_ns = (state.clock.lowest_ns + state.clock.highest_ns) // 2

@@ -67,7 +67,7 @@ class CredentialsReference(Strict):
     """Reference to credentials, which are read on the computer that runs the query, and are never stored.
 
     For `http` they are lines of a [curl config](https://curl.se/docs/manpage.html#-K), such as
-    `user = "admin:PASSWORD"`, for `snmp` those of an `snmp.conf`, such as `defCommunity NAME`.
+    `user = "admin:PASSWORD"`. For `snmp` they are lines of an `snmp.conf`, such as `defCommunity NAME`.
 
     Attributes:
         file: Absolute path of a file that only its owner can read; for `snmp` its name must be `snmp.conf`.
@@ -139,7 +139,7 @@ class Snmp(Strict):
 
 
 class Http(Strict):
-    """A device that answers HTTP requests (GET) by JSON, read by `curl`.
+    """A device that answers HTTP requests (GET) with JSON, read by `curl`.
 
     Attributes:
         url: URL whose host is an IP address.
@@ -240,7 +240,7 @@ class TelemetrySource(Strict):
         values: Location of each value in the output of `snmp`, `http` or `command`.
         interval: Time between two queries, in whole seconds.
         limit: Time limit of a query, in whole seconds. A query that takes longer is killed and has no value.
-        wired: Whether `snmp` or `http` reaches the radio itself by a cable on the interface under test. Without it, a
+        wired: True if `snmp` or `http` reaches the radio itself over a cable on the interface under test. If false, a
             source whose address is reached over this interface is not queried.
     """
 

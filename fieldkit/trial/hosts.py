@@ -34,7 +34,7 @@ def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence, step
     for role in sorted(procedure.roles()):
         name = scene.robot(role).name
         before, after = (
-            evidence.read_or_none(host.state, file(role)) for file in (host.before_file, host.after_file)
+            evidence.read_or_none(host.read_state, file(role)) for file in (host.before_file, host.after_file)
         )
         for file, state in ((host.before_file(role), before), (host.after_file(role), after)):
             if state is None:

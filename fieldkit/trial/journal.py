@@ -17,7 +17,7 @@ from fieldkit.trial.plan import Plan
 
 JOURNAL_FILE: Final = laptop_files.JOURNAL
 
-_OPEN: Final = frozenset({Status.PLANNED, Status.RUNNING, Status.MEASURED})
+_OPEN_STATUSES: Final = frozenset({Status.PLANNED, Status.RUNNING, Status.MEASURED})
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ def ended_attempts(entries: list[JournalEntry]) -> list[Attempt]:
     return [
         to_attempt(entry, is_before_reopening=line < planned_at.get(entry.repeat, -1))
         for line, entry in enumerate(entries)
-        if entry.status not in _OPEN
+        if entry.status not in _OPEN_STATUSES
     ]
 
 

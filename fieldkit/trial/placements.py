@@ -41,26 +41,26 @@ def _contradictions(scene: Scene, evidence: AttemptEvidence) -> Iterator[str]:
         sources_by_role = recorded_positions.read_position_sources(evidence).robots
     except EvidenceError:
         return
-    for ends in combinations([role for role in sort_roles(sources_by_role) if role in places_m], 2):
+    for pair in combinations([role for role in sort_roles(sources_by_role) if role in places_m], 2):
         try:
-            source, destination = recorded_positions.trajectories_of_pair(evidence, (ends[0], ends[1]))
-            is_satellite = recorded_positions.samples_of(evidence, ends[0]).frame == WGS84
+            source, destination = recorded_positions.trajectories_of_pair(evidence, (pair[0], pair[1]))
+            is_satellite = recorded_positions.samples_of(evidence, pair[0]).frame == WGS84
         except EvidenceError:
             continue  # without positions there is no distance
-        times_ns = _times_ns(evidence, ends[0], source, destination)
+        times_ns = _times_ns(evidence, pair[0], source, destination)
         recorded_m = np.linalg.norm(destination.at_m(times_ns) - source.at_m(times_ns), axis=1)
-        planned_m = float(np.linalg.norm(np.subtract(places_m[ends[1]], places_m[ends[0]])))
+        planned_m = float(np.linalg.norm(np.subtract(places_m[pair[1]], places_m[pair[0]])))
         deviation_m = float(np.abs(recorded_m - planned_m).min())
         if deviation_m > (SATELLITE_M if is_satellite else TRACKER_M) + SHARE * planned_m:
-            closest_m = float(recorded_m[np.abs(recorded_m - planned_m).argmin()])
-            planned_text = f"the planned distance of the {ends[0]} and the {ends[1]} is {planned_m:.1f} m"
-            yield f"{planned_text}, but the distance of their recorded positions is {closest_m:.1f} m"
+            nearest_m = float(recorded_m[np.abs(recorded_m - planned_m).argmin()])
+            planned_text = f"the planned distance of the {pair[0]} and the {pair[1]} is {planned_m:.1f} m"
+            yield f"{planned_text}, but the distance of their recorded positions is {nearest_m:.1f} m"
 
 
 def _times_ns(evidence: AttemptEvidence, role: Role, *trajectories: Trajectory) -> Ints:
     """Return the times at which the distance of two robots is compared, by the laptop's clock."""
     times_ns = np.unique(np.concatenate([trajectory.times_ns for trajectory in trajectories]))
-    states = [evidence.read_or_none(host.state, file(role)) for file in (host.before_file, host.after_file)]
+    states = [evidence.read_or_none(host.read_state, file(role)) for file in (host.before_file, host.after_file)]
     clocks = [state.clock for state in states if state is not None and state.clock is not None]
     if len(clocks) < len(states):
         return times_ns

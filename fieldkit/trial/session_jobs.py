@@ -26,6 +26,7 @@ which must be the name of the folder of each job."""
 
 _INSTALL_TIMEOUT_S: Final = 30.0
 _GRACE_S: Final = 5
+"""Time after which a job that does not stop is killed."""
 
 
 def planned_jobs(cast: Cast, session: str) -> list[Planned]:

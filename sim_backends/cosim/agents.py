@@ -85,7 +85,7 @@ class Agents:
 
     Args:
         physics: Moves the bodies.
-        programs: The program of each agent; an agent may have none.
+        programs: Programs by agent name; agents without a program are missing.
         lifetimes: The lifetimes of agents that do not exist during the whole run.
         starts: The start states of agents that are absent at time 0; None if there are no such agents.
 
@@ -262,12 +262,11 @@ class Agents:
         return earliest_ns
 
     def _schedule(self, names: Iterable[str], earliest_ns: int | None = None) -> None:
-        """Read the next wake times of programs, and update the queue. The time of a program changes when it wakes.
+        """Read the next wake times of programs, and update the queue; a program changes its time only when it wakes.
 
         Args:
             names: The agents of the programs.
-            earliest_ns: Time at which the agents appeared, before which their programs do not wake; None if they have
-                not just appeared.
+            earliest_ns: Earliest wake time: the time at which the agents appeared. None if they were already present.
         """
         for name in names:
             try:

@@ -127,11 +127,11 @@ def mean_errors(all_errors: Sequence[Errors]) -> Errors:
         return math.fsum(values) / len(values) if values else math.nan
 
     def spread(name: str) -> Spread:
-        largest = [number for errors in all_errors if not math.isnan(number := getattr(errors, name).largest)]
+        maxima = [number for errors in all_errors if not math.isnan(number := getattr(errors, name).largest)]
         return Spread(
             mean(lambda errors: getattr(errors, name).mean),
             mean(lambda errors: getattr(errors, name).p95),
-            max(largest, default=math.nan),
+            max(maxima, default=math.nan),
         )
 
     spreads = {field.name: spread(field.name) for field in fields(Errors) if field.type is Spread}

@@ -74,8 +74,8 @@ class Action:
     """The output of a program when it wakes.
 
     Attributes:
-        datagrams: Datagrams that it sends.
-        command: Command to its agent's body, or None to keep the previous one.
+        datagrams: Datagrams to send.
+        command: Command to the agent's body, or None to keep the previous command.
     """
 
     datagrams: Sequence[Datagram] = ()
@@ -83,10 +83,10 @@ class Action:
 
 
 class Program(Protocol):
-    """Software of one agent: it reads the agent's state, receives datagrams, sends, and steers."""
+    """Software of one agent: it reads the agent's state, receives and sends datagrams, and steers the body."""
 
     def next_wake_ns(self) -> int | None:
-        """Return the time when its timer fires next, or None without a timer; only `wake` changes this time."""
+        """Return the time when its timer fires next, or None if no timer is set; only `wake` changes this time."""
         ...
 
     def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:

@@ -1,4 +1,4 @@
-"""Tracks each packet from sending to delivery or drop, and the errors of the positions that the network assumed."""
+"""Tracks each packet until its delivery or drop, and computes errors of the positions that the network assumed."""
 
 import math
 from collections.abc import Collection, Container, Iterable, Mapping, Sequence
@@ -14,7 +14,7 @@ from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.world.motion import STILL, DeadReckoned, State, extrapolate
 
 ABSENT: Final = "agent absent"
-"""Reason of a packet whose source or destination has not appeared yet, or has disappeared before it arrived."""
+"""Reason of a drop: source or destination had not appeared yet, or disappeared before the packet arrived."""
 
 
 def transmitters(network: object) -> tuple[str, ...]:
@@ -48,13 +48,13 @@ def max_position_error_m(
     *,
     has_fixed_emitters: bool,
 ) -> float:
-    """Return the largest error of the network's relative position of two agents.
+    """Return the largest error, over all pairs of agents, of the relative position that the network assumes.
 
     Args:
         assumed_states: States of the agents that the network assumes.
         true_states: True states of the agents in `names`, in the same order.
         names: The agents to include.
-        has_fixed_emitters: True to also include a point that never moves.
+        has_fixed_emitters: True to also include the pairs of an agent and a point that never moves.
     """
     offsets_m = _offsets_m([assumed_states[name] for name in names], true_states)
     return _max_distance_m([*offsets_m, STILL] if has_fixed_emitters else offsets_m)
@@ -74,7 +74,9 @@ def _max_distance_m(offsets_m: Sequence[Vector]) -> float:
 
 
 class PacketLedger:
-    """Tracks each packet from its entry to its arrival or drop; an impossible report raises a `FederateError`.
+    """Tracks each packet from its entry to its arrival or drop.
+
+    A report of the network that cannot be true raises a `FederateError`.
 
     Args:
         fates: Mapping to which the ledger adds the fate of every packet that enters the network, by flow and number.
@@ -107,7 +109,7 @@ class PacketLedger:
         assumed_states: Mapping[str, State],
         absences: Mapping[str, AgentAbsence] | None = None,
     ) -> Fate:
-        """Record a datagram as a packet that enters the network; it is dropped if one of its ends is absent.
+        """Record a datagram as a packet that enters the network; if its source or destination is absent, drop it.
 
         Args:
             sent_datagram: The datagram, as its program sent it.
@@ -116,7 +118,7 @@ class PacketLedger:
             absences: The agents that are absent at the end of the window; None if all have always been present.
 
         Raises:
-            FederateError: Its destination is not an agent, or its flow already has a packet of this number.
+            FederateError: Its destination is not an agent, or its flow already has a packet with this number.
         """
         at_ns, source, datagram, true_states = sent_datagram
         destination = datagram.destination
@@ -128,6 +130,7 @@ class PacketLedger:
                 name in absences and absences[name].since_ns <= enters_ns for name in (source, destination)
             )
             last_states = {name: absence.state for name, absence in absences.items()}
+            # A missing state of an agent is replaced by its last state or by its state in the other mapping.
             assumed_states, true_states = (
                 {**true_states, **last_states, **assumed_states},
                 {**assumed_states, **last_states, **true_states},
@@ -171,7 +174,7 @@ class PacketLedger:
         return fate
 
     def withdraw(self, names: Container[str]) -> list[Fate]:
-        """Drop all packets from and to some agents that are under way, and return their fates."""
+        """Drop all packets from or to some agents that are under way, and return their fates."""
         packet_ids = [
             packet_id
             for packet_id, (fate, _) in self._under_way.items()

@@ -14,6 +14,7 @@ Point = tuple[float, float]
 """Metres east and north, or typographic points (1/72 inch) from the lower left corner of the figure."""
 
 _FLOOR_M: Final = 0.01
+"""A shape whose lower side is at most this high is on the ground; shorter paths have no direction of travel."""
 _ARROW_SHARE: Final = 0.04
 """Length of an arrow, as a share of the diagonal of the rectangle that the path covers."""
 
@@ -44,7 +45,7 @@ class LogPanel:
         x_label: Quantity and unit of x.
         y_label: Quantity and unit of y.
         curves: The curves.
-        labels_at_right: True to stack the labels at the right; the axis then leaves space for the longest.
+        labels_at_right: True to stack the labels at the right, where the axis leaves space for them.
         over_time: True if x is a time that starts at 0: its axis is then linear, and there are no markers.
     """
 
@@ -110,10 +111,12 @@ def direction_arrow(path_m: Sequence[Point]) -> tuple[Point, Point] | None:
 
 _DISTANCE_FACTOR = 1.3
 """Factor between the candidate distances of a label from its point."""
-_MAX_STEPS = 12
+_MAX_DISTANCES = 12
+"""Number of candidate distances of a label from its point."""
 _OVERLAP_COST = 10.0
 """Cost of any overlap, as a distance from the point in heights of the label."""
 _ROUNDING = 1e-9
+"""A smaller share of a label outside the bounds is a rounding error."""
 
 
 @dataclass(frozen=True)
@@ -202,7 +205,7 @@ def _boxes_around(point: Point, size: tuple[float, float]) -> Iterator[LabelBox]
     x, y = point
     width, height = size
     away = height * 0.6
-    for _ in range(_MAX_STEPS):
+    for _ in range(_MAX_DISTANCES):
         for left, bottom in (
             (x + away, y - height / 2),
             (x - away - width, y - height / 2),
@@ -218,7 +221,7 @@ def _boxes_around(point: Point, size: tuple[float, float]) -> Iterator[LabelBox]
 
 
 def _cost(box: LabelBox, point: Point, bounds: LabelBox, obstacles: Sequence[LabelBox]) -> float:
-    """Return the cost of a box: overlap weighs most, then the part outside the bounds, then the distance."""
+    """Return the cost of a box: any overlap and any part outside the bounds, then their size, then the distance."""
     covered = sum(box.overlap(other) for other in obstacles) / box.area
     outside = 1 - box.overlap(bounds) / box.area
     overlaps = (covered > 0) + (outside > _ROUNDING)

@@ -1,4 +1,4 @@
-"""Figures of co-simulations for publications; the only module of `sim_backends` that imports matplotlib.
+"""Draws figures of co-simulations for publications. No other module of `sim_backends` imports matplotlib.
 
 The figures have the same style as the figures of trials (`fieldkit.report.theme`). Their bytes are the same on every
 machine.
@@ -36,10 +36,12 @@ from sim_backends.cosim.plot_layout import (
 _FONT_POINTS: Final = 8.0
 """Font size that IEEE requires."""
 _BOTH_COLUMNS_INCHES: Final = 7.16
-_PANEL_INCHES: Final = 2.9
+"""Width of a figure: both columns of an IEEE paper."""
+_PANEL_HEIGHT_INCHES: Final = 2.9
 _LABEL_POINTS: Final = 7.0
 """Font size of the labels of curves."""
-_RUN_INCHES: Final = 3.2
+_RUN_HEIGHT_INCHES: Final = 3.2
+"""Height of the figure of a run."""
 _TIME_AXIS_FACTOR: Final = 1.45
 """Ratio of the length of the time axis to the duration of the run; the difference is the space for labels."""
 _MARKER_POINTS: Final = 5.0
@@ -49,7 +51,8 @@ _ZERO_SHARE: Final = 0.16
 _LEADER_POINTS: Final = 5.0
 """Minimum distance of a label from its point at which a line connects them."""
 _BACKGROUND: Final = {"facecolor": LIGHT["paper"], "edgecolor": "none", "pad": 0.3}
-_DARKENING: Final = 0.75
+_TEXT_BRIGHTNESS: Final = 0.75
+"""Factor between the brightness of a curve and of its label."""
 _LETTER_WIDTH: Final = 0.58
 """Mean width of a letter of DejaVu Sans, relative to the font size."""
 
@@ -76,7 +79,7 @@ def log_figure(panels: Sequence[LogPanel], form: Format) -> bytes:
     columns = min(2, len(panels))
     rows = -(-len(panels) // columns)
     with _drawing():
-        figure = Figure(figsize=(_BOTH_COLUMNS_INCHES, _PANEL_INCHES * rows), layout="constrained")
+        figure = Figure(figsize=(_BOTH_COLUMNS_INCHES, _PANEL_HEIGHT_INCHES * rows), layout="constrained")
         drawn_panels = []
         for number, panel in enumerate(panels, start=1):
             axes = figure.add_subplot(rows, columns, number)
@@ -110,7 +113,7 @@ def run_figure(
         outlines: Obstacles around the agents.
     """
     with _drawing():
-        figure = Figure(figsize=(_BOTH_COLUMNS_INCHES, _RUN_INCHES), layout="constrained")
+        figure = Figure(figsize=(_BOTH_COLUMNS_INCHES, _RUN_HEIGHT_INCHES), layout="constrained")
         grid = figure.add_gridspec(2, 2, width_ratios=(1, 1.25))
         map_axes = figure.add_subplot(grid[:, 0])
         map_axes.set_title(sanitized(title))
@@ -171,7 +174,7 @@ def interval_figure(panels: Mapping[str, Mapping[str, tuple[float, float, float]
         form: File format.
     """
     with _drawing():
-        figure = Figure(figsize=(_BOTH_COLUMNS_INCHES, _PANEL_INCHES), layout="constrained")
+        figure = Figure(figsize=(_BOTH_COLUMNS_INCHES, _PANEL_HEIGHT_INCHES), layout="constrained")
         first: Axes | None = None
         for number, (label, values) in enumerate(panels.items(), start=1):
             axes = figure.add_subplot(1, len(panels), number, sharey=first)
@@ -235,6 +238,7 @@ def _ticks(axes: Axes, panel: LogPanel, zero: float | None, low: float, high: fl
     else:
         axes.set_xlim(first / 2, last * 2 * (last / first if panel.labels_at_right else 1))
         axes.set_xticks([tick for tick in axes.get_xticks() if first / 2 <= tick <= last * 2])
+    # On the logarithmic axis, the zeros are between its lower end and a dotted line, which separates them from `low`.
     axes.set_ylim(zero / (low / zero) ** 0.7 if zero is not None else low, high)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(FuncFormatter(_plain))
@@ -331,7 +335,7 @@ def _style(name: str, number: int) -> tuple[Colour, Marker]:
 
 def _darker(colour: str) -> str:
     """Return a darker colour, in which text is readable on white."""
-    red, green, blue = (int(int(colour[at : at + 2], 16) * _DARKENING) for at in (1, 3, 5))
+    red, green, blue = (int(int(colour[at : at + 2], 16) * _TEXT_BRIGHTNESS) for at in (1, 3, 5))
     return f"#{red:02x}{green:02x}{blue:02x}"
 
 

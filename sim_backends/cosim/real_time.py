@@ -1,4 +1,4 @@
-"""Runs in real time: each window ends at an absolute deadline of the wall clock, and lateness is counted.
+"""Runs simulations in real time: each window has an absolute deadline in wall time, and late windows are counted.
 
 Sleeping for the length of each window would add the time of every computation to the duration of the run. A window
 that is late is therefore followed by windows without a pause until the run has caught up.
@@ -15,7 +15,7 @@ from sim_backends.cosim.scenario.build import Simulation
 from sim_backends.cosim.wall_time import Progress, rate_limited
 
 LATE_BOUND_S: Final = 0.1
-"""Default of the largest lateness; equal to the default of `late_bound` of emulated robots."""
+"""Default of the largest permitted lateness; equal to the default of `late_bound` of emulated robots."""
 
 
 class RealTimeError(EvidenceError):
@@ -60,14 +60,16 @@ class Pace:
 
     Attributes:
         factor: Simulated seconds per second of wall time, above 0.
-        late_bound_s: Largest lateness, in seconds of wall time; a run with a later window is stopped.
+        late_bound_s: Largest permitted lateness, in seconds of wall time; a run with a later window is stopped.
     """
 
     factor: float
     late_bound_s: float = LATE_BOUND_S
 
     def run(self, simulation: Simulation, lateness: WindowLateness, progress: Progress | None = None) -> None:
-        """Run a simulation until its end; the deadline of the time t is the start of the run plus t / factor.
+        """Run a simulation until its end.
+
+        A window that ends at the simulated time t has the deadline t / factor after the start of the run.
 
         Args:
             simulation: The simulation at time 0.

@@ -1,4 +1,4 @@
-"""Measures the wall time of a run by part, reports its progress, and delays the answer of a federate as a fault."""
+"""Measures the wall time of each part of a run, limits the rate of progress reports, and can delay an answer."""
 
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -82,7 +82,7 @@ Federate = TypeVar("Federate", bound=PhysicsFederate | NetworkFederate | Program
 
 
 class Stall:
-    """Delays one answer.
+    """Delays one answer of a federate or program, as a fault.
 
     Args:
         at_ns: Simulated time of the stall: the first request for this time or a later one is delayed.
@@ -125,6 +125,8 @@ _REQUESTS: Final = ("advance", "wake")
 
 
 class _StallingFederate:
+    """Wraps a federate or program, and delays its answer to the first request of a stall."""
+
     def __init__(self, federate: object, stall: Stall) -> None:
         self._federate = federate
         self._stall = stall

@@ -307,9 +307,9 @@ class EmulatedBackend:
 
     def _note_simulators(self, sink: Sink) -> None:
         if self.simulators:
-            purposes = "the robots have:" if self._options.has_linux_wifi else "the robots run on the co-simulation:"
+            subject = "the robots have:" if self._options.has_linux_wifi else "the robots run on the co-simulation:"
             texts = (f"{purpose} {simulator}" for purpose, simulator in self.simulators.items())
-            sink(Note(f"{purposes} {', '.join(texts)}"))
+            sink(Note(f"{subject} {', '.join(texts)}"))
 
     def _find_ros(self, names: Iterable[str]) -> RosChoice:
         """Check that this machine has the programs that these robots need, and return the source of their ROS."""

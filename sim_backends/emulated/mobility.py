@@ -184,7 +184,7 @@ class Mobility:
 
     @contextmanager
     def moving(self, move: Move) -> Iterator[None]:
-        """Move a robot while the body runs; then move it back to its position, also after an error.
+        """Move a robot while the body runs; then move it back to its position, even after an error.
 
         Raises:
             LinkError: The medium process exited or did not answer.

@@ -1,6 +1,7 @@
 """Sections of robot profiles that emulated robots implement: the base of a ground robot, the autopilot of a drone.
 
-An installed package defines their models (`fieldkit.config.profiles.ProfileSection`); without it no profile has them.
+If the package that defines their models (`fieldkit.config.profiles.ProfileSection`) is not installed, no profile has
+these sections.
 """
 
 from collections.abc import Iterable

@@ -80,8 +80,8 @@ class Node:
 
         Args:
             mesh: True if robots forward packets for each other.
-            guest_hello_s: Hello interval of a node that uses the robots' routes and forwards nothing itself; None if
-                the node is a robot with a complete routing daemon, or needs none.
+            guest_hello_s: Hello interval of the routing daemon of the laptop, which uses the robots' routes but
+                forwards no packets. None for a robot, or without a mesh.
 
         Raises:
             LinkError: The node has exited or did not answer.
@@ -182,7 +182,7 @@ class EmulatedRobot(Node):
         self.physics_fds = (fd, *others) if others else ()
 
     def open_wifi(self, device: str) -> None:
-        """Bring up the Wi-Fi interface `device`, which was moved to the robot. Raises the errors of `open_radio`."""
+        """Bring up the Wi-Fi interface `device` in the robot's namespace. Raises the errors of `open_radio`."""
         if self.spec.wifi is None:
             raise RobotError("it has no Linux Wi-Fi", where=self.name)
         link = {"device": device, "interface": self.interface, "address": self.address}
@@ -234,11 +234,17 @@ class EmulatedRobot(Node):
         self._worker.request({"do": "move", "path": asdict(path)})
 
     def halt(self) -> None:
-        """Cut the power: kill all processes but init, and discard the memory. Raises the errors of `open_radio`."""
+        """Emulate a loss of power: kill all processes except init, and clear the folders that are in memory.
+
+        Raises the errors of `open_radio`.
+        """
         self._worker.request({"do": "halt", "interfaces": self._interfaces})
 
     def boot(self) -> None:
-        """Boot after `halt`: the interface is up and the programs are starting. Raises the errors of `open_radio`."""
+        """Boot after `halt`: bring up the interfaces and start the programs, without waiting until they are ready.
+
+        Raises the errors of `open_radio`.
+        """
         self._worker.request({"do": "boot", "interfaces": self._interfaces, "robot": asdict(self.spec)})
 
     @override

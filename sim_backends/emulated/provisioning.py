@@ -85,7 +85,7 @@ class KeyPair:
 def definition(kind: str, text: str = "") -> Definition:
     """Return the definition of the ROS 1 message type `package/Name`; `text` is used if ROS has no such type.
 
-    Raises the errors of `template_of`.
+    Raises the errors of `templates.template_of`.
     """
     from sim_backends.emulated.ros import templates  # noqa: PLC0415 (it imports rosbags, which takes 50 ms)
 
@@ -93,12 +93,15 @@ def definition(kind: str, text: str = "") -> Definition:
 
 
 def sensors_of(robot: "Robot | LabRobot") -> tuple[Sensor, ...]:
-    """Return the sensors of a robot, one per published topic. Raises the errors of `template_of`."""
+    """Return the sensors of a robot, one per published topic. Raises the errors of `templates.template_of`."""
     return tuple(_sensor(topic) for topic in robot.profile.topics)
 
 
 def _definitions(robot: "Robot | LabRobot") -> dict[str, Definition]:
-    """Return the definitions of the message types that a robot publishes. Raises the errors of `template_of`."""
+    """Return the definitions of the message types that a robot publishes.
+
+    Raises the errors of `templates.template_of`.
+    """
     definitions = {topic.type: definition(topic.type, topic.definition) for topic in robot.profile.topics}
     if static_frames.links(sensors_of(robot)):
         definitions[static_frames.TYPE] = definition(static_frames.TYPE)

@@ -179,7 +179,7 @@ class ReceivedStates(Mapping[str, State]):
     def has_limits_of(self, other: Mapping[str, State]) -> bool:
         """Return True if other states have the same agents and acceleration limits.
 
-        The result may be False although they are the same.
+        The agents are compared by identity, so the result may be False although they are the same.
         """
         return isinstance(other, ReceivedStates) and self._rows is other._rows and self._limits == other._limits  # noqa: SLF001 (of the same class)
 

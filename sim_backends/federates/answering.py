@@ -40,7 +40,7 @@ from sim_backends.world.motion import DeadReckoned
 
 _MAX_COPIES: Final = 1000
 
-Make = Callable[[Hello], Any]
+MakeFederate = Callable[[Hello], Any]
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class FederateService:
         transports: Transports that it supports; empty for any.
     """
 
-    make: Make
+    make: MakeFederate
     name: str = ""
     software: str = ""
     is_deterministic: bool = True
@@ -154,6 +154,7 @@ class _Heartbeat:
         while not self._stopped.wait(self._interval_s):
             with self._lock, suppress(ClosedError):
                 current_request = self._request
+                # A request that was already current at the previous tick has lasted for at least one interval.
                 if current_request is not None and current_request is previous and not self._stopped.is_set():
                     request, copy_number, at_ns = current_request
                     self._channel.send(encode(MessageKind.BUSY, request, copy_number, encode_number(at_ns)), None)

@@ -83,25 +83,25 @@ class CompiledProgram:
                 raise ConfigurationError(f"{self.name} needs {tool}, which is not installed", remedy=self.install)
         libraries = []
         for package in self.packages:
-            version = _output("pkg-config", "--modversion", package)
+            version = _run("pkg-config", "--modversion", package)
             if version.returncode:
                 raise ConfigurationError(
                     f"{self.name} needs the library {package}, which is not installed", remedy=self.install
                 )
             libraries.append(f"{package} {version.stdout.strip()}")
-        return _output("g++", "--version").stdout.partition("\n")[0], libraries
+        return _run("g++", "--version").stdout.partition("\n")[0], libraries
 
     def _compile(self, program: Path) -> None:
         sys.stderr.write(f"note: compiling {self.name}; this takes {self.duration_text}, once for these libraries\n")
         options = self.libraries
         if options is None:
             arguments = ("--cflags", "--libs", *self.packages)
-            options = _output("pkg-config", *arguments).stdout.split() if self.packages else []
+            options = _run("pkg-config", *arguments).stdout.split() if self.packages else []
         with tempfile.TemporaryDirectory(dir=program.parent, prefix=f".{self.name}-") as folder:
             result = Path(folder) / "program"
             words = ["g++", *self.flags, f"-I{_HEADERS}", "-o", str(result), str(self.source), *options]
             try:
-                compilation = _output(*words)
+                compilation = _run(*words)
             except subprocess.TimeoutExpired as error:
                 raise ConfigurationError(f"{self.name} was not compiled within {_LIMIT_S:g} s") from error
             if compilation.returncode:
@@ -132,7 +132,7 @@ def cache_folder() -> Path:
     return (base if base.is_absolute() else Path.home() / ".cache") / "fieldkit" / "programs"
 
 
-def _output(*words: str) -> "subprocess.CompletedProcess[str]":
+def _run(*words: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(words, capture_output=True, text=True, timeout=_LIMIT_S, check=False)
 
 

@@ -117,7 +117,7 @@ def decode_advance_physics(body: bytes, agents: AgentTable) -> tuple[int, int, d
     reader = FrameReader(body)
     to_ns, from_ns = reader.unpack(_TWO_TIMES)
     commands = read_commands(reader, agents)
-    reader.end()
+    reader.check_end()
     return to_ns, from_ns, commands
 
 
@@ -142,7 +142,7 @@ def decode_states(body: bytes, agents: AgentTable) -> tuple[int, ReceivedStates]
     (at_ns,) = reader.unpack(_TIME)
     read_announcements(reader, agents)
     states = read_states(reader, agents)
-    reader.end()
+    reader.check_end()
     return at_ns, states
 
 
@@ -192,7 +192,7 @@ class AdvanceNetwork(NamedTuple):
         read_announcements(reader, agents)
         states = read_states(reader, agents)
         packets = read_packets(reader, agents)
-        reader.end()
+        reader.check_end()
         return AdvanceNetwork(to_ns, states, packets, since_ns, reckoning_ns)
 
 
@@ -237,7 +237,7 @@ class NetworkOutcomes(NamedTuple):
         at_ns, next_event_ns = reader.unpack(_TWO_TIMES)
         arrivals, drops = read_arrivals(reader, agents), read_drops(reader)
         delays = read_arrival_delays(reader, len(arrivals)) if reader.remaining_bytes else ()
-        reader.end()
+        reader.check_end()
         return NetworkOutcomes(at_ns, next_event_ns, arrivals, drops, delays)
 
 
@@ -254,7 +254,7 @@ def decode_number(body: bytes) -> int:
     """
     reader = FrameReader(body)
     (number,) = reader.unpack(_TIME)
-    reader.end()
+    reader.check_end()
     return int(number)
 
 
@@ -271,7 +271,7 @@ def decode_fork(body: bytes) -> int:
     """
     reader = FrameReader(body)
     (copy,) = reader.unpack(_U32)
-    reader.end()
+    reader.check_end()
     return int(copy)
 
 
@@ -283,5 +283,5 @@ def decode_text(body: bytes) -> str:
     """
     reader = FrameReader(body)
     text = reader.text()
-    reader.end()
+    reader.check_end()
     return text

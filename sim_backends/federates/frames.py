@@ -234,7 +234,7 @@ class FrameReader:
         """Return the next count of items, stored in two bytes. Arguments and errors are those of `count`."""
         return self.count(item_bytes, _LENGTH)
 
-    def end(self) -> None:
+    def check_end(self) -> None:
         """Check that there are no more bytes.
 
         Raises:

@@ -87,7 +87,7 @@ def decode_join(body: bytes) -> str:
     reader = FrameReader(body)
     _read_prefix(reader)
     token = reader.text()
-    reader.end()
+    reader.check_end()
     return token
 
 
@@ -200,7 +200,7 @@ class Hello:
         agents = [_read_agent(reader, table) for _ in range(reader.count(_AGENT_BYTES))]
         position = reader.position
         configuration = reader.read_bytes(reader.count(1))
-        reader.end()
+        reader.check_end()
         hello = Hello(role, agents, seed, step_ns, end_ns, name, configuration, heartbeat_ms, token)
         if configuration_hash != hello.configuration_hash:
             raise MalformedFrameError(position, "the configuration does not have the announced hash")
@@ -281,7 +281,7 @@ class Welcome:
         transports = [reader.text() for _ in range(reader.short_count(2))]
         transmitters = [reader.unpack(_U32)[0] for _ in range(reader.count(4))]
         emitters_m: list[Any] = [reader.unpack(_POSITION) for _ in range(reader.count(24))]
-        reader.end()
+        reader.check_end()
         if not all(math.isfinite(sum(position)) for position in emitters_m):
             raise MalformedFrameError(reader.position, "the position of an emitter is not finite")
         # Bits of capabilities that this version does not have are ignored.

@@ -57,7 +57,7 @@ def decode_links(body: bytes, agents: AgentTable, utc_ns: int) -> dict[str, Link
             raise MalformedFrameError(position, f"the link of {name} to {peer} has no radio, or a wrong counter")
         rates_bit_s = _or_none(tx_rate_bit_s), _or_none(rx_rate_bit_s)
         links[name].append(StationSample(peer, _or_none(signal_dbm), *rates_bit_s, *counters))
-    reader.end()
+    reader.check_end()
     return {
         name: LinkSample(utc_ns, (*links[name],), None, _or_none(noise_dbm), active_ns, busy_ns)
         for name, (noise_dbm, active_ns, busy_ns) in radios.items()

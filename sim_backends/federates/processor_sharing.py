@@ -15,6 +15,7 @@ _STAT: Final = Path("/proc/thread-self/stat")
 _PROCESSOR_FIELD: Final = 36
 """Index of field 39 of `/proc/PID/stat` (proc(5)), the processor, in the fields after the name in parentheses."""
 _PERIOD_S: Final = 0.1
+"""Time for which both processes stay on the same processor."""
 
 
 class ProcessorSharing:
@@ -48,6 +49,7 @@ class ProcessorSharing:
             return
         with suppress(ProcessLookupError):  # the child has exited; the exchange reports this
             if self._processor is not None:
+                # The next exchange is unrestricted.
                 self._processor = None
                 os.sched_setaffinity(self._pid, self._allowed_processors)
                 return

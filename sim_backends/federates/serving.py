@@ -5,7 +5,7 @@ import time
 from contextlib import closing
 from typing import Any, Final
 
-from sim_backends.federates.answering import FederateService, Make, serve_channel
+from sim_backends.federates.answering import FederateService, MakeFederate, serve_channel
 from sim_backends.federates.channels import DeadlineError, StreamChannel
 from sim_backends.federates.transports.contract import TransportAddress, read_token
 from sim_backends.federates.transports.joining import join
@@ -16,7 +16,7 @@ _HELLO_S: Final = 10.0
 """Maximum wait for the first message after a program connects; other programs are queued meanwhile."""
 
 
-def serve(make: Make, *, address: str | None = None, runs: int | None = None, **properties: Any) -> None:  # noqa: ANN401 (of `FederateService`)
+def serve(make: MakeFederate, *, address: str | None = None, runs: int | None = None, **properties: Any) -> None:  # noqa: ANN401 (of `FederateService`)
     """Serve a physics or network class.
 
     Args:

@@ -175,7 +175,7 @@ class WorldMonitor
     // Report to the coordinator, if necessary, that the request is still running.
     void Beat()
     {
-        m_heartbeat.Check(std::max<int64_t>(reached_ns, 0));
+        m_heartbeat.SendIfDue(std::max<int64_t>(reached_ns, 0));
     }
 
     // The end of an error message, with the last message of Gazebo's clock.

@@ -78,6 +78,8 @@ class IpCaptures
   private:
     static constexpr size_t kSnapBytes = 128;
     static constexpr size_t kIpBytes = 20;
+    static constexpr uint8_t kIcmp = 1; // IP protocol numbers
+    static constexpr uint8_t kTcp = 6;
 
     struct Flow
     {
@@ -108,7 +110,7 @@ class IpCaptures
         IdTag tag;
         auto datagram = packet->PeekPacketTag(tag) ? m_datagrams.find(tag.number) : m_datagrams.end();
         bool is_first = header.GetFragmentOffset() == 0 && bytes.size() >= kIpBytes + 8;
-        if (header.GetProtocol() == 6 && is_first)
+        if (header.GetProtocol() == kTcp && is_first)
         {
             RenamePort(bytes, {source, Word(bytes, kIpBytes)}, kIpBytes + 2);
             RenamePort(bytes, {m_addresses.at(header.GetDestination()), Word(bytes, kIpBytes + 2)}, kIpBytes);
@@ -143,7 +145,7 @@ class IpCaptures
         {
             return;
         }
-        bytes[9] = 1; // ICMP; its header is as long as the UDP header (RFC 792)
+        bytes[9] = kIcmp; // an echo header is as long as the UDP header (RFC 792)
         if (is_first)
         {
             uint8_t* echo = &bytes[kIpBytes];

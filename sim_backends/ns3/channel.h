@@ -236,9 +236,9 @@ class Channel
     double m_exponent;
     double m_shadowingDb;
     bool m_fades;
-    double m_k;
-    double m_stir;
-    int64_t m_slotNs = 1;
+    double m_k;           // Rician K-factor of links in line of sight, as a ratio of powers
+    double m_stir;        // speed of the moving scatterers, in m/s
+    int64_t m_slotNs = 1; // time for which a fading gain is used
     std::vector<Link> m_links;
     std::vector<std::array<double, 3>> m_waves; // wave numbers east and north, phase
 };

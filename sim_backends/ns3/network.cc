@@ -448,8 +448,8 @@ class Network
                 !traffic.contains("qos") || traffic["qos"].value("reliability", "reliable") == "reliable";
             if (m_carriesTopics && traffic.at("protocol") == "topic" && is_reliable)
             {
-                throw Refusal("topics: udp carries best_effort topics only, and those of " +
-                              traffic.at("from").get<std::string>() + " are reliable");
+                throw Refusal("topics: udp carries best_effort topics only, but " +
+                              traffic.at("from").get<std::string>() + " publishes a reliable topic");
             }
         }
     }

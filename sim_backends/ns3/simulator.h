@@ -49,7 +49,7 @@ class PeekScheduler : public MapScheduler
     {
         if (++m_events % 1024 == 0)
         {
-            g_heartbeat.Check(NowNs());
+            g_heartbeat.SendIfDue(NowNs());
         }
         return MapScheduler::RemoveNext();
     }

@@ -273,7 +273,7 @@ Install(std::vector<Station>& stations, const WifiSetup& setup, Channel& channel
         // ns-3 uses a long slot for stations of 802.11b, which do not exist here.
         device->GetPhy()->SetAttribute("Slot", TimeValue(MicroSeconds(9)));
         tracker.Add(device, station.mobility);
-        g_heartbeat.Check(NowNs());
+        g_heartbeat.SendIfDue(NowNs());
     }
     InstallIp(stations, tracker);
 }

@@ -92,7 +92,7 @@ class Bodies:
         return {name: self._track(name, self._initial_pose(name), 0).state(0) for name in self.names}
 
     def limit_m_s2(self, name: str) -> float:
-        """Return the limit of one body, see `limits_m_s2`; if it is absent, the limit at its start."""
+        """Return the limit of a body (see `BodyLimits`); if it is absent, the limit at its start."""
         if name not in self._present:
             start_limit_m_s2: float = self._bodies[name].limit_m_s2(self._initial_pose(name))
             return start_limit_m_s2
@@ -268,7 +268,7 @@ class Bodies:
             )
 
     def _resolve_contacts(self, candidates: Mapping[str, ContactCandidates], step: int) -> None:
-        """Stop moving bodies at their contacts in the step that ends now, in order of their names."""
+        """Stop the moving bodies at their contacts in the last step before `step`, in order of their names."""
         previous_m = {name: self._tracks[name].pose(step - 1).place_m for name in candidates}
         current_m = dict(previous_m)
         tracks, touching = {}, {}

@@ -1,8 +1,8 @@
 """Protocols of a body that the built-in physics federate moves: its commands, pose and track.
 
-A body has no mutable state: from a pose and a command it derives a course, which gives the pose at every later step
-and is evaluated on request. The result therefore does not depend on when it is requested, and a body at rest costs
-nothing. The states of all bodies at a step are also computed on request, from their tracks.
+A body has no mutable state. From a pose and a command it derives a course, from which the pose at any later step can
+be computed on request. The pose therefore does not depend on the times of requests, and a body at rest needs no
+computation. The states of all bodies at a step are also computed on request, from their tracks.
 """
 
 from collections.abc import Iterator, KeysView, Mapping
@@ -64,7 +64,7 @@ PoseT_co = TypeVar("PoseT_co", bound=Pose, covariant=True)
 
 
 class Course(Protocol[PoseT_co]):
-    """The poses of a body from a step on, if nothing else happens."""
+    """The poses of a body from a step on, without a new command and without contacts."""
 
     @property
     def steps(self) -> int | None:
@@ -128,7 +128,7 @@ class Body(Protocol[PoseT]):
         Args:
             pose: The pose that the body would have without the contact.
             stop: Its position after the contact, and its contacts.
-            command: Its last command, None for none.
+            command: Its last command; None before the first.
         """
         ...
 

@@ -40,8 +40,9 @@ class Footprint:
 
     Attributes:
         name: Name of the obstacle.
-        closest_m: Returns the point of its outline that is closest to a point outside, metres east and north.
-        reach_m: Radius around that point: the radius of a round obstacle, 0 for one with edges.
+        closest_m: Returns its closest point to a given point, metres east and north; for a round obstacle, always
+            the centre.
+        reach_m: Radius of a round obstacle; 0 for an obstacle with edges.
         low_m: Height of its lower face.
         high_m: Height of its upper face.
         wall_m: Returns the height up to which it is an obstacle at one of its points; None if this is `high_m`
@@ -82,7 +83,7 @@ class ContactStop:
     contacts: Sequence[Contact]
 
     def sliding_velocity(self, velocity: Vector) -> Vector:
-        """Return the part of a velocity that leads into none of the touched obstacles."""
+        """Return a velocity without its components into the touched obstacles."""
         for contact in self.contacts:
             inward = sum(v * n for v, n in zip(velocity, contact.normal, strict=True))
             velocity = _add(velocity, contact.normal, -min(inward, 0.0))
@@ -169,7 +170,7 @@ def rectangle(
 
 
 def gap_m(footprint: Footprint, extent: Extent, place_m: Vector) -> float:
-    """Return the distance that a cylinder must at least move to touch a footprint; 0 if it touches it."""
+    """Return the minimum distance between a cylinder and a footprint; 0 if they touch."""
     horizontal_m = _horizontal_gap_m(footprint, extent, place_m)
     vertical_m = max(place_m[2] - footprint.high_m, footprint.low_m - place_m[2] - extent.height_m)
     return math.hypot(max(horizontal_m, 0.0), max(vertical_m, 0.0))
@@ -203,8 +204,8 @@ def move(
         return None
     moved_m = math.dist(from_m, place_m)
     if moved_m > path_m:
-        # If sliding around a corner made the path longer than the intended one, it is shortened; in a corner,
-        # to 0.
+        # The cylinder slid around a corner on a path that is longer than the planned one. The move is repeated with a
+        # nearer target. If the path is then still too long, the cylinder does not move.
         place_m, retry_contacts = _move_in_pieces(
             extent, from_m, _interpolate(from_m, to_m, path_m / moved_m), footprints, edge
         )
@@ -257,8 +258,8 @@ def _push_out(
 def _exit_direction(footprint: Footprint, extent: Extent, from_m: Vector, place_m: Vector) -> tuple[Vector, float]:
     """Return the direction and distance out of an obstacle that a cylinder overlaps.
 
-    The direction is vertical if the cylinder came from above or below, otherwise horizontal. A driving body is moved
-    neither up nor down but back: on a ramp it may touch something above itself.
+    The direction is vertical if the cylinder came from above or below, otherwise horizontal. A driving body is never
+    moved vertically. If it comes from above or below, for example on a ramp below a roof, it is moved back.
     """
     closest_e_m, closest_n_m = footprint.closest_m(place_m[0], place_m[1])
     east_m, north_m = place_m[0] - closest_e_m, place_m[1] - closest_n_m

@@ -183,7 +183,7 @@ class DifferentialDrive:
         turn_rad_s = _clamp(twist.turn_rad_s, limits.turn_rad_s)
         max_m_s2 = self._acceleration_m_s2(pose, faster=speed_m_s > pose.speed_m_s)
         has_no_grip = max_m_s2 <= _NO_GRIP_M_S2 and speed_m_s != pose.speed_m_s
-        if has_no_grip:  # the friction is just sufficient to hold the robot on the slope
+        if has_no_grip:  # the friction is only sufficient to prevent a slide down the slope
             speed_m_s = pose.speed_m_s
         a_m_s2, speed_steps = _approach(pose.speed_m_s, speed_m_s, max_m_s2, step_s)
         a_rad_s2, turn_steps = _approach(pose.turn_rad_s, turn_rad_s, limits.turn_acceleration_rad_s2, step_s)
@@ -204,8 +204,13 @@ class DifferentialDrive:
     def _acceleration_m_s2(self, pose: DrivePose, *, faster: bool) -> float:
         """Return the maximum change of its speed per second on the ground below it.
 
-        The total friction force in all directions is friction times the normal force, m g cos(slope). Across the
-        heading it holds the robot against gravity; along the heading gravity adds to it or reduces it.
+        The friction force is at most friction times the normal force, m g cos(slope), in any direction. Its component
+        across the heading must prevent a sideways slide; the rest accelerates or brakes the robot along its heading,
+        with or against gravity.
+
+        Args:
+            pose: The pose.
+            faster: True if its forward speed must increase, False if it must decrease.
         """
         limits = self._limits
         if pose.grade == _LEVEL:
@@ -235,7 +240,7 @@ class DifferentialDrive:
         )
 
     def limit_m_s2(self, pose: DrivePose) -> float:
-        """Implement `Body.limit_m_s2`: along the heading by the drive, across it by turning."""
+        """Implement `Body.limit_m_s2`: the motors accelerate along the heading, and a turn across it."""
         limits = self._limits
         stretch = math.hypot(1.0, *pose.grade)
         return math.hypot(limits.acceleration_m_s2, limits.speed_m_s * limits.turn_rad_s * stretch)

@@ -18,7 +18,10 @@ from sim_backends.world.world import World
 
 _LEVEL_M: Final = 1e-3
 """Smaller differences in height count as level: a robot rolls over them."""
+_ON_AREA_M: Final = 1e-6
+"""Maximum distance of a point from an area in which it is, because the distance has a rounding error."""
 _FLOOR: Final = Footprint("ground", lambda east_m, north_m: (east_m, north_m), 0.0, -math.inf, 0.0)
+"""The flat ground as an obstacle for flying bodies."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,7 @@ class _Area:
 
     Attributes:
         obstacle: The raised area or ramp.
-        nearest_m: Returns its point closest to a given point, metres east and north.
+        nearest_m: Returns the point of the area that is closest to a given point, metres east and north.
     """
 
     obstacle: Raised | Ramp
@@ -78,7 +81,7 @@ class Ground:
 
     def surface(self, east_m: float, north_m: float) -> Surface:
         """Return the ground at a point: the highest area there."""
-        areas = [area.obstacle for area in self._areas if area.distance_m(east_m, north_m) <= _LEVEL_M / 1000]
+        areas = [area.obstacle for area in self._areas if area.distance_m(east_m, north_m) <= _ON_AREA_M]
         highest = max(areas, key=lambda area: area.height_m((east_m, north_m)), default=None)
         if highest is None:
             return Surface(0.0)

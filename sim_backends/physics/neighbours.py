@@ -1,6 +1,6 @@
 """Neighbour lists: possible contacts of each body before a list expires, and the minimum time to a contact.
 
-A grid over the ground gives the bodies near a position without a search through all bodies.
+A grid over the ground finds the bodies near a position without a search through all bodies.
 """
 
 import math
@@ -15,13 +15,14 @@ from sim_backends.physics.collisions import Footprint, gap_m
 from sim_backends.physics.ground import Ground
 
 _ROUNDING: Final = 1 + 1e-9
+"""Factor by which cells are larger than required, because the number of a cell is computed with a rounding error."""
 
 
 class CellGrid:
-    """Numbers at positions, grouped by square cells. The nine cells around a position contain all nearby numbers.
+    """Indices of bodies, grouped by square cells. The nine cells around a position contain all bodies near it.
 
     Args:
-        distance_m: Horizontal distance within which numbers are nearby, in metres.
+        distance_m: Horizontal distance, in metres, up to which a body is near.
     """
 
     def __init__(self, distance_m: float) -> None:
@@ -29,15 +30,15 @@ class CellGrid:
         self._cell_m = max(distance_m * _ROUNDING, 1.0)
         self._cells: defaultdict[tuple[int, int], list[int]] = defaultdict(list)
 
-    def add(self, number: int, place_m: Vector) -> None:
-        """Add a number at a position, in finite metres."""
-        self._cells[self._cell(place_m)].append(number)
+    def add(self, index: int, place_m: Vector) -> None:
+        """Add the index of a body at a position, in finite metres."""
+        self._cells[self._cell(place_m)].append(index)
 
     def nearby_indices(self, place_m: Vector) -> list[int]:
-        """Return all numbers within the distance of a position, and some that are farther away, in order."""
+        """Return the indices of all bodies near a position, and of some that are farther away, in ascending order."""
         east, north = self._cell(place_m)
         cells = [(east + e, north + n) for e in (-1, 0, 1) for n in (-1, 0, 1)]
-        return sorted(number for cell in cells if cell in self._cells for number in self._cells[cell])
+        return sorted(index for cell in cells if cell in self._cells for index in self._cells[cell])
 
     def _cell(self, place_m: Vector) -> tuple[int, int]:
         return math.floor(place_m[0] / self._cell_m), math.floor(place_m[1] / self._cell_m)
@@ -98,14 +99,14 @@ class Neighbours:
         self._horizon_s = horizon_s
         self._kinematics_by_name = {name: _kinematics(name, body, poses[name]) for name, body in bodies.items()}
         self._min_times_s: dict[str, float] = {}
-        bodies_now = list(self._kinematics_by_name.values())
-        reach_m = max((mover.body.radius_m + mover.top_speed_m_s * horizon_s for mover in bodies_now), default=0.0)
+        movers = list(self._kinematics_by_name.values())
+        reach_m = max((mover.body.radius_m + mover.top_speed_m_s * horizon_s for mover in movers), default=0.0)
         grid = CellGrid(2 * reach_m)
-        for number, mover in enumerate(bodies_now):
+        for index, mover in enumerate(movers):
             self._add_ground_candidates(mover, grounds[mover.name])
             for other in grid.nearby_indices(mover.place_m):
-                self._add_pair_candidates(mover, bodies_now[other])
-            grid.add(number, mover.place_m)
+                self._add_pair_candidates(mover, movers[other])
+            grid.add(index, mover.place_m)
 
     def min_time_to_contact_s(self, name: str) -> float:
         """Return the minimum time from the creation of the list to a contact of a body."""

@@ -16,8 +16,8 @@ class Paths:
     Args:
         motions: The motions; no two of them move the same agent.
         step_ns: Time step; there are states only at whole steps.
-        limits_m_s2: Maximum acceleration of each agent. For agents that are not listed it follows from the corners of
-            `WayPoints`; for any other motion it is infinite.
+        limits_m_s2: Maximum acceleration of some agents. The limit of any other agent is computed from the corners of
+            its `WayPoints`, or is infinite if its motion is of another kind.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class Paths:
         return self._states
 
     def limit_m_s2(self, name: str) -> float:
-        """Return the limit of an agent that is not listed; it is valid from the time of the last returned states."""
+        """Return the computed limit of an agent; it is valid from the time of the last returned states."""
         waypoints = self._waypoints.get(name)
         return math.inf if waypoints is None else waypoints.limit_m_s2(self._at_ns)
 
@@ -59,8 +59,8 @@ class PathLimits(Mapping[str, float]):
         self._limits_m_s2 = limits_m_s2
 
     def __getitem__(self, name: str) -> float:
-        limits_m_s2 = self._limits_m_s2.get(name)
-        return self._paths.limit_m_s2(name) if limits_m_s2 is None else limits_m_s2
+        given_m_s2 = self._limits_m_s2.get(name)
+        return self._paths.limit_m_s2(name) if given_m_s2 is None else given_m_s2
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._paths.names)

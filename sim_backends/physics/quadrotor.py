@@ -3,11 +3,12 @@
 The autopilot is a cascade, as in PX4 (PX4 user guide, controller diagrams). The target velocity gives an acceleration
 within limits. This acceleration, with compensation of gravity and drag, gives a thrust vector within bounds of tilt
 and magnitude. The thrust vector gives the target roll and pitch. Roll and pitch follow with a first-order lag and a
-limited rate. The thrust is chosen so that its vertical component at the actual attitude has the desired value. With f
-the thrust per mass, in axes of its yaw (forward, left, up),
+limited rate. The thrust is chosen so that its vertical component at the actual attitude has the desired value. Let f
+be the thrust per mass in axes that turn with the yaw (forward, left, up), g gravity, v the velocity, and b and c the
+linear and the quadratic drag:
 
-    f = |f| (cos(roll) sin(pitch), -sin(roll), cos(roll) cos(pitch)), acceleration = f - g - (linear + quadratic |v|)
-    v / mass.
+    f = |f| (cos(roll) sin(pitch), -sin(roll), cos(roll) cos(pitch))
+    acceleration = f - g - (b + c |v|) v / mass
 """
 
 import math
@@ -29,7 +30,7 @@ _MAX_STEPS: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class FlightTarget:
-    """Command of an autopilot that limits velocity and acceleration itself, and switches the rotors.
+    """Command of an autopilot that limits velocity and acceleration itself, and switches the rotors on and off.
 
     Attributes:
         velocity: Its target.
@@ -44,7 +45,7 @@ class FlightTarget:
     powered: bool = True
 
     def limits_within(self, limits: QuadrotorLimits) -> QuadrotorLimits:
-        """Return the limits of a quadrotor with the accelerations of this command; without power it has no thrust."""
+        """Return a quadrotor's limits with the accelerations of this command, and without thrust if it is off."""
         return replace(
             limits,
             acceleration_m_s2=self.acceleration_m_s2,

@@ -18,7 +18,7 @@ class DriveLimits:
         turn_acceleration_rad_s2: Maximum change of the yaw rate per second.
         radius_m: Radius of the upright cylinder that contains it.
         height_m: Height of that cylinder.
-        friction: Coefficient of friction of its tires; it has grip on slopes with a smaller rise over run.
+        friction: Coefficient of friction of its tires; on a slope with a larger rise over run they have no grip.
     """
 
     speed_m_s: float
@@ -159,5 +159,5 @@ BODIES: Final[dict[str, DriveLimits | QuadrotorLimits]] = {
 
 
 def quadrotor(profile: str) -> QuadrotorLimits:
-    """Return the limits of a drone of this profile; the limits of the paper's drone if the profile is unknown."""
+    """Return the limits of a quadrotor with this profile; for an unknown profile, those of the paper's drone."""
     return QUADROTORS.get(profile, DUCKIEDRONE)

@@ -60,6 +60,7 @@ class PowerSave(Generic[Payload]):
             self._wake(now_ns, station.index)
             return False
         receiver = frame.receiver
+        # A station without a timeout is always awake.
         if receiver is not None and now_ns < self._awake_until_ns.get(receiver, now_ns + 1):
             self._wake(now_ns, receiver)
             return False

@@ -30,7 +30,7 @@ SUPPORT_MODULES = {
     "lifetimes",
     "mujoco_fleet",
     "namespaces",
-    "own_time",
+    "overhead",
     "pandas_peer",
     "slow_links",
 } | {

@@ -180,8 +180,8 @@ def test_the_satisfaction_loop_reports_each_round(lab: Path) -> None:
     rule = ("--policy", "velocity_aware", "--window", "10ms")
     run = cosim(lab, "satisfy", "pass.yaml", *rule, "--threshold", "99%")
     assert run.code == 0, run.err
-    assert "accepted at 99 %" in run.out
-    assert "the exact reference loses" in run.out
+    assert "is accepted (threshold 99 %)" in run.out
+    assert "the loss of the exact reference is" in run.out
     unsatisfied = cosim(
         lab, "satisfy", "pass.yaml", *rule, "--threshold", "0%", "--rounds", "2", "--set", LOSSY, "--format", "csv"
     )

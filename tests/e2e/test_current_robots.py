@@ -44,7 +44,7 @@ def test_a_robot_without_ip_is_rejected_with_the_reason(tmp_path: Path) -> None:
     run = run_here(lab(tmp_path, "crazyflie"), "trial", *TRIAL, "--dry-run")
     assert run.code == 2
     assert "fieldkit.yaml:3" in run.err
-    assert "carries packets of CRTP" in run.err
+    assert "carries CRTP packets" in run.err
 
 
 @pytest.mark.emulated

@@ -294,9 +294,9 @@ def _read_evidence(read: Callable[[Path], object], data: bytes, place: Path) -> 
 
 
 def _read_host(path: Path) -> None:
-    host.read(path)
-    host.stations(path)
-    state = host.state(path)
+    host.read_counters(path)
+    host.station_dump(path)
+    state = host.read_state(path)
     for ending in (state.endings or {}).values():
         endings.termination_error(ending, frozenset({endings.Cause.EXITED}))
     if state.clock is not None:

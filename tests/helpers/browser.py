@@ -10,12 +10,13 @@ from playwright.sync_api import Browser, Page, Route, sync_playwright
 
 PHONE = 390
 LAPTOP = 1280
+"""Widths of a page in pixels."""
 _TIMEOUT_MS = 120_000
 
 
 @dataclass
 class OpenedPage:
-    """An open page, its console messages, and the URLs that it requested other than that of its file."""
+    """An open page, its console messages, and the URLs that it requested besides the URL of its file."""
 
     page: Page
     console_messages: list[str] = field(default_factory=list)

@@ -50,7 +50,7 @@ def los_plan(*, repeats: int = 2, protocols: tuple[Protocol, ...] = (), record_s
 
 
 def plain_plan(*, repeats: int = 2, protocols: tuple[Protocol, ...] = ()) -> Plan:
-    """A plan like that of `los_plan`, but its steps need neither `fieldkit.ros` nor `fieldkit.motion`."""
+    """A plan like the result of `los_plan`, but with steps that need neither `fieldkit.ros` nor `fieldkit.motion`."""
     return _plan(schema.validate(schema.parse(PLAIN, source="los.yaml"), Procedure), repeats, protocols)
 
 

@@ -213,6 +213,7 @@ def repeat_line(content: bytes, draw: random.Random) -> bytes:
 
 
 _KINDS: Mapping[str, Callable[[bytes, random.Random], bytes]] = {
+    # `changes` implements these two kinds itself and does not call their functions.
     "delete": flip,
     "copy": flip,
     "flip": flip,

@@ -1,6 +1,6 @@
 """Tests of the requirements of fieldkit on shells and testbeds: derive a class, add the fixtures, and run pytest.
 
-The backends of other packages are tested in the same way as those of fieldkit; see `test_conformance.py`.
+The backends of other packages are tested in the same way as fieldkit's backends; see `test_conformance.py`.
 """
 
 import hashlib
@@ -31,6 +31,7 @@ LARGE_FILE_BYTES = fetching.PIECE_BYTES + 100
 """Size of an evidence file that must be fetched in two pieces."""
 
 GAP_S = 3.0
+"""Duration of a short outage of the link."""
 NOTICED_S = 40.0
 """Time limit for a wait on a dead link, also on a busy machine; on an idle machine it takes at most 10 s.
 

@@ -111,7 +111,7 @@ def cosim_bench(
     control_files: ControlFiles | None = None,
     body: RobotBody = BODY,
 ) -> Iterator[CosimBench]:
-    """Yield two placed namespaces on a co-simulated medium; `body` and `control_files` are those of `a`."""
+    """Yield two placed namespaces on a co-simulated medium; `body` and `control_files` belong to `a`."""
     sync = sync or SyncOptions()
     with ExitStack() as stack:
         medium = stack.enter_context(

@@ -30,7 +30,7 @@ START_US: Final = 1_795_000_000_000_000
 """A time in November 2026."""
 
 Damage = Callable[[bytes], Iterable[bytes]]
-"""Takes a frame and returns the data that is sent in its place."""
+"""Returns the data that is sent in place of a frame."""
 
 
 class Sender:

@@ -2,7 +2,7 @@
 
 `python -m tests.helpers.faulty_federates ROLE FAULT` serves one over its standard input and output. Without arguments
 it reads lines `ROLE FAULT ADDRESS RUNS DELAY`, serves each federate in a forked process, and prints the process id.
-The fork avoids that each process repeats the imports.
+Because of the fork, the imports are executed only once.
 """
 
 import os

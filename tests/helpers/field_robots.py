@@ -1,4 +1,7 @@
-"""Emulated robots that the test starts, so that they outlive fieldkit; the field backend reaches them by loopback."""
+"""Emulated robots that the test starts, so that they still run after fieldkit has ended.
+
+The field backend reaches them over loopback.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -53,7 +53,7 @@ class AttemptTruth:
     Attributes:
         transfers: The transfers.
         pings: Number of requests and number of replies.
-        loads: Number of data packets that iperf3 sent, and number that arrived_count.
+        loads: Number of data packets that iperf3 sent, and number of them that arrived.
         cookies_bytes: Size of the cookie that a TCP client sends before the data; it is never lost.
         udp_to: Destination address of each UDP flow.
     """
@@ -137,7 +137,7 @@ class Attempt:
                 raise AssertionError(other)
 
     def _own_jobs(self, planned: list[Planned], step: object) -> list[Planned]:
-        """The jobs of the step, without those of the steps inside it."""
+        """The jobs of the step, without the jobs of the steps inside it."""
         inner_jobs = [
             planned_job.job for entry in getattr(step, "during", ()) for planned_job in entry.step.jobs(self._scene)
         ]
@@ -234,11 +234,8 @@ class Attempt:
                 rtt_text = f" time={(reply_ns - request_ns) / 1e6:.2f} ms" if payload >= 16 else ""
                 lines.append(f"{timestamp} {payload + 8} bytes from {target}: icmp_seq={number} ttl=64{rtt_text}")
                 reply_count += 1
-                self.truth.pings[name] = (request_count, reply_count)
-                lines += [
-                    f"{request_count} packets transmitted, {reply_count} received, 0% packet loss, time 1ms",
-                    "",
-                ]
+        self.truth.pings[name] = (request_count, reply_count)
+        lines += [f"{request_count} packets transmitted, {reply_count} received, 0% packet loss, time 1ms", ""]
         self._path(job.stdout).write_text("\n".join(lines), encoding="ascii")
 
     def _echo(
@@ -301,7 +298,7 @@ class Attempt:
             self._path(planned.job.stdout).write_text(json.dumps(output), encoding="ascii")
 
     def _fault(self, job: Job) -> None:
-        """The observer lost the robot for 3 s, and the cause of the fault lasted 1 s."""
+        """Write the evidence of a fault that lasted 1 s, and after which the robot did not answer for 3 s."""
         if job.name.endswith("-heals"):
             self._path(job.stdout).write_text("lasted_s 1.000\ninterval_s 0.1\n", encoding="ascii")
         elif job.log.endswith("-watch.txt"):

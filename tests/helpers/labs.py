@@ -29,8 +29,7 @@ def built_in_ros(folder: Path, name: str = SITE_FILE, *, radio: str = "{}") -> P
     """Write a site file with the default robots but with the built-in ROS instead of Debian's; return its path.
 
     Tests that do not depend on ROS use it, because a short trial then takes two thirds of the CPU time. A repeat is
-    not
-    void if a busy machine delivers packets late, so these tests must not compare delays. `radio` has the radio's
+    not void if a busy machine delivers packets late, so these tests must not compare delays. `radio` has the radio's
     options.
     """
     site = folder / name

@@ -65,7 +65,7 @@ class PacketFates:
     Attributes:
         lost: Number of packets that never arrived.
         duplicated: Number of arrivals beyond the first of each packet.
-        reordered: Number of packets whose first arrival is after that of a packet sent later.
+        reordered: Number of packets that first arrive after a packet that was sent later.
         bursts: Number of runs of lost packets.
     """
 

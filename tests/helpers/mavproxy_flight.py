@@ -32,6 +32,7 @@ DISARMED: Final = b"DISARMED"
 """Output of MAVProxy when the drone has confirmed the command, and when the drone reports that it is disarmed."""
 _WAYPOINT: Final = 16
 _RELATIVE: Final = 3
+"""MAV_CMD_NAV_WAYPOINT, and MAV_FRAME_GLOBAL_RELATIVE_ALT: altitudes are relative to the home position."""
 _RETRY_S: Final = 3.0
 NEAR_M: Final = 0.3
 """Distance from a corner within which the mission continues to the next item."""

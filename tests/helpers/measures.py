@@ -8,8 +8,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FaultKind, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import oracle_delays, outage, ping, tcpdump_log, track
-from fieldkit.measure.transfers import transfer_columns as of_transfers
-from fieldkit.measure.transfers import transfer_measures
+from fieldkit.measure.transfers import transfer_columns, transfer_measures
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.trial.columns import measured_columns
 
@@ -46,7 +45,8 @@ def measure(folder: Path, transfer: Transfer | None) -> Measures:
     measured |= track.measure(positions, ping.MOTION_COLUMNS, (Role.SENDER, Role.RECEIVER), reply_times_ns)
     if transfer is not None:
         measured |= transfer_measures.measure(evidence, transfer) | _captures(evidence)
-        assert not {column.name for column in of_transfers.COLUMNS} - measured.values.keys() - measured.missing.keys()
+        names = {column.name for column in transfer_columns.COLUMNS}
+        assert names <= measured.values.keys() | measured.missing.keys()
     for kind in FaultKind:
         try:
             measured |= outage.measure(kind, evidence.read(outage.read, "", kind))
@@ -64,6 +64,6 @@ def _captures(evidence: AttemptEvidence) -> Measured:
         frame_count = capture.frames if capture else None
         dropped = log.dropped_by_kernel if log else None
         measured |= Measured.from_optional(
-            {f"{role}_captured": frame_count, f"{role}_capture_dropped": dropped}, "not at hand"
+            {f"{role}_captured": frame_count, f"{role}_capture_dropped": dropped}, "not available"
         )
     return measured

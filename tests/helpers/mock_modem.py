@@ -1,6 +1,6 @@
 """A ModemManager with one LTE modem on the system bus, for mmcli. Debian's Python runs it, because it has dbusmock.
 
-The interfaces are those of ModemManager 1.20: org.freedesktop.ModemManager1.Modem, .Signal and .Modem3gpp.
+It has the interfaces of ModemManager 1.20: org.freedesktop.ModemManager1.Modem, .Signal and .Modem3gpp.
 """
 
 # mypy: ignore-errors

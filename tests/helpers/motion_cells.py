@@ -120,8 +120,7 @@ class Expectation:
         detected_by: The program that detects the fault.
         does: The behaviour of the robot.
         begins_s: Time limit after the fault for a ground robot to be stationary or for a drone to descend; None if it
-        may
-            continue.
+            may continue.
         ends_s: Time limit after the fault for a drone to be on the ground; None if it may continue.
         alarm: True if fieldkit prints an alarm in capitals, unless the drone has landed.
         alarm_s: Time limit for the alarm, even if the drone lands; None for no limit.

@@ -82,7 +82,7 @@ def problems(cell: MotionCell, outcome: MotionOutcome) -> list[str]:
     if not expectation.judged:
         return [*result, *_alarm_problems(expectation, outcome), *_program_problems(expectation, outcome)]
     name, scheduling_s = "descends" if cell.craft.flies else "stops", outcome.scheduling_s
-    if Party.FIELDKIT in cell.parties:  # it does not renew the lease, so the robot stops even without the command
+    if Party.FIELDKIT in cell.parties:  # fieldkit does not renew the lease, so the robot stops without the command
         scheduling_s = min(scheduling_s, (FLIGHT_LEASE_S if cell.craft.flies else DRIVE_LEASE_S) - OPERATOR_S)
     result += _time_problems(name, expectation.begins_s, outcome.begins_s, scheduling_s)
     result += _time_problems("on the ground", expectation.ends_s, outcome.ends_s, scheduling_s)

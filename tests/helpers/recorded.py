@@ -49,7 +49,7 @@ def make(out: Path, *, packets: int = PACKETS, lost: Sequence[int] = LOST) -> Pa
 
 
 def make_plain(out: Path) -> Path:
-    """Write the folder of a trial like that of `make`, but it sends a generated file in place of a bag."""
+    """Write the folder of a trial as `make` does, but with a trial that sends a generated file in place of a bag."""
     plan = plain_plan(repeats=1, protocols=(Protocol.UDP,))
     return make_of(plan, out, lambda folder: (folder / "send.bin").write_bytes(bytes(100_000)))
 

@@ -29,7 +29,7 @@ class Transmitted:
     Attributes:
         at_ns: The time at which it was passed to the wire.
         packet: The packet.
-        arrives: True if at least one copy arrives.
+        arrived: True if at least one copy arrives.
     """
 
     at_ns: int

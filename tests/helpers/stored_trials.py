@@ -43,7 +43,7 @@ def copy_trials(folder: Path) -> Iterator[list[Path]]:
 
 
 def texts(trials: Sequence[Path]) -> Iterator[tuple[str, str]]:
-    """Yield the name and text of each output; the working folder is that of `copy_trials`.
+    """Yield the name and text of each output; call it in the working folder that `copy_trials` sets.
 
     `trials` contains the lossless run, the lossy run, and others, in the order in which they are stored.
     """
@@ -192,7 +192,7 @@ def _plain(value: Any) -> Any:  # noqa: ANN401 (any part of a chart)
     return value if isinstance(value, str | None) else [_plain(item) for item in value]
 
 
-def _leaves(value: Any) -> Iterator[str | float | None]:  # noqa: ANN401 (what `_plain` returns)
+def _leaves(value: Any) -> Iterator[str | float | None]:  # noqa: ANN401 (a result of `_plain`)
     if isinstance(value, list):
         for item in value:
             yield from _leaves(item)

@@ -19,7 +19,11 @@ SEGMENT_BYTES = 1000
 
 @dataclass
 class Stream:
-    """Frames of both captures. Times are in ns since the start, on one clock; packets arrive after a delay."""
+    """Frames of both captures.
+
+    Arguments of the methods are in ns since the start, by the sender's clock. The receiver's clock is ahead of it by
+    `ahead_ns`. Packets arrive after `delay_ns`.
+    """
 
     delay_ns: int = 2 * MS
     sport: int = 40000

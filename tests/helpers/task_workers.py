@@ -37,7 +37,7 @@ traffic:
 
 
 def worker_processes(parent: int) -> list[int]:
-    """Return the descendants of a process that run tasks of `multiprocessing`, also those of Dask's nannies."""
+    """Return the descendants of a process that run tasks of `multiprocessing`, including Dask workers."""
     return [pid for pid in descendants(parent) if b"spawn_main" in _command_line(pid)]
 
 

@@ -98,6 +98,7 @@ def test_a_stream_continues_when_the_link_is_restored(
     client.settimeout(TIMEOUT_S)
     while len(received_data) < len(DATA):
         received_data += client.recv(1 << 16)
+    assert received_data == DATA
     thread.join()
 
 

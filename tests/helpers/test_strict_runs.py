@@ -96,7 +96,7 @@ ORPHAN_OF_A_NAMESPACE = """
 OTHER_PROCESS = """
     @pytest.fixture
     def other_process():
-        # Started before the test has separate namespaces, so it works in those of the machine.
+        # Started before the test has separate namespaces, so it runs in the namespaces of the machine.
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
         with subprocess.Popen(("sh", "-e"), text=True, **pipes) as shell:
             yield shell

@@ -32,7 +32,7 @@ def install_wheel(folder: Path) -> Path:
     (wheel,) = wheels.iterdir()
     _run(*pip, "--python", str(python), "install", "--no-index", "--no-deps", str(wheel))
     (packages,) = (venv / "lib").glob("python*/site-packages")
-    # Packages of the environment take precedence; .pth files in this path, such as that of the checkout, are ignored.
+    # Packages of the environment take precedence; .pth files in this path, such as the checkout's, are ignored.
     (packages / "dependencies.pth").write_text(f"{sysconfig.get_path('purelib')}\n", encoding="utf-8")
     return python
 

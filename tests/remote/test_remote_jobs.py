@@ -525,7 +525,7 @@ def test_end_of_each_job_is_recorded_with_boot_id_and_clock(shell: LocalShell, t
     into = tmp_path / "local"
     into.mkdir()
     fetching.fetch(shell, FOLDER, "sender", "lo", into)
-    before, after = (host.state(into / f"sender-{moment}.txt") for moment in ("before", "after"))
+    before, after = (host.read_state(into / f"sender-{moment}.txt") for moment in ("before", "after"))
     assert after.endings is not None
     assert before.endings is None
     endings = {name: (ending.cause, ending.code) for name, ending in after.endings.items() if name != LINK_JOB}

@@ -63,20 +63,20 @@ def test_snapshots_of_an_attempt_are_fetched(shell: LocalShell, tmp_path: Path) 
     assert calls.read_text().splitlines() == ["-n -c tracking"] * 2, "no names are resolved, and no call is repeated"
 
 
-def test_the_clock_is_reported_at_intervals_until_the_sampler_is_stopped(
-    shell: LocalShell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_clock_is_reported_at_intervals_until_the_sampler_is_stopped(shell: LocalShell, tmp_path: Path) -> None:
     """The clock loses its source during the attempt; the sampler is stopped while a program hangs."""
-    text = script.text()
+    installed = shell.home / script.SCRIPT_PATH
+    text = installed.read_text(encoding="ascii")
     assert "CLOCK_INTERVAL=10 " in text
-    monkeypatch.setattr(script, "text", lambda: text.replace("CLOCK_INTERVAL=10 ", "CLOCK_INTERVAL=1 "))
-    jobs.install(shell, Deadline.after(30))
+    installed.write_text(text.replace("CLOCK_INTERVAL=10 ", "CLOCK_INTERVAL=1 "), encoding="ascii")
     count = tmp_path / "count"
     add_program(
         tmp_path,
         "chronyc",
         f"echo x >>{shlex.quote(str(count))}\n"
-        f"case $(wc -l <{shlex.quote(str(count))}) in *1) file=synchronized-4.3;; *5) exec sleep 600;; *) file=none-4.3;; esac\n"
+        f"case $(wc -l <{shlex.quote(str(count))}) in\n"
+        "*1) file=synchronized-4.3 ;; *5) exec sleep 600 ;; *) file=none-4.3 ;;\n"
+        "esac\n"
         f"cat {shlex.quote(str(DATA))}/chrony/$file.csv",
     )
     evidence.begin(shell, FOLDER, "sender", "wlan0")

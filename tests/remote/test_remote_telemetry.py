@@ -106,7 +106,7 @@ def test_link_is_sampled_until_its_folder_is_packed(shell: LocalShell, tmp_path:
     assert measured.values["sender_signal_median_dbm"] == -60.0
     assert measured.values["sender_noise_dbm"] == -84.0
     assert measured.values["sender_tx_failures"] == measured.values["sender_roams"] == 0
-    after = host.state(into / "sender-after.txt")
+    after = host.read_state(into / "sender-after.txt")
     assert after.endings is not None
     assert after.endings["link"].cause is Cause.STOPPED
     query_log = (tmp_path / "queries").read_text().splitlines()

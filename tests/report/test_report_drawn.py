@@ -61,7 +61,7 @@ def test_curve_has_a_cross_at_a_distance_without_arrivals() -> None:
     assert [label for _, label in panel.x_ticks] == ["10m", "20m", "60m"]
     assert panel.right is not None
     assert panel.right > 60
-    assert "nothing arrived: 3 of 3 at 60m" in panel.words
+    assert "nothing arrived: 3 of 3 at 60m" in panel.description
     assert "a cross at the edge, with the reason, if a condition has no value" in chart.caption
 
 
@@ -199,7 +199,7 @@ def test_distances_have_the_labels_that_the_operator_typed() -> None:
     rows = [*rows_at(10), *(replace(row, distance="60ft") for row in rows_at(18.288))]
     panel = panel_of(curves(parsed(rows), "rtt_median_s"))
     assert [label for _, label in panel.x_ticks] == ["10m", "60ft"]
-    assert "at 60ft" in panel.words
+    assert "at 60ft" in panel.description
 
 
 @pytest.mark.parametrize("lanes", [(), ("RTT",)])

@@ -141,7 +141,7 @@ def test_labels_of_equal_distances_are_sorted_by_text(tmp_path: Path) -> None:
     labels = ("30ft", "9.144m", "914.4cm")
     rows = [lawns.row(number, distance=label, distance_m=9.144) for number, label in enumerate(labels, start=1)]
     cells = aggregate(table(tmp_path, rows))
-    places = [place.replace("\N{NO-BREAK SPACE}", " ") for place in distribution._places(cells)]
+    places = [place.replace("\N{NO-BREAK SPACE}", " ") for place in distribution._shown_distances(cells)]
     assert places == ["30ft", "9.144m", "914.4cm"]
 
 
@@ -233,7 +233,7 @@ def test_warnings_of_a_page(tmp_path: Path) -> None:
     assert listed_warnings[3][0].startswith("* 95\N{NO-BREAK SPACE}% interval assuming a normal distribution")
     assert "2 repeats give 50 %" in plain_text(listed_warnings[3][0])
     assert listed_warnings[4] == (
-        "One-way delay withheld, all or in part, in 1 valid repeat.",
+        "One-way delay withheld, completely or partly, in 1 valid repeat.",
         ["the clock drifts (1)"],
     )
     assert listed_warnings[5][0].startswith("Different versions of fieldkit")

@@ -108,7 +108,7 @@ def test_a_ping_without_any_reply_shows_all_its_losses(trial: Path) -> None:
     trips = next(panel for panel in panels(trial) if panel.title == "round trips")
     lost = next(series for series in trips.series if series.label == "no reply")
     assert len(lost.x) == 10
-    assert trips.words == "0 round trips; 10 without a reply"
+    assert trips.description == "0 round trips; 10 without a reply"
 
 
 def add_step(trial: Path, text: str) -> None:
@@ -162,4 +162,4 @@ def test_a_topic_has_a_panel_of_its_delays_and_losses(trial: Path) -> None:
     received, lost = delays.series
     assert list(received.y) == pytest.approx([0.0, 0.0, 5.0])
     assert np.diff(lost.x) == pytest.approx([0.3])
-    assert delays.words == "5 samples sent, 2 lost, 3 received"
+    assert delays.description == "5 samples sent, 2 lost, 3 received"

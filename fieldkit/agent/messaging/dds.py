@@ -35,8 +35,10 @@ are kept. ROS 2 has no limit."""
 
 _ANY_STATE = SampleState.Any | ViewState.Any | InstanceState.Any
 _BATCH = 256
+"""Maximum number of samples that one call takes from a reader."""
 _MAX_ENDPOINTS = 4096
 _OPERATION_COUNT = 14
+"""Number of pointers in `struct ddsi_sertype_ops`."""
 _DESCRIPTIONS = slice(8, 11)
 """Indices of `type_id`, `type_map` and `type_info` in the operations of a type."""
 _WAIT_NS = 100_000_000

@@ -26,6 +26,7 @@ PORTS = ("xmlrpc_port", "tcpros_port")
 """Settings for the ports of a node; without them, any free port is used."""
 
 _MAX_QUEUE = 1000
+"""Queue length if the quality of service gives no depth, or keeps all samples."""
 _RETRY_S = 0.05
 _MASTER_TIMEOUT_S = 10.0
 

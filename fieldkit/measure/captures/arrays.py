@@ -107,7 +107,8 @@ class NarrowColumn:
         """Return a copy of the column.
 
         Raises:
-            AttributeError: The column was read from the class instead of a table: the field has no default.
+            AttributeError: The column was read from the class instead of a table. `dataclass` reads it in this way,
+                and regards the field as one without a default.
         """
         if table is None:
             raise AttributeError(self._name)

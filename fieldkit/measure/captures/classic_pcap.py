@@ -51,10 +51,10 @@ def chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
         if not valid.all():
             frames = frames.where(slice(0, int(valid.argmin())))
             damage = f"no packet header at byte {starts[len(frames)]}, after packet {count + len(frames)}"
-        elif at > size:
+        elif at > size:  # the last record extends beyond the end of the file
             frames = frames.where(slice(0, len(frames) - 1))
             damage = f"ends inside the packet at byte {starts[-1]}, after packet {count + len(frames)}"
-        elif size - _RECORD_HEADER_BYTES < at < size:
+        elif size - _RECORD_HEADER_BYTES < at < size:  # the file ends inside a record header
             damage = f"ends inside the packet at byte {at}, after packet {count + len(frames)}"
         count += len(frames)
         yield Chunk(frames, damage)

@@ -72,6 +72,7 @@ ICMP: Final = 1
 TCP: Final = 6
 UDP: Final = 17
 SCTP: Final = 132
+"""IP protocol numbers."""
 
 Addresses = NDArray[np.uint64]
 """Shape (n, 2): upper and lower half of each IPv6 address. IPv4 addresses are IPv4-mapped (RFC 4291, 2.5.5.2)."""
@@ -93,6 +94,7 @@ _IPV4: Final = layout(
 IPV6_HEADER_BYTES: Final = 40
 """Length of the fixed header of IPv6."""
 _MAPPED: Final = 0xFFFF << 32
+"""Lower half of the prefix of IPv4-mapped addresses, `::ffff:0:0/96`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +168,7 @@ def ip_headers(integers: Integers, frames: Frames, at: Ints) -> Headers:
 
 
 def _ipv4_headers(integers: Integers, frame: Ints, at: Ints, captured: Ints, wire: Ints) -> Headers:
+    """Return the valid IPv4 headers at the positions `at`."""
     head = integers.fields(_IPV4, at)
     header = (head["length"] & 0xF) * 4
     # Segmentation offload leaves the total length 0 in frames above 64 KiB; the wire length is used instead.

@@ -10,9 +10,11 @@ import numpy as np
 from fieldkit.measure.captures.arrays import Integers, Ints
 from fieldkit.measure.captures.headers import IPV6_HEADER_BYTES, TCP, UDP, Addresses, Headers
 
+# Types of extension headers.
 _HOP_BY_HOP: Final = 0
 _FRAGMENT: Final = 44
 _AUTHENTICATION: Final = 51
+# Type and length of the option with the length of a jumbogram.
 _JUMBO_OPTION: Final = 0xC204
 # Hop-by-hop, routing, fragment, authentication, destination, mobility, host identity and shim6 headers have the same
 # format, except for the encoding of the length.

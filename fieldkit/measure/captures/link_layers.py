@@ -14,12 +14,17 @@ from fieldkit.measure.captures.headers import COOKED_V2, NO_HEADER
 
 HeaderFinder = Callable[[Integers, Frames], Ints]
 
+# EtherTypes of IPv4 and IPv6, and of VLAN tags.
 _IP_TYPES: Final = (0x0800, 0x86DD)
 _TAG_TYPES: Final = (0x8100, 0x88A8, 0x9100)
 # AF_INET of all systems, AF_INET6 of Linux, NetBSD, FreeBSD, macOS.
 _IP_FAMILIES: Final = (2, 10, 24, 28, 30)
+# The LLC header of a SNAP frame: DSAP and SSAP 0xAA, control 0x03, and the first byte of the OUI.
 _SNAP: Final = 0xAAAA0300
 _RADIOTAP_HEADER_BYTES: Final = 8
+# Bits of radiotap's field `flags`.
+_RADIOTAP_PADDED: Final = 0x20
+_RADIOTAP_WRONG_FCS: Final = 0x40
 
 
 def _after_ethertype(integers: Integers, frames: Frames, type_at: Ints, network: Ints) -> Ints:
@@ -81,8 +86,9 @@ def _radiotap(integers: Integers, frames: Frames) -> Ints:
     has_timestamp = present & 1 == 1
     flags_at = np.where(has_timestamp, frames.start + (fields_at - frames.start + 7) // 8 * 8 + 8, fields_at)
     flags = np.where((present & 2 == 2) & (flags_at < end), integers.u8(flags_at), 0)
-    network = _after_mac_header(integers, frames, frames.start + length, padded=flags & 0x20 != 0)
-    return np.where((integers.u8(frames.start) == 0) & (flags & 0x40 == 0), network, NO_HEADER)
+    network = _after_mac_header(integers, frames, frames.start + length, padded=flags & _RADIOTAP_PADDED != 0)
+    is_version_0 = integers.u8(frames.start) == 0
+    return np.where(is_version_0 & (flags & _RADIOTAP_WRONG_FCS == 0), network, NO_HEADER)
 
 
 def _80211(integers: Integers, frames: Frames) -> Ints:

@@ -67,8 +67,9 @@ least this many bytes after the headers."""
 _CONTENT: Final = layout(LITTLE, CONTENT_BYTES, **{str(at): (at, 8) for at in range(0, CONTENT_BYTES, 8)})
 # Masks of the first 0 to 8 bytes of a little-endian word, by the number of bytes.
 _FIRST_BYTES_MASKS: Final = np.array([(1 << 8 * count) - 1 for count in range(9)], dtype=np.uint64).astype(np.int64)
-_REPLY: Final = 0
-_REQUEST: Final = 8
+_ICMP_ECHO_REPLY: Final = 0
+_ICMP_ECHO_REQUEST: Final = 8
+# Kinds of TCP options.
 _MSS_OPTION: Final = 2
 _STAMP_OPTION: Final = 8
 # Two no-operation options before the time stamp: most systems align it this way (RFC 7323, appendix A).
@@ -259,7 +260,9 @@ def _echo_identifiers(integers: Integers, icmp: Mask, transport: Ints) -> Ints:
     identifiers = np.full_like(transport, NO_ECHO)
     at = transport[icmp]
     kind, identifier = integers.u8(at), integers.u16(at + 4)
-    identifiers[icmp] = np.select([kind == _REQUEST, kind == _REPLY], [identifier, identifier + ECHO_REPLY], NO_ECHO)
+    identifiers[icmp] = np.select(
+        [kind == _ICMP_ECHO_REQUEST, kind == _ICMP_ECHO_REPLY], [identifier, identifier + ECHO_REPLY], NO_ECHO
+    )
     return identifiers
 
 

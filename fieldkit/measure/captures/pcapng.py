@@ -18,6 +18,7 @@ from fieldkit.measure.captures.headers import check_link_type
 MAGIC: Final = b"\x0a\x0d\x0d\x0a"
 """First four bytes of a file in either byte order: the block type of a section header."""
 
+# Block types.
 _SECTION: Final = 0x0A0D0D0A
 _INTERFACE: Final = 1
 _OBSOLETE_PACKET: Final = 2
@@ -26,9 +27,11 @@ _ENHANCED_PACKET: Final = 6
 _PACKETS: Final = frozenset({_OBSOLETE_PACKET, _SIMPLE_PACKET, _ENHANCED_PACKET})
 _DEFINITIONS: Final = frozenset({_SECTION, _INTERFACE})
 _ORDERS: Final[dict[bytes, Order]] = {b"\x1a\x2b\x3c\x4d": BIG, b"\x4d\x3c\x2b\x1a": LITTLE}
+# Smallest lengths of a section header, an interface description and any block.
 _SECTION_BYTES: Final = 28
 _INTERFACE_BYTES: Final = 20
 _SMALLEST_BLOCK_BYTES: Final = 12
+# Snap length that is larger than any 32-bit packet length.
 _NO_LIMIT: Final = 1 << 32
 # Wireshark's WTAP_MAX_PACKET_SIZE_STANDARD, which equals libpcap's MAXIMUM_SNAPLEN.
 _MAX_CAPTURED_BYTES: Final = 262_144
@@ -108,16 +111,17 @@ def _frames(data: Buffer, section: _Section, start: Ints) -> tuple[Frames, Mask]
     integers = Integers(data, section.order)
     kind, length = integers.u32(start), integers.u32(start + 4)
     simple = kind == _SIMPLE_PACKET
-    number = np.where(kind == _OBSOLETE_PACKET, integers.u16(start + 8), integers.u32(start + 8))
-    number[simple] = 0
+    interface_index = np.where(kind == _OBSOLETE_PACKET, integers.u16(start + 8), integers.u32(start + 8))
+    interface_index[simple] = 0
+    has_interface = interface_index < len(section.interfaces)
     wire = integers.u32(start + np.where(simple, 8, 24))
     captured = np.where(simple, np.minimum(wire, _snap_bytes(section)), integers.u32(start + 20))
     link_type, time_ns = np.zeros_like(start), np.zeros_like(start)
     high, low = integers.u32(start + 12).astype(np.uint64), integers.u32(start + 16).astype(np.uint64)
-    for interface in np.flatnonzero(np.bincount(number[number < len(section.interfaces)])).tolist():
-        rows = np.flatnonzero(number == interface)
-        link_type[rows] = section.interfaces[interface].link_type
-        time_ns[rows] = section.interfaces[interface].time_ns(high[rows] << np.uint64(32) | low[rows])
+    for index in np.flatnonzero(np.bincount(interface_index[has_interface])).tolist():
+        rows = np.flatnonzero(interface_index == index)
+        link_type[rows] = section.interfaces[index].link_type
+        time_ns[rows] = section.interfaces[index].time_ns(high[rows] << np.uint64(32) | low[rows])
     time_ns[simple] = NO_TIME
     frames = Frames(
         start=start + np.where(simple, 12, 28),
@@ -126,7 +130,7 @@ def _frames(data: Buffer, section: _Section, start: Ints) -> tuple[Frames, Mask]
         time_ns=time_ns,
         link_type=link_type,
     )
-    valid = (number < len(section.interfaces)) & (captured <= np.minimum(wire, _MAX_CAPTURED_BYTES))
+    valid = has_interface & (captured <= np.minimum(wire, _MAX_CAPTURED_BYTES))
     valid &= (captured <= length - np.where(simple, 16, 32)) & (length % 4 == 0)
     return frames, valid & (integers.u32(start + length - 4) == length)
 
@@ -185,6 +189,7 @@ def _describe_damage(data: Buffer, order: Order, at: int) -> str:
     return f"no block at byte {at}"
 
 
+# Options of an interface description: opt_endofopt, if_tsresol, if_tsoffset.
 _END_OF_OPTIONS: Final = 0
 _RESOLUTION: Final = 9
 _OFFSET: Final = 14

@@ -148,6 +148,7 @@ def _gaps(intervals: tuple[IperfInterval, ...]) -> Iterator[str]:
 
 
 def _interval_problems(interval: IperfInterval) -> Iterator[str]:
+    """Yield the contradictions within an interval, as predicates: `has 100 bytes, but its streams have 90`."""
     if interval.start_s is not None and interval.end_s is not None:
         duration_s = interval.end_s - interval.start_s
         if abs(duration_s - interval.duration_s) > _ROUNDING_S:
@@ -158,7 +159,7 @@ def _interval_problems(interval: IperfInterval) -> Iterator[str]:
     rate = interval.rate_bit_s
     if rate is not None and not math.isclose(rate, interval.bit_s, rel_tol=_ROUNDING, abs_tol=8):
         yield f"has {interval.bit_s:.0f} bit/s by its bytes, but reports {rate:.0f} bit/s"
-    # A negative loss is no contradiction: a datagram that arrives late is counted as lost in one interval, and
+    # A negative loss is possible: a datagram that arrives late is counted as lost in one interval, and
     # subtracted from the losses of the next.
     if interval.lost is not None and interval.datagrams is not None and interval.lost > interval.datagrams:
         yield f"has {interval.lost} of {interval.datagrams} datagrams lost"
@@ -196,6 +197,7 @@ def compare_ends(client: IperfTest, server: IperfTest, settings: IperfSettings) 
 
 
 def _differences(test: IperfTest, settings: IperfSettings) -> Iterator[str]:
+    """Yield the differences between a test and the procedure's settings, as predicates."""
     start = test.start
     comparisons = {
         "protocol": (start.protocol or None, str(settings.protocol)),

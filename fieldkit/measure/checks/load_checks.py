@@ -117,7 +117,7 @@ def _check_arrivals(
     total_bytes = sum(interval.payload_bytes for interval in received.intervals)
     if not len(progress.times_ns):
         if total_bytes:
-            yield f"iperf3 received {total_bytes} bytes, but the receiver's capture contains none of them"
+            yield f"iperf3 received {total_bytes} bytes, but the receiver's capture contains no payload of the test"
         return
     first_ns = int(progress.times_ns[0])
     request_ns = _last_request_ns(flow, evidence, first_ns)
@@ -204,6 +204,7 @@ def _first_seq(stream: Packets) -> int | None:
 
 
 def _acknowledgments(flow: LoadFlow, packets: Packets, sport: int, dport: int) -> Packets:
+    """Return the packets that acknowledge data of a stream."""
     ends = packets.are_from(flow.destination_address) & packets.are_to(flow.source_address)
     return packets.where(
         ends

@@ -201,6 +201,7 @@ def check_output(output: Ping, count: int, payload_bytes: int, window: tuple[int
 
 
 def _check_summary(output: Ping) -> Iterator[str]:
+    """Yield a contradiction for each time in ping's summary that differs from its reply lines."""
     times_s = [reply.rtt_s for reply in output.replies if reply.rtt_s is not None and not reply.damaged]
     if output.summary_s is None or not times_s:
         return
@@ -259,6 +260,7 @@ def _unprinted_replies(output: Ping, captured: CapturedPing, interval_s: float, 
 
 
 def _time_problems(output: Ping, answers: list[Reply], captured: CapturedPing, role: str) -> Iterator[str]:
+    """Yield the contradictions between the printed times and the times in the requester's capture."""
     excess_s, print_delay_s = [], []
     factor = _BUSYBOX_FACTOR if output.first_seq == 0 else 1  # only busybox numbers the requests from 0
     for reply in answers:

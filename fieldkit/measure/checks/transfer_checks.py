@@ -109,6 +109,7 @@ def _byte_count_contradictions(
 def _udp_contradictions(
     sender: Packets, receiver: Packets, files: _Files | None, transfer: Transfer
 ) -> Iterator[str]:
+    """Yield contradictions between the datagrams in both captures and the files' sizes."""
     both = transfer.forward(sender), transfer.forward(receiver)
     # A capture also contains later fragments of other programs' datagrams.
     ids = np.concatenate([packets.ip_id[packets.dport == transfer.port] for packets in both])
@@ -150,6 +151,7 @@ def _packet_keys(packets: Packets) -> Keys:
 def _tcp_contradictions(
     sender: Packets, receiver: Packets, files: _Files | None, transfer: Transfer, *, finished: bool
 ) -> Iterator[str]:
+    """Yield contradictions between the bytes in both captures, TCP's acknowledgments and the files' sizes."""
     sent, received = (
         packets.where(packets.dport == transfer.port)
         for packets in (transfer.forward(sender), transfer.forward(receiver))
@@ -235,7 +237,7 @@ CROSS_CHECKS: Final = (
         ),
         source="`sender.pcap`, `receiver.pcap`",
         against=("each other", "`ROLE-capture.log`: tcpdump's counters", "TCP's acknowledgments", "both files"),
-        tolerance="none; losses, copies and reordering on the link are no contradictions",
+        tolerance="none; losses, copies and reordering on the link are not contradictions",
     ),
     CrossCheck(
         quantity="delay and its variation",
@@ -274,7 +276,7 @@ CROSS_CHECKS: Final = (
     CrossCheck(
         quantity="distance and speed during the transfer",
         columns=("transfer_distance_*", "transfer_*_speed_m_s"),
-        source="`track.csv` of the emulator, else `positions.json`",
+        source="`track.csv` of the emulator; without an emulator, `positions.json`",
         against=(),
         tolerance="the positions are compared only if steps move robots or record positions",
         outcome=CheckOutcome.UNCHECKED,

@@ -16,7 +16,7 @@ from typing import Final
 
 _READING: Final = re.compile(r"(\d{1,12})\.(\d{2}) (\d{1,11})(?:\.(\d{9}))? (\d{1,12})\.(\d{2})", re.ASCII)
 
-_TICK_NS: Final = 10_000_000
+_TICK_NS: Final = 10_000_000  # resolution of /proc/uptime
 _SECOND_NS: Final = 1_000_000_000
 
 

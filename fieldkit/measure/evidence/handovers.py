@@ -184,6 +184,7 @@ def _window_ns(output: Ping | None, interval_s: float) -> tuple[float, float]:
 
 
 def _measure_gaps(handovers: Sequence[Handover], output: Ping | None, interval_s: float) -> Measured:
+    """Return the columns of the gaps that the handovers caused."""
     candidates = [] if output is None else [gap_around(handover, output, interval_s) for handover in handovers]
     gaps = [gap for gap in candidates if gap is not None]
     if not gaps:

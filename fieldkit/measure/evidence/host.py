@@ -111,7 +111,7 @@ def after_file(role: Role) -> str:
     return f"{role}-after.txt"
 
 
-def state(path: Path) -> HostState:
+def read_state(path: Path) -> HostState:
     """Return the state in a host-state file, without counters.
 
     Raises:
@@ -161,10 +161,10 @@ def job_times_ns(path: Path) -> Mapping[str, tuple[int, int]]:
     }
 
 
-def stations(path: Path) -> str:
+def station_dump(path: Path) -> str:
     """Return the output of `iw station dump`, or an empty string if it is missing.
 
-    Raises the same errors as `state`.
+    Raises the same errors as `read_state`.
     """
     return _sections(reading.text(path)).get("iw station dump", "")
 
@@ -179,16 +179,16 @@ def congestion_control(path: Path) -> str | None:
     return name if len(name) <= _MAX_NAME_BYTES and re.fullmatch(r"[a-z][a-z0-9_-]*", name) else None
 
 
-def read(path: Path) -> Counters:
+def read_counters(path: Path) -> Counters:
     """Return the counters of a host-state file.
 
     Raises:
         EvidenceError: The file is missing or cannot be read.
     """
-    return parse(reading.text(path))
+    return parse_counters(reading.text(path))
 
 
-def parse(text: str) -> Counters:
+def parse_counters(text: str) -> Counters:
     """Return the counters in the text of a host-state file; missing counters are None."""
     table = _parse_snmp(_sections(text).get(_SNMP, ""))
     return Counters(
@@ -211,7 +211,7 @@ def received_bytes(path: Path, interface: str) -> int | None:
     return int(counter[1]) if counter else None
 
 
-def difference(before: Counters, after: Counters) -> Counters:
+def increments(before: Counters, after: Counters) -> Counters:
     """Return the increments of the counters; None for a counter that is missing, or decreased because of a reboot."""
     return Counters(
         udp_buffer_errors=_increment(before.udp_buffer_errors, after.udp_buffer_errors),
@@ -272,9 +272,9 @@ def measure(before: Counters | None, after: Counters | None) -> Measured:
     """Return the columns; `before` and `after` are None if the state is not available."""
     if before is None or after is None:
         return Measured.all_missing(COLUMNS, "the receiver's state is not available")
-    increments = difference(before, after)
+    counters = increments(before, after)
     values = {
-        "receiver_udp_buffer_errors": increments.udp_buffer_errors,
-        "receiver_reassembly_failures": increments.reassembly_failures,
+        "receiver_udp_buffer_errors": counters.udp_buffer_errors,
+        "receiver_reassembly_failures": counters.reassembly_failures,
     }
     return Measured.from_optional(values, "the receiver restarted, or does not count them")

@@ -86,6 +86,7 @@ _MAX_BYTES: Final = 16 << 20
 # cJSON before 1.5.9 printed nan and inf, which are not valid JSON.
 _INVALID_NUMBER: Final = re.compile(r"(?<=[:,\[])(\s*)[-+]?(?:nan|inf(?:inity)?)\b(?=\s*[,\]}])", re.IGNORECASE)
 _MIN_INTERVALS: Final = 3
+"""Number of full intervals from which on the first one is excluded."""
 _MIN_LENGTH_SHARE: Final = 0.5
 """An interval that is shorter than this share of the longest one is not a full interval, but the end of the test. On
 a link with losses, it contains some tenths of a second without data, until the receiver is notified of the end.
@@ -213,6 +214,7 @@ def parse(text: str) -> IperfTest:
 
 
 def _intervals(document: Mapping[str, Any]) -> Iterator[IperfInterval]:
+    """Yield the intervals of a test, without omitted and incomplete ones."""
     for interval in items(document, "intervals"):
         total = mapping(interval, "sum")
         duration_s, payload_bytes = number(total, "seconds"), count(total, "bytes")

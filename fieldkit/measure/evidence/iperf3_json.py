@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 _MAX_COUNT: Final = 2**53
+"""Larger integers are not exact as a float."""
 
 
 def mapping(document: Mapping[str, Any], key: str) -> Mapping[str, Any]:

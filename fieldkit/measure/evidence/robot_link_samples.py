@@ -32,12 +32,12 @@ _POWER: Final = re.compile(r"(-[0-9]{1,3})(?:\.[0-9]{1,2})?\b(?: \[[^\]\n]{0,60}
 _RATE: Final = re.compile(r"([0-9]{1,6}(?:\.[0-9]{1,2})?) MBit/s", re.ASCII)
 _LINK_PACKETS: Final = re.compile(r"[0-9]{1,18} bytes \(([0-9]{1,18}) packets\)", re.ASCII)
 _WIRELESS_LINE: Final = re.compile(r"[0-9a-f]{4} +-?[0-9]{1,4}\.? +(-[0-9]{1,3})\.? +(-?[0-9]{1,4})\.? ", re.ASCII)
-_UNKNOWN_NOISE: Final = -256.0
-_MS: Final = 1_000_000
+_UNKNOWN_NOISE: Final = -256.0  # /proc/net/wireless prints it if the driver does not report the noise
+_NS_PER_MS: Final = 1_000_000
 _SECTION: Final = re.compile(
     r"^==> ([0-9]{1,10})\.([0-9]{2}) (link|survey|station|wireless) <==\n", re.MULTILINE | re.ASCII
 )
-_TICK_NS: Final = 10_000_000
+_TICK_NS: Final = 10_000_000  # resolution of the seconds since boot
 
 
 def parse_stations(text: str) -> tuple[StationSample, ...]:
@@ -86,8 +86,10 @@ def parse_channel(text: str) -> tuple[float | None, int | None, int | None]:
         if "[in use]" in lines.get("frequency", ""):
             active_ms = _parse_value(_IW_COUNT, lines, "channel active time", int)
             busy_ms = _parse_value(_IW_COUNT, lines, "channel busy time", int)
-            times = (None, None) if active_ms is None or busy_ms is None else (active_ms * _MS, busy_ms * _MS)
-            return _parse_value(_POWER, lines, "noise", float), *times
+            noise_dbm = _parse_value(_POWER, lines, "noise", float)
+            if active_ms is None or busy_ms is None:
+                return noise_dbm, None, None
+            return noise_dbm, active_ms * _NS_PER_MS, busy_ms * _NS_PER_MS
     return None, None, None
 
 
@@ -125,7 +127,7 @@ def read(folder: Path, role: Role) -> Sequence[LinkSample]:
         EvidenceError: The files are missing, or do not contain the robot's clock.
     """
     paths = [folder / name(role) for name in (host.before_file, host.after_file) if (folder / name(role)).is_file()]
-    dumps = [(state.clock, host.stations(path)) for path in paths if (state := host.state(path)).clock]
+    dumps = [(state.clock, host.station_dump(path)) for path in paths if (state := host.read_state(path)).clock]
     if not dumps or dumps[0][0] is None:
         raise EvidenceError("does not contain the clock", where=str(folder / host.before_file(role)))
     clock = dumps[0][0]

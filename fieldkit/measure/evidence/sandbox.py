@@ -1,9 +1,9 @@
 """Sandboxed reading of untrusted files, in a process with limits for memory, CPU time and disk.
 
-A library without precautions decompresses a whole file, runs queries that the file's database schema can change, and
-follows every reference. A check of the file in advance cannot detect all of this. The reader is a process because a
-process can be killed, unlike a thread. It is started by the first query, which takes 0.1 s, and also answers later
-queries. It exits if it is idle for some time, and if it runs out of memory.
+An untrusted file can make a library decompress any amount of data, run queries that the file's database schema
+defines, or follow references without end. A check of the file in advance cannot detect all of this. The reader is a
+process, because a process can be killed, unlike a thread. The first query starts it, which takes 0.1 s; the process
+also answers later queries. It exits if it is idle for some time, and if it runs out of memory.
 """
 
 import json
@@ -40,9 +40,11 @@ MAX_CPU_S: Final = 3600
 # limit is larger than the CPU time, because other processes may use the CPU.
 _WALL_PER_CPU_S: Final = 6
 _EXIT_WAIT_S: Final = 5.0
+"""Time within which a process that has closed its output must exit; then it is killed."""
 ERROR_KEY: Final = "unanswered"
 """Key of the error message in the answer to a query that failed."""
 _TIMED_OUT: Final = -signal.SIGXCPU
+"""Exit code after a limit of time: the kernel sends SIGXCPU at the limit of CPU time."""
 # Exit codes that the file did not cause: 0 after the idle time; signals of the kernel's out-of-memory killer, a
 # service manager or a person.
 _EXTERNAL_EXIT_CODES: Final = {0, -signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP, -signal.SIGINT}

@@ -6,6 +6,7 @@ from itertools import pairwise
 from typing import Final
 
 NUMBERS: Final = 256
+"""Number of different sequence numbers."""
 SILENCE_US: Final = 1_000_000
 """After this time without a message, sequence numbers may have wrapped. They are then not sufficient to compute the
 number of lost messages."""

@@ -267,8 +267,7 @@ def travel_contradiction(
 def _recorded_contradiction(evidence: AttemptEvidence, role: Role, farthest_m: float) -> str | None:
     """Return the reason why recorded positions of a robot contradict the distance, or None if they do not.
 
-    The recording may be longer than the movement. A larger recorded distance is therefore no contradiction, but a
-    smaller one is.
+    The recording may be longer than the movement. Therefore, only a smaller recorded distance is a contradiction.
     """
     try:
         position_source = read_position_sources(evidence).robots.get(role)

@@ -25,7 +25,8 @@ LOCAL: Final = "metres"
 """Frame of a file with metres from an unknown origin."""
 
 MAX_SAMPLES: Final = 1_000_000
-_MAX_NS: Final = 2**62
+"""Maximum number of positions in a file."""
+_MAX_NS: Final = 2**62  # in the year 2116
 _NS_PER: Final = {"t_s": 10**9, "t_ms": 10**6, "t_us": 10**3, "t_ns": 1}
 _UNIX_TIME: Final = re.compile(r"-?[0-9]{1,20}(?:\.[0-9]*)?", re.ASCII)
 _AXES: Final = ("x", "y", "z")

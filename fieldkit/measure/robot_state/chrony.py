@@ -19,6 +19,7 @@ NAME: Final = "chrony"
 """Name of the source in a snapshot, and of the program in reports."""
 
 _FIELDS: Final = 14
+"""Number of fields with `-c`."""
 _LOCAL: Final = "7F7F0101"
 """Reference ID of a chronyd that serves its own clock (`local` in chrony.conf(5))."""
 _SYNCHRONIZED: Final = frozenset(("Normal", "Insert second", "Delete second"))

@@ -55,7 +55,7 @@ def offset(request_ns: int, response_ns: int, clock: Clock) -> Offset | None:
 def laptop_offset(evidence: AttemptEvidence, role: Role) -> Offset | None:
     """Return the offset of a robot's clock from the laptop's at the start of an attempt; None if unknown."""
     times_ns = (evidence.read_or_none(read, FILE) or {}).get(role)
-    state = evidence.read_or_none(host.state, host.before_file(role))
+    state = evidence.read_or_none(host.read_state, host.before_file(role))
     if times_ns is None or state is None or state.clock is None:
         return None
     return offset(*times_ns, state.clock)

@@ -23,6 +23,7 @@ _FAILURES: Final = {None: "was interrupted", 137: "did not answer in time", 153:
 _NOT_EXECUTABLE: Final = (126, 127)
 """Exit codes of a program that cannot be started. 126 occurs because BusyBox finds files that are not executable."""
 MAX_SOURCES: Final = 50
+"""Further sources in a snapshot are ignored."""
 
 
 @dataclass(frozen=True)

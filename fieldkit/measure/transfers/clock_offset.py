@@ -39,6 +39,7 @@ STAMP_S: Final = 1e-6
 """Maximum error of the difference of two times: tcpdump truncates times to microseconds."""
 
 _HULL_POINTS: Final = 1024
+"""Maximum number of points from which a convex hull is computed."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,11 +30,15 @@ COLUMNS: Final = columns(
     (
         "one_way_median_s",
         "s",
-        "Median one-way delay; empty as for one_way_min_s.",
+        "Median one-way delay; empty if its error is too large, see one_way_min_s.",
         Figure("one-way delay", Kind.MEDIAN, rank=31, of_sent="one_way_median_sent_s"),
     ),
-    ("one_way_mean_s", "s", "Mean one-way delay; empty as for one_way_min_s."),
-    ("one_way_p95_s", "s", "95th percentile of the one-way delay; empty as for one_way_min_s."),
+    ("one_way_mean_s", "s", "Mean one-way delay; empty if its error is too large, see one_way_min_s."),
+    (
+        "one_way_p95_s",
+        "s",
+        "95th percentile of the one-way delay; empty if its error is too large, see one_way_min_s.",
+    ),
     ("one_way_error_s", "s", "Maximum error of the one-way delays that is caused by the clocks."),
     ("one_way_withheld", "text", "Reason why one-way delays are empty; empty if all of them have a value."),
     (
@@ -95,6 +99,7 @@ SINGLE_PACKET: Final = "one direction has a single packet in both captures, and 
 _JITTER_GAIN: Final = 1 / 16
 """Weight of the newest step in the interarrival jitter of RFC 3550."""
 _WEIGHTED_STEPS: Final = 1000
+"""Number of steps that are used; the weight of older steps is below 1e-29."""
 
 
 def udp_pairs(packets: udp.UdpPackets) -> StampPairs:
@@ -185,7 +190,7 @@ def packet_delays(
     Return None if the clock offset cannot be estimated, or if its error is unlimited.
 
     Args:
-        pairs: The transfer's packets, paired as for `measure`; all must have times.
+        pairs: The transfer's packets, from `udp_pairs` or `tcp_pairs`; all must have times.
         sender: Packets of the sender's capture, all with times.
         receiver: Packets of the receiver's capture, all with times.
         transfer: Identifies the transfer's packets.
@@ -282,6 +287,7 @@ def _clock(clocks: Clocks) -> Measured:
 
 
 def _one_way(delay_s: Floats, error_s: float, sent: int) -> Measured:
+    """Return the columns of the one-way delay; a column whose error is too large is empty."""
     figures = {
         "one_way_min_s": float(delay_s.min()),
         "one_way_median_s": float(np.median(delay_s)),

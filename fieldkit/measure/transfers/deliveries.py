@@ -2,7 +2,7 @@
 
 TCP delivers bytes in order, each once (RFC 9293, section 3.10.7.4): a frame is a delivery if it extends the
 contiguous received bytes. UDP delivers complete datagrams. A retransmitted copy, a duplicate, a fragment that does
-not complete its datagram and a segment after a gap are no deliveries. Segmentation offload changes the time of a
+not complete its datagram and a segment after a gap are not deliveries. Segmentation offload changes the time of a
 delivery by at most one frame.
 
 All times are by the clock of the receiver's capture. The sender's times are converted with the fastest packet of the

@@ -77,6 +77,7 @@ def read(evidence: AttemptEvidence, transfer: Transfer) -> Fates | None:
 
 
 def _udp_fates(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates | None:
+    """Return the fates of UDP packets, or None if it is ambiguous which packets were lost."""
     packets = udp.match_transfer(sender, receiver, transfer)
     is_transfer_packet, sent_index = packets.is_transfer_packet, packets.match.sent_index
     if (is_transfer_packet & packets.match.ambiguous).any():

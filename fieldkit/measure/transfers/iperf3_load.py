@@ -248,7 +248,7 @@ def measure_stalls(flow: str, load: LoadStreams, sender: Packets | None, receive
 
 
 def read_deliveries(load: LoadStreams, sender: Packets | None, receiver: Packets | None) -> list[StreamDeliveries]:
-    """Return the deliveries of each stream of a load. The arguments are those of `measure_stalls`.
+    """Return the deliveries of each stream of a load. The arguments are the same as for `measure_stalls`.
 
     Raises:
         EvidenceError: The deliveries cannot be determined from the captures.
@@ -277,7 +277,7 @@ def read_deliveries(load: LoadStreams, sender: Packets | None, receiver: Packets
 
 
 def measure_jitter(load: LoadStreams, sender: Packets | None, receiver: Packets | None) -> Measured:
-    """Return the columns of the jitter of a UDP load; the arguments are those of `measure_stalls`."""
+    """Return the columns of the jitter of a UDP load. The arguments are the same as for `measure_stalls`."""
     if load.protocol is not Protocol.UDP:
         return Measured.all_missing(JITTER, f"not applicable to {load.protocol}")
     if sender is None or receiver is None:

@@ -223,6 +223,7 @@ def _match_frames(sent: Packets, received: Packets) -> Match:
 
 
 def _match_pieces(sent: Packets, received: Packets, frames: Match) -> Payload:
+    """Match the pieces of payload, given the match of whole frames."""
     sent_pieces, received_pieces = tcp_streams.cut(sent, received)
     stamp, received_stamp = usable_stamps(sent, received)
     key = row_hashes(sent_pieces.range_id, stamp[sent_pieces.frame])

@@ -51,7 +51,8 @@ COLUMNS: Final = columns(
     ),
 )
 
-_SEQUENCE: Final = 1 << 32
+_SEQUENCE_NUMBERS: Final = 1 << 32
+"""Number of TCP sequence numbers."""
 
 
 @dataclass(frozen=True)
@@ -138,8 +139,8 @@ def _closed_ns(sent: Packets, receiver: Packets, transfer: Transfer, counts: tcp
     closing = reverse.where(
         (reverse.sport == transfer.port) & (reverse.dport == sent.sport[0]) & (reverse.tcp_flags & FIN != 0)
     )
-    acked_beyond = (closing.tcp_ack - (int(isn[0]) + 1 + counts.unique_bytes)) % _SEQUENCE
-    times_ns = closing.time_ns[acked_beyond < _SEQUENCE // 2]
+    acked_beyond = (closing.tcp_ack - (int(isn[0]) + 1 + counts.unique_bytes)) % _SEQUENCE_NUMBERS
+    times_ns = closing.time_ns[acked_beyond < _SEQUENCE_NUMBERS // 2]
     return None if not len(times_ns) or (times_ns == NO_TIME).any() else int(times_ns.min())
 
 

@@ -121,7 +121,7 @@ def find_stalls(stream: StreamDeliveries) -> Stalls:
 
 
 def _stall_without_arrivals(stream: StreamDeliveries) -> Stalls:
-    """Return the stall of a stream of which nothing arrived: its whole duration."""
+    """Return the stall of a stream without arrivals; it has the stream's whole duration."""
     duration_s = ((stream.end_ns or stream.begin_ns) - stream.begin_ns) / 1e9
     if duration_s <= 0:
         raise EvidenceError("no packet of the flow arrived, and only one was sent")
@@ -165,7 +165,7 @@ def flow_schedule(evidence: AttemptEvidence, transfer: Transfer, listener: str) 
 
 
 def read_transfer_deliveries(evidence: AttemptEvidence, transfer: Transfer, listener: str) -> list[StreamDeliveries]:
-    """Return the deliveries of each connection. The arguments are those of `flow_schedule`.
+    """Return the deliveries of each connection. The arguments are the same as for `flow_schedule`.
 
     Raises:
         EvidenceError: The deliveries cannot be determined from the captures.

@@ -62,8 +62,8 @@ LAYERS: Final = columns(
         "ip_packets_doubtful",
         "count",
         (
-            "Packets of ip_packets_sent that are ambiguous: their headers and contents equal those of other packets"
-            " that were sent at nearly the same time, and only some of these packets arrived. Empty for TCP."
+            "Packets of ip_packets_sent that are ambiguous: other packets with the same headers and contents were"
+            " sent at nearly the same time, and only some of these packets arrived. Empty for TCP."
         ),
     ),
     (

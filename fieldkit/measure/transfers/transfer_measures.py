@@ -88,7 +88,7 @@ def measure(evidence: AttemptEvidence, transfer: Transfer, listener: str = "") -
             evidence, DISTANCE, (transfer.source, transfer.destination), _sent_ns(sender, transfer)
         )
         | _paper(sender, None if contradiction else receiver, ping_output, transfer)
-        | host.measure(*(evidence.read_or_none(host.read, name) for name in states))
+        | host.measure(*(evidence.read_or_none(host.read_counters, name) for name in states))
         | _system(evidence, transfer)
     )
 
@@ -133,6 +133,7 @@ def loss(arrived: int | None, sent: int | None) -> float | None:
 
 
 def _files(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
+    """Return the columns of the sent and the received file."""
     sent_bytes = evidence.read_or_none(reading.size, transfer.sent_file)
     received_bytes = evidence.read_or_none(reading.size, transfer.received_file)
     contents = evidence.read_or_none(recordings.read, transfer.sent_file)
@@ -258,6 +259,7 @@ def _sent_ns(sender: Capture | None, transfer: Transfer) -> list[int]:
 def _paper(
     sender: Capture | None, receiver: Capture | None, ping_output: ping.Ping | None, transfer: Transfer
 ) -> Measured:
+    """Return the columns `paper_*`."""
     window_bytes = PAPER_WINDOW_BYTES[transfer.protocol]
     sent = paper_frames_from(sender.packets, transfer.sender_address, transfer.port) if sender else None
     received = paper_frames_to(receiver.packets, transfer.receiver_address, transfer.port) if receiver else None

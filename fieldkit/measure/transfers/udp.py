@@ -93,7 +93,7 @@ class UdpCounts:
         datagrams_sent: Sent datagrams.
         datagrams_received: Datagrams of which all fragments arrived.
         bytes_sent: Sent payload bytes, without UDP headers.
-        bytes_received: Payload bytes that arrived, including those of incomplete datagrams.
+        bytes_received: Payload bytes that arrived, including bytes of incomplete datagrams.
         transfer_s: Time from the first to the last packet at the receiver, in seconds; None if nothing arrived.
     """
 

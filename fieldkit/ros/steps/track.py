@@ -48,7 +48,7 @@ _RECORD_SCRIPT: Final = (
 )
 
 
-class Spot(Strict):
+class FixedPosition(Strict):
     """A fixed position of a robot: degrees and metres on the earth, or metres in the frame of a tracker.
 
     Attributes:
@@ -70,7 +70,7 @@ class Spot(Strict):
     z: Number | schema.Int = 0.0
 
     @schema.model_validator(mode="after")
-    def _has_one_position(self) -> "Spot":
+    def _has_one_position(self) -> "FixedPosition":
         on_earth, in_frame = (self.lat, self.lon), (self.frame, self.x, self.y)
         if None in (in_frame if self.frame is not None else on_earth) or {*on_earth, *in_frame} - {None} == set():
             raise schema.validation_error("a position needs lat and lon, or frame, x and y")
@@ -111,7 +111,7 @@ class TrackedRobot(Strict):
     child: str | None = None
     times: Literal["header", "received"] = "header"
     gap: Annotated[Duration, Field(gt=0)] = position_sources.GAP_S
-    at: Spot | None = None
+    at: FixedPosition | None = None
 
     @schema.model_validator(mode="after")
     def _has_one_source(self) -> "TrackedRobot":

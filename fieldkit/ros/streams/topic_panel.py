@@ -53,7 +53,7 @@ def panels(step: Step, evidence: AttemptEvidence, times: AttemptTimes, zero_ns: 
         x_label=TIME_LABEL,
         y_label="[ms]",
         series=series,
-        words=(
+        description=(
             f"{len(sent_samples.sequence)} samples sent, {int(is_lost.sum())} lost, "
             f"{len(received_samples.sequence)} received"
         ),

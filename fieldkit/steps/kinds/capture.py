@@ -346,7 +346,7 @@ def _time_problems(role: Role, capture: Capture, view: View) -> Iterator[str]:
     if back_s > BACK_S:
         yield f"a packet is {back_s:.3f} s earlier than the one before it: the clock was set back"
     before, after = (
-        view.evidence.read_or_none(host.state, file(role)) for file in (host.before_file, host.after_file)
+        view.evidence.read_or_none(host.read_state, file(role)) for file in (host.before_file, host.after_file)
     )
     if before and before.clock and times_ns.min() < before.clock.first_ns - STAMP_NS:
         early_s = (before.clock.first_ns - int(times_ns.min())) / 1e9

@@ -352,7 +352,7 @@ class TransferStep(
 
     def _ending(self, view: View, role: Role, job: str) -> Ending | None:
         """Return the recorded termination of a netcat, or None if there is no record."""
-        after = view.evidence.read_or_none(host.state, host.after_file(role))
+        after = view.evidence.read_or_none(host.read_state, host.after_file(role))
         return (after.endings or {}).get(job) if after else None
 
     @override

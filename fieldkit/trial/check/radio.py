@@ -101,7 +101,7 @@ def _judge_control(robot: Robot, sections: Sections, report: Report) -> None:
         report.warn(
             "control",
             "SSH shares the radio under test, but the site file does not contain control: radio",
-            "write control: radio in the site file, or give host another network",
+            "write control: radio in the site file, or set host to its address on another network",
         )
 
 

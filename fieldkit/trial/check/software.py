@@ -44,6 +44,7 @@ _PACKAGES: Final = {
 }
 _TOOLS: Final = "tools"
 _AGENT_S: Final = 30.0
+"""Timeout of a check by the agent."""
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ _PROBE_FUNCTION: Final = r"""run_tool() {
 }
 """
 _MARK: Final = re.compile(rb"^==> (?:(?P<name>[a-z]+)|exit (?P<code>[0-9]{1,3})) <==$", re.MULTILINE)
+# Exit codes of a POSIX shell: a program that cannot be executed or is not found, and a program killed by SIGKILL (9).
 _MISSING: Final = {126, 127}
 _KILLED: Final = 128 + 9
 _USER: Final = "user"
@@ -139,7 +140,7 @@ def _parse_netcat(text: str, code: int, program: str) -> tuple[Netcat, str]:
         if match := pattern.search(text):
             return kind, printable(match[0].encode())
     raise _unknown_tool_error(
-        text, code, program, "sudo apt-get install netcat-traditional, and netcat: nc.traditional in"
+        text, code, program, "sudo apt-get install netcat-traditional, and write netcat: nc.traditional"
     )
 
 
@@ -149,7 +150,7 @@ def _parse_ping(text: str, code: int, program: str) -> tuple[PingTool, str]:
         return PingTool.IPUTILS if is_new else PingTool.IPUTILS_OLD, printable(match[0].encode())
     if match := _BUSYBOX.search(text):
         return PingTool.BUSYBOX, printable(match[0].encode())
-    raise _unknown_tool_error(text, code, program, "sudo apt-get install iputils-ping, and ping: ping in")
+    raise _unknown_tool_error(text, code, program, "sudo apt-get install iputils-ping, and write ping: ping")
 
 
 def _require_ping(text: str, program: str, kind: PingTool) -> None:
@@ -165,7 +166,7 @@ def _require_ping(text: str, program: str, kind: PingTool) -> None:
 def _parse_capture(text: str, code: int, program: str) -> tuple[bool, str]:
     if match := _TCPDUMP.search(text):
         return "--immediate-mode" in text, printable(match[0].encode())
-    raise _unknown_tool_error(text, code, program, "sudo apt-get install tcpdump, and capture: tcpdump in")
+    raise _unknown_tool_error(text, code, program, "sudo apt-get install tcpdump, and write capture: tcpdump")
 
 
 def _parse_recorder(text: str, code: int, profile: RobotProfile) -> Recorder:
@@ -207,4 +208,4 @@ def _unknown_tool_error(text: str, code: int, program: str, remedy: str) -> Robo
         return _timeout_error(program)
     problem = f"there is no {program}" if code in _MISSING else f"{program} is of an unknown kind"
     excerpt = printable(text.encode(), limit=100)
-    return RobotError(f"{problem}: {excerpt}" if excerpt else problem, remedy=f"{remedy} its profile")
+    return RobotError(f"{problem}: {excerpt}" if excerpt else problem, remedy=f"{remedy} in its profile")

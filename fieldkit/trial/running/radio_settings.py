@@ -13,7 +13,7 @@ from fieldkit.steps.scene import Shells
 from fieldkit.trial import gates
 from fieldkit.trial.plan import Plan
 
-_READ_S: Final = 10.0
+_READ_TIMEOUT_S: Final = 10.0
 _SEPARATOR: Final = "=="
 
 # Only the kernel is queried, so no packet is sent. In a session without a terminal, PATH often lacks the folder of
@@ -45,7 +45,7 @@ def read(plan: Plan, shells: Shells) -> dict[Role, dict[str, str]]:
 
 def _read_robot(shell: Shell, interface: str) -> Mapping[str, str]:
     completed = shell.run(
-        ("sh", "-s", interface), stdin=_SCRIPT.encode(), deadline=Deadline.after(_READ_S), check=False
+        ("sh", "-s", interface), stdin=_SCRIPT.encode(), deadline=Deadline.after(_READ_TIMEOUT_S), check=False
     )
     info, _, domain = completed.stdout.decode(errors="replace").partition(f"{_SEPARATOR}\n")
     if not info:

@@ -33,7 +33,7 @@ from fieldkit.trial.running.unfetched import UnfetchedEvidence
 
 T = TypeVar("T")
 
-_WATCH_S: Final = 0.5
+_WATCH_INTERVAL_S: Final = 0.5
 
 
 class Robots:
@@ -156,7 +156,7 @@ class Robots:
         has_ended = Event()
 
         def watch() -> None:
-            while not has_ended.wait(_WATCH_S):
+            while not has_ended.wait(_WATCH_INTERVAL_S):
                 try:
                     self.check_alive()
                 except TestbedLostError:

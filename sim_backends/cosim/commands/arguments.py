@@ -55,13 +55,13 @@ def _add_run(commands: Commands) -> None:
     parser.add_argument(
         "--realtime",
         metavar="FACTOR",
-        help="run at this number of simulated seconds per second, for example 1, one run after the other; a run that "
-        "is slower has no results",
+        help="simulate this number of seconds per second of wall time, for example 1; several runs are then not "
+        "parallel, and a run that is slower has no results",
     )
     parser.add_argument(
         "--late-bound",
         metavar="TIME",
-        help="with --realtime: largest lateness of a window, in wall time (default 100ms)",
+        help="with --realtime: largest permitted lateness of a window, in wall time (default 100ms)",
     )
     parser.add_argument(
         "--out",
@@ -93,7 +93,7 @@ def _add_sweep(commands: Commands) -> None:
         nargs="+",
         default=[],
         metavar="NAME=VALUE,...",
-        help="settings with their values: policy, window, distance (of the ends of the first flow), physics, "
+        help="settings with their values: policy, window, distance (between the ends of the first flow), physics, "
         "network, or a key of the scenario's file, for example radio.exponent=2,3",
     )
     _add_seeds(parser)
@@ -295,7 +295,7 @@ def _add_schema(commands: Commands) -> None:
 
 
 def _add_scenario(parser: Parser) -> None:
-    """Add the scenario and the options that change it; `settings.scenario` reads both."""
+    """Add the scenario and the options that change it; `settings.read_scenario` reads both."""
     scenario = parser.add_argument(
         "scenario",
         metavar="SCENARIO",

@@ -18,7 +18,7 @@ from sim_backends.cosim.studies.shootout import Bias, compute_biases, run_outcom
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the scenario with each policy and each seed, and print the mean differences.
+    """Run the scenario with each policy and each seed, and print the mean differences from the reference.
 
     Raises:
         ConfigurationError: There is only one seed.

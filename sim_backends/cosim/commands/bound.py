@@ -27,17 +27,17 @@ _COLUMNS: Final = (
     SheetColumn("largest_m", "largest (mm)", "position error with error_bounded", 1e3),
     SheetColumn("exchanges", "exchanges", "with error_bounded"),
     SheetColumn("added_s", "added (ms)", "mean delay that error_bounded adds", 1e3),
-    SheetColumn("all_window_s", "all (ms)", "longest fixed window that keeps the bound in all runs, by search", 1e3),
-    SheetColumn("all_exchanges", "its exchanges", ""),
-    SheetColumn("all_factor", "factor", "ratio of its exchanges to those of error_bounded"),
-    SheetColumn("found_window_s", "this (ms)", "longest fixed window that keeps the bound in this run", 1e3),
-    SheetColumn("found_exchanges", "its exchanges", ""),
-    SheetColumn("found_factor", "factor", ""),
+    SheetColumn("all_window_s", "all runs (ms)", "longest fixed window that keeps the bound in all runs", 1e3),
+    SheetColumn("all_exchanges", "fixed", "exchanges with that window"),
+    SheetColumn("all_factor", "factor", "ratio of fixed to exchanges"),
+    SheetColumn("found_window_s", "this run (ms)", "longest fixed window that keeps the bound in this run", 1e3),
+    SheetColumn("found_exchanges", "fixed", "exchanges with that window"),
+    SheetColumn("found_factor", "factor", "ratio of fixed to exchanges"),
 )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Search for the longest fixed window that keeps the bound; print its cost and that of `error_bounded`.
+    """Search for the longest fixed window that keeps the bound; print its cost and the cost of `error_bounded`.
 
     Raises:
         ConfigurationError: An option does not apply to this mode.

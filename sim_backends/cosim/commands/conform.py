@@ -60,7 +60,7 @@ def _hello(scenario: CosimScenario, role: int) -> Hello:
 
 
 def _role(endpoint: str, scenario: CosimScenario, requested_role: str | None, deadline_s: float) -> tuple[int, str]:
-    """Return the role of a federate, and its name for messages: the requested role, or the first that it accepts.
+    """Return the role of a federate (the requested role, or the first that it accepts) and its name for messages.
 
     Raises:
         FieldkitError: The federate accepts no role.

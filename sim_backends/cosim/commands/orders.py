@@ -37,7 +37,7 @@ START_TIMES: Final = 20
 """Number of start times for the windows of each policy, in the exact reference of each seed."""
 _COLUMNS: Final = (
     SheetColumn("policy", "policy", ""),
-    SheetColumn("window_s", "w (ms)", "actual window, mean", 1e3),
+    SheetColumn("window_s", "w (ms)", "mean of the actual windows", 1e3),
     SheetColumn(
         "delivery_s",
         "time (ms)",
@@ -48,7 +48,7 @@ _COLUMNS: Final = (
     SheetColumn(
         "position_m", "position (mm)", "mean error of the relative position of two agents in the network", 1e3
     ),
-    SheetColumn("fates", "fate (%)", "packets with another fate", 100),
+    SheetColumn("fates", "fate (%)", "packets lost here or in the reference, but not in both", 100),
     SheetColumn("path_m", "path (mm)", "mean position error of agents at the end of a window", 1e3),
 )
 _HEADS: Final[Mapping[str, str]] = MappingProxyType(

@@ -70,7 +70,7 @@ def scenario_of(recording: Recording) -> CosimScenario:
         return schema.validate(schema.parse(manifest.about.scenario, source="scenario"), CosimScenario)
     except ConfigurationError as error:
         remedy = f"replay it with fieldkit {manifest.versions.get('fieldkit', '')}".rstrip()
-        raise EvidenceError(f"its scenario cannot be read: {error.located}", remedy=remedy) from error
+        raise EvidenceError(f"the recorded scenario cannot be read: {error.located}", remedy=remedy) from error
 
 
 def title_of(recording: Recording) -> str:

@@ -66,7 +66,7 @@ def recoveries(scenario: CosimScenario, run: Run) -> list[FlowRecovery]:
 
 
 def _affects(fault: Fault, ends: set[str], scenario: CosimScenario) -> bool:
-    """Return True if a fault is on the path between two ends."""
+    """Return True if a fault affects the path between two agents."""
     relay = scenario.relay if scenario.topology is Topology.MASTER else None
     hops = [ends] if relay is None or relay in ends else [{end, relay} for end in ends]
     match fault:

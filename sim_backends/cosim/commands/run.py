@@ -25,17 +25,17 @@ INTERRUPTED: Final = 130
 _COLUMNS: Final = (
     SheetColumn("seed", "seed", "seed of all random draws"),
     SheetColumn("flow", "flow", "stream of packets and its receiver"),
-    SheetColumn("protocol", "by", "its transport"),
+    SheetColumn("protocol", "transport", "transport of the packets"),
     SheetColumn("sent", "sent", "packets whose fate is decided"),
     SheetColumn(
-        "under_way", "open", "packets still under way when the run ended, which are not part of the other columns"
+        "under_way", "under way", "packets whose fate was not decided when the run ended; the other columns omit them"
     ),
     SheetColumn("loss", "lost (%)", "share of the sent packets that never arrived", 100),
     SheetColumn("delay_mean_s", "delay (ms)", "mean time of a packet in the network", 1e3),
     SheetColumn("delay_p95_s", "p95", "its 95th percentile", 1e3),
     SheetColumn("delay_max_s", "max", "its maximum", 1e3),
     SheetColumn("delay_added_s", "added", "mean delay that the sync policy added, in ms", 1e3),
-    SheetColumn("distance_mean_m", "apart (m)", "mean distance of sender and receiver"),
+    SheetColumn("distance_mean_m", "distance (m)", "mean distance between sender and receiver"),
 )
 
 
@@ -52,9 +52,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigurationError("only one run can publish events of EMANE", remedy="add --seed 1")
     pace = settings.read_pace(arguments)
     text = settings.policy_text(policy, scenario)
-    build(
-        without_federates(scenario), policy=policy
-    )  # raises before the folder is created if the scenario is invalid
+    # If the scenario is invalid, this raises before the folder is created.
+    build(without_federates(scenario), policy=policy)
     folder = None if arguments.out is None else RunFolder(arguments.out, scenario, text, seeds)
     settings.note_commensurate_events(scenario, [policy], [scenario.policy.window], len(seeds))
     with showing_progress() as sink:
@@ -141,7 +140,10 @@ def _recovery_sheet(scenario: CosimScenario, results: Sequence[SeedResult]) -> S
         SheetColumn("end_s", "ended at (s)", "end of the fault"),
         SheetColumn("lost", "lost", "packets that were sent during the fault and lost"),
         SheetColumn(
-            "recovered_s", "recovered after (ms)", "from its end to the first arrival of a later packet", 1e3
+            "recovered_s",
+            "recovered after (ms)",
+            "from the end of the fault to the first arrival of a packet that was sent after it",
+            1e3,
         ),
     )
     rows: list[Sequence[Value]] = [
@@ -165,7 +167,7 @@ def _lateness_sheet(results: Sequence[SeedResult]) -> Sheet:
         SheetColumn("seed", "seed", ""),
         SheetColumn("late_up_to_s", "late up to (ms)", "lateness of a window against real time; 0: in time", 1e3),
         SheetColumn(
-            "windows", "windows", "number of windows whose lateness is at most this, and above that of the row before"
+            "windows", "windows", "number of windows with this lateness at most, but more than in the previous row"
         ),
         SheetColumn("share", "share (%)", "share of all windows", 100),
     )

@@ -26,7 +26,7 @@ _COLUMNS: Final = (
     SheetColumn("round", "round", ""),
     SheetColumn("window_s", "w (ms)", "initial window", 1e3),
     SheetColumn("median_window_s", "median (ms)", "median of the windows that the rule computed", 1e3),
-    SheetColumn("loss", "lost (%)", "share of packets whose fate is decided", 100),
+    SheetColumn("loss", "lost (%)", "lost packets as a share of those whose fate is decided", 100),
     SheetColumn("fate_disagreement", "fate (%)", "lost in this run or in the reference, but not in both", 100),
     SheetColumn(
         "delivery_error_mean_s",
@@ -35,7 +35,7 @@ _COLUMNS: Final = (
         1e3,
     ),
     SheetColumn("position_error_mean_m", "position (mm)", "mean error of relative positions in the network", 1e3),
-    SheetColumn("exchanges", "exchanges", "cost of the round"),
+    SheetColumn("exchanges", "exchanges", "number of windows of the round"),
 )
 
 
@@ -108,13 +108,16 @@ def _sheet(title: str, satisfaction: Satisfaction) -> Sheet:
 
 
 def _summary(satisfaction: Satisfaction, threshold: float) -> str:
-    reference = f"the exact reference loses {number_text(100 * satisfaction.reference_loss)} %"
-    lines = [f"{reference} in {satisfaction.reference_exchanges:,} exchanges, independently of the window"]
+    reference_percent = number_text(100 * satisfaction.reference_loss)
+    reference = f"the loss of the exact reference is {reference_percent} %, independently of the window"
+    lines = [f"{reference}; it needs {satisfaction.reference_exchanges:,} exchanges"]
     if satisfaction.rounds:
         last_round = satisfaction.rounds[-1]
+        rounds = format_count(len(satisfaction.rounds), "round")
         outcome = "accepted" if satisfaction.is_satisfied else "not accepted"
+        loss_percent, threshold_percent = (number_text(100 * share) for share in (last_round.loss, threshold))
         lines.append(
-            f"{outcome} at {number_text(100 * threshold)} %: {number_text(100 * last_round.loss)} % after "
-            f"{format_count(len(satisfaction.rounds), 'round')} and {satisfaction.exchanges:,} exchanges"
+            f"after {rounds} and {satisfaction.exchanges:,} exchanges, the loss of {loss_percent} % is {outcome} "
+            f"(threshold {threshold_percent} %)"
         )
     return "\n".join(lines)

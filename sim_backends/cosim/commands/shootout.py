@@ -26,7 +26,7 @@ from sim_backends.cosim.studies.shootout import Row, rows, run_outcomes
 COLUMNS: Final = (
     SheetColumn("policy", "policy", ""),
     SheetColumn("window_s", "w (ms)", "window", 1e3),
-    SheetColumn("seeds", "seeds", "number of runs over which the means are taken"),
+    SheetColumn("seeds", "seeds", "number of runs in the means"),
     SheetColumn(
         "delivery_error_mean_s",
         "time (ms)",
@@ -37,7 +37,9 @@ COLUMNS: Final = (
     SheetColumn("delivery_error_max_s", "max", "its maximum", 1e3),
     SheetColumn("delay_added_s", "added", "mean delay that the policy added, in ms", 1e3),
     SheetColumn("fate_disagreement", "fate (%)", "packets lost here or in the reference, but not in both", 100),
-    SheetColumn("causality_violations", "late", "arrivals at a time that the receiver was already past, per run"),
+    SheetColumn(
+        "causality_violations", "late", "arrivals per run at a time that was already in the past of the receiver"
+    ),
     SheetColumn("position_error_mean_m", "position (mm)", "mean error of relative positions in the network", 1e3),
     SheetColumn("position_error_p95_m", "p95", "its 95th percentile", 1e3),
     SheetColumn("position_error_max_m", "max", "its maximum", 1e3),
@@ -50,9 +52,9 @@ COLUMNS: Final = (
     SheetColumn("path_error_max_m", "max", "its maximum", 1e3),
     SheetColumn("exchanges_per_s", "per s", "exchanges per simulated second"),
     SheetColumn("wall_agents", "agents (%)", "share of wall time in physics and programs", 100),
-    SheetColumn("wall_network", "network", "in the network", 100),
-    SheetColumn("wall_exchange", "exchange", "in the coordinator", 100),
-    SheetColumn("wall_wait", "wait", "in federates that were idle", 100),
+    SheetColumn("wall_network", "network", "share of wall time in the network", 100),
+    SheetColumn("wall_exchange", "exchange", "share of wall time in the coordinator", 100),
+    SheetColumn("wall_wait", "wait", "share of wall time in federates that only waited", 100),
     SheetColumn("real_time_factor", "speed", "simulated time over wall time"),
     *FORMATION,
 )

@@ -25,9 +25,10 @@ before the next event. If a network cannot extrapolate, it assumes that agents d
 they have moved; if one physics step moves them farther than the bound, the bound cannot be kept, and the
 policy raises an error.
 
-The bound may be given in dB of path loss. By the log-distance law, 10 n log10(d), if a pair has the assumed distance
-d and is nearer by x, its path loss is lower by 10 n log10(d / (d - x)); if it is farther by x, the change is smaller.
-A bound of b dB therefore allows x = d (1 - 10^(-b / 10 n)), which decreases no faster than the assumed distance.
+The bound may be given in dB of path loss. By the log-distance law, the path loss at a distance d is a constant plus
+10 n log10(d). If two agents with the assumed distance d are nearer by x, their path loss is lower by
+10 n log10(d / (d - x)); if they are farther by x, the change is smaller. A bound of b dB therefore allows an error
+x = d (1 - 10^(-b / 10 n)), which decreases no faster than the assumed distance.
 """
 
 import math
@@ -105,8 +106,8 @@ class ErrorBounded:
         end_ns = self.extended_end_ns(situation)
         if end_ns > now_ns:
             return end_ns
-        # The window ends at the next whole step or later: within a step, dead reckoning is as accurate as states at
-        # steps can be.
+        # The window ends at the next whole step, even if an error may reach its bound before: there are no newer
+        # states before that step.
         end_ns = _step_begin_ns(situation) + situation.physics_step_ns
         use_ns = situation.next_use_ns
         if use_ns is not None and use_ns < end_ns:
@@ -126,19 +127,20 @@ class ErrorBounded:
     def extended_end_ns(self, situation: Situation) -> int:
         """Return the last physics step up to which no error can exceed its bound, or no position is used."""
         pairs = self._pairs(situation)
+        # A step of 1 ns is the resolution of time, so the extrapolation is then as good as continuous.
         allowed_s = pairs.allowed_s(0.0 if self._reckoning_step_ns == 1 else self._reckoning_step_ns / 1e9)
-        first = int(np.argmin(allowed_s)) if len(allowed_s) else None
-        self._decided_by = "" if first is None else pairs.name(first)
+        first_pair = int(np.argmin(allowed_s)) if len(allowed_s) else None
+        self._decided_by = "" if first_pair is None else pairs.name(first_pair)
         step_ns, begin_ns, use_ns = situation.physics_step_ns, _step_begin_ns(situation), situation.next_use_ns
-        least_s = math.inf if first is None else float(allowed_s[first])
-        unused_ns = math.inf if use_ns is None else use_ns - begin_ns
+        allowed_ns = math.inf if first_pair is None else float(allowed_s[first_pair]) * 1e9
+        until_use_ns = math.inf if use_ns is None else use_ns - begin_ns
         longest_ns = self._begin_ns + self._longest_ns - begin_ns
-        steps = math.floor(min(max(least_s * 1e9, unused_ns), longest_ns) / step_ns)
+        steps = math.floor(min(max(allowed_ns, until_use_ns), longest_ns) / step_ns)
         return max(begin_ns + steps * step_ns, situation.now_ns)
 
     @property
     def decided_by(self) -> str:
-        """The pair, or the agent, that could have reached the bound first in the last window."""
+        """The pair or the single agent whose error could reach the bound first in the last window."""
         return self._decided_by
 
     def _check_step(self, situation: Situation) -> None:
@@ -236,7 +238,10 @@ class _Pairs:
 def _pair_rows(
     pairs: tuple[Pair, ...], other_agents: tuple[str, ...], fixed_count: int
 ) -> tuple[Sequence[str], Integers, Integers]:
-    """Return the active agents, and the rows of both members of each pair; fixed points have the rows after them."""
+    """Return the active agents, and the rows of both members of each pair.
+
+    The rows of the fixed points follow the rows of the agents.
+    """
     names = sorted({*other_agents, *(name for pair in pairs for name in pair)})
     first, second = np.triu_indices(len(names) + fixed_count, k=1)
     with_agent = first < len(names)

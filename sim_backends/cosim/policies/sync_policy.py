@@ -10,7 +10,7 @@ from fieldkit.core.model import Vector
 from sim_backends.world.motion import State
 
 Pair = tuple[str, str]
-"""Names of a publisher and a subscriber."""
+"""Names of a sender and a receiver; the paper calls them publisher and subscriber."""
 
 
 @dataclass(slots=True)
@@ -25,7 +25,8 @@ class Situation:
         next_event_ns: Returns the time of the next event in the network, or None.
         physics_step_ns: Time step of the physics simulator.
         limits_m_s2: Largest change of each agent's velocity per second.
-        next_send_ns: Time before which no program sends, or None; only set for policies that look ahead.
+        next_send_ns: Time before which no program sends, or None if no program will send; only set for policies that
+            look ahead.
         assumed_states: States of the agents that the network assumes now, and from which it extrapolates; only set
             for policies that look ahead. None means that the agents stay at their positions.
         other_agents: Agents that forward or interfere, and agents that have sent packets but are not in `pairs`.
@@ -69,8 +70,8 @@ class SyncPolicy(Protocol):
         name: Its name in scenarios and tables.
         exact: True if every event is at the end of a window, so that all data is used without delay.
         defers_sends: True if a packet enters the network at the end of the window in which it was sent.
-        uses_end_states: True if the network uses the states at the end of a window for the whole window; the end then
-            belongs to the window. Otherwise the network uses the states at the beginning.
+        uses_end_states: True if the network uses the states at the end of a window for the whole window; events at
+            the end time then belong to the window. Otherwise the network uses the states at the beginning.
         defers_arrivals: True if an arrival counts from the end of its window; otherwise it counts from its actual
             time, which is already in the past of the receiver.
     """

@@ -1,4 +1,4 @@
-"""The sync policies other than `error_bounded`, and the computation of ends of windows without accumulated errors."""
+"""The sync policies other than `error_bounded`, and a sum of window lengths without accumulated rounding errors."""
 
 import math
 from collections.abc import Sequence
@@ -41,7 +41,8 @@ class FixedWindow:
     """Base class of the policies whose windows all have the same length.
 
     Args:
-        window_s: Their length in seconds; fractions of a nanosecond are added to later windows.
+        window_s: Their length in seconds. Windows end at whole nanoseconds; the remaining fractions are carried over
+            to later windows.
 
     Raises:
         PolicyError: It is not a positive time.
@@ -129,7 +130,7 @@ class VariableStepped:
 
 
 NS_PER_M_S = 1e6
-"""Change of the window in nanoseconds per m/s of speed difference: 1/1000 s."""
+"""Change of the window per m/s of speed difference, in nanoseconds: the paper's constant 1/1000 s."""
 
 
 class VelocityAwareRaw:
@@ -214,14 +215,14 @@ class VelocityAware:
     def next_window(self, situation: Situation) -> int:
         """Return the end of the next window."""
         states = situation.states
-        slowest_m_s, self._pair = min(
+        lowest_m_s, self._pair = min(
             (
                 (math.dist(states[pair[0]].velocity_m_s, states[pair[1]].velocity_m_s), pair)
                 for pair in situation.pairs
             ),
             default=(math.inf, ()),
         )
-        length_ns = min(self._window_ns + slowest_m_s * NS_PER_M_S, self._longest_ns)
+        length_ns = min(self._window_ns + lowest_m_s * NS_PER_M_S, self._longest_ns)
         return self._windows.end_ns(situation.now_ns, max(length_ns, situation.physics_step_ns))
 
     @property

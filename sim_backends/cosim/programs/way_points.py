@@ -1,4 +1,4 @@
-"""Programs that steer an agent along waypoints or with a profile of velocities."""
+"""Programs that steer an agent along waypoints, or with a sequence of velocities."""
 
 import math
 from bisect import bisect_right
@@ -87,7 +87,7 @@ class DriveThrough(NeverSends):
         reached_m: float = 0.1,
         braking_m_s2: float = 0.5,
     ) -> None:
-        _check(points_m, speed_m_s)
+        _check_path(points_m, speed_m_s)
         self._points_m = tuple(points_m)
         self._speed_m_s = speed_m_s
         self._timer = PeriodicTimer(period_ns, begin_ns)
@@ -143,7 +143,7 @@ class FlyThrough(NeverSends):
         period_ns: int = PERIOD_NS,
         reached_m: float = 0.3,
     ) -> None:
-        _check(points_m, speed_m_s)
+        _check_path(points_m, speed_m_s)
         self._points_m = tuple(points_m)
         self._speed_m_s = speed_m_s
         self._timer = PeriodicTimer(period_ns, begin_ns)
@@ -207,7 +207,7 @@ def fly_towards(own_state: State, point_m: Vector, speed_m_s: float, *, stops: b
     return Velocity((east, north, up))
 
 
-def _check(points_m: Sequence[Sequence[float]], speed_m_s: float) -> None:
+def _check_path(points_m: Sequence[Sequence[float]], speed_m_s: float) -> None:
     if not points_m or not 0 < speed_m_s < math.inf:
         raise ConfigurationError(
             f"{len(points_m)} points at {speed_m_s:g} m/s are not a path",
@@ -229,7 +229,7 @@ class ProfileLeg:
 
 
 class VelocityProfile(NeverSends):
-    """Gives the body the command of each leg in order, and then stops it.
+    """Commands the body with the velocity of each leg in order, and then stops it.
 
     Args:
         legs: The legs.
@@ -255,11 +255,11 @@ class VelocityProfile(NeverSends):
 
     def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
         """Return the command of the leg that has begun, if any."""
-        due = bisect_right(self._times_ns, now_ns)
-        if due == self._next_index:
+        begun_legs = bisect_right(self._times_ns, now_ns)
+        if begun_legs == self._next_index:
             return Action()
-        self._next_index = due
-        return Action(command=self._commands[due - 1])
+        self._next_index = begun_legs
+        return Action(command=self._commands[begun_legs - 1])
 
 
 class SpeedOscillation(NeverSends):

@@ -67,9 +67,11 @@ class Outage:
         self._is_stopped = False
 
     def next_wake_ns(self) -> int | None:
-        """Return the program's next wake time, but no later than the start of the outage if that is still ahead."""
+        """Return the program's next wake time, or the start of the outage if this is earlier and not yet passed."""
         wake_ns = self._program.next_wake_ns()
-        return wake_ns if self._is_stopped else min(self._begin_ns, self._begin_ns if wake_ns is None else wake_ns)
+        if self._is_stopped:
+            return wake_ns
+        return self._begin_ns if wake_ns is None else min(wake_ns, self._begin_ns)
 
     def next_send_ns(self) -> int | None:
         """Return the program's next send time."""

@@ -1,4 +1,4 @@
-"""Writes a pcap file per robot, with the internet headers of its packets.
+"""Writes a pcap file per robot, with the headers of its IP packets.
 
 A network in another process reports no IP packets. `PacketObserver` therefore creates them from the packets of
 programs.

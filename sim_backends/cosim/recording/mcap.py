@@ -1,7 +1,7 @@
 """Exports a recording as an MCAP file, for Foxglove and other readers of MCAP: states of robots, and packets.
 
-The only module of `sim_backends` that imports mcap. File format: https://mcap.dev/spec; Foxglove displays the schemas
-with names `foxglove.*`: https://docs.foxglove.dev/docs/sdk/schemas.
+No other module of `sim_backends` imports mcap. The file format is defined at https://mcap.dev/spec. Foxglove displays
+messages with the schemas `foxglove.*` (https://docs.foxglove.dev/docs/sdk/schemas).
 """
 
 import heapq

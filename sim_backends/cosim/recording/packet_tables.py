@@ -1,6 +1,6 @@
-"""Writes and reads the tables of a recording. Each is a folder of Parquet files that are readable independently.
+"""Writes and reads the tables of a recording. Each table is a folder of Parquet files, its parts.
 
-The only module of `sim_backends` that imports pyarrow. `RecordingState` is the state of a recording between parts.
+Each part is readable without the others. `RecordingState` is the state of a recording between two parts.
 """
 
 import hashlib
@@ -166,7 +166,7 @@ def read_parts(folder: Path, table: str, count: int) -> dict[str, list[Any]]:
         try:
             part = pa.parquet.read_table(path.absolute(), partitioning=None)
             if not part.schema.equals(SCHEMAS[table]):
-                raise EvidenceError(f"its columns are not those of {table}", where=str(path), remedy=RUN_AGAIN)
+                raise EvidenceError(f"the columns of the table {table} differ", where=str(path), remedy=RUN_AGAIN)
             for name in columns:
                 columns[name] += _values(part.column(name).combine_chunks())
         except FileNotFoundError as error:

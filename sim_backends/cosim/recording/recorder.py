@@ -1,4 +1,4 @@
-"""Records a run while it runs: tables in parts, captures, `run.json`, and samples of the true states."""
+"""Records a run during its execution: tables in parts, captures, `run.json`, and samples of the true states."""
 
 import errno
 import os

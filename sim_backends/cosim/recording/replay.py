@@ -1,4 +1,4 @@
-"""Reads the record of a run from a recording; a recording that was changed or truncated is an error."""
+"""Reads the record of a run from a recording; raises an error if the recording was changed or truncated."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -82,10 +82,10 @@ def _digest(
     run: Run, fates: Sequence[Fate], entered_windows: Sequence[int], ended_windows: Sequence[int | None]
 ) -> str:
     """Return the digest of the recorded events; `fates` is in the order in which they were decided."""
-    entered_window = {fate.packet.packet_id: window for fate, window in zip(fates, entered_windows, strict=True)}
+    window_by_packet = {fate.packet.packet_id: window for fate, window in zip(fates, entered_windows, strict=True)}
     entered_by_window: dict[int, list[Fate]] = {}
     for fate in run.fates.values():
-        entered_by_window.setdefault(entered_window[fate.packet.packet_id], []).append(fate)
+        entered_by_window.setdefault(window_by_packet[fate.packet.packet_id], []).append(fate)
     ended_by_window: dict[int | None, list[Fate]] = {}
     for fate, window in zip(fates, ended_windows, strict=True):
         ended_by_window.setdefault(window, []).append(fate)

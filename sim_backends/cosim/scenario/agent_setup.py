@@ -195,7 +195,7 @@ START_INTERVAL_S: Final = 0.1
 def make_programs(
     scenario: CosimScenario, seed: int, controllers: Mapping[str, Program], stops: Mapping[str, Any]
 ) -> dict[str, Program]:
-    """Return the programs of all agents with traffic or a controller, by the name of the agent.
+    """Return the programs of all agents that have traffic or a controller, by the name of the agent.
 
     Args:
         scenario: The scenario.

@@ -184,7 +184,7 @@ def _disturbances(scenario: CosimScenario, world: World) -> Iterator[Disturbance
 
 
 def _nothing_to_close() -> None:
-    """Close a federate that runs in this process and has no method `close`."""
+    """Do nothing: a federate in this process may have no method `close`."""
 
 
 @dataclass
@@ -227,8 +227,9 @@ class Simulation:
             progress: Called at most every 0.2 s of wall time, or None.
 
         Raises:
-            PolicyError: The policy has no window. After any error, `Coordinator.run` has the record so far.
-            FederateError: Physics, network or a program failed, or did not answer in time.
+            PolicyError: The policy cannot determine a window.
+            FederateError: Physics, network or a program failed, or did not answer in time. After any error,
+                `Coordinator.run` has the record so far.
         """
         return self.coordinator.advance(self.scenario.duration_ns if until_ns is None else until_ns, progress)
 

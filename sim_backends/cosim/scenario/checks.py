@@ -160,7 +160,7 @@ def check(scenario: CosimScenario, world: World, where: Callable[[Location], str
     Args:
         scenario: The scenario.
         world: Its world.
-        where: Returns the line of keys in the scenario's file, for the message.
+        where: Returns the line of a value in the scenario's file from its keys, for the message.
 
     Raises:
         ConfigurationError: It cannot be run; the message has the first reason and its line in the file.
@@ -207,7 +207,7 @@ def _infrastructure(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
     radio = scenario.radio
     if not radio.has_infrastructure:
         return
-    from sim_backends.radio.infrastructure import infrastructure  # noqa: PLC0415 (other scenarios need none of it)
+    from sim_backends.radio.infrastructure import infrastructure  # noqa: PLC0415 (other scenarios do not need it)
 
     has_relay = scenario.topology is Topology.MASTER
     if problem := infrastructure.conflict(radio, antennas_of(scenario), has_relay=has_relay):

@@ -1,4 +1,4 @@
-"""Starts, connects to or creates the external federates of a scenario; no other module of the co-simulation does."""
+"""Starts, connects to or creates the external federates of a scenario, as the only module of the co-simulation."""
 
 import dataclasses
 import json
@@ -42,8 +42,8 @@ def without_federates(scenario: CosimScenario) -> CosimScenario:
 
 def has_addresses(scenario: CosimScenario) -> bool:
     """Return True if a federate of the scenario has the address of a transport instead of a command."""
-    federates = (scenario.physics.federate, scenario.network.federate)
-    return any(endpoint is not None and parse_address(endpoint) is not None for endpoint in federates)
+    endpoints = (scenario.physics.federate, scenario.network.federate)
+    return any(endpoint is not None and parse_address(endpoint) is not None for endpoint in endpoints)
 
 
 def writes_captures(scenario: CosimScenario) -> bool:
@@ -136,7 +136,7 @@ def simulators() -> list[SimulatorName]:
 def open_physics(
     scenario: CosimScenario, world: World, bodies: Mapping[str, Body[Any]], seed: int, deadline_s: float | None
 ) -> PhysicsFederate | None:
-    """Start, connect to or create the scenario's external physics federate; return None if it has none.
+    """Start, connect to or create the scenario's external physics federate; return None for the built-in physics.
 
     Args:
         scenario: The scenario.
@@ -169,7 +169,7 @@ def open_network(
     *,
     captures: Mapping[str, Any] | None = None,
 ) -> NetworkFederate | None:
-    """Start, connect to or create the scenario's external network federate; return None if it has none.
+    """Start, connect to or create the scenario's external network federate; return None for the built-in network.
 
     Args:
         scenario: The scenario.

@@ -73,7 +73,7 @@ def commensurate_events(scenario: CosimScenario, windows_s: Sequence[float]) -> 
 
 
 def incommensurate_window_s(scenario: CosimScenario, window_s: float) -> float | None:
-    """Return the nearest window of whole steps without commensurate events; None if no window of the search has this.
+    """Return the nearest window of whole steps without commensurate events; None if the search finds no such window.
 
     The search covers half to twice the length of the window, but at most `_MAX_STEPS` steps above it.
     """

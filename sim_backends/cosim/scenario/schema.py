@@ -48,7 +48,7 @@ class PolicyChoice(Strict):
         name: The default policy of a run.
         window: Length of a window, or the parameter w of the velocity-aware policies.
         longest: Longest window of policies with variable windows.
-        bound: For `error_bounded`: largest error of the relative position of two transmitting agents in the network.
+        bound: For `error_bounded`: largest error of the relative position that the network assumes for two agents.
         bound_db: Instead of `bound`: largest error of the path loss between them in free line of sight, in dB.
         exponent: Exponent of the log-distance law for `bound_db`.
     """

@@ -1,4 +1,4 @@
-"""Counts the exchanges needed to keep a bound, with `error_bounded` and with the longest sufficient fixed window."""
+"""Counts the exchanges (windows) needed to keep a bound: with `error_bounded`, and with the longest fixed window."""
 
 import math
 from collections.abc import Callable, Sequence

@@ -58,10 +58,8 @@ class LocalErrors:
     def order(self, measure: str) -> IntervalEstimate:
         """Return the order of an error: the exponent n if the error is proportional to the n-th power of the window.
 
-        It is the slope of a line fitted on logarithmic axes.
-
-        Its interval is a jackknife over the times at which windows begin. The result is nan if fewer than two lengths
-        had an error.
+        It is the slope of a line that is fitted to the mean errors on logarithmic axes. Its interval is a jackknife
+        interval over the times at which windows begin. The result is nan if fewer than two lengths had an error.
         """
         sums, counts = self.sums[measure], self.counts[measure]
         value = _slope(self.window_s.mean(axis=1), sums.sum(axis=1), counts.sum(axis=1))
@@ -101,7 +99,7 @@ def local_errors(
         tail_ns: Time for which forks continue after the window; packets whose fate is undecided then are ignored.
 
     Raises:
-        PolicyError: A policy has no window for a situation.
+        PolicyError: A policy cannot determine a window.
         FieldkitError: A fork changed the run from which it was forked, because an object was not copied.
     """
     shape = len(parameters), len(starts_ns)

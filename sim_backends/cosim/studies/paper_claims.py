@@ -47,7 +47,7 @@ class Claim(NamedTuple):
         compared_system: The system with which the paper's system is compared.
         sight_group: The sight conditions that the claim covers, as a key of `SIGHT_GROUPS`.
         quantity: `delay`, with a relative change, or `loss`, with a difference.
-        claimed_change: The change that the paper states; None if it states none.
+        claimed_change: The change that the paper states, or None if it does not state this change.
         change_in_tables: The change according to the tables of the paper; nan if the tables do not contain it.
         measured_change: The change in the simulations of this program, with its 95 % interval.
         rows: Number of rows that the change is based on. For a delay, packets must have arrived in both systems.
@@ -63,7 +63,7 @@ class Claim(NamedTuple):
 
     @property
     def agreement(self) -> Agreement | None:
-        """The relation of the measured change to the stated one; None if the paper states none."""
+        """The relation of the measured change to the stated one; None if the paper does not state this change."""
         return None if self.claimed_change is None else compare(self.claimed_change, self.measured_change)
 
 

@@ -142,9 +142,9 @@ EMANE: Final[Mapping[str, tuple[Printed, Printed]]] = MappingProxyType(
 """Section "Discussion": mean round trip and share of lost requests of 100 pings, before and after node 10 moved."""
 
 FIXED: Final = "fixed window"
-"""The system of the paper with a window that does not adapt."""
+"""The compared system that is equal to the system of the paper, except that its window does not adapt."""
 MASTER: Final = "master-based"
-"""ROS 1 with TCP."""
+"""The compared system that uses a ROS 1 master, with TCP."""
 
 CLAIMS: Final[Mapping[tuple[str, str], tuple[Printed, Printed]]] = MappingProxyType(
     {

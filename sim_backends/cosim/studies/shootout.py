@@ -191,8 +191,8 @@ class Row:
         policy: Its name.
         by_seed: Its errors relative to the reference for each seed; empty if it could not be run.
         formations: Position errors of the followers, for each seed.
-        growth_m: Times in seconds; and the largest distance of an agent from its position in the reference, as a mean
-            over seeds. Both have the shape (times,).
+        growth_m: Two arrays of shape (times,): times in seconds, and the largest distance of an agent from its
+            position in the reference at that time, as a mean over seeds.
         failure: The reason why it could not be run with a seed; empty if it could be run with all seeds.
     """
 

@@ -37,6 +37,7 @@ _SHORT_NAMES: Final = {
     "network": "network.federate",
 }
 _NOT_SETTINGS: Final = frozenset({"name", "summary", "seeds"})
+"""Keys of a scenario that cannot be factors."""
 _BETWEEN_VALUES: Final = re.compile(r",(?![^\[{]*[\]}])")
 """A comma outside brackets."""
 _PLAIN_NUMBER: Final = re.compile(r"[+-]?[0-9.]+(?:[eE][+-]?[0-9]+)?")
@@ -53,7 +54,7 @@ _QUANTITIES: Final = (
     ("_dbm", "dBm", {"dBm": 1.0}),
     ("_value", "1", FRACTION_PER_UNIT),
 )
-"""Suffix and unit of the column of numbers of each kind of quantity, and the factors of all its units."""
+"""For each kind of quantity: suffix and unit of its column of numbers, and the factors of all its units."""
 
 
 def _parse_in_unit(text: str, unit: str, factors: dict[str, float]) -> float:
@@ -167,10 +168,10 @@ def _parse_value(name: str, text: str) -> Any:  # noqa: ANN401 (any YAML value)
 
 
 def _require_setting(factor: Factor, scenario: CosimScenario) -> None:
-    """Check that the keys above a setting exist; the schema checks the last one.
+    """Check that the parent keys of a setting exist; the schema checks its last key.
 
     Raises:
-        ConfigurationError: They do not exist; the setting would add a mapping to the scenario.
+        ConfigurationError: A parent key does not exist, so the setting would add a mapping to the scenario.
     """
     document = schema.parse(schema.dump(scenario), source="").data
     names = [*_SHORT_NAMES, DISTANCE, *(key for key, _ in _leaves(document) if key not in _NOT_SETTINGS)]

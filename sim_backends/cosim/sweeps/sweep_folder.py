@@ -35,7 +35,7 @@ class RunFailure:
         reason: Reason of the last failure.
         remedy: Remedy for the failure; may be empty.
         exit_code: Exit code of the error.
-        rows: Columns of its flows until the failure.
+        rows: A row of columns for each of its flows, with the results until the failure.
         is_final: True if another attempt would fail in the same way.
     """
 
@@ -114,7 +114,7 @@ class SweepFolder:
         return {path.stem for path in (self.path / _RUNS).glob("*.json")}
 
     def rows(self, run: SweepRun) -> Rows:
-        """Return the columns of the flows of a run; empty if it is neither finished nor failed.
+        """Return a row of columns for each flow of a run; empty if the run has neither finished nor failed.
 
         Raises:
             EvidenceError: Its file is damaged.

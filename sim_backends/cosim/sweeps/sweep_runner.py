@@ -148,7 +148,9 @@ def run_sweep(
     ]:
         for end in completed(work, tasks, workers, lambda text: sink(Note(text))):
             run = tasks[end.number]
-            if isinstance(end.error, ConfigurationError):  # all scenarios are valid, so it is an error of the worker
+            if isinstance(
+                end.error, ConfigurationError
+            ):  # all scenarios were checked, so the worker is set up wrongly
                 raise end.error
             attempts[run.name] += 1
             failure = _failure(end, attempts[run.name])
@@ -184,12 +186,9 @@ class _Reporter:
     """Reports the end of each run and the remaining time."""
 
     def __init__(self, sink: Sink, finished_count: int, total: int) -> None:
-        self._sink, self._finished_count, self._total, self._initial_count = (
-            sink,
-            finished_count,
-            total,
-            finished_count,
-        )
+        self._sink = sink
+        self._finished_count = self._initial_count = finished_count
+        self._total = total
         self._start_s = time.monotonic()
         sink(Progress("sweep", finished_count, total, "runs"))
 

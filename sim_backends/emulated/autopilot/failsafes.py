@@ -172,6 +172,7 @@ class ArduCopterFailsafes:
     def _action_reactions(
         self, action: int, modes: dict[int, Mode], text: str, state: VehicleState
     ) -> Iterator[Reaction]:
+        """Yield the reaction of a failsafe whose parameter has the value `action`; `modes` is the mode by value."""
         mode = modes.get(action)
         if not state.is_armed or mode is None:
             yield Reaction(text)

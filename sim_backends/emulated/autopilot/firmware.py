@@ -66,7 +66,7 @@ class Firmware:
         version: AUTOPILOT_VERSION.flight_sw_version: major, minor, patch, type.
         capabilities: MAV_PROTOCOL_CAPABILITY.
         base_mode: Constant MAV_MODE_FLAG bits of its heartbeat.
-        modes: Custom mode of each mode.
+        modes: Number of each mode, as in `custom_mode` of HEARTBEAT.
         names: Name of each mode in AVAILABLE_MODES.
         starting_flags: Flags of its position estimate before the estimate has an origin.
         boot_mode: Mode after power-on.

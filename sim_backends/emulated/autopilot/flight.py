@@ -67,6 +67,7 @@ class Airframe:
         self._pose = FlightPose(place_m, heading_rad=facing_rad)
         self.home_m = place_m
         self._obstacles = obstacles
+        # Obstacles near the position of the last search.
         self._obstacles_nearby: Sequence[Footprint] = ()
         self._searched_m: Vector = (math.inf, 0.0, 0.0)
         self._limits = limits

@@ -152,7 +152,10 @@ class _Client:
         """Return True if a frame with this target is for the client; 0 is a broadcast."""
         if not system:
             return True
-        return any(system == sender and component in {0, part} for sender, part in self.senders)
+        return any(
+            system == sender_system and component in {0, sender_component}
+            for sender_system, sender_component in self.senders
+        )
 
 
 _MAX_SENDERS: Final = 64

@@ -163,7 +163,7 @@ class Vehicle(VehicleBase):
                 self.body.rest(now_ns)
                 self.land_detector.has_landed = True
                 break
-            self._update_ground_state()
+            self._check_flight_state()
             self.body.motors_on = self.is_armed
             target_m_s = self._target_m_s()  # it may change the mode
             self.body.step(target_m_s, self.limits, self.guidance.yaw_rad(self.mode, self.body))
@@ -173,8 +173,8 @@ class Vehicle(VehicleBase):
     def _update_boot_state(self) -> None:
         """Set the origin once the position estimate is good; until then, report why the vehicle cannot be armed."""
         now_ns, estimate = self.body.now_ns, self.estimate
-        if self.firmware.is_ardupilot and not self.is_armed and now_ns >= self._prearm_ns:
-            self._prearm_ns = now_ns + _PREARM_NS
+        if self.firmware.is_ardupilot and not self.is_armed and now_ns >= self._next_prearm_ns:
+            self._next_prearm_ns = now_ns + _PREARM_NS
             if estimate.is_starting(now_ns) or estimate.origin_m is not None:
                 self.check()
         if not estimate.advance(now_ns, self.body.place_m):
@@ -242,7 +242,7 @@ class Vehicle(VehicleBase):
         """Return the exception for a refused command; ArduCopter answers without a text."""
         return Refused("" if self.firmware.is_ardupilot else reason)
 
-    def _update_ground_state(self) -> None:
+    def _check_flight_state(self) -> None:
         """Detect take-off and landing; stop idle motors; react to missing set-points and to the fence."""
         now_ns, is_ardupilot = self.body.now_ns, self.firmware.is_ardupilot
         self.land_detector.advance(now_ns, on_ground=self.body.on_ground)

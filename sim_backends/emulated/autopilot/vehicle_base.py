@@ -80,7 +80,7 @@ class VehicleBase:
     def boot(self, now_ns: int) -> None:
         """Boot: set the mode after power-on, and reset failsafes and origin."""
         self.estimate.boot(now_ns)
-        self._prearm_ns = now_ns
+        self._next_prearm_ns = now_ns
         self.mode = self.firmware.boot_mode
         self.is_armed = False
         self.failsafes = self.firmware.failsafes(self._parameters)

@@ -74,7 +74,9 @@ class CosimulatedMedium(MediumServer):
         self._steerings: dict[str, Steering] = {}
         self._session: CosimSession | None = None
         self._clock = RealTime()
+        # Packets that were read and have not entered the network.
         self._queue: deque[RealPacket] = deque()
+        # As in `Medium`: a device that has packets now was still empty at `_arrived_after_ns`.
         self._arrived_after_ns = self._previous_poll_ns = time.monotonic_ns()
         self._window_lateness_counts: Counter[int] = Counter()
         # Delays that the sync policy adds. Their transmission part contains the undivided delay of the network.

@@ -74,6 +74,7 @@ class CosimSession:
             clock=clock,
         )
         self.builtin: BuiltinNetwork | None = None
+        # Delays that the network has reported: by receiver and packet (built-in network), or by packet number.
         self._delays: dict[tuple[str, PacketIdentity], Delay] = {}
         self._arrival_delays: dict[int, ArrivalDelay] = {}
         if settings.simulators.network == BUILTIN:

@@ -100,10 +100,13 @@ class LabPhysics:
         self._started_ns = 0
         self._advanced_ns = 0
         self._now_ns = 0
+        # Commands that the physics simulator receives when it advances next, and the last command of each robot.
         self._pending_commands: dict[str, Command] = {}
         self._active_commands: dict[str, Command] = {}
+        # States that the lab has assigned, and the stations that it has put out of range of all others.
         self._assigned_states = dict.fromkeys(stations, State(OFF_AIR_M))
         self._hidden_stations: frozenset[str] = frozenset()
+        # Position and heading with which each robot was last placed in the physics simulator.
         self._poses_in_physics: dict[str, tuple[Vector, float]] = {}
         self._physics_states: Mapping[str, State] = {}
         self._states: Mapping[str, State] = self._assigned_states
@@ -189,6 +192,7 @@ class LabPhysics:
             self._physics_states, self._has_changed = states, True
 
     def _report(self, to_ns: int) -> None:
+        # The states are those after the last whole step.
         at_ns = self._clock.monotonic_ns(to_ns - (to_ns - self._started_ns) % self.step_ns)
         for name, steering in self._steerings.items():
             if steering.is_driven and steering.is_report_due(at_ns):
@@ -282,7 +286,7 @@ def _differs(pose: tuple[Vector, float], other: tuple[Vector, float] | None) -> 
 
 
 class _Limits(Mapping[str, float]):
-    """The acceleration limits of all stations, which change with their commands."""
+    """The acceleration limits of all stations; a limit changes when a robot receives its first command."""
 
     def __init__(self, physics: LabPhysics, stations: tuple[str, ...]) -> None:
         self._physics = physics

@@ -79,7 +79,9 @@ class RealAgents(Agents):
         super().__init__(physics, {})
         self.delivered_packets: list[RealPacket] = []
         self._devices = devices
+        # End of the last window.
         self._reached_ns = 0
+        # Number of the last packet of each flow.
         self._numbers: dict[str, int] = {}
         self._contents: dict[PacketIdentity, bytes] = {}
 

@@ -63,8 +63,10 @@ class Steering(ABC):
         self._pending: deque[TimedCommand] = deque(maxlen=_PENDING_COMMANDS)
         self._reporter = MotionReporter(_path(paths), _path(motion_record), now_ns)
         self.is_driven = False
+        # Motion of the robot when the lab last placed it.
         self._start: RobotMotionState = AT_REST
         self.is_placed = False
+        # Time at which `idle` is applied unless another command arrives; None if no command is active.
         self._stop_due_ns: int | None = None
         # Time and heading of the last record.
         self._last_report: tuple[int, float] | None = None

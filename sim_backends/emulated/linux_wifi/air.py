@@ -233,6 +233,7 @@ class Air:
             raise ValueError("the air needs at least one radio, each with a name")
         self._channel_arguments = seed, options, antennas, world
         self._channels: dict[int, _Channel] = {}
+        # Channel of the last frame of each radio.
         self._tuned_mhz: dict[str, int] = {}
         self._positions_m: Mapping[str, Vector] = {}
         self._velocities_m_s: Mapping[str, Vector] = {}

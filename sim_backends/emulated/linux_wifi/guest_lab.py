@@ -32,7 +32,7 @@ _REPLY_S: Final = 15.0
 _POLL_S: Final = 0.5
 _MAX_ANSWER_BYTES: Final = 8 << 20
 _LOGIN: Final = Codec(GuestLogin)
-_WHERE: Final = "the lab in the virtual machine"
+_SUBJECT: Final = "the lab in the virtual machine"
 _LAB: Final = "/run/lab"
 """Folder in the machine in which the lab is started."""
 
@@ -119,7 +119,7 @@ class GuestLab:
                 except TimeoutError:
                     self._check_alive()
                     if deadline.expired:
-                        raise LinkError(f"{_WHERE} does not answer", remedy="try again") from None
+                        raise LinkError(f"{_SUBJECT} does not answer", remedy="try again") from None
                     continue
                 answer += data
                 if not data or len(answer) > _MAX_ANSWER_BYTES:
@@ -127,7 +127,7 @@ class GuestLab:
         try:
             return read(answer)
         except ValueError as error:
-            raise LinkError(f"{_WHERE} gave no valid answer: {error}") from error
+            raise LinkError(f"{_SUBJECT} gave no valid answer: {error}") from error
 
 
 def _read_login(answer: bytes) -> GuestLogin:

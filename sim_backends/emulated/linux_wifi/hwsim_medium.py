@@ -78,11 +78,13 @@ class HwsimMedium:
         self.air = air
         self.counts = MediumCounts()
         self.totals: dict[Pair, LinkTotals] = {}
-        self._names = dict(radios)
-        self._radio_of = {name: radio for radio, name in radios.items()}
+        self._name_of_radio = dict(radios)
+        self._radio_of_name = {name: radio for radio, name in radios.items()}
         # The first interface of a radio has the radio's permanent address, which differs in one bit from `radio`.
-        self._by_address = {bytes((radio[0] & ~_RADIO_BIT,)) + radio[1:]: name for radio, name in self._names.items()}
-        self._address_counts = Counter(self._by_address.values())
+        self._name_of_interface = {
+            bytes((radio[0] & ~_RADIO_BIT,)) + radio[1:]: name for radio, name in self._name_of_radio.items()
+        }
+        self._address_counts = Counter(self._name_of_interface.values())
 
     def receive(self, now_ns: int, message: NetlinkMessage) -> None:
         """Accept a message from the kernel at `now_ns`. Malformed messages are counted and ignored."""
@@ -108,34 +110,34 @@ class HwsimMedium:
         return [message for message in messages if message is not None]
 
     def _transmit(self, now_ns: int, sent_frame: SentFrame) -> None:
-        name = self._names.get(sent_frame.radio)
+        name = self._name_of_radio.get(sent_frame.radio)
         if name is None or not MIN_FREQUENCY_MHZ <= sent_frame.frequency_mhz <= MAX_FREQUENCY_MHZ:
             self.counts.rejected_messages += 1
             return
         address = sent_frame.transmitter
         # An interface that existed before the medium started was not announced. An address that already belongs to a
         # radio is not reassigned.
-        if address is not None and not address[0] & 1 and address not in self._by_address:
+        if address is not None and not address[0] & 1 and address not in self._name_of_interface:
             self._add_address(address, name)
-        self.air.transmit(now_ns, sent_frame, name, self._by_address.get(sent_frame.receiver))
+        self.air.transmit(now_ns, sent_frame, name, self._name_of_interface.get(sent_frame.receiver))
 
     def _update_address(self, event: InterfaceAddress) -> None:
-        name = self._names.get(event.radio)
+        name = self._name_of_radio.get(event.radio)
         if name is None:
             self.counts.rejected_messages += 1
         elif event.is_added:
             self._remove_address(event.address)
             self._add_address(event.address, name)
-        elif self._by_address.get(event.address) == name:
+        elif self._name_of_interface.get(event.address) == name:
             self._remove_address(event.address)
 
     def _add_address(self, address: bytes, name: str) -> None:
         if self._address_counts[name] < _MAX_ADDRESSES:
-            self._by_address[address] = name
+            self._name_of_interface[address] = name
             self._address_counts[name] += 1
 
     def _remove_address(self, address: bytes) -> None:
-        name = self._by_address.pop(address, None)
+        name = self._name_of_interface.pop(address, None)
         if name is not None:
             self._address_counts[name] -= 1
 
@@ -143,7 +145,7 @@ class HwsimMedium:
         frame = reception.frame
         self._totals(frame.source, reception.receiver).signal_dbm = reception.signal_dbm
         rate_index = legacy_index(reception.mode, frame.sent_frame.frequency_mhz)
-        radio = self._radio_of[reception.receiver]
+        radio = self._radio_of_name[reception.receiver]
         return encode_reception(frame.sent_frame, radio, rate_index=rate_index, signal_dbm=reception.signal_dbm)
 
     def _status_message(self, frame: FrameOnAir) -> bytes:

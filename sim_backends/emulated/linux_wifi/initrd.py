@@ -2,8 +2,8 @@
 
 Everything else is the root file system of the host, which the machine mounts read-only over 9p, below a layer in
 memory that contains all changes. The archive has the format `newc` (Linux,
-Documentation/driver-api/early-userspace/buffer-format.rst). This module writes it, because a program for it would
-have to be installed, and needs a copy of each file.
+Documentation/driver-api/early-userspace/buffer-format.rst). This module writes the archive itself, because the
+program `cpio` would have to be installed, and would need a copy of each file.
 """
 
 import re

@@ -24,7 +24,10 @@ _MAX_PENDING: Final = 2048
 
 
 class _ChannelStream:
-    """One stream: a socket pair, whose near end belongs to the user of the stream, and received frames."""
+    """One stream: a socket pair and received frames.
+
+    The user of the stream reads and writes the near end, and the threads of the channel the far end.
+    """
 
     def __init__(self) -> None:
         self.near, self.far = socket.socketpair()

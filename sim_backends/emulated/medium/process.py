@@ -40,11 +40,14 @@ class Medium(MediumServer):
     def __init__(self, seed: int, framing: Framing, channel: socket.socket) -> None:
         super().__init__(seed, framing, channel)
         self._model: RadioModel[bytes] = UniformLinks(seed, self._options)
+        # Number of ports for which the model was created.
         self._ports_in_model = 0
+        # True if a radio has access categories, which depend on the DSCP of packets.
         self._has_priorities = False
         # A device that has packets now was still empty at `_arrived_after_ns`, if the previous round read all
         # packets.
         self._arrived_after_ns = self._previous_poll_ns = time.monotonic_ns()
+        # Time to which the timer is set.
         self._timer_ns: int | None = None
 
     def run(self) -> None:

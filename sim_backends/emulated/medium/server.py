@@ -92,6 +92,7 @@ class MediumServer(ABC):
         self._layout = Layout()
         # The robots on the air and the number of ports, for which the routes of the ports were computed.
         self._routing_state: tuple[Set[str], int] = frozenset(), 0
+        # Robots whose interface was up in the last poll, and the time of this poll.
         self._on_air_robots: set[str] = set()
         self._polled_ns = 0
         self._ports: dict[str, Port] = {}

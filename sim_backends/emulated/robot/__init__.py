@@ -1,1 +1,1 @@
-"""Inside of an emulated robot: its init process, file system, network and services."""
+"""Code that runs inside an emulated robot: init process, file system, network and services."""

@@ -27,7 +27,7 @@ from sim_backends.world.motion import STILL, WayPoints
 class AssignedPath:
     """Path on which the lab moves a robot, which stops at its end.
 
-    A path of one point means that the robot stands there.
+    On a path of one point, the robot stays at this point.
 
     Attributes:
         start_ns: Start of the motion, as a time of the monotonic clock, which is common to all robots on one machine.
@@ -209,7 +209,7 @@ class MotionReporter:
     def poll_placement(self, now_ns: int) -> RobotMotionState | None:
         """Return the motion at the position where the lab has placed the robot since the last call, or None.
 
-        The first call returns the current motion of the robot, also after the process has been restarted.
+        The first call returns the current motion of the robot, even if the process has been restarted.
 
         Args:
             now_ns: Time from the monotonic clock; must not decrease from call to call.

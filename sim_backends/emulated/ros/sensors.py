@@ -167,6 +167,7 @@ class Publication:
         self._sensor = sensor
         self._source = Source(sensor, targets, moving_targets)
         self._start_s = start_s
+        # Number of the next message; None while there is no subscriber.
         self._number: int | None = None
         self._topic_socket = TopicSocket(sensor.topic, _header(sensor.topic, sensor.type, definition), selector)
 

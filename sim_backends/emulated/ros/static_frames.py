@@ -1,6 +1,7 @@
 """Static transforms of an emulated robot: the content of `/tf_static` (REP 105, tf2_ros.StaticTransformBroadcaster).
 
-All its sensors measure at the robot's position, whatever the name of their frame, so every transform is the identity.
+All its sensors measure at the robot's position, independently of their frame's name, so every transform is the
+identity.
 """
 
 import struct

@@ -1,8 +1,8 @@
-"""Messages of any ROS 1 type from its definition: constant bytes, and the position of one large list.
+"""Templates for messages of any ROS 1 type: constant bytes before and after one list of numbers.
 
-The lab parses the definition with rosbags; a robot gets only bytes, and fills the list in each message. Numbers are 0
-and strings empty; quaternions are the identity. The fields that describe an image, a compressed image or a point
-cloud are set.
+The lab computes a template from the definition of the type, with rosbags. The robot fills the list in each message,
+so it needs no parser of definitions. In the constant bytes, numbers are 0, strings are empty, and quaternions are the
+identity. The fields that describe an image, a compressed image or a point cloud are set.
 """
 
 import struct

@@ -79,6 +79,9 @@ class SampleChannel:
         run: Number of the run.
         first_sample: The first sample, if it was received already.
         owns_bus: True if `close` must close the bus.
+
+    Attributes:
+        other_hellos: Samples with the `hello` of other runs that arrived during this run.
     """
 
     def __init__(self, bus: SampleBus, run: int, *, first_sample: bytes = b"", owns_bus: bool = False) -> None:

@@ -25,6 +25,7 @@ OVERTAKEN: Final = "overtaken by a later sample"
 BLOCKED: Final = "the writer was blocked for longer than max_blocking_time"
 _NEVER_NS: Final = -(10**18)
 _PIGGYBACK_PAUSE_NS: Final = 100_000
+"""A message with data has no heartbeat for this time after a heartbeat, unless a response is required."""
 _HEARTBEATS_AT_FULL_RATE: Final = 5
 
 
@@ -40,8 +41,8 @@ class TopicWriter:
 
     Attributes:
         on_reader_start: Called when its reader starts, or starts again.
-        share_heartbeat: Called with separate heartbeats at whole periods, to send them together with heartbeats of
-            other writers; None sends them directly.
+        share_heartbeat: Called with each separate heartbeat that is due at a multiple of the heartbeat interval, to
+            send it together with heartbeats of other writers; None if all heartbeats are sent directly.
     """
 
     def __init__(
@@ -207,6 +208,7 @@ class TopicWriter:
     def _schedule_heartbeat(self, after_ns: int) -> None:
         at_ns = self._wire.now_ns + after_ns
         if self.share_heartbeat is not None:
+            # Round up to a multiple of the interval, so that the heartbeats of several writers are due together.
             at_ns += -at_ns % self._timing.heartbeat_ns
         self._heartbeat_timer.bring_forward(at_ns)
 

@@ -27,18 +27,18 @@ UdpLite: 0 0 0 0 77 0 0 0 0
 
 
 def test_counters_are_read_from_their_section_and_group() -> None:
-    counters = host.parse(STATE.format(reassembly=3, buffer=17))
+    counters = host.parse_counters(STATE.format(reassembly=3, buffer=17))
     assert (counters.udp_buffer_errors, counters.reassembly_failures) == (17, 3)
 
 
 def test_the_difference_of_counters_is_after_minus_before() -> None:
-    before, after = (host.parse(STATE.format(reassembly=n, buffer=10 * n)) for n in (3, 5))
-    change = host.difference(before, after)
+    before, after = (host.parse_counters(STATE.format(reassembly=n, buffer=10 * n)) for n in (3, 5))
+    change = host.increments(before, after)
     assert (change.udp_buffer_errors, change.reassembly_failures) == (20, 2)
 
 
 def test_a_counter_that_is_missing_or_decreased_has_no_difference() -> None:
-    assert host.difference(Counters(None, 5), Counters(3, 4)) == Counters(None, None)
+    assert host.increments(Counters(None, 5), Counters(3, 4)) == Counters(None, None)
 
 
 @pytest.mark.parametrize(
@@ -46,13 +46,13 @@ def test_a_counter_that_is_missing_or_decreased_has_no_difference() -> None:
     ["", "==> /proc/net/snmp <==\n", "Ip: ReasmFails\nIp: 1\n", "==> /proc/net/snmp <==\nIp: ReasmFails\nIp: x\n"],
 )
 def test_a_state_without_counters_has_none(text: str) -> None:
-    assert host.parse(text) == Counters(None, None)
+    assert host.parse_counters(text) == Counters(None, None)
 
 
 @given(st.text(), st.text(st.sampled_from("= \n/:UdpIp019RcvbufErrors"), max_size=80))
 def test_any_text_raises_no_error(text: str, snmp: str) -> None:
-    host.parse(text)
-    host.parse("==> /proc/net/snmp <==\n" + snmp)
+    host.parse_counters(text)
+    host.parse_counters("==> /proc/net/snmp <==\n" + snmp)
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ class StationaryPhysics:
 
 
 class ScheduledProgram:
-    """A program that, at each wake, plans the next one by the next entry of a list: a delay, or None for never."""
+    """A program whose times between wakes are the items of a list; after None it has no timer."""
 
     def __init__(self, name: str, delays_ns: Sequence[int | None], wakes: list[tuple[int, str]]) -> None:
         self._name = name

@@ -1,6 +1,5 @@
-"""The physics class of docs/cosim-api.md, the example `carts.py`; and errors of incomplete physics classes."""
+"""The example physics class `carts.py` runs with every policy, and incomplete physics classes are refused."""
 
-import math
 from typing import Any
 
 import pytest
@@ -86,4 +85,3 @@ def test_a_program_that_drives_requires_states_with_a_heading(carts: Any) -> Non
     }
     with pytest.raises(FieldkitError, match="the heading of its robot"):
         build(SCENARIO, physics=incomplete_physics).run()
-    assert math.isfinite(incomplete_physics.step_ns)

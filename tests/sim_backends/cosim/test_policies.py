@@ -1,4 +1,4 @@
-"""Sync policies compared with results computed by hand: robots pass each other, links have a hard range limit."""
+"""Sync policies compared with results computed by hand: two robots pass each other, with a link of limited range."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -82,7 +82,14 @@ def same_time(at_ns: int) -> int:
 
 @dataclass(frozen=True)
 class ExpectedTimes:
-    """A policy, and functions for the entry time of packets, the time of assumed states, and the counted arrival."""
+    """A policy, and the times that it determines for a packet, as functions.
+
+    Attributes:
+        policy: The policy.
+        enters: Returns the time when a packet enters the network from the time when it was sent.
+        assumes: Returns the time of the assumed states from the time when the packet enters.
+        counts: Returns the time from which an arrival counts from the time of the arrival.
+    """
 
     policy: SyncPolicy
     enters: Callable[[int], int] = same_time
@@ -108,7 +115,7 @@ EXPECTATIONS = [
 
 
 @pytest.mark.parametrize("expected", EXPECTATIONS, ids=lambda expected: expected.policy.name)
-def test_fates_and_times_equal_those_computed_by_hand(expected: ExpectedTimes) -> None:
+def test_fates_and_times_equal_values_computed_by_hand(expected: ExpectedTimes) -> None:
     run = passing_run(expected.policy)
     assert len(run.fates) == -(-END_NS // PERIOD_NS)
     lost_count = 0

@@ -99,7 +99,7 @@ TOPIC = {"protocol": "topic", "from": "ann", "to": ["bob"]}
         ({"scenario/radio/mode": "n3"}, "the mode n3 needs the standard 802.11n in all radios"),
         (
             {"options/topics": "udp", "scenario/traffic": [TOPIC]},
-            "topics: udp carries best_effort topics only, and those of ann are reliable",
+            "topics: udp carries best_effort topics only, but ann publishes a reliable topic",
         ),
     ],
     ids=lambda value: None if isinstance(value, str) else next(iter(value)),

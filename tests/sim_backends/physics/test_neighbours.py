@@ -25,19 +25,19 @@ YARD = world({"name": "oak", "kind": "tree", "at_m": (0, 3), "trunk_radius": "0.
 
 @given(st.lists(PLACES, max_size=40), PLACES, st.floats(0, 20))
 @example([(1.0, 1.0, 0.0)], (1.0, 1.0, 0.0), 5e-324)
-def test_a_grid_search_returns_all_numbers_nearby(
+def test_a_grid_search_returns_the_indices_of_all_bodies_nearby(
     places_m: list[tuple[float, float, float]], place_m: tuple[float, float, float], within_m: float
 ) -> None:
     grid = CellGrid(within_m)
-    for number, other_m in enumerate(places_m):
-        grid.add(number, other_m)
-    numbers = grid.nearby_indices(place_m)
-    assert numbers == sorted(set(numbers))
-    expected = {number for number, other_m in enumerate(places_m) if math.dist(other_m[:2], place_m[:2]) <= within_m}
-    assert expected <= set(numbers)
+    for index, other_m in enumerate(places_m):
+        grid.add(index, other_m)
+    indices = grid.nearby_indices(place_m)
+    assert indices == sorted(set(indices))
+    expected = {index for index, other_m in enumerate(places_m) if math.dist(other_m[:2], place_m[:2]) <= within_m}
+    assert expected <= set(indices)
 
 
-def test_a_grid_search_omits_distant_numbers() -> None:
+def test_a_grid_search_omits_distant_bodies() -> None:
     grid = CellGrid(1.0)
     grid.add(0, (100.0, 0.0, 0.0))
     assert grid.nearby_indices((0.0, 0.0, 0.0)) == []

@@ -466,4 +466,4 @@ def test_the_remedy_for_a_clock_uses_an_available_tool() -> None:
 
 def test_the_remedy_for_the_control_route_names_the_site_file() -> None:
     finding = only(judge_radio(SENDER, control=CommandResult("10.42.0.254 51000 10.42.0.1 22", 0)), "control")
-    assert finding.remedy == "write control: radio in the site file, or give host another network"
+    assert finding.remedy == "write control: radio in the site file, or set host to its address on another network"

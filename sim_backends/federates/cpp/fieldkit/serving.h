@@ -39,7 +39,7 @@ class Heartbeat
     }
 
     // Send `busy` with the time that the run has reached, if it is due.
-    void Check(int64_t at_ns)
+    void SendIfDue(int64_t at_ns)
     {
         if (Clock::now() >= Due())
         {

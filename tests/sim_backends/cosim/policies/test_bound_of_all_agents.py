@@ -78,7 +78,7 @@ def test_no_position_error_exceeds_the_bound(
     period_ns: int,
     pauses_ns: list[int],
 ) -> None:
-    """The oracle is each motion itself, extrapolated between the steps of the physics."""
+    """The true positions are those of each motion, extrapolated between the steps of the physics."""
     motions_by_name = {name: WayPoints(name, *motion) for name, motion in zip(NAMES, motions, strict=True)}
     network = StateRecorder(extrapolates, sorted(transmitters), [MAST_M] if has_mast else [])
     agents = Agents(Paths([*motions_by_name.values()]), {"a": Periodic("a", "b", period_ns=period_ns)})
@@ -112,13 +112,13 @@ def _extrapolated_m(state: State, duration_ns: int) -> tuple[float, ...]:
     return tuple(x + v * duration_ns / 1e9 for x, v in zip(state.position_m, state.velocity_m_s, strict=True))
 
 
-def test_the_host_of_a_ros_1_master_counts_because_it_sends_to_all() -> None:
+def test_the_bound_includes_the_host_of_a_ros_1_master_because_it_sends_to_all() -> None:
     simulation = build(load_scenario("field_30ft", {"topology": "masterless"}))
     assert simulation.coordinator.situation.other_agents == ("drone",)
 
 
 @pytest.mark.parametrize("role", ["relay", "jammer"])
-def test_agents_that_forward_or_interfere_count_in_the_bound_and_in_the_errors(role: str) -> None:
+def test_the_bound_and_the_errors_include_agents_that_forward_or_interfere(role: str) -> None:
     """A drone flies between two stationary robots, whose positions alone would have no error."""
     drone = {
         "robot": "iris",
@@ -151,7 +151,7 @@ def test_agents_that_forward_or_interfere_count_in_the_bound_and_in_the_errors(r
     assert compare_runs(runs["bounded"], runs["scheduled"]).position_error_m.largest > 0.1
 
 
-def test_a_jammer_at_a_fixed_position_counts_if_two_robots_move_side_by_side() -> None:
+def test_the_errors_include_a_jammer_at_a_fixed_position_if_two_robots_move_side_by_side() -> None:
     """Their distance does not change, but their distances from the jammer do."""
     motions = [WayPoints(name, [(0.0, y, 0.0), (9.0, y, 0.0)], 2.0) for name, y in (("a", 0.0), ("b", 1.0))]
     for emitters_m, expected_m in ((), 0.0), ([MAST_M], 0.2):

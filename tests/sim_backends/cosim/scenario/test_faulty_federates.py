@@ -20,7 +20,7 @@ from tests.helpers.federate_transports import SCHEMES, new_addresses, ros_master
 from tests.helpers.runs import cosim
 
 DEADLINE_S: Final = 1.5
-"""Deadline of answers; that of the start is longer, because a busy machine may need it."""
+"""Deadline of answers. The deadline of the start is longer, because a start may take long on a busy machine."""
 OPTIONS: Final = ("--duration", "300ms", "--policy", "sliding_window", "--window", "10ms", "--deadline", "60s")
 UNANSWERED: Final = f"has not answered for {DEADLINE_S:g} s: request to advance from 0.2"
 MESSAGES: Final = {
@@ -55,7 +55,7 @@ def is_running(pid: int) -> bool:
 
 
 def check_run(lab: Path, role: str, fault: str, address: str) -> None:
-    """Run the scenario, whose federate has a fault, and check exit code, message and recording."""
+    """Run a scenario whose federate has a fault, and check exit code, message and recording."""
     # DDS reports only after 10 s that a participant has exited without a message.
     code, message = MESSAGES["suspended" if fault == "killed" and address.startswith("dds") else fault]
     started_s = time.monotonic()

@@ -22,7 +22,7 @@ from tests.helpers.runs import cosim
 
 SCENARIO = """\
 name: visitor
-summary: a robot that is there between 400 ms and 900 ms
+summary: a robot that exists between 400 ms and 900 ms
 world: open
 duration: 1200ms
 radio: {fading: false}
@@ -68,7 +68,7 @@ def is_present(at_ns: int) -> bool:
 
 
 def check_fates(run: Run) -> None:
-    """Check each packet from and to agent c."""
+    """Check each packet from or to agent c."""
     fates_of_c = [fate for fate in run.fates.values() if "c" in (fate.packet.source, fate.packet.destination)]
     assert not any(fate.packet.source == "c" and not is_present(fate.packet.sent_ns) for fate in fates_of_c)
     for fate in fates_of_c:
@@ -151,7 +151,7 @@ def test_fates_are_the_same_with_external_federates(changes: Mapping[str, Any], 
     check_fates(run_scenario(path, "sliding_window", {"policy.window": "5ms", **changes}))
 
 
-def test_absent_agents_need_no_support_by_the_network(path: Path, tmp_path: Path) -> None:
+def test_absent_agents_need_no_support_of_the_network(path: Path, tmp_path: Path) -> None:
     program = tmp_path / "net.py"
     program.write_text(SIMPLE_NETWORK, encoding="utf-8")
     check_fates(run_scenario(path, "event_driven", {"network.federate": shlex.join((sys.executable, str(program)))}))

@@ -1,4 +1,4 @@
-"""Measures of how well followers keep their positions, on known paths."""
+"""Position errors of followers on known paths."""
 
 import math
 

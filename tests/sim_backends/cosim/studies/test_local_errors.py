@@ -159,7 +159,7 @@ def test_the_position_error_of_one_window_in_a_closed_loop_is_of_the_second_orde
 
 
 def test_the_position_error_of_a_whole_run_grows_and_is_of_the_first_order() -> None:
-    """As in solvers of differential equations; the mean lag is w / 2, so the speed is too low by 2 m/s^2 w / 2."""
+    """With a mean lag of w / 2, the speed is too low by 2 m/s^2 w / 2, so the position error grows with time."""
 
     def tracks(policy: SyncPolicy) -> Tracks:
         sampled_physics = SampledPhysics(CommandedMotion(), 50 * MS)

@@ -39,9 +39,9 @@ def claims_of(
 
 
 def test_a_change_compares_means_and_every_row_has_the_same_weight() -> None:
-    own_delays_s = np.array([[1.0, 3.0], [0.02, 0.04]])
+    adaptive_delays_s = np.array([[1.0, 3.0], [0.02, 0.04]])
     compared_delays_s = np.array([[2.0, 2.0], [0.01, 0.005]])
-    change, rows = delay_change(own_delays_s, compared_delays_s)
+    change, rows = delay_change(adaptive_delays_s, compared_delays_s)
     # From 2 to 2, and from 0.0075 to 0.03: factors of 1 and 4, whose geometric mean is 2.
     assert change.value == pytest.approx(1.0)
     assert rows == 2
@@ -51,13 +51,13 @@ def test_a_change_compares_means_and_every_row_has_the_same_weight() -> None:
     assert change.high == pytest.approx(math.expm1(math.log(2) + t_quantile(1) * error))
 
 
-def test_only_rows_and_seeds_count_in_which_packets_arrived_in_both_systems() -> None:
-    own_delays_s = np.array([[1.0, 9.0, 3.0], [NAN, 1.0, 1.0], [NAN, NAN, NAN]])
+def test_only_rows_and_seeds_with_arrivals_in_both_systems_are_used() -> None:
+    adaptive_delays_s = np.array([[1.0, 9.0, 3.0], [NAN, 1.0, 1.0], [NAN, NAN, NAN]])
     compared_delays_s = np.array([[2.0, NAN, 2.0], [1.0, NAN, 1.0], [1.0, 1.0, 1.0]])
-    change, rows = delay_change(own_delays_s, compared_delays_s)
+    change, rows = delay_change(adaptive_delays_s, compared_delays_s)
     assert rows == 1
     assert change.value == pytest.approx(0.0)
-    undefined_change, rows = delay_change(own_delays_s[2:], compared_delays_s[2:])
+    undefined_change, rows = delay_change(adaptive_delays_s[2:], compared_delays_s[2:])
     assert rows == 0
     assert math.isnan(undefined_change.value)
 

@@ -1,4 +1,4 @@
-"""The overhead of a repeat by phase (*own time*): its wall time minus the time of the tools on the robots."""
+"""The overhead of a repeat by phase: its wall time minus the time of the tools on the robots."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from typing import Final
 from benchmarks.lifetimes import Lifetime
 
 TOOLS: Final = {"rosbag": 1, "tcpdump": 2, "nc.traditional": 2, "ping": 1, "tar": 2}
-"""Tools on the robots in one repeat, and how often each runs."""
+"""Number of runs of each tool on the robots in one repeat."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class Repeat:
         return sum(self.own_ms.values())
 
 
-def own_time_ms(start_ns: int, phases: dict[str, int], end_ns: int, tools: Sequence[Lifetime]) -> dict[str, float]:
-    """Return the wall time of a repeat minus the time of the tools, in ms, split by phase.
+def overhead_ms(start_ns: int, phases: dict[str, int], end_ns: int, tools: Sequence[Lifetime]) -> dict[str, float]:
+    """Return the wall time of a repeat minus the time of the tools, in ms, by phase.
 
     Args:
         start_ns: Start of the repeat.
