@@ -34,9 +34,11 @@ has_hung() { # true if source $1 did not answer in time in an earlier snapshot
     case $hung_sources in *":$1:"*) ;; *) return 1 ;; esac
 }
 
+has_timesyncd() { [ -d /run/systemd/system ] && command -v timedatectl >/dev/null; }
+
 start_clock_sources() {
     ! command -v chronyc >/dev/null || start_source chrony chronyc -n -c tracking
-    if [ -d /run/systemd/system ] && command -v timedatectl >/dev/null; then
+    if has_timesyncd; then
         start_source timedatectl timedatectl show
         start_source timesyncd timedatectl timesync-status
     fi
@@ -118,7 +120,7 @@ CLOCK_INTERVAL=10 # s between reports of the clock sources during an attempt
 start_clock_sampler() { # $1 role: start to report on the clock in this folder; does nothing if no program sets the clock, or
     # if it was started before
     PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
-    command -v chronyc >/dev/null || command -v pmc >/dev/null || [ -d /run/systemd/system ] || return 0
+    command -v chronyc >/dev/null || command -v pmc >/dev/null || has_timesyncd || return 0
     mkdir "$PWD/.jobs/clock" 2>/dev/null || return 0
     meta=$PWD/.jobs/clock
     read -r token _ <.began

@@ -24,7 +24,7 @@ from fieldkit.trial.step_errors import StepErrors
 
 _TIME_UNITS: Final = frozenset(("s", "bit/s", "m/s", "ppm"))
 _NO_TIMES: Final = (
-    "the backend's clock counts instructions of an emulated processor, so it measures no real durations"
+    "the backend's clock counts instructions of a simulated processor, so it measures no real durations"
 )
 
 
