@@ -19,8 +19,8 @@ start_sampler() {
     detach "$meta" 86400 - 0 /dev/null "$1-link.txt" "$meta/log" "$shell" "$self" sample "$2" "$token"
 }
 
-stop_samplers() { # stop the jobs of the link and of the telemetry sources of role $1
-    for meta in .jobs/link .jobs/telemetry-*; do
+stop_samplers() { # stop the jobs of the link, of the clock and of the telemetry sources of role $1
+    for meta in .jobs/link .jobs/clock .jobs/telemetry-*; do
         [ -d "$meta" ] || continue
         end_sampler
     done

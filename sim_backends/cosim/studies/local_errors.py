@@ -103,12 +103,11 @@ def local_errors(
         FieldkitError: A fork changed the run from which it was forked, because an object was not copied.
     """
     shape = len(parameters), len(starts_ns)
-    results = {
-        name: LocalErrors(
-            np.zeros(shape), *({measure: np.zeros(shape) for measure in MEASURES} for _ in ("sums", "counts"))
-        )
-        for name in policies
-    }
+
+    def zeros() -> dict[str, Floats]:
+        return {measure: np.zeros(shape) for measure in MEASURES}
+
+    results = {name: LocalErrors(np.zeros(shape), zeros(), zeros()) for name in policies}
     reference = make(EventDriven())
     for column, start_ns in enumerate(starts_ns):
         _delete_decided(reference.advance(start_ns))

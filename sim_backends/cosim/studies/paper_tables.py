@@ -79,6 +79,7 @@ def compare(printed: Printed, measured: IntervalEstimate) -> Agreement:
 
 
 def _or_value(bound: float, value: float) -> float:
+    """Return a bound of an interval, or the value if the bound is unknown."""
     return value if math.isnan(bound) else bound
 
 

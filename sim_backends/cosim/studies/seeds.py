@@ -42,7 +42,8 @@ class Task:
     setup: str = ""
 
     def __str__(self) -> str:
-        return f"{self.setup and f'{self.setup}, '}policy {self.policy}, seed {self.seed}"
+        setup = f"{self.setup}, " if self.setup else ""
+        return f"{setup}policy {self.policy}, seed {self.seed}"
 
 
 def run_many(
