@@ -109,7 +109,7 @@ snapshot() {
     )
 }
 
-start_other_sources() { # $1 interface of the radio, or -
+start_other_sources() { # start the sources except those of the clock; $1 interface of the radio, or -
     [ "$1" = - ] || start_radio_sources "$1"
     start_source health sh "$self" health
     ! command -v ip >/dev/null || start_source interfaces ip -o link
@@ -118,8 +118,8 @@ start_other_sources() { # $1 interface of the radio, or -
 
 CLOCK_INTERVAL=10 # s between reports of the clock sources during an attempt
 
-start_clock_sampler() { # $1 role: start to report on the clock in this folder; does nothing if no program sets the clock, or
-    # if it was started before
+# Start a job that reports on the clock of role $1. Do nothing if no program sets the clock, or if it was started before.
+start_clock_sampler() {
     PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
     command -v chronyc >/dev/null || command -v pmc >/dev/null || has_timesyncd || return 0
     mkdir "$PWD/.jobs/clock" 2>/dev/null || return 0
@@ -129,15 +129,15 @@ start_clock_sampler() { # $1 role: start to report on the clock in this folder; 
     detach "$meta" 86400 - 0 /dev/null "$1-sources-during.txt" "$meta/log" sh "$self" sample_clock "$token" "$CLOCK_INTERVAL"
 }
 
-# Print a line `==> next <==` and the outputs of the clock sources at intervals of $2 s, until it is stopped, the folder is
-# deleted, or the lock of token $1 (-: none) is lost.
+# Print a line `==> next <==` and the outputs of the clock sources at intervals of $2 s until this job is stopped, its folder
+# is deleted, or the lock of token $1 (-: none) is lost.
 sample_clock() {
     while [ -e .began ]; do
         trap 'kill "$child"; exit 0' TERM INT HUP
         sleep "$2" &
         child=$!
         wait "$child"
-        trap '' TERM INT HUP # a snapshot ends within SOURCE_S seconds, and the programs that it started with it
+        trap '' TERM INT HUP # signals do not interrupt a snapshot, which ends with its programs within SOURCE_S seconds
         [ "$1" = - ] || owns_lock || return 0
         echo "==> next <=="
         snapshot ".clock-$$" - ../.hung-sources clock
