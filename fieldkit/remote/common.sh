@@ -20,7 +20,8 @@
 #                                        delete OLD, renew the lock (TOKEN `-`: none), check for KIB of free disk space,
 #                                        create DIR, write the state of the host to ROLE-before.txt and a snapshot to
 #                                        ROLE-sources-before.txt, and start the job `link`, which samples the Wi-Fi
-#                                        into ROLE-link.txt, and a job for each SOURCE
+#                                        into ROLE-link.txt, the job `clock`, which reports on the clock in
+#                                        ROLE-sources-during.txt, and a job for each SOURCE
 #   job.sh poll FILE TOKEN ADDRESS INTERFACE INTERVAL LIMIT ARGV...
 #                                        run ARGV at intervals and print its output, see telemetry.sh
 #   job.sh pack  DIR ROLE INTERFACE      stop these jobs, write ROLE-after.txt, ROLE-sources-after.txt and hashes, send
@@ -50,6 +51,7 @@
 #   job.sh life_signs FILE               print FILE and the time since boot
 #   job.sh snapshot                      print the outputs of all sources of the robot's state, see `snapshot.sh`
 #   job.sh sample INTERFACE TOKEN        print the state of the Wi-Fi link until it is stopped, see telemetry.sh
+#   job.sh sample_clock TOKEN SECONDS    print the state of the clock at intervals until it is stopped, see snapshot.sh
 #   job.sh health                        print the load, temperatures, batteries and free disk space of this computer
 #   job.sh needs                         fail if a program is missing that this script calls
 #   job.sh command_loop                  print `ready`; then run each line of standard input, `NONCE [held] VERB WORD...`, as

@@ -101,6 +101,7 @@ begin() {
     [ -e "$role-before.txt" ] || print_state "$interface" >"$role-before.txt" 2>&1 || fail_to_write "$role-before.txt"
     write_snapshot "$role-sources-before.txt" "$interface"
     start_sampler "$role" "$interface"
+    start_clock_sampler "$role"
     [ $# -le 6 ] || { shift 6 && poll_sources "$role" "$interface" "$@"; }
     read -r boot </proc/sys/kernel/random/boot_id && echo "$boot"
 }

@@ -18,8 +18,8 @@ start_sampler() { # $1 role, $2 interface: start to sample in this folder; does 
     detach "$meta" 86400 - 0 /dev/null "$1-link.txt" "$meta/log" "$shell" "$self" sample "$2" "$token"
 }
 
-stop_samplers() { # $1 role: stop the samplers of the link and of the sources of the profile
-    for meta in .jobs/link .jobs/telemetry-*; do
+stop_samplers() { # $1 role: stop the samplers of the link, of the clock and of the sources of the profile
+    for meta in .jobs/link .jobs/clock .jobs/telemetry-*; do
         [ -d "$meta" ] || continue
         end_sampler
     done
