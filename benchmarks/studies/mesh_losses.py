@@ -32,6 +32,7 @@ from sim_backends.emulated.robot.spec import USER
 from sim_backends.world.world import load_world
 
 HELLO_S: Final = 0.5
+"""Hello interval of babeld."""
 SETTLE_S: Final = 10.0
 """Time after switching a robot on before its route is checked: more than babeld's history of 16 hellos."""
 

@@ -12,7 +12,7 @@ from fieldkit.analysis.repeats import Key, Repeats
 from fieldkit.analysis.statistics import (
     MIN_FOR_INDEPENDENCE_TESTS,
     Intervals,
-    assured,
+    guaranteed_coverage,
     mean_shares,
     means,
     medians,
@@ -291,7 +291,7 @@ def _same_size_estimates(repeats: Repeats, quantity: Quantity, cell_rows: Indice
         point_estimates.high if upper_of_sent is upper else _mean_or_median(quantity, values, upper_of_sent).high
     )
     n = values.shape[1]
-    coverage = assured(n) if quantity.kind is Kind.MEDIAN and n > 1 else None
+    coverage = guaranteed_coverage(n) if quantity.kind is Kind.MEDIAN and n > 1 else None
     samples = [
         RepeatValues(
             values[cell],
@@ -331,7 +331,7 @@ def _upper_of_sent(
 
 def _mean_or_median(quantity: Quantity, values: NDArray[np.float64], upper: NDArray[np.float64]) -> Intervals:
     """Return the mean or median over repeats of a quantity that is not counted."""
-    least, most = quantity.possible
+    least, most = quantity.possible_range
     if quantity.kind is Kind.MEDIAN:
         return medians(values, least, most, upper=upper)
     if quantity.unit == "share":

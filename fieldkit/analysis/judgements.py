@@ -13,7 +13,7 @@ from fieldkit.analysis import one_sided_bounds
 from fieldkit.analysis.cells import Cell, Estimate, RepeatValues
 from fieldkit.analysis.expectations import Expectation, Scope
 
-_LOST_AS_LATE: Final = "if the delay of lost items is infinite, the interval extends beyond the bound"
+_INFINITE_DELAY_REASON: Final = "if the delay of lost items is infinite, the interval extends beyond the bound"
 
 
 class Ruling(StrEnum):
@@ -148,7 +148,9 @@ def _decide_figure(expectation: Expectation, estimate: Estimate) -> _Decision:
     if not any(ends):
         return _Decision(Ruling.FAILS)
     is_extended = high is not None and estimate.high is not None and high > estimate.high
-    return _Decision(Ruling.OPEN, _LOST_AS_LATE if is_extended and expectation.is_met(estimate.high or 0.0) else "")
+    return _Decision(
+        Ruling.OPEN, _INFINITE_DELAY_REASON if is_extended and expectation.is_met(estimate.high or 0.0) else ""
+    )
 
 
 def _count_met(expectation: Expectation, sample: RepeatValues) -> tuple[int, int]:

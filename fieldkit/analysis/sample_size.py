@@ -35,11 +35,11 @@ def unmet_requirements(
     """
     quantities_by_name = {quantity.name: quantity for quantity in measured_quantities}
     for expectation in expectations:
-        if needs := _needs(expectation, quantities_by_name[expectation.quantity], repeats):
-            yield f"expected {expectation.text}: {needs}"
+        if requirement := _requirement(expectation, quantities_by_name[expectation.quantity], repeats):
+            yield f"expected {expectation.text}: {requirement}"
 
 
-def _needs(expectation: Expectation, quantity: Quantity, repeats: int) -> str:
+def _requirement(expectation: Expectation, quantity: Quantity, repeats: int) -> str:
     available_text = f"this trial has {repeats}"
     if expectation.scope is Scope.PACKETS:
         packets = one_sided_bounds.packets_for(expectation.bound)
@@ -58,7 +58,7 @@ def _needs(expectation: Expectation, quantity: Quantity, repeats: int) -> str:
             if repeats < needed
             else ""
         )
-    needed = _for_interval(expectation, quantity)
+    needed = _repeats_for_interval(expectation, quantity)
     if repeats < needed:
         alternative = f"; to check only the packets of this trial, write: {expectation.text} of all packets"
         has_alternative = quantity.kind is Kind.COUNTED and expectation.is_below
@@ -77,7 +77,7 @@ def _repeats_text(needed: int, quantity: Quantity) -> str:
     return f"needs at least {needed} repeats for 95 % confidence, {best_case}"
 
 
-def _for_interval(expectation: Expectation, quantity: Quantity) -> int:
+def _repeats_for_interval(expectation: Expectation, quantity: Quantity) -> int:
     """Return the smallest number of repeats with which the 95 % interval of a figure can be within the bound.
 
     For a share, it is computed with the score interval of repeats without loss (Wilson 1927), whose end is

@@ -9,7 +9,7 @@ from fieldkit.analysis.statistics import NORMAL
 from fieldkit.core.model import Interval
 
 
-def between(a: Interval, b: Interval) -> Interval:
+def difference_interval(a: Interval, b: Interval) -> Interval:
     """Return `b - a` with an interval of the same confidence, from the intervals of two independent estimates.
 
     The distances from the estimates to their bounds are added as squares, separately for each side. For Wilson

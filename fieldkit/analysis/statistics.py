@@ -172,7 +172,7 @@ def medians(
     probability of at least 95 % for any distribution, computed with a binomial sum (Thompson 1936, Ann. Math. Stat.
     7:122). With fewer repeats, no two order statistics reach 95 %. The interval is then the union of Student's
     interval, which assumes a normal distribution, and the range of the repeats, whose coverage for any distribution
-    is `assured`.
+    is `guaranteed_coverage`.
 
     The value of a right-censored repeat is its lower bound, and its `upper` is infinity. The lower end is computed
     from the lower bounds and the upper end from the upper bounds, so the interval contains the interval that would
@@ -209,7 +209,7 @@ def medians(
     )
 
 
-def assured(n: int) -> float:
+def guaranteed_coverage(n: int) -> float:
     """Return the coverage of the interval of a median of n repeats for any distribution.
 
     The range of all repeats does not contain the median only if all repeats are on one side of it.

@@ -106,7 +106,7 @@ class TableLine:
         return self.payload_bytes is None or cell.payload_bytes.get(self.quantities[0].name, ()) == self.payload_bytes
 
 
-def part_of(n: int, cell: Cell) -> str:
+def partial_count(n: int, cell: Cell) -> str:
     """Return a text such as `4 of 5` if only some of a cell's valid repeats have a value, or else an empty string."""
     return f"{n} of {cell.n_valid}" if n < cell.n_valid else ""
 

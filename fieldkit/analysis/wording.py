@@ -8,7 +8,7 @@ from typing import Final
 
 from fieldkit.analysis.cells import Cell, Estimate
 from fieldkit.analysis.quantities import Quantity, Tally, in_order
-from fieldkit.analysis.statistics import CONFIDENCE, MIN_FOR_ORDER_STATISTICS, assured
+from fieldkit.analysis.statistics import CONFIDENCE, MIN_FOR_ORDER_STATISTICS, guaranteed_coverage
 from fieldkit.core import columns
 from fieldkit.core.columns import Kind
 from fieldkit.core.model import FINAL_STATUSES, Status
@@ -137,7 +137,7 @@ def cautions(cells: Sequence[Cell], names: Collection[str] | None = None) -> Ite
         if names is None or name in names
     ]
     if few := sorted({estimate.n for _, estimate in selected if assumes_normal(estimate)}, reverse=True):
-        coverage = ", ".join(f"{n} repeats give {100 * assured(n):.0f} %" for n in few)
+        coverage = ", ".join(f"{n} repeats give {100 * guaranteed_coverage(n):.0f} %" for n in few)
         yield (
             f"* 95 % interval assuming a normal distribution; without that assumption {coverage}. "
             f"Use {MIN_FOR_ORDER_STATISTICS} or more repeats"
@@ -199,7 +199,7 @@ def measured(cells: Sequence[Cell]) -> tuple[Quantity, ...]:
 
 def key(cell: Cell, name: str) -> str:
     """Return the text of a value in a cell's key, `-` if it is missing."""
-    return columns.cell(cell.key[name]) or "-"
+    return columns.cell_text(cell.key[name]) or "-"
 
 
 def varying_and_common(by: Sequence[str], cells: Sequence[Cell]) -> tuple[list[str], list[str]]:

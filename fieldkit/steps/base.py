@@ -25,14 +25,14 @@ from fieldkit.steps.view import View
 StepName = Annotated[
     str,
     schema.pattern_field(
-        r"^[a-z][a-z0-9_]{0,30}$", "a name: at most 31 lower-case letters, digits and _, a letter first"
+        r"^[a-z][a-z0-9_]{0,30}$", "a name of at most 31 lower-case letters, digits and _, with a letter first"
     ),
 ]
 """Name of a step or a bag."""
 FileName = Annotated[
     str,
     schema.pattern_field(
-        r"^[a-z][a-z0-9_.-]{0,40}$", "the name of a file: at most 41 lower-case letters, digits, _ . and -"
+        r"^[a-z][a-z0-9_.-]{0,40}$", "a file name of at most 41 lower-case letters, digits, _ . and -"
     ),
 ]
 """Name of a file in the folder of an attempt."""
@@ -57,8 +57,8 @@ class Step(Strict, ABC):
         capture_buffer_kib: Kernel buffer that a capture needs for the step's packets; 0 if the default is enough.
         needs_complete_capture: Whether a repeat is void if a capture around the step dropped packets. If not, the
             step leaves the columns that depend on the capture empty.
-        name: Letters, digits and `_`, a lower-case letter first; distinguishes the step from others of its kind.
-            The names of its jobs, files and columns start with it.
+        name: Lower-case letters, digits and `_`, with a letter first. It distinguishes the step from others of its
+            kind. The names of its jobs, files and columns start with it.
     """
 
     columns: ClassVar[tuple[Column, ...]] = ()

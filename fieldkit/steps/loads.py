@@ -54,11 +54,11 @@ class LoadOptions(OverLink):
         """Return the transport protocol of the load in repeats of `protocol`."""
         return self.protocol or protocol
 
-    def server(self, *options: str) -> tuple[str, ...]:
+    def server_command(self, *options: str) -> tuple[str, ...]:
         """Return the command of the server, which serves one test and exits."""
         return (PROGRAM, "-s", "-1", "-p", str(self.port), *options)
 
-    def client(self, scene: Scene, *options: str) -> tuple[str, ...]:
+    def client_command(self, scene: Scene, *options: str) -> tuple[str, ...]:
         """Return the command of the client, which sends the load."""
         is_udp = self.transport_protocol(scene.protocol) is Protocol.UDP
         rate = self.rate or (DEFAULT_UDP_BIT_S if is_udp else None)

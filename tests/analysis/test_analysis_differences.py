@@ -8,7 +8,7 @@ import scipy
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.analysis.significance import between, cliffs_delta, holm, p_value
+from fieldkit.analysis.significance import cliffs_delta, difference_interval, holm, p_value
 from fieldkit.core.model import Interval
 from tests.helpers.single import wilson
 
@@ -27,12 +27,12 @@ def test_the_difference_of_wilson_intervals_has_newcombes_interval(
     counts: tuple[int, int, int, int], bounds: tuple[float, float]
 ) -> None:
     """Newcombe 1998, Stat. Med. 17:873, table II, row 10."""
-    interval = between(wilson(counts[2], counts[3]), wilson(counts[0], counts[1]))
+    interval = difference_interval(wilson(counts[2], counts[3]), wilson(counts[0], counts[1]))
     assert (interval.low, interval.high) == pytest.approx(bounds, abs=6e-5)
 
 
 def test_the_difference_of_normal_intervals_has_a_normal_interval() -> None:
-    interval = between(Interval(10, 7, 13), Interval(20, 16, 24))
+    interval = difference_interval(Interval(10, 7, 13), Interval(20, 16, 24))
     assert (interval.value, interval.low, interval.high) == (10, 5, 15)
 
 

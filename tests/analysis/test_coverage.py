@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fieldkit.analysis.statistics import Intervals, assured, mean_shares, means, medians, shares, wilson_intervals
+from fieldkit.analysis.statistics import (
+    Intervals,
+    guaranteed_coverage,
+    mean_shares,
+    means,
+    medians,
+    shares,
+    wilson_intervals,
+)
 from tests.helpers.nightly import mark_nightly
 
 CELLS: Final = 4000  # leaves a standard error of 0.35 % at a coverage of 95 %
@@ -214,14 +222,14 @@ REPEAT_NUMBERS: Final = (2, 3, 4, 5, 6, 7, 10, 20, 30)
 
 
 @pytest.mark.parametrize("name", mark_nightly(SHAPES, in_ci=["two modes, 60:40"]))
-def test_medians_have_the_assured_coverage_for_any_distribution(
+def test_medians_have_the_guaranteed_coverage_for_any_distribution(
     name: str, record_property: Callable[[str, object], None]
 ) -> None:
     random = np.random.default_rng(16)
     draw, true_median = SHAPES[name]
     coverages = {n: coverage_percent(medians(draw(random, (CELLS, n))), true_median) for n in REPEAT_NUMBERS}
     record_property("result", f"median, {name}, of {REPEAT_NUMBERS}: {as_text(list(coverages.values()))}")
-    assert all(percentage >= 100 * assured(n) - 1 for n, percentage in coverages.items())
+    assert all(percentage >= 100 * guaranteed_coverage(n) - 1 for n, percentage in coverages.items())
     assert table_row(f"median, {name}") == pytest.approx(list(coverages.values()), abs=0.8)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fieldkit.analysis.significance import between, holm, p_value
+from fieldkit.analysis.significance import difference_interval, holm, p_value
 from fieldkit.analysis.statistics import Intervals, medians, shares
 from fieldkit.core.model import Interval
 
@@ -48,7 +48,7 @@ def loss_intervals(values: Floats) -> Intervals:
 
 def differences(a: Intervals, b: Intervals) -> list[Interval]:
     sides = [[Interval(*bounds) for bounds in zip(side.value, side.low, side.high, strict=True)] for side in (a, b)]
-    return [between(first, second) for first, second in zip(*sides, strict=True)]
+    return [difference_interval(first, second) for first, second in zip(*sides, strict=True)]
 
 
 @cache

@@ -120,7 +120,7 @@ def test_error_has_the_line_of_the_key(tmp_path: Path) -> None:
         (
             "into: recv.bag",
             "into: ../recv.bag",
-            "'../recv.bag' is not the name of a file: at most 41 lower-case letters",
+            "'../recv.bag' is not a file name of at most 41 lower-case letters",
         ),
         ("into: recv.bag", "file: a/b/c.bag", "is not the name of a recording"),
         ("port: 1234\n", "port: 0\n", "greater than 0"),

@@ -164,7 +164,7 @@ def test_gates_and_rows_prefix_columns_reasons_and_summaries(tmp_path: Path) -> 
         (
             "ping: {name: up, ",
             "ping: {name: 2up, ",
-            "'2up' is not a name: at most 31 lower-case letters, digits and _",
+            "'2up' is not a name of at most 31 lower-case letters, digits and _",
         ),
         ("ping: {name: up, ", "ping: {name: up.2, ", "'up.2' is not a name"),
         ("ping: {name: up, ", "ping: {", "a ping is defined twice; give each of them another name."),

@@ -53,6 +53,7 @@ _ARMED = 0x80
 _CRITICAL = 5
 """MAV_STATE_CRITICAL: PX4 (HEARTBEAT.hpp) and ArduPilot report it while a failsafe is active."""
 _LOCAL_NED = 1
+"""MAV_FRAME_LOCAL_NED."""
 _POSITION_AND_YAW = 0b100111111000
 """POSITION_TARGET_TYPEMASK: position and yaw are used; velocity, acceleration and yaw rate are ignored."""
 _OWN_SYSTEM = 245

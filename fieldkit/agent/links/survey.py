@@ -13,7 +13,7 @@ from typing import Iterator
 from fieldkit.agent.autopilots.autopilot import PREFLIGHT
 from fieldkit.agent.flying.session import AutopilotSession
 
-_HEARTBEAT_S = 5.0
+_HEARTBEAT_TIMEOUT_S = 5.0
 _POLL_S = 0.1
 _SERIAL_PATTERNS = ("/dev/serial/by-id/*", "/dev/ttyACM*", "/dev/ttyUSB*", "/dev/ttyAMA*", "/dev/ttyTHS*")
 _TCP_PORTS, _UDP_PORTS = range(5760, 5764), range(14540, 14561)
@@ -46,7 +46,7 @@ def survey(connection: str, stop_event: threading.Event) -> int:
     system, error = 0, ""
     try:
         with closing(AutopilotSession(connection, component=PREFLIGHT)) as session:
-            deadline_s = time.monotonic() + _HEARTBEAT_S
+            deadline_s = time.monotonic() + _HEARTBEAT_TIMEOUT_S
             while not session.drone.alive and not stop_event.is_set() and time.monotonic() < deadline_s:
                 session.exchange(_POLL_S)
             system = session.drone.system

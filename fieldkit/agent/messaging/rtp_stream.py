@@ -30,7 +30,7 @@ FD = "{fd}"
 
 _PLAYING = "Setting pipeline to PLAYING"
 _GREY = b"\x80"
-_EXIT_S = 5.0
+_EXIT_TIMEOUT_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def send(video: Video, log: Log, stop_event: threading.Event) -> None:
         else:
             frames.close()
             with suppress(subprocess.TimeoutExpired):
-                process.wait(_EXIT_S)
+                process.wait(_EXIT_TIMEOUT_S)
             stop_event.wait(SETTLING_S)
             return
     if not stop_event.is_set():
@@ -207,7 +207,7 @@ def _stop(process: subprocess.Popen[str]) -> None:
     if process.poll() is None:
         process.send_signal(signal.SIGINT)
     try:
-        process.wait(_EXIT_S)
+        process.wait(_EXIT_TIMEOUT_S)
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()

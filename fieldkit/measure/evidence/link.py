@@ -10,7 +10,7 @@ from itertools import pairwise
 from statistics import median
 from typing import Final
 
-from fieldkit.core.columns import BACKGROUND, Column, Figure, Kind, Measured, Value, cell, columns
+from fieldkit.core.columns import BACKGROUND, Column, Figure, Kind, Measured, Value, cell_text, columns
 from fieldkit.core.model import LinkSample, Role, StationSample
 
 _DBM: Final = (-300.0, 100.0)
@@ -124,7 +124,7 @@ def measure(role: Role, samples: Sequence[LinkSample]) -> Measured:
     impossible = (
         column.name
         for column in _COLUMNS[role]
-        if column.invalid_value_reason(cell(measured.values.get(column.name)))
+        if column.invalid_value_reason(cell_text(measured.values.get(column.name)))
     )
     return measured.without(dict.fromkeys(impossible, _NOT_REPORTED))
 

@@ -60,9 +60,12 @@ class AskStep(Step, DescribesActions, AsksOperator, WritesOnLaptop, Summarizes):
     """
 
     column: StepName
-    question: Annotated[str, schema.pattern_field(r"^\S[^\n]{0,200}$", "a question: one line")]
+    question: Annotated[str, schema.pattern_field(r"^\S[^\n]{0,200}$", "a question on one line")]
     unit: (
-        Annotated[str, schema.pattern_field(r"^[^\s0-9][^\s]{0,15}$", "a unit: up to 16 characters, no digit first")]
+        Annotated[
+            str,
+            schema.pattern_field(r"^[^\s0-9][^\s]{0,15}$", "a unit of up to 16 characters that starts with no digit"),
+        ]
         | None
     ) = None
     choices: Annotated[tuple[_Word, ...], Field(min_length=2, max_length=20)] | None = None

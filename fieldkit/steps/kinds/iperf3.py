@@ -108,8 +108,8 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
         end_options = ("-t", f"{self._duration_s:.0f}") if self.size is None else ("-n", f"{self.size:.0f}")
-        client = self.client(scene, *end_options, *(("-R",) if self.reverse else ()), "-i", "1", "--json")
-        yield self._planned_job(scene, self.receiver, "server", self.server("-i", "1", "--json"))
+        client = self.client_command(scene, *end_options, *(("-R",) if self.reverse else ()), "-i", "1", "--json")
+        yield self._planned_job(scene, self.receiver, "server", self.server_command("-i", "1", "--json"))
         yield self._planned_job(scene, self.sender, "client", client)
 
     def _planned_job(self, scene: Scene, role: Role, name: str, argv: tuple[str, ...]) -> Planned:

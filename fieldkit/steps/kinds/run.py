@@ -11,7 +11,7 @@ from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.named_programs import NamedProgram
 from fieldkit.config.schema import AfterValidator, Bool, Bytes, Duration, Field, Int, Number, Strict
-from fieldkit.core.columns import Column, Figure, Kind, Measured, Value, cell
+from fieldkit.core.columns import Column, Figure, Kind, Measured, Value, cell_text
 from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role
@@ -60,13 +60,13 @@ class PrintedColumn(Strict):
     name: Annotated[
         str,
         schema.pattern_field(
-            r"^[a-z][a-z0-9_]{0,40}$", "a name: at most 41 lower-case letters, digits and _, a letter first"
+            r"^[a-z][a-z0-9_]{0,40}$", "a name of at most 41 lower-case letters, digits and _, with a letter first"
         ),
     ]
     unit: Annotated[
         str,
         schema.pattern_field(
-            r"^[^\s,;\"][^,;\"\x00-\x1f]{0,15}$", "a unit: 1 to 16 characters, none of them , ; or quotes"
+            r"^[^\s,;\"][^,;\"\x00-\x1f]{0,15}$", "a unit of 1 to 16 characters, without , ; and quotes"
         ),
     ]
     meaning: Annotated[str, Field(max_length=300)] = ""
@@ -368,6 +368,6 @@ class RunStep(Step, UsesSpace, Summarizes):
         for column in self.figures:
             if column.name in values:
                 value = values[column.name]
-                value_text = f"{value:.4g}" if isinstance(value, float) else cell(value)
+                value_text = f"{value:.4g}" if isinstance(value, float) else cell_text(value)
                 unit = "" if column.unit in {"text", "bool", "count", "hash"} else f" {column.unit}"
                 yield f"{column.label or column.name} {value_text}{unit}"

@@ -66,9 +66,9 @@ class SoakStep(LoadOptions, Nest, Listens, SendsTraffic):
         """Return the jobs of server and client."""
         limit_s = LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene))
         interface = scene.link(self.sender, self.over).interface
-        client = self.client(scene, "-t", str(_FOREVER_S))
+        client = self.client_command(scene, "-t", str(_FOREVER_S))
         ends = {
-            self.receiver: (self.server(), jobs.ready_when_bound(Protocol.TCP, self.port)),
+            self.receiver: (self.server_command(), jobs.ready_when_bound(Protocol.TCP, self.port)),
             self.sender: (("sh", "-c", _FLOWS, "sh", interface, *client), "log:flows"),
         }
         server, sender = (

@@ -63,7 +63,7 @@ BagName = Annotated[
     str,
     schema.pattern_field(
         r"^[a-z][a-z0-9_.-]{0,40}(/[a-z][a-z0-9_.-]{0,40})?$",
-        "the name of a recording, scan, or of its file, scan.bag or scan/scan_0.db3",
+        "the name of a recording (scan), or of its file (scan.bag or scan/scan_0.db3)",
     ),
 ]
 

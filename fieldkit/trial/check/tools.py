@@ -31,6 +31,7 @@ _PROBE_FUNCTION: Final = r"""run_tool() {
 }
 """
 _MARK: Final = re.compile(rb"^==> (?:(?P<name>[a-z]+)|exit (?P<code>[0-9]{1,3})) <==$", re.MULTILINE)
+# Exit codes of a POSIX shell: a program that cannot be executed or is not found, and a program killed by SIGKILL (9).
 _MISSING: Final = {126, 127}
 _KILLED: Final = 128 + 9
 _USER: Final = "user"

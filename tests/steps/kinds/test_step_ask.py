@@ -68,7 +68,7 @@ def run_and_view(step: AskStep, folder: Path, operator: ScriptedOperator | None 
         (f"{WIND}, usual: strong", "usual is 'strong'; permitted answers: a number in m/s from 0 to 40"),
         (f"{GRASS}, usual: high", "usual is 'high'; permitted answers: 1 dry, 2 wet; - if unknown\n"),
         ("column: a, question: b, choices: [a]", "at least 2 items"),
-        ("column: A, question: b", "'A' is not a name: at most 31 lower-case letters"),
+        ("column: A, question: b", "'A' is not a name of at most 31 lower-case letters"),
         ("column: a, question: b, unit: 2m", "'2m' is not a unit"),
         ("column: a, question: b, choices: [a, b, a]", "a choice is listed twice"),
         ("column: a, question: b, choices: [a, '2']", "choices.1: '2' cannot be a choice: write words"),
@@ -118,7 +118,7 @@ def test_the_answer_to_a_number_question_is_in_a_column_with_its_unit(tmp_path: 
     step = ask(WIND)
     view = run_and_view(step, tmp_path / "a", ScriptedOperator("3.5"))
     (column,) = step.output_columns()
-    assert (column.name, column.unit, column.possible) == ("wind", "m/s", (0.0, 40.0))
+    assert (column.name, column.unit, column.possible_range) == ("wind", "m/s", (0.0, 40.0))
     assert step.measure(view).values == {"wind": 3.5}
     assert list(step.summary({"wind": 3.5})) == ["wind 3.5 m/s"]
     assert not list(step.check(view))
