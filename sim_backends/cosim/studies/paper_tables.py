@@ -276,7 +276,7 @@ def paper_table(table: str, changes: Mapping[str, Any]) -> PaperTable:
 
     Args:
         table: One of `TABLES`.
-        changes: Values by dotted key of the scenario file, which replace those of the file.
+        changes: Values that replace values of the scenario file, by dotted key.
 
     Raises:
         ConfigurationError: The changes are invalid.

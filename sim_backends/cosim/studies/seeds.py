@@ -18,7 +18,7 @@ _FEW_PACKETS: Final = 400
 
 
 def workers_for(packets: float, workers: Workers = ALL_PROCESSORS) -> Workers:
-    """Return the workers for a number of packets: without a choice of the user, only this process if it is faster.
+    """Return the workers that the user chose; without a choice, only this process if that is faster.
 
     Args:
         packets: Approximate number of packets in all runs.
