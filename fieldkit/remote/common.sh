@@ -89,7 +89,9 @@ read_uptime() { # set now to the seconds since boot
     read -r now _ </proc/uptime && now=${now%.*}
 }
 
-sleep_for() { # sleep for $1 seconds; rounded up if `sleep` supports whole seconds only; above 128 a signal has ended it
+# Sleep for $1 seconds, rounded up if `sleep` supports whole seconds only. An exit code above 128 means that a signal ended
+# the sleep.
+sleep_for() {
     sleep "$1" 2>/dev/null || [ $? -gt 128 ] || sleep $((${1%.*} + 1))
 }
 

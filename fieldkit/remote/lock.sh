@@ -121,7 +121,9 @@ holder() {
     return 0
 }
 
-abort() { # break the lock in the name of $1, and stop all jobs; on a full disk the lock may be broken only after that
+# Break the lock in the name of $1, and stop all jobs. If the disk is full, try to break the lock again after the jobs, which
+# may have filled it, were stopped.
+abort() {
     by=$1
     record_break aborted && has_failed= || has_failed=1
     [ "$kind" = held ] && echo "held $who $what" || echo free

@@ -269,7 +269,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
         measured = topic_evidence.without_contradicted_times(self, view, logs, measured)
         return (
             measured
-            | topic_columns.withheld_mark(topic_evidence.dropped_reason(self, view))
+            | topic_columns.measure_withheld(topic_evidence.dropped_reason(self, view))
             | self._measure_reads(view, ends, packets)
         )
 
@@ -286,7 +286,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
 
         addresses = (view.scene.robot(role).address for role in (self.sender, self.receiver))
         plan = sample_reads.ReadPlan(self._reads_prefix, self.reads.rate, self.reads.limit, 1 / self.rate)
-        return sample_reads.measure(plan, *ends, *sample_reads.read_clocks(*packets, *addresses))
+        return sample_reads.measure(plan, *ends, *sample_reads.find_clocks(*packets, *addresses))
 
     @property
     def _reads_prefix(self) -> str:

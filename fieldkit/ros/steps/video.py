@@ -250,7 +250,7 @@ class VideoStep(AlongStep, Prepares, HasNeeds, UsesSpace, Listens, SendsTraffic,
         sender, receiver = (capture.packets if capture else None for capture in captures)
         plan = sample_reads.ReadPlan("seen", self.reads.rate, self.reads.limit, 1 / self.rate)
         addresses = (view.scene.robot(role).address for role in roles)
-        clocks, unknown_clocks = sample_reads.read_clocks(sender, receiver, *addresses)
+        clocks, unknown_clocks = sample_reads.find_clocks(sender, receiver, *addresses)
         return (
             video_columns.measure_frames(sent, received)
             | video_columns.measure_packets(rtp_sent, rtp_received, received, 1 / self.rate)
