@@ -14,7 +14,7 @@ from fieldkit.core.columns import BACKGROUND, Column, Figure, Kind, Measured, Va
 from fieldkit.core.model import LinkSample, Role, StationSample
 
 _DBM: Final = (-300.0, 100.0)
-"""Range of valid signals and noises."""
+"""Valid range of a signal or noise."""
 _NOT_SAMPLED: Final = "the robot's radio was not sampled: the robot has no Wi-Fi or no iw, or was not associated"
 _NOT_REPORTED: Final = "the robot's radio does not report it"
 _RESET: Final = "the link was established again, and the last counts before were not sampled"
