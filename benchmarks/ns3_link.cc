@@ -89,8 +89,8 @@ struct Options
     uint16_t streams = 1;
     uint16_t guard_ns = 800;
     uint32_t ampdu = 0;
-    uint32_t rts = 4692480;
-    bool bare = false;
+    uint32_t rts = 4692480; // size of the largest frame without RTS; this one is above any frame
+    bool bare = false;      // without ns-3's retry limits for aggregates, and without its BlockAckReqs
     std::string classes = "0";
     bool txop = true;
     std::string band = "BAND_2_4GHZ";
@@ -142,7 +142,8 @@ NetDeviceContainer Install(const Options& options, NodeContainer nodes)
     phy.Set("Antennas", UintegerValue(options.streams));
     phy.Set("MaxSupportedTxSpatialStreams", UintegerValue(options.streams));
     phy.Set("MaxSupportedRxSpatialStreams", UintegerValue(options.streams));
-    // By default without RTS, also before aggregates of more than 65,535 bytes; the window of Block Acks of 802.11ax.
+    // By default no RTS is sent, not even before aggregates of more than 65,535 bytes. The Block Ack window of 802.11ax
+    // has 256 MPDUs.
     Config::SetDefault("ns3::WifiRemoteStationManager::RtsCtsThreshold", UintegerValue(options.rts));
     Config::SetDefault("ns3::HeConfiguration::MpduBufferSize", UintegerValue(256));
     Config::SetDefault("ns3::HtConfiguration::ShortGuardIntervalSupported", BooleanValue(options.guard_ns == 400));
@@ -188,8 +189,8 @@ std::vector<double> Goodputs(const Options& options)
 {
     if (options.bare)
     {
-        // ns-3 3.37 counts failed aggregates to a receiver until 7, also if others succeeded in between, and then drops
-        // a whole aggregate. After each failed aggregate it sends a BlockAckReq with a backoff of its own.
+        // ns-3 3.37 drops a whole aggregate after 7 failed aggregates to a receiver, even if others succeeded in between.
+        // After each failed aggregate it sends a BlockAckReq, with a separate backoff.
         Config::SetDefault("ns3::QosTxop::UseExplicitBarAfterMissedBlockAck", BooleanValue(false));
         Config::SetDefault("ns3::WifiRemoteStationManager::MaxSsrc", UintegerValue(1000000));
         Config::SetDefault("ns3::WifiRemoteStationManager::MaxSlrc", UintegerValue(1000000));
@@ -238,7 +239,7 @@ std::vector<double> Goodputs(const Options& options)
         sinks.push_back(DynamicCast<PacketSink>(sink.Install(nodes.Get(options.stations)).Get(0)));
         targets.push_back(to);
     }
-    // A saturated station, without events for many packets that exceed its queue.
+    // Saturate the stations. A much higher rate would only add events for packets that full queues drop.
     uint64_t offered_bit_s =
         options.ampdu ? 1.1 * WifiMode(options.mode).GetDataRate(options.width, options.guard_ns, options.streams) : 70000000;
     for (uint32_t n = 0; n < options.stations; n++)
@@ -266,7 +267,7 @@ std::vector<double> Goodputs(const Options& options)
     return bits;
 }
 
-// Lost packets, by comma-separated numbers from 0, in the order of arrival.
+// An error model that loses the packets with the given numbers: comma-separated, from 0, in the order of arrival.
 Ptr<ErrorModel> Losing(const std::string& numbers)
 {
     std::list<uint32_t> lost;
@@ -298,7 +299,7 @@ Ipv4InterfaceContainer Cable(const Options& options, NodeContainer& nodes)
     return interfaces;
 }
 
-// Packets wait only in the queue of the MAC, without a time limit.
+// Two nodes, on a cable or over Wi-Fi. Over Wi-Fi packets wait only in the queue of the MAC, without a time limit.
 Ipv4InterfaceContainer Pair(const Options& options, NodeContainer& nodes)
 {
     if (options.cable)
@@ -335,7 +336,7 @@ void Udp(const Options& options)
     source->TraceConnectWithoutContext("Tx", Callback<void, Ptr<const Packet>>([&](Ptr<const Packet> packet) {
         sent += packet->GetSize();
     }));
-    // Queued packets still arrive.
+    // The additional time is for packets in the queue.
     Simulator::Stop(Seconds(options.seconds + 5));
     Simulator::Run();
     double arrived = received->GetTotalRx();
@@ -379,7 +380,7 @@ void Trace(Ptr<Socket> socket, bool everything)
 
 void Tcp(const Options& options)
 {
-    // Like Linux, without HyStart, which the model lacks.
+    // Use the settings of Linux, but without HyStart, which the co-simulation's TCP does not have.
     Config::SetDefault("ns3::TcpL4Protocol::SocketType", TypeIdValue(TypeId::LookupByName(options.control)));
     Config::SetDefault("ns3::TcpL4Protocol::RecoveryType", TypeIdValue(TypeId::LookupByName(options.recovery)));
     Config::SetDefault("ns3::TcpCubic::HyStart", BooleanValue(false));

@@ -12,7 +12,7 @@ port=1234 port_hex=04D2 old=
 
 on() { ssh -F "$config" "$1" "$2" </dev/null; } # robot, command line for its shell
 
-both() { # command line for both robots, run in parallel; `$me` is the role
+both() { # command line that both robots run in parallel; `$me` is the role
     on sender "me=sender; $1" &
     on receiver "me=receiver; $1"
     wait $!
@@ -50,7 +50,7 @@ collect() { # robot: fetch its files and check them
     (cd "$folder/$1" && sha256sum --quiet -c SHA256SUMS)
 }
 
-check_capture() { # log: no packet was dropped, all matching packets were written
+check_capture() { # log of tcpdump; fails if a packet was dropped, or not all matching packets were written
     awk '/listening on/ {up = 1} /packets? captured/ {captured = $1} /received by filter/ {received = $1}
         /dropped by/ {dropped += $1} END {exit !(up && captured != "" && captured == received && !dropped)}' "$1"
 }

@@ -24,7 +24,7 @@ from fieldkit.config.site import Site
 from fieldkit.core import campaign_events, errors, events, sweep_events
 from fieldkit.core.columns import Column
 from fieldkit.core.model import MAX_STEPS
-from fieldkit.core.result_rows import DifferenceRow, EstimateRow, declared
+from fieldkit.core.result_rows import DifferenceRow, EstimateRow, declared_columns
 from fieldkit.measure.transfers.fates import PACKET_COLUMNS
 from fieldkit.pytest import plugin
 from fieldkit.steps.base import Step, step_types
@@ -283,8 +283,8 @@ def recording_tables() -> str:
 def columns() -> str:
     """Return the page of columns of `trial.csv`, `summary.csv` and comparisons."""
     trial = installed_columns()
-    summary = (*(column for column in trial if column.name in DEFAULT_BY), *declared(EstimateRow))
-    files = {"trial.csv": trial, "summary.csv": summary, "fieldkit compare": declared(DifferenceRow)}
+    summary = (*(column for column in trial if column.name in DEFAULT_BY), *declared_columns(EstimateRow))
+    files = {"trial.csv": trial, "summary.csv": summary, "fieldkit compare": declared_columns(DifferenceRow)}
     blocks = [
         (
             "`fieldkit columns` prints this list; `fieldkit columns PROCEDURE` prints those that a procedure fills. "

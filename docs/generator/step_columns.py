@@ -6,7 +6,7 @@ from typing import Final
 from docs.generator.markdown import page, table
 from fieldkit.core.columns import Column
 from fieldkit.core.model import FaultKind
-from fieldkit.measure.checks import ping_duplicates
+from fieldkit.measure.checks import ping_duplicates, ping_links
 from fieldkit.measure.evidence import handovers, iperf3, ping_gaps
 from fieldkit.measure.transfers import iperf3_load, recoveries, stalls
 from fieldkit.motion.logs import drive_log, fly_log, tlog
@@ -19,6 +19,7 @@ from fieldkit.trial.columns import installed_columns
 STEP_COLUMNS: Final[Mapping[str, tuple[Column, ...]]] = {
     "`ping` with `gap: true`": (*ping_gaps.GAP_COLUMNS, *ping_gaps.OPEN_GAP_COLUMNS),
     "`ping` with `duplicates: true`": ping_duplicates.COLUMNS,
+    "`ping` with `links`": ping_links.declare_columns("LINK"),
     "`roam`": handovers.COLUMNS,
     "`iperf3`": (*iperf3.COLUMNS, *iperf3_load.COLUMNS, *iperf3_load.JITTER),
     "`iperf3`, `soak`": stalls.declare_columns("FLOW", "FLOW", 0),
@@ -32,7 +33,7 @@ STEP_COLUMNS: Final[Mapping[str, tuple[Column, ...]]] = {
     "`fly`": fly_log.COLUMNS,
     "`move` of a robot that fieldkit drives": drive_log.COLUMNS,
 }
-"""Columns by the step that fills them; FLOW is the kind of step."""
+"""Columns by the step that fills them; FLOW is the kind of step, and LINK the name of a link."""
 
 
 def escaped(text: str) -> str:

@@ -331,7 +331,7 @@ def _upper_of_sent(
 
 def _mean_or_median(quantity: Quantity, values: NDArray[np.float64], upper: NDArray[np.float64]) -> Intervals:
     """Return the mean or median over repeats of a quantity that is not counted."""
-    least, most = quantity.possible
+    least, most = quantity.possible_range
     if quantity.kind is Kind.MEDIAN:
         return medians(values, least, most, upper=upper)
     if quantity.unit == "share":

@@ -9,7 +9,7 @@ import numpy as np
 from fieldkit.analysis.parsing import Numbers
 from fieldkit.analysis.quantities import DEFAULT_BY
 from fieldkit.analysis.repeats import Key, Repeats
-from fieldkit.core.columns import cell, plain_name
+from fieldkit.core.columns import cell_text, plain_name
 
 UNKNOWN: Final = "unknown"
 
@@ -182,7 +182,7 @@ def _compare_column(name: str, a: Repeats, b: Repeats, *, refuses: bool) -> Iter
 
 def _values(name: str, rows: Repeats) -> str:
     values = set(rows.column(name)) - {"", None}
-    return ", ".join(sorted(map(cell, values))) or UNKNOWN
+    return ", ".join(sorted(map(cell_text, values))) or UNKNOWN
 
 
 def _file_sizes(a: Repeats, b: Repeats) -> Iterator[Concern]:

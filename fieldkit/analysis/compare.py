@@ -12,7 +12,7 @@ from fieldkit.analysis.comparable import Concern
 from fieldkit.analysis.parsing import Numbers
 from fieldkit.analysis.quantities import Quantity, Tally, quantities
 from fieldkit.analysis.repeats import Key, Repeats
-from fieldkit.core.columns import cell
+from fieldkit.core.columns import cell_text
 from fieldkit.core.model import Interval, Status
 
 PAIRED_BY: Final = ("scenario", "topology", "distance_m", "protocol")
@@ -240,6 +240,6 @@ def _condition_name(by: Sequence[str], key: Key) -> str:
     """Return the name of a condition, such as `los, master, 9.144 m, udp`."""
     units = {"distance_m": " m"}
     return ", ".join(
-        f"no {name}" if value in {"", None} else f"{cell(value)}{units.get(name, '')}"
+        f"no {name}" if value in {"", None} else f"{cell_text(value)}{units.get(name, '')}"
         for name, value in zip(by, key, strict=True)
     )

@@ -10,7 +10,7 @@ from fieldkit.analysis.quantities import DIFFERENCE_UNITS, Tally
 from fieldkit.analysis.result_tables import rounded
 from fieldkit.analysis.statistics import CONFIDENCE
 from fieldkit.core.columns import SCHEMA_VERSION, Kind, csv_text
-from fieldkit.core.result_rows import DifferenceRow, declared
+from fieldkit.core.result_rows import DifferenceRow, declared_columns
 from fieldkit.core.text import json_text
 from fieldkit.core.units import format_count
 
@@ -29,7 +29,7 @@ def difference_rows(comparison: Comparison) -> Iterator[tuple[Pair, DifferenceRo
 
 def to_csv(comparison: Comparison) -> str:
     """Return a comparison as CSV: the columns that identify conditions, then the columns of `DifferenceRow`."""
-    names = [column.name for column in declared(DifferenceRow)]
+    names = [column.name for column in declared_columns(DifferenceRow)]
     rows = (
         [*pair.key.values(), *(getattr(row, name) for name in names)] for pair, row in difference_rows(comparison)
     )

@@ -30,7 +30,7 @@ class Quantity:
         unit: Unit of the column; `share` for a flag.
         arrived: Column with the number of received items; None unless counted.
         sent: Column with the number of sent items; None unless counted.
-        possible: Smallest and largest possible value of a repeat.
+        possible_range: Smallest and largest possible value of a repeat.
         rank: Sort key in tables.
         at_least: Column of lower bounds (right-censored values), or None; see `columns.Figure`.
         of_sent: Column of the same statistic over all sent items, or None; see `columns.Figure`.
@@ -42,7 +42,7 @@ class Quantity:
     unit: str
     arrived: str | None = None
     sent: str | None = None
-    possible: Bounds = (-sys.float_info.max, sys.float_info.max)
+    possible_range: Bounds = (-sys.float_info.max, sys.float_info.max)
     rank: int = FIRST_EXTERNAL_RANK
     at_least: str | None = None
     of_sent: str | None = None
@@ -60,7 +60,7 @@ class Quantity:
             unit="share" if figure.kind is Kind.FLAG else column.unit,
             arrived=figure.arrived,
             sent=figure.sent,
-            possible=column.possible,
+            possible_range=column.possible_range,
             rank=figure.rank,
             at_least=figure.at_least,
             of_sent=figure.of_sent,

@@ -7,7 +7,7 @@ from typing import Any, Final
 from fieldkit.analysis import wording
 from fieldkit.analysis.cells import Cell
 from fieldkit.core.columns import SCHEMA_VERSION, Kind, csv_text
-from fieldkit.core.result_rows import EstimateRow, declared
+from fieldkit.core.result_rows import EstimateRow, declared_columns
 from fieldkit.core.text import json_text
 
 MORE: Final = "more_wanted"
@@ -51,7 +51,7 @@ def to_csv(by: Sequence[str], cells: Sequence[Cell], more: Sequence[Mapping[str,
         cells: The cells.
         more: Number of additional repeats by quantity, for each cell. If it is not empty, it is the last column.
     """
-    names = [column.name for column in declared(EstimateRow)]
+    names = [column.name for column in declared_columns(EstimateRow)]
     additional = more or ({},) * len(cells)
     rows = (
         [*(cell.key[name] for name in by), *(getattr(row, name) for name in names)]

@@ -26,7 +26,7 @@ _SPREADSHEET_REMEDY: Final = (
 def are_possible(values: Numbers, column: Column) -> bool:
     """Return True if all values of a column are possible or missing, by the rule of `Column.invalid_value_reason`."""
     present = values[~np.isnan(values)]
-    low, high = column.possible if column.type is not bool else (0, 1)
+    low, high = column.possible_range if column.type is not bool else (0, 1)
     is_in_range = (present >= low) & (present <= high)
     return bool((is_in_range & (present == np.floor(present))).all() if column.type is int else is_in_range.all())
 

@@ -199,7 +199,7 @@ def measured(cells: Sequence[Cell]) -> tuple[Quantity, ...]:
 
 def key(cell: Cell, name: str) -> str:
     """Return the text of a value in a cell's key, `-` if it is missing."""
-    return columns.cell(cell.key[name]) or "-"
+    return columns.cell_text(cell.key[name]) or "-"
 
 
 def varying_and_common(by: Sequence[str], cells: Sequence[Cell]) -> tuple[list[str], list[str]]:

@@ -16,7 +16,7 @@ from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.analysis.sample_size import additional_repeats_by_cell
 from fieldkit.analysis.table_lines import TableLine
 from fieldkit.cli import results
-from fieldkit.cli.display import print_folded, show_note, table
+from fieldkit.cli.display import print_folded, print_table, show_note
 from fieldkit.cli.shared_arguments import CONDITION
 from fieldkit.core.columns import Kind, plain_name
 from fieldkit.core.errors import ConfigurationError, EvidenceError
@@ -213,7 +213,7 @@ def _print_judgements(
         )
     if rows:
         head = ("expected", *differing_columns, "measured", "95 % interval", "")
-        table(head, rows, fold=(0, len(head) - 1))
+        print_table(head, rows, fold=(0, len(head) - 1))
 
 
 def _print_table(
@@ -232,7 +232,7 @@ def _print_table(
         [*(wording.key(cell, name) for name in differing_columns), *values.values()]
         for cell, values in zip(cells, figures, strict=True)
     ]
-    table(head, rows, title=full_title, right=range(len(differing_columns), len(head) - words))
+    print_table(head, rows, title=full_title, right=range(len(differing_columns), len(head) - words))
 
 
 def _additional_repeats(line: TableLine, cell: Cell, additional: Mapping[str, int]) -> int | str:

@@ -11,7 +11,7 @@ import numpy as np
 from fieldkit.analysis.compare import PAIRED_BY
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.cli.display import show_note
-from fieldkit.core.columns import cell
+from fieldkit.core.columns import cell_text
 from fieldkit.core.errors import ConfigurationError, did_you_mean, shell_command
 from fieldkit.trial.stored import sources
 from fieldkit.trial.stored.sources import Sources
@@ -67,7 +67,7 @@ def read(arguments: argparse.Namespace) -> Sides:
     if is_default:
         by = tuple(other for other in by if other not in varied)
     rows = [run.read(also=(*by, name)) for run in (a, b)]
-    value_a, value_b = _two_values(rows, name, values)
+    value_a, value_b = _parse_two_values(rows, name, values)
     is_sweep = bool(a.sweep_condition) and paths[0] == paths[1]
     return Sides(
         _with_value(rows[0], name, value_a),
@@ -99,10 +99,10 @@ def _require_two(paths: Sequence[Path]) -> None:
 
 
 def _texts(rows: Repeats, name: str) -> list[str]:
-    return [cell(value) for value in rows.column(name)]
+    return [cell_text(value) for value in rows.column(name)]
 
 
-def _two_values(sides: Sequence[Repeats], name: str, text: str) -> tuple[str, str]:
+def _parse_two_values(sides: Sequence[Repeats], name: str, text: str) -> tuple[str, str]:
     """Return the values of A and B; a value may contain commas.
 
     Raises:

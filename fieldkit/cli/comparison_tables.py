@@ -11,7 +11,7 @@ from fieldkit.analysis.comparable import MARKS, NO_MARKS, VARIED, Concern
 from fieldkit.analysis.compare import Comparison, Difference, Pair, compare
 from fieldkit.analysis.quantities import Quantity, parse_amount, symbols
 from fieldkit.cli import comparison_sides
-from fieldkit.cli.display import show_note, table
+from fieldkit.cli.display import print_table, show_note
 from fieldkit.core.errors import ConfigurationError, did_you_mean, shell_command
 from fieldkit.core.text import print_text
 
@@ -30,7 +30,7 @@ _HEAD: Final = ("quantity", "A", "B", "delta", "verdict")
 def show(arguments: argparse.Namespace) -> int:
     """Print the comparison."""
     sides = comparison_sides.read(arguments)
-    thresholds = dict(_threshold(text, sides.sources.quantities) for text in arguments.threshold)
+    thresholds = dict(_parse_threshold(text, sides.sources.quantities) for text in arguments.threshold)
     comparison = compare(sides.a, sides.b, sides.by, thresholds=thresholds, varied=sides.varied)
     _require_common_condition(comparison, arguments)
     _require_measured(comparison, thresholds)
@@ -43,7 +43,7 @@ def show(arguments: argparse.Namespace) -> int:
     for concern in comparison.concerns:
         show_note(f"{_concern_text(comparison, concern)}: {concern}")
     if arguments.format == "table":
-        _table(comparison)
+        _print_comparison(comparison)
     else:
         print_text(_FORMATS[arguments.format](comparison), end="")
     return THRESHOLD_MISSED if comparison.exceeds_threshold else 0
@@ -55,7 +55,7 @@ def _marks_remedy(comparison: Comparison) -> str:
     return f""", or exclude marked repeats: --where '{MARKS} == "{NO_MARKS}"'""" if has_marks else ""
 
 
-def _threshold(text: str, quantities: Mapping[str, Quantity]) -> tuple[str, float]:
+def _parse_threshold(text: str, quantities: Mapping[str, Quantity]) -> tuple[str, float]:
     name, _, value = text.partition("=")
     if name not in quantities:
         raise ConfigurationError(
@@ -132,10 +132,10 @@ def _require_measured(comparison: Comparison, thresholds: Mapping[str, float]) -
             )
 
 
-def _table(comparison: Comparison) -> None:
+def _print_comparison(comparison: Comparison) -> None:
     for pair in comparison.pairs:
         if not pair.missing_in:
-            table(_HEAD, _lines(comparison, pair), title=f"{pair.name}: {_repeats(pair)}", right=(1, 2, 3))
+            print_table(_HEAD, _lines(comparison, pair), title=f"{pair.name}: {_repeats(pair)}", right=(1, 2, 3))
     print_text(_DELTA)
     print_text("\n".join(comparison_results.conclusions(comparison)))
 

@@ -54,7 +54,7 @@ def show_note(text: str) -> None:
     _console(stderr=True).print(_sanitized(Text.assemble(("note: ", "yellow"), add_options(text))))
 
 
-def fits(head: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
+def fits_terminal(head: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
     """Return True if the terminal is wide enough for a table. Files and pipes have no limit."""
     return not sys.stdout.isatty() or _table_width(_widths([head, *rows])) <= _console().width
 
@@ -65,7 +65,7 @@ def print_folded(text: str) -> None:
     print(textwrap.fill(text, _console().width) if sys.stdout.isatty() else text)
 
 
-def table(
+def print_table(
     head: Sequence[str],
     rows: Sequence[Sequence[str]],
     *,

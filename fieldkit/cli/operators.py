@@ -101,24 +101,24 @@ class Script(prompts.Operator):
     @override
     def ask(self, request: str, *, may_skip: bool = False) -> Answer:
         self._sink(Request(request, may_skip))
-        line = self._next(request)
+        line = self._next_line(request)
         answer = prompts.parse(line, may_skip=may_skip)
         if answer is None:
-            raise self._no_answer(line, request, prompts.answer_hint(may_skip=may_skip))
+            raise self._invalid_answer_error(line, request, prompts.answer_hint(may_skip=may_skip))
         self._sink(Answered(answer.skip, answer.note))
         return answer
 
     @override
     def enter(self, question: Question) -> str:
         self._sink(Asked(question.text, question.answer_hint))
-        line = self._next(question.text)
+        line = self._next_line(question.text)
         answer = question.read(line)
         if answer is None:
-            raise self._no_answer(line, question.text, question.answer_hint)
+            raise self._invalid_answer_error(line, question.text, question.answer_hint)
         self._sink(Entered(answer))
         return answer
 
-    def _next(self, request: str) -> str:
+    def _next_line(self, request: str) -> str:
         self._line_number += 1
         line = next(self._lines, None)
         if line is None:
@@ -127,7 +127,7 @@ class Script(prompts.Operator):
             )
         return line
 
-    def _no_answer(self, line: str, request: str, remedy: str) -> ConfigurationError:
+    def _invalid_answer_error(self, line: str, request: str, remedy: str) -> ConfigurationError:
         return ConfigurationError(
             f"{line.strip()!r} is not an answer to: {request}", where=self._where, remedy=remedy
         )

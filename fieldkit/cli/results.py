@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 from fieldkit.analysis import table_lines, wording
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.table_lines import TableLine
-from fieldkit.cli.display import fits, print_folded, show_error, table
+from fieldkit.cli.display import fits_terminal, print_folded, print_table, show_error
 from fieldkit.cli.hints import add_options
 from fieldkit.core.columns import plain_name
 from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError, shell_command
@@ -56,9 +56,11 @@ def show_summary(cells: Sequence[Cell], *, show_all: bool = False, expected: Col
             ([_summary([cell], shown_lines) for cell in group], ()),
             ([_summary([cell], shown_lines, separator="\n") for cell in group], (0,)),
         )
-        tables, fold = next((layout for layout in layouts if all(fits(*part) for part in layout[0])), layouts[-1])
+        tables, fold = next(
+            (layout for layout in layouts if all(fits_terminal(*part) for part in layout[0])), layouts[-1]
+        )
         for head, rows in tables:
-            table(head, rows, title=title, right=range(1, len(head)), fold=fold)
+            print_table(head, rows, title=title, right=range(1, len(head)), fold=fold)
     for caution in wording.cautions(cells, names):
         print_folded(caution)
     return len(omitted_names)
@@ -147,7 +149,7 @@ def print_expectations(judgements: "Sequence[Judgement]") -> None:
         from fieldkit.analysis.judgement_words import judgement_texts  # noqa: PLC0415 (few procedures have expectations)
 
         rows = [judgement_texts(judgement) for judgement in judgements]
-        table(("expected", "of", "measured", "[95 % interval]", ""), rows, fold=(0, 4))
+        print_table(("expected", "of", "measured", "[95 % interval]", ""), rows, fold=(0, 4))
 
 
 def _show_next(outcomes_run: Sequence[Outcome], omitted_count: int) -> None:

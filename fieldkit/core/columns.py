@@ -139,11 +139,11 @@ class Column:
         return _TYPES.get(self.unit, float)
 
     @property
-    def possible(self) -> Bounds:
+    def possible_range(self) -> Bounds:
         """Smallest and largest possible value, both included, after rounding as in the CSV."""
         low, high = self.bounds or _UNIT_BOUNDS.get(self.unit, (-sys.float_info.max, sys.float_info.max))
         if self.type is float:
-            return min(low, float(cell(float(low)))), max(high, float(cell(float(high))))
+            return min(low, float(cell_text(float(low)))), max(high, float(cell_text(float(high))))
         return low, high
 
     def declaration_error(self) -> str | None:
@@ -188,7 +188,7 @@ class Column:
         # A whole number equals `value // 1`. Infinity does not, but its error is that it is out of range.
         if self.type is int and not (is_integer if self.unit == "ns" else value in {math.inf, value // 1}):
             return "not a whole number"
-        low, high = self.possible
+        low, high = self.possible_range
         return None if low <= value <= high else f"not from {low:.9g} to {high:.9g}"
 
 
@@ -301,7 +301,7 @@ class Measured:
         return Measured(values, {name: reason for name, reason in missing.items() if name not in values})
 
 
-def cell(value: object) -> str:
+def cell_text(value: object) -> str:
     """Return `value` as the text of a cell: empty for None, `true`/`false`, floats to 9 digits, text in one line."""
     if value is None:
         return ""
@@ -318,6 +318,6 @@ def csv_text(names: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
 def csv_line(values: Iterable[object]) -> str:
     """Return values as one CSV line with a line feed; text that a spreadsheet would read as a formula is escaped."""
     out = io.StringIO()
-    cells = (escape_formula(cell(value)) if isinstance(value, str) else cell(value) for value in values)
+    cells = (escape_formula(cell_text(value)) if isinstance(value, str) else cell_text(value) for value in values)
     csv.writer(out, lineterminator="\n").writerow(cells)
     return out.getvalue()

@@ -107,6 +107,6 @@ class DifferenceRow:
     verdict: str | None = _column("text", "Result in words.")
 
 
-def declared(row: type[Any]) -> tuple[Column, ...]:
+def declared_columns(row: type[Any]) -> tuple[Column, ...]:
     """Return the columns that a data class declares by its fields."""
     return tuple(Column(item.name, item.metadata["unit"], item.metadata["meaning"]) for item in fields(row))

@@ -80,7 +80,7 @@ def is_private(status: os.stat_result) -> bool:
     return stat.S_ISDIR(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o077
 
 
-def not_private(path: Path) -> ConfigurationError:
+def not_private_error(path: Path) -> ConfigurationError:
     """Return the error for a path that another user owns or has access to."""
     remedy = f"remove it, or set XDG_RUNTIME_DIR to your private folder: {shell_command('ls', '-ld', path)}"
     return ConfigurationError("other users own it or have access to it", where=str(path), remedy=remedy)
@@ -128,7 +128,7 @@ def _open_and_lock(path: Path, file: str) -> tuple[int, int]:
         except FileNotFoundError:
             continue  # the process that held the last lock has removed the folder
         except NotADirectoryError as error:
-            raise not_private(path) from error
+            raise not_private_error(path) from error
         try:
             lock = _try_lock_file(folder, file) if is_private(os.fstat(folder)) else _raise_not_private(path)
         except BaseException:
@@ -140,7 +140,7 @@ def _open_and_lock(path: Path, file: str) -> tuple[int, int]:
 
 
 def _raise_not_private(path: Path) -> NoReturn:
-    raise not_private(path)
+    raise not_private_error(path)
 
 
 def _try_lock_file(folder: int, file: str, tries: int = _LOCK_TRIES) -> int | None:

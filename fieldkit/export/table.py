@@ -13,8 +13,8 @@ from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.parsing import Numbers, Texts
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.analysis.result_tables import estimate_rows
-from fieldkit.core.columns import SCHEMA_VERSION, Column, cell, csv_text
-from fieldkit.core.result_rows import EstimateRow, declared
+from fieldkit.core.columns import SCHEMA_VERSION, Column, cell_text, csv_text
+from fieldkit.core.result_rows import EstimateRow, declared_columns
 from fieldkit.measure.transfers import fates
 from fieldkit.measure.transfers.fates import SentPackets
 
@@ -69,7 +69,7 @@ def cells_table(by: Sequence[Column], cells: Sequence[Cell]) -> Table:
     rows = [
         (*(cell.key[column.name] for column in by), *astuple(row)) for cell in cells for row in estimate_rows(cell)
     ]
-    columns = (*by, *declared(EstimateRow))
+    columns = (*by, *declared_columns(EstimateRow))
     return _table_of_rows(columns, [[None if value == "" else value for value in row] for row in rows])
 
 
@@ -109,7 +109,7 @@ def _schema(columns: Sequence[Column]) -> pa.Schema:
     return pa.schema(
         [
             pa.field(
-                cell(column.name), _TYPES[column.type], metadata={"unit": column.unit, "meaning": column.meaning}
+                cell_text(column.name), _TYPES[column.type], metadata={"unit": column.unit, "meaning": column.meaning}
             )
             for column in columns
         ],
@@ -118,7 +118,7 @@ def _schema(columns: Sequence[Column]) -> pa.Schema:
 
 
 def _texts(column: Texts) -> pa.Array:
-    printable = {text: cell(text) for text in set(column.tolist())}
+    printable = {text: cell_text(text) for text in set(column.tolist())}
     texts = [printable[text] or None for text in column.tolist()]
     return pa.array(texts, pa.string()).dictionary_encode()
 

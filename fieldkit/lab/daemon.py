@@ -18,7 +18,7 @@ from fieldkit.core.events import Sink
 from fieldkit.core.runtime import NameHeldError
 from fieldkit.lab import requests
 from fieldkit.lab.folder import LabFolder, make, remove
-from fieldkit.lab.protocol import Lab, LabBackend, Login, unknown_robot
+from fieldkit.lab.protocol import Lab, LabBackend, Login, unknown_robot_error
 from fieldkit.lab.requests import LabState, RobotState
 
 OnReady = Callable[[Path], None]
@@ -201,7 +201,7 @@ def _move(robots: Lab, name: str, destination: str) -> bytes:
     """Move a robot; return the answer, which is its new position or an error."""
     try:
         if name not in robots.members:
-            raise unknown_robot(name, robots.members)
+            raise unknown_robot_error(name, robots.members)
         return requests.pack_place(robots.move(name, requests.unpack_destination(destination)))
     except FieldkitError as error:
         return requests.pack_error(error)

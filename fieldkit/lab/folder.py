@@ -59,7 +59,7 @@ def of_directory(directory: Path) -> LabFolder:
     digest = hashlib.sha256(os.fsencode(directory.resolve())).hexdigest()[:16]
     path = runtime.base_folder() / f"fieldkit-{os.geteuid()}-{digest}"
     if not _is_private_or_absent(path):
-        raise runtime.not_private(path)
+        raise runtime.not_private_error(path)
     return LabFolder(path)
 
 
@@ -73,7 +73,7 @@ def make(folder: LabFolder) -> None:
     try:
         folder.path.mkdir(mode=0o700)
     except FileExistsError as error:
-        raise runtime.not_private(folder.path) from error
+        raise runtime.not_private_error(folder.path) from error
 
 
 def remove(folder: LabFolder) -> None:

@@ -192,7 +192,7 @@ class ChoosesWifi(Protocol):
         ...
 
 
-def unknown_robot(name: str, names: Iterable[str]) -> ConfigurationError:
+def unknown_robot_error(name: str, names: Iterable[str]) -> ConfigurationError:
     """Return the error for a robot that is not in the lab, with the most similar name as a hint."""
     return ConfigurationError(
         f"there is no robot {name!r} in this lab", remedy=did_you_mean(name, names, "fieldkit lab ps lists them")

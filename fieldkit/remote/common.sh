@@ -20,12 +20,13 @@
 #                                        delete OLD, renew the lock (TOKEN `-`: none), check for KIB of free disk space,
 #                                        create DIR, write the state of the host to ROLE-before.txt and a snapshot to
 #                                        ROLE-sources-before.txt, and start the job `link`, which samples the Wi-Fi
-#                                        into ROLE-link.txt, and a job for each SOURCE
+#                                        into ROLE-link.txt, the job `clock`, which reports on the clock in
+#                                        ROLE-sources-during.txt, and a job for each SOURCE
 #   job.sh poll FILE TOKEN ADDRESS INTERFACE INTERVAL LIMIT ARGV...
 #                                        run ARGV at intervals and print its output, see telemetry.sh
-#   job.sh pack  DIR ROLE INTERFACE      stop these jobs, write ROLE-after.txt, ROLE-sources-after.txt and hashes, send
-#                                        small files as a tar: first the hashes and the list of large files; then fail if a
-#                                        job for which `stop` did not wait has failed
+#   job.sh pack  DIR ROLE INTERFACE      stop the jobs that `begin` started, write ROLE-after.txt, ROLE-sources-after.txt and
+#                                        hashes, send small files as a tar: first the hashes and the list of large files;
+#                                        then fail if a job for which `stop` did not wait has failed
 #   job.sh piece DIR FILE NUMBER BYTES   send a piece of FILE; pieces are counted from 0
 #   job.sh sum   DIR FILE                print the hash of FILE
 #   job.sh end   DIR                     stop all running jobs of DIR; no other job can start there
@@ -50,6 +51,7 @@
 #   job.sh life_signs FILE               print FILE and the time since boot
 #   job.sh snapshot                      print the outputs of all sources of the robot's state, see `snapshot.sh`
 #   job.sh sample INTERFACE TOKEN        print the state of the Wi-Fi link until it is stopped, see telemetry.sh
+#   job.sh sample_clock TOKEN SECONDS    print the state of the clock at intervals until it is stopped, see snapshot.sh
 #   job.sh health                        print the load, temperatures, batteries and free disk space of this computer
 #   job.sh needs                         fail if a program is missing that this script calls
 #   job.sh command_loop                  print `ready`; then run each line of standard input, `NONCE [held] VERB WORD...`, as
@@ -87,7 +89,9 @@ read_uptime() { # set now to the seconds since boot
     read -r now _ </proc/uptime && now=${now%.*}
 }
 
-sleep_for() { # sleep for $1 seconds; rounded up if `sleep` supports whole seconds only; above 128 a signal has ended it
+# Sleep for $1 seconds, rounded up if `sleep` supports whole seconds only. An exit code above 128 means that a signal ended
+# the sleep.
+sleep_for() {
     sleep "$1" 2>/dev/null || [ $? -gt 128 ] || sleep $((${1%.*} + 1))
 }
 

@@ -2,7 +2,7 @@
 
 PIECE=4194304 # as PIECE_BYTES of fetching.py
 
-print_state() { # print the state of the host; $1 interface
+print_state() { # print the state of the host and of interface $1
     interface=$1
     set --
     for file in /proc/net/snmp /proc/net/netstat /proc/net/dev /proc/net/wireless /proc/loadavg \
@@ -101,6 +101,7 @@ begin() {
     [ -e "$role-before.txt" ] || print_state "$interface" >"$role-before.txt" 2>&1 || fail_to_write "$role-before.txt"
     write_snapshot "$role-sources-before.txt" "$interface"
     start_sampler "$role" "$interface"
+    start_clock_sampler "$role"
     [ $# -le 6 ] || { shift 6 && poll_sources "$role" "$interface" "$@"; }
     read -r boot </proc/sys/kernel/random/boot_id && echo "$boot"
 }

@@ -74,7 +74,7 @@ class HostKey:
             blob = base64.b64decode(encoded, validate=True)
         except (ValueError, binascii.Error):
             kind, blob = "", b""
-        # RFC 4253, section 6.6: the blob begins with the length of the type, and the type.
+        # RFC 4253, section 6.6: the blob begins with the length of the type, then the type itself.
         prefix = len(kind).to_bytes(4) + kind.encode()
         if not kind or not blob.startswith(prefix) or blob == prefix:
             raise ConfigurationError(

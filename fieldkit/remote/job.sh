@@ -260,7 +260,7 @@ main() {
     verb=${1-}
     [ $# -gt 0 ] && shift
     case $verb in
-        sample | health | poll) "$verb" "$@" ;;
+        sample | sample_clock | health | poll) "$verb" "$@" ;;
         snapshot) snapshot "$base/.sources-$$" - - ;;
         start | run | serve) launch "$verb" "$@" ;;
         wait) await "$1/.jobs/$2" "$3" || exit 124; result "$1/.jobs/$2" ;;

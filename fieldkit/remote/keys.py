@@ -36,14 +36,14 @@ def read_private_key(path: str, *, where: str) -> str:
         raise ConfigurationError(
             f"its key {path} cannot be read",
             where=where,
-            remedy=f"{_on_key('ls -l', path)}; correct key: in the site file, or leave it out to use the agent",
+            remedy=f"{_key_command('ls -l', path)}; correct key: in the site file, or leave it out to use the agent",
         ) from error
     _parse_private_key(text, where=where, path=path)
     return text
 
 
-def _on_key(command: str, path: str) -> str:
-    """Return a shell command with a key file; `~/` stays outside the quotes, where the shell expands it."""
+def _key_command(command: str, path: str) -> str:
+    """Return a shell command for a key file; `~/` is outside the quotes, so that the shell expands it."""
     home = "~/" if path.startswith("~/") else ""
     return f"{command} {home}{shell_command(path.removeprefix(home))}"
 
@@ -56,12 +56,12 @@ def _parse_private_key(text: str, *, where: str, path: str = "FILE") -> paramiko
             raise ConfigurationError(
                 "its private key has a passphrase",
                 where=where,
-                remedy=f"{_on_key('ssh-add', path)}, and leave out key: in the site file",
+                remedy=f"{_key_command('ssh-add', path)}, and leave out key: in the site file",
             ) from error
         except (paramiko.SSHException, ValueError):
             continue
     raise ConfigurationError(
         "its private key cannot be used",
         where=where,
-        remedy=f"use an ed25519 key: {_on_key('ssh-keygen -t ed25519 -f', f'{path}.new')}",
+        remedy=f"use an ed25519 key: {_key_command('ssh-keygen -t ed25519 -f', f'{path}.new')}",
     )

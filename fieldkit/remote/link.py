@@ -111,7 +111,7 @@ class _Packetizer(paramiko.packet.Packetizer):
         return piece
 
 
-class _Pipe(paramiko.buffered_pipe.BufferedPipe):  # type: ignore[type-arg]
+class _LimitedBuffer(paramiko.buffered_pipe.BufferedPipe):  # type: ignore[type-arg]
     """A buffer that is limited to the channel's window; paramiko would buffer any amount of unread data."""
 
     def __init__(self, window_bytes: int) -> None:
@@ -311,18 +311,18 @@ class Link:
 
     def _open(self, transport: paramiko.Transport) -> Channel:
         try:
-            channel = transport.open_session(timeout=self._channel_s)
+            channel = transport.open_session(timeout=self._channel_timeout_s)
         except paramiko.SSHException as error:
             # If two channels are refused at the same time, paramiko reports the reason for one only.
             if isinstance(error, paramiko.ChannelException) or _REFUSED in str(error):
                 raise NoSessionError(getattr(error, "text", "it gives no reason")) from error
             raise
         window_bytes = transport.default_window_size
-        channel.in_buffer, channel.in_stderr_buffer = _Pipe(window_bytes), _Pipe(window_bytes)
+        channel.in_buffer, channel.in_stderr_buffer = _LimitedBuffer(window_bytes), _LimitedBuffer(window_bytes)
         return channel
 
     @property
-    def _channel_s(self) -> float:
+    def _channel_timeout_s(self) -> float:
         """Timeout for opening a channel; longer than the deadline of the waiting thread."""
         return 2 * self._timing.connect_s
 

@@ -1,8 +1,8 @@
 # The lock of this robot.
 #
 # The lock is the complete file lock.N with the highest number in the folder of this script. It contains KIND TOKEN BOOT
-# FROM TO SINCE UNTIL WHO WHAT. KIND is held, free, aborted or stopped. FROM and TO are the start and the expiry of the lock in
-# seconds since boot; SINCE and UNTIL are the same times in seconds of the clock.
+# FROM TO SINCE UNTIL WHO WHAT. KIND is held, free, aborted or stopped. FROM and TO are the start and the expiry of the lock
+# in seconds since boot; SINCE and UNTIL are the same times in seconds of the clock.
 #
 # Two laptops may change the lock at the same time, and flock may be missing. Therefore each change creates a new file with
 # the next number, which only one process can create. The highest number is never deleted, so a process that creates a
@@ -34,7 +34,8 @@ read_newest() { # read the newest complete record; set n to the highest number (
     done
 }
 
-write_record() { # KIND TOKEN SECONDS WHO WHAT: write the next record; false if another process was faster, or on an error
+# Write the next record with the arguments KIND TOKEN SECONDS WHO WHAT; false if another process was faster, or on an error.
+write_record() {
     read_uptime
     read -r boot </proc/sys/kernel/random/boot_id
     read_wall_clock
@@ -120,7 +121,9 @@ holder() {
     return 0
 }
 
-abort() { # break the lock in the name of $1, and stop all jobs; on a full disk the lock may be broken only after that
+# Break the lock in the name of $1, and stop all jobs. If the disk is full, try to break the lock again after the jobs, which
+# may have filled it, were stopped.
+abort() {
     by=$1
     record_break aborted && has_failed= || has_failed=1
     [ "$kind" = held ] && echo "held $who $what" || echo free

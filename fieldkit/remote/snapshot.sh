@@ -1,4 +1,5 @@
-# Snapshot of the state of a robot, as its programs report it, before and after an attempt.
+# Snapshot of the state of a robot, as its programs report it, before and after an attempt; the state of its clock also
+# during the attempt.
 #
 # All sources run at the same time, each with a time limit, so a program that hangs delays an attempt by SOURCE_S seconds
 # at most, and is not started again in the same trial. The sources use local sockets only and send no packet over a
@@ -10,7 +11,7 @@ SOURCE_S=2
 KILLED=137 # exit code after SIGKILL
 SOURCE_BLOCKS=64 # limit of the output of a source, in blocks of 512 or 1,024 bytes
 
-start_source() { # NAME COMMAND...: start a source; it writes the file NAME in $folder
+start_source() { # start the source $1 with the command in the other arguments; it writes the file $1 in $folder
     [ -d "$folder" ] || mkdir "$folder" || return
     name=$folder/$1
     if has_hung "$1"; then
@@ -33,9 +34,11 @@ has_hung() { # true if source $1 did not answer in time in an earlier snapshot
     case $hung_sources in *":$1:"*) ;; *) return 1 ;; esac
 }
 
+has_timesyncd() { [ -d /run/systemd/system ] && command -v timedatectl >/dev/null; }
+
 start_clock_sources() {
     ! command -v chronyc >/dev/null || start_source chrony chronyc -n -c tracking
-    if [ -d /run/systemd/system ] && command -v timedatectl >/dev/null; then
+    if has_timesyncd; then
         start_source timedatectl timedatectl show
         start_source timesyncd timedatectl timesync-status
     fi
@@ -64,7 +67,7 @@ health() { # print values of the computer, one per line
     (read_free_space && echo "disk $free") || :
 }
 
-start_radio_sources() { # $1 interface
+start_radio_sources() { # start the sources for the radio with interface $1
     command -v iw >/dev/null || return 0
     start_source iw-info iw dev "$1" info
     has_hung iw-info || wait "$!"
@@ -86,17 +89,17 @@ start_radio_sources() { # $1 interface
     start_source iw-scan "$@"
 }
 
-snapshot() { # $1 a new folder for temporary files, $2 interface of the radio, or -, $3 file with the names of sources that
-    # hung, to which further ones are added, or -: print the outputs of all sources
+# Print the outputs of all sources. $1: new folder for temporary files; $2: interface of the radio, or -; $3: file with the
+# names of sources that hung before, to which the names of others are added, or -; $4: `clock` for the sources of the clock
+# only, otherwise empty.
+snapshot() {
     folder=$1 hung_sources=:
     [ ! -s "$3" ] || while read -r name; do hung_sources=$hung_sources$name:; done <"$3"
     (
         PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin # often missing in a session without a terminal
         export LC_ALL=C
         start_clock_sources
-        [ "$2" = - ] || start_radio_sources "$2"
-        start_source health sh "$self" health
-        ! command -v vcgencmd >/dev/null || start_source vcgencmd vcgencmd get_throttled
+        [ "${4-}" = clock ] || start_other_sources "$2"
         wait
         [ "$3" = - ] || for source in "$folder"/*; do
             [ "$(tail -n 1 "$source")" != "code $KILLED" ] || has_hung "${source##*/}" || echo "${source##*/}" >>"$3"
@@ -104,4 +107,39 @@ snapshot() { # $1 a new folder for temporary files, $2 interface of the radio, o
         cd "$folder" && awk 'FNR == 1 { print "==> " FILENAME " <==" } { print " " $0 }' *
         rm -rf -- "../${folder##*/}" "/tmp/fieldkit-pmc-$$"
     )
+}
+
+start_other_sources() { # start the sources except those of the clock; $1 interface of the radio, or -
+    [ "$1" = - ] || start_radio_sources "$1"
+    start_source health sh "$self" health
+    ! command -v ip >/dev/null || start_source interfaces ip -o link
+    ! command -v vcgencmd >/dev/null || start_source vcgencmd vcgencmd get_throttled
+}
+
+CLOCK_INTERVAL=10 # s between reports of the clock sources during an attempt
+
+# Start a job that reports on the clock of role $1. Do nothing if no program sets the clock, or if it was started before.
+start_clock_sampler() {
+    PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
+    command -v chronyc >/dev/null || command -v pmc >/dev/null || has_timesyncd || return 0
+    mkdir "$PWD/.jobs/clock" 2>/dev/null || return 0
+    meta=$PWD/.jobs/clock
+    read -r token _ <.began
+    echo "report on the clock" >"$meta/command"
+    detach "$meta" 86400 - 0 /dev/null "$1-sources-during.txt" "$meta/log" sh "$self" sample_clock "$token" "$CLOCK_INTERVAL"
+}
+
+# Print a line `==> next <==` and the outputs of the clock sources at intervals of $2 s until this job is stopped, its folder
+# is deleted, or the lock of token $1 (-: none) is lost.
+sample_clock() {
+    while [ -e .began ]; do
+        trap 'kill "$child"; exit 0' TERM INT HUP
+        sleep "$2" &
+        child=$!
+        wait "$child"
+        trap '' TERM INT HUP # signals do not interrupt a snapshot, which ends with its programs within SOURCE_S seconds
+        [ "$1" = - ] || owns_lock || return 0
+        echo "==> next <=="
+        snapshot ".clock-$$" - ../.hung-sources clock
+    done
 }

@@ -8,7 +8,8 @@ CHECK_INTERVAL=500 # interval of checks of the channel, the cell and the lock, i
 SHARE=12 AHEAD=3000 # CPU budget in thousandths of a core, and initial credit in 10 us
 BLOCKS=8192 # limit of the file size, in blocks of 512 or 1,024 bytes
 
-start_sampler() { # $1 role, $2 interface: start to sample in this folder; does nothing without iw, or if it was started before
+# Start a job that samples interface $2 of role $1. Do nothing without iw, or if it was started before.
+start_sampler() {
     PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
     command -v iw >/dev/null && mkdir "$PWD/.jobs/link" 2>/dev/null || return 0
     meta=$PWD/.jobs/link shell=sh
@@ -18,8 +19,8 @@ start_sampler() { # $1 role, $2 interface: start to sample in this folder; does 
     detach "$meta" 86400 - 0 /dev/null "$1-link.txt" "$meta/log" "$shell" "$self" sample "$2" "$token"
 }
 
-stop_samplers() { # $1 role: stop the samplers of the link and of the sources of the profile
-    for meta in .jobs/link .jobs/telemetry-*; do
+stop_samplers() { # stop the jobs of the link, of the clock and of the telemetry sources of role $1
+    for meta in .jobs/link .jobs/clock .jobs/telemetry-*; do
         [ -d "$meta" ] || continue
         end_sampler
     done
@@ -41,7 +42,9 @@ end_sampler() { # stop the sampler in $meta
     fi
 }
 
-poll_sources() { # $1 role, $2 interface, then a quoted line for each source: NAME and the words of `poll` from ADDRESS on
+# Start a job for each telemetry source. $1 role, $2 interface; then for each source a quoted line with its NAME and the
+# arguments of `poll` from ADDRESS on.
+poll_sources() {
     PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
     role=$1 interface=$2
     shift 2
@@ -49,7 +52,7 @@ poll_sources() { # $1 role, $2 interface, then a quoted line for each source: NA
     for line do poll_source "$line"; done
 }
 
-poll_source() { # $1 quoted line of a source; does nothing if it was started before
+poll_source() { # start the job of the source in the quoted line $1, unless it was started before
     eval "set -- $1"
     meta=$PWD/.jobs/telemetry-$1 file=$role-telemetry-$1.txt
     mkdir "$meta" 2>/dev/null || return 0
@@ -61,8 +64,9 @@ poll_source() { # $1 quoted line of a source; does nothing if it was started bef
 MAX_OUTPUT=65536 # limit of an output, in bytes
 MAX_TOTAL=4194304 # limit of all outputs of a source
 
-# Run ARGV at intervals; $1 file that must exist, otherwise it exits, $2 token of the lock or -, ADDRESS or -, INTERFACE that
-# ADDRESS must not use, or -, INTERVAL in s (0: once), LIMIT of a run in s, ARGV...
+# Run ARGV at intervals and print its outputs, until file $1 no longer exists or the lock of token $2 (-: none) is lost. The
+# other arguments: ADDRESS that is queried, or -; INTERFACE by which packets to ADDRESS must not leave, or -; INTERVAL in s
+# (0: run once); LIMIT of a run in s; ARGV...
 poll() {
     required_file=$1 token=$2 address=$3 tested_interface=$4 interval=$5 limit=$6 total=0 child=
     shift 6
@@ -112,7 +116,8 @@ uses_tested_interface() { # true if packets to $address leave by the interface u
     case "$route " in *" dev $tested_interface "*) ;; *) return 1 ;; esac
 }
 
-sample() { # $1 interface, $2 token of the lock, or -: until it is stopped, the folder is deleted, or the lock is lost
+# Print samples of interface $1 until this job is stopped, its folder is deleted, or the lock of token $2 (-: none) is lost.
+sample() {
     interface=$1 token=$2 next_check=0 next_query=0 wifi=
     ulimit -f "$BLOCKS"
     exec 8<>.jobs/link/end # no process writes to this FIFO: `read` from it is a sleep without a fork

@@ -77,7 +77,8 @@ def charts(
 
 def _labels(repeats: Repeats, name: str, text: str) -> dict[str | float | None, str]:
     return {
-        value: columns.cell(label) for value, label in zip(repeats.column(name), repeats.column(text), strict=True)
+        value: columns.cell_text(label)
+        for value, label in zip(repeats.column(name), repeats.column(text), strict=True)
     }
 
 

@@ -11,7 +11,7 @@ from itertools import pairwise
 from statistics import median
 from typing import Final
 
-from fieldkit.core.columns import BACKGROUND, Column, Figure, Kind, Measured, Value, cell, columns
+from fieldkit.core.columns import BACKGROUND, Column, Figure, Kind, Measured, Value, cell_text, columns
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
@@ -149,8 +149,10 @@ def _measured(role: Role, series: Mapping[str, _Series]) -> Measured:
             name = f"{role}_{column}"
             if value is None:
                 missing[name] = quantity_series.reason
-            elif _COLUMNS_BY_NAME[name].invalid_value_reason(cell(value)):
-                missing[name] = f"{quantity_series.reason.partition(':')[0]}: its value {cell(value)} is impossible"
+            elif _COLUMNS_BY_NAME[name].invalid_value_reason(cell_text(value)):
+                missing[name] = (
+                    f"{quantity_series.reason.partition(':')[0]}: its value {cell_text(value)} is impossible"
+                )
             else:
                 values[name] = value
     return Measured(values, missing)

@@ -25,7 +25,7 @@ ATTEMPT_CHECKS: Final = (
     CrossCheck(
         quantity="clocks and their time sources",
         columns=("*_time_*", "*_laptop_offset_*", "marks*"),
-        source="`ROLE-sources-before.txt`, `ROLE-sources-after.txt`; `exchanges.txt` with `ROLE-before.txt`: clock",
+        source="`ROLE-sources-*.txt`; `exchanges.txt` with `ROLE-before.txt`: clock",
         against=(),
         tolerance="compared with the clock offset in both captures: a contradiction is the mark `clocks disagree`",
         outcome=CheckOutcome.UNCHECKED,

@@ -7,7 +7,7 @@ from typing import Final
 
 from fieldkit.backends.protocols import CLOCK, INSTRUCTIONS
 from fieldkit.config.profiles import TELEMETRY
-from fieldkit.core.columns import Column, Measured, cell, step_prefixed
+from fieldkit.core.columns import Column, Measured, cell_text, step_prefixed
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Lateness, RepeatId, Role, sort_roles
 from fieldkit.measure.attempt import AttemptEvidence
@@ -23,9 +23,7 @@ from fieldkit.trial.procedure import PlacedStep, Procedure
 from fieldkit.trial.step_errors import StepErrors
 
 _TIME_UNITS: Final = frozenset(("s", "bit/s", "m/s", "ppm"))
-_NO_TIMES: Final = (
-    "the backend's clock counts instructions of an emulated processor, so it measures no real durations"
-)
+_NO_TIMES: Final = "the backend's clock counts instructions of a virtual processor, so it measures no real durations"
 
 
 @dataclass(frozen=True)
@@ -167,7 +165,7 @@ def _impossible_values(
     Such values are removed, because a table that contains them could not be read again.
     """
     for column in columns:
-        text = "" if column.type is str else cell(measured.values.get(column.name))
+        text = "" if column.type is str else cell_text(measured.values.get(column.name))
         if text and (problem := "not a number" if text == "nan" else column.invalid_value_reason(text)):
             yield (
                 column.name,

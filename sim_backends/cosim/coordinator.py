@@ -187,7 +187,7 @@ class Coordinator:
             else:
                 end_ns = self._next_window(begin_ns, to_ns)
                 lap("exchange")
-                # If the network uses the states at the end of the window, that time is part of the window.
+                # If the network uses the states at the end of the window, events at that time belong to the window.
                 last_ns = end_ns if uses_end_states else end_ns - 1
                 sent_datagrams, states = agents.advance(begin_ns, last_ns, end_ns)
                 lap("agents")

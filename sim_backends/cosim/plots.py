@@ -236,6 +236,7 @@ def _ticks(axes: Axes, panel: LogPanel, zero: float | None, low: float, high: fl
     if panel.over_time:
         _set_time_axis(axes, last)
     else:
+        # If labels are at the right, the logarithmic axis is about twice as long as the curves.
         axes.set_xlim(first / 2, last * 2 * (last / first if panel.labels_at_right else 1))
         axes.set_xticks([tick for tick in axes.get_xticks() if first / 2 <= tick <= last * 2])
     # On the logarithmic axis, the zeros are between its lower end and a dotted line, which separates them from `low`.

@@ -22,12 +22,12 @@ class Fate:
         assumed_states: States of source and destination that the network assumed when the packet entered.
         true_states: True states of source and destination at the time of sending: the states at the last physics
             step, extrapolated at their velocity. At an acceleration a and a step h the error is at most a h^2 / 2.
-        arrived_ns: Time when the network delivered it, or None.
+        arrived_ns: Time when the network delivered the packet, or None.
         counted_ns: Time from which the arrival counts for its receiver: `arrived_ns` or the end of the window,
             depending on the policy.
         late_ns: Time from `counted_ns` to the simulated time of the receiver at delivery, if that is later; otherwise
             0.
-        reason: The reason why it never arrived; empty if it arrived or is under way.
+        reason: The reason why the packet was dropped; empty if it arrived or is under way.
         position_error_m: Largest error of the relative position that the network assumed for two of the agents that
             affect the packet; None if only its source and destination affect it (`packet_ledger.position_error_m`).
     """
@@ -59,7 +59,8 @@ class Run:
     Attributes:
         fates: The fate of every packet, by flow and number.
         windows_ns: The ends of all windows.
-        wall_s: Wall time by part: agents, network, exchange, and wait, the time in which federates only waited.
+        wall_s: Wall time by part: `agents` (physics and programs), `network`, `exchange` (policy and coordinator),
+            `wait` (time in which federates only waited).
         digest: Hash over every packet, arrival, drop and window, in order (`EventDigest`).
     """
 

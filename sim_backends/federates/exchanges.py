@@ -24,8 +24,8 @@ the message is for, and in copies that are made of it later.
   no meaning.
 - **Physics: requests.** The first `to_ns` is 0; it never decreases. Commands apply in the steps that begin at or
   after `from_ns`, so the states at `from_ns` still have the old velocity. A command applies until the agent gets a
-  new one. The coordinator sends no request without commands for a time within the same step. The federate refuses a
-  type of command that welcome does not list.
+  new one. The coordinator omits a request without commands for a time in the step whose states it already has. The
+  federate refuses a type of command that welcome does not list.
 - **Network.** It simulates up to and including `to_ns`, and returns each packet exactly once: as an arrival with
   `enters_ns` <= `at_ns` <= `to_ns`, and `at_ns` not before the previous `to_ns`; or as a drop with its reason. Both
   lists are in order of time. `at_ns` of outcomes is `to_ns`. Packets are in order of `enters_ns`, which may equal the

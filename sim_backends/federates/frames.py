@@ -46,11 +46,11 @@ class MessageKind(IntEnum):
         PING: coordinator: `value` i64
         PONG: federate: `value` i64 of the ping
         BUSY: federate: `at_ns` i64, the time that it has reached
-        FORK: coordinator: `copy` u32, number of the new copy of the federate in the state of the header's copy
+        FORK: coordinator: `copy` u32, the number of a new copy, which is made of the copy in the header
         DONE: federate: empty; answers fork
-        RELEASE: coordinator: empty; the header's copy is not used again; without an answer
+        RELEASE: coordinator: empty; the copy in the header is not used again; there is no answer
         ERROR: federate: `text`; answers any request; the session ends
-        BYE: coordinator: empty; the federate ends, without an answer
+        BYE: coordinator: empty; the run ends, and there is no answer
         SAMPLE_LINKS: coordinator: empty; only to a network with the capability 64
         LINKS: federate: `radios` u32, each a radio sample, `links` u32, each a link sample
     """

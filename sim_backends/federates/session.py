@@ -29,7 +29,7 @@ from sim_backends.federates.transports.contract import read_token
 from sim_backends.federates.transports.joining import accept_federate
 from sim_backends.federates.transports.transport_table import FORMS, parse_address
 
-PATIENCE: Final = 20
+BUSY_DEADLINE_FACTOR: Final = 20
 """A federate that sends `busy` may take this multiple of the deadline for an answer."""
 _FOREVER_S: Final = 1e9
 _BYE_S: Final = 0.2
@@ -178,7 +178,7 @@ class FederateSession:
     def _exchange(self, request: bytes, expected_header: Header) -> ProtocolFrame:
         """Send a request, and return the answer or the error; each `busy` message extends the wait for it."""
         start_s = time.monotonic()
-        limit_s, final_limit_s = start_s + self._deadline_s, start_s + PATIENCE * self._deadline_s
+        limit_s, final_limit_s = start_s + self._deadline_s, start_s + BUSY_DEADLINE_FACTOR * self._deadline_s
         self._busy_ns = None
         if self.observer is not None:
             self.observer(request, None)
@@ -214,7 +214,7 @@ class FederateSession:
         raise error
 
     def _fail_unanswered(self, request_text: str) -> NoReturn:
-        limit_s = self._deadline_s if self._busy_ns is None else PATIENCE * self._deadline_s
+        limit_s = self._deadline_s if self._busy_ns is None else BUSY_DEADLINE_FACTOR * self._deadline_s
         busy_text = "" if self._busy_ns is None else f"; it last reported {seconds_text(self._busy_ns)}"
         error = UnansweredError(
             f"{self.name} has not answered for {limit_s:g} s: request to {request_text}{self._progress()}{busy_text}"

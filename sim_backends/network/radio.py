@@ -81,6 +81,7 @@ class RadioNetwork:
         jammers = [disturbance for disturbance in disturbances if isinstance(disturbance, Jammer)]
         self.transmitters = frozenset({relay or "", *(jammer.agent for jammer in jammers)} - {""})
         self.fixed_emitters_m = tuple(jammer.position_m for jammer in jammers if jammer.position_m is not None)
+        # Remaining start and end times of disturbances, latest first, so that the next one is removed from the end.
         self._changes_ns = changes_ns(disturbances)[::-1]
         self._stations_off: set[str] = set()
         self._absent_stations: frozenset[str] = frozenset()

@@ -18,7 +18,8 @@ class Ns3Options(SimulatorOptions):
     """Options of the network simulator [ns-3](ns3.md).
 
     Attributes:
-        standard: Standard of all radios. If omitted, it is 802.11n if all radios support it, otherwise 802.11g.
+        standard: Standard of all radios. If omitted, it is 802.11n if all profiles have this standard, otherwise
+            802.11g.
         ampdu_bytes: Largest aggregate of frames in 802.11n; 0 sends frames singly, as the built-in network does.
         topics: With `udp`, topics with `reliability: best_effort` are sent as UDP datagrams with the headers of RTPS,
             without discovery.

@@ -59,7 +59,7 @@ ROTORS_OFF: Final = FlightTarget(Velocity(), 0.0, (0.0, 0.0), powered=False)
 
 
 class FlightStatus(NamedTuple):
-    """State of a quadrotor beyond `State`, as its sensors measure it.
+    """The values of a quadrotor that its sensors measure and that `State` does not contain.
 
     Attributes:
         place_m: Position of its lowest point, metres east, north, up.

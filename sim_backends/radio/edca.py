@@ -83,6 +83,7 @@ class CategoryContention(Contention):
 
     def __init__(self, draw: Callable[[], float], ifs_ns: int, *, cw_min: int, cw_max: int) -> None:
         super().__init__(draw, ifs_ns, cw_min=cw_min, cw_max=cw_max)
+        # True if a backoff was drawn for the next frame, even if none of its slots remain.
         self._has_backoff = False
 
     def arrive(self, now_ns: int) -> None:

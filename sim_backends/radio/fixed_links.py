@@ -58,9 +58,10 @@ class FixedLink:
         self._lost = 0
         self._loss_draw = PacketDraws(seed, transmitter, receiver, "loss").draw
         self._jitter_draw = PacketDraws(seed, transmitter, receiver, "jitter").draw
+        # Time from which the link is free, and start times of the transmissions of queued packets.
         self._free_ns = 0
-        self._last_arrival_ns = 0
         self._starts_ns: deque[int] = deque()
+        self._last_arrival_ns = 0
         self.set_parameters(LinkParameters())
 
     def set_parameters(self, parameters: LinkParameters) -> None:

@@ -96,12 +96,13 @@ class FrameExchange(Generic[Payload]):
         """End the exchange of a station whose radio is switched off, and cancel its next one."""
         self.reception.abort(station.index, now_ns)
         self.events.cancel_start(station.index)
-        station.exchange_id += station.exchange_id & 1  # even: the station is not in an exchange
+        if station.is_in_exchange:
+            station.exchange_id += 1
         station.aggregate = None
 
     def retry_when_idle(self, now_ns: int, station: Station[Payload]) -> None:
         """Schedule the next exchange of a station that may have waited for the end of jammer noise."""
-        if not _has_frames(station) or station.exchange_id & 1 or station.index in self.events.starts:
+        if not _has_frames(station) or station.is_in_exchange or station.index in self.events.starts:
             return
         if self.reception.is_jammed(station.index):
             self.events.schedule(now_ns + _JAMMED_RETRY_NS, self.retry_when_idle, station)

@@ -1,9 +1,9 @@
 """Directed links: their parameters and counters, the delays of packets over them, and reasons for losses.
 
-The module can be imported without the models that use it. Delays have the four parts of the paper's eq. 2, in
-nanoseconds: processing, queuing, transmission and propagation. A `Delay` is one integer with five fields of 64 bits
-(584 years each): a number of packets, and the sum of each part. Delays are added with `+`. Updating the delay of a
-packet takes 45 ns; updating five separate counters takes 100 ns, and the medium has only 4 us per packet.
+The module can be imported without the models that use it. Delays have four parts, in nanoseconds: processing,
+queuing, transmission and propagation. A `Delay` is one integer with five fields of 64 bits (584 years each): a number
+of packets, and the sum of each part. Delays are added with `+`. Updating the delay of a packet takes 45 ns; updating
+five separate counters takes 100 ns, and the medium has only 4 us per packet.
 """
 
 from collections.abc import Callable

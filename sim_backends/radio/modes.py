@@ -219,8 +219,8 @@ def basic_mode(band: Band) -> WifiMode:
 def control_mode(mode: WifiMode) -> WifiMode:
     """Return the mode of the ACK to a frame in `mode`: the fastest mandatory rate up to the frame's rate (10.6.6.5).
 
-    The reference rate of an HT, VHT or HE mode is the rate of the clause 17 mode with the same modulation and code
-    rate (10.6.11).
+    The rate of an HT, VHT or HE frame is its non-HT reference rate: the rate of the clause 17 mode with the same
+    modulation and code rate (10.6.11).
     """
     reference, modes = mode, OFDM_MODES[mode.band.name]
     if mode.is_high_throughput:

@@ -71,6 +71,7 @@ class PacketDelivery(Generic[Payload]):
             peer.count(delivered=False)
             self.lose(now_ns, station.index, frame, OUT_OF_RANGE)
             return
+        # The first frame, which is being sent or waits for the channel, is not counted.
         if len(queue) > self._queue_packets:
             if peer is not None:
                 peer.queue_dropped += 1
@@ -79,8 +80,8 @@ class PacketDelivery(Generic[Payload]):
         queue.append(frame)
         if len(queue) == 1:
             if station.categories is not None:
-                station.categories.arrive(now_ns, frame, in_exchange=bool(station.exchange_id & 1))
-            if not station.exchange_id & 1:
+                station.categories.arrive(now_ns, frame, in_exchange=station.is_in_exchange)
+            if not station.is_in_exchange:
                 self._events.schedule_start(station.contention.earliest_start_ns(now_ns), station.index)
 
     def discard_queue(self, now_ns: int, station: Station[Payload]) -> None:

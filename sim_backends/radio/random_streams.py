@@ -14,7 +14,7 @@ import numpy as np
 from numpy.random import Philox  # numpy would import it at the first draw, which would delay a packet
 from numpy.typing import NDArray
 
-# Most streams are used for a few draws only: there is one per flow, attempt and purpose.
+# Blocks are small, because there is a stream per flow, attempt and purpose, and most streams are used for few draws.
 _BLOCK: Final = 64
 # Philox-4x64 generates four 64-bit words per step of its counter.
 _STEPS_PER_BLOCK: Final = _BLOCK // 4

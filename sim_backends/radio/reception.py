@@ -82,11 +82,8 @@ class Reception(Generic[Payload]):
         station.sending_until_ns = end_ns
         station.contention.set_busy_until(end_ns)
         stations, events, starts = self._stations, self._events, self._events.starts
-        has_no_interference, powers_mw, noise_mw = (
-            not transmission.interferers,
-            reach.powers_mw,
-            self._channel.noise_mw,
-        )
+        powers_mw, noise_mw = reach.powers_mw, self._channel.noise_mw
+        has_no_interference = not transmission.interferers
         add_receiver = transmission.receivers.add
         sensed_ns = now_ns + CCA_TIME_NS
         for index in reach.detected_by:

@@ -69,6 +69,11 @@ class Station(Generic[Payload]):
         self.rts_threshold_bytes = rts_threshold_bytes
         self.exchange_id = self.packet_count = 0
 
+    @property
+    def is_in_exchange(self) -> bool:
+        """True from the start to the end of an exchange."""
+        return bool(self.exchange_id & 1)
+
     def use_categories(self, mapping: DscpMapping, band: Band) -> None:
         """Use the queues and the contention of the access categories instead of the single queue."""
         self.contention = self.categories = AccessCategories(mapping, band, self._backoff)

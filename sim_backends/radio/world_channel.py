@@ -81,7 +81,7 @@ class WorldChannel(RadioChannel):
         self._ends = by_name[np.stack(np.triu_indices(count, 1))]
         self._link_of = np.zeros((count, count), dtype=np.int64)
         self._link_of[tuple(self._ends)] = self._link_of[tuple(self._ends[::-1])] = np.arange(self._ends.shape[1])
-        self._own_links = [np.delete(links_of, station) for station, links_of in enumerate(self._link_of)]
+        self._links_of_station = [np.delete(links_of, station) for station, links_of in enumerate(self._link_of)]
         self._others = [np.delete(np.arange(count), station) for station in range(count)]
         self._gain_caches: list[GainCache | None] = [None] * count
         self._fading = Fading(
@@ -184,7 +184,7 @@ class WorldChannel(RadioChannel):
         """Use these losses in dB (rows: transmitters, columns: receivers) until an end moves; inf is out of range."""
         self._revision += 1
         self._loss_db = loss_db
-        self._k = np.zeros(loss_db.shape)
+        self._rician_k = np.zeros(loss_db.shape)
         self._stale = np.zeros(self._ends.shape[1], dtype=bool)
         self._rows: list[LinkRow | None] = [None] * len(loss_db)
 
@@ -200,18 +200,20 @@ class WorldChannel(RadioChannel):
 
     def _gains(self, station: int, slot: int) -> Floats:
         """Return the gains of a station's links in a time slot, 0 to itself; `_row` must have been called before."""
-        cache, own_links = self._gain_cache(station), self._own_links[station]
+        cache, station_links = self._gain_cache(station), self._links_of_station[station]
         if cache.fades is None or cache.revision != self._revision:
             first, second = cache.ends
             start_m, end_m = self._positions_m[first], self._positions_m[second]
             velocities_m_s = (self._velocities_m_s[first], self._velocities_m_s[second]) if self._in_motion else None
-            cache.fades = cache.echoes.fades(start_m, end_m, velocities_m_s, self._k[first, second], self._moved_ns)
+            cache.fades = cache.echoes.fades(
+                start_m, end_m, velocities_m_s, self._rician_k[first, second], self._moved_ns
+            )
             cache.revision, cache.slot = self._revision, -1
         if cache.slot != slot:
             cache.gains = cache.fades.gains((slot * self._gain_valid_ns - self._moved_ns) * 1e-9)
             cache.slot = slot
         gains = np.zeros(len(self.names))
-        gains[self._others[station]] = cache.gains if cache.links is own_links else cache.gains[own_links]
+        gains[self._others[station]] = cache.gains if cache.links is station_links else cache.gains[station_links]
         return gains
 
     def _gain_cache(self, station: int) -> GainCache:
@@ -219,7 +221,7 @@ class WorldChannel(RadioChannel):
         if cache is None:
             # An ACK needs the same gain as its data frame, so if there are few links they are computed together.
             has_few_links = self._ends.shape[1] <= _BATCH_LINKS
-            links = np.arange(self._ends.shape[1]) if has_few_links else self._own_links[station]
+            links = np.arange(self._ends.shape[1]) if has_few_links else self._links_of_station[station]
             cache = GainCache(links, self._ends[:, links], self._fading.echoes(links))
             if has_few_links:
                 self._gain_caches = [cache] * len(self.names)
@@ -229,8 +231,8 @@ class WorldChannel(RadioChannel):
 
     def _update_links(self, station: int) -> None:
         """Compute the stale links of a station, and all other stale links too if there are few."""
-        own_links = self._own_links[station]
-        stale = own_links[self._stale[own_links]]
+        station_links = self._links_of_station[station]
+        stale = station_links[self._stale[station_links]]
         if not len(stale):
             return
         if np.count_nonzero(self._stale) <= _BATCH_LINKS:
@@ -247,7 +249,7 @@ class WorldChannel(RadioChannel):
         # Any obstacle on the path adds loss and removes the constant component.
         k = np.where(obstacles_db == 0, 10 ** (self._options.k_db / 10), 0.0)
         self._loss_db[first, second], self._loss_db[second, first] = loss_db, reverse_db
-        self._k[first, second] = self._k[second, first] = k
+        self._rician_k[first, second] = self._rician_k[second, first] = k
         self._stale[stale] = False
 
     def loss_db(self, start_m: Floats, end_m: Floats) -> Floats:

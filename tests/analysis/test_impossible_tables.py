@@ -142,7 +142,7 @@ def test_a_share_without_its_counts_is_missing(tmp_path: Path, capsys: pytest.Ca
 
 def cells_of(column: Column) -> st.SearchStrategy[str]:
     """Return a strategy for cells of a column: empty, possible values, bounds, and errors of programs and people."""
-    low, high = column.possible
+    low, high = column.possible_range
     hostile = st.sampled_from(
         ["nan", "NaN", "inf", "-1", "2.5", "1e308", "-38460", "true", "TRUE", "NA", "9" * 400, "\x1b[31m<b>|&%", "0"]
     )

@@ -16,7 +16,7 @@ import pytest
 import fieldkit
 from fieldkit.api import trials as api
 from fieldkit.cli import main
-from fieldkit.core.columns import cell
+from fieldkit.core.columns import cell_text
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.export.table import Table
 from fieldkit.trial import store
@@ -55,7 +55,7 @@ def as_csv(table: Table) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(table.column_names)
-    writer.writerows([cell(value) for value in row.values()] for row in table.to_pylist())
+    writer.writerows([cell_text(value) for value in row.values()] for row in table.to_pylist())
     return out.getvalue()
 
 

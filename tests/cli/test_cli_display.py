@@ -13,7 +13,7 @@ import pytest
 
 from fieldkit.cli import main
 from fieldkit.cli.commands import listings
-from fieldkit.cli.display import table
+from fieldkit.cli.display import print_table
 from fieldkit.cli.event_words import event_words
 from fieldkit.core.campaign_events import CampaignPlanned, CampaignWent
 from fieldkit.core.events import RepeatEnded
@@ -23,7 +23,7 @@ from tests.helpers.stored_trials import TRIALS
 
 
 def test_a_table_wider_than_the_screen_does_not_wrap_names_and_values(capsys: pytest.CaptureFixture[str]) -> None:
-    table([f"quantity {n}" for n in range(20)], [["masterless", *["[0.00, 56.15]"] * 19]], right=range(1, 20))
+    print_table([f"quantity {n}" for n in range(20)], [["masterless", *["[0.00, 56.15]"] * 19]], right=range(1, 20))
     header, _, row = capsys.readouterr().out.splitlines()
     assert len(row) > 200
     assert row.split("  ") == [" masterless", *["[0.00, 56.15]"] * 19]
@@ -66,7 +66,7 @@ def test_a_summary_of_a_trial_fits_a_narrow_terminal(
 
 def test_long_text_wraps_between_words(capsys: pytest.CaptureFixture[str]) -> None:
     verdict = "no difference seen; " * 20
-    table(("quantity", "A", "verdict"), [("RTT, median", "1.05 ms", verdict)], right=(1,))
+    print_table(("quantity", "A", "verdict"), [("RTT, median", "1.05 ms", verdict)], right=(1,))
     _, _, *lines = capsys.readouterr().out.splitlines()
     assert len(lines) > 1
     assert all(len(line) <= 160 for line in lines)
@@ -75,7 +75,7 @@ def test_long_text_wraps_between_words(capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_a_title_longer_than_its_table_stays_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    table(("n",), [("3",)], title="repeats, nlos, masterless, emulated, 30ft")
+    print_table(("n",), [("3",)], title="repeats, nlos, masterless, emulated, 30ft")
     assert capsys.readouterr().out.splitlines()[0] == "repeats, nlos, masterless, emulated, 30ft"
 
 
@@ -106,7 +106,7 @@ def test_paths_in_the_list_of_robots_are_not_wrapped(capsys: pytest.CaptureFixtu
 
 def test_table_has_a_header_a_rule_and_aligned_columns(capsys: pytest.CaptureFixture[str]) -> None:
     rows = [("RTT", "1.05 ms\n[1.00, 1.10]", "same"), ("漢", "", ""), ("", "", "")]
-    table(("quantity", "A", "verdict"), rows, title="los", right=(1,))
+    print_table(("quantity", "A", "verdict"), rows, title="los", right=(1,))
     assert capsys.readouterr().out.splitlines() == [
         "los",
         " quantity             A  verdict",

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.cells import cell_len
 
-from fieldkit.cli.display import table
+from fieldkit.cli.display import print_table
 from fieldkit.cli.event_words import event_words
 from fieldkit.cli.progress import ProgressBar
 from fieldkit.core.campaign_events import CampaignTrial
@@ -27,11 +27,11 @@ class Terminal(io.StringIO):
         return True
 
 
-def print_table(width: int, headers: list[str], rows: list[tuple[str, ...]], right_aligned: list[int]) -> str:
+def printed_table(width: int, headers: list[str], rows: list[tuple[str, ...]], right_aligned: list[int]) -> str:
     out = Terminal()
     with redirect_stdout(out), patch.dict("os.environ", COLUMNS=str(width), TERM="xterm"):
         assert sys.stdout.isatty()
-        table(headers, rows, right=right_aligned)
+        print_table(headers, rows, right=right_aligned)
     return re.sub("\x1b[^m]*m", "", out.getvalue())
 
 
@@ -42,7 +42,7 @@ def test_a_table_keeps_every_word_and_is_no_wider_than_the_terminal(data: st.Dat
     headers = data.draw(st.lists(st.from_regex(r"[a-z]{1,12}", fullmatch=True), min_size=size, max_size=size))
     rows = data.draw(st.lists(st.tuples(*[CELL] * size), min_size=1, max_size=4))
     right_aligned = data.draw(st.lists(st.integers(0, size - 1), max_size=2))
-    text = print_table(width, headers, rows, right_aligned)
+    text = printed_table(width, headers, rows, right_aligned)
     words = [word for row in rows for cell in row for word in cell.split()]
     printed_words = text.split()
     assert all(printed_words.count(word) >= words.count(word) for word in words)

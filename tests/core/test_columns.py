@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.core.columns import Column, Measured, cell, columns
+from fieldkit.core.columns import Column, Measured, cell_text, columns
 
 DECLARED = columns(10, ("a", "count", "x"), ("b", "s", "x"), ("c", "text", "x"))
 NAMES = ("a", "b", "c", "d")
@@ -65,8 +65,8 @@ def test_the_unit_determines_the_type_of_values() -> None:
 def test_a_rounded_value_at_a_bound_is_still_possible() -> None:
     bounds = 1.0000000004, 2.0000000006
     column = Column("level", "dBm", "x", bounds=bounds)
-    assert [cell(bound) for bound in bounds] == ["1", "2"]
-    assert [column.invalid_value_reason(cell(bound)) for bound in bounds] == [None, None]
+    assert [cell_text(bound) for bound in bounds] == ["1", "2"]
+    assert [column.invalid_value_reason(cell_text(bound)) for bound in bounds] == [None, None]
     assert column.invalid_value_reason("0.999999999") == "not from 1 to 2"
     assert column.invalid_value_reason("2.00000001") is not None
 

@@ -60,6 +60,7 @@ steps:
                   payload_bytes: 56
                   gap: true
                   duplicates: true
+                  links: [wifi, cell]
 """
 
 
@@ -85,3 +86,14 @@ def test_each_step_uses_its_link_and_packets_use_another_link_if_one_is_lost(tmp
     # babeld sends each packet over one link. The captures contain the packets of both.
     assert row["rtt_duplicates"] == "0"
     assert int(row["any.sender_captured"]) >= 110
+    # Requests left over the Wi-Fi before and after the fault, and over the cellular link during it.
+    sent = {link: int(row[f"rtt_over_{link}_sent"]) for link in ("wifi", "cell")}
+    lost = {link: int(row[f"rtt_over_{link}_lost"]) for link in ("wifi", "cell")}
+    assert sent["wifi"] >= 20
+    assert sent["cell"] >= 10
+    assert sum(sent.values()) <= 110
+    assert lost["wifi"] >= 3, "babeld needs some time to detect the loss"
+    assert lost["cell"] == 0
+    failover_s = float(row["rtt_over_cell_failover_s"])
+    assert failover_s == pytest.approx(float(row["rtt_gap_s"]), abs=0.35), "the delay over the two links differs"
+    assert (row["rtt_over_wifi_duplicates"], row["rtt_over_cell_duplicates"]) == ("0", "0")

@@ -13,7 +13,7 @@ from typing import Any, Final, cast
 import numpy as np
 
 from fieldkit.config import schema
-from fieldkit.core.columns import cell
+from fieldkit.core.columns import cell_text
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Role
 from fieldkit.core.prompts import Question
@@ -80,7 +80,7 @@ def _measure_drive(data: bytes, place: Path) -> None:
     (place / drive_log.FILE).write_bytes(data)
     measured = drive_log.measure(drive_log.read(place / drive_log.FILE))
     for column in drive_log.COLUMNS:
-        assert column.invalid_value_reason(cell(measured.values.get(column.name))) is None, column.name
+        assert column.invalid_value_reason(cell_text(measured.values.get(column.name))) is None, column.name
 
 
 def _read_drive_status(data: bytes, _: Path) -> None:
@@ -209,7 +209,7 @@ def _read_reception(data: bytes, place: Path) -> None:
     (place / "scan.bag").write_bytes(_recorded_bag())
     measured = recorded_topics.measure(recorded_topics.read(place, "log", "scan.bag", ["/scan"], 5.0))
     for column in recorded_topics.COLUMNS:
-        assert column.invalid_value_reason(cell(measured.values.get(column.name))) is None, column.name
+        assert column.invalid_value_reason(cell_text(measured.values.get(column.name))) is None, column.name
 
 
 def _lines(lines: Iterator[dict[str, Any]]) -> bytes:

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from fieldkit.core.columns import Measured, cell
+from fieldkit.core.columns import Measured, cell_text
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import LinkSample, Role
 from fieldkit.measure.attempt import AttemptEvidence
@@ -41,7 +41,7 @@ def _measure(samples: list[LinkSample]) -> None:
     measured = link.measure(Role.SENDER, samples)
     link.link_history(samples)
     for column in link.COLUMNS:
-        assert column.invalid_value_reason(cell(measured.values.get(column.name))) is None, column.name
+        assert column.invalid_value_reason(cell_text(measured.values.get(column.name))) is None, column.name
 
 
 def _read_testbed_samples(data: bytes, place: Path) -> None:
@@ -92,7 +92,7 @@ def _measure_states(data: bytes, place: Path) -> None:
     measured = attempt_states.measure(evidence, names, Measured())
     list(attempt_states.problems(evidence, names, {}))
     for column in (*state_columns.MARK_COLUMNS, *state_columns.declare_columns("sender")):
-        assert column.invalid_value_reason(cell(measured.values.get(column.name))) is None, column.name
+        assert column.invalid_value_reason(cell_text(measured.values.get(column.name))) is None, column.name
 
 
 def _snapshot(**paths: str) -> bytes:

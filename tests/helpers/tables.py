@@ -8,7 +8,7 @@ import numpy as np
 
 from fieldkit.analysis.parsing import Numbers, Texts
 from fieldkit.analysis.repeats import SOURCE, Repeats
-from fieldkit.core.columns import SCHEMA_VERSION, Value, cell
+from fieldkit.core.columns import SCHEMA_VERSION, Value, cell_text
 from fieldkit.trial import rows
 from fieldkit.trial.columns import trial_columns
 
@@ -105,7 +105,7 @@ def parsed(table: Sequence[Mapping[str, Value]]) -> Repeats:
     numbers: dict[str, Numbers] = {}
     texts: dict[str, Texts] = {}
     for column in trial_columns():
-        cells = [cell(row.get(column.name)) for row in table]
+        cells = [cell_text(row.get(column.name)) for row in table]
         if column.type is str:
             texts[column.name] = np.array(cells, dtype=np.object_)
         elif column.type is bool:

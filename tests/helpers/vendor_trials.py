@@ -100,6 +100,6 @@ def _value(column: Column, random: np.random.Generator) -> Value:
         return bool(random.integers(0, 4))
     if column.type is int:
         return int(random.integers(1, 9))
-    low, high = column.possible
+    low, high = column.possible_range
     scale = {"s": 0.01, "bit/s": 4e6, "V": 7.4}.get(column.unit, 0.1)
     return float(np.clip(random.lognormal(0, 0.2) * scale, low, high))

@@ -290,7 +290,7 @@ def test_events_write_only_printable_characters_to_the_terminal(text: str) -> No
         assert text_of_event.plain.replace("\n", "").replace("\N{NO-BREAK SPACE}", "").isprintable()
 
 
-@pytest.mark.parametrize("show", [display.show_error, lambda text: display.table(["x"], [[text]])])
+@pytest.mark.parametrize("show", [display.show_error, lambda text: display.print_table(["x"], [[text]])])
 def test_errors_and_tables_show_markup_and_escapes_literally(
     show: Callable[[str], None], capsys: pytest.CaptureFixture[str]
 ) -> None:

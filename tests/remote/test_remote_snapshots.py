@@ -63,6 +63,37 @@ def test_snapshots_of_an_attempt_are_fetched(shell: LocalShell, tmp_path: Path) 
     assert calls.read_text().splitlines() == ["-n -c tracking"] * 2, "no names are resolved, and no call is repeated"
 
 
+def test_the_clock_is_reported_at_intervals_until_the_sampler_is_stopped(shell: LocalShell, tmp_path: Path) -> None:
+    """The clock loses its source during the attempt; the sampler is stopped while a program hangs."""
+    installed = shell.home / script.SCRIPT_PATH
+    text = installed.read_text(encoding="ascii")
+    assert "CLOCK_INTERVAL=10 " in text
+    installed.write_text(text.replace("CLOCK_INTERVAL=10 ", "CLOCK_INTERVAL=1 "), encoding="ascii")
+    count = tmp_path / "count"
+    add_program(
+        tmp_path,
+        "chronyc",
+        f"echo x >>{shlex.quote(str(count))}\n"
+        f"case $(wc -l <{shlex.quote(str(count))}) in\n"
+        "*1) file=synchronized-4.3 ;; *5) exec sleep 600 ;; *) file=none-4.3 ;;\n"
+        "esac\n"
+        f"cat {shlex.quote(str(DATA))}/chrony/$file.csv",
+    )
+    evidence.begin(shell, FOLDER, "sender", "wlan0")
+    wait_until(lambda: len(count.read_text().splitlines()) == 5, Deadline.after(60))
+    (tmp_path / "local").mkdir()
+    fetching.fetch(shell, FOLDER, "sender", "wlan0", tmp_path / "local")
+    before = snapshots.read(tmp_path / "local" / "sender-sources-before.txt")
+    during = snapshots.read_series(tmp_path / "local" / "sender-sources-during.txt")
+    assert chrony.parse(before["chrony"]).is_synchronized
+    assert all(snapshot.keys() == {"chrony"} for snapshot in during)
+    assert [chrony.parse(snapshot["chrony"]).problem for snapshot in during[:3]] == ["chrony has no source"] * 3
+    clock = clock_states.read("robot", (before, *during), None)
+    assert clock.report is not None
+    assert clock.report.problem == "chrony has no source", "the less favourable report is used"
+    assert not [path for path in (shell.home / ".fieldkit" / FOLDER).rglob("*") if path.name.startswith(".clock-")]
+
+
 def test_programs_that_hang_or_flood_give_no_value_and_hardly_delay_a_snapshot(
     shell: LocalShell, tmp_path: Path
 ) -> None:

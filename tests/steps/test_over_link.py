@@ -82,14 +82,17 @@ def test_a_capture_of_a_link_without_an_interface_is_on_all_interfaces() -> None
 @pytest.mark.parametrize(
     ("keys", "is_captured", "reason"),
     [
-        ("over: either", True, None),
-        ("over: either", False, "a capture on both robots"),
-        ("count: 10", True, "needs `over`"),
-        ("over: either, count: 65536", True, "at most 65535 requests"),
+        ("over: either, duplicates: true", True, None),
+        ("over: either, duplicates: true", False, "a capture on both robots"),
+        ("count: 10, duplicates: true", True, "needs `over`"),
+        ("over: either, count: 65536, duplicates: true", True, "at most 65535 requests"),
+        ("over: either, links: [wifi, cell]", True, None),
+        ("over: either, links: [wifi]", False, "links needs `over`, and a capture on both robots"),
+        ("over: either, count: 65536, links: [wifi]", True, "links allows at most 65535 requests"),
     ],
 )
-def test_duplicates_need_a_capture_of_the_link(keys: str, is_captured: bool, reason: str | None) -> None:
-    step = parse_step(PingStep, f"from: sender, to: receiver, {keys}, duplicates: true")
+def test_columns_of_links_need_a_capture(keys: str, is_captured: bool, reason: str | None) -> None:
+    step = parse_step(PingStep, f"from: sender, to: receiver, {keys}")
     capture = parse_step(CaptureStep, "over: either, during: [{wait: {duration: 1s}}]")
     assert isinstance(step, PingStep)
     assert isinstance(capture, CaptureStep)
@@ -112,6 +115,12 @@ def test_a_link_that_a_robot_does_not_have_is_rejected_with_the_nearest_name() -
     assert "cell" in error.value.remedy
     with pytest.raises(ConfigurationError, match="a reboot does not allow link"):
         parse_step(FaultStep, "robot: receiver, kind: reboot, link: cell")
+
+
+def test_a_link_with_columns_must_exist_on_both_robots() -> None:
+    step = parse_step(PingStep, "from: sender, to: receiver, over: either, links: [cell, satellite]")
+    with pytest.raises(ConfigurationError, match="has no link 'satellite'"):
+        commands(step)
 
 
 def test_flows_and_route_checks_name_the_link() -> None:

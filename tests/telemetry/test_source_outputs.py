@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldkit.config import schema
-from fieldkit.core.columns import cell
+from fieldkit.core.columns import cell_text
 from fieldkit.core.model import Role
 from fieldkit.telemetry import source_outputs, telemetry_columns
 from fieldkit.telemetry.source_outputs import Values
@@ -149,5 +149,5 @@ def test_no_output_crashes_a_parser_or_gives_an_impossible_cell(text: str) -> No
 def test_every_column_is_declared_correctly() -> None:
     for column in telemetry_columns.COLUMNS:
         assert column.declaration_error() is None, column.name
-    assert cell(None) == ""
+    assert cell_text(None) == ""
     assert len(telemetry_columns.of_role(Role.SENDER)) == len(telemetry_columns.COLUMNS) / 2

@@ -63,7 +63,7 @@ def tables_of_columns(draw: st.DrawFn) -> tuple[list[Column], dict[str, Value]]:
 
 def values(column: Column) -> st.SearchStrategy[Value]:
     """Return a strategy for the values of a column, as in a CSV file."""
-    low, high = column.possible
+    low, high = column.possible_range
     if column.type is str:
         return WORDS
     if column.type is bool:
@@ -114,7 +114,7 @@ def test_a_named_column_has_named_figures_and_counts() -> None:
         "up.ip_packets_received",
         "up.ip_packets_sent",
     )
-    assert (up.unit, up.meaning, up.possible) == (loss.unit, loss.meaning, loss.possible)
+    assert (up.unit, up.meaning, up.possible_range) == (loss.unit, loss.meaning, loss.possible_range)
     assert with_step_name("", loss) is loss
 
 

@@ -253,6 +253,6 @@ def test_times_are_missing_if_the_clock_counts_instructions(folder: Path) -> Non
     assert "bag_duration_s" in missing_names
     assert all(name.endswith(("_s", "_ppm")) for name in missing_names)
     assert {withheld.missing[name] for name in missing_names} == {
-        "the backend's clock counts instructions of an emulated processor, so it measures no real durations"
+        "the backend's clock counts instructions of a virtual processor, so it measures no real durations"
     }
     assert withheld.values["file_loss"] == values_of_real_clock.values["file_loss"]

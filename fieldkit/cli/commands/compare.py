@@ -29,7 +29,7 @@ def add(parser: Parser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("a", type=Path, metavar="A", help=shared.PATH_HELP)
     parser.add_argument("b", type=Path, metavar="B", nargs="?", help="the second run (default: A, with --between)")
-    parser.add_argument("more", type=Path, nargs="*", default=[], help=argparse.SUPPRESS)  # from a shell pattern
+    parser.add_argument("more", type=Path, nargs="*", default=[], help=argparse.SUPPRESS)  # reported as an error
     parser.add_argument(
         "--between",
         default="",

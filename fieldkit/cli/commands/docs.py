@@ -3,7 +3,7 @@
 import argparse
 import webbrowser
 
-from fieldkit.cli.display import table
+from fieldkit.cli.display import print_table
 from fieldkit.cli.parser import Parser
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.text import print_text
@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
     from fieldkit.config import documentation
 
     if arguments.list:
-        table(("topic", "page"), [(topic, str(path)) for topic, path in documentation.topics().items()])
+        print_table(("topic", "page"), [(topic, str(path)) for topic, path in documentation.topics().items()])
         return 0
     page = documentation.find(arguments.topic)
     if arguments.path:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from fieldkit.cli import shared_arguments as shared
-from fieldkit.cli.display import show_error, show_note, table
+from fieldkit.cli.display import print_table, show_error, show_note
 from fieldkit.cli.parser import Commands, Parser
 from fieldkit.core import files
 from fieldkit.core.errors import ConfigurationError, FieldkitError
@@ -176,12 +176,12 @@ def list_robots(arguments: argparse.Namespace) -> int:
             robot.profile,
             ", ".join(robot.roles),
             robot.address,
-            _place(robot.place_m),
+            _place_text(robot.place_m),
             ", ".join(robot.programs) or "stopped",
         )
         for robot in state.robots
     ]
-    table(("robot", "profile", "roles", "address", "east, north, up (m)", "runs"), rows)
+    print_table(("robot", "profile", "roles", "address", "east, north, up (m)", "runs"), rows)
     print_text(f"up for {format_duration(state.up_s)}, pid {state.pid}")
     if state.lateness is not None:
         _show_lateness(state.lateness)
@@ -213,7 +213,7 @@ def move(arguments: argparse.Namespace) -> int:
     east_m, north_m, *up_m = map(parse_offset_m, words)
     destination = Destination(east_m, north_m, up_m[0] if up_m else None, is_relative)
     place_m = requests.move(_lab_folder(), arguments.robot, destination)
-    print_text(f"{arguments.robot} is at {_place(place_m)} (m east, north, up)")
+    print_text(f"{arguments.robot} is at {_place_text(place_m)} (m east, north, up)")
     return 0
 
 
@@ -224,7 +224,7 @@ def shell(arguments: argparse.Namespace) -> int:
     lab_folder = _lab_folder()
     names = [robot.name for robot in requests.state(lab_folder).robots]
     if arguments.robot not in names:
-        raise protocol.unknown_robot(arguments.robot, names)
+        raise protocol.unknown_robot_error(arguments.robot, names)
     program = shutil.which("ssh")
     if program is None:
         raise ConfigurationError("there is no ssh", remedy="sudo apt-get install openssh-client")
@@ -277,7 +277,7 @@ def plot(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _place(place_m: Vector) -> str:
+def _place_text(place_m: Vector) -> str:
     """Return a position as text, to the centimetre: `198.5, 200, 0.2`."""
     return ", ".join(f"{round(metres, 2):.10g}" for metres in place_m)
 

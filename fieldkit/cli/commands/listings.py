@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.cli import shared_arguments as shared
-from fieldkit.cli.display import table
+from fieldkit.cli.display import print_table
 from fieldkit.cli.parser import Parser
 from fieldkit.config import locations
 from fieldkit.core.columns import plain_name
 from fieldkit.core.errors import ConfigurationError, did_you_mean
-from fieldkit.core.result_rows import DifferenceRow, EstimateRow, declared
+from fieldkit.core.result_rows import DifferenceRow, EstimateRow, declared_columns
 from fieldkit.core.text import print_text
 
 
@@ -53,7 +53,7 @@ def _list_or_show(kind: locations.Kind, summary: Callable[[str], str], name: str
     """List all files of `kind`, or show the file called `name`."""
     if name is None:
         rows = [(item, str(path), summary(item)) for item, path in locations.names(kind).items()]
-        table(("name", "file", "summary"), rows)  # only the last column is folded, so paths are not
+        print_table(("name", "file", "summary"), rows)  # only the last column is folded, so paths are not
     else:
         summary(name)  # raises if the file has an error
         print_text(locations.find(kind, name).read_text(encoding="utf-8"), end="")
@@ -105,7 +105,7 @@ def _columns_of(procedure: str) -> int:
         (column.name, column.unit, column.figure.kind if column.figure else "", column.meaning)
         for column in shown_columns
     ]
-    table(("column", "unit", "aggregated as", "meaning"), rows)
+    print_table(("column", "unit", "aggregated as", "meaning"), rows)
     return 0
 
 
@@ -117,8 +117,8 @@ def _columns(name: str | None) -> int:
     trial = installed_columns()
     columns_by_file = {
         "trial.csv": trial,
-        "summary.csv": (*(column for column in trial if column.name in DEFAULT_BY), *declared(EstimateRow)),
-        "compare": declared(DifferenceRow),
+        "summary.csv": (*(column for column in trial if column.name in DEFAULT_BY), *declared_columns(EstimateRow)),
+        "compare": declared_columns(DifferenceRow),
     }
     column_names = {column.name for columns in columns_by_file.values() for column in columns}
     # A step with a name adds its name to the names of its columns.
@@ -134,5 +134,5 @@ def _columns(name: str | None) -> int:
             f"there is no column {name!r}",
             remedy=did_you_mean(name or "", column_names, "fieldkit columns lists them"),
         )
-    table(("file", "column", "unit", "meaning"), rows)
+    print_table(("file", "column", "unit", "meaning"), rows)
     return 0

@@ -15,13 +15,14 @@ from fieldkit.measure.evidence.iperf3 import IperfInterval, IperfTest
 _ROUNDING_S: Final = 0.002
 """Tolerance for rounding: iperf3 prints times with 6 digits, and some versions print `seconds` with more."""
 _SUMMARY_DELAY_S: Final = 0.02
-"""Maximum time between the end of the last interval and the end in the summary: the clock is read again for it."""
+"""Maximum time between the end of the last interval and the end in the summary. iperf3 reads the clock again for the
+summary."""
 _MAX_OMITTED_S: Final = 1.1
 """Maximum length of a last interval without data, which version 3.17 omits."""
 _ROUNDING: Final = 1e-3
 """Relative tolerance for rounding of rates and jitter values."""
 _EARLY_S: Final = 0.1
-"""A timer of the client may end a test earlier than its full duration by up to this time."""
+"""The client's timer may end a test by up to this time before its full duration."""
 _TIMESTAMP_S: Final = 2
 """Tolerance for start times, because `timesecs` has a resolution of whole seconds."""
 

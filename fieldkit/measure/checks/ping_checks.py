@@ -158,10 +158,13 @@ CROSS_CHECKS: Final = (
         tolerance="none",
     ),
     CrossCheck(
-        quantity="copies over several links",
-        columns=("rtt_duplicates",),
+        quantity="requests and copies over several links",
+        columns=("rtt_duplicates", "rtt_over_*"),
         source="captures on all interfaces: interface of each echo",
-        against=("`ping.txt`: replies with `(DUP!)`", "receiver's capture: at most one reply per received request"),
+        against=(
+            "`ping.txt`: replies with `(DUP!)`",
+            "receiver's capture: at most one reply per received request, and each answered request",
+        ),
         tolerance=(
             "ping may not count a copy that arrives in its last 0.1 s, or later than one interval after the last "
             "request; fragmented requests are not compared"

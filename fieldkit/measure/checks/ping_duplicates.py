@@ -83,21 +83,35 @@ def measure(sender: PingEchoes | None, receiver: PingEchoes | None) -> Measured:
         sender: Echoes in the sender's capture; None if the capture is missing or incomplete.
         receiver: Echoes in the receiver's capture; None if the capture is missing or incomplete.
     """
+    echoes = echoes_by_interface(sender, receiver)
+    if isinstance(echoes, str):
+        return Measured.all_missing(COLUMNS, echoes)
+    at_sender, at_receiver = echoes
+    return Measured({"rtt_duplicates": count_copies(at_receiver.requests) + count_copies(at_sender.replies)})
+
+
+def echoes_by_interface(
+    sender: PingEchoes | None, receiver: PingEchoes | None
+) -> tuple[PingEchoes, PingEchoes] | str:
+    """Return both arguments, or the reason why they do not show over which interface each echo was captured."""
     if sender is None or receiver is None:
-        return Measured.all_missing(COLUMNS, "a robot has no complete capture around the ping")
+        return "a robot has no complete capture around the ping"
     if sender.are_fragmented or receiver.are_fragmented:
-        return Measured.all_missing(COLUMNS, "the requests are fragmented")
-    arrived = receiver.requests, sender.replies
-    if any((echoes.interface == NO_INTERFACE).any() for echoes in arrived):
-        reason = "a capture does not contain interfaces: it needs a link with the interface lo, and tcpdump 4.99"
-        return Measured.all_missing(COLUMNS, reason)
-    return Measured({"rtt_duplicates": sum(map(count_copies, arrived))})
+        return "the requests are fragmented"
+    if any((echoes.interface == NO_INTERFACE).any() for echoes in (*sender, *receiver)):
+        return "a capture does not contain interfaces: it needs a link with the interface lo, and tcpdump 4.99"
+    return sender, receiver
 
 
 def count_copies(echoes: Packets) -> int:
     """Return the sum over all packets of the number of interfaces on which a packet arrived, minus one."""
-    rows = np.stack((_keys(echoes), echoes.interface))
+    rows = np.stack((echo_keys(echoes), echoes.interface))
     return len(np.unique(rows, axis=1).T) - len(np.unique(rows[0]))
+
+
+def echo_keys(echoes: Packets) -> Ints:
+    """Return a number for the identifier and the sequence number of each echo."""
+    return (echoes.echo << 16) | echoes.echo_seq
 
 
 def contradictions(
@@ -124,12 +138,10 @@ def contradictions(
             reply = f"the first to request {min(unprinted)}"
             yield f"the sender's capture has {duplicates} of replies that ping did not print, {reply}"
     requests, answers = receiver
-    unrequested = Counter((_keys(answers) - (ECHO_REPLY << 16)).tolist()) - Counter(_keys(requests).tolist())
+    unrequested = Counter((echo_keys(answers) - (ECHO_REPLY << 16)).tolist()) - Counter(echo_keys(requests).tolist())
     if unrequested:
         answers_text = format_count(unrequested.total(), "answer")
         yield f"the receiver's capture has {answers_text} to requests that it does not contain"
-
-
-def _keys(echoes: Packets) -> Ints:
-    """Return a number for the identifier and the sequence number of each echo."""
-    return (echoes.echo << 16) | echoes.echo_seq
+    if missing_seqs := {reply.seq for reply in output.answers}.difference(requests.echo_seq.tolist()):
+        requests_text = format_count(len(missing_seqs), "answered request")
+        yield f"the receiver's capture does not contain {requests_text}, the first is request {min(missing_seqs)}"

@@ -86,7 +86,7 @@ _MAX_BYTES: Final = 16 << 20
 # cJSON before 1.5.9 printed nan and inf, which are not valid JSON.
 _INVALID_NUMBER: Final = re.compile(r"(?<=[:,\[])(\s*)[-+]?(?:nan|inf(?:inity)?)\b(?=\s*[,\]}])", re.IGNORECASE)
 _MIN_INTERVALS: Final = 3
-"""Number of full intervals from which on the first one is excluded."""
+"""The first full interval is excluded if there are at least this many."""
 _MIN_LENGTH_SHARE: Final = 0.5
 """An interval that is shorter than this share of the longest one is not a full interval, but the end of the test. On
 a link with losses, it contains some tenths of a second without data, until the receiver is notified of the end.

@@ -10,11 +10,11 @@ from itertools import pairwise
 from statistics import median
 from typing import Final
 
-from fieldkit.core.columns import BACKGROUND, Column, Figure, Kind, Measured, Value, cell, columns
+from fieldkit.core.columns import BACKGROUND, Column, Figure, Kind, Measured, Value, cell_text, columns
 from fieldkit.core.model import LinkSample, Role, StationSample
 
 _DBM: Final = (-300.0, 100.0)
-"""Range of valid signals and noises."""
+"""Valid range of a signal or noise."""
 _NOT_SAMPLED: Final = "the robot's radio was not sampled: the robot has no Wi-Fi or no iw, or was not associated"
 _NOT_REPORTED: Final = "the robot's radio does not report it"
 _RESET: Final = "the link was established again, and the last counts before were not sampled"
@@ -124,7 +124,7 @@ def measure(role: Role, samples: Sequence[LinkSample]) -> Measured:
     impossible = (
         column.name
         for column in _COLUMNS[role]
-        if column.invalid_value_reason(cell(measured.values.get(column.name)))
+        if column.invalid_value_reason(cell_text(measured.values.get(column.name)))
     )
     return measured.without(dict.fromkeys(impossible, _NOT_REPORTED))
 

@@ -6,7 +6,7 @@ from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
 
 POSITION_CHECKS: Final = (
     CrossCheck(
-        quantity="planned positions in the record",
+        quantity="stored planned positions",
         columns=("positions_from",),
         source="`positions.json`: positions and their start times",
         against=("the placement in `trial.yaml`",),

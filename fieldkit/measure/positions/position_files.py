@@ -18,7 +18,7 @@ from fieldkit.measure.positions.position_sources import PositionSource
 from fieldkit.measure.positions.samples import MAX_SAMPLES, WGS84, Samples, read_csv, require_increasing
 
 MAX_STALE_S: Final = 10.0
-"""If time stamps and reception times differ by more than this, the time stamps are of another clock."""
+"""If time stamps and reception times differ by more than this, they are from different clocks."""
 
 PositionReader = Callable[[Path, PositionSource], Samples]
 """Function that returns the samples of a source in a file, and raises the same errors as `read_topic`."""

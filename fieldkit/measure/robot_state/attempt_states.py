@@ -1,5 +1,7 @@
 """Columns and marks of an attempt that follow from the states of the robots before and after it.
 
+The states of the clocks during the attempt are also used.
+
 A parser is imported only if a robot has the source that it parses.
 """
 
@@ -87,9 +89,11 @@ def _measure_clocks(
         return result, [], False
     from fieldkit.measure.robot_state import clock_states  # noqa: PLC0415 (see the docstring)
 
-    robot_clocks = {
-        role: clock_states.read(name, snapshots_by_role[role], offsets[role]) for role, name in names.items()
-    }
+    robot_clocks = {}
+    for role, name in names.items():
+        before, after = snapshots_by_role[role]
+        during = evidence.read_or_none(snapshots.read_series, snapshots.during_file(role)) or ()
+        robot_clocks[role] = clock_states.read(name, (before, *during, after), offsets[role])
     for role, clock in robot_clocks.items():
         result |= clock_states.measure(role, clock)
     is_known = any(clock.report is not None for clock in robot_clocks.values())

@@ -26,8 +26,8 @@ class RobotClock:
 
     Attributes:
         name: Name of the robot.
-        reports: Reports before and after the attempt (`choose_report`). A report is missing if no program returned
-            one.
+        reports: Reports before, during and after the attempt (`choose_report`). A report is missing if no program
+            returned one.
         laptop: Offset from the laptop's clock; None if unknown.
     """
 
@@ -67,16 +67,16 @@ def choose_report(candidates: Sequence[ClockReport]) -> ClockReport | None:
     return next((report for report in candidates if report.is_synchronized), candidates[0] if candidates else None)
 
 
-def read(name: str, pair: Sequence[Snapshot], laptop: Offset | None) -> RobotClock:
+def read(name: str, attempt_snapshots: Sequence[Snapshot], laptop: Offset | None) -> RobotClock:
     """Return the clock of a robot in an attempt.
 
     Args:
         name: Name of the robot.
-        pair: Snapshots of the robot before and after the attempt.
+        attempt_snapshots: Snapshots of the robot before, during and after the attempt.
         laptop: Offset of the robot's clock from the laptop's; None if unknown.
     """
-    reports_of_pair = (choose_report(reports(snapshot)) for snapshot in pair)
-    return RobotClock(name, tuple(report for report in reports_of_pair if report is not None), laptop)
+    chosen_reports = (choose_report(reports(snapshot)) for snapshot in attempt_snapshots)
+    return RobotClock(name, tuple(report for report in chosen_reports if report is not None), laptop)
 
 
 def measure(role: Role, clock: RobotClock) -> Measured:

@@ -15,6 +15,7 @@ from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import reading
 
+_NEXT: Final = "\n==> next <==\n"
 _HEADER: Final = re.compile(r"==> ([a-z][a-z0-9-]{0,30}) <==", re.ASCII)
 _CODE: Final = re.compile(r" code ([0-9]{1,3})", re.ASCII)
 _FAILURES: Final = {None: "was interrupted", 137: "did not answer in time", 153: "printed too much"}
@@ -57,6 +58,11 @@ def after_file(role: Role) -> str:
     return f"{role}-sources-after.txt"
 
 
+def during_file(role: Role) -> str:
+    """Return the name of the file with the reports on a robot's clock during an attempt."""
+    return f"{role}-sources-during.txt"
+
+
 def read(path: Path) -> Snapshot:
     """Return the snapshot in a file.
 
@@ -64,6 +70,18 @@ def read(path: Path) -> Snapshot:
         EvidenceError: The file is missing or cannot be read.
     """
     return parse(reading.text(path))
+
+
+def read_series(path: Path) -> tuple[Snapshot, ...]:
+    """Return the snapshots in a file with a line `==> next <==` before each of them, except for an interrupted one.
+
+    Raises:
+        EvidenceError: The file is missing or cannot be read.
+    """
+    _, *texts = f"\n{reading.text(path)}".split(_NEXT)
+    if texts and not _CODE.fullmatch(texts[-1].rstrip("\n").rpartition("\n")[2]):
+        del texts[-1]
+    return tuple(map(parse, texts))
 
 
 def read_attempt(evidence: AttemptEvidence, role: Role) -> tuple[Snapshot, Snapshot]:

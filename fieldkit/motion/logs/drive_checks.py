@@ -53,13 +53,14 @@ def contradictions(log: Sequence[DriveMoment], plan: DrivePlan) -> Iterator[str]
     if log[-1].ended != HOME or any(moment.ended for moment in log[:-1]):
         yield f"does not end at the starting position of the robot: {log[-1].ended or 'it ends on the path'}"
     yield from time_contradictions(log, plan.window)
-    if not log[0].off_m - _START_M <= log[0].driven_m <= (1 + _JITTER_SHARE) * (log[0].off_m + _START_M) + _JITTER_M:
-        yield f"starts {log[0].off_m:.2f} m from its origin, after {log[0].driven_m:.2f} m driven"
+    start_m, driven_m = log[0].distance_m, log[0].driven_m
+    if not start_m - _START_M <= driven_m <= (1 + _JITTER_SHARE) * (start_m + _START_M) + _JITTER_M:
+        yield f"starts {start_m:.2f} m from its origin, after {driven_m:.2f} m driven"
     if any(_jumps(*pair) for pair in pairwise(log)):
         yield "the distance between two consecutive poses differs from the driven distance"
-    off_m = max(_deviation_m(moment, plan.legs) for moment in log)
-    if off_m > MAX_DEVIATION_M:
-        yield f"its odometry deviates by {off_m:.1f} m from the commanded path"
+    deviation_m = max(_deviation_m(moment, plan.legs) for moment in log)
+    if deviation_m > MAX_DEVIATION_M:
+        yield f"its odometry deviates by {deviation_m:.1f} m from the commanded path"
     fastest_m_s = max(speeds_m_s(log), default=0.0)
     if fastest_m_s > _SPEED_SHARE * plan.speed_m_s + _SPEED_M_S:
         yield f"it drove at {fastest_m_s:.2f} m/s instead of {plan.speed_m_s:g} m/s"

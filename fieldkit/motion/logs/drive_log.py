@@ -99,7 +99,7 @@ class DriveMoment:
     utc_ns: int = 0
 
     @property
-    def off_m(self) -> float:
+    def distance_m(self) -> float:
         """Distance from the start."""
         return math.hypot(self.x_m, self.y_m)
 
@@ -147,10 +147,10 @@ def measure(log: Sequence[DriveMoment] | None) -> Measured:
     all_speeds_m_s = (*outward_speeds_m_s, *speeds_m_s([record for record in log if record.phase == "back"]))
     values: dict[str, Value | None] = {
         "drive_out_m": outward[-1].driven_m if outward else None,
-        "drive_farthest_m": max(record.off_m for record in log),
+        "drive_farthest_m": max(record.distance_m for record in log),
         "drive_speed_median_m_s": float(np.median(outward_speeds_m_s)) if outward_speeds_m_s else None,
         "drive_speed_max_m_s": max(all_speeds_m_s, default=None),
-        "drive_back_off_m": None if home is None else home.off_m,
+        "drive_back_off_m": None if home is None else home.distance_m,
         "drive_back_turned_rad": None if home is None else home.yaw_rad,
         "drive_ended": log[-1].ended or None,
     }

@@ -50,7 +50,7 @@ def contradictions(log: Sequence[FlightMoment], plan: FlyPlan) -> Iterator[str]:
         yield "two consecutive positions are farther apart than the speeds allow"
     for direction, distance_m, limit_m in (
         ("high", max(moment.up_m for moment in log), plan.highest_m + POSITION_ERROR_M),
-        ("away", max(moment.off_m for moment in log), plan.farthest_m + POSITION_ERROR_M),
+        ("away", max(moment.distance_m for moment in log), plan.farthest_m + POSITION_ERROR_M),
     ):
         if distance_m > limit_m:
             allowed_m = limit_m - POSITION_ERROR_M

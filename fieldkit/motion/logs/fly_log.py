@@ -81,7 +81,7 @@ class FlightMoment:
     utc_ns: int = 0
 
     @property
-    def off_m(self) -> float:
+    def distance_m(self) -> float:
         """Horizontal distance from the origin."""
         return math.hypot(self.ahead_m, self.left_m)
 
@@ -122,9 +122,9 @@ def measure(log: Sequence[FlightMoment] | None) -> Measured:
     values: dict[str, Value | None] = {
         "fly_height_median_m": float(np.median(heights_m)) if heights_m else None,
         "fly_height_max_m": max(moment.up_m for moment in log),
-        "fly_farthest_m": max(moment.off_m for moment in log),
+        "fly_farthest_m": max(moment.distance_m for moment in log),
         "fly_speed_median_m_s": float(np.median(speeds_m_s)) if speeds_m_s else None,
         "fly_speed_max_m_s": max(moment.speed_m_s for moment in log),
-        "fly_back_off_m": log[-1].off_m if log[-1].phase == DESCENDING else None,
+        "fly_back_off_m": log[-1].distance_m if log[-1].phase == DESCENDING else None,
     }
     return Measured.from_optional(values, "the log has no line of this phase of the flight")

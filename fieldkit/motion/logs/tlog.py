@@ -294,7 +294,7 @@ def _possible_value(column: Column, value: Value | None) -> Value | None:
     """Return the value converted to the column's type; None if it is outside of the column's bounds."""
     if value is None or isinstance(value, bool | str):
         return value
-    low, high = column.possible
+    low, high = column.possible_range
     return column.type(value + 0) if low <= value <= high else None  # adding 0 converts -0 to 0
 
 

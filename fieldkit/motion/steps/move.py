@@ -259,7 +259,7 @@ class MoveStep(
         if log is None:
             return measured
         during_ns = (log[0].utc_ns, log[-1].utc_ns) if log[0].utc_ns else None
-        away_m = max(moment.off_m for moment in log)
+        away_m = max(moment.distance_m for moment in log)
         reason = recorded_positions.travel_contradiction(
             view.evidence, self.robot, away_m, self.motion.speed_m_s, during_ns
         )

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.cli import shared_arguments as shared
-from fieldkit.cli.display import show_error, show_note, table
+from fieldkit.cli.display import print_table, show_error, show_note
 from fieldkit.cli.parser import Parser
 from fieldkit.core.errors import EvidenceError, FieldkitError, shell_command
 from fieldkit.core.text import json_text, print_text
@@ -81,7 +81,7 @@ def _show(path: Path, bag_contents: BagContents) -> None:
         for topic in bag_contents.topics
     ]
     if rows:
-        table(("topic", "type", "messages", "Hz"), rows, right=(2, 3))
+        print_table(("topic", "type", "messages", "Hz"), rows, right=(2, 3))
     _show_problems(path, bag_contents)
 
 

@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 
 from fieldkit.agent.messaging.middleware import Network
 from fieldkit.cli import shared_arguments as shared
-from fieldkit.cli.display import show_error, show_note, table
+from fieldkit.cli.display import print_table, show_error, show_note
 from fieldkit.cli.parser import Parser
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import BRIDGE_IS_UP, ROS_MASTER_PORT
@@ -236,7 +236,7 @@ def _show(counts: Sequence[CrossingCounts]) -> None:
         )
         for topic_counts in counts
     ]
-    table(header, rows, right=range(2, len(header)))
+    print_table(header, rows, right=range(2, len(header)))
 
 
 def _milliseconds(delay_s: float | None) -> str:

@@ -32,7 +32,12 @@ _LOSS: Final = Quantity(
     (0.0, 1.0),
 )
 _DELAY: Final = Quantity(
-    "topic_delay_p95_s", "delay, 95 %", Kind.MEDIAN, "s", possible=(0.0, math.inf), of_sent="topic_delay_p95_sent_s"
+    "topic_delay_p95_s",
+    "delay, 95 %",
+    Kind.MEDIAN,
+    "s",
+    possible_range=(0.0, math.inf),
+    of_sent="topic_delay_p95_sent_s",
 )
 
 

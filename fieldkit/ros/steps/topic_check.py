@@ -25,8 +25,9 @@ from fieldkit.trial.plan import Plan
 
 RECORD_S: Final = 2.0
 LONGEST_S: Final = 20.0
+"""Shortest and longest duration of the recording."""
 MESSAGES: Final = 2
-"""Number of messages of a slow topic for which the recording waits, at most for `LONGEST_S`."""
+"""The recording is long enough for this number of messages of the slowest topic, within these limits."""
 TOLERANCE: Final = 0.5
 """Allowed deviation of a topic's rate, as a fraction of the rate."""
 
@@ -56,7 +57,7 @@ def check_topics(plan: Plan, role: Role, shell: Shell, probe_result: ProbeResult
     topics = tuple(dict.fromkeys((*topics_to_check, *((battery,) if battery else ()))))
     if not topics or not can_record(plan, role, probe_result):
         return
-    step = recording(role, robot, topics)
+    step = recording_step(role, robot, topics)
     scene = plan.scene(
         RepeatId(plan.protocols[0], 1), jobs.work_folder(plan.trial, "check"), {role: probe_result.variants}
     )
@@ -116,7 +117,7 @@ def rate_of(robot: Robot, topic: str) -> float | None:
     return next((entry.rate for entry in robot.profile.topics if entry.name == topic), None)
 
 
-def recording(role: Role, robot: Robot, topics: Sequence[str]) -> RecordStep:
+def recording_step(role: Role, robot: Robot, topics: Sequence[str]) -> RecordStep:
     """Return the shortest recording step that covers every topic."""
     slowest_s = max((1 / rate_hz for topic in topics if (rate_hz := rate_of(robot, topic))), default=0.0)
     duration_s = max(RECORD_S, min(MESSAGES * slowest_s, LONGEST_S))

@@ -236,7 +236,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
     @override
     def output_columns(self) -> tuple[Column, ...]:
         """Return the columns of topics, which only trials with this step have."""
-        from fieldkit.ros.streams import sample_reads, topic_columns, topic_stalls  # noqa: PLC0415 (only this step)
+        from fieldkit.ros.streams import sample_reads, topic_columns, topic_stalls  # noqa: PLC0415 (needed only by this step)
 
         read_columns = sample_reads.declare_columns(self._reads_prefix, "topic_sent") if self.reads else ()
         return (*topic_columns.COLUMNS, *topic_stalls.COLUMNS, *read_columns)
@@ -244,7 +244,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
     @override
     def check(self, view: View) -> Iterator[str]:
         """Yield a reason if a log is incomplete, or contradicts the other log, the attempt or the captures."""
-        from fieldkit.ros.streams import topic_evidence  # noqa: PLC0415 (as above)
+        from fieldkit.ros.streams import topic_evidence  # noqa: PLC0415 (needed only by this step)
 
         logs, errors = topic_evidence.read(self, view, self._logs)
         yield from errors
@@ -256,7 +256,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
 
     @override
     def measure(self, view: View) -> Measured:
-        from fieldkit.ros.streams import topic_columns, topic_evidence, topic_stalls  # noqa: PLC0415 (as above)
+        from fieldkit.ros.streams import topic_columns, topic_evidence, topic_stalls  # noqa: PLC0415 (needed only by this step)
 
         logs, _ = topic_evidence.read(self, view, self._logs)
         ends = logs.get(self.sender), logs.get(self.receiver)
@@ -269,7 +269,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
         measured = topic_evidence.without_contradicted_times(self, view, logs, measured)
         return (
             measured
-            | topic_columns.withheld_mark(topic_evidence.dropped_reason(self, view))
+            | topic_columns.measure_withheld(topic_evidence.dropped_reason(self, view))
             | self._measure_reads(view, ends, packets)
         )
 
@@ -282,11 +282,11 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
         """Return the columns of the reads of the newest sample."""
         if self.reads is None:
             return Measured()
-        from fieldkit.ros.streams import sample_reads  # noqa: PLC0415 (as above)
+        from fieldkit.ros.streams import sample_reads  # noqa: PLC0415 (needed only by this step)
 
         addresses = (view.scene.robot(role).address for role in (self.sender, self.receiver))
         plan = sample_reads.ReadPlan(self._reads_prefix, self.reads.rate, self.reads.limit, 1 / self.rate)
-        return sample_reads.measure(plan, *ends, *sample_reads.read_clocks(*packets, *addresses))
+        return sample_reads.measure(plan, *ends, *sample_reads.find_clocks(*packets, *addresses))
 
     @property
     def _reads_prefix(self) -> str:
@@ -295,7 +295,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
 
     def deliveries(self, view: View) -> "Sequence[StreamDeliveries]":
         """Return the deliveries of the stream; see `SendsFlow.deliveries`."""
-        from fieldkit.ros.streams import topic_stalls  # noqa: PLC0415 (as above)
+        from fieldkit.ros.streams import topic_stalls  # noqa: PLC0415 (needed only by this step)
 
         return topic_stalls.read_deliveries(
             self._traffic(view), self._both_logs(view), self._packets(view), self._schedule
@@ -313,7 +313,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
         return self.receiver
 
     def _traffic(self, view: View) -> "TopicTraffic":
-        from fieldkit.ros.streams import topic_columns  # noqa: PLC0415 (as above)
+        from fieldkit.ros.streams import topic_columns  # noqa: PLC0415 (needed only by this step)
 
         return topic_columns.TopicTraffic(
             sender_address=view.scene.robot(self.sender).address,
@@ -325,7 +325,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
 
     def _both_logs(self, view: View) -> "tuple[TopicLog | None, TopicLog | None]":
         """Return the complete logs of publisher and subscriber."""
-        from fieldkit.ros.streams import topic_evidence  # noqa: PLC0415 (as above)
+        from fieldkit.ros.streams import topic_evidence  # noqa: PLC0415 (needed only by this step)
 
         logs, _ = topic_evidence.read(self, view, self._logs)
         return logs.get(self.sender), logs.get(self.receiver)
@@ -337,7 +337,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
 
     @property
     def _schedule(self) -> "FlowSchedule":
-        from fieldkit.measure.transfers.deliveries import FlowSchedule  # noqa: PLC0415 (as above)
+        from fieldkit.measure.transfers.deliveries import FlowSchedule  # noqa: PLC0415 (needed only by this step)
 
         # The last sample is sent one interval before the end.
         return FlowSchedule(interval_s=1 / self.rate, duration_s=max(self.duration - 1 / self.rate, 0.0))

@@ -203,7 +203,7 @@ class VideoStep(AlongStep, Prepares, HasNeeds, UsesSpace, Listens, SendsTraffic,
     @override
     def check(self, view: View) -> Iterator[str]:
         """Yield a reason if a log is incomplete, or contradicts the other log, the attempt or the captures."""
-        from fieldkit.ros.streams import topic_checks, topic_evidence  # noqa: PLC0415 (as above)
+        from fieldkit.ros.streams import topic_checks, topic_evidence  # noqa: PLC0415 (needed only by this step)
 
         logs, errors = topic_evidence.read_logs(view, self._files)
         yield from errors
@@ -219,7 +219,7 @@ class VideoStep(AlongStep, Prepares, HasNeeds, UsesSpace, Listens, SendsTraffic,
 
     def _plan(self) -> "TopicPlan":
         """Return the settings with which the logs are compared."""
-        from fieldkit.ros.streams import topic_checks  # noqa: PLC0415 (as above)
+        from fieldkit.ros.streams import topic_checks  # noqa: PLC0415 (needed only by this step)
 
         width, height = dimensions(self.size)
         return topic_checks.TopicPlan(
@@ -239,8 +239,8 @@ class VideoStep(AlongStep, Prepares, HasNeeds, UsesSpace, Listens, SendsTraffic,
 
     @override
     def measure(self, view: View) -> Measured:
-        from fieldkit.ros.streams import sample_reads, topic_evidence  # noqa: PLC0415 (as above)
-        from fieldkit.ros.video import video_columns  # noqa: PLC0415 (as above)
+        from fieldkit.ros.streams import sample_reads, topic_evidence  # noqa: PLC0415 (needed only by this step)
+        from fieldkit.ros.video import video_columns  # noqa: PLC0415 (needed only by this step)
 
         logs, _ = topic_evidence.read_logs(view, self._files)
         roles = self.sender, self.receiver
@@ -250,7 +250,7 @@ class VideoStep(AlongStep, Prepares, HasNeeds, UsesSpace, Listens, SendsTraffic,
         sender, receiver = (capture.packets if capture else None for capture in captures)
         plan = sample_reads.ReadPlan("seen", self.reads.rate, self.reads.limit, 1 / self.rate)
         addresses = (view.scene.robot(role).address for role in roles)
-        clocks, unknown_clocks = sample_reads.read_clocks(sender, receiver, *addresses)
+        clocks, unknown_clocks = sample_reads.find_clocks(sender, receiver, *addresses)
         return (
             video_columns.measure_frames(sent, received)
             | video_columns.measure_packets(rtp_sent, rtp_received, received, 1 / self.rate)
@@ -259,7 +259,7 @@ class VideoStep(AlongStep, Prepares, HasNeeds, UsesSpace, Listens, SendsTraffic,
 
     def _rtp_packets(self, view: View, role: Role) -> "RtpPackets | None":
         """Return the packets of the video in a robot's capture; None without a complete capture."""
-        from fieldkit.ros.video import rtp_packets  # noqa: PLC0415 (as above)
+        from fieldkit.ros.video import rtp_packets  # noqa: PLC0415 (needed only by this step)
 
         name = capture_around(view.within, role)
         return (

@@ -167,7 +167,7 @@ def measure(
     return _named(plan, values, names)
 
 
-def read_clocks(
+def find_clocks(
     sender: Packets | None, receiver: Packets | None, sender_address: str, receiver_address: str
 ) -> tuple[Clocks | None, str]:
     """Return the clock offset of two robots for `measure`, and the reason why it is unknown.

@@ -228,8 +228,8 @@ def withheld_reasons(measured: Measured, reason: str) -> dict[str, str]:
     return {name: reason for name in sorted(names) if name not in measured.values}
 
 
-def withheld_mark(reason: str) -> Measured:
-    """Return the column that marks a topic that was measured without its captures.
+def measure_withheld(reason: str) -> Measured:
+    """Return the column `topic_capture_withheld`.
 
     Args:
         reason: The reason why the captures are not used; empty if they are used.

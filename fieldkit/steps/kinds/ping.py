@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import product
 from typing import TYPE_CHECKING, Annotated, Final, Self
 
 import numpy as np
@@ -9,6 +10,7 @@ from typing_extensions import override
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
+from fieldkit.config.profiles import LinkName
 from fieldkit.config.schema import Bool, Duration, Field, Int, Strict
 from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import EvidenceError
@@ -33,6 +35,7 @@ from fieldkit.steps.view import View, capture_around
 
 if TYPE_CHECKING:
     from fieldkit.measure.checks.ping_duplicates import PingEchoes
+    from fieldkit.measure.checks.ping_links import LinkEnds
 
 REPLY_TIMEOUT_S: Final = 2
 """Time that ping waits for the reply to its last request (option `-W`)."""
@@ -91,6 +94,9 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
         duplicates: Whether a column reports the requests and replies that arrived again over another link,
             `rtt_duplicates`. It needs `over` with a link whose interface is `lo`, and a `capture` over this link on
             both robots around the ping.
+        links: Names of links for each of which columns report the requests that left over it, those of them that were
+            lost, duplicates, and the failover time: `rtt_over_LINK_sent`, `..._lost`, `..._duplicates`,
+            `..._failover_s`. It needs the same as `duplicates`.
         forwarded: Whether robots forward packets for each other; the checks then require a routing daemon on each.
     """
 
@@ -106,6 +112,7 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
     payload_bytes: Payloads = Payloads.defaults()
     gap: Bool = Field(default=False, exclude_if=schema.is_empty)
     duplicates: Bool = Field(default=False, exclude_if=schema.is_empty)
+    links: list[LinkName] = Field(default_factory=list, exclude_if=schema.is_empty)
     forwarded: Bool = Field(default=False, exclude_if=schema.is_empty)
 
     @schema.model_validator(mode="after")
@@ -116,13 +123,19 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
 
     @override
     def placement_error(self, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
-        if not self.duplicates:
+        if not self._needs_interfaces:
             return super().placement_error(earlier, within)
+        key = "duplicates" if self.duplicates else "links"
         if self.count > MAX_SEQUENCE_COUNT:
-            return f"duplicates allows at most {MAX_SEQUENCE_COUNT} requests, because their numbers repeat"
+            return f"{key} allows at most {MAX_SEQUENCE_COUNT} requests, because their numbers repeat"
         if not self.over or not all(capture_around(within, role) for role in (self.sender, self.receiver)):
-            return "duplicates needs `over`, and a capture on both robots around the ping"
+            return f"{key} needs `over`, and a capture on both robots around the ping"
         return super().placement_error(earlier, within)
+
+    @property
+    def _needs_interfaces(self) -> bool:
+        """True if columns need the interface over which each echo arrived."""
+        return self.duplicates or bool(self.links)
 
     @override
     def with_duration(self, seconds: float) -> Self:
@@ -131,6 +144,8 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
+        for link, role in product(self.links, (self.sender, self.receiver)):
+            scene.link(role, link)  # raises ConfigurationError if the robot has no such link
         requests = ("-c", str(self.count), "-i", f"{self.interval:g}", "-s", str(self.payload_of(scene.protocol)))
         options = (*requests, "-W", str(REPLY_TIMEOUT_S))
         yield Planned(
@@ -215,8 +230,8 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
             f"{self._file}: {reason}"
             for reason in ping_checks.check_output(result, self.count, payload_bytes, window)
         )
-        if self.duplicates:
-            from fieldkit.measure.checks import ping_duplicates  # noqa: PLC0415 (only with `duplicates: true`)
+        if self._needs_interfaces:
+            from fieldkit.measure.checks import ping_duplicates  # noqa: PLC0415 (only with several links)
 
             reasons = ping_duplicates.contradictions(result, self.interval, *self._captured_echoes(view))
             yield from (f"{self._file}: {reason}" for reason in reasons)
@@ -267,6 +282,18 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
         size_bytes = self.payload_of(view.scene.protocol) + _HEADER_BYTES
         captures = (view.capture(role) for role in (self.sender, self.receiver))
         return tuple(captured_echoes(capture, source, destination, size_bytes) for capture in captures)
+
+    def _link_ends(self, view: View) -> "dict[str, LinkEnds]":
+        """Return the indices of the interfaces of each link."""
+        from fieldkit.measure.checks.ping_links import LinkEnds  # noqa: PLC0415 (only with `links`)
+        from fieldkit.measure.robot_state.interfaces import read_indices  # noqa: PLC0415 (as above)
+
+        roles = (self.sender, self.receiver)
+        indices = {role: read_indices(view.evidence, role) for role in roles}
+        return {
+            link: LinkEnds(*(indices[role].get(view.scene.link(role, link).interface) for role in roles))
+            for link in self.links
+        }
 
     def _packets_missing_in_capture(self, result: Ping, role: Role, view: View) -> Iterator[str]:
         """Yield a reason if ping printed more answers, or more answered requests, than a capture contains.
@@ -326,6 +353,10 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
             from fieldkit.measure.checks import ping_duplicates  # noqa: PLC0415 (only with `duplicates: true`)
 
             chosen += ping_duplicates.COLUMNS
+        if self.links:
+            from fieldkit.measure.checks import ping_links  # noqa: PLC0415 (only with `links`)
+
+            chosen += [column for link in self.links for column in ping_links.declare_columns(link)]
         return (*self.columns, *chosen)
 
     @override
@@ -343,10 +374,16 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
             from fieldkit.measure.checks import ping_duplicates  # noqa: PLC0415 (only with `duplicates: true`)
 
             duplicates = ping_duplicates.measure(*self._captured_echoes(view))
+        by_link = Measured()
+        if self.links:
+            from fieldkit.measure.checks import ping_links  # noqa: PLC0415 (only with `links`)
+
+            by_link = ping_links.measure(self._link_ends(view), *self._captured_echoes(view))
         return (
             ping.measure(result)
             | gap
             | duplicates
+            | by_link
             | position_columns.measure(view.evidence, ping.MOTION_COLUMNS, ends, reply_times_ns)
         )
 

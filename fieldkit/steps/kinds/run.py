@@ -11,7 +11,7 @@ from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.named_programs import NamedProgram
 from fieldkit.config.schema import AfterValidator, Bool, Bytes, Duration, Field, Int, Number, Strict
-from fieldkit.core.columns import Column, Figure, Kind, Measured, Value, cell
+from fieldkit.core.columns import Column, Figure, Kind, Measured, Value, cell_text
 from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Protocol, Role
@@ -368,6 +368,6 @@ class RunStep(Step, UsesSpace, Summarizes):
         for column in self.figures:
             if column.name in values:
                 value = values[column.name]
-                value_text = f"{value:.4g}" if isinstance(value, float) else cell(value)
+                value_text = f"{value:.4g}" if isinstance(value, float) else cell_text(value)
                 unit = "" if column.unit in {"text", "bool", "count", "hash"} else f" {column.unit}"
                 yield f"{column.label or column.name} {value_text}{unit}"

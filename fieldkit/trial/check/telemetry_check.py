@@ -3,7 +3,7 @@
 import os
 
 from fieldkit.config.profiles import TELEMETRY
-from fieldkit.core.columns import cell
+from fieldkit.core.columns import cell_text
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Role
 from fieldkit.remote.script import CALL, REPLY_S
@@ -35,7 +35,9 @@ def check_sources(plan: Plan, role: Role, shell: Shell, probe_result: ProbeResul
             output = shell.run(words, deadline=Deadline.after(source.limit + REPLY_S), check=False).stdout
         readings = source_readings.parse(output, source)
         if readings.values:
-            values_text = ", ".join(f"{quantity} {cell(value)}" for quantity, value in readings.values[0].items())
+            values_text = ", ".join(
+                f"{quantity} {cell_text(value)}" for quantity, value in readings.values[0].items()
+            )
             report.ok(f"telemetry {name}", values_text)
         else:
             reason = readings.reason or "the query did not end"

@@ -82,7 +82,7 @@ def merge_columns(declared: Iterable[tuple[Path, Iterable[Column]]]) -> dict[str
                     remedy="combine only trials in which the column is the same",
                 )
             if first.bounds != column.bounds:
-                (low, high), (other_low, other_high) = first.possible, column.possible
+                (low, high), (other_low, other_high) = first.possible_range, column.possible_range
                 merged[column.name] = first_path, replace(first, bounds=(min(low, other_low), max(high, other_high)))
     return {name: column for name, (_, column) in merged.items()}
 

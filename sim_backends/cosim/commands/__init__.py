@@ -1,1 +1,1 @@
-"""The commands `fieldkit cosim ...`; any package can add commands in this way (docs/add-a-command.md)."""
+"""The commands `fieldkit cosim ...`. Other packages can add commands in the same way (docs/add-a-command.md)."""

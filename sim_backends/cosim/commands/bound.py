@@ -22,14 +22,16 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.bounds import BoundCost, FixedCost, bound_cost, fixed_cost, longest_sufficient_window
 from sim_backends.cosim.studies.seeds import Task, run_many
 
-_COLUMNS: Final = (
-    SheetColumn("seed", "seed", ""),
+_SEED: Final = SheetColumn("seed", "seed", "")
+_BOUND: Final = (
     SheetColumn("largest_m", "largest (mm)", "position error with error_bounded", 1e3),
     SheetColumn("exchanges", "exchanges", "with error_bounded"),
     SheetColumn("added_s", "added (ms)", "mean delay that error_bounded adds", 1e3),
     SheetColumn("all_window_s", "all runs (ms)", "longest fixed window that keeps the bound in all runs", 1e3),
     SheetColumn("all_exchanges", "fixed", "exchanges with that window"),
     SheetColumn("all_factor", "factor", "ratio of fixed to exchanges"),
+)
+_WINDOW_OF_RUN: Final = (
     SheetColumn("found_window_s", "this run (ms)", "longest fixed window that keeps the bound in this run", 1e3),
     SheetColumn("found_exchanges", "fixed", "exchanges with that window"),
     SheetColumn("found_factor", "factor", "ratio of fixed to exchanges"),
@@ -110,13 +112,15 @@ def _sheet(
         for index, (seed, cost) in enumerate(zip(seeds, costs, strict=True))
     ]
     title = f"{scenario.name}, {scenario.topology}: a bound of {number_text(scenario.policy.bound * 1e3)} mm"
-    names = [column.name for column in _COLUMNS]
     return Sheet(
-        _COLUMNS,
+        (_SEED, *_BOUND, *_WINDOW_OF_RUN),
         rows,
         [
-            SheetPart(title, names[:7]),
-            SheetPart("longest fixed window of each run, determined after the run", [names[0], *names[7:]]),
+            SheetPart(title, [column.name for column in (_SEED, *_BOUND)]),
+            SheetPart(
+                "longest fixed window of each run, determined after the run",
+                [column.name for column in (_SEED, *_WINDOW_OF_RUN)],
+            ),
         ],
     )
 

@@ -3,7 +3,7 @@
 import argparse
 from typing import Final
 
-from fieldkit.cli.display import show_note, table
+from fieldkit.cli.display import print_table, show_note
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.text import json_text, print_text
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, show_all
@@ -36,9 +36,9 @@ def list_all(arguments: argparse.Namespace) -> int:
             show_note(f"{error.located}: this sync policy is omitted")
     simulator_rows = simulators()
     if arguments.format == "table":
-        table([column.head for column in _SCENARIO], scenario_rows)
-        table([column.head for column in _SIMULATOR], simulator_rows)
-        table([column.head for column in _POLICY], policy_rows)
+        print_table([column.head for column in _SCENARIO], scenario_rows)
+        print_table([column.head for column in _SIMULATOR], simulator_rows)
+        print_table([column.head for column in _POLICY], policy_rows)
         return 0
     sheets = {
         "scenarios": Sheet(_SCENARIO, scenario_rows, [SheetPart("scenarios", ("scenario", "summary"))]),

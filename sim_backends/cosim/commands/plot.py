@@ -37,7 +37,7 @@ _LOCAL_ERRORS: Final = {
 
 @dataclass(frozen=True)
 class CostPoint:
-    """The errors and the cost of a policy with a window; an error is nan if there are no packets to measure it.
+    """The errors and the cost of a policy, with one window; an error is nan if there are no packets to measure it.
 
     Attributes:
         policy: Its name.
@@ -116,12 +116,11 @@ def error_against_window(by_policy: Mapping[str, LocalErrors]) -> Callable[[Form
     """Return a function that draws local errors against the window: a panel per error, a curve per policy."""
     panels = []
     for measure, (panel_title, label, factor) in _LOCAL_ERRORS.items():
-        curves = [
-            Curve(name, x, y, f"{name}\norder {order_text(errors, measure)}")
-            for name, errors in by_policy.items()
-            if len((points := _positive_points(errors, measure, factor))[0]) > 1
-            for x, y in (points,)
-        ]
+        curves = []
+        for name, errors in by_policy.items():
+            windows_ms, values = _positive_points(errors, measure, factor)
+            if len(windows_ms) > 1:
+                curves.append(Curve(name, windows_ms, values, f"{name}\norder {order_text(errors, measure)}"))
         if curves:
             panels.append(LogPanel(panel_title, "window (ms)", label, curves, labels_at_right=True))
     return lambda form: plots.log_figure(panels, form)

@@ -358,7 +358,11 @@ def seed_result(
     """
     ended_s = run.windows_ns[-1] / 1e9 if run.windows_ns else 0.0
     error = ended_by if isinstance(ended_by, FieldkitError) else None
-    stop_reason = error.located if error is not None else f"interrupted at {ended_s:g} s"
+    stop_reason = ""
+    if error is not None:
+        stop_reason = error.located
+    elif ended_by is not None:
+        stop_reason = f"interrupted at {ended_s:g} s"
     return SeedResult(
         seed=seed,
         flows=flow_results(run),
@@ -370,7 +374,7 @@ def seed_result(
         | {agent: state.position_m for agent, state in (starts or {}).items()},
         recoveries=recoveries(scenario, run),
         formation=compute_formation(scenario, tracks_of(states)),
-        stop_reason="" if ended_by is None else stop_reason,
+        stop_reason=stop_reason,
         error=error,
         lateness=lateness,
     )

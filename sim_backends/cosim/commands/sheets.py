@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final
 
-from fieldkit.cli.display import table
+from fieldkit.cli.display import print_table
 from fieldkit.core.columns import csv_text
 from fieldkit.core.text import json_text, print_text
 
@@ -135,7 +135,7 @@ def _table(sheet: Sheet) -> None:
     for part in sheet.parts:
         heads, rows = sheet.part_cells(part)
         right = [index for index in range(len(heads)) if all(_NUMBER.fullmatch(row[index]) for row in rows)]
-        table(heads, rows, title=part.title, right=right)
+        print_table(heads, rows, title=part.title, right=right)
         legend = sheet.legend(part, explained_heads)
         explained_heads |= legend.keys()
         if legend:

@@ -23,10 +23,12 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.formation import compute_formation, has_followers
 from sim_backends.cosim.studies.shootout import Row, rows, run_outcomes
 
-COLUMNS: Final = (
+_ROW: Final = (
     SheetColumn("policy", "policy", ""),
     SheetColumn("window_s", "w (ms)", "window", 1e3),
     SheetColumn("seeds", "seeds", "number of runs in the means"),
+)
+_TIMES: Final = (
     SheetColumn(
         "delivery_error_mean_s",
         "time (ms)",
@@ -40,6 +42,8 @@ COLUMNS: Final = (
     SheetColumn(
         "causality_violations", "late", "arrivals per run at a time that was already in the past of the receiver"
     ),
+)
+_POSITIONS: Final = (
     SheetColumn("position_error_mean_m", "position (mm)", "mean error of relative positions in the network", 1e3),
     SheetColumn("position_error_p95_m", "p95", "its 95th percentile", 1e3),
     SheetColumn("position_error_max_m", "max", "its maximum", 1e3),
@@ -50,19 +54,17 @@ COLUMNS: Final = (
         1e3,
     ),
     SheetColumn("path_error_max_m", "max", "its maximum", 1e3),
+)
+_COSTS: Final = (
     SheetColumn("exchanges_per_s", "per s", "exchanges per simulated second"),
     SheetColumn("wall_agents", "agents (%)", "share of wall time in physics and programs", 100),
     SheetColumn("wall_network", "network", "share of wall time in the network", 100),
     SheetColumn("wall_exchange", "exchange", "share of wall time in the coordinator", 100),
     SheetColumn("wall_wait", "wait", "share of wall time in federates that only waited", 100),
     SheetColumn("real_time_factor", "speed", "simulated time over wall time"),
-    *FORMATION,
 )
+COLUMNS: Final = (*_ROW, *_TIMES, *_POSITIONS, *_COSTS, *FORMATION)
 _ROUNDING: Final = 1e-6
-_TIME_COLUMNS: Final = ("policy", *(column.name for column in COLUMNS[3:9]))
-_POSITION_COLUMNS: Final = ("policy", *(column.name for column in COLUMNS[9:14]))
-_COST_COLUMNS: Final = ("policy", *(column.name for column in COLUMNS[14:20]))
-_FOLLOWER_COLUMNS: Final = ("policy", *(column.name for column in FORMATION))
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -147,19 +149,22 @@ def _build(scenario: CosimScenario, policy: str, seed: int) -> Simulation:
 def _sheet(scenario: CosimScenario, all_rows: Sequence[tuple[float, Row]], seeds: Sequence[int]) -> Sheet:
     name = f"{scenario.name}, {scenario.topology}, {format_count(len(seeds), 'seed')}"
     windows_s = {window_s for window_s, _ in all_rows}
+    row_labels = ["policy", "window_s"]
     if len(windows_s) == 1:
         name += f", window {windows_s.pop() * 1e3:g} ms"
-        window: tuple[str, ...] = ()
-    else:
-        window = ("window_s",)
+        row_labels = ["policy"]
+
+    def part(title: str, columns: Sequence[SheetColumn]) -> SheetPart:
+        return SheetPart(title, [*row_labels, *(column.name for column in columns)])
+
     return Sheet(
         COLUMNS,
         [_values(window_s, row) for window_s, row in all_rows],
         [
-            SheetPart(f"{name}: packets against the exact reference, {EventDriven.name}", (*window, *_TIME_COLUMNS)),
-            SheetPart("positions", (*window, *_POSITION_COLUMNS)),
-            *([SheetPart("followers", (*window, *_FOLLOWER_COLUMNS))] if has_followers(scenario) else []),
-            SheetPart("cost", (*window, *_COST_COLUMNS)),
+            part(f"{name}: packets against the exact reference, {EventDriven.name}", _TIMES),
+            part("positions", _POSITIONS),
+            *([part("followers", FORMATION)] if has_followers(scenario) else []),
+            part("cost", _COSTS),
         ],
     )
 

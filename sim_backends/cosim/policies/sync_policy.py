@@ -88,7 +88,7 @@ class SyncPolicy(Protocol):
         The end may be between physics steps. None means that the window lasts until the end of the run.
 
         Raises:
-            PolicyError: The policy has no window for this situation.
+            PolicyError: The policy cannot determine a window for this situation.
         """
         ...
 

@@ -226,4 +226,5 @@ class Playback:
 def file_pieces(size_bytes: int, piece_bytes: int) -> list[BagMessage]:
     """Return a file as messages of at most `piece_bytes` that are all due at the same time."""
     full_pieces, last_bytes = divmod(size_bytes, piece_bytes)
-    return [BagMessage(0, size) for size in (*[piece_bytes] * full_pieces, *([last_bytes] if last_bytes else []))]
+    sizes_bytes = [piece_bytes] * full_pieces + ([last_bytes] if last_bytes else [])
+    return [BagMessage(0, size) for size in sizes_bytes]

@@ -41,7 +41,7 @@ class Sampling:
         self._due_ns = every_ns
 
     def is_due(self, end_ns: int) -> bool:
-        """Return True if the states at the end of this window are recorded; called once per window, in order."""
+        """Return True if the states at the end of a window must be recorded; call it once per window, in order."""
         if end_ns < self._due_ns:
             return False
         self._due_ns = (end_ns // self._every_ns + 1) * self._every_ns
@@ -179,7 +179,7 @@ class RunRecorder:
         """
         states = window.states if self._sampling.is_due(window.end_ns) else _NO_STATES
         # The states of all windows would need too much memory.
-        self._windows.append(Window(*window[:5], states, _NO_STATES, window.wall_s))
+        self._windows.append(window._replace(states=states, assumed_states=_NO_STATES))
         if len(self._windows) >= _MAX_WINDOWS or time.perf_counter() - self._last_write_s >= self._part_every_s:
             self._write_part()
             self._last_write_s = time.perf_counter()

@@ -188,8 +188,8 @@ def path_points_m(plan: WayPointsPlan, start_m: Vector) -> list[Vector]:
 
 
 START_INTERVAL_S: Final = 0.1
-"""Traffic without a period begins at a random time in this interval, which is the default of the scenario's key
-`policy.longest`, the longest window."""
+"""Traffic without a period begins at a random time in an interval of this length, which equals the default of the
+scenario's key `policy.longest`, the longest window."""
 
 
 def make_programs(

@@ -45,7 +45,7 @@ class EmaneObserver(AbstractContextManager["EmaneObserver"]):
 
     Args:
         options: The event channel.
-        nems: NEM identifier of each agent.
+        nems: Identifier of the NEM (EMANE's term for a radio) of each agent.
         losses: Returns the path losses; None to publish locations only.
         observer: The other observer, or None.
 
@@ -108,7 +108,7 @@ class EmaneObserver(AbstractContextManager["EmaneObserver"]):
         return NemLocation(nem, *self._frame.geodetic(state.position_m), emane_velocity(state.velocity_m_s))
 
     def _pathlosses(self, states: Mapping[str, State]) -> list[SerializedEvent]:
-        """Return an event for each agent, with its losses to all other agents; they are equal in both directions."""
+        """Return an event for each agent, with its path losses to all others; both directions have equal losses."""
         assert self._losses is not None
         names = [name for name in self._nems if name in states]
         losses_db = self._losses([states[name].position_m for name in names])

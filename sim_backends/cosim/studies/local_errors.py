@@ -26,9 +26,9 @@ from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.world.motion import State
 
 MEASURES: Final = ("delivery_s", "late_s", "position_m", "fates", "path_m")
-"""Error of the delivery time; time by which an arrival was in the receiver's past; error of the relative position
-of sender and receiver in the network; share of packets with another fate; position error of agents at the end of the
-window."""
+"""In this order: error of the delivery time; time by which an arrival was in the receiver's past; error of the
+relative position that the network assumed for sender and receiver; share of packets that arrived in only one of the
+two runs; position error of agents at the end of the window."""
 
 TAIL_NS: Final = 200_000_000
 """Time for which forks continue after the window, so that the fates of the affected packets are decided."""
@@ -103,12 +103,11 @@ def local_errors(
         FieldkitError: A fork changed the run from which it was forked, because an object was not copied.
     """
     shape = len(parameters), len(starts_ns)
-    results = {
-        name: LocalErrors(
-            np.zeros(shape), *({measure: np.zeros(shape) for measure in MEASURES} for _ in ("sums", "counts"))
-        )
-        for name in policies
-    }
+
+    def zeros() -> dict[str, Floats]:
+        return {measure: np.zeros(shape) for measure in MEASURES}
+
+    results = {name: LocalErrors(np.zeros(shape), zeros(), zeros()) for name in policies}
     reference = make(EventDriven())
     for column, start_ns in enumerate(starts_ns):
         _delete_decided(reference.advance(start_ns))

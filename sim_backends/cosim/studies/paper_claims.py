@@ -71,7 +71,7 @@ def claim_setups(changes: Changes) -> dict[str, Setup]:
     """Return the setups to run for the claims, by name.
 
     Args:
-        changes: Values by dotted key of the scenario file, which replace those of the file.
+        changes: Values that replace values of the scenario file, by dotted key.
 
     Raises:
         ConfigurationError: The changes are invalid.

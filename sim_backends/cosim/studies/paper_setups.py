@@ -122,7 +122,7 @@ def _flow_sample(sent_packets: int, delays_s: Sequence[float], fates: Sequence[F
 
 
 Changes = Mapping[str, Any]
-"""Values by dotted key of a scenario file, which replace those of the file."""
+"""Values that replace values of a scenario file, by dotted key."""
 
 RADIOS: Final[Mapping[str, Changes]] = MappingProxyType(
     {"wifi": MappingProxyType({}), "1 Mbit/s": MappingProxyType({"radio": {"rate": "1Mbit/s"}})}

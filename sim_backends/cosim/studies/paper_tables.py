@@ -79,6 +79,7 @@ def compare(printed: Printed, measured: IntervalEstimate) -> Agreement:
 
 
 def _or_value(bound: float, value: float) -> float:
+    """Return a bound of an interval, or the value if the bound is unknown."""
     return value if math.isnan(bound) else bound
 
 
@@ -275,7 +276,7 @@ def paper_table(table: str, changes: Mapping[str, Any]) -> PaperTable:
 
     Args:
         table: One of `TABLES`.
-        changes: Values by dotted key of the scenario file, which replace those of the file.
+        changes: Values that replace values of the scenario file, by dotted key.
 
     Raises:
         ConfigurationError: The changes are invalid.

@@ -18,7 +18,7 @@ _FEW_PACKETS: Final = 400
 
 
 def workers_for(packets: float, workers: Workers = ALL_PROCESSORS) -> Workers:
-    """Return the workers for a number of packets: without a choice of the user, only this process if it is faster.
+    """Return the workers that the user chose; without a choice, only this process if that is faster.
 
     Args:
         packets: Approximate number of packets in all runs.
@@ -42,7 +42,8 @@ class Task:
     setup: str = ""
 
     def __str__(self) -> str:
-        return f"{self.setup and f'{self.setup}, '}policy {self.policy}, seed {self.seed}"
+        setup = f"{self.setup}, " if self.setup else ""
+        return f"{setup}policy {self.policy}, seed {self.seed}"
 
 
 def run_many(

@@ -141,7 +141,7 @@ def load_combinations(
     Args:
         name_or_path: Name or path of the scenario.
         factors: The factors.
-        changes: Values by dotted key of the scenario file, which replace those of the file in all combinations.
+        changes: Values that replace values of the scenario file in all combinations, by dotted key.
 
     Raises:
         ConfigurationError: There is no such factor, or a combination is invalid.

@@ -95,7 +95,7 @@ def plan_sweep(
         name_or_path: Name or path of the scenario.
         factors: The factors.
         seeds: Seeds of each combination of values.
-        changes: Values by dotted key of the scenario file, which replace those of the file in all settings.
+        changes: Values that replace values of the scenario file in all settings, by dotted key.
 
     Raises:
         ConfigurationError: A factor or a value is invalid, or two values are the same.

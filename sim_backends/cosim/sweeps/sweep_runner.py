@@ -159,7 +159,8 @@ def run_sweep(
                 finished.add(run.name)
             elif failure is not None:
                 folder.write_failure(run, failure)
-                final_failures |= {run.name} if failure.is_final else set()
+                if failure.is_final:
+                    final_failures.add(run.name)
             report.report_end(run, failure)
     failures = [
         (run, failure) for run in missing_runs if run.name not in finished and (failure := folder.failure(run))

@@ -1,7 +1,7 @@
 """Conformance checks of the motion of a physics federate: signs, axes and units.
 
 Agents need time to accelerate, and wheels slip. The tolerances are therefore wide: for example, a robot that drives
-30 % of the commanded distance passes.
+a third of the commanded distance passes.
 """
 
 import json

@@ -136,6 +136,7 @@ class DatagramChannel:
         self._readable = select.poll()
         self._readable.register(endpoint, select.POLLIN)
         self._identity = connection, cookie
+        # Number of the next datagram with data to send, and of the next one to receive.
         self._number = self._expected = 0
         self._unacknowledged: dict[int, bytes] = {}
         self._sent_s: dict[int, float] = {}  # only datagrams that were sent once

@@ -43,7 +43,7 @@ class _Response:
             data.
         numbers: Requested samples.
         missing_fragments: Requested fragments of the sample after them.
-        is_timed_repeat: True if it is a request only because enough time has passed since the same request.
+        is_timed_repeat: True if it repeats a request only because enough time has passed since that request.
     """
 
     kind: _Kind

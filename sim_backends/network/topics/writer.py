@@ -245,7 +245,7 @@ class TopicWriter:
         for number in nack.missing:
             sample = self._history.samples.get(number)
             if sample is not None:
-                # The reader requests the other fragments of a larger sample when it has received their number.
+                # The first fragment contains the number of fragments; the reader then requests the others.
                 submessages.append(self._data(sample, 0, 1))
         self._respond(submessages)
 

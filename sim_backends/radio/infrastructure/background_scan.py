@@ -83,7 +83,7 @@ class BackgroundScan:
                 self.next_ns = now_ns + self.long_ns
 
     def _on_weak_signal(self, now_ns: int) -> None:
-        """Use the short interval, and scan immediately unless a scan was recent (bgscan_simple.c).
+        """Use the short interval, and scan immediately unless scans were recent or many (bgscan_simple.c).
 
         A scan is recent for 1 s if the long interval was in use, otherwise for 10 s.
         """

@@ -330,7 +330,7 @@ def _queues(station: Station[Payload]) -> Iterable[deque[Frame[Payload]]]:
 
 def _frames_in_exchange(station: Station[Payload]) -> Collection[Frame[Payload]]:
     """Return the frames of a station's current exchange; empty if there is none."""
-    if not station.exchange_id & 1:
+    if not station.is_in_exchange:
         return ()
     if station.aggregate is not None:
         return set(station.aggregate.frames)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.core.columns import cell
+from fieldkit.core.columns import cell_text
 from fieldkit.core.model import LinkSample, Role, StationSample
 from fieldkit.measure.evidence import link
 
@@ -85,7 +85,7 @@ def test_any_values_of_a_driver_give_valid_cells_or_are_missing(link_samples: li
     measured_link = link.measure(Role.SENDER, link_samples)
     for column in link.COLUMNS[: len(link.COLUMNS) // 2]:
         assert (column.name in measured_link.values) is not (column.name in measured_link.missing)
-        assert not column.invalid_value_reason(cell(measured_link.values.get(column.name)))
+        assert not column.invalid_value_reason(cell_text(measured_link.values.get(column.name)))
 
 
 def test_the_link_of_an_access_point_is_that_of_the_station_with_the_most_packets() -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.core.columns import Measured, cell
+from fieldkit.core.columns import Measured, cell_text
 from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence.clock import Clock
@@ -34,7 +34,7 @@ def measure(folder: Path, **values: float | str) -> Measured:
     declared_columns = (*MARK_COLUMNS, *(column for role in NAMES for column in declare_columns(role)))
     for column in declared_columns:
         assert (column.name in measured.values) != (column.name in measured.missing), column.name
-        assert column.invalid_value_reason(cell(measured.values.get(column.name))) is None
+        assert column.invalid_value_reason(cell_text(measured.values.get(column.name))) is None
     return measured
 
 

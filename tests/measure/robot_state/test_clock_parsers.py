@@ -10,6 +10,7 @@ from fieldkit.measure.robot_state import (
     chrony,
     clock_states,
     health,
+    interfaces,
     neighbourhood,
     ptp,
     snapshots,
@@ -166,7 +167,11 @@ def test_a_source_cannot_print_the_output_of_another(tmp_path: Path) -> None:
 def test_the_script_has_a_command_for_each_parser() -> None:
     script = (Path(snapshots.__file__).parents[2] / "remote" / "snapshot.sh").read_text(encoding="ascii")
     names = set(re.findall(r"start_source ([a-z-]+) ", script))
-    assert names == attempt_states.CLOCK_SOURCES | attempt_states.RADIO_SOURCES | {health.NAME, health.THROTTLED_NAME}
+    assert names == attempt_states.CLOCK_SOURCES | attempt_states.RADIO_SOURCES | {
+        health.NAME,
+        health.THROTTLED_NAME,
+        interfaces.NAME,
+    }
 
 
 def test_the_names_of_sources_that_need_a_parser_are_complete() -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.core.columns import Measured, cell
+from fieldkit.core.columns import Measured, cell_text
 from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.robot_state import attempt_states, health, state_columns
@@ -97,4 +97,4 @@ def test_a_throttled_computer_marks_the_repeat(tmp_path: Path) -> None:
     for column in (*state_columns.MARK_COLUMNS, *state_columns.declare_columns("sender")):
         assert (column.name in measured.values) != (column.name in measured.missing), column.name
         assert column.declaration_error() is None
-        assert column.invalid_value_reason(cell(measured.values.get(column.name))) is None
+        assert column.invalid_value_reason(cell_text(measured.values.get(column.name))) is None

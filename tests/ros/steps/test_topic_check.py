@@ -105,15 +105,15 @@ def test_a_topic_missing_in_the_profile_has_no_rate() -> None:
 def test_a_check_records_long_enough_for_the_slowest_topic() -> None:
     assert topic_check.required_topics(PLAN, Role.SENDER) == ("/scan",)
     assert topic_check.required_topics(PLAN, Role.RELAY) == ()
-    assert topic_check.recording(Role.SENDER, SENDER, ["/scan"]).duration == topic_check.RECORD_S
-    assert topic_check.recording(Role.RELAY, RELAY, ["/pidrone/battery"]).duration == 2.0, "two messages at 1 Hz"
+    assert topic_check.recording_step(Role.SENDER, SENDER, ["/scan"]).duration == topic_check.RECORD_S
+    assert topic_check.recording_step(Role.RELAY, RELAY, ["/pidrone/battery"]).duration == 2.0, "two messages at 1 Hz"
     topic = ros_of(RELAY.profile).topics[0].model_copy(update={"name": "/slow", "rate": 0.2})
     ros = ros_of(RELAY.profile).model_copy(update={"topics": (topic,)})
     slow_robot = RELAY.model_copy(update={"profile": RELAY.profile.model_copy(update={"ros": ros})})
-    assert topic_check.recording(Role.RELAY, slow_robot, ["/slow"]).duration == 10.0
+    assert topic_check.recording_step(Role.RELAY, slow_robot, ["/slow"]).duration == 10.0
     profile = TURTLEBOT.model_copy(update={"ros": ros_of(TURTLEBOT).model_copy(update={"variant": "ros2"})})
     ros2 = SENDER.model_copy(update={"profile": profile})
-    assert topic_check.recording(Role.SENDER, ros2, ["/scan"]).duration == 6.0, (
+    assert topic_check.recording_step(Role.SENDER, ros2, ["/scan"]).duration == 6.0, (
         "a recorder that fieldkit stops needs additional time to start"
     )
     assert topic_check.battery_of(RELAY) == "/pidrone/battery"

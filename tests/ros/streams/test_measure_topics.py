@@ -64,9 +64,9 @@ def captures(ahead_ns: int = 0, one_way_ns: int = MS // 100) -> tuple[Packets, P
 
 
 def measure(sent: TopicLog, received: TopicLog, *captured: Packets | None) -> dict[str, object]:
-    result = topic_columns.measure(FLOW, sent, received, *(captured or (None, None))) | topic_columns.withheld_mark(
-        ""
-    )
+    result = topic_columns.measure(
+        FLOW, sent, received, *(captured or (None, None))
+    ) | topic_columns.measure_withheld("")
     assert result.values.keys() | result.missing.keys() == {column.name for column in topic_columns.COLUMNS}
     return dict(result.values)
 
@@ -260,6 +260,6 @@ def test_only_columns_that_need_the_captures_are_withheld() -> None:
     assert set(reasons.values()) == {"packets were dropped"}
     assert without_captures.values.keys() >= {"topic_loss", "topic_jitter_s", "topic_delay_variation_p95_s"}
     assert topic_columns.withheld_reasons(without_captures, "") == {}
-    assert topic_columns.withheld_mark("packets were dropped").values == {
+    assert topic_columns.measure_withheld("packets were dropped").values == {
         "topic_capture_withheld": "packets were dropped"
     }

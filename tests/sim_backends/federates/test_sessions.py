@@ -135,7 +135,7 @@ def test_a_federate_that_sends_heartbeats_may_need_longer_than_the_deadline(monk
     physics.advance(0, {})
     physics.advance(2 * MS, {})
     physics.advance(3 * MS, {})
-    monkeypatch.setattr("sim_backends.federates.session.PATIENCE", 1)
+    monkeypatch.setattr("sim_backends.federates.session.BUSY_DEADLINE_FACTOR", 1)
     physics_without_patience = RemotePhysics(*Pair(FederateService(SlowPhysics), deadline_s=1.5)(hello))
     physics_without_patience.advance(0, {})
     physics_without_patience.advance(2 * MS, {})

@@ -151,8 +151,8 @@ def test_noise_corrupts_only_overlapping_frames(begin_ns: int, end_ns: int, is_c
     jammer = Jammer(power_at_receiver_dbm + path_loss_db(2), begin_ns, end_ns, position_m=(22.0, 0.0, 1.0))
     assert jammer.power_dbm - path_loss_db(22) < ENERGY_DETECTION_DBM
     (at_ns,) = run_jammed(packets([(0, "a", "b", 1000)]), jammer).arrived.values()
-    wave_ns = round(20 / SPEED_OF_LIGHT_M_S * 1e9)
-    assert (at_ns > FRAME_NS + wave_ns) is is_corrupted
+    propagation_ns = round(20 / SPEED_OF_LIGHT_M_S * 1e9)
+    assert (at_ns > FRAME_NS + propagation_ns) is is_corrupted
 
 
 @pytest.mark.parametrize(("excess_db", "is_delayed"), [(0.1, True), (-0.1, False)])

@@ -35,15 +35,15 @@ class Outcome:
     """Results of datagrams that were sent separately.
 
     Attributes:
-        packets: Share of IP packets lost with a single transmission, as in UDP.
-        datagrams: Share of datagrams with at least one lost packet.
-        repaired: Share of IP packets lost with up to four transmissions, as in TCP.
+        packet_loss: Share of IP packets lost with a single transmission, as in UDP.
+        datagram_loss: Share of datagrams with at least one lost packet.
+        loss_after_retransmission: Share of IP packets lost although they were sent up to four times, as in TCP.
         delay_s: Median time until the last packet of a complete datagram arrived.
     """
 
-    packets: float
-    datagrams: float
-    repaired: float
+    packet_loss: float
+    datagram_loss: float
+    loss_after_retransmission: float
     delay_s: float
 
 
@@ -67,9 +67,9 @@ def trial(scenario: Scenario, topology: Topology, distance: str, *, fading: bool
         missing_counts_after_all.append(len(missing_fragments))
     packets = DATAGRAMS * len(FRAGMENTS)
     return Outcome(
-        packets=sum(missing_counts_after_one) / packets,
-        datagrams=sum(map(bool, missing_counts_after_one)) / DATAGRAMS,
-        repaired=sum(missing_counts_after_all) / packets,
+        packet_loss=sum(missing_counts_after_one) / packets,
+        datagram_loss=sum(map(bool, missing_counts_after_one)) / DATAGRAMS,
+        loss_after_retransmission=sum(missing_counts_after_all) / packets,
         delay_s=float(np.median(delays_ns)) / 1e9,
     )
 
@@ -92,14 +92,16 @@ def test_behind_the_wall_loss_grows_with_distance_and_is_higher_for_datagrams_th
     topology: Topology, distances: tuple[str, ...]
 ) -> None:
     outcomes = [trial(Scenario.NLOS, topology, distance) for distance in distances]
-    assert all(nearer.packets < farther.packets for nearer, farther in pairwise(outcomes))
+    assert all(nearer.packet_loss < farther.packet_loss for nearer, farther in pairwise(outcomes))
     farthest = outcomes[-1]
-    assert farthest.packets < farthest.datagrams < 6 * farthest.packets
+    assert farthest.packet_loss < farthest.datagram_loss < 6 * farthest.packet_loss
 
 
 @pytest.mark.parametrize(("topology", "distance"), [(Topology.MASTER, "30ft"), (Topology.MASTERLESS, "55ft")])
 def test_the_wall_increases_the_loss(topology: Topology, distance: str) -> None:
-    los_loss, nlos_loss = (trial(scenario, topology, distance).packets for scenario in (Scenario.LOS, Scenario.NLOS))
+    los_loss, nlos_loss = (
+        trial(scenario, topology, distance).packet_loss for scenario in (Scenario.LOS, Scenario.NLOS)
+    )
     assert nlos_loss > los_loss + 0.001
 
 
@@ -108,7 +110,7 @@ def test_the_wall_increases_the_loss(topology: Topology, distance: str) -> None:
 def test_retransmission_reduces_the_loss_below_one_percent(
     scenario: Scenario, topology: Topology, distance: str
 ) -> None:
-    assert trial(scenario, topology, distance).repaired < 0.01
+    assert trial(scenario, topology, distance).loss_after_retransmission < 0.01
 
 
 @pytest.mark.parametrize("distance", ["10ft", "30ft"])
@@ -121,11 +123,11 @@ def test_the_access_point_adds_one_hop_of_delay(distance: str) -> None:
 
 def test_without_fading_no_packet_is_lost_at_the_distances_of_the_paper() -> None:
     for scenario in Scenario:
-        assert trial(scenario, Topology.MASTERLESS, "55ft", fading=False).packets == 0
+        assert trial(scenario, Topology.MASTERLESS, "55ft", fading=False).packet_loss == 0
 
 
 @pytest.mark.parametrize(("topology", "distance"), [(Topology.MASTER, "30ft"), (Topology.MASTERLESS, "55ft")])
 def test_on_the_lawn_of_the_paper_less_than_a_third_of_the_datagrams_are_lost(
     topology: Topology, distance: str
 ) -> None:
-    assert trial(Scenario.NLOS, topology, distance).datagrams < 1 / 3
+    assert trial(Scenario.NLOS, topology, distance).datagram_loss < 1 / 3

@@ -118,7 +118,7 @@ def test_the_answer_to_a_number_question_is_in_a_column_with_its_unit(tmp_path: 
     step = ask(WIND)
     view = run_and_view(step, tmp_path / "a", ScriptedOperator("3.5"))
     (column,) = step.output_columns()
-    assert (column.name, column.unit, column.possible) == ("wind", "m/s", (0.0, 40.0))
+    assert (column.name, column.unit, column.possible_range) == ("wind", "m/s", (0.0, 40.0))
     assert step.measure(view).values == {"wind": 3.5}
     assert list(step.summary({"wind": 3.5})) == ["wind 3.5 m/s"]
     assert not list(step.check(view))

@@ -46,17 +46,17 @@ class Transfer:
             transport.send(Packet(number, "a", "b", MSS, ("f", number), 0, 0, "tcp"))
         self.wire.run(until_ns)
 
-    def transmissions(self, *, times: int | None = None) -> list[tuple[int, int]]:
+    def transmissions(self, *, earlier: int | None = None) -> list[tuple[int, int]]:
         """Return time and number of each transmission of a data segment.
 
         Args:
-            times: Return only transmissions with this number of earlier ones, or all.
+            earlier: Number of earlier transmissions of the same segment; None for all transmissions.
         """
         return [
             (transmission.at_ns, transmission.packet.body[1].number)
             for transmission in self.wire.transmitted
             if transmission.packet.body[1].length
-            and times in {None, transmission.packet.body[1].earlier_transmissions}
+            and earlier in {None, transmission.packet.body[1].earlier_transmissions}
         ]
 
     def events(self, event: str) -> list[TcpSample]:
@@ -110,10 +110,10 @@ def test_losses_in_a_window_are_repaired_in_one_round_trip(congestion: str, lost
     options = TcpOptions(segments_per_ack=1, congestion=congestion)  # type: ignore[arg-type]
     transfer = Transfer(150, options, script=losing_data(lost_numbers))
     sent_ns = 4 * ROUND_TRIP_NS
-    assert [at_ns for at_ns, number in transfer.transmissions(times=0) if number in lost_numbers] == [sent_ns] * len(
-        lost_numbers
-    )
-    assert transfer.transmissions(times=1) == [(sent_ns + ROUND_TRIP_NS, number) for number in sorted(lost_numbers)]
+    assert [at_ns for at_ns, number in transfer.transmissions(earlier=0) if number in lost_numbers] == [
+        sent_ns
+    ] * len(lost_numbers)
+    assert transfer.transmissions(earlier=1) == [(sent_ns + ROUND_TRIP_NS, number) for number in sorted(lost_numbers)]
     assert len(transfer.transmissions()) == 150 + len(lost_numbers)
     assert len(transfer.events("loss")) == 1
     assert not transfer.events("timeout")
@@ -155,8 +155,8 @@ def test_the_last_segment_is_retransmitted_with_exponential_backoff(times: int) 
     assert transfer.wire.delivered[3] == ROUND_TRIP_NS + DELAY_NS
     # The timer of 200 ms starts with the last ACK, which the fourth segment, as the second of two, causes
     # immediately.
-    ack_times_ns = 2 * ROUND_TRIP_NS
-    retransmissions_ns = [ack_times_ns + (2**count - 1) * 200 * MS for count in range(1, times + 1)]
+    last_ack_ns = 2 * ROUND_TRIP_NS
+    retransmissions_ns = [last_ack_ns + (2**count - 1) * 200 * MS for count in range(1, times + 1)]
     assert [at_ns for at_ns, number in transfer.transmissions() if number == 4][1:] == retransmissions_ns
     assert transfer.wire.delivered[4] == retransmissions_ns[-1] + DELAY_NS
     assert [sample.window_bytes for sample in transfer.events("timeout")] == [MSS] * times
@@ -172,7 +172,9 @@ def test_after_a_timeout_slow_start_retransmits_only_missing_segments() -> None:
         {n: 1 + (n in lost_numbers) for n in range(70)}
     )
     start_ns = transfer.events("timeout")[0].at_ns
-    segments_per_round = Counter((at_ns - start_ns) // ROUND_TRIP_NS for at_ns, _ in transfer.transmissions(times=1))
+    segments_per_round = Counter(
+        (at_ns - start_ns) // ROUND_TRIP_NS for at_ns, _ in transfer.transmissions(earlier=1)
+    )
     assert segments_per_round == {0: 1, 1: 2, 2: 4, 3: 8, 4: 16, 5: 7}
 
 
@@ -188,7 +190,7 @@ def test_a_repeatedly_lost_segment_waits_for_another_timeout() -> None:
     transfer = Transfer(70, ACK_EACH_SEGMENT, script=script)
     assert len(transfer.events("timeout")) == 2
     assert not transfer.events("loss")
-    assert max(Counter(number for _, number in transfer.transmissions(times=1)).values()) == 1
+    assert max(Counter(number for _, number in transfer.transmissions(earlier=1)).values()) == 1
 
 
 @pytest.mark.parametrize("congestion", ["newreno", "cubic-rfc9438"])
@@ -390,4 +392,4 @@ def test_linux_detects_a_loss_by_two_later_segments_after_a_quarter_of_a_round_t
 def test_without_reordering_only_lost_segments_are_sent_again(lost_numbers: set[int], control: Congestion) -> None:
     options = TcpOptions(segments_per_ack=1, congestion=control)
     transfer = Transfer(100, options, script=losing_data(lost_numbers), rate_bit_s=20_000_000)
-    assert {number for _, number in transfer.transmissions(times=1)} == lost_numbers
+    assert {number for _, number in transfer.transmissions(earlier=1)} == lost_numbers
