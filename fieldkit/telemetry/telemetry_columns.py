@@ -32,7 +32,7 @@ def _role_columns(role: Role) -> tuple[Column, ...]:
             "text",
             (
                 f"Telemetry sources of the {role}'s profile that gave values: NAME (KIND): VALUES. `others` "
-                "names the source of the other columns of its radio: iw, or the emulator."
+                "names the source of the other columns of its radio: `iw`, or `testbed` for an emulated robot."
             ),
             Figure(f"link source, {role}", Kind.WORDS, rank=BACKGROUND),
         ),

@@ -190,6 +190,7 @@ def _tcp_progress(flow: LoadFlow, streams: list[Packets], evidence: LoadEvidence
         acknowledged = (acknowledgments.tcp_ack - first_seq) % 2**32
         if max(received.max(initial=0), acknowledged.max(initial=0)) > LONGEST_BYTES:
             return None
+        # Captured data raises the upper bound, and acknowledgments raise the lower bound.
         for at_ns, position, increments, other_increments in (
             (data.time_ns, received, upper, lower),
             (acknowledgments.time_ns, acknowledged, lower, upper),
@@ -201,6 +202,7 @@ def _tcp_progress(flow: LoadFlow, streams: list[Packets], evidence: LoadEvidence
     times_ns = np.concatenate(parts_ns)
     order = np.argsort(times_ns, kind="stable")
     bounds = [np.cumsum(np.concatenate(parts)[order]) for parts in (lower, upper)]
+    # Entries before the first payload, such as those of the cookie, are omitted.
     first = int(np.argmax(bounds[1] > 0)) if len(times_ns) and bounds[1][-1] > 0 else len(times_ns)
     return _Progress(times_ns[order][first:], bounds[0][first:], bounds[1][first:])
 
