@@ -6,8 +6,8 @@ A packet is late if it is delivered later than the radio model determines (`Orac
 physics and network run in windows of time, which can also be late, and the sync policy, which decides when the two
 exchange data, adds to the delay of packets.
 
-The air delay has four components (`Oracle.delays`). Its file has a line with the number of packets, `packets 215`, and
-a line for each component, which is summed over all packets, in integer nanoseconds.
+The air delay has four components (`Oracle.delays`). Its file has a line with the number of packets, `packets 215`,
+and a line for each component, which is summed over all packets, in integer nanoseconds.
 """
 
 import re
