@@ -44,7 +44,7 @@ def condition(folder: Path) -> dict[str, str]:
     Raises the same errors as `read`.
 
     Returns:
-        For each column, in order, the name of the column that has the same values as the user typed them.
+        For each column, in order, the name of the column that contains its values as the user typed them.
     """
     by, partitions = ([*map(str, _metadata(folder, key))] for key in ("by", "partitions"))  # type: ignore[call-overload]
     return dict(zip(by, (*by[:1], *partitions), strict=True))

@@ -25,7 +25,7 @@ def columns(
     Args:
         names: Names of all columns of the table, in order.
         body: Lines of the table without the header, with their line ends.
-        declared: The requested columns. A column that the table does not have has no value in any row.
+        declared: The requested columns. A column that is missing in the table has no value in any row.
 
     Raises:
         ValueError: A line or a value is invalid.

@@ -151,7 +151,7 @@ class Repeats:
 
 
 def parse(content: bytes, declared: Iterable[Column], where: str = "trial.csv") -> Repeats:
-    """Return the rows of a trial.csv. A declared column that the file does not have has no value in any row.
+    """Return the rows of a trial.csv. A declared column that is missing in the file has no value in any row.
 
     Raises:
         EvidenceError: A value is not possible for its column.

@@ -81,7 +81,7 @@ def _repeats_for_interval(expectation: Expectation, quantity: Quantity) -> int:
     """Return the smallest number of repeats with which the 95 % interval of a figure can be within the bound.
 
     For a share, it is computed with the score interval of repeats without loss (Wilson 1927), whose end is
-    z²/(n + z²). The factor 1 + 1e-12 prevents that a rounding error reduces the number.
+    z²/(n + z²). Because of the factor 1 + 1e-12, rounding errors do not reduce the number.
     """
     if quantity.unit != "share" or quantity.kind is Kind.MEDIAN:
         return 2

@@ -89,7 +89,7 @@ def job_end_ns(evidence: AttemptEvidence, role: Role, job: str) -> int | None:
         return None
     if before.clock is None or after.clock is None or clock.step_description(before.clock, after.clock):
         return None
-    ending = (after.endings or {}).get(job)
-    if ending is None or ending.ended_s is None:
+    termination = (after.terminations or {}).get(job)
+    if termination is None or termination.ended_s is None:
         return None
-    return round(1e9 * ending.ended_s) + (after.clock.lowest_ns + after.clock.highest_ns) // 2
+    return round(1e9 * termination.ended_s) + (after.clock.lowest_ns + after.clock.highest_ns) // 2

@@ -93,9 +93,9 @@ class ProgramStep(Step):
     def check(self, view: View) -> Iterator[str]:
         """Yield a reason if the program failed, and a reason for each column without a value, without duplicates."""
         after = view.evidence.read_or_none(host.read_state, host.after_file(self.robot))
-        ending = (after.endings or {}).get(self.prefixed_name(self.kind_name())) if after else None
-        if ending is not None and ending.code is not None and ending.code not in self.exit_codes:
-            yield f"{view.scene.robot(self.robot).name}: {self.kind_name()} ended with exit code {ending.code}"
+        termination = (after.terminations or {}).get(self.prefixed_name(self.kind_name())) if after else None
+        if termination is not None and termination.code is not None and termination.code not in self.exit_codes:
+            yield f"{view.scene.robot(self.robot).name}: {self.kind_name()} ended with exit code {termination.code}"
         names_by_reason: dict[str, list[str]] = {}
         for name, reason in self.measure(view).missing.items():
             names_by_reason.setdefault(reason, []).append(name)

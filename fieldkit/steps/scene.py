@@ -12,7 +12,7 @@ from fieldkit.core import geometry
 from fieldkit.core.errors import ConfigurationError, RobotError, did_you_mean
 from fieldkit.core.model import Placement, Protocol, Role, Vector, Verdict
 from fieldkit.core.threads import StopSignal
-from fieldkit.measure.evidence.endings import Cause
+from fieldkit.measure.evidence.terminations import Cause
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 from fieldkit.steps import variants

@@ -5,7 +5,7 @@ from typing import Final
 
 from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import clock, endings, host
+from fieldkit.measure.evidence import clock, host, terminations
 from fieldkit.measure.evidence.host import HostState
 from fieldkit.steps.capabilities import Restarts
 from fieldkit.steps.nest import own_jobs
@@ -46,7 +46,7 @@ def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence, step
                 yield f"{name}: {REBOOTED}"
                 continue  # a reboot also terminates the jobs and restarts the clock
             yield from (f"{name}: {reason}" for reason in _clock_problems(before, after))
-        if after is not None and after.endings is not None:
+        if after is not None and after.terminations is not None:
             yield from (
                 f"{name}: {reason}" for reason in _job_problems(procedure, planned_jobs, role, after, evidence)
             )
@@ -91,12 +91,14 @@ def _job_problems(
     for planned in planned_jobs:
         if planned.role is not role:
             continue
-        ending = (after.endings or {}).get(planned.job.name)
+        termination = (after.terminations or {}).get(planned.job.name)
         if (
-            ending is None
+            termination is None
             and role not in restarted_roles(procedure)
             and any(evidence.has(file) for file in (planned.job.log, planned.job.stdout) if file)
         ):
             yield f"its job {planned.job.name} ran, but its exit was not recorded"
-        if ending and (reason := endings.termination_error(ending, planned.permitted_causes, planned.least_s)):
+        if termination and (
+            reason := terminations.termination_error(termination, planned.permitted_causes, planned.least_s)
+        ):
             yield f"its job {planned.job.name} {reason}"

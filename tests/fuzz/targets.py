@@ -29,7 +29,6 @@ from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.evidence import (
     clock,
-    endings,
     host,
     iperf3,
     oracle_delays,
@@ -37,6 +36,7 @@ from fieldkit.measure.evidence import (
     ping,
     program_output,
     tcpdump_log,
+    terminations,
     track,
 )
 from fieldkit.measure.evidence.sandbox import ReaderError
@@ -297,8 +297,8 @@ def _read_host(path: Path) -> None:
     host.read_counters(path)
     host.station_dump(path)
     state = host.read_state(path)
-    for ending in (state.endings or {}).values():
-        endings.termination_error(ending, frozenset({endings.Cause.EXITED}))
+    for termination in (state.terminations or {}).values():
+        terminations.termination_error(termination, frozenset({terminations.Cause.EXITED}))
     if state.clock is not None:
         clock.step_description(state.clock, state.clock)
 

@@ -21,7 +21,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Protocol
 from fieldkit.measure.evidence import clock, host
-from fieldkit.measure.evidence.endings import Cause
+from fieldkit.measure.evidence.terminations import Cause
 from fieldkit.remote import evidence, fetching, jobs, script
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Completed
@@ -526,17 +526,21 @@ def test_end_of_each_job_is_recorded_with_boot_id_and_clock(shell: LocalShell, t
     into.mkdir()
     fetching.fetch(shell, FOLDER, "sender", "lo", into)
     before, after = (host.read_state(into / f"sender-{moment}.txt") for moment in ("before", "after"))
-    assert after.endings is not None
-    assert before.endings is None
-    endings = {name: (ending.cause, ending.code) for name, ending in after.endings.items() if name != LINK_JOB}
-    assert endings == {
+    assert after.terminations is not None
+    assert before.terminations is None
+    terminations = {
+        name: (termination.cause, termination.code)
+        for name, termination in after.terminations.items()
+        if name != LINK_JOB
+    }
+    assert terminations == {
         "stopped": (Cause.STOPPED, 0),
         "broken": (Cause.EXITED, 0),
         "lost": (Cause.EXITED, None),
         "job": (Cause.EXITED, 3),
         "slow": (Cause.LIMIT, 0),
     }
-    duration_s = after.endings["job"].duration_s
+    duration_s = after.terminations["job"].duration_s
     assert duration_s is not None
     assert duration_s >= 0.28
     assert before.boot == after.boot == evidence.boot_id(shell) == evidence.begin(shell, FOLDER, "sender", "lo")

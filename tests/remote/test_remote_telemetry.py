@@ -17,7 +17,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import host, link
-from fieldkit.measure.evidence.endings import Cause
+from fieldkit.measure.evidence.terminations import Cause
 from fieldkit.remote import evidence, fetching, jobs, script
 from tests.helpers.paths import DATA
 from tests.helpers.sshd import wait_until
@@ -107,8 +107,8 @@ def test_link_is_sampled_until_its_folder_is_packed(shell: LocalShell, tmp_path:
     assert measured.values["sender_noise_dbm"] == -84.0
     assert measured.values["sender_tx_failures"] == measured.values["sender_roams"] == 0
     after = host.read_state(into / "sender-after.txt")
-    assert after.endings is not None
-    assert after.endings["link"].cause is Cause.STOPPED
+    assert after.terminations is not None
+    assert after.terminations["link"].cause is Cause.STOPPED
     query_log = (tmp_path / "queries").read_text().splitlines()
     assert "dev wlan0 station get 04:f0:21:32:3f:d2" in query_log, (
         "some drivers list the station of the access point nowhere else"

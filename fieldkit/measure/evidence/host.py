@@ -8,9 +8,9 @@ from typing import Final
 
 from fieldkit.core.columns import Measured, columns
 from fieldkit.core.model import Role
-from fieldkit.measure.evidence import clock, endings, reading
+from fieldkit.measure.evidence import clock, reading, terminations
 from fieldkit.measure.evidence.clock import Clock
-from fieldkit.measure.evidence.endings import Ending
+from fieldkit.measure.evidence.terminations import Termination
 
 COLUMNS: Final = columns(
     80,
@@ -87,13 +87,13 @@ class HostState:
     Attributes:
         boot: Boot ID of the kernel.
         clock: Bounds of the clock.
-        endings: Terminations of the attempt's jobs by name; only in the state after an attempt.
+        terminations: Terminations of the attempt's jobs by name; only in the state after an attempt.
         sections: Names of the file's sections.
     """
 
     boot: str | None
     clock: Clock | None
-    endings: Mapping[str, Ending] | None
+    terminations: Mapping[str, Termination] | None
     sections: frozenset[str] = frozenset()
 
 
@@ -120,7 +120,7 @@ def read_state(path: Path) -> HostState:
     sections = _sections(reading.text(path))
     lines = {name: sections[name].split("\n") for name in (BOOT, CLOCK, JOBS) if name in sections}
     boot = next((match[0] for line in lines.get("boot", ()) if (match := _BOOT.fullmatch(line))), None)
-    jobs = endings.parse(lines["jobs"]) if JOBS in lines else None
+    jobs = terminations.parse(lines["jobs"]) if JOBS in lines else None
     return HostState(boot, clock.parse(lines.get(CLOCK, ())), jobs, frozenset(sections))
 
 
@@ -153,7 +153,7 @@ def job_times_ns(path: Path) -> Mapping[str, tuple[int, int]]:
     if bounds is None:
         return {}
     boot_ns = (bounds.lowest_ns + bounds.highest_ns) // 2
-    times_s = endings.times_s(sections.get("jobs", "").split("\n"))
+    times_s = terminations.times_s(sections.get("jobs", "").split("\n"))
     return {
         name: (boot_ns + round(started_s * 1e9), boot_ns + round(ended_s * 1e9))
         for name, (started_s, ended_s) in times_s.items()

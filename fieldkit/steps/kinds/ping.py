@@ -94,9 +94,9 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
         duplicates: Whether a column reports the requests and replies that arrived again over another link,
             `rtt_duplicates`. It needs `over` with a link whose interface is `lo`, and a `capture` over this link on
             both robots around the ping.
-        links: Names of links for each of which columns report the requests that left over it, those of them that were
-            lost, duplicates, and the failover time: `rtt_over_LINK_sent`, `..._lost`, `..._duplicates`,
-            `..._failover_s`. It needs the same as `duplicates`.
+        links: Names of links. For each link, columns report the requests sent over it, how many of them were lost,
+            duplicates, and the failover time: `rtt_over_LINK_sent`, `..._lost`, `..._duplicates`, `..._failover_s`.
+            The requirements are the same as for `duplicates`.
         forwarded: Whether robots forward packets for each other; the checks then require a routing daemon on each.
     """
 

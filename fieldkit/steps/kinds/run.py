@@ -336,9 +336,9 @@ class RunStep(Step, UsesSpace, Summarizes):
     def check(self, view: View) -> Iterator[str]:
         """Yield a reason for a wrong exit code, unreadable output, and each missing value or value out of bounds."""
         after = view.evidence.read_or_none(host.read_state, host.after_file(self.robot))
-        ending = (after.endings or {}).get(self.prefixed_name("run")) if after else None
-        if ending is not None and ending.code is not None and ending.code not in self.expect.code:
-            yield f"{view.scene.robot(self.robot).name}: {self._program_name} ended with exit code {ending.code}"
+        termination = (after.terminations or {}).get(self.prefixed_name("run")) if after else None
+        if termination is not None and termination.code is not None and termination.code not in self.expect.code:
+            yield f"{view.scene.robot(self.robot).name}: {self._program_name} ended with exit code {termination.code}"
         try:
             view.evidence.read(program_output.text, self._output)
         except EvidenceError as error:

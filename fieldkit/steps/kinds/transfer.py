@@ -19,7 +19,7 @@ from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.checks import transfer_checks
 from fieldkit.measure.checks.transfer_checks import CROSS_CHECKS
 from fieldkit.measure.evidence import host, oracle_delays, reading
-from fieldkit.measure.evidence.endings import Cause, Ending
+from fieldkit.measure.evidence.terminations import Cause, Termination
 from fieldkit.measure.transfers import stalls, transfer_measures
 from fieldkit.measure.transfers.deliveries import StreamDeliveries
 from fieldkit.measure.transfers.transfer_columns import COLUMNS
@@ -326,9 +326,9 @@ class TransferStep(
     def check(self, view: View) -> Iterator[str]:
         """Yield a reason for a missing file, a netcat that was stopped by a signal, and each contradiction."""
         transfer = self.transfer(view.scene, view.within)
-        endings = [self._ending(view, role, job) for role, job in self._jobs]
+        terminations = [self._termination(view, role, job) for role, job in self._jobs]
         listener_exit, sender_exit = (
-            ending if ending and ending.cause is Cause.EXITED else None for ending in endings
+            termination if termination and termination.cause is Cause.EXITED else None for termination in terminations
         )
         if not view.evidence.has(self._into):
             yield f"{self._into} is missing"
@@ -336,7 +336,7 @@ class TransferStep(
             yield reason
         else:
             finished = listener_exit is not None and listener_exit.code == 0
-            was_stopped = endings[0] is not None and listener_exit is None
+            was_stopped = terminations[0] is not None and listener_exit is None
             yield from transfer_checks.find_contradictions(
                 view.evidence, transfer, finished=finished, was_stopped=was_stopped
             )
@@ -350,10 +350,10 @@ class TransferStep(
     def _jobs(self) -> tuple[tuple[Role, str], tuple[Role, str]]:
         return (self.receiver, self.prefixed_name(_LISTEN)), (self.sender, self.prefixed_name(_SEND))
 
-    def _ending(self, view: View, role: Role, job: str) -> Ending | None:
+    def _termination(self, view: View, role: Role, job: str) -> Termination | None:
         """Return the recorded termination of a netcat, or None if there is no record."""
         after = view.evidence.read_or_none(host.read_state, host.after_file(role))
-        return (after.endings or {}).get(job) if after else None
+        return (after.terminations or {}).get(job) if after else None
 
     @override
     def measure(self, view: View) -> Measured:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-_ENDING: Final = re.compile(
+_TERMINATION: Final = re.compile(
     r"(?P<name>[A-Za-z0-9._-]{1,60}) (?P<how>itself|asked|limit|running) (?P<code>\d{1,3}|-) "
     r"(?P<started>\d{1,15}) (?P<ended>\d{1,12}\.\d{2}|-)",
     re.ASCII,
@@ -42,7 +42,7 @@ _NOT_ALLOWED: Final = {
 
 
 @dataclass(frozen=True)
-class Ending:
+class Termination:
     """Termination of a job.
 
     Attributes:
@@ -58,47 +58,53 @@ class Ending:
     ended_s: float | None = None
 
 
-def parse(lines: Iterable[str]) -> Mapping[str, Ending]:
+def parse(lines: Iterable[str]) -> Mapping[str, Termination]:
     """Return the terminations by the names of the jobs; other lines are ignored."""
-    return {match["name"]: _ending(match) for line in lines if (match := _ENDING.fullmatch(line))}
+    return {match["name"]: _termination(match) for line in lines if (match := _TERMINATION.fullmatch(line))}
 
 
 def times_s(lines: Iterable[str]) -> Mapping[str, tuple[float, float | None]]:
     """Return start and end of each job in seconds since boot, by name; the end is None if unknown."""
-    matches = [match for line in lines if (match := _ENDING.fullmatch(line))]
+    matches = [match for line in lines if (match := _TERMINATION.fullmatch(line))]
     started_s = {match["name"]: int(match["started"]) / _TICKS_PER_S for match in matches}
     ended_s = {match["name"]: None if match["ended"] == "-" else float(match["ended"]) for match in matches}
     return {name: (start_s, ended_s[name]) for name, start_s in started_s.items()}
 
 
-def _ending(match: re.Match[str]) -> Ending:
+def _termination(match: re.Match[str]) -> Termination:
     ended_s = None if match["ended"] == "-" else float(match["ended"])
     duration_s = None if ended_s is None else ended_s - int(match["started"]) / _TICKS_PER_S
-    return Ending(Cause(match["how"]), None if match["code"] == "-" else int(match["code"]), duration_s, ended_s)
+    return Termination(Cause(match["how"]), None if match["code"] == "-" else int(match["code"]), duration_s, ended_s)
 
 
-def termination_error(ending: Ending, allowed: Collection[Cause], min_duration_s: float = 0.0) -> str | None:
+def termination_error(
+    termination: Termination, allowed: Collection[Cause], min_duration_s: float = 0.0
+) -> str | None:
     """Return the reason why the termination of a job is not acceptable, or None if it is.
 
     The reason does not contain the job's name.
 
     Args:
-        ending: The termination.
+        termination: The termination.
         allowed: Acceptable causes.
         min_duration_s: Minimum duration of a job that exits without being stopped, in seconds.
     """
-    if ending.code is None:
-        return "was still running when the evidence was collected" if ending.cause is Cause.RUNNING else "was killed"
-    if ending.cause not in allowed:
-        return _NOT_ALLOWED[ending.cause].format(ending.code)
-    if ending.cause is Cause.EXITED and ending.code > _KILLED:
-        return f"was killed by {_signal(ending.code - _KILLED)}, not by fieldkit"
+    if termination.code is None:
+        return (
+            "was still running when the evidence was collected"
+            if termination.cause is Cause.RUNNING
+            else "was killed"
+        )
+    if termination.cause not in allowed:
+        return _NOT_ALLOWED[termination.cause].format(termination.code)
+    if termination.cause is Cause.EXITED and termination.code > _KILLED:
+        return f"was killed by {_signal(termination.code - _KILLED)}, not by fieldkit"
     if (
-        ending.cause is Cause.EXITED
-        and ending.duration_s is not None
-        and ending.duration_s + _TOLERANCE_S < min_duration_s
+        termination.cause is Cause.EXITED
+        and termination.duration_s is not None
+        and termination.duration_s + _TOLERANCE_S < min_duration_s
     ):
-        return f"exited after {ending.duration_s:.1f} s instead of {min_duration_s:g} s"
+        return f"exited after {termination.duration_s:.1f} s instead of {min_duration_s:g} s"
     return None
 
 

@@ -4,8 +4,8 @@ from collections.abc import Collection
 
 import pytest
 
-from fieldkit.measure.evidence import endings
-from fieldkit.measure.evidence.endings import Cause, Ending
+from fieldkit.measure.evidence import terminations
+from fieldkit.measure.evidence.terminations import Cause, Termination
 
 RECORDED = """\
 capture asked 0 1286133 12863.58
@@ -17,16 +17,16 @@ send limit 130 1286154 12981.58
 
 
 def test_recorded_terminations_are_parsed() -> None:
-    by_name = endings.parse(RECORDED.splitlines())
+    by_name = terminations.parse(RECORDED.splitlines())
     assert (by_name["capture"].cause, by_name["capture"].code) == (Cause.STOPPED, 0)
     assert by_name["capture"].duration_s == pytest.approx(2.25)
-    assert by_name["killed"] == Ending(Cause.EXITED, None, None)
+    assert by_name["killed"] == Termination(Cause.EXITED, None, None)
     assert [by_name[name].cause for name in ("ping", "busy", "send")] == [Cause.EXITED, Cause.RUNNING, Cause.LIMIT]
 
 
 @pytest.mark.parametrize("line", ["", "capture", "a b 0 1 2.00", "ping itself 0 1 2.0 more", "x itself 9999 1 2.00"])
 def test_other_lines_are_ignored(line: str) -> None:
-    assert endings.parse([line]) == {}
+    assert terminations.parse([line]) == {}
 
 
 @pytest.mark.parametrize(
@@ -52,4 +52,6 @@ def test_other_lines_are_ignored(line: str) -> None:
 def test_a_termination_that_is_not_allowed_is_an_error(
     line: str, allowed_causes: Collection[Cause], min_duration_s: float, problem: str | None
 ) -> None:
-    assert endings.termination_error(endings.parse([line])["job"], allowed_causes, min_duration_s) == problem
+    assert (
+        terminations.termination_error(terminations.parse([line])["job"], allowed_causes, min_duration_s) == problem
+    )
