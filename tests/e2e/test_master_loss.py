@@ -14,7 +14,7 @@ from tests.helpers.runs import Run, only_trial, rows, run_here
 
 pytestmark = pytest.mark.emulated
 
-# On a busy machine a recorder needs several seconds to reach the master, so the drone is lost later than in the shipped
+# On a busy machine a recorder needs several seconds to reach the master, so the drone is lost later than in shipped
 # procedures.
 TIMES = (
     *("duration: 5s, name: before", "duration: 4s, name: before"),
