@@ -24,7 +24,9 @@ def add_site(parser: Parser) -> None:
     """Add the options that select robots."""
     names = ", ".join(point.name for point in plugins.entry_points(plugins.BACKENDS))
     parser.add_argument(
-        "--backend", metavar="NAME", help=f"one of: {names} (default: the site file's; without one, emulated)"
+        "--backend",
+        metavar="NAME",
+        help=f"one of: {names} (default: the site file's, or emulated without a site file)",
     )
     parser.add_argument(
         "--site",

@@ -37,6 +37,8 @@ RECORD_BYTES: Final = _RECORD.itemsize
 
 _KINDS: Final = range(1, 11)
 _SAMPLE, DISCOVERY_STARTED, MATCHED, REFUSED, SKIPPED, FOREIGN, _END, _WRITER, READ, UNREADABLE = _KINDS
+"""Kinds of records: see the constants of the same names in `fieldkit.agent.messaging.records`. `MATCHED` is the
+discovery of the other end, `FOREIGN` a message of another program, and `_WRITER` the role and topic of the writer."""
 PUBLISHER: Final = 1
 SUBSCRIBER: Final = 2
 _HAS_CHECKSUM: Final = 1

@@ -75,6 +75,7 @@ def read(path: Path, port: int) -> RtpPackets:
         frames = chunk.frames.where(ip.frame)
         rtp_at = ip.payload_at + UDP_HEADER_BYTES
         is_captured = rtp_at + _RTP_BYTES <= frames.start + frames.captured_bytes
+        # The destination port is at byte 2 of the UDP header (RFC 768).
         is_video = (ip.protocol == UDP) & (ip.fragment_offset == 0) & (integers.u16(ip.payload_at + 2) == port)
         chosen = np.flatnonzero(is_captured & is_video & (integers.u8(rtp_at) >> 6 == _VERSION))
         rtp_at = rtp_at[chosen]
