@@ -163,7 +163,7 @@ def _print_tables(
     _print_table("repeats", condition_columns, cells, counts)
     differing_columns, _ = wording.varying_and_common(condition_columns, cells)
     for line in shown_lines:
-        measured_cells = [cell for cell in cells if line.estimate(cell) or line.is_lacking(cell)]
+        measured_cells = [cell for cell in cells if line.estimate(cell) or line.lacks_value(cell)]
         scale = line.scale(measured_cells)
         figures = [_figures(line, cell, scale) for cell in measured_cells]
         if any(quantity.name in cell_repeats for cell_repeats in additional for quantity in line.quantities):
