@@ -1,8 +1,8 @@
 """Log of an autonomous drive of a ground robot, and its columns.
 
-The robot's agent writes a JSON object per line, ten times a second (`fieldkit.agent.driving.drive`): time, pose by
-its odometry in the frame of the start, and driven distance. The last line contains the reason for the end. All
-values are measurements of the robot.
+fieldkit's agent on the robot writes a JSON object per line, ten times a second (`fieldkit.agent.driving.drive`):
+time, pose by its odometry in the frame of the start, and driven distance. The last line contains the reason for the
+end. All values are measurements of the robot.
 """
 
 import math

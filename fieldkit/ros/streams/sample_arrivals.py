@@ -113,6 +113,7 @@ def _contiguous_ns(subscriber: SampleFlow, end: Ints) -> Ints | None:
     data, _ = connection
     base = int(end[0])
     starts, first = np.unique(seq_difference(data.tcp_seq, base), return_index=True)
+    # TCP delivers the bytes of a segment when all segments before it have arrived, too.
     until_ns = np.maximum.accumulate(data.time_ns[first])
     contiguous_ns: Ints = until_ns[np.maximum(np.searchsorted(starts, seq_difference(end, base), side="left") - 1, 0)]
     return contiguous_ns

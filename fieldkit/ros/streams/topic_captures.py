@@ -227,6 +227,7 @@ def _uncaptured_samples(plan: TopicPlan, arrivals: TopicSamples, subscriber: Sam
     size_bytes = plan.size_bytes + plan.envelope_bytes
     headless_count = int((~np.isin(arrivals.sequence, subscriber.heads.sequence)).sum())
     payload_bytes = packets.tcp_payload_bytes + np.maximum(packets.udp_bytes - UDP_HEADER_BYTES, 0)
+    # `capacity` is the number of samples without a captured head that fit into the captured bytes.
     if subscriber.is_tcp or size_bytes > _DATAGRAM_BYTES:
         capacity = int(payload_bytes.sum()) // size_bytes - len(subscriber.heads.first())
     else:

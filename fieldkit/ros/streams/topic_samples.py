@@ -1,4 +1,4 @@
-"""Samples of topics, read from logs that the agent writes on a robot and from captures, by the heads of samples.
+"""Samples of topics, from logs that fieldkit's agent writes on a robot, and from captures, by the heads of samples.
 
 A log (`fieldkit.agent.messaging.records`) is a magic number followed by fixed-size records. If the writer of a log
 was killed, the log ends with zeros, because the file grows by blocks.
