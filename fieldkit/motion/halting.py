@@ -17,7 +17,7 @@ _LINE: Final = re.compile(r"(?P<program>\S+/\.jobs/\S+) (?P<state>[a-z]+)")
 
 @dataclass(frozen=True)
 class HaltResult:
-    """Result of `halt` on a robot.
+    """Result of a function of this module on a robot.
 
     Attributes:
         programs: State of each program that was stopped, by `TRIAL/ATTEMPT/.jobs/NAME` below the robot's home.
@@ -69,7 +69,10 @@ def halt_attempt(shell: Shell, folder: str, operator: str, deadline: Deadline) -
 
 
 def poll_states(shell: Shell, programs: Iterable[str], deadline: Deadline) -> HaltResult:
-    """Return the current state of programs that `halt_attempt` returned. Raises the same errors as `halt_attempt`."""
+    """Return the current state of programs that `halt_attempt` has stopped.
+
+    Raises the same errors as `halt_attempt`.
+    """
     return HaltResult(_states(call(shell, "motion_states", *programs, deadline=deadline)))
 
 

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from fieldkit.core.model import Vector
 
 Floats = NDArray[np.float64]
-"""Metres east, north, up."""
+"""Positions are in metres east, north, up."""
 
 _CIRCLE_CORNERS: Final = 32
+"""Number of corners of the polygon that is drawn for a circle."""
 
-# Margin against rounding errors: a path at this distance does not touch a shape.
 _NEAR_M: Final = 0.001
+"""Margin of bounding boxes against rounding errors. A path at this distance from a shape does not touch it."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ class Solids:
         inside = np.zeros((self._count, len(start_m)))
         below_m, above_m = np.minimum(start_m, end_m), np.maximum(start_m, end_m)
         for indices, inside_share, (low_m, high_m, *arrays) in self._kinds:
-            # Most paths are far from most shapes, which is faster to check with bounding boxes.
+            # Most shapes are far from all paths. Bounding boxes exclude them faster than the exact computation.
             candidates = ((above_m >= low_m) & (below_m <= high_m)).all(axis=-1).any(axis=-1)
             if candidates.any():
                 inside[indices[candidates]] = inside_share(start_m, end_m, *(array[candidates] for array in arrays))
@@ -183,7 +184,10 @@ def _slab(start: Floats, end: Floats, half: Floats) -> tuple[Floats, Floats]:
 
 
 def _disc(start: Floats, end: Floats, radius: Floats) -> tuple[Floats, Floats]:
-    """Return the same as `_slab` for discs around the origin and paths of shape (m, n, 2)."""
+    """Return the fractions of each path at which the path enters and leaves a disc around the origin, as `_slab`.
+
+    Paths are seen from above and have the shape (m, n, 2). The fractions are the roots of a quadratic equation.
+    """
     step = end - start
     a = (step * step).sum(axis=-1)
     half_b = (start * step).sum(axis=-1)

@@ -113,7 +113,7 @@ def test_a_link_that_a_robot_does_not_have_is_rejected_with_the_nearest_name() -
     with pytest.raises(ConfigurationError, match=r"turtlebot-2 \(receiver\) has no link 'cel'") as error:
         commands(parse_step(PingStep, "from: sender, to: receiver, over: cel"))
     assert "cell" in error.value.remedy
-    with pytest.raises(ConfigurationError, match="a reboot does not allow link"):
+    with pytest.raises(ConfigurationError, match="kind reboot does not allow the key link"):
         parse_step(FaultStep, "robot: receiver, kind: reboot, link: cell")
 
 

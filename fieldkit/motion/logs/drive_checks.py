@@ -27,6 +27,7 @@ _SPEED_SHARE: Final = 1.5
 _SPEED_M_S: Final = 0.1
 """Tolerance of a speed over half a second, for one additional odometry message and for overshoot of the control."""
 _COMMAND_M_S: Final = 1e-3
+"""Tolerance of a commanded speed, which the log has rounded."""
 _COAST_M: Final = 1.0
 _COAST_SHARE: Final = 0.1
 """Tolerance of the distance driven at a commanded speed of 0, and its increase per driven metre. After a command to

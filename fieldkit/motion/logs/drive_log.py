@@ -69,6 +69,7 @@ _SPEED_INTERVAL_S: Final = 0.5
 """Interval over which a speed is computed. One odometry message more or less changes it by 3 % at 50 Hz and by 7 %
 at 30 Hz."""
 _ROUNDING: Final = 1e-4
+"""Largest error of a rounded heading in the log, in radians."""
 
 
 @dataclass(frozen=True)

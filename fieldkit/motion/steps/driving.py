@@ -1,4 +1,8 @@
-"""Drive a robot by its velocity topic while other steps run. The agent steers it; the laptop renews the lease."""
+"""Drive a robot by its velocity topic while other steps run.
+
+The agent, fieldkit's program on the robot, steers it. Orders of the laptop are valid for a limited time, the lease.
+The laptop renews them; otherwise the robot stops (`fieldkit.motion.steps.lease`).
+"""
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -260,7 +264,7 @@ def _wait_until_ready(scene: Scene, drive_lease: DriveLease, move: Move) -> None
         )
     drive_lease.check_running()
     if not drive_lease.is_ready:
-        raise drive_lease.failure(f"it was not stationary for {START_S:g} s")
+        raise drive_lease.failure(f"it did not report within {START_S:g} s that it is stationary at its place")
     if origins_of(scene).robots_stay and origins_of(scene).get(move.role) is None:
         pose = drive_lease.pose
         if pose is None:

@@ -140,7 +140,7 @@ def withheld_columns(
         values: Columns of the topic from the logs.
         arrivals: Samples that arrived, each once.
         captured: The topic in both captures.
-        reliable: As in `TopicPlan`.
+        reliable: Whether samples are retransmitted until they arrive.
         deadline_s: Deadline of the topic; None if it has no deadline.
     """
     if captured.subscriber is None or not len(arrivals):
@@ -286,6 +286,7 @@ def _is_received(
         next_index = np.searchsorted(numbers, heads.sequence, side="right")
         next_ns = np.append(samples.at_ns[first], -1)[next_index]
         return has_all_bytes & (gapless | (next_ns >= heads.at_ns))
+    # A best-effort sample that arrives after a later one may be dropped.
     is_delivered: Mask = has_all_bytes & (heads.at_ns >= np.maximum.accumulate(heads.at_ns))
     return is_delivered
 
@@ -318,6 +319,7 @@ def _may_have_overflowed(
         read_ns[:-1], next_ns
     )
     queue_length = np.maximum(queue_length, read_together)
+    # A queue drops a sample only if at least `depth` samples arrive after it, or are read together with it.
     newest_ns = arrived_ns[max(len(arrived_ns) - plan.depth, 0)]
     may_have_overflowed: Mask = (queue_length >= plan.depth) & ((lost_ns < newest_ns) | (read_together >= plan.depth))
     return may_have_overflowed

@@ -196,7 +196,7 @@ def measure(
     """Return the measured columns of a topic.
 
     Args:
-        flow: Identifies its packets.
+        flow: Addresses and ports that identify the packets of the topic.
         publisher_log: Log of the publisher; None if it is incomplete.
         subscriber_log: Log of the subscriber; None if it is incomplete.
         publisher_packets: Packets that the publisher's robot captured; None without a complete capture.
