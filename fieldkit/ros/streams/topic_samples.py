@@ -22,7 +22,7 @@ import numpy as np
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.captures.arrays import LITTLE, Buffer, Frames, Integers, Ints, Mask, Table
-from fieldkit.measure.captures.headers import TCP, ip_headers, network
+from fieldkit.measure.captures.headers import TCP, ip_header_positions, ip_headers
 from fieldkit.measure.captures.packets import ACK, UDP_HEADER_BYTES, Packets
 from fieldkit.measure.captures.pcap import CHUNK_BYTES, frame_reader
 from fieldkit.measure.evidence import reading
@@ -210,7 +210,7 @@ def find_bytes(path: Path, pattern: bytes) -> Occurrences:
     reader = frame_reader(data)
     parts, packet_count = [_no_occurrences()], 0
     for chunk in reader(data, where=str(path), chunk_bytes=CHUNK_BYTES) if reader else ():
-        ip = ip_headers(integers, chunk.frames, network(integers, chunk.frames))
+        ip = ip_headers(integers, chunk.frames, ip_header_positions(integers, chunk.frames))
         frames = chunk.frames.where(ip.frame)
         matches = _positions(data, frames, pattern)
         row = np.searchsorted(frames.start, matches, side="right") - 1

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from fieldkit.measure.captures.arrays import BIG, Integers, Ints, Table
-from fieldkit.measure.captures.headers import UDP, ip_headers, network
+from fieldkit.measure.captures.headers import UDP, ip_header_positions, ip_headers
 from fieldkit.measure.captures.packets import UDP_HEADER_BYTES
 from fieldkit.measure.captures.pcap import CHUNK_BYTES, frame_reader
 from fieldkit.measure.evidence import reading
@@ -71,7 +71,7 @@ def read(path: Path, port: int) -> RtpPackets:
     reader = frame_reader(data)
     parts = [RtpPackets(*(np.empty(0, dtype=np.int64) for _ in range(4)))]
     for chunk in reader(data, where=str(path), chunk_bytes=CHUNK_BYTES) if reader else ():
-        ip = ip_headers(integers, chunk.frames, network(integers, chunk.frames))
+        ip = ip_headers(integers, chunk.frames, ip_header_positions(integers, chunk.frames))
         frames = chunk.frames.where(ip.frame)
         rtp_at = ip.payload_at + UDP_HEADER_BYTES
         is_captured = rtp_at + _RTP_BYTES <= frames.start + frames.captured_bytes
