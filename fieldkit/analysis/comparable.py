@@ -1,4 +1,4 @@
-"""Comparability of two runs: differences between their conditions that make their numbers incomparable."""
+"""Whether two runs (sets of trials) can be compared: differences that make their numbers incomparable."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass

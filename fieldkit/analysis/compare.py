@@ -16,7 +16,8 @@ from fieldkit.core.columns import cell_text
 from fieldkit.core.model import Interval, Status
 
 PAIRED_BY: Final = ("scenario", "topology", "distance_m", "protocol")
-"""Columns that must be equal for two cells to be compared; the backend and names may differ."""
+"""Columns that must be equal for two cells (the repeats under one condition) to be compared; the backend and the
+names of trials may differ."""
 
 
 @dataclass(frozen=True)

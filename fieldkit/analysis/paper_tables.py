@@ -1,4 +1,4 @@
-"""Cells as tables for readers, in Markdown and LaTeX."""
+"""Tables of cells (the repeats under one condition, and their estimates) for readers, in Markdown and LaTeX."""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -66,7 +66,7 @@ class _Column:
     protocol: str
 
     def has(self, cell: Cell) -> bool:
-        has_figure = self.line.estimate(cell) is not None or self.line.is_lacking(cell)
+        has_figure = self.line.estimate(cell) is not None or self.line.lacks_value(cell)
         return has_figure and (self.scenario, self.protocol) == _scenario_and_protocol(cell)
 
 

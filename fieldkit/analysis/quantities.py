@@ -1,4 +1,4 @@
-"""Quantities: columns of trial.csv that are aggregated over repeats, as their figures declare."""
+"""Quantities: columns of trial.csv that are aggregated over repeats, as declared by `Column.figure`."""
 
 import re
 import sys
@@ -79,6 +79,7 @@ class Quantity:
     @property
     def is_builtin(self) -> bool:
         """True for a built-in quantity, False if another package or a lab declares it."""
+        # Ranks from `BACKGROUND` on belong to built-in quantities that every trial has.
         return not FIRST_EXTERNAL_RANK <= self.rank < BACKGROUND
 
     @property

@@ -1,4 +1,4 @@
-"""Cells as tables for programs, in CSV and JSON."""
+"""Tables of cells (the repeats under one condition, and their estimates) for programs, in CSV and JSON."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, fields
@@ -11,6 +11,7 @@ from fieldkit.core.result_rows import EstimateRow, declared_columns
 from fieldkit.core.text import json_text
 
 MORE: Final = "more_wanted"
+"""Column with the number of additional repeats that the requested width of an interval needs."""
 
 
 def estimate_rows(cell: Cell) -> Iterator[EstimateRow]:

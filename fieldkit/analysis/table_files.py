@@ -25,7 +25,7 @@ _SPREADSHEET_MARKS: Final = {
 }
 """Problem and correct format, by the start of a header that a spreadsheet wrote in another format."""
 _BATCH_BYTES: Final = 1 << 25
-"""Number of bytes that are parsed together."""
+"""Number of bytes that are parsed together, approximately."""
 _MAX_HEADER_BYTES: Final = 1 << 20
 
 
@@ -79,6 +79,7 @@ def read(
             parts.append(dataset)
             order.append(np.full(len(dataset), number))
             continue
+        # A large table is read in blocks, unless `content` reads its bytes in another way.
         if content == Path.read_bytes and (large := _read_large(path, columns_by_name)) is not None:
             parts.append(large)
             order.append(np.full(len(large), number))
@@ -188,7 +189,16 @@ def names(path: Path) -> tuple[str, ...]:
 
 @dataclass
 class _Batch:
-    """Tables with the same header."""
+    """Tables with the same header.
+
+    Attributes:
+        header: The header line, without its line end.
+        names: Names of the columns.
+        numbers: Index of each table in the order of all tables.
+        paths: Path of each table.
+        bodies: Lines of each table without the header.
+        size: Total size of the bodies in bytes.
+    """
 
     header: bytes
     names: tuple[str, ...]
@@ -302,6 +312,7 @@ def _is_valid(rows: Repeats, declared: Mapping[str, Column]) -> bool:
 
 
 def _source(path: Path) -> str:
+    """Return the trial's folder for a `trial.csv`, otherwise the path itself."""
     return str(path.parent if path.name == "trial.csv" or path.is_dir() else path)
 
 

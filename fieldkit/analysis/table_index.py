@@ -9,6 +9,7 @@ The file consists of a Parquet file, a JSON description of the tables, the lengt
 (BLAKE2b) of these parts, and `MAGIC`. A file that is damaged or belongs to another user is ignored.
 """
 
+import errno
 import hashlib
 import json
 import os
@@ -216,8 +217,9 @@ def load(path: Path) -> TableIndex:
 
 
 def _require_private(status: os.stat_result, path: Path) -> None:
+    """Raise PermissionError if another user owns a file or folder, or can write it."""
     if status.st_uid != os.geteuid() or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-        raise PermissionError(1, "another user can write it", str(path))
+        raise PermissionError(errno.EPERM, "another user can write it", str(path))
 
 
 def _digest(content: Any) -> bytes:  # noqa: ANN401 (any buffer)
@@ -236,6 +238,7 @@ def _entries(description: Mapping[str, Any]) -> Iterator[tuple[TableStamp, Entry
 
 
 def _description(entries: Iterable[Entry], types: Mapping[str, str]) -> bytes:
+    """Return the JSON description of the tables; equal facts of several tables are stored once."""
     numbers: dict[TableFacts, int] = {}
     tables = [
         (entry.path, *entry.stamp, numbers.setdefault(entry.facts, len(numbers)), entry.start, entry.rows)
@@ -325,7 +328,7 @@ def replacing(path: Path, types: Mapping[str, str]) -> Iterator[IndexWriter]:
             writer.finish()
         Path(name).rename(path)
     except pa.ArrowException as error:
-        raise OSError(5, str(error), str(path)) from error
+        raise OSError(errno.EIO, str(error), str(path)) from error
     finally:
         with suppress(FileNotFoundError):
             Path(name).unlink()

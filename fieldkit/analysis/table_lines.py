@@ -1,4 +1,7 @@
-"""Lines of tables: selection of quantities, labels, and formatting of the figures of cells."""
+"""Lines of tables: their quantities and labels, and the texts of the figures of cells.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -34,6 +37,7 @@ _OPERATOR: Final = (
 """Quantities for an operator during a trial, in this order."""
 
 _FAULT_ENDINGS: Final = ("_recovered", "_recovery_s")
+"""Ends of the names of columns about faults that are also shown to an operator."""
 
 _SENT: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {
@@ -68,7 +72,7 @@ class TableLine:
         names = (quantity.name for quantity in self.quantities)
         return next((cell.estimates[name] for name in names if name in cell.estimates), None)
 
-    def is_lacking(self, cell: Cell) -> bool:
+    def lacks_value(self, cell: Cell) -> bool:
         """Return True if the quantity was measured in a cell, but no valid repeat has a value."""
         return (
             self._includes(cell)
@@ -100,7 +104,7 @@ class TableLine:
         return wording.with_interval(wording.amount(scale, estimate), scale, estimate, between)
 
     def _no_value(self, cell: Cell) -> str:
-        return f"none, 0 of {cell.n_valid}" if self.is_lacking(cell) else ""
+        return f"none, 0 of {cell.n_valid}" if self.lacks_value(cell) else ""
 
     def _includes(self, cell: Cell) -> bool:
         return self.payload_bytes is None or cell.payload_bytes.get(self.quantities[0].name, ()) == self.payload_bytes

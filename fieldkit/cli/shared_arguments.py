@@ -16,6 +16,7 @@ CONDITION: Final = "procedure,scenario,topology,backend,distance,distance_m,prot
 """Equal to `analysis.quantities.DEFAULT_BY`; a test compares them."""
 
 _MAX_DIGITS: Final = 15
+"""Maximum number of digits of a whole number. A float represents all numbers of this length exactly."""
 
 _PROTOCOL_HELP: Final = "may be given more than once (default: the procedure's)"
 
@@ -24,7 +25,9 @@ def add_site(parser: Parser) -> None:
     """Add the options that select robots."""
     names = ", ".join(point.name for point in plugins.entry_points(plugins.BACKENDS))
     parser.add_argument(
-        "--backend", metavar="NAME", help=f"one of: {names} (default: the site file's; without one, emulated)"
+        "--backend",
+        metavar="NAME",
+        help=f"one of: {names} (default: the site file's, or emulated without a site file)",
     )
     parser.add_argument(
         "--site",

@@ -221,6 +221,7 @@ def _activities_of_jobs(times: AttemptTimes) -> Iterator[Activity]:
     names = dict.fromkeys(name for _, name in times.jobs)
     for name in names:
         what = plain_name(name)
+        # The job `listen` is shown as `receive`. If there is a `receive`, the other jobs have their own activities.
         if what.startswith("fault-") or (what in _SHOWN_BY_EVIDENCE and {what, "receive"} & names_with_evidence):
             continue
         spans = [span for (_, job), span in times.jobs.items() if job == name]
@@ -231,7 +232,7 @@ def _activities_of_jobs(times: AttemptTimes) -> Iterator[Activity]:
 
 
 def _activities_of_faults(times: AttemptTimes, evidence: AttemptEvidence) -> Iterator[Activity]:
-    """Yield each fault from its start to the end of its cause, at which the job that waits for recovery starts."""
+    """Yield each fault from its start to its end, at which the job that waits for recovery starts."""
     for (role, name), (recovery_ns, _) in times.jobs.items():
         step, _, what = name.rpartition(".")
         kind = what.removeprefix("fault-").removesuffix(_RECOVERY_JOB_SUFFIX)

@@ -127,13 +127,12 @@ def nothing_arrived(repeats: Repeats, quantity: Quantity, rows: NDArray[np.int64
     related = {step_prefixed(quantity.step, loss) for loss in _LOSSES.get(kind, _TRANSFER_LOSSES)}
     losses = {name: column[rows] for name, column in repeats.numbers.items() if plain_name(name) in _ALL_LOSSES}
     related_columns = [column for name, column in losses.items() if name in related]
-    is_known = (
-        np.any([np.isfinite(column) for column in related_columns], axis=0)
-        if related_columns
-        else np.zeros(len(rows), np.bool_)
-    )
-    is_lost = np.any([column >= 1 for column in related_columns], axis=0) if related_columns else is_known
-    lost: Rows = np.where(is_known, is_lost, _all_lost(list(losses.values()), len(rows)))
+    is_all_lost = _all_lost(list(losses.values()), len(rows))
+    if not related_columns:
+        return is_all_lost
+    is_known = np.any([np.isfinite(column) for column in related_columns], axis=0)
+    is_related_lost = np.any([column >= 1 for column in related_columns], axis=0)
+    lost: Rows = np.where(is_known, is_related_lost, is_all_lost)
     return lost
 
 

@@ -171,7 +171,7 @@ class _CurveDrawing:
         yield Chart(
             name=f"{name}-of-steps" if quantity.step else name,
             title=f"{label} against distance{', by step' if has_steps else ''}",
-            caption=_caption(quantity, points, limits_by_protocol, is_lacking=bool(missing)),
+            caption=_caption(quantity, points, limits_by_protocol, has_missing=bool(missing)),
             panels=[
                 self._panel(title, places, y_label, limits_by_protocol[wording.text(places[0].cell, "protocol")])
                 for title, places in groups.items()
@@ -255,7 +255,7 @@ def _caption(
     points: Sequence[Point],
     limits: Mapping[str, tuple[float, float]],
     *,
-    is_lacking: bool,
+    has_missing: bool,
 ) -> str:
     has_no_loss = (
         quantity.unit == "share" and quantity.kind is not Kind.FLAG and any(point.value == 0 for point in points)
@@ -265,7 +265,7 @@ def _caption(
         f"{_MEANINGS[quantity.kind]}, with its 95 % interval{_NO_LOSS_NOTE if has_no_loss else ''}",
         "" if quantity.kind is Kind.FLAG else "faint: each repeat",
         _CUT_NOTE if is_cut else "",
-        _ABSENCE_NOTE if is_lacking else "",
+        _ABSENCE_NOTE if has_missing else "",
         _COUNT_NOTE if any(point.note for point in points) else "",
         _BOUND_NOTE if any(any(point.bounds) for point in points) else "",
     )

@@ -1,6 +1,7 @@
 """Draw panels on axes of matplotlib. `figures` creates pages and files from them."""
 
 import math
+import textwrap
 from collections.abc import Collection
 from itertools import pairwise
 from typing import Any, Final
@@ -93,7 +94,7 @@ def _set_axes(axes: Axes, panel: Panel) -> None:
     if panel.x_log:
         axes.set_xscale("log")
     if panel.lanes:
-        axes.set_yticks(range(len(panel.lanes)), [_shorten(lane, _LANE) for lane in panel.lanes])
+        axes.set_yticks(range(len(panel.lanes)), [_wrap(lane, _LANE) for lane in panel.lanes])
         if panel.is_strip:
             axes.tick_params(axis="y", labelsize=_STRIP_LANE)
         axes.set_ylim(-0.6, len(panel.lanes) - 0.4)
@@ -223,6 +224,11 @@ def _draw_edge(axes: Axes, edge: EdgeMark, *, sideways: bool) -> None:
         va="center" if sideways else ("top" if edge.is_high else "bottom"),
     )
     text.set_in_layout(False)  # the text is inside of the axes, so they must not shrink for it
+
+
+def _wrap(text: str, max_length: int) -> str:
+    """Return a text from outside in at most two lines."""
+    return "\n".join(textwrap.wrap(sanitized(text), max_length, max_lines=2, placeholder="…", break_on_hyphens=False))
 
 
 def _shorten(text: str, max_length: int) -> str:

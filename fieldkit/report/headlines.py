@@ -73,6 +73,7 @@ In these trials pings serve only to measure the clock offset, and transfers only
 _MAX_FIRST: Final = 6
 """Maximum number of headlines of expected and user-defined quantities."""
 _MAX_PLACES: Final = 3
+"""Maximum number of conditions that a line names."""
 _COUNT_TEXTS: Final = {
     "all_lost": "nothing arrived in {}",
     "failed": "{} failed",

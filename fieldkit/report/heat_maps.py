@@ -86,6 +86,7 @@ def _chart(quantity: Quantity, cells: Sequence[Cell], axes: Sequence[_Axis], oth
     groups: dict[str, list[Cell]] = {}
     for cell in cells:
         labels = [(axis.name, axis.labels[cell.key[axis.column]]) for axis in others]
+        # The first label is the flow, which needs no name.
         title = ", ".join(label if number == 0 else f"{name} {label}" for number, (name, label) in enumerate(labels))
         groups.setdefault(title, []).append(cell)
     values = [cell.estimates[quantity.name].value for cell in cells]

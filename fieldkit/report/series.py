@@ -81,11 +81,12 @@ def panels(cells: Sequence[Cell]) -> Mapping[str, Sequence[Cell]]:
 
 
 def _kind(cell: Cell) -> tuple[str, str]:
+    """Return scenario and procedure of a cell, which determine the colour of its series."""
     return wording.text(cell, "scenario"), wording.text(cell, "procedure")
 
 
 def _by_scenario(kind: tuple[str, str]) -> tuple[bool, int, str, str]:
-    """Return the sort key of a kind: first kinds whose procedure is named after the scenario."""
+    """Return the sort key of a scenario and procedure; procedures that are named after their scenario come first."""
     scenario, procedure = kind
     index = _SCENARIOS.index(scenario) if scenario in _SCENARIOS else len(_SCENARIOS)
     return scenario != procedure, index, scenario, procedure
@@ -181,14 +182,14 @@ def point(cell: Cell, quantity: Quantity, factor: float, evidence: Evidence) -> 
     values, is_bound = evidence.observed(cell, quantity)
     every_kth = slice(None, None, max(math.ceil(len(values) / max_behind(evidence)), 1))
     if quantity.kind is Kind.FLAG:
-        values = values[:0]
+        values, is_bound = values[:0], is_bound[:0]
     return Point(
         cell,
         factor * estimate.value,
         low,
         high,
         repeats=tuple((factor * values[every_kth]).tolist()),
-        bounds=tuple(is_bound[every_kth].tolist())[: len(values)],
+        bounds=tuple(is_bound[every_kth].tolist()),
         is_bound=estimate.is_lower_bound,
         note=incomplete(estimate),
     )

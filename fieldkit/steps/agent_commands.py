@@ -1,4 +1,4 @@
-"""Commands for a robot's Python, including the commands of the agent."""
+"""Commands for a robot's Python, including the commands of the agent, fieldkit's program on robots."""
 
 import json
 from collections.abc import Mapping

@@ -28,7 +28,7 @@ StepName = Annotated[
         r"^[a-z][a-z0-9_]{0,30}$", "a name of at most 31 lower-case letters, digits and _, with a letter first"
     ),
 ]
-"""Name of a step or a bag."""
+"""Name of a step or of a bag, a recording of ROS topics."""
 FileName = Annotated[
     str,
     schema.pattern_field(
@@ -41,19 +41,19 @@ FileName = Annotated[
 class Step(Strict, ABC):
     """One action of a procedure.
 
-    Its fields are its YAML keys. Plans, preflight checks, gates, rows and reports call the methods below; they do not
-    depend on the kind. A kind usually defines `jobs`, `check` and `measure`; every method has a default. A kind that
-    runs one program is a `fieldkit.steps.program.ProgramStep`, which needs two methods. Methods that few kinds need
-    are in `fieldkit.steps.capabilities`.
+    Its fields are its YAML keys. The code of plans, preflight checks, evidence checks, `trial.csv` and reports calls
+    the methods below, and does not depend on the kind of step. A kind usually defines `jobs`, `check` and `measure`;
+    every method has a default. A kind that runs one program is a `fieldkit.steps.program.ProgramStep`, which needs
+    two methods. Methods that few kinds need are in `fieldkit.steps.capabilities`.
 
-    `jobs` is pure: `--dry-run` prints it, tests compare it with golden lines, and `run` starts the same jobs. To add
-    a kind, write its module and name its class in `fieldkit.steps.kinds`, or in an entry point of the group
-    `fieldkit.steps`.
+    `jobs` has no side effects: `--dry-run` prints its jobs, tests compare them with stored lines, and `run` starts
+    them. To add a kind, write its module and name its class in `fieldkit.steps.kinds`, or in an entry point of the
+    group `fieldkit.steps`.
 
     Attributes:
         columns: Columns that steps of its kind measure.
         cross_checks: Sources of these columns, and the checks between them.
-        kept_bytes: Bytes of each frame that a capture must keep for the step; 0 if headers are enough.
+        kept_bytes: Bytes of each frame that a capture must keep for the step; 0 if the default number is enough.
         capture_buffer_kib: Kernel buffer that a capture needs for the step's packets; 0 if the default is enough.
         needs_complete_capture: Whether a repeat is void if a capture around the step dropped packets. If not, the
             step leaves the columns that depend on the capture empty.
@@ -123,7 +123,7 @@ class Step(Strict, ABC):
         """
         return ()
 
-    def check(self, view: View) -> Iterator[str]:  # noqa: ARG002 (missing values of columns are reported by the gates)
+    def check(self, view: View) -> Iterator[str]:  # noqa: ARG002 (subclasses need it)
         """Yield each reason why the evidence is incomplete or contradictory, a sentence without a full stop."""
         return iter(())
 
@@ -131,7 +131,7 @@ class Step(Strict, ABC):
         """Return the columns that the step measures."""
         return self.columns
 
-    def measure(self, view: View) -> Measured:  # noqa: ARG002 (some steps measure nothing)
+    def measure(self, view: View) -> Measured:  # noqa: ARG002 (by default a step measures nothing)
         """Return a value for each of `output_columns`, or the reason why it is missing."""
         return Measured()
 

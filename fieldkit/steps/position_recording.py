@@ -104,6 +104,8 @@ def run_while_recording(
 
 
 def _stop(testbed: Testbed, recordings: Sequence[Planned]) -> Sequence[int]:
+    """Stop the recordings; return the exit code of each."""
+
     def stop(recording: Planned) -> int:
         return jobs.stop(testbed.shells[recording.role], recording.job, grace_s=CLOSE_S)
 
@@ -149,7 +151,7 @@ def problems(view: View, roles: Sequence[Role]) -> Iterator[str]:
 def _place_problems(view: View, sources: PositionSources) -> Iterator[str]:
     """Yield a reason for each robot whose fixed position or start differs from its placement.
 
-    Positions in another frame, and positions with times from another clock, are not compared.
+    Positions in another frame, with times from another clock, or from a GPX or CSV file are not compared.
     """
     for role, position_source in sources.robots.items():
         planned_m = view.scene.places_m.get(role)
@@ -158,7 +160,7 @@ def _place_problems(view: View, sources: PositionSources) -> Iterator[str]:
             planned_m is None
             or position_source.frame != PLACED
             or position_source.offset_s
-            or not (position_source.place or position_source.topic)
+            or not (position_source.place or position_source.topic)  # a GPX or CSV file
         ):
             continue
         deviation_m = math.dist(planned_m, [metres or 0.0 for metres in recorded_m])

@@ -91,7 +91,7 @@ class ProgramStep(Step):
 
     @override
     def check(self, view: View) -> Iterator[str]:
-        """Yield a reason if the program failed, and a reason for each column without a value, without duplicates."""
+        """Yield a reason if the program failed, and each reason for missing values with the names of its columns."""
         after = view.evidence.read_or_none(host.read_state, host.after_file(self.robot))
         termination = (after.terminations or {}).get(self.prefixed_name(self.kind_name())) if after else None
         if termination is not None and termination.code is not None and termination.code not in self.exit_codes:

@@ -42,7 +42,8 @@ BY_EXIT: Final = frozenset({Cause.EXITED})
 BY_LIMIT: Final = frozenset({Cause.LIMIT})
 BY_EXIT_OR_LIMIT: Final = BY_EXIT | BY_LIMIT
 BY_FIELDKIT: Final = frozenset({Cause.STOPPED})
-"""Values of `Planned.permitted_causes`: the job exits, is stopped at its time limit, or is stopped by fieldkit."""
+"""Values of `Planned.permitted_causes`: the job exits by itself, is stopped at its time limit, or is stopped by
+fieldkit."""
 
 
 @dataclass(frozen=True)
@@ -304,6 +305,7 @@ class ListeningPort:
     def is_ambiguous_with(self, other: "ListeningPort") -> bool:
         """Return True if the packets of both ports cannot be distinguished in a capture."""
         is_same = (self.role, self.port, self.peer) == (other.role, other.port, other.peer)
+        # Data that flows in opposite directions can be distinguished.
         is_opposite = None not in {self.source, other.source} and self.source != other.source
         return is_same and not is_opposite
 

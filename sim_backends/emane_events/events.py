@@ -1,8 +1,8 @@
 """Encoding of EMANE's events: `event.proto`, `locationevent.proto` and `pathlossevent.proto` of EMANE 1.5.
 
 A datagram of the event channel is a big-endian u16 with the size of the message `Event`, and the message. The message
-has the identifier and the sequence number of its publisher, and one or more serialized events, each for one NEM or
-for all.
+has the identifier and the sequence number of its publisher, and one or more serialized events. Each is for one NEM
+(network emulation module, a radio in EMANE) or for all NEMs.
 """
 
 import math
@@ -50,7 +50,7 @@ class EmaneVelocity:
 
 @dataclass(frozen=True)
 class NemLocation:
-    """Location of a NEM, a node of EMANE.
+    """Location of a NEM.
 
     Attributes:
         nem: Its identifier.

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from typing import Final
 
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
+"""Wire types. A varint is an integer in groups of 7 bits, the lowest first, each in a byte."""
 _DOUBLE: Final = struct.Struct("<d")
 _FLOAT: Final = struct.Struct("<f")
 _MAX_VARINT_BYTES: Final = 10

@@ -54,6 +54,7 @@ class EmulatedBackend:
     """
 
     by_hand: Final = False
+    """No person sets up the robots or carries them to their places."""
     permissions: frozenset[str] = frozenset()
     """No permission is needed, because emulated robots endanger no person."""
 
@@ -102,7 +103,7 @@ class EmulatedBackend:
 
     @property
     def simulators(self) -> Mapping[str, str]:
-        """Implement `Simulating.simulators`."""
+        """Implement `Simulating.simulators`: Linux Wi-Fi, or the simulators of a co-simulation; otherwise empty."""
         if self._options.has_linux_wifi:
             from sim_backends.emulated.linux_wifi import virtual_machine  # noqa: PLC0415 (only some labs use it)
 
@@ -135,7 +136,7 @@ class EmulatedBackend:
         return len(self._site.robots) + len(self._options.radio.access_points)
 
     def use_wifi(self, kind: str) -> None:
-        """Implement `ChoosesWifi.use_wifi`."""
+        """Implement `ChoosesWifi.use_wifi`: replace the option `wifi` of the site file."""
         self._options = self._options.with_wifi(kind)
 
     def _site_of_guest(self) -> dict[str, object]:
@@ -148,7 +149,10 @@ class EmulatedBackend:
 
     @property
     def lab_bytes(self) -> int:
-        """Implement `Backend.lab_bytes`: fixed links have no transmission attempts to record."""
+        """Implement `Backend.lab_bytes`: the size limit of the record of transmission attempts.
+
+        The result is 0 if the site file requests no record, or fixes the links, which have no attempts.
+        """
         if not self._options.record_air or self._options.radio.is_fixed:
             return 0
         from sim_backends.emulated.medium.air_log import LIMIT_BYTES  # noqa: PLC0415 (it imports numpy, which is slow)
@@ -165,7 +169,7 @@ class EmulatedBackend:
         }
 
     def _link_addresses(self, topology: Topology) -> dict[str, dict[str, str]]:
-        """Return the addresses on further links of the robots of a topology."""
+        """Return each robot's addresses on its links other than the radio, for the robots of a topology."""
         profiles = profiles_of(self._site, self._document, self._site.roles.get(topology, {}).values())
         return {
             name: link_addresses(profile, self._addresses[name], self._options)
@@ -174,9 +178,10 @@ class EmulatedBackend:
         }
 
     def _abilities(self, robot: Robot, cast: Cast) -> frozenset[str]:
-        """Return the sections of the robot's profile with which steps may move it.
+        """Return the names of the profile sections with which steps of a trial may move the robot.
 
-        If other robots of the cast would also receive the commanded velocities of a robot, the lab moves it instead.
+        If other robots of the cast would also receive its commanded velocities, the section `drive` is omitted, and
+        the lab moves the robot itself.
         """
         drive = drive_of(robot.profile)
         is_driven = (
@@ -196,7 +201,7 @@ class EmulatedBackend:
         sink: Sink,
         operator: Operator,
     ) -> Iterator[Testbed]:
-        """Implement `Backend.open`."""
+        """Implement `Backend.open` after a check that this machine has the programs of the robots."""
         # A dry run needs only `cast`, and imports neither SSH nor keys.
         from sim_backends.emulated import requirements, testbed  # noqa: PLC0415
 

@@ -13,7 +13,9 @@ from sim_backends.emulated.robot.spec import HELLO_S, NETCATS, Netcat, Ping, Ssh
 from sim_backends.radio.radio_options import INFRASTRUCTURE, RadioOptions
 
 BOOT_S: Final = 2.0
+"""Default of the option `boot`."""
 LATE_BOUND_S: Final = 0.1
+"""Default of the option `late_bound`."""
 
 
 class RosChoice(StrEnum):
@@ -69,6 +71,7 @@ class RobotOptions(Strict):
 
 
 HOST_TOOLS: Final = RobotOptions.defaults()
+"""Options of a robot that the site file does not name under `robots`: it has the tools of this machine."""
 
 
 class MeshOptions(Strict):
@@ -210,7 +213,7 @@ class EmulatedOptions(Strict):
         return self
 
     @schema.model_validator(mode="after")
-    def _network_supports_options(self) -> "EmulatedOptions":
+    def _check_network(self) -> "EmulatedOptions":
         if self.network in {None, "builtin"}:
             return self
         for key, is_used, feature in (

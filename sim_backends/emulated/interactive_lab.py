@@ -60,6 +60,7 @@ class EmulatedLab:
             self._assign_position(name, self._positions_m[name])
         running.media.place(self._positions_m)
         running.positions_writer.write(self._positions_m)
+        # The lateness of the startup is not reported, so its counts are subtracted from later ones.
         self._first_stats = running.medium.stats() if options.is_cosimulated else None
         self.members = members
         self.login = Login(USER, running.private_key, running.host_keys)
@@ -103,7 +104,7 @@ class EmulatedLab:
         self._running.robots[name].move(AssignedPath(start_ns, [position_m], speed_m_s=1.0, facing_rad=0.0))
 
     def watching(self) -> AbstractContextManager[object]:
-        """Return a context that keeps the medium up to date with robots that steer themselves."""
+        """Return a context in which the medium receives the positions of robots that steer themselves."""
         if not any(robot.spec.steers for robot in self._running.robots.values()):
             return nullcontext()
         self._watch = MotionThread(self._update_positions, "watch")
@@ -192,6 +193,7 @@ def overview(
     channel.move(0, positions_m)
     names = list(members)
     pairs = [] if options.radio.is_fixed else list(combinations(range(len(names)), 2))
+    # The positions of the first robot of each pair, and those of the second one.
     first, second = (np.array([positions_m[names[pair[end]]] for pair in pairs]).reshape(-1, 3) for end in (0, 1))
     links = [
         LabLink(
@@ -202,6 +204,7 @@ def overview(
         )
         for (first_index, second_index), crossings in zip(pairs, world.crossings(first, second), strict=True)
     ]
+    # In drawing order: a higher part covers a lower one.
     parts = sorted(world.parts, key=lambda part: part.shape.top_m)
     outlines = [Outline(part.material, part.shape.corners_m()) for part in parts]
     robots = {name: position_m[:2] for name, position_m in positions_m.items()}
@@ -215,6 +218,7 @@ def _new_counts(before: Mapping[int, int], after: Mapping[int, int]) -> Counter[
 
 def _programs(robot_pid: int) -> Iterator[str]:
     """Yield the name of each process of a robot except its init process."""
+    # The robot's outermost process is `unshare`, whose only child is the init process.
     pending = [pid for init_pid in _children(robot_pid) for pid in _children(init_pid)]
     while pending:
         yield from filter(None, map(_name, pending))

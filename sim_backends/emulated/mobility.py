@@ -30,6 +30,7 @@ continues between the updates.
 
 _MIN_PERIOD_S: Final = 0.02
 _MAX_PERIOD_S: Final = 0.1
+"""Limits of the time between two updates of the medium while the lab moves a robot."""
 
 WATCH_S: Final = 0.05
 """Polling interval for robots that steer themselves, while they are at rest; a robot that starts to drive at 0.2 m/s
@@ -158,6 +159,7 @@ class Mobility:
         with self._lock:
             self._placement = placement
             # The robots are updated before the medium: the new path invalidates motion that refers to the old one.
+            # A move without legs keeps a robot where it is; its speed has no effect.
             for role in self._robots:
                 self._send_path(Move(role, (), speed_m_s=1.0), time.monotonic_ns())
             self._update_medium()
@@ -205,7 +207,7 @@ class Mobility:
             self._send_path(Move(move.role, (), move.speed_m_s), time.monotonic_ns())
 
     def watching(self) -> AbstractContextManager[object]:
-        """Return a context that keeps the medium up to date with robots that steer themselves."""
+        """Return a context in which the medium receives the positions of robots that steer themselves."""
         if not any(robot.spec.steers for robot in self._robots.values()):
             return nullcontext()
         return MotionThread(self._watch, "watch")
@@ -277,7 +279,7 @@ class Mobility:
             return self._next_update_s(now_ns, states)
 
     def _extend_track(self, utc_ns: int, states: Mapping[str, State]) -> None:
-        """Append to the track the robots whose position or velocity has changed; `utc_ns` is the time of `states`."""
+        """Append a point for each robot whose position or velocity has changed; `utc_ns` is the time of `states`."""
         last = {point.role: point for point in self._track}
         for role, robot in self._cast.items():
             state = states.get(robot.name)

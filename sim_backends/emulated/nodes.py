@@ -104,7 +104,7 @@ class Node:
             RobotError: The radio was not opened.
         """
         if self._radio_fd is None:
-            raise RobotError("its radio is off", where=self.name)
+            raise RobotError("its radio has not been opened", where=self.name)
         return self._radio_fd
 
     def stream_to(self, host: str, port: int, timeout_s: float) -> socket.socket:
@@ -184,7 +184,7 @@ class EmulatedRobot(Node):
     def open_wifi(self, device: str) -> None:
         """Bring up the Wi-Fi interface `device` in the robot's namespace. Raises the errors of `open_radio`."""
         if self.spec.wifi is None:
-            raise RobotError("it has no Linux Wi-Fi", where=self.name)
+            raise RobotError("the robot has no Linux Wi-Fi", where=self.name)
         link = {"device": device, "interface": self.interface, "address": self.address}
         self._worker.request({"do": "open wifi", "wifi": asdict(self.spec.wifi), **link})
 
@@ -207,12 +207,15 @@ class EmulatedRobot(Node):
                 (self.link_fds[name],) = fds
 
     def switch_off(self, link: str = "") -> None:
-        """Take the interface of a further link, or of the radio, down. Raises the errors of `open_radio`."""
+        """Take down the interface of a further link, or of the radio without `link`.
+
+        Raises the errors of `open_radio`.
+        """
         interface, _ = self.spec.links.get(link, (self.spec.interface, ""))
         self._worker.request({"do": "switch off", "interface": interface})
 
     def switch_on(self, link: str = "") -> None:
-        """Bring the interface of a further link, or of the radio, up again. Raises the errors of `open_radio`."""
+        """Bring up the interface that `switch_off` has taken down. Raises the errors of `open_radio`."""
         if link in self.spec.links:
             self._worker.request({"do": "switch link on", "interface": self.spec.links[link][0]})
         else:
@@ -351,7 +354,7 @@ def running_robots(
         }
         media = Media(medium, links)
         positions_writer = stack.enter_context(closing(PositionsWriter([robot.name for robot in robots.values()])))
-        # The pool is shut down after the robots have exited, because a request that waits for a robot ends only then.
+        # The pool is shut down after the robots have exited, because a waiting request ends when its robot exits.
         pool = stack.enter_context(ThreadPoolExecutor(min(len(robots), _MAX_PARALLEL_STARTS)))
         running: dict[RobotKey, EmulatedRobot] = {}
         for key in robots:
@@ -373,7 +376,7 @@ def running_robots(
         if any(robot.spec.waits_for_another for robot in running.values()):
             names = [*(robot.name for robot in running.values()), *(options.radio.access_points if wifi else ())]
             media.place(placement.side_by_side_m(names))
-        list(startups)
+        list(startups)  # waits until the programs are ready, and raises their errors
         yield RunningRobots(
             running,
             medium,
@@ -402,6 +405,7 @@ def _cosimulated_medium(
 
 
 def _build(robot: EmulatedRobot, radios: "Mapping[str, HwsimRadio]") -> None:
+    """Build a robot and bring up its interfaces; `radios` are the kernel's radios of robots with Linux Wi-Fi."""
     robot.build()
     radio = radios.get(robot.name)
     if radio is not None:

@@ -26,7 +26,7 @@ _CEILING_M: Final = 100_000.0
 def positions_m(cast: Cast, placement: Placement, world: World) -> dict[str, Vector]:
     """Return the position of each antenna, metres east, north, up, on the world's line for the scenario.
 
-    The line starts at the sender. If the scenario has an obstacle, it is at that end of the line (paper, section
+    The line starts at the sender. If the scenario has an obstacle, the obstacle is near the sender (paper, section
     VI-A). `geometry.positions_m` determines the distances of the other robots from the sender.
 
     Raises:
@@ -59,6 +59,7 @@ def assigned_path(placement: Placement, move: Move, world: World, start_ns: int)
         start_ns: Start of the move, as a time of the monotonic clock.
     """
     line, (along_m, left_m) = _line(placement, world), _along_line_m(placement)[move.role]
+    # 1 m ahead of the robot, which faces along the line (1) or against it (-1).
     ahead_m = math.cos(geometry.heading_rad(move.role, "away"))
     start, goal = line.at(along_m, left_m), line.at(along_m + ahead_m, left_m)
     facing_rad = math.atan2(goal[1] - start[1], goal[0] - start[0])

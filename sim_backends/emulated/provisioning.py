@@ -118,11 +118,12 @@ def _sensor(topic: PublishedTopic) -> Sensor:
 
 
 def laser_targets(world: World) -> tuple[LaserTarget, ...]:
-    """Return the laser targets of a world."""
+    """Return the obstacles of a world in the form in which a robot's laser uses them."""
     return tuple(_laser_target(part.shape) for part in world.parts)
 
 
 def _laser_target(shape: Shape) -> LaserTarget:
+    # The bottom of a shape is as far below its centre as the top is above it.
     base_m, top_m = shape.centre_m[2] - (shape.top_m - shape.centre_m[2]), shape.top_m
     if isinstance(shape, Cylinder):
         return LaserTarget((shape.centre_m[:2],), shape.radius_m, base_m, top_m)
@@ -160,8 +161,8 @@ def ros_master_of(robot: "Robot | LabRobot") -> str:
 def _registered_topics(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) -> tuple[str, ...]:
     """Return the topics that a robot registers at its ROS master.
 
-    If robots share a master, a topic that several of them have is registered by the first one: nodes of a second
-    robot have the same names, and the master shuts down the earlier nodes of these names.
+    If robots share a master, a topic that several of them have is registered only by the first one. The nodes of the
+    others would have the same names, and a master shuts down a node when another one registers with its name.
     """
     registered: set[str] = set()
     for other in robots:
@@ -213,6 +214,7 @@ def link_addresses(profile: RobotProfile, address: str, options: EmulatedOptions
     last_byte = int(IPv4Address(address)) - int(NETWORK.network_address)
     # The Nth link in alphabetical order has the network 10.42.N.0/24.
     networks = {name: NETWORK.network_address + 256 * number for number, name in enumerate(sorted(options.links), 1)}
+    # In a mesh, a link on the loopback interface is a second address of the robot, reachable over all other links.
     for name, interface in profile.further_links.items():
         if interface == LOOPBACK_INTERFACE and options.mesh is not None:
             networks[name] = SHARED_NETWORK.network_address
@@ -236,6 +238,7 @@ def _prefix_length(interface: str) -> int:
 
 
 def _base(profile: RobotProfile, *, is_simulated: bool) -> Base | None:
+    """Return the settings of a robot's base controller; None if its profile has no section `drive`."""
     drive = drive_of(profile)
     if drive is None:
         return None
@@ -250,7 +253,7 @@ def _ros2_spec(
 ) -> Ros2Spec | None:
     """Return the settings of a robot's ROS 2 over the radio.
 
-    The result is None if the robot has none, or if its middleware is not installed on this machine.
+    The result is None if the robot has no ROS 2 over the radio, or if this machine lacks the middleware.
 
     Raises:
         ConfigurationError: The robot with the router is not among `robots`.

@@ -111,6 +111,6 @@ def check_shared_master(ros: RosChoice) -> None:
     if packages:
         raise ConfigurationError(
             "the site file gives robots one ROS master (ros_master), which for emulated robots needs Debian's ROS",
-            remedy=f"apt-get install --no-install-recommends {' '.join(packages)}, and ros: debian or auto under "
-            "emulated; or remove ros_master",
+            remedy=f"apt-get install --no-install-recommends {' '.join(packages)}, and write ros: debian or "
+            "ros: auto under emulated; or remove ros_master",
         )

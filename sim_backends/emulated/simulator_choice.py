@@ -66,6 +66,7 @@ def resolve(options: EmulatedOptions) -> Simulators:
 
 
 def _physics(options: EmulatedOptions) -> str:
+    """Return the name of the physics simulator, or its command line if it is a separate program."""
     name = options.physics or KINEMATIC
     if name == KINEMATIC:
         return name
@@ -81,7 +82,7 @@ def _gazebo_options() -> dict[str, Any]:
     """Return the options of Gazebo, with its partition and address from the environment.
 
     The medium process does not inherit these environment variables, so it receives them as options. Velocities are
-    means over a window, because the velocities over its last step would need a second request per window.
+    means over a window, because the velocities over the last step of a window would need a second request.
     """
     set_options = {
         option: os.environ.get(f"GZ_{variable}") or os.environ.get(f"IGN_{variable}")
@@ -95,6 +96,7 @@ def _gazebo_options() -> dict[str, Any]:
 
 
 def _network(options: EmulatedOptions) -> str:
+    """Return `builtin`, or the command line of the network simulator."""
     name = options.network or BUILTIN
     if name == BUILTIN:
         return name

@@ -56,6 +56,7 @@ class EmulatedOracle:
         self._mobility = mobility
         self._late_bound_s = options.late_bound
         self._records_air = options.record_air
+        # A co-simulation exchanges data at the end of windows of time; a window can be late like a packet.
         self._has_windows = options.is_cosimulated
 
     def track(self, since_utc_ns: int) -> tuple[TrackPoint, ...]:
@@ -166,7 +167,7 @@ class EmulatedTestbed:
         self._mobility.return_to_place(role)
 
     def watching(self) -> AbstractContextManager[object]:
-        """Return a context that keeps the medium up to date with robots that steer themselves."""
+        """Return a context in which the medium receives the positions of robots that steer themselves."""
         return self._mobility.watching()
 
     def moving(self, move: Move) -> AbstractContextManager[None]:
@@ -175,7 +176,7 @@ class EmulatedTestbed:
 
 
 class LinuxWifiTestbed(EmulatedTestbed):
-    """Robots with Linux Wi-Fi, whose radio is measured as on real robots.
+    """Robots with Linux Wi-Fi. Their radio is measured with the tools of real robots, so there is no oracle.
 
     The arguments are those of the base class.
     """

@@ -24,7 +24,7 @@ struct Agent
     Vector velocity;
     int64_t appears_ns = 0, disappears_ns = -1; // -1 for never
     bool is_present = false; // it has a model, which may not have published a pose yet
-    bool is_new = false;    // its model has not published a pose yet
+    bool is_new = false;    // its model was created and has not published a pose yet
     bool had_model = false; // it had a model before the run
 
     bool HasLifetime() const
@@ -44,12 +44,13 @@ struct Agent
         return model_pose.position + model_pose.Rotated(antenna);
     }
 
+    // Angle from its heading to its target heading, which is the fourth value of a command to an agent that flies.
     double YawError() const
     {
         return std::remainder(command.values[3] - pose.Yaw(), 2 * M_PI);
     }
 
-    // True if it has a target direction that it has not reached yet.
+    // True if it has a target heading (NaN for none) that it has not reached yet.
     bool Turns() const
     {
         return is_present && flies && !std::isnan(command.values[3]) && std::fabs(YawError()) > 1e-3;

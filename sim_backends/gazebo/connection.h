@@ -291,6 +291,7 @@ class Connection
         std::string worlds;
         for (const std::string& service : services)
         {
+            // The service of a world is called /world/NAME/control; 7 and 8 characters are before and after the name.
             if (service.rfind("/world/", 0) == 0 && service.size() > 15 &&
                 service.compare(service.size() - 8, 8, "/control") == 0)
             {

@@ -27,8 +27,9 @@ _INSTALL: Final = (
 
 
 def adapter() -> CompiledProgram:
-    """Return the adapter for the oldest installed version of Gazebo Transport."""
+    """Return the adapter for the oldest installed version of Gazebo Transport; for Fortress if none is installed."""
     libraries = next((names for names in _LIBRARIES if _are_installed(names)), _LIBRARIES[0])
+    # From Garden on, the namespaces and headers are called `gz` instead of `ignition`.
     flags = ["-O1", "-std=c++17"] if libraries is _LIBRARIES[0] else ["-O1", "-std=c++17", "-DFIELDKIT_GZ"]
     return CompiledProgram(
         "gazebo-adapter", _SOURCE, (*libraries, "nlohmann_json"), _INSTALL, flags=flags, duration_text="about 15 s"

@@ -47,14 +47,14 @@ class GazeboOptions(SimulatorOptions):
         place: Set the poses of the robots before a run.
         settle_s: Simulated time in which robots come to rest, before the reset and before time 0.
         start_error_m: Largest distance of a robot from its start.
-        velocity: Velocities are the difference of positions over the last `step`, or over the `window` at half the
-            cost.
+        velocity: Velocities are the difference of positions over the last `step`, or over the `window`, which takes
+            one request to Gazebo per window instead of two.
         gravity_m_s2: Gravity that is compensated for robots that fly; 0 if their links have no gravity.
         yaw_gain_per_s: Commanded yaw rate of robots that fly, per radian of heading error.
         control_period_s: Interval between commands to robots that fly, in simulated time.
-        limit_m_s2: Largest acceleration, for `error_bounded`; if omitted, that policy exchanges every step while an
-            agent sends.
-        deterministic: Declare that equal requests give equal answers.
+        limit_m_s2: Largest acceleration, for the exchange policy `error_bounded`; if omitted, this policy exchanges
+            positions at every step while an agent sends.
+        deterministic: True to declare that equal requests give equal answers.
         timeout_s: Maximum wait without progress, in wall time.
     """
 

@@ -32,6 +32,7 @@ _WHEEL_MASS_SHARE: Final = 0.05
 """Mass of a wheel as a share of the robot's mass."""
 _UPRIGHT: Final = (0.0, 0.0, 0.0)
 _WHEEL_AXIS: Final = (-math.pi / 2, 0.0, 0.0)
+"""Roll, pitch and yaw of an upright body, and of a wheel, whose axle is the z axis of its link."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class _Chassis:
         wheel_width_m: Width of its wheels.
         track_m: Distance between left and right wheels.
         base_m: Distance between front and rear wheels; 0 for two wheels with a ball caster in front and behind.
-        mass_kg: Its mass.
+        mass_kg: Mass of the robot with its wheels.
         lateral_friction: Coefficient of friction along the axle: four wheels must slide sideways in turns.
     """
 
@@ -105,6 +106,7 @@ def world_sdf(
     sun = SubElement(element, "light", type="directional", name="sun")
     _add_texts(sun, cast_shadows="true", pose="0 0 20 0 0 0", direction="-0.5 0.1 -0.9", diffuse="0.8 0.8 0.8 1")
     ground = _static_model(element, "ground_plane")
+    # The plane's centre is the origin, a corner of the area, so it must be more than twice as large as the area.
     for kind in ("collision", "visual"):
         geometry = SubElement(SubElement(ground, kind, name=kind), "geometry")
         _add_texts(
@@ -270,15 +272,23 @@ def _add_drive(model: Element, limits: DriveLimits, version: Version) -> None:
 
 
 def _wheel_name(side: int, end: int) -> str:
-    return f"{'left' if side > 0 else 'right'}{('', '-front', '-rear')[end]}-wheel"
+    """Return the name of a wheel.
+
+    Args:
+        side: 1 for the left side, -1 for the right side.
+        end: 1 for the front, -1 for the rear, 0 for the only wheel of a side.
+    """
+    end_text = {1: "-front", -1: "-rear", 0: ""}[end]
+    return f"{'left' if side > 0 else 'right'}{end_text}-wheel"
 
 
 def _add_wheel(model: Element, chassis: _Chassis, friction: float, side: int, end: int) -> None:
+    """Add a wheel and its joint; see `_wheel_name` for `side` and `end`."""
     name = _wheel_name(side, end)
     link = SubElement(model, "link", name=f"{name}-link")
     radius_m, width_m = chassis.wheel_radius_m, chassis.wheel_width_m
     _add_pose(link, (end * chassis.base_m / 2, side * chassis.track_m / 2, radius_m), _WHEEL_AXIS)
-    # A box with an edge of sqrt(3) times the radius has the inertia of the cylinder.
+    # A box whose edge is sqrt(3) = 1.7 times the radius has the inertia of the cylinder.
     _add_inertia(link, _WHEEL_MASS_SHARE * chassis.mass_kg, (1.7 * radius_m, 1.7 * radius_m, width_m))
     cylinder = Cylinder(_UPRIGHT, radius_m, width_m)
     _add_shape(link, "tire", cylinder, _UPRIGHT, frictions=(chassis.lateral_friction, friction))
@@ -286,10 +296,11 @@ def _add_wheel(model: Element, chassis: _Chassis, friction: float, side: int, en
     _add_texts(joint, parent="chassis", child=f"{name}-link")
     axis = SubElement(joint, "axis")
     _add_texts(axis, xyz="0 0 1")
-    _add_texts(SubElement(axis, "limit"), lower=-1e16, upper=1e16)
+    _add_texts(SubElement(axis, "limit"), lower=-1e16, upper=1e16)  # no limit of the angle
 
 
 def _add_casters(link: Element, chassis: _Chassis) -> None:
+    """Add a ball without friction in front and one behind, as high as the underside."""
     radius_m = chassis.clearance_m / 2
     for number, end in enumerate((1, -1)):
         element = SubElement(link, "collision", name=f"caster-{number}")

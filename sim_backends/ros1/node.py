@@ -16,9 +16,10 @@ from typing import Any, Final
 from urllib.parse import urlsplit
 
 from sim_backends.ros1.framing import PacketSplitter, pack, pack_header, unpack_header
-from sim_backends.ros1.node_calls import CALL_S, SUCCESS, MasterError, RosNodeRequests, RosNodeServer, call
+from sim_backends.ros1.node_calls import CALL_S, FAILURE, SUCCESS, MasterError, RosNodeRequests, RosNodeServer, call
 
 _RETRY_S: Final = 0.1
+"""Time between two calls of a master that does not answer."""
 _CHUNK_BYTES: Final = 1 << 16
 
 
@@ -221,7 +222,7 @@ class RosSubscriber:
 
 
 class RosNode:
-    """A node.
+    """A node that publishes topics and subscribes to topics.
 
     Args:
         name: Its name.
@@ -280,6 +281,7 @@ class RosNode:
         return subscriber
 
     def _register(self, method: str, topic: str, kind: RosMessageType, deadline_s: float) -> list[str]:
+        """Call a registration method of the master; return the URIs in its answer."""
         while True:
             try:
                 uris = call(self._master, method, self._name, topic, kind.name, self._uri)
@@ -317,7 +319,7 @@ class RosNode:
 
     def _request_topic(self, _caller: str, topic: str, protocols: Sequence[Any]) -> list[Any]:
         if topic not in self._publishers or not any(protocol[:1] == ["TCPROS"] for protocol in protocols):
-            return [0, f"{topic} is not published here by TCPROS", 0]
+            return [FAILURE, f"{topic} is not published here by TCPROS", 0]
         return [SUCCESS, "", ["TCPROS", self._host, self._stream_server.getsockname()[1]]]
 
     def _publisher_update(self, _caller: str, topic: str, publishers: Sequence[str]) -> list[Any]:

@@ -14,7 +14,8 @@ from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
 from typing_extensions import override
 
 SUCCESS: Final = 1
-"""Status of a successful call."""
+FAILURE: Final = 0
+"""Statuses of a successful and of a failed call."""
 CALL_S: Final = 5.0
 """Timeout of a call."""
 

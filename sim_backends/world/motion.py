@@ -1,6 +1,6 @@
 """Motion of robots: position and velocity of each at any time, and their dead reckoning.
 
-Dead reckoning is extrapolation with constant velocity (IEEE Std 1278.1-2012, annex E, DRM FPW).
+Dead reckoning is extrapolation with constant velocity (IEEE Std 1278.1-2012, annex E, algorithm DRM FPW).
 """
 
 import math
@@ -36,7 +36,7 @@ class Lifetime(NamedTuple):
 
     Attributes:
         appears_ns: Time from which the robot exists.
-        disappears_ns: Time from which it no longer exists; None if it never disappears.
+        disappears_ns: Time from which it does not exist; None if it never disappears.
     """
 
     appears_ns: int = 0

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from fieldkit.core.model import Vector
 
 Floats = NDArray[np.float64]
-"""Metres east, north, up."""
+"""Positions are in metres east, north, up."""
 
 _CIRCLE_CORNERS: Final = 32
+"""Number of corners of the polygon that is drawn for a circle."""
 
-# Margin against rounding errors: a path at this distance does not touch a shape.
 _NEAR_M: Final = 0.001
+"""Margin of bounding boxes against rounding errors. A path at this distance from a shape does not touch it."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ class Solids:
         inside = np.zeros((self._count, len(start_m)))
         below_m, above_m = np.minimum(start_m, end_m), np.maximum(start_m, end_m)
         for indices, inside_share, (low_m, high_m, *arrays) in self._kinds:
-            # Most paths are far from most shapes, which is faster to check with bounding boxes.
+            # Most shapes are far from all paths. Bounding boxes exclude them faster than the exact computation.
             candidates = ((above_m >= low_m) & (below_m <= high_m)).all(axis=-1).any(axis=-1)
             if candidates.any():
                 inside[indices[candidates]] = inside_share(start_m, end_m, *(array[candidates] for array in arrays))
@@ -173,17 +174,23 @@ def _slab(start: Floats, end: Floats, half: Floats) -> tuple[Floats, Floats]:
     The fractions are 1 and 0 if the path does not enter the range.
     """
     step = end - start
-    level = step == 0
-    step = np.where(level, 1.0, step)
-    with np.errstate(over="ignore"):  # an almost level path intersects the planes infinitely far away
+    is_parallel = step == 0  # to the planes at -half and half
+    step = np.where(is_parallel, 1.0, step)
+    with np.errstate(over="ignore"):  # an almost parallel path intersects the planes infinitely far away
         first, second = (-half - start) / step, (half - start) / step
     entry, exit_ = np.clip(np.minimum(first, second), 0, 1), np.clip(np.maximum(first, second), 0, 1)
     within = np.abs(start) < half
-    return np.where(level, np.where(within, 0.0, 1.0), entry), np.where(level, np.where(within, 1.0, 0.0), exit_)
+    return (
+        np.where(is_parallel, np.where(within, 0.0, 1.0), entry),
+        np.where(is_parallel, np.where(within, 1.0, 0.0), exit_),
+    )
 
 
 def _disc(start: Floats, end: Floats, radius: Floats) -> tuple[Floats, Floats]:
-    """Return the same as `_slab` for discs around the origin and paths of shape (m, n, 2)."""
+    """Return the fractions of each path at which the path enters and leaves a disc around the origin, as `_slab`.
+
+    Paths are seen from above and have the shape (m, n, 2). The fractions are the roots of a quadratic equation.
+    """
     step = end - start
     a = (step * step).sum(axis=-1)
     half_b = (start * step).sum(axis=-1)
@@ -195,5 +202,8 @@ def _disc(start: Floats, end: Floats, radius: Floats) -> tuple[Floats, Floats]:
     divisor = np.where(is_vertical, 1.0, a)
     entry = np.clip((-half_b - root) / divisor, 0, 1)
     exit_ = np.clip((-half_b + root) / divisor, 0, 1)
-    always = is_vertical & (c < 0)
-    return np.where(crosses, entry, np.where(always, 0.0, 1.0)), np.where(crosses, exit_, np.where(always, 1.0, 0.0))
+    stays_inside = is_vertical & (c < 0)
+    return (
+        np.where(crosses, entry, np.where(stays_inside, 0.0, 1.0)),
+        np.where(crosses, exit_, np.where(stays_inside, 1.0, 0.0)),
+    )

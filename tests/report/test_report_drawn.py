@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -200,6 +201,16 @@ def test_distances_have_the_labels_that_the_operator_typed() -> None:
     panel = panel_of(curves(parsed(rows), "rtt_median_s"))
     assert [label for _, label in panel.x_ticks] == ["10m", "60ft"]
     assert "at 60ft" in panel.description
+
+
+def test_a_long_name_of_a_lane_has_two_lines() -> None:
+    series = Series("", Style("blue", "o", "none"), [1.0, 2.0], [0.0, 1.0], join="none")
+    lanes = ("ping recovery after link-down", "a name " + 10 * "that is too long ")
+    figure = figures.panel_svg(Panel("", "", "", [series], "", top=3.0, right=3.0, lanes=lanes))
+    texts = re.findall(r">([^<>]+)</(?:text|tspan)>", figure)
+    assert {"ping recovery after", "link-down", "a name that is too long"} <= set(texts)
+    assert sum("that is too long" in text for text in texts) == 2
+    assert texts.count("that is too long that is…") == 1
 
 
 @pytest.mark.parametrize("lanes", [(), ("RTT",)])

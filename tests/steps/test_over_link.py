@@ -113,7 +113,7 @@ def test_a_link_that_a_robot_does_not_have_is_rejected_with_the_nearest_name() -
     with pytest.raises(ConfigurationError, match=r"turtlebot-2 \(receiver\) has no link 'cel'") as error:
         commands(parse_step(PingStep, "from: sender, to: receiver, over: cel"))
     assert "cell" in error.value.remedy
-    with pytest.raises(ConfigurationError, match="a reboot does not allow link"):
+    with pytest.raises(ConfigurationError, match="kind reboot does not allow the key link"):
         parse_step(FaultStep, "robot: receiver, kind: reboot, link: cell")
 
 
@@ -130,6 +130,9 @@ def test_flows_and_route_checks_name_the_link() -> None:
     assert [flow.link for flow in step.flows(SCENE)] == ["cell"]
     (need,) = step.needs(SCENE)
     assert need.argv == ("ip", "-o", "route", "get", "100.64.0.2")
+    send = parse_step(SendStep, "from: sender, to: receiver, size: 5kB, over: cell")
+    assert isinstance(send, HasNeeds)
+    assert [check.argv for check in send.needs(SCENE)] == [need.argv]
     for other in ("", ", over: wifi", ", over: either"):
         radio = parse_step(PingStep, f"from: sender, to: receiver{other}")
         assert isinstance(radio, HasNeeds)

@@ -22,7 +22,7 @@ COMMANDS: Final[Mapping[str, str]] = MappingProxyType(
         "trial": "run a procedure at one or more distances",
         "campaign": "run the trials of a campaign file, or continue them",
         "resume": "continue a trial that stopped",
-        "stop": "stop robots that fieldkit moves, immediately",
+        "stop": "immediately stop robots that fieldkit moves",
         "abort": "terminate all jobs of fieldkit on the robots and remove their locks",
         "lab": "start emulated robots on this machine for experiments",
         "aggregate": "aggregate the repeats of many trials, with intervals",

@@ -31,7 +31,7 @@ def add(parser: Parser) -> None:
     actions = parser.add_commands(title="commands", metavar="COMMAND")
     action = actions.add_parser(
         "up",
-        help="start the robots of the site file, all in one place, or N equal ones",
+        help="start the robots of the site file, or N equal robots",
         description="Start every robot of the site file, with any roles and backend, or N equal robots with "
         "--robots, and return when all can be reached. They are placed in a square in the middle of the world, at "
         "most 5 m apart, and communicate directly with each other; radio, world and ROS are those of the site file's "
@@ -94,7 +94,7 @@ def _add_sdf(actions: Commands) -> None:
         "--gazebo",
         ("fortress", "garden"),
         default="fortress",
-        help="names of the plugins: fortress (default), or garden for it and later versions",
+        help="use the plugin names of fortress (default), or of garden and later versions",
     )
     shared.add_robots(parser)
     parser.set_defaults(run=print_sdf)

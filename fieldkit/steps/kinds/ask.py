@@ -33,7 +33,8 @@ def _checked_choice(word: str) -> str:
     has_valid_form = 0 < len(word) <= _MAX_CHARACTERS and word.isprintable() and word == word.strip()
     if not has_valid_form or word.isdigit() or word in {UNKNOWN, *MISSING}:
         raise schema.validation_error(
-            f"{word[:40]!r} cannot be a choice: write words of at most {_MAX_CHARACTERS} characters"
+            f"{word[:40]!r} cannot be a choice: write words of at most {_MAX_CHARACTERS} characters; "
+            "numbers and - are not allowed"
         )
     return word
 

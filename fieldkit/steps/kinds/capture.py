@@ -36,23 +36,23 @@ from fieldkit.steps.surroundings import EarlierStep, EnclosingStep
 from fieldkit.steps.variants import Tool
 from fieldkit.steps.view import View
 
-# In immediate mode the kernel dropped 177 of 215 packets of a burst with the default snap length and buffer, and none
-# with these values.
 SNAP_BYTES: Final = 128
 BUFFER_KIB: Final = 4096
+"""Bytes of each frame that are captured, and size of the kernel's buffer. With tcpdump's defaults for these values,
+the kernel dropped 177 of 215 packets of a burst in immediate mode; with these values, it dropped none."""
 
 LIMIT_S: Final = 900.0
 """Time limit of a capture in addition to the limits of the steps inside."""
 
-# Size of the header of each captured frame in the file.
 _RECORD_BYTES: Final = 16
+"""Size of the header of each captured frame in the file."""
 
-# Without immediate mode the kernel passes packets to tcpdump within a second: of 215 packets, tcpdump had none after
-# 0.5 s and all after 1.0 s.
 RING_S: Final = 2
+"""Time before tcpdump is stopped if it does not support immediate mode. The kernel then passes packets to tcpdump
+with a delay of up to a second: of 215 packets, tcpdump had none after 0.5 s and all after 1.0 s."""
 
-# Text of tcpdump's last line. After this line the kernel needs 15 to 31 ms to close the socket.
 LAST_LINE: Final = "dropped by kernel"
+"""Text of tcpdump's last line. After this line the kernel needs 15 to 31 ms to close the socket."""
 
 BACK_S: Final = 0.1
 """Maximum step backwards between time stamps: packets received by two processors may be recorded out of order."""
@@ -173,7 +173,7 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
 
     @property
     def _needs_all_packets(self) -> bool:
-        """Whether a packet dropped before tcpdump makes a measurement of a step inside wrong."""
+        """Whether a packet dropped before tcpdump makes the repeat void; see `Step.needs_complete_capture`."""
         return any(step.needs_complete_capture for step in self._leaves())
 
     def _leaves(self) -> Iterator[Step]:
@@ -192,6 +192,7 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
             f"src host {scene.link(role, self.over).address} and dst host {group}" for group, role in sorted(groups)
         ]
         ports = dict.fromkeys(port for port in (*(flow.port for flow in flows), self.port) if port is not None)
+        # `ip[6:2] & 0x1fff` is the fragment offset, which is 0 only in unfragmented packets and first fragments.
         packet_kinds = " or ".join((*(f"port {port}" for port in ports), "icmp", "ip[6:2] & 0x1fff != 0"))
         host_filter = hosts[0] if len(hosts) == 1 else f"({' or '.join(f'({pair})' for pair in hosts)})"
         return f"{host_filter} and ({packet_kinds})"
@@ -258,6 +259,8 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
                 raise scene.failure(capture, f"tcpdump ended with exit code {code}")
 
     def _stop(self, scene: Scene, testbed: Testbed, captures: Sequence[Planned]) -> list[int]:
+        """Stop the captures; return the exit code of each."""
+
         def stop(capture: Planned) -> int:
             if not scene.tools(capture.role).immediate_mode:
                 jobs.begin_wait(testbed.shells[capture.role], capture.job, RING_S).end(RING_S + jobs.REPLY_S)
@@ -277,7 +280,7 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
     def check(self, view: View) -> Iterator[str]:
         """Yield a reason for each incomplete capture file, and for dropped packets; see `Step.check`.
 
-        Dropped packets are permitted if each step inside withholds the columns that depend on them.
+        Dropped packets are permitted if each step inside leaves the columns that depend on them empty.
         """
         for role in self.robots:
             for problem in _problems(

@@ -37,11 +37,14 @@ from fieldkit.steps.view import View
 if TYPE_CHECKING:
     from concurrent.futures import Future
 
-# Time allowed for the operator to cause a fault.
 PATIENCE_S: Final = 600.0
+"""Time allowed for the operator to cause a fault."""
 
 _CLOCK_S: Final = 5.0
 """Timeout of a time query."""
+
+_START_S: Final = 0.3
+"""Approximate time in which the observer starts and stops."""
 
 _KINDS_WITH_DURATION: Final = frozenset({FaultKind.LINK_DOWN, FaultKind.OUT_OF_RANGE})
 
@@ -111,9 +114,10 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
             ("process", self.process is not None, self.kind is FaultKind.KILL),
         ):
             if is_given != is_required:
-                raise schema.validation_error(f"a {self.kind} {'needs' if is_required else 'does not allow'} {key}:")
+                verb = "needs" if is_required else "does not allow"
+                raise schema.validation_error(f"a fault of the kind {self.kind} {verb} the key {key}:")
         if self.link and self.kind is not FaultKind.LINK_DOWN:
-            raise schema.validation_error(f"a {self.kind} does not allow link:", "link")
+            raise schema.validation_error(f"a fault of the kind {self.kind} does not allow the key link:", "link")
         return self
 
     @property
@@ -155,7 +159,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
         pool = ThreadPoolExecutor(max_workers=1)
         steps = pool.submit(self._run_inside, inner_scene, testbed, announce)
         try:
-            self._run_before_fault(steps)
+            self._wait_until_fault(steps)
             announce(f"{self.kind} of {scene.robot(self.robot).name}", self.lasts)
             request_ns = time.time_ns()
             duration_s = testbed.inject(self.cause)
@@ -170,9 +174,9 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
             with suppress(FieldkitError):
                 end_inside(self, scene, testbed)
             wait([steps])
-            mistake = steps.exception()
-            if mistake is not None and mistake is not error and is_bug(mistake):
-                raise mistake from error
+            inner_error = steps.exception()
+            if inner_error is not None and inner_error is not error and is_bug(inner_error):
+                raise inner_error from error
             raise
         finally:
             inner_scene.halt.set()
@@ -200,11 +204,11 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     def _record_times(
         self, scene: Scene, request_ns: int, duration_s: float | None, clock_offsets: Mapping[Role, Offset]
     ) -> None:
-        """Record the times of the fault by the laptop's clock; called when the cause has ended."""
+        """Record the times of the fault by the laptop's clock; called when the fault itself has ended."""
         if scene.laptop_folder is None:
             return
         now_ns = time.time_ns()
-        # A fault with a duration started `duration_s` ago; a reboot or a kill lasts from the request until now.
+        # A fault with a known duration started `duration_s` ago. Otherwise it lasted from the request until now.
         start_ns = now_ns - round(1e9 * duration_s) if duration_s else request_ns
         times = FaultTimes(start_ns, None if duration_s is None else now_ns, clock_offsets)
         path = scene.laptop_folder / self.prefixed_name(recoveries.fault_times_file(self.kind))
@@ -221,8 +225,11 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
             if not scene.halt.is_set:
                 entry.step.run(scene, testbed, announce)
 
-    def _run_before_fault(self, steps: "Future[None]") -> None:
-        """Wait until the fault is due. If a step inside fails before, raise its error: the fault is not the cause."""
+    def _wait_until_fault(self, steps: "Future[None]") -> None:
+        """Wait until it is time for the fault.
+
+        If a step inside fails before that time, its error is raised, because the fault is not the cause.
+        """
         from concurrent.futures import wait  # noqa: PLC0415 (as above)
 
         deadline = Deadline.after(self.after)
@@ -264,7 +271,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     def check(self, view: View) -> Iterator[str]:
         """Yield a reason if the observer's files are incomplete or do not show the fault."""
         try:
-            view.evidence.read(outage.read, "", self.kind, self.prefix)
+            view.evidence.read(outage.read, "", self.kind, self.prefix)  # "": the folder of the attempt
         except EvidenceError as error:
             yield f"{PurePath(error.where).name}: {error.what}"
 
@@ -289,4 +296,4 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
 
     @override
     def expected_s(self, protocol: Protocol) -> float:
-        return max(self.after + (self.lasts or 0.0) + RECOVERED_S, self.inside_s(protocol)) + 0.3
+        return max(self.after + (self.lasts or 0.0) + RECOVERED_S, self.inside_s(protocol)) + _START_S

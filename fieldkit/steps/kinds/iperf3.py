@@ -39,6 +39,9 @@ _SERVER_EXIT_S: Final = 5
 _DEFAULT_S: Final = 10.0
 """Default duration of iperf3."""
 
+_START_S: Final = 0.5
+"""Approximate time in which server and client start and exit."""
+
 _INTERVAL_BYTES: Final = 600
 """Size of iperf3's report on one second of one stream."""
 
@@ -118,7 +121,7 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
             folder=scene.folder,
             name=self.prefixed_name(f"iperf3-{name}"),
             argv=argv,
-            limit_s=self.limit + _SERVER_EXIT_S * is_server,
+            limit_s=self.limit + (_SERVER_EXIT_S if is_server else 0),
             log=self._log(role),
             stdout=self._json(role),
             ready=jobs.ready_when_bound(Protocol.TCP, self.port) if is_server else None,
@@ -163,7 +166,7 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
     @override
     def expected_s(self, protocol: Protocol) -> float:
         duration_s = self._duration_s if self.size is None else 8 * self.size / self.expected_bit_s(protocol)
-        return duration_s + 0.5
+        return duration_s + _START_S
 
     @override
     def files(self) -> tuple[str, ...]:

@@ -46,6 +46,8 @@ _HEADER_BYTES: Final = 8
 OLD_IPUTILS_MIN_INTERVAL_S: Final = 0.2
 """Shortest interval that iputils before 20210722 allows without root."""
 MAX_COUNT: Final = 1_000_000
+_SPARE_S: Final = 10.0
+"""Time limit of the job in addition to the time that ping needs."""
 _ROUNDING: Final = 1e-6
 """Rounding error that must not add a request when a duration is divided by the interval."""
 
@@ -154,7 +156,7 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
                 folder=scene.folder,
                 name=self.prefixed_name("ping"),
                 argv=command_line(scene, self.sender, options, scene.link(self.receiver, self.over).address),
-                limit_s=self.count * self.interval + REPLY_TIMEOUT_S + 10.0,
+                limit_s=self.count * self.interval + REPLY_TIMEOUT_S + _SPARE_S,
                 log=self._log,
                 stdout=self._file,
             ),
@@ -331,6 +333,7 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
         source, destination = (view.scene.link(role, self.over).address for role in (self.sender, self.receiver))
         requests, arrivals = (capture.packets.icmp(source, destination) for capture in (sender, receiver))
         replies = sender.packets.icmp(destination, source)
+        # `echo` is the identifier of a ping process; in replies, `ECHO_REPLY` is added to it.
         is_request = (arrivals.echo != NO_ECHO) & (arrivals.echo < ECHO_REPLY)
         was_sent = np.isin(arrivals.echo, requests.echo)
         earlier_count = int((is_request & ~was_sent).sum())

@@ -29,6 +29,9 @@ LIMIT_S: Final = 900.0
 _FOREVER_S: Final = 86_400
 """Maximum duration that iperf3 accepts."""
 
+_START_S: Final = 0.5
+"""Approximate time in which server and client start and are stopped."""
+
 _STALLS: Final = stalls.declare_columns("soak", "the load", rank=69)
 
 # Executes the command in $2 and later arguments, and prints "flows" when interface $1 has sent 10 kB. iperf3 itself
@@ -66,12 +69,12 @@ class SoakStep(LoadOptions, Nest, Listens, SendsTraffic):
         """Return the jobs of server and client."""
         limit_s = LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene))
         interface = scene.link(self.sender, self.over).interface
-        client = self.client_command(scene, "-t", str(_FOREVER_S))
+        client_command = self.client_command(scene, "-t", str(_FOREVER_S))
         ends = {
             self.receiver: (self.server_command(), jobs.ready_when_bound(Protocol.TCP, self.port)),
-            self.sender: (("sh", "-c", _FLOWS, "sh", interface, *client), "log:flows"),
+            self.sender: (("sh", "-c", _FLOWS, "sh", interface, *client_command), "log:flows"),
         }
-        server, sender = (
+        server, client = (
             Planned(
                 role,
                 Job(
@@ -83,7 +86,7 @@ class SoakStep(LoadOptions, Nest, Listens, SendsTraffic):
             )
             for role, (argv, ready) in ends.items()
         )
-        return server, sender
+        return server, client
 
     @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
@@ -105,7 +108,7 @@ class SoakStep(LoadOptions, Nest, Listens, SendsTraffic):
 
     @override
     def expected_s(self, protocol: Protocol) -> float:
-        return 0.5 + self.inside_s(protocol)
+        return _START_S + self.inside_s(protocol)
 
     @override
     def files(self) -> tuple[str, ...]:

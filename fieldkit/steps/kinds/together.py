@@ -27,7 +27,7 @@ MAX_PARALLEL: Final = 8
 
 
 class TogetherStep(Nest, Prepares, DescribesActions):
-    """Runs its steps at the same time: all listeners are up before the first step begins.
+    """Runs its steps at the same time: all listeners are ready before the first step begins.
 
     It ends when the last of them ends. If one fails, all others are stopped, including a `wait`. For a sequence
     inside it, use a step that has `during`, for example a `capture`. A step that may prompt the operator (`fault`,

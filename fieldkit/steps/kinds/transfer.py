@@ -69,6 +69,8 @@ BagName = Annotated[
 
 _LISTEN: Final = "listen"
 _SEND: Final = "send"
+_START_S: Final = 0.3
+"""Approximate duration of a transfer on a good link, without the idle time of UDP."""
 MAX_LATE_SHARE: Final = 0.1
 """Maximum time between the start of a listener and the start of its sender, as a share of the listener's limit. It
 applies if the listener was stopped at its limit."""
@@ -380,7 +382,7 @@ class TransferStep(
         )
 
     def _shares_port(self, view: View) -> bool:
-        """Return True if another flow in the same capture uses its port, in either direction."""
+        """Return True if another flow in the same capture uses the port of the transfer, in either direction."""
         captures = (step for step in reversed(view.within) if isinstance(step, Nest) and step.captures())
         flows = next((list(flows_inside(nest, view.scene)) for nest in captures), [])
         return sum(flow.port == self.port for flow in flows) > 1
@@ -388,8 +390,9 @@ class TransferStep(
     def _shares_udp_counters(self, scene: Scene) -> bool:
         """Return True if other steps also send UDP to the receiver, whose kernel has one set of UDP counters."""
         flows = (flow for flow in scene.flows if flow.destination == self.receiver and flow.port is not None)
-        udp_flows = sum((flow.protocol or scene.protocol) is Protocol.UDP for flow in flows)
-        return udp_flows > (scene.protocol is Protocol.UDP)
+        udp_flow_count = sum((flow.protocol or scene.protocol) is Protocol.UDP for flow in flows)
+        own_flow_count = 1 if scene.protocol is Protocol.UDP else 0
+        return udp_flow_count > own_flow_count
 
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
@@ -403,4 +406,4 @@ class TransferStep(
 
     @override
     def expected_s(self, protocol: Protocol) -> float:
-        return 0.3 + (self.idle if protocol is Protocol.UDP else 0.0)
+        return _START_S + (self.idle if protocol is Protocol.UDP else 0.0)

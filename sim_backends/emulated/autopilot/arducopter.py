@@ -19,8 +19,11 @@ from sim_backends.emulated.autopilot.parameters import (
 
 _d = dialect
 _FIRST_ITEM: Final = 1
+"""Number of the first item of a mission that is flown; item 0 is home."""
 _CM: Final = 100.0
+"""Centimetres per metre."""
 _RTL_M: Final = 15.0
+"""Default of the height of RTL above home."""
 
 _WITHOUT_EFFECT: Final = without_effect(
     **{f"FLTMODE{number}": mode for number, mode in enumerate((7, 9, 6, 3, 5, 0), 1)},
@@ -56,7 +59,7 @@ _WITHOUT_EFFECT: Final = without_effect(
     RTL_LOIT_TIME=0,
     STAT_RUNTIME=0,
 )
-"""Parameters that QGroundControl, MAVProxy and MAVSDK read."""
+"""Parameters that QGroundControl, MAVProxy and MAVSDK read; the vehicle does not use them."""
 
 _GROUPS: Final = (
     StreamGroup(_d.MAV_DATA_STREAM_RAW_SENSORS, "SR0_RAW_SENS", (_d.MAVLINK_MSG_ID_RAW_IMU,)),
@@ -149,7 +152,7 @@ def _mode_refusal(mode: Mode, conditions: ModeConditions) -> ModeRefusal | None:
 
 ARDUCOPTER: Final = Firmware(
     autopilot=_d.MAV_AUTOPILOT_ARDUPILOTMEGA,
-    version=0x040600FF,
+    version=0x040600FF,  # 4.6.0, an official release
     capabilities=COMMON_CAPABILITIES | _d.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST,
     base_mode=_d.MAV_MODE_FLAG_STABILIZE_ENABLED
     | _d.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED

@@ -26,11 +26,14 @@ from sim_backends.physics.collisions import Footprint
 from sim_backends.physics.robot_limits import QuadrotorLimits
 
 _ALL: Final = 0
+"""System or component id that addresses all systems or components."""
+# Bits of the field `type_mask` of a set-point (POSITION_TARGET_TYPEMASK).
 _POSITION_IGNORED: Final = 0b111
 _VELOCITY_IGNORED: Final = 0b111000
 _YAW_IGNORED: Final = 0b10000000000
 _LAST_MESSAGE_ID: Final = 0xFFFFFF
 _TEXT_BYTES: Final = 50
+"""Length of the text of a STATUSTEXT message."""
 
 
 class Autopilot:
@@ -225,6 +228,7 @@ class Autopilot:
         else:
             return
         has_yaw = not message.type_mask & _YAW_IGNORED and math.isfinite(message.yaw)
+        # MAVLink's yaw is clockwise from north.
         yaw_rad = math.remainder(math.pi / 2 - message.yaw, math.tau) if has_yaw else None
         velocity = (message.vy, message.vx, -message.vz)
         if not message.type_mask & _VELOCITY_IGNORED:

@@ -118,7 +118,7 @@ class Commands:
             return _DENIED
         number, sub = int(message.param2), int(message.param3)
         if self._vehicle.firmware.autopilot == dialect.MAV_AUTOPILOT_PX4:
-            number = number << 16 | sub << 24
+            number = number << 16 | sub << 24  # main mode and sub mode, as in `custom_mode` of HEARTBEAT
         return _ACCEPTED if self._change_custom_mode(number) else self._vehicle.firmware.unknown_mode
 
     def _change_custom_mode(self, custom_mode: int) -> bool:

@@ -88,7 +88,7 @@ class Failsafes(Protocol):
 
 
 class ArduCopterFailsafes:
-    """Battery and ground-station failsafes of ArduCopter.
+    """Battery and ground-station (GCS) failsafes of ArduCopter.
 
     A triggered battery failsafe lasts until the next boot. A triggered ground-station failsafe lasts until a
     heartbeat arrives.
@@ -103,7 +103,7 @@ class ArduCopterFailsafes:
         self._parameters = parameters
         # Number of the last stage in `_STAGES` that was triggered, from 1; 0 if none was.
         self._stage = 0
-        # For each stage whose voltage limit is undershot, the time since which this is the case.
+        # Time since which the voltage has been below the limit of a stage, by its name.
         self._below_ns: dict[str, int] = {}
         self._gcs_heartbeat_ns: int | None = None
         self._gcs_lost = False

@@ -74,7 +74,7 @@ class Firmware:
         refusal_result: MAV_RESULT of a command that it refuses now.
         unknown_mode: MAV_RESULT of a change to a mode that it does not have.
         unknown_rate: MAV_RESULT of MAV_CMD_SET_MESSAGE_INTERVAL for a message that it does not send.
-        unknown_message: MAV_RESULT of MAV_CMD_REQUEST_MESSAGE for such a message.
+        unknown_message: MAV_RESULT of MAV_CMD_REQUEST_MESSAGE for a message that it does not send.
         mode_refusal: Returns the refusal of a change of mode; None if it is accepted.
         prearm_prefixes: Prefixes of texts with reasons against arming: in answers to MAV_CMD_RUN_PREARM_CHECKS, and
             after a refused command to arm.

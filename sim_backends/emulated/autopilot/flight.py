@@ -19,6 +19,7 @@ from sim_backends.physics.quadrotor import FlightPose, Quadrotor
 from sim_backends.physics.robot_limits import QuadrotorLimits
 
 STEP_NS: Final = 10_000_000
+"""Time step of the flight."""
 _STEP_S: Final = STEP_NS / 1e9
 
 _APPROACH: Final = 0.5
@@ -113,7 +114,7 @@ class Airframe:
             self._limits, self._quadrotor = limits, Quadrotor(limits, self._pose.place_m)
         body = self._quadrotor if self.motors_on else self._unpowered
         before_m = self._pose.place_m
-        pose = body.course(self._pose, Velocity(target_m_s, yaw_rad), _STEP_S).at(1)
+        pose = body.course(self._pose, Velocity(target_m_s, yaw_rad), _STEP_S).at(1)  # after one step
         obstacles = self._nearby_obstacles(before_m)
         stop = move(body, before_m, pose.place_m, obstacles)
         if stop is not None:
@@ -166,7 +167,7 @@ def limits_within(limits: QuadrotorLimits, parameters: Parameters) -> QuadrotorL
 
 
 def velocity_to(goal_m: Vector, body: Airframe, limits: QuadrotorLimits) -> Vector:
-    """Return the velocity towards a point relative to home; from this velocity it can stop at the point."""
+    """Return the velocity towards a point relative to home, at which the drone can still stop at the point."""
     east, north, up = (goal - current for goal, current in zip(goal_m, body.position_m, strict=True))
     distance_m = math.hypot(east, north)
     along_per_s, climb_per_s = limits.gains_per_s
@@ -178,8 +179,9 @@ def velocity_to(goal_m: Vector, body: Airframe, limits: QuadrotorLimits) -> Vect
 
 
 def stop_m(body: Airframe, limits: QuadrotorLimits) -> Vector:
-    """Return the position at which it can stop, relative to home; the position is not below home.
+    """Return the position, relative to home, at which the drone stops if it brakes now.
 
+    A drone that is not below home is assumed not to sink below home.
     The stopping distance is the distance during the lags of attitude and velocity control, plus v^2 / 2a.
     """
     (x, y, z), (east, north, up) = body.position_m, body.velocity_m_s

@@ -51,7 +51,14 @@ AVAILABLE_MODES: Final = 435
 
 
 class _RawMessage(dialect.MAVLink_message):  # type: ignore[misc]  # pymavlink has no types
-    """A message whose payload is packed by this module."""
+    """A message whose payload is packed by this module.
+
+    Args:
+        number: Message id.
+        name: Name of the message.
+        payload: The packed fields.
+        crc_extra: CRC_EXTRA of the message: a number, derived from its fields, that the checksum of a frame includes.
+    """
 
     def __init__(self, number: int, name: str, payload: bytes, crc_extra: int) -> None:
         super().__init__(number, name)

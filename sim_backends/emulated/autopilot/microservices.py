@@ -16,6 +16,7 @@ from sim_backends.emulated.autopilot.mission_plan import MAX_ITEMS, Item, item_o
 from sim_backends.emulated.autopilot.parameters import NAME_BYTES, Parameters
 
 _NO_NUMBER: Final = -1
+"""Value of `param_index` if a client names the parameter instead of giving its number."""
 _INT, _FLOAT = dialect.MAV_PARAM_TYPE_INT32, dialect.MAV_PARAM_TYPE_REAL32
 _WARNING: Final = dialect.MAV_SEVERITY_WARNING
 
@@ -146,6 +147,7 @@ def decoded_name(name: str | bytes) -> str:
 MIN_INTERVAL_NS: Final = 20_000_000
 """Minimum interval of a message."""
 HEARTBEAT_US: Final = 1_000_000
+"""Default interval of the heartbeat."""
 
 
 class Streams:

@@ -9,7 +9,9 @@ CELL_V: Final = (3.5, 4.2)
 CELLS: Final = 3
 FULL_V: Final = CELLS * CELL_V[1]
 _HOVER_A: Final = 10.0
+"""Current while the motors turn."""
 _REST_A: Final = 0.5
+"""Current while the motors are off."""
 
 FLIGHT_S: Final = 15 * 60
 """Flight time of a full charge."""
@@ -43,7 +45,7 @@ class Battery:
     @property
     def used_mah(self) -> float:
         """Charge that has been used since power-on."""
-        return (1 - self.charge) * self.flight_s / 3.6 * _HOVER_A
+        return (1 - self.charge) * self.flight_s * _HOVER_A / 3.6  # 1 mAh is 3.6 As
 
     @property
     def voltage_v(self) -> float:

@@ -23,6 +23,7 @@ _CRITICAL: Final = 0.07
 
 
 def _custom(main: int, sub: int = 0) -> int:
+    """Return the number of a mode in `custom_mode` of HEARTBEAT, from its main mode and its sub mode."""
     return main << 16 | sub << 24
 
 
@@ -53,7 +54,7 @@ _WITHOUT_EFFECT: Final = without_effect(
     SYS_AUTOSTART=10040,
     SYS_HITL=0,
 )
-"""Parameters that QGroundControl and MAVSDK read."""
+"""Parameters that QGroundControl and MAVSDK read; the vehicle does not use them."""
 
 
 def _parameters_within(limits: FlightLimits) -> tuple[Parameter, ...]:
@@ -113,7 +114,7 @@ def _mode_refusal(mode: Mode, conditions: ModeConditions) -> ModeRefusal | None:
 
 PX4: Final = Firmware(
     autopilot=_d.MAV_AUTOPILOT_PX4,
-    version=0x011000FF,
+    version=0x011000FF,  # 1.16.0, an official release
     capabilities=COMMON_CAPABILITIES | _d.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE,
     base_mode=_d.MAV_MODE_FLAG_STABILIZE_ENABLED | _d.MAV_MODE_FLAG_GUIDED_ENABLED,
     # Main and sub mode (px4_custom_mode.h).

@@ -136,6 +136,7 @@ class Telemetry:
         failed_check = dialect.MAV_SYS_STATUS_PREARM_CHECK if self._vehicle.arming_errors else 0
         return dialect.MAVLink_sys_status_message(
             *(_SENSORS, _SENSORS, _SENSORS & ~failed_check),
+            # 200: the processor load is 20 %. The zeros are error counters.
             *(200, _u16(battery.voltage_v * 1e3), round(battery.current_a * 1e2), math.ceil(battery.charge * 100)),
             *(0,) * 6,
         )
@@ -147,7 +148,7 @@ class Telemetry:
             0,
             dialect.MAV_BATTERY_FUNCTION_ALL,
             dialect.MAV_BATTERY_TYPE_LIPO,
-            0x7FFF,
+            0x7FFF,  # unknown temperature
             cells,
             *(round(battery.current_a * 1e2), round(battery.used_mah), -1, math.ceil(battery.charge * 100)),
         )
@@ -162,6 +163,7 @@ class Telemetry:
             fix,
             *degrees_e7(east_m, north_m),
             round(up_m * 1e3),
+            # HDOP 0.8 and VDOP 1.2; the last number is that of the satellites.
             *(80, 120, round(math.hypot(east, north) * 1e2), self._course_cdeg(east, north), 12),
         )
 
@@ -216,6 +218,7 @@ class Telemetry:
             *acceleration,
             *self._rates,
             *self._in_body(_MAGNET_GAUSS),
+            # Differential pressure 0, temperature 25 degrees; all fields are valid.
             *(_pressure_hpa(up_m), 0.0, up_m, 25.0, 0xFFFF),
         )
 

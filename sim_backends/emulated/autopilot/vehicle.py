@@ -140,8 +140,7 @@ class Vehicle(VehicleBase):
         """Change the mode at the request of a client; the current mode is kept if it is requested again.
 
         Raises:
-            Refused: The mode requires a mission, recent set-points, or that the vehicle is flying, and this is not
-                the case.
+            Refused: A condition of the mode is not met: a mission, recent set-points, or that the vehicle is flying.
         """
         self._switch(mode)
         self.failsafes.on_mode_change(self.body.now_ns)

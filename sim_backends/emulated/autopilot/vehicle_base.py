@@ -74,7 +74,7 @@ class VehicleBase:
         self.mission = Mission(firmware.first_item)
         self.status_texts: list[StatusText] = []
         self.home_m: Vector = (0.0, 0.0, 0.0)
-        self.place(self.home_m, math.pi / 2, now_ns)
+        self.place(self.home_m, math.pi / 2, now_ns)  # facing north
         self.boot(now_ns)
 
     def boot(self, now_ns: int) -> None:

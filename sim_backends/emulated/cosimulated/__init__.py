@@ -11,6 +11,6 @@
 | `steering` | commanded velocities of one robot, and the record of its motion | records in the robot |
 | `simulators` | builds the physics and the network | cosim, network, radio, physics |
 
-The coordinator is the same as in simulated co-simulations, with the same windows, policies and ledger. Only its
-agents differ: the end of a window is a deadline of the monotonic clock.
+The coordinator, its windows and its policies are the same as in a co-simulation without real robots' programs. Only
+its agents differ: the end of a window is a deadline of the monotonic clock.
 """

@@ -45,6 +45,7 @@ from sim_backends.world.motion import STILL, State
 _MAX_SLEEP_NS: Final = 10_000_000
 """Maximum sleep. If the process wakes up later, packets may have waited for the additional time."""
 _END_NS: Final = 1 << 62
+"""A simulated time that no session reaches."""
 _WINDOWS: Final = 1000
 """Number of windows after which the record of the coordinator is cleared."""
 _MAX_LAG_NS: Final = 1_000_000_000
@@ -79,7 +80,8 @@ class CosimulatedMedium(MediumServer):
         # As in `Medium`: a device that has packets now was still empty at `_arrived_after_ns`.
         self._arrived_after_ns = self._previous_poll_ns = time.monotonic_ns()
         self._window_lateness_counts: Counter[int] = Counter()
-        # Delays that the sync policy adds. Their transmission part contains the undivided delay of the network.
+        # Delays that the sync policy adds, as processing delay. Their transmission part contains another value: the
+        # delay of the network whose parts are unknown (`undivided_ns`).
         self._added_delays = FlowDelays()
 
     def run(self) -> None:
@@ -144,6 +146,8 @@ class CosimulatedMedium(MediumServer):
     def _poll(self, due_ns: int | None, *, answers: bool = True) -> None:
         """Wait until a time of the monotonic clock, a packet or a request; read the packets and answer the request.
 
+        If `answers` is False, a request is left for the next call.
+
         `Medium._wait` explains the earliest time at which the packets can have arrived.
         """
         polled_ns = time.monotonic_ns()
@@ -200,7 +204,7 @@ class CosimulatedMedium(MediumServer):
     # Methods of `WindowObserver`.
 
     def begin(self, states: Mapping[str, State]) -> None:
-        """Implement `WindowObserver.begin`."""
+        """Implement `WindowObserver.begin`: the medium records no initial states."""
 
     def window(self, window: Window) -> None:
         """Implement `WindowObserver.window`: write the packets that arrived, and record the lateness."""

@@ -113,6 +113,7 @@ class CosimSession:
         if (parts := self._arrival_delays.get(packet.packet_id)) is not None:
             return _delay_of_parts(packet, delay_ns, parts), 0
         identity = packet.identity
+        # A broadcast is one transmission of the network, although the coordinator has a packet for each receiver.
         if packet.protocol == BROADCAST:
             identity = broadcast_flow(packet.source), identity[1]
         delay = self._delays.pop((packet.destination, identity), None)

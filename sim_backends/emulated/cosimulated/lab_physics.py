@@ -26,6 +26,7 @@ OFF_AIR_M: Final[Vector] = (0.0, 0.0, 1e7)
 _POLL_NS: Final = 10_000_000
 """Polling interval of the paths that the lab assigns to robots."""
 _MOVED_M: Final = 1e-6
+"""A robot that the lab has placed less than this away from its last position has not been moved."""
 
 
 @runtime_checkable
@@ -98,6 +99,7 @@ class LabPhysics:
         self._physics: PhysicsFederate | None = None
         # Simulated time at which the time of the physics simulator was 0. It increases while the simulator is paused.
         self._started_ns = 0
+        # Simulated time up to which the physics simulator has advanced, and the end of the last window.
         self._advanced_ns = 0
         self._now_ns = 0
         # Commands that the physics simulator receives when it advances next, and the last command of each robot.
@@ -110,6 +112,7 @@ class LabPhysics:
         self._poses_in_physics: dict[str, tuple[Vector, float]] = {}
         self._physics_states: Mapping[str, State] = {}
         self._states: Mapping[str, State] = self._assigned_states
+        # True if a state has changed since `_states` was computed.
         self._has_changed = True
         self._polled_ns = 0
 

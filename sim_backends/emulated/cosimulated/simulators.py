@@ -135,7 +135,7 @@ def start_physics(settings: LabSettings, states: Mapping[str, State]) -> Physics
         physics.close()
         raise ConfigurationError(
             f"{physics.session.name} has a step of {physics.step_ns} ns instead of {step_ns} ns",
-            remedy="configure this step in the simulator's world",
+            remedy=f"configure a step of {step_ns} ns in the simulator's world",
         )
     return physics
 
@@ -214,7 +214,11 @@ def _hello(settings: LabSettings, role: int, states: Mapping[str, State]) -> Hel
 
 
 def _configuration(settings: LabSettings, states: Mapping[str, State]) -> dict[str, Any]:
-    """Return the configuration that a scenario with the same radio, world and robots would have."""
+    """Return the configuration that a scenario with the same radio, world and robots would have.
+
+    A scenario needs a duration and a robot model of each agent. The values here are placeholders: `Hello` has the end
+    of the run, and `robots` has the bodies.
+    """
     topology = Topology.MASTERLESS if settings.relay is None else Topology.MASTER
     scenario = CosimScenario.model_validate(
         {

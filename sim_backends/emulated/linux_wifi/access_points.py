@@ -1,6 +1,7 @@
-"""Access points of Linux that are not robots: radios of hwsim in one network namespace, with hostapd and a bridge.
+"""Access points of Linux that are not robots.
 
-The bridge is the distribution system: stations of different access points reach each other.
+They are radios of mac80211_hwsim (the kernel's simulated radios) in one network namespace, with hostapd and a bridge.
+Through the bridge, stations of different access points reach each other.
 """
 
 import subprocess
@@ -37,8 +38,8 @@ table netdev fieldkit {{
 """
 """nftables rules for frames that the bridge forwards, which do not pass the hook `output` of the robots' rules."""
 _BEACON_INTERVALS_TU: Final = (100, 101, 103, 107, 109, 113)
-"""They differ because hwsim derives the times of beacons from one clock: beacons of equal intervals would always
-collide."""
+"""Intervals of the beacons in time units (1024 us). They differ because mac80211_hwsim derives the times of beacons
+from one clock: beacons of equal intervals would always collide."""
 _ENABLED: Final = "AP-ENABLED"
 _START_S: Final = 60.0
 _EXIT_S: Final = 5.0
@@ -105,7 +106,7 @@ class AccessPoints:
     def _start(self, radios: Mapping[str, HwsimRadio]) -> None:
         deadline = Deadline.after(_START_S)
         namespaces = [Path(f"/proc/{pid}/ns/net") for pid in ("self", self._process.pid)]
-        while len({path.readlink() for path in namespaces}) < len(namespaces):
+        while len({path.readlink() for path in namespaces}) < len(namespaces):  # until it has its own namespace
             self._wait(deadline)
         for radio in radios.values():
             radio.move_to_namespace(self._process.pid)

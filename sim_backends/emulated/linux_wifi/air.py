@@ -1,8 +1,9 @@
 """The air between radios of Linux: the radio model decides whether each try of a frame succeeds.
 
-Every channel in use has a separate radio model, because frames on different channels do not interfere. hwsim does not
-report the channel to which a radio listens. A radio is therefore assumed to be on the channel of its last frame, and
-on all channels before its first frame. On all channels the radio model uses the path loss of 2.4 GHz.
+Every channel in use has a separate radio model, because frames on different channels do not interfere. The driver of
+the radios (mac80211_hwsim) does not report the channel to which a radio listens. A radio is therefore assumed to be
+on the channel of its last frame, and on all channels before its first frame. On all channels the radio model uses the
+path loss of 2.4 GHz.
 """
 
 from collections.abc import Mapping

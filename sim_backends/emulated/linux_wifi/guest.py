@@ -68,7 +68,7 @@ def run_command(argv: Sequence[str], results: Path, *, radios: int) -> int:
 
 def prologue(folder: Path) -> str:
     """Return the part of a shell script that prepares the machine for programs of fieldkit in a folder."""
-    # Programs of a folder of extracted packages are not on the PATH of the robots.
+    # If packages were extracted to a folder, their programs are not on the PATH of the robots, so they get links.
     links = [
         shlex.join(("ln", "-sf", path, f"/usr/local/sbin/{name}"))
         for name in PACKAGE_OF

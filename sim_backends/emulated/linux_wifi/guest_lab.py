@@ -179,6 +179,7 @@ def bring_up(
 
 
 def _check(machine: Machine) -> None:
+    """Print the new output of the machine; raise TestbedLostError if it has ended."""
     sys.stderr.write(machine.new_output().decode(errors="replace"))
     machine.check_alive()
 

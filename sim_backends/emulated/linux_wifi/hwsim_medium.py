@@ -27,6 +27,7 @@ MIN_FREQUENCY_MHZ: Final = 2_412
 _MAX_ADDRESSES: Final = 64
 """Maximum number of addresses of a radio, because a robot can change the address of its interface at any time."""
 _RADIO_BIT: Final = 0x40
+"""Bit in the first byte by which the address that identifies a radio differs from the address of its interface."""
 
 
 @dataclass
@@ -80,7 +81,7 @@ class HwsimMedium:
         self.totals: dict[Pair, LinkTotals] = {}
         self._name_of_radio = dict(radios)
         self._radio_of_name = {name: radio for radio, name in radios.items()}
-        # The first interface of a radio has the radio's permanent address, which differs in one bit from `radio`.
+        # The address of a radio's first interface differs in one bit from the address that identifies the radio.
         self._name_of_interface = {
             bytes((radio[0] & ~_RADIO_BIT,)) + radio[1:]: name for radio, name in self._name_of_radio.items()
         }

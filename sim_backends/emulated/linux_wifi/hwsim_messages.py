@@ -16,6 +16,7 @@ CMD_TX_INFO_FRAME: Final = 3
 CMD_ADD_MAC_ADDR: Final = 7
 CMD_DEL_MAC_ADDR: Final = 8
 
+# Attributes of a message (HWSIM_ATTR_*).
 _RECEIVER: Final = 1
 _TRANSMITTER: Final = 2
 _FRAME: Final = 3

@@ -33,6 +33,7 @@ def wifi_specs(
     station = WifiSpec("station", secrets.token_hex(_PASSPHRASE_BYTES), settings.security, settings.monitor)
     if radio.access_points:
         roaming = radio.roaming
+        # The module `simple` of wpa_supplicant: a short interval below a signal threshold, a long one above it.
         scan = f"simple:{roaming.short:.0f}:{roaming.threshold_dbm:.0f}:{roaming.long:.0f}"
         return dict.fromkeys(robots, replace(station, background_scan=scan, channels=roaming.channels))
     if Role.RELAY not in robots:
@@ -50,4 +51,5 @@ def medium(
     options: RadioOptions, world: World, seed: int, radios: Mapping[str, HwsimRadio], wifi: Iterable[WifiSpec]
 ) -> WifiClient:
     """Return the medium of the radios, for robots with these settings. Raises the errors of `WifiClient`."""
+    # Settings of stations matter only for access points that are not robots; then all robots have the same settings.
     return WifiClient(options, world, seed=seed, radios=radios, station=next(iter(wifi)))

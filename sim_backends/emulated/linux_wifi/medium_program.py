@@ -38,6 +38,7 @@ from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import World
 
 _BURST: Final = 64
+"""Maximum number of datagrams of the kernel that are received before requests are served."""
 _MAX_REQUEST_BYTES: Final = 1 << 20
 _READ_BYTES: Final = 1 << 16
 

@@ -99,7 +99,7 @@ def require_radios(count: int, wait_s: float = _RETURN_S) -> list[HwsimRadio]:
         time.sleep(_POLL_S)
     if len(radios) < count:
         raise ConfigurationError(
-            f"the lab has {count} robots, but mac80211_hwsim has {len(radios)} radios here",
+            f"the robots and access points need {count} radios, but mac80211_hwsim has {len(radios)} here",
             remedy=f"as root: modprobe -r mac80211_hwsim; modprobe mac80211_hwsim radios={count}",
         )
     return radios[:count]

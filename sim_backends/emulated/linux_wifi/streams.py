@@ -24,7 +24,7 @@ _MAX_PENDING: Final = 2048
 
 
 class _ChannelStream:
-    """One stream: a socket pair and received frames.
+    """One stream: a socket pair, and the data of received frames (empty at the end of the stream).
 
     The user of the stream reads and writes the near end, and the threads of the channel the far end.
     """

@@ -22,10 +22,12 @@ LIMIT_BYTES: Final = 64 << 20
 """Maximum size of both files together; later attempts are omitted."""
 
 _SNAP_BYTES: Final = 160
+"""Number of bytes of each frame that the capture contains at most (snapshot length)."""
 _PCAP_HEADER: Final = struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, _SNAP_BYTES, 105)
 _RECORD_HEADER: Final = struct.Struct("<IIII")
 # Frame control, duration, receiver, transmitter, BSSID, sequence control: as in an ad hoc network (IBSS).
 _MAC: Final = struct.Struct("<BBH6s6s6sH")
+# Type `data` in the first byte of frame control, and the flag Retry in the second one.
 _DATA, _RETRY = 0x08, 0x08
 # Frame control, duration (0 in an ACK of the last fragment; not modelled in RTS and CTS), receiver, and in RTS the
 # transmitter: IEEE 802.11-2020, 9.3.1.2 to 9.3.1.4.
@@ -63,7 +65,8 @@ class AirLog:
         self._addresses = {
             name: _BSSID[:4] + struct.pack(">H", number) for number, name in enumerate(sorted(names), 1)
         }
-        self._utc_ns = time.time_ns() - time.monotonic_ns()
+        # Attempts have times of the monotonic clock.
+        self._utc_offset_ns = time.time_ns() - time.monotonic_ns()
         self._remaining_bytes = limit_bytes - len(_PCAP_HEADER) - len(_COLUMNS)
         self._pcap.write(_PCAP_HEADER)
         self._table.write(_COLUMNS)
@@ -84,7 +87,7 @@ class AirLog:
     def _record(self, attempt: TransmissionAttempt) -> bytes:
         receiver = _BROADCAST if attempt.receiver is None else self._addresses[attempt.receiver]
         frame = self._control_frame(attempt, receiver) if attempt.control else self._data_frame(attempt, receiver)
-        seconds, rest_ns = divmod(attempt.start_ns + self._utc_ns, 1_000_000_000)
+        seconds, rest_ns = divmod(attempt.start_ns + self._utc_offset_ns, 1_000_000_000)
         snapshot = frame[:_SNAP_BYTES]
         return _RECORD_HEADER.pack(seconds, rest_ns, len(snapshot), len(frame)) + snapshot
 
@@ -101,8 +104,8 @@ class AirLog:
 
     def _line(self, attempt: TransmissionAttempt) -> bytes:
         values = (
-            attempt.start_ns + self._utc_ns,
-            attempt.end_ns + self._utc_ns,
+            attempt.start_ns + self._utc_offset_ns,
+            attempt.end_ns + self._utc_offset_ns,
             attempt.transmitter,
             attempt.receiver or "",
             attempt.mode.name,

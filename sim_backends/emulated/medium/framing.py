@@ -10,6 +10,7 @@ from ipaddress import IPv4Address, IPv4Interface
 from typing import Final
 
 NO_ROBOT: Final = ""
+"""Receiver of a packet whose destination address no robot has."""
 
 Routes = Mapping[bytes, str | None]
 """Robot per destination address, None for broadcast; empty for a robot that is not placed."""
@@ -63,7 +64,7 @@ def _is_ipv4(packet: bytes) -> bool:
 def _receiver_by_ip(packet: bytes, routes: Routes) -> str | None:
     address = packet[16:20]
     robot = routes.get(address, NO_ROBOT)
-    # Multicast: 224.0.0.0/4, RFC 5771.
+    # Multicast: 224.0.0.0/4, RFC 5771. A robot without routes is off the air and reaches no other robot.
     return None if robot == NO_ROBOT and address[0] >> 4 == 0xE and routes else robot
 
 

@@ -120,6 +120,7 @@ class MediumClient:
             ConfigurationError: A named robot is not attached, or the relay has no position.
             LinkError: The medium process exited or did not answer.
         """
+        # Positions of unknown robots, and a relay without a position.
         invalid_names = (positions_m.keys() - self._robots) | ({relay} - {None} - positions_m.keys())
         if invalid_names:
             raise ConfigurationError(

@@ -1,4 +1,4 @@
-"""Ports of the medium, and their statistics: packets sent and delivered, lateness, delays, and delays per flow."""
+"""Ports of the medium (the devices of the robots), and their statistics: counts, lateness and delays of packets."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
@@ -11,6 +11,7 @@ from sim_backends.emulated.medium.framing import Routes
 from sim_backends.emulated.process.worker import Message
 from sim_backends.radio.links import PACKET, Delay, LinkCounters, Pair, delay_parts
 
+# Byte 6 of the IPv4 header: the flag MF, and the upper bits of the fragment offset; byte 7 has the lower bits.
 _MORE_FRAGMENTS: Final = 0x20
 _OFFSET: Final = 0x1F
 

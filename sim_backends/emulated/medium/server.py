@@ -75,7 +75,7 @@ class MediumServer(ABC):
     Args:
         seed: Seed of all random draws.
         framing: Framing of the devices.
-        channel: Socket of the owner's requests.
+        channel: Socket of the requests of the owner, which is the process of the lab.
     """
 
     def __init__(self, seed: int, framing: Framing, channel: socket.socket) -> None:

@@ -22,6 +22,7 @@ _PROBES: Final = (("--user", "--map-root-user"), _AS_ROOT_INSIDE)
 _SUBORDINATES: Final = 65534
 """Number of subordinate ids that a node needs: one for each id up to the id of the account `nobody`."""
 _USUAL_SUBORDINATES: Final = 65536
+"""Number of subordinate ids that useradd assigns to a user (SUB_UID_COUNT of login.defs)."""
 _FIRST_SUBORDINATE: Final = 100_000
 """The first subordinate id that useradd assigns (SUB_UID_MIN of login.defs)."""
 
@@ -76,8 +77,8 @@ def check() -> None:
     except KeyError as error:
         raise ConfigurationError(f"user {uid} has no account", remedy=f"sudo useradd --uid {uid} NAME") from error
     _check_subordinates(user, uid)
-    for as_root in _PROBES:
-        argv = _command(as_root, "true")
+    for user_options in _PROBES:
+        argv = _command(user_options, "true")
         result = subprocess.run(
             argv, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False, env={"PATH": PATH}
         )
@@ -120,13 +121,13 @@ def _check_subordinates(user: str, uid: int) -> None:
 
 
 def _refusal(user: str, cause: str) -> ConfigurationError:
-    for name, remedy in forbidding_settings(Path("/proc/sys")).items():
+    for name, remedy in forbidding_settings(Path("/proc/sys")).items():  # only the first one is reported
         return ConfigurationError(f"the kernel forbids user namespaces: {name}", remedy=remedy)
     return ConfigurationError(f"{user} cannot create namespaces: {cause}", remedy="use sudo, or see man newuidmap")
 
 
-def _command(as_root: tuple[str, ...], *words: str) -> tuple[str, ...]:
-    return ("unshare", *as_root, *_NAMESPACES, "--fork", "--kill-child", "--", *words)
+def _command(user_options: tuple[str, ...], *words: str) -> tuple[str, ...]:
+    return ("unshare", *user_options, *_NAMESPACES, "--fork", "--kill-child", "--", *words)
 
 
 def _text(path: Path) -> str:

@@ -30,6 +30,7 @@ def command(module: str) -> list[str]:
 
 
 LINE_LIMIT_BYTES: Final = 8 << 20
+"""Maximum length of a message, which is one line of JSON."""
 DESCRIPTORS: Final = 4
 """Maximum number of file descriptors in one message."""
 
@@ -76,8 +77,10 @@ def receive(channel: socket.socket, deadline: Deadline) -> tuple[Message, list[i
 
 
 REPLY_S: Final = 15.0
+"""Minimum time that a request waits for its reply."""
 
 _EXIT_S: Final = 2.0
+"""Time for a process to exit at a request before it is killed."""
 _EXIT_STATUS_S: Final = 0.5
 """Maximum time after a process has closed its descriptors until its exit status is available."""
 _EXITED: Final = "it exited"
@@ -95,7 +98,7 @@ class Worker:
         name: Name for messages.
         module: The module; its arguments are the descriptor number of its socket, then `words`.
         words: Further arguments.
-        descriptors: Descriptors of this process that the process inherits, with the same numbers.
+        descriptors: Descriptors of this process that the worker process inherits, with the same numbers.
         command_prefix: Command prefix that runs the interpreter, for example `unshare ... --`.
         home: Value of `HOME`.
 

@@ -19,12 +19,16 @@ TIMEOUT_NS: Final = 500_000_000
 ROS's default."""
 
 STEP_NS: Final = 10_000_000
+"""Time step of the motion."""
 _TURN_RISE_S: Final = 0.5
 """Time in which the turn rate rises from 0 to its limit."""
 
 
 def odometry(start: RobotMotionState, position_m: Vector, heading_rad: float) -> Vector:
-    """Return the odometry of a robot after a motion; see `RecordedMotion.odometry`.
+    """Return the odometry of a robot after a motion.
+
+    Odometry is the pose relative to where the robot was switched on: metres ahead, metres to the left, and the angle
+    to the left in radians.
 
     Args:
         start: State of motion of the robot at the start of the motion.
@@ -73,7 +77,7 @@ class BaseController:
 
     @property
     def odometry(self) -> tuple[float, float, float]:
-        """Odometry; see `RecordedMotion.odometry`."""
+        """Odometry of the current pose, as the function `odometry` returns it."""
         return odometry(self._start, self._pose.place_m, self._pose.heading_rad)
 
     def reset(self, motion: RobotMotionState) -> None:
@@ -99,4 +103,4 @@ class BaseController:
             if self._commanded_ns is not None and self._now_ns - self._commanded_ns > TIMEOUT_NS:
                 self._commanded_ns = None
             command = Twist() if self._commanded_ns is None else self._command
-            self._pose = self._drive.course(self._pose, command, STEP_NS / 1e9).at(1)
+            self._pose = self._drive.course(self._pose, command, STEP_NS / 1e9).at(1)  # the pose after one step

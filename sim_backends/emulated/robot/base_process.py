@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from sim_backends.emulated.robot.base_controller import BaseController
 
 _TICK_S: Final = 0.02
+"""Time between two records of the motion while the robot moves."""
 
 
 def serve(base: Base, *, assigned_paths: Path, motion_record: Path, ready: Path) -> None:
@@ -35,7 +36,7 @@ def serve(base: Base, *, assigned_paths: Path, motion_record: Path, ready: Path)
     Raises:
         OSError: The socket cannot be created.
     """
-    CHANNEL.unlink(missing_ok=True)  # remains after a process was killed
+    CHANNEL.unlink(missing_ok=True)  # the file remains if an earlier process was killed
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel:
         channel.bind(str(CHANNEL))
         if base.is_simulated:
@@ -93,6 +94,7 @@ CHANNEL: Final = Path(STATE, "velocities")
 
 _TWIST: Final = struct.Struct("<6d")
 BYTES: Final = _TWIST.size
+"""Length of a datagram. A receiver reads one byte more, so that it notices a longer datagram."""
 
 STAMPED: Final = "geometry_msgs/TwistStamped"
 """Type of velocity messages with a time stamp."""

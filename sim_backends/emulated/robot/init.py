@@ -34,7 +34,7 @@ RESTART_S: Final = 0.1
 
 _POLL_S: Final = 0.005
 _HALT_S: Final = 5.0
-_LOG_TAIL: Final = 3
+_LOG_TAIL_LINES: Final = 3
 
 
 class Supervisor:
@@ -125,7 +125,7 @@ def _log(service: Service) -> Path:
 
 def _tail(service: Service) -> str:
     lines = _log(service).read_text(encoding="utf-8", errors="replace").splitlines()
-    return " / ".join(lines[-_LOG_TAIL:]) or "its log is empty"
+    return " / ".join(lines[-_LOG_TAIL_LINES:]) or "its log is empty"
 
 
 START_S: Final = 30.0
@@ -164,8 +164,8 @@ class Init:
                 self._supervisor.reap()
             if self._channel.fileno() in readable:
                 is_connected = self._serve()
-        # Until the interface is down, hwsim stores frames without a status, and these prevent the kernel from
-        # removing this network namespace.
+        # While the interface is up, the driver mac80211_hwsim stores frames whose transmission has no result yet, and
+        # these prevent the kernel from removing this network namespace.
         if self._wifi is not None:
             network.switch_off(self._interface)
 
@@ -334,7 +334,7 @@ def discard_memory() -> None:
     for folder in VOLATILE:
         mounts.clear(Path(folder), keep=(STATE, rootfs.SSHD_FOLDER))
     mounts.clear(Path(services.READY_FOLDER))
-    rootfs.new_boot_id()
+    rootfs.replace_boot_id()
 
 
 def _pids() -> list[int]:

@@ -51,6 +51,7 @@ def isolate(*, replaced_files: Iterable[str] = ()) -> None:
         OSError: The kernel refused a mount.
     """
     replaced_files = tuple(replaced_files)
+    # Top-level folders of these files that this machine does not have.
     missing = {top for path in replaced_files if not Path(top := f"/{Path(path).parts[1]}").exists()}
     _make_read_only("/")
     if missing:

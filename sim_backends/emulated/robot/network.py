@@ -17,7 +17,7 @@ from sim_backends.emulated.medium.framing import mac_of
 from sim_backends.emulated.robot.spec import LOOPBACK_INTERFACE, SHARED_NETWORK, STATE
 
 PID_FILE: Final = Path(STATE, "babeld.pid")
-"""File that the daemon writes when it has its socket and its interface, before its first hello."""
+"""File that babeld writes when it has its socket and its interface, before its first hello."""
 
 LINK_COST: Final = 1024
 """Cost of a further link in Babel; a radio without loss costs 256, so that it is preferred."""
@@ -48,7 +48,7 @@ def babeld_command(interface: str, address: str, hello_s: float, links: Mapping[
 
 
 def guest_babeld_command(interface: str, address: str, hello_s: float) -> tuple[str, ...]:
-    """Return the command of a node that uses the robots' routes, and announces only the route to itself.
+    """Return the command of the routing daemon of a node that uses the robots' routes, but announces only itself.
 
     The daemon writes no files. The arguments are those of `babeld_command`.
     """
@@ -275,6 +275,7 @@ def has_listener(port: int) -> bool:
     """Return True if a TCP socket listens on `port`, as the kernel's table shows; no connection is made."""
     local = f":{port:04X} "
     listening = "0A"
+    # The first 21 characters of a line are its number and the local address.
     lines = Path("/proc/net/tcp").read_text(encoding="ascii").splitlines()[1:]
     return any(local in line[:21] and line.split()[3] == listening for line in lines)
 

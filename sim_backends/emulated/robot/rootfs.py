@@ -105,7 +105,7 @@ def write_files(spec: RobotSpec) -> None:
         mounts.mount_overlay(state / "etc", Path("/etc"))
     ssh_server.convert_key(spec)
     mount_programs(spec)
-    new_boot_id()
+    replace_boot_id()
     mounts.bind(Path(BOOT_ID), Path("/proc/sys/kernel/random/boot_id"))
 
 
@@ -152,8 +152,8 @@ def _writable_folder(folder: Path, replaced_names: set[str]) -> Iterator[Path]:
     mirror.rmdir()
 
 
-def new_boot_id() -> None:
-    """Generate a new boot id, visible at `/proc/sys/kernel/random/boot_id`."""
+def replace_boot_id() -> None:
+    """Give the robot a new boot id, visible at `/proc/sys/kernel/random/boot_id`."""
     Path(BOOT_ID).write_bytes(Path("/proc/sys/kernel/random/uuid").read_bytes())
 
 

@@ -1,10 +1,13 @@
 """Publishes an emulated robot's sensors over DDS or Zenoh, as nodes of ROS 2 do; or runs a Zenoh router.
 
-Arguments: `route` and the robot's address; or `relay`, the address, the node's name, the topic of velocities for the
-base and its type (may be empty), and as JSON the ROS 2 settings (`Ros2Spec`) and the type of each topic. The sensors
-process creates each message. The relay converts it to CDR as the robot's distribution defines the type, and publishes
-it while a robot or another node on the radio subscribes to the topic. It always publishes `/tf_static`, for late
-subscribers. It also sends received velocities to the base. The node logs on `/rosout`.
+The command line is `route ADDRESS` for the router, or `relay ADDRESS NODE VELOCITY_TOPIC VELOCITY_TYPE ROS2 TYPES`.
+ADDRESS is the robot's. ROS2 (the fields of `Ros2Spec`) and TYPES (the type of each topic) are JSON. The two words
+about velocities are empty for a robot without a base.
+
+The sensors process creates each message. The relay converts it to CDR as the robot's distribution defines the type,
+and publishes it while a node on the radio subscribes to the topic. It publishes `/tf_static` even without a
+subscriber, because later subscribers get the last message of this topic. It also sends received velocities to the
+base. Its node logs on `/rosout`.
 """
 
 import contextlib
@@ -65,7 +68,7 @@ class Ros2Relay:
             self._conversions[topic] = self._conversion(description.type)
 
     def _topic(self, name: str, kind: str, quality: QosProfile) -> Topic:
-        """Return the description of a topic, with the number of this endpoint."""
+        """Return the description of a topic for a new publisher or subscriber, which gets the next number."""
         self._endpoints += 1
         domain, node = self._network.domain, self._network.node
         description = topics.describe(
@@ -83,6 +86,7 @@ class Ros2Relay:
         self._rosout.write(bytes(typestore.serialize_cdr(line, _LOG)))
 
     def _conversion(self, kind: str) -> Callable[[bytes], bytes]:
+        """Return the function that converts a serialized ROS 1 message to CDR."""
         defaults: dict[str, Any] = {}
         types = self._types
         return lambda data: bytes(
@@ -101,7 +105,7 @@ class Ros2Relay:
         types = self._types.ros2
 
         def send(data: bytes, at_ns: int) -> None:
-            with contextlib.suppress(OSError, SerdeError):  # no process receives it, or it has another type
+            with contextlib.suppress(OSError, SerdeError):  # the base restarts, or the message has another type
                 message: Any = types.deserialize_cdr(data, description.type)
                 if kind == base_process.STAMPED:
                     stamp = message.header.stamp
@@ -131,7 +135,7 @@ class Ros2Relay:
             has_subscriber = publisher.matched() > 0
             if has_subscriber != (topic in self._subscribed_topics):
                 self.log(f"{topic} has {'a subscriber' if has_subscriber else 'no subscribers'}")
-                self._subscribed_topics ^= {topic}
+                self._subscribed_topics ^= {topic}  # adds the topic, or removes it
             if topic == static_frames.TOPIC or has_subscriber:
                 listener.wanted_topics.add(topic)
             else:

@@ -1,8 +1,9 @@
 """Publishes an emulated robot's sensors to its ROS master; runs under Debian's Python, which has rospy.
 
-Arguments: the node's name, the topic of velocities for the base and its type (may be empty), and the topics to
-publish. The master may run on another robot, over the radio. The sensors process creates and serializes each message;
-the relay publishes it unchanged while the topic has subscribers. It also sends received velocities to the base.
+The command line is `NODE VELOCITY_TOPIC VELOCITY_TYPE TOPIC...`; the two words about velocities are empty for a robot
+without a base. The master may run on another robot, over the radio. The sensors process creates and serializes each
+message; the relay publishes it unchanged while the topic has subscribers. It also sends received velocities to the
+base.
 """
 
 import contextlib
@@ -23,11 +24,14 @@ from sim_backends.emulated.robot import base_process, services
 from sim_backends.emulated.ros import tcpros
 from sim_backends.ros1 import framing
 
-_MASTER_S: Final = 20.0
+_STARTUP_S: Final = 20.0
+"""Timeout for the start of the sensors process, and of the ROS master."""
 _CONNECT_S: Final = 5.0
+"""Timeout of one connection attempt to the master."""
 _SENSORS_S: Final = 20.0
+"""Timeout for the restart of the sensors process."""
 _QUEUE_MESSAGES: Final = 100
-_CHUNK: Final = 1 << 16
+_CHUNK_BYTES: Final = 1 << 16
 
 
 class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no types
@@ -139,10 +143,10 @@ def _connect(path: str) -> socket.socket:
 def _next_packet(stream: socket.socket, packets: framing.PacketSplitter) -> bytes:
     """Return the next packet, or b"" at the end of the stream."""
     while True:
-        for payload in packets:
+        for payload in packets:  # returns the first complete packet, if there is one
             return payload
         try:
-            data = stream.recv(_CHUNK)
+            data = stream.recv(_CHUNK_BYTES)
         except ConnectionResetError:
             data = b""
         if not data:
@@ -165,7 +169,7 @@ def _message_class(header: dict[str, str]) -> Any:  # noqa: ANN401 (rospy has no
 
 
 def _wait(error_text: str, condition: Callable[[], bool]) -> None:
-    deadline = Deadline.after(_MASTER_S)
+    deadline = Deadline.after(_STARTUP_S)
     while not condition():
         if deadline.expired:
             raise TimeoutError(error_text)
@@ -192,7 +196,7 @@ def main() -> None:
         _relay_velocities(velocities, velocity_type)
     services.ready_file("ros_relay").touch()
     rospy.spin()
-    del relays
+    del relays  # rospy has finished; until now this list kept the relays alive
 
 
 if __name__ == "__main__":

@@ -27,9 +27,9 @@ STATE: Final = "/run/robot"
 """Folder in the robot that its init process writes to: files mounted over `/etc`, logs, readiness files."""
 
 LOOPBACK_INTERFACE: Final = "lo"
-"""Interface of a further link that is only an address: the routing daemon announces it over every other link."""
+"""Interface of a link that is only an address: the routing daemon announces this address over every other link."""
 SHARED_NETWORK: Final = IPv4Network("10.42.255.0/24")
-"""Addresses of the robots on that link."""
+"""Addresses of the robots on such a link."""
 LOOPBACK: Final = "127.0.0.1"
 
 ANTENNA_M: Final = 0.2
@@ -97,7 +97,7 @@ class WifiSpec:
         mode: `ad hoc`, `mesh point`, `access point` or `station`.
         passphrase: Passphrase of the access point; empty without one.
         security: Security of the access point.
-        has_monitor: True if the robot has a monitor interface.
+        has_monitor: True if the robot has a monitor interface, which captures all frames of its radio.
         background_scan: Setting `bgscan` of wpa_supplicant, with which a station finds other access points; or empty.
         channels: Number of channels of the 2.4 GHz band, from the first, that a station scans.
     """
@@ -153,7 +153,8 @@ class RobotSpec:
         ros2: Settings of its ROS 2 nodes; None if no ROS 2 node communicates over the radio.
         routes_zenoh: True if it runs the Zenoh router.
         wifi: Settings of its Linux Wi-Fi; None for a robot whose radio is a TUN or TAP device.
-        links: Interface and address with the prefix length of each further link, by its name.
+        links: Interface and address with the prefix length of each further link (a link other than the radio under
+            test), by the name of the link.
         bridge: Command that bridges its topics from ROS 1 to another middleware; empty if none runs automatically.
     """
 

@@ -1,4 +1,4 @@
-"""Record of the last velocity command to a robot's base, which the physics simulator that moves the robot reads.
+"""Record of the last velocity command to a robot's base. The physics simulator that moves the robot reads it.
 
 Only the standard library is imported, because programs under Debian's Python import this module, too.
 """

@@ -34,10 +34,11 @@ table inet fieldkit {
     }
 }
 """
-"""nftables rules that assign all sent packets to access category VO.
+"""nftables rules that assign all sent packets to access category VO (mac80211 reads 0x107 as the priority 7).
 
-The other categories would use block-ACK sessions, in which mac80211 ignores the attempts that hwsim reports. hwsim
-has no queues per category, so this changes nothing else.
+The other categories would use block-ACK sessions, in which mac80211 ignores the transmission attempts that the driver
+of the simulated radios (mac80211_hwsim) reports. The driver has no queues per category, so the rules change nothing
+else.
 """
 
 _ACCESS_POINT: Final = """\
@@ -77,6 +78,7 @@ _CONFIGURATION: Final = Path(STATE, "wifi.conf")
 PROGRAMS: Final = {"access point": "hostapd", "station": "wpa_supplicant"}
 """Program of each mode that needs one."""
 _CONNECTED: Final = {"access point": "AP-ENABLED", "station": "CTRL-EVENT-CONNECTED"}
+"""Text that the program of a mode logs when it is ready."""
 
 
 def bring_up(device: str, interface: str, address: str, wifi: WifiSpec) -> None:

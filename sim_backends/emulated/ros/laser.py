@@ -111,7 +111,7 @@ _ABSENT: Final = (math.nan, math.nan, math.nan)
 
 
 class _Slots:
-    """Layout of the two slots for a number of robots."""
+    """Layout of the two slots for a number of robots: the slot's number, the positions of all robots, the CRC."""
 
     def __init__(self, robots: int) -> None:
         self.positions = struct.Struct(f"<{_AXES * robots}d")
@@ -190,4 +190,4 @@ class Neighbourhood:
             if number > self._number and _CRC.unpack(crc)[0] == zlib.crc32(body):
                 self._number = number
                 axes = iter(self._slots.positions.unpack_from(body, _NUMBER.size))
-                self._positions_m = list(zip(axes, axes, axes, strict=True))
+                self._positions_m = list(zip(axes, axes, axes, strict=True))  # groups of three axes

@@ -97,7 +97,7 @@ class Source:
 
 
 def _template_generator(template: Template) -> Generator:
-    """Return a generator that fills the list with incompressible noise, or with normally distributed floats."""
+    """Return a generator that fills the template's list with random bytes, or with normally distributed floats."""
     head, tail, size_bytes = bytes.fromhex(template.head), bytes.fromhex(template.tail), template.size_bytes
     pool = b""
 

@@ -108,7 +108,7 @@ class MotionRecord(Record):
             OSError: The file cannot be read.
         """
         values = self._slots.read()
-        if values is not None and values is not self._values:
+        if values is not None and values is not self._values:  # a new object means new values
             self._values, self._last = values, _to_motion(*values)
         return self._last
 

@@ -88,7 +88,8 @@ class Odometer:
         self._record = None if motion_record is None else MotionRecord.open(motion_record)
         self._read_bytes = 0
         self._path: AssignedPath | None = None
-        # Motion of the robot when its last path started.
+        # Motion of the robot when its last path started. `_read_paths` needs it and changes it; it is then reset,
+        # because odometry does not include motion before its start.
         self._base = AT_REST
         self._read_paths(now_ns)
         self._base = AT_REST

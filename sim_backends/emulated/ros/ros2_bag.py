@@ -64,7 +64,7 @@ class Rosbag2Recorder:
         self._storage = storage
         self._format: Literal[8, 9] = 8 if distribution in _BEFORE_JAZZY else 9
         types = MessageTypes(Distribution.of(distribution))
-        self._sensors, self._types = types.ros1, types.ros2
+        self._ros1_types, self._ros2_types = types.ros1, types.ros2
         self._defaults: dict[str, object] = {}
         self._connections: dict[str, Connection] = {}
         # Topics for which a message of another type was reported.
@@ -95,18 +95,25 @@ class Rosbag2Recorder:
 
     def _write(self, writer: Writer, header: Header, message: bytes | None) -> None:
         topic, kind = header["topic"], type_of(header)
-        if kind not in self._types.fielddefs or kind not in self._sensors.fielddefs:
+        if kind not in self._ros2_types.fielddefs or kind not in self._ros1_types.fielddefs:
             return  # the package of the type is not installed; the original logs this and continues
         if topic not in self._connections:
             profiles = (_discovered_qos(offered_qos.of_topic(topic, header["type"])),)
             self._connections[topic] = writer.add_connection(
-                topic, kind, typestore=self._types, offered_qos_profiles=profiles
+                topic, kind, typestore=self._ros2_types, offered_qos_profiles=profiles
             )
             _log("rosbag2_recorder", f"Subscribed to topic '{topic}'")
         if message is not None:
             try:
                 data = migrate_bytes(
-                    self._sensors, self._types, kind, kind, self._defaults, message, src_is2=False, dst_is2=True
+                    self._ros1_types,
+                    self._ros2_types,
+                    kind,
+                    kind,
+                    self._defaults,
+                    message,
+                    src_is2=False,
+                    dst_is2=True,
                 )
             except Exception as error:  # noqa: BLE001 (on any error the publisher's bytes are not a message of this type)
                 if topic not in self._reported_topics:
@@ -181,7 +188,7 @@ def main(argv: Sequence[str], distribution: str) -> int | str:
     """Run a command line; return its exit code, or the original's error message, for exit code 1."""
     options = _parser(distribution).parse_args(argv)
     topics = [f"/{topic.lstrip('/')}" for topic in (*options.positional, *options.topics)]
-    if bool(topics) is options.all:
+    if bool(topics) is options.all:  # both, or neither
         return "[ERROR] [ros2bag]: Need to specify either topics or --all"
     folder = Path(options.output or datetime.now().astimezone().strftime("rosbag2_%Y_%m_%d-%H_%M_%S"))
     if folder.exists():

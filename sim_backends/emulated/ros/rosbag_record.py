@@ -14,7 +14,7 @@ from rosbags.rosbag1 import Writer
 from sim_backends.emulated.ros import tcpros
 from sim_backends.emulated.ros.tcpros import Header, Listener, type_of
 
-# Polling interval of the original for its end and for new publishers.
+# Interval at which the original checks whether it must stop, and whether there are new publishers.
 _TICK_S: Final = 0.25
 
 

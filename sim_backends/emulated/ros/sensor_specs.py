@@ -29,6 +29,8 @@ GENERATED_TYPES: Final = (
 class Template:
     """Serialized parts of the messages of a type that has no generator.
 
+    A robot sends these parts in each message, and fills one list of numbers between them with random values.
+
     Attributes:
         has_header: True if the message starts with a header.
         head: Content between the header and the list that is filled, serialized, in hexadecimal digits.

@@ -122,7 +122,7 @@ class TopicSocket:
         self._selector = selector
         self._subscribers: list[Subscriber] = []
         path = tcpros.socket_path(topic)
-        path.unlink(missing_ok=True)  # remains after a process was killed
+        path.unlink(missing_ok=True)  # the file remains if an earlier process was killed
         self._socket = socket.socket(socket.AF_UNIX)
         self._socket.bind(str(path))
         self._socket.listen()

@@ -16,7 +16,9 @@ from typing import Final
 from sim_backends.ros1.framing import PacketSplitter, pack, pack_header, unpack_header
 
 FOLDER: Final = "/run/ros"
+"""Folder of the sockets."""
 CALLER: Final = "/sensors"
+"""Name of the publisher's node."""
 
 
 def socket_path(topic: str) -> Path:
@@ -35,7 +37,7 @@ def request(caller: str, topic: str) -> bytes:
     return pack(pack_header({"callerid": caller, "topic": topic, "md5sum": "*", "type": "*"}))
 
 
-_CHUNK: Final = 1 << 16
+_CHUNK_BYTES: Final = 1 << 16
 _TYPE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*")
 
 Header = Mapping[str, str]
@@ -100,7 +102,7 @@ class Listener:
     def _read(self, subscription: _Subscription) -> Iterator[tuple[Header, bytes | None]]:
         data = b""
         with contextlib.suppress(ConnectionResetError):
-            data = subscription.stream.recv(_CHUNK)
+            data = subscription.stream.recv(_CHUNK_BYTES)
         if not data:
             self.unsubscribe(subscription.topic)
             return
@@ -137,7 +139,9 @@ class Listener:
 
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, stop)
-        signal.pthread_sigmask(signal.SIG_SETMASK, [])
+        signal.pthread_sigmask(
+            signal.SIG_SETMASK, []
+        )  # `rosbag` has blocked the signals before it forks the recorder
 
 
 def _header(payload: bytes, topic: str) -> Header:

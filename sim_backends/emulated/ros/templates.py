@@ -135,6 +135,7 @@ class _SerializedFields:
     def add_message(self, kind: str) -> bool:
         """Add every field of the outermost message except its header; return True if it has a header."""
         _, fields = self._store.fielddefs[kind]
+        # Each field is (name, (kind of node, argument)).
         has_header = bool(fields) and fields[0][1][1] == _HEADER
         for name, field in fields[1:] if has_header else fields:
             if name in self._values:
@@ -144,7 +145,8 @@ class _SerializedFields:
         return has_header
 
     def _add(self, data: bytes) -> None:
-        self.parts[self.list_type is not None].extend(data)
+        before_list, after_list = self.parts
+        (before_list if self.list_type is None else after_list).extend(data)
 
     def _add_field(self, node: Any, argument: Any) -> None:  # noqa: ANN401 (rosbags' own tuples)
         match node.name:
@@ -165,7 +167,7 @@ class _SerializedFields:
 
     def _add_list(self, node: Any, argument: Any) -> None:  # noqa: ANN401 (as above)
         if self.list_type is not None or not self._size_bytes or node.name != "BASE" or argument[0] == "string":
-            self._add(bytes(4))
+            self._add(bytes(4))  # an empty list
             return
         item_bytes = struct.calcsize(_STRUCT_FORMATS[argument[0]])
         if self._size_bytes % item_bytes:

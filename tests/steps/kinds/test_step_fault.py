@@ -56,12 +56,12 @@ def lines(step: FaultStep, scene: Scene = SCENE) -> list[tuple[Role, str]]:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("robot: sender, kind: link-down", "a link-down needs for:"),
-        ("robot: sender, kind: out-of-range", "an? out-of-range needs for:"),
-        ("robot: sender, kind: reboot, for: 3s", "a reboot does not allow for:"),
-        ("robot: sender, kind: kill, process: nc, for: 3s", "a kill does not allow for:"),
-        ("robot: sender, kind: kill", "a kill needs process:"),
-        ("robot: sender, kind: reboot, process: nc", "a reboot does not allow process:"),
+        ("robot: sender, kind: link-down", "a fault of the kind link-down needs the key for:"),
+        ("robot: sender, kind: out-of-range", "kind out-of-range needs the key for:"),
+        ("robot: sender, kind: reboot, for: 3s", "kind reboot does not allow the key for:"),
+        ("robot: sender, kind: kill, process: nc, for: 3s", "kind kill does not allow the key for:"),
+        ("robot: sender, kind: kill", "kind kill needs the key process:"),
+        ("robot: sender, kind: reboot, process: nc", "kind reboot does not allow the key process:"),
         ("robot: sender, kind: link-down, for: 3", "has no unit"),
         ("robot: sender, kind: link-down, for: 0s", "greater than 0"),
         ("robot: sender, kind: linkdown, for: 3s", "'link-down'"),
