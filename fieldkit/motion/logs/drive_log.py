@@ -1,8 +1,8 @@
 """Log of an autonomous drive of a ground robot, and its columns.
 
-The robot's agent writes a JSON object per line, ten times a second (`fieldkit.agent.driving.drive`): time, pose by
-its odometry in the frame of the start, and driven distance. The last line contains the reason for the end. All
-values are measurements of the robot.
+fieldkit's agent on the robot writes a JSON object per line, ten times a second (`fieldkit.agent.driving.drive`):
+time, pose by its odometry in the frame of the start, and driven distance. The last line contains the reason for the
+end. All values are measurements of the robot.
 """
 
 import math
@@ -69,6 +69,7 @@ _SPEED_INTERVAL_S: Final = 0.5
 """Interval over which a speed is computed. One odometry message more or less changes it by 3 % at 50 Hz and by 7 %
 at 30 Hz."""
 _ROUNDING: Final = 1e-4
+"""Largest error of a rounded heading in the log, in radians."""
 
 
 @dataclass(frozen=True)

@@ -209,7 +209,10 @@ def _message_values(message: Any) -> Iterator[tuple[str, float]]:  # noqa: ANN40
 
 
 def _column_values(series: dict[str, list[float]]) -> Iterator[tuple[str, float]]:
-    """Yield names of columns, without their prefix, and their values, computed from series of values."""
+    """Yield names of columns, without their prefix, and their values, computed from series of values.
+
+    A column is named by quantity, statistic and unit: the largest value of `climb_m_s` is `climb_max_m_s`.
+    """
     for name in ("height_m", "speed_m_s", "climb_m_s"):
         # Either message can be missing if the link has many losses; both are relative to home.
         series[name] = series[f"{name}/local"] or series[f"{name}/global"]
@@ -242,7 +245,8 @@ def _positions(data: bytes, autopilot: Source, kind: str) -> Iterator[tuple[int,
     """Yield time of arrival in us, the autopilot's time in ms, three coordinates and the heading of each message.
 
     The coordinates of `LOCAL_POSITION_NED` are metres east, north and up; those of `GLOBAL_POSITION_INT` are latitude
-    and longitude in degrees, and metres up. The heading is from the last ATTITUDE, in radians from east to north.
+    and longitude in degrees, and metres up. The heading is from the last ATTITUDE (before the first one, from the
+    first one; 0 without one), in radians from east to north.
     """
     decoder, heading_rad, rows = TlogDecoder(), math.nan, []
     for frame in frames(data):

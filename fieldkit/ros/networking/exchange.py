@@ -53,6 +53,7 @@ def multicast_port(domain: int) -> int:
 
 def unicast_port(domain: int) -> int:
     """Return the port of unicast test datagrams."""
+    # RTPS: the discovery port of a participant is d1 (10) and PG (2) times its ID above the multicast port.
     return multicast_port(domain) + 10 + 2 * _PARTICIPANT
 
 
