@@ -91,7 +91,7 @@ class FlightRecorder:
 
     @property
     def ready(self) -> bool:
-        """Whether each requested message was received, or refused by the autopilot."""
+        """Whether each requested message was received, or refused by the autopilot; then it stays True."""
         self._was_ready |= self._autopilot is not None and self._missing_kinds <= set(self._refusals)
         return self._was_ready
 
@@ -157,6 +157,7 @@ class FlightRecorder:
         for kind, rate in self._link.messages.items():
             if rate.result not in (None, ACCEPTED, *RETRY_RESULTS):
                 self._refusals[kind] = rate.result
+            # The product of rate in Hz and interval in us is 1e6 if the message has its requested rate.
             elif self.ready and kind in self._slow_s and rate.hz * self._requested_us[kind] < _MIN_FRACTION * 1e6:
                 self._slow_s[kind] += elapsed_s
 

@@ -195,7 +195,7 @@ class Robots:
 
     def _collect(self, role: Role, remote: str, into: Path, *, ended_normally: bool) -> tuple[str, bool] | None:
         """Fetch the evidence of one robot. If this fails, return the reason and True if it is still on the robot."""
-        shell, attempt = self.shells[role], remote.rpartition("/")[2]
+        shell, attempt = self.shells[role], remote.rpartition("/")[2]  # for example `udp-07-1`: repeat and attempt
 
         def announce(progress_text: str, remaining_s: float) -> None:
             name = f"collect evidence, {progress_text} of {self._plan.cast[role].name}"

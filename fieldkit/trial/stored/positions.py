@@ -52,7 +52,7 @@ def set_positions(
         sources: GPX or CSV file, or a fixed place, by role; empty to remove positions that were added before.
         offset_s: Offset that is added to the times of the files to convert them to the laptop's clock, in seconds.
         gap_s: Longest time between two points over which positions are interpolated linearly, in seconds.
-        heights: True to use heights above the ellipsoid.
+        heights: True to use heights above the ellipsoid as well; False for horizontal distances.
 
     Raises:
         ConfigurationError: `folder` is not a trial, another process runs the trial, it has no such role, or a file is
