@@ -53,7 +53,7 @@ class MessageKind(IntEnum):
         RELEASE: coordinator: empty; the copy in the header is not used again; there is no answer
         ERROR: federate: `text`; answers any request; the session ends
         BYE: coordinator: empty; the run ends, and there is no answer
-        SAMPLE_LINKS: coordinator: empty; only to a network with the capability 64
+        SAMPLE_LINKS: coordinator: empty; only to a network with the capability *samples links*
         LINKS: federate: `radios` u32, each a radio sample, `links` u32, each a link sample
     """
 
