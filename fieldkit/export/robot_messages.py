@@ -122,7 +122,8 @@ def packet_fates(captures: Mapping[str, Capture], transfers: Iterable[Transfer])
         sent, received = marked[sender_file], marked[receiver_file]
         forward = sent.packets.are_from(sender) & sent.packets.are_to(receiver) & ~matched.ambiguous
         sent.lost[forward] = ~matched.arrived[forward]
-        is_ambiguous = np.append(matched.ambiguous, False)[matched.sent_index]  # the last entry is for match.NONE
+        # `match.NONE` (-1), for a packet that is not in the sender's capture, selects the appended False.
+        is_ambiguous = np.append(matched.ambiguous, False)[matched.sent_index]
         forward = received.packets.are_from(sender) & received.packets.are_to(receiver) & ~is_ambiguous
         received.copy[forward] = matched.duplicates[forward]
     return marked

@@ -29,7 +29,7 @@ _TYPES: Final[Mapping[type, pa.DataType]] = {
 
 
 def write_csv(file: BinaryIO, repeats: Repeats) -> None:
-    """Write all columns. The columns of every trial are first.
+    """Write all columns. The first ones are the columns that every trial has.
 
     Raises:
         OSError: The file cannot be written.
@@ -49,7 +49,10 @@ def write_parquet(file: BinaryIO, repeats: Repeats) -> None:
 
 
 def repeats_table(repeats: Repeats) -> Table:
-    """Return all columns except the source. Units and meanings are metadata; the columns of every trial are first."""
+    """Return all columns except `source`, the file that a row was read from. Units and meanings are metadata.
+
+    The first ones are the columns that every trial has.
+    """
     arrays = [
         _texts(repeats.texts[column.name])
         if column.name in repeats.texts

@@ -1,4 +1,4 @@
-"""The evidence of one attempt: a folder whose files are read on first use and cached."""
+"""The evidence of one attempt at a repeat: a folder whose files are read on first use and cached."""
 
 from collections.abc import Callable, Hashable, Sequence
 from pathlib import Path
@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 class AttemptEvidence:
-    """Evidence of one attempt. Gates, measurements, reports and exports read the files through it.
+    """Evidence of one attempt. Gates (checks that void a repeat), measurements, reports and exports read it.
 
     Errors are cached as well: every later read of a missing, unreadable or damaged file raises the same error.
 
@@ -94,7 +94,10 @@ class AttemptEvidence:
         return (self.folder / name).is_file()
 
     def links(self, role: Role) -> Sequence[LinkSample]:
-        """Return link samples of a robot in order of time: the testbed's or, if there are none, the robot's."""
+        """Return link samples of a robot in the order of time.
+
+        They are from the file of a testbed that models the radios or, without it, from the robot's own samples.
+        """
         testbed_samples = self.read_or_none(link_samples.read, link_samples.FILE) or {}
         if samples := testbed_samples.get(role):
             return samples

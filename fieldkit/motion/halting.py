@@ -1,4 +1,4 @@
-"""Stop the programs of the agent that drive or fly robots, including programs of other instances of fieldkit."""
+"""Stop fieldkit's programs that drive or fly robots, including programs of other instances of fieldkit."""
 
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -17,7 +17,7 @@ _LINE: Final = re.compile(r"(?P<program>\S+/\.jobs/\S+) (?P<state>[a-z]+)")
 
 @dataclass(frozen=True)
 class HaltResult:
-    """Result of `halt` on a robot.
+    """Result of a function of this module on a robot.
 
     Attributes:
         programs: State of each program that was stopped, by `TRIAL/ATTEMPT/.jobs/NAME` below the robot's home.
@@ -69,12 +69,18 @@ def halt_attempt(shell: Shell, folder: str, operator: str, deadline: Deadline) -
 
 
 def poll_states(shell: Shell, programs: Iterable[str], deadline: Deadline) -> HaltResult:
-    """Return the current state of programs that `halt_attempt` returned. Raises the same errors as `halt_attempt`."""
+    """Return the current state of programs that `halt_attempt` has stopped.
+
+    Raises the same errors as `halt_attempt`.
+    """
     return HaltResult(_states(call(shell, "motion_states", *programs, deadline=deadline)))
 
 
 def read_liveness(shell: Shell, file: str, deadline: Deadline) -> bytes:
     """Return the liveness file of a drone's pilot and guard, followed by /proc/uptime.
+
+    The pilot is the program that flies the drone, the guard is the program that lands it if the pilot fails. The file
+    contains their counters, which show that they run.
 
     Raises the same errors as `halt_attempt`.
     """

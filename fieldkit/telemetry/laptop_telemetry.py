@@ -1,4 +1,4 @@
-"""Query telemetry sources from the laptop during the steps of an attempt.
+"""Queries of telemetry sources by the laptop during the steps of an attempt.
 
 The laptop runs the same program as a robot: `poll` in telemetry.sh.
 """
@@ -21,7 +21,7 @@ from fieldkit.telemetry.telemetry_section import TelemetrySource
 _END_S: Final = 2.0
 """Time after SIGTERM within which a query must exit; then it is killed."""
 ONCE: Final = "0"
-"""Interval of a single query."""
+"""Interval with which `poll` runs a query once."""
 
 
 @contextmanager
@@ -58,7 +58,15 @@ def querying(cast: Cast, folder: Path) -> Iterator[None]:
 
 
 def _argv(source: TelemetrySource, credentials: str | None, interval: str | None = None) -> tuple[str, ...]:
+    """Return the command that runs `poll` on the laptop.
+
+    Args:
+        source: The source.
+        credentials: File with the credentials; None for the file of the profile, if any.
+        interval: Time between two queries in s, `ONCE` for a single query; None for the interval of the source.
+    """
     address, tested_interface, source_interval, *remaining_words = source.poll_words("-", credentials)
+    # The queries stop when this process has exited; no lock (-) is checked.
     words = (f"/proc/{os.getpid()}", "-", address, tested_interface, interval or source_interval, *remaining_words)
     return ("sh", "-c", SCRIPT.decode(), "job.sh", "poll", *words)
 

@@ -1,4 +1,4 @@
-"""Read values from an output of a telemetry source: mmcli, batctl, or any output with the locations of the profile.
+"""Values in an output of a telemetry source: mmcli, batctl, or another one, for which the profile locates values.
 
 Outputs are not trusted: JSON may have any shape and any numbers. A value that is missing, or has another type, is
 absent, never 0.
@@ -18,6 +18,7 @@ Values = Mapping[str, float | str]
 """Values by name, as in `telemetry_section.Values`."""
 
 TEXTS: Final = frozenset({"band", "cell"})
+"""Names of the values that are text; the others are numbers."""
 _NUMBER: Final = re.compile(r"([+-]?[0-9]{1,15}(?:\.[0-9]{1,9})?)(?: ?(dBm|dB))?", re.ASCII)
 _UNITS: Final = {"signal_dbm": "dBm", "noise_dbm": "dBm", "sinr_db": "dB"}
 _MISSING_TEXTS: Final = frozenset({"", "--", "unknown", "n/a", "none", "null"})
@@ -197,7 +198,9 @@ def _cell_fields(text: str) -> Iterator[tuple[str, str]]:
 
 
 def mesh_values(output: str) -> Values:
-    """Return the number of neighbours in the outputs of batctl: neighbours, an empty line, originators.
+    """Return the number of neighbours in the outputs of batctl: its neighbours, an empty line, and its originators.
+
+    The list of originators, which are all nodes of the mesh, is not used.
 
     Raises:
         ValueError: The output is neither JSON nor a table of batctl.

@@ -32,7 +32,7 @@ def _role_columns(role: Role) -> tuple[Column, ...]:
             "text",
             (
                 f"Telemetry sources of the {role}'s profile that gave values: NAME (KIND): VALUES. `others` "
-                "names the source of the other columns of its radio: iw, or the emulator."
+                "names the source of the other columns of its radio: `iw`, or `testbed` for an emulated robot."
             ),
             Figure(f"link source, {role}", Kind.WORDS, rank=BACKGROUND),
         ),
@@ -76,7 +76,7 @@ def of_role(role: Role) -> tuple[Column, ...]:
 
 
 @dataclass(frozen=True)
-class TelemetryVerdict:
+class TelemetryResult:
     """Columns of a robot's link, and the failures of its sources.
 
     Attributes:
@@ -96,7 +96,7 @@ class _Series:
     reason: str
 
 
-def measure(role: Role, telemetry: TelemetrySection, evidence: AttemptEvidence, base: Measured) -> TelemetryVerdict:
+def measure(role: Role, telemetry: TelemetrySection, evidence: AttemptEvidence, base: Measured) -> TelemetryResult:
     """Return the columns of one robot.
 
     Args:
@@ -129,6 +129,7 @@ def measure(role: Role, telemetry: TelemetrySection, evidence: AttemptEvidence, 
         if not readings.values:
             notes.append(f"telemetry {name} of the {role} gave no value: {reason or 'no query ended'}")
     source_columns = _measured(role, series)
+    # The columns of the sources, with or without a value, replace those of `base`.
     remaining = base.without(dict.fromkeys(source_columns.values, "") | dict(source_columns.missing))
     if remaining.values:
         source_texts.append(f"others: {'testbed' if evidence.has(link_samples.FILE) else 'iw'}")
@@ -137,7 +138,7 @@ def measure(role: Role, telemetry: TelemetrySection, evidence: AttemptEvidence, 
         "no source gave a value",
     )
     missing_columns = Measured.all_missing(of_role(role), "no telemetry source of the profile gives it")
-    return TelemetryVerdict(source_columns | role_columns | remaining | missing_columns, tuple(notes))
+    return TelemetryResult(source_columns | role_columns | remaining | missing_columns, tuple(notes))
 
 
 def _measured(role: Role, series: Mapping[str, _Series]) -> Measured:

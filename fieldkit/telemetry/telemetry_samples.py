@@ -31,7 +31,7 @@ def read(evidence: AttemptEvidence, role: Role, profile: RobotProfile) -> Sequen
     """Return the values of the sources that a robot queried during an attempt, in the order of time.
 
     Sources that the laptop queried are omitted: their times are counted from the boot of the laptop, and the evidence
-    does not contain its time.
+    does not contain the time of this boot.
     """
     telemetry = telemetry_of(profile)
     state = evidence.read_or_none(host.read_state, host.before_file(role))

@@ -1,6 +1,7 @@
-"""Agents by index, and their states, in the layout of the wire protocol.
+"""Announced agents and their states, in the layout of the wire protocol of federates.
 
-A state consists of the index of the agent, a reserved field, its position, velocity and heading, and the limit of its
+A message announces each agent once, with its name and its index; later messages contain only the index. A state
+consists of the index of the agent, a reserved field, its position, velocity and heading, and the limit of its
 acceleration. Every exchange contains the states of all agents, so they are packed and checked together. A received
 state is unpacked only when it is requested.
 """
@@ -18,9 +19,11 @@ from sim_backends.world.motion import State
 
 _INDEX: Final = struct.Struct("<I")
 _NEW_AGENT_BYTES: Final = _INDEX.size + 2
+"""Smallest size of an announcement: the index, and the length of the name."""
 STATE: Final = struct.Struct("<II8d")
 _MOTION: Final = struct.Struct("<7d")
 _MOTION_OFFSET: Final = 8
+"""Offset of position, velocity and heading in a state: they follow the index and the reserved field."""
 _NO_NEW_AGENTS: Final = count_bytes(0)
 
 
@@ -179,7 +182,7 @@ class ReceivedStates(Mapping[str, State]):
     def has_limits_of(self, other: Mapping[str, State]) -> bool:
         """Return True if other states have the same agents and acceleration limits.
 
-        The agents are compared by identity, so the result may be False although they are the same.
+        The mappings of agents are compared by identity, so the result may be False although the agents are equal.
         """
         return isinstance(other, ReceivedStates) and self._rows is other._rows and self._limits == other._limits  # noqa: SLF001 (of the same class)
 

@@ -1,4 +1,7 @@
-"""Answers the requests of a coordinator on behalf of a federate."""
+"""Answers the requests of a coordinator on behalf of a federate.
+
+A federate is a physics or network simulator. The coordinator is the process of fieldkit that runs the co-simulation.
+"""
 
 import copy
 import sys
@@ -22,6 +25,9 @@ from sim_backends.federates.exchanges import (
     encode_states,
 )
 from sim_backends.federates.frames import (
+    COPY_POSITION,
+    HEADER_BYTES,
+    KIND_POSITION,
     MAX_HELLO_BYTES,
     MAX_TEXT_BYTES,
     NETWORK,
@@ -135,7 +141,7 @@ class _Heartbeat:
         threading.Thread(target=self._run, daemon=True).start()
 
     def begin(self, request: int, copy_number: int, at_ns: int) -> None:
-        """Begin to send `busy` for a request, with a simulated time."""
+        """Begin to send `busy` for a request; `at_ns` is the simulated time that the federate has reached."""
         self._request = request, copy_number, at_ns
 
     def answer(self, frame: bytes) -> None:
@@ -236,7 +242,7 @@ class _Run:
             return MessageKind.PONG, encode_number(decode_number(body))
         federate_copy = self.copies.get(header.copy)
         if federate_copy is None:
-            raise MalformedFrameError(12, f"there is no copy {header.copy}, or hello is missing")
+            raise MalformedFrameError(COPY_POSITION, f"there is no copy {header.copy}, or hello is missing")
         if self.heartbeat is not None:
             self.heartbeat.begin(header.request, header.copy, federate_copy.last_ns)
         if header.kind is MessageKind.ADVANCE_PHYSICS and hasattr(federate_copy.federate, "step_ns"):
@@ -245,7 +251,7 @@ class _Run:
             return MessageKind.OUTCOMES, self._advance_network(federate_copy, body)
         if header.kind is MessageKind.FORK and self.service.forks:
             return MessageKind.DONE, self._fork(federate_copy, decode_fork(body))
-        raise MalformedFrameError(4, f"the request {header.kind.name.lower()} is not supported")
+        raise MalformedFrameError(KIND_POSITION, f"the request {header.kind.name.lower()} is not supported")
 
     def _begin(self, hello: Hello, request: int) -> bytes:
         if not is_same_token(hello.token, self.token):
@@ -286,7 +292,7 @@ class _Run:
 
     def _fork(self, federate_copy: _FederateCopy, number: int) -> bytes:
         if number in self.copies or len(self.copies) > _MAX_COPIES:
-            raise MalformedFrameError(16, f"copy {number} already exists, or there are too many copies")
+            raise MalformedFrameError(HEADER_BYTES, f"copy {number} already exists, or there are too many copies")
         self.copies[number] = _FederateCopy(
             copy.deepcopy(federate_copy.federate), federate_copy.agents.copy(), federate_copy.last_ns
         )

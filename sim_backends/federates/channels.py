@@ -20,7 +20,7 @@ class DeadlineError(TimeoutError):
 
 
 class FrameChannel(Protocol):
-    """Carries frames."""
+    """A connection that carries frames, the messages of the protocol."""
 
     def send(self, frame: bytes, deadline_s: float | None) -> None:
         """Send a frame.

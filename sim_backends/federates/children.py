@@ -17,6 +17,7 @@ _EXIT_S: Final = 1.0
 """Time for a process to exit after its input was closed, and again after SIGTERM."""
 _POLL_S: Final = 0.005
 _SHOWN_BYTES: Final = 4096
+"""Largest number of bytes of standard error that are read for a message."""
 _SHOWN_LINES: Final = 10
 """Largest number of lines that are shown: enough for the cause of an error in a stack trace."""
 _NOTE: Final = "note: "

@@ -23,6 +23,8 @@ _COUNT: Final = struct.Struct("<I")
 _LENGTH: Final = struct.Struct("<H")
 _HEADER: Final = struct.Struct("<IHHII")
 HEADER_BYTES: Final = _HEADER.size
+# Positions of the fields of a header, for errors.
+_SIZE_POSITION, KIND_POSITION, _RESERVED_POSITION, REQUEST_POSITION, COPY_POSITION = 0, 4, 6, 8, 12
 
 
 class MessageKind(IntEnum):
@@ -51,7 +53,7 @@ class MessageKind(IntEnum):
         RELEASE: coordinator: empty; the copy in the header is not used again; there is no answer
         ERROR: federate: `text`; answers any request; the session ends
         BYE: coordinator: empty; the run ends, and there is no answer
-        SAMPLE_LINKS: coordinator: empty; only to a network with the capability 64
+        SAMPLE_LINKS: coordinator: empty; only to a network with the capability *samples links*
         LINKS: federate: `radios` u32, each a radio sample, `links` u32, each a link sample
     """
 
@@ -146,11 +148,11 @@ def read_header(data: bytes | bytearray, max_bytes: int = MAX_FRAME_BYTES) -> He
     size, kind, reserved, request, copy = _HEADER.unpack_from(data)
     message_kind = _KINDS.get(kind)
     if message_kind is None:
-        raise UnknownKindError(4, f"there is no kind of message {kind}")
+        raise UnknownKindError(KIND_POSITION, f"there is no kind of message {kind}")
     if size > max_bytes:
-        raise MalformedFrameError(0, f"a size of {size} bytes is above {max_bytes}")
+        raise MalformedFrameError(_SIZE_POSITION, f"a size of {size} bytes is above {max_bytes}")
     if reserved:
-        raise MalformedFrameError(6, f"the reserved field is {reserved}, not 0")
+        raise MalformedFrameError(_RESERVED_POSITION, f"the reserved field is {reserved}, not 0")
     return Header(size, message_kind, request, copy)
 
 

@@ -37,6 +37,7 @@ _U16: Final = struct.Struct("<H")
 _U32: Final = struct.Struct("<I")
 _POSITION: Final = struct.Struct("<3d")
 _AGENT_BYTES: Final = 4 + _AGENT.size + STATE.size
+"""Smallest size of an agent in hello; its two texts have at least their lengths, 2 bytes each."""
 
 
 class FederateCapability(IntFlag):
@@ -70,7 +71,7 @@ def _read_prefix(reader: FrameReader) -> None:
     if magic != MAGIC:
         raise MalformedFrameError(reader.position - 10, "this is not fieldkit's protocol for federates")
     if version != VERSION:
-        raise MalformedFrameError(reader.position - 2, f"protocol version {version}; this program has {VERSION}")
+        raise MalformedFrameError(reader.position - 2, f"protocol version {version}; this program supports {VERSION}")
 
 
 def encode_join(token: str) -> bytes:
@@ -273,9 +274,9 @@ class Welcome:
         version, role, _, bits, step_ns, next_event_ns, configuration_hash = reader.unpack(_WELCOME)
         begin = reader.position - _WELCOME.size
         if version != VERSION:
-            raise MalformedFrameError(begin, f"protocol version {version}; this program has {VERSION}")
+            raise MalformedFrameError(begin, f"protocol version {version}; this program supports {VERSION}")
         if role not in ROLES or (step_ns <= 0 if role == PHYSICS else step_ns < 0):
-            raise MalformedFrameError(begin + 2, f"role {role} with a step of {step_ns} ns")
+            raise MalformedFrameError(begin + 2, f"role {role} with a step of {step_ns} ns is invalid")
         name, software = reader.text(), reader.text()
         commands = [reader.unpack(_U16)[0] for _ in range(reader.short_count(2))]
         transports = [reader.text() for _ in range(reader.short_count(2))]

@@ -73,7 +73,7 @@ class IpRadio:
         before: Delay = 0,  # noqa: ARG002 (see RadioModel)
         dscp: int = 0,  # noqa: ARG002
     ) -> None:
-        """Implement `RadioModel.send`; a federate has one access category."""
+        """Implement `RadioModel.send`; the federate does not receive the DSCP."""
         if destination is not None:
             receivers, protocol, identity = [destination], UNICAST, packet or payload.identity
         else:

@@ -68,9 +68,10 @@ class PhysicsFederate(Protocol):
 
     Attributes:
         step_ns: Time step; there are states at whole steps only.
-        limits_m_s2: Largest change of each agent's velocity per second, in m/s^2; `math.inf` if unknown. Only
-            `error_bounded` uses it. If a value is too small, errors may exceed the bound; if it is infinity, more
-            exchanges are needed. The mapping is read once; its values may change during the run.
+        limits_m_s2: Largest change of each agent's velocity per second, in m/s^2; `math.inf` if unknown. Only the
+            sync policy `error_bounded` uses it. If a value is too small, position errors may exceed the bound of this
+            policy; if it is infinity, more exchanges are needed. The mapping is read once; its values may change
+            during the run.
     """
 
     step_ns: int
@@ -91,8 +92,8 @@ class NetworkFederate(Protocol):
     """Carries packets.
 
     If agents forward or interfere, an attribute `transmitters` has their names; if objects that are not agents
-    interfere, an attribute `fixed_emitters_m` has their positions. `error_bounded` and the position errors include
-    them.
+    interfere, an attribute `fixed_emitters_m` has their positions. The sync policy `error_bounded` and the position
+    errors of a run include them.
     """
 
     def advance(

@@ -70,6 +70,7 @@ class _RemoteFederate:
         duplicate = object.__new__(type(self))
         memo[id(self)] = duplicate
         duplicate.__dict__.update(copy.deepcopy({**self.__dict__, "_copy": number}, memo))
+        # The copy is released when its proxy is deleted. At the exit of the process the session ends anyway.
         weakref.finalize(duplicate, self.session.release, number).atexit = False
         return duplicate
 

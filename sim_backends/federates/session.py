@@ -1,4 +1,7 @@
-"""The coordinator's side of a connection to an external federate: handshake, requests, deadlines, errors."""
+"""The coordinator's side of a connection to an external federate: handshake, requests, deadlines, errors.
+
+A federate is a physics or network simulator. The coordinator is the process of fieldkit that runs the co-simulation.
+"""
 
 import re
 import sys
@@ -13,6 +16,8 @@ from sim_backends.federates.channels import ClosedError, DeadlineError, FrameCha
 from sim_backends.federates.children import Child
 from sim_backends.federates.exchanges import decode_number, decode_text
 from sim_backends.federates.frames import (
+    KIND_POSITION,
+    REQUEST_POSITION,
     ROLES,
     Header,
     MalformedFrameError,
@@ -195,12 +200,14 @@ class FederateSession:
                 self.observer(request, frame)
             if number != expected_header.request or copy != expected_header.copy:
                 raise MalformedFrameError(
-                    8,
+                    REQUEST_POSITION,
                     f"it is for request {number} and copy {copy}, not {expected_header.request} and "
                     f"{expected_header.copy}",
                 )
             if kind is not expected_header.kind and kind is not MessageKind.ERROR:
-                raise MalformedFrameError(4, f"it is {kind.name.lower()}, not {expected_header.kind.name.lower()}")
+                raise MalformedFrameError(
+                    KIND_POSITION, f"it is {kind.name.lower()}, not {expected_header.kind.name.lower()}"
+                )
             return frame
 
     def fail(self, message: str, remedy: str = "") -> NoReturn:

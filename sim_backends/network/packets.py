@@ -40,7 +40,7 @@ class Packet(NamedTuple):
         size_bytes: Its size.
         identity: Flow and number, from which random numbers are derived.
         sent_ns: Time at which its program sent it.
-        enters_ns: Time at which the network receives it; later than `sent_ns` if a policy delays it.
+        enters_ns: Time at which the network receives it; later than `sent_ns` if the sync policy delays it.
         protocol: Name of the transport that carries it.
     """
 
@@ -87,7 +87,7 @@ class ReceivedDatagram(NamedTuple):
         source: Name of the sender.
         payload: Its content.
         sent_ns: Time at which its program sent it.
-        arrived_ns: Arrival time, as assigned by the policy.
+        arrived_ns: Arrival time; the sync policy assigns it.
     """
 
     source: str

@@ -40,7 +40,7 @@ class RadioNetwork:
     The radio receives the positions of stations when an event is processed, not at every window, so the result does
     not depend on earlier updates. It receives no velocities: for the radio, stations stay at the coordinator's
     positions, or move in steps if the coordinator passes dead-reckoned states. The position error therefore depends
-    only on the policy. A station without a state is absent: its radio is off.
+    only on the coordinator's sync policy. A station without a state is absent: its radio is off.
 
     `Transport.record_loss` is called only for packets with a single destination. For broadcasts, `CountsMisses`
     records the hosts that miss them.

@@ -76,8 +76,8 @@ class IpCaptures
     }
 
   private:
-    static constexpr size_t kSnapBytes = 128;
-    static constexpr size_t kIpBytes = 20;
+    static constexpr size_t kSnapBytes = 128; // bytes of each packet that a capture contains
+    static constexpr size_t kIpBytes = 20; // size of the IP header; it has the protocol at byte 9, the checksum at 10
     static constexpr uint8_t kIcmp = 1; // IP protocol numbers
     static constexpr uint8_t kTcp = 6;
 
@@ -105,7 +105,7 @@ class IpCaptures
             return; // a broadcast
         }
         Ipv4Address source = m_addresses.at(header.GetSource());
-        source.Serialize(&bytes[12]);
+        source.Serialize(&bytes[12]); // the addresses are at bytes 12 and 16 of the IP header
         m_addresses.at(header.GetDestination()).Serialize(&bytes[16]);
         IdTag tag;
         auto datagram = packet->PeekPacketTag(tag) ? m_datagrams.find(tag.number) : m_datagrams.end();

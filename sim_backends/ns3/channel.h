@@ -61,6 +61,7 @@ class Channel
         {
             return link.mean_db;
         }
+        // The quotient is rounded down, also before time 0.
         int64_t slot = now_ns >= 0 ? now_ns / m_slotNs : -((-now_ns + m_slotNs - 1) / m_slotNs);
         if (!link.has_gain || link.slot != slot)
         {
@@ -93,14 +94,15 @@ class Channel
     }
 
   private:
-    static constexpr int kEchoes = 12;
-    static constexpr int kWaves = 256;
+    static constexpr int kEchoes = 12; // multipath components of each link
+    static constexpr int kWaves = 256; // plane waves whose sum is the shadowing field
 
+    // A multipath component of a link.
     struct Echo
     {
-        double directions[4];
-        double stir;
-        double phase;
+        double directions[4]; // east and north components at the first end, then at the second end
+        double stir;          // rate at which moving scatterers lengthen its path, in m/s
+        double phase;         // at time 0 with both ends at the origin
     };
 
     struct Link
@@ -108,10 +110,10 @@ class Channel
         Point start, end;
         bool is_computed = false;
         bool has_gain = false;
-        int cuts = 0;
-        double mean_db = 0;
-        double k = 0;
-        int64_t slot = 0;
+        int cuts = 0;       // reasons why the stations cannot receive each other
+        double mean_db = 0; // loss without fading
+        double k = 0;       // Rician K-factor, as a ratio of powers
+        int64_t slot = 0;   // time slot of the gain
         double gain_db = 0;
         std::vector<Echo> echoes;
     };

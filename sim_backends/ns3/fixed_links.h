@@ -105,6 +105,7 @@ class FixedLinks : public SimpleChannel
             Transmit(hop);
             return;
         }
+        // The loop uses a separate vector, because it changes the receivers of the hop.
         for (size_t number : std::vector<size_t>(std::move(hop.receivers)))
         {
             hop.to = number;
@@ -151,7 +152,7 @@ class FixedLinks : public SimpleChannel
         PacketIdentity identity = identity_of(tag.number);
         Ipv4Header header;
         packet->PeekHeader(header);
-        constexpr uint16_t kFragmentBytes = 1480;
+        constexpr uint16_t kFragmentBytes = 1480; // payload of a full fragment with an MTU of 1500 bytes
         if (int fragment = header.GetFragmentOffset() / kFragmentBytes)
         {
             identity.first += " fragment " + std::to_string(fragment);

@@ -26,7 +26,7 @@
 namespace fieldkit
 {
 
-// A number that a packet carries without using any bytes.
+// A number that is attached to a packet of ns-3, and adds no bytes to it.
 class NumberTag : public Tag
 {
   public:
@@ -120,7 +120,8 @@ class FrameTracker
   public:
     static constexpr size_t kNoStation = SIZE_MAX;
 
-    // Station whose access point forwards a frame before it acknowledges it, as it does without aggregates.
+    // Station with the access point, if the access point forwards a frame before it acknowledges the frame. It does so
+    // if frames are not aggregated.
     size_t relay = kNoStation;
 
     // Called when a frame is lost, with the id of its packet and the reason.

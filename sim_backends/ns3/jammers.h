@@ -13,7 +13,7 @@
 namespace fieldkit
 {
 
-// Gives access to protected members of ns-3's WifiPhy.
+// Gives access to protected members of ns-3's WifiPhy: C++ allows pointers to them only in a subclass.
 class RadioAccess : public WifiPhy
 {
   public:
@@ -51,7 +51,7 @@ class Jammers
     Jammers(const std::vector<Station>& stations, const Channel& channel, double noise_dbm)
         : m_stations(stations),
           m_channel(channel),
-          m_negligible_dbm(noise_dbm - 40) // it would increase the noise by 0.0004 dB
+          m_negligible_dbm(noise_dbm - 40) // this power would increase the noise by 0.0004 dB
     {
     }
 

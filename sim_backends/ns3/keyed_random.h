@@ -13,7 +13,7 @@
 namespace fieldkit
 {
 
-// BLAKE2b without a key, for at most one block of 128 bytes per step (RFC 7693).
+// BLAKE2b without a key (RFC 7693), with a digest of 128 bits. Short names of variables are those of the RFC.
 class Blake2b
 {
   public:
@@ -53,7 +53,7 @@ class Blake2b
     Blake2b()
         : m_state(kInitial)
     {
-        m_state[0] ^= 0x01010000 ^ kDigestBytes;
+        m_state[0] ^= 0x01010000 ^ kDigestBytes; // parameters: fanout 1, depth 1, no key, size of the digest
     }
 
     static uint64_t Rotate(uint64_t value, int bits)
@@ -159,7 +159,8 @@ class RandomStream
     // A step of Philox-4x64.
     std::array<uint64_t, kBlockWords> Block(uint64_t number) const
     {
-        std::array<uint64_t, kBlockWords> counter = {number + 1, 0, 0, 0}; // numpy increments it before it generates
+        // numpy increments the counter before it generates the first words.
+        std::array<uint64_t, kBlockWords> counter = {number + 1, 0, 0, 0};
         uint64_t k0 = m_key[0];
         uint64_t k1 = m_key[1];
         for (int round = 0; round < 10; round++)

@@ -286,6 +286,7 @@ class Network
         m_links->tracker = &m_tracker;
         m_links->identity_of = [this](uint64_t id) {
             auto packet = m_pending.find(id);
+            // A packet that has arrived or was dropped is not pending; its other fragments get this identity.
             return packet == m_pending.end() ? PacketIdentity("decided", id)
                                              : PacketIdentity(packet->second.flow, packet->second.number);
         };
@@ -296,7 +297,8 @@ class Network
     {
         if (!m_setup.pcap.empty() && !m_stations.empty())
         {
-            std::ofstream first; // ns-3 aborts if it cannot open a file
+            // Open the first file here to report an error: ns-3 aborts if it cannot open a file.
+            std::ofstream first;
             OpenNew(first, m_setup.pcap + m_stations[0].name + ".pcap", "pcap");
         }
         m_setup.mode = radio.value("mode", "");
@@ -569,6 +571,7 @@ class Network
         {
             throw Refusal("there is no transport " + packet.protocol);
         }
+        // 65507 bytes is the largest payload of UDP over IPv4.
         uint64_t limit = packet.protocol == "tcp" ? uint64_t{1} << 30 : 65507 - kRtpsHeaderBytes;
         if (packet.size_bytes > limit)
         {

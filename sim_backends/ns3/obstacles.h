@@ -246,7 +246,7 @@ class Obstacles
         }
         else if (kind == "ramp")
         {
-            const int steps = 8;
+            const int steps = 8; // a ramp is approximated by this number of boxes
             for (int step = 0; step < steps; step++)
             {
                 double share = (step + 0.5) / steps;
@@ -255,6 +255,7 @@ class Obstacles
         }
         else if (kind == "building")
         {
+            // Four walls, and a roof of the same thickness on them.
             double thick = Number(obstacle.at("thickness"));
             double under = size[2] - thick;
             std::string material = obstacle.at("material");

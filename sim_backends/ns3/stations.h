@@ -53,7 +53,7 @@ class AgentMobility : public MobilityModel
         return CreateObject<AgentMobility>(*this);
     }
 
-    size_t station = 0;
+    size_t station = 0; // index of the station
 
   private:
     Vector DoGetPosition() const override
@@ -267,6 +267,7 @@ Install(std::vector<Station>& stations, const WifiSetup& setup, Channel& channel
             phy.SetPcapDataLinkType(WifiPhyHelper::DLT_IEEE802_11_RADIO);
             phy.EnablePcap(setup.pcap + station.name + ".pcap", devices.Get(0), true, true);
         }
+        // Each station has its own random streams, which other stations do not change.
         wifi.AssignStreams(devices, 1000 * static_cast<int64_t>(number));
         station.device = devices.Get(0);
         auto device = DynamicCast<WifiNetDevice>(station.device);

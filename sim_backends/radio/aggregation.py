@@ -1,9 +1,9 @@
 """A-MPDU: aggregates of frames to one receiver, acknowledged by a Block Ack (IEEE 802.11-2020, 9.7, 10.12 and 10.25).
 
-The originator sends frames again, alone or with new ones, until they are acknowledged or given up. The recipient
-passes them up in the order of their sequence numbers, so a frame waits for the ones before it. Two steps of the
-standard are instantaneous here: the agreement exists from the first frame, and the recipient immediately skips a
-frame that the originator has given up (a BlockAckReq reports this in the standard).
+The originator (the sending station) sends frames again, alone or with new ones, until they are acknowledged or given
+up. The recipient passes them to the layer above in the order of their sequence numbers, so a frame waits for the ones
+before it. Two steps of the standard are instantaneous here: the agreement exists from the first frame, and the
+recipient immediately skips a frame that the originator has given up (a BlockAckReq reports this in the standard).
 """
 
 from collections import deque
@@ -23,8 +23,9 @@ TYPICAL_FRAMES: Final = 16
 """Number of frames per aggregate for which rate control compares modes. An assumption, between 1 and the window."""
 
 _DELIMITER_BYTES: Final = 4
+"""Size of the delimiter before each frame of an aggregate."""
 MAX_PPDU_NS: Final = 5_484_000
-"""aPPDUMaxTime: tables 19-25, 21-28 and 27-54."""
+"""Longest airtime of an aggregate (aPPDUMaxTime): tables 19-25, 21-28 and 27-54."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,8 @@ class AmpduLimits:
     """Limits of aggregates.
 
     Attributes:
-        window: Maximum number of frames from the oldest unacknowledged one to the newest: size of the bitmap.
+        window: Maximum number of frames from the oldest unacknowledged one to the newest. It is the number of bits in
+            the bitmap of a Block Ack.
         max_bytes: Maximum size of an A-MPDU.
     """
 
@@ -108,7 +110,7 @@ class BlockAckSession(Generic[Payload]):
         """
         limit_bytes = min(self._limits.max_bytes, _bytes_in(mode, limit_ns))
         frames: list[Frame[Payload]] = []
-        first, size_bytes, last_sequence = queue[0], 0, 0
+        first, size_bytes, end_sequence = queue[0], 0, 0
         for frame in queue:
             if frame.receiver != first.receiver:
                 continue
@@ -116,8 +118,8 @@ class BlockAckSession(Generic[Payload]):
             # Each subframe but the last is padded to a multiple of 4 bytes.
             new_bytes = -(-size_bytes // 4) * 4 + _DELIMITER_BYTES + frame.size_bytes + QOS_HEADER_BYTES
             if not frames:
-                last_sequence = sequence + self._limits.window
-            elif new_bytes > limit_bytes or sequence >= last_sequence:
+                end_sequence = sequence + self._limits.window
+            elif new_bytes > limit_bytes or sequence >= end_sequence:
                 break
             if frame.sequence < 0:
                 frame.sequence = sequence

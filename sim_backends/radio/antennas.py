@@ -42,7 +42,8 @@ class Antenna:
         standard: Standard of its radio, if it has no `phy`.
         tx_power_dbm: Transmit power.
         sensitivity_dbm: Received power of the weakest frame that it detects.
-        phy: Its capability since 802.11n; None for 802.11g, or 802.11n with one stream in 20 MHz, at 2.4 GHz.
+        phy: Its capability, for 802.11n and later; None for 802.11g, or 802.11n with one stream in 20 MHz, at 2.4
+            GHz.
     """
 
     standard: Standard

@@ -1,7 +1,8 @@
 """EDCA: four access categories with their own queue and contention in each station (IEEE 802.11-2020, 10.23.2).
 
-The parameters are the defaults of Linux's mac80211: table 9-155 with the TXOP limits of IEEE 802.11-2012 for voice
-and video. In the other categories a TXOP has one exchange.
+A station that has won the contention may send for the time of a transmission opportunity (TXOP). The parameters are
+the defaults of Linux's mac80211: table 9-155 with the TXOP limits of IEEE 802.11-2012 for voice and video. In the
+other categories a TXOP has one exchange.
 """
 
 from collections import deque
@@ -153,6 +154,7 @@ class AccessCategories(ChannelAccess, Generic[Payload]):
         self._by_priority = [self._queues[category] for category in _PRIORITY]
         self.active = self._queues[BEST_EFFORT]
         self._sifs_ns = band.sifs_ns
+        # End of the transmission opportunity, 0 if it has one exchange; start of the next exchange in it.
         self._txop_end_ns = self._continue_ns = 0
 
     @property

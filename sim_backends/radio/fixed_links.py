@@ -1,7 +1,7 @@
 """Links that behave the same at all positions of the stations: each has a queue, a rate, a delay and a loss.
 
-The model uses no clock and no socket. The caller passes the time in integer nanoseconds, which must not decrease: the
-medium reads it from the monotonic clock; tests and co-simulations use virtual time.
+The model uses no clock and no socket. The caller passes the time in integer nanoseconds, which must not decrease. In
+an emulated lab the time is read from the monotonic clock; tests and co-simulations use virtual time.
 """
 
 import heapq
@@ -318,7 +318,7 @@ class FixedLinks(Generic[Payload]):
             return
         at_ns, delay_sum = result
         if before:
-            before -= PACKET
+            before -= PACKET  # `delay_sum` already counts the packet
         if at_ns <= now_ns:
             self._arrive(at_ns, packet, delay_sum + before)
             return
@@ -389,4 +389,4 @@ class UniformLinks(FixedLinks[Payload]):
             )
 
     def log_attempts(self, log: Callable[[TransmissionAttempt], None] | None) -> None:
-        """See `RadioModel.log_attempts`."""
+        """Implement `RadioModel.log_attempts`; fixed links have no attempts."""

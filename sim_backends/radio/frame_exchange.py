@@ -53,7 +53,7 @@ class FrameExchange(Generic[Payload]):
         channel: Received powers between the stations.
         seed: Seed of all random draws.
         queue_packets: Maximum number of queued packets per station.
-        make_delivery: Class of the delivery.
+        make_delivery: Class of `delivery`.
 
     Attributes:
         stations: Stations by index.
@@ -115,7 +115,7 @@ class FrameExchange(Generic[Payload]):
 
     def _start(self, now_ns: int, index: int) -> None:
         station = self.stations[index]
-        station.contention.earliest_start_ns(now_ns)
+        station.contention.earliest_start_ns(now_ns)  # counts down the backoff slots that were idle until now
         if self.reception.is_jammed(index):
             self.events.schedule(now_ns + _JAMMED_RETRY_NS, self.retry_when_idle, station)
             return
@@ -203,7 +203,7 @@ class FrameExchange(Generic[Payload]):
         self, now_ns: int, station: Station[Payload], peer: Peer[Payload], session: BlockAckSession[Payload]
     ) -> None:
         first = station.queue[0]
-        # Hardware repeats an aggregate in the next mode of the chain only if the Block Ack is missing.
+        # Hardware repeats an aggregate in the next mode of the retry chain only if the Block Ack is missing.
         mode = peer.mode = peer.rate.choose(now_ns, first.packet, min(peer.failed_exchanges + 1, SHORT_RETRY_LIMIT))
         limit_ns = MAX_PPDU_NS
         if station.categories is not None:

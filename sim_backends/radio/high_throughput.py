@@ -55,7 +55,8 @@ _SUBCARRIERS: Final[dict[HighThroughput, dict[int, int]]] = {
     "HE": {20: 234, 40: 468, 80: 980},
 }
 
-# Data bits per symbol of 4 us that one convolutional encoder handles: tables of 19.5 and 21.5. HE would use LDPC.
+# Data bits per symbol of 4 us that one convolutional encoder handles: tables of 19.5 and 21.5. HE would use LDPC; in
+# this model it has one encoder for any number of bits.
 _ENCODER_BITS_PER_SYMBOL: Final[dict[HighThroughput, int]] = {"HT": 1080, "VHT": 2160, "HE": 1 << 30}
 
 _LEGACY_PREAMBLE_NS: Final = 20_000

@@ -17,7 +17,7 @@ class LinkRow:
     Attributes:
         is_linked: For each station, True if the two stations receive each other without fading; None before the
             first use.
-        slot: Number of the time slot (of the validity of a gain) for which `powers_mw` was computed; -1 for none.
+        slot: Number of the time slot for which `powers_mw` was computed; gains are constant in a slot. -1 for none.
         powers_mw: Received power of the station at each other station in that slot; without fading if `slot` is -1.
     """
 

@@ -3,7 +3,7 @@
 The module can be imported without the models that use it. Delays have four parts, in nanoseconds: processing,
 queuing, transmission and propagation. A `Delay` is one integer with five fields of 64 bits (584 years each): a number
 of packets, and the sum of each part. Delays are added with `+`. Updating the delay of a packet takes 45 ns; updating
-five separate counters takes 100 ns, and the medium has only 4 us per packet.
+five separate counters takes 100 ns, and the radio of an emulated lab has only 4 us per packet.
 """
 
 from collections.abc import Callable

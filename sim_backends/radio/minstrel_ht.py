@@ -36,7 +36,10 @@ _SEGMENT_NS: Final = 6_000_000
 _RANKED: Final = 4
 """Number of modes in a ranking: `MAX_THR_RATES` of mac80211."""
 _SAMPLES_PER_TYPE: Final = 5
+# Shares of acknowledged frames. Below the first, the throughput of a mode counts as 0. Above the second, a higher
+# share does not increase the throughput. Below the third, a mode has two tries in the chain.
 _UNUSABLE_SHARE, _CAPPED_SHARE, _UNRELIABLE_SHARE = 0.1, 0.9, 0.2
+# Share above which a mode can be the robust one; share above which a slower mode is not sampled.
 _ROBUST_SHARE, _RELIABLE_SHARE = 0.75, 0.95
 # If fewer than 25 % of more than 30 frames were acknowledged, a mode is replaced before the next update.
 _FAILING_FRAMES, _FAILING_SHARE = 30, 0.25
@@ -49,6 +52,7 @@ _SECOND_WEIGHT: Final = -(_DECAY**2)
 _NEW_WEIGHT: Final = 1 - _LAST_WEIGHT - _SECOND_WEIGHT
 _SMALLEST_SHARE: Final = 1 / 4096
 
+# Kinds of sampled modes (see `_refill_samples`), and the order in which they are sampled.
 _FASTER, _JUMP, _SLOWER = range(3)
 _SAMPLE_ORDER: Final = (_FASTER, _JUMP, _FASTER, _JUMP, _FASTER, _SLOWER)
 

@@ -24,7 +24,7 @@ BITS_PER_SUBCARRIER: Final[dict[Modulation, int]] = {
 }
 
 SLOT_NS: Final = 9_000
-"""Tables 17-21 and 18-5, short slot, because there is no 802.11b station."""
+"""Duration of a backoff slot: the short slot of tables 17-21 and 18-5, because there is no 802.11b station."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ DIFS_NS: Final = BAND_2_4.difs_ns
 CW_MIN: Final = 15
 CW_MAX: Final = 1023
 SHORT_RETRY_LIMIT: Final = 7
-"""CW of table 18-5; dot11ShortRetryLimit by annex C."""
+"""Smallest and largest contention window (table 18-5); largest number of attempts (dot11ShortRetryLimit, annex C)."""
 
 ENERGY_DETECTION_DBM: Final = -62.0
 """Any signal of at least this power keeps a station from sending: 17.3.10.6, 20 dB above -82 dBm."""

@@ -2,9 +2,9 @@
 
 A station dozes when it has sent and received nothing for a time. The access point buffers frames for it until the
 next beacon, which wakes the station. A frame from the station also ends its doze, and the access point then sends the
-buffered frames immediately: pings to a Raspberry Pi are slow, pings from it are not. Broadcasts wait for the next
-DTIM if any station uses power save. Beacons, null frames and PS-Polls take no airtime here, every beacon is received,
-and a station wakes up in no time.
+buffered frames immediately: pings to a Raspberry Pi are slow, pings from it are not. If any station uses power save,
+broadcasts wait for the next beacon with a DTIM, after which all stations listen. Beacons, null frames and PS-Polls
+take no airtime here, every beacon is received, and a station wakes up in no time.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -19,9 +19,10 @@ BEACON_INTERVAL_NS: Final = 102_400_000
 """100 time units of 1.024 ms: the default of access points."""
 
 DTIM_PERIOD: Final = 2
-"""The default of hostapd."""
+"""Every second beacon has a DTIM: the default of hostapd."""
 
 Release = Callable[[int, Station[Payload], Frame[Payload]], None]
+"""Called with the time, the transmitter and a frame that the transmitter may send now."""
 
 
 class PowerSave(Generic[Payload]):

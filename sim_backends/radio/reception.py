@@ -76,7 +76,7 @@ class Reception(Generic[Payload]):
             other.interferers.append(transmission)
         transmission.interferers.extend(on_air)
         transmission.interferers.extend(self._emissions.values())
-        if station.receiving is not None:
+        if station.receiving is not None:  # a station that sends stops receiving
             station.receiving.receivers.discard(station.index)
             station.receiving = None
         station.sending_until_ns = end_ns
@@ -100,7 +100,7 @@ class Reception(Generic[Payload]):
             scheduled_start = starts.get(index)
             if scheduled_start is None:
                 neighbour.contention.on_busy(now_ns, reserved_ns)
-            elif scheduled_start[0] > sensed_ns:
+            elif scheduled_start[0] > sensed_ns:  # otherwise the station starts before it senses this frame
                 events.schedule_start(neighbour.contention.postpone(now_ns, reserved_ns), index)
         on_air.append(transmission)
 

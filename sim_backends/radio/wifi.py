@@ -1,6 +1,6 @@
-"""802.11 stations on one channel: DCF with hidden stations, retries, ACKs, relaying by an access point.
+"""802.11 stations on one channel: contention (DCF), hidden stations, ACKs, retries, relaying by an access point.
 
-The engine is event-driven, computes with integer nanoseconds, and uses no clock and no socket. It implements
+The model is event-driven, computes with integer nanoseconds, and uses no clock and no socket. It implements
 `model.RadioModel`. Frames between stations with `phy` are aggregated, and may have RTS and CTS and access categories.
 Power save delays frames to stations of an access point. Beacons have airtime only if the option
 `access_points` is used; fragmentation is not modelled.
@@ -40,7 +40,7 @@ class Wifi(Generic[Payload]):
         channel: Received powers between the stations.
         seed: Seed of all random draws.
         queue_packets: Maximum number of queued packets per station.
-        make_delivery: Class of the delivery.
+        make_delivery: Class that queues and delivers the packets.
     """
 
     def __init__(

@@ -79,6 +79,7 @@ class WorldChannel(RadioChannel):
         # The first end of a link is the one whose name sorts first, for any order of the stations.
         by_name = np.array(sorted(range(count), key=self.names.__getitem__), dtype=np.int64)
         self._ends = by_name[np.stack(np.triu_indices(count, 1))]
+        # Index of the link between two stations, the same in both directions.
         self._link_of = np.zeros((count, count), dtype=np.int64)
         self._link_of[tuple(self._ends)] = self._link_of[tuple(self._ends[::-1])] = np.arange(self._ends.shape[1])
         self._links_of_station = [np.delete(links_of, station) for station, links_of in enumerate(self._link_of)]
@@ -99,7 +100,7 @@ class WorldChannel(RadioChannel):
         self._present = np.zeros(count, dtype=bool)
         self._positions_m, self._velocities_m_s = np.zeros((2, count, 3))
         self._moved_ns, self._gain_valid_ns = 0, self._compute_gain_valid_ns()
-        self._revision = 0
+        self._revision = 0  # increases with each change of positions, velocities or losses
         self.use_losses(np.full((count, count), np.inf))
 
     def move(
@@ -185,6 +186,7 @@ class WorldChannel(RadioChannel):
         self._revision += 1
         self._loss_db = loss_db
         self._rician_k = np.zeros(loss_db.shape)
+        # True for each link whose loss must be computed again, because an end has moved or the link was cut.
         self._stale = np.zeros(self._ends.shape[1], dtype=bool)
         self._rows: list[LinkRow | None] = [None] * len(loss_db)
 
@@ -288,7 +290,7 @@ class WorldChannel(RadioChannel):
 
     @override
     def are_linked(self, transmitter: int, receiver: int) -> bool:
-        """Use mean powers, so that a deep fade breaks no association."""
+        """Compare the mean powers with the sensitivities, so that a deep fade does not end an association."""
         row = self._row(transmitter)
         if row.is_linked is None:
             reverse_mw = _milliwatts(self._tx_powers_dbm - self._loss_db[:, transmitter])

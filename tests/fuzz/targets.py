@@ -379,7 +379,7 @@ def _read_program_output(data: bytes, place: Path) -> None:
     for reading in readings:
         for unit in ("V", "count", "ns", "share", "bool", "text"):
             with suppress(EvidenceError):
-                program_output.value(Column("x", unit, "X."), reading())
+                program_output.to_column_value(Column("x", unit, "X."), reading())
 
 
 def _all_targets() -> Iterator[Target]:

@@ -109,7 +109,7 @@ def test_earlier_packets_queued_at_the_sender_make_an_attempt_void(tmp_path: Pat
     for role in ("sender", "receiver"):
         attempt.change_capture(role, lambda packets: [*delayed_packets, *packets])
     (reason,) = attempt.problems()
-    assert reason == f"{EARLIER}: 1 packet to the transfer's port left before its sender started"
+    assert reason == f"{EARLIER}: 1 packet to the transfer's port left before the transfer started"
 
 
 def test_fragments_without_a_first_fragment_make_an_attempt_void(tmp_path: Path) -> None:

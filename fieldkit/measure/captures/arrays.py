@@ -13,6 +13,7 @@ Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Keys = NDArray[np.uint64]
+"""Hashes of rows, from `row_hashes`."""
 Buffer = bytes | mmap
 
 BIG: Final = ">"
@@ -20,8 +21,8 @@ LITTLE: Final = "<"
 Order = Literal["<", ">"]
 """Byte order in the notation of `struct` and numpy."""
 
-
-# Multiplier of `row_hashes`: 2**64 divided by the golden ratio. It is odd, so that the multiplication is invertible.
+# Multiplier of `row_hashes`: 2**64 divided by the golden ratio. The value is odd, so that the multiplication is
+# invertible.
 _MULTIPLIER: Final = np.uint64(0x9E3779B97F4A7C15)
 
 
@@ -45,7 +46,7 @@ class Table:
         return len(next(iter(vars(self).values())))
 
     def where(self, selection: Mask | Ints | slice) -> Self:
-        """Return the rows that a mask or a slice selects, or the rows at the indices of an array, in its order."""
+        """Return the rows that a mask or a slice selects, or the rows at the given indices, in their order."""
         if not isinstance(selection, slice) and selection.dtype == np.bool_ and selection.all():
             return self
         return type(self)(**{name: column[selection] for name, column in vars(self).items()})
@@ -107,8 +108,7 @@ class NarrowColumn:
         """Return a copy of the column.
 
         Raises:
-            AttributeError: The column was read from the class instead of a table. `dataclass` reads it in this way,
-                and regards the field as one without a default.
+            AttributeError: The column was read from the class instead of a table.
         """
         if table is None:
             raise AttributeError(self._name)
@@ -183,7 +183,7 @@ def row_hashes(*columns: Ints | Keys) -> Keys:
     for column in columns:
         hashes ^= column.view(np.uint64)
         hashes *= _MULTIPLIER
-        hashes ^= hashes >> np.uint64(29)
+        hashes ^= hashes >> np.uint64(29)  # the multiplication mixes only lower bits into higher ones
     return hashes
 
 

@@ -45,7 +45,7 @@ def check_link_type(*link_types: int, where: str) -> None:
         )
 
 
-def network(integers: Integers, frames: Frames) -> Ints:
+def ip_header_positions(integers: Integers, frames: Frames) -> Ints:
     """Return the position of each frame's IP header in the file; `NO_HEADER` if none is found."""
     header_at = np.full(len(frames), NO_HEADER)
     for link_type in np.flatnonzero(np.bincount(frames.link_type)).tolist():

@@ -13,6 +13,7 @@ from fieldkit.measure.captures.arrays import LITTLE, Frames, Integers, Ints, Mas
 from fieldkit.measure.captures.headers import COOKED_V2, NO_HEADER
 
 HeaderFinder = Callable[[Integers, Frames], Ints]
+"""Function that returns the position of the IP header of each frame; `NO_HEADER` for a frame without one."""
 
 # EtherTypes of IPv4 and IPv6, and of VLAN tags.
 _IP_TYPES: Final = (0x0800, 0x86DD)
@@ -22,7 +23,7 @@ _IP_FAMILIES: Final = (2, 10, 24, 28, 30)
 # The LLC header of a SNAP frame: DSAP and SSAP 0xAA, control 0x03, and the first byte of the OUI.
 _SNAP: Final = 0xAAAA0300
 _RADIOTAP_HEADER_BYTES: Final = 8
-# Bits of radiotap's field `flags`.
+# Bits of radiotap's field `flags`. The FCS is the frame check sequence.
 _RADIOTAP_PADDED: Final = 0x20
 _RADIOTAP_WRONG_FCS: Final = 0x40
 
@@ -77,6 +78,7 @@ def _radiotap(integers: Integers, frames: Frames) -> Ints:
     end = frames.start + np.minimum(length, frames.captured_bytes)
     present = little.u32(frames.start + 4)
     fields_at = frames.start + _RADIOTAP_HEADER_BYTES
+    # Bit 31 of a word of presence bits shows that another such word follows.
     extended = np.flatnonzero(present >> 31)
     while len(extended):
         is_extended = little.u32(fields_at[extended]) >> 31 == 1
@@ -128,11 +130,11 @@ LINKS: Final[Mapping[int, HeaderFinder]] = MappingProxyType(
     {
         0: _null,  # BSD loopback
         1: _ethernet,
-        105: _80211,
+        105: _80211,  # IEEE 802.11 without radiotap
         108: _null,  # OpenBSD loopback
-        113: _cooked,
+        113: _cooked,  # Linux, captured on all interfaces
         127: _radiotap,
-        COOKED_V2: _cooked_v2,
+        COOKED_V2: _cooked_v2,  # the same, by tcpdump 4.99 and later
     }
 )
 """Function that finds the IP headers, by link type number. The types of `headers.RAW_LINKS` need no function."""

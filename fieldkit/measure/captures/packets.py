@@ -30,8 +30,8 @@ from fieldkit.measure.captures.headers import (
     Addresses,
     address,
     interfaces,
+    ip_header_positions,
     ip_headers,
-    network,
 )
 
 FIN: Final = 0x01
@@ -162,6 +162,7 @@ _STORAGE_TYPES: Final[Mapping[str, type[np.integer[Any]]]] = MappingProxyType(
 )
 """Columns stored in fewer than eight bytes. Each type can store the header field and the negative special values."""
 
+# The columns are set after `dataclass` has read the fields, because it would use them as default values.
 for _name, _storage_type in _STORAGE_TYPES.items():
     _column = NarrowColumn(_storage_type)
     _column.__set_name__(Packets, _name)
@@ -170,7 +171,7 @@ for _name, _storage_type in _STORAGE_TYPES.items():
 
 def decode(integers: Integers, frames: Frames) -> Packets:
     """Return the IP packets of `frames`; frames of other protocols or with a truncated IP header are omitted."""
-    ip = ip_headers(integers, frames, network(integers, frames))
+    ip = ip_headers(integers, frames, ip_header_positions(integers, frames))
     if len(ip) < len(frames):
         frames = frames.where(ip.frame)
     transport, payload, protocol = ip.payload_at, ip.payload_bytes, ip.protocol
@@ -223,6 +224,7 @@ def _time_stamps(integers: Integers, tcp: Mask, transport: Ints, end: Ints) -> I
     if not tcp.any():
         return stamps
     is_aligned = tcp & (transport + 32 <= end)
+    # Of the packets that are long enough, keep those whose options begin with the time stamp.
     is_aligned[is_aligned] = integers.u32(transport[is_aligned] + 20) == _ALIGNED_STAMP
     stamps[is_aligned] = integers.u32(transport[is_aligned] + 24)
     others = np.flatnonzero(tcp & ~is_aligned & (transport + 30 <= end))
@@ -247,6 +249,7 @@ def _option(integers: Integers, rows: Ints, transport: Ints, end: Ints, option: 
     while has_more.any():
         rows, at, end = rows[has_more], at[has_more], end[has_more]
         kind = integers.u8(at)
+        # An option of kind 1 (no operation) has no length field, and kind 0 ends the list.
         step = np.where(kind == 1, 1, integers.u8(at + 1))
         matches = (kind == option) & (step == size)
         values[rows[matches]] = read(at[matches] + 2)

@@ -242,7 +242,14 @@ def _totals(client: IperfTest, sender: IperfTest, receiver: IperfTest, settings:
 
 
 def date_problem(test: IperfTest, window: tuple[int, int] | None) -> str | None:
-    """Return the reason why a test did not run during the attempt by the robot's clock, or None if it did."""
+    """Return a sentence if a test began outside of the attempt according to the robot's clock.
+
+    Return None if the test began during the attempt, or if one of the times is unknown.
+
+    Args:
+        test: The test.
+        window: The robot's clock before and after the attempt, nanoseconds since 1970 UTC; None if unknown.
+    """
     if window is None or test.start.start_utc_s is None:
         return None
     first_s, last_s = (edge_ns / 1e9 for edge_ns in window)

@@ -90,7 +90,14 @@ class _Progress:
 def find_contradictions(
     flow: LoadFlow, sent: IperfTest, received: IperfTest, evidence: LoadEvidence
 ) -> Iterator[str]:
-    """Yield the contradictions between the JSON of both ends and both captures; none if a capture has no times."""
+    """Yield the contradictions between the JSON of both ends and both captures; none if a capture has no times.
+
+    Args:
+        flow: Addresses and ports of the test, which identify its packets.
+        sent: JSON of the sender.
+        received: JSON of the receiver.
+        evidence: Captures and kernel counters of both ends.
+    """
     if (evidence.receiver.time_ns == NO_TIME).any() or (evidence.sender.time_ns == NO_TIME).any():
         return
     sent_streams, received_streams = flow.streams(evidence.sender), flow.streams(evidence.receiver)
@@ -160,6 +167,7 @@ def _last_request_ns(flow: LoadFlow, evidence: LoadEvidence, first_ns: int) -> i
 
 def _udp_progress(flow: LoadFlow, streams: list[Packets]) -> _Progress:
     times_ns = np.sort(np.concatenate([stream.time_ns for stream in streams]))
+    # A stream contains only the first packet of each datagram.
     upper = flow.payload_bytes * np.arange(1, len(times_ns) + 1)
     # The first fragment of a fragmented datagram does not show that the other fragments arrived.
     fragmented = any(stream.more_fragments.any() for stream in streams)
@@ -182,6 +190,7 @@ def _tcp_progress(flow: LoadFlow, streams: list[Packets], evidence: LoadEvidence
         acknowledged = (acknowledgments.tcp_ack - first_seq) % 2**32
         if max(received.max(initial=0), acknowledged.max(initial=0)) > LONGEST_BYTES:
             return None
+        # Captured data raises the upper bound, and acknowledgments raise the lower bound.
         for at_ns, position, increments, other_increments in (
             (data.time_ns, received, upper, lower),
             (acknowledgments.time_ns, acknowledged, lower, upper),
@@ -193,6 +202,7 @@ def _tcp_progress(flow: LoadFlow, streams: list[Packets], evidence: LoadEvidence
     times_ns = np.concatenate(parts_ns)
     order = np.argsort(times_ns, kind="stable")
     bounds = [np.cumsum(np.concatenate(parts)[order]) for parts in (lower, upper)]
+    # Entries before the first payload, such as those of the cookie, are omitted.
     first = int(np.argmax(bounds[1] > 0)) if len(times_ns) and bounds[1][-1] > 0 else len(times_ns)
     return _Progress(times_ns[order][first:], bounds[0][first:], bounds[1][first:])
 

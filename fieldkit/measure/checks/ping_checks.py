@@ -99,19 +99,19 @@ _MAX_EARLIER_S: Final = 0.000_2
 _MAX_LATER_S: Final = 0.020
 """Maximum of a printed round-trip time minus the captured one: the process of ping may be delayed."""
 _MAX_MEDIAN_LATER_S: Final = 0.001
-"""Maximum of the median of these differences."""
+"""Maximum of the median of printed round-trip times minus the captured ones."""
 _BUSYBOX_FACTOR: Final = 5
 """Factor by which the limits are larger for busybox's ping, which may print later."""
 _MAX_PRINT_DELAY_S: Final = 1.0
 """Maximum of the time stamp of a printed line minus the captured time of the reply."""
 _MAX_MEDIAN_PRINT_DELAY_S: Final = 0.05
-"""Maximum of the median of these delays."""
+"""Maximum of the median of time stamps minus captured times."""
 _MAX_SEQUENCE: Final = 0xFFFF
 """Largest ICMP sequence number; the numbers of a longer ping wrap."""
 _WAIT_SHARE: Final = 0.9
 """Minimum share of the interval that ping waits after its last request; below 1, because a timer may fire early."""
 _UNREAD_S: Final = 0.1
-"""ping may exit before it reads a reply that arrived less than this time before."""
+"""ping may exit without reading a reply that arrived less than this time before its exit."""
 _CLOCK_SLACK_S: Final = 1.0
 """Tolerance for time stamps before the first or after the last reading of the robot's clock."""
 

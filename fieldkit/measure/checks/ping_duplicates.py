@@ -33,8 +33,8 @@ COLUMNS: Final = columns(
 
 _UNREAD_S: Final = 0.1
 _WAIT_SHARE: Final = 0.9
-"""ping certainly prints the replies that arrive in this share of the last interval, minus `_UNREAD_S`; as in
-`ping_checks`."""
+"""ping certainly prints the replies that arrive within this share of an interval, minus `_UNREAD_S`, after the last
+request. `ping_checks` uses the same limits."""
 
 
 class PingEchoes(NamedTuple):
@@ -99,12 +99,12 @@ def echoes_by_interface(
     if sender.are_fragmented or receiver.are_fragmented:
         return "the requests are fragmented"
     if any((echoes.interface == NO_INTERFACE).any() for echoes in (*sender, *receiver)):
-        return "a capture does not contain interfaces: it needs a link with the interface lo, and tcpdump 4.99"
+        return "a capture does not contain interfaces: ping over a link with the interface lo, and use tcpdump 4.99"
     return sender, receiver
 
 
 def count_copies(echoes: Packets) -> int:
-    """Return the sum over all packets of the number of interfaces on which a packet arrived, minus one."""
+    """Return the number of copies: for each packet, the number of interfaces on which it arrived, minus one."""
     rows = np.stack((echo_keys(echoes), echoes.interface))
     return len(np.unique(rows, axis=1).T) - len(np.unique(rows[0]))
 

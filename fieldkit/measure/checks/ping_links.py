@@ -68,7 +68,7 @@ def measure(links: Mapping[str, LinkEnds], sender: PingEchoes | None, receiver: 
     Args:
         links: The links by name.
         sender: Echoes in the sender's capture; None if it is missing or incomplete.
-        receiver: Echoes in the receiver's capture; None as above.
+        receiver: Echoes in the receiver's capture; None if it is missing or incomplete.
     """
     echoes = echoes_by_interface(sender, receiver)
     result = Measured()
@@ -89,6 +89,7 @@ def _measure_link(link: str, ends: LinkEnds, sent: Packets, arrived: Packets) ->
     arrived_keys = echo_keys(arrived)
     keys, first_rows = np.unique(arrived_keys, return_index=True)
     is_over_link = arrived.interface == ends.receiver
+    # Requests that arrived over this link, but whose first arrival was over another link.
     later_keys = np.setdiff1d(arrived_keys[is_over_link], keys[is_over_link[first_rows]])
     values: dict[str, int | float] = {
         f"{prefix}_sent": len(sent_keys),

@@ -91,7 +91,7 @@ def _earlier_traffic(sender: Packets, receiver: Packets, transfer: Transfer) -> 
     ports, first = np.unique(starts.sport, return_index=True)
     if len(ports) > 1:
         delayed = int((starts.sport != ports[first.argmax()]).sum())
-        return f"{format_count(delayed, 'packet')} to the transfer's port left before its sender started"
+        return f"{format_count(delayed, 'packet')} to the transfer's port left before the transfer started"
     return None
 
 

@@ -27,8 +27,7 @@ CROSS_CHECK: Final = CrossCheck(
     against=("both captures: datagrams that arrived completely, in their order", "`scan.bag`: their content"),
     tolerance=(
         "the file may lack datagrams that the receiver's kernel counts as dropped (InErrors, ReasmFails, NoPorts), "
-        "and the "
-        "last ones if the listener was stopped at its time limit"
+        "and the last ones if the listener was stopped at its time limit"
     ),
 )
 
@@ -65,8 +64,10 @@ def find_contradictions(
         return
     blocks, has_no_copies = arrival
     counters = evidence.counters(transfer.destination)
-    drop_counters = (counters.udp_undelivered, counters.reassembly_failures or 0, counters.udp_no_ports or 0)
-    dropped = None if was_stopped or drop_counters[0] is None else sum(count or 0 for count in drop_counters)
+    # `dropped` is None if the number of datagrams that did not reach the file is unknown.
+    dropped = None
+    if not was_stopped and counters.udp_undelivered is not None:
+        dropped = counters.udp_undelivered + (counters.reassembly_failures or 0) + (counters.udp_no_ports or 0)
     arrived_text = f"{format_count(len(blocks), 'datagram')} arrived completely"
     if not has_no_copies:
         # Copies may also be delivered, so only sizes are compared, not positions in the file.
@@ -107,7 +108,7 @@ def _is_block_at(
 
 
 def _blocks(sent: Packets, received: Packets, port: int, size_bytes: int) -> tuple[Sequence[_Block], bool] | None:
-    """Return the datagrams that arrived completely, in this order, and True if no fragment arrived twice.
+    """Return the datagrams that arrived completely, in the order of arrival, and True if no fragment arrived twice.
 
     Return None if the datagrams cannot be identified.
     """

@@ -36,7 +36,7 @@ COLUMNS: Final = columns(
     (
         "roam_ping_pongs",
         "count",
-        "Handovers back to an access point at most `ping_pong` after the handover from it to another one.",
+        "Handovers back to an access point that the robot had left at most the time `ping_pong` of the step before.",
         Figure("ping-pong handovers", Kind.MEDIAN),
     ),
     (
@@ -173,7 +173,7 @@ def measure(samples: Sequence[LinkSample], output: Ping | None, interval_s: floa
 
 
 def _window_ns(output: Ping | None, interval_s: float) -> tuple[float, float]:
-    """Return start and end of a run of ping in ns; the interval is infinite if its answers have no time stamps."""
+    """Return start and end of a run of ping in ns; minus and plus infinity if its answers have no time stamps."""
     answers = [] if output is None else sorted(stamped_answers(output))
     if output is None or not answers or output.transmitted is None:
         return -math.inf, math.inf

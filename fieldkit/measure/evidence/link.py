@@ -135,7 +135,7 @@ def link_history(samples: Sequence[LinkSample]) -> list[tuple[int, StationSample
     A station is associated with one access point at a time, although its samples can contain others.
     """
     associated = next((sample.cell for sample in samples if sample.cell), "")
-    if any(sample.cell for sample in samples):
+    if any(sample.cell for sample in samples):  # the radio is a station
         station_names = {station.station for sample in samples for station in sample.stations}
     else:
         station_names = {_busiest_station(samples), ""}

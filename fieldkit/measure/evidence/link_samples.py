@@ -1,7 +1,8 @@
 """Samples of the radios' links during an attempt: names of their files, and the file that a testbed writes.
 
-The samples are from the robot's sampler (`robot_link_samples`) or from the testbed (`Oracle.links`). A testbed's
-`link.csv` has a line per time and peer station. If the testbed has access points, the last column is `cell`.
+The samples are from a script on the robot, the sampler (`robot_link_samples`), or from a testbed that models the
+radios (`Oracle.links`). A testbed's `link.csv` has a line per time and peer station. If the testbed has access
+points, the last column is `cell`.
 """
 
 import re

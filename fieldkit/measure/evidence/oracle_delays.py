@@ -3,9 +3,11 @@
 The source of exact data about a modelled radio is called *oracle* (`backends.protocols.Oracle`).
 
 A packet is late if it is delivered later than the radio model determines (`Oracle.lateness`). In a co-simulation,
-windows also have a lateness, and the sync policy adds to the delay of packets. The air delay has four components
-(`Oracle.delays`). Its file has a line with the number of packets, `packets 215`, and a line for each component, which
-is summed over all packets, in integer nanoseconds.
+physics and network run in windows of time, which can also be late, and the sync policy, which decides when the two
+exchange data, adds to the delay of packets.
+
+The air delay has four components (`Oracle.delays`). Its file has a line with the number of packets, `packets 215`,
+and a line for each component, which is summed over all packets, in integer nanoseconds.
 """
 
 import re
@@ -151,7 +153,7 @@ def measure_window_lateness(lateness: Lateness | None) -> Measured:
 
 
 def lateness_problem(lateness: Lateness) -> str | None:
-    """Return the reason why the emulation was later than its model, or None if it was not."""
+    """Return a sentence if a packet or a window was later than the bound; otherwise None."""
     bound_ns, problem = lateness.bound_ns, ""
     packet_ns = lateness_quantile_ns(lateness.packets, 1.0)
     window_ns = lateness_quantile_ns(lateness.windows or {}, 1.0)

@@ -15,7 +15,7 @@ GAP_COLUMNS: Final = columns(
         "s",
         (
             "Longest time between consecutive replies; empty if ping printed no time stamps, or if the time without "
-            "a reply at its start or end was at least as long, or at least 1 s."
+            "a reply at the start or end of ping was at least as long, or at least 1 s."
         ),
         Figure("longest gap between answers", Kind.MEDIAN, at_least="rtt_gap_at_least_s"),
     ),

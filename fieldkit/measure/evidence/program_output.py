@@ -54,7 +54,7 @@ def _compile_path(text: str) -> Any:  # noqa: ANN401 (jmespath declares no types
 @cache
 def _compile_expression(text: str) -> Any:  # noqa: ANN401 (re2 declares no types)
     """Return a compiled expression; raises ValueError if the text is not a regular expression."""
-    import re2  # noqa: PLC0415 (an optional package; see jmespath above)
+    import re2  # noqa: PLC0415 (an optional package, and most commands need no expression)
 
     options = re2.Options()
     options.log_errors = False
@@ -142,7 +142,7 @@ def search_text(output: str, expression: str) -> str | None:
     return group
 
 
-def value(column: Column, extracted: object) -> Value:
+def to_column_value(column: Column, extracted: object) -> Value:
     """Convert an extracted value to a value of a column.
 
     Raises:
@@ -164,4 +164,6 @@ def value(column: Column, extracted: object) -> Value:
         raise EvidenceError(f"it is {shortened!r}, {reason}")
     if column.type is bool:
         return text.lower() in {"true", "1"}
-    return float(text) if column.type is float else int(text) if text.lstrip("+-").isdigit() else int(float(text))
+    if column.type is float:
+        return float(text)
+    return int(text) if text.lstrip("+-").isdigit() else int(float(text))  # the text may be 1e3

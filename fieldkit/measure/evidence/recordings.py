@@ -37,10 +37,10 @@ def read(path: Path) -> RecordingContents:
     Raises:
         EvidenceError: The file is missing, damaged or without messages, or no package reads its format.
     """
-    point = _readers().get(path.suffix)
-    if point is None:
+    entry_point = _readers().get(path.suffix)
+    if entry_point is None:
         raise EvidenceError("is not a recording in a known format", where=str(path))
-    reader: RecordingReader = plugins.load(point)
+    reader: RecordingReader = plugins.load(entry_point)
     return reader(path)
 
 

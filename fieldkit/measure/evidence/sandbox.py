@@ -81,7 +81,7 @@ class SandboxedReader:
             ReaderError: The reader failed, or exceeded the limits of memory, disk or time.
         """
         with self._query_lock:
-            for _ in range(2):
+            for _ in range(2):  # the second time only if the process was stopped from outside
                 with _temporary_folder() as folder:
                     answer, code = self._exchange([question, _limits(size_bytes), folder], size_bytes)
                 if answer or code not in _EXTERNAL_EXIT_CODES:

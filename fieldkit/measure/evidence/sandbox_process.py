@@ -31,7 +31,7 @@ def serve(answer: Callable[[Json], Json]) -> None:
     questions.register(sys.stdin.fileno(), select.POLLIN)
     has_memory = True
     while has_memory and questions.poll(_IDLE_MS) and (line := sys.stdin.readline()):
-        question, limits, tempfile.tempdir = json.loads(line)
+        question, limits, tempfile.tempdir = json.loads(line)  # libraries unpack files into this folder
         _apply_limits(*limits)
         try:
             reply = answer(question)

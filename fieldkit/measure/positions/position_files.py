@@ -72,10 +72,10 @@ def read_topic(path: Path, position_source: PositionSource) -> Samples:
     Raises:
         EvidenceError: The file cannot be read or has no positions, or no package reads its format.
     """
-    point = _readers().get(path.suffix)
-    if point is None:
+    entry_point = _readers().get(path.suffix)
+    if entry_point is None:
         raise EvidenceError("is not a recording in a known format", where=str(path))
-    reader: PositionReader = plugins.load(point)
+    reader: PositionReader = plugins.load(entry_point)
     return reader(path, position_source)
 
 

@@ -47,9 +47,8 @@ def measure(
             reason = f"the positions of the {role} from {sources.robots[role].description} {problem}"
             return Measured.all_missing(columns, reason)
     separation = trajectories.separation_between(source, destination, start_ns, end_ns)
-    return Measured.from_optional(
-        {column.name: getattr(separation, column.name.partition("_")[2]) for column in columns}, ""
-    )
+    values = {column.name: getattr(separation, column.name.partition("_")[2]) for column in columns}
+    return Measured.from_optional(values, "")  # no value is None, so no reason is needed
 
 
 def distances_m(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> Sequence[tuple[int, float | None]]:
@@ -65,7 +64,7 @@ def distances_m(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> Sequence[
     for at_ns, distance_m in zip(*trajectories.distances_m(source, destination), strict=True):
         previous_ns = distances[-1][0] - offset_ns if distances else int(at_ns)
         if any(trajectory.coverage_problem(previous_ns, int(at_ns)) for trajectory in (source, destination)):
-            distances.append((previous_ns + offset_ns + 1, None))
+            distances.append((previous_ns + offset_ns + 1, None))  # the gap starts 1 ns after the previous pair
         distances.append((int(at_ns) + offset_ns, float(distance_m)))
     return distances
 

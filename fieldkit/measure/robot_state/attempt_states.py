@@ -1,8 +1,8 @@
-"""Columns and marks of an attempt that follow from the states of the robots before and after it.
+"""Columns and marks of an attempt, from the states of the robots before and after it.
 
-The states of the clocks during the attempt are also used.
-
-A parser is imported only if a robot has the source that it parses.
+A mark is the name of a condition that can explain a difference between repeats. The states of the clocks during the
+attempt are also used. A source is a program that reports a state. Its parser is imported only if a robot has the
+source.
 """
 
 from collections.abc import Iterator, Mapping
@@ -59,7 +59,7 @@ def measure(evidence: AttemptEvidence, names: Mapping[Role, str], measured: Meas
 def problems(
     evidence: AttemptEvidence, names: Mapping[Role, str], radios: Mapping[Role, Mapping[str, str]]
 ) -> Iterator[str]:
-    """Yield each reason why the states of the robots make an attempt void.
+    """Yield a sentence for each state of a robot that makes the attempt void.
 
     Args:
         evidence: The attempt.
@@ -117,6 +117,7 @@ def _measure_radios(
 
 
 def _with_clock_reasons(measured: Measured, reasons: str) -> Measured:
+    """Append the reasons to the columns `one_way_withheld` of steps whose clock offset is unknown."""
     values = dict(measured.values)
     for name, value in measured.values.items():
         offset_name = name.removesuffix(_ONE_WAY) + _OFFSET

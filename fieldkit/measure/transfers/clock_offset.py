@@ -195,6 +195,7 @@ def _points(pairs: StampPairs, middle_ns: int, base_ns: int) -> tuple[Floats, Fl
 
 def _possible_skews(skews: Floats, width_s: Floats) -> tuple[float, float]:
     """Return the range of skews in which `width_s` is not negative; it is concave, and linear between the skews."""
+    # `np.interp` needs ascending widths, so the skews after the peak are in reversed order.
     peak = int(width_s.argmax())
     rising, falling = slice(None, peak + 1), slice(None, peak - 1 if peak else None, -1)
     return (

@@ -126,6 +126,7 @@ def tcp_pair_indices(frames: tcp.TcpFrames) -> tuple[Ints, Ints]:
     """
     sent_pieces, received_pieces, matched = frames.payload.sent, frames.payload.received, frames.payload.match
     is_certain = matched.arrived & ~matched.ambiguous & _is_last_piece(sent_pieces)
+    # Of these pieces, keep those that match the last piece of a received frame.
     is_certain[is_certain] = _is_last_piece(received_pieces)[matched.received_index[is_certain]]
     return sent_pieces.frame[is_certain], received_pieces.frame[matched.received_index[is_certain]]
 
@@ -298,6 +299,7 @@ def _one_way(delay_s: Floats, error_s: float, sent: int) -> Measured:
         names = (*figures, "one_way_error_s", "one_way_median_sent_s")
         return Measured({"one_way_withheld": SINGLE_PACKET}, dict.fromkeys(names, SINGLE_PACKET))
     values = {name: value if error_s <= LARGEST_ERROR * value else None for name, value in figures.items()}
+    # The third word of a name such as `one_way_median_s` is the statistic.
     withheld_names = ", ".join(name.split("_")[2] for name, value in values.items() if value is None)
     reason = f"the error is above a tenth of: {withheld_names}" if withheld_names else None
     of_sent = None if values["one_way_median_s"] is None else quantile_of_sent(delay_s, sent, 0.5)

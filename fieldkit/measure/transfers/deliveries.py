@@ -95,8 +95,9 @@ def udp_stream_deliveries(packets: UdpPackets, in_stream: Mask, expected: FlowSc
         EvidenceError: The deliveries cannot be determined from the captures.
     """
     matched = packets.match
-    stream_packets = np.append(in_stream, False)[packets.datagram]  # the last entry is for NO_DATAGRAM
-    received_packets = np.append(stream_packets, False)[matched.sent_index]  # the last entry is for match.NONE
+    # The indices `NO_DATAGRAM` and `match.NONE` are -1, and select the appended False.
+    stream_packets = np.append(in_stream, False)[packets.datagram]
+    received_packets = np.append(stream_packets, False)[matched.sent_index]
     if (received_packets & matched.possible_copy).any():
         raise EvidenceError("its packets cannot be distinguished, and some of the received packets may be copies")
     sent_ns = packets.sent.time_ns[stream_packets]
@@ -189,10 +190,12 @@ def advancing_frames(frames: Packets) -> tuple[Ints, Ints]:
 def stream_deliveries(
     at_ns: Ints, sent_ns: tuple[int, int, int], pairs: StampPairs, expected: FlowSchedule, *, rtt_s: float = 0.0
 ) -> StreamDeliveries:
-    """Return the deliveries of a stream whose payload was due until the last payload was sent, or for its duration.
+    """Return the deliveries of a stream.
+
+    Payload was due for the known duration of the stream or, without one, until the last payload was sent.
 
     Args:
-        at_ns: Times of stream.
+        at_ns: Times at which new payload of the stream arrived, ascending.
         sent_ns: Times at which the sender sent the first packet, the first payload and the last payload.
         pairs: Packets of the stream that are in both captures.
         expected: Known properties of the stream.

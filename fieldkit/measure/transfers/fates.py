@@ -83,7 +83,7 @@ def _udp_fates(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates 
     if (is_transfer_packet & packets.match.ambiguous).any():
         return None
     offset_bytes = np.cumsum(packets.sent.ip_payload_bytes * is_transfer_packet) - packets.sent.ip_payload_bytes
-    received = np.append(is_transfer_packet, False)[sent_index]  # the last entry is for match.NONE
+    received = np.append(is_transfer_packet, False)[sent_index]  # `match.NONE` (-1) selects the appended False
     return Fates(
         sent_ns=packets.sent.time_ns[is_transfer_packet],
         sent_bytes=offset_bytes[is_transfer_packet],

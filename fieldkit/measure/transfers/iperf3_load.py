@@ -255,7 +255,7 @@ def read_deliveries(load: LoadStreams, sender: Packets | None, receiver: Packets
     """
     if sender is None or receiver is None:
         raise EvidenceError("there are no complete captures of both ends")
-    _require_steady_clocks(load, sender, receiver)
+    _steady_clocks(load, sender, receiver)
     if load.protocol is Protocol.UDP:
         packets = _udp_packets(load, sender, receiver)
         masks = load.datagram_masks(packets.sent.where(packets.first))
@@ -308,7 +308,7 @@ def _udp_packets(load: LoadStreams, sender: Packets, receiver: Packets) -> UdpPa
     return UdpPackets(sent, received, match(sent, received), *datagrams(sent), load.port)
 
 
-def _require_steady_clocks(load: LoadStreams, sender: Packets, receiver: Packets) -> Clocks | None:
+def _steady_clocks(load: LoadStreams, sender: Packets, receiver: Packets) -> Clocks | None:
     """Return the offset between the clocks, or None if a direction without packets makes an estimate impossible.
 
     Raises:
@@ -324,7 +324,7 @@ def _require_steady_clocks(load: LoadStreams, sender: Packets, receiver: Packets
 
 def _transits_ns(load: LoadStreams, sender: Packets, receiver: Packets) -> Iterator[Ints]:
     """Yield the delays in ns of the datagrams of each stream, in the order of arrival."""
-    clocks = _require_steady_clocks(load, sender, receiver)
+    clocks = _steady_clocks(load, sender, receiver)
     if clocks is None:
         raise EvidenceError("no packet from receiver to sender is in both captures")
     matched = _udp_packets(load, sender, receiver)

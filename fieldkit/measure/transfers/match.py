@@ -101,9 +101,11 @@ def match(sent: Packets, received: Packets) -> Match:
         (payload.sent, payload.received, frames.received_index, payload.match.received_index),
         (payload.received, payload.sent, frames.sent_index, payload.match.sent_index),
     ):
+        # A frame takes the match of its first piece; the index `NONE` (-1) selects the appended `NONE`.
         frame, first = np.unique(from_pieces.frame, return_index=True)
         index[frame] = np.append(to_pieces.frame, NONE)[piece_index[first]]
     frames.ambiguous[payload.sent.frame[payload.match.ambiguous]] = True
+    # A frame is a duplicate unless one of its pieces is not.
     frames.duplicates[payload.received.frame] = True
     frames.duplicates[payload.received.frame[~payload.match.duplicates]] = False
     return frames
@@ -364,7 +366,7 @@ def _nearest(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns:
     order = np.lexsort((np.concatenate((time_ns, received_time_ns)), np.concatenate((group, received_group))))
     is_sent = order < len(group)
     first, last = (np.cumsum(sent) - sent)[received_group], np.cumsum(sent)[received_group] - 1
-    after = np.cumsum(is_sent)[~is_sent]
+    after = np.cumsum(is_sent)[~is_sent]  # number of sent items that precede each received item in this order
     earlier, later = np.maximum(after - 1, first), np.minimum(after, last)
     nearest: Ints = (
         np.where(received_time_ns - time_ns[earlier] < time_ns[later] - received_time_ns, earlier, later) - first

@@ -85,7 +85,8 @@ class Rates:
 def udp_rates(packets: udp.UdpPackets) -> Rates:
     """Return the rates of a UDP transfer."""
     sent_index = packets.match.sent_index
-    is_of_transfer = np.append(packets.is_transfer_packet, False)[sent_index]  # the last entry is for match.NONE
+    # `match.NONE` (-1), for a packet that is not in the sender's capture, selects the appended False.
+    is_of_transfer = np.append(packets.is_transfer_packet, False)[sent_index]
     received, datagram = (
         packets.received.where(is_of_transfer),
         np.append(packets.datagram, NONE)[sent_index[is_of_transfer]],

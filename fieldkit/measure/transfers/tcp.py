@@ -151,7 +151,7 @@ def sent_again(frames: TcpFrames) -> Mask:
 
 
 def _count_spurious(payload: Payload) -> int:
-    """Return the number of frames all of whose bytes reached the receiver in earlier sent frames."""
+    """Return the number of sent frames that contain only bytes of earlier frames that arrived."""
     is_needless = _is_repeated(payload.sent, payload.sent.where(payload.match.arrived))
     return len(np.unique(payload.sent.frame)) - len(np.unique(payload.sent.frame[~is_needless]))
 
@@ -160,7 +160,8 @@ def _count_reordered(payload: Payload) -> int:
     """Return the number of received frames that arrived after bytes that were sent later."""
     first_copies = np.flatnonzero((payload.match.sent_index != NONE) & ~payload.match.duplicates)
     is_late = first_copies[reordered(payload.match.sent_index[first_copies])]
-    return int(np.isin(np.unique(payload.received.frame, return_index=True)[1], is_late).sum())
+    first_pieces = np.unique(payload.received.frame, return_index=True)[1]
+    return int(np.isin(first_pieces, is_late).sum())
 
 
 def _mss_bytes(sender: Packets, receiver: Packets, port: int) -> int:

@@ -228,8 +228,10 @@ TIMES: Final = [column for column in LAYERS if column.name in {"transfer_s", "tr
 """Columns that depend only on the receiver's clock."""
 
 OF_TCP: Final = frozenset(column.name for column in LAYERS if column.name.startswith("tcp_"))
+"""Names of the columns that only a TCP transfer has."""
 OF_UDP: Final = frozenset(
     column.name
     for column in LAYERS
     if column.name.startswith(("ip_", "datagram")) and column.name not in {"ip_packets_sent", "ip_packets_received"}
 )
+"""Names of the columns that only a UDP transfer has."""

@@ -56,8 +56,8 @@ def _has_port(packets: Packets, port: int) -> Mask:
 def measure(evidence: AttemptEvidence, transfer: Transfer, listener: str = "") -> Measured:
     """Return all columns of a transfer.
 
-    Columns that depend on missing, unreadable or damaged evidence are missing. The gates decide if the repeat is
-    valid without them.
+    Columns that depend on missing, unreadable or damaged evidence are missing. Other checks, the gates, decide
+    whether the repeat is valid without these columns.
 
     Args:
         evidence: The attempt's evidence.

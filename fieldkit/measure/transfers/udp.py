@@ -17,8 +17,8 @@ NO_DATAGRAM: Final = -1
 def datagrams(packets: Packets) -> tuple[Ints, Ints]:
     """Return the index of the first packet of each datagram, and the datagram index of each packet.
 
-    A later fragment belongs to the last first fragment before it that has the same addresses and id or, if there is
-    none, to the next such fragment. If there is neither, its datagram is `NO_DATAGRAM`.
+    A later fragment belongs to the nearest earlier first fragment with the same addresses and id. If there is none,
+    it belongs to the nearest later one. If there is none either, its datagram is `NO_DATAGRAM`.
     """
     is_fragment = packets.more_fragments | (packets.fragment_offset > 0)
     # An unfragmented packet has no other fragments, even if another packet has the same id.
@@ -27,6 +27,7 @@ def datagrams(packets: Packets) -> tuple[Ints, Ints]:
     order = np.lexsort((packets.time_ns, key))
     key, is_first = key[order], packets.fragment_offset[order] == 0
     firsts_until = np.append(0, np.cumsum(is_first))
+    # The prepended value differs from the first key, so that the first packet is an edge too.
     edges = np.append(np.flatnonzero(np.diff(key, prepend=~key[:1])), len(key))
     before_key, through_key = (np.repeat(firsts_until[side], np.diff(edges)) for side in (edges[:-1], edges[1:]))
     number = np.maximum(firsts_until[1:] - 1, before_key)
@@ -124,7 +125,7 @@ def count(packets: UdpPackets) -> UdpCounts:
     arrived, is_sent = matched.arrived, packets.is_transfer_packet
     complete_datagrams = complete(packets)
     payload = payload_bytes(sent)
-    is_received = np.append(is_sent, False)[matched.sent_index]  # the last entry is for match.NONE
+    is_received = np.append(is_sent, False)[matched.sent_index]  # `match.NONE` (-1) selects the appended False
     bursts = _bursts(~arrived[is_sent])
     time_ns = received.time_ns[is_received]
     ambiguous_count = int((is_sent & matched.ambiguous).sum())

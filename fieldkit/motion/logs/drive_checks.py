@@ -27,6 +27,7 @@ _SPEED_SHARE: Final = 1.5
 _SPEED_M_S: Final = 0.1
 """Tolerance of a speed over half a second, for one additional odometry message and for overshoot of the control."""
 _COMMAND_M_S: Final = 1e-3
+"""Tolerance of a commanded speed, which the log has rounded."""
 _COAST_M: Final = 1.0
 _COAST_SHARE: Final = 0.1
 """Tolerance of the distance driven at a commanded speed of 0, and its increase per driven metre. After a command to
@@ -53,6 +54,7 @@ def contradictions(log: Sequence[DriveMoment], plan: DrivePlan) -> Iterator[str]
     if log[-1].ended != HOME or any(moment.ended for moment in log[:-1]):
         yield f"does not end at the starting position of the robot: {log[-1].ended or 'it ends on the path'}"
     yield from time_contradictions(log, plan.window)
+    # A drive starts up to `_START_M` from its origin, and the robot may have driven before the first line.
     start_m, driven_m = log[0].distance_m, log[0].driven_m
     if not start_m - _START_M <= driven_m <= (1 + _JITTER_SHARE) * (start_m + _START_M) + _JITTER_M:
         yield f"starts {start_m:.2f} m from its origin, after {driven_m:.2f} m driven"

@@ -1,8 +1,8 @@
 """Log of an autonomous drive of a ground robot, and its columns.
 
-The robot's agent writes a JSON object per line, ten times a second (`fieldkit.agent.driving.drive`): time, pose by
-its odometry in the frame of the start, and driven distance. The last line contains the reason for the end. All
-values are measurements of the robot.
+fieldkit's agent on the robot writes a JSON object per line, ten times a second (`fieldkit.agent.driving.drive`):
+time, pose by its odometry in the frame of the start, and driven distance. The last line contains the reason for the
+end. All values are measurements of the robot.
 """
 
 import math
@@ -69,6 +69,7 @@ _SPEED_INTERVAL_S: Final = 0.5
 """Interval over which a speed is computed. One odometry message more or less changes it by 3 % at 50 Hz and by 7 %
 at 30 Hz."""
 _ROUNDING: Final = 1e-4
+"""Largest error of a rounded heading in the log, in radians."""
 
 
 @dataclass(frozen=True)
@@ -108,11 +109,11 @@ def read(path: Path) -> tuple[DriveMoment, ...]:
     """Return the lines of a log in chronological order; an incomplete last line is omitted.
 
     Raises:
-        EvidenceError: The log is missing, empty, or has an invalid line.
+        EvidenceError: The log is missing, empty, has an invalid line, or its lines are not in order.
     """
     log = motion_log.read(path, _parse_moment, "drive")
     if any(after.driven_m < before.driven_m for before, after in pairwise(log)):
-        raise EvidenceError("its lines are not in chronological order", where=str(path))
+        raise EvidenceError("its driven distance decreases, so its lines are not in order", where=str(path))
     return log
 
 

@@ -64,7 +64,8 @@ def telemetry_contradiction(log: Sequence[FlightMoment], places_m: Floats) -> st
 
     Args:
         log: The log.
-        places_m: Positions in the telemetry of the same autopilot during the flight. Shape (n, 3).
+        places_m: Positions in the telemetry of the same autopilot during the flight: metres along two horizontal
+            axes, and up. Shape (n, 3).
     """
     if not len(places_m):
         return None
@@ -73,7 +74,8 @@ def telemetry_contradiction(log: Sequence[FlightMoment], places_m: Floats) -> st
         telemetry_m, logged_m = (
             float(np.linalg.norm(np.ptp(positions_m[:, axes], axis=0))) for positions_m in (places_m, log_m)
         )
-        # The bounding boxes have different axes; rotation changes the diagonal by a factor of up to sqrt(2).
+        # The axes of the two bounding boxes differ: east and north in telemetry, ahead and left in the log.
+        # A rotation changes the diagonal by a factor of up to sqrt(2).
         if telemetry_m > math.sqrt(2) * logged_m + POSITION_ERROR_M:
             return f"moved {telemetry_m:.1f} m {direction} in its telemetry, but only {logged_m:.1f} m in its log"
     return None

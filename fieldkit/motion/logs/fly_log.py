@@ -1,8 +1,9 @@
 """Log of a drone's flight, and its columns.
 
-The agent writes a JSON object per line, ten times a second (`fieldkit.agent.flying.flight_log`): time, phase of the
-flight, and the autopilot's position estimate relative to the origin of the trial's flights, which is the position and
-heading of the first start. All values are measurements of the drone. The first line contains the origin.
+fieldkit's agent on the drone writes a JSON object per line, ten times a second (`fieldkit.agent.flying.flight_log`):
+time, phase of the flight, and the autopilot's position estimate relative to the origin of the trial's flights, which
+is the position and heading of the first start. All values are measurements of the drone. The first line contains the
+origin.
 """
 
 import math
@@ -55,7 +56,7 @@ COLUMNS: Final = columns(
 """Columns of trials with a step `fly`."""
 
 _STEP_PHASES: Final = frozenset({ON_PATH, AT_PATH_END})
-"""Phases in which the inner steps run."""
+"""Phases in which the inner steps run: the steps inside the step `fly`."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,8 @@ class FlightMoment:
         ahead_m: Position ahead of the origin.
         left_m: Position to the left of the origin.
         up_m: Height over the origin.
-        speed_m_s: Its speed.
-        utc_ns: Time by its computer's clock, nanoseconds since 1970 UTC; 0 if the line does not have it.
+        speed_m_s: Speed of the drone.
+        utc_ns: Time by the clock of the drone's computer, nanoseconds since 1970 UTC; 0 if the line does not have it.
     """
 
     at_s: float

@@ -21,6 +21,7 @@ _STALL_S: Final = 2.0
 
 
 _END: Final = re.compile(r'(.*), "crc32": ([0-9]{1,10})\}', re.ASCII)
+"""Last line of a log: the first group is followed by the CRC-32 of everything before it."""
 
 
 class MotionMoment(Protocol):

@@ -1,5 +1,7 @@
 """Loss of messages that an autopilot sends to every station at a fixed period.
 
+Stations are the programs that receive its messages, such as a ground station and fieldkit's recorder.
+
 Sequence numbers alone overestimate this loss: a router withholds messages that are addressed to other stations, and
 their numbers are missing too. Therefore, a message counts as lost only if the autopilot's time (`time_boot_ms`) shows
 that a message was due, and a sequence number is missing at that time.
@@ -55,11 +57,11 @@ class StreamMessage:
 
 
 class _Hypothesis(NamedTuple):
-    """An assignment of messages to periods, up to one message; hypotheses are ordered by cost.
+    """An assignment of the messages read so far to periods; hypotheses are ordered by cost.
 
     Attributes:
         cost: Sum of squared deviations and of costs of skipped periods, in squared periods.
-        phase_ms: Scheduled time of the last message, milliseconds.
+        phase_ms: Scheduled time of the last of these messages, milliseconds.
         lost_count: Number of lost messages.
     """
 
@@ -154,7 +156,7 @@ def _period_ms(messages: Sequence[StreamMessage], indices: Sequence[int], interv
         if interval_us:
             return interval_us / 1e3
         intervals_ms = sorted(after.boot_ms - before.boot_ms for before, after in pairwise(messages))
-    edge = len(intervals_ms) // 4
+    edge = len(intervals_ms) // 4  # the mean of the middle half is not affected by late messages
     observed_ms = mean(intervals_ms[edge : len(intervals_ms) - edge])
     if observed_ms <= 0:
         return None

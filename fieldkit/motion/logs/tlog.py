@@ -24,6 +24,7 @@ _TIME_TOLERANCE_US: Final = 1_000
 _OFFSET_BOUNDS_M: Final = (-1e9, 1e9)
 _ANGLE: Final = (-360.0, 360.0)
 _HEIGHT_BOUNDS: Final = (-1e6, 1e6)
+"""Bounds of possible values of columns, also for vertical speeds; other values are omitted."""
 
 COLUMNS: Final = columns(
     100,
@@ -267,6 +268,7 @@ def contradictions(
         yield f"has a frame {(log.last_us - summary.ended_us) / 1e6:.3f} s after its recorder stopped"
     if log.back_us > _TIME_TOLERANCE_US:
         yield f"has a frame that is {log.back_us / 1e6:.3f} s earlier than the previous one"
+    # The window is widened to whole microseconds, the resolution of the log.
     if window is not None and not window[0] // 1000 <= log.first_us <= log.last_us <= -(-window[1] // 1000):
         yield "has frames from before the attempt or after it, by the recorder's clock"
 

@@ -1,7 +1,8 @@
 """The journal of motions: the origin of each self-moving robot, each motion, and each permission after a fault.
 
-It is stored next to the journal of the trial, or of the campaign that the trial belongs to. It is append-only, and
-each line is synced to disk before the program continues (`fieldkit.core.jsonl`).
+The origin is the position and heading at the first start. The journal is stored next to the journal of the trial, or
+of the campaign that the trial belongs to. It is append-only, and each line is synced to disk before the program
+continues (`fieldkit.core.jsonl`).
 """
 
 import time
@@ -44,9 +45,10 @@ class MotionEntry:
 
     Attributes:
         utc_ns: Time of the entry, in nanoseconds since 1970 UTC.
-        event: `origin`: `origin` is valid from now on. `begun`: the robot may move from now on. `ended`: its motion
-            ended as planned. `held`: a fault stopped it, or it did not start. `confirmed`: a person confirmed that it
-            is at its place. `allowed`: an option allowed it to move from its current position.
+        event: `origin`: the origin in this entry is valid from now on. `begun`: the robot may move from now on.
+            `ended`: its motion ended as planned. `held`: a fault stopped it, or it did not start. `confirmed`: a
+            person confirmed that it is at its place. `allowed`: an option allowed it to move from its current
+            position.
         robot: Name of the robot.
         place: Name of the place of the origin, from `place_of`.
         origin: The origin; for `ended`, the robot's position at the end, if it reported one.
@@ -166,7 +168,7 @@ class MotionJournal:
 
         Args:
             confirmation: Description of the confirmation.
-            at_place: Whether a person confirmed that they are at their places; their origins are then recorded again.
+            at_place: Whether a person confirmed that the robots are at their places; new origins are then recorded.
         """
         event = MotionEvent.CONFIRMED if at_place else MotionEvent.ALLOWED
         for hold in self.holds:
@@ -186,7 +188,7 @@ class JournaledOrigins:
 
     Args:
         journal: The journal of motions.
-        folder: The trial, for messages.
+        folder: Folder of the trial, for messages.
         robots: Name of the robot in each role.
         placement: The placement of the trial.
         may_return: Whether a robot may drive back to its origin; see `Origins`.
@@ -269,7 +271,9 @@ def hold_error(robot_holds: Sequence[MotionHold], folder: Path) -> MotionHeldErr
     """Return the error for robots that must not move until a person confirms."""
     robots = "; ".join(f"{hold.robot}: {hold.reason}" for hold in robot_holds)
     campaign = folder.parent / laptop_files.CAMPAIGN
-    command = "fieldkit campaign, as before" if campaign.is_file() else shell_command("fieldkit", "resume", folder)
+    command = (
+        "the same fieldkit campaign command" if campaign.is_file() else shell_command("fieldkit", "resume", folder)
+    )
     return MotionHeldError(
         f"a fault stopped a robot, and no robot moves until a person confirms: {robots}",
         remedy=f"put the robot at its place, check that its path is free, then run without --yes: {command}; or add "

@@ -1,4 +1,8 @@
-"""Drive a robot by its velocity topic while other steps run. The agent steers it; the laptop renews the lease."""
+"""Drive a robot by its velocity topic while other steps run.
+
+The agent, fieldkit's program on the robot, steers it. Orders of the laptop are valid for a limited time, the lease.
+The laptop renews them; otherwise the robot stops (`fieldkit.motion.steps.lease`).
+"""
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -225,8 +229,8 @@ def _network(robot: Robot, middleware: MiddlewareName) -> dict[str, Any]:
 def drive_robot(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name_pattern: str) -> Iterator[DriveLease]:
     """Drive a robot along its path while the body runs, and back to its place afterwards; yield its lease.
 
-    After an error in the body the robot drives back, too; if it cannot, the operator brings it back. After an
-    interruption (Ctrl-C) the robot stops where it is.
+    After an error in the body the robot drives back, too. A real robot that cannot drive back stays where it is until
+    a person has confirmed that it is at its place. After an interruption (Ctrl-C) the robot stops where it is.
 
     Raises:
         LinkError: The robot did not answer.
@@ -260,7 +264,7 @@ def _wait_until_ready(scene: Scene, drive_lease: DriveLease, move: Move) -> None
         )
     drive_lease.check_running()
     if not drive_lease.is_ready:
-        raise drive_lease.failure(f"it was not stationary for {START_S:g} s")
+        raise drive_lease.failure(f"it did not report within {START_S:g} s that it is stationary at its place")
     if origins_of(scene).robots_stay and origins_of(scene).get(move.role) is None:
         pose = drive_lease.pose
         if pose is None:
@@ -274,10 +278,10 @@ def _out_and_back(  # noqa: PLR0917 (all of them belong to one motion)
     """Drive a robot along its path while the body runs, then back; see `drive_robot`."""
 
     def bring_back() -> str:
-        final_state = _bring_back(testbed, shell, job, drive_lease, move, by_hand=not origins_of(scene).robots_stay)
+        final_state = _bring_back(testbed, shell, job, drive_lease, move, in_lab=not origins_of(scene).robots_stay)
         if final_state == drive_log.HOME:
             motion.mark_ended(drive_lease.pose)
-        elif drive_lease.status.get("ended"):
+        elif drive_lease.status.get("ended"):  # the robot has stopped on its path, and reported its pose
             motion.at = drive_lease.pose
         return final_state
 
@@ -303,20 +307,19 @@ def _out_and_back(  # noqa: PLR0917 (all of them belong to one motion)
 
 
 def _bring_back(
-    testbed: Testbed, shell: Shell, job: Job, drive_lease: DriveLease, move: Move, *, by_hand: bool
+    testbed: Testbed, shell: Shell, job: Job, drive_lease: DriveLease, move: Move, *, in_lab: bool
 ) -> str:
     """Order a robot back, and return `DriveLease.final_state`.
 
-    If the robot does not come back and `by_hand` is set, the operator is asked to bring it back.
-
-    Without `by_hand` a robot that did not come back stays where it is: before robots move again, a person is asked to
-    put it at its place (`fieldkit.motion.running.permission`).
+    In a lab the testbed then puts the robot at its exact place, whether it came back or not. A real robot that did
+    not come back stays where it is: before robots move again, a person is asked to put it at its place
+    (`fieldkit.motion.running.permission`).
     """
     drive_lease.turn_back()
     drive_lease.wait(lambda: drive_lease.final_state, Deadline.after(START_S + limit_s(move)))
     final_state = drive_lease.final_state
     _stop_driver(shell, job)
-    if by_hand or final_state == drive_log.HOME:
+    if in_lab or final_state == drive_log.HOME:
         testbed.bring_back(move.role, has_returned=final_state == drive_log.HOME)
     return final_state
 

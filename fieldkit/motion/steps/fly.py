@@ -52,6 +52,7 @@ _SLACK_S: Final = 30.0
 _SLOWEST_M_S: Final = 0.3
 """Lower bound of the landing speed. PX4 lands at 0.7 m/s (MPC_LAND_SPEED), slower near the ground (MPC_LAND_CRWL)."""
 _LIMIT_S: Final = 3600.0
+"""Time that the limit of the pilot's job exceeds the expected duration of the flight."""
 _AT_REST_S: Final = 3.0
 """Approximate time that the log covers before the take-off and after the landing."""
 _LOG_BYTES_PER_S: Final = 2200.0
@@ -182,6 +183,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         return self.prefixed_name(fly_log.FILE)
 
     def _pilot(self, scene: Scene) -> Planned:
+        """Return the job of the pilot, the program that flies the drone."""
         limit_s = _LIMIT_S + self.expected_s(scene.protocol)
         return piloting.flight_job(scene, self.robot, self.prefixed_name("fly"), self._plan(scene), limit_s)
 
@@ -191,6 +193,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         return max(self.lease, piloting.LEASE_S)
 
     def _guard(self, scene: Scene) -> Planned:
+        """Return the job of the guard, which ends the flight if the pilot fails or the attempt is aborted."""
         return piloting.guard_job(
             scene,
             self.robot,

@@ -16,15 +16,17 @@ _KINDS = {
     "tcp": "TCP",
 }
 _LINK_SERVER_TEXTS = {True: "use it through the link server", False: "uses it through the link server"}
+"""Text by whether several programs use the connection, which the link server, a program on the robot, shares among
+them."""
 
 
 def link_need(robot: Robot, role: Role, connection: str, programs: Sequence[str]) -> Need:
     """Return the preflight check of the connection to an autopilot.
 
     Args:
-        robot: The robot whose programs use it.
-        role: Its role.
-        connection: The connection.
+        robot: The robot whose programs use the connection.
+        role: Role of the robot.
+        connection: The connection, such as `udpout:127.0.0.1:14550`.
         programs: Names of the programs: `pilot`, `guard`, `recorder`.
     """
 

@@ -55,6 +55,7 @@ _DEFAULT_HZ: Final = 40.0
 """Approximate number of messages per second that an autopilot sends without a request."""
 _FRAME_BYTES: Final = 40
 _STAMP_BYTES: Final = 8
+"""Approximate size of a frame in the log, and size of the time before it."""
 _START_S: Final = 2.0
 """Approximate time for the start of the recorder."""
 _READY_S: Final = 75
@@ -280,7 +281,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
             yield from position_recording.problems(view, (self.robot,))
 
     def places_m(self, view: View) -> Floats:
-        """Return the positions in the messages LOCAL_POSITION_NED: metres north, east and up. Shape (n, 3)."""
+        """Return the positions in the messages LOCAL_POSITION_NED: metres east, north and up. Shape (n, 3)."""
         rows = view.evidence.read_or_none(tlog.positions, self._file, self.system, LOCAL) or []
         return np.array([row[2:5] for row in rows], dtype=float).reshape(-1, 3)
 

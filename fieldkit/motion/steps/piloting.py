@@ -1,7 +1,8 @@
 """Control of drones from the laptop: jobs of the programs on the drone that fly or guard it, and their leases.
 
-The programs are parts of the agent (`fieldkit.agent.flying.flight`, `fieldkit.agent.flying.guard`). If this process
-is killed, or the control link is down for longer than the lease, they end the flight by the action of `on_abort`.
+The programs are parts of fieldkit's agent (`fieldkit.agent.flying.flight`, `fieldkit.agent.flying.guard`). An
+order to them is valid for a limited time, the lease, and the laptop renews it. If this process is killed, or the
+control link is down for longer than the lease, the programs end the flight by the action of `on_abort`.
 """
 
 import json
@@ -36,6 +37,7 @@ LEASE_S: Final = 15.0
 
 READY: Final = " ready"
 _GUARD_S: Final = 86_400.0
+"""Time limit of the guard's job: a day, longer than any attempt."""
 _RESCUE_S: Final = 900.0
 """Time limit of the rescue's job: longer than any landing, and shorter than the lifetime of the robot's lock, so that
 the lock need not be extended when the rescue starts."""
@@ -49,6 +51,7 @@ _END_LINE: Final = re.compile(r"(?:[0-9.]+ )?(?:error|land|return): (?P<reason>.
 """Line of the program when it aborts the flight or stops sending to the autopilot."""
 _SEPARATOR: Final = "\x1e"
 _TAILS: Final = 'for name do tail -c 2000 "$name" 2>/dev/null | tr "\\036" " "; printf "\\036"; done'
+"""Shell script that prints the end of each file, followed by `_SEPARATOR` (octal 036)."""
 
 
 def onboard_connection(robot: Robot) -> str:
@@ -297,6 +300,7 @@ def leased_program(
         RobotError: The program did not start, or failed.
     """
     robot = scene.robot(program.role)
+    # The body may take up to twice its approximate duration.
     silent_lease_s = lease_s + 2 * body_s if robot.control is Control.RADIO else None
     fallback = f"if it flies, it comes down automatically within {silent_lease_s or lease_s:g} s"
     mover = RobotMover(robot.name, shell, scene.folder, fallback)

@@ -43,6 +43,7 @@ def answer(request: Json) -> Json:
         return contents(rosbag1.Reader(path))
     if path.suffix == ".db3":
         _check_database(path)
+    # The first reader counts the messages in the file, the second one reads their number from metadata.yaml.
     return contents(_open_ros2(path)) | {"metadata_messages": contents(_open_ros2(path.parent))["messages"]}
 
 
@@ -59,7 +60,7 @@ def _open_ros2(path: Path) -> "rosbag2.Reader":
 def contents(reader: "rosbag1.Reader | rosbag2.Reader") -> Json:
     """Return the contents of a bag, keyed by the attributes of `RecordingContents`."""
     with reader:
-        by_topic = {_checked_topic(topic): _checked_count(info.msgcount) for topic, info in reader.topics.items()}
+        by_topic = {_checked_name(topic): _checked_count(info.msgcount) for topic, info in reader.topics.items()}
         messages, started_ns = _checked_count(reader.message_count), _checked_count(reader.start_time)
         if len(by_topic) > _MAX_TOPICS or sum(by_topic.values()) != messages:
             raise ValueError(
@@ -80,7 +81,7 @@ def topic_stats(reader: "rosbag1.Reader | rosbag2.Reader") -> Json:
     by_topic: dict[str, dict[str, int]] = {}
     with reader:
         for connection, stamp_ns, _ in reader.messages():
-            at_ns, topic = _checked_count(stamp_ns), _checked_topic(connection.topic)
+            at_ns, topic = _checked_count(stamp_ns), _checked_name(connection.topic)
             initial = {"messages": 0, "first_utc_ns": at_ns, "last_utc_ns": at_ns, "gap_ns": 0}
             stats = by_topic.setdefault(topic, initial)
             if len(by_topic) > _MAX_TOPICS:
@@ -128,7 +129,7 @@ def positions(path: Path, topic: str, child: str) -> Json:
             for part in message.transforms if connection.msgtype == _TF_MESSAGE else (message,):
                 if (pose := _pose(connection.msgtype, part, child)) is not None:
                     stamp = part.header.stamp
-                    frames.add(_checked_topic(part.header.frame_id))
+                    frames.add(_checked_name(part.header.frame_id))
                     rows.append((int(stamp.sec) * 10**9 + int(stamp.nanosec), received_ns, *pose))
     return {"types": sorted(types), "frames": sorted(frames), "rows": rows}
 
@@ -188,9 +189,9 @@ def _checked_count(value: object) -> int:
     return value
 
 
-def _checked_topic(value: object) -> str:
+def _checked_name(value: object) -> str:
     if not isinstance(value, str):
-        raise TypeError(f"{value!r:.40} is not a topic")
+        raise TypeError(f"{value!r:.40} is not the name of a topic or frame")
     return value
 
 

@@ -65,7 +65,7 @@ class Counterparts:
         with _any_error_as_serde_error(self.ros2):
             converted = bytes(types.ros2.cdr_to_ros1(data, self.ros2))
         if len(converted) < len(self.added_bytes):
-            raise SerdeError(f"a message of {self.ros2} of {len(converted)} bytes")
+            raise SerdeError(f"a message of {self.ros2} has only {len(converted)} bytes")
         return converted[: len(converted) - len(self.added_bytes)]
 
 

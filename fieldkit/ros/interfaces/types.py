@@ -44,7 +44,7 @@ class Distribution(StrEnum):
 
     @property
     def gid_bytes(self) -> int:
-        """Length of a GID in the messages of its rmw_dds_common, in bytes."""
+        """Length of a GID (global identifier of an endpoint) in the messages of its rmw_dds_common, in bytes."""
         return 16 if self.has_type_hashes else 24
 
 

@@ -11,7 +11,11 @@ from fieldkit.steps.scene import CommandResult
 
 
 class MiddlewareName(StrEnum):
-    """A middleware."""
+    """Middleware of a topic, with the Python library that fieldkit uses: see `BINDINGS`.
+
+    `DDS` and `ZENOH` use their libraries directly. `ROS2` uses rclpy of the robot's own ROS 2, with any RMW (ROS
+    middleware implementation).
+    """
 
     DDS = "dds"
     ZENOH = "zenoh"
@@ -20,7 +24,10 @@ class MiddlewareName(StrEnum):
 
 
 class Discovery(StrEnum):
-    """Method by which publishers and subscribers discover each other."""
+    """Method by which publishers and subscribers discover each other.
+
+    `ENVIRONMENT` is the method that the environment of the robot's own ROS 2 selects.
+    """
 
     MULTICAST = "multicast"
     PEERS = "peers"

@@ -16,7 +16,7 @@ from fieldkit.ros.networking.state import RosProgram, RosState, Variables
 from fieldkit.trial.check.report import Report
 
 DEFAULT_RMW: Final = "rmw_fastrtps_cpp"
-"""Default RMW of all distributions from Foxy to Kilted (REP 2000)."""
+"""Default RMW (ROS middleware implementation) of all distributions from Foxy to Kilted (REP 2000)."""
 _ZENOH_PORT: Final = 7447
 _SERVER_PORT: Final = 11811
 """Default port of a discovery server of Fast DDS."""
@@ -181,6 +181,7 @@ def _judge_router(state: RosState, report: Report) -> None:
 
 
 def _as_program(state: RosState) -> RosProgram:
+    """Return a program with the environment of the robot's setup files and profile."""
     return RosProgram("", state.variables)
 
 

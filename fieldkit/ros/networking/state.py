@@ -41,6 +41,7 @@ _OTHER_HOOKS: Final = {"output", "forward", "postrouting", "egress"}
 """Hooks of nftables that packets to the robot's programs do not traverse."""
 
 Variables = Mapping[str, str]
+"""Environment variables by name."""
 
 
 @dataclass(frozen=True)

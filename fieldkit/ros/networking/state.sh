@@ -52,6 +52,7 @@ section environment own_environment
 section programs ros_programs
 section kernel kernel
 section route ip -o route get 239.255.0.1
+# Sockets that listen (TCP, state 0A) or are bound (UDP, state 07) and have no peer (port 0000).
 section listeners grep -h ":0000 0[7A] " /proc/net/tcp /proc/net/tcp6 /proc/net/udp /proc/net/udp6
 section hostname hostname
 section cyclonedds settings_of "${CYCLONEDDS_URI-}"

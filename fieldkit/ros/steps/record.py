@@ -278,7 +278,7 @@ class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpa
 
     @override
     def expected_s(self, protocol: Protocol) -> float:
-        return self.duration + 0.5
+        return self.duration + 0.5  # a recorder needs about this time to start and to close its bag
 
 
 def _ros(robot: Robot) -> Ros:

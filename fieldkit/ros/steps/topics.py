@@ -57,10 +57,11 @@ BUFFER_KIB: Final = 32_768
 so 4 MiB hold 10,000 packets. Fast DDS sent 60,000 packets per second when it requested lost fragments again."""
 
 _GRACE_S: Final = 5
+"""Time in which a stopped subscriber, router or master must exit; then it is killed."""
 _OVERHEAD_S: Final = 10.0
 """Time for the start of Python and the middleware, and for the publisher's wait at its end."""
 _RECORD_BYTES: Final = 32
-"""Size of a sample's record in a log."""
+"""Size of the record of a sample or a read in a log."""
 _ENVELOPE_BYTES: Final = 100
 """Approximate size of the headers of middleware and IP per sample."""
 
@@ -157,6 +158,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
     def _stream(
         self, scene: Scene, testbed: Testbed, other_jobs: list[Planned], publish: Planned, announce: Announce
     ) -> None:
+        """Run the publisher, stop the other programs, and check all exit codes."""
         announce("topics", self.expected_s(scene.protocol))
         with ExitStack() as silence_contexts:
             for role in self.participants:
@@ -215,6 +217,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
 
     @override
     def flows(self, scene: Scene) -> Iterator[Flow]:
+        # For each frame with data, at most one frame with an acknowledgement is expected.
         frames = 2 * self._samples * fragments(self.size_bytes + _ENVELOPE_BYTES)
         ends = (self.sender, self.receiver)
         server = self.server_role

@@ -72,7 +72,7 @@ class FixedPosition(Strict):
     @schema.model_validator(mode="after")
     def _has_one_position(self) -> "FixedPosition":
         on_earth, in_frame = (self.lat, self.lon), (self.frame, self.x, self.y)
-        if None in (in_frame if self.frame is not None else on_earth) or {*on_earth, *in_frame} - {None} == set():
+        if None in (on_earth if self.frame is None else in_frame):
             raise schema.validation_error("a position needs lat and lon, or frame, x and y")
         if self.frame is not None and (*on_earth, self.alt) != (None, None, None):
             raise schema.validation_error("a position has lat and lon, or frame, x and y, not both")
@@ -175,7 +175,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
                     "robot": role,
                     "topics": [tracked.topic],
                     "duration": f"{duration_s:.9g}s",
-                    "name": f"track_{role}"[:31],
+                    "name": f"track_{role}"[:31],  # the maximum length of a name
                 }
             )
             for role, tracked in self.robots.items()

@@ -38,8 +38,11 @@ _BUFFER_KIB: Final = 32_768
 _PATIENCE_S: Final = 20.0
 """Time for the start of the pipelines. At its first start, GStreamer searches for its plugins."""
 _OVERHEAD_S: Final = 10.0
+"""Additional time in the limits of the jobs, for the start of Python and the end of the pipelines."""
 _GRACE_S: Final = 8
+"""Time in which the stopped receiver must exit; then it is killed."""
 _RECORD_BYTES: Final = 32
+"""Size of the record of a frame or a read in a log."""
 _PIXELS_PER_BYTE: Final = 8
 """Approximate number of pixels without noise per byte of JPEG."""
 

@@ -1,4 +1,7 @@
-"""Arrivals of samples: the times in a subscriber's log compared with the times in its capture."""
+"""Arrivals of samples: the times in a subscriber's log compared with the times in its capture.
+
+A sample is found in a capture by its head, which contains its number and time of sending (`topic_samples`).
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -43,8 +46,8 @@ class SampleArrivals:
         Args:
             samples: Samples in the log, each once.
             subscriber: The topic in the subscriber's capture.
-            complete: See `CapturedTopic`.
-            reliable: See `TopicPlan`.
+            complete: Whether the subscriber's capture has all packets of the topic's data that were sent.
+            reliable: Whether samples are retransmitted until they arrive.
         """
         heads = subscriber.heads.first()
         _, log_index, capture_index = np.intersect1d(samples.sequence, heads.sequence, return_indices=True)
@@ -92,6 +95,8 @@ def _may_have_waited(samples: TopicSamples, heads: SampleHeads) -> Mask:
     is_captured = heads.sequence[rank] == numbers
     all_numbers = np.concatenate((numbers, heads.sequence))
     after_gap = (numbers > 0) & ~np.isin(numbers - 1, all_numbers)
+    # Time until which later samples may have waited: for an uncaptured sample, until its record in the log; for a
+    # captured sample after a gap, until its record, or until the middleware has detected the loss.
     released_ns = np.where(is_captured, 0, at_ns)
     released_ns[after_gap & is_captured] = np.minimum(at_ns, heads.at_ns[rank] + _MAX_RELEASE_WAIT_NS)[
         after_gap & is_captured
@@ -108,6 +113,7 @@ def _contiguous_ns(subscriber: SampleFlow, end: Ints) -> Ints | None:
     data, _ = connection
     base = int(end[0])
     starts, first = np.unique(seq_difference(data.tcp_seq, base), return_index=True)
+    # TCP delivers the bytes of a segment when all segments before it have arrived, too.
     until_ns = np.maximum.accumulate(data.time_ns[first])
     contiguous_ns: Ints = until_ns[np.maximum(np.searchsorted(starts, seq_difference(end, base), side="left") - 1, 0)]
     return contiguous_ns

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 MESSAGE: Final = "std_msgs/msg/UInt8MultiArray"
 IMAGE_MESSAGE: Final = "sensor_msgs/msg/Image"
 MIN_BYTES: Final = 24
+"""Size of the head of a sample: magic number, sequence number and time of sending."""
 MAX_BYTES: Final = 16e6
 _DEFAULT_BYTES: Final = 1000.0
 LONGEST_S: Final = 3600.0

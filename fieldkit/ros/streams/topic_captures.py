@@ -140,7 +140,7 @@ def withheld_columns(
         values: Columns of the topic from the logs.
         arrivals: Samples that arrived, each once.
         captured: The topic in both captures.
-        reliable: As in `TopicPlan`.
+        reliable: Whether samples are retransmitted until they arrive.
         deadline_s: Deadline of the topic; None if it has no deadline.
     """
     if captured.subscriber is None or not len(arrivals):
@@ -227,6 +227,7 @@ def _uncaptured_samples(plan: TopicPlan, arrivals: TopicSamples, subscriber: Sam
     size_bytes = plan.size_bytes + plan.envelope_bytes
     headless_count = int((~np.isin(arrivals.sequence, subscriber.heads.sequence)).sum())
     payload_bytes = packets.tcp_payload_bytes + np.maximum(packets.udp_bytes - UDP_HEADER_BYTES, 0)
+    # `capacity` is the number of samples without a captured head that fit into the captured bytes.
     if subscriber.is_tcp or size_bytes > _DATAGRAM_BYTES:
         capacity = int(payload_bytes.sum()) // size_bytes - len(subscriber.heads.first())
     else:
@@ -286,6 +287,7 @@ def _is_received(
         next_index = np.searchsorted(numbers, heads.sequence, side="right")
         next_ns = np.append(samples.at_ns[first], -1)[next_index]
         return has_all_bytes & (gapless | (next_ns >= heads.at_ns))
+    # A best-effort sample that arrives after a later one may be dropped.
     is_delivered: Mask = has_all_bytes & (heads.at_ns >= np.maximum.accumulate(heads.at_ns))
     return is_delivered
 
@@ -318,6 +320,7 @@ def _may_have_overflowed(
         read_ns[:-1], next_ns
     )
     queue_length = np.maximum(queue_length, read_together)
+    # A queue drops a sample only if at least `depth` samples arrive after it, or are read together with it.
     newest_ns = arrived_ns[max(len(arrived_ns) - plan.depth, 0)]
     may_have_overflowed: Mask = (queue_length >= plan.depth) & ((lost_ns < newest_ns) | (read_together >= plan.depth))
     return may_have_overflowed

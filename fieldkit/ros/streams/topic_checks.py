@@ -20,7 +20,7 @@ MAX_SLEW_NS: Final = 1_000_000
 """Maximum time by which a slewed clock may make a program's later time stamp smaller than the previous one."""
 
 SETTLING_NS: Final = 500_000_000
-"""Minimum time between the record of the match and the first sample
+"""Minimum time between the record that the subscription was discovered (`MATCHED`) and the first sample
 (`fieldkit.agent.messaging.stream.SETTLING_S`)."""
 
 PADDING_BYTES: Final = 3
@@ -178,7 +178,7 @@ CROSS_CHECKS: Final = (
         tolerance=(
             "a sample that arrived may be missing if the subscriber's queue overflowed, if an earlier one is missing "
             "and "
-            "the middleware preserves the order, or within 0.3 s of the match or of the end"
+            "the middleware preserves the order, or within 0.3 s of the discovery or the end"
         ),
     ),
     CrossCheck(
@@ -218,8 +218,8 @@ CROSS_CHECKS: Final = (
     CrossCheck(
         quantity="discovery",
         columns=("topic_discovered", "topic_discovery_s"),
-        source="`ROLE-topic.bin` of the publisher: start and match",
-        against=("the robot's clock before and after the attempt", "the first sample, 0.5 s after the match"),
+        source="`ROLE-topic.bin` of the publisher: start and discovery",
+        against=("the robot's clock before and after the attempt", "the first sample, 0.5 s after the discovery"),
         tolerance=(
             "the first sample may be 0.1 s late, as on a busy robot; if it is later, the discovery time is empty"
         ),

@@ -196,7 +196,7 @@ def measure(
     """Return the measured columns of a topic.
 
     Args:
-        flow: Identifies its packets.
+        flow: Addresses and ports that identify the packets of the topic.
         publisher_log: Log of the publisher; None if it is incomplete.
         subscriber_log: Log of the subscriber; None if it is incomplete.
         publisher_packets: Packets that the publisher's robot captured; None without a complete capture.
@@ -337,6 +337,7 @@ def _traffic(flow: TopicTraffic, publisher_packets: Packets | None) -> Measured:
     packets = with_ports(publisher_packets)
     to_data, to_discovery = np.isin(packets.dport, data), np.isin(packets.dport, discovery)
     from_data, from_discovery = np.isin(packets.sport, data), np.isin(packets.sport, discovery)
+    # If the two ports of a packet are of different kinds, the destination port decides.
     kinds = {
         "data": to_data | (from_data & ~to_discovery),
         "discovery": to_discovery | (from_discovery & ~to_data),

@@ -1,4 +1,4 @@
-"""Samples of topics, read from logs that the agent writes on a robot and from captures, by the heads of samples.
+"""Samples of topics, from logs that fieldkit's agent writes on a robot, and from captures, by the heads of samples.
 
 A log (`fieldkit.agent.messaging.records`) is a magic number followed by fixed-size records. If the writer of a log
 was killed, the log ends with zeros, because the file grows by blocks.
@@ -22,7 +22,7 @@ import numpy as np
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.captures.arrays import LITTLE, Buffer, Frames, Integers, Ints, Mask, Table
-from fieldkit.measure.captures.headers import TCP, ip_headers, network
+from fieldkit.measure.captures.headers import TCP, ip_header_positions, ip_headers
 from fieldkit.measure.captures.packets import ACK, UDP_HEADER_BYTES, Packets
 from fieldkit.measure.captures.pcap import CHUNK_BYTES, frame_reader
 from fieldkit.measure.evidence import reading
@@ -37,6 +37,8 @@ RECORD_BYTES: Final = _RECORD.itemsize
 
 _KINDS: Final = range(1, 11)
 _SAMPLE, DISCOVERY_STARTED, MATCHED, REFUSED, SKIPPED, FOREIGN, _END, _WRITER, READ, UNREADABLE = _KINDS
+"""Kinds of records: see the constants of the same names in `fieldkit.agent.messaging.records`. `MATCHED` is the
+discovery of the other end, `FOREIGN` a message of another program, and `_WRITER` the role and topic of the writer."""
 PUBLISHER: Final = 1
 SUBSCRIBER: Final = 2
 _HAS_CHECKSUM: Final = 1
@@ -176,6 +178,7 @@ def _is_intact(content: bytes | mmap, end_record: np.void, *, required: bool) ->
 
 
 _WORD_BYTES: Final = 8
+"""Size of an integer in the head of a sample."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +211,7 @@ def find_bytes(path: Path, pattern: bytes) -> Occurrences:
     reader = frame_reader(data)
     parts, packet_count = [_no_occurrences()], 0
     for chunk in reader(data, where=str(path), chunk_bytes=CHUNK_BYTES) if reader else ():
-        ip = ip_headers(integers, chunk.frames, network(integers, chunk.frames))
+        ip = ip_headers(integers, chunk.frames, ip_header_positions(integers, chunk.frames))
         frames = chunk.frames.where(ip.frame)
         matches = _positions(data, frames, pattern)
         row = np.searchsorted(frames.start, matches, side="right") - 1
@@ -240,6 +243,7 @@ def _positions(data: Buffer, frames: Frames, pattern: bytes) -> Ints:
 
 MAGIC: Final = b"fieldkit"
 HEAD_BYTES: Final = 24
+"""Size of the head of a sample: magic number, sequence number and time of sending."""
 
 
 @dataclass(frozen=True, eq=False)

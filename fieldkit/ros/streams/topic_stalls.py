@@ -16,7 +16,7 @@ from fieldkit.ros.streams.topic_samples import TopicLog
 # The columns of transfers need captures; those of topics need the logs.
 COLUMNS = tuple(
     replace(column, meaning=column.meaning.replace("complete captures", "complete logs"))
-    for column in stalls.declare_columns("topic", "the topic", 83)
+    for column in stalls.declare_columns("topic", "the topic", rank=83)
 )
 
 
@@ -60,7 +60,8 @@ def topic_deliveries(
         raise EvidenceError("a sample is earlier than the one before it: a clock was set back")
     pairs = StampPairs(samples.sent_ns[sent_index], subscriber_log.samples.at_ns[received_index])
     first_ns, last_ns = int(samples.sent_ns.min()), int(samples.sent_ns.max())
-    return deliveries.stream_deliveries(np.sort(at_ns), (first_ns, first_ns, last_ns), pairs, schedule)
+    sent_ns = first_ns, first_ns, last_ns  # the first packet of a topic's data has the first payload
+    return deliveries.stream_deliveries(np.sort(at_ns), sent_ns, pairs, schedule)
 
 
 def measure(
@@ -72,7 +73,7 @@ def measure(
     """Return the columns of the stalls of a topic.
 
     Args:
-        flow: Identifies its packets.
+        flow: Addresses and ports that identify the packets of the topic.
         logs: Logs of publisher and subscriber; see `topic_deliveries`.
         captures: Packets that their robots captured; None without a complete capture.
         schedule: Interval and duration of the stream.

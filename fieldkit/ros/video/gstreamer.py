@@ -33,7 +33,7 @@ def sender(size: str, rate_hz: float, quality: int, address: str, port: int) -> 
         port: Its port.
     """
     width, height = dimensions(size)
-    rate = Fraction(rate_hz).limit_denominator(1001)
+    rate = Fraction(rate_hz).limit_denominator(1001)  # rates of NTSC are such fractions: 29.97 Hz is 30000/1001
     return _command(
         ("fdsrc", f"fd={_FD}", f"blocksize={width * height * 3 // 2}"),
         (

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from fieldkit.measure.captures.arrays import BIG, Integers, Ints, Table
-from fieldkit.measure.captures.headers import UDP, ip_headers, network
+from fieldkit.measure.captures.headers import UDP, ip_header_positions, ip_headers
 from fieldkit.measure.captures.packets import UDP_HEADER_BYTES
 from fieldkit.measure.captures.pcap import CHUNK_BYTES, frame_reader
 from fieldkit.measure.evidence import reading
@@ -71,10 +71,11 @@ def read(path: Path, port: int) -> RtpPackets:
     reader = frame_reader(data)
     parts = [RtpPackets(*(np.empty(0, dtype=np.int64) for _ in range(4)))]
     for chunk in reader(data, where=str(path), chunk_bytes=CHUNK_BYTES) if reader else ():
-        ip = ip_headers(integers, chunk.frames, network(integers, chunk.frames))
+        ip = ip_headers(integers, chunk.frames, ip_header_positions(integers, chunk.frames))
         frames = chunk.frames.where(ip.frame)
         rtp_at = ip.payload_at + UDP_HEADER_BYTES
         is_captured = rtp_at + _RTP_BYTES <= frames.start + frames.captured_bytes
+        # The destination port is at byte 2 of the UDP header (RFC 768).
         is_video = (ip.protocol == UDP) & (ip.fragment_offset == 0) & (integers.u16(ip.payload_at + 2) == port)
         chosen = np.flatnonzero(is_captured & is_video & (integers.u8(rtp_at) >> 6 == _VERSION))
         rtp_at = rtp_at[chosen]
@@ -91,6 +92,7 @@ def read(path: Path, port: int) -> RtpPackets:
 
 def match_frames(sent: RtpPackets, received: RtpPackets) -> CapturedFrames:
     """Return the frames of the sender's capture, with their packets in the receiver's capture."""
+    # The arrays below have one element per time stamp, sorted by time stamp; the result is in the order of sending.
     stamps, first = np.unique(sent.stamp, return_index=True)
     in_order = np.argsort(first)
     _, distinct = np.unique(sent.keys, return_index=True)

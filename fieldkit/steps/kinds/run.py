@@ -99,7 +99,7 @@ class PrintedColumn(Strict):
             content = view.evidence.read(program_output.at_path, file, self.path)
         else:
             content = view.evidence.read(program_output.by_expression, file, self.expression or "")
-        return program_output.value(self.column, content)
+        return program_output.to_column_value(self.column, content)
 
 
 class Bounds(Strict):

@@ -119,6 +119,7 @@ def check_turn(target: Target) -> None:
                 f"{name} turned for {_DRIVE_S:g} s at {_TURN_RAD_S:g} rad/s, and its heading changed by "
                 f"{turned_rad[name]:.3g} rad"
             )
+        # The direction of motion in the last three windows is compared with the heading near their middle.
         moved_m = _displacement_m(later[-4][name], later[-1][name])
         heading_rad = _heading_rad(later[-2], name)
         if abs(_angle(math.atan2(moved_m[1], moved_m[0]), heading_rad)) > _DIRECTION_RAD:

@@ -145,7 +145,7 @@ def _run(probe: FederateProbe, window_ns: int, until_ns: int = _END_NS) -> _Fate
 
 
 def check_first_request(target: Target) -> None:
-    """A first request for time -1, which a window of length 0 causes, is answered."""
+    """A first request for time -1, which is sent if the first window has length 0, is answered."""
     probe = target.open()
     outcomes = probe.advance_network(-1, _states(probe))
     if outcomes.at_ns != -1 or outcomes.arrivals or outcomes.drops:

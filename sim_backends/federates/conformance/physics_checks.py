@@ -144,7 +144,7 @@ def check_motion(target: Target) -> None:
 
 
 def check_limits(target: Target) -> None:
-    """The error of an extrapolation at the velocity is at most a t^2 / 2, where a is the returned limit."""
+    """A position that is extrapolated for a time t has an error of at most a t^2 / 2; a is the returned limit."""
     probe = target.open()
     before = probe.advance_physics(0)
     step_ns, commands = probe.welcome.step_ns, _commands(probe)

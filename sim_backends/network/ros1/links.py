@@ -23,13 +23,13 @@ _UDPROS_HEADER_BYTES: Final = 8
 
 @dataclass(frozen=True, slots=True)
 class Probe:
-    """A keep-alive probe of a connection, or the response to it.
+    """A keep-alive probe that a subscriber sends on a connection, or the publisher's response.
 
     Attributes:
         flow: Flow of the connection.
         connection: Number of the connection, from 1.
         number: Number of the probe.
-        is_alive: The response; None for a query.
+        is_alive: The response: True if this connection is open at the publisher. None in a probe.
     """
 
     flow: str
@@ -40,7 +40,7 @@ class Probe:
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """A datagram of UDPROS.
+    """A datagram of UDPROS, which carries a part of a message.
 
     Attributes:
         flow: Name of the flow.

@@ -129,6 +129,8 @@ def cube_root(number: int) -> int:
 class Cubic(NewReno):
     """The window of RFC 9438; slow start as in RFC 5681, without HyStart++ (RFC 9406).
 
+    An epoch is a period of congestion avoidance: it begins with the first growth of the window after a reduction.
+
     Args:
         options: Segment size, initial window and growth of the window.
     """
@@ -179,8 +181,10 @@ class Cubic(NewReno):
 
     def _reset_epoch(self) -> None:
         self._epoch_ns: int | None = None
+        # Time from the start of the epoch to the plateau of the cubic function (K), and the window there.
         self._plateau_ns = 0
         self._origin_bytes = 0
+        # The window that Reno would have (W_est).
         self._reno_bytes = 0
         self._reno_credit = 0
 

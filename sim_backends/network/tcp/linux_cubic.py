@@ -29,6 +29,8 @@ _WINDOWS_PER_SEGMENT_AT_TARGET: Final = 100
 class LinuxCubic(NewReno):
     """The window of Linux's CUBIC; slow start as in RFC 5681, without HyStart.
 
+    An epoch is a period of congestion avoidance: it begins with the first growth of the window after a reduction.
+
     Args:
         options: Segment size, initial window and growth of the window.
 
@@ -80,8 +82,10 @@ class LinuxCubic(NewReno):
 
     def _restart_epoch(self) -> None:
         self._epoch_ns: int | None = None
+        # Time from the start of the epoch to the plateau of the cubic function (K), and the window there in segments.
         self._plateau_ns = 0
         self._origin = 0
+        # The window that Reno would have, in segments.
         self._reno = 0
         self._reno_acked_bytes = 0
         self._acked_per_segment = 0

@@ -125,6 +125,7 @@ class RackScoreboard(Scoreboard):
 
     def _reordering_window_ns(self, *, is_recovering: bool) -> int:
         """Return the tolerated delay of a segment beyond a round trip (RFC 8985, 6.2, step 4)."""
+        # Three segments after the first unacknowledged one have arrived by SACK.
         threshold_reached = (
             len(self._latest_sacked) == DUPLICATE_THRESHOLD
             and self._latest_sacked[0] >= self._removed_count + self._acked_count

@@ -214,10 +214,12 @@ class TopicReader:
         kind: _Kind = "silent_ack"
         if numbers or missing_fragments:
             may_repeat = now_ns >= self._requested_ns + self._timing.nack_delay_ns
+            # True if the first missing data was not requested before.
             is_new = (
                 self._next_number,
                 missing_fragments.missing[0] if missing_fragments else 0,
             ) >= self._requested_end
+            # True if the writer has answered the last request, and data is still missing.
             was_resent = self._has_new_directed_heartbeat and (not self._was_timed_repeat or may_repeat)
             if is_new or was_resent or may_repeat:
                 requests_only_fragments = (

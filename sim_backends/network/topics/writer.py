@@ -164,6 +164,7 @@ class TopicWriter:
         return Data(sample, first, count, sample.fragments(fragment_bytes), fragment_bytes)
 
     def _piggyback(self) -> tuple[Submessage, ...]:
+        """Return the heartbeat that is sent in the same message as data, or nothing if none is due."""
         now_ns = self._wire.now_ns
         # After a pause of 80 % of the interval, a separate heartbeat would soon require a response. If the heartbeat
         # in this message requires it, the separate one is not needed.

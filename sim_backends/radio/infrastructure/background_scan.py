@@ -57,9 +57,9 @@ class BackgroundScan:
         Args:
             now_ns: Time of the association.
             signal_dbm: Signal of the access point at that time.
-            threshold_dbm: See the class.
-            short_ns: See the class.
-            long_ns: See the class.
+            threshold_dbm: Signal below which scans have the short interval.
+            short_ns: Short interval.
+            long_ns: Long interval.
         """
         interval_ns = long_ns if signal_dbm >= threshold_dbm else short_ns
         return cls(threshold_dbm, short_ns, long_ns, signal_dbm, now_ns + interval_ns, interval_ns, now_ns)
@@ -101,7 +101,7 @@ class BackgroundScan:
     def on_scan(self, now_ns: int) -> None:
         """Record that a scan starts.
 
-        After many consecutive scans at the short interval, it switches to the long interval.
+        After many consecutive scans at the short interval, the schedule switches to the long interval.
         """
         if self._interval_ns == self.short_ns:
             self._short_scans += 1

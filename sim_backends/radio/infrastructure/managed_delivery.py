@@ -19,7 +19,6 @@ from sim_backends.radio.links import NOT_ASSOCIATED, RADIO_OFF, Payload
 from sim_backends.radio.packet_delivery import PacketDelivery
 from sim_backends.radio.stations import Peer, Station
 
-_OVERHEAD_BYTES: Final = HEADER_BYTES
 # Expedited forwarding: access category voice or video.
 _HIGHEST_DSCP: Final = 46
 
@@ -93,7 +92,7 @@ class ManagedDelivery(PacketDelivery[Payload]):
         self._management_counts[transmitter] += 1
         frame: Frame[Payload] = Frame(
             content,  # type: ignore[arg-type]  # a management frame has no payload of a program
-            size_bytes - _OVERHEAD_BYTES,
+            size_bytes - HEADER_BYTES,
             self._channel.names[transmitter],
             receiver,
             (),

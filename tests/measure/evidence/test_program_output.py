@@ -37,7 +37,7 @@ def output(tmp_path: Path) -> Path:
     ],
 )
 def test_a_path_extracts_a_value_of_its_column(output: Path, path: str, unit: str, value: object) -> None:
-    extracted = program_output.value(column(unit), program_output.at_path(output, path))
+    extracted = program_output.to_column_value(column(unit), program_output.at_path(output, path))
     assert (extracted, type(extracted)) == (value, type(value))
 
 
@@ -60,14 +60,15 @@ def test_a_path_extracts_a_value_of_its_column(output: Path, path: str, unit: st
 )
 def test_an_invalid_value_is_an_error(extracted: object, unit: str, reason: str) -> None:
     with pytest.raises(EvidenceError, match=reason):
-        program_output.value(column(unit), extracted)
+        program_output.to_column_value(column(unit), extracted)
 
 
 def test_a_number_as_text_is_accepted_and_texts_are_sanitized() -> None:
-    assert program_output.value(column("V"), " 12.5\n") == 12.5
-    assert program_output.value(column("count"), "1e3") == 1000
-    assert program_output.value(column("text"), "a\x1b[31m\u202eb\r\nc" + 500 * "d").startswith("a?[31m?b c")  # type: ignore[union-attr]
-    assert len(str(program_output.value(column("text"), 500 * "d"))) == 200
+    assert program_output.to_column_value(column("V"), " 12.5\n") == 12.5
+    assert program_output.to_column_value(column("count"), "1e3") == 1000
+    sanitized = str(program_output.to_column_value(column("text"), "a\x1b[31m\u202eb\r\nc" + 500 * "d"))
+    assert sanitized.startswith("a?[31m?b c")
+    assert len(str(program_output.to_column_value(column("text"), 500 * "d"))) == 200
 
 
 def test_an_expression_extracts_the_first_match_of_its_group(output: Path) -> None:
@@ -133,7 +134,7 @@ def test_truncated_output_is_an_error(output: Path) -> None:
 def test_any_extracted_value_is_a_valid_cell_or_an_error(extracted: object, unit: str) -> None:
     extracted = json.loads(json.dumps(extracted))
     try:
-        value = program_output.value(column(unit), extracted)
+        value = program_output.to_column_value(column(unit), extracted)
     except EvidenceError:
         return
     assert isinstance(value, column(unit).type)

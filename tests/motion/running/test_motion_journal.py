@@ -99,7 +99,7 @@ def test_a_stop_by_the_operator_holds_the_robots_of_a_campaign(tmp_path: Path) -
     second = JournaledOrigins(MotionJournal(journal_of(trials[1])), trials[1], ROBOTS, NEAR)
     with pytest.raises(MotionHeldError, match="rover-1: stopped by the operator") as error_info:
         second.require()
-    assert "fieldkit campaign, as before" in error_info.value.remedy
+    assert "the same fieldkit campaign command" in error_info.value.remedy
 
 
 def test_a_kill_during_a_motion_holds_the_robots(tmp_path: Path) -> None:

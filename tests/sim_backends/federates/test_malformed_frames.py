@@ -69,10 +69,10 @@ def test_a_wrong_header_is_refused(fields: tuple[int, ...], message: str) -> Non
     ("name", "position", "wrong_bytes", "message"),
     [
         ("hello", 0, b"HTTP/1.1", "byte 16: this is not fieldkit's protocol for federates"),
-        ("hello", 8, b"\2\0", "byte 24: protocol version 2; this program has 1"),
+        ("hello", 8, b"\2\0", "byte 24: protocol version 2; this program supports 1"),
         ("hello", 10, b"\3", "byte 26: there is no role 3"),
-        ("welcome", 0, b"\2\0", "byte 16: protocol version 2; this program has 1"),
-        ("welcome", 8, bytes(8), "byte 18: role 1 with a step of 0 ns"),
+        ("welcome", 0, b"\2\0", "byte 16: protocol version 2; this program supports 1"),
+        ("welcome", 8, bytes(8), "byte 18: role 1 with a step of 0 ns is invalid"),
         ("states", 8, b"\xff\xff\xff\xff", "byte 24: 4294967295 items of at least 6 bytes do not fit"),
         ("states", 12, b"\x09", "byte 28: the new agent has index 9, not 2"),
         ("advance physics", 20, b"\x05", "byte 36: agent 5 was not announced"),

@@ -27,8 +27,8 @@ struct Command
 
 struct PhysicsRequest
 {
-    int64_t to_ns = 0;
-    int64_t from_ns = 0;
+    int64_t to_ns = 0; // simulated time to advance to
+    int64_t from_ns = 0; // simulated time from which the commands apply
     std::vector<Command> commands;
 };
 

@@ -18,12 +18,12 @@ enum Role : uint8_t
 enum Capability : uint32_t
 {
     kDeterministic = 1, // equal requests give equal answers
-    kForks = 2,
-    kNextEvent = 4,
-    kExtrapolates = 8,
-    kAgentsAppear = 16,
-    kAgentsDisappear = 32,
-    kSamplesLinks = 64,
+    kForks = 2, // it can be copied in its current state
+    kNextEvent = 4, // nothing happens before `next_event_ns`, unless a new packet enters
+    kExtrapolates = 8, // it moves agents by dead reckoning
+    kAgentsAppear = 16, // agents that are not in hello may appear
+    kAgentsDisappear = 32, // agents may disappear, and return
+    kSamplesLinks = 64, // it answers requests for samples of the links of its radios
 };
 
 constexpr uint32_t kMaxAgents = 10'000;
@@ -39,12 +39,12 @@ struct Agent
 
 struct Hello
 {
-    uint32_t heartbeat_ms = 0;
+    uint32_t heartbeat_ms = 0; // interval at which a federate sends `busy` while it computes
     uint64_t seed = 0;
-    int64_t step_ns = 0;
-    int64_t end_ns = 0;
-    std::string configuration_hash;
-    std::string token;
+    int64_t step_ns = 0; // physics step that the scenario requests
+    int64_t end_ns = 0; // end of the run
+    std::string configuration_hash; // SHA-256 of `configuration`
+    std::string token; // of a connection between machines
     std::string name; // of the scenario
     std::vector<Agent> agents;
     std::string configuration; // JSON
@@ -64,7 +64,7 @@ ReadHello(const std::string& body, Role role)
     auto version = reader.Get<uint16_t>();
     if (version != kVersion)
     {
-        throw MalformedFrame(position, "protocol version " + std::to_string(version) + "; this program has " +
+        throw MalformedFrame(position, "protocol version " + std::to_string(version) + "; this program supports " +
                                            std::to_string(kVersion));
     }
     if (reader.Get<uint8_t>() != role)
@@ -105,15 +105,15 @@ struct Welcome
 {
     Role role = kPhysics;
     uint32_t capabilities = 0;
-    int64_t step_ns = 0;
-    int64_t next_event_ns = -1;
+    int64_t step_ns = 0; // 0 for a network
+    int64_t next_event_ns = -1; // time of the first event of a network; -1 if there is none
     std::string configuration_hash; // the hash in hello
     std::string name;
     std::string software;
-    std::vector<uint16_t> commands;
-    std::vector<std::string> transports;
-    std::vector<uint32_t> transmitters; // indices of agents
-    std::vector<std::array<double, 3>> emitters_m;
+    std::vector<uint16_t> commands; // types of commands that it supports
+    std::vector<std::string> transports; // names of transports that it supports; empty for any
+    std::vector<uint32_t> transmitters; // indices of agents that forward or interfere
+    std::vector<std::array<double, 3>> emitters_m; // positions of other sources of interference
 };
 
 inline std::string

@@ -8,26 +8,26 @@
 namespace fieldkit::protocol
 {
 
-constexpr size_t kPacketBytes = 52;
+constexpr size_t kPacketBytes = 52; // smallest size of a packet: five numbers, two indices, and two empty texts
 
 struct Packet
 {
-    uint64_t id = 0;
-    int64_t number = 0;
+    uint64_t id = 0; // number of the packet in the run
+    int64_t number = 0; // number of the packet in its flow
     uint64_t size_bytes = 0;
-    int64_t sent_ns = 0;
-    int64_t enters_ns = 0;
+    int64_t sent_ns = 0; // when its program sent it
+    int64_t enters_ns = 0; // when it enters the network
     uint32_t source = 0; // index of an agent
     uint32_t destination = 0; // index of an agent
     std::string flow;
-    std::string protocol;
+    std::string protocol; // name of a transport: udp, tcp, topic, ros1, ip or ip-broadcast
 };
 
 struct NetworkRequest
 {
-    int64_t to_ns = 0;
-    int64_t since_ns = 0;
-    int64_t reckoning_ns = 0;
+    int64_t to_ns = 0; // simulated time to advance to
+    int64_t since_ns = 0; // time of `states`; only dead reckoning uses it
+    int64_t reckoning_ns = 0; // step of dead reckoning; 0 if agents do not move until the next request
     std::vector<NewAgent> new_agents;
     std::vector<State> states;
     std::vector<Packet> packets;

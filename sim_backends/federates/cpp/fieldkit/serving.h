@@ -13,7 +13,7 @@
 namespace fieldkit::protocol
 {
 
-// Sends `busy` while a request takes longer than the heartbeat.
+// Sends `busy` at an interval while a request is computed.
 class Heartbeat
 {
   public:
