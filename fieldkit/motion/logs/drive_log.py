@@ -109,11 +109,11 @@ def read(path: Path) -> tuple[DriveMoment, ...]:
     """Return the lines of a log in chronological order; an incomplete last line is omitted.
 
     Raises:
-        EvidenceError: The log is missing, empty, or has an invalid line.
+        EvidenceError: The log is missing, empty, has an invalid line, or its lines are not in order.
     """
     log = motion_log.read(path, _parse_moment, "drive")
     if any(after.driven_m < before.driven_m for before, after in pairwise(log)):
-        raise EvidenceError("its lines are not in chronological order", where=str(path))
+        raise EvidenceError("its driven distance decreases, so its lines are not in order", where=str(path))
     return log
 
 

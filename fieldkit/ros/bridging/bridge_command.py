@@ -104,6 +104,7 @@ def add(parser: Parser) -> None:
 
 
 _POLL_S: Final = 1.0
+"""Interval at which the bridge looks for nodes that use a topic with another type."""
 _ROUTER_PORT: Final = 7447
 _NODE: Final = re.compile(r"[A-Za-z]\w*", re.ASCII)
 

@@ -19,7 +19,9 @@ MIN_ARRIVED: Final = 18
 """Minimum number of arrived datagrams, out of `COUNT`, on a good link: 10 % loss."""
 
 _RESOLVE_S: Final = 15.0
+"""Timeout for the resolution of a name."""
 _LOOPBACK: Final = {None, "localhost", "127.0.0.1", "::1"}
+"""Hosts in the URI of a master that runs on the robot itself; None if the URI has no host."""
 _FRAGMENTS: Final = -(-SIZES[FRAGMENTED] // 1480)
 """Number of IP fragments, rounded up, if each has 1480 bytes of payload (MTU 1500 without the IPv4 header)."""
 
