@@ -22,6 +22,7 @@ _WARNING: Final = dialect.MAV_SEVERITY_WARNING
 
 _FTP_HEADER: Final = struct.Struct("<HBBBBBxI")
 _FTP_BYTES: Final = 251
+"""Length of the payload of FILE_TRANSFER_PROTOCOL."""
 _ACK, _NAK = 128, 129
 _OPEN_OPCODES: Final = frozenset({4, 11, 14})
 """Opcodes that open a file or compute its checksum: OpenFileRO, OpenFileWO, CalcFileCRC32."""

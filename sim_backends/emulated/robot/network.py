@@ -73,6 +73,7 @@ def _settings(interface: str, address: str, hello_s: float, *rules: str) -> tupl
 
 DEVICE: Final = "/dev/net/tun"
 QUEUE_PACKETS: Final = 4096
+"""Length of the queue of an interface."""
 
 # linux/if_tun.h
 _TUNSETIFF: Final = 0x400454CA
@@ -89,6 +90,7 @@ _NAME_BYTES: Final = 15
 
 MTU_BYTES: Final = 1500
 _TIMEOUT_S: Final = 5.0
+"""Timeout of `ip`."""
 
 
 def open_tun(name: str, *, ethernet: bool = False) -> int:
