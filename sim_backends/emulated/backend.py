@@ -230,7 +230,7 @@ class EmulatedBackend:
 
     @contextmanager
     def open_lab(self, *, seed: int, sink: Sink) -> "Iterator[Lab]":
-        """Implement `LabBackend.open_lab`."""
+        """Implement `LabBackend.open_lab`: in this process, or for Linux Wi-Fi in a virtual machine if necessary."""
         from sim_backends.emulated import interactive_lab  # noqa: PLC0415 (as in `open`)
 
         if self._site.control is Control.RADIO:

@@ -1,4 +1,7 @@
-"""Mobility of robots in an emulated lab: positions and velocities over time, as the medium receives them."""
+"""Mobility of robots in an emulated lab: positions and velocities over time, as the medium receives them.
+
+The lab moves most robots. A robot steers itself if a program on board (a base controller or an autopilot) moves it.
+"""
 
 import math
 import threading

@@ -45,6 +45,7 @@ from sim_backends.federates.transports.contract import is_same_token
 from sim_backends.world.motion import DeadReckoned
 
 _MAX_COPIES: Final = 1000
+"""Largest number of copies of a federate in one run."""
 
 MakeFederate = Callable[[Hello], Any]
 

@@ -51,6 +51,7 @@ class FixedRate(RateControl):
         """Implement `RateControl.report`."""
 
 
+# Constants of `Minstrel`; its docstring describes them.
 _UPDATE_NS: Final = 100_000_000
 _OLD_WEIGHT: Final = 0.75
 _SAMPLE_SHARE: Final = 0.1

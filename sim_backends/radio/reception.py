@@ -22,6 +22,7 @@ from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.stations import Station
 
 _DETECTABLE_RATIO: Final = 10 ** (PREAMBLE_SNR_DB / 10)
+"""Smallest ratio of a preamble to noise and interference at which a station detects the preamble."""
 _ENERGY_DETECTION_MW: Final = 10 ** (ENERGY_DETECTION_DBM / 10)
 
 

@@ -82,11 +82,13 @@ class FlightRecorder:
         self._requested_us = {int(kind): interval_us for kind, interval_us in recording.intervals_us.items()}
         self._missing_kinds = {kind for kind, interval_us in self._requested_us.items() if interval_us > 0}
         self._refusals: dict[int, int] = {}
+        # Time during which each message was too slow, and the time of the last update of these values.
         self._slow_s = dict.fromkeys(self._missing_kinds, 0.0)
+        self._rates_s = time.monotonic()
         self._writer = FrameWriter()
         self._frames = self._bytes = self._dropped_frames = self._checksum = 0
         self._next_heartbeat_s = self._next_request_s = 0.0
-        self._rates_s = self._first_heartbeat_s = time.monotonic()
+        self._first_heartbeat_s = time.monotonic()
         self._was_ready = False
 
     @property

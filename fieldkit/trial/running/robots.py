@@ -124,12 +124,12 @@ class Robots:
             self._run_steps(scene, announce)
             return
         before, since_ns = oracle.lateness(), time.time_ns()
-        oracle.links(continue_sampling=True)
+        oracle.links(continue_sampling=True)  # starts to sample the links, or drops the samples of the last attempt
         oracle.record_air(scene.laptop_folder)
         try:
             self._run_steps(scene, announce)
         finally:
-            oracle.record_air(None)
+            oracle.record_air(None)  # ends the recording of transmissions
         after, positions, links = oracle.lateness(), oracle.track(since_ns), oracle.links(continue_sampling=False)
         if scene.laptop_folder is not None:
             (scene.laptop_folder / track.FILE).write_text(track.text(positions), encoding="ascii")

@@ -149,6 +149,7 @@ def _place(text: str) -> PositionSource | None:
     is_in_range = is_length or (abs(first) <= 90 and abs(second) <= 180)
     if first_is_length is not is_length or not is_in_range or len(third) > 1:
         return None
+    # Without a third number, a place in metres is at height 0, and the height of other places is unknown.
     height_m = third[0][0] if third else 0.0 if is_length else None
     return PositionSource(place=(first, second, height_m), frame=LOCAL if is_length else WGS84)
 

@@ -168,6 +168,7 @@ class Streams:
         for kind, due_ns in self._due_ns.items():
             if due_ns <= now_ns:
                 interval_ns = self._interval_ns[kind]
+                # The first time after `now_ns` that is a whole number of intervals after `due_ns`.
                 self._due_ns[kind] = now_ns + interval_ns - (now_ns - due_ns) % interval_ns
                 yield kind
 

@@ -40,7 +40,7 @@ _END_NS: Final = 10**9 * 10**8
 
 
 class Simulators(NamedTuple):
-    """The simulators of a lab.
+    """The simulators of a lab. A federate is a simulator that takes part in a co-simulation.
 
     Attributes:
         physics: `kinematic`, or a name or command of a physics federate.

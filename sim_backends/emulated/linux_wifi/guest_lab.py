@@ -79,15 +79,15 @@ class GuestLab:
         return stream
 
     def programs(self, name: str) -> tuple[str, ...]:
-        """Implement `Lab.programs`."""
+        """Implement `Lab.programs`: the answer of the lab in the machine."""
         return self._state(name).programs
 
     def place_m(self, name: str) -> Vector:
-        """Implement `Lab.place_m`."""
+        """Implement `Lab.place_m`: the answer of the lab in the machine."""
         return self._state(name).place_m
 
     def move(self, name: str, to: Destination) -> Vector:
-        """Implement `Lab.move`."""
+        """Implement `Lab.move`: the lab in the machine moves the robot."""
         return self._request(f"move {name} {pack_destination(to)}", unpack_place_m)
 
     def overview(self) -> Overview:

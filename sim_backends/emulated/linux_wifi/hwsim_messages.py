@@ -39,7 +39,7 @@ RATE_80_MHZ: Final = 1 << 9
 RATE_160_MHZ: Final = 1 << 10
 
 STAGES: Final = 4
-"""Length of a rate chain, IEEE80211_TX_MAX_RATES."""
+"""Number of stages of a rate chain (IEEE80211_TX_MAX_RATES): the rates that mac80211 gives a frame, one per stage."""
 MIN_FRAME_BYTES: Final = 10
 """Frame control, duration and the receiver's address: the shortest frames of 802.11, 9.3.1 (without FCS)."""
 MAX_FRAME_BYTES: Final = 11_454

@@ -67,7 +67,7 @@ def serve(stream: socket.socket, lab: LabFolder) -> None:
             client.connect(str(lab.socket))
             client.sendall(request + b"\n")
             if not request.startswith(b"connect "):
-                stream.sendall(b"".join(iter(lambda: client.recv(_CHUNK_BYTES), b"")))
+                stream.sendall(b"".join(iter(lambda: client.recv(_CHUNK_BYTES), b"")))  # the whole answer
                 return
             message, descriptors, _, _ = socket.recv_fds(client, 4096, 1)
         if not descriptors:

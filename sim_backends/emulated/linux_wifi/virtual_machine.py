@@ -42,6 +42,7 @@ PACKAGE_OF: Final = {
 ROOT_VARIABLE: Final = "FIELDKIT_WIFI_ROOT"
 """Environment variable with a folder in which packages were extracted instead of being installed."""
 
+# Offsets of fields in the header of a boot image (Linux, Documentation/arch/x86/boot.rst).
 _BOOT_SECTORS_OFFSET: Final = 0x1F1
 _BOOT_MAGIC_OFFSET: Final = 0x202
 _BOOT_PAYLOAD_OFFSET: Final = 0x248

@@ -130,6 +130,7 @@ def open_device() -> int:
 
 def _set_queue(index: int) -> None:
     # Netlink is used, because the ioctl (also in busybox's ip) needs a capability that no user namespace grants.
+    # The structs ifinfomsg, rtattr and nlmsghdr.
     link = struct.pack("=BxHiII", socket.AF_UNSPEC, 0, index, 0, 0)
     length = struct.pack("=HHI", 8, _IFLA_TXQLEN, QUEUE_PACKETS)
     size_bytes = _HEADER_BYTES + len(link) + len(length)

@@ -24,6 +24,7 @@ from typing import Final, Protocol
 from sim_backends.federates.channels import ClosedError, DeadlineError
 from sim_backends.federates.frames import (
     HEADER_BYTES,
+    KIND_POSITION,
     MAX_FRAME_BYTES,
     MalformedFrameError,
     MessageKind,
@@ -33,13 +34,16 @@ from sim_backends.federates.frames import (
 from sim_backends.federates.transports.contract import ChannelListener
 
 _RUN: Final = struct.Struct("<Q")
-_KIND_OFFSET: Final = _RUN.size + 4
+_KIND_OFFSET: Final = _RUN.size + KIND_POSITION
+"""Offset of the kind of message in a sample."""
 _CHECK_S: Final = 0.5
 """Interval at which a channel that waits checks that the other side exists."""
 _PEER_S: Final = 10.0
 """Longest time for which the accepting side waits until its peer is discovered. An earlier answer may be lost."""
 _MAX_WAITING: Final = 16
+"""Largest number of runs that wait for the end of the current run."""
 _POLL_S: Final = 0.01
+"""Interval of checks whether the peer was discovered."""
 
 
 class SampleBus(Protocol):

@@ -16,7 +16,9 @@ from sim_backends.network.topics.writer import Transmit
 from sim_backends.network.wire import Wire, WireTimer
 
 _NEVER_NS: Final = -(10**18)
+"""A time before the start of every run."""
 _MAX_BITS: Final = 256
+"""Largest number of samples, or of fragments of a sample, in the bitmap of one request."""
 _INITIAL_BACKOFF: Final = ((10 * SECOND, 1), (60 * SECOND, 2), (120 * SECOND, 5))
 """Upper limits of the time since the reader was matched, each with a factor.
 

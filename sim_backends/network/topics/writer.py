@@ -24,9 +24,11 @@ OVERTAKEN: Final = "overtaken by a later sample"
 """Reason for a best-effort sample that arrives after a later one; a loss is reported with the reason of the loss."""
 BLOCKED: Final = "the writer was blocked for longer than max_blocking_time"
 _NEVER_NS: Final = -(10**18)
+"""A time before the start of every run."""
 _PIGGYBACK_PAUSE_NS: Final = 100_000
 """A message with data has no heartbeat for this time after a heartbeat, unless a response is required."""
 _HEARTBEATS_AT_FULL_RATE: Final = 5
+"""For every two heartbeats beyond this number since the last write, the interval doubles."""
 
 
 class TopicWriter:
