@@ -283,6 +283,7 @@ class EmulatedBackend:
         return members
 
     def _check_infrastructure(self, names: Iterable[str], *, has_relay: bool) -> None:
+        """Raise ConfigurationError if the access points or neighbours in the options conflict with the robots."""
         if not self._options.radio.has_infrastructure:
             return
         from sim_backends.radio.infrastructure import infrastructure  # noqa: PLC0415 (only some labs use it)
@@ -330,6 +331,7 @@ class EmulatedBackend:
 
 
 def _check_ros(robot: "Robot | LabRobot", options: EmulatedOptions) -> None:
+    """Raise ConfigurationError if the lab does not support the ROS settings of a profile."""
     ros = robot.profile.ros
     if ros is None:
         return

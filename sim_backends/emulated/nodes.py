@@ -393,6 +393,7 @@ def running_robots(
 def _cosimulated_medium(
     options: EmulatedOptions, world: World, robots: Mapping[RobotKey, Robot | LabRobot], seed: int, framing: Framing
 ) -> MediumClient:
+    """Start the medium of a lab on the co-simulation."""
     from sim_backends.emulated import simulator_choice  # noqa: PLC0415 (other labs import no simulator)
     from sim_backends.emulated.cosimulated.client import CosimulatedClient  # noqa: PLC0415 (as above)
 

@@ -75,6 +75,7 @@ class ParameterService:
             yield self.value(name)
 
     def _set(self, name: str, message: Message) -> None:
+        """Set a parameter to the value in a PARAM_SET message, unless the type is wrong."""
         value = message.param_value
         if not self._firmware.is_ardupilot:
             expected_type = _INT if self._parameters.is_integer(name) else _FLOAT
@@ -273,6 +274,7 @@ class MissionTransfer:
         yield _request(upload)
 
     def _start_upload(self, count: int, client: tuple[int, int], now_ns: int) -> Message:
+        """Return the answer to MISSION_COUNT: the request for the first item, or a result."""
         if self._upload is not None and self._upload.client != client:
             return _ack(client, dialect.MAV_MISSION_DENIED)
         self._last_upload = None
@@ -287,6 +289,7 @@ class MissionTransfer:
         return _request(self._upload)
 
     def _accept_item(self, message: Message, client: tuple[int, int], now_ns: int) -> Iterator[Message]:
+        """Yield the answer to an item of an upload: the request for the next item, or the result."""
         upload = self._upload
         if upload is None or upload.client != client:
             if self._last_upload is not None and self._last_upload[:2] == (client, message.seq):
@@ -311,6 +314,7 @@ class MissionTransfer:
         yield _ack(client, dialect.MAV_MISSION_ACCEPTED)
 
     def _item(self, number: int, client: tuple[int, int]) -> Message:
+        """Return an item of the mission, for a download."""
         items = self._items()
         if number >= len(items):
             return _ack(client, dialect.MAV_MISSION_INVALID_SEQUENCE)

@@ -69,6 +69,7 @@ class SimulatedAirframe(Airframe):
         self._command(Velocity(), self._limits, powered=False)
 
     def _command(self, target: Velocity, limits: QuadrotorLimits, *, powered: bool) -> None:
+        """Record a command for the physics simulator."""
         self._is_off = not powered
         self._commands.write(
             FlightCommand(

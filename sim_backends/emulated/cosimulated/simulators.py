@@ -194,6 +194,7 @@ def start_network(settings: LabSettings, states: Mapping[str, State]) -> remote.
 
 
 def _hello(settings: LabSettings, role: int, states: Mapping[str, State]) -> Hello:
+    """Return the first message to a simulator: the run, the agents and the configuration."""
     agents = [
         AgentStart(
             name,

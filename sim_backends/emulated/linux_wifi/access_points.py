@@ -104,6 +104,7 @@ class AccessPoints:
         self._folder.cleanup()
 
     def _start(self, radios: Mapping[str, HwsimRadio]) -> None:
+        """Move the radios to the process, and return when every access point is on."""
         deadline = Deadline.after(_START_S)
         namespaces = [Path(f"/proc/{pid}/ns/net") for pid in ("self", self._process.pid)]
         while len({path.readlink() for path in namespaces}) < len(namespaces):  # until it has its own namespace

@@ -167,6 +167,7 @@ class _Channel:
         self._gains.move(now_ns, positions_m, velocities_m_s)
 
     def transmit(self, now_ns: int, frame: FrameOnAir) -> None:
+        """Send a frame. If none of its tries is possible, its status is reported immediately."""
         number = self._numbers[frame.source]
         self._numbers[frame.source] = number + 1
         identity = frame.source, number
@@ -200,6 +201,7 @@ class _Channel:
             self.events.statuses.append(frame)
 
     def _on_attempt(self, attempt: TransmissionAttempt) -> None:
+        """Store the mode of a received attempt. The status of a broadcast is known after its only attempt."""
         frame = attempt.payload
         if not isinstance(frame, FrameOnAir):
             return  # an ACK

@@ -109,6 +109,7 @@ class GuestLab:
         return stream
 
     def _request(self, request: str, read: Callable[[bytes], Answer], deadline: Deadline | None = None) -> Answer:
+        """Return the answer of the lab to a request, decoded by `read`."""
         deadline = deadline or Deadline.after(_REPLY_S)
         answer = b""
         with closing(self._open(request)) as stream:

@@ -112,6 +112,7 @@ def module_order(modules: Path, names: Iterable[str]) -> list[Path]:
     order: dict[str, Path] = {}
 
     def add(name: str) -> None:
+        """Add a module after its dependencies."""
         if name in order or name in builtin:
             return
         if name not in paths:

@@ -224,6 +224,7 @@ class FamilySocket:
         return [message for message in decode_messages(datagram) if message.type in {self._family, NLMSG_ERROR}]
 
     def _request_family(self, name: str) -> int:
+        """Request the identifier of the family from the kernel, and return it."""
         self._socket.settimeout(_TIMEOUT_S)
         self._socket.sendto(family_request(name).encode(), (0, 0))
         while True:

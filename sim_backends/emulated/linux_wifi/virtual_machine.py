@@ -222,6 +222,7 @@ class Machine:
         )
 
     def _has_ended(self, timeout_s: float, *, is_interrupted: bool) -> bool:
+        """Wait; return True if the machine has ended. The first Ctrl-C interrupts the script; a second is raised."""
         try:
             self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
@@ -312,6 +313,7 @@ def _mount_command(results: Path) -> str:
 
 
 def _command_line(folder: Path, memory_mib: int, results: Path | None) -> list[str]:
+    """Return the command line of QEMU."""
     accelerators = _accelerators()
     options = _KERNEL_OPTIONS if "kvm" in accelerators else f"{_KERNEL_OPTIONS} {_INSTRUCTION_CLOCK}"
     argv = ["setpriv", "--pdeathsig", "KILL", "--", "qemu-system-x86_64", *accelerators]

@@ -139,6 +139,7 @@ class MediumServer(ABC):
         return True
 
     def _answer(self, request: Message, descriptors: list[int]) -> Message:
+        """Execute a request of the lab and return the reply."""
         match request["do"]:
             case "attach":
                 (fd,) = descriptors

@@ -170,6 +170,7 @@ class Init:
             network.switch_off(self._interface)
 
     def _serve(self) -> bool:
+        """Execute one request and send the reply; return False if the lab has closed the socket."""
         message = worker.receive(self._channel, Deadline.after(_MESSAGE_S))
         if message is None:
             return False
@@ -236,6 +237,7 @@ class Init:
         self._spawn(spec)
 
     def _change_radio(self, request: Message) -> None:
+        """Execute a request that changes a network interface."""
         match request["do"]:
             case "open wifi":
                 self._wifi, self._interface = WifiSpec(**request["wifi"]), request["interface"]

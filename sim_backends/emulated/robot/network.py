@@ -129,6 +129,7 @@ def open_device() -> int:
 
 
 def _set_queue(index: int) -> None:
+    """Set the queue of the interface with this index to `QUEUE_PACKETS`."""
     # Netlink is used, because the ioctl (also in busybox's ip) needs a capability that no user namespace grants.
     # The structs ifinfomsg, rtattr and nlmsghdr.
     link = struct.pack("=BxHiII", socket.AF_UNSPEC, 0, index, 0, 0)

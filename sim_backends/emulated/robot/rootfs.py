@@ -185,6 +185,7 @@ def _ros_packages(setup: Path) -> Path:
 
 
 def _etc_files(spec: RobotSpec) -> dict[str, str]:
+    """Return the content of the robot's own files in `/etc`, by name."""
     names = "".join(f"{address}\t{name}\n" for name, address in spec.hosts.items())
     return {
         "passwd": _ACCOUNTS.format(shell="/bin/sh" if spec.userland == "busybox" else "/bin/bash"),
