@@ -193,6 +193,7 @@ class MinstrelHt(RateControl):
         return min(share, _CAPPED_SHARE) / time_ns, share
 
     def _update(self, now_ns: int) -> None:
+        """Update the statistics of all modes, and choose the modes of the chain and the modes to sample."""
         if self._aggregates:
             length = self._aggregate_frames / self._aggregates
             self._mean_length = _LENGTH_OLD_WEIGHT * self._mean_length + (1 - _LENGTH_OLD_WEIGHT) * length

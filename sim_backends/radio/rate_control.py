@@ -145,6 +145,7 @@ class Minstrel(RateControl):
         self._rank()
 
     def _rank(self) -> None:
+        """Choose the best, the second best and the most robust mode, and build the default chain."""
         throughput = {mode: share / self._time_ns[mode] for mode, share in self._share.items()}
         # Among modes with almost no success, the slowest is tried first.
         ranked_modes = sorted(

@@ -202,6 +202,7 @@ class Reception(Generic[Payload]):
         return decoded_frames
 
     def _reach(self, transmitter: int, now_ns: int) -> _Reach:
+        """Return the stations that a transmitter reaches now."""
         powers_mw = self._channel.powers_mw(transmitter, now_ns)
         reach = self._reaches.get(transmitter)
         if reach is not None and reach.powers_mw is powers_mw:

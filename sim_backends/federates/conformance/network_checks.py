@@ -118,6 +118,7 @@ class _FateAccount:
             )
 
     def _check_next_event(self, outcomes: NetworkOutcomes, to_ns: int, *, has_packets: bool) -> None:
+        """Check that nothing happened before the announced next event, and that the new one is in the future."""
         announced_ns, self._next_event_ns = self._next_event_ns, outcomes.next_event_ns
         if outcomes.next_event_ns != NO_EVENT and outcomes.next_event_ns <= to_ns:
             raise CheckError(f"after advancing to {to_ns} ns, its next event is at {outcomes.next_event_ns} ns")

@@ -165,7 +165,7 @@ class DdsAddress:
 
     @property
     def is_loopback(self) -> bool:
-        """See `TransportAddress`."""
+        """True if only programs on this machine can use it."""
         return is_loopback(self.interface)
 
     @property

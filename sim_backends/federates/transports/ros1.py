@@ -121,7 +121,7 @@ class Ros1Address:
 
     @property
     def is_loopback(self) -> bool:
-        """See `TransportAddress`."""
+        """True if only programs on this machine can use it."""
         return is_loopback(urlsplit(self.master).hostname or "") and (not self.host or is_loopback(self.host))
 
     def connect(self, deadline_s: float) -> samples.SampleChannel:

@@ -114,6 +114,12 @@ class SampleChannel:
         return ProtocolFrame(header, sample[body_offset:])
 
     def _next_sample(self, deadline_s: float | None) -> bytes:
+        """Return the next sample of this run.
+
+        Raises:
+            ClosedError: One side has ended the run, or the other side has disappeared.
+            DeadlineError: No sample arrived in time.
+        """
         if self._first_sample:
             first_sample, self._first_sample = self._first_sample, b""
             return first_sample

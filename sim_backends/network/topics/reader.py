@@ -145,6 +145,7 @@ class TopicReader:
             self._on_heartbeat(message)
 
     def _on_data(self, data: Data) -> None:
+        """Store the fragments of a sample, and deliver all samples that are next in order."""
         number = data.sample.number
         if number < self._next_number or number in self._complete_samples:
             return
@@ -254,6 +255,7 @@ class TopicReader:
             self._send(response)
 
     def _send(self, response: _Response) -> None:
+        """Send a response, and record what it requests and acknowledges."""
         now_ns = self._wire.now_ns
         self._has_new_heartbeat = self._has_new_directed_heartbeat = False
         self._was_timed_repeat = response.is_timed_repeat

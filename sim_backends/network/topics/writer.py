@@ -143,6 +143,7 @@ class TopicWriter:
         self._resume()
 
     def _send(self, sample: Sample) -> None:
+        """Send a new sample in as many messages as it needs; the last one has a heartbeat if one is due."""
         self._last_number += 1
         sample.number = self._last_number
         evicted_sample = self._history.insert(sample) if self._is_reliable else None
