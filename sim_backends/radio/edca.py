@@ -48,6 +48,7 @@ PARAMETERS: Final = (
 """Default parameters by access category."""
 
 _UNLIMITED_NS: Final = 1 << 62
+# Access categories, highest priority first.
 _PRIORITY: Final = (VOICE, VIDEO, BEST_EFFORT, BACKGROUND)
 
 # Access category by user priority: table 10-1.

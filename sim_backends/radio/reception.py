@@ -22,6 +22,7 @@ from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.stations import Station
 
 _DETECTABLE_RATIO: Final = 10 ** (PREAMBLE_SNR_DB / 10)
+"""Smallest ratio of a preamble to noise and interference at which a station detects the preamble."""
 _ENERGY_DETECTION_MW: Final = 10 ** (ENERGY_DETECTION_DBM / 10)
 
 
@@ -201,6 +202,7 @@ class Reception(Generic[Payload]):
         return decoded_frames
 
     def _reach(self, transmitter: int, now_ns: int) -> _Reach:
+        """Return the stations that a transmitter reaches now."""
         powers_mw = self._channel.powers_mw(transmitter, now_ns)
         reach = self._reaches.get(transmitter)
         if reach is not None and reach.powers_mw is powers_mw:

@@ -64,7 +64,7 @@ COLUMNS: Final = columns(
 
 _OUT: Final = frozenset({"out", "there"})
 """Phases from the start of the path until the robot turns back."""
-_PHASES: Final = frozenset({"waits", "back", HOME}) | _OUT
+_PHASES: Final = frozenset({"waits", "returns", "back", HOME}) | _OUT
 _SPEED_INTERVAL_S: Final = 0.5
 """Interval over which a speed is computed. One odometry message more or less changes it by 3 % at 50 Hz and by 7 %
 at 30 Hz."""
@@ -78,8 +78,8 @@ class DriveMoment:
 
     Attributes:
         at_s: Time since the start of the program.
-        phase: Phase of the drive: `waits` before the start, `out` on the path, `there` at its end, `back` on the way
-            back, or `home`.
+        phase: Phase of the drive: `waits` before the start, `returns` if the robot first drives to its origin, `out`
+            on the path, `there` at its end, `back` on the way back, or `home`.
         x_m: Position ahead of the start.
         y_m: Position to the left of the start.
         yaw_rad: Heading relative to the start, positive to the left.

@@ -222,7 +222,8 @@ def _watch(forwarders: Sequence[Forwarder], stop_event: threading.Event) -> None
 
 
 def _show(counts: Sequence[CrossingCounts]) -> None:
-    header = ("topic", "direction", "messages", "per second", "bytes", "refused", "unreadable", "median", "99 %")
+    counters = ("messages", "per second", "bytes", "refused", "unreadable")
+    header = ("topic", "direction", *counters, "delay, median", "delay, 99 %")
     rows = [
         (
             topic_counts.topic,

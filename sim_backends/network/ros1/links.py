@@ -18,6 +18,7 @@ OUT_OF_ORDER: Final = "blocks of UDPROS out of order"
 _PROBE_BYTES: Final = 20 + 32
 """Size of a TCP segment without data, with timestamps and the IP header."""
 _UDP_BYTES: Final = 20 + 8
+"""Size of the headers of IP and UDP."""
 _UDPROS_HEADER_BYTES: Final = 8
 
 

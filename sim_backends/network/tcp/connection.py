@@ -163,6 +163,7 @@ class TcpConnection:
         self._on_closed(self._name)
 
     def _log_event(self, event: str) -> None:
+        """Pass the state of the sender to the log."""
         if self._log is None:
             return
         control, round_trips = self._sender.control, self._sender.round_trips

@@ -144,6 +144,7 @@ class TopicDiscovery:
             self._sedp_session(peer, host).reader.on_message(heartbeat)
 
     def _on_announcement(self, host: str, peer: str, *, is_directed: bool) -> None:
+        """Process an announcement of `peer` at `host`; discover the peer if it is new or its lease had expired."""
         if self._wire.now_ns < self._discovery_timing.starts_ns.get(host, 0) or host not in self._participants:
             return
         remote_participant = self._remote_participants.get((host, peer))
@@ -191,6 +192,7 @@ class TopicDiscovery:
         self._wire.transmit(IpPacket(participant, peer or None, TRANSPORT, SPDP_BYTES, key, body))
 
     def _respond(self, host: str, peer: str, count: int) -> None:
+        """Send a response to the announcement of a new participant, and schedule the remaining ones."""
         if count and self._remote_participants[host, peer].is_alive:
             self._announce(host, peer)
             next_ns = self._wire.now_ns + self._discovery_timing.directed_ns

@@ -6,6 +6,7 @@ from sim_backends.network.topics.qos import MS, Qos, RtpsTiming
 from sim_backends.network.topics.rtps import Sample
 
 _GROWTH_PAUSE_NS: Final = 10 * MS
+"""Minimum time between two increases of the high watermark."""
 
 
 class WriterHistory:
