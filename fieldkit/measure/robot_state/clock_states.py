@@ -18,6 +18,7 @@ _MARGIN_S: Final = 0.001
 WRONG_CLOCK: Final = "wrong clock"
 NO_SOURCE: Final = "no time source"
 DISAGREE: Final = "clocks disagree"
+"""Names of marks."""
 
 
 @dataclass(frozen=True)

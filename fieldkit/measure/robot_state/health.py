@@ -23,6 +23,7 @@ THROTTLED_NAME: Final = "vcgencmd"
 
 UNDER_VOLTAGE: Final = "under-voltage"
 THROTTLED: Final = "throttled"
+"""Names of marks."""
 _FLAGS: Final = ("under-voltage", "frequency capped", "throttled", "soft temperature limit")
 """Flags in the order of their bits."""
 _SINCE_BOOT: Final = 16

@@ -30,6 +30,7 @@ SETTINGS: Final = ("channel", "regulatory_domain")
 """Settings of a radio that must not change during a trial."""
 
 BUSY_CHANNEL: Final = "busy channel"
+"""Name of a mark."""
 BUSY_SHARE: Final = 0.2
 """A repeat is marked if others use more than this share of the airtime."""
 
