@@ -53,7 +53,7 @@ def phase(t_ns: int, repeat: str, name: str) -> Json:
 
 
 def rtt(t_ns: int, repeat: str, reply: Reply) -> Json:
-    """Return a message with the schema `RTT`: a reply to ping, printed at `t_ns`. `repeat` is the attempt's folder."""
+    """Return a message with the schema `RTT`: a reply to ping printed at `t_ns`. `repeat` is the attempt's folder."""
     head = {"timestamp": time(t_ns), "repeat": repeat}
     fields = {"seq": reply.seq, "rtt_s": reply.rtt_s, "duplicate": reply.duplicate, "damaged": reply.damaged}
     return {**head, **_present(fields)}
