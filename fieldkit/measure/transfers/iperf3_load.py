@@ -333,7 +333,7 @@ def _transits_ns(load: LoadStreams, sender: Packets, receiver: Packets) -> Itera
     first, arrived_ns = matched.sent.where(matched.first), deliveries.arrivals_ns(matched)
     for mask in load.datagram_masks(first):
         if (np.append(mask, False)[matched.datagram] & matched.match.ambiguous).any():
-            raise EvidenceError("its packets cannot be distinguished, so their arrival times are unknown")
+            raise EvidenceError("packets of the flow cannot be distinguished, so their arrival times are unknown")
         is_complete = mask & (arrived_ns != NO_TIME)
         if is_complete.any():
             order = np.argsort(arrived_ns[is_complete], kind="stable")
