@@ -3,7 +3,7 @@
 The tables have 40 repeats each and 160 conditions in all, with random values of a fixed seed in every column. Each
 round runs `fieldkit aggregate` as a user would, once per number of tables, to show whether the cost grows linearly.
 The peer reads the smallest number of tables in the same round: pandas concatenates and groups them, and scipy
-computes a bootstrap interval per cell and quantity. The benchmark stops if their means and medians differ.
+computes a bootstrap interval per condition and quantity. The benchmark stops if their means and medians differ.
 
 `--rows N` adds one table of N repeats, like the CSV that `fieldkit export` writes for a campaign.
 """
@@ -37,6 +37,7 @@ TABLE: Final = "table.csv"
 ROOT: Final = Path(__file__).resolve().parents[1]
 
 Figures = dict[tuple[tuple[str, ...], str], tuple[float, ...]]
+"""Number of values, mean, median and 95th percentile, by condition and quantity."""
 
 
 @dataclass(frozen=True)

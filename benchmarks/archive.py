@@ -95,7 +95,7 @@ def run_round(archive: Path, work: Path) -> dict[str, Run]:
 
 
 def show(rounds: Sequence[Mapping[str, Run]]) -> None:
-    """Print a table; ratios are medians over the rounds of the ratio in each round."""
+    """Print a table. A ratio is computed in each round, and the median of all rounds is printed."""
     names = list(rounds[0])
     print(
         "| | s, median (lowest to highest) | processor time (s) | peak memory (MB) | time / pandas | time / DuckDB |"
@@ -127,6 +127,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="fieldkit-bench-") as name:
         archive, work = Path(name) / "archive", Path(name)
         write_archive(archive, arguments.trials, arguments.repeats)
+        # Wait until all tables have the minimum age.
         run([sys.executable, "-c", f"import time; time.sleep({AGE_S})"], work / "slept")
         run([sys.executable, "-m", "benchmarks.archive_peers", "write", str(archive)], work / "written")
         load = os.getloadavg()[0]

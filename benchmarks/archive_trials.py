@@ -22,7 +22,10 @@ _PINGS: Final = 10
 _SCALED: Final = ("rtt_min_s", "rtt_median_s", "rtt_mean_s", "rtt_p95_s", "rtt_max_s", "rtt_jitter_s", "delay_s")
 """Columns that are multiplied by a random factor."""
 _KINDS: Final = (*("_los_",) * 7, "evidence", "selfheal", "driveaway")
-"""Seven of ten trials have the procedure los. The plan of an evidence trial declares 42 columns."""
+"""Parts of the names of the stored trials that are copied in turn: seven of ten have the procedure los.
+
+The plan of an evidence trial declares 42 columns.
+"""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Time of an exchange with an external federate: `python -m benchmarks.cosim_exchange [--json]`.
 
-An exchange with a physics simulator is a request without commands and an answer with the states of all agents; an
+A federate is a simulator that the coordinator of the co-simulation advances; an external one is another process. An
+exchange with a physics simulator is a request without commands and an answer with the states of all agents; an
 exchange with a network simulator is a request with these states and an answer without packets. The federate does
 nothing else. The duration of the coordinator's call is measured; the rounds of all transports alternate. The lower
 bound is a plain socket between two Python programs, over which the same number of bytes is sent and received without

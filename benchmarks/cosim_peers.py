@@ -131,7 +131,7 @@ def mosaik_simulator(value: Any) -> Any:  # noqa: ANN401 (a class of mosaik, whi
     import mosaik_api_v3  # noqa: PLC0415 (takes long, and few benchmarks need it)
 
     class Constant(mosaik_api_v3.Simulator):  # type: ignore[misc]
-        last_step: tuple[int, Callable[[], None]] = -1, lambda: None
+        last_step: tuple[int, Callable[[], None]] = -1, lambda: None  # a step, and a function that is called in it
 
         def __init__(self) -> None:
             models = {"Part": {"public": True, "params": [], "attrs": ["output", "input"]}}

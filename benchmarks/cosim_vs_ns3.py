@@ -59,6 +59,7 @@ Peer = Literal["802.11g", "802.11a", "corrected", "ours"]
 PEERS: Final[tuple[Peer, ...]] = ("802.11g", "802.11a", "corrected", "ours")
 """Three variants of ns-3, and the co-simulation."""
 DISTANCES_M: Final = {
+    # 802.11g with the mode g54, or with minstrel's choice of modes (None); in sight (False) or behind the wall (True)
     ("g54", False): (10, 44, 46, 47, 48),
     ("g54", True): (15, 19, 20, 21),
     (None, False): (10, 50, 70, 80, 90),
@@ -71,7 +72,13 @@ Trace = list[tuple[float, float]]
 
 @dataclass(frozen=True)
 class Cell:
-    """A link."""
+    """A link.
+
+    Attributes:
+        mode: Wi-Fi mode of all frames; None for the modes that minstrel selects.
+        wall: True if the wall is between the stations.
+        distance_m: Distance of the stations in metres.
+    """
 
     mode: str | None
     wall: bool

@@ -4,7 +4,7 @@
 
 The first of ten robots sends 100 pings of 64 bytes to the tenth, before and after the tenth moves by 100 m along each
 axis. Each radio and round has a new lab, started by the commands of docs/studies/emane.md. ping prints 64 bytes: 56
-of payload and 8 of ICMP header; with the IP header it is 84. All times are round trips in ms; loss is in percent.
+of payload and 8 of ICMP header; the IP packet has 84 bytes. All times are round trips in ms; loss is in percent.
 """
 
 import argparse

@@ -48,7 +48,7 @@ class CaseFailed(Exception):  # noqa: N818 (it is the result of a case)
 
 
 class Bench:
-    """Runs the programs of the agent against one connection.
+    """Runs programs of the agent, fieldkit's Python program on robots, with one connection to an autopilot.
 
     Args:
         connection: Name of the connection to the autopilot, as in the key `mavlink.connection` of a profile.
@@ -110,7 +110,7 @@ class Bench:
         return f"{high_m:.1f} m high, {far_m:.1f} m far, landed"
 
     def lease_expires(self) -> str:
-        """Stop renewing the orders while the drone is in the air; check that the drone lands."""
+        """Let the last order expire while the drone is in the air; check that the drone lands."""
         with self._flight() as process:
             self._write_order("climb", lease_s=60.0)
             self._wait_for_phase(process, "up")
@@ -167,6 +167,7 @@ class Bench:
         return subprocess.run(argv, capture_output=True, text=True, timeout=60, check=False)
 
     def _write_order(self, what: str, lease_s: float = 120.0) -> None:
+        """Write an order for the flying program. The order is valid for `lease_s` seconds (its lease)."""
         self._orders += 1
         new_file = self._folder / "orders.new"
         new_file.write_text(f"{self._orders} {what} {lease_s:g}\n", encoding="ascii")

@@ -1,12 +1,12 @@
 """802.11n, ac and ax compared with ns-3: `python -m benchmarks.high_throughput_vs_ns3 [--json]`.
 
-It has the same requirements as `radio_vs_ns3`. For all modes, airtimes and packet errors of 1000 bytes are compared.
-Known differences of airtimes are due to ns-3: it does not end the data of short guard intervals at multiples of 4 us
-(19.4.3, 21.4.3), omits VHT-SIG-B (4 us) of frames to one station, and uses 8 us for each HE-LTF at all guard
-intervals. Then goodput with A-MPDU is compared in one mode: for one station at signal-to-noise ratios down to the
-limit of its range; for several stations, also without ns-3's retry limit and BlockAckReq (`bare`: ns-3 3.37 does not
-reset the count of failed aggregates to a receiver after a successful one, and drops a whole aggregate at the seventh
-failure); with RTS; and with access categories.
+Needs ns-3 3.37 and a C++ compiler: `apt-get install libns3-dev g++`. For all modes, airtimes and packet errors of
+1000 bytes are compared. Known differences of airtimes are due to ns-3: it does not end the data of short guard
+intervals at multiples of 4 us (19.4.3, 21.4.3), omits VHT-SIG-B (4 us) of frames to one station, and uses 8 us for
+each HE-LTF at all guard intervals. Then goodput with A-MPDU is compared in one mode: for one station at
+signal-to-noise ratios down to the limit of its range; for several stations, also without ns-3's retry limit and
+BlockAckReq (`bare`: ns-3 3.37 does not reset the count of failed aggregates to a receiver after a successful one, and
+drops a whole aggregate at the seventh failure); with RTS; and with access categories.
 """
 
 import argparse
@@ -29,6 +29,7 @@ from sim_backends.radio.world_channel import WorldChannel
 WIDTHS_MHZ: Final[dict[HighThroughput, tuple[int, ...]]] = {"HT": (20, 40), "VHT": (20, 40, 80), "HE": (20, 40, 80)}
 STREAMS: Final = (1, 2)
 HT20_7: Final = format_modes("HT", "2.4 GHz", 20, 1, 800)[7]
+"""The mode of the goodputs: MCS 7 of 802.11n with one stream in 20 MHz."""
 RATIOS_DB: Final = (40.0, 26.0, 24.5, 24.0, 23.5, 23.0)
 """Signal-to-noise ratios of a single station."""
 STATIONS: Final = (2, 5, 10, 20)
@@ -41,7 +42,10 @@ HE_LTF_NS: Final = {800: 7_200, 1600: 8_000, 3200: 16_000}
 
 
 def mcs_of(mode: WifiMode) -> int:
-    """Return the MCS within one number of streams."""
+    """Return the number of a mode's modulation and coding scheme (MCS), from 0 for each number of streams.
+
+    802.11n itself continues the numbers: 8 to 15 have two streams.
+    """
     return int(mode.name.split("-mcs")[1].split("-")[0]) % (8 if mode.phy_format == "HT" else 100)
 
 
@@ -89,7 +93,10 @@ def airtime_differences(ns3: Ns3) -> dict[str, int]:
 
 
 def error_curves(ns3: Ns3) -> dict[str, list[tuple[float, float, float]]]:
-    """Return per mode of 80 MHz or 40 MHz the SNR in dB and the packet error, of ns-3 and of the radio model."""
+    """Return, for each mode with one stream in 40 MHz, points of the SNR in dB and both packet errors.
+
+    The errors are those of ns-3 and of the radio model. Only modes with a guard interval of 800 ns are compared.
+    """
     curves = {}
     for mode in all_modes():
         if mode.streams == 1 and mode.width_mhz == WIDTHS_MHZ["HT"][-1] and mode.guard_interval_ns == 800:
@@ -133,7 +140,7 @@ def goodput_mbit_s(
         sources = [source for _, _, _, source, _ in wifi.deliveries(now_ns)]
         arrived += len(sources)
         lost_now = sum(counters.lost for counters in wifi.counters().values()) if stations == 1 else 0
-        sources += names[:1] * (lost_now - lost)
+        sources += names[:1] * (lost_now - lost)  # a lost packet of a single station is replaced, too
         lost = lost_now
         for source in sources:
             wifi.send(now_ns, source, source, PAYLOAD_BYTES + 28, "receiver", dscp=dscp or 0)

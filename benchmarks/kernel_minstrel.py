@@ -2,8 +2,8 @@
 
 The program runs in the virtual machine of `minstrel_vs_kernel`, with two radios of mac80211_hwsim in an ad hoc cell.
 One radio sends a frame to the other at fixed intervals. The program is their medium: for each try of a frame it reads
-the probability of an error from the trace. It prints a line for each frame: time in microseconds, stages
-`rate:tries:flags` of the chain, and the number of tries, with `+` if the frame was received.
+the probability of an error from the trace. It prints a line for each frame: time in microseconds, the chain that the
+kernel selected (stages `rate:tries:flags`), and the number of tries, with `+` if the frame was received.
 """
 
 import json

@@ -1,10 +1,11 @@
 """Cost of each layer of the radio model: `python -m benchmarks.layers [--json]`, as root.
 
-First the engine is measured in virtual time, without a medium, while layers are added: processor time per packet of
-64 bytes of UDP payload between two stations, one of which always has packets to send, and its share of the packets'
-air time (above 100 % a saturated channel does not run in real time). Then all layers are measured with more stations,
-which are in range of each other and send to the first one. Then the medium is measured: round trips of ping between
-two namespaces, and their mean without the delays from the model.
+First the radio model alone (the engine) is measured in virtual time, while layers are added: processor time per
+packet of 64 bytes of UDP payload between two stations, one of which always has packets to send, and its share of the
+packets' air time (above 100 % a saturated channel does not run in real time). Then all layers are measured with more
+stations, which are in range of each other and send to the first one. Then the medium (the process that carries
+packets between robots) is measured: round trips of ping between two namespaces, and their mean without the delays
+from the model.
 """
 
 import argparse

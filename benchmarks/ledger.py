@@ -1,10 +1,11 @@
 """Overhead of the ledger in trials of many repeats: `python -m benchmarks.ledger`; needs no root.
 
-The trials have one ping per repeat, with generated evidence instead of robots. The benchmark prints the wall time,
-including disk access, of these operations: storing an attempt (files, journal, row, table, manifest), as the mean
-over all attempts and over the last hundred; opening the trial again as `fieldkit resume` does, which reads all
-evidence; reading the number of finished repeats; and storing the next ten attempts. `--keep FOLDER` keeps the trials
-in that folder, and `--open FOLDER` measures existing trials, also with fieldkit of another checkout (`PYTHONPATH`).
+The ledger stores finished attempts. The trials have one ping per repeat, with generated evidence instead of robots.
+The benchmark prints the wall time, including disk access, of these operations: storing an attempt (files, journal,
+row, table, manifest), as the mean over all attempts and over the last hundred; opening the trial again as `fieldkit
+resume` does, which reads all evidence; reading the number of finished repeats; and storing the next ten attempts.
+`--keep FOLDER` keeps the trials in that folder, and `--open FOLDER` measures existing trials, also with fieldkit of
+another checkout (`PYTHONPATH`).
 """
 
 import argparse

@@ -1,11 +1,12 @@
 """Cost of the medium, compared with a bare veth pair: `python -m benchmarks.medium [--json]`, as root.
 
-It uses two namespaces without robots. Each round measures for each path, in this order: round-trip time at zero delay
-(ping), TCP throughput (iperf3), 64-byte UDP payloads at full rate (iperf3), and the error of a 5 ms delay. For UDP it
-counts the packets at the receiver's interface, and the packets that the receiving program reads; on two cores the
-processor time of that program is the bottleneck. For the delay, a sender writes its send time into a datagram every
-2 ms, and the receiver's kernel records the arrival time by the same clock. The column `bare timer` has the part of
-the error that is due to the machine: the lateness of a 5 ms sleep at the same priority.
+The medium is the process that carries packets between emulated robots. Two namespaces without robots are used. Each
+round measures for each path, in this order: round-trip time at zero delay (ping), TCP throughput (iperf3), 64-byte
+UDP payloads at full rate (iperf3), and the error of a 5 ms delay. For UDP it counts the packets at the receiver's
+interface, and the packets that the receiving program reads; on two cores the processor time of that program is the
+bottleneck. For the delay, a sender writes its send time into a datagram every 2 ms, and the receiver's kernel records
+the arrival time by the same clock. The column `bare timer` has the part of the error that is due to the machine: the
+lateness of a 5 ms sleep at the same priority.
 """
 
 import argparse

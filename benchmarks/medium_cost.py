@@ -1,9 +1,10 @@
 """Processor time of the medium per packet, compared with another version: `python -m benchmarks.medium_cost FOLDER`.
 
-FOLDER is a checkout of the other version, for example by `git worktree add`; the program needs root. Only the process
-of the medium is of that version: the senders are the same. Each round sends datagrams of 64 bytes at a fixed rate
-through both versions in sequence, over fixed links and over the Wi-Fi of the default radio. Processor time does not
-include the time for which the process waited for a processor, so other load has little effect on it.
+The medium is the process that carries packets between emulated robots. FOLDER is a checkout of the other version, for
+example by `git worktree add`; the program needs root. Only the process of the medium is of that version: the senders
+are the same. Each round sends datagrams of 64 bytes at a fixed rate through both versions in sequence, over fixed
+links and over the Wi-Fi of the default radio. Processor time does not include the time for which the process waited
+for a processor, so other load has little effect on it.
 """
 
 import argparse

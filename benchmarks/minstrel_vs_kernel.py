@@ -72,7 +72,7 @@ class SelectedFrame:
         time_ns: Time at which it was sent.
         modes: Mode of each try; None for a rate of 802.11b.
         is_received: True if the last try succeeded.
-        is_sample: True if the first try was a sample.
+        is_sample: True if the first try was a sample, with which minstrel tests another mode.
     """
 
     time_ns: int

@@ -27,7 +27,9 @@ STEPS: Final = 10
 WINDOW_S: Final = 0.01
 STEP_NS: Final = 1_000_000
 START_NS: Final = 1_000_000_000
+"""Time at which the robots have reached constant speeds."""
 BLOCK: Final = 10
+"""Number of windows in a measurement."""
 
 
 class NoPackets:

@@ -47,7 +47,7 @@ def mirror() -> str:
 
 
 def extract_release(release: str, folder: Path) -> None:
-    """Extract libns3-dev of a Debian release and all packages that it needs into `root`, without installing them."""
+    """Extract libns3-dev of a Debian release, and all packages that it needs, into the subfolder `root`."""
     apt, root = folder / "apt", folder / "root"
     for name in ("etc/apt/sources.list.d", "etc/apt/preferences.d", "state/lists/partial", "cache/archives/partial"):
         (apt / name).mkdir(parents=True, exist_ok=True)

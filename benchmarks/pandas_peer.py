@@ -21,7 +21,7 @@ RESAMPLES: Final = 999
 
 
 def main() -> None:
-    """Print mean, median, 95th percentile and a bootstrap interval of every quantity of every cell."""
+    """Print mean, median, 95th percentile and a bootstrap interval of every quantity under every condition."""
     tables = sorted(Path(sys.argv[1]).glob("*/trial.csv"))
     rows = pd.concat([pd.read_csv(path, dtype={"distance_m": float}) for path in tables], ignore_index=True)
     results = []

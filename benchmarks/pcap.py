@@ -65,7 +65,9 @@ READ: Final = STREAM.replace("sum(len(part.packets) for part in pcap.stream(", "
 """The same program, but it keeps all packets in columns."""
 
 Peer = Callable[[Path, Path], int]
+"""Returns the number of lost packets from the captures of sender and receiver."""
 Key = tuple[int, int]
+"""Identification and offset of an IP packet."""
 
 
 def fragments() -> Iterator[bytes]:

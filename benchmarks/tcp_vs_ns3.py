@@ -1,9 +1,9 @@
 """TCP of the co-simulation compared with ns-3's, with equal losses on a cable: `python -m benchmarks.tcp_vs_ns3`.
 
-It has the same requirements as `radio_vs_ns3`. One station sends to another at full rate. The cable loses packets
-with given numbers, so that all differences are due to TCP. With fixed loss patterns it prints the congestion windows
-after the losses; with random losses, which are equal for all peers, it prints the goodputs. `--events PATTERN
-CONTROL` prints the events around the first difference between ns-3 and fieldkit.
+Needs ns-3 3.37 and a C++ compiler: `apt-get install libns3-dev g++`. One station sends to another at full rate. The
+cable loses packets with given numbers, so that all differences are due to TCP. With fixed loss patterns it prints the
+congestion windows after the losses; with random losses, which are equal for all peers, it prints the goodputs.
+`--events PATTERN CONTROL` prints the events around the first difference between ns-3 and fieldkit.
 """
 
 import argparse
@@ -30,6 +30,7 @@ SECONDS: Final = 10.0
 SEEDS: Final = 40
 MAX_PACKETS: Final = 20_000
 AT_S: Final = (0.2, 0.3, 0.5, 1.0, 2.0, 5.0)
+"""Times at which the congestion window is printed."""
 SEGMENT_BYTES: Final = TcpOptions().segment_bytes
 
 

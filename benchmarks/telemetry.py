@@ -33,6 +33,7 @@ from tests.helpers.telemetry_devices import ENTERPRISE, json_server, modem_bus, 
 
 SHELLS: Final = {"bash": ("bash",), "dash": ("dash",), "busybox ash": ("busybox", "sh")}
 SLOWER: Final = (1, 4, 8)
+"""Numbers of runs of `iw` per call of the sampler."""
 
 _STATION: Final = """\
 Station f0:99:bf:0e:86:98 (on wlan0)

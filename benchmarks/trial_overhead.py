@@ -1,10 +1,11 @@
 """Overhead of fieldkit per repeat, compared with a script: `python -m benchmarks.trial_overhead [--json]`, as root.
 
 Both run the same steps on the same emulated robots, in alternating repeats: create a folder and log the host's state
-on both robots, record, capture at both ends, send the bag, drain, ping, log the state again, fetch all files and
-check their hashes. The overhead is the wall time of a repeat minus the time of the tools: the recorder's process, the
-time from the start of the sending nc to the end of the listening one, and the process of ping. These times are from
-kernel events (`benchmarks.lifetimes`) for both peers. Each repeat checks that both run the same command lines.
+on both robots, record, capture at both ends, send the bag, wait until the captures are complete, ping, log the state
+again, fetch all files and check their hashes. The overhead is the wall time of a repeat minus the time of the tools:
+the recorder's process, the time from the start of the sending nc to the end of the listening one, and the process of
+ping. These times are from kernel events (`benchmarks.lifetimes`) for both peers. Each repeat checks that both run the
+same command lines.
 
 Both peers are measured over control links without delay, and over control links with a round trip of 100 ms, as on
 bad Wi-Fi. On the latter, sequential round trips are counted too.

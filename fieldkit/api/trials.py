@@ -1,4 +1,4 @@
-"""Trials in memory: their repeats, cells and packets as Arrow tables."""
+"""Trials in memory: their repeats, cells (the repeats of one condition) and packets as Arrow tables."""
 
 import math
 import warnings

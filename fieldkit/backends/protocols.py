@@ -281,7 +281,10 @@ class Attended(Protocol):
 CLOCK: Final = "clock"
 """Key in `Simulating.simulators` of the simulator that provides the clock."""
 INSTRUCTIONS: Final = "instructions"
-"""A clock that counts the instructions of an emulated processor; differences of its times are not real durations."""
+"""Description of the simulator `CLOCK` if its clock counts the instructions of an emulated processor.
+
+Differences of its times are then not real durations.
+"""
 
 
 class Backend(Protocol):

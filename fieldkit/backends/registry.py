@@ -1,4 +1,4 @@
-"""Installed backends by name, and the cast that a site file gives them."""
+"""Installed backends by name, and the cast (the robot in each role) that a site file defines."""
 
 from collections.abc import Iterable, Mapping
 from contextlib import nullcontext
@@ -29,7 +29,7 @@ def load_backend(name: str, site: Site | None, document: Document | None) -> Bac
 
 
 LinkAddresses = Mapping[str, Mapping[str, str]]
-"""Address on each further link by the link's name, by the robot's name."""
+"""For each robot, by its name, the address on each of its further links, by the name of the link."""
 
 
 def cast_of(
@@ -39,7 +39,7 @@ def cast_of(
     addresses: Mapping[str, str],
     link_addresses: LinkAddresses = MappingProxyType({}),
 ) -> Cast:
-    """Return the cast that a site file gives for a topology.
+    """Return the cast that a site file defines for a topology.
 
     Args:
         site: The site file.

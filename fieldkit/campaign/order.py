@@ -47,6 +47,7 @@ DEFAULT_WALK: Final = 3.0
 
 _CARRIED_ROBOTS: Final = {Topology.MASTER: 2, Topology.MASTERLESS: 1}
 _SWAPS_PER_TRIAL: Final = 50
+"""Number of random swaps that are tried, per trial."""
 _ROUNDING_M: Final = 1e-6
 
 

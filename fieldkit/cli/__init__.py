@@ -103,8 +103,8 @@ def _run_with_error_messages(top: Parser, argv: Sequence[str] | None, options: h
         _show_error(str(error))
         return error.exit_code
     except BrokenPipeError:
-        # The reader of our output has exited, so an error message cannot be delivered. Python writes the rest of the
-        # buffer when it exits, and would change the exit code.
+        # The reader of our output has exited, so an error message cannot be delivered. At its exit Python writes the
+        # rest of the buffer. Without this redirection the write would fail and change the exit code.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.stderr.close()
         return 0

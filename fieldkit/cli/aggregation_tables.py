@@ -27,7 +27,10 @@ from fieldkit.trial.stored import sources
 from fieldkit.trial.stored.sources import Sources
 
 _AdditionalRepeats = Sequence[Mapping[str, int]]
-"""For each cell, the number of additional repeats per quantity; empty unless `--width` is given."""
+"""For each cell (the repeats of one condition), the number of additional repeats per quantity.
+
+Empty unless `--width` is given.
+"""
 
 _FOR_PROGRAMS: Final = MappingProxyType({"csv": result_tables.to_csv, "json": result_tables.to_json})
 _FOR_PAPERS: Final = MappingProxyType({"markdown": paper_tables.to_markdown, "latex": paper_tables.to_latex})
@@ -73,7 +76,7 @@ def show(arguments: argparse.Namespace) -> int:
     }
     mixture_names = {column.name for column in data.columns if plain_name(column.name) in MIXTURE_COLUMNS}
     repeats = data.read({*condition_columns, *needed_names, *mixture_names, "started_utc_ns"})
-    for mixture in mixtures(repeats, condition_columns):
+    for mixture in mixtures(repeats, condition_columns):  # cells that mix repeats with different settings
         show_note(mixture.removesuffix("."))
     cells = aggregate(repeats, condition_columns, quantities=quantities, words=text_columns)
     additional = additional_repeats_by_cell(cells, widths) if widths else ()
@@ -133,6 +136,7 @@ def _parse_width(text: str, quantities: Sequence[Quantity]) -> tuple[str, float]
     other_units = [unit for unit in units if unit not in PER_UNIT]
     unit = next((unit for unit in (*PER_UNIT, *other_units) if symbol in symbols(unit)), None)
     if unit is None:
+        # Raises an error that names the valid units if the number or the unit is invalid.
         parse_quantity(text, {symbol: 1.0 for unit in (*PER_UNIT, *other_units) for symbol in symbols(unit)}, "width")
         raise ConfigurationError(f"--width: {text!r} is not a width", remedy=_WIDTH_REMEDY)
     width = parse_amount(text, unit, "width")
@@ -224,7 +228,10 @@ def _print_table(
     *,
     words: int = 0,
 ) -> None:
-    """Print a row per cell. Key columns that all cells share go into the title. The last `words` columns are text."""
+    """Print a row per cell. The last `words` columns are text.
+
+    A condition column with the same value in all cells is shown in the title instead.
+    """
     differing_columns, common = wording.varying_and_common(condition_columns, cells)
     full_title = ", ".join([title, *dict.fromkeys(wording.key(cells[0], name) for name in common)])
     head = [*differing_columns, *figures[0]]

@@ -79,7 +79,10 @@ def read(arguments: argparse.Namespace) -> Sides:
 
 
 def _columns_by_factor(run: Sources) -> list[frozenset[str]]:
-    """Return the columns of each factor of a sweep: its values as in the command, and its values as numbers."""
+    """Return the columns of each factor (a setting that a sweep varies).
+
+    One column has its values as in the command, and one has them as numbers.
+    """
     return [frozenset(names) for names in run.sweep_columns.items()]
 
 

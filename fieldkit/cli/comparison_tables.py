@@ -50,7 +50,10 @@ def show(arguments: argparse.Namespace) -> int:
 
 
 def _marks_remedy(comparison: Comparison) -> str:
-    """Return the option that excludes marked repeats; empty if marks are not a reason for the refusal."""
+    """Return the option that excludes repeats with marks (conditions that can explain a difference).
+
+    Empty if marks are not a reason for the refusal.
+    """
     has_marks = any(refusal.what.startswith(f"{MARKS}, ") for refusal in comparison.refusals)
     return f""", or exclude marked repeats: --where '{MARKS} == "{NO_MARKS}"'""" if has_marks else ""
 

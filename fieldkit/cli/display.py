@@ -28,7 +28,9 @@ from fieldkit.core.model import Verdict
 from fieldkit.core.text import json_text, sanitized
 
 _PLAIN_WIDTH: Final = 160
+"""Width of lines in a file or a pipe, in columns."""
 _RULE: Final = " ─"
+"""Start of the line below the head of a table."""
 
 
 class _Output(Console):
@@ -251,10 +253,7 @@ def _serialize(sink: Sink) -> Sink:
 
 
 def event_text(event: Event, width: int | None = None) -> Text | None:
-    """Return the displayed text of an event, or None if only the live line shows it.
-
-    Raises the same errors as `event_words`.
-    """
+    """Return the displayed text of an event, or None if only the live line shows it."""
     parts = event_words(event, width)
     return _sanitized(Text.assemble(*((add_options(text), style) for text, style in parts))) if parts else None
 

@@ -33,8 +33,10 @@ def interruptible() -> Iterator[Stop]:
     system may kill this process before the repeat has finished. Later signals are ignored, because the clean-up that
     follows has deadlines.
 
-    A thread gives the order. It receives signals through a file descriptor (`signal.set_wakeup_fd`), even while the
-    main thread cannot run a handler.
+    `KeyboardInterrupt` is delayed while the trial writes files that must not be left incomplete (`Stop.saving`).
+
+    A thread gives the order to stop. It receives signals through a file descriptor (`signal.set_wakeup_fd`), even
+    while the main thread cannot run a handler.
     """
     stop = Stop()
     stopping = False

@@ -1,9 +1,9 @@
 """Parse command lines, and list the commands of installed packages by their entry points.
 
-A usage error is raised like every other error; it suggests a similar word if there is one. A package is imported
-when its command is used. `NAME = "package.module:function"` names a function that gets the command's `Parser` and
-declares the arguments of the command, as `add` does in the modules of `fieldkit.cli.commands`. It must set the
-default `run` to `package.module:function`, the function that runs the command.
+A usage error is raised like every other error; it suggests a similar word if there is one. A package is imported when
+its command is used. An entry point `NAME = "package.module:function"` names a function that gets the command's
+`Parser` and declares the arguments of the command, as `add` does in the modules of `fieldkit.cli.commands`. It must
+set the default `run` to `package.module:function`, the function that runs the command.
 """
 
 import argparse
@@ -164,7 +164,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def add_plugin_commands(commands: Commands) -> None:
-    """Add a parser for each command. Its arguments are declared at first use."""
+    """Add a parser for each command of another package. Its arguments are declared at first use."""
     for name, targets in sorted(plugin_targets().items()):
         if name in commands.choices:
             continue  # a command of fieldkit

@@ -16,6 +16,7 @@ CONDITION: Final = "procedure,scenario,topology,backend,distance,distance_m,prot
 """Equal to `analysis.quantities.DEFAULT_BY`; a test compares them."""
 
 _MAX_DIGITS: Final = 15
+"""Maximum number of digits of a whole number. A float represents all numbers of this length exactly."""
 
 _PROTOCOL_HELP: Final = "may be given more than once (default: the procedure's)"
 

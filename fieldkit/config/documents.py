@@ -138,6 +138,7 @@ _OTHER_LINE_ENDS: Final = frozenset("\r\N{NEXT LINE}\N{LINE SEPARATOR}\N{PARAGRA
 _Dumper.add_representer(str, _Dumper.represent_text)
 
 
+# The core schema of YAML 1.2: for each tag, the pattern of its values and their possible first characters.
 _CORE_SCHEMA: Final = {
     "null": (r"~|null|", ["~", "n", ""]),
     "bool": (r"true|false", ["t", "f"]),

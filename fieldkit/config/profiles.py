@@ -12,7 +12,7 @@ from fieldkit.config.wifi_phy import WifiPhy, check_standard
 from fieldkit.core import plugins
 
 TELEMETRY: Final = "telemetry"
-"""Key of the section with sources of the state of a radio without `iw` (`fieldkit.telemetry`)."""
+"""Key of the section that lists telemetry sources, which report the state of a radio without `iw`."""
 
 RECORD_PLACEHOLDERS: Final = frozenset({"duration_s", "name", "topics"})
 

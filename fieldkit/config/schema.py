@@ -1,7 +1,7 @@
 """Load, validate and freeze YAML and JSON. Errors in YAML contain file, line and the most similar valid key.
 
-This is the only module that imports pydantic. Profiles, procedures, site files and back-end options are subclasses of
-`Strict`, loaded by `load`.
+This is the only module that imports pydantic. Profiles, procedures, site files and options of backends are subclasses
+of `Strict`, loaded by `load`.
 """
 
 from collections.abc import Callable, Iterable, Mapping

@@ -28,6 +28,7 @@ Result = TypeVar("Result")
 
 _CONNECT_S: Final = 15.0
 _REFRESH_S: Final = 1.0
+"""Minimum time between two queries of the number of workers."""
 
 
 class ClusterExecutor(WorkerExecutor):

@@ -24,7 +24,7 @@ Value = int | float | bool | str
 
 _TYPES: Final = {"text": str, "hash": str, "bool": bool, "count": int, "B": int, "ns": int}
 _EXACT_INTEGERS: Final = (0, 2**53)  # a float represents these exactly, so every program reads them correctly
-_MAX_TIME_S: Final = 1e10
+_MAX_TIME_S: Final = 1e10  # about 300 years
 _UNIT_BOUNDS: Final[Mapping[str, tuple[float, float]]] = {
     "count": _EXACT_INTEGERS,
     "B": _EXACT_INTEGERS,

@@ -171,7 +171,7 @@ def _lock_with_retries(lock: int, file: str, tries: int) -> None:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             if not tries_left:
-                raise NameHeldError("another process holds it", where=file) from error
+                raise NameHeldError("another process holds this lock", where=file) from error
             time.sleep(_RETRY_INTERVAL_S)
         else:
             return

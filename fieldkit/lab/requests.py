@@ -202,6 +202,7 @@ def _request(folder: LabFolder, request: str, read: Callable[[bytes], Answer]) -
     with _lab_connection(folder) as lab:
         try:
             lab.sendall(f"{request}\n".encode())
+            # The lab closes the connection after its answer, so an empty chunk is the end.
             return read(b"".join(iter(lambda: lab.recv(1 << 16), b"")))
         except (OSError, ValueError) as error:
             raise LinkError(f"the lab does not answer: {error}", remedy="fieldkit lab down") from error

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 _FIXTURES: Final = frozenset({"lab", "robots", "trial"})
 _KEEPER: Final = pytest.StashKey[Any]()  # the `EvidenceKeeper`
-_STAMP: Final = pytest.StashKey[str]()
-_RUN: Final = "fieldkit_run"
+_STAMP: Final = pytest.StashKey[str]()  # the name of the folder of this run, which is its start time
+_RUN: Final = "fieldkit_run"  # key of this folder name in the input of a worker of pytest-xdist
 
 OPTIONS: Final[dict[str, tuple[str, str, tuple[str, ...] | None]]] = {
     "backend": ("NAME", "backend of the robots: emulated, field or another; default: that of the site file", None),

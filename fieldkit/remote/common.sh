@@ -42,9 +42,10 @@
 #   job.sh abort WHO                     break the lock, print `held WHO WHAT` or `free`, stop all jobs of all trials and list
 #                                        them as `left` does; needs no installed script and no free disk space; then list the
 #                                        programs that still land a drone: `lands DIR/.jobs/NAME STATE`, as `motion_states`
-#   job.sh halt_motion WHO [DIR]         stop all programs of the agent that drive or fly this robot, or guard a drone, and
-#                                        the trial that holds the lock; with DIR only the programs of DIR, without the lock;
-#                                        then list them: DIR/.jobs/NAME STATE, as `motion_states`
+#   job.sh halt_motion WHO [DIR]         stop all programs of the agent (fieldkit's Python program on robots) that drive or
+#                                        fly this robot, or guard a drone, and the trial that holds the lock; with DIR only
+#                                        the programs of DIR, without the lock; then list them: DIR/.jobs/NAME STATE, as
+#                                        `motion_states`
 #   job.sh motion_states DIR/.jobs/NAME...
 #                                        list the states: `stationary`, `landed`, `land` or `return` (in progress), `ended`,
 #                                        `silent`, or `alarm` (a drone may be in the air)

@@ -18,6 +18,7 @@ from fieldkit.remote.sockets import Connect, Timing
 T = TypeVar("T")
 
 _POLL_S: Final = 0.2
+"""Interval between checks whether packets may be sent again, because the measurement may end early."""
 
 
 class Connection:
@@ -180,7 +181,11 @@ class Connection:
             self._on_notice(f"{self.address.robot}: the link is lost; trying again for {duration}")
 
     def _wait_for_end_of_silence(self, error: Exception, close_event: threading.Event, *, notify: bool) -> float:
-        """Wait until packets may be sent again; return the maximum of this time that was expected, in seconds."""
+        """Wait until packets may be sent again.
+
+        Returns:
+            The longest wait that was expected at its start, in seconds.
+        """
         initial_s = self._silence_s()
         if initial_s and notify:
             wait = format_duration(initial_s)
@@ -217,7 +222,7 @@ class Connection:
         """Send no packets on the link during the body; see `Shell.silence`.
 
         Keepalive probes are not sent either, so the link is not closed for lack of answers during this time. The
-        body starts after the channels that are being opened are open.
+        body starts when no channel is being opened any more.
         """
         if not self._crosses_radio:
             yield

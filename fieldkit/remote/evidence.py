@@ -9,6 +9,7 @@ from fieldkit.remote.script import CALL, HOME, REPLY_S, call, require_success, w
 from fieldkit.remote.shell import Shell
 
 MIN_FREE_KIB: Final = 100 * 1024
+"""Free disk space that an attempt needs, unless its caller requires another amount."""
 
 
 def begin_command(
@@ -23,6 +24,7 @@ def begin_command(
 ) -> tuple[str, ...]:
     """Return the command that creates `folder` and records the state of the host in it; see `begin`."""
     lock = "-" if token is None else word(token)
+    # The script reads its arguments by position, so an empty word stands for a missing `old_folder` before sources.
     optional_words = (old_folder or "", *map(quote, sources)) if sources else ((old_folder,) if old_folder else ())
     return (*CALL, "begin", folder, role, interface, str(required_kib), lock, *optional_words)
 

@@ -68,6 +68,7 @@ print_job_ends() {
 
 read_free_space() { # set free to the free disk space in KiB
     table=$(df -Pk "$base")
+    # The words of the last line: device, size, used, free.
     set -- ${table##*
 }
     free=${4-}

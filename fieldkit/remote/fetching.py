@@ -36,7 +36,7 @@ _MIN_HASH_BYTES_PER_S: Final = 2e6
 """Minimum rate of sha256sum on a robot: a tenth of the rate on a Raspberry Pi Zero."""
 
 _MAX_ARCHIVE_BYTES: Final = 2 * PIECE_BYTES
-"""Maximum size of the archive: the small files with their headers, and the lists."""
+"""Maximum size of the archive: the small files with their headers, and the lists of hashes and of large files."""
 _CHUNK_BYTES: Final = 1 << 20
 _LIST_CHUNKS: Final = 2
 """Maximum length of the lists of hashes and of sizes, in chunks of 64 KiB."""

@@ -10,7 +10,7 @@ from fieldkit.core.errors import ConfigurationError
 
 @dataclass(frozen=True)
 class Address:
-    """Address of a robot, for messages; a `Connect` opens the connection.
+    """Address of a robot, for messages. A function of type `sockets.Connect` opens the connection.
 
     Attributes:
         robot: Its name in the lab.

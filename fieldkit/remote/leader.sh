@@ -35,8 +35,9 @@ supervise() { # run a job as the leader of its session and process group; $1 is 
     { identify $$ && echo "$identity" >"$meta/pid"; } || exit "$GENERAL" # without a record it could not be stopped
     # `end` writes .ended before it lists the jobs, and this job has written its pid, so one of the two detects the other.
     [ ! -e "${meta%/.jobs/*}/.ended" ] || exit "$GENERAL"
-    # The watchdog does not receive the final SIGTERM if it arrives before the watchdog has reset its traps. It therefore
-    # ends if the exit code was written already or, because the folder may have been deleted, if the leader has exited.
+    # This subshell is the watchdog, which stops the job at its time limit. It does not receive the final SIGTERM if the
+    # signal arrives before the watchdog has reset its traps. It therefore ends if the exit code was written already or,
+    # because the folder may have been deleted, if the leader has exited.
     (trap - INT TERM HUP
         [ -s "$meta/exit" ] || ! kill -0 $$ 2>/dev/null || { await_ready; sleep_for "$limit"; printf '' >"$meta/limit"; kill -INT 0; sleep 5; kill -KILL 0; }) \
         </dev/null >/dev/null 2>&1 9>&- &

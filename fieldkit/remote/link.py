@@ -137,7 +137,7 @@ class Link:
         timing: Timeouts of the connection.
 
     Attributes:
-        awaited_action: The next action of the server, for messages: `FIRST_ACTION`, or `send its SSH banner`.
+        awaited_action: The next action of the server, for messages, for example `send its SSH banner`.
     """
 
     FIRST_ACTION: Final = "accept the connection"

@@ -1,4 +1,5 @@
-# Stop the motion programs of this robot: the programs of the agent that drive it, fly it, or guard a drone.
+# Stop the motion programs of this robot: the programs of the agent (fieldkit's Python program on robots) that drive it, fly
+# it, or guard a drone, which means that they land the drone if the program that flies it stops.
 
 is_motion_program() { # true if the job in $1 is a motion program; sets program to `drive` or `fly`
     line=

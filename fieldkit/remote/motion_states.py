@@ -12,7 +12,7 @@ class MotionState(StrEnum):
         NOTHING: No program of fieldkit moves it; nothing is sent to it.
         STATIONARY: Its odometry shows no motion.
         LANDED: Its motors have stopped.
-        ENDED: The program has ended without a report about the robot: it had not started to move it.
+        ENDED: The program has ended without a report about the robot, because it had not started to move the robot.
         LAND: A drone is landing at its position.
         RETURN: A drone is returning, and will then land.
         SILENT: The program received a signal and has not confirmed anything. A driving program was killed.

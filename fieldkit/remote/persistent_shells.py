@@ -296,7 +296,7 @@ class _Stream:
     Attributes:
         has_started: Whether the start mark has arrived.
         output: Unread output of the command.
-        code: Its exit code; None before the end mark has arrived.
+        code: Exit code of the command; None before the end mark has arrived.
     """
 
     def __init__(self, nonce: bytes) -> None:

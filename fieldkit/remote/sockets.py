@@ -17,7 +17,7 @@ class Timing:
             This timeout is shorter, because an unused link may have been lost earlier.
         probe_s: Silence after which the kernel sends keepalive probes, in whole seconds.
         dead_s: Age of unacknowledged data at which the connection is lost. With SSH keepalives alone, paramiko
-            reported a dead connection as active for more than 25 s (field notes).
+            reported a dead connection as active for more than 25 s in field tests.
         reply_s: Minimum remaining time of a repeated command.
         pause_s: First pause between attempts to reconnect; it is doubled after each attempt, up to `probe_s`.
     """

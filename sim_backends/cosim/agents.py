@@ -71,6 +71,7 @@ class _PresentStates(Mapping[str, State]):
 
 
 _MAX_WAKES_AT_ONE_TIME: Final = 1000
+"""Number of wakes of a program without an advance of time; with more, the program has failed."""
 _NO_LIFETIMES: Final[Mapping[str, Lifetime]] = MappingProxyType({})
 _CHANGE: Final = ""
 """Name of the queue entry for the next beginning or end of a lifetime; it sorts before all names of agents."""
@@ -120,6 +121,7 @@ class Agents:
         self._names = frozenset(programs) - self.absent.keys()
         self._states: Mapping[str, State] = {}
         self._names_outside_lifetime = frozenset(self.absent)
+        # In descending order, so that the next change is the last item.
         self._changes_ns = sorted({at_ns for lifetime in lifetimes.values() for at_ns in lifetime.changes_ns})[::-1]
         self._states_ns = 0
         self._received: dict[str, list[ReceivedDatagram]] = {}
@@ -131,7 +133,9 @@ class Agents:
         self._schedule_change()
 
     def states(self, now_ns: int) -> Mapping[str, State]:
-        """Return the states of the agents that are present at the last physics step that is not after `now_ns`.
+        """Advance the bodies to `now_ns`, and return the states of the agents that are present then.
+
+        These are the states at the last physics step at or before `now_ns`.
 
         Raises:
             FederateError: The physics federate failed, did not answer in time, or returned no state for an agent that
@@ -221,7 +225,7 @@ class Agents:
         """Return the states that the network uses in a window, for all agents that were present in the window.
 
         An agent that appeared in the window has its state at the end of the window. An agent that disappeared has its
-        last state.
+        last state. Each call includes only the changes since the previous call.
 
         Args:
             begin: The states that the sync policy selects for the window: those at its beginning or at its end.
@@ -355,7 +359,9 @@ class Agents:
         return names
 
     def _wake(self, now_ns: int, received_by_name: Mapping[str, Sequence[ReceivedDatagram]]) -> list[SentDatagram]:
+        """Wake the programs of these agents, and return the datagrams that they send."""
         states = self.states(now_ns)
+        # `_CHANGE` is not an agent: its queue entry only causes the states at this time to be read.
         if self.absent or _CHANGE in received_by_name:
             received_by_name = {
                 name: received_by_name[name] for name in received_by_name if name in states and name in self.programs

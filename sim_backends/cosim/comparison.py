@@ -1,4 +1,8 @@
-"""Compares a run with the exact reference of the same scenario, packet by packet (the coupled errors)."""
+"""Compares a run, packet by packet, with the exact reference.
+
+The exact reference is a run of the same scenario and seed with the policy `event_driven`, which exchanges all data
+without delay.
+"""
 
 import math
 from collections.abc import Callable, Sequence
@@ -34,7 +38,7 @@ class Errors:
     """The errors and the cost of a run. A value for which there are no packets is nan.
 
     Attributes:
-        packets: Number of packets whose fate is decided in both runs.
+        packets: Number of packets that arrived or were dropped in each of the two runs.
         delivery_error_s: Absolute difference of delivery times, over packets that arrived in both runs.
         position_error_m: Largest error, at the time when a packet was sent, of the relative position that the network
             assumed for two of the agents that transmit, forward or interfere in this run. The true positions are the

@@ -96,6 +96,7 @@ class Coordinator:
         self._ledger = PacketLedger(
             self.run.fates, agents.physics.step_ns, measured_agents, has_fixed_emitters=bool(emitters_m)
         )
+        # Agents whose positions affect packets: they send, receive, forward or interfere.
         self._active = in_pairs | {*other_agents}
         self._pairs, self._other_agents = tuple(pairs), other_agents
         self._deferred: Sequence[SentDatagram] = ()
@@ -144,12 +145,13 @@ class Coordinator:
         try:
             self._run_windows(to_ns, max_windows, None if progress is None else rate_limited(progress))
         finally:
-            self._wall_time.window()
+            self._wall_time.end_window()
             self.run.digest = self._digest.hexdigest()
         return self.run
 
     def fork(self) -> "Coordinator":
         """Return an independent copy of this co-simulation in its current state, without an observer."""
+        # The second argument replaces the observer by None in the copy.
         return copy.deepcopy(self, {id(self._observer): None})
 
     def _next_wake_ns(self) -> int | None:
@@ -255,7 +257,7 @@ class Coordinator:
         begin = situation.states
         # The window ends when an agent appears or disappears, because the set of states for the network then changes.
         to_ns = min(to_ns, agents.next_change_ns() or to_ns)
-        # A network without dead reckoning assumes that agents do not move.
+        # A network that does not extrapolate velocities (dead reckoning) assumes that agents do not move.
         moving = begin if self._extrapolates else {name: State(state.position_m) for name, state in begin.items()}
         step_ns = situation.physics_step_ns
         # The states are from the last physics step, which may be before the beginning of the window.
@@ -358,7 +360,7 @@ class Coordinator:
         """
         decided_fates, agents, ledger = [], self._agents, self._ledger
         for arrival in arrivals:
-            if ledger.is_withdrawn(arrival.packet_id):
+            if ledger.discard_withdrawn(arrival.packet_id):
                 continue
             fate, payload = ledger.arrive(arrival, begin_ns, last_ns)
             packet = fate.packet
@@ -372,7 +374,7 @@ class Coordinator:
             agents.deliver(packet.destination, received_datagram)
             decided_fates.append(fate)
         for drop in drops:
-            if ledger.is_withdrawn(drop.packet_id):
+            if ledger.discard_withdrawn(drop.packet_id):
                 continue
             fate = ledger.drop(drop)
             if agents.absent and agents.is_absent((fate.packet.source, fate.packet.destination), end_ns):
@@ -395,7 +397,7 @@ class Coordinator:
         end_ns, states = self.situation.now_ns, self.situation.states
         if self._observer is not None:
             decided_by = getattr(self.policy, "decided_by", "")
-            wall_s = self._wall_time.window()
+            wall_s = self._wall_time.end_window()
             self._observer.window(
                 Window(begin_ns, end_ns, decided_by, entered_fates, decided_fates, states, assumed_states, wall_s)
             )

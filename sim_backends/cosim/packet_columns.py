@@ -31,12 +31,13 @@ _TEXTS: Final[dict[str, Callable[[Fate], str]]] = {
 
 
 def columns(run: Run) -> dict[str, NDArray[Any]]:
-    """Return one array per column, with one row per packet in the order in which the packets entered the network.
+    """Return one array per column, with one value per packet in the order in which the packets entered the network.
 
     `flow`, `source`, `destination`, `protocol` and `reason` are texts; `reason` is the reason why the packet never
     arrived, and is empty if it arrived or is under way. `number`, `size_bytes` and the times `sent_ns`, `enters_ns`,
     `arrived_ns`, `counted_ns` and `late_ns`, in nanoseconds of simulated time, are 64-bit integers; a missing time is
-    `NEVER`.
+    `NEVER`. An arrival counts for the receiver from `counted_ns`. If the receiver's simulated time is then already
+    later, `late_ns` is the difference; otherwise it is 0.
     """
     fates = list(run.fates.values())
     texts = {name: np.array([value_of(fate) for fate in fates], dtype=np.str_) for name, value_of in _TEXTS.items()}
@@ -48,7 +49,7 @@ def columns(run: Run) -> dict[str, NDArray[Any]]:
 
 
 def round_trips_s(run: Run, flow: str) -> NDArray[np.float64]:
-    """Return the round-trip time of each request of a ping in order; nan for requests without a reply.
+    """Return the round-trip time of each request of a ping in the order of requests; nan for a missing reply.
 
     Args:
         run: The run.

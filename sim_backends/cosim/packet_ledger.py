@@ -109,7 +109,9 @@ class PacketLedger:
         assumed_states: Mapping[str, State],
         absences: Mapping[str, AgentAbsence] | None = None,
     ) -> Fate:
-        """Record a datagram as a packet that enters the network; if its source or destination is absent, drop it.
+        """Record a datagram as a packet that enters the network, and return its fate.
+
+        If its source or destination is absent, the packet is dropped.
 
         Args:
             sent_datagram: The datagram, as its program sent it.
@@ -174,7 +176,10 @@ class PacketLedger:
         return fate
 
     def withdraw(self, names: Container[str]) -> list[Fate]:
-        """Drop all packets from or to some agents that are under way, and return their fates."""
+        """Drop all packets under way from or to these agents, and return their fates.
+
+        The network does not know of this, and may report these packets later (`discard_withdrawn`).
+        """
         packet_ids = [
             packet_id
             for packet_id, (fate, _) in self._under_way.items()
@@ -186,8 +191,8 @@ class PacketLedger:
             fate.reason = ABSENT
         return fates
 
-    def is_withdrawn(self, packet_id: int) -> bool:
-        """Return True if a packet was withdrawn, but only once: a second call for the same packet returns False."""
+    def discard_withdrawn(self, packet_id: int) -> bool:
+        """Return True if a packet was withdrawn, and forget it, because the network reports each packet only once."""
         if packet_id not in self._withdrawn_ids:
             return False
         self._withdrawn_ids.remove(packet_id)
@@ -226,6 +231,7 @@ class PacketLedger:
         return fate
 
     def _end(self, packet_id: int) -> tuple[Fate, Any]:
+        """Remove a packet from the packets under way, and return its fate and payload."""
         try:
             return self._under_way.pop(packet_id)
         except KeyError:

@@ -14,7 +14,9 @@ Point = tuple[float, float]
 """Metres east and north, or typographic points (1/72 inch) from the lower left corner of the figure."""
 
 _FLOOR_M: Final = 0.01
-"""A shape whose lower side is at most this high is on the ground; shorter paths have no direction of travel."""
+"""A shape whose lower side is at most this high is on the ground."""
+_SHORTEST_ARROW_M: Final = 0.01
+"""A path that extends less far than this has no direction of travel."""
 _ARROW_SHARE: Final = 0.04
 """Length of an arrow, as a share of the diagonal of the rectangle that the path covers."""
 
@@ -104,7 +106,7 @@ def direction_arrow(path_m: Sequence[Point]) -> tuple[Point, Point] | None:
     extent_m = math.hypot(*(max(axis) - min(axis) for axis in zip(*path_m, strict=True)))
     for from_e, from_n in reversed(path_m):
         distance_m = math.dist((from_e, from_n), path_m[-1])
-        if distance_m >= max(_ARROW_SHARE * extent_m, _FLOOR_M):
+        if distance_m >= max(_ARROW_SHARE * extent_m, _SHORTEST_ARROW_M):
             return (from_e, from_n), (east_m, north_m)
     return None
 
@@ -202,6 +204,7 @@ def stack_labels(
 
 
 def _boxes_around(point: Point, size: tuple[float, float]) -> Iterator[LabelBox]:
+    """Yield boxes in eight directions from a point, the nearest first; 0.7 is about the cosine of a diagonal."""
     x, y = point
     width, height = size
     away = height * 0.6
@@ -221,7 +224,11 @@ def _boxes_around(point: Point, size: tuple[float, float]) -> Iterator[LabelBox]
 
 
 def _cost(box: LabelBox, point: Point, bounds: LabelBox, obstacles: Sequence[LabelBox]) -> float:
-    """Return the cost of a box: any overlap and any part outside the bounds, then their size, then the distance."""
+    """Return the cost of a box.
+
+    Most important is whether the box overlaps an obstacle or extends beyond the bounds, then how far, and then its
+    distance from the point. The weights were chosen by eye.
+    """
     covered = sum(box.overlap(other) for other in obstacles) / box.area
     outside = 1 - box.overlap(bounds) / box.area
     overlaps = (covered > 0) + (outside > _ROUNDING)

@@ -47,7 +47,7 @@ _TIME_AXIS_FACTOR: Final = 1.45
 _MARKER_POINTS: Final = 5.0
 _POINTS_PER_INCH: Final = 72.0
 _ZERO_SHARE: Final = 0.16
-"""Distance of the line for zeros below the axis, as a share of the axis' decades."""
+"""Distance of the line for zeros below the lowest power of ten, as a share of the length of the logarithmic axis."""
 _LEADER_POINTS: Final = 5.0
 """Minimum distance of a label from its point at which a line connects them."""
 _BACKGROUND: Final = {"facecolor": LIGHT["paper"], "edgecolor": "none", "pad": 0.3}
@@ -77,7 +77,7 @@ def log_figure(panels: Sequence[LogPanel], form: Format) -> bytes:
         form: File format.
     """
     columns = min(2, len(panels))
-    rows = -(-len(panels) // columns)
+    rows = math.ceil(len(panels) / columns)
     with _drawing():
         figure = Figure(figsize=(_BOTH_COLUMNS_INCHES, _PANEL_HEIGHT_INCHES * rows), layout="constrained")
         drawn_panels = []
@@ -217,6 +217,7 @@ def _draw_log(axes: Axes, panel: LogPanel) -> list[Line2D]:
     axes.set_title(panel.title)
     positive = [value for curve in panel.curves for value in curve.y if value > 0]
     low, high = (min(positive), max(positive)) if positive else (0.1, 1.0)
+    # Whole decades; the factor keeps a marker at a power of ten below the upper end.
     low, high = 10 ** math.floor(math.log10(low)), 10 ** math.ceil(math.log10(high * 1.001))
     has_zero = any(value == 0 for curve in panel.curves for value in curve.y)
     zero = low / 10 ** (_ZERO_SHARE * max(math.log10(high / low), 1))
@@ -226,11 +227,20 @@ def _draw_log(axes: Axes, panel: LogPanel) -> list[Line2D]:
         shown_marker = "" if panel.over_time else marker
         style: dict[str, Any] = {"color": LIGHT[colour], "marker": shown_marker, "markersize": _MARKER_POINTS}
         drawn_lines += axes.plot(curve.x, [max(y, zero) for y in curve.y], clip_on=False, zorder=3, **style)
-    _ticks(axes, panel, zero if has_zero else None, low, high)
+    _set_ticks(axes, panel, zero if has_zero else None, low, high)
     return drawn_lines
 
 
-def _ticks(axes: Axes, panel: LogPanel, zero: float | None, low: float, high: float) -> None:
+def _set_ticks(axes: Axes, panel: LogPanel, zero: float | None, low: float, high: float) -> None:
+    """Set the limits and the ticks of both axes.
+
+    Args:
+        axes: The axes.
+        panel: The curves.
+        zero: Position of the line for zeros on the y axis; None if no value is 0.
+        low: Lower end of the logarithmic y axis.
+        high: Upper end of the logarithmic y axis.
+    """
     xs = [value for curve in panel.curves for value in curve.x if value > 0]
     first, last = min(xs, default=0.5), max(xs, default=1.0)
     if panel.over_time:
@@ -302,6 +312,16 @@ def _text_size(text: str) -> tuple[float, float]:
 
 
 def _annotate(axes: Axes, text: str, point: Point, box: LabelBox, colour: str, *, at_left: bool) -> None:
+    """Write a label into a box; if the box is far from its point, draw a line to it.
+
+    Args:
+        axes: The axes.
+        text: The label.
+        point: The point that the label belongs to.
+        box: The box of the label.
+        colour: Colour of the curve.
+        at_left: True if the line begins at the left side of the label.
+    """
     line = {"arrowstyle": "-", "color": colour, "linewidth": 0.5, "shrinkA": 0, "shrinkB": _MARKER_POINTS / 2}
     end = {"relpos": (0.0, 0.5)} if at_left else {}
     axes.annotate(
@@ -342,6 +362,7 @@ def _darker(colour: str) -> str:
 
 @contextmanager
 def _drawing() -> Iterator[None]:
+    """Apply the style of the figures during the body of the `with` statement."""
     sizes = dict.fromkeys(("font.size", "axes.titlesize", "axes.labelsize"), _FONT_POINTS)
     settings: dict[Any, Any] = {**SETTINGS, **sizes}
     with mpl.rc_context():
@@ -352,6 +373,7 @@ def _drawing() -> Iterator[None]:
 
 
 def _saved(figure: Figure, form: Format) -> bytes:
+    """Return a figure as the content of a file."""
     out = io.BytesIO()
     figure.savefig(out, format=form, metadata=METADATA[form])
     return out.getvalue()

@@ -46,7 +46,7 @@ _SHORTEST_NS: Final = 100_000
 
 
 def _limit_ns(late_ns: int) -> int:
-    """Return the upper limit under which a lateness is counted (`WindowLateness.windows`)."""
+    """Return the smallest limit (a key of `WindowLateness.windows`) that is not below a lateness."""
     if late_ns <= 0:
         return 0
     decade_ns = _SHORTEST_NS

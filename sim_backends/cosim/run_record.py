@@ -71,8 +71,9 @@ class Run:
 
 
 _EVENT: Final = struct.Struct("<cQQ")
+"""A hashed event: its kind (`a` arrival, `d` drop, `w` window), the number of the packet or window, and the time."""
 _PACKET: Final = struct.Struct("<QqqQQ")
-
+"""A hashed packet: its id, number in the flow, size, and the times when it was sent and entered the network."""
 _HASHED_BYTES: Final = 1 << 15
 """Events are hashed in blocks of this size, because hashing each window separately would take longer."""
 

@@ -10,7 +10,7 @@ from sim_backends.cosim.federates import AnswerTimeoutError, NetworkFederate, Ph
 _PROGRESS_EVERY_S: Final = 0.2
 
 Progress = Callable[[int, float], None]
-"""Called with the simulated nanoseconds so far, and the wall seconds since the start of `advance`."""
+"""Called with the simulated nanoseconds so far, and the wall seconds since the run was started or continued."""
 
 
 @runtime_checkable
@@ -32,7 +32,7 @@ class WallTime:
     Time during which a federate of that part waited is added to `wait` instead.
 
     Args:
-        total_s: The sums in seconds, by part; each call of `window` updates them.
+        total_s: The sums in seconds, by part; each call of `end_window` updates them.
         agents: Physics and programs.
         network: The network.
     """
@@ -64,7 +64,7 @@ class WallTime:
             self._spent_s[part] -= new_s
             self._spent_s["wait"] += new_s
 
-    def window(self) -> dict[str, float]:
+    def end_window(self) -> dict[str, float]:
         """Return the wall time by part since the last call, and add it to the sums."""
         spent_s, self._spent_s = self._spent_s, dict.fromkeys(self._spent_s, 0.0)
         for part, part_s in spent_s.items():
@@ -133,11 +133,11 @@ class _StallingFederate:
 
     @property
     def waited_s(self) -> float:
-        """The waiting time of the stall and of the federate itself (`wall_time.HasWaitingTime`)."""
+        """The waiting time of the stall and of the federate itself (`HasWaitingTime`)."""
         return self._stall.waited_s + (self._federate.waited_s if isinstance(self._federate, HasWaitingTime) else 0.0)
 
     def __getattr__(self, name: str) -> Any:  # noqa: ANN401 (depends on the federate)
-        if name.startswith("_"):  # an unfinished copy has no federate yet
+        if name.startswith("_"):  # `copy.deepcopy` reads attributes of a copy before `_federate` is set
             raise AttributeError(name)
         attribute = getattr(self._federate, name)
         return partial(self._delayed, attribute) if name in _REQUESTS else attribute

@@ -128,6 +128,7 @@ over with the centre of mass of the URDF, which is above the axle.
 """
 
 CASTER_RADIUS_M: Final = 0.01
+"""Radius of the sphere that models a caster."""
 
 
 def chassis(profile: str, limits: DriveLimits) -> Chassis:

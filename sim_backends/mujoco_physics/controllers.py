@@ -119,6 +119,8 @@ class FlightController:
         self._target = Velocity()
         self._is_powered = True
         self._hold_yaw_rad: float | None = None
+        # The attitude follows its target with a first-order lag: its rate is the difference divided by the lag. These
+        # largest differences therefore limit the rate.
         self._max_lean_rad = limits.tilt_rate_rad_s * limits.lag_s
         self._max_turn_rad = limits.yaw_rate_rad_s * limits.lag_s
 

@@ -19,6 +19,7 @@ from sim_backends.world.shapes import Box, Shape
 from sim_backends.world.world import World
 
 SENSED_NUMBERS: Final = 9
+"""Number of values of the sensors of an agent."""
 WHEEL_CONTROL_PER_S: Final = 40.0
 """Natural frequency of the speed control of a wheel. The control is critically damped, and lags its set-point by 0.05
 s."""
@@ -206,6 +207,7 @@ class _Document:
     def _add_grip(self, name: str, friction: float) -> None:
         """Add contacts with friction between a shape and the ground; contacts with obstacles have no friction."""
         for ground in self._grounds:
+            # `condim="3"` uses only the first two coefficients, for sliding; the others are MuJoCo's defaults.
             _add(
                 self._grips,
                 "pair",

@@ -41,7 +41,9 @@ _MIN_SUPPORT_NORMAL: Final = 0.5
 _PARKED_M: Final = 10_000.0
 """Distance east and north at which absent agents are parked; the rounding error there is at most 1 um."""
 _PARKED_APART_M: Final = 10.0
+"""Distance between parked agents."""
 _PARKED_UP_M: Final = 0.0
+"""Height of parked agents: they stand on the ground."""
 
 
 class SensedStates(Mapping[str, State]):
@@ -121,6 +123,8 @@ class MujocoPhysics:
             self._controller(row, robot, limit) for row, (robot, limit) in enumerate(zip(robots, limits, strict=True))
         ]
         self._stops = [Velocity() if isinstance(limit, QuadrotorLimits) else Twist() for limit in limits]
+        # Rows of the agents whose controllers run at every tick, and of those whose controllers also run at the next
+        # step, because of a new command or position.
         self._active = set(range(len(robots)))
         self._due: set[int] = set()
         self._last_tick_steps = [-self._tick_steps] * len(robots)
@@ -157,6 +161,7 @@ class MujocoPhysics:
         return self._states
 
     def _present_rows(self) -> Mapping[str, int]:
+        """Return the row of each agent that is present, by its name."""
         if not self._absent:
             return self._rows
         return {name: row for name, row in self._rows.items() if row not in self._absent}
@@ -274,6 +279,7 @@ class MujocoPhysics:
         self._registers = Registers(*views)
 
     def _controller(self, row: int, robot: RobotModel, limits: DriveLimits | QuadrotorLimits) -> Controller:
+        """Return a new controller of a robot, which has no command yet."""
         model = self.model
         if isinstance(limits, DriveLimits):
             assert isinstance(robot.body, Chassis)

@@ -1,10 +1,10 @@
 """The built-in physics federate: bodies in a world follow their courses, and stop at a contact.
 
 Bodies move in time steps. A command takes effect at the first step at or after the time of the command,
-and the motion does not depend on how the time is divided into calls. Two measures make this fast. A course is
-evaluated only when a state is requested. Contacts are checked only between bodies in a neighbour list (Verlet, Phys.
-Rev. 159, 98, 1967): a body that is farther from all obstacles and bodies than its top speed allows cannot touch
-anything until the list expires.
+and the motion does not depend on how the time is divided into calls. Two measures make this fast. The course of a
+body, which is its motion until the next command or contact, is evaluated only when a state is requested. Contacts are
+checked only between bodies in a neighbour list (Verlet, Phys. Rev. 159, 98, 1967): a body that cannot reach another
+body or an obstacle before the list expires, even at top speed, is not in the list.
 """
 
 import math
@@ -41,7 +41,8 @@ class Bodies:
     Attributes:
         step_ns: Time step.
         names: Names of the bodies, in order.
-        limits_m_s2: See `BodyLimits`; valid from the time of the last returned states.
+        limits_m_s2: Maximum acceleration of each body, which bounds the error of its extrapolated position
+            (`BodyLimits`); valid from the time of the last returned states.
         collisions: The starts of all contacts so far, in order of time.
 
     Raises:
@@ -92,7 +93,7 @@ class Bodies:
         return {name: self._track(name, self._initial_pose(name), 0).state(0) for name in self.names}
 
     def limit_m_s2(self, name: str) -> float:
-        """Return the limit of a body (see `BodyLimits`); if it is absent, the limit at its start."""
+        """Return the maximum acceleration of a body (`BodyLimits`); if it is absent, the value at its start."""
         if name not in self._present:
             start_limit_m_s2: float = self._bodies[name].limit_m_s2(self._initial_pose(name))
             return start_limit_m_s2
@@ -152,6 +153,7 @@ class Bodies:
         return FlightStatus(pose.place_m, pose.roll_rad, pose.pitch_rad, self._is_supported(name, body, pose.place_m))
 
     def _is_supported(self, name: str, body: Body[Any], place_m: Vector) -> bool:
+        """Return True if a body would touch something below it after a very small move downwards."""
         candidates = self._current_neighbours().candidates.get(name)
         if candidates is None:
             return False

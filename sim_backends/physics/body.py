@@ -1,8 +1,9 @@
 """Protocols of a body that the built-in physics federate moves: its commands, pose and track.
 
-A body has no mutable state. From a pose and a command it derives a course, from which the pose at any later step can
-be computed on request. The pose therefore does not depend on the times of requests, and a body at rest needs no
-computation. The states of all bodies at a step are also computed on request, from their tracks.
+A body has no mutable state. From a pose and a command it derives a course: its motion until the next command or
+contact. From a course, the pose at any later step can be computed on request. The pose therefore does not depend on
+the times of requests, and a body at rest needs no computation. The states of all bodies at a step are also computed
+on request, from their tracks.
 """
 
 from collections.abc import Iterator, KeysView, Mapping

@@ -159,5 +159,5 @@ BODIES: Final[dict[str, DriveLimits | QuadrotorLimits]] = {
 
 
 def quadrotor(profile: str) -> QuadrotorLimits:
-    """Return the limits of a quadrotor with this profile; for an unknown profile, those of the paper's drone."""
+    """Return the limits of a quadrotor with this profile; for an unknown profile, those of the Duckiedrone."""
     return QUADROTORS.get(profile, DUCKIEDRONE)

@@ -19,8 +19,8 @@ def add(parser: Parser) -> None:
     parser.description = (
         "Terminate every job of fieldkit on every robot of the site file, of any trial and from any laptop, and "
         "remove the robots' locks. For each robot, print the terminated jobs, and terminated processes whose folder "
-        "had been deleted; `not locked` means that no program held the lock. A trial on these robots stops, and "
-        "reports the user that aborted it. Exit code 3 if a robot was not reached, a job was not terminated or, on a "
+        "was deleted; `not locked` means that no program held the lock. A trial on these robots stops, and "
+        "reports the user who aborted it. Exit code 3 if a robot was not reached, a job was not terminated or, on a "
         "full disk, a lock was not removed; 1 if you answer no. The other robots are processed nevertheless. "
         "Emulated robots stop with their lab, so nothing is done for them."
     )

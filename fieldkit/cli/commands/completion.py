@@ -1,6 +1,7 @@
 """Complete command lines in bash, zsh and fish. Only this module imports argcomplete.
 
-Argcomplete runs fieldkit at each press of the Tab key, so nothing here imports the strict readers of files.
+Argcomplete runs fieldkit at each press of the Tab key. Therefore this module does not import the code that validates
+files, which would take long.
 """
 
 import argparse
@@ -101,7 +102,10 @@ def _robots_of_lab() -> list[str]:
 
 
 def _trials(prefix: str) -> Iterator[str]:
-    """Yield trials and other folders whose paths start with `prefix`; without a prefix also trials in `trials`."""
+    """Yield the trials and other folders in the folder of `prefix`; without a prefix also those in `trials`.
+
+    Argcomplete drops the paths that do not start with `prefix`.
+    """
     folder = os.path.dirname(prefix)  # noqa: PTH120 (a Path drops `./` and a trailing slash)
     for parent in (folder,) if prefix else ("", _TRIALS):
         try:

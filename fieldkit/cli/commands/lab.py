@@ -94,7 +94,7 @@ def _add_sdf(actions: Commands) -> None:
         "--gazebo",
         ("fortress", "garden"),
         default="fortress",
-        help="names of the plugins: fortress (default), or garden for it and later versions",
+        help="use the plugin names of fortress (default), or of garden and later versions",
     )
     shared.add_robots(parser)
     parser.set_defaults(run=print_sdf)

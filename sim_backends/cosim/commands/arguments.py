@@ -121,7 +121,7 @@ def _add_shootout(commands: Commands) -> None:
         epilog="example: fieldkit cosim shootout baylands --window 1ms,10ms,100ms --figure shootout.svg",
     )
     _add_scenario(parser)
-    _add_policy(parser, "may be given more than once (default: all)", action="append", default=[])
+    _add_policy(parser, "sync policy; may be given more than once (default: all)", action="append", default=[])
     _add_window(parser, "windows to compare", dest="windows", metavar="TIME,...")
     _add_seeds(parser)
     _add_federates(parser)

@@ -137,8 +137,8 @@ def _summary(
     if added_s:
         text += (
             f", and adds {number_text(math.fsum(added_s) / len(added_s) * 1e3)} ms to a delay, because an arrival "
-            "waits for the end of its window: half of policy.longest is "
-            f"{number_text(scenario.policy.longest * 500)} ms"
+            "waits for the end of its window; on average, that is half of a window, and half of the longest window "
+            f"(policy.longest) is {number_text(scenario.policy.longest * 500)} ms"
         )
     if not fixed_costs:
         return f"{text}, and no fixed window keeps the bound"

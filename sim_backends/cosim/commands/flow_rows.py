@@ -1,4 +1,4 @@
-"""Rows of trial.csv for the flows of a run: one row per flow."""
+"""Rows of trial.csv for the flows of a simulated run: one row per flow."""
 
 import hashlib
 import json
@@ -14,8 +14,8 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 BACKEND: Final = "cosim"
 
 _NOT_PROCEDURE: Final = frozenset({"name", "summary", "policy", "seeds", "duration", "trial"})
-"""Keys of a scenario that do not change the procedure: the compared policy, the number of runs, their duration,
-and the trial that it reproduces."""
+"""Keys of a scenario that are not part of the procedure, so that runs which differ in them have the same hash of the
+procedure."""
 
 
 def flow_rows(
@@ -46,6 +46,7 @@ def flow_rows(
 def _identity(
     trial: str, scenario: CosimScenario, policy: str, result: SeedResult, flow: FlowResult
 ) -> dict[str, Value]:
+    """Return the columns that identify a row: trial, conditions, agents and status."""
     distance_m = _distance_m(flow, scenario, result.starts_m)
     identity: dict[str, Value] = {
         "schema_version": SCHEMA_VERSION,

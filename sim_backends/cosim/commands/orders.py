@@ -1,4 +1,8 @@
-"""The command `fieldkit cosim shootout --orders`, which computes local errors and the order of each sync policy."""
+"""The command `fieldkit cosim shootout --orders`, which computes local errors and the order of each sync policy.
+
+A local error is the error of a single window that begins in the state of the exact reference. If the order of a
+policy is n, this error is proportional to the n-th power of the window.
+"""
 
 import argparse
 from collections.abc import Mapping, Sequence
@@ -33,6 +37,7 @@ from sim_backends.cosim.studies.local_errors import (
 from sim_backends.cosim.studies.seeds import Task, run_many
 
 WINDOWS_S: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
+"""Windows for which local errors are computed unless the option `--window` is given."""
 START_TIMES: Final = 20
 """Number of start times for the windows of each policy, in the exact reference of each seed."""
 _COLUMNS: Final = (
@@ -54,6 +59,7 @@ _COLUMNS: Final = (
 _HEADS: Final[Mapping[str, str]] = MappingProxyType(
     {column.name: column.head.partition(" (")[0] for column in _COLUMNS if column.name in MEASURES}
 )
+"""Heading of each measure without its unit, because an order has no unit."""
 
 
 def run(arguments: argparse.Namespace) -> int:

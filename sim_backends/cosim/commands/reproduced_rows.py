@@ -21,6 +21,9 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.world.world import load_world
 
 _TTL: Final = 64
+"""Time to live of packets, as in captures."""
+_ICMP_HEADER_BYTES: Final = 8
+_IP_HEADER_BYTES: Final = 20
 
 
 class ReproducedRows:
@@ -139,11 +142,12 @@ class ReproducedRows:
     def _ping_text(self, repeat: ReproducedRepeat, trips: FlowRoundTrips) -> str:
         """Return the round trips of a ping as output of iputils `ping -n -D`."""
         address, payload_bytes = self._addresses[repeat.ping.to[0]], repeat.ping.size_bytes
-        lines = [f"PING {address} ({address}) {payload_bytes}({payload_bytes + 28}) bytes of data."]
+        icmp_bytes = payload_bytes + _ICMP_HEADER_BYTES
+        lines = [f"PING {address} ({address}) {payload_bytes}({icmp_bytes + _IP_HEADER_BYTES}) bytes of data."]
         for sequence, at_ns, trip_s in trips.times:
             seconds, microseconds = divmod(at_ns // 1000, 10**6)
             lines.append(
-                f"[{seconds}.{microseconds:06}] {payload_bytes + 8} bytes from {address}: icmp_seq={sequence + 1} "
+                f"[{seconds}.{microseconds:06}] {icmp_bytes} bytes from {address}: icmp_seq={sequence + 1} "
                 f"ttl={_TTL} time={1e3 * trip_s:.6f} ms"
             )
         loss = 1 - trips.reply_count / trips.request_count if trips.request_count else 0.0

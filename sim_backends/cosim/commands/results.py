@@ -82,7 +82,7 @@ def _affects(fault: Fault, ends: set[str], scenario: CosimScenario) -> bool:
 Floats = NDArray[np.float64]
 
 _JITTER_GAIN = 1 / 16
-"""Gain of the estimator (RFC 3550, section 6.4.1)."""
+"""Gain of the estimator of jitter (RFC 3550, section 6.4.1)."""
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.formation import has_followers
 
 INTERRUPTED: Final = 130
+"""Exit code after Ctrl-C, as in shells: 128 plus the number of SIGINT."""
 
 _COLUMNS: Final = (
     SheetColumn("seed", "seed", "seed of all random draws"),
@@ -101,7 +102,7 @@ def show_results(form: str, title: str, scenario: CosimScenario, results: Sequen
         print_text(_cost_text(timely_results))
     for result in results:
         if isinstance(result.error, RealTimeError):
-            show_note(f"seed {result.seed}: it was slower than real time, so it has no results")
+            show_note(f"seed {result.seed}: the run was slower than real time, so it has no results")
         elif result.stop_reason:
             # The command reports the full error when it ends.
             reason = result.stop_reason if result.error is None else f"stopped at {result.simulated_s:g} s"

@@ -1,4 +1,7 @@
-"""The command `fieldkit cosim satisfy`, the paper's loop that repeats a run until the loss is satisfactory."""
+"""The command `fieldkit cosim satisfy`: it repeats a run with other windows until the loss is satisfactory.
+
+This is the satisfaction loop of the paper (cited in docs/index.md).
+"""
 
 import argparse
 from functools import partial

@@ -47,7 +47,11 @@ def progress_reporter(sink: Sink, unit: str = "runs") -> Callable[[str, float, f
 
 
 ENOUGH_SEEDS: Final = 20
-"""Each seed draws one phase; the mean over 20 phases has a standard error of 7 % of a window."""
+"""Number of seeds from which on commensurate periods are not reported.
+
+The phase of a periodic event is the time within a window at which it occurs; each seed draws another phase. The mean
+over 20 phases has a standard error of 6.5 % of a window.
+"""
 
 
 def read_scenario(arguments: argparse.Namespace) -> CosimScenario:
@@ -221,6 +225,8 @@ def note_commensurate_events(
 ) -> None:
     """Print a note on each window that is commensurate with a period of the scenario; suggest a better window.
 
+    Periodic events then occur only at few times within a window (phases), which are not typical of the policy.
+
     Args:
         scenario: The scenario.
         policies: Names of the sync policies that run it.
@@ -241,9 +247,10 @@ def note_commensurate_events(
         other_s = incommensurate_window_s(scenario, window_s)
         instead = f"--seeds {ENOUGH_SEEDS}" if other_s is None else f"--window {other_s * 1e3:.6g}ms"
         show_note(
-            f"the window of {window_s * 1e3:.6g} ms is commensurate with the period of {periods}; errors and added "
-            "delays therefore depend on these phases, which the seed draws, and do not characterize the policy: use "
-            f"{instead}" + ("" if other_s is None else f", or --seeds {ENOUGH_SEEDS}")
+            f"the window of {window_s * 1e3:.6g} ms is commensurate with the period of {periods}: these events occur "
+            "at few times within a window (phases), which the seed draws. Errors and added delays depend on these "
+            f"phases, so they are not typical of the policy: use {instead}"
+            + ("" if other_s is None else f", or --seeds {ENOUGH_SEEDS}")
         )
 
 

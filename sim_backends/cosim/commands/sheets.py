@@ -20,7 +20,9 @@ _MAX_WIDTH: Final = 98
 """Largest line length of legends; it also applies in a wider terminal."""
 
 _MISSING: Final = "-"
+"""Text of a missing value in a printed table."""
 _NUMBER: Final = re.compile(r"-|-?[0-9][0-9.,]*(e[+-]?[0-9]+)?")
+"""A number in a printed table, or a missing value; columns of numbers are aligned at the right."""
 
 
 @dataclass(frozen=True)

@@ -65,6 +65,7 @@ _COSTS: Final = (
 )
 COLUMNS: Final = (*_ROW, *_TIMES, *_POSITIONS, *_COSTS, *FORMATION)
 _ROUNDING: Final = 1e-6
+"""A smaller excess over a bound, as a share of the bound, is a rounding error."""
 
 
 def run(arguments: argparse.Namespace) -> int:

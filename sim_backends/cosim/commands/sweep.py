@@ -25,10 +25,12 @@ from sim_backends.cosim.sweeps.sweep_plan import SweepPlan, SweepRun, plan_sweep
 from sim_backends.cosim.sweeps.sweep_runner import run_sweep
 
 INTERRUPTED: Final = 130
+"""Exit code after Ctrl-C, as in shells: 128 plus the number of SIGINT."""
 
 _ERROR_CLASSES: Final = {
     error.exit_code: error for error in (FieldkitError, ConfigurationError, LinkError, EvidenceError)
 }
+"""The class of the error of a failed run, by the exit code that the sweep's folder stores."""
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -1,4 +1,7 @@
-"""The command `fieldkit cosim table`, which compares the numbers of the paper with those of simulations."""
+"""The command `fieldkit cosim table`, which compares the numbers of the paper with those of simulations.
+
+The paper is the publication that fieldkit reproduces (cited in docs/index.md).
+"""
 
 import argparse
 from collections.abc import Sequence
@@ -24,7 +27,7 @@ _TITLES: Final = {
 }
 _LABELS: Final = {
     "line": SheetColumn("line", "sight", "with or without line of sight"),
-    "distance_m": SheetColumn("distance_m", "m", ""),
+    "distance_m": SheetColumn("distance_m", "distance (m)", ""),
     "protocol": SheetColumn("protocol", "protocol", ""),
     "radio": SheetColumn("radio", "radio", ""),
     "when": SheetColumn("when", "when", ""),

@@ -1,6 +1,6 @@
 """The sync policy `error_bounded`, whose windows are as long as a bound on position errors of the network allows.
 
-The paper has no such policy.
+The paper (cited in docs/index.md), which proposes the velocity-aware policies, has no such policy.
 
 The network extrapolates the agents at the velocities that they had at the beginning of the window, as simulators of
 many vehicles do between updates (dead reckoning, IEEE Std 1278.1, annex E). Physics and programs advance ahead of the
@@ -83,12 +83,19 @@ class ErrorBounded:
         bound_db: float | None = None,
         exponent: float = 3.0,
     ) -> None:
-        for value, unit in ((bound_m, "m"), (bound_db, "dB"), (exponent, "as exponent")):
+        for quantity, value, unit in (
+            ("bound", bound_m, " m"),
+            ("bound", bound_db, " dB"),
+            ("exponent", exponent, ""),
+        ):
             if value is not None and not 0 < value < math.inf:
                 raise PolicyError(
-                    f"{value:g} {unit} is not above 0", where=self.name, remedy="set it to a value above 0"
+                    f"the {quantity} of {value:g}{unit} is not above 0",
+                    where=self.name,
+                    remedy="set it to a value above 0",
                 )
         self._bound_m = bound_m
+        # The bound as a share of the assumed distance; 0 for a bound in metres.
         self._share = 0.0 if bound_db is None else 1 - 10 ** (-bound_db / (10 * exponent))
         self._longest_ns = window_ns(self.name, longest_s)
         self._begin_ns = 0
@@ -256,6 +263,7 @@ def _arrays(states: Sequence[State], fixed_m: Sequence[Vector]) -> tuple[Floats,
 
 
 def _norms(vectors: Floats) -> Floats:
+    """Return the length of each vector, one per row."""
     lengths: Floats = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
     return lengths
 

@@ -38,7 +38,7 @@ BUILTIN: Final[Mapping[str, PolicyKind]] = {kind.name: kind for kind in _KINDS}
 """Every built-in policy by its name; the exact ones are first."""
 
 _WINDOW_S: Final = 0.001
-"""The paper's initial window, section V."""
+"""The initial window of the paper (cited in docs/index.md), section V."""
 
 
 @cache

@@ -10,7 +10,7 @@ from fieldkit.core.model import Vector
 from sim_backends.world.motion import State
 
 Pair = tuple[str, str]
-"""Names of a sender and a receiver; the paper calls them publisher and subscriber."""
+"""Names of a sender and a receiver; the paper (cited in docs/index.md) calls them publisher and subscriber."""
 
 
 @dataclass(slots=True)

@@ -130,11 +130,16 @@ class VariableStepped:
 
 
 NS_PER_M_S = 1e6
-"""Change of the window per m/s of speed difference, in nanoseconds: the paper's constant 1/1000 s."""
+"""Change of the window per m/s of speed difference, in nanoseconds.
+
+It is the constant 1/1000 s of the paper (cited in docs/index.md).
+"""
 
 
 class VelocityAwareRaw:
     """The smallest window `w + (Vp - Vs) / 1000` of any pair of publisher and subscriber: the rule of the paper.
+
+    Vp and Vs are the speeds of the publisher and the subscriber.
 
     Args:
         window_s: w, in seconds.
@@ -191,6 +196,8 @@ class VelocityAwareRaw:
 
 class VelocityAware:
     """The smallest window `w + |Vp - Vs| / 1000` of any pair, at least a physics step.
+
+    |Vp - Vs| is the relative speed of publisher and subscriber.
 
     Args:
         window_s: w, in seconds.

@@ -15,7 +15,7 @@ from sim_backends.physics.body import Twist, Velocity
 from sim_backends.world.motion import State
 
 PERIOD_NS: Final = 50_000_000
-"""Usual control rate, 20 Hz (ROS 2 Navigation, `controller_frequency`)."""
+"""Period of the usual control rate of 20 Hz (ROS 2 Navigation, `controller_frequency`)."""
 
 
 class NeverSends:

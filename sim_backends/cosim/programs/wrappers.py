@@ -128,7 +128,8 @@ class AgentClock:
         """Return the first time at which the reading of the clock is `reading_ns` or later."""
         if reading_ns < self.begin_ns:
             return reading_ns
-        # After n ns in the interval it has advanced by floor(n (1 + rate)): find the smallest sufficient n.
+        # After n ns in the interval the clock has advanced by floor(n (1 + rate)). This finds the smallest sufficient
+        # n; the two minus signs make the division round up.
         missing_ns = reading_ns - self.begin_ns - self.offset_ns
         since_ns = max(-(-missing_ns * _BILLION // (_BILLION + self.rate_ppb)), 0)
         time_in_interval_ns = self.begin_ns + since_ns
@@ -139,6 +140,8 @@ class AgentClock:
 
 @dataclass(frozen=True, slots=True)
 class _StampedPayload:
+    """A payload with the time of sending, as read from the sender's clock."""
+
     payload: Any
     sent_ns: int
 

@@ -43,9 +43,11 @@ _ECHO_HEADER: Final = struct.Struct(">BBHHH")
 """Type, code, checksum, identifier and sequence number (RFC 792)."""
 _SYN, _PUSH, _ACK = 0x02, 0x08, 0x10
 _MORE_FRAGMENTS: Final = 0x2000
+"""Flag of all fragments of a packet except the last one (RFC 791)."""
 _WINDOW_SCALE: Final = 7
 """Linux's value for a receive buffer of 6 MiB."""
 _MSS: Final = 1460
+"""Maximum segment size: 1500 bytes of Ethernet without the headers of IP and TCP."""
 
 
 @dataclass(frozen=True)
@@ -107,12 +109,12 @@ class IpEncoder:
         payload_part = transport_header[begin : begin + fragment.size_bytes - HEADER_BYTES]
         fragment_flag = _MORE_FRAGMENTS if fragment.index + 1 < fragment.count else 0
         words = (
-            0x45,
-            0,
+            0x45,  # version 4, header of 5 words
+            0,  # type of service
             fragment.size_bytes,
             fragment.ip_id & 0xFFFF,
             fragment_flag | begin // 8,
-            64,
+            64,  # time to live
             protocol,
         )
         ends = self._packed[packet.source], self._packed[packet.destination]
@@ -138,7 +140,7 @@ class IpEncoder:
             protocol, header = _UDP, _UDP_HEADER.pack(*self._udp_ports(packet), length, 0)
             checksum_offset = 6
         pseudo = self._packed[packet.source] + self._packed[packet.destination] + struct.pack(">HH", protocol, length)
-        # Zeros in the data do not change the sum. A sum of 0 is sent as all ones (RFC 768); for TCP both are valid.
+        # The data is all zeros, which do not change the sum. A sum of 0 is sent as all ones (RFC 768), also for TCP.
         checksum = _checksum(pseudo + header) or 0xFFFF
         return protocol, header[:checksum_offset] + struct.pack(">H", checksum) + header[checksum_offset + 2 :]
 
@@ -170,17 +172,18 @@ class IpEncoder:
                 *(ports if packet.source == name.source else ports[::-1]),
                 segment.first & 0xFFFFFFFF,
                 (segment.acknowledges or 0) & 0xFFFFFFFF,
-                (20 + len(options)) // 4 << 4,
+                (20 + len(options)) // 4 << 4,  # length of the header in words, in the upper four bits
                 flags,
                 min(window, 0xFFFF),
-                0,
-                0,
+                0,  # checksum, which the caller inserts
+                0,  # urgent pointer
             )
             + options
         )
 
 
 def _timestamps(segment: Segment) -> bytes:
+    """Return the timestamps option (RFC 7323): kind 8, length 10, and two times in milliseconds."""
     return struct.pack(">BBII", 8, 10, _ms(segment.sent_ns), _ms(segment.echoes_ns or 0))
 
 
@@ -194,6 +197,10 @@ def _syn_options(segment: Segment) -> bytes:
 
 
 def _options(segment: Segment) -> bytes:
+    """Return the options of a segment without SYN: timestamps, and SACK blocks (kind 5) if there are any.
+
+    Before each option are two bytes of padding (kind 1), as Linux sends them.
+    """
     options = b"\1\1" + _timestamps(segment)
     if segment.sacks:
         blocks = [edge & 0xFFFFFFFF for block in segment.sacks for edge in block]
@@ -304,6 +311,7 @@ def first_tcp_packet_ns(capture: bytes, port: int) -> int | None:
     """
     for at_ns, begin, end in _records(capture):
         packet = capture[begin + _RECORD_HEADER.size : end]
+        # Byte 9 of the IP header is the protocol; bytes 2 and 3 of the TCP header are the destination port.
         if packet[9] == _TCP and packet[HEADER_BYTES + 2 : HEADER_BYTES + 4] == port.to_bytes(2, "big"):
             return at_ns
     return None

@@ -88,8 +88,9 @@ _DISK_FULL_ERRORS: Final = {errno.ENOSPC, errno.EDQUOT}
 CAPTURES: Final = "captures"
 """Folder of the captures in a recording, with a file for each robot, `ROBOT.pcap`."""
 _RESERVE: Final = ".reserve"
+"""File that occupies disk space; it is deleted when the run ends or the disk is full."""
 _RESERVE_BYTES: Final = 1 << 20
-"""Disk space that is allocated in advance for the last windows and the manifest, in case the disk becomes full."""
+"""Size of this file: space for the last windows and the manifest."""
 _NO_STATES: Final[Mapping[str, State]] = {}
 
 

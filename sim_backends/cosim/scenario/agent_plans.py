@@ -252,9 +252,10 @@ class StreamTraffic(_Traffic):
 class BagTraffic(_Traffic):
     """A recorded bag is played back, each message at its recorded time.
 
-    The defaults are the paper's: 10 s of accelerometer data. The size is the size of a serialized `sensor_msgs/Imu`
-    with the frame `imu_link`: 24 bytes of header, 32 of orientation, 24 of angular velocity, 24 of acceleration, and
-    a covariance of 72 bytes for each of these three quantities. The rate is that of the Husky's simulated IMU.
+    The defaults are those of the [paper](index.md#how-to-cite): 10 s of accelerometer data. The size is the size of a
+    serialized `sensor_msgs/Imu` with the frame `imu_link`: 24 bytes of header, 32 of orientation, 24 of angular
+    velocity, 24 of acceleration, and a covariance of 72 bytes for each of these three quantities. The rate is that of
+    the Husky's simulated IMU.
 
     Attributes:
         kind: `bag`.

@@ -52,8 +52,8 @@ def list_robots() -> list[str]:
 def limits_of(robot: str) -> DriveLimits | QuadrotorLimits:
     """Return the limits of a robot's body.
 
-    For the name of a robot profile, these are the limits of the paper's ground robot or quadrotor, with the top speed
-    of the profile.
+    For the name of a robot profile, these are the limits of the TurtleBot3 Burger, or of the Duckiedrone if the robot
+    flies, with the top speed of the profile.
     """
     if robot in BODIES:
         return BODIES[robot]
@@ -101,7 +101,7 @@ def antennas_of(scenario: CosimScenario) -> dict[str, Antenna]:
 
 
 STATION_M_S: Final = 1.0
-"""Largest speed at which an agent returns to its station."""
+"""Station keeping: largest speed at which an agent returns to its station."""
 
 
 def stop_commands(bodies: Mapping[str, Body[Any]]) -> dict[str, Twist | Velocity]:
@@ -115,8 +115,8 @@ def make_controllers(scenario: CosimScenario, bodies: Mapping[str, Body[Any]], s
     Args:
         scenario: The scenario.
         bodies: The body of each agent.
-        seed: Seed of the phases that the scenario does not set; the controllers of different robots do not run at the
-            same times.
+        seed: Seed of the phases (times of first commands) that the scenario does not set; the controllers of
+            different robots do not run at the same times.
     """
     programs = {
         name: _controller(plan, bodies[name], plan.lifetime.appears_ns, _phase_ns(name, plan, seed))
@@ -126,6 +126,7 @@ def make_controllers(scenario: CosimScenario, bodies: Mapping[str, Body[Any]], s
 
 
 def _phase_ns(name: str, plan: AgentPlan, seed: int) -> int:
+    """Return the time of the first command of a controller, from the appearance of its agent."""
     if plan.phase is not None:
         return round(plan.phase * 1e9)
     return int(RandomStream(seed, name, "controller's phase").draw(0) * PERIOD_NS)
@@ -262,6 +263,7 @@ def _sender(traffic: Traffic, flow: str, to: str, begin_s: float, seed: int) -> 
 def _with_faults(
     scenario: CosimScenario, program_by_agent: Mapping[str, Program], stops: Mapping[str, Any]
 ) -> Iterator[tuple[str, Program]]:
+    """Yield each agent and its program, wrapped so that the faults of its clock and its computer take effect."""
     skews = [fault for fault in scenario.faults if isinstance(fault, ClockSkewFault)]
     clocks = {
         skew.agent: AgentClock(skew.begin_ns, skew.end_ns, round(skew.offset_ms * 1e6), round(skew.rate_ppm * 1e3))

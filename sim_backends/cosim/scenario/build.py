@@ -198,7 +198,7 @@ class Simulation:
         agents: Bodies and programs.
         network: Carries packets.
         coordinator: Runs agents and network.
-        federates: Stops the external federates when it is closed.
+        federates: Context of the external federates; closing it stops them.
     """
 
     scenario: CosimScenario

@@ -29,7 +29,7 @@ PACKET_BYTES: Final = 1200
 WINDOW_BYTES: Final = 40
 """Size of the record of a window: an integer and its entry in a list."""
 PAIR_BYTES: Final = 1600
-"""Largest memory of the radio per pair of stations: 1540 to 1660 bytes were measured with 100 to 300 stations."""
+"""Memory of the radio per pair of stations: 1540 to 1660 bytes were measured with 100 to 300 stations."""
 EVENTS_PER_PACKET: Final = 10
 """Largest number of windows per packet if each network event ends a window; 7 were measured with `baylands`."""
 
@@ -78,6 +78,7 @@ class Demand(NamedTuple):
 
 
 _ROUNDING = 1e-9
+"""A smaller excess over a limit, as a share of the limit, is a rounding error."""
 
 
 def excesses(motion: object, start_m: Vector, limits: Limits) -> Iterator[Demand]:

@@ -1,4 +1,7 @@
-"""Starts, connects to or creates the external federates of a scenario, as the only module of the co-simulation."""
+"""Starts, connects to or creates the external federates of a scenario.
+
+No other module of the co-simulation does this.
+"""
 
 import dataclasses
 import json

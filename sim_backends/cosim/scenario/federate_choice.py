@@ -30,7 +30,7 @@ Federate = Annotated[str | None, AfterValidator(_without_built_in)]
 
 
 def _options_of(role: int) -> Callable[[Any, ValidationInfo], Options]:
-    """Return the validator of the options of the federate that the same mapping names."""
+    """Return a validator of `options`; the key `federate` of the same mapping determines which options are valid."""
 
     def validated(value: Any, info: ValidationInfo) -> Options:  # noqa: ANN401 (any YAML value)
         if not isinstance(value, dict | SimulatorOptions | None):

@@ -1,8 +1,8 @@
-"""Finds periods that are commensurate with a window, so that a run samples only a few phases of the window.
+"""Finds periods that are commensurate with a window: a few periods are a whole number of windows.
 
-The error of a policy depends on the phase of the window at which a packet is sent. If b periods are a whole number of
-windows, packets are sent at b phases only, the same ones in every window, and the measured error is the error at
-these phases, not the error of the policy.
+The phase of a packet is the time from the beginning of a window until the packet is sent. The error of a policy
+depends on this phase. If b periods are a whole number of windows, packets are sent at b phases only. The measured
+error is then the error at these phases, not the error of the policy.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,8 +14,12 @@ from sim_backends.cosim.scenario.agent_plans import BagTraffic, FollowPlan
 from sim_backends.cosim.scenario.schema import CosimScenario
 
 MAX_PHASES: Final = 10
-"""The mean over 10 evenly distributed phases has an error of at most a twentieth of a window."""
+"""Events with more phases are not reported.
+
+The mean over 10 evenly distributed phases has an error of at most a twentieth of a window.
+"""
 _MAX_STEPS: Final = 100
+"""Largest number of physics steps by which a proposed window is longer than the given one."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +30,7 @@ class PeriodicEvent:
         name: Its name, for messages.
         period_s: Its period.
         count: Number of times that it occurs in a run.
-        jitter_s: Its jitter.
+        jitter_s: Largest random delay of an occurrence.
     """
 
     name: str
@@ -91,7 +95,7 @@ def _few_phases(event: PeriodicEvent, window_s: float) -> int | None:
     After b periods the phase has drifted by d windows, so in n periods it drifts by n d / b. The phases are 1 / b
     apart, so their number stays b if n d < 1.
     """
-    if 2 * event.jitter_s >= window_s:
+    if 2 * event.jitter_s >= window_s:  # the jitter distributes the phases over at least half of a window
         return None
     for phases in range(1, min(MAX_PHASES, int(event.count / 2)) + 1):
         windows = phases * event.period_s / window_s

@@ -79,6 +79,7 @@ class ReproducedTrial(Strict):
                         (protocol.value, key),
                     )
                     return
+        # For each protocol, the start of its first and of its last traffic.
         spans = [
             sorted(by_name[name].start for name in (flows.transfer, flows.ping)) for flows in self.flows.values()
         ]

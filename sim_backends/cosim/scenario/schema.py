@@ -175,7 +175,7 @@ class AgentPlan(Strict):
     def _disappears_after_it_appears(self) -> "AgentPlan":
         if self.disappears is not None and self.disappears <= self.appears:
             raise schema.validation_error(
-                f"its disappearance at {self.disappears:g} s is not after its appearance at {self.appears:g} s",
+                f"the agent disappears at {self.disappears:g} s, but appears only at {self.appears:g} s",
                 "disappears",
             )
         return self
@@ -184,7 +184,7 @@ class AgentPlan(Strict):
     def _one_start(self) -> "AgentPlan":
         if (self.at_m is None) == (self.along is None):
             raise schema.validation_error(
-                "it needs either at_m: [EAST, NORTH], or along: 20m, a distance on the line of the world file"
+                "an agent needs either at_m: [EAST, NORTH], or along: 20m, a distance on the line of the world file"
             )
         return self
 

@@ -49,12 +49,12 @@ def mean(values: Floats) -> IntervalEstimate:
 def jackknife(value: float, leave_one_out: Floats) -> IntervalEstimate:
     """Return a statistic of repeats with its jackknife interval.
 
-    Args:
-        value: The statistic of all repeats.
-        leave_one_out: For each repeat, the statistic of all other repeats, shape (n,).
+    The interval is computed from the statistics that omit one repeat each. Their variance is n - 1 times smaller than
+    the variance of the statistic itself (Efron and Stein 1981, Ann. Stat. 9:586).
 
-    The variance of these values is n - 1 times smaller than the variance of the statistic (Efron and Stein 1981, Ann.
-    Stat. 9:586).
+    Args:
+        value: The statistic of all n repeats.
+        leave_one_out: For each repeat, the statistic of all other repeats, shape (n,).
     """
     count = len(leave_one_out)
     if count < 2 or not np.isfinite(leave_one_out).all():

@@ -1,9 +1,9 @@
 """Local errors: the errors of a sync policy in single windows that start from the state of the exact reference.
 
-They are measured as for solvers of differential equations. The reference runs exactly. At many times, a fork of the
-reference runs one window with the policy and then continues exactly. Differences from the reference are then caused
-by that window only, and not by earlier windows. If the window is halved, the errors decrease according to the order
-of the policy.
+They are measured as for solvers of differential equations. The reference runs exactly. At many times, a fork (a copy)
+of the reference runs one window with the policy and then continues exactly. Differences from the reference are then
+caused by that window only, and not by earlier windows. If the window is halved, the errors decrease according to the
+order of the policy: with order n, to a share of 1/2^n.
 
 A window affects the packets that, in the reference, were sent or arrived within it.
 """

@@ -1,9 +1,9 @@
-"""Measured changes for the claims of the paper about its middleware.
+"""Measures the changes that the paper claims for its middleware.
 
-The paper claims that an adaptive window is better than a fixed one, and that masterless communication is better than
-communication through a ROS master. Both claims are measured in the rows of the paper's tables 1 and 3, with the same
-seeds. The measures are the change of the mean delay of packets that arrive, and the change of the share of packets
-that do not arrive.
+The paper is the publication that fieldkit reproduces (cited in docs/index.md). It claims that an adaptive window is
+better than a fixed one, and that masterless communication is better than communication through a ROS master. Both
+claims are examined by simulations of the rows of its tables 1 and 3, with the same seeds. The measures are the change
+of the mean delay of packets that arrive, and the change of the share of packets that do not arrive.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""The simulations of the paper, and the samples of their flows over seeds."""
+"""The simulations of the paper (cited in docs/index.md), and the samples of their flows over seeds."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -21,6 +21,7 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.seeds import ALL_PROCESSORS, Task, run_many
 
 UNDER_WAY = "under way when the run ended"
+"""Reason in `FlowSample.reasons` of a packet that was neither delivered nor dropped."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The tables of the paper: the printed values, and their agreement with the simulations of this program."""
+"""The tables of the paper (cited in docs/index.md): the printed values, and their agreement with simulations."""
 
 import math
 from collections import Counter

@@ -1,8 +1,8 @@
 """The paper's satisfaction loop: a round is repeated with another window until its loss is accepted.
 
-In the paper (section III, below algorithm 1), the network's loss is compared with a threshold. While the loss is
-above the threshold, algorithm 1 changes the window, and the same round is run again, until a result "is deemed to be
-satisfactory". The window of a round is the result of the rule in the previous round.
+In the paper (cited in docs/index.md; section III, below algorithm 1), the network's loss is compared with a
+threshold. While the loss is above the threshold, algorithm 1 changes the window, and the same round is run again,
+until a result "is deemed to be satisfactory". The window of a round is the result of the rule in the previous round.
 
 A sync policy does not change the losses of the radio. Each round is therefore compared with the exact reference of
 the same scenario and seed, whose loss does not depend on a window. The loop only changes the error of the result, and

@@ -233,6 +233,7 @@ def rows(outcomes: Outcomes, formation: Callable[[Tracks], Formation] = lambda _
 
 
 def _growth_m(outcomes: Outcomes, policy: str) -> tuple[Floats, Floats]:
+    """Return the value of `Row.growth_m` for a policy."""
     pairs = [(outcomes.reference[seed].tracks, outcome.tracks) for seed, outcome in outcomes.runs[policy].items()]
     largest_m = [np.fmax.reduce(tracks.distances_m(reference), axis=1) for reference, tracks in pairs]
     length = min(map(len, largest_m), default=0)

@@ -148,9 +148,8 @@ def run_sweep(
     ]:
         for end in completed(work, tasks, workers, lambda text: sink(Note(text))):
             run = tasks[end.number]
-            if isinstance(
-                end.error, ConfigurationError
-            ):  # all scenarios were checked, so the worker is set up wrongly
+            # All scenarios were checked before, so this error means that the worker is set up wrongly.
+            if isinstance(end.error, ConfigurationError):
                 raise end.error
             attempts[run.name] += 1
             failure = _failure(end, attempts[run.name])

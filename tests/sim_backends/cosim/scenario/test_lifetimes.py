@@ -206,7 +206,7 @@ def test_a_run_with_lifetimes_can_be_recorded_and_replayed(path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"agents.c.disappears": "300ms"}, "its disappearance at 0.3 s is not after its appearance at 0.4 s"),
+        ({"agents.c.disappears": "300ms"}, "the agent disappears at 0.3 s, but appears only at 0.4 s"),
         ({"agents.c.at_m": [20, 10], "agents.c.motion": {"kind": "standing"}}, "c starts within b"),
     ],
 )
