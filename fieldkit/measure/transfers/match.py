@@ -236,7 +236,7 @@ def _match_pieces(sent: Packets, received: Packets, frames: Match) -> Payload:
     # Without a time stamp, a received frame that offload cut or joined may be a part of any sent frame.
     may_be_part = (received_frame == 0) & (received_stamp[received_pieces.frame] == NO_STAMP)
     may_be_part |= ~np.isin(row_hashes(received_key, received_frame), row_hashes(key, sent_frame))
-    received_frame = np.where(may_be_part, NOT_CAPTURED, received_frame)  # `match_keys` then ignores the frame
+    received_frame = np.where(may_be_part, NOT_CAPTURED, received_frame)  # then `match_keys` does not compare frames
     pieces = match_keys(
         key,
         sent.time_ns[sent_pieces.frame],
