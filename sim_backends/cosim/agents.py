@@ -26,7 +26,7 @@ class SentDatagram(NamedTuple):
         at_ns: Time of sending.
         source: Name of the sending agent.
         datagram: The datagram.
-        states: States of all agents at the last physics step before `at_ns`.
+        states: States of all agents at the last physics step at or before `at_ns`.
     """
 
     at_ns: int
@@ -87,7 +87,7 @@ class Agents:
     Args:
         physics: Moves the bodies.
         programs: Programs by agent name; agents without a program are missing.
-        lifetimes: The lifetimes of agents that do not exist during the whole run.
+        lifetimes: The lifetimes of the agents that exist only during a part of the run.
         starts: The start states of agents that are absent at time 0; None if there are no such agents.
 
     Raises:
@@ -322,7 +322,12 @@ class Agents:
         return bool(self._received)
 
     def advance(self, now_ns: int, last_ns: int, end_ns: int) -> tuple[list[SentDatagram], Mapping[str, State]]:
-        """Wake programs that received datagrams or whose timers fire until `last_ns`; move bodies to `end_ns`.
+        """Wake programs that received datagrams, and programs whose timers fire; then move the bodies.
+
+        Args:
+            now_ns: Beginning of the window; stored datagrams are delivered at this time.
+            last_ns: Time up to which timers fire, inclusive.
+            end_ns: Time to which the bodies move: the end of the window.
 
         Returns:
             The datagrams that programs sent, and the states at `end_ns` (see `states`).

@@ -35,8 +35,8 @@ class Bodies:
         bodies: The bodies, by the name of their agent.
         world: Ground and obstacles; None for open flat ground.
         step_ns: Time step; there are states only at whole steps.
-        lifetimes: Bodies that do not exist during the whole run. A body exists from the last step before its lifetime
-            begins to the first step after its lifetime ends.
+        lifetimes: Lifetimes of the bodies that exist only during a part of the run. A body exists from the last step
+            before its lifetime begins to the first step after its lifetime ends.
 
     Attributes:
         step_ns: Time step.

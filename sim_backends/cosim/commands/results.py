@@ -39,7 +39,7 @@ class FlowRecovery:
 
 
 def recoveries(scenario: CosimScenario, run: Run) -> list[FlowRecovery]:
-    """Return the recovery of each flow that a fault of the radio affected, by fault and flow.
+    """Return the recovery of each flow from each fault of the radio that affected it.
 
     A fault that has no end, or that ends after the run, is ignored.
 

@@ -161,10 +161,10 @@ def check(scenario: CosimScenario, world: World, where: Callable[[Location], str
     Args:
         scenario: The scenario.
         world: Its world.
-        where: Returns the line of a value in the scenario's file from its keys, for the message.
+        where: Returns the place of a value for the message, for example its line in the file, from its keys.
 
     Raises:
-        ConfigurationError: It cannot be run; the message has the first reason and its line in the file.
+        ConfigurationError: It cannot be run; the message has the first reason and its place.
     """
     for problem in problems(scenario, world):
         raise ConfigurationError(problem.message, where=where(problem.location), remedy=problem.remedy)

@@ -111,6 +111,7 @@ def _schema(rows: Iterable[Mapping[str, Value]], factors: Sequence[Factor]) -> p
         for name, column_type in types.items()
         if name not in partitions
     ]
+    # `partitions`: the columns that are folders, with their meanings. `by`: the columns that identify a condition.
     metadata = {
         "fieldkit_version": version("fieldkit"),
         "schema_version": str(SCHEMA_VERSION),
