@@ -160,7 +160,8 @@ class Agents:
         except AttributeError:
             raise FederateError(
                 f"physics, requested to advance to {seconds_text(now_ns)}, returned {states!r}, which is not a "
-                "mapping of states"
+                "mapping of states",
+                remedy="return a mapping from the name of each agent to its State",
             ) from None
         self._states = states
         return states
@@ -202,7 +203,10 @@ class Agents:
         missing_names = lost_names - self._names_outside_lifetime
         if missing_names and not (self._states and getattr(self.physics, "agents_disappear", False)):
             names = ", ".join(sorted(missing_names))
-            raise FederateError(f"physics, requested to advance to {seconds_text(now_ns)}, has no state of {names}")
+            raise FederateError(
+                f"physics, requested to advance to {seconds_text(now_ns)}, has no state of {names}",
+                remedy="return the states of all agents, or set agents_disappear to True if physics removes agents",
+            )
         for name in sorted(lost_names):
             state = self._states[name]
             lifetime = self._lifetimes.get(name)
@@ -347,7 +351,8 @@ class Agents:
             if repeats > _MAX_WAKES_AT_ONE_TIME:
                 raise FederateError(
                     f"the program of {' and '.join(names)} woke {repeats} times at {seconds_text(wake_ns)}: its "
-                    "next wake time does not advance"
+                    "next wake time does not advance",
+                    remedy="correct the program: after a wake, next_wake_ns must return a later time",
                 )
             previous_wake_ns = wake_ns
             sent_datagrams += self._wake(wake_ns, dict.fromkeys(names, ()))

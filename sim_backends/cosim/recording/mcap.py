@@ -25,6 +25,7 @@ _TEXT: Final = {"type": "string"}
 
 
 def _object(title: str, properties: Json, *optional: str) -> Json:
+    """Return the JSON schema of an object; all its properties are required, except those in `optional`."""
     required = [name for name in properties if name not in optional]
     return {"title": title, "type": "object", "properties": properties, "required": required}
 

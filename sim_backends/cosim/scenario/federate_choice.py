@@ -1,4 +1,4 @@
-"""The section of a scenario file that selects the federate for the physics or the network, and its options."""
+"""The section of a scenario file that selects the federate (simulator) for physics or network, and its options."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, Final
