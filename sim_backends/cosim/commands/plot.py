@@ -214,6 +214,7 @@ def _paths_m(recording: Recording) -> dict[str, list[tuple[float, float]]]:
 
 
 def _traces(recording: Recording) -> list[FlowTrace]:
+    """Return the packets of each flow over time, without packets whose fate is not decided."""
     flows: dict[str, list[tuple[float, float, float]]] = {}
     for fate in recording.run.fates.values():
         if fate.is_decided:

@@ -75,6 +75,11 @@ class ReproducedRows:
         return Distance(metres, f"{metres:g}m")
 
     def _check(self, trial: ReproducedTrial) -> None:
+        """Check that the line of sight and the traffic of the scenario agree with the procedure.
+
+        Raises:
+            ConfigurationError: They differ.
+        """
         procedure = trial.procedure
         remedy = "change the scenario, or remove `trial` from it"
         if self._trial.scenario != self._scenario.line:

@@ -159,6 +159,7 @@ def _packets(recording: Recording) -> Iterator[Message]:
 
 
 def _fate(fate: Fate) -> dict[str, Any]:
+    """Return the fields that describe the fate of a packet; none while the packet is under way."""
     if fate.arrived_ns is None or fate.counted_ns is None:
         return {"arrived": False, "reason": fate.reason} if fate.reason else {}
     packet = fate.packet
