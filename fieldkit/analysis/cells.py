@@ -300,6 +300,7 @@ def _same_size_estimates(repeats: Repeats, quantity: Quantity, cell_rows: Indice
         )
         for cell in range(len(values))
     ]
+    # One row per cell, with the attributes of `Estimate` from `value` on, in their order.
     for row in zip(
         point_estimates.value.tolist(),
         *map(_or_none, (point_estimates.low, point_estimates.high)),

@@ -47,7 +47,7 @@ def condition(folder: Path) -> dict[str, str]:
         For each column, in order, the name of the column that contains its values as the user typed them.
     """
     by, partitions = ([*map(str, _metadata(folder, key))] for key in ("by", "partitions"))  # type: ignore[call-overload]
-    return dict(zip(by, (*by[:1], *partitions), strict=True))
+    return dict(zip(by, (*by[:1], *partitions), strict=True))  # the flow's column has the typed names itself
 
 
 def declared_columns(folder: Path) -> tuple[Column, ...]:

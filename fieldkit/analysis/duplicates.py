@@ -30,7 +30,7 @@ def deduplicated(repeats: Repeats) -> tuple[Repeats, tuple[str, ...]]:
         f"{source}: {format_count(rows, 'row')} also in {kept}, counted once"
         for (source, kept), rows in pairs.items()
     )
-    return repeats.where(np.setdiff1d(firsts, duplicates)), notes
+    return repeats.where(np.sort(index)), notes
 
 
 def _check_equal(kept: Repeats, other: Repeats) -> None:

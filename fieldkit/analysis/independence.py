@@ -78,6 +78,7 @@ def _von_neumann(centred: Floats) -> tuple[Floats, Floats]:
     """
     n = centred.shape[1]
     s, q = (centred**2).sum(axis=1), (centred**4).sum(axis=1)
+    # Numbers of ordered selections of two, three and four different ranks.
     two, three, four = n * (n - 1), n * (n - 1) * (n - 2), n * (n - 1) * (n - 2) * (n - 3)
     squares, cubes = (s**2 - q) / two, -q / two  # means of x^2 y^2 and x^3 y over different ranks
     pairs, all_four = (2 * q - s**2) / three, (3 * s**2 - 6 * q) / four  # means of x^2 y z and x y z w

@@ -79,6 +79,7 @@ def read(
             parts.append(dataset)
             order.append(np.full(len(dataset), number))
             continue
+        # A large table is read in blocks, unless `content` reads its bytes in another way.
         if content == Path.read_bytes and (large := _read_large(path, columns_by_name)) is not None:
             parts.append(large)
             order.append(np.full(len(large), number))

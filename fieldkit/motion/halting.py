@@ -1,4 +1,4 @@
-"""Stop the programs of the agent that drive or fly robots, including programs of other instances of fieldkit."""
+"""Stop fieldkit's programs that drive or fly robots, including programs of other instances of fieldkit."""
 
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -78,6 +78,9 @@ def poll_states(shell: Shell, programs: Iterable[str], deadline: Deadline) -> Ha
 
 def read_liveness(shell: Shell, file: str, deadline: Deadline) -> bytes:
     """Return the liveness file of a drone's pilot and guard, followed by /proc/uptime.
+
+    The pilot is the program that flies the drone, the guard is the program that lands it if the pilot fails. The file
+    contains their counters, which show that they run.
 
     Raises the same errors as `halt_attempt`.
     """

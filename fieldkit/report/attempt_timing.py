@@ -232,7 +232,7 @@ def _activities_of_jobs(times: AttemptTimes) -> Iterator[Activity]:
 
 
 def _activities_of_faults(times: AttemptTimes, evidence: AttemptEvidence) -> Iterator[Activity]:
-    """Yield each fault from its start to the end of its cause, at which the job that waits for recovery starts."""
+    """Yield each fault from its start to its end, at which the job that waits for recovery starts."""
     for (role, name), (recovery_ns, _) in times.jobs.items():
         step, _, what = name.rpartition(".")
         kind = what.removeprefix("fault-").removesuffix(_RECOVERY_JOB_SUFFIX)

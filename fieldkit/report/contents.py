@@ -246,16 +246,16 @@ def _further_charts(
         first: Plain names of quantities that are drawn already.
     """
     drawn_names = {*distance.LOSS, *distance.DELAY, *distance.RATE, *first}
-    undefined_names: dict[str, str] = {}  # by plain name, the first name
+    further_names: dict[str, str] = {}  # by plain name, the name of the first quantity
     for quantity in measured_in(cells):
         if (
             not quantity.is_builtin
             and plain_name(quantity.name) not in drawn_names
             and distance.has_curve(cells, quantity, evidence)
         ):
-            undefined_names.setdefault(plain_name(quantity.name), quantity.name)
-    selected_names = dict.fromkeys((*map(plain_name, requested), *list(undefined_names)[:_MAX_FURTHER]))
-    undrawn_names = [name for plain, name in undefined_names.items() if plain not in selected_names]
+            further_names.setdefault(plain_name(quantity.name), quantity.name)
+    selected_names = dict.fromkeys((*map(plain_name, requested), *list(further_names)[:_MAX_FURTHER]))
+    undrawn_names = [name for plain, name in further_names.items() if plain not in selected_names]
     return ChartSection(
         "further",
         "Further figures against distance",

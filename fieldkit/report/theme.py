@@ -69,10 +69,10 @@ SETTINGS: Final[dict[Any, Any]] = {
     "grid.linewidth": 0.6,
     "legend.frameon": False,
     "lines.linewidth": 1.4,
-    "pdf.fonttype": 42,
+    "pdf.fonttype": 42,  # TrueType, because IEEE accepts no Type 3 fonts
     "savefig.dpi": 300,
-    "svg.fonttype": "none",
-    "svg.hashsalt": "fieldkit",
+    "svg.fonttype": "none",  # texts remain texts
+    "svg.hashsalt": "fieldkit",  # a fixed salt gives equal ids in each run
     "text.color": LIGHT["ink"],
     # Names from evidence must not be parsed as formulas.
     "text.parse_math": False,

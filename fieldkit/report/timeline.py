@@ -203,6 +203,8 @@ def estimate_send_times(
 ) -> NDArray[np.float64]:
     """Return approximate send times of requests without a reply, interpolated by sequence number.
 
+    Before the first and after the last answered request, the mean interval is used.
+
     Args:
         lost_numbers: Sequence numbers of the requests without a reply.
         answered_numbers: Sequence numbers of answered requests, ascending.

@@ -173,6 +173,7 @@ def load_evidence(repeats: Repeats, attempt: str = "") -> Evidence:
             if differences := verification.differences(Path(source)):
                 summary = verification.summarize(differences)
                 limitations.append(f"{source}: evidence that differs from the manifest is left out: {summary}")
+                # The first two parts of a name are the attempt's folder: `repeats/udp-07`.
                 changed_folders |= {Path(source, *Path(name).parts[:2]) for name in differences}
         except FieldkitError as error:
             limitations.append(error.located)

@@ -110,6 +110,7 @@ class LoadOptions(OverLink):
             ports=ports,
             expected=FlowSchedule(
                 interval_s=self.interval_s(scene.protocol),
+                # A TCP stream from the client starts with iperf3's cookie.
                 head_bytes=0 if reverse or transport is Protocol.UDP else COOKIE_BYTES,
                 duration_s=duration_s,
                 receiver_end_ns=receiver_end_ns,

@@ -85,6 +85,7 @@ class Motions:
             return False
         self.stop_ordered = True
         if self._first_order_lock.acquire(blocking=False):
+            # If a robot was registered more than once, its first mover stops it.
             movers = {mover.robot: mover for mover in reversed(self._movers)}
             threading.Thread(
                 target=self._stop, args=(tuple(movers.values()), report), name="stop", daemon=True

@@ -24,6 +24,7 @@ DATAGRAM_BYTES: Final[Mapping[Netcat, int]] = {Netcat.TRADITIONAL: 8192, Netcat.
 
 _READ_BYTES: Final = {Netcat.TRADITIONAL: 8192, Netcat.OPENBSD: 16384, Netcat.NCAT: 8192}
 _OLD_NCAT_READ_BYTES: Final = 131072
+"""Maximum number of bytes that a listener reads from a datagram, and the number for ncat before `_NCAT_CHANGED`."""
 _NCAT_CHANGED: Final = (7, 94)
 """Since this version (Debian 13 has 7.95) a listening ncat reads UDP into its TCP buffer of 8192 bytes (commit
 4e6c8feb1 of nmap), so that longer datagrams are truncated."""

@@ -174,13 +174,16 @@ def _slab(start: Floats, end: Floats, half: Floats) -> tuple[Floats, Floats]:
     The fractions are 1 and 0 if the path does not enter the range.
     """
     step = end - start
-    level = step == 0
-    step = np.where(level, 1.0, step)
-    with np.errstate(over="ignore"):  # an almost level path intersects the planes infinitely far away
+    is_parallel = step == 0  # to the planes at -half and half
+    step = np.where(is_parallel, 1.0, step)
+    with np.errstate(over="ignore"):  # an almost parallel path intersects the planes infinitely far away
         first, second = (-half - start) / step, (half - start) / step
     entry, exit_ = np.clip(np.minimum(first, second), 0, 1), np.clip(np.maximum(first, second), 0, 1)
     within = np.abs(start) < half
-    return np.where(level, np.where(within, 0.0, 1.0), entry), np.where(level, np.where(within, 1.0, 0.0), exit_)
+    return (
+        np.where(is_parallel, np.where(within, 0.0, 1.0), entry),
+        np.where(is_parallel, np.where(within, 1.0, 0.0), exit_),
+    )
 
 
 def _disc(start: Floats, end: Floats, radius: Floats) -> tuple[Floats, Floats]:
@@ -199,5 +202,8 @@ def _disc(start: Floats, end: Floats, radius: Floats) -> tuple[Floats, Floats]:
     divisor = np.where(is_vertical, 1.0, a)
     entry = np.clip((-half_b - root) / divisor, 0, 1)
     exit_ = np.clip((-half_b + root) / divisor, 0, 1)
-    always = is_vertical & (c < 0)
-    return np.where(crosses, entry, np.where(always, 0.0, 1.0)), np.where(crosses, exit_, np.where(always, 1.0, 0.0))
+    stays_inside = is_vertical & (c < 0)
+    return (
+        np.where(crosses, entry, np.where(stays_inside, 0.0, 1.0)),
+        np.where(crosses, exit_, np.where(stays_inside, 1.0, 0.0)),
+    )

@@ -130,6 +130,9 @@ def test_flows_and_route_checks_name_the_link() -> None:
     assert [flow.link for flow in step.flows(SCENE)] == ["cell"]
     (need,) = step.needs(SCENE)
     assert need.argv == ("ip", "-o", "route", "get", "100.64.0.2")
+    send = parse_step(SendStep, "from: sender, to: receiver, size: 5kB, over: cell")
+    assert isinstance(send, HasNeeds)
+    assert [check.argv for check in send.needs(SCENE)] == [need.argv]
     for other in ("", ", over: wifi", ", over: either"):
         radio = parse_step(PingStep, f"from: sender, to: receiver{other}")
         assert isinstance(radio, HasNeeds)

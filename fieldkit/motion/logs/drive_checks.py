@@ -54,6 +54,7 @@ def contradictions(log: Sequence[DriveMoment], plan: DrivePlan) -> Iterator[str]
     if log[-1].ended != HOME or any(moment.ended for moment in log[:-1]):
         yield f"does not end at the starting position of the robot: {log[-1].ended or 'it ends on the path'}"
     yield from time_contradictions(log, plan.window)
+    # A drive starts up to `_START_M` from its origin, and the robot may have driven before the first line.
     start_m, driven_m = log[0].distance_m, log[0].driven_m
     if not start_m - _START_M <= driven_m <= (1 + _JITTER_SHARE) * (start_m + _START_M) + _JITTER_M:
         yield f"starts {start_m:.2f} m from its origin, after {driven_m:.2f} m driven"

@@ -1,8 +1,9 @@
 """Log of a drone's flight, and its columns.
 
-The agent writes a JSON object per line, ten times a second (`fieldkit.agent.flying.flight_log`): time, phase of the
-flight, and the autopilot's position estimate relative to the origin of the trial's flights, which is the position and
-heading of the first start. All values are measurements of the drone. The first line contains the origin.
+fieldkit's agent on the drone writes a JSON object per line, ten times a second (`fieldkit.agent.flying.flight_log`):
+time, phase of the flight, and the autopilot's position estimate relative to the origin of the trial's flights, which
+is the position and heading of the first start. All values are measurements of the drone. The first line contains the
+origin.
 """
 
 import math

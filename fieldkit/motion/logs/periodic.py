@@ -1,5 +1,7 @@
 """Loss of messages that an autopilot sends to every station at a fixed period.
 
+Stations are the programs that receive its messages, such as a ground station and fieldkit's recorder.
+
 Sequence numbers alone overestimate this loss: a router withholds messages that are addressed to other stations, and
 their numbers are missing too. Therefore, a message counts as lost only if the autopilot's time (`time_boot_ms`) shows
 that a message was due, and a sequence number is missing at that time.

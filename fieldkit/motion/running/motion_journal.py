@@ -1,7 +1,8 @@
 """The journal of motions: the origin of each self-moving robot, each motion, and each permission after a fault.
 
-It is stored next to the journal of the trial, or of the campaign that the trial belongs to. It is append-only, and
-each line is synced to disk before the program continues (`fieldkit.core.jsonl`).
+The origin is the position and heading at the first start. The journal is stored next to the journal of the trial, or
+of the campaign that the trial belongs to. It is append-only, and each line is synced to disk before the program
+continues (`fieldkit.core.jsonl`).
 """
 
 import time

@@ -1,4 +1,7 @@
-"""The lease of the program that drives a robot, and the status that the program reports."""
+"""The lease of the program that drives a robot, and the status that the program reports.
+
+The lease is the time after which an order expires unless the laptop renews it (`fieldkit.motion.steps.lease`).
+"""
 
 import json
 import math

@@ -126,7 +126,7 @@ def files(name_pattern: str) -> tuple[str, ...]:
     return tuple(name_pattern.format(file) for file in (drive_log.FILE, orders_file("drive"), STATUS, _LOG))
 
 
-def _drive(robot: Robot) -> Drive:
+def _drive_section(robot: Robot) -> Drive:
     """Return the section `drive` of a robot's profile.
 
     Raises:
@@ -139,7 +139,7 @@ def _drive(robot: Robot) -> Drive:
     return drive
 
 
-def _origin(scene: Scene, move: Move) -> dict[str, Any]:
+def _origin_fields(scene: Scene, move: Move) -> dict[str, Any]:
     """Return the keys of a drive task that depend on the origin of the robot in this trial."""
     origins = origins_of(scene)
     origin, last = origins.get(move.role), origins.last(move.role)
@@ -153,7 +153,7 @@ def _origin(scene: Scene, move: Move) -> dict[str, Any]:
 
 def _task(robot: Robot, move: Move) -> dict[str, Any]:
     """Return the fields of a `fieldkit.agent.driving.drive_plan.DriveTask`."""
-    drive = _drive(robot)
+    drive = _drive_section(robot)
     return {
         "legs": [(leg.away_m, leg.left_m) for leg in move.legs],
         "speed_m_s": move.speed_m_s,
@@ -172,7 +172,7 @@ def _driver_arguments(scene: Scene, move: Move, name_pattern: str) -> str:
     from fieldkit.ros.interfaces.qos import PROFILES  # noqa: PLC0415
 
     robot = scene.robot(move.role)
-    drive = _drive(robot)
+    drive = _drive_section(robot)
     middleware, ros = middleware_of(robot), robot.profile.ros
     message_types = (
         types.MessageTypes(types.Distribution.of(ros.command.distribution)) if ros else types.standard_types()
@@ -198,7 +198,7 @@ def _driver_arguments(scene: Scene, move: Move, name_pattern: str) -> str:
         "command": topic(drive.topic, drive.type, "default", 1),
         **({"frame": drive.frame} if drive.type == TWIST_STAMPED else {}),
         "odometry": topic(drive.odometry, "nav_msgs/msg/Odometry", "sensor_data", 2),
-        "task": {**_task(robot, move), **_origin(scene, move)},
+        "task": {**_task(robot, move), **_origin_fields(scene, move)},
         "orders": orders_file(name_pattern.format("drive")),
         "status": name_pattern.format(STATUS),
         "stationary": jobs.stationary_file(name_pattern.format("drive")),
@@ -229,8 +229,8 @@ def _network(robot: Robot, middleware: MiddlewareName) -> dict[str, Any]:
 def drive_robot(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name_pattern: str) -> Iterator[DriveLease]:
     """Drive a robot along its path while the body runs, and back to its place afterwards; yield its lease.
 
-    After an error in the body the robot drives back, too; if it cannot, the operator brings it back. After an
-    interruption (Ctrl-C) the robot stops where it is.
+    After an error in the body the robot drives back, too. A real robot that cannot drive back stays where it is until
+    a person has confirmed that it is at its place. After an interruption (Ctrl-C) the robot stops where it is.
 
     Raises:
         LinkError: The robot did not answer.
@@ -239,7 +239,7 @@ def drive_robot(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name_
         OSError: The journal of motions cannot be written; the robot does not start.
     """
     shell, robot = testbed.shells[move.role], scene.robot(move.role)
-    lease_s = _drive(robot).lease
+    lease_s = _drive_section(robot).lease
     mover = RobotMover(robot.name, shell, scene.folder, f"it stops automatically within {lease_s:g} s")
     drive_lease = DriveLease(shell, plan.job, name_pattern, lease_s)
     with scene.motions.moving(mover), lease.start_program(shell, plan.job), drive_lease, ExitStack() as stack:
@@ -278,10 +278,10 @@ def _out_and_back(  # noqa: PLR0917 (all of them belong to one motion)
     """Drive a robot along its path while the body runs, then back; see `drive_robot`."""
 
     def bring_back() -> str:
-        final_state = _bring_back(testbed, shell, job, drive_lease, move, by_hand=not origins_of(scene).robots_stay)
+        final_state = _bring_back(testbed, shell, job, drive_lease, move, in_lab=not origins_of(scene).robots_stay)
         if final_state == drive_log.HOME:
             motion.mark_ended(drive_lease.pose)
-        elif drive_lease.status.get("ended"):
+        elif drive_lease.status.get("ended"):  # the robot has stopped on its path, and reported its pose
             motion.at = drive_lease.pose
         return final_state
 
@@ -307,20 +307,19 @@ def _out_and_back(  # noqa: PLR0917 (all of them belong to one motion)
 
 
 def _bring_back(
-    testbed: Testbed, shell: Shell, job: Job, drive_lease: DriveLease, move: Move, *, by_hand: bool
+    testbed: Testbed, shell: Shell, job: Job, drive_lease: DriveLease, move: Move, *, in_lab: bool
 ) -> str:
     """Order a robot back, and return `DriveLease.final_state`.
 
-    If the robot does not come back and `by_hand` is set, the operator is asked to bring it back.
-
-    Without `by_hand` a robot that did not come back stays where it is: before robots move again, a person is asked to
-    put it at its place (`fieldkit.motion.running.permission`).
+    In a lab the testbed then puts the robot at its exact place, whether it came back or not. A real robot that did
+    not come back stays where it is: before robots move again, a person is asked to put it at its place
+    (`fieldkit.motion.running.permission`).
     """
     drive_lease.turn_back()
     drive_lease.wait(lambda: drive_lease.final_state, Deadline.after(START_S + limit_s(move)))
     final_state = drive_lease.final_state
     _stop_driver(shell, job)
-    if by_hand or final_state == drive_log.HOME:
+    if in_lab or final_state == drive_log.HOME:
         testbed.bring_back(move.role, has_returned=final_state == drive_log.HOME)
     return final_state
 

@@ -1,4 +1,8 @@
-"""The alarm of a flight that ends without a landing: last known state of the drone, and the required action."""
+"""The alarm of a flight that ends without a landing: last known state of the drone, and the required action.
+
+The pilot is the program that flies the drone, the guard lands it if the pilot fails, and the rescue lands it if both
+fail.
+"""
 
 import json
 from collections.abc import Iterator, Sequence

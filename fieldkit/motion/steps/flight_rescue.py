@@ -1,7 +1,8 @@
 """Rescue of a drone from the laptop: it is landed if its pilot and its guard have both exited or are suspended.
 
-The pilot and the guard monitor each other. The rescue monitors both by the counters in the file that they share. It
-polls several times a second, so it is used only if the control connection does not cross the radio under test.
+The pilot is the program that flies the drone, the guard is the program that lands it if the pilot fails. They run on
+the drone and monitor each other. The rescue monitors both by the counters in the file that they share. It polls
+several times a second, so it is used only if the control connection does not cross the radio under test.
 """
 
 import threading
@@ -97,6 +98,7 @@ class FlightRescue:
         return self._may_send and not self.failure
 
     def _watch(self) -> None:
+        """Poll the counters until this context is left; start the rescue if neither program runs."""
         monitor = LivenessMonitor()
         while not self._exit_event.wait(_POLL_S):
             try:

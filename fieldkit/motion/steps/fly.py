@@ -183,6 +183,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         return self.prefixed_name(fly_log.FILE)
 
     def _pilot(self, scene: Scene) -> Planned:
+        """Return the job of the pilot, the program that flies the drone."""
         limit_s = _LIMIT_S + self.expected_s(scene.protocol)
         return piloting.flight_job(scene, self.robot, self.prefixed_name("fly"), self._plan(scene), limit_s)
 
@@ -192,6 +193,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         return max(self.lease, piloting.LEASE_S)
 
     def _guard(self, scene: Scene) -> Planned:
+        """Return the job of the guard, which ends the flight if the pilot fails or the attempt is aborted."""
         return piloting.guard_job(
             scene,
             self.robot,

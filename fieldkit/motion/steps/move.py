@@ -98,6 +98,7 @@ class MoveStep(
             speed_m_s = min(speed_m_s, fastest_m_s)
             if fence_m is not None and geometry.farthest_m(legs) > fence_m:
                 margin_m = min(_FENCE_MARGIN_M, fence_m / 2)
+                # A path of which nothing remains is kept unchanged.
                 path = tuple(filter(None, map(PathLeg.of, geometry.clip_path(legs, fence_m - margin_m)))) or path
         update = {"path": path, "speed": speed_m_s, "within_limits": False, "driven": self.driven or can_drive(robot)}
         step = self.model_copy(update=update)

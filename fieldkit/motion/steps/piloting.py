@@ -1,7 +1,8 @@
 """Control of drones from the laptop: jobs of the programs on the drone that fly or guard it, and their leases.
 
-The programs are parts of the agent (`fieldkit.agent.flying.flight`, `fieldkit.agent.flying.guard`). If this process
-is killed, or the control link is down for longer than the lease, they end the flight by the action of `on_abort`.
+The programs are parts of fieldkit's agent (`fieldkit.agent.flying.flight`, `fieldkit.agent.flying.guard`). An
+order to them is valid for a limited time, the lease, and the laptop renews it. If this process is killed, or the
+control link is down for longer than the lease, the programs end the flight by the action of `on_abort`.
 """
 
 import json

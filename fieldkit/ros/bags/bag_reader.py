@@ -43,6 +43,7 @@ def answer(request: Json) -> Json:
         return contents(rosbag1.Reader(path))
     if path.suffix == ".db3":
         _check_database(path)
+    # The first reader counts the messages in the file, the second one reads their number from metadata.yaml.
     return contents(_open_ros2(path)) | {"metadata_messages": contents(_open_ros2(path.parent))["messages"]}
 
 

@@ -1,4 +1,4 @@
-"""Describe topics for the agent on a robot (`fieldkit.agent.messaging.middleware.Topic`)."""
+"""Describe topics for fieldkit's agent on a robot (`fieldkit.agent.messaging.middleware.Topic`)."""
 
 from typing import Any
 

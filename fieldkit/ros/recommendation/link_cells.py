@@ -170,6 +170,7 @@ def estimate_text(estimate: Estimate | None, factor: float) -> str:
     if estimate is None or estimate.sample is None:
         return "unknown"
     low, high = (f"{factor * end:.2f}" if end is not None else "unknown" for end in (estimate.low, estimate.high))
+    # A repeat whose value is only a lower bound is shown with this bound.
     repeats = ", ".join(f"{factor * value:.1f}" for value in estimate.sample.low.tolist())
     missing = f", unknown in {estimate.missing}" if estimate.missing else ""
     return f"{factor * estimate.value:.2f} [{low}, {high}], by repeat {repeats}{missing}"

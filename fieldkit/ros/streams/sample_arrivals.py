@@ -75,7 +75,10 @@ class SampleArrivals:
 
 
 def _complete_ns(subscriber: SampleFlow, heads: SampleHeads, *, complete: bool, reliable: bool) -> Ints | None:
-    """Return the time at which each sample and all earlier ones had arrived, by sample number; None if unknown."""
+    """Return the times at which the samples of `heads` were completely received; None if they are unknown.
+
+    Over TCP and with a reliable middleware, all earlier samples must have been received, too.
+    """
     if subscriber.is_tcp:
         return _contiguous_ns(subscriber, heads.end)
     if heads.is_complete.all():
@@ -85,7 +88,9 @@ def _complete_ns(subscriber: SampleFlow, heads: SampleHeads, *, complete: bool, 
 
 
 def _may_have_waited(samples: TopicSamples, heads: SampleHeads) -> Mask:
-    """Return a mask of the captured samples, by number, that may have waited for a sample that was not captured.
+    """Return a mask of the captured samples that may have waited for a sample that was not captured.
+
+    Its elements are in the order of sample numbers.
 
     A reliable middleware delays samples until the previous one has arrived or is known to be lost.
     """
@@ -113,6 +118,7 @@ def _contiguous_ns(subscriber: SampleFlow, end: Ints) -> Ints | None:
     data, _ = connection
     base = int(end[0])
     starts, first = np.unique(seq_difference(data.tcp_seq, base), return_index=True)
+    # TCP delivers the bytes of a segment when all segments before it have arrived, too.
     until_ns = np.maximum.accumulate(data.time_ns[first])
     contiguous_ns: Ints = until_ns[np.maximum(np.searchsorted(starts, seq_difference(end, base), side="left") - 1, 0)]
     return contiguous_ns

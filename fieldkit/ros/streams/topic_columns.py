@@ -337,6 +337,7 @@ def _traffic(flow: TopicTraffic, publisher_packets: Packets | None) -> Measured:
     packets = with_ports(publisher_packets)
     to_data, to_discovery = np.isin(packets.dport, data), np.isin(packets.dport, discovery)
     from_data, from_discovery = np.isin(packets.sport, data), np.isin(packets.sport, discovery)
+    # If the two ports of a packet are of different kinds, the destination port decides.
     kinds = {
         "data": to_data | (from_data & ~to_discovery),
         "discovery": to_discovery | (from_discovery & ~to_data),

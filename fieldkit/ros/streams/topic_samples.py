@@ -1,4 +1,4 @@
-"""Samples of topics, read from logs that the agent writes on a robot and from captures, by the heads of samples.
+"""Samples of topics, from logs that fieldkit's agent writes on a robot, and from captures, by the heads of samples.
 
 A log (`fieldkit.agent.messaging.records`) is a magic number followed by fixed-size records. If the writer of a log
 was killed, the log ends with zeros, because the file grows by blocks.
@@ -178,6 +178,7 @@ def _is_intact(content: bytes | mmap, end_record: np.void, *, required: bool) ->
 
 
 _WORD_BYTES: Final = 8
+"""Size of an integer in the head of a sample."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,6 +243,7 @@ def _positions(data: Buffer, frames: Frames, pattern: bytes) -> Ints:
 
 MAGIC: Final = b"fieldkit"
 HEAD_BYTES: Final = 24
+"""Size of the head of a sample: magic number, sequence number and time of sending."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -92,6 +92,7 @@ def read(path: Path, port: int) -> RtpPackets:
 
 def match_frames(sent: RtpPackets, received: RtpPackets) -> CapturedFrames:
     """Return the frames of the sender's capture, with their packets in the receiver's capture."""
+    # The arrays below have one element per time stamp, sorted by time stamp; the result is in the order of sending.
     stamps, first = np.unique(sent.stamp, return_index=True)
     in_order = np.argsort(first)
     _, distinct = np.unique(sent.keys, return_index=True)

@@ -192,6 +192,7 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
             f"src host {scene.link(role, self.over).address} and dst host {group}" for group, role in sorted(groups)
         ]
         ports = dict.fromkeys(port for port in (*(flow.port for flow in flows), self.port) if port is not None)
+        # `ip[6:2] & 0x1fff` is the fragment offset, which is 0 only in unfragmented packets and first fragments.
         packet_kinds = " or ".join((*(f"port {port}" for port in ports), "icmp", "ip[6:2] & 0x1fff != 0"))
         host_filter = hosts[0] if len(hosts) == 1 else f"({' or '.join(f'({pair})' for pair in hosts)})"
         return f"{host_filter} and ({packet_kinds})"

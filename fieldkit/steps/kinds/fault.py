@@ -204,11 +204,11 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     def _record_times(
         self, scene: Scene, request_ns: int, duration_s: float | None, clock_offsets: Mapping[Role, Offset]
     ) -> None:
-        """Record the times of the fault by the laptop's clock; called when the cause has ended."""
+        """Record the times of the fault by the laptop's clock; called when the fault itself has ended."""
         if scene.laptop_folder is None:
             return
         now_ns = time.time_ns()
-        # A fault with a duration started `duration_s` ago; a reboot or a kill lasts from the request until now.
+        # A fault with a known duration started `duration_s` ago. Otherwise it lasted from the request until now.
         start_ns = now_ns - round(1e9 * duration_s) if duration_s else request_ns
         times = FaultTimes(start_ns, None if duration_s is None else now_ns, clock_offsets)
         path = scene.laptop_folder / self.prefixed_name(recoveries.fault_times_file(self.kind))

@@ -15,6 +15,7 @@ RECOVERED_S: Final = 1.0
 """A robot has recovered when it has sent as many answers as it normally sends in this time."""
 
 _INTERVAL_S: Final = 0.1
+"""Time between two pings or polls."""
 
 # Every $2 seconds, prints the seconds since boot. While processes named $1 run, also prints `up` and their process
 # IDs. Zombies do not count.
@@ -25,8 +26,8 @@ _WATCH: Final = (
     'read -r now _ </proc/uptime; echo "$now${pids:+ up}$pids"; sleep "$2"; done'
 )
 
-# Prints the duration of the cause ($1) and the interval ($2), then waits until file $3 has $5 more lines that contain
-# $4.
+# Prints the duration of the cause ($1: how long the fault itself lasted, without the recovery) and the interval of
+# pings or polls ($2). Then waits until file $3 has $5 more lines that contain $4.
 _WAIT_FOR_RECOVERY: Final = (
     'echo "lasted_s $1"; echo "interval_s $2"; enough=$(($(grep -c "$4" "$3") + $5)); '
     'until [ "$(grep -c "$4" "$3")" -ge "$enough" ]; do sleep 0.1; done'
@@ -87,11 +88,11 @@ class Observer:
         return Planned(self.role, job, program=program, tool=Tool.PING, permitted_causes=BY_FIELDKIT)
 
     def await_recovery(self, lasted_s: str, limit_s: float) -> Planned:
-        """Return the job that records the duration of the cause and ends when the robot has recovered.
+        """Return the job that records how long the fault itself lasted, and ends when the robot has recovered.
 
         Args:
-            lasted_s: Duration of the cause in seconds, as text, or `unknown`.
-            limit_s: Timeout.
+            lasted_s: Duration of the fault in seconds, as text, or `unknown`.
+            limit_s: Time after which the job stops waiting.
         """
         answer = " up " if self._is_kill else "bytes from"
         arguments = (
@@ -121,7 +122,7 @@ class Observer:
 
     @property
     def _interval_s(self) -> float:
-        """Time between two requests; old iputils allow less than 200 ms only for root."""
+        """Time between two pings or polls; old iputils allow less than 200 ms only for root."""
         tools = self.scene.tools(self.role)
         is_slow = not self._is_kill and tools.ping is PingTool.IPUTILS_OLD and not tools.root
         return ping.OLD_IPUTILS_MIN_INTERVAL_S if is_slow else _INTERVAL_S

@@ -105,7 +105,8 @@ class SendStep(TransferStep):
 
     @override
     def needs(self, scene: Scene) -> Iterator[Need]:
-        """Yield the check of the file to send."""
+        """Yield the checks of a transfer, and the check of the file to send."""
+        yield from super().needs(scene)
         if self.file is not None:
             yield Need(self.sender, f"file {self.file}", ("sh", "-c", _COUNT, "sh", self._path, "-"), self._judge)
 

@@ -135,6 +135,7 @@ class ArduCopterFailsafes:
         yield from self._gcs(state)
 
     def _battery(self, state: VehicleState) -> Iterator[Reaction]:
+        """Yield the reactions to each stage of a low battery that is reached for the first time."""
         parameters = self._parameters
         for stage, (name, level_text) in enumerate(self._STAGES, 1):
             limit_v, limit_mah = parameters[f"BATT_{name}_VOLT"], parameters[f"BATT_{name}_MAH"]
@@ -155,6 +156,7 @@ class ArduCopterFailsafes:
             )
 
     def _gcs(self, state: VehicleState) -> Iterator[Reaction]:
+        """Yield the reactions to the loss of the ground station, and to its return."""
         parameters = self._parameters
         if not parameters["FS_GCS_ENABLE"] or self._gcs_heartbeat_ns is None:
             if self._gcs_lost:
@@ -243,6 +245,7 @@ class Px4Failsafes:
             yield Reaction("Failsafe activated", _CRITICAL, mode)
 
     def _data_link(self, state: VehicleState) -> Iterator[Reaction]:
+        """Yield the reactions to the loss of the ground station, and to its return."""
         if self._gcs_heartbeat_ns is None:
             return
         is_lost = state.now_ns - self._gcs_heartbeat_ns > self._parameters["COM_DL_LOSS_T"] * 1e9
@@ -255,6 +258,7 @@ class Px4Failsafes:
             yield Reaction("Connection to ground station regained", _INFO)
 
     def _battery(self, state: VehicleState) -> Iterator[Reaction]:
+        """Yield the reactions to a battery warning that is higher than all before."""
         parameters, charge = self._parameters, state.battery.charge
         warning = sum(charge < parameters[name] for name in ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR"))
         if warning <= self._warning:
@@ -265,6 +269,7 @@ class Px4Failsafes:
         yield from self._trigger(_LOW_BATTERY_ACTIONS.get((int(parameters["COM_LOW_BAT_ACT"]), warning)), state)
 
     def _trigger(self, mode: Mode | None, state: VehicleState) -> Iterator[Reaction]:
+        """Yield the change to a mode; nothing if the vehicle is on the ground, or already returns or lands."""
         if (
             mode is None
             or not state.is_armed

@@ -7,6 +7,7 @@ from fieldkit.core.model import Vector
 CELL_V: Final = (3.5, 4.2)
 """Voltage of a lithium polymer cell, empty and full."""
 CELLS: Final = 3
+"""Number of cells in series."""
 FULL_V: Final = CELLS * CELL_V[1]
 _HOVER_A: Final = 10.0
 """Current while the motors turn."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Final
 
 NAME_BYTES: Final = 16
+"""Length of a name in messages."""
 
 
 @dataclass(frozen=True)

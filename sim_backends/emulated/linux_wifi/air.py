@@ -27,6 +27,7 @@ from sim_backends.radio.world_channel import WorldChannel
 from sim_backends.world.world import World
 
 _FCS_BYTES: Final = 4
+"""Length of the frame check sequence, which frames from the kernel do not contain."""
 _LOWEST_SIGNAL_DBM: Final = -120
 _ABSENT: Final = ""
 """Station without a position: the receiver of frames to an address that no radio has."""
@@ -167,6 +168,7 @@ class _Channel:
         self._gains.move(now_ns, positions_m, velocities_m_s)
 
     def transmit(self, now_ns: int, frame: FrameOnAir) -> None:
+        """Send a frame. If none of its tries is possible, its status is reported immediately."""
         number = self._numbers[frame.source]
         self._numbers[frame.source] = number + 1
         identity = frame.source, number
@@ -200,6 +202,7 @@ class _Channel:
             self.events.statuses.append(frame)
 
     def _on_attempt(self, attempt: TransmissionAttempt) -> None:
+        """Store the mode of a received attempt. The status of a broadcast is known after its only attempt."""
         frame = attempt.payload
         if not isinstance(frame, FrameOnAir):
             return  # an ACK

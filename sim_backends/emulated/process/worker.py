@@ -208,6 +208,7 @@ class Worker:
         self._log.close()
 
     def _exit_error(self, cause: str) -> TestbedLostError:
+        """Return the error for a process that does not answer, with the signal that killed it and its last output."""
         if self._log.closed:
             cause, last_line = "it was stopped", ""
         else:
