@@ -114,6 +114,7 @@ def _count(
                 continue
             kind = words[2].decode("ascii", "replace")
             is_counted_sender = address in numbers_by_sender or len(numbers_by_sender) < _MAX_SENDERS
+            # A number has at most four digits, so a faulty sender cannot fill the memory.
             if is_counted_sender and len(data) == SIZES.get(kind) and words[3].isdigit() and len(words[3]) <= 4:
                 numbers_by_sender.setdefault(address, {}).setdefault(kind, set()).add(words[3])
     return {

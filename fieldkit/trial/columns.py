@@ -13,7 +13,7 @@ from fieldkit.measure.robot_state import state_columns
 from fieldkit.steps.base import Step, step_types
 
 IDENTITY: Final = columns.columns(
-    0,
+    0,  # the rank: these columns are the first columns of the table
     ("schema_version", "count", "Version of the columns in the version of fieldkit that measured the row."),
     ("trial", "text", "Name of the trial's folder."),
     ("procedure", "text", "Name of the procedure."),
@@ -99,7 +99,10 @@ def additional_columns(steps: Iterable[Step]) -> tuple[Column, ...]:
 
 
 def robot_columns(roles: Iterable[Role]) -> tuple[Column, ...]:
-    """Return the columns of the robots' states (clocks, computers, radios) and of the marks that these cause."""
+    """Return the columns of the robots' states (clocks, computers, radios) and of marks.
+
+    A mark is a condition of a robot that can explain a difference between repeats, for example a wrong clock.
+    """
     role_columns = (column for role in sort_roles(roles) for column in state_columns.declare_columns(role))
     return (*state_columns.MARK_COLUMNS, *role_columns)
 
@@ -139,6 +142,7 @@ def installed_columns() -> tuple[Column, ...]:
     for kind, step in step_types().items():
         for column in step.columns:
             declaration_error = column.declaration_error()
+            # `setdefault` returns the column that has this name already, if there is one.
             if declaration_error or columns_by_name.setdefault(column.name, column) != column:
                 raise ConfigurationError(
                     f"the kind of step {kind!r} declares a column {column.name!r}, "

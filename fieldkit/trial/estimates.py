@@ -1,4 +1,8 @@
-"""Estimates of the duration of repeats, from the procedure for a good link and, later, from finished repeats."""
+"""Estimates of the duration of repeats, based on finished repeats.
+
+Without finished repeats, they are based on the procedure: the likely duration is that of a good link, the upper bound
+that of a link over which no packet arrives.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -34,12 +38,13 @@ class FinishedRepeat:
 
 def dead_link_s(procedure: Procedure, protocol: Protocol) -> float:
     """Return the longest duration of an attempt in which no packet arrives and all steps reach their timeouts."""
+    # `limit` and `patience` are the timeouts of steps. A step without such a key adds nothing.
     waits_s = (getattr(placed.step, name, 0.0) for placed in procedure.walk() for name in ("limit", "patience"))
     return procedure.expected_s(protocol) + sum(waits_s)
 
 
 def finished_repeats(plan: Plan, entries: Iterable[JournalEntry]) -> list[FinishedRepeat]:
-    """Return the finished repeats of a journal with their durations; interrupted attempts are not included."""
+    """Return the finished repeats of a journal with their durations, without those of interrupted attempts."""
     start_ns: dict[RepeatId, int] = {}
     duration_s: dict[RepeatId, float] = {}
     finished: dict[RepeatId, None] = {}
@@ -49,7 +54,8 @@ def finished_repeats(plan: Plan, entries: Iterable[JournalEntry]) -> list[Finish
         elif entry.status in FINAL_STATUSES and entry.repeat in start_ns and not entry.excused:
             attempt_s = max(entry.utc_ns - start_ns[entry.repeat], 0) / 1e9
             duration_s[entry.repeat] = duration_s.get(entry.repeat, 0.0) + attempt_s
-            finished |= {entry.repeat: None} if entry.status is not Status.VOID else {}
+            if entry.status is not Status.VOID:
+                finished[entry.repeat] = None
     return [FinishedRepeat(plan, repeat.protocol, duration_s[repeat]) for repeat in finished]
 
 

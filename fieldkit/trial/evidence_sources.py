@@ -57,7 +57,7 @@ ATTEMPT_CHECKS: Final = (
         columns=(),
         source="sections of `ROLE-after.txt`",
         against=("sections of `ROLE-before.txt`",),
-        tolerance="a section that a robot cannot provide is missing in both; older trials have no jobs",
+        tolerance="a section that a robot cannot provide is missing in both; older trials have no section `jobs`",
     ),
     CrossCheck(
         quantity="robot that wrote a file",
@@ -99,7 +99,7 @@ def covers(kind: str, column: str) -> bool:
 
 
 def markdown() -> str:
-    """Return the table for `docs/evidence.md`."""
+    """Return the table for `docs/evidence.md`. Its last column is the consequence of a larger difference."""
     lines = [
         "| step | quantity | source | compared with | permitted difference | otherwise |",
         "| --- | --- | --- | --- | --- | --- |",

@@ -1,4 +1,7 @@
-"""The columns that `trial.yaml` lists: the columns of the trial's table that are not in the table of every trial."""
+"""The columns that `trial.yaml` lists: the columns of the trial's table that are not in the table of every trial.
+
+They are frozen: a later version of fieldkit or of a step's package reads the table with the same columns.
+"""
 
 import json
 import sys
@@ -13,11 +16,11 @@ from fieldkit.core.columns import Column, Figure, Kind
 
 MAX_COLUMNS: Final = 3000
 """Maximum number of columns that a trial's table has in addition to the columns of every trial."""
-_MAX_FLOAT: Final = sys.float_info.max  # the YAML reader rejects infinity, and no column has such a value
+_MAX_FLOAT: Final = sys.float_info.max  # replaces an infinite bound, because the YAML reader rejects infinity
 
 
 class FrozenFigure(Strict):
-    """A frozen `fieldkit.core.columns.Figure`."""
+    """A `fieldkit.core.columns.Figure` in the form that `trial.yaml` contains."""
 
     label: str
     kind: Kind
@@ -29,7 +32,7 @@ class FrozenFigure(Strict):
 
 
 class FrozenColumn(Strict):
-    """A frozen `fieldkit.core.columns.Column`. Its rank is its position in the list."""
+    """A `fieldkit.core.columns.Column` as `trial.yaml` contains it. Its position in the list is its rank."""
 
     name: str
     unit: str

@@ -22,6 +22,7 @@ from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import PlacedStep, Procedure
 from fieldkit.trial.step_errors import StepErrors
 
+# Units of values that depend on durations.
 _TIME_UNITS: Final = frozenset(("s", "bit/s", "m/s", "ppm"))
 _NO_TIMES: Final = "the backend's clock counts instructions of a virtual processor, so it measures no real durations"
 
@@ -46,6 +47,7 @@ class EvidenceVerdict:
     @property
     def has_failed(self) -> bool:
         """True if exceptions of steps are the only problems: another attempt would raise them again."""
+        # Each exception is also one of the problems.
         return 0 < len(self.problems) <= len(self.step_errors)
 
 
@@ -60,10 +62,11 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
     Raises:
         MemoryError: This machine has too little memory; this is not a problem of the evidence.
     """
-    scene = plan.scene(repeat, "")
+    scene = plan.scene(repeat, "")  # no folder on the robots is needed, because no command is run
     step_errors = StepErrors()
     # The robots' states are checked first, because their problems cause many of the other problems.
     problems = list(hosts.problems(plan.procedure, scene, evidence, step_errors))
+    # Lateness is the delay of an emulator relative to its radio model; robots with real radios have none.
     lateness = evidence.read_or_none(oracle_delays.read_lateness, oracle_delays.LATENESS_FILE)
     has_no_times = plan.simulators.get(CLOCK) == INSTRUCTIONS
     measured = oracle_delays.measure_lateness(lateness) | oracle_delays.measure_window_lateness(lateness)

@@ -21,8 +21,8 @@ def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence, step
     """Yield the robots' problems that make an attempt void, including missing sections of their state files.
 
     A section that a robot cannot provide is missing before and after the attempt. A section that is missing only
-    once was lost. If a step restarts a robot, only its jobs are checked, because its clock starts again. Exceptions
-    of steps are added to `step_errors`.
+    once was lost. If a step restarts a robot, the robot's boot ID and clock are not compared, because both change.
+    Exceptions of steps are added to `step_errors`.
     """
     planned_jobs: list[Planned] = []
     for placed in procedure.walk():
@@ -61,9 +61,10 @@ def restarted_roles(procedure: Procedure) -> frozenset[Role]:
 def drop_effects_of_reboots(reasons: Sequence[str]) -> list[str]:
     """Return the reasons why an attempt is void, without duplicates and without the effects of reboots.
 
-    If a robot rebooted, the reboot is its only reason.
+    If a robot rebooted, all other reasons that start with the robot's name are removed.
     """
-    reasons = list(dict.fromkeys(reasons))  # after a lost link, the step and the fetching give the same reason
+    # If a link is lost, a step and the fetching of evidence give the same reason.
+    reasons = list(dict.fromkeys(reasons))
     rebooted_robots = [reason.removesuffix(REBOOTED) for reason in reasons if reason.endswith(f": {REBOOTED}")]
     return [
         reason for reason in reasons if reason.endswith(REBOOTED) or not reason.startswith(tuple(rebooted_robots))

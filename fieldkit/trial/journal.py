@@ -31,7 +31,8 @@ class JournalEntry:
         attempt: Number of the attempt; 0 while the repeat is planned.
         status: Status of the repeat or attempt.
         reason: Reason why the attempt is not valid.
-        excused: True if the attempt was interrupted from outside and therefore is not one of the allowed attempts.
+        excused: True if the attempt was interrupted, for example by the operator, and therefore does not count as one
+            of the allowed attempts.
     """
 
     utc_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
@@ -61,9 +62,10 @@ class Attempt:
         started_utc_ns: Start, nanoseconds since 1970 UTC.
         status: Final status, or `running` or `measured` if the attempt has not ended.
         reason: Reason why the attempt is not valid.
-        excused: True if the attempt is not one of the allowed attempts, because it was interrupted from outside or
-            its repeat was reopened later.
-        reopened: True if the attempt failed and its repeat was reopened later. The attempt is then void.
+        excused: True if the attempt does not count as one of the allowed attempts, because it was interrupted or its
+            repeat was reopened later.
+        reopened: True if the attempt failed and its repeat was reopened later (`reopen_failed`). The attempt is then
+            void.
     """
 
     repeat: RepeatId
@@ -123,7 +125,7 @@ def reopen_failed(folder: Path, plan: Plan) -> int:
 
 
 def remove_torn_line(folder: Path) -> None:
-    """Remove an incomplete last line that a crash left; see `jsonl.repair_last_line`."""
+    """Remove the last line of the journal if a crash left it incomplete; see `jsonl.repair_last_line`."""
     jsonl.repair_last_line(folder / JOURNAL_FILE, _CODEC.parse)
 
 
@@ -159,6 +161,7 @@ def _impossible_entries(entries: list[JournalEntry], plan: Plan) -> Iterator[tup
         if repeat.protocol not in plan.protocols or repeat.number > plan.repeats:
             yield line, f"the plan has no repeat {repeat}"
         elif entry.status is Status.PLANNED:
+            # A failed repeat may be planned again. A repeat without a final status is planned for the first time.
             if final_status.pop(repeat, Status.FAILED) is not Status.FAILED:
                 yield line, f"{repeat} is planned again, although it was valid"
         elif entry.status is Status.RUNNING:
@@ -169,7 +172,8 @@ def _impossible_entries(entries: list[JournalEntry], plan: Plan) -> Iterator[tup
             yield line, f"attempt {entry.attempt} at {repeat} is {entry.status}, although it is not running"
         elif entry.status in FINAL_STATUSES:
             ended.add(attempt)
-            final_status |= {repeat: entry.status} if entry.status is not Status.VOID else {}
+            if entry.status is not Status.VOID:
+                final_status[repeat] = entry.status
 
 
 def ended_attempts(entries: list[JournalEntry]) -> list[Attempt]:

@@ -1,6 +1,6 @@
 """The manifest of a trial: a SHA-256 checksum of each file, computed once when the file is stored.
 
-It has the format of `sha256sum`.
+The manifest has the format of the program `sha256sum`.
 """
 
 import hashlib
@@ -20,6 +20,7 @@ Sums = Mapping[str, str]
 """Checksum of each file by its name relative to the trial's folder."""
 
 _LIMIT_BYTES: Final = 1 << 28
+"""Maximum size of a manifest, and of a file whose unchanged lines are counted."""
 _HEX_DIGITS: Final = frozenset("0123456789abcdef")
 
 # sha256sum escapes names that contain a line break or backslash, and starts the line with a backslash.
@@ -47,9 +48,10 @@ class Manifest:
         return attempt in self._lines
 
     def unchanged_lines(self, name: str) -> int | None:
-        """Return the number of lines that the checksum of a top-level file covers; None if these lines have changed.
+        """Return the number of lines of a top-level file that have not changed since its checksum was computed.
 
-        More lines may have been appended since. The result is 0 for a file without a checksum.
+        Lines that were appended later are not counted. The result is None if the other lines have changed, and 0 if
+        the file has no checksum.
         """
         return count_unchanged_lines(self._folder / name, self._top_level[name]) if name in self._top_level else 0
 
@@ -123,7 +125,7 @@ def is_positions(name: str) -> bool:
 
 
 def count_unchanged_lines(path: Path, digest: str) -> int | None:
-    """Return the number of lines at the start of a file that have this checksum, or None if no number has it."""
+    """Return the number of lines at the start of a file that have this checksum, or None if no lines have it."""
     hasher, count = hashlib.sha256(), 0
     try:
         lines = files.read(path, _LIMIT_BYTES).splitlines(keepends=True)
@@ -176,6 +178,7 @@ def _line(name: str, digest: str) -> bytes:
     escaped = name
     for char, escape in _ESCAPES:
         escaped = escaped.replace(char, escape)
+    # chr(92) is a backslash.
     return os.fsencode(f"{'' if escaped == name else chr(92)}{digest}  {escaped}\n")
 
 
@@ -191,6 +194,7 @@ def _parse(line: bytes) -> tuple[str, str]:
 def _unescaped(name: str) -> str:
     chars = {escape[1]: char for char, escape in _ESCAPES}
     parts = iter(name)
+    # After a backslash, `next` takes the character that is escaped.
     return "".join(chars.get(next(parts, ""), "?") if char == "\\" else char for char in parts)
 
 

@@ -22,8 +22,8 @@ below 5 m in 95 % of cases (gps.gov, GPS accuracy); next to a wall it is larger.
 TRACKER_M: Final = 2.0
 """Tolerance for other positions: each of two robots may be 1 m away from its planned place."""
 SHARE: Final = 0.1
-"""Share of the planned distance that is added to both tolerances, for distances that were paced off and for drift of
-odometry."""
+"""Share of the planned distance that is added to the tolerance. It allows for distances that were measured by
+counting paces, and for drift of odometry."""
 
 
 def contradiction(scene: Scene, evidence: AttemptEvidence) -> str | None:
@@ -58,7 +58,11 @@ def _contradictions(scene: Scene, evidence: AttemptEvidence) -> Iterator[str]:
 
 
 def _times_ns(evidence: AttemptEvidence, role: Role, *trajectories: Trajectory) -> Ints:
-    """Return the times at which the distance of two robots is compared, by the laptop's clock."""
+    """Return the times at which the recorded distance of two robots is compared with the planned one.
+
+    They are times of the laptop's clock, from the reading of a robot's state before the attempt to the reading after
+    the attempt. If a reading is missing, they are all times at which a position was recorded.
+    """
     times_ns = np.unique(np.concatenate([trajectory.times_ns for trajectory in trajectories]))
     states = [evidence.read_or_none(host.read_state, file(role)) for file in (host.before_file, host.after_file)]
     clocks = [state.clock for state in states if state is not None and state.clock is not None]

@@ -43,7 +43,8 @@ class Plan(Strict):
         profiles_sha256: Hash of the profiles of the cast.
         procedure_sha256: Hash of the procedure.
         backend: Name of the backend.
-        session: ID of the run of fieldkit, which the robots' locks contain; a resumed trial uses the same value.
+        session: ID of the run of fieldkit that started the trial. The locks on the robots contain it, and a resumed
+            trial uses it again.
         seed: Seed of all random numbers.
         notes: Notes of the operator.
         topology: Topology.
@@ -53,7 +54,7 @@ class Plan(Strict):
         repeats: Repeats per protocol.
         cast: The robot in each role.
         procedure: The procedure.
-        lab_bytes: Maximum number of bytes that the lab adds to an attempt.
+        lab_bytes: Maximum number of bytes that the testbed itself adds to an attempt, such as data of an emulator.
         simulators: Physics, network and sync policy of a backend that simulates them; otherwise empty.
         step_packages: The package of each kind of step that does not ship with fieldkit.
         radios: Channel and regulatory domain of each robot's radio at the start, which must not change during the
@@ -112,12 +113,12 @@ class Plan(Strict):
         return self.model_copy(update={"notes": "; ".join(filter(None, (self.notes, note)))})
 
     def scene(self, repeat: RepeatId, folder: str, variants: Mapping[Role, Variants] = MappingProxyType({})) -> Scene:
-        """Return the inputs for the command lines of one attempt. `variants` are from the preflight checks."""
+        """Return the inputs for the command lines of one attempt. `variants` are the tools of each robot."""
         scene = self.procedure.scene(repeat.protocol, self.cast, folder, variants)
         return replace(scene, placement=self.placement, repeat=repeat.number)
 
     def scenes(self, variants: Mapping[Role, Variants] = MappingProxyType({})) -> tuple[Scene, ...]:
-        """Return a scene for each protocol, for values that are equal in all of its repeats."""
+        """Return a scene for each protocol. It is used for values that are the same in all repeats of a protocol."""
         return tuple(self.procedure.scene(protocol, self.cast, "check", variants) for protocol in self.protocols)
 
     def jobs(self, scene: Scene) -> Iterator[Planned]:

@@ -35,6 +35,6 @@ def captures(plan: Plan) -> Mapping[str, Role]:
 
 
 def bags(plan: Plan) -> Mapping[Role, str]:
-    """Return the name of the first file that is recorded on each robot, relative to an attempt's folder."""
+    """Return the first file (usually a ROS bag) that is recorded on each robot, relative to an attempt's folder."""
     scene = plan.procedure.scene(plan.protocols[0], plan.cast, "")
     return {role: recordings[0].name for role, recordings in scene.recordings.items()}

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 from typing_extensions import override
 
@@ -49,16 +49,19 @@ from fieldkit.trial.procedure_section import ProcedureSection
 if TYPE_CHECKING:
     from fieldkit.analysis.expectations import Expectation
 
+_OVERHEAD_S: Final = 0.5
+"""Estimated duration of the parts of a repeat that are not steps, for example the creation of folders."""
+
 Repeats = Annotated[Int, Field(gt=0, le=MAX_REPEATS)]
 """Number of repeats per protocol."""
 
 
 class Place(PathLeg):
-    """Place of a robot in a role that the procedure defines. Directions are given as in a leg of a path.
+    """Place of a robot in a role that the procedure defines. The keys for directions are those of a path's segment.
 
     Attributes:
-        near: Role of the robot that the place is relative to: `sender`, `receiver` or `relay`. At least one of the
-            four directions is required.
+        near: Role of the robot that the place is relative to: `sender`, `receiver` or `relay`. `away`, `towards`,
+            `left` or `right` is also required.
     """
 
     near: Role
@@ -80,9 +83,9 @@ class Procedure(catalog.Named, Sectioned):
     Steps in one capture must differ in port, sender or receiver. A procedure that cannot be measured is rejected when
     it is loaded; the message contains the line.
 
-    In `master`, the distance is between each station and the relay, and the stations are on opposite sides of it. In
-    `masterless`, it is between sender and receiver. Protocols alternate from repeat to repeat, so that slow changes
-    of the channel affect both equally.
+    In `master`, sender and receiver are on opposite sides of the relay, and the distance is between each of them and
+    the relay. In `masterless`, it is between sender and receiver. Protocols alternate from repeat to repeat, so that
+    slow changes of the channel affect both equally.
 
     Attributes:
         scenario: `los` (line of sight), or `nlos`: the sender is behind a wall.
@@ -254,7 +257,7 @@ class Procedure(catalog.Named, Sectioned):
 
     def expected_s(self, protocol: Protocol) -> float:
         """Return the estimated duration of one repeat on a good link, in seconds."""
-        return 0.5 + sum(entry.step.expected_s(protocol) for entry in self.steps)
+        return _OVERHEAD_S + sum(entry.step.expected_s(protocol) for entry in self.steps)
 
     def with_record(self, duration_s: float) -> "Procedure":
         """Return this procedure with the duration `duration_s` for every recording."""
@@ -326,6 +329,8 @@ class PlacedStep:
 
     def runs_at_same_time_as(self, other: "PlacedStep") -> bool:
         """Return True if an earlier step runs at the same time as this step, and neither contains the other."""
+        # Compare the nested steps around both steps, from the outermost step. `fork` is the depth of the first
+        # difference. The steps run at the same time if the last common step runs its inner steps in parallel.
         paths = zip((*self.within, self.step), (*other.within, other.step), strict=False)
         fork = next((index for index, (step, other_step) in enumerate(paths) if step is not other_step), 0)
         return fork > 0 and self.within[fork - 1].parallel
@@ -372,7 +377,7 @@ def load_procedure(name: str) -> Procedure:
 
 
 def read_procedure(path: Path) -> Procedure:
-    """Return the procedure in any file.
+    """Return the procedure in the file `path`, which can be in any folder.
 
     Raises:
         ConfigurationError: The file cannot be read, or has an error.

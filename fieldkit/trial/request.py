@@ -69,7 +69,7 @@ def make_plan(
         backend: Name of the backend.
         cast: The robot in each role. Robots in roles that the procedure does not use are not part of the plan.
         now: Start of the trial, which is part of its name.
-        session: The run of fieldkit that the trial belongs to; None if the run contains only this trial.
+        session: ID of the run of fieldkit; None if the run contains only this trial.
         lab_bytes: Maximum number of bytes that the lab adds to an attempt (`Backend.lab_bytes`).
         simulators: Simulators of the backend (`simulators_of`).
 
@@ -140,7 +140,7 @@ def _telemetry_columns(cast: Cast) -> Iterator[Column]:
 
 def _robot_data(cast: Cast) -> dict[str, object]:
     """Return the data that distinguishes the robots of this trial from the robots of other trials."""
-    # Equal robots must have the same hash as in earlier versions, which included the key "mavlink" in every profile.
+    # The key "mavlink" keeps the hash equal to that of trials of earlier versions, whose profiles all had this key.
     data: dict[str, object] = {
         role: {"mavlink": None, **robot.profile.model_dump(mode="json")} for role, robot in cast.items()
     }

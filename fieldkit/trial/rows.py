@@ -88,7 +88,7 @@ def describe(plan: Plan, row: Row) -> str:
 
 
 def _step_numbers(step: Step, row: Row) -> Iterator[str]:
-    """Return the most important numbers of a step, from the columns with its prefix."""
+    """Return the most important numbers of a step, from the columns with the prefix of the step."""
     prefix = step_prefixed(step.prefix, "")
     values = {column.removeprefix(prefix): value for column, value in row.items() if column.startswith(prefix)}
     return step.summary(values) if isinstance(step, Summarizes) else iter(())
@@ -125,22 +125,22 @@ def line(row: Row, table: Sequence[Column]) -> str:
     return columns.csv_line(row.get(column.name) for column in table)
 
 
-def write_table(folder: Path, table: str) -> None:
+def write_table(folder: Path, csv_text: str) -> None:
     """Write trial.csv of a trial."""
-    files.write(folder / store.TRIAL_CSV, table.encode())
+    files.write(folder / store.TRIAL_CSV, csv_text.encode())
 
 
-def summary(folder: Path, plan: Plan, table: str) -> tuple[Cell, ...]:
-    """Return the summary of a trial's table.
+def summary(folder: Path, plan: Plan, csv_text: str) -> tuple[Cell, ...]:
+    """Return the summary of a trial. `csv_text` is the content of its trial.csv.
 
     Raises:
         EvidenceError: A value does not match the declaration of its column.
     """
-    return aggregate(repeats.parse(table.encode(), plan.table, str(folder / store.TRIAL_CSV)))
+    return aggregate(repeats.parse(csv_text.encode(), plan.table, str(folder / store.TRIAL_CSV)))
 
 
-def write_summary(folder: Path, plan: Plan, table: str) -> tuple[Cell, ...]:
-    """Write summary.csv for a trial's table and return its cells. Raises the same errors as `summary`."""
-    cells = summary(folder, plan, table)
+def write_summary(folder: Path, plan: Plan, csv_text: str) -> tuple[Cell, ...]:
+    """Write summary.csv of a trial and return its cells. Arguments and errors are those of `summary`."""
+    cells = summary(folder, plan, csv_text)
     files.write(folder / store.SUMMARY_CSV, result_tables.to_csv(DEFAULT_BY, cells).encode())
     return cells

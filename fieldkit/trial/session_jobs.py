@@ -1,8 +1,9 @@
 """Jobs that run on robots during a whole session, such as a topic bridge.
 
-They run from before the first check until the end of the session, so that the preflight checks, operators and all
-trials of the session use the robot in the same state. They are normal jobs: `fieldkit abort` stops them, and a
-resumed session uses jobs that are still running. Packages add them by entry points (`plugins.SESSION_JOBS`).
+A session is one run of fieldkit with one or more trials. The jobs start before the first preflight check and run
+until the session ends, so that the checks and all trials use the robots in the same state. They are normal jobs:
+`fieldkit abort` stops them, and a resumed session uses jobs that are still running. Packages add such jobs by entry
+points (`plugins.SESSION_JOBS`).
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -96,7 +97,8 @@ def _stop(shell: Shell, job: Job) -> str:
     try:
         was_running = any(f"{job.folder}/" in line for line in jobs.list_running(shell, Deadline.after(jobs.REPLY_S)))
         code = jobs.stop(shell, job, grace_s=_GRACE_S)
-        evidence.discard(shell, job.folder.split("/")[-2])
+        session = job.folder.split("/")[-2]  # the job's folder is in the folder of the session
+        evidence.discard(shell, session)
     except TestbedLostError:
         return ""  # the job ended because its robot is gone
     except FieldkitError as error:

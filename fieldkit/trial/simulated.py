@@ -192,10 +192,11 @@ class SimulatedTrial:
 
 
 def differences(measured: Mapping[str, Value], known_values: Mapping[str, Value]) -> str:
-    """Return a text on the columns with different values in evidence and simulation; empty if there are none."""
-    same_names = {"received_bytes": "tcp_received_bytes", "sent_bytes": "tcp_unique_bytes"}
+    """Return a text that names the columns with different values in evidence and simulation; empty without any."""
+    tcp_names = {"received_bytes": "tcp_received_bytes", "sent_bytes": "tcp_unique_bytes"}
     pairs = list(known_values.items())
-    pairs += [(same_names[name], value) for name, value in known_values.items() if name in same_names]
+    # For TCP, captures give these values in other columns.
+    pairs += [(tcp_names[name], value) for name, value in known_values.items() if name in tcp_names]
     difference_texts = []
     for name, value in pairs:
         measured_value = measured.get(name)
@@ -207,7 +208,10 @@ def differences(measured: Mapping[str, Value], known_values: Mapping[str, Value]
 
 
 def _goodput(row: Mapping[str, Value]) -> dict[str, Value]:
-    """Return the goodput as defined in `rates`: if the first packet is a whole datagram, it is not counted."""
+    """Return the goodput as `measure.transfers.rates` defines it.
+
+    The bytes of the first packet are not counted if it is a whole datagram, that is, if no datagram was fragmented.
+    """
     received_bytes, completion_s = row.get("received_bytes"), row.get("completion_s")
     if not isinstance(received_bytes, int) or not isinstance(completion_s, float) or completion_s <= 0:
         return {}

@@ -1,4 +1,7 @@
-"""A trial's folder: file names, plan, and folders of attempts. Folders are synced before they are renamed."""
+"""A trial's folder: file names, plan, and folders of attempts.
+
+The folder of an attempt is synced to disk before it is renamed to its final name.
+"""
 
 import shutil
 import tempfile
@@ -101,9 +104,9 @@ def commit_attempt(partial_folder: Path, name: str) -> Path:
 
 
 def find_committed_attempt(folder: Path, names: Iterable[str]) -> Path | None:
-    """Return the folder of an attempt that was renamed before fieldkit was killed, or None if there is none.
+    """Return the final folder of an attempt if fieldkit was killed after it had renamed the folder; otherwise None.
 
-    The journal lacks the entry of such an attempt.
+    The journal then lacks the entry about the end of the attempt.
 
     Args:
         folder: The trial's folder.

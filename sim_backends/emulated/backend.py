@@ -230,7 +230,7 @@ class EmulatedBackend:
 
     @contextmanager
     def open_lab(self, *, seed: int, sink: Sink) -> "Iterator[Lab]":
-        """Implement `LabBackend.open_lab`."""
+        """Implement `LabBackend.open_lab`: in this process, or for Linux Wi-Fi in a virtual machine if necessary."""
         from sim_backends.emulated import interactive_lab  # noqa: PLC0415 (as in `open`)
 
         if self._site.control is Control.RADIO:
@@ -283,6 +283,7 @@ class EmulatedBackend:
         return members
 
     def _check_infrastructure(self, names: Iterable[str], *, has_relay: bool) -> None:
+        """Raise ConfigurationError if the access points or neighbours in the options conflict with the robots."""
         if not self._options.radio.has_infrastructure:
             return
         from sim_backends.radio.infrastructure import infrastructure  # noqa: PLC0415 (only some labs use it)
@@ -330,6 +331,7 @@ class EmulatedBackend:
 
 
 def _check_ros(robot: "Robot | LabRobot", options: EmulatedOptions) -> None:
+    """Raise ConfigurationError if the lab does not support the ROS settings of a profile."""
     ros = robot.profile.ros
     if ros is None:
         return

@@ -66,7 +66,7 @@ class EmulatedLab:
         self.login = Login(USER, running.private_key, running.host_keys)
 
     def connect(self, name: str, timeout_s: float) -> socket.socket:
-        """Implement `Lab.connect`."""
+        """Implement `Lab.connect`: the connection bypasses the radio."""
         return self._running.robots[name].connect(timeout_s)
 
     def programs(self, name: str) -> tuple[str, ...]:
@@ -74,7 +74,7 @@ class EmulatedLab:
         return tuple(dict.fromkeys(_programs(self._running.robots[name].pid)))
 
     def place_m(self, name: str) -> Vector:
-        """Implement `Lab.place_m`."""
+        """Implement `Lab.place_m`: the position as of the last update."""
         self._running.media.check_alive()
         if self._watch is not None:
             self._watch.check()
@@ -82,7 +82,7 @@ class EmulatedLab:
             return self._positions_m[name]
 
     def move(self, name: str, to: Destination) -> Vector:
-        """Implement `Lab.move`."""
+        """Implement `Lab.move`: the robot arrives immediately."""
         with self._lock:
             position_m = placement.destination_m(self._positions_m[name], to, self._world)
             positions_m = self._positions_m | {name: position_m}
@@ -104,7 +104,7 @@ class EmulatedLab:
         self._running.robots[name].move(AssignedPath(start_ns, [position_m], speed_m_s=1.0, facing_rad=0.0))
 
     def watching(self) -> AbstractContextManager[object]:
-        """Return a context in which the medium receives the positions of robots that steer themselves."""
+        """Return a context in which the medium receives the positions of robots that programs on board steer."""
         if not any(robot.spec.steers for robot in self._running.robots.values()):
             return nullcontext()
         self._watch = MotionThread(self._update_positions, "watch")
@@ -128,7 +128,7 @@ class EmulatedLab:
         return WATCH_S
 
     def lateness(self) -> LabLateness | None:
-        """Implement `Lab.lateness`."""
+        """Implement `Lab.lateness`: the lateness of packets and windows since the lab was ready."""
         before = self._first_stats
         if before is None:
             return None
@@ -144,7 +144,7 @@ class EmulatedLab:
         )
 
     def overview(self) -> Overview:
-        """Implement `Lab.overview`."""
+        """Implement `Lab.overview`: the map with the current positions."""
         return overview(self.members, self._positions_m, self._options, self._world)
 
 

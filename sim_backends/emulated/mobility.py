@@ -1,4 +1,7 @@
-"""Mobility of robots in an emulated lab: positions and velocities over time, as the medium receives them."""
+"""Mobility of robots in an emulated lab: positions and velocities over time, as the medium receives them.
+
+The lab moves most robots. A robot steers itself if a program on board (a base controller or an autopilot) moves it.
+"""
 
 import math
 import threading
@@ -294,6 +297,7 @@ class Mobility:
         return motion.state if flies else positions.on_ground(motion.state, self._world)
 
     def _next_update_s(self, now_ns: int, states: Mapping[str, State]) -> float | None:
+        """Return the seconds until the next update of the medium, or None if all motions have ended."""
         remaining_ns = [
             math.inf if motion.end_ns is None else start_ns + motion.end_ns - now_ns
             for start_ns, motion in self._motions

@@ -160,7 +160,8 @@ class EmulatedRobot(Node):
         physics_fds: Descriptors for a physics simulator that moves the robot, set by `build`: its motion record, its
             file of assigned paths, and either its record of commanded velocities or, for a robot with an autopilot,
             its records of commands and of flight. Empty if no simulator moves the robot.
-        link_fds: Descriptor of the TUN device of each further link, by its name, after `open_links`.
+        link_fds: Descriptor of the TUN device of each further link (a link beside the radio under test), by its name,
+            after `open_links`.
 
     Raises:
         ConfigurationError: A program of util-linux is missing.
@@ -333,7 +334,7 @@ def running_robots(
     fixed_mode(options.radio.mode, {robot.name: antenna_of(robot.profile.radio) for robot in robots.values()})
     login, host_keys = KeyPair.make(), {key: KeyPair.make() for key in robots}
     with ExitStack() as stack:
-        framing = IP if options.mesh is None else ETHERNET
+        framing = IP if options.mesh is None else ETHERNET  # in a mesh, MAC addresses identify the next hop
         wifi: Mapping[RobotKey, WifiSpec] = {}
         radios: Mapping[str, HwsimRadio] = {}
         if options.has_linux_wifi:
@@ -392,6 +393,7 @@ def running_robots(
 def _cosimulated_medium(
     options: EmulatedOptions, world: World, robots: Mapping[RobotKey, Robot | LabRobot], seed: int, framing: Framing
 ) -> MediumClient:
+    """Start the medium of a lab on the co-simulation."""
     from sim_backends.emulated import simulator_choice  # noqa: PLC0415 (other labs import no simulator)
     from sim_backends.emulated.cosimulated.client import CosimulatedClient  # noqa: PLC0415 (as above)
 

@@ -138,7 +138,7 @@ def _neighbours(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) ->
 
 
 def neighbour(number: int, profile: RobotProfile) -> Neighbour:
-    """Return the body of a robot from the ground up to its antenna, or to its top if that is higher.
+    """Return the body of a robot as a cylinder, from the ground up to its antenna, or to its top if that is higher.
 
     A robot whose body is unknown has the body of the paper's ground robot or of the paper's drone.
     """
@@ -161,8 +161,9 @@ def ros_master_of(robot: "Robot | LabRobot") -> str:
 def _registered_topics(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) -> tuple[str, ...]:
     """Return the topics that a robot registers at its ROS master.
 
-    If robots share a master, a topic that several of them have is registered only by the first one. The nodes of the
-    others would have the same names, and a master shuts down a node when another one registers with its name.
+    If robots share a master, a topic that several of them have is registered only by the first one. With real robots,
+    too, only one of them publishes it: their drivers have the same node names, and a master shuts down a node when
+    another one registers with its name.
     """
     registered: set[str] = set()
     for other in robots:

@@ -1,4 +1,4 @@
-"""The testbed of the emulated robots of one cast."""
+"""The testbed of the emulated robots of one cast (the robot of each role in a trial)."""
 
 import socket
 import time
@@ -64,25 +64,25 @@ class EmulatedOracle:
         return self._mobility.track(since_utc_ns)
 
     def delays(self, source: Role, destination: Role, protocol: Protocol, port: int, *, link: str = "") -> DelayParts:
-        """Implement `Oracle.delays`."""
+        """Implement `Oracle.delays`: the medium sums the delays of the flow."""
         return self._media.medium_of(link).delays(
             self._names[source], self._names[destination], _IP_PROTOCOL[protocol], port
         )
 
     def lateness(self) -> Lateness:
-        """Implement `Oracle.lateness`."""
+        """Implement `Oracle.lateness`: counts of packets, and of windows of a co-simulation, by lateness."""
         windows = self._medium.stats().window_lateness_counts if self._has_windows else None
         return Lateness(
             bound_ns=round(self._late_bound_s * 1e9), packets=self._media.lateness_counts(), windows=windows
         )
 
     def links(self, *, continue_sampling: bool) -> dict[Role, list[LinkSample]]:
-        """Implement `Oracle.links`."""
+        """Implement `Oracle.links`: samples of the radio under test."""
         links = self._medium.links(continue_sampling=continue_sampling)
         return {role: links.get(name, []) for role, name in self._names.items()}
 
     def record_air(self, folder: Path | None) -> None:
-        """Implement `Oracle.record_air`."""
+        """Implement `Oracle.record_air`: record transmissions if the site file enables this."""
         if self._records_air:
             self._medium.record(folder)
 
@@ -126,16 +126,16 @@ class EmulatedTestbed:
 
     @property
     def shells(self) -> Mapping[Role, Shell]:
-        """Implement `Testbed.shells`."""
+        """Implement `Testbed.shells`: the control connection of each robot."""
         return self._shells
 
     @property
     def oracle(self) -> EmulatedOracle:
-        """Implement `Testbed.oracle`."""
+        """Implement `Testbed.oracle`: the ground truth of the medium."""
         return self._oracle
 
     def check_alive(self) -> None:
-        """Implement `Transient.check_alive`."""
+        """Implement `Transient.check_alive`: check the media, the robots and the laptop."""
         self._media.check_alive()
         nodes: list[Node] = [*self.robots.values()]
         for node in nodes if self._laptop is None else [*nodes, self._laptop]:
@@ -167,7 +167,7 @@ class EmulatedTestbed:
         self._mobility.return_to_place(role)
 
     def watching(self) -> AbstractContextManager[object]:
-        """Return a context in which the medium receives the positions of robots that steer themselves."""
+        """Return a context in which the medium receives the positions of robots that programs on board steer."""
         return self._mobility.watching()
 
     def moving(self, move: Move) -> AbstractContextManager[None]:

@@ -45,6 +45,7 @@ from sim_backends.federates.transports.contract import is_same_token
 from sim_backends.world.motion import DeadReckoned
 
 _MAX_COPIES: Final = 1000
+"""Largest number of copies of a federate in one run."""
 
 MakeFederate = Callable[[Hello], Any]
 
@@ -254,6 +255,7 @@ class _Run:
         raise MalformedFrameError(KIND_POSITION, f"the request {header.kind.name.lower()} is not supported")
 
     def _begin(self, hello: Hello, request: int) -> bytes:
+        """Check the token, create the federate, and return the body of `welcome`."""
         if not is_same_token(hello.token, self.token):
             raise PermissionError("the token is wrong")
         self.heartbeat = _Heartbeat(self.channel, max(hello.heartbeat_ms / 1e3, 0.01))
@@ -291,6 +293,7 @@ class _Run:
         )
 
     def _fork(self, federate_copy: _FederateCopy, number: int) -> bytes:
+        """Copy the federate in its current state."""
         if number in self.copies or len(self.copies) > _MAX_COPIES:
             raise MalformedFrameError(HEADER_BYTES, f"copy {number} already exists, or there are too many copies")
         self.copies[number] = _FederateCopy(

@@ -9,6 +9,7 @@ from typing import Final, Protocol
 from sim_backends.federates.frames import HEADER_BYTES, MAX_FRAME_BYTES, ProtocolFrame, read_header
 
 _CHUNK_BYTES: Final = 1 << 16
+"""Largest number of bytes that one call reads."""
 
 
 class ClosedError(ConnectionError):

@@ -20,7 +20,9 @@ from fieldkit.core.errors import ConfigurationError
 _LIMIT_S: Final = 900.0
 """Timeout of a compilation, and of the wait for another process that compiles the same program."""
 _POLL_S: Final = 0.1
+"""Interval of attempts to lock the file."""
 _SHOWN_LINES: Final = 15
+"""Largest number of lines of the compiler that an error contains."""
 _HEADERS: Final = Path(__file__).parent / "cpp"
 """Include path of the headers for federates in C++: `#include "fieldkit/frames.h"`."""
 _INCLUDE: Final = re.compile(r'^\s*#\s*include\s*"([^"]+)"', re.MULTILINE)

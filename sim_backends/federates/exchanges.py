@@ -1,8 +1,8 @@
 """Requests and answers of the wire protocol after the handshake, and the rules for both sides.
 
 Agents have indices from 0 in the order of their announcement, first the agents in `hello`. An agent that appears
-later gets the next index in the first message that mentions it. The index is valid in the copy of the federate that
-the message is for, and in copies that are made of it later.
+later gets the next index in the first message that mentions it. The coordinator can copy a federate by `fork`; an
+index is valid in the copy that the message is for, and in copies that are made of this copy later.
 
 - **Handshake.** The coordinator sends hello; the federate answers with welcome or error. `welcome` repeats the
   configuration hash, which is the SHA-256 of the JSON. `name` is the scenario's name in hello, and the federate's
@@ -34,11 +34,11 @@ the message is for, and in copies that are made of it later.
 - **Dead reckoning.** If `reckoning_ns` is above 0, which needs the capability *extrapolates*, the position at t is
   `position_m` + n `reckoning_ns` `velocity_m_s`, where n is (t - `since_ns`) / `reckoning_ns`, rounded down.
   Otherwise agents stay at their positions until the next request.
-- **Absent agents** have no state. A physics federate with the capability 32 omits agents that it has removed;
-  they may return.
-  With the scenario's keys `appears` and `disappears` the coordinator ignores states of absent agents, sends them no
-  commands, and drops their packets as `agent absent`; the network still reports the fates of those that it already
-  carries. A network without the capability 32 receives the last states of absent agents, or their start states.
+- **Absent agents** have no state. A physics federate with the capability *agents disappear* omits agents that it has
+  removed; they may return. With the scenario's keys `appears` and `disappears` the coordinator ignores states of
+  absent agents, sends them no commands, and drops their packets as `agent absent`; the network still reports the
+  fates of packets that it already carries. A network without the capability *agents disappear* receives the last
+  states of absent agents, or their start states.
 - **Interference.** Transmitters in welcome are agents that forward or interfere; emitters are sources of interference
   that are not agents.
 - **Deadlines.** A federate that computes for longer than `heartbeat_ms` sends busy. The coordinator waits 30 s for a

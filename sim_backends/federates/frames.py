@@ -12,11 +12,17 @@ from typing import Any, Final, NamedTuple
 VERSION: Final = 1
 MAGIC: Final = b"FIELDKIT"
 MAX_FRAME_BYTES: Final = 16 << 20
+"""Largest size of a body."""
 MAX_HELLO_BYTES: Final = 4 << 20
+"""Largest size of the body of `hello`."""
 MAX_JOIN_BYTES: Final = 2048
+"""Largest size of the body of `join`."""
 MAX_TEXT_BYTES: Final = 1000
+"""Largest size of a text in a body."""
 MAX_AGENTS: Final = 10_000
+"""Largest number of agents in a run."""
 PHYSICS, NETWORK = 1, 2
+"""Numbers of the roles in `hello` and `welcome`."""
 ROLES: Final = {PHYSICS: "physics", NETWORK: "network"}
 
 _COUNT: Final = struct.Struct("<I")
@@ -53,7 +59,7 @@ class MessageKind(IntEnum):
         RELEASE: coordinator: empty; the copy in the header is not used again; there is no answer
         ERROR: federate: `text`; answers any request; the session ends
         BYE: coordinator: empty; the run ends, and there is no answer
-        SAMPLE_LINKS: coordinator: empty; only to a network with the capability 64
+        SAMPLE_LINKS: coordinator: empty; only to a network with the capability *samples links*
         LINKS: federate: `radios` u32, each a radio sample, `links` u32, each a link sample
     """
 

@@ -12,6 +12,7 @@ from sim_backends.federates.frames import FrameReader, MalformedFrameError, coun
 _RADIO = struct.Struct("<IIdqq")
 _LINK = struct.Struct("<II3d4Q")
 _MAX_COUNT = 1 << 62
+"""Largest accepted counter; a larger one is an error of the federate."""
 
 
 def encode_links(samples: Mapping[str, LinkSample], agents: AgentTable) -> bytes:

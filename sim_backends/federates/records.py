@@ -19,8 +19,10 @@ _COMMAND: Final = struct.Struct("<IHH")
 _TWIST: Final = struct.Struct("<2d")
 _VELOCITY: Final = struct.Struct("<4d")
 TWIST, VELOCITY = 1, 2
+"""Numbers of the types of commands in the protocol."""
 COMMAND_TYPES: Final = (TWIST, VELOCITY)
 _MAX_BYTES: Final = 1 << 62
+"""Largest accepted size of a packet."""
 
 LAYOUTS: Final = {
     "agent": "`name` text, `profile` text, `flies` u8, `antenna_m` f64 (its height above the body's position), "

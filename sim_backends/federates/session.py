@@ -37,9 +37,13 @@ from sim_backends.federates.transports.transport_table import FORMS, parse_addre
 BUSY_DEADLINE_FACTOR: Final = 20
 """A federate that sends `busy` may take this multiple of the deadline for an answer."""
 _FOREVER_S: Final = 1e9
+"""Deadline of a session without a deadline: about 30 years."""
 _BYE_S: Final = 0.2
+"""Longest wait until `bye` is sent."""
 _MAX_SHOWN: Final = 400
+"""Largest number of characters of a federate's text in a message."""
 _REQUEST_NUMBERS: Final = 1 << 32
+"""Number of request numbers, which have 32 bits; then they begin again at 0."""
 _ADDRESS_PATTERN: Final = re.compile(r"[a-z][a-z0-9+.-]*:\S*")
 
 Answer = TypeVar("Answer")

@@ -12,6 +12,7 @@ from sim_backends.federates.named import ProgramFederate
 from sim_backends.ns3.ns3_options import Ns3Options
 
 _MODULES: Final = ("core", "network", "internet", "mobility", "propagation", "traffic-control", "wifi")
+"""Modules of ns-3 that the program uses."""
 _CPP20_SINCE: Final = (3, 43)
 """The headers of 3.37 do not compile as C++20. Later versions in Debian (3.43 and 3.48) do not compile as C++17."""
 

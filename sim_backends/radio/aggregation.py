@@ -33,7 +33,8 @@ class AmpduLimits:
     """Limits of aggregates.
 
     Attributes:
-        window: Maximum number of frames from the oldest unacknowledged one to the newest: size of the bitmap.
+        window: Maximum number of frames from the oldest unacknowledged one to the newest. It is the number of bits in
+            the bitmap of a Block Ack.
         max_bytes: Maximum size of an A-MPDU.
     """
 

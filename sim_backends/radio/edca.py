@@ -48,6 +48,7 @@ PARAMETERS: Final = (
 """Default parameters by access category."""
 
 _UNLIMITED_NS: Final = 1 << 62
+# Access categories, highest priority first.
 _PRIORITY: Final = (VOICE, VIDEO, BEST_EFFORT, BACKGROUND)
 
 # Access category by user priority: table 10-1.
@@ -154,6 +155,7 @@ class AccessCategories(ChannelAccess, Generic[Payload]):
         self._by_priority = [self._queues[category] for category in _PRIORITY]
         self.active = self._queues[BEST_EFFORT]
         self._sifs_ns = band.sifs_ns
+        # End of the transmission opportunity, 0 if it has one exchange; start of the next exchange in it.
         self._txop_end_ns = self._continue_ns = 0
 
     @property

@@ -32,6 +32,7 @@ _SPECTRA: Final[Mapping[Fraction, tuple[int, int, tuple[int, ...]]]] = {
     ),
 }
 
+# Ratios of signal to noise in the table of `_log_success_per_bit`: step, lowest and highest.
 _STEP_DB: Final = 0.05
 _LOWEST_DB: Final = -10.0
 _HIGHEST_DB: Final = 40.0

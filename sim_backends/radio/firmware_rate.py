@@ -20,9 +20,12 @@ from sim_backends.radio.modes import WifiMode
 from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.radio.rate_control import RateControl
 
+# A mode is usable if at most this share of frames of this size is corrupted.
 _REFERENCE_BYTES: Final = 1200
 _TARGET_ERROR: Final = 0.1
+# Shares of acknowledged frames below and above which the mode changes by one step.
 _STEP_DOWN_BELOW, _STEP_UP_ABOVE = 0.5, 0.9
+# Range and precision of the search for the ratio of signal to noise that a mode requires.
 _LOWEST_DB, _HIGHEST_DB, _PRECISION_DB = -10.0, 60.0, 0.01
 
 

@@ -305,6 +305,7 @@ class FixedLinks(Generic[Payload]):
             self._arrive(at_ns, packet, delay_sum + before)
 
     def _transmit(self, now_ns: int, packet: _LinkPacket[Payload], before: Delay) -> None:
+        """Send a packet over its link, or log its loss."""
         link, _, size_bytes, _, _, _, identity = packet
         if self._off or self._cut:
             ends = link.transmitter, link.receiver

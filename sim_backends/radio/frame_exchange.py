@@ -111,9 +111,11 @@ class FrameExchange(Generic[Payload]):
             self._contend(now_ns, station)
 
     def _contend(self, now_ns: int, station: Station[Payload]) -> None:
+        """Schedule the next exchange of a station after contention."""
         self.events.schedule_start(station.contention.earliest_start_ns(now_ns), station.index)
 
     def _start(self, now_ns: int, index: int) -> None:
+        """Start an exchange of a station whose backoff has ended."""
         station = self.stations[index]
         station.contention.earliest_start_ns(now_ns)  # counts down the backoff slots that were idle until now
         if self.reception.is_jammed(index):
@@ -132,6 +134,7 @@ class FrameExchange(Generic[Payload]):
     def _start_frame(
         self, now_ns: int, station: Station[Payload], peer: Peer[Payload] | None, frame: Frame[Payload]
     ) -> None:
+        """Start an attempt to send a single frame, after RTS and CTS if it is large."""
         if not frame.attempts:
             frame.first_attempt_ns = now_ns
         frame.attempts += 1
@@ -155,6 +158,7 @@ class FrameExchange(Generic[Payload]):
         frame: Frame[Payload],
         mode: WifiMode,
     ) -> None:
+        """Transmit a single frame."""
         size_bytes = frame.size_bytes + HEADER_BYTES
         end_ns = now_ns + mode.airtime_ns(size_bytes)
         reserved_ns = end_ns if peer is None else end_ns + self._sifs_ns + ack_ns(mode)
@@ -172,6 +176,7 @@ class FrameExchange(Generic[Payload]):
         frame: Frame[Payload],
         transmission: Transmission,
     ) -> None:
+        """Determine which stations decode a frame that ends now, and wait for the ACK if it has one receiver."""
         receivers = sorted(transmission.receivers) if peer is None else [peer.receiver]
         received = [index for index in receivers if self.reception.decodes(index, transmission, "data")]
         self.reception.end(now_ns, transmission)
@@ -202,6 +207,7 @@ class FrameExchange(Generic[Payload]):
     def _start_aggregate(
         self, now_ns: int, station: Station[Payload], peer: Peer[Payload], session: BlockAckSession[Payload]
     ) -> None:
+        """Build an aggregate, and start an attempt to send it, after RTS and CTS if it is large."""
         first = station.queue[0]
         # Hardware repeats an aggregate in the next mode of the retry chain only if the Block Ack is missing.
         mode = peer.mode = peer.rate.choose(now_ns, first.packet, min(peer.failed_exchanges + 1, SHORT_RETRY_LIMIT))
@@ -250,6 +256,7 @@ class FrameExchange(Generic[Payload]):
     def _send_aggregate(
         self, now_ns: int, station: Station[Payload], peer: Peer[Payload], aggregate: Aggregate[Payload]
     ) -> None:
+        """Transmit an aggregate."""
         mode, first = peer.mode, aggregate.frames[0]
         size_bytes, response_bytes = aggregate.size_bytes, aggregate.response_bytes
         end_ns = now_ns + mode.airtime_ns(size_bytes)
@@ -269,6 +276,7 @@ class FrameExchange(Generic[Payload]):
         aggregate: Aggregate[Payload],
         transmission: Transmission,
     ) -> None:
+        """Determine which frames of an aggregate that ends now are decoded, and wait for the Block Ack."""
         decoded_frames = aggregate.decoded_frames = self.reception.decode_frames(
             peer.receiver, transmission, aggregate
         )
@@ -377,6 +385,7 @@ class FrameExchange(Generic[Payload]):
     def _end_exchange(
         self, now_ns: int, station: Station[Payload], peer: Peer[Payload] | None, *, is_done: bool
     ) -> None:
+        """End the exchange of a single frame, and schedule the next exchange of the station."""
         station.exchange_id += 1
         if is_done:
             station.contention.on_success()
@@ -398,6 +407,7 @@ class FrameExchange(Generic[Payload]):
         acknowledged: bool,
         is_sent: bool,
     ) -> None:
+        """End an attempt to send an aggregate: count the results, and remove finished frames from the queue."""
         aggregate = station.aggregate
         assert aggregate is not None
         station.aggregate = None

@@ -25,6 +25,7 @@ HEADER_BYTES: Final = 24 + 8 + 4
 """MAC header with three addresses, LLC and SNAP, FCS: IEEE 802.11-2020, 9.3.2.1; RFC 1042."""
 
 _NEVER_NS: Final = 1 << 63
+"""A time after the end of every run."""
 
 ControlFrame = Literal["", "ACK", "RTS", "CTS"]
 

@@ -28,6 +28,7 @@ from sim_backends.radio.modes import (
 
 HighThroughput = Literal["HT", "VHT", "HE"]
 
+# Amendments of 802.11, earliest first.
 _ORDER: Final[tuple[WifiAmendment, ...]] = ("n", "ac", "ax")
 _FORMATS: Final[dict[WifiAmendment, HighThroughput]] = {"n": "HT", "ac": "VHT", "ax": "HE"}
 

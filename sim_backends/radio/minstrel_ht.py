@@ -26,6 +26,7 @@ from sim_backends.radio.rate_control import RateControl
 
 _UPDATE_NS: Final = 50_000_000
 _SAMPLE_NS: Final = 20_000_000
+# The durations of modes are compared for aggregates of 16 frames of 1200 bytes.
 _REFERENCE_BITS: Final = 8 * 1200
 _REFERENCE_FRAMES: Final = 16
 _OVERHEAD_NS: Final = 108_000
@@ -36,14 +37,17 @@ _SEGMENT_NS: Final = 6_000_000
 _RANKED: Final = 4
 """Number of modes in a ranking: `MAX_THR_RATES` of mac80211."""
 _SAMPLES_PER_TYPE: Final = 5
+"""Largest number of modes in each list of modes to sample."""
 # Shares of acknowledged frames. Below the first, the throughput of a mode counts as 0. Above the second, a higher
 # share does not increase the throughput. Below the third, a mode has two tries in the chain.
 _UNUSABLE_SHARE, _CAPPED_SHARE, _UNRELIABLE_SHARE = 0.1, 0.9, 0.2
-# Share above which a mode can be the robust one; share above which a slower mode is not sampled.
+# The robust mode is the fastest mode with a share above the first. Slower modes with a share above the second are not
+# sampled.
 _ROBUST_SHARE, _RELIABLE_SHARE = 0.75, 0.95
 # If fewer than 25 % of more than 30 frames were acknowledged, a mode is replaced before the next update.
 _FAILING_FRAMES, _FAILING_SHARE = 30, 0.25
 _LENGTH_OLD_WEIGHT: Final = 96 / 128
+"""Weight of the old value in the mean length of aggregates."""
 
 # A low-pass filter of the second order with a period of 16 values; rc80211_minstrel_ht.h has its formula.
 _DECAY: Final = math.exp(-math.pi * math.sqrt(2) / 16)
@@ -51,6 +55,7 @@ _LAST_WEIGHT: Final = 2 * _DECAY * math.cos(math.sqrt(2) * 2 * math.pi / 16)
 _SECOND_WEIGHT: Final = -(_DECAY**2)
 _NEW_WEIGHT: Final = 1 - _LAST_WEIGHT - _SECOND_WEIGHT
 _SMALLEST_SHARE: Final = 1 / 4096
+"""Smallest share after a measurement; a share of 0 means that there was none."""
 
 # Kinds of sampled modes (see `_refill_samples`), and the order in which they are sampled.
 _FASTER, _JUMP, _SLOWER = range(3)
@@ -188,6 +193,7 @@ class MinstrelHt(RateControl):
         return min(share, _CAPPED_SHARE) / time_ns, share
 
     def _update(self, now_ns: int) -> None:
+        """Update the statistics of all modes, and choose the modes of the chain and the modes to sample."""
         if self._aggregates:
             length = self._aggregate_frames / self._aggregates
             self._mean_length = _LENGTH_OLD_WEIGHT * self._mean_length + (1 - _LENGTH_OLD_WEIGHT) * length

@@ -58,6 +58,7 @@ class Band:
 
 
 CHANNEL_6_HZ: Final = 2.437e9
+"""Centre frequency of channel 6."""
 
 BAND_2_4: Final = Band("2.4 GHz", CHANNEL_6_HZ, 10_000, 6_000)
 BANDS: Final[dict[BandName, Band]] = {
@@ -79,8 +80,11 @@ ENERGY_DETECTION_DBM: Final = -62.0
 """Any signal of at least this power keeps a station from sending: 17.3.10.6, 20 dB above -82 dBm."""
 
 ACK_BYTES: Final = 14
+"""Size of an ACK."""
 SYMBOL_NS: Final = 4_000
+"""Duration of an OFDM symbol with a guard interval of 800 ns."""
 _SERVICE_BITS, _TAIL_BITS = 16, 6
+"""Bits that are added before and after the data of a frame."""
 _OFDM_PREAMBLE_NS: Final = 20_000
 _HT_PREAMBLE_NS: Final = 36_000
 

@@ -67,8 +67,10 @@ def _friis_db(length_m: Floats, frequency_hz: float) -> Floats:
 
 
 _ECHOES: Final = 12
+"""Number of multipath components of a link."""
 
 _WAVES: Final = 256
+"""Number of plane waves in the shadowing field."""
 
 
 class Fading:

@@ -33,6 +33,7 @@ INFRASTRUCTURE: Final = ("access_points", "neighbours", "microwave_ovens")
 
 _RATE: Final = "54Mbit/s"
 _HOP_S: Final = 0.0002
+"""Default rate and delay of fixed links."""
 
 
 _MODES: Final = f"{', '.join(mode.name for mode in (*G_MODES, *N_MODES))}, a6 to a54, he80-mcs11-2ss-800ns"

@@ -51,6 +51,7 @@ class FixedRate(RateControl):
         """Implement `RateControl.report`."""
 
 
+# Constants of `Minstrel`; its docstring describes them.
 _UPDATE_NS: Final = 100_000_000
 _OLD_WEIGHT: Final = 0.75
 _SAMPLE_SHARE: Final = 0.1
@@ -144,6 +145,7 @@ class Minstrel(RateControl):
         self._rank()
 
     def _rank(self) -> None:
+        """Choose the best, the second best and the most robust mode, and build the default chain."""
         throughput = {mode: share / self._time_ns[mode] for mode, share in self._share.items()}
         # Among modes with almost no success, the slowest is tried first.
         ranked_modes = sorted(

@@ -22,6 +22,7 @@ from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.stations import Station
 
 _DETECTABLE_RATIO: Final = 10 ** (PREAMBLE_SNR_DB / 10)
+"""Smallest ratio of a preamble to noise and interference at which a station detects the preamble."""
 _ENERGY_DETECTION_MW: Final = 10 ** (ENERGY_DETECTION_DBM / 10)
 
 
@@ -76,7 +77,7 @@ class Reception(Generic[Payload]):
             other.interferers.append(transmission)
         transmission.interferers.extend(on_air)
         transmission.interferers.extend(self._emissions.values())
-        if station.receiving is not None:
+        if station.receiving is not None:  # a station that sends stops receiving
             station.receiving.receivers.discard(station.index)
             station.receiving = None
         station.sending_until_ns = end_ns
@@ -100,7 +101,7 @@ class Reception(Generic[Payload]):
             scheduled_start = starts.get(index)
             if scheduled_start is None:
                 neighbour.contention.on_busy(now_ns, reserved_ns)
-            elif scheduled_start[0] > sensed_ns:
+            elif scheduled_start[0] > sensed_ns:  # otherwise the station starts before it senses this frame
                 events.schedule_start(neighbour.contention.postpone(now_ns, reserved_ns), index)
         on_air.append(transmission)
 
@@ -201,6 +202,7 @@ class Reception(Generic[Payload]):
         return decoded_frames
 
     def _reach(self, transmitter: int, now_ns: int) -> _Reach:
+        """Return the stations that a transmitter reaches now."""
         powers_mw = self._channel.powers_mw(transmitter, now_ns)
         reach = self._reaches.get(transmitter)
         if reach is not None and reach.powers_mw is powers_mw:

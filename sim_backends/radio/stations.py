@@ -86,6 +86,7 @@ class Station(Generic[Payload]):
         # A station that drew 0 slots and finds the channel busy draws again.
         self._redraws = self._redraws + 1 if attempt == self._redraws_of else 0
         self._redraws_of = attempt
+        # Each redraw and each attempt has its own draw.
         return self._draws.draw(frame.packet, self._redraws * (SHORT_RETRY_LIMIT + 1) + frame.attempts)
 
 

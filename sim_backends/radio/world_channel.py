@@ -79,6 +79,7 @@ class WorldChannel(RadioChannel):
         # The first end of a link is the one whose name sorts first, for any order of the stations.
         by_name = np.array(sorted(range(count), key=self.names.__getitem__), dtype=np.int64)
         self._ends = by_name[np.stack(np.triu_indices(count, 1))]
+        # Index of the link between two stations, the same in both directions.
         self._link_of = np.zeros((count, count), dtype=np.int64)
         self._link_of[tuple(self._ends)] = self._link_of[tuple(self._ends[::-1])] = np.arange(self._ends.shape[1])
         self._links_of_station = [np.delete(links_of, station) for station, links_of in enumerate(self._link_of)]

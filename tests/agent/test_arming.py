@@ -77,7 +77,7 @@ def test_no_faults_for_a_ready_autopilot() -> None:
     [
         (
             {"first_heartbeat": heartbeat(d.MAV_AUTOPILOT_GENERIC)},
-            "its autopilot is neither PX4 nor ArduCopter (0, 2)",
+            "its autopilot is neither PX4 nor ArduCopter (MAV_AUTOPILOT 0, MAV_TYPE 2)",
         ),
         (
             {"first_heartbeat": heartbeat(d.MAV_AUTOPILOT_PX4, base=d.MAV_MODE_FLAG_SAFETY_ARMED)},

@@ -370,7 +370,7 @@ def wait_until_created(path: Path) -> None:
         ("/dev/null:115200", "Inappropriate ioctl"),
         ("/dev/none:115200", "No such file"),
         ("/dev/null:7", "does not support 7 baud"),
-        ("usb:1:2", "is not a connection: udpout:"),
+        ("usb:1:2", "is not a connection: it must start with udpout:"),
     ],
 )
 def test_connection_that_cannot_be_opened_is_reported(

@@ -1,4 +1,4 @@
-"""Flight dialect of ArduCopter. ArduPilot's other vehicles have other modes."""
+"""Flight dialect of ArduCopter: its modes, commands and parameters. ArduPilot's other vehicles have other modes."""
 
 from __future__ import annotations
 
@@ -48,9 +48,11 @@ _FENCE_TOP, _FENCE_CIRCLE = 1, 2
 
 
 class ArduCopter:
-    """Dialect of ArduCopter. On the ground it ignores set-points: it takes off by command, and then follows them.
+    """Dialect of ArduCopter.
 
-    In GUIDED it holds the last position without a time limit (GUID_TIMEOUT applies to velocities only).
+    On the ground, ArduCopter ignores set-points (target positions). It takes off by command, and then follows
+    set-points. If set-points are missing in GUIDED, it holds the last position without a time limit (GUID_TIMEOUT
+    applies to velocities only).
     """
 
     name = "ArduCopter"
@@ -70,19 +72,19 @@ class ArduCopter:
         return autopilot == _ARDUPILOT and vehicle in _COPTERS
 
     def is_guided(self, mode: int) -> bool:
-        """Return True in GUIDED, the mode in which it follows set-points."""
+        """Return True in GUIDED, the mode in which ArduCopter follows set-points."""
         return mode == _GUIDED
 
     def is_program_controlled(self, mode: int) -> bool:
-        """Return True in AUTO and GUIDED; in LOITER and the other modes a person flies it."""
+        """Return True in AUTO and GUIDED. In LOITER and the other modes, a person flies the drone."""
         return mode in (_AUTO, _GUIDED)
 
     def lands_or_returns(self, mode: int) -> bool:
-        """Return True in the modes in which it lands automatically: RTL, LAND, SMART_RTL and AUTO_RTL."""
+        """Return True in the modes in which the drone lands automatically: RTL, LAND, SMART_RTL and AUTO_RTL."""
         return mode in (_RTL, _LAND, _SMART_RTL, _AUTO_RTL)
 
     def is_failsafe_hold(self, mode: int) -> bool:  # noqa: ARG002
-        """Return False: without set-points it stays in GUIDED."""
+        """Return False, because ArduCopter stays in GUIDED if set-points are missing."""
         return False
 
     def mode_name(self, mode: int) -> str:
@@ -105,7 +107,7 @@ class ArduCopter:
         return (SET_MODE, CUSTOM_MODE, _RTL if action == "return" else _LAND)
 
     def limits(self, values: Mapping[str, float]) -> AutopilotLimits:
-        """Return the limits; RTL_ALT is in cm, and RTL_ALT_M, in m, replaced it in ArduCopter 4.7."""
+        """Return the limits. RTL_ALT is in cm; ArduCopter 4.7 replaced it by RTL_ALT_M, which is in m."""
         fences = int(values.get("FENCE_TYPE", 0)) if values.get("FENCE_ENABLE") else 0
         return_m = values["RTL_ALT"] / 100 if "RTL_ALT" in values else values.get("RTL_ALT_M")
         return AutopilotLimits(

@@ -41,7 +41,8 @@ from fieldkit.agent.flying.reports import AutopilotTexts, printable
 FRESH_S = 2.0
 """Maximum age of a report that describes the current state."""
 PILOT, GUARD, PREFLIGHT = 191, 192, 193
-"""Component ids of fieldkit's programs: MAV_COMP_ID_ONBOARD_COMPUTER and the next two."""
+"""Component ids of fieldkit's programs: the pilot, which flies a drone; the guard, which lands it if the pilot stops;
+and the preflight check. They are MAV_COMP_ID_ONBOARD_COMPUTER and the next two ids."""
 
 _DIALECTS: Sequence[FlightDialect] = (Px4(), ArduCopter())
 _TIME_AND_FLOATS = struct.Struct("<I6f")
@@ -62,6 +63,7 @@ _TYPE_ONBOARD = 18
 """MAV_TYPE_ONBOARD_CONTROLLER."""
 _MAX_PAYLOAD_BYTES = 255
 _NAME_BYTES = 16
+"""Length of the name of a parameter."""
 
 
 @dataclass(frozen=True)
@@ -180,6 +182,7 @@ class AutopilotState:
             COMMAND_ACK: self._on_command_ack,
             STATUSTEXT: self.texts.add_message,
             SYS_STATUS: self._on_status,
+            # The flags follow 40 bytes in ESTIMATOR_STATUS, and 20 bytes in EKF_STATUS_REPORT.
             ESTIMATOR_STATUS: lambda payload: self._on_estimate(payload, "<40xH"),
             EKF_STATUS_REPORT: lambda payload: self._on_estimate(payload, "<20xH"),
             HOME_POSITION: lambda _: setattr(self, "has_home", True),
@@ -269,7 +272,7 @@ class AutopilotState:
             self.speed_m_s = math.hypot(*values[3:])
 
     def _on_global_position(self, payload: bytes) -> None:
-        """Process GLOBAL_POSITION_INT; ArduPilot sends zeros if its position is unknown."""
+        """Process GLOBAL_POSITION_INT, in 1e-7 degrees. ArduPilot sends zeros if its position is unknown."""
         latitude, longitude = struct.unpack_from("<ii", payload, 4)
         if (latitude or longitude) and abs(latitude) <= 90e7 and abs(longitude) <= 180e7:
             self._latitude_longitude, self._latitude_longitude_s = (latitude / 1e7, longitude / 1e7), time.monotonic()

@@ -1,5 +1,7 @@
 """Interface of a flight dialect: the modes, commands and parameters of one family of autopilots.
 
+A set-point is a target position that a program sends repeatedly. An autopilot follows set-points only in one mode.
+
 Commands and their numbers are defined in https://mavlink.io/en/messages/common.html.
 """
 
@@ -22,12 +24,12 @@ Command = Tuple[float, ...]
 
 @dataclass(frozen=True)
 class AutopilotLimits:
-    """Limits that an autopilot enforces, in metres; None if it has no such limit or did not report it.
+    """Limits that an autopilot enforces, in metres; None for a limit that it does not have or did not report.
 
     Attributes:
         height_m: Maximum height above home.
         radius_m: Maximum horizontal distance from home.
-        return_m: Minimum height above home when it returns.
+        return_m: Minimum height above home while the drone returns.
     """
 
     height_m: float | None = None
@@ -40,10 +42,11 @@ class FlightDialect(Protocol):
 
     Attributes:
         name: Name of the family.
-        guided_mode: Name of the mode in which it follows set-points.
-        estimate_message: Id of the message with the flags of its position estimate.
-        limit_parameters: Names of the parameters with its limits; `|` separates alternative names of one parameter.
-        checks_current_mode: Whether its arming checks apply to its current mode.
+        guided_mode: Name of the mode in which the autopilot follows set-points.
+        estimate_message: Id of the message with the flags of the position estimate.
+        limit_parameters: Names of the parameters with the limits of the autopilot; `|` separates alternative names of
+            one parameter.
+        checks_current_mode: Whether the arming checks of the autopilot apply to its current mode.
     """
 
     name: str
@@ -56,28 +59,28 @@ class FlightDialect(Protocol):
         """Return True if an autopilot belongs to this family, by MAV_AUTOPILOT and MAV_TYPE of its heartbeat."""
 
     def is_guided(self, mode: int) -> bool:
-        """Return True if it follows set-points in a mode, which is the custom mode of its heartbeat."""
+        """Return True if the autopilot follows set-points in a mode (the custom mode of its heartbeat)."""
 
     def is_program_controlled(self, mode: int) -> bool:
-        """Return True if set-points, a mission or commands control it in a mode, instead of a person."""
+        """Return True if set-points, a mission or commands control the drone in a mode, not a person."""
 
     def lands_or_returns(self, mode: int) -> bool:
-        """Return True if it lands, or returns and lands, automatically in a mode."""
+        """Return True if the drone lands, or returns and lands, automatically in a mode."""
 
     def is_failsafe_hold(self, mode: int) -> bool:
-        """Return True if its failsafe for missing set-points holds the position in this mode."""
+        """Return True if a mode is the failsafe for missing set-points, which holds the position."""
 
     def mode_name(self, mode: int) -> str:
         """Return the name of a mode, or its number if the mode is unknown."""
 
     def guided_command(self) -> Command:
-        """Return the command that selects the mode in which it follows set-points."""
+        """Return the command that selects the mode in which the autopilot follows set-points."""
 
     def take_off_commands(self, height_m: float, climb_m_s: float) -> Sequence[Command]:
-        """Return the commands for the take-off of an armed drone; empty if it takes off by set-points."""
+        """Return the commands for the take-off of an armed drone; empty if set-points are enough."""
 
     def bring_down_command(self, action: str) -> Command:
         """Return the command to `land` at the current position, or to `return`."""
 
     def limits(self, values: Mapping[str, float]) -> AutopilotLimits:
-        """Return its limits, from the values of the parameters of `limit_parameters`."""
+        """Return the limits, from the values of the parameters in `limit_parameters`."""

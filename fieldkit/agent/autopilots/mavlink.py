@@ -82,16 +82,18 @@ class FlightRecorder:
         self._requested_us = {int(kind): interval_us for kind, interval_us in recording.intervals_us.items()}
         self._missing_kinds = {kind for kind, interval_us in self._requested_us.items() if interval_us > 0}
         self._refusals: dict[int, int] = {}
+        # Time during which each message was too slow, and the time of the last update of these values.
         self._slow_s = dict.fromkeys(self._missing_kinds, 0.0)
+        self._rates_s = time.monotonic()
         self._writer = FrameWriter()
         self._frames = self._bytes = self._dropped_frames = self._checksum = 0
         self._next_heartbeat_s = self._next_request_s = 0.0
-        self._rates_s = self._first_heartbeat_s = time.monotonic()
+        self._first_heartbeat_s = time.monotonic()
         self._was_ready = False
 
     @property
     def ready(self) -> bool:
-        """Whether each requested message was received, or refused by the autopilot."""
+        """Whether each requested message was received, or refused by the autopilot; then it stays True."""
         self._was_ready |= self._autopilot is not None and self._missing_kinds <= set(self._refusals)
         return self._was_ready
 
@@ -157,6 +159,7 @@ class FlightRecorder:
         for kind, rate in self._link.messages.items():
             if rate.result not in (None, ACCEPTED, *RETRY_RESULTS):
                 self._refusals[kind] = rate.result
+            # The product of rate in Hz and interval in us is 1e6 if the message has its requested rate.
             elif self.ready and kind in self._slow_s and rate.hz * self._requested_us[kind] < _MIN_FRACTION * 1e6:
                 self._slow_s[kind] += elapsed_s
 

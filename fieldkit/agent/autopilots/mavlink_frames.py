@@ -25,6 +25,7 @@ TYPE_LOG = 38
 
 _MAGIC_1, _MAGIC_2 = 0xFE, 0xFD
 _SIGNED = 1
+"""Flag of frames of MAVLink 2 that end with a signature."""
 _SIGNATURE_BYTES = 13
 _ACTIVE = 4
 """MAV_STATE_ACTIVE."""
@@ -56,6 +57,7 @@ def frame_bytes(buffer: bytes | bytearray) -> int | None:
     """
     if len(buffer) < 3:
         return None
+    # The second byte is the length of the payload. Header and checksum have 8 (MAVLink 1) or 12 bytes (MAVLink 2).
     if buffer[0] == _MAGIC_1:
         return 8 + buffer[1]
     return 12 + buffer[1] + (_SIGNATURE_BYTES if buffer[2] & _SIGNED else 0)
@@ -131,7 +133,7 @@ class FrameWriter:
 
 @dataclass(frozen=True)
 class ParsedFrame:
-    """Message id, sender and payload of a frame."""
+    """Message id (`kind`), sender and payload of a frame."""
 
     kind: int
     system: int

@@ -16,7 +16,7 @@ class FlightLink(Protocol):
         """The requested messages, by id."""
 
     def fileno(self) -> int:
-        """Return the file descriptor to wait for, which does not change."""
+        """Return a file descriptor that is readable when frames have arrived. It never changes."""
 
     def receive(self) -> Iterator[bytes]:
         """Yield the frames that have arrived; bytes outside frames are ignored."""
@@ -32,10 +32,10 @@ class FlightLink(Protocol):
 
 
 def open_link(connection: str) -> SharedLink:
-    """Open a shared connection to an autopilot. If it is lost, the link server reopens it.
+    """Open a shared connection to an autopilot. The link server reopens a lost connection.
 
     Raises:
-        OSError: It cannot be opened.
+        OSError: The connection cannot be opened.
         ValueError: The name of the connection is invalid.
     """
     devices.check(connection)

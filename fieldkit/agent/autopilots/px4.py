@@ -1,4 +1,4 @@
-"""Flight dialect of PX4."""
+"""Flight dialect of PX4: its modes, commands and parameters."""
 
 from __future__ import annotations
 
@@ -38,7 +38,10 @@ _SUB = {
 
 
 class Px4:
-    """Dialect of PX4, which takes off by set-points and holds its position if they are missing (COM_OF_LOSS_T)."""
+    """Dialect of PX4.
+
+    PX4 takes off by set-points (target positions). If set-points are missing, it holds its position (COM_OF_LOSS_T).
+    """
 
     name = "PX4"
     guided_mode = "OFFBOARD"
@@ -51,7 +54,7 @@ class Px4:
         return autopilot == _PX4
 
     def is_guided(self, mode: int) -> bool:
-        """Return True in OFFBOARD, the mode in which it follows set-points."""
+        """Return True in OFFBOARD, the mode in which PX4 follows set-points."""
         return _mode_parts(mode)[0] == _OFFBOARD
 
     def is_program_controlled(self, mode: int) -> bool:
@@ -63,12 +66,12 @@ class Px4:
         return main == _OFFBOARD or (main == _AUTO and sub in (_TAKEOFF, _LOITER, _MISSION))
 
     def lands_or_returns(self, mode: int) -> bool:
-        """Return True in the modes in which it lands automatically: AUTO.RTL, AUTO.LAND and AUTO.PRECLAND."""
+        """Return True in the modes in which the drone lands automatically: AUTO.RTL, AUTO.LAND and AUTO.PRECLAND."""
         main, sub = _mode_parts(mode)
         return main == _AUTO and sub in (_RTL, _LAND, _PRECLAND)
 
     def is_failsafe_hold(self, mode: int) -> bool:
-        """Return True in AUTO.LOITER, its failsafe mode without a remote control (COM_OBL_RC_ACT)."""
+        """Return True in AUTO.LOITER, the failsafe mode of PX4 without a remote control (COM_OBL_RC_ACT)."""
         return _mode_parts(mode) == (_AUTO, _LOITER)
 
     def mode_name(self, mode: int) -> str:
@@ -83,7 +86,7 @@ class Px4:
         return (SET_MODE, CUSTOM_MODE, _OFFBOARD)
 
     def take_off_commands(self, height_m: float, climb_m_s: float) -> Sequence[Command]:  # noqa: ARG002
-        """Return no commands: it takes off by set-points."""
+        """Return no commands, because PX4 takes off by set-points."""
         return ()
 
     def bring_down_command(self, action: str) -> Command:

@@ -26,7 +26,7 @@ from fieldkit.agent.orders import Orders
 
 RATE_HZ = 20.0
 _MIN_STOP_S = 0.5
-"""Minimum time for which zero velocities are published at the end, because one may be lost."""
+"""Minimum time for which zero velocities are published at the end, because a single message may be lost."""
 _MAX_STOP_S = 1.5
 """Maximum time for which zero velocities are published while odometry shows that the robot still moves."""
 _TIMEOUT_S = 15.0
@@ -39,15 +39,15 @@ def drive(middleware: Middleware, arguments: Mapping[str, Any], log: Path, stop_
 
     Args:
         middleware: The started middleware.
-        arguments: `command` and `odometry`, the topics; `frame`, the frame of stamped velocities (needed only for
-            them); `task`, the `DriveTask`; `orders`, the file that the laptop writes; `status`, the file with the
-            progress, which the laptop reads; `stationary`, a file that is created when the robot is stationary at
-            the end (optional); `cdr`, True if messages are encoded in CDR as in ROS 2, False for ROS 1.
+        arguments: `command` and `odometry`, the topics; `frame`, the frame id of velocities (needed only if they have
+            a header); `task`, the `DriveTask`; `orders`, the file that the laptop writes; `status`, the file with the
+            progress, which the laptop reads; `stationary`, a file that is created when the robot is stationary at the
+            end (optional); `cdr`, True if messages are encoded in CDR as in ROS 2, False for ROS 1.
         log: The log file: a line of JSON ten times per second.
         stop_event: Set when the drive must end.
 
     Returns:
-        The reason why it ended early; empty if the robot is back at its origin.
+        The reason why the drive ended early; empty if the robot is back at its origin.
 
     Raises:
         MiddlewareError: The velocity topic has no subscription, or no odometry arrives.

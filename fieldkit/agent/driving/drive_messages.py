@@ -1,4 +1,6 @@
-"""Messages of a drive: velocities to the base of a robot and its odometry, in the serializations of ROS 1 and ROS 2.
+"""Messages of a drive, in the serializations of ROS 1 and ROS 2: velocities and odometry.
+
+The base of a robot, which controls its wheels, receives velocities and sends odometry.
 
 ROS 1 has little-endian fields without padding. ROS 2 has CDR (little-endian here): strings end with a zero byte, and
 a value is aligned to its size, counted from the end of the encapsulation header.
@@ -79,4 +81,5 @@ def read_odometry(data: bytes, *, cdr: bool) -> OdometryPose | None:
         return None
     if not all(map(math.isfinite, (x_m, y_m, x, y, z, w))):
         return None
+    # The heading (yaw) of the orientation, which is a quaternion.
     return OdometryPose(x_m, y_m, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))

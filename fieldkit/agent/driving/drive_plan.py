@@ -15,9 +15,9 @@ ORDERS = (WAIT, OUT, BACK, END)
 
 START_M = 0.3
 START_RAD = 0.3
-"""Maximum distance and angle between a robot and its origin at a start: larger than the error after a drive back
-(`ARRIVAL_TOLERANCE_M`, `HEADING_TOLERANCE_RAD`, and braking), smaller than the distance if a person has moved the
-robot."""
+"""Maximum distance and angle between a robot and its origin at a start. They are larger than the error after a drive
+back (`ARRIVAL_TOLERANCE_M`, `HEADING_TOLERANCE_RAD`, and braking). If they are exceeded, a person has probably moved
+the robot."""
 OFF_PATH_M = 1.0
 """A robot that is farther from its path than this does not drive back to its origin automatically."""
 GAP_S = 0.5

@@ -39,8 +39,8 @@ _STILL_M, _STILL_RAD, _STILL_S = 0.05, 0.05, 0.4
 """A robot whose odometry changes by less than this distance and angle during this time is stationary."""
 _WAITS, _RETURNS = "waits", "returns"
 _STUCK_M, _STUCK_S = 0.5, 2.0
-"""Progress is checked after a commanded distance: `_STUCK_M`, plus the distance of `_STUCK_S` at full speed. At least
-a quarter of it must have been driven."""
+"""The progress of a robot is checked whenever it should have driven `_STUCK_M` plus the distance of `_STUCK_S` at
+full speed. It must have driven at least a quarter of this distance."""
 
 
 class OdometryPose(NamedTuple):
@@ -88,6 +88,7 @@ class Driver:
         self._created_s = now_s
         self._now_s = self._order_s = self._odometry_s = self._phase_s = now_s
         self._origin = None if task.origin is None else OdometryPose(*task.origin)
+        # The pose from which the robot has not moved since `_reference_s`, as long as it waits.
         self._reference: OdometryPose | None = None
         self._reference_s = now_s
         self._pose: OdometryPose | None = None
@@ -99,7 +100,7 @@ class Driver:
         # The remaining legs, each from corner to corner. After the last one the robot turns to its final heading.
         self._legs = [*zip(self._corners, self._corners[1:])]
         self._velocity: DriveVelocity = ZERO_VELOCITY
-        self._turning = True
+        self._turning = True  # the robot turns in place
         # The commanded and the driven distance since the last progress check, and the position at that check.
         self._commanded_m = self._moved_m = 0.0
         self._progress_position = (0.0, 0.0)

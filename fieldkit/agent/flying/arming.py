@@ -86,7 +86,7 @@ class ArmingCheck:
         self._drone = drone
         self._needs = needs
         self._start_s = time.monotonic()
-        self._retry_s = 0.0
+        self._next_request_s = 0.0
         self._checks_done_s: float | None = None
         drone.status = drone.estimate = None
         drone.texts.clear()
@@ -97,9 +97,9 @@ class ArmingCheck:
         drone, now_s = self._drone, time.monotonic()
         if self._checks_done_s is None and PREARM_CHECKS in drone.command_results:
             self._checks_done_s = now_s
-        if now_s < self._retry_s or drone.dialect is None:
+        if now_s < self._next_request_s or drone.dialect is None:
             return
-        self._retry_s = now_s + _RETRY_S
+        self._next_request_s = now_s + _RETRY_S
         for kind, value in ((SYS_STATUS, drone.status), (LOCAL_POSITION_NED, drone.position_m)):
             if value is None:
                 drone.commands.request_stream(kind, _RATE_HZ)
@@ -121,7 +121,7 @@ class ArmingCheck:
 
     @property
     def is_starting(self) -> bool:
-        """Whether the position estimate is not ready yet; this takes about 30 s after power-on."""
+        """Whether the position estimate is not ready yet. It is ready about 30 s after power-on."""
         reports_no_estimate = any(_NO_ESTIMATE in text for text in self._drone.texts.warnings)
         return self._drone.dialect is not None and (reports_no_estimate or any(self._position_faults()))
 
@@ -147,10 +147,8 @@ class ArmingCheck:
         """Yield the faults that were detected."""
         drone = self._drone
         if drone.dialect is None:
-            what = "its autopilot is neither PX4 nor ArduCopter ({}, {})".format(*drone.family)
-            yield ArmingFault(
-                f"{what}: MAV_AUTOPILOT, MAV_TYPE", "fly it by other means; a step mavlink records the flight"
-            )
+            what = "its autopilot is neither PX4 nor ArduCopter (MAV_AUTOPILOT {}, MAV_TYPE {})".format(*drone.family)
+            yield ArmingFault(what, "fly it by other means; a step mavlink records the flight")
             return
         if drone.armed:
             yield ArmingFault("its motors are running", "land it first")

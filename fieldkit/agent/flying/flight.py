@@ -1,4 +1,4 @@
-"""Fly a drone for a trial by set-points, and land it if the flight is aborted.
+"""Fly a drone for a trial by set-points (target positions), and land it if the flight is aborted.
 
 The laptop writes orders to a file. Each order has a lease, the number of seconds for which it is valid. The drone
 lands or returns, as its plan requires, if an order is not renewed in time because the laptop or its link is lost, if
@@ -239,7 +239,7 @@ class OffboardPilot:
             hover_threshold_m = height_m / 2 if drone.speed_m_s < _SLOW_M_S else math.inf
             return risen_m() > min(_RISEN_FRACTION * height_m, hover_threshold_m)
 
-        *preceding_commands, last_command = commands
+        *preceding_commands, last_command = commands  # the last one is the take-off
         for command in commands:
             drone.command_results.pop(int(command[0]), None)
         for command in preceding_commands:

@@ -93,6 +93,7 @@ class FlightPlan:
     @property
     def needs(self) -> FlightNeeds:
         """Requirements of the flight that an autopilot must meet."""
+        # The path relative to an origin at zero, on the ground.
         corners_m = self.corners_m(FlightOrigin("", "", 0.0, 0.0, 0.0), 0.0)
         return FlightNeeds(
             highest_m=max(-down_m for _, _, down_m in corners_m),

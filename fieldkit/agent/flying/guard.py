@@ -51,6 +51,7 @@ class FlightGuard:
         self._drone = self._session.drone
         self._orders = Orders(plan.orders, (STAY, LEAVE), plan.lease_s)
         self._iteration_s: float | None = None
+        # The mode of a drone that was already flying at the start of the guard; None after the first change of mode.
         self._first_mode: int | None = None
         self._mode_name = ""
 
@@ -78,6 +79,7 @@ class FlightGuard:
         self._first_mode = self._drone.mode if self._drone.armed else None
         for kind in (HEARTBEAT, LOCAL_POSITION_NED):
             self._drone.commands.request_stream(kind, RATE_HZ)
+        # The lease of the orders begins now.
         self._orders = Orders(self._plan.orders, (STAY, LEAVE), self._plan.lease_s)
         self._iteration_s = None
 

@@ -53,7 +53,9 @@ def bring_down(
     may_command: Callable[[], bool],
     each_iteration: Callable[[], None] = lambda: None,
 ) -> None:
-    """Command a drone to `land` or `return`, and wait until its motors have stopped; if it does not return, it lands.
+    """Command a drone to `land` or `return`, and wait until its motors have stopped.
+
+    If the drone does not obey the command `return`, it is commanded to land.
 
     Commands are sent only while `may_command` returns True: in the modes in which fieldkit controls the drone. The
     first command waits for a new heartbeat, because the mode may have changed since the last one. A drone that lands

@@ -67,7 +67,7 @@ class LivenessFile:
         own_index: Index of the entry of this program: `PILOT` or `GUARD`.
 
     Raises:
-        OSError: It cannot be created or allocated.
+        OSError: The file cannot be created or allocated.
     """
 
     def __init__(self, path: str, own_index: int) -> None:

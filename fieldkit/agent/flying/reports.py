@@ -20,6 +20,7 @@ class AutopilotTexts:
 
     def add_message(self, payload: bytes) -> None:
         """Add a message; the chunks of a long text have the same number (STATUSTEXT, id and chunk_seq)."""
+        # The payload has the severity (1 byte), a text of 50 bytes, the id and chunk_seq.
         text = printable(payload[1:51].split(b"\0")[0].decode("utf-8", "replace"))
         number, chunk_index = _CHUNK.unpack_from(payload, 51)
         severity = payload[0]

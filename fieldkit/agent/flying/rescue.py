@@ -89,5 +89,5 @@ def _wait_for_autopilot(session: AutopilotSession, deadline_s: float) -> None:
             raise FlightError(REFUSED, f"no heartbeat of the autopilot in {NO_HEARTBEAT_S:g} s")
         if time.monotonic() > warning_s:
             log_line(alarm(session.drone))
-            warning_s = deadline_s
+            warning_s = deadline_s  # no second alarm
         session.exchange(_POLL_S)

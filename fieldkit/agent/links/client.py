@@ -69,12 +69,14 @@ class SharedLink:
 
     def __init__(self, connection: str) -> None:
         self._connection = connection
+        # The thread writes received frames to `_frames_in`; the program reads them from `_frames_out`.
         self._frames_out, self._frames_in = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         for stream in (self._frames_out, self._frames_in):
             stream.setblocking(False)
             stream.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
         self._lock = threading.Lock()
         self._server: socket.socket | None = None
+        # The last request for an interval, by the target and the message id in its frame.
         self._requests: dict[tuple[bytes, bytes], bytes] = {}
         self._stop_event = threading.Event()
         self._last_answer_s = 0.0
@@ -111,7 +113,7 @@ class SharedLink:
             self._stop_event.wait(0.01)
 
     def fileno(self) -> int:
-        """Return the file descriptor to wait for, which does not change."""
+        """Return a file descriptor that is readable when frames have arrived. It never changes."""
         return self._frames_out.fileno()
 
     def receive(self) -> Iterator[bytes]:
@@ -125,7 +127,7 @@ class SharedLink:
         """Send a frame; a request for an interval is stored and repeated to a new server."""
         message = parse_frame(frame)
         if message.kind == COMMAND_LONG:
-            payload = message.payload.ljust(33, b"\0")
+            payload = message.payload.ljust(33, b"\0")  # MAVLink 2 omits trailing zeros of the 33 bytes
             if int.from_bytes(payload[_COMMAND_OFFSET : _COMMAND_OFFSET + 2], "little") == SET_MESSAGE_INTERVAL:
                 with self._lock:
                     self._requests[payload[_TARGET_OFFSET : _TARGET_OFFSET + 2], payload[:4]] = frame
@@ -204,7 +206,7 @@ class SharedLink:
             with open(f"/proc/{link_files.peer_credentials(self._server)[0]}/stat", encoding="utf-8") as file:  # noqa: PTH123
                 return file.read().rpartition(")")[2].split()[0] in ("T", "t")
         except (OSError, IndexError):
-            return True
+            return True  # the process does not exist any more
 
     def _kill_server(self) -> None:
         """Kill the server. Its socket is open, so no other process can have its pid."""

@@ -65,7 +65,7 @@ def check(connection: str) -> None:
         return
     host, _, port = suffix.rpartition(":")
     if kind not in ("tcp", "udpout", "udpin"):
-        raise ValueError(f"{connection} is not a connection: udpout:, udpin:, tcp: or /dev/")
+        raise ValueError(f"{connection} is not a connection: it must start with udpout:, udpin:, tcp: or /dev/")
     if not host or not port.isdigit() or not 0 < int(port) < 65_536:
         raise ValueError(f"{connection} has no HOST:PORT")
 
@@ -193,6 +193,7 @@ def _open_serial(path: str, baud: int) -> int:
     try:
         tty.setraw(descriptor, termios.TCSANOW)
         settings = termios.tcgetattr(descriptor)
+        # Entry 2 has the control flags; entries 4 and 5 are the input and the output speed.
         settings[2] |= termios.CLOCAL | termios.CREAD
         settings[2] &= ~termios.CRTSCTS
         settings[4] = settings[5] = speed

@@ -1,9 +1,9 @@
 """Message intervals that several clients request from one autopilot.
 
-An interval applies to a port of the autopilot: all programs on that port share it, and other stations may change it.
-The smallest requested interval is set. It is set again if the rate of the message is too low, and reset to the
-default when no client requests the message any longer (MAV_CMD_SET_MESSAGE_INTERVAL,
-https://mavlink.io/en/messages/common.html).
+An interval applies to a port of the autopilot: all programs on that port share it, and ground stations may change it.
+The link server sets the smallest requested interval. It sets the interval again if the rate of the message is too
+low. It resets the interval to the default when no client requests the message any longer
+(MAV_CMD_SET_MESSAGE_INTERVAL, https://mavlink.io/en/messages/common.html).
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ _MAX_RESETS = 3
 Target = Tuple[int, int]
 """System and component of an autopilot."""
 Key = Tuple[Target, int]
+"""Target of a request, and message id."""
 
 
 class MessageInterval:

@@ -1,7 +1,7 @@
 """Files of a link server: a Unix-domain socket and a lock file in a private folder.
 
-Their name is a hash of the connection, the network namespace and the boot ID, so that connections of different robots
-with a shared home folder, or of containers, are not confused.
+The names of both are a hash of the connection, the network namespace and the boot ID, so that connections of
+different robots with a shared home folder, or of containers, are not confused.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def folder() -> str:
     """Return the folder of sockets, which only this user can access.
 
     Raises:
-        OSError: It cannot be created, or belongs to another user.
+        OSError: The folder cannot be created, or belongs to another user.
     """
     path = os.path.expanduser(os.path.join(*_FOLDER))  # noqa: PTH111, PTH118 (Python 3.8)
     os.makedirs(path, mode=0o700, exist_ok=True)  # noqa: PTH103
@@ -68,6 +68,7 @@ def lock(connection: str) -> int | None:
             os.close(descriptor)
             return None
         try:
+            # A server that ends removes its lock file. The lock is valid only if the path still leads to this file.
             if os.fstat(descriptor).st_ino == os.stat(path).st_ino:  # noqa: PTH116
                 return descriptor
         except FileNotFoundError:

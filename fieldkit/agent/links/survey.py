@@ -17,7 +17,7 @@ _HEARTBEAT_TIMEOUT_S = 5.0
 _POLL_S = 0.1
 _SERIAL_PATTERNS = ("/dev/serial/by-id/*", "/dev/ttyACM*", "/dev/ttyUSB*", "/dev/ttyAMA*", "/dev/ttyTHS*")
 _TCP_PORTS, _UDP_PORTS = range(5760, 5764), range(14540, 14561)
-"""Ports of mavlink-router and of simulated autopilots, by their documentation."""
+"""Ports of mavlink-router and of simulated autopilots, according to their documentation."""
 _LISTENING = "0A"
 """State of a listening socket (Linux, include/net/tcp_states.h)."""
 
@@ -33,6 +33,7 @@ def candidates() -> Iterator[str]:
 def _open_ports(protocol: str) -> set[int]:
     """Return the ports on which programs of this computer listen (proc(5), /proc/net/tcp)."""
     with open(f"/proc/net/{protocol}", encoding="ascii") as file:  # noqa: PTH123
+        # The second word of a line is ADDRESS:PORT in hexadecimal, the fourth word is the state.
         rows = [line.split() for line in file.readlines()[1:]]
     return {int(row[1].rpartition(":")[2], 16) for row in rows if protocol == "udp" or row[3] == _LISTENING}
 

@@ -130,6 +130,7 @@ def _durability(qos: Quality, *, writes: bool) -> list[Any]:
     keeps_all = qos.history == "keep_all" and not qos.late_reader_depth
     depth = qos.late_reader_depth or qos.depth or 1
     history = Policy.History.KeepAll if keeps_all else Policy.History.KeepLast(depth)
+    # A delay of 0 ns before samples of deleted instances are removed, and no limits of resources.
     service = [Policy.DurabilityService(0, history, *[_UNLIMITED] * 3)] if writes else []
     return [Policy.Durability.TransientLocal, *service]
 

@@ -13,7 +13,8 @@ from typing import Sequence
 from fieldkit.agent.messaging.middleware import Quality, Topic
 
 GID_BYTES = 16
-"""Length of a GID in the message since ROS 2 Iron; 24 until Humble (rmw/types.h, RMW_GID_STORAGE_SIZE)."""
+"""Length of a GID (the identifier of an endpoint) in the message since ROS 2 Iron; 24 until Humble (rmw/types.h,
+RMW_GID_STORAGE_SIZE)."""
 
 PARTICIPANT_DATA = "enclave=/;"
 """User data of a participant since ROS 2 Foxy; rmw_fastrtps ignores participants without them."""
@@ -60,7 +61,7 @@ def entities_info(
         node: Name of the node, in the root namespace.
         readers: GUID of each of its readers.
         writers: GUID of each of its writers.
-        gid_bytes: Length of a GID, which is a GUID padded with zeros.
+        gid_bytes: Length of a GID, which is a GUID (the identifier in DDS) padded with zeros.
     """
     message = bytearray()
 
@@ -72,7 +73,7 @@ def entities_info(
         message.extend(guid + bytes(gid_bytes - _GUID_BYTES))
 
     add_gid(participant)
-    add_number(1)
+    add_number(1)  # the number of nodes
     for text in ("/", node):
         data = text.encode() + b"\0"
         add_number(len(data))

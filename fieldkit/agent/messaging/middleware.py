@@ -96,7 +96,8 @@ class Network:
         domain: ROS domain.
         node: Name of the node.
         transport: `tcp` or `udp`, for Zenoh.
-        gid_bytes: Length of a GID in the node information of DDS participants: 16 since ROS 2 Iron, 24 before.
+        gid_bytes: Length of a GID (the identifier of an endpoint) in the node information of DDS participants: 16
+            since ROS 2 Iron, 24 before.
         settings: Settings of the middleware by their path: for example `Discovery/SPDPInterval` of CycloneDDS,
             `transport/link/tx/queue/size/data` of Zenoh; `xmlrpc_port`, `tcpros_port`, `tcp_nodelay` (`1` disables
             Nagle's algorithm) and `patience_s` (timeout for the master) of ROS 1. ROS 2 has no such settings, because
@@ -122,7 +123,7 @@ class Publisher(Protocol):
         """Send a sample; return True if the middleware accepted it."""
 
     def matched(self) -> int:
-        """Return the number of matched subscriptions; for Zenoh, 1 for any number."""
+        """Return the number of matched subscriptions; for Zenoh, 1 if there is any."""
 
     def drain(self, limit_s: float) -> None:
         """Wait until all samples are acknowledged, at most for this time.

@@ -1,9 +1,10 @@
 """The log of a publisher or subscriber: a magic number and records of fixed size.
 
 The log is mapped into memory. No record is lost if the program is killed, because the kernel writes the mapped pages
-to the file. A store needs no system call, so that logging does not delay samples. The file grows in pieces. A piece
-is allocated on disk before it is mapped, so that a full disk causes an error at that time, instead of SIGBUS at a
-later store. (A failing disk still causes SIGBUS.) If a log was not closed, zeros follow its last record.
+to the file. Writing a record needs no system call, so that logging does not delay samples. The file grows in pieces.
+A piece is allocated on disk before it is mapped. A full disk therefore causes an error at that time, and not SIGBUS
+when a record is written later. (A failing disk still causes SIGBUS.) If a log was not closed, zeros follow its last
+record.
 
 `fieldkit.ros.streams.topic_samples` reads these logs.
 """

@@ -85,7 +85,7 @@ def send(video: Video, log: Log, stop_event: threading.Event) -> None:
             except BrokenPipeError:
                 break
             log.note(records.SAMPLE, time.time_ns(), size=video.frame_bytes, sequence=sequence, sent_ns=sent_ns)
-        else:
+        else:  # all frames were sent
             frames.close()
             with suppress(subprocess.TimeoutExpired):
                 process.wait(_EXIT_TIMEOUT_S)

@@ -24,6 +24,7 @@ _TIME_TOLERANCE_US: Final = 1_000
 _OFFSET_BOUNDS_M: Final = (-1e9, 1e9)
 _ANGLE: Final = (-360.0, 360.0)
 _HEIGHT_BOUNDS: Final = (-1e6, 1e6)
+"""Bounds of possible values of columns, also for vertical speeds; other values are omitted."""
 
 COLUMNS: Final = columns(
     100,

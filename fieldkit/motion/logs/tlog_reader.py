@@ -26,10 +26,12 @@ _MAX_TIME_US: Final = 2**52
 _MAX_DISTANCE_M: Final = 1e9
 _MAGIC_1: Final = 0xFE
 _MAGIC_2: Final = 0xFD
+"""First byte of a frame of MAVLink 1, and of MAVLink 2."""
 _SIGNED_FLAG: Final = 1
 _SIGNATURE_BYTES: Final = 13
 _UNKNOWN_16: Final = 0xFFFF
 _UNKNOWN_8: Final = 0xFF
+"""Values of unsigned fields of 16 and 8 bits that the sender does not know."""
 _RADIO: Final = "RADIO_STATUS"
 """Status of a telemetry radio's link; the radio has a separate system ID."""
 
@@ -51,7 +53,7 @@ class LoggedFrame:
 
     @property
     def source(self) -> Source:
-        """The sender."""
+        """The sender. The positions of its IDs are those of MAVLink 1 or of MAVLink 2."""
         system = 3 if self.data[0] == _MAGIC_1 else 5
         return self.data[system], self.data[system + 1]
 
@@ -149,6 +151,7 @@ def _autopilot(data: bytes, system_id: int) -> Source:
 
 
 def _summary(data: bytes, autopilot: Source, ended_us: int, intervals_us: Mapping[str, int]) -> Json:
+    """Return the counts and values from which `tlog.read` computes the columns."""
     decoder, series = TlogDecoder(), defaultdict[str, list[float]](list)
     kinds, numbers, frame_count, backward_us = Counter[str](), list[tuple[int, int]](), 0, 0
     first_us, last_us, previous_us = _MAX_TIME_US, 0, 0

@@ -116,6 +116,7 @@ class MotionPermission:
                 )
 
     def _require_confirmed(self, origins: JournaledOrigins) -> None:
+        """Let the held robots move again if an option or a person allows it; otherwise raise an error."""
         testbed = self._testbed
         if isinstance(testbed, Attended):
             if permissions.MOVE_AFTER_FAULT in testbed.permissions:

@@ -126,7 +126,7 @@ def files(name_pattern: str) -> tuple[str, ...]:
     return tuple(name_pattern.format(file) for file in (drive_log.FILE, orders_file("drive"), STATUS, _LOG))
 
 
-def _drive(robot: Robot) -> Drive:
+def _drive_section(robot: Robot) -> Drive:
     """Return the section `drive` of a robot's profile.
 
     Raises:
@@ -139,7 +139,7 @@ def _drive(robot: Robot) -> Drive:
     return drive
 
 
-def _origin(scene: Scene, move: Move) -> dict[str, Any]:
+def _origin_fields(scene: Scene, move: Move) -> dict[str, Any]:
     """Return the keys of a drive task that depend on the origin of the robot in this trial."""
     origins = origins_of(scene)
     origin, last = origins.get(move.role), origins.last(move.role)
@@ -153,7 +153,7 @@ def _origin(scene: Scene, move: Move) -> dict[str, Any]:
 
 def _task(robot: Robot, move: Move) -> dict[str, Any]:
     """Return the fields of a `fieldkit.agent.driving.drive_plan.DriveTask`."""
-    drive = _drive(robot)
+    drive = _drive_section(robot)
     return {
         "legs": [(leg.away_m, leg.left_m) for leg in move.legs],
         "speed_m_s": move.speed_m_s,
@@ -172,7 +172,7 @@ def _driver_arguments(scene: Scene, move: Move, name_pattern: str) -> str:
     from fieldkit.ros.interfaces.qos import PROFILES  # noqa: PLC0415
 
     robot = scene.robot(move.role)
-    drive = _drive(robot)
+    drive = _drive_section(robot)
     middleware, ros = middleware_of(robot), robot.profile.ros
     message_types = (
         types.MessageTypes(types.Distribution.of(ros.command.distribution)) if ros else types.standard_types()
@@ -198,7 +198,7 @@ def _driver_arguments(scene: Scene, move: Move, name_pattern: str) -> str:
         "command": topic(drive.topic, drive.type, "default", 1),
         **({"frame": drive.frame} if drive.type == TWIST_STAMPED else {}),
         "odometry": topic(drive.odometry, "nav_msgs/msg/Odometry", "sensor_data", 2),
-        "task": {**_task(robot, move), **_origin(scene, move)},
+        "task": {**_task(robot, move), **_origin_fields(scene, move)},
         "orders": orders_file(name_pattern.format("drive")),
         "status": name_pattern.format(STATUS),
         "stationary": jobs.stationary_file(name_pattern.format("drive")),
@@ -239,7 +239,7 @@ def drive_robot(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name_
         OSError: The journal of motions cannot be written; the robot does not start.
     """
     shell, robot = testbed.shells[move.role], scene.robot(move.role)
-    lease_s = _drive(robot).lease
+    lease_s = _drive_section(robot).lease
     mover = RobotMover(robot.name, shell, scene.folder, f"it stops automatically within {lease_s:g} s")
     drive_lease = DriveLease(shell, plan.job, name_pattern, lease_s)
     with scene.motions.moving(mover), lease.start_program(shell, plan.job), drive_lease, ExitStack() as stack:

@@ -98,6 +98,7 @@ class FlightRescue:
         return self._may_send and not self.failure
 
     def _watch(self) -> None:
+        """Poll the counters until this context is left; start the rescue if neither program runs."""
         monitor = LivenessMonitor()
         while not self._exit_event.wait(_POLL_S):
             try:

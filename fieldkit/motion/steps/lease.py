@@ -169,6 +169,7 @@ class LeaseKeeper:
         return time.monotonic() - self._changed_s
 
     def _send(self, within_s: float) -> bytes:
+        """Write the order with a new number on the robot, and read the program's output and exit code."""
         with self._lock:
             line = f"{next(self._numbers)} {self._order} {self._expires_s:g}"
         argv = ("sh", "-c", _ORDER, "sh", self._exit_file, self._orders_file, line, self._output_file)

@@ -11,6 +11,7 @@ from fieldkit.ros.bags.bag import METADATA
 
 _ROS1_SUFFIXES: Final = {".bag", ".active"}
 _MAGIC_BYTES: Final = 16
+"""Number of bytes that are read to detect a format: the length of the longest magic number."""
 
 
 class BagFormat(StrEnum):
@@ -92,6 +93,7 @@ def find(path: Path) -> BagFiles:
 
 
 def _bag_from_file(path: Path, bag_format: BagFormat) -> BagFiles:
+    """Return the bag of a data file: the bag of its folder if that has no other data file, else the file alone."""
     if bag_format is BagFormat.ROS1:
         if path.suffix not in _ROS1_SUFFIXES:
             raise ConfigurationError(
@@ -105,6 +107,7 @@ def _bag_from_file(path: Path, bag_format: BagFormat) -> BagFiles:
 
 
 def _bag_in_folder(folder: Path) -> BagFiles:
+    """Return the bag in a folder: a ROS 2 bag with one or more data files, or a single file without metadata."""
     files = sorted(file for file in folder.iterdir() if file.is_file())
     bag_files = [(file, bag_format) for file in files if (bag_format := _format_or_none(file)) is not None]
     if len(bag_files) == 1 and not (folder / METADATA).is_file():
@@ -130,6 +133,7 @@ def _is_closed_mcap(file: Path, bag_format: BagFormat) -> bool:
 
 
 def _format(file: Path) -> BagFormat:
+    """Return the format of a file; raise an error with the probable cause if it is not a bag."""
     if file.exists() and not file.is_file():
         raise ConfigurationError("this is neither a file nor a folder", where=str(file), remedy=_WHAT_TO_NAME)
     bag_format = _format_or_none(file)

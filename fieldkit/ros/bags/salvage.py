@@ -75,6 +75,7 @@ _MESSAGE, _CHUNK, _CONNECTION = 2, 5, 7
 _KNOWN_KINDS: Final = range(2, 8)
 """Values of the field `op` in the header of a record."""
 _MAX_CHUNK_BYTES: Final = 1 << 30
+"""Maximum size of a decompressed chunk, which limits the memory if its header is corrupt."""
 
 
 def _ros1(file: Path) -> Iterator[RecoveredMessage]:
@@ -210,6 +211,7 @@ def _rows(database: sqlite3.Connection) -> Iterator[RecoveredMessage]:
 
 
 def _topics(database: sqlite3.Connection) -> Iterator[tuple[int, BagConnection]]:
+    """Yield the id and the connection of each topic; older schemas lack some of the columns."""
     definitions = {}
     if _columns(database, "message_definitions"):
         definitions = dict(

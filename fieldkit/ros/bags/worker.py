@@ -160,7 +160,7 @@ def repair(bag: BagFiles, to: Path) -> Json:
             for file in bag.files:
                 for source, at_ns, data in salvage.messages(bag.format, file):
                     if source not in connections:
-                        connections[source] = _connection(writer, source, types)
+                        connections[source] = _add_connection(writer, source, types)
                     writer.write(connections[source], at_ns, data)
                     count += 1
         except DamagedError as error:
@@ -175,7 +175,7 @@ def _writer(bag_format: BagFormat, to: Path) -> rosbag1.Writer | rosbag2.Writer:
     return rosbag2.Writer(to, version=_METADATA_VERSION, storage_plugin=plugin)
 
 
-def _connection(writer: rosbag1.Writer | rosbag2.Writer, source: BagConnection, types: Typestore) -> Connection:
+def _add_connection(writer: rosbag1.Writer | rosbag2.Writer, source: BagConnection, types: Typestore) -> Connection:
     if isinstance(writer, rosbag1.Writer):
         return writer.add_connection(
             source.topic,

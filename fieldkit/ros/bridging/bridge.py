@@ -207,6 +207,7 @@ def _running_side(side: Side) -> Iterator[_RunningSide]:
 def _create_forwarder(
     crossing: Crossing, source: _RunningSide, target: _RunningSide, types: MessageTypes, number: int
 ) -> Forwarder:
+    """Describe the topic for both sides, check its type there, and start to forward it."""
     sides = (source, target)
     pair = counterparts.of_type(types, crossing.type_name) if _uses_ros1(*sides) else None
     topic_pair = [

@@ -104,6 +104,7 @@ def add(parser: Parser) -> None:
 
 
 _POLL_S: Final = 1.0
+"""Interval at which the bridge looks for nodes that use a topic with another type."""
 _ROUTER_PORT: Final = 7447
 _NODE: Final = re.compile(r"[A-Za-z]\w*", re.ASCII)
 
@@ -221,7 +222,8 @@ def _watch(forwarders: Sequence[Forwarder], stop_event: threading.Event) -> None
 
 
 def _show(counts: Sequence[CrossingCounts]) -> None:
-    header = ("topic", "direction", "messages", "per second", "bytes", "refused", "unreadable", "median", "99 %")
+    counters = ("messages", "per second", "bytes", "refused", "unreadable")
+    header = ("topic", "direction", *counters, "delay, median", "delay, 99 %")
     rows = [
         (
             topic_counts.topic,

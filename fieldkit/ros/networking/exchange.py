@@ -27,8 +27,10 @@ _PARTICIPANT: Final = 119
 """Highest participant ID of a domain (RTPS 2.5, section 9.6.2.3). No ROS program on a robot has an ID that high, so
 its port is free."""
 _GROUP: Final = "239.255.0.1"
+"""Multicast group that DDS uses for discovery."""
 _SEND_S: Final = 30.0
 _READ_S: Final = 10.0
+"""Timeouts for sending the datagrams of one robot, and for reading its counts."""
 _COUNTS_FILE: Final = "counts.json"
 
 

@@ -19,7 +19,9 @@ MIN_ARRIVED: Final = 18
 """Minimum number of arrived datagrams, out of `COUNT`, on a good link: 10 % loss."""
 
 _RESOLVE_S: Final = 15.0
+"""Timeout for the resolution of a name."""
 _LOOPBACK: Final = {None, "localhost", "127.0.0.1", "::1"}
+"""Hosts in the URI of a master that runs on the robot itself; None if the URI has no host."""
 _FRAGMENTS: Final = -(-SIZES[FRAGMENTED] // 1480)
 """Number of IP fragments, rounded up, if each has 1480 bytes of payload (MTU 1500 without the IPv4 header)."""
 
@@ -50,7 +52,7 @@ def judge_arrivals(
         return
     if settings.needs_multicast(state.variables):
         if unicast:
-            none_reason = f"no multicast arrives, unicast does{firewall_note}"
+            none_reason = f"no multicast arrives, but unicast does{firewall_note}"
             multicast_remedy = f"export ROS_STATIC_PEERS={source.address}   # or a discovery server"
         else:
             none_reason, multicast_remedy = f"no multicast arrives{firewall_note}", remedy

@@ -60,6 +60,7 @@ def _xml(root: ET.Element, comment: Sequence[str]) -> str:
 
 
 def _cyclonedds(settings: Mapping[str, str]) -> ET.Element:
+    """Return the XML of settings, whose paths have the form `Element/Element@attribute`."""
     root = ET.Element("CycloneDDS")
     domain = ET.SubElement(root, "Domain", Id="any")
     for path, value in settings.items():

@@ -63,6 +63,7 @@ def add(parser: Parser) -> None:
 
 
 NOTHING_WRITTEN: int = 1
+"""Exit code if no file was written."""
 
 
 def recommend(arguments: argparse.Namespace) -> int:

@@ -9,6 +9,7 @@ from fieldkit.steps.scene import CommandResult, Need, Scene
 
 _TIMEOUT_S: Final = 5
 _OK: Final = " 200 "
+"""Part of the first line of a successful HTTP answer."""
 
 # The simplest method of a master (wiki.ros.org/ROS/Master_API).
 _CALL: Final = (

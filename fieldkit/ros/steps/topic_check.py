@@ -37,6 +37,7 @@ _START_S: Final = 4.0
 # Limit of a recording that is needed only for the battery. A recorder would wait longer if its ROS master is missing.
 _SHORT_LIMIT_S: Final = 6.0
 _END_BYTES: Final = 4096
+"""Number of bytes that are read from the end of a log."""
 _BATTERY: Final = "sensor_msgs/BatteryState"
 
 

@@ -158,6 +158,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
     def _stream(
         self, scene: Scene, testbed: Testbed, other_jobs: list[Planned], publish: Planned, announce: Announce
     ) -> None:
+        """Run the publisher, stop the other programs, and check all exit codes."""
         announce("topics", self.expected_s(scene.protocol))
         with ExitStack() as silence_contexts:
             for role in self.participants:

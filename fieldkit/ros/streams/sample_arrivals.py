@@ -75,7 +75,10 @@ class SampleArrivals:
 
 
 def _complete_ns(subscriber: SampleFlow, heads: SampleHeads, *, complete: bool, reliable: bool) -> Ints | None:
-    """Return the time at which each sample and all earlier ones had arrived, by sample number; None if unknown."""
+    """Return the times at which the samples of `heads` were completely received; None if they are unknown.
+
+    Over TCP and with a reliable middleware, all earlier samples must have been received, too.
+    """
     if subscriber.is_tcp:
         return _contiguous_ns(subscriber, heads.end)
     if heads.is_complete.all():
@@ -85,7 +88,9 @@ def _complete_ns(subscriber: SampleFlow, heads: SampleHeads, *, complete: bool, 
 
 
 def _may_have_waited(samples: TopicSamples, heads: SampleHeads) -> Mask:
-    """Return a mask of the captured samples, by number, that may have waited for a sample that was not captured.
+    """Return a mask of the captured samples that may have waited for a sample that was not captured.
+
+    Its elements are in the order of sample numbers.
 
     A reliable middleware delays samples until the previous one has arrived or is known to be lost.
     """

@@ -31,6 +31,7 @@ RANK: Final = 130
 MIN_READS: Final = 0.9
 """If a program read less often than this share of the planned reads, columns that need each read are empty."""
 _TAIL: Final = 0.95
+"""Quantile of the ages in the column `age_p95_s`."""
 
 
 @dataclass(frozen=True)

@@ -221,6 +221,7 @@ def _surplus_copies(samples: TopicSamples, subscriber: SampleFlow) -> Iterator[s
 
 def _uncaptured_samples(plan: TopicPlan, arrivals: TopicSamples, subscriber: SampleFlow) -> Iterator[str]:
     """Yield a contradiction if the capture has too few packets for the samples in a log without duplicates."""
+    # Without the expected ports and without heads, the packets of the topic are unknown.
     if not plan.uses_expected_ports and not len(subscriber.heads):
         return
     packets = subscriber.packets
@@ -275,7 +276,7 @@ def _missing_count(plan: TopicPlan, log: TopicLog, subscriber: SampleFlow, *, co
 def _is_received(
     plan: TopicPlan, heads: SampleHeads, samples: TopicSamples, subscriber: SampleFlow, *, complete: bool
 ) -> Mask:
-    """Return a mask of the samples, by number, that the subscriber's middleware must have delivered."""
+    """Return a mask of the samples in `heads` that the subscriber's middleware must have delivered."""
     if subscriber.is_tcp:
         return _is_acknowledged(heads, subscriber)
     has_all_bytes = heads.is_complete | complete
@@ -293,7 +294,7 @@ def _is_received(
 
 
 def _is_acknowledged(heads: SampleHeads, subscriber: SampleFlow) -> Mask:
-    """Return a mask of the samples over TCP that the subscriber's kernel acknowledged completely."""
+    """Return a mask of the samples in `heads` that the subscriber's kernel acknowledged completely over TCP."""
     connection = subscriber.connection()
     if connection is None or not len(connection[1]):
         return np.zeros(len(heads), dtype=np.bool_)
@@ -305,7 +306,7 @@ def _is_acknowledged(heads: SampleHeads, subscriber: SampleFlow) -> Mask:
 def _may_have_overflowed(
     plan: TopicPlan, samples: TopicSamples, heads: SampleHeads, is_missing: Mask, end_ns: int
 ) -> Mask:
-    """Return a mask of the samples missing in a log that a queue of the subscriber may have dropped."""
+    """Return a mask of the missing samples of `heads` that a queue of the subscriber may have dropped."""
     if plan.depth is None:
         return np.zeros(int(is_missing.sum()), dtype=np.bool_)
     arrived_ns, read_ns = np.sort(heads.at_ns), np.append(np.sort(samples.at_ns), end_ns)

@@ -178,6 +178,7 @@ def _is_intact(content: bytes | mmap, end_record: np.void, *, required: bool) ->
 
 
 _WORD_BYTES: Final = 8
+"""Size of an integer in the head of a sample."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,6 +243,7 @@ def _positions(data: Buffer, frames: Frames, pattern: bytes) -> Ints:
 
 MAGIC: Final = b"fieldkit"
 HEAD_BYTES: Final = 24
+"""Size of the head of a sample: magic number, sequence number and time of sending."""
 
 
 @dataclass(frozen=True, eq=False)

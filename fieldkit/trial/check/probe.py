@@ -35,7 +35,7 @@ def run_probe(shell: Shell, interface: str, commands: Mapping[str, Sequence[str]
 
     Raises:
         LinkError: The robot did not answer within `PROBE_S`.
-        RobotError: The output exceeds the limit of a probe.
+        RobotError: The probe wrote too much output.
     """
     completed = shell.run(
         ("sh", "-s", interface),

@@ -72,6 +72,6 @@ class Report:
         return remedy
 
 
-_SUDO: Final = re.compile(r"\bsudo (?!-)")
+_SUDO: Final = re.compile(r"\bsudo (?!-)")  # `sudo` with an option, such as `sudo -u`, is not replaced
 _SETCAP: Final = re.compile(r"\bsetcap ")
 _INSTALL: Final = re.compile(r"\bsudo apt-get install (?P<package>[a-z0-9.+-]+)")

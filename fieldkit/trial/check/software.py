@@ -1,4 +1,8 @@
-"""Check, with the output of the probe, that a robot has the programs that steps start, and their other needs."""
+"""Check that a robot has the programs that steps start, and fulfils the other needs of steps.
+
+Most checks use the output of the probe, a script that reads the state of a robot. The others use the agent, a Python
+program of fieldkit that is copied to the robot.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -44,7 +48,7 @@ _PACKAGES: Final = {
 }
 _TOOLS: Final = "tools"
 _AGENT_S: Final = 30.0
-"""Timeout of a check by the agent."""
+"""Timeout of a check that the agent runs."""
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ def check_sources(plan: Plan, role: Role, shell: Shell, probe_result: ProbeResul
             output = laptop_telemetry.query_once(source, os.environ)
         else:
             address, interface, _, *options = source.poll_words(profile.radio.interface)
+            # `poll` runs while the first file exists: `/` always does. The second argument `-` means: without a lock.
             words = (*CALL, "poll", "/", "-", address, interface, laptop_telemetry.ONCE, *options)
             output = shell.run(words, deadline=Deadline.after(source.limit + REPLY_S), check=False).stdout
         readings = source_readings.parse(output, source)

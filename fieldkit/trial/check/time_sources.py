@@ -18,7 +18,8 @@ from fieldkit.trial.check.report import Report
 CHECK: Final = "time source"
 
 SNAPSHOT_S: Final = 15.0
-"""Timeout of a snapshot. Its sources need at most 2 s; the remaining time is for a slow connection."""
+"""Timeout of a snapshot: the outputs of programs that report the robot's state. These programs need at most 2 s; the
+remaining time is for a slow connection."""
 
 _NO_PROGRAM: Final = "no program of the robot reports that it sets the clock"
 _INSTALL: Final = "sudo apt-get install chrony   # then add a line `server ADDRESS iburst` to /etc/chrony/chrony.conf"
@@ -45,7 +46,7 @@ class RobotTime:
 
 
 def read_reports(shell: Shell) -> tuple[ClockReport, ...]:
-    """Return the reports of a robot's programs about its clock. The job script must be installed.
+    """Return the reports of a robot's programs about its clock. `jobs.install` must be called first.
 
     Raises:
         LinkError: The robot did not answer.

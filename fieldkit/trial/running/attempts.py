@@ -67,7 +67,9 @@ class Attempts:
         self._motions = motions
         self._origins = origins
         self._last_remote = ""
+        """Remote folder of the previous attempt, which is deleted when the next attempt begins."""
         self._progress: Status | None = None
+        """State of the current attempt: None before its steps, then `running` and `measured`."""
 
     def make(self, repeat: RepeatId) -> str:
         """Make another attempt at a repeat, and store it with any result.
@@ -77,9 +79,10 @@ class Attempts:
 
         Raises:
             ConfigurationError: This machine has no space for the evidence.
-            FieldkitError: The trial cannot continue. The attempt is stored, but is not one of the allowed attempts.
-            KeyboardInterrupt: The user pressed Ctrl-C. The attempt is stored, but is not one of the allowed attempts.
-                If its steps have ended, `recover` completes the attempt.
+            FieldkitError: The trial cannot continue. The attempt is stored, but does not count as one of the
+                allowed attempts.
+            KeyboardInterrupt: The user pressed Ctrl-C. The attempt is stored, but does not count as one of the
+                allowed attempts. If its steps have ended, `recover` completes the attempt.
             OSError: The disk is full or was removed.
         """
         self._robots.check_alive()

@@ -48,7 +48,7 @@ class Ledger:
         self._lines: list[str] = []
         self._line_count_on_disk = 0
         self._last: tuple[Attempt, Row] | None = None
-        self._numbers: dict[RepeatId, int] = {}
+        self._last_numbers: dict[RepeatId, int] = {}
         self._counted_attempts: Counter[RepeatId] = Counter()
         self._finished: set[RepeatId] = set()
         self._counts: Counter[Status] = Counter()
@@ -114,8 +114,9 @@ class Ledger:
         Raises:
             OSError: The disk is full or was removed.
         """
-        started = Attempt(repeat, 1 + self._numbers.get(repeat, 0), time.time_ns(), Status.RUNNING)
+        started = Attempt(repeat, 1 + self._last_numbers.get(repeat, 0), time.time_ns(), Status.RUNNING)
         self._append(started, started.started_utc_ns)
+        # In a trial of up to 100 attempts, the manifest then covers the journal entry of this start.
         if self._is_due(len(self._lines) - 1):
             self._manifest.write()
         return started
@@ -171,6 +172,7 @@ class Ledger:
         self._manifest.rename(before, attempt.folder)
 
     def _is_due(self, line_count: int) -> bool:
+        """Return True if a file with the first `line_count` attempts must be written again (see `TABLE_SHARE`)."""
         return len(self._lines) - line_count >= TABLE_SHARE * len(self._lines)
 
     def _write(self) -> None:
@@ -227,7 +229,9 @@ class Ledger:
 
     def _add_line(self, attempt: Attempt, line: str) -> None:
         self._lines.append(line)
-        self._numbers[attempt.repeat] = max(attempt.number, self._numbers.get(attempt.repeat, 0))
-        self._counted_attempts[attempt.repeat] += not attempt.excused
-        self._finished |= {attempt.repeat} if attempt.status in {Status.VALID, Status.FAILED} else set()
+        self._last_numbers[attempt.repeat] = max(attempt.number, self._last_numbers.get(attempt.repeat, 0))
+        if not attempt.excused:
+            self._counted_attempts[attempt.repeat] += 1
+        if attempt.status in {Status.VALID, Status.FAILED}:
+            self._finished.add(attempt.repeat)
         self._counts[attempt.status] += 1

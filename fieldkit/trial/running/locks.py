@@ -22,8 +22,8 @@ from fieldkit.remote.shell import Shell
 from fieldkit.steps.scene import Shells
 
 TTL_S: Final = 3600
-"""Lifetime of a lock that is not renewed. `evidence.begin` renews it after half of this time. It is longer than an
-attempt, and longer than it takes to carry robots to another place."""
+"""Lifetime of a lock that is not renewed. `evidence.begin` renews it after half of this time. The lifetime is longer
+than an attempt, and longer than it takes to carry robots to another place."""
 
 _LOCK_STATE: Final = re.compile(rb"(?P<token>\S+) (?P<remaining_s>[0-9]{1,11}) (?P<user>\S+) (?P<purpose>\S+)\n")
 
@@ -33,7 +33,7 @@ class Holder:
     """Holder of a lock on robots. At most 80 letters, digits and characters of `._@-` of each text are used.
 
     Attributes:
-        token: ID of the trial. A holder with the same token can lock its robots again.
+        token: ID of the run of fieldkit (`Plan.session`). A holder with the same token can lock its robots again.
         user: `user@laptop`, see `runtime.user_at_host`.
         purpose: Purpose of the lock, for example the name of the trial.
     """
@@ -139,6 +139,7 @@ def require_lock(shell: Shell, token: str) -> None:
         LockLostError: The trial was aborted, or the lock expired and another holder locked the robot.
         RobotError: The robot could not read its lock.
     """
+    # `renew` fails if the lock was lost. 0 is the time in seconds for which the lock must last at least.
     call(shell, "renew", word(token), "0", deadline=Deadline.after(REPLY_S))
 
 

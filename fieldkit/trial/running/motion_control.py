@@ -1,4 +1,4 @@
-"""Interface to the package that moves robots: permission to move, and guards of drones, during trials.
+"""Interface to the package that moves robots during trials: it permits or refuses motion before each attempt.
 
 The package has the entry point `control` of the group `fieldkit.motion`. It is imported only for trials in which
 robots move.

@@ -27,7 +27,7 @@ from fieldkit.trial.running import locks
 from fieldkit.trial.running.locks import LockState
 
 JOBS_S: Final = 10.0
-"""Timeout for installing the job script, and for listing the running jobs."""
+"""Timeout for installing the job script, which starts and stops programs on a robot, and for listing running jobs."""
 
 RobotCheck = Callable[[Plan, Role, Shell, ProbeResult, Report], None]
 """A check that a package adds to `fieldkit check`. It runs after all other checks, and adds its findings to the
@@ -148,7 +148,7 @@ def _check_robot(
     plan: Plan, role: Role, shell: Shell, variants_by_role: dict[Role, Variants], report: Report, *, all_checks: bool
 ) -> bool:
     """Add the findings about a robot. Return False if another user has locked it."""
-    stage, robot = _CONNECTION, plan.cast[role]
+    stage, robot = _CONNECTION, plan.cast[role]  # if an error is raised, it is reported as the check `stage`
     try:
         offset = contact.judge(shell, report)
         stage = "probe"

@@ -124,12 +124,12 @@ class Robots:
             self._run_steps(scene, announce)
             return
         before, since_ns = oracle.lateness(), time.time_ns()
-        oracle.links(continue_sampling=True)
+        oracle.links(continue_sampling=True)  # starts to sample the links, or drops the samples of the last attempt
         oracle.record_air(scene.laptop_folder)
         try:
             self._run_steps(scene, announce)
         finally:
-            oracle.record_air(None)
+            oracle.record_air(None)  # ends the recording of transmissions
         after, positions, links = oracle.lateness(), oracle.track(since_ns), oracle.links(continue_sampling=False)
         if scene.laptop_folder is not None:
             (scene.laptop_folder / track.FILE).write_text(track.text(positions), encoding="ascii")
@@ -195,7 +195,7 @@ class Robots:
 
     def _collect(self, role: Role, remote: str, into: Path, *, ended_normally: bool) -> tuple[str, bool] | None:
         """Fetch the evidence of one robot. If this fails, return the reason and True if it is still on the robot."""
-        shell, attempt = self.shells[role], remote.rpartition("/")[2]
+        shell, attempt = self.shells[role], remote.rpartition("/")[2]  # for example `udp-07-1`: repeat and attempt
 
         def announce(progress_text: str, remaining_s: float) -> None:
             name = f"collect evidence, {progress_text} of {self._plan.cast[role].name}"

@@ -29,6 +29,7 @@ _IN_PARALLEL: Final = 200
 """Smallest number of plans that are read in parallel. Reading a plan takes 20 ms; starting processes takes 1 s."""
 
 Note = Callable[[str], None]
+"""Function that shows a sentence to the user."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,7 @@ class IndexedTables:
 
     @cached_property
     def tables(self) -> frozenset[Path]:
-        """The tables whose rows are in the index."""
+        """The tables whose rows are in the index. An invalid table has an entry with a negative number of rows."""
         return frozenset(table for table, entry in self.entries.items() if entry.rows >= 0)
 
     def facts(self, table: Path) -> TableFacts | None:
@@ -91,13 +92,13 @@ def find(tables: Iterable[Path], workers: Workers, note: Note) -> IndexedTables:
     now_ns = time.time_ns()
     entries, new = {}, {}
     for table, name in absolute.items():
-        stamps = _stamp(name)
-        if stamps is None:
+        stamp = _stamp(name)
+        if stamp is None:
             continue
-        if stamps in index.entries:
-            entries[table] = index.entries[stamps]
-        elif _can_be_indexed(stamps, now_ns):
-            new[table] = stamps
+        if stamp in index.entries:
+            entries[table] = index.entries[stamp]
+        elif _can_be_indexed(stamp, now_ns):
+            new[table] = stamp
     indexed = IndexedTables(path, index, entries)
     if len(new) < (MIN_NEW if index.entries else MIN_TABLES):
         return indexed
@@ -109,8 +110,10 @@ def _no_index_note(path: Path, error: OSError) -> str:
     return f"{path}: {error.strerror or error}; tables are read without an index, which takes longer (see --no-index)"
 
 
-def _can_be_indexed(stamps: TableStamp, now_ns: int) -> bool:
-    return stamps[0].size <= MAX_TABLE_BYTES and all(item is None or item.is_settled(now_ns) for item in stamps)
+def _can_be_indexed(stamp: TableStamp, now_ns: int) -> bool:
+    """Return True if a table is not too large, and neither the table nor its plan has just changed."""
+    table_stamp, _ = stamp
+    return table_stamp.size <= MAX_TABLE_BYTES and all(part is None or part.is_settled(now_ns) for part in stamp)
 
 
 def _facts(tables: Sequence[Path], workers: Workers, note: Note) -> dict[Path, TableFacts]:
@@ -159,6 +162,7 @@ def write(indexed: IndexedTables, columns: Sequence[Column], note: Note) -> Inde
             if index.entries:
                 writer.copy(index, _kept_entries(indexed))
             for arrays, counts in table_files.typed_tables(_unchanged(indexed.new), declared):
+                # `writer.add` sets the start of each table, which is 0 here.
                 new_entries = [Entry(str(table.absolute()), *indexed.new[table], 0, rows) for table, rows in counts]
                 writer.add(arrays, new_entries)
         written = table_index.load(indexed.path)
@@ -191,4 +195,5 @@ def _unchanged(new: Mapping[Path, tuple[TableStamp, TableFacts]]) -> Iterator[tu
 
 
 def _stamp(table: Path) -> TableStamp | None:
+    """Return the stamp of a table and its plan (their sizes and times of change), or None if it cannot be indexed."""
     return table_index.stamp(table, table.parent / PLAN_FILE)

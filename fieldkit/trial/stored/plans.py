@@ -16,7 +16,7 @@ from fieldkit.trial.journal import JOURNAL_FILE
 from fieldkit.trial.plan import PLAN_FILE, Plan
 
 DEPTH: Final = 3
-"""Maximum depth of an evidence file below `repeats/`: a subfolder of an attempt's folder."""
+"""Maximum depth of an evidence file below `repeats/`: `ATTEMPT/SUBFOLDER/FILE`."""
 
 _TRIAL_FILES: Final = frozenset(
     {

@@ -52,7 +52,7 @@ def set_positions(
         sources: GPX or CSV file, or a fixed place, by role; empty to remove positions that were added before.
         offset_s: Offset that is added to the times of the files to convert them to the laptop's clock, in seconds.
         gap_s: Longest time between two points over which positions are interpolated linearly, in seconds.
-        heights: True to use heights above the ellipsoid.
+        heights: True to use heights above the ellipsoid as well; False for horizontal distances.
 
     Raises:
         ConfigurationError: `folder` is not a trial, another process runs the trial, it has no such role, or a file is
@@ -149,6 +149,7 @@ def _place(text: str) -> PositionSource | None:
     is_in_range = is_length or (abs(first) <= 90 and abs(second) <= 180)
     if first_is_length is not is_length or not is_in_range or len(third) > 1:
         return None
+    # Without a third number, a place in metres is at height 0, and the height of other places is unknown.
     height_m = third[0][0] if third else 0.0 if is_length else None
     return PositionSource(place=(first, second, height_m), frame=LOCAL if is_length else WGS84)
 

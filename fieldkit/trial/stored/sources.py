@@ -70,6 +70,8 @@ class Sources:
     def condition(self, text: str, *, option: str = "--by") -> tuple[str, ...]:
         """Return the columns that define a condition, without duplicates.
 
+        Repeats with equal values in these columns have the same condition and are aggregated together.
+
         Args:
             text: Comma-separated names.
             option: Option or argument with these names, for the message.
@@ -89,7 +91,11 @@ class Sources:
 
     @cached_property
     def sweep_columns(self) -> Mapping[str, str]:
-        """The columns that define a condition (`datasets.condition`); empty if a table is not a sweep."""
+        """The columns that define a condition of a sweep (co-simulations with varied parameters).
+
+        The value of each is the column with its values as the user typed them (`datasets.condition`). The mapping is
+        empty if a table is not a sweep.
+        """
         if not all(table.is_dir() for table in self.tables):
             return {}
         from fieldkit.analysis import datasets  # noqa: PLC0415 (imports pandas if it is installed)
@@ -98,7 +104,7 @@ class Sources:
 
     @property
     def sweep_condition(self) -> tuple[str, ...]:
-        """The columns that define a condition, the flow and the factors; empty if a table is not a sweep."""
+        """The names of the columns in `sweep_columns`: the flow, then the parameters that the sweep varies."""
         return tuple(self.sweep_columns)
 
     def select(
@@ -248,7 +254,10 @@ def find_each(
     workers: Workers = ALL_PROCESSORS,
     use_index: bool = True,
 ) -> list[Sources]:
-    """Return the sources at the paths of each run; see `find`. Each of them has the columns of all runs."""
+    """Return the sources of each run; see `find`. All of them have the columns of all runs.
+
+    A run is a group of paths, for example one side of a comparison.
+    """
     tables_by_run = [_find_tables(paths, note, rebuild=rebuild) for paths in runs]
     all_tables = list(dict.fromkeys(table for run_tables in tables_by_run for table in run_tables))
     indexed = indexed_tables.find(all_tables, workers, note) if use_index and not rebuild else NO_INDEX

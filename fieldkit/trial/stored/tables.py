@@ -9,7 +9,7 @@ from fieldkit.analysis import table_files
 from fieldkit.analysis.repeats import SOURCE
 from fieldkit.analysis.table_index import TableFacts
 from fieldkit.core import files
-from fieldkit.core.columns import Column, plain_name, with_step_name
+from fieldkit.core.columns import Column, with_step_name
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.trial import frozen, store
 from fieldkit.trial.columns import installed_columns, trial_columns
@@ -98,12 +98,13 @@ def _other_names_of(table: Path, known_facts: TableFacts | None) -> tuple[str, .
 @lru_cache  # thousands of tables have the same columns
 def other_names(names: tuple[str, ...]) -> tuple[str, ...]:
     """Return the names of a table's columns that are not in every trial."""
+    # A header can have a column without a name. `SOURCE` is added when tables are combined.
     common_names = {column.name for column in trial_columns()} | {"", SOURCE}
     return tuple(name for name in names if name not in common_names)
 
 
 def frozen_columns(table: Path) -> tuple[Column, ...]:
-    """Return the columns that a dataset declares, or the columns in the plan in the folder of a table.
+    """Return the columns in the plan next to a table. For a dataset (a folder), return those that it declares.
 
     Raises:
         ConfigurationError: The plan cannot be read.
@@ -128,11 +129,11 @@ def expectation_texts(table: Path) -> tuple[str, ...]:
 
 
 def _by_name(name: str, installed_columns: Mapping[str, Column]) -> Column:
-    """Return the column for a name that no plan declares."""
+    """Return the column for a name, such as `rtt_loss` or `up.rtt_loss`, that no plan declares."""
     step, _, plain = name.rpartition(".")
-    column = installed_columns.get(name) or (
-        installed_columns.get(plain_name(name)) and with_step_name(step, installed_columns[plain])
-    )
+    column = installed_columns.get(name)
+    if column is None and plain in installed_columns:
+        column = with_step_name(step, installed_columns[plain])
     return column if column and not column.declaration_error() else table_files.undeclared(name)
 
 

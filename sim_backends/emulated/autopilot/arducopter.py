@@ -182,7 +182,7 @@ ARDUCOPTER: Final = Firmware(
         Mode.POSHOLD: "POSHOLD",
         Mode.BRAKE: "BRAKE",
     },
-    starting_flags=0xA7,
+    starting_flags=0xA7,  # attitude, velocities, height and constant-position mode; no horizontal position
     boot_mode=Mode.STABILIZE,
     modes_without_arming=frozenset({Mode.LAND, Mode.RTL, Mode.HOMECOMING, Mode.BRAKE, Mode.MISSION}),
     refusal_result=_d.MAV_RESULT_FAILED,

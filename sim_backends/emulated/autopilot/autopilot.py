@@ -40,8 +40,8 @@ class Autopilot:
     """An autopilot and its vehicle.
 
     Args:
-        firmware: Family of the autopilot.
-        system: System id.
+        firmware: Behaviour of PX4 or of ArduCopter.
+        system: MAVLink system id.
         limits: Limits of the robot's profile.
         airframe_limits: Limits of its airframe.
         obstacles: Obstacles in the world, including the floor.
@@ -154,6 +154,7 @@ class Autopilot:
         self.vehicle.status_texts.clear()
 
     def _replies(self, message: Message, now_ns: int) -> Iterator[Message]:
+        """Yield the answers to a message that is addressed to the autopilot."""
         kind = message.get_type()
         if kind in {"COMMAND_LONG", "COMMAND_INT"}:
             yield from self._run_command(message, now_ns)

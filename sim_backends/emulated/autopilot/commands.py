@@ -109,6 +109,7 @@ class Commands:
         return self._change_mode(Mode.MISSION)
 
     def _set_mode(self, message: Message) -> int:
+        """Execute MAV_CMD_DO_SET_MODE."""
         if (
             not is_integer_up_to(message.param1, 255)
             or not int(message.param1) & dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED

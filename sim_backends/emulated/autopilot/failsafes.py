@@ -27,7 +27,7 @@ class VehicleState:
     """State of the vehicle on which failsafes depend.
 
     Attributes:
-        now_ns: Time.
+        now_ns: The current time.
         is_armed: True if it is armed.
         has_landed: True if it is on the ground.
         mode: Its mode.
@@ -94,7 +94,7 @@ class ArduCopterFailsafes:
     heartbeat arrives.
 
     Args:
-        parameters: BATT_*, FS_GCS_*, SYSID_MYGCS.
+        parameters: The vehicle's parameters; these failsafes read BATT_*, FS_GCS_* and SYSID_MYGCS.
     """
 
     _STAGES: Final = (("LOW", "is low"), ("CRT", "is critical"))
@@ -135,6 +135,7 @@ class ArduCopterFailsafes:
         yield from self._gcs(state)
 
     def _battery(self, state: VehicleState) -> Iterator[Reaction]:
+        """Yield the reactions to each stage of a low battery that is reached for the first time."""
         parameters = self._parameters
         for stage, (name, level_text) in enumerate(self._STAGES, 1):
             limit_v, limit_mah = parameters[f"BATT_{name}_VOLT"], parameters[f"BATT_{name}_MAH"]
@@ -155,6 +156,7 @@ class ArduCopterFailsafes:
             )
 
     def _gcs(self, state: VehicleState) -> Iterator[Reaction]:
+        """Yield the reactions to the loss of the ground station, and to its return."""
         parameters = self._parameters
         if not parameters["FS_GCS_ENABLE"] or self._gcs_heartbeat_ns is None:
             if self._gcs_lost:
@@ -197,7 +199,8 @@ class Px4Failsafes:
     failsafe.
 
     Args:
-        parameters: NAV_DLL_ACT, COM_DL_LOSS_T, COM_LOW_BAT_ACT, BAT_*_THR, COM_FAIL_ACT_T.
+        parameters: The vehicle's parameters; these failsafes read NAV_DLL_ACT, COM_DL_LOSS_T, COM_LOW_BAT_ACT,
+            BAT_*_THR and COM_FAIL_ACT_T.
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -243,6 +246,7 @@ class Px4Failsafes:
             yield Reaction("Failsafe activated", _CRITICAL, mode)
 
     def _data_link(self, state: VehicleState) -> Iterator[Reaction]:
+        """Yield the reactions to the loss of the ground station, and to its return."""
         if self._gcs_heartbeat_ns is None:
             return
         is_lost = state.now_ns - self._gcs_heartbeat_ns > self._parameters["COM_DL_LOSS_T"] * 1e9
@@ -255,6 +259,7 @@ class Px4Failsafes:
             yield Reaction("Connection to ground station regained", _INFO)
 
     def _battery(self, state: VehicleState) -> Iterator[Reaction]:
+        """Yield the reactions to a battery warning that is higher than all before."""
         parameters, charge = self._parameters, state.battery.charge
         warning = sum(charge < parameters[name] for name in ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR"))
         if warning <= self._warning:
@@ -265,6 +270,7 @@ class Px4Failsafes:
         yield from self._trigger(_LOW_BATTERY_ACTIONS.get((int(parameters["COM_LOW_BAT_ACT"]), warning)), state)
 
     def _trigger(self, mode: Mode | None, state: VehicleState) -> Iterator[Reaction]:
+        """Yield the change to a mode; nothing if the vehicle is on the ground, or already returns or lands."""
         if (
             mode is None
             or not state.is_armed
@@ -302,7 +308,7 @@ class Fence:
     """Fence of one vehicle; positions are relative to home: metres east, north, up.
 
     Args:
-        parameters: GF_MAX_*, FENCE_ACTION.
+        parameters: The vehicle's parameters; the fence reads GF_MAX_* and FENCE_ACTION.
     """
 
     def __init__(self, parameters: Parameters) -> None:

@@ -22,6 +22,7 @@ _WARNING: Final = dialect.MAV_SEVERITY_WARNING
 
 _FTP_HEADER: Final = struct.Struct("<HBBBBBxI")
 _FTP_BYTES: Final = 251
+"""Length of the payload of FILE_TRANSFER_PROTOCOL."""
 _ACK, _NAK = 128, 129
 _OPEN_OPCODES: Final = frozenset({4, 11, 14})
 """Opcodes that open a file or compute its checksum: OpenFileRO, OpenFileWO, CalcFileCRC32."""
@@ -38,7 +39,7 @@ class ParameterService:
     cast, ignores the type in the client's message, and does not answer for an unknown name.
 
     Args:
-        firmware: Family of the autopilot.
+        firmware: Family of the autopilot, PX4 or ArduCopter.
         parameters: Its parameters.
         on_change: Called with the name of a parameter that was set.
         report: Called with the severity and the text of a STATUSTEXT message.
@@ -75,6 +76,7 @@ class ParameterService:
             yield self.value(name)
 
     def _set(self, name: str, message: Message) -> None:
+        """Set a parameter to the value in a PARAM_SET message, unless the type is wrong."""
         value = message.param_value
         if not self._firmware.is_ardupilot:
             expected_type = _INT if self._parameters.is_integer(name) else _FLOAT
@@ -168,6 +170,7 @@ class Streams:
         for kind, due_ns in self._due_ns.items():
             if due_ns <= now_ns:
                 interval_ns = self._interval_ns[kind]
+                # The first time after `now_ns` that is a whole number of intervals after `due_ns`.
                 self._due_ns[kind] = now_ns + interval_ns - (now_ns - due_ns) % interval_ns
                 yield kind
 
@@ -272,6 +275,7 @@ class MissionTransfer:
         yield _request(upload)
 
     def _start_upload(self, count: int, client: tuple[int, int], now_ns: int) -> Message:
+        """Return the answer to MISSION_COUNT: the request for the first item, or a result."""
         if self._upload is not None and self._upload.client != client:
             return _ack(client, dialect.MAV_MISSION_DENIED)
         self._last_upload = None
@@ -286,6 +290,7 @@ class MissionTransfer:
         return _request(self._upload)
 
     def _accept_item(self, message: Message, client: tuple[int, int], now_ns: int) -> Iterator[Message]:
+        """Yield the answer to an item of an upload: the request for the next item, or the result."""
         upload = self._upload
         if upload is None or upload.client != client:
             if self._last_upload is not None and self._last_upload[:2] == (client, message.seq):
@@ -310,6 +315,7 @@ class MissionTransfer:
         yield _ack(client, dialect.MAV_MISSION_ACCEPTED)
 
     def _item(self, number: int, client: tuple[int, int]) -> Message:
+        """Return an item of the mission, for a download."""
         items = self._items()
         if number >= len(items):
             return _ack(client, dialect.MAV_MISSION_INVALID_SEQUENCE)

@@ -141,7 +141,7 @@ PX4: Final = Firmware(
         Mode.ALT_HOLD: "Altitude",
         Mode.POSHOLD: "Position",
     },
-    starting_flags=0xA5,
+    starting_flags=0xA5,  # attitude, vertical velocity, height and constant-position mode; no horizontal position
     boot_mode=Mode.LOITER,
     modes_without_arming=frozenset(),
     refusal_result=_d.MAV_RESULT_TEMPORARILY_REJECTED,

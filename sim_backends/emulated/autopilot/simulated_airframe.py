@@ -24,7 +24,7 @@ class SimulatedAirframe(Airframe):
     Args:
         limits: Limits of the airframe.
         place_m: Position of its lowest point in the world, which is also home.
-        facing_rad: Heading.
+        facing_rad: Initial heading.
         now_ns: Time of this state.
         commands: Record of the autopilot's commands.
         flight_record: Record in which the physics simulator stores the flight.
@@ -69,6 +69,7 @@ class SimulatedAirframe(Airframe):
         self._command(Velocity(), self._limits, powered=False)
 
     def _command(self, target: Velocity, limits: QuadrotorLimits, *, powered: bool) -> None:
+        """Record a command for the physics simulator."""
         self._is_off = not powered
         self._commands.write(
             FlightCommand(
@@ -96,5 +97,5 @@ class SimulatedAirframe(Airframe):
         if flight.is_supported:
             return flight.place_m
         elapsed_s = min(max(self.now_ns - flight.time_ns, 0), _MAX_EXTRAPOLATION_NS) / 1e9
-        (e, n, u), (v_e, v_n, v_u) = flight.place_m, flight.velocity_m_s
-        return e + v_e * elapsed_s, n + v_n * elapsed_s, u + v_u * elapsed_s
+        (east_m, north_m, up_m), (east_m_s, north_m_s, up_m_s) = flight.place_m, flight.velocity_m_s
+        return east_m + east_m_s * elapsed_s, north_m + north_m_s * elapsed_s, up_m + up_m_s * elapsed_s

@@ -11,6 +11,7 @@
 | `steering` | commanded velocities of one robot, and the record of its motion | records in the robot |
 | `simulators` | builds the physics and the network | cosim, network, radio, physics |
 
-The coordinator, its windows and its policies are the same as in a co-simulation without real robots' programs. Only
-its agents differ: the end of a window is a deadline of the monotonic clock.
+The coordinator advances physics and network together, in windows of simulated time. It is the same as in a
+co-simulation without real programs, with the same policies. Only its agents (the robots and their programs) differ:
+the end of a window is a deadline of the monotonic clock.
 """

@@ -4,7 +4,8 @@
 requests as the process of a radio model, and two more: `simulate`, with simulators and policy, and `body`, with the
 body of a robot.
 
-A session is one run of the coordinator. Its time is 0 when the session starts, and its windows end in real time. If
+A session is one run of the coordinator, which advances physics and network together, in windows of simulated time.
+Its time is 0 when the session starts, and its windows end in real time. If
 the set of stations or the relay changes, a new session starts, and packets on the air of the old session are lost.
 """
 
@@ -105,7 +106,7 @@ class CosimulatedMedium(MediumServer):
     # Methods of `Devices`.
 
     def wait(self, until_ns: int) -> None:
-        """Implement `Devices.wait`."""
+        """Implement `Devices.wait`: read packets and answer requests until a simulated time."""
         session = self._session
         while True:
             due_ns = self._clock.monotonic_ns(until_ns)
@@ -128,18 +129,18 @@ class CosimulatedMedium(MediumServer):
             self._poll(due_ns, answers=False)
 
     def first_ns(self) -> int | None:
-        """Implement `Devices.first_ns`."""
+        """Implement `Devices.first_ns`: the time of the first packet in the queue."""
         return self._queue[0].at_ns if self._queue else None
 
     def pop_packets(self, last_ns: int) -> list[RealPacket]:
-        """Implement `Devices.pop_packets`."""
+        """Implement `Devices.pop_packets`: take the packets up to a time from the queue."""
         packets, queue = [], self._queue
         while queue and queue[0].at_ns <= last_ns:
             packets.append(queue.popleft())
         return packets
 
     def receivers(self, source: str) -> Sequence[str]:
-        """Implement `Devices.receivers`."""
+        """Implement `Devices.receivers`: the other robots on the air."""
         robots_on_air, _ = self._routing_state
         return sorted(robots_on_air - {source})
 
@@ -250,6 +251,7 @@ class CosimulatedMedium(MediumServer):
         delay += late_ns * PROCESSING_NS
         port.delays[packet.source] += delay + undivided_ns * PROCESSING_NS
         if self._flows.delays_by_flow and (inner := self._framing.ipv4(packet.content)) is not None:
+            # From sending until the packet entered the network, and from its arrival until the end of the window.
             added_ns = end_ns - fate.arrived_ns + fate.packet.enters_ns - fate.packet.sent_ns
             self._flows.count(inner, delay, port.address.packed)
             added_delay = PACKET + added_ns * PROCESSING_NS + undivided_ns * TRANSMISSION_NS

@@ -1,4 +1,4 @@
-"""A session of a lab on the co-simulation: one run of the coordinator."""
+"""A session of a lab on the co-simulation: one run of the coordinator, which advances physics and network."""
 
 import time
 from collections.abc import Mapping
@@ -103,6 +103,9 @@ class CosimSession:
 
     def network_delay(self, fate: Fate) -> tuple[Delay, int]:
         """Return the parts of a packet's delay in the network, and the rest of the delay, whose parts are unknown.
+
+        Args:
+            fate: The record of the packet's arrival.
 
         Raises:
             FederateError: The parts exceed the delay.

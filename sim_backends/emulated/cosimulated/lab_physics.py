@@ -167,13 +167,14 @@ class LabPhysics:
             close()
 
     def _commands(self, to_ns: int) -> Iterator[tuple[int, str, Command]]:
+        """Yield the commands of the robots' programs up to a time: time, name of the robot, command."""
         until_ns = self._clock.monotonic_ns(to_ns)
         for name, steering in self._steerings.items():
             for at_ns, command in steering.commands(until_ns):
                 yield self._clock.simulated_ns(at_ns), name, command
 
     def _drive(self, name: str, at_ns: int, command: Command) -> None:
-        """Apply a command to a robot at a time. If the robot already follows this command, nothing is done."""
+        """Apply a command to a robot from a time on. If the robot already follows this command, nothing is done."""
         if self._active_commands.get(name) == command:
             return
         self._active_commands[name] = command
@@ -195,6 +196,7 @@ class LabPhysics:
             self._physics_states, self._has_changed = states, True
 
     def _report(self, to_ns: int) -> None:
+        """Write the records of motion that are due."""
         # The states are those after the last whole step.
         at_ns = self._clock.monotonic_ns(to_ns - (to_ns - self._started_ns) % self.step_ns)
         for name, steering in self._steerings.items():
@@ -205,6 +207,7 @@ class LabPhysics:
                 steering.report(at_ns, self._physics_states[name], flight)
 
     def _combine_states(self) -> Mapping[str, State]:
+        """Return the state of each station: simulated if a program drives it, otherwise assigned by the lab."""
         states = dict(self._assigned_states)
         for name, steering in self._steerings.items():
             if steering.is_driven and self._physics is not None:
@@ -214,6 +217,7 @@ class LabPhysics:
         return states
 
     def _poll_placements(self, now_ns: int) -> None:
+        """Stop the robots that the lab has placed at another position; they are at rest there until a new command."""
         self._polled_ns = now_ns
         for name, steering in self._steerings.items():
             state = self._physics_states.get(name)
@@ -275,6 +279,7 @@ class LabPhysics:
         self._physics_states = self._physics.advance(0, {})
 
     def _body_state(self, name: str) -> State:
+        """Return the state at which a robot starts in a new physics simulator: its current position, at rest."""
         steering = self._steerings.get(name)
         if steering is not None and steering.is_driven and name in self._physics_states:
             state = self._physics_states[name]

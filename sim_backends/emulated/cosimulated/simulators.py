@@ -40,7 +40,7 @@ _END_NS: Final = 10**9 * 10**8
 
 
 class Simulators(NamedTuple):
-    """The simulators of a lab.
+    """The simulators of a lab. A federate is a simulator that takes part in a co-simulation.
 
     Attributes:
         physics: `kinematic`, or a name or command of a physics federate.
@@ -114,7 +114,7 @@ def start_physics(settings: LabSettings, states: Mapping[str, State]) -> Physics
     """Start the physics simulator with robots at rest.
 
     Args:
-        settings: The session.
+        settings: Settings of the session.
         states: State of the antenna of each robot.
 
     Raises:
@@ -194,6 +194,7 @@ def start_network(settings: LabSettings, states: Mapping[str, State]) -> remote.
 
 
 def _hello(settings: LabSettings, role: int, states: Mapping[str, State]) -> Hello:
+    """Return the first message to a simulator: the run, the agents and the configuration."""
     agents = [
         AgentStart(
             name,

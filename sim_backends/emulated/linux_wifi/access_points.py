@@ -42,7 +42,9 @@ _BEACON_INTERVALS_TU: Final = (100, 101, 103, 107, 109, 113)
 from one clock: beacons of equal intervals would always collide."""
 _ENABLED: Final = "AP-ENABLED"
 _START_S: Final = 60.0
+"""Timeout for the start of all access points."""
 _EXIT_S: Final = 5.0
+"""Time for hostapd to exit at a signal before it is killed."""
 _POLL_S: Final = 0.1
 
 
@@ -104,6 +106,7 @@ class AccessPoints:
         self._folder.cleanup()
 
     def _start(self, radios: Mapping[str, HwsimRadio]) -> None:
+        """Move the radios to the process, and return when every access point is on."""
         deadline = Deadline.after(_START_S)
         namespaces = [Path(f"/proc/{pid}/ns/net") for pid in ("self", self._process.pid)]
         while len({path.readlink() for path in namespaces}) < len(namespaces):  # until it has its own namespace

@@ -27,6 +27,7 @@ from sim_backends.radio.world_channel import WorldChannel
 from sim_backends.world.world import World
 
 _FCS_BYTES: Final = 4
+"""Length of the frame check sequence, which frames from the kernel do not contain."""
 _LOWEST_SIGNAL_DBM: Final = -120
 _ABSENT: Final = ""
 """Station without a position: the receiver of frames to an address that no radio has."""
@@ -140,7 +141,7 @@ class _Channel:
     Args:
         seed: Seed of all random draws.
         options: Radio options.
-        antennas: The stations.
+        antennas: The radios, by name.
         world: Obstacles; None for open ground.
 
     Attributes:
@@ -167,6 +168,7 @@ class _Channel:
         self._gains.move(now_ns, positions_m, velocities_m_s)
 
     def transmit(self, now_ns: int, frame: FrameOnAir) -> None:
+        """Send a frame. If none of its tries is possible, its status is reported immediately."""
         number = self._numbers[frame.source]
         self._numbers[frame.source] = number + 1
         identity = frame.source, number
@@ -200,6 +202,7 @@ class _Channel:
             self.events.statuses.append(frame)
 
     def _on_attempt(self, attempt: TransmissionAttempt) -> None:
+        """Store the mode of a received attempt. The status of a broadcast is known after its only attempt."""
         frame = attempt.payload
         if not isinstance(frame, FrameOnAir):
             return  # an ACK

@@ -29,6 +29,7 @@ Answer = TypeVar("Answer")
 _START_S: Final = 1800.0
 """Maximum time until the robots can be reached. On an idle host with an emulated processor this takes 2 minutes."""
 _REPLY_S: Final = 15.0
+"""Timeout of a request."""
 _POLL_S: Final = 0.5
 _MAX_ANSWER_BYTES: Final = 8 << 20
 _LOGIN: Final = Codec(GuestLogin)
@@ -79,15 +80,15 @@ class GuestLab:
         return stream
 
     def programs(self, name: str) -> tuple[str, ...]:
-        """Implement `Lab.programs`."""
+        """Implement `Lab.programs`: the answer of the lab in the machine."""
         return self._state(name).programs
 
     def place_m(self, name: str) -> Vector:
-        """Implement `Lab.place_m`."""
+        """Implement `Lab.place_m`: the answer of the lab in the machine."""
         return self._state(name).place_m
 
     def move(self, name: str, to: Destination) -> Vector:
-        """Implement `Lab.move`."""
+        """Implement `Lab.move`: the lab in the machine moves the robot."""
         return self._request(f"move {name} {pack_destination(to)}", unpack_place_m)
 
     def overview(self) -> Overview:
@@ -109,6 +110,7 @@ class GuestLab:
         return stream
 
     def _request(self, request: str, read: Callable[[bytes], Answer], deadline: Deadline | None = None) -> Answer:
+        """Return the answer of the lab to a request, decoded by `read`."""
         deadline = deadline or Deadline.after(_REPLY_S)
         answer = b""
         with closing(self._open(request)) as stream:

@@ -24,6 +24,7 @@ from sim_backends.radio.links import Pair
 
 MAX_FREQUENCY_MHZ: Final = 7_125
 MIN_FREQUENCY_MHZ: Final = 2_412
+"""Limits of the bands of Wi-Fi, from channel 1 at 2.4 GHz to the end of the 6 GHz band."""
 _MAX_ADDRESSES: Final = 64
 """Maximum number of addresses of a radio, because a robot can change the address of its interface at any time."""
 _RADIO_BIT: Final = 0x40
@@ -111,6 +112,7 @@ class HwsimMedium:
         return [message for message in messages if message is not None]
 
     def _transmit(self, now_ns: int, sent_frame: SentFrame) -> None:
+        """Pass a frame to the air, and store the address of its transmitter."""
         name = self._name_of_radio.get(sent_frame.radio)
         if name is None or not MIN_FREQUENCY_MHZ <= sent_frame.frequency_mhz <= MAX_FREQUENCY_MHZ:
             self.counts.rejected_messages += 1
@@ -123,6 +125,7 @@ class HwsimMedium:
         self.air.transmit(now_ns, sent_frame, name, self._name_of_interface.get(sent_frame.receiver))
 
     def _update_address(self, event: InterfaceAddress) -> None:
+        """Add or remove an address that the kernel has announced."""
         name = self._name_of_radio.get(event.radio)
         if name is None:
             self.counts.rejected_messages += 1
@@ -150,6 +153,7 @@ class HwsimMedium:
         return encode_reception(frame.sent_frame, radio, rate_index=rate_index, signal_dbm=reception.signal_dbm)
 
     def _status_message(self, frame: FrameOnAir) -> bytes:
+        """Return the report on a frame for its sender, and add the frame to the totals."""
         tries = frame.chain.tries_made(frame.attempts)
         if frame.receiver:
             totals = self._totals(frame.source, frame.receiver)

@@ -10,6 +10,7 @@ from sim_backends.emulated.linux_wifi.netlink import NetlinkFormatError, decode_
 FAMILY: Final = "MAC80211_HWSIM"
 _VERSION: Final = 1
 
+# Commands (HWSIM_CMD_*).
 CMD_REGISTER: Final = 1
 CMD_FRAME: Final = 2
 CMD_TX_INFO_FRAME: Final = 3
@@ -28,9 +29,11 @@ _COOKIE: Final = 8
 _FREQUENCY: Final = 19
 _TX_INFO_FLAGS: Final = 21
 
+# Flags of a frame (HWSIM_TX_CTL_NO_ACK, HWSIM_TX_STAT_ACK).
 FLAG_NO_ACK: Final = 2
 FLAG_ACKNOWLEDGED: Final = 4
 
+# Flags of a stage of a rate chain (MAC80211_HWSIM_TX_RC_*).
 RATE_MCS: Final = 1 << 3
 RATE_40_MHZ: Final = 1 << 5
 RATE_SHORT_GUARD_INTERVAL: Final = 1 << 7
@@ -39,7 +42,7 @@ RATE_80_MHZ: Final = 1 << 9
 RATE_160_MHZ: Final = 1 << 10
 
 STAGES: Final = 4
-"""Length of a rate chain, IEEE80211_TX_MAX_RATES."""
+"""Number of stages of a rate chain (IEEE80211_TX_MAX_RATES): the rates that mac80211 gives a frame, one per stage."""
 MIN_FRAME_BYTES: Final = 10
 """Frame control, duration and the receiver's address: the shortest frames of 802.11, 9.3.1 (without FCS)."""
 MAX_FRAME_BYTES: Final = 11_454
@@ -225,6 +228,7 @@ def _sent_frame(attributes: dict[int, bytes]) -> SentFrame:
 
 
 def _stages(rates: bytes, flags: bytes) -> tuple[RateStage, ...]:
+    """Return the stages of a rate chain from the attributes TX_INFO and TX_INFO_FLAGS."""
     stages = []
     # The flags have the same order; a kernel before 4.20 does not send them.
     all_flags = (

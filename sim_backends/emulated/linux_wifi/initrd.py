@@ -112,6 +112,7 @@ def module_order(modules: Path, names: Iterable[str]) -> list[Path]:
     order: dict[str, Path] = {}
 
     def add(name: str) -> None:
+        """Add a module after its dependencies."""
         if name in order or name in builtin:
             return
         if name not in paths:
@@ -152,6 +153,7 @@ def cpio_archive(files: Mapping[str, tuple[int, bytes]], folders: Iterable[str])
         files: Permissions and content of each file, by path without a slash at the start.
         folders: Additional folders; the folders of files are included.
     """
+    # With "x", a folder of `folders` is one of its own parents; so is each file, which is removed again.
     parents = {str(parent) for path in (*files, *folders) for parent in (Path(path) / "x").parents}
     parents -= {".", *files}
     entries = [(path, stat.S_IFDIR | 0o755, b"") for path in sorted(parents)]
@@ -160,6 +162,7 @@ def cpio_archive(files: Mapping[str, tuple[int, bytes]], folders: Iterable[str])
     archive = bytearray()
     for number, (path, mode, content) in enumerate(entries, start=1):
         name = path.encode() + b"\0"
+        # Inode, mode, uid, gid, links, time, size, four device numbers, length of the name, checksum.
         fields = (number, mode, 0, 0, 1, 0, len(content), 0, 0, 0, 0, len(name), 0)
         archive += b"070701" + b"".join(b"%08X" % value for value in fields) + name
         archive += bytes(-len(archive) % 4)

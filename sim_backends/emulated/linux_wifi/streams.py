@@ -88,6 +88,7 @@ class ChannelStreams:
                     stream.frames.put_nowait(b"")
 
     def _receive(self, number: int, kind: int, data: bytes) -> None:
+        """Handle a frame of the other side: it opens a stream, has data for one, or ends one."""
         with self._lock:
             stream = self._streams.get(number)
             if kind == _OPEN and stream is None and self._accept is not None and len(self._streams) < _MAX_STREAMS:

@@ -42,6 +42,7 @@ PACKAGE_OF: Final = {
 ROOT_VARIABLE: Final = "FIELDKIT_WIFI_ROOT"
 """Environment variable with a folder in which packages were extracted instead of being installed."""
 
+# Offsets of fields in the header of a boot image (Linux, Documentation/arch/x86/boot.rst).
 _BOOT_SECTORS_OFFSET: Final = 0x1F1
 _BOOT_MAGIC_OFFSET: Final = 0x202
 _BOOT_PAYLOAD_OFFSET: Final = 0x248
@@ -221,6 +222,7 @@ class Machine:
         )
 
     def _has_ended(self, timeout_s: float, *, is_interrupted: bool) -> bool:
+        """Wait; return True if the machine has ended. The first Ctrl-C interrupts the script; a second is raised."""
         try:
             self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
@@ -311,6 +313,7 @@ def _mount_command(results: Path) -> str:
 
 
 def _command_line(folder: Path, memory_mib: int, results: Path | None) -> list[str]:
+    """Return the command line of QEMU."""
     accelerators = _accelerators()
     options = _KERNEL_OPTIONS if "kvm" in accelerators else f"{_KERNEL_OPTIONS} {_INSTRUCTION_CLOCK}"
     argv = ["setpriv", "--pdeathsig", "KILL", "--", "qemu-system-x86_64", *accelerators]

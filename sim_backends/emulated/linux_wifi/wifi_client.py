@@ -1,4 +1,4 @@
-"""The lab's client of the medium of hwsim: it has the socket that is registered with the kernel."""
+"""The lab's client of the medium of mac80211_hwsim: it has the socket that is registered with the kernel."""
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -21,7 +21,7 @@ from sim_backends.world.world import World
 
 
 class WifiClient(MediumClient):
-    """Starts the medium of hwsim's radios, and access points that are not robots.
+    """Starts the medium of the simulated radios (hwsim), and access points that are not robots.
 
     Arguments that are not described are those of `MediumClient`. This object keeps the registered socket open. If the
     medium is killed or suspended, no frame is delivered.

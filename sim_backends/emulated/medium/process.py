@@ -90,8 +90,8 @@ class Medium(MediumServer):
         flows, requested_flows = self._flows, self._flows.delays_by_flow
         framing, has_priorities = self._framing, self._has_priorities
         carries, destination_of, header_bytes = framing.carries, framing.destination, framing.header_bytes
-        # The sum of this value and the time of reading is the delay of one packet that has waited since
-        # `backlog_since_ns`.
+        # The sum of this value and the time of reading is the `Delay` of one packet that has waited since
+        # `backlog_since_ns`: a plain number of ns in a `Delay` is processing delay, and `PACKET` counts one packet.
         delay_offset = PACKET - port.backlog_since_ns
         for _ in range(BURST):
             try:

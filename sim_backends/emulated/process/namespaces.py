@@ -38,6 +38,7 @@ _KERNEL_SETTINGS: Final = {
 allows them."""
 
 _TIMEOUT_S: Final = 10.0
+"""Timeout of a probe."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,7 @@ def id_ranges(text: str) -> list[IdRange]:
 
 
 def _check_subordinates(user: str, uid: int) -> None:
+    """Raise ConfigurationError if the user has too few subordinate ids."""
     ranges_by_file = {path: id_ranges(_text(Path(path))) for path in _OPTION_OF}
     has_enough = {
         path: any(ids.owner in {user, str(uid)} and ids.count >= _SUBORDINATES for ids in ranges)

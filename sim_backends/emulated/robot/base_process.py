@@ -78,6 +78,7 @@ def _receive_velocities(channel: socket.socket, controller: "BaseController", no
 
 
 def _write_motion(reporter: MotionReporter, controller: "BaseController", now_ns: int) -> None:
+    """Record the pose and the odometry of the robot."""
     pose = controller.pose
     reporter.write(
         now_ns,

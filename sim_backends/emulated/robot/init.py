@@ -34,6 +34,7 @@ RESTART_S: Final = 0.1
 
 _POLL_S: Final = 0.005
 _HALT_S: Final = 5.0
+"""Timeout until all killed processes have exited."""
 _LOG_TAIL_LINES: Final = 3
 
 
@@ -132,6 +133,7 @@ START_S: Final = 30.0
 """Timeout for the start of a robot's programs; Debian's ROS takes a few seconds on a busy machine."""
 
 _MESSAGE_S: Final = 10.0
+"""Timeout of a message from or to the lab."""
 
 VOLATILE: Final = ("/tmp", "/run", "/dev/shm")  # noqa: S108 (in the robot)
 """Folders whose content is in the robot's memory, and is lost without power; other folders are on its SD card."""
@@ -170,6 +172,7 @@ class Init:
             network.switch_off(self._interface)
 
     def _serve(self) -> bool:
+        """Execute one request and send the reply; return False if the lab has closed the socket."""
         message = worker.receive(self._channel, Deadline.after(_MESSAGE_S))
         if message is None:
             return False
@@ -236,6 +239,7 @@ class Init:
         self._spawn(spec)
 
     def _change_radio(self, request: Message) -> None:
+        """Execute a request that changes a network interface."""
         match request["do"]:
             case "open wifi":
                 self._wifi, self._interface = WifiSpec(**request["wifi"]), request["interface"]

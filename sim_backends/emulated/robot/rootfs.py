@@ -74,6 +74,7 @@ _KEPT_WITH_BUSYBOX: Final = (
     "wpa_supplicant",
 )
 _TIMEOUT_S: Final = 5.0
+"""Timeout of `busybox --list`."""
 
 Layer = dict[str, str | None]
 """Link target per name in a folder of programs; None for a name that is removed."""
@@ -185,6 +186,7 @@ def _ros_packages(setup: Path) -> Path:
 
 
 def _etc_files(spec: RobotSpec) -> dict[str, str]:
+    """Return the content of the robot's own files in `/etc`, by name."""
     names = "".join(f"{address}\t{name}\n" for name, address in spec.hosts.items())
     return {
         "passwd": _ACCOUNTS.format(shell="/bin/sh" if spec.userland == "busybox" else "/bin/bash"),

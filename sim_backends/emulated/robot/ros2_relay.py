@@ -4,10 +4,10 @@ The command line is `route ADDRESS` for the router, or `relay ADDRESS NODE VELOC
 ADDRESS is the robot's. ROS2 (the fields of `Ros2Spec`) and TYPES (the type of each topic) are JSON. The two words
 about velocities are empty for a robot without a base.
 
-The sensors process creates each message. The relay converts it to CDR as the robot's distribution defines the type,
-and publishes it while a node on the radio subscribes to the topic. It publishes `/tf_static` even without a
-subscriber, because later subscribers get the last message of this topic. It also sends received velocities to the
-base. Its node logs on `/rosout`.
+The sensors process creates each message. The relay converts it to CDR, the serialization of ROS 2, as the robot's
+distribution defines the type, and publishes it while a node on the radio subscribes to the topic. It publishes
+`/tf_static` even without a subscriber, because later subscribers get the last message of this topic. It also sends
+received velocities to the base. Its node logs on `/rosout`.
 """
 
 import contextlib

@@ -87,6 +87,7 @@ def name_process(name: str) -> None:
 
 
 def _run(name: str, work: Callable[[], None], log: Path) -> int:
+    """Run `work` in a forked process; return its exit code."""
     try:
         name_process(name)
         _detach(log)
@@ -196,6 +197,7 @@ def _velocity_topic(spec: RobotSpec) -> tuple[str, str]:
 
 
 def _drone(spec: RobotSpec, port: int) -> autopilot.Drone:
+    """Return the settings of the robot's autopilot."""
     return autopilot.Drone(
         system=spec.system,
         port=port,

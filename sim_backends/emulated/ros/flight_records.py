@@ -119,7 +119,7 @@ class FlightRecord(Record):
             int(flight.is_supported),
             *flight.place_m,
             *flight.velocity_m_s,
-            *flight[5:],
+            *flight[5:],  # heading, turn rate, roll and pitch
         )
 
     def read(self) -> FlightMotion | None:
@@ -131,5 +131,6 @@ class FlightRecord(Record):
         values = self._slots.read()
         if values is None:
             return None
-        time_ns, path_start_ns, is_supported, e, n, u, v_e, v_n, v_u, *angles = values
-        return FlightMotion(time_ns, path_start_ns, bool(is_supported), (e, n, u), (v_e, v_n, v_u), *angles)
+        time_ns, path_start_ns, is_supported, *numbers = values
+        place_m, velocity_m_s, angles = tuple(numbers[:3]), tuple(numbers[3:6]), numbers[6:]
+        return FlightMotion(time_ns, path_start_ns, bool(is_supported), place_m, velocity_m_s, *angles)

@@ -120,8 +120,8 @@ def _to_motion(time_ns: int, path_start_ns: int, *values: float) -> RecordedMoti
 
 
 def _extrapolate(position_m: Vector, velocity_m_s: Vector, for_s: float) -> Vector:
-    (east, north, up), (e, n, u) = position_m, velocity_m_s
-    return east + e * for_s, north + n * for_s, up + u * for_s
+    (east_m, north_m, up_m), (east_m_s, north_m_s, up_m_s) = position_m, velocity_m_s
+    return east_m + east_m_s * for_s, north_m + north_m_s * for_s, up_m + up_m_s * for_s
 
 
 def _vector(values: tuple[float, ...]) -> Vector:

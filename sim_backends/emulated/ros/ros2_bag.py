@@ -1,9 +1,9 @@
 """The `ros2` command of an emulated robot without ROS: `ros2 bag record` writes bags like ROS 2's own.
 
-It does not use DDS. It reads the robot's sensors as the built-in `rosbag` does, converts each message to CDR, and
-stores it with the requested rosbag2 plugin and the quality of service that the publisher offers. Like the original,
-it has no option for a duration, and stops on SIGINT or SIGTERM. Options of the original that no trial uses are
-rejected as unknown.
+It does not use DDS. It reads the robot's sensors as the built-in `rosbag` does, converts each message to CDR (the
+serialization of ROS 2), and stores it with the requested rosbag2 plugin and the quality of service that the publisher
+offers. Like the original, it has no option for a duration, and stops on SIGINT or SIGTERM. Options of the original
+that no trial uses are rejected as unknown.
 """
 
 import argparse
@@ -94,6 +94,7 @@ class Rosbag2Recorder:
         return listener.stop_signal
 
     def _write(self, writer: Writer, header: Header, message: bytes | None) -> None:
+        """Write a message to the bag; a new topic is first added to the bag."""
         topic, kind = header["topic"], type_of(header)
         if kind not in self._ros2_types.fielddefs or kind not in self._ros1_types.fielddefs:
             return  # the package of the type is not installed; the original logs this and continues

@@ -47,6 +47,7 @@ def record(argv: Sequence[str]) -> int:
 
 
 def _record_in_child(values: optparse.Values) -> int:
+    """Record a bag in the recorder process; return its exit code."""
     try:
         Rosbag1Recorder(
             Options(
@@ -150,6 +151,7 @@ def _error_text(name: str, error: Exception) -> str:
 
 
 def _summary(reader: Reader, name: str) -> str:
+    """Return the summary of a bag in the layout of ROS's `rosbag info`."""
     blocks: dict[str, list[str]] = {"path": [name], "version": ["2.0"]}
     if reader.message_count:
         # rosbags adds 1 ns to the last stamp, so that an interval of stamps includes that message.

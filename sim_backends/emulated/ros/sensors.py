@@ -63,6 +63,7 @@ class Subscriber:
             self._read()
 
     def _flush(self) -> None:
+        """Send as much as the socket accepts; the rest is sent when it is writable again."""
         try:
             with contextlib.suppress(BlockingIOError):
                 del self._unsent[: self._stream.send(self._unsent)]
@@ -74,6 +75,7 @@ class Subscriber:
             self._selector.modify(self._stream, events, self.serve)
 
     def _read(self) -> None:
+        """Receive data. A subscriber that has closed its socket, or violates the protocol, is disconnected."""
         try:
             data = self._stream.recv(_CHUNK_BYTES)
             if not self.is_subscribed:

@@ -100,6 +100,7 @@ class Listener:
                 yield from self._read(key.data)
 
     def _read(self, subscription: _Subscription) -> Iterator[tuple[Header, bytes | None]]:
+        """Receive data of a subscription, and yield its events."""
         data = b""
         with contextlib.suppress(ConnectionResetError):
             data = subscription.stream.recv(_CHUNK_BYTES)
@@ -129,6 +130,7 @@ class Listener:
                 yield subscription.header, payload
 
     def _stop_on_signals(self) -> None:
+        """Store SIGINT or SIGTERM in `stop_signal`; a signal also ends the wait of the selector."""
         receiver, signals = socket.socketpair()
         signals.setblocking(False)
         signal.set_wakeup_fd(signals.detach())

@@ -37,6 +37,7 @@ _STRUCT_FORMATS: Final = {
     "float64": "d",
 }
 _POINT_BYTES: Final = 16
+"""Length of a point in a PointCloud2: four float32 fields."""
 _FLOAT32: Final = 7  # sensor_msgs/PointField.FLOAT32
 
 Values = Mapping[str, bytes]
@@ -149,6 +150,7 @@ class _SerializedFields:
         (before_list if self.list_type is None else after_list).extend(data)
 
     def _add_field(self, node: Any, argument: Any) -> None:  # noqa: ANN401 (rosbags' own tuples)
+        """Add a field with the value 0 or empty; a quaternion is the identity."""
         match node.name:
             case "BASE":
                 self._add(
@@ -166,6 +168,7 @@ class _SerializedFields:
                 self._add_list(*argument[0])
 
     def _add_list(self, node: Any, argument: Any) -> None:  # noqa: ANN401 (as above)
+        """Add a list. The first list of numbers that can have the required size becomes the gap; others are empty."""
         if self.list_type is not None or not self._size_bytes or node.name != "BASE" or argument[0] == "string":
             self._add(bytes(4))  # an empty list
             return

@@ -17,16 +17,21 @@ from sim_backends.physics.body import Twist, Velocity
 from sim_backends.world.motion import State
 
 _WINDOW_S: Final = 0.05
+"""Window of the checks that add up a motion window by window."""
 _LONG_WINDOW_S: Final = 0.25
 """Window of the checks that compare only the start and the end of a motion; long windows save time."""
 _DRIVE_S: Final = 3.0
+"""Time for which robots drive."""
 _FLY_S: Final = 5.0
+"""Time for which robots fly."""
 _YAW_S: Final = 8.0
 """Longest time for a turn to another yaw."""
 _SPEED_M_S: Final = 0.2
 """A speed that even small robots reach."""
 _TURN_RAD_S: Final = 0.3
+"""Commanded turn rate."""
 _FLIGHT_M_S: Final = (0.4, 0.0, 0.2)
+"""Commanded velocity of robots that fly: east, north, up."""
 _HEADING_RAD: Final = 0.25
 """Largest error of a heading that an agent keeps or has reached."""
 _DIRECTION_RAD: Final = 0.6

@@ -14,17 +14,23 @@ from sim_backends.world.motion import State
 
 _MS: Final = 1_000_000
 _WINDOW_NS: Final = 1_100_000
+"""Length of a window in most checks."""
 _END_NS: Final = 5_000 * _MS
 """Time until which the fate of every packet must be decided."""
 _FAR_M: Final = 1e6
+"""Distance of an agent that is out of range of any radio."""
 _SIZE_BYTES: Final = 200
+"""Size of a packet."""
 _MAX_EVENTS: Final = 500
+"""Largest number of announced events that are checked."""
 _SEEDS: Final = 4
+"""Number of seeds that are compared."""
 _DISTANCES_M: Final = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0)
 """Distances at which packets are sent, because a network may lose packets at only some of the distances."""
 _GROUP_SIZE: Final = 32
 """Number of packets at each distance."""
 _SPACING_NS: Final = 20 * _MS
+"""Time between two packets; each packet should arrive before the next one enters."""
 _RANDOM_CHANGES: Final = 4
 """Minimum number of changes between arrivals and losses if losses are random. A network that
 only changes a route has fewer."""
@@ -112,6 +118,7 @@ class _FateAccount:
             )
 
     def _check_next_event(self, outcomes: NetworkOutcomes, to_ns: int, *, has_packets: bool) -> None:
+        """Check that nothing happened before the announced next event, and that the new one is in the future."""
         announced_ns, self._next_event_ns = self._next_event_ns, outcomes.next_event_ns
         if outcomes.next_event_ns != NO_EVENT and outcomes.next_event_ns <= to_ns:
             raise CheckError(f"after advancing to {to_ns} ns, its next event is at {outcomes.next_event_ns} ns")

@@ -30,9 +30,13 @@ _MOVED_M: Final = 0.02
 _JUMP_M: Final = 0.05
 """In a step, a body moves at most by this length plus its motion at twice its speed."""
 _UNKNOWN_TYPE: Final = 32767
+"""A type of command that does not exist."""
 _LIMIT_STEPS: Final = 10
+"""Number of steps over which positions are extrapolated."""
 _COMMANDED_STEPS: Final = 1000
+"""Number of steps after a command in which the motion is checked."""
 _SPEED_M_S: Final = 0.3
+"""Commanded speed."""
 
 
 def _command(agent: AgentStart) -> Twist | Velocity:

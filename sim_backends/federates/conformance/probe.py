@@ -25,7 +25,9 @@ from sim_backends.network.packets import Packet
 from sim_backends.world.motion import State
 
 _SHOWN_BYTES: Final = 120
+"""Largest number of bytes in the description of a frame."""
 _CLOSE_S: Final = 5.0
+"""Longest wait until the federate closes the connection after `bye`."""
 
 
 class CheckError(Exception):

@@ -131,7 +131,7 @@ class HostAndPort:
 
     @property
     def is_loopback(self) -> bool:
-        """See `TransportAddress`."""
+        """True if only programs on this machine can use it."""
         return is_loopback(self.host)
 
 

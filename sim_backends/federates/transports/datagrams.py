@@ -37,7 +37,9 @@ DATAGRAM_VERSION: Final = 1
 _WINDOW: Final = 64
 """Largest number of unacknowledged datagrams; they fit into a receive buffer of Linux's default size."""
 _LINGER_S: Final = 0.5
+"""Longest wait for acknowledgements when a side ends."""
 _PROBE_S: Final = 2.0
+"""Interval at which a side that waits sends an acknowledgement."""
 _SILENCE_S: Final = 3600.0
 """Time without a datagram after which the connection ends; it is long, because a federate may be suspended."""
 

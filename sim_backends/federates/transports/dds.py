@@ -27,6 +27,7 @@ from sim_backends.federates.transports.contract import ChannelListener, Federate
 
 _LOOPBACK: Final = "127.0.0.1"
 _MAX_DOMAIN: Final = 232
+"""Largest number of a domain; the ports of the next one would be above 65535."""
 _TYPE: Final = "fieldkit/Frame"
 _QUALITY: Final = Quality(
     reliability="reliable", history="keep_all", durability="transient_local", late_reader_depth=2
@@ -164,7 +165,7 @@ class DdsAddress:
 
     @property
     def is_loopback(self) -> bool:
-        """See `TransportAddress`."""
+        """True if only programs on this machine can use it."""
         return is_loopback(self.interface)
 
     @property

@@ -24,6 +24,8 @@ from sim_backends.ros1.node_calls import MasterError
 _DEFAULT_MASTER: Final = "http://localhost:11311"
 _NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _MASTER_TIMEOUT_S: Final = 60.0
+"""Longest wait of a federate that listens for the master."""
+# Name of the type, MD5 sum of its definition, and its definition.
 MESSAGE: Final = RosMessageType(
     "std_msgs/UInt8MultiArray",
     "82373f1612381bb6ee473b5cd6f5d89c",
@@ -119,7 +121,7 @@ class Ros1Address:
 
     @property
     def is_loopback(self) -> bool:
-        """See `TransportAddress`."""
+        """True if only programs on this machine can use it."""
         return is_loopback(urlsplit(self.master).hostname or "") and (not self.host or is_loopback(self.host))
 
     def connect(self, deadline_s: float) -> samples.SampleChannel:

@@ -24,6 +24,7 @@ from typing import Final, Protocol
 from sim_backends.federates.channels import ClosedError, DeadlineError
 from sim_backends.federates.frames import (
     HEADER_BYTES,
+    KIND_POSITION,
     MAX_FRAME_BYTES,
     MalformedFrameError,
     MessageKind,
@@ -33,13 +34,16 @@ from sim_backends.federates.frames import (
 from sim_backends.federates.transports.contract import ChannelListener
 
 _RUN: Final = struct.Struct("<Q")
-_KIND_OFFSET: Final = _RUN.size + 4
+_KIND_OFFSET: Final = _RUN.size + KIND_POSITION
+"""Offset of the kind of message in a sample."""
 _CHECK_S: Final = 0.5
 """Interval at which a channel that waits checks that the other side exists."""
 _PEER_S: Final = 10.0
 """Longest time for which the accepting side waits until its peer is discovered. An earlier answer may be lost."""
 _MAX_WAITING: Final = 16
+"""Largest number of runs that wait for the end of the current run."""
 _POLL_S: Final = 0.01
+"""Interval of checks whether the peer was discovered."""
 
 
 class SampleBus(Protocol):
@@ -110,6 +114,12 @@ class SampleChannel:
         return ProtocolFrame(header, sample[body_offset:])
 
     def _next_sample(self, deadline_s: float | None) -> bytes:
+        """Return the next sample of this run.
+
+        Raises:
+            ClosedError: One side has ended the run, or the other side has disappeared.
+            DeadlineError: No sample arrived in time.
+        """
         if self._first_sample:
             first_sample, self._first_sample = self._first_sample, b""
             return first_sample

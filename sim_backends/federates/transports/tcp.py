@@ -12,6 +12,7 @@ from sim_backends.federates.channels import DeadlineError, StreamChannel, socket
 from sim_backends.federates.transports.contract import FederateTransport, HostAndPort, split_host_and_port
 
 _RETRY_S: Final = 0.05
+"""Pause after a failed attempt to connect."""
 
 
 class TcpListener:

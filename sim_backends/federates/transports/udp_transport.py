@@ -26,6 +26,7 @@ from sim_backends.federates.transports.datagrams import (
 )
 
 _RETRY_S: Final = 0.05
+"""First interval at which a connection is requested again; it doubles up to `_MAX_RETRY_S`."""
 _MAX_RETRY_S: Final = 1.0
 
 

@@ -18,18 +18,19 @@ OUT_OF_ORDER: Final = "blocks of UDPROS out of order"
 _PROBE_BYTES: Final = 20 + 32
 """Size of a TCP segment without data, with timestamps and the IP header."""
 _UDP_BYTES: Final = 20 + 8
+"""Size of the headers of IP and UDP."""
 _UDPROS_HEADER_BYTES: Final = 8
 
 
 @dataclass(frozen=True, slots=True)
 class Probe:
-    """A keep-alive probe of a connection, or the response to it.
+    """A keep-alive probe that a subscriber sends on a connection, or the publisher's response.
 
     Attributes:
         flow: Flow of the connection.
         connection: Number of the connection, from 1.
         number: Number of the probe.
-        is_alive: The response; None for a query.
+        is_alive: The response: True if this connection is open at the publisher. None in a probe.
     """
 
     flow: str
@@ -40,7 +41,7 @@ class Probe:
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """A datagram of UDPROS.
+    """A datagram of UDPROS, which carries a part of a message.
 
     Attributes:
         flow: Name of the flow.

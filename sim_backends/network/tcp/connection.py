@@ -4,10 +4,11 @@ A program's messages are written to the stream of its flow's connection, which i
 stays open. A message is delivered when its last byte has been read, in order, at its destination. When a connection
 is given up, undelivered messages are dropped; the next message opens another connection.
 
-Standards: RFC 9293 with 2018, 3042, 5681, 6298, 6582, 6675, 6928, 6937, 7323, 8985 and 9438. The default is the TCP
-of Linux without tail loss probes (RFC 8985, 7), undo after a spurious timeout (RFC 5682), HyStart (RFC 9406),
-duplicate SACKs (RFC 2883), ECN, pacing, full send buffers, keep-alive, and closing. A receiver does not retransmit
-its SYN-ACK: the sender retransmits its SYN. Windows count bytes; the windows of Linux's CUBIC are whole segments.
+The model follows RFC 9293, 2018, 3042, 5681, 6298, 6582, 6675, 6928, 6937, 7323, 8985 and 9438. By default it behaves
+like the TCP of Linux. It does not model tail loss probes (RFC 8985, 7), undo after a spurious timeout (RFC 5682),
+HyStart (RFC 9406), duplicate SACKs (RFC 2883), ECN, pacing, full send buffers, keep-alive, and closing. A receiver
+does not retransmit its SYN-ACK: the sender retransmits its SYN. Windows count bytes; the windows of Linux's CUBIC are
+whole segments.
 """
 
 from collections.abc import Callable
@@ -162,6 +163,7 @@ class TcpConnection:
         self._on_closed(self._name)
 
     def _log_event(self, event: str) -> None:
+        """Pass the state of the sender to the log."""
         if self._log is None:
             return
         control, round_trips = self._sender.control, self._sender.round_trips

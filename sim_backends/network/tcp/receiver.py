@@ -73,6 +73,7 @@ class Receiver:
             self._send_ack()
 
     def _advance(self, segment: Segment) -> None:
+        """Accept a segment that begins at or before the next expected byte, and acknowledge it now or later."""
         had_gap = bool(self._sack_order)
         self.next_expected = segment.end
         if had_gap:
@@ -100,6 +101,7 @@ class Receiver:
         self._sack_order = [segment.first, *other_ranges]
 
     def _send_ack(self) -> None:
+        """Acknowledge all data that was received in order, and report out-of-order ranges by SACK."""
         assert self._last_segment is not None
         blocks = [self._out_of_order.containing(number) for number in self._sack_order[:MAX_SACKS]]
         sacks = tuple(block for block in blocks if block is not None)

@@ -13,6 +13,7 @@ DUPLICATE_THRESHOLD: Final = 3
 """Number of later segments that must arrive before a segment is lost (RFC 5681, 3.2; RFC 6675, 2: DupThresh)."""
 
 _COMPACT: Final = 256
+"""Number of acknowledged segments that are removed from the list together."""
 
 
 @dataclass(slots=True)

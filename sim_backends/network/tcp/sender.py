@@ -134,6 +134,7 @@ class Sender:
         self.round_trips.sample(self._wire.now_ns - segment.echoes_ns)
 
     def _on_ack(self, segment: Segment) -> None:
+        """Process an ACK: update the scoreboard, the round trip and the window, detect losses, and send."""
         scoreboard, ack_number, now_ns = self.scoreboard, segment.acknowledges, self._wire.now_ns
         assert ack_number is not None
         self._receive_window_bytes = segment.window_bytes
@@ -213,6 +214,7 @@ class Sender:
         return min(self.scoreboard.next_number - self.scoreboard.first_unacknowledged, self.control.window_bytes)
 
     def _on_timeout(self) -> None:
+        """Process a retransmission timeout: give up the connection, or send all missing segments again."""
         self._timeouts += 1
         if not self._is_open:
             self._on_syn_timeout()
@@ -301,6 +303,7 @@ class Sender:
             self._timer.stop()
 
     def _emit(self, first: int, length: int, *, number: int, earlier_transmissions: int, syn: bool = False) -> None:
+        """Create a segment and send it."""
         acknowledges = None if syn else 1
         self._transmit(
             Segment(

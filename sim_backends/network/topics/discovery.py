@@ -1,4 +1,7 @@
-"""Discovery in publish-subscribe: participants by SPDP, their endpoints by SEDP (DDSI-RTPS 2.5, clause 8.5).
+"""Discovery in publish-subscribe, as in DDSI-RTPS 2.5, clause 8.5.
+
+Each agent has one participant. Participants discover each other by SPDP (Simple Participant Discovery Protocol), and
+then their writers and readers (endpoints) by SEDP (Simple Endpoint Discovery Protocol).
 
 No master is needed. A participant announces itself by multicast. A participant that receives an announcement for the
 first time responds by unicast, and sends its publications and subscriptions over reliable built-in topics. CycloneDDS
@@ -28,10 +31,12 @@ _BUILTIN_TOPICS: Final = 5
 liveliness, and the requests and replies of type lookup.
 """
 _LIVELINESS_BYTES: Final = 28
+"""Size of the data by which a participant asserts its liveliness."""
 _WRITER_BYTES: Final = 200
 _READER_BYTES: Final = 212
 """Sizes of the SEDP data of a writer and of a reader, without the names of topic and type."""
 _DIRECTED_RESPONSES: Final = 4
+"""Number of responses to the announcement of a new participant."""
 _LEASE_EXPIRED: Final = "the lease of the subscriber expired"
 
 
@@ -139,6 +144,7 @@ class TopicDiscovery:
             self._sedp_session(peer, host).reader.on_message(heartbeat)
 
     def _on_announcement(self, host: str, peer: str, *, is_directed: bool) -> None:
+        """Process an announcement of `peer` at `host`; discover the peer if it is new or its lease had expired."""
         if self._wire.now_ns < self._discovery_timing.starts_ns.get(host, 0) or host not in self._participants:
             return
         remote_participant = self._remote_participants.get((host, peer))
@@ -186,6 +192,7 @@ class TopicDiscovery:
         self._wire.transmit(IpPacket(participant, peer or None, TRANSPORT, SPDP_BYTES, key, body))
 
     def _respond(self, host: str, peer: str, count: int) -> None:
+        """Send a response to the announcement of a new participant, and schedule the remaining ones."""
         if count and self._remote_participants[host, peer].is_alive:
             self._announce(host, peer)
             next_ns = self._wire.now_ns + self._discovery_timing.directed_ns

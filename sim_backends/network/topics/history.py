@@ -6,15 +6,16 @@ from sim_backends.network.topics.qos import MS, Qos, RtpsTiming
 from sim_backends.network.topics.rtps import Sample
 
 _GROWTH_PAUSE_NS: Final = 10 * MS
+"""Minimum time between two increases of the high watermark."""
 
 
 class WriterHistory:
     """The unacknowledged samples.
 
-    With `keep_all` a writer blocks while the samples' size is above a high watermark, until it is below a low
-    watermark and no sample that was sent again is unacknowledged. The high watermark grows while nothing is lost, and
-    shrinks after a loss (CycloneDDS, `ddsi_transmit.c`: `throttle_writer`, `maybe_grow_whc`; `ddsi_endpoint.c`:
-    `set_retransmitting`).
+    With `keep_all` a writer blocks when the sum of the samples' sizes exceeds a high watermark. It resumes when the
+    sum is at most a low watermark; after a retransmission, it resumes only when all samples are acknowledged. The
+    high watermark grows while nothing is lost, and shrinks after a loss (CycloneDDS, `ddsi_transmit.c`:
+    `throttle_writer`, `maybe_grow_whc`; `ddsi_endpoint.c`: `set_retransmitting`).
 
     Args:
         qos: Quality of service of the flow.
@@ -62,7 +63,7 @@ class WriterHistory:
         return samples
 
     def on_resend(self) -> None:
-        """Reduce the high watermark for a retransmission, but only once until all samples are acknowledged."""
+        """Reduce the high watermark by 20 % at a retransmission, but only once until all samples are acknowledged."""
         if not self._has_resent:
             self._has_resent = True
             self._high_bytes = max(8 * self._high_bytes // 10, self._low_bytes)

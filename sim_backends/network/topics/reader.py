@@ -16,7 +16,9 @@ from sim_backends.network.topics.writer import Transmit
 from sim_backends.network.wire import Wire, WireTimer
 
 _NEVER_NS: Final = -(10**18)
+"""A time before the start of every run."""
 _MAX_BITS: Final = 256
+"""Largest number of samples, or of fragments of a sample, in the bitmap of one request."""
 _INITIAL_BACKOFF: Final = ((10 * SECOND, 1), (60 * SECOND, 2), (120 * SECOND, 5))
 """Upper limits of the time since the reader was matched, each with a factor.
 
@@ -143,6 +145,7 @@ class TopicReader:
             self._on_heartbeat(message)
 
     def _on_data(self, data: Data) -> None:
+        """Store the fragments of a sample, and deliver all samples that are next in order."""
         number = data.sample.number
         if number < self._next_number or number in self._complete_samples:
             return
@@ -214,10 +217,12 @@ class TopicReader:
         kind: _Kind = "silent_ack"
         if numbers or missing_fragments:
             may_repeat = now_ns >= self._requested_ns + self._timing.nack_delay_ns
+            # True if the first missing data was not requested before.
             is_new = (
                 self._next_number,
                 missing_fragments.missing[0] if missing_fragments else 0,
             ) >= self._requested_end
+            # True if the writer has answered the last request, and data is still missing.
             was_resent = self._has_new_directed_heartbeat and (not self._was_timed_repeat or may_repeat)
             if is_new or was_resent or may_repeat:
                 requests_only_fragments = (
@@ -250,6 +255,7 @@ class TopicReader:
             self._send(response)
 
     def _send(self, response: _Response) -> None:
+        """Send a response, and record what it requests and acknowledges."""
         now_ns = self._wire.now_ns
         self._has_new_heartbeat = self._has_new_directed_heartbeat = False
         self._was_timed_repeat = response.is_timed_repeat

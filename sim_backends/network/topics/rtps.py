@@ -12,6 +12,7 @@ RTPS_HEADER_BYTES: Final = 20
 """Protocol, version, vendor, prefix of the participant's GUID (clause 9.4.4)."""
 INFO_DESTINATION_BYTES: Final = 16
 INFO_TIMESTAMP_BYTES: Final = 12
+# Sizes of submessages, without samples and bitmaps.
 _DATA_BYTES: Final = 24
 _DATA_FRAG_BYTES: Final = 36
 _HEARTBEAT_BYTES: Final = 32

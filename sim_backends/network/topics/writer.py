@@ -24,9 +24,11 @@ OVERTAKEN: Final = "overtaken by a later sample"
 """Reason for a best-effort sample that arrives after a later one; a loss is reported with the reason of the loss."""
 BLOCKED: Final = "the writer was blocked for longer than max_blocking_time"
 _NEVER_NS: Final = -(10**18)
+"""A time before the start of every run."""
 _PIGGYBACK_PAUSE_NS: Final = 100_000
 """A message with data has no heartbeat for this time after a heartbeat, unless a response is required."""
 _HEARTBEATS_AT_FULL_RATE: Final = 5
+"""For every two heartbeats beyond this number since the last write, the interval doubles."""
 
 
 class TopicWriter:
@@ -141,6 +143,7 @@ class TopicWriter:
         self._resume()
 
     def _send(self, sample: Sample) -> None:
+        """Send a new sample in as many messages as it needs; the last one has a heartbeat if one is due."""
         self._last_number += 1
         sample.number = self._last_number
         evicted_sample = self._history.insert(sample) if self._is_reliable else None

@@ -159,6 +159,7 @@ class ManagedDelivery(PacketDelivery[Payload]):
             super().enqueue(now_ns, transmitter, frame)
 
     def _distribute_broadcast(self, now_ns: int, frame: Frame[Payload]) -> None:
+        """Pass a broadcast to each access point that has associated robots; it is lost for other robots."""
         members: dict[int, set[int]] = {}
         for robot in self.robots:
             access_point = self.serving_access_point.get(robot)

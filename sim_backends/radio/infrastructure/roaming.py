@@ -196,6 +196,7 @@ class Roaming:
         self._events.schedule(now_ns + pause_ns, self._visit_channel, client, channel + 1)
 
     def _finish_scan(self, now_ns: int, client: _Association) -> None:
+        """Associate with the strongest access point, if the robot has none or this one is sufficiently stronger."""
         client.levels_dbm = self._levels_dbm(now_ns, client)
         strongest = self._strongest(client)
         if client.scan is None:

@@ -126,6 +126,14 @@ def test_a_missing_or_empty_log_is_refused(tmp_path: Path) -> None:
         drive_log.read(write_log(tmp_path, [], end="[1]\n"))
 
 
+@pytest.mark.parametrize("phase", ["waits", "returns"])
+def test_a_drive_that_ends_before_the_path_has_its_reason(tmp_path: Path, phase: str) -> None:
+    log = drive_log.read(write_log(tmp_path, [{**LINE, "phase": phase, "ended": "ordered to stop"}]))
+    measured = drive_log.measure(log)
+    assert measured.values["drive_ended"] == "ordered to stop"
+    assert "drive_out_m" in measured.missing
+
+
 any_numbers = st.floats(allow_nan=True, allow_infinity=True) | st.integers() | st.none() | st.text(max_size=3)
 NUMBERS = ("at_s", "x_m", "y_m", "yaw_rad", "driven_m", "forward_m_s")
 lines = st.fixed_dictionaries(
