@@ -39,7 +39,7 @@ class ParameterService:
     cast, ignores the type in the client's message, and does not answer for an unknown name.
 
     Args:
-        firmware: Family of the autopilot.
+        firmware: Family of the autopilot, PX4 or ArduCopter.
         parameters: Its parameters.
         on_change: Called with the name of a parameter that was set.
         report: Called with the severity and the text of a STATUSTEXT message.

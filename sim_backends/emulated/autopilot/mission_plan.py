@@ -50,8 +50,8 @@ class Item:
     """One item, as in MISSION_ITEM_INT.
 
     Attributes:
-        frame: MAV_FRAME.
-        command: MAV_CMD.
+        frame: MAV_FRAME of the position.
+        command: MAV_CMD of the action.
         parameters: First four parameters of the command.
         x: Latitude, 1e-7 degrees.
         y: Longitude, 1e-7 degrees.

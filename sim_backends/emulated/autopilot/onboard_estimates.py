@@ -23,7 +23,7 @@ class Battery:
 
     Attributes:
         charge: Remaining charge, from 0 to 1.
-        current_a: Current.
+        current_a: Current that the drone draws.
         full_v: Voltage of the full battery (SIM_BATT_VOLTAGE of ArduPilot's simulator).
         flight_s: Flight time of a full charge (SIM_BAT_DRAIN of PX4's simulator).
         min_charge: Minimum of `charge` (SIM_BAT_MIN_PCT as a fraction).

@@ -141,7 +141,7 @@ class _Channel:
     Args:
         seed: Seed of all random draws.
         options: Radio options.
-        antennas: The stations.
+        antennas: The radios, by name.
         world: Obstacles; None for open ground.
 
     Attributes:
