@@ -17,7 +17,7 @@ _INFINITE_DELAY_REASON: Final = "if the delay of lost items is infinite, the int
 
 
 class Ruling(StrEnum):
-    """Outcome of an expectation."""
+    """Outcome of an expectation, which is a requirement on a figure of a trial."""
 
     HOLDS = "holds"
     FAILS = "does not hold"

@@ -34,6 +34,7 @@ DELAY: Final = (
     "seen_age_p95_s",
 )
 RATE: Final = ("goodput_bit_s", "throughput_bit_s", "iperf3_throughput_bit_s")
+"""Quantities with charts against distance by default, by section of the page."""
 
 _DODGE: Final = 0.026
 """Offset between series at the same distance, as a share of the axis, so that intervals do not overlap."""

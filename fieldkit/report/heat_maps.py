@@ -24,6 +24,7 @@ _DEFAULT_NAMES: Final = (
 )
 """Quantities that are drawn by default."""
 _MAX_PANELS: Final = 12
+"""Maximum number of maps of a quantity."""
 
 
 @dataclass(frozen=True)

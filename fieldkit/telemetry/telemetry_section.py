@@ -223,6 +223,7 @@ _QUANTITIES_BY_KIND: Final[Mapping[str, tuple[str, ...]]] = {
 }
 """Values of the kinds whose output has a known format."""
 KINDS: Final = ("modemmanager", "batctl", "snmp", "http", "command")
+"""Kinds of sources; each is a key of a source."""
 
 _WholeSeconds = Annotated[Duration, Field(ge=1, le=60, multiple_of=1)]
 

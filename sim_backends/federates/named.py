@@ -134,7 +134,7 @@ def command_line(endpoint: str, role: int) -> str:
         return federate.command()
     if isinstance(federate, PythonFederate):
         federate.load()
-        return shlex.join((sys.executable, "-P", "-m", "sim_backends.federates", ROLES[role], endpoint))
+        return shlex.join((sys.executable, "-P", "-m", "sim_backends.federates.serve_named", ROLES[role], endpoint))
     if _WORD.fullmatch(endpoint) and shutil.which(endpoint) is None:
         names = [point.name for point in plugins.entry_points(plugins.FEDERATES)]
         choices = f"simulators: {', '.join(names)}; or a command, or an address: fieldkit docs federates"

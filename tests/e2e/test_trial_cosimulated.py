@@ -164,6 +164,25 @@ def test_an_impossible_combination_is_rejected(emulated: str, reason: str, tmp_p
 
 
 @pytest.mark.skipif(bool(missing_libraries()), reason=missing_libraries())
+def test_a_trial_in_gazebo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The bound is large, because Gazebo has no real-time priority here, and the tests use all processors."""
+    emulated = "{physics: gazebo, ros: builtin, late_bound: 10s}"
+    make_site(tmp_path, emulated)
+    (tmp_path / "gazebo").mkdir()
+    sdf = run_here(tmp_path, "lab", "sdf")
+    assert sdf.code == 0, sdf.err
+    with gazebo_server(tmp_path / "gazebo", sdf.out) as server:
+        monkeypatch.setenv("IGN_PARTITION", server.options["partition"])
+        monkeypatch.setenv("IGN_IP", server.options["ip"])
+        row = trial_row(tmp_path, emulated)
+    assert row["backend"].startswith("emulated (physics gazebo, network builtin, sync ")
+    assert row["file_loss"] == "0"
+    assert float(row["delay_s"]) > float(row["delay_policy_s"]) > 0
+    assert 0 < float(row["cosim_late_max_s"]) < 10
+    assert -90 < float(row["sender_signal_median_dbm"]) < -20
+
+
+@pytest.mark.skipif(bool(missing_libraries()), reason=missing_libraries())
 def test_real_ros_drives_a_robot_in_gazebo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make_site(tmp_path, "{physics: gazebo, ros: debian, world: lawn}")
     (tmp_path / "gazebo").mkdir()

@@ -178,7 +178,7 @@ class StreamOptions(Strict):
         return dimensions(self.image)[0] if self.image else 0
 
     @property
-    def message(self) -> str:
+    def _message_type(self) -> str:
         """Type of the messages."""
         return IMAGE_MESSAGE if self.image else MESSAGE
 
@@ -258,7 +258,7 @@ class StreamOptions(Strict):
         topic_description = topics.describe(
             types.standard_types(),
             self.topic,
-            self.message,
+            self._message_type,
             self.qos.resolved(),
             domain=self.domain,
             node=network["node"],

@@ -46,7 +46,7 @@ class Airframe:
     Args:
         limits: Limits of the airframe.
         place_m: Position of its lowest point in the world, which is also home.
-        facing_rad: Heading.
+        facing_rad: Initial heading.
         obstacles: Obstacles in the world, including the floor.
         now_ns: Time of this state.
 
@@ -222,7 +222,7 @@ class Guidance:
     """Goal and set-points of the vehicle; positions are relative to home.
 
     Args:
-        firmware: Family of the autopilot.
+        firmware: Family of the autopilot, PX4 or ArduCopter.
         parameters: Its parameters.
 
     Attributes:

@@ -33,6 +33,7 @@ _DATA, _RETRY = 0x08, 0x08
 # transmitter: IEEE 802.11-2020, 9.3.1.2 to 9.3.1.4.
 _CONTROL: Final = struct.Struct("<BBH6s")
 _FRAME_CONTROL: Final[dict[ControlFrame, int]] = {"ACK": 0xD4, "RTS": 0xB4, "CTS": 0xC4}
+# BSSID of all frames; the addresses of the stations begin with the same bytes.
 _BSSID: Final = b"\x02" + bytes(5)
 _BROADCAST: Final = b"\xff" * 6
 # LLC and SNAP headers before the packet's type: RFC 1042.

@@ -1,6 +1,6 @@
 """Serves a named federate that is a Python class.
 
-The command is, for example, `python -m sim_backends.federates physics mujoco [ADDRESS]`.
+The command is, for example, `python -m sim_backends.federates.serve_named physics mujoco [ADDRESS]`.
 """
 
 import sys
