@@ -219,6 +219,12 @@ class Coordinator:
                 self._wall_time.start()
 
     def _next_window(self, begin_ns: int, to_ns: int) -> int:
+        """Return the end of the next window, as determined by the policy, but at most `to_ns`.
+
+        Raises:
+            PolicyError: The policy cannot determine a window, or time does not advance.
+            FederateError: The policy failed, or did not return a whole number.
+        """
         try:
             end_ns = self.policy.next_window(self.situation)
         except PolicyError:

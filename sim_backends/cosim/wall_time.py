@@ -15,7 +15,7 @@ Progress = Callable[[int, float], None]
 
 @runtime_checkable
 class HasWaitingTime(Protocol):
-    """A federate or program that waits in wall time: for another process, a device, or a fault.
+    """A federate (physics or network) or program that waits in wall time: for another process, a device, or a fault.
 
     It raises `AnswerTimeoutError` if it waits for longer than its deadline.
 

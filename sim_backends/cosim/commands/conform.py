@@ -1,4 +1,7 @@
-"""The command `fieldkit cosim conform`, which checks that an external federate follows the protocol."""
+"""The command `fieldkit cosim conform`, which checks that an external federate follows the protocol of federates.
+
+A federate is a simulator of physics or network that takes part in a co-simulation.
+"""
 
 import argparse
 import shlex

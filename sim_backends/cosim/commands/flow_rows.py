@@ -77,6 +77,7 @@ def scenario_hashes(scenario: CosimScenario) -> dict[str, Value]:
 
 
 def _measured_columns(flow: FlowResult) -> dict[str, Value]:
+    """Return the columns with the measured values of a flow; values that do not exist are nan."""
     delay_s = flow.delay_s
     datagrams: dict[str, Value] = {}
     if flow.protocol == "udp":

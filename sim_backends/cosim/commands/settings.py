@@ -265,6 +265,7 @@ def policy_text(name: str, scenario: CosimScenario) -> str:
 
 
 def _change(text: str) -> tuple[str, Any]:
+    """Return the key and the value of an option `--set KEY=VALUE`."""
     key, separator, value = text.partition("=")
     if not separator or not all(key.split(".")):
         raise ConfigurationError(

@@ -65,6 +65,7 @@ def policies() -> Mapping[str, PolicyKind]:
 
 
 def _load(point: EntryPoint) -> PolicyKind:
+    """Load the sync policy of an entry point, and check its members and its name."""
     kind: PolicyKind = plugins.load(point)
     problem = ""
     if missing_names := missing_members(kind):

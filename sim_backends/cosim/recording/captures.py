@@ -151,6 +151,7 @@ class IpEncoder:
         return self._flows.setdefault(flow, len(self._flows)) % _PORTS
 
     def _udp_ports(self, packet: IpPacket) -> tuple[int, int]:
+        """Return the source port and the destination port of a packet."""
         if packet.transport == "topic":
             return _TOPIC_PORT, _DISCOVERY_PORT if packet.destination is None else _TOPIC_PORT
         # Only the identity of a UDP packet contains the name of a flow; other transports number their packets.
@@ -160,6 +161,7 @@ class IpEncoder:
         return _FIRST_EPHEMERAL_PORT + number, self._captured_flow(name).port or _FIRST_PORT + number
 
     def _tcp(self, packet: IpPacket, name: ConnectionName, segment: Segment) -> bytes:
+        """Return the TCP header of a segment, with its options and without a checksum."""
         number = self._flow_number(name)
         ports = _FIRST_EPHEMERAL_PORT + number, self._captured_flow(name.flow).port or _FIRST_PORT + number
         options = _syn_options(segment) if segment.syn else _options(segment)

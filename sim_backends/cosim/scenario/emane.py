@@ -145,6 +145,7 @@ def emane_observer(scenario: CosimScenario, seed: int, observer: WindowObserver 
 
 
 def _losses(scenario: CosimScenario, seed: int) -> Losses:
+    """Return a function that computes the path losses between positions in the world of a scenario."""
     channel = WorldChannel(seed, antennas_of(scenario), scenario.radio, load_world(scenario.world))
 
     def losses_db(positions_m: Sequence[Vector]) -> dict[tuple[int, int], float]:

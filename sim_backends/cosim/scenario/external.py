@@ -1,6 +1,7 @@
 """Starts, connects to or creates the external federates of a scenario.
 
-No other module of the co-simulation does this.
+An external federate is a simulator of physics or network that replaces the built-in one. No other module of the
+co-simulation starts them.
 """
 
 import dataclasses

@@ -254,7 +254,7 @@ class CosimScenario(Named):
 
     @property
     def lifetimes(self) -> dict[str, Lifetime]:
-        """The lifetimes of the agents that do not exist during the whole run."""
+        """The lifetimes of the agents that exist only during a part of the run."""
         lifetimes = {name: plan.lifetime for name, plan in self.agents.items()}
         return {name: lifetime for name, lifetime in lifetimes.items() if lifetime != Lifetime()}
 
