@@ -29,7 +29,7 @@ class HasWaitingTime(Protocol):
 class WallTime:
     """Stopwatch that adds each lap to one part of the wall time.
 
-    Time during which a federate of that part waited is added to `wait` instead.
+    Time in which a federate only waited is added to `wait`, not to the part of the federate.
 
     Args:
         total_s: The sums in seconds, by part; each call of `end_window` updates them.
