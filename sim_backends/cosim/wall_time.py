@@ -8,6 +8,7 @@ from typing import Any, Final, Literal, Protocol, TypeVar, cast, runtime_checkab
 from sim_backends.cosim.federates import AnswerTimeoutError, NetworkFederate, PhysicsFederate, Program
 
 _PROGRESS_EVERY_S: Final = 0.2
+"""Shortest time between two progress reports, in wall time."""
 
 Progress = Callable[[int, float], None]
 """Called with the simulated nanoseconds so far, and the wall seconds since the run was started or continued."""

@@ -130,6 +130,7 @@ def looks_ahead(policy: SyncPolicy) -> TypeGuard[LookingAhead]:
 
 
 _MEMBERS: Final = ("name", "exact", "defers_sends", "uses_end_states", "defers_arrivals", "next_window")
+"""Members that every sync policy must have."""
 
 
 def missing_members(policy: object) -> list[str]:

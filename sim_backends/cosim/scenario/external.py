@@ -32,6 +32,7 @@ _BUILT_IN_SUMMARIES: Final = {
     PHYSICS: "robots with differential drives and quadrotors, with limits of velocity and acceleration",
     NETWORK: "802.11g and 802.11n in the world of the scenario, with UDP, TCP, DDS and ROS 1",
 }
+"""Summary of the built-in physics and network, for lists of simulators."""
 
 
 def without_federates(scenario: CosimScenario) -> CosimScenario:
