@@ -80,7 +80,7 @@ def _role(endpoint: str, scenario: CosimScenario, requested_role: str | None, de
             continue
         session.close()
         return role, session.name
-    raise FieldkitError(f"{endpoint} accepts no role")
+    raise FieldkitError(f"{endpoint} accepts no role", remedy="correct the command or --role")
 
 
 def _federate_change(endpoint: str) -> dict[str, str]:

@@ -240,4 +240,6 @@ def _make_federate(federate: PythonFederate, name: str, hello: Hello) -> Any:  #
     try:
         return service.make(hello)
     except ValueError as error:
-        raise ConfigurationError(f"{ROLES[hello.role]} {name}: {error}") from error
+        raise ConfigurationError(
+            f"{ROLES[hello.role]} {name}: {error}", remedy="change the scenario, or use another simulator"
+        ) from error
