@@ -40,9 +40,9 @@ class Errors:
     Attributes:
         packets: Number of packets that arrived or were dropped in each of the two runs.
         delivery_error_s: Absolute difference of delivery times, over packets that arrived in both runs.
-        position_error_m: Error of the positions that the network assumed when a packet was sent: for each two agents
-            that transmit, forward or interfere in this run, the error of their relative position; the largest of
-            these. The true positions are the positions on the continuous trajectories. If the network uses the same
+        position_error_m: Error of the positions that the network assumed when a packet was sent: the largest
+            error, over all pairs of agents that transmit, forward or interfere in this run, of the relative position.
+            The true positions are the positions on the continuous trajectories. If the network uses the same
             state for a step of length h, its mean error at speed v is therefore v h / 2.
         path_error_m: Distance of agents from their positions in the reference, over time; above 0 only if programs
             steer by received data.

@@ -28,9 +28,9 @@ class Fate:
         late_ns: Time from `counted_ns` to the simulated time of the receiver at delivery, if that is later; otherwise
             0.
         reason: The reason why the packet was dropped; empty if it arrived or is under way.
-        position_error_m: For each two agents that affect the packet, the network's error of their relative position;
-            the largest of these. None if only source and destination affect the packet: then
-            `packet_ledger.position_error_m` computes it.
+        position_error_m: Largest error, over all pairs of agents that affect the packet, of the relative position
+            that the network assumed. None if only source and destination affect the packet: then
+            `packet_ledger.position_error_m` computes the error.
     """
 
     packet: Packet
