@@ -1,4 +1,7 @@
-"""Judgements of expectations by measured figures. If repeats are missing or censored, the ruling is never `holds`."""
+"""Judgements of expectations by measured figures. If repeats are missing or censored, the ruling is never `holds`.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence

@@ -1,4 +1,7 @@
-"""Texts about estimates: numbers with units, intervals, verdicts, cautions."""
+"""Texts about estimates: numbers with units, intervals, verdicts, cautions.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 import math
 import re

@@ -1,4 +1,7 @@
-"""Number of repeats with a value of a quantity under each condition, and reasons for missing values."""
+"""Number of repeats with a value of a quantity under each condition, and reasons for missing values.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,7 @@
-"""Charts against distance: one per quantity, with panels for protocols, topologies and named steps."""
+"""Charts against distance: one per quantity, with panels for protocols, topologies and named steps.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

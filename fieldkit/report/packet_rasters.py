@@ -1,4 +1,7 @@
-"""Packet rasters: the packets of each repeat in the order of sending, with losses and retransmissions marked."""
+"""Packet rasters: the packets of each repeat in the order of sending, with losses and retransmissions marked.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 import math
 from collections.abc import Iterator, Sequence

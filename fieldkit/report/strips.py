@@ -1,4 +1,7 @@
-"""Strip charts: one mark per attempt, in order of time, with the loss as its height."""
+"""Strip charts: one mark per attempt, in order of time, with the loss as its height.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
