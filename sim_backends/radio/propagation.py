@@ -143,7 +143,7 @@ class Fading:
 
 @dataclass(frozen=True)
 class Echoes:
-    """The echoes of some links.
+    """The multipath components (echoes) of some links.
 
     Attributes:
         rad_per_m: Phase change per metre.

@@ -61,6 +61,7 @@ class Reception(Generic[Payload]):
         self._stations = stations
         self._events = events
         band = channel.band
+        # Time by which EIFS is longer than the inter-frame space of a station.
         self._eifs_extra_ns = band.sifs_ns + ack_ns(basic_mode(band))
         self._on_air: list[Transmission] = []
         self._emissions: dict[str, Emission] = {}

@@ -63,7 +63,7 @@ class Sender:
         self._timer = WireTimer(wire, host, self._on_timeout)
         self._reordering_timer = WireTimer(wire, host, self._on_reordering_timeout)
         self._is_open = False
-        self._echo_ns: int | None = None
+        self._echo_ns: int | None = None  # the last received timestamp, which later segments echo
         self._receive_window_bytes = 0
         # Consecutive timeouts without progress.
         self._timeouts = 0

@@ -121,10 +121,12 @@ class TopicDiscovery:
         self._user_sessions = dict(sessions)
         self._timing = timing
         self._discovery_timing = discovery_timing
+        # State of a remote participant, by the participant that has discovered it, and its own name.
         self._remote_participants: dict[tuple[str, str], _RemoteParticipant] = {}
         self._announcement_counts: dict[tuple[str, str], int] = {}
+        # Heartbeats that a participant sends in one message now, by its name and the peer.
         self._collected_heartbeats: dict[str, dict[str, Heartbeat]] = {}
-        self._shared_counts: dict[str, int] = {}
+        self._shared_counts: dict[str, int] = {}  # messages with shared heartbeats
         self._participants = sorted({end for flow in flows.values() for end in (flow.publisher, flow.subscriber)})
         for participant in self._participants:
             starts_ns = max(discovery_timing.starts_ns.get(participant, 0), wire.now_ns)
