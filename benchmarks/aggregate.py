@@ -31,6 +31,7 @@ REPEATS: Final = 40
 SENT: Final = 216
 """Packets sent in each repeat."""
 _COUNTED: Final = tuple(quantity for quantity in quantities(trial_columns()) if quantity.sent and quantity.arrived)
+"""Quantities with a column of sent items and a column of received items."""
 START_NS: Final = 1_700_000_000 * 10**9
 """Start of the first repeat."""
 TABLE: Final = "table.csv"

@@ -156,6 +156,7 @@ def run_mosaik(kind: str, count: int, steps: int) -> tuple[float, float]:
     """Return the seconds of wall time and of processor time of a run with mosaik."""
     import mosaik  # noqa: PLC0415 (takes long, and few benchmarks need it)
 
+    # mosaik imports a simulator by the names of its module and its class.
     globals()["StatesSimulator"] = mosaik_simulator([[0.5] * _STATE_NUMBERS] * count)
     globals()["MessageSimulator"] = mosaik_simulator(MESSAGE.decode())
     served = f"{shlex.quote(sys.executable)} -m benchmarks.cosim_peers states {count} %(addr)s"

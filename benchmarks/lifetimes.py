@@ -186,6 +186,7 @@ def _identify(pid: int, namespaces: frozenset[int], programs: frozenset[str]) ->
         with open(f"/proc/{pid}/cmdline", "rb", buffering=0) as file:  # noqa: PTH123 (pathlib is slower, and the process may exit)
             argv = file.read().decode(errors="replace").split("\0")[:-1]
         names = [word.rsplit("/", 1)[-1] for word in argv[:2]]
+        # The name of a script is the second word of its command line.
         name = names[-1] if names[:1] in _INTERPRETERS else "".join(names[:1])
         if name in programs and _namespace(pid) in namespaces:
             return name, argv

@@ -48,6 +48,7 @@ PAYLOAD_BYTES: Final = 1_000
 _FRAME_BYTES: Final = 1_036
 """Size for which packet errors are computed: the payload with the headers of 802.11 and LLC, and the FCS."""
 _NEAR_M, _FAR_M, _EXPONENT, _NEAR_DB = 5.0, 80.0, 3.0, 40.0
+"""Smallest and largest distance, exponent of the path loss, and signal-to-noise ratio at the smallest distance."""
 _LEVEL_DB, _LOWEST_DB, _LEVELS = 0.25, -10.0, 240
 """Step, lowest value and number of the signal-to-noise ratios for which a trace has packet errors."""
 _FADING_PATHS, _DOPPLER_HZ = 16, 8.0

@@ -2,8 +2,8 @@
 
 The medium is the process that carries packets between emulated robots. For each world and number of robots, the
 benchmark moves one robot repeatedly by 0.1 m, and measures the medium's processor time per move, and the time until
-the medium answers, during which it forwards no packets. The reference moves all robots
-in each step, so that all links are computed.
+the medium answers, during which it forwards no packets. The reference moves all robots in each step, so that all
+links are computed.
 """
 
 import argparse

@@ -49,7 +49,7 @@ def overhead_ms(start_ns: int, phases: dict[str, int], end_ns: int, tools: Seque
         "begin": phases["record"] - start_ns,
         "record": phases["start captures"] - phases["record"] - (record.end_ns - record.start_ns),
         "start captures": phases["transfer"] - phases["start captures"],
-        "start listener, hold": send.start_ns - phases["transfer"],
+        "start transfer": send.start_ns - phases["transfer"],
         "end transfer": phases["drain captures"] - listen.end_ns,
         "drain captures": phases["ping"] - phases["drain captures"],
         "ping": phases["collect evidence"] - phases["ping"] - (ping.end_ns - ping.start_ns),

@@ -2,12 +2,12 @@
 
 The medium is the process that carries packets between emulated robots. For each number of robots, over ideal fixed
 links, over Wi-Fi and over a bare veth pair, the benchmark measures round trips between two robots, the lateness of
-their packets in the medium, the rate of 64-byte UDP payloads, and the throughput of TCP. The other
-robots are silent and should not add cost; the processor time per frame is measured at 2,000 packets/s. Then all
-neighbours form pairs, in each of which one robot sends to the other: over fixed links at full rate, over Wi-Fi at
-2,000 packets/s in total, about a third of the channel's capacity. These robots are network namespaces without
-services. Finally, it measures robots with SSH server and sensors: their start-up time and processor time, and the
-memory per robot without shared pages (`own`) and with a proportional part of them (`pss`).
+their packets in the medium, the rate of 64-byte UDP payloads, and the throughput of TCP. The other robots are silent
+and should not add cost; the processor time per frame is measured at 2,000 packets/s. Then all neighbours form pairs,
+in each of which one robot sends to the other: over fixed links at full rate, over Wi-Fi at 2,000 packets/s in total,
+about a third of the channel's capacity. These robots are network namespaces without services. Finally, it measures
+robots with SSH server and sensors: their start-up time and processor time, and the memory per robot without shared
+pages (`own`) and with a proportional part of them (`pss`).
 """
 
 import argparse

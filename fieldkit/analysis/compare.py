@@ -1,4 +1,7 @@
-"""Comparison of two runs A and B: differences per condition and quantity."""
+"""Comparison of two runs A and B: differences per condition and quantity.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,8 +19,7 @@ from fieldkit.core.columns import cell_text
 from fieldkit.core.model import Interval, Status
 
 PAIRED_BY: Final = ("scenario", "topology", "distance_m", "protocol")
-"""Columns that must be equal for two cells (the repeats under one condition) to be compared; the backend and the
-names of trials may differ."""
+"""Columns that must be equal for two cells to be compared; the backend and the names of trials may differ."""
 
 
 @dataclass(frozen=True)

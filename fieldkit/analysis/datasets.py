@@ -1,5 +1,7 @@
 """Datasets of Parquet files: the results of a sweep, with the columns of trial.csv and columns of its settings.
 
+A sweep runs a simulation with several values of each factor. A flow is a stream of packets and its receiver.
+
 The metadata of each file has the names of the columns that are folders (`partitions`), the columns that identify a
 condition (`by`), and declarations of columns that trials do not have.
 """

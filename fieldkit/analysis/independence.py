@@ -26,7 +26,7 @@ def p_values(values: Floats) -> Floats:
     The tests are two-sided for a trend, and one-sided for consecutive values that are too similar.
 
     Args:
-        values: Shape (cells, n), in the order of time.
+        values: Shape (cells, n), in the order of time; a cell is the repeats under one condition.
 
     Returns:
         Shape (cells,); NaN for fewer than `MIN_FOR_INDEPENDENCE_TESTS` repeats or fewer than five distinct values.

@@ -1,4 +1,7 @@
-"""Judgements of expectations by measured figures. If repeats are missing or censored, the ruling is never `holds`."""
+"""Judgements of expectations by measured figures. If repeats are missing or censored, the ruling is never `holds`.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,7 +20,7 @@ _INFINITE_DELAY_REASON: Final = "if the delay of lost items is infinite, the int
 
 
 class Ruling(StrEnum):
-    """Outcome of an expectation."""
+    """Outcome of an expectation, which is a requirement on a figure of a trial."""
 
     HOLDS = "holds"
     FAILS = "does not hold"

@@ -20,6 +20,7 @@ ROUNDING: Final = 1e-12
 """Relative rounding error up to which a bound equals a required share."""
 
 _BISECTIONS: Final = 60
+"""Number of bisections of the range 0 to 1. The result is then as exact as a double can be."""
 
 
 def share_low(met: int, n: int) -> float:

@@ -1,6 +1,8 @@
 """Sample sizes: how many repeats or packets an expectation needs, and how many additional repeats a cell needs.
 
 Expectations are checked before the trial runs. Additional repeats narrow the interval of a cell to a requested width.
+
+A cell is the repeats under one condition, with their estimates.
 """
 
 import math

@@ -1,8 +1,8 @@
-"""Statistics over repeats with 95 % intervals: shares, means and medians, and differences of two samples.
+"""Statistics over repeats with 95 % intervals: shares, means and medians.
 
 Repeats are independent sampling units; the items of a repeat may depend on each other. All formulas are in closed
-form and vectorized over cells. There is no resampling, so results do not depend on a seed. docs/method-intervals.md
-has the coverage of the intervals.
+form and vectorized over cells; a cell is the repeats under one condition. There is no resampling, so results do not
+depend on a seed. docs/method-intervals.md has the coverage of the intervals.
 """
 
 import math

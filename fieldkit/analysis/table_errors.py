@@ -15,6 +15,7 @@ from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitErro
 from fieldkit.core.model import FINAL_STATUSES
 
 _MAX_SHOWN: Final = 40
+"""Maximum number of characters of a cell in a message."""
 _TOLERANCE: Final = 1e-6  # larger than the rounding errors of numbers in a table
 _REMEDY: Final = "correct the line, or create the file again: fieldkit rebuild TRIAL"
 _SPREADSHEET_REMEDY: Final = (

@@ -27,6 +27,7 @@ _SPREADSHEET_MARKS: Final = {
 _BATCH_BYTES: Final = 1 << 25
 """Number of bytes that are parsed together, approximately."""
 _MAX_HEADER_BYTES: Final = 1 << 20
+"""Maximum length of a header line that is read."""
 
 
 def read(

@@ -1,4 +1,7 @@
-"""Texts about estimates: numbers with units, intervals, verdicts, cautions."""
+"""Texts about estimates: numbers with units, intervals, verdicts, cautions.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 import math
 import re
@@ -16,11 +19,14 @@ from fieldkit.core.model import FINAL_STATUSES, Status
 _MIN_IN_SECONDS_S: Final = 10.0
 _MIN_IN_MBIT_BIT_S: Final = 1e6
 _MIN_WITHOUT_DECIMALS: Final = 100.0
+"""From these values on, times are written in seconds, rates in Mbit/s, and numbers without decimals."""
 _MAX_DECIMALS: Final = 9
 _UNITLESS: Final = frozenset(("count", "number"))
 _MAX_LISTED: Final = 3
+"""Maximum number of estimates that a caution names."""
 _MAX_WORDS: Final = 5
 _MAX_WORD_LENGTH: Final = 30
+"""Maximum number of words that are listed with their counts, and maximum number of characters of each."""
 _PLAIN_WORD: Final = re.compile(r"[A-Za-z](?:[\w -]*[A-Za-z])?")
 
 

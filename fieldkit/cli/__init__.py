@@ -37,7 +37,7 @@ Imports create fewer objects, so it does not run during imports, when it would f
 """
 
 _ONE_THREAD: Final = ("OPENBLAS_NUM_THREADS", "1")
-"""Setting of OpenBLAS, which numpy uses. By default it starts a thread per core, and each thread spins for 30 ms.
+"""Setting of OpenBLAS, which numpy uses. By default it starts a thread per core, and each waits busily for 30 ms.
 
 The matrices of fieldkit are too small to be processed faster by several threads.
 """

@@ -27,7 +27,7 @@ def request(arguments: argparse.Namespace, distance: Distance, *, seed: int = 1,
     """Return the trial request at one distance.
 
     Raises:
-        ConfigurationError: There is no such procedure, or the recording has no length.
+        ConfigurationError: There is no such procedure, or the duration of the recording is not valid.
     """
     record_s = None if arguments.record is None else parse_duration_s(arguments.record, "--record")
     if record_s == 0:
@@ -93,7 +93,7 @@ def run_elsewhere(selected_backend: Backend, arguments: argparse.Namespace, resu
     junit: Path | None = getattr(arguments, "junit", None)
     if junit is not None and not junit.resolve().is_relative_to(results.resolve()):
         raise ConfigurationError(
-            f"with these robots, only files below {results} can be written",
+            f"with this backend, the command can write only files below {results}",
             where="--junit",
             remedy=f"write for example --junit {results / junit.name}",
         )

@@ -133,7 +133,7 @@ def _missing_key(problem: Any) -> str:  # noqa: ANN401 (an `ErrorDetails` of pyd
 
 
 def _without_cascading_errors(problems: Sequence[Any]) -> list[Any]:
-    """Return the problems, except about lists that are too short only because of errors in their items."""
+    """Return the problems, except those about lists that are too short only because of errors in their items."""
 
     def is_cascading(problem: Any) -> bool:  # noqa: ANN401 (an `ErrorDetails` of pydantic, which is not imported here)
         depth = len(problem["loc"])

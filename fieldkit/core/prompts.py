@@ -12,7 +12,9 @@ from typing_extensions import override
 from fieldkit.core.text import sanitized
 
 SKIP: Final = "s"
+"""Answer that postpones a request."""
 NOTE: Final = "n "
+"""Start of an answer that means "done" and continues with a note."""
 UNKNOWN: Final = "-"
 """Answer that means "unknown"."""
 

@@ -7,6 +7,7 @@ from fieldkit.core.columns import Column
 
 
 def _column(unit: str, meaning: str) -> Any:  # noqa: ANN401 (as dataclasses.field)
+    """Return the data class field of a column. Its default, None, is an empty cell."""
     return field(default=None, metadata={"unit": unit, "meaning": meaning})
 
 

@@ -83,6 +83,8 @@ def completed(
 
 
 class _Submission(Generic[Task, Result]):
+    """Runs the tasks of one call of `completed` on an executor; the arguments are those of `completed`."""
+
     def __init__(
         self, work: Callable[[Task], Result], tasks: Sequence[Task], workers: Workers, note: Callable[[str], None]
     ) -> None:
@@ -96,6 +98,7 @@ class _Submission(Generic[Task, Result]):
         self._lost_count = 0
 
     def ends(self) -> Iterator[TaskEnd[Result]]:
+        """Submit the tasks, and yield the end of each as it completes."""
         try:
             while self._waiting or self._run_alone or self._submitted:
                 self._submit()

@@ -36,6 +36,7 @@ from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
 
 UNKNOWN_FATE: Final = -1
+"""Value for a packet of which it is unknown whether it was lost, or is a copy."""
 _SLICE: Final = 1 << 14
 """Number of packets that are converted to Python objects at a time."""
 
@@ -101,7 +102,9 @@ _LARGEST_PAYLOAD_BYTES: Final = 1480
 
 
 def packet_fates(captures: Mapping[str, Capture], transfers: Iterable[Transfer]) -> Mapping[str, MarkedPackets]:
-    """Return the packets of each capture. The fates of packets of transfers that both ends captured are known.
+    """Return the packets of each capture, with their fates.
+
+    A fate is known only if the packet belongs to a transfer that both ends captured.
 
     Args:
         captures: The captures by file.
@@ -135,7 +138,7 @@ def _with_unknown_fates(packets: Packets) -> MarkedPackets:
 
 
 def _matched(sender: Capture, receiver: Capture, same_path: Sequence[Transfer]) -> Match | None:
-    """Return the match of the packets of two captures, or None if a transfer of this path makes it impossible."""
+    """Match the packets of two captures. Return None if the packets of a transfer on this path cannot be matched."""
     sent, received = sender.packets, receiver.packets
     if sender.damage or receiver.damage:
         return None

@@ -34,7 +34,7 @@ def time(t_ns: int) -> Json:
 
 
 def log(t_ns: int, level: Level, text: str, *, name: str, file: str, line: int = 0) -> Json:
-    """Return a message of `LOG`.
+    """Return a message with the schema `LOG`.
 
     Args:
         t_ns: Time in nanoseconds since 1970 UTC.
@@ -48,19 +48,19 @@ def log(t_ns: int, level: Level, text: str, *, name: str, file: str, line: int =
 
 
 def phase(t_ns: int, repeat: str, name: str) -> Json:
-    """Return a message of `PHASE`: the phase that starts in the repeat whose folder is `repeat`."""
+    """Return a message with the schema `PHASE`: the phase that starts in the repeat whose folder is `repeat`."""
     return {"timestamp": time(t_ns), "repeat": repeat, "phase": name}
 
 
 def rtt(t_ns: int, repeat: str, reply: Reply) -> Json:
-    """Return a message of `RTT`, for a reply printed at `t_ns` in the repeat whose folder is `repeat`."""
+    """Return a message with the schema `RTT`: a reply to ping printed at `t_ns`. `repeat` is the attempt's folder."""
     head = {"timestamp": time(t_ns), "repeat": repeat}
     fields = {"seq": reply.seq, "rtt_s": reply.rtt_s, "duplicate": reply.duplicate, "damaged": reply.damaged}
     return {**head, **_present(fields)}
 
 
 def link(repeat: str, sample: LinkSample) -> Json:
-    """Return a message of `LINK` for a sample of a radio in the repeat whose folder is `repeat`."""
+    """Return a message with the schema `LINK`: a sample of a radio in the repeat whose folder is `repeat`."""
     radio = {
         "noise_dbm": sample.noise_dbm,
         "active_s": None if sample.active_ns is None else sample.active_ns / 1e9,
@@ -71,7 +71,7 @@ def link(repeat: str, sample: LinkSample) -> Json:
 
 
 def telemetry(repeat: str, sample: TelemetrySample) -> Json:
-    """Return a message of `TELEMETRY` for the values of a source in the repeat whose folder is `repeat`."""
+    """Return a message with the schema `TELEMETRY`: values of a source in the repeat whose folder is `repeat`."""
     return {"timestamp": time(sample.utc_ns), "repeat": repeat, **sample.values}
 
 
@@ -80,14 +80,17 @@ def _present(values: Mapping[str, Any]) -> Json:
 
 
 def repeat(t_ns: int, folder: str, row: Row, table: tuple[Column, ...]) -> Json:
-    """Return a message of `repeat_schema`: the numbers of the attempt in `folder`, without missing numbers."""
+    """Return a message with the schema `repeat_schema`: the known numbers of the attempt in `folder`."""
     measured = {name: row[name] for name in _measured(table) if name in row}
     head = {"timestamp": time(t_ns), "repeat": folder, "status": row["status"], "reason": row.get("reason", "")}
     return head | measured
 
 
 def transform(t_ns: int, child: str, position_m: Vector, frame: str = "field") -> Json:
-    """Return the position of a robot in a frame, as a message of `TRANSFORMS`; its orientation is unknown."""
+    """Return a robot's position in a frame, as a message with the schema `TRANSFORMS`.
+
+    The rotation is always 0, because the orientation of the robot is unknown.
+    """
     transform = {
         "timestamp": time(t_ns),
         "parent_frame_id": frame,
@@ -99,7 +102,7 @@ def transform(t_ns: int, child: str, position_m: Vector, frame: str = "field") -
 
 
 def location(t_ns: int, robot: str, place: Vector) -> Json:
-    """Return the geographic position of a robot, as a message of `LOCATION`.
+    """Return a robot's geographic position as a message with the schema `LOCATION`.
 
     Args:
         t_ns: Time in nanoseconds since 1970 UTC.

@@ -26,6 +26,7 @@ _TYPES: Final[Mapping[type, pa.DataType]] = {
     int: pa.int64(),
     float: pa.float64(),
 }
+"""Arrow type by the Python type of a column."""
 
 
 def write_csv(file: BinaryIO, repeats: Repeats) -> None:

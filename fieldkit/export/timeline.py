@@ -105,7 +105,7 @@ def _laptop(plan: Plan, evidence: _Evidence, entries: list[JournalEntry], *, pla
         yield Message(_LOG, entry.utc_ns, _log_message(entry, line))
         if entry.status is Status.RUNNING:
             yield from _places(plan, entry.utc_ns) if planned else ()
-        elif entry.status is not Status.MEASURED:
+        elif entry.status is not Status.MEASURED:  # the attempt has ended
             attempt = next(ended)
             yield _numbers(plan, attempt, evidence(attempt), entry.utc_ns)
 

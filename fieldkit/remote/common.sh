@@ -141,7 +141,7 @@ rebooted() { # true if the robot has rebooted since the start of the job in $1 o
 enter() { # change to folder $1
     cd "$1" 2>/dev/null && return
     read_uptime
-    # Soon after a boot, the reboot is the probable cause.
+    # In the first TTL seconds (an hour) after a boot, the reboot is the probable cause.
     [ "$now" -gt "$TTL" ] || fail "no folder $1: the robot booted $now s ago" "$REBOOTED"
     fail "no folder $1"
 }

@@ -1,7 +1,7 @@
 # The leader of the session and process group of a job. This part is before the larger parts of the script, and exits after
 # the job: parsing the other parts would take half a millisecond for each of up to eight jobs of a repeat.
 
-is_bound() { # true if a socket is bound; $1 protocol, $2 port in hex; a TCP listener has state 0A
+is_bound() { # true if a socket is bound; $1 protocol, $2 port in hex; a TCP listener has state 0A, a UDP socket 07
     if [ "$1" = tcp ] && listening=$(ss -tn state listening "sport = :$((0x$2))" 2>/dev/null); then
         # ss requests listeners only; reading a table of all connections takes up to 4 ms.
         case $listening in *":$((0x$2)) "*) return ;; *) return 1 ;; esac

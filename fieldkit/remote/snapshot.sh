@@ -82,7 +82,7 @@ start_radio_sources() { # start the sources for the radio with interface $1
     # is passive, so the difference shows the load by other transmitters.
     start_source iw-survey sh -c 'iw dev "$1" survey dump && { sleep 0.5 || sleep 1; } && echo == && iw dev "$1" survey dump' sh "$1"
     case $info in *"channel "*" ("*" MHz"*) ;; *) return 0 ;; esac
-    info=${info#*channel *" ("}
+    info=${info#*channel *" ("} # of `channel 6 (2437 MHz), ...` the frequency remains
     info=${info%%" MHz"*}
     set -- iw dev "$1" scan freq "${info%.*}" passive
     [ "$(id -u)" = 0 ] || set -- sudo -n "$@"

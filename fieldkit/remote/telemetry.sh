@@ -149,6 +149,7 @@ sample() {
             read_cpu_time
             next_query=$((first + ((used - used_before) * 1000 - AHEAD) / SHARE))
         fi
+        # A short pause only if the kernel reports a link quality, or if iw must be called again.
         [ -n "$has_quality" ] || [ "$at" -ge "$next_query" ] && pause=$TICK || pause=1
         if [ -n "$has_read_timeout" ]; then read -r -t "$pause" _ <&8; else sleep_for 1; fi
     done

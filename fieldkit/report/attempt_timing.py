@@ -296,6 +296,7 @@ class DrawsPanels(Protocol):
 TIME_LABEL: Final = "time [s]"
 """Label of the time axis of the panels."""
 _ENDS: Final = (Style("blue", line="solid"), Style("green", line="dashed"))
+"""Styles of the sender and of the receiver."""
 
 
 def flow_panels(evidence: AttemptEvidence, plan: Plan, times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:

@@ -1,4 +1,7 @@
-"""Contents of a report, made from a table of repeats and the evidence that belongs to it."""
+"""Contents of a report, made from a table of repeats and the evidence that belongs to it.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 import shlex
 from collections import Counter

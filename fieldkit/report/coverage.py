@@ -1,4 +1,7 @@
-"""Number of repeats with a value of a quantity under each condition, and reasons for missing values."""
+"""Number of repeats with a value of a quantity under each condition, and reasons for missing values.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -27,11 +30,13 @@ _LOSSES: Final = {
 }
 """Losses that belong to a quantity, by the first part of its column's name."""
 _TRANSFER_LOSSES: Final = ("datagram_loss", "ip_loss", "tcp_byte_loss", "file_loss")
+"""Losses that belong to all other quantities."""
 _ALL_LOSSES: Final = frozenset((*_TRANSFER_LOSSES, *(name for names in _LOSSES.values() for name in names)))
 
 NOTHING_ARRIVED: Final = "nothing arrived"
 NO_VALUE: Final = "no value"
 NO_VALID_REPEAT: Final = "no valid repeat"
+"""Reasons for missing values; see `Absence.reason`."""
 
 
 @dataclass(frozen=True)

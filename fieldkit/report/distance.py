@@ -1,4 +1,7 @@
-"""Charts against distance: one per quantity, with panels for protocols, topologies and named steps."""
+"""Charts against distance: one per quantity, with panels for protocols, topologies and named steps.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -34,6 +37,7 @@ DELAY: Final = (
     "seen_age_p95_s",
 )
 RATE: Final = ("goodput_bit_s", "throughput_bit_s", "iperf3_throughput_bit_s")
+"""Quantities with charts against distance by default, by section of the page."""
 
 _DODGE: Final = 0.026
 """Offset between series at the same distance, as a share of the axis, so that intervals do not overlap."""

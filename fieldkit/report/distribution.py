@@ -1,4 +1,7 @@
-"""Distribution functions of all round-trip times if outputs of ping are available, otherwise of values of repeats."""
+"""Distribution functions of all round-trip times if outputs of ping are available, otherwise of values of repeats.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

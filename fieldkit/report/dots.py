@@ -1,4 +1,7 @@
-"""Dot plots of quantities that were measured at one distance: a lane per quantity, a panel per unit."""
+"""Dot plots of quantities that were measured at one distance: a lane per quantity, a panel per unit.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -18,7 +18,7 @@ from fieldkit.report.theme import LIGHT, Style
 
 _MARKER: Final = 5.0
 _POINT: Final = 3.0
-"""Size of small markers."""
+"""Sizes of normal and of small markers."""
 _NOTE: Final = 6.5
 """Font size of texts next to points."""
 _FAINT: Final = 0.3
@@ -39,7 +39,7 @@ _DARK: Final = 0.6
 """Position on the colour scale of a heat map, 0 to 1, from which texts are light."""
 _ON_LIGHT: Final = "#111111"
 _ON_DARK: Final = "#fefefe"
-"""Neither is a colour of the theme, because the colours of a heat map are the same in both themes."""
+"""Colours of texts in a heat map, on light and on dark colours. They are the same in both themes, as its colours."""
 _LEVEL_CHARACTERS: Final = 40
 """Labels below a heat map are vertical if they need more than this number of characters in total."""
 _NOTE_COLUMNS: Final = 12

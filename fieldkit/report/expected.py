@@ -1,4 +1,7 @@
-"""Judgements of the expectations of trials, for reports."""
+"""Judgements of the expectations of trials, for reports.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -33,11 +33,13 @@ _STRIP_MARGINS_INCHES: Final = (1.45, 0.15, 0.42, 0.28)
 _LANE_INCHES: Final = 0.3
 _HEAT_ROW_INCHES: Final = 0.16
 _LANE_MARGINS_INCHES: Final = 1.05
+"""Heights of a lane, of a row of a heat map, and of both margins of a panel with lanes or rows."""
 # IEEE requires a width of one column, 3.5 in, or of both, 7.16 in, and a font of 8 pt in figures.
 _COLUMN_INCHES: Final = 3.5
 _BOTH_COLUMNS_INCHES: Final = 7.16
 _PAPER_PANEL_INCHES: Final = 2.3
 _PAPER_LEGEND_INCHES: Final = 0.3
+"""Heights of a panel and of the legend in a figure for a paper."""
 
 _MATERIALS: Final[dict[str, Colour]] = {"foliage": "green", "wood": "orange", "brick": "red", "ground": "orange"}
 """Colours of obstacles that are not grey."""

@@ -1,4 +1,7 @@
-"""Headlines of a report: first the missing results, then each quantity, its worst condition first."""
+"""Headlines of a report: first the missing results, then each quantity, its worst condition first.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,9 @@
-"""Heat maps of a sweep: a quantity over two of its factors, one map per flow and combination of the other factors."""
+"""Heat maps of a sweep: a quantity over two of its factors, one map per flow and combination of the other factors.
+
+A sweep runs a simulation with several values of each factor. A flow is a stream of packets and its receiver.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,6 +29,7 @@ _DEFAULT_NAMES: Final = (
 )
 """Quantities that are drawn by default."""
 _MAX_PANELS: Final = 12
+"""Maximum number of maps of a quantity."""
 
 
 @dataclass(frozen=True)

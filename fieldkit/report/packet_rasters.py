@@ -1,4 +1,7 @@
-"""Packet rasters: the packets of each repeat in the order of sending, with losses and retransmissions marked."""
+"""Packet rasters: the packets of each repeat in the order of sending, with losses and retransmissions marked.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -32,7 +35,7 @@ class Raster:
     """A raster with a line per repeat and a column per packet.
 
     Attributes:
-        place: The part of the condition in which the rasters of its group differ.
+        place: Distance, and the scenario, procedure and backend if they differ between cells.
         lines: Number of lines.
         columns: Number of columns of the longest line.
         lengths: Number of columns of each line.

@@ -26,6 +26,7 @@ from fieldkit.report.contents import Contents
 
 DEFAULT_NAME: Final = "report.html"
 _START: Final = b"<!DOCTYPE html>"
+"""First bytes of a report; other files are not overwritten."""
 _TEMPLATE: Final = "report.html"
 _SVG: Final = "http://www.w3.org/2000/svg"
 _XLINK: Final = "http://www.w3.org/1999/xlink"

@@ -1,4 +1,7 @@
-"""Series of figures: panels of conditions, the style of each series in all figures, and estimates as points."""
+"""Series of figures: panels of conditions, the style of each series in all figures, and estimates as points.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence

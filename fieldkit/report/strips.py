@@ -1,4 +1,7 @@
-"""Strip charts: one mark per attempt, in order of time, with the loss as its height."""
+"""Strip charts: one mark per attempt, in order of time, with the loss as its height.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,9 +19,10 @@ from fieldkit.report.theme import Colour
 from fieldkit.report.trial_folders import Evidence
 
 MAX_MARKS: Final = 2000
-"""Maximum number of marks on a page, divided equally among its strips. Further valid attempts are left out evenly."""
+"""Maximum number of marks on a page, divided equally among its strips. If a strip has more valid attempts, every
+k-th has a mark, approximately."""
 MAX_OTHER_MARKS: Final = 2000
-"""Like `MAX_MARKS`, for void and failed attempts."""
+"""Maximum number of marks of void and failed attempts on a page; see `MAX_MARKS`."""
 MIN_MARKS: Final = 20
 """Number of valid attempts, and of other attempts, that a strip shows even if it exceeds its share of the maxima."""
 
@@ -47,7 +51,7 @@ class Strip:
 
     Attributes:
         cell: The cell.
-        place: The part of its condition in which the cells of its group differ.
+        place: Distance, and the scenario, procedure and backend if they differ between cells.
         colour: Colour of its series.
         marks: Marks in order of time.
         omitted_count: Number of valid attempts without a mark.

@@ -1,4 +1,7 @@
-"""The first part of a report: description of the trials, warnings for readers who quote figures, and provenance."""
+"""The first part of a report: description of the trials, warnings for readers who quote figures, and provenance.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence

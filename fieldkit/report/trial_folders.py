@@ -1,4 +1,7 @@
-"""The trial folders of the rows of a table, if available: plan, raw files, links."""
+"""The trial folders of the rows of a table, if available: plan, raw files, links.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence, Set

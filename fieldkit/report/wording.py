@@ -1,4 +1,7 @@
-"""Numbers, conditions and quantities as text, the same in the summary, in tables and below figures."""
+"""Numbers, conditions and quantities as text, the same in the summary, in tables and below figures.
+
+A cell is the repeats under one condition, with their estimates.
+"""
 
 import re
 from collections.abc import Collection, Sequence

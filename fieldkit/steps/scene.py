@@ -165,7 +165,7 @@ class Planned:
         setup: Shell files to source before this search.
         tool: The tool of the program; None if it has no variants.
         permitted_causes: Permitted causes of its end; after another cause its evidence is incomplete.
-        least_s: Minimum duration in seconds of a job that ended normally.
+        min_duration_s: Minimum duration in seconds of a job that ended normally.
         remedy: What to do if the program is missing; empty for the default remedy on profile and package.
         put: Program of the lab that the job needs on the robot; None if it needs no such program.
     """
@@ -176,7 +176,7 @@ class Planned:
     setup: tuple[str, ...] = ()
     tool: Tool | None = None
     permitted_causes: frozenset[Cause] = BY_EXIT
-    least_s: float = 0.0
+    min_duration_s: float = 0.0
     remedy: str = ""
     put: PutProgram | None = None
 

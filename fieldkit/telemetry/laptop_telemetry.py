@@ -20,6 +20,8 @@ from fieldkit.telemetry.telemetry_section import TelemetrySource
 
 _END_S: Final = 2.0
 """Time after SIGTERM within which a query must exit; then it is killed."""
+_MARGIN_S: Final = 10.0
+"""Time in addition to the limit of a query, in which the shell starts and exits."""
 ONCE: Final = "0"
 """Interval with which `poll` runs a query once."""
 
@@ -83,7 +85,7 @@ def query_once(source: TelemetrySource, environment: Mapping[str, str]) -> bytes
             start_new_session=True,
         )
         try:
-            output, _ = process.communicate(timeout=source.limit + 10)
+            output, _ = process.communicate(timeout=source.limit + _MARGIN_S)
         except subprocess.TimeoutExpired:
             output = b""
         finally:

@@ -186,6 +186,7 @@ def _modem_signal(signal: object, technologies: list[str]) -> dict[str, float | 
 
 
 def _texts(items: object) -> list[str]:
+    """Return the texts of a JSON list. Their number and lengths are limited, because outputs are not trusted."""
     return [item[:500] for item in items[:100] if isinstance(item, str)] if isinstance(items, list) else []
 
 

@@ -142,6 +142,7 @@ def installed_columns() -> tuple[Column, ...]:
     for kind, step in step_types().items():
         for column in step.columns:
             declaration_error = column.declaration_error()
+            # `setdefault` returns the column that has this name already, if there is one.
             if declaration_error or columns_by_name.setdefault(column.name, column) != column:
                 raise ConfigurationError(
                     f"the kind of step {kind!r} declares a column {column.name!r}, "

@@ -100,6 +100,6 @@ def _job_problems(
         ):
             yield f"its job {planned.job.name} ran, but its exit was not recorded"
         if termination and (
-            reason := terminations.termination_error(termination, planned.permitted_causes, planned.least_s)
+            reason := terminations.termination_error(termination, planned.permitted_causes, planned.min_duration_s)
         ):
             yield f"its job {planned.job.name} {reason}"

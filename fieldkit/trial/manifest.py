@@ -194,6 +194,7 @@ def _parse(line: bytes) -> tuple[str, str]:
 def _unescaped(name: str) -> str:
     chars = {escape[1]: char for char, escape in _ESCAPES}
     parts = iter(name)
+    # After a backslash, `next` takes the character that is escaped.
     return "".join(chars.get(next(parts, ""), "?") if char == "\\" else char for char in parts)
 
 

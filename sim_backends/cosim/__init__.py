@@ -1,7 +1,7 @@
 """Co-simulation: robots that move and a network that carries their packets, at one simulated time.
 
 Scripts need two functions: `from sim_backends.cosim import load_scenario, build`. They are imported on first use, so
-that a federate can import a module of this package without importing all others.
+that a federate (a physics or network simulator) can import a module of this package without importing all others.
 """
 
 from importlib import import_module

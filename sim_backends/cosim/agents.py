@@ -26,7 +26,7 @@ class SentDatagram(NamedTuple):
         at_ns: Time of sending.
         source: Name of the sending agent.
         datagram: The datagram.
-        states: States of all agents at the last physics step before `at_ns`.
+        states: States of all agents at the last physics step at or before `at_ns`.
     """
 
     at_ns: int
@@ -87,7 +87,7 @@ class Agents:
     Args:
         physics: Moves the bodies.
         programs: Programs by agent name; agents without a program are missing.
-        lifetimes: The lifetimes of agents that do not exist during the whole run.
+        lifetimes: The lifetimes of the agents that exist only during a part of the run.
         starts: The start states of agents that are absent at time 0; None if there are no such agents.
 
     Raises:
@@ -160,7 +160,8 @@ class Agents:
         except AttributeError:
             raise FederateError(
                 f"physics, requested to advance to {seconds_text(now_ns)}, returned {states!r}, which is not a "
-                "mapping of states"
+                "mapping of states",
+                remedy="return a mapping from the name of each agent to its State",
             ) from None
         self._states = states
         return states
@@ -202,7 +203,10 @@ class Agents:
         missing_names = lost_names - self._names_outside_lifetime
         if missing_names and not (self._states and getattr(self.physics, "agents_disappear", False)):
             names = ", ".join(sorted(missing_names))
-            raise FederateError(f"physics, requested to advance to {seconds_text(now_ns)}, has no state of {names}")
+            raise FederateError(
+                f"physics, requested to advance to {seconds_text(now_ns)}, has no state of {names}",
+                remedy="return the states of all agents, or set agents_disappear to True if physics removes agents",
+            )
         for name in sorted(lost_names):
             state = self._states[name]
             lifetime = self._lifetimes.get(name)
@@ -322,7 +326,12 @@ class Agents:
         return bool(self._received)
 
     def advance(self, now_ns: int, last_ns: int, end_ns: int) -> tuple[list[SentDatagram], Mapping[str, State]]:
-        """Wake programs that received datagrams or whose timers fire until `last_ns`; move bodies to `end_ns`.
+        """Wake programs that received datagrams, and programs whose timers fire; then move the bodies.
+
+        Args:
+            now_ns: Beginning of the window; stored datagrams are delivered at this time.
+            last_ns: Time up to which timers fire, inclusive.
+            end_ns: Time to which the bodies move: the end of the window.
 
         Returns:
             The datagrams that programs sent, and the states at `end_ns` (see `states`).
@@ -342,7 +351,8 @@ class Agents:
             if repeats > _MAX_WAKES_AT_ONE_TIME:
                 raise FederateError(
                     f"the program of {' and '.join(names)} woke {repeats} times at {seconds_text(wake_ns)}: its "
-                    "next wake time does not advance"
+                    "next wake time does not advance",
+                    remedy="correct the program: after a wake, next_wake_ns must return a later time",
                 )
             previous_wake_ns = wake_ns
             sent_datagrams += self._wake(wake_ns, dict.fromkeys(names, ()))

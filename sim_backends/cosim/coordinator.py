@@ -123,7 +123,8 @@ class Coordinator:
         if unmoved_agents:
             raise ConfigurationError(
                 f"the physics federate has no state of {', '.join(sorted(unmoved_agents))}, but agents that send, "
-                "receive or interfere need one"
+                "receive or interfere need one",
+                remedy="return the states of all agents from advance",
             )
         self._select_present()
         if observer is not None:
@@ -219,6 +220,12 @@ class Coordinator:
                 self._wall_time.start()
 
     def _next_window(self, begin_ns: int, to_ns: int) -> int:
+        """Return the end of the next window, as determined by the policy, but at most `to_ns`.
+
+        Raises:
+            PolicyError: The policy cannot determine a window, or time does not advance.
+            FederateError: The policy failed, or did not return a whole number.
+        """
         try:
             end_ns = self.policy.next_window(self.situation)
         except PolicyError:

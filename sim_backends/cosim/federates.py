@@ -1,4 +1,7 @@
-"""Programs of agents, and checks of federates; the protocols of federates are in `sim_backends.federates`."""
+"""Programs of agents, and checks of federates (the simulators of physics and network).
+
+The protocols of federates are in `sim_backends.federates`.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -94,7 +97,7 @@ class Program(Protocol):
 
         Args:
             now_ns: The current time.
-            own_state: State of its agent at the last physics step.
+            own_state: State of the program's agent at the last physics step.
             received_datagrams: Datagrams that have arrived since the previous call.
         """
         ...

@@ -15,6 +15,7 @@ from sim_backends.world.motion import STILL, DeadReckoned, State, extrapolate
 
 ABSENT: Final = "agent absent"
 """Reason of a drop: source or destination had not appeared yet, or disappeared before the packet arrived."""
+_CORRECT_NETWORK: Final = "correct the network federate; fieldkit cosim conform checks its answers"
 
 
 def transmitters(network: object) -> tuple[str, ...]:
@@ -79,7 +80,7 @@ class PacketLedger:
     A report of the network that cannot be true raises a `FederateError`.
 
     Args:
-        fates: Mapping to which the ledger adds the fate of every packet that enters the network, by flow and number.
+        fates: The ledger adds the fate of every packet to this mapping, by flow and number.
         step_ns: The physics step.
         measured_agents: Agents that the position error of every packet includes, in addition to its sender and
             receiver.
@@ -140,11 +141,15 @@ class PacketLedger:
         try:
             assumed_ends = assumed_states[source], assumed_states[destination]
         except KeyError:
-            raise FederateError(f"the program of {source} sent to {destination}, which is not an agent") from None
+            raise FederateError(
+                f"the program of {source} sent to {destination}, which is not an agent",
+                remedy="correct the destination in the program",
+            ) from None
         identity = datagram.flow, datagram.number
         if identity in self._fates:
             raise FederateError(
-                f"the program of {source} sent two packets of flow {datagram.flow} with the number {datagram.number}"
+                f"the program of {source} sent two packets of flow {datagram.flow} with the number {datagram.number}",
+                remedy="correct the program: each packet of a flow needs a different number",
             )
         self._packet_count += 1
         packet = Packet(
@@ -209,13 +214,15 @@ class PacketLedger:
         packet = fate.packet
         if arrival.receiver != packet.destination:
             raise FederateError(
-                f"the network delivered packet {packet.packet_id} for {packet.destination} to {arrival.receiver}"
+                f"the network delivered packet {packet.packet_id} for {packet.destination} to {arrival.receiver}",
+                remedy=_CORRECT_NETWORK,
             )
         if not max(begin_ns, packet.enters_ns) <= arrival.at_ns <= last_ns:
             raise FederateError(
                 f"the network, requested to advance from {seconds_text(begin_ns)} to {seconds_text(last_ns)}, "
                 f"delivered packet {packet.packet_id}, which entered at {seconds_text(packet.enters_ns)}, at "
-                f"{seconds_text(arrival.at_ns)}"
+                f"{seconds_text(arrival.at_ns)}",
+                remedy=_CORRECT_NETWORK,
             )
         fate.arrived_ns = arrival.at_ns
         return fate, payload
@@ -238,4 +245,6 @@ class PacketLedger:
             explanation = (
                 "which was reported before" if 0 < packet_id <= self._packet_count else "which never entered it"
             )
-            raise FederateError(f"the network reported the fate of packet {packet_id}, {explanation}") from None
+            raise FederateError(
+                f"the network reported the fate of packet {packet_id}, {explanation}", remedy=_CORRECT_NETWORK
+            ) from None

@@ -29,6 +29,7 @@ LOCATION, PATHLOSS = 100, 101
 """Identifiers of events (EMANE, `include/emane/events/eventids.h`)."""
 ALL_NEMS: Final = 0
 MAX_NEM: Final = 65534
+"""Identifier that means all NEMs, and the largest identifier of a NEM."""
 _SIZE: Final = struct.Struct("!H")
 _UUID_BYTES: Final = 16
 

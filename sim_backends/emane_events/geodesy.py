@@ -12,6 +12,7 @@ _E2: Final = _F * (2 - _F)
 """Semi-major axis, flattening and squared eccentricity of the ellipsoid."""
 _CONVERGED_RAD: Final = 1e-15
 _ITERATIONS: Final = 20
+"""The computation of a latitude ends when the latitude changes by less than this angle, or after 20 iterations."""
 
 Geodetic = tuple[float, float, float]
 """Latitude and longitude in degrees, height above the ellipsoid in metres."""

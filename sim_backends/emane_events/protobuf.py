@@ -9,7 +9,9 @@ VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
 _DOUBLE: Final = struct.Struct("<d")
 _FLOAT: Final = struct.Struct("<f")
 _MAX_VARINT_BYTES: Final = 10
+"""Number of bytes of a varint with 64 bits."""
 Value = int | bytes
+"""Value of a varint, or the bytes of a field of another type."""
 
 
 class MalformedEventError(ValueError):

@@ -41,7 +41,7 @@ from sim_backends.federates.frames import (
 )
 from sim_backends.federates.handshake import NO_EVENT, FederateCapability, Hello, Welcome
 from sim_backends.federates.records import COMMAND_TYPES, command_type
-from sim_backends.federates.transports.contract import is_same_token
+from sim_backends.federates.transports.contract import TOKEN_VARIABLE, is_same_token
 from sim_backends.world.motion import DeadReckoned
 
 _MAX_COPIES: Final = 1000
@@ -257,7 +257,7 @@ class _Run:
     def _begin(self, hello: Hello, request: int) -> bytes:
         """Check the token, create the federate, and return the body of `welcome`."""
         if not is_same_token(hello.token, self.token):
-            raise PermissionError("the token is wrong")
+            raise PermissionError(f"the token is wrong; set {TOKEN_VARIABLE} to the same text on both sides")
         self.heartbeat = _Heartbeat(self.channel, max(hello.heartbeat_ms / 1e3, 0.01))
         self.heartbeat.begin(request, 0, 0)
         federate = self.service.make(hello)

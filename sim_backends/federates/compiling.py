@@ -105,7 +105,10 @@ class CompiledProgram:
             try:
                 compilation = _run(*words)
             except subprocess.TimeoutExpired as error:
-                raise ConfigurationError(f"{self.name} was not compiled within {_LIMIT_S:g} s") from error
+                raise ConfigurationError(
+                    f"{self.name} was not compiled within {_LIMIT_S:g} s",
+                    remedy="repeat it when the machine is less busy",
+                ) from error
             if compilation.returncode:
                 lines = compilation.stderr.splitlines()[:_SHOWN_LINES]
                 raise ConfigurationError(
@@ -154,7 +157,9 @@ def _locked(path: Path, name: str) -> Iterator[None]:
             except BlockingIOError as error:
                 if time.monotonic() > deadline_s:
                     raise ConfigurationError(
-                        f"another process has been compiling {name} for {_LIMIT_S:g} s", where=str(path)
+                        f"another process has been compiling {name} for {_LIMIT_S:g} s",
+                        where=str(path),
+                        remedy="wait until it has finished, or end it",
                     ) from error
                 time.sleep(_POLL_S)
         yield

@@ -1,4 +1,4 @@
-"""Protocols of federates, and the errors that name the federate that failed or did not answer."""
+"""Interfaces of federates (the simulators of a co-simulation), and errors that name the federate that failed."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
@@ -58,7 +58,7 @@ def seconds_text(time_ns: int) -> str:
 
 
 class PhysicsFederate(Protocol):
-    """Moves the agents.
+    """A physics simulator: it moves the agents.
 
     If an attribute `agents_disappear` is True, an agent may be missing in the states: it has disappeared, and may
     appear again. Otherwise the run ends with an error if an agent is missing.
@@ -89,7 +89,7 @@ class PhysicsFederate(Protocol):
 
 
 class NetworkFederate(Protocol):
-    """Carries packets.
+    """A network simulator: it carries the packets of the agents.
 
     If agents forward or interfere, an attribute `transmitters` has their names; if objects that are not agents
     interfere, an attribute `fixed_emitters_m` has their positions. The sync policy `error_bounded` and the position

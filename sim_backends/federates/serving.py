@@ -43,7 +43,7 @@ def serve_service(service: FederateService, *, address: str | None = None, runs:
     """
     transport_address = None if address is None else parse_address(address)
     if address is not None and transport_address is None:
-        raise ValueError(f"{address!r} is not one of {', '.join(FORMS)}")
+        raise ValueError(f"{address!r} is not an address; use {', '.join(FORMS)}")
     if transport_address is None:
         with closing(_standard_channel()) as channel:
             succeeded = serve_channel(channel, service)

@@ -29,7 +29,7 @@ class SimulatorOptions(Strict):
         yield from ()
 
     def unsupported(self, scenario: Mapping[str, Any]) -> Iterator[tuple[str, Location]]:
-        """Yield every part of a scenario that the simulator does not support, with its keys.
+        """Yield a message for each part of a scenario that the simulator does not support, and its keys.
 
         Args:
             scenario: The scenario as in the configuration of hello, in JSON values.

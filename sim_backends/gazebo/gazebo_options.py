@@ -52,8 +52,8 @@ class GazeboOptions(SimulatorOptions):
         gravity_m_s2: Gravity that is compensated for robots that fly; 0 if their links have no gravity.
         yaw_gain_per_s: Commanded yaw rate of robots that fly, per radian of heading error.
         control_period_s: Interval between commands to robots that fly, in simulated time.
-        limit_m_s2: Largest acceleration, for the exchange policy `error_bounded`; if omitted, this policy exchanges
-            positions at every step while an agent sends.
+        limit_m_s2: Largest acceleration, for the sync policy `error_bounded`; if omitted, this policy exchanges
+            states after every step while an agent sends.
         deterministic: True to declare that equal requests give equal answers.
         timeout_s: Maximum wait without progress, in wall time.
     """

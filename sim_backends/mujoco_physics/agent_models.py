@@ -43,6 +43,7 @@ def agent_model(agent: AgentStart, limits: DriveLimits | QuadrotorLimits, world:
         return RobotModel(place_m, quaternion(heading_rad), agent.antenna_m, 0.0, limits)
     cos, sin = math.cos(heading_rad), math.sin(heading_rad)
     east, north = Ground(world, math.inf).surface(e, n).grade
+    # Slopes of the ground in the robot's forward and left directions.
     forward, left = east * cos + north * sin, north * cos - east * sin
     roll_rad = math.asin(left / math.hypot(1.0, forward, left))
     orientation = quaternion(heading_rad, -math.atan(forward), roll_rad)

@@ -291,6 +291,7 @@ class MujocoPhysics:
         return FlightController(limits, body.id, int(target.mocapid[0]), velocity, model.actuator(f"a{row}").id)
 
     def _apply_commands(self) -> None:
+        """Pass the pending commands to the controllers; commands to absent agents are ignored."""
         commands, self._pending_commands = self._pending_commands, {}
         for name, command in commands.items():
             if name not in self._rows:

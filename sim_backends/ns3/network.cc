@@ -409,6 +409,7 @@ class Network
         }
     }
 
+    // The time in ns-3 of a time in the scenario, in seconds.
     static Time At(const Json& seconds)
     {
         return NanoSeconds(g_start_ns + std::llround(Number(seconds) * 1e9));

@@ -122,15 +122,15 @@ class Obstacles
             Point to = Local(end);
             double entry = 0;
             double exit = 1;
-            Slab(from[2], to[2], half[2], entry, exit);
+            LimitToSlab(from[2], to[2], half[2], entry, exit);
             if (is_cylinder)
             {
-                Disc(from, to, entry, exit);
+                LimitToDisc(from, to, entry, exit);
             }
             else
             {
-                Slab(from[0], to[0], half[0], entry, exit);
-                Slab(from[1], to[1], half[1], entry, exit);
+                LimitToSlab(from[0], to[0], half[0], entry, exit);
+                LimitToSlab(from[1], to[1], half[1], entry, exit);
             }
             return std::max(exit - entry, 0.0);
         }
@@ -144,7 +144,7 @@ class Obstacles
         }
 
         // Reduce the shares [entry, exit] of the path to those between the planes at -half and half on one axis.
-        static void Slab(double start, double end, double half, double& entry, double& exit)
+        static void LimitToSlab(double start, double end, double half, double& entry, double& exit)
         {
             double step = end - start;
             if (step == 0)
@@ -159,7 +159,7 @@ class Obstacles
         }
 
         // Reduce the shares [entry, exit] of the path to those within the radius of the cylinder.
-        void Disc(const Point& start, const Point& end, double& entry, double& exit) const
+        void LimitToDisc(const Point& start, const Point& end, double& entry, double& exit) const
         {
             double x = end[0] - start[0];
             double y = end[1] - start[1];

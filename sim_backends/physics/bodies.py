@@ -26,6 +26,7 @@ from sim_backends.world.world import World
 _SUPPORT_M: Final = 1e-3
 """Maximum distance between a quadrotor and the ground or obstacle that supports it."""
 _ALWAYS: Final[Mapping[str, Lifetime]] = MappingProxyType({})
+"""Lifetimes if all bodies exist during the whole run."""
 
 
 class Bodies:
@@ -35,8 +36,8 @@ class Bodies:
         bodies: The bodies, by the name of their agent.
         world: Ground and obstacles; None for open flat ground.
         step_ns: Time step; there are states only at whole steps.
-        lifetimes: Bodies that do not exist during the whole run. A body exists from the last step before its lifetime
-            begins to the first step after its lifetime ends.
+        lifetimes: Lifetimes of the bodies that exist only during a part of the run. A body exists from the last step
+            before its lifetime begins to the first step after its lifetime ends.
 
     Attributes:
         step_ns: Time step.
@@ -186,6 +187,7 @@ class Bodies:
         )
 
     def _apply_commands(self) -> None:
+        """Let the pending commands take effect at the current step."""
         commands_by_name, self._pending_commands = self._pending_commands, {}
         tracks = {}
         for name, command in commands_by_name.items():
@@ -350,6 +352,7 @@ class Bodies:
             grid.add(number, place_m)
 
     def _check_free(self, name: str, place_m: Vector, footprints: Iterable[Footprint]) -> None:
+        """Check that a body does not overlap any of these footprints at its start."""
         body = self._bodies[name]
         for footprint in footprints:
             if overlaps(footprint, body, place_m):

@@ -33,7 +33,7 @@ class Velocity:
     """Command to a flying body.
 
     Attributes:
-        velocity_m_s: Metres per second east, north, up.
+        velocity_m_s: Target velocity, metres per second east, north, up.
         yaw_rad: Direction of its nose, from east towards north; None keeps the current direction.
     """
 
@@ -51,7 +51,7 @@ class Pose(Protocol):
 
     @property
     def velocity_m_s(self) -> Vector:
-        """Metres per second east, north, up."""
+        """Its velocity, metres per second east, north, up."""
         ...
 
     @property

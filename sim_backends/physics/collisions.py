@@ -137,6 +137,7 @@ def shape_footprint(name: str, shape: Shape) -> Footprint:
 
 
 def _heights_m(shape: Shape) -> tuple[float, float]:
+    """Return the heights of the lower and the upper face of a shape."""
     return 2 * shape.centre_m[2] - shape.top_m, shape.top_m
 
 

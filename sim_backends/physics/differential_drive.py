@@ -24,6 +24,7 @@ from sim_backends.physics.robot_limits import DriveLimits
 from sim_backends.world.motion import GRAVITY_M_S2
 
 _LEVEL: Final = (0.0, 0.0)
+"""Grade of level ground."""
 _REACHED: Final = 1e-12
 """Tolerance for reaching a target, in m/s or rad/s: rounding errors are that large."""
 
@@ -36,7 +37,7 @@ class DrivePose(NamedTuple):
 
     Attributes:
         place_m: Position of the ground below its centre, metres east, north, up.
-        heading_rad: From east towards north; continuous over full turns.
+        heading_rad: Its heading, from east towards north; it increases beyond a full turn.
         speed_m_s: Forward speed, negative for backwards.
         turn_rad_s: Yaw rate, positive to the left.
         sliding_m_s: Its velocity along an obstacle that it touches; None if it moves along its heading.
@@ -190,7 +191,7 @@ class DifferentialDrive:
         steps = min((count for count in (speed_steps, turn_steps) if count), default=None)
         is_turning = bool(turn_steps or turn_rad_s)
         if (turn_steps or (is_turning and pose.grade != _LEVEL)) and (speed_steps or speed_m_s or has_no_grip):
-            steps = 1  # see the top of this module
+            steps = 1  # the displacement is approximated step by step, see the top of this module
         return Arc(
             pose,
             pose.speed_m_s if speed_steps else speed_m_s,

@@ -33,7 +33,7 @@ class FlightTarget:
     """Command of an autopilot that limits velocity and acceleration itself, and switches the rotors on and off.
 
     Attributes:
-        velocity: Its target.
+        velocity: The target velocity.
         acceleration_m_s2: Maximum commanded horizontal acceleration.
         climb_m_s2: Maximum commanded accelerations downwards and upwards.
         powered: False if the rotors are off; then the quadrotor falls.
@@ -45,7 +45,7 @@ class FlightTarget:
     powered: bool = True
 
     def limits_within(self, limits: QuadrotorLimits) -> QuadrotorLimits:
-        """Return a quadrotor's limits with the accelerations of this command, and without thrust if it is off."""
+        """Return a quadrotor's limits with the accelerations of this command; if rotors are off, without thrust."""
         return replace(
             limits,
             acceleration_m_s2=self.acceleration_m_s2,
@@ -59,7 +59,7 @@ ROTORS_OFF: Final = FlightTarget(Velocity(), 0.0, (0.0, 0.0), powered=False)
 
 
 class FlightStatus(NamedTuple):
-    """The values of a quadrotor that its sensors measure and that `State` does not contain.
+    """Values that the sensors of a quadrotor measure in addition to `State`.
 
     Attributes:
         place_m: Position of its lowest point, metres east, north, up.
@@ -79,9 +79,9 @@ class FlightPose(NamedTuple):
 
     Attributes:
         place_m: Position of its lowest point, metres east, north, up.
-        velocity_m_s: Metres per second east, north, up.
-        roll_rad: Positive with its left side up.
-        pitch_rad: Positive with its nose down.
+        velocity_m_s: Its velocity, metres per second east, north, up.
+        roll_rad: Its roll, positive with its left side up.
+        pitch_rad: Its pitch, positive with its nose down.
         heading_rad: Direction of its nose, from east towards north.
     """
 

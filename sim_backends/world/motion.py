@@ -12,6 +12,7 @@ from typing import Final, NamedTuple, Protocol
 from fieldkit.core.model import Vector
 
 STILL: Final[Vector] = (0.0, 0.0, 0.0)
+"""Velocity of a robot that does not move."""
 
 GRAVITY_M_S2: Final = 9.80665
 """Standard acceleration of gravity (CGPM 1901)."""

@@ -1,4 +1,4 @@
-"""World files: obstacles, ground and lines for the robots; and the loss of radio paths through them."""
+"""World files: obstacles, ground and lines for the robots; and the loss of radio paths through obstacles."""
 
 import math
 from dataclasses import dataclass
@@ -23,12 +23,12 @@ SHIPPED: Final = Path(__file__).parent / "worlds"
 
 @dataclass(frozen=True)
 class ObstacleCrossing:
-    """The part of a path that is inside one part of an obstacle.
+    """The section of a path that is inside one shape of an obstacle.
 
     Attributes:
         obstacle: Name of the obstacle.
         material: Name of the material.
-        length_m: Length of the part.
+        length_m: Length of the section.
     """
 
     obstacle: str
@@ -83,7 +83,12 @@ class World(Named):
         return tuple(part for obstacle in self.obstacles for part in obstacle.parts())
 
     def crossings(self, start_m: Floats, end_m: Floats) -> list[tuple[ObstacleCrossing, ...]]:
-        """Return the parts crossed by each straight path between points of shape (n, 3), in the order of the file."""
+        """Return the shapes that each of n straight paths crosses, in the order of the file.
+
+        Args:
+            start_m: Starts of the paths, shape (n, 3).
+            end_m: Ends of the paths, shape (n, 3).
+        """
         return [
             tuple(
                 ObstacleCrossing(part.obstacle, part.material, length_m)

@@ -121,7 +121,7 @@ class ArmingCheck:
 
     @property
     def is_starting(self) -> bool:
-        """Whether the position estimate is not ready yet; this takes about 30 s after power-on."""
+        """Whether the position estimate is not ready yet. It is ready about 30 s after power-on."""
         reports_no_estimate = any(_NO_ESTIMATE in text for text in self._drone.texts.warnings)
         return self._drone.dialect is not None and (reports_no_estimate or any(self._position_faults()))
 

@@ -206,7 +206,7 @@ class SharedLink:
             with open(f"/proc/{link_files.peer_credentials(self._server)[0]}/stat", encoding="utf-8") as file:  # noqa: PTH123
                 return file.read().rpartition(")")[2].split()[0] in ("T", "t")
         except (OSError, IndexError):
-            return True
+            return True  # the process does not exist any more
 
     def _kill_server(self) -> None:
         """Kill the server. Its socket is open, so no other process can have its pid."""

@@ -73,7 +73,7 @@ def entities_info(
         message.extend(guid + bytes(gid_bytes - _GUID_BYTES))
 
     add_gid(participant)
-    add_number(1)
+    add_number(1)  # the number of nodes
     for text in ("/", node):
         data = text.encode() + b"\0"
         add_number(len(data))

@@ -143,7 +143,9 @@ def scheduled(rate_hz: float, duration_s: float, log: Log, stop_event: threading
     start_s, sequence, tick, ticks = time.monotonic(), 0, 0, round(duration_s * rate_hz)
     while tick < ticks:
         wait_s = start_s + tick / rate_hz - time.monotonic()
-        if stop_event.wait(wait_s) if wait_s > 0 else stop_event.is_set():
+        if wait_s > 0:
+            stop_event.wait(wait_s)
+        if stop_event.is_set():
             return
         yield sequence
         sequence += 1

@@ -47,7 +47,10 @@ LISTINGS: Final = ("robots", "procedures", "columns")
 """Commands in the module `listings`."""
 
 FROM_ENTRY_POINTS: Final = frozenset({"bag", "bridge", "middleware", "stop"})
-"""Commands whose modules are found by entry points (`plugin_targets`). The help omits a command without one."""
+"""Commands whose modules are found by entry points (`plugin_targets`).
+
+The help omits a command whose entry point is not installed.
+"""
 
 
 def add_all(commands: Commands) -> None:

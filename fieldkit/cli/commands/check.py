@@ -23,8 +23,8 @@ def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit check`."""
     parser.description = (
         "Check everything that a trial of the procedure needs from the robots and from this machine; change nothing, "
-        "and do not ask for robots to be placed. `fieldkit trial` does this too, without a test recording. For "
-        "the estimate of disk space, give --repeats and --record of the planned trial."
+        "and do not ask for robots to be placed. `fieldkit trial` makes the same checks, except for the test "
+        "recording. For the estimate of disk space, give --repeats and --record of the planned trial."
     )
     parser.takes_lengths = True
     parser.epilog = "example: fieldkit check los --topology masterless"

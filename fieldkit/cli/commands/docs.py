@@ -38,5 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.path:
         print_text(str(page.path))
     elif not webbrowser.open(page.uri):
-        raise ConfigurationError("this machine has no browser", remedy=f"open it elsewhere: {page.path}")
+        raise ConfigurationError(
+            "this machine has no browser", remedy=f"open the page on another machine: {page.path}"
+        )
     return 0

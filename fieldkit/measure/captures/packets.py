@@ -38,9 +38,11 @@ FIN: Final = 0x01
 SYN: Final = 0x02
 RST: Final = 0x04
 ACK: Final = 0x10
+"""TCP flags."""
 
 UDP_HEADER_BYTES: Final = 8
 
+# The ports are at the same place in TCP, UDP and SCTP. `udp_bytes` is a field of UDP; the other fields are of TCP.
 _TRANSPORT: Final = layout(
     BIG, 20, sport=(0, 2), dport=(2, 2), udp_bytes=(4, 2), seq=(4, 4), ack=(8, 4), length=(12, 1), flags=(13, 1)
 )

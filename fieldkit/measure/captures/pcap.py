@@ -53,7 +53,7 @@ def frame_reader(data: Buffer) -> ChunkReader | None:
 
 @dataclass(frozen=True)
 class Capture:
-    """Packets of a capture file or of a chunk of it.
+    """Packets of a whole capture file, or of one chunk.
 
     Attributes:
         packets: IP packets.

@@ -157,7 +157,7 @@ def _interval_problems(interval: IperfInterval) -> Iterator[str]:
             yield f"lasts {duration_s:.3f} s by its start and end, but {reported}"
     if interval.stream_bytes is not None and interval.stream_bytes != interval.payload_bytes:
         yield f"has {interval.payload_bytes} bytes, but its streams have {interval.stream_bytes}"
-    rate = interval.rate_bit_s
+    rate = interval.rate_bit_s  # may differ by one byte per second, 8 bit/s, if the interval is almost empty
     if rate is not None and not math.isclose(rate, interval.bit_s, rel_tol=_ROUNDING, abs_tol=8):
         yield f"has {interval.bit_s:.0f} bit/s by its bytes, but reports {rate:.0f} bit/s"
     # A negative loss is possible: a datagram that arrives late is counted as lost in one interval, and

@@ -209,6 +209,7 @@ def _check_summary(output: Ping) -> Iterator[str]:
     for name, summary_s, printed_s in zip(
         ("shortest", "mean", "longest"), output.summary_s, line_times_s, strict=True
     ):
+        # The summary has microseconds, so that each time may also differ by 2 us.
         if abs(summary_s - printed_s) > _ROUNDING * max(summary_s, printed_s) + 2e-6:
             lines_text = f"but its lines have {1e3 * printed_s:.3f} ms"
             yield f"ping's summary has {1e3 * summary_s:g} ms as the {name} time, {lines_text}"

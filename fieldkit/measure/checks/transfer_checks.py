@@ -43,7 +43,7 @@ def find_contradictions(
     Args:
         evidence: The attempt's evidence.
         transfer: The transfer.
-        finished: True if the evidence shows that the listener exited without being stopped.
+        finished: True if the evidence shows that the listener, the receiving program, exited without being stopped.
         was_stopped: True if the evidence shows that the listener was stopped before it had finished.
     """
     files = _files(evidence, transfer)

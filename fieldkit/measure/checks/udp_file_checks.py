@@ -52,7 +52,7 @@ def find_contradictions(
         transfer: The transfer, over UDP.
         sender: Packets of the sender's undamaged capture.
         receiver: Packets of the receiver's undamaged capture.
-        was_stopped: True if the listener was stopped before it had finished.
+        was_stopped: True if the listener, the receiving netcat, was stopped before it had finished.
     """
     sent_file, received_file = (
         evidence.read_or_none(reading.mapped, name) for name in (transfer.sent_file, transfer.received_file)

@@ -44,6 +44,7 @@ _BOOT: Final = re.compile(r"[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 BOOT: Final = "boot"
 CLOCK: Final = "clock"
 JOBS: Final = "jobs"
+"""Names of sections; see `before_file`."""
 _SNMP: Final = "/proc/net/snmp"
 _CONGESTION: Final = "/proc/sys/net/ipv4/tcp_congestion_control"
 _MAX_NAME_BYTES: Final = 16
@@ -125,7 +126,7 @@ def read_state(path: Path) -> HostState:
 
 
 def incomplete_sections(before: HostState, after: HostState) -> Iterator[str]:
-    """Yield the names of sections that are in only one of the two states of an attempt.
+    """Yield the names of sections that only one of the two states of an attempt contains.
 
     A section that the host does not support is in neither state. Files of fieldkit versions that did not record the
     boot ID have no section of jobs.

@@ -6,6 +6,7 @@ from fieldkit.core.columns import Column, Figure, Kind, columns, fault_column_na
 from fieldkit.core.model import FaultKind
 
 _KINDS_IN_ORDER: Final = (FaultKind.LINK_DOWN, FaultKind.OUT_OF_RANGE, FaultKind.REBOOT, FaultKind.KILL)
+"""Kinds of faults in the order of their columns."""
 
 
 def _recovered_state(kind: FaultKind) -> str:

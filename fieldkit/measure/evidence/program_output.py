@@ -127,7 +127,7 @@ def search_json(printed: object, where: str) -> object:
 
 
 def by_expression(path: Path, expression: str) -> object:
-    """Return the text of the expression's group in the first match in a program's output, or None without a match.
+    """Return the text that the expression's group first matches in a program's output, or None without a match.
 
     Raises:
         EvidenceError: For the same reasons as `text`.
@@ -136,7 +136,7 @@ def by_expression(path: Path, expression: str) -> object:
 
 
 def search_text(output: str, expression: str) -> str | None:
-    """Return the text of the expression's group in the first match in a text, or None without a match."""
+    """Return the part of a text that the expression's group first matches, or None without a match."""
     match = _compile_expression(expression).search(output)
     group: str | None = None if match is None else match[1]
     return group

@@ -121,7 +121,7 @@ def counted_csv_text(header: str, lines: Iterable[str]) -> str:
 
 
 def read_counted_csv(path: Path, header: str, pattern: re.Pattern[str], error: str) -> list[re.Match[str]]:
-    """Return the lines of a CSV file with a number of lines, as matches of a pattern.
+    """Return the lines of a file that `counted_csv_text` created, as matches of a pattern.
 
     Args:
         path: The file.

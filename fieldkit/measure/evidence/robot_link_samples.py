@@ -122,7 +122,9 @@ def _rate_bit_s(lines: Mapping[str, str], name: str) -> float | None:
 
 
 def read(folder: Path, role: Role) -> Sequence[LinkSample]:
-    """Return the samples of a robot's sampler and of its states before and after an attempt, in the order of time.
+    """Return the samples of an attempt, in the order of time.
+
+    They are from the robot's sampler, and from the files with its state before and after the attempt.
 
     Raises:
         EvidenceError: The files are missing, or do not contain the robot's clock.

@@ -19,8 +19,7 @@ POSITION_CHECKS: Final = (
         against=("the placement in `trial.yaml`",),
         tolerance=(
             "distances may differ by 10 % plus 2 m, or plus 15 m with satellite receivers, because of errors of "
-            "placement "
-            "and of receivers"
+            "placement and of receivers"
         ),
         outcome=CheckOutcome.WITHHELD,
     ),

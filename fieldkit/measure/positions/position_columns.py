@@ -31,7 +31,7 @@ def measure(
     ends: tuple[Role, Role],
     times_ns: Collection[int],
 ) -> Measured:
-    """Return the columns of distance and speeds of two robots between the earliest and the latest of several times.
+    """Return the columns of distance and speeds of two robots, from the earliest to the latest of several times.
 
     Args:
         evidence: The attempt's evidence.

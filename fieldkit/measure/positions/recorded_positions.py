@@ -30,7 +30,16 @@ def measure(
     ends: tuple[Role, Role],
     times_ns: Collection[int],
 ) -> Measured:
-    """Return the columns of `position_columns.measure` for an attempt with recorded positions."""
+    """Return the columns of distance and speeds of two robots, from the earliest to the latest of several times.
+
+    If neither robot has a source in `positions.json`, the positions of the testbed are used.
+
+    Args:
+        evidence: The attempt's evidence.
+        columns: The columns, `PREFIX_distance_start_m` and so on.
+        ends: Sender and receiver.
+        times_ns: The times by the sender's clock, in nanoseconds since 1970 UTC.
+    """
     try:
         sources = read_position_sources(evidence)
         if not sources.robots.keys() & set(ends):
@@ -52,7 +61,11 @@ def measure(
 
 
 def distances_m(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> Sequence[tuple[int, float | None]]:
-    """Return the distances of `position_columns.distances_m` for an attempt with recorded positions."""
+    """Return the distance of two robots over time, as (time, distance) pairs.
+
+    Times are in nanoseconds since 1970 UTC by the first robot's clock. A gap in the positions is a pair without a
+    distance (None). If neither robot has a source in `positions.json`, the positions of the testbed are used.
+    """
     try:
         sources = read_position_sources(evidence)
         if not sources.robots.keys() & set(ends):

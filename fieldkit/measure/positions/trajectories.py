@@ -15,7 +15,7 @@ SPEED_SPAN_NS: Final = 200_000_000
 _ALWAYS: Final = np.array([0, 2**62])
 """Times of a trajectory that covers every time span, in ns since 1970."""
 _NEGLIGIBLE_PATH: Final = 1e-6
-"""A path is regarded as a point if it is shorter than this share of its distance from the origin."""
+"""A path is regarded as a point if it is shorter than this share of its distance from the origin, or of 1 mm."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,6 +18,7 @@ from fieldkit.measure.robot_state.state_columns import declare_columns
 
 CLOCK_SOURCES: Final = frozenset(("chrony", "ptp", "timesyncd", "timedatectl"))
 RADIO_SOURCES: Final = frozenset(("iw-info", "iw-reg", "iw-scan", "iw-survey"))
+"""Names of the sources that report on clocks and on radios."""
 _ONE_WAY: Final = "one_way_withheld"
 _OFFSET: Final = "clock_offset_s"
 _NO_SOURCE: Final = "no program of the robot reports it"

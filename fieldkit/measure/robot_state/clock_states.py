@@ -18,6 +18,7 @@ _MARGIN_S: Final = 0.001
 WRONG_CLOCK: Final = "wrong clock"
 NO_SOURCE: Final = "no time source"
 DISAGREE: Final = "clocks disagree"
+"""Names of marks."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ def read(name: str, attempt_snapshots: Sequence[Snapshot], laptop: Offset | None
 
 
 def measure(role: Role, clock: RobotClock) -> Measured:
-    """Return the columns of the clock of the robot in a role."""
+    """Return the columns of one robot's clock."""
     report = clock.report
     is_synchronized = report is not None and report.is_synchronized
     reason = (report.problem if report else "") or "no program of the robot reports on its clock"

@@ -67,7 +67,7 @@ def is_wrong(clock_offset: Offset) -> bool:
 
 
 def measure(role: Role, clock_offset: Offset | None) -> Measured:
-    """Return the columns of the offset of the robot in a role."""
+    """Return the columns of one robot's clock offset."""
     values: dict[str, Value | None] = {
         f"{role}_laptop_offset_s": None if clock_offset is None else clock_offset.offset_s,
         f"{role}_laptop_offset_error_s": None if clock_offset is None else clock_offset.error_s,

@@ -23,6 +23,7 @@ THROTTLED_NAME: Final = "vcgencmd"
 
 UNDER_VOLTAGE: Final = "under-voltage"
 THROTTLED: Final = "throttled"
+"""Names of marks."""
 _FLAGS: Final = ("under-voltage", "frequency capped", "throttled", "soft temperature limit")
 """Flags in the order of their bits."""
 _SINCE_BOOT: Final = 16
@@ -122,7 +123,7 @@ def _busy_share(before: Health, after: Health) -> float | None:
 
 
 def measure(role: Role, before: Health, after: Health) -> Measured:
-    """Return the columns of the computer of the robot in a role."""
+    """Return the columns of one robot's computer, from the states before and after an attempt."""
     flags = flags_during(before, after)
     temperatures_c = [state.temperature_c for state in (before, after) if state.temperature_c is not None]
     values: dict[str, Value | None] = {

@@ -1,4 +1,7 @@
-"""Marks of an attempt: conditions of the robots that can explain a difference between repeats."""
+"""Marks of an attempt: conditions of the robots that can explain a difference between repeats.
+
+A source is a program on a robot that reports such conditions.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -30,6 +30,7 @@ SETTINGS: Final = ("channel", "regulatory_domain")
 """Settings of a radio that must not change during a trial."""
 
 BUSY_CHANNEL: Final = "busy channel"
+"""Name of a mark."""
 BUSY_SHARE: Final = 0.2
 """A repeat is marked if others use more than this share of the airtime."""
 
@@ -167,7 +168,7 @@ def _times_ms(survey: str) -> Mapping[str, int] | None:
 
 
 def measure(role: Role, states: Sequence[RadioState]) -> Measured:
-    """Return the columns of the neighbourhood of the robot in a role: the largest values of several states."""
+    """Return the columns of one robot's channel and its other users. Each number is the largest of several states."""
     channels = list(dict.fromkeys(str(state.channel) for state in states if state.channel))
     countries = list(dict.fromkeys(state.country for state in states if state.country))
     counts = [len(state.signals_dbm) for state in states if state.signals_dbm is not None]

@@ -29,7 +29,7 @@ MARK_COLUMNS: Final = columns(
 
 
 def declare_columns(role: str) -> tuple[Column, ...]:
-    """Return the columns of the robot in a role."""
+    """Return the columns of one robot's state."""
     return columns(
         160,
         (

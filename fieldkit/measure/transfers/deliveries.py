@@ -99,7 +99,7 @@ def udp_stream_deliveries(packets: UdpPackets, in_stream: Mask, expected: FlowSc
     stream_packets = np.append(in_stream, False)[packets.datagram]
     received_packets = np.append(stream_packets, False)[matched.sent_index]
     if (received_packets & matched.possible_copy).any():
-        raise EvidenceError("its packets cannot be distinguished, and some of the received packets may be copies")
+        raise EvidenceError("packets of the flow cannot be distinguished, and received packets may be copies")
     sent_ns = packets.sent.time_ns[stream_packets]
     _require_times(sent_ns, packets.received.time_ns[received_packets])
     complete_ns = arrivals_ns(packets)[in_stream]

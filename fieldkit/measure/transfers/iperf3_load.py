@@ -157,7 +157,7 @@ JITTER_CROSS_CHECKS: Final = (
         against=("both captures: packets of the other direction, and the clock offset that fits all packets",),
         tolerance=(
             "an unknown clock drift of 0.1 ms per second; no other source records the time of a single datagram, but "
-            "because packets are captured in order, it can be wrong by at most 0.1 s"
+            "because packets are captured in order, this time can be wrong by at most 0.1 s"
         ),
         outcome=CheckOutcome.WITHHELD,
     ),
@@ -323,7 +323,7 @@ def _steady_clocks(load: LoadStreams, sender: Packets, receiver: Packets) -> Clo
 
 
 def _transits_ns(load: LoadStreams, sender: Packets, receiver: Packets) -> Iterator[Ints]:
-    """Yield the delays in ns of the datagrams of each stream, in the order of arrival."""
+    """Yield, for each stream, the delays of its datagrams in ns, in the order of arrival."""
     clocks = _steady_clocks(load, sender, receiver)
     if clocks is None:
         raise EvidenceError("no packet from receiver to sender is in both captures")
@@ -333,7 +333,7 @@ def _transits_ns(load: LoadStreams, sender: Packets, receiver: Packets) -> Itera
     first, arrived_ns = matched.sent.where(matched.first), deliveries.arrivals_ns(matched)
     for mask in load.datagram_masks(first):
         if (np.append(mask, False)[matched.datagram] & matched.match.ambiguous).any():
-            raise EvidenceError("its packets cannot be distinguished, so their arrival times are unknown")
+            raise EvidenceError("packets of the flow cannot be distinguished, so their arrival times are unknown")
         is_complete = mask & (arrived_ns != NO_TIME)
         if is_complete.any():
             order = np.argsort(arrived_ns[is_complete], kind="stable")

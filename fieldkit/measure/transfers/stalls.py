@@ -1,10 +1,12 @@
 """Stalls of a flow: times during which new payload was overdue at its receiver.
 
-Payload is overdue from the previous delivery on; in a flow with a fixed rate, from one sending interval after the
-previous delivery on. Time in which the sender has nothing to send is therefore not part of a stall. A stall is a time
-longer than `StreamDeliveries.min_stall_s` during which payload is overdue. The time before the first payload, when a
-connection is established, and the time after the last payload are included only if they are longer than this. A
-stall after the last payload is right-censored: it had not ended when the flow ended.
+A delivery is an arrival of new payload. In a flow with a fixed rate, payload is overdue from one sending interval
+after the previous delivery on, so that the time in which the sender has nothing to send is not part of a stall. In
+other flows, payload is overdue from the previous delivery on.
+
+A stall is a time longer than `StreamDeliveries.min_stall_s` during which payload is overdue. The time before the
+first payload, when a connection is established, and the time after the last payload are included only if they are
+longer than this minimum. A stall after the last payload is right-censored: it had not ended when the flow ended.
 """
 
 from collections.abc import Callable, Sequence

@@ -17,7 +17,7 @@ from fieldkit.measure.captures.packets import ACK, FIN, SYN, Packets
 _MAX_STREAM_BYTES: Final = 1 << 44
 
 # The number of pieces is quadratic if all frames overlap. In a transfer it is not, because each end of a frame
-# divides only one other frame and its copies.
+# divides only one other frame and its copies. The limit is a number per frame plus a constant.
 _PIECES_PER_FRAME: Final = 16
 _MIN_PIECE_LIMIT: Final = 1 << 20
 
@@ -46,10 +46,10 @@ def cut(sent: Packets, received: Packets) -> tuple[Pieces, Pieces]:
     frames = [np.flatnonzero(packets.protocol == TCP) for packets in (sent, received)]
     all_frames = Packets.concatenated((sent.where(frames[0]), received.where(frames[1])))
     connection_key = row_hashes(*all_frames.src.T, *all_frames.dst.T, all_frames.sport << 16 | all_frames.dport)
-    _, first, connection = np.unique(connection_key, return_index=True, return_inverse=True)
+    _, first_rows, connection = np.unique(connection_key, return_index=True, return_inverse=True)
     sides = slice(0, len(frames[0])), slice(len(frames[0]), None)
     start = np.concatenate(
-        [_starts(all_frames.where(side), connection[side], all_frames.tcp_seq[first]) for side in sides]
+        [_starts(all_frames.where(side), connection[side], all_frames.tcp_seq[first_rows]) for side in sides]
     )
     stop = start + all_frames.tcp_payload_bytes
     edges = np.unique(np.concatenate((start, stop)))
@@ -164,6 +164,7 @@ class Connections:
 
     def _positions(self, ports: Ints, numbers: Ints) -> Ints:
         index = np.searchsorted(self.ports, ports)
+        # The position is negative for numbers before the first byte. Each connection has its own range of positions.
         relative = (numbers - self.first_seq[index] + LONGEST_BYTES) % 2**32 - LONGEST_BYTES
         positions: Ints = (index + 1 << _CONNECTION_BITS) + relative
         return positions

@@ -23,7 +23,7 @@ class Transfer:
         receiver_address: Address of the receiver on the link under test.
         port: Port that the receiver listens on.
         sent_file: Name of the sent file in the attempt's folder.
-        received_file: Name of the file that the listener wrote, in the same folder.
+        received_file: Name of the file that the listener, the receiving program, wrote in the same folder.
         captures: Names of the sender's and the receiver's capture in the same folder; None without a capture.
         name: Name of the step, which is the prefix of the transfer's other files; empty if the step has no name.
     """

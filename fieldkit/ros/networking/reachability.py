@@ -52,7 +52,7 @@ def judge_arrivals(
         return
     if settings.needs_multicast(state.variables):
         if unicast:
-            none_reason = f"no multicast arrives, unicast does{firewall_note}"
+            none_reason = f"no multicast arrives, but unicast does{firewall_note}"
             multicast_remedy = f"export ROS_STATIC_PEERS={source.address}   # or a discovery server"
         else:
             none_reason, multicast_remedy = f"no multicast arrives{firewall_note}", remedy

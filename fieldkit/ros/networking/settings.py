@@ -252,7 +252,8 @@ def _compare_domains(first_robot: Robot, expected: Variables, actual: Variables,
     if domain(actual) != domain(expected):
         report.fail(
             "same ROS domain",
-            f"domain {domain(actual)}, but {first_robot.name} is in domain {domain(expected)}: no discovery",
+            f"domain {domain(actual)}, but {first_robot.name} is in domain {domain(expected)}: their nodes do not "
+            "discover each other",
             "use one ROS_DOMAIN_ID on all robots",
         )
 
@@ -290,7 +291,7 @@ def _compare_servers(first_robot: Robot, expected: Variables, actual: Variables,
         report.fail(
             "same discovery server",
             f"{own_server or 'no discovery server'}, but {first_robot.name} has {first_server or 'none'}: "
-            "no discovery",
+            "their nodes do not discover each other",
             "use one ROS_DISCOVERY_SERVER on all robots, or on none",
         )
 

@@ -150,7 +150,7 @@ class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpa
             setup=ros.command.setup,
             tool=Tool.RECORDER,
             permitted_causes=BY_EXIT if has_duration else BY_LIMIT,
-            least_s=self.duration,
+            min_duration_s=self.duration,
         )
 
     @override

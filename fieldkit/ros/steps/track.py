@@ -162,7 +162,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
             limit_s=recorder.duration,
             ready="log:recording",
         )
-        return replace(planned, job=job, permitted_causes=BY_FIELDKIT, least_s=0.0)
+        return replace(planned, job=job, permitted_causes=BY_FIELDKIT, min_duration_s=0.0)
 
     def _recorders(self, duration_s: float = 1.0) -> Mapping[Role, RecordStep]:
         """Return a `record` step for each robot with a topic.

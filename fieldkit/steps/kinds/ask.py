@@ -26,6 +26,7 @@ from fieldkit.steps.scene import Announce, Planned, Scene
 from fieldkit.steps.view import View
 
 _MAX_CHARACTERS: Final = 31
+"""Maximum length of a choice."""
 
 
 def _checked_choice(word: str) -> str:

@@ -311,6 +311,7 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
 
 
 def _problems(role: Role, file: str, log_file: str, view: View, *, needs_all: bool) -> Iterator[str]:
+    """Yield the reasons why a robot's capture cannot be used; with `needs_all`, also if packets were dropped."""
     try:
         log = view.evidence.read(tcpdump_log.read, log_file)
         capture = view.evidence.read(pcap.read, file)

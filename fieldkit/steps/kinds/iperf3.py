@@ -126,8 +126,8 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
             stdout=self._json(role),
             ready=jobs.ready_when_bound(Protocol.TCP, self.port) if is_server else None,
         )
-        least_s = 0.0 if is_server or self.size is not None else self._duration_s
-        return Planned(role, job, program=PROGRAM, least_s=least_s)
+        min_duration_s = 0.0 if is_server or self.size is not None else self._duration_s
+        return Planned(role, job, program=PROGRAM, min_duration_s=min_duration_s)
 
     @override
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:

@@ -31,6 +31,7 @@ _GENERATE: Final = (
     'line = ""; for (i = 0; i < 8; i++) { x = (x * 16807) % 2147483647; line = line sprintf("%08x", x) } '
     'printf "%s", substr(line, 1, bytes - n) } }'
 )
+# Makes the path in $1 absolute; a relative path is in the home of the user.
 _ABSOLUTE_PATH: Final = 'case $1 in /*) ;; *) set -- "$HOME/$1" "$2" ;; esac; '
 _COPY: Final = f'{_ABSOLUTE_PATH}exec cp -- "$1" "$2"'
 _COUNT: Final = f'{_ABSOLUTE_PATH}exec wc -c <"$1"'

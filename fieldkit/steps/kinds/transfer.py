@@ -295,6 +295,7 @@ class TransferStep(
 
     @property
     def _logs(self) -> tuple[str, str]:
+        """Log files of the listener and of the sender."""
         return self.prefixed_name(f"{self.receiver}-listen.log"), self.prefixed_name(f"{self.sender}-send.log")
 
     @override
@@ -328,7 +329,7 @@ class TransferStep(
     def check(self, view: View) -> Iterator[str]:
         """Yield a reason for a missing file, a netcat that was stopped by a signal, and each contradiction."""
         transfer = self.transfer(view.scene, view.within)
-        terminations = [self._termination(view, role, job) for role, job in self._jobs]
+        terminations = [self._termination(view, role, job) for role, job in self._job_names]
         listener_exit, sender_exit = (
             termination if termination and termination.cause is Cause.EXITED else None for termination in terminations
         )
@@ -349,7 +350,8 @@ class TransferStep(
             yield f"{self._logs[1]}: netcat was terminated by a signal"
 
     @property
-    def _jobs(self) -> tuple[tuple[Role, str], tuple[Role, str]]:
+    def _job_names(self) -> tuple[tuple[Role, str], tuple[Role, str]]:
+        """Role and job name of the listener, and of the sender."""
         return (self.receiver, self.prefixed_name(_LISTEN)), (self.sender, self.prefixed_name(_SEND))
 
     def _termination(self, view: View, role: Role, job: str) -> Termination | None:

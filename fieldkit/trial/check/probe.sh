@@ -38,6 +38,7 @@ section user id -u
 section user-tools have sudo apt-get setcap ss netstat
 section control echo "${SSH_CONNECTION-}"
 section disk df -Pk .
+# States of sockets: 0A is a TCP socket that listens, 07 is a UDP socket.
 section listeners grep -h ":0000 0[7A] " /proc/net/tcp /proc/net/tcp6 /proc/net/udp /proc/net/udp6
 section interface admin ip addr show dev "$interface"
 section offloads admin ethtool -k "$interface"

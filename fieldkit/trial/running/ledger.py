@@ -230,6 +230,8 @@ class Ledger:
     def _add_line(self, attempt: Attempt, line: str) -> None:
         self._lines.append(line)
         self._last_numbers[attempt.repeat] = max(attempt.number, self._last_numbers.get(attempt.repeat, 0))
-        self._counted_attempts[attempt.repeat] += not attempt.excused
-        self._finished |= {attempt.repeat} if attempt.status in {Status.VALID, Status.FAILED} else set()
+        if not attempt.excused:
+            self._counted_attempts[attempt.repeat] += 1
+        if attempt.status in {Status.VALID, Status.FAILED}:
+            self._finished.add(attempt.repeat)
         self._counts[attempt.status] += 1

@@ -22,8 +22,8 @@ from fieldkit.remote.shell import Shell
 from fieldkit.steps.scene import Shells
 
 TTL_S: Final = 3600
-"""Lifetime of a lock that is not renewed. `evidence.begin` renews it after half of this time. It is longer than an
-attempt, and longer than it takes to carry robots to another place."""
+"""Lifetime of a lock that is not renewed. `evidence.begin` renews it after half of this time. The lifetime is longer
+than an attempt, and longer than it takes to carry robots to another place."""
 
 _LOCK_STATE: Final = re.compile(rb"(?P<token>\S+) (?P<remaining_s>[0-9]{1,11}) (?P<user>\S+) (?P<purpose>\S+)\n")
 

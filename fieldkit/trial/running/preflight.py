@@ -148,7 +148,7 @@ def _check_robot(
     plan: Plan, role: Role, shell: Shell, variants_by_role: dict[Role, Variants], report: Report, *, all_checks: bool
 ) -> bool:
     """Add the findings about a robot. Return False if another user has locked it."""
-    stage, robot = _CONNECTION, plan.cast[role]
+    stage, robot = _CONNECTION, plan.cast[role]  # if an error is raised, it is reported as the check `stage`
     try:
         offset = contact.judge(shell, report)
         stage = "probe"

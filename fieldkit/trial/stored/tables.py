@@ -9,7 +9,7 @@ from fieldkit.analysis import table_files
 from fieldkit.analysis.repeats import SOURCE
 from fieldkit.analysis.table_index import TableFacts
 from fieldkit.core import files
-from fieldkit.core.columns import Column, plain_name, with_step_name
+from fieldkit.core.columns import Column, with_step_name
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.trial import frozen, store
 from fieldkit.trial.columns import installed_columns, trial_columns
@@ -131,9 +131,9 @@ def expectation_texts(table: Path) -> tuple[str, ...]:
 def _by_name(name: str, installed_columns: Mapping[str, Column]) -> Column:
     """Return the column for a name, such as `rtt_loss` or `up.rtt_loss`, that no plan declares."""
     step, _, plain = name.rpartition(".")
-    column = installed_columns.get(name) or (
-        installed_columns.get(plain_name(name)) and with_step_name(step, installed_columns[plain])
-    )
+    column = installed_columns.get(name)
+    if column is None and plain in installed_columns:
+        column = with_step_name(step, installed_columns[plain])
     return column if column and not column.declaration_error() else table_files.undeclared(name)
 
 

@@ -1,4 +1,7 @@
-"""The command `fieldkit cosim conform`, which checks that an external federate follows the protocol."""
+"""The command `fieldkit cosim conform`, which checks that an external federate follows the protocol of federates.
+
+A federate is a simulator of physics or network that takes part in a co-simulation.
+"""
 
 import argparse
 import shlex
@@ -77,11 +80,11 @@ def _role(endpoint: str, scenario: CosimScenario, requested_role: str | None, de
             continue
         session.close()
         return role, session.name
-    raise FieldkitError(f"{endpoint} accepts no role")
+    raise FieldkitError(f"{endpoint} accepts no role", remedy="correct the command or --role")
 
 
 def _federate_change(endpoint: str) -> dict[str, str]:
-    """Return the change that makes a scenario use a named federate, so that its options are validated."""
+    """Return the change of a scenario that selects a named federate; the federate's options are then validated."""
     return {
         f"{ROLES[role]}.federate": endpoint for role in (PHYSICS, NETWORK) if _is_federate_with_role(endpoint, role)
     }

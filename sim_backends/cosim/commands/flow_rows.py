@@ -14,8 +14,7 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 BACKEND: Final = "cosim"
 
 _NOT_PROCEDURE: Final = frozenset({"name", "summary", "policy", "seeds", "duration", "trial"})
-"""Keys of a scenario that are not part of the procedure, so that runs which differ in them have the same hash of the
-procedure."""
+"""Keys of a scenario that are not part of the procedure: if only their values differ, its hash is the same."""
 
 
 def flow_rows(
@@ -77,6 +76,7 @@ def scenario_hashes(scenario: CosimScenario) -> dict[str, Value]:
 
 
 def _measured_columns(flow: FlowResult) -> dict[str, Value]:
+    """Return the columns with the measured values of a flow; values that do not exist are nan."""
     delay_s = flow.delay_s
     datagrams: dict[str, Value] = {}
     if flow.protocol == "udp":

@@ -114,6 +114,8 @@ def _measure(
 
 
 def _local_errors(scenario: CosimScenario, windows_s: Sequence[float], task: Task) -> LocalErrors | PolicyError:
+    """Return the local errors of a policy with one seed, or the error with which the policy failed."""
+
     def make(policy: SyncPolicy) -> Coordinator:
         return build(scenario, policy=policy, seed=task.seed, measures_all=True).coordinator
 

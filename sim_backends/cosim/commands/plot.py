@@ -30,7 +30,7 @@ _LOCAL_ERRORS: Final = {
     "late_s": ("Arrivals in the past", "mean lateness (ms)", 1e3),
     "position_m": ("Assumed position", "mean error (mm)", 1e3),
     "path_m": ("Path of the agents", "mean error (mm)", 1e3),
-    "fates": ("Other fate", "packets (%)", 100.0),
+    "fates": ("Lost in only one run", "packets (%)", 100.0),
 }
 """Title, label and factor of the panel of each local error."""
 
@@ -214,6 +214,7 @@ def _paths_m(recording: Recording) -> dict[str, list[tuple[float, float]]]:
 
 
 def _traces(recording: Recording) -> list[FlowTrace]:
+    """Return the packets of each flow over time, without packets whose fate is not decided."""
     flows: dict[str, list[tuple[float, float, float]]] = {}
     for fate in recording.run.fates.values():
         if fate.is_decided:

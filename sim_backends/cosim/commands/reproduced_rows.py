@@ -61,7 +61,7 @@ class ReproducedRows:
             distance=self._distance(),
             record_s=trial.record,
             backend=BACKEND,
-            seed=0,
+            seed=0,  # each row has its own seed
         )
         self._check(trial)
         self.flows = frozenset(name for repeat in self._repeats for name in _flow_names(repeat))
@@ -75,6 +75,11 @@ class ReproducedRows:
         return Distance(metres, f"{metres:g}m")
 
     def _check(self, trial: ReproducedTrial) -> None:
+        """Check that the line of sight and the traffic of the scenario agree with the procedure.
+
+        Raises:
+            ConfigurationError: They differ.
+        """
         procedure = trial.procedure
         remedy = "change the scenario, or remove `trial` from it"
         if self._trial.scenario != self._scenario.line:
@@ -85,7 +90,7 @@ class ReproducedRows:
                 remedy=remedy,
             )
         for repeat in self._repeats:
-            for setting_name, planned, simulated in _settings(self._trial.exchange(repeat.protocol), repeat):
+            for setting_name, planned, simulated in _compared_settings(self._trial.exchange(repeat.protocol), repeat):
                 if planned != simulated:
                     raise ConfigurationError(
                         f"{setting_name} is {simulated}, and {planned} in the procedure {procedure}",
@@ -193,7 +198,9 @@ def _flow_names(repeat: ReproducedRepeat) -> tuple[str, str, str]:
     return transfer, ping, ping + REPLY
 
 
-def _settings(planned: PlannedExchange, repeat: ReproducedRepeat) -> Iterator[tuple[str, float | None, float | None]]:
+def _compared_settings(
+    planned: PlannedExchange, repeat: ReproducedRepeat
+) -> Iterator[tuple[str, float | None, float | None]]:
     """Yield each setting of a repeat, with its value in the procedure and in the scenario."""
     yield "the port of the transfer", planned.port, repeat.transfer.port
     yield "the number of echo requests", planned.requests, repeat.ping.count

@@ -39,7 +39,7 @@ class FlowRecovery:
 
 
 def recoveries(scenario: CosimScenario, run: Run) -> list[FlowRecovery]:
-    """Return the recovery of each flow that a fault of the radio affected, by fault and flow.
+    """Return the recovery of each flow from each fault of the radio that affected it.
 
     A fault that has no end, or that ends after the run, is ignored.
 
@@ -184,6 +184,7 @@ def flow_results(run: Run) -> tuple[FlowResult, ...]:
 
 
 def _result(name: str, fates: Sequence[Fate], replies: Sequence[Fate] | None) -> FlowResult:
+    """Return the results of a flow from the fates of its packets; `replies` is None if the flow is not a ping."""
     packet = fates[0].packet
     decided_fates = [fate for fate in fates if fate.is_decided]
     times = [
@@ -229,6 +230,7 @@ def _result(name: str, fates: Sequence[Fate], replies: Sequence[Fate] | None) ->
 
 
 def _round_trips(requests: Sequence[Fate], replies: Sequence[Fate]) -> FlowRoundTrips:
+    """Return the round trips of a ping from the fates of its requests and replies."""
     replies_by_number = {reply.packet.identity[1]: reply for reply in replies}
     request_count = 0
     times: list[tuple[int, int, float]] = []

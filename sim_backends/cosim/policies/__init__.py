@@ -1,1 +1,1 @@
-"""Sync policies: they determine how long physics and network run independently, and the states that they assume."""
+"""Sync policies: they determine how long physics and network run without an exchange of data (a window)."""

@@ -90,9 +90,9 @@ class ErrorBounded:
         ):
             if value is not None and not 0 < value < math.inf:
                 raise PolicyError(
-                    f"the {quantity} of {value:g}{unit} is not above 0",
+                    f"the {quantity} of {value:g}{unit} is not a finite number above 0",
                     where=self.name,
-                    remedy="set it to a value above 0",
+                    remedy="use for example a bound of 0.01 m, and an exponent of 3",
                 )
         self._bound_m = bound_m
         # The bound as a share of the assumed distance; 0 for a bound in metres.
@@ -122,7 +122,10 @@ class ErrorBounded:
         return end_ns
 
     def reckoning_step_ns(self, situation: Situation) -> int:
-        """Return the physics step, or a shorter one if the motion in a step would use too much of the bound."""
+        """Return the step of dead reckoning.
+
+        It is the physics step, or a shorter step if the motion in a physics step would use too much of the bound.
+        """
         pairs = self._pairs(situation)
         with np.errstate(divide="ignore"):
             longest_s = float(np.min(_STEP_SHARE * pairs.bounds_m / pairs.assumed_m_s, initial=math.inf))
@@ -151,6 +154,11 @@ class ErrorBounded:
         return self._decided_by
 
     def _check_step(self, situation: Situation) -> None:
+        """Check that no error exceeds its bound in the next physics step, which is the shortest window.
+
+        Raises:
+            PolicyError: An error may exceed its bound.
+        """
         pairs, step_s = self._pairs(situation), situation.physics_step_ns / 1e9
         errors_m = pairs.error_rates_m_s * step_s
         if not (errors_m > pairs.bounds_m).any():
@@ -165,6 +173,7 @@ class ErrorBounded:
         )
 
     def _pairs(self, situation: Situation) -> "_Pairs":
+        """Return the errors, speeds and bounds of all pairs of agents that the policy examines."""
         fixed_m = situation.fixed_emitters_m if self._share else _GROUND_M
         names, first, second = _pair_rows(tuple(situation.pairs), situation.other_agents, len(fixed_m))
         states = [situation.states[name] for name in names]

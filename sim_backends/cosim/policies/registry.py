@@ -34,6 +34,7 @@ _KINDS: Final[tuple[type[SyncPolicy], ...]] = (
     VelocityAware,
     ErrorBounded,
 )
+"""The built-in policies, the exact ones first."""
 BUILTIN: Final[Mapping[str, PolicyKind]] = {kind.name: kind for kind in _KINDS}
 """Every built-in policy by its name; the exact ones are first."""
 
@@ -65,6 +66,7 @@ def policies() -> Mapping[str, PolicyKind]:
 
 
 def _load(point: EntryPoint) -> PolicyKind:
+    """Load the sync policy of an entry point, and check its members and its name."""
     kind: PolicyKind = plugins.load(point)
     problem = ""
     if missing_names := missing_members(kind):

@@ -134,6 +134,7 @@ class FollowAtHeadway(NeverSends):
         gap_m = math.hypot(e, n)
         if not gap_m:
             return Twist()
+        # Speed of the leader in the direction from the follower to the leader.
         leader_m_s = (leader.velocity_m_s[0] * e + leader.velocity_m_s[1] * n) / gap_m
         speed_m_s = math.hypot(*own_state.velocity_m_s[:2])
         error_m = gap_m - self._standstill_m - self._headway_s * speed_m_s

@@ -90,6 +90,7 @@ class Outage:
 
 
 _BILLION: Final = 10**9
+"""Nanoseconds per second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,6 +183,7 @@ class ProgramWithClock:
         return Action(stamped_datagrams, action.command)
 
     def _unstamped(self, received_datagram: ReceivedDatagram) -> ReceivedDatagram:
+        """Return a datagram with its original payload, the sender's time of sending, and the own time of arrival."""
         stamped_payload: _StampedPayload = received_datagram.payload
         arrived_ns = self._clock.reading_ns(received_datagram.arrived_ns)
         return ReceivedDatagram(

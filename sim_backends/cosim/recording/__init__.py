@@ -1,1 +1,1 @@
-"""Recordings of runs: written during a run, readable even if the run is killed, and replayed to the same numbers."""
+"""Recordings of runs. They are written during a run, and are readable even if the run is killed."""

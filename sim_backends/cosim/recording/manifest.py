@@ -118,6 +118,7 @@ def recording_lock(folder: Path) -> Iterator[None]:
 
 
 def _is_locked(folder: Path) -> bool:
+    """Return True if a process holds the lock of a recording, so that its run is under way."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -143,6 +144,7 @@ def read_manifest(folder: Path) -> RunManifest:
 
 
 def _read_file(folder: Path) -> RunManifest:
+    """Read and check `run.json`, with the ending that it contains."""
     path = folder / _NAME
     try:
         content = json.loads(path.read_bytes())

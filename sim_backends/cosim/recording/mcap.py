@@ -25,6 +25,7 @@ _TEXT: Final = {"type": "string"}
 
 
 def _object(title: str, properties: Json, *optional: str) -> Json:
+    """Return the JSON schema of an object; all its properties are required, except those in `optional`."""
     required = [name for name in properties if name not in optional]
     return {"title": title, "type": "object", "properties": properties, "required": required}
 
@@ -158,6 +159,7 @@ def _packets(recording: Recording) -> Iterator[Message]:
 
 
 def _fate(fate: Fate) -> dict[str, Any]:
+    """Return the fields that describe the fate of a packet; none while the packet is under way."""
     if fate.arrived_ns is None or fate.counted_ns is None:
         return {"arrived": False, "reason": fate.reason} if fate.reason else {}
     packet = fate.packet

@@ -31,6 +31,7 @@ def _field(name: str, kind: pa.DataType, unit: str, meaning: str) -> pa.Field:
 
 
 def _end_fields(prefix: str, meaning: str) -> list[pa.Field]:
+    """Return the fields of the states of source and destination, for example `known_source_m`."""
     kinds = (
         ("m", _VECTOR, "m", "position (east, north, up)", ""),
         ("m_s", _VECTOR, "m/s", "velocity (east, north, up)", ""),

@@ -27,6 +27,7 @@ from sim_backends.network.ip import Fragment
 from sim_backends.world.motion import State
 
 SAMPLING_INTERVAL_NS: Final = 100_000_000
+"""Default interval at which states are recorded, in simulated time."""
 
 
 class Sampling:
@@ -203,6 +204,7 @@ class RunRecorder:
             self._finish(error)
 
     def _finish(self, error: BaseException | None) -> None:
+        """Write the remaining windows and the end of the run; `error` is what ended the run early, or None."""
         ending = RunEnding.COMPLETE
         if error is not None:
             ending = RunEnding.INTERRUPTED if isinstance(error, KeyboardInterrupt) else RunEnding.FAILED
@@ -306,6 +308,7 @@ class RunRecorder:
             (self._folder / _RESERVE).unlink(missing_ok=True)
 
     def _error(self, error: OSError) -> RecordingError:
+        """Return the error for a failed write, and remember that the recording is incomplete."""
         self._has_failed = True
         return RecordingError(
             f"the recording cannot be written: {error.strerror}; the parts written before remain readable",

@@ -133,6 +133,7 @@ def _phase_ns(name: str, plan: AgentPlan, seed: int) -> int:
 
 
 def _controller(plan: AgentPlan, body: Body[Any], appears_ns: int, phase_ns: int) -> Program | None:
+    """Return the program that steers an agent; None if the agent only stands."""
     motion = plan.motion
     first_ns = appears_ns + phase_ns
     match motion:
@@ -223,6 +224,7 @@ def make_programs(
 
 
 def _sender(traffic: Traffic, flow: str, to: str, begin_s: float, seed: int) -> Program:
+    """Return the program that sends the packets of a flow."""
     phase = RandomStream(seed, flow, "phase").draw(0)
     begin_ns = _ns(begin_s + phase * (traffic.period_s or START_INTERVAL_S))
     match traffic:

@@ -149,6 +149,7 @@ def _transports(scenario: CosimScenario, seed: int) -> Mapping[str, TransportFac
 
 
 def _discovery(topics: Mapping[str, TopicFlow], seed: int) -> DiscoveryTiming:
+    """Return the times at which the participants of topics start discovery; the seed determines them."""
     participants = {end for flow in topics.values() for end in (flow.publisher, flow.subscriber)}
     starts_ns = {
         name: int(RandomStream(seed, name, "participant's start").draw(0) * _STARTS_WITHIN_NS)

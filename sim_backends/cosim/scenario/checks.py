@@ -161,16 +161,17 @@ def check(scenario: CosimScenario, world: World, where: Callable[[Location], str
     Args:
         scenario: The scenario.
         world: Its world.
-        where: Returns the line of a value in the scenario's file from its keys, for the message.
+        where: Returns the place of a value for the message, for example its line in the file, from its keys.
 
     Raises:
-        ConfigurationError: It cannot be run; the message has the first reason and its line in the file.
+        ConfigurationError: It cannot be run; the message has the first reason and its place.
     """
     for problem in problems(scenario, world):
         raise ConfigurationError(problem.message, where=where(problem.location), remedy=problem.remedy)
 
 
 def _lines(scenario: CosimScenario, world: World) -> Iterator[ScenarioProblem]:
+    """Yield a problem for each agent that starts along a line which the world does not have."""
     for name, plan in scenario.agents.items():
         if plan.along is not None and scenario.line not in world.lines:
             yield ScenarioProblem(
@@ -181,6 +182,7 @@ def _lines(scenario: CosimScenario, world: World) -> Iterator[ScenarioProblem]:
 
 
 def _robots(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
+    """Yield a problem for each agent whose robot does not exist."""
     robot_names = list_robots()
     for name, plan in scenario.agents.items():
         if plan.robot not in robot_names:
@@ -192,6 +194,7 @@ def _robots(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
 
 
 def _radios(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
+    """Yield a problem for each agent that needs a radio and has none."""
     stations = antennas_of(scenario)
     agents_without_radio = ({name for pair in scenario.pairs for name in pair} | {scenario.relay}) - stations.keys()
     for name, plan in scenario.agents.items():
@@ -205,6 +208,7 @@ def _radios(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
 
 
 def _infrastructure(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
+    """Yield a problem if the infrastructure (such as access points) contradicts the rest of the scenario."""
     radio = scenario.radio
     if not radio.has_infrastructure:
         return
@@ -221,6 +225,7 @@ def _infrastructure(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
 
 
 def _starts(scenario: CosimScenario, world: World) -> Iterator[ScenarioProblem]:
+    """Yield a problem if an agent on wheels has a start or motion that needs flight, or a start is in an obstacle."""
     for name, plan in scenario.agents.items():
         if isinstance(limits_of(plan.robot), QuadrotorLimits):
             continue
@@ -248,6 +253,7 @@ def _starts(scenario: CosimScenario, world: World) -> Iterator[ScenarioProblem]:
 
 
 def _speeds(scenario: CosimScenario, world: World) -> Iterator[ScenarioProblem]:
+    """Yield a problem for each speed or rate that a body cannot reach."""
     bodies_at_start = make_bodies(scenario, world)
     for name, plan in scenario.agents.items():
         start_m = bodies_at_start[name].place_m
@@ -261,6 +267,7 @@ def _speeds(scenario: CosimScenario, world: World) -> Iterator[ScenarioProblem]:
 
 
 def _memory(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
+    """Yield a problem if a run needs more memory than is available."""
     needed, available = needed_bytes(scenario), available_bytes()
     if available is not None and needed > available:
         message = (

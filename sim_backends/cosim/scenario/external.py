@@ -1,6 +1,7 @@
 """Starts, connects to or creates the external federates of a scenario.
 
-No other module of the co-simulation does this.
+An external federate is a simulator of physics or network that replaces the built-in one. No other module of the
+co-simulation starts them.
 """
 
 import dataclasses
@@ -31,6 +32,7 @@ _BUILT_IN_SUMMARIES: Final = {
     PHYSICS: "robots with differential drives and quadrotors, with limits of velocity and acceleration",
     NETWORK: "802.11g and 802.11n in the world of the scenario, with UDP, TCP, DDS and ROS 1",
 }
+"""Summary of the built-in physics and network, for lists of simulators."""
 
 
 def without_federates(scenario: CosimScenario) -> CosimScenario:
@@ -238,4 +240,6 @@ def _make_federate(federate: PythonFederate, name: str, hello: Hello) -> Any:  #
     try:
         return service.make(hello)
     except ValueError as error:
-        raise ConfigurationError(f"{ROLES[hello.role]} {name}: {error}") from error
+        raise ConfigurationError(
+            f"{ROLES[hello.role]} {name}: {error}", remedy="change the scenario, or use another simulator"
+        ) from error

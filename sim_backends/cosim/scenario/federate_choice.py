@@ -1,4 +1,4 @@
-"""The section of a scenario file that selects the federate for the physics or the network, and its options."""
+"""The section of a scenario file that selects the federate (simulator) for physics or network, and its options."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, Final
@@ -66,7 +66,7 @@ def agent_references(options: Options) -> Iterator[tuple[str, Location]]:
 
 
 def unsupported(options: Options, scenario: schema.Strict) -> Iterator[tuple[str, Location]]:
-    """Yield every part of a scenario that the simulator with these options does not support, with its keys."""
+    """Yield a message for each part of a scenario that the simulator does not support, and the keys of that part."""
     if isinstance(options, SimulatorOptions):
         yield from options.unsupported(scenario.model_dump(mode="json", by_alias=True, exclude_none=True))
 
@@ -90,11 +90,11 @@ def drop_options_of_replaced_federates(data: Any, changes: Mapping[str, Any]) ->
 
 
 def add_options(definitions: dict[str, Any], sections: Mapping[str, str]) -> None:
-    """Add the JSON schema of the options of each installed simulator, which are valid if the scenario uses it.
+    """Add the options of each installed simulator to the JSON schema; they are valid if the scenario names it.
 
     Args:
         definitions: The definitions of the JSON schema of scenarios.
-        sections: Name of the definition of the physics and of the network, by role.
+        sections: For each role, `physics` or `network`: the name of the definition of its section.
     """
     for name, federate in federates().items():
         if federate.options is None:

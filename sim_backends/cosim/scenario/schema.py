@@ -254,7 +254,7 @@ class CosimScenario(Named):
 
     @property
     def lifetimes(self) -> dict[str, Lifetime]:
-        """The lifetimes of the agents that do not exist during the whole run."""
+        """The lifetimes of the agents that exist only during a part of the run."""
         lifetimes = {name: plan.lifetime for name, plan in self.agents.items()}
         return {name: lifetime for name, lifetime in lifetimes.items() if lifetime != Lifetime()}
 
@@ -345,7 +345,7 @@ class CosimScenario(Named):
             if isinstance(fault, ClockSkewFault):
                 if fault.agent in agents:
                     raise schema.validation_error(
-                        f"{fault.agent} has two clock-skew faults", "faults", number, "agent"
+                        f"{fault.agent} has two clock-skew faults; remove one of them", "faults", number, "agent"
                     )
                 agents.add(fault.agent)
         return self

@@ -1,4 +1,4 @@
-"""Serves the built-in physics or network as an external federate.
+"""Serves the built-in physics or network as an external federate: a simulator in another process.
 
 The command is `python -m sim_backends.cosim.scenario.served physics [ADDRESS]`, or `network` instead of `physics`.
 ADDRESS is the address of a transport; without it, standard input and output are used.

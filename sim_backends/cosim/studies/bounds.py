@@ -122,7 +122,7 @@ def _longest_fixed(
         return math.nan, FixedCost(math.nan, 0)
     too_long_s = longest_s
     while too_long_s > _TOLERANCE * best[0]:
-        window_s = math.sqrt(best[0] * too_long_s)
+        window_s = math.sqrt(best[0] * too_long_s)  # the geometric mean, because the tolerance is a factor
         window_cost = cost(window_s)
         if window_cost.largest_m > bound_m:
             too_long_s = window_s

@@ -151,7 +151,7 @@ class _Outcome:
 
 
 def _run_to_outcome(fork: Coordinator, end_ns: int, tail_ns: int) -> _Outcome:
-    """Continue a fork that has reached the end of a window with the exact policy."""
+    """Continue a fork, which has reached the end of a window, with the exact policy, and return its outcome."""
     states = fork.situation.states
     fork.policy = EventDriven()
     return _Outcome(fork.advance(end_ns + tail_ns).fates, states)
@@ -203,6 +203,7 @@ def _delete_decided(run: Run) -> None:
 def _check_unchanged(
     make: Callable[[SyncPolicy], Coordinator], starts_ns: Sequence[int], reference: Coordinator
 ) -> None:
+    """Check that no fork has changed the reference, by comparison with a run that was not forked."""
     without_forks = make(EventDriven())
     for start_ns in starts_ns:
         _delete_decided(without_forks.advance(start_ns))

@@ -110,6 +110,7 @@ def run_outcomes(
 
 
 def _outcome(make: Make, task: Task) -> RunOutcome | PolicyError:
+    """Return the outcome of a run, or the error with which its policy failed."""
     scenario_run = make(task.policy, task.seed)
     sampled_physics = SampledPhysics(scenario_run.agents.physics, SAMPLING_NS)
     scenario_run.agents.physics = sampled_physics

@@ -76,6 +76,7 @@ def write_dataset(plan: SweepPlan, folder: SweepFolder) -> int:
 
 
 def _rows_of(setting: SweepSetting, plan: SweepPlan, folder: SweepFolder) -> list[dict[str, Value]]:
+    """Return the rows of all runs of a setting, with the values of the factors as numbers."""
     numbers: dict[str, Value] = {}
     for factor in plan.factors:
         if (number_column := factor.numbers) is not None:
@@ -111,6 +112,7 @@ def _schema(rows: Iterable[Mapping[str, Value]], factors: Sequence[Factor]) -> p
         for name, column_type in types.items()
         if name not in partitions
     ]
+    # `partitions`: the columns that are folders, with their meanings. `by`: the columns that identify a condition.
     metadata = {
         "fieldkit_version": version("fieldkit"),
         "schema_version": str(SCHEMA_VERSION),

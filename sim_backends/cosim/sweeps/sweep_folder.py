@@ -94,6 +94,7 @@ class SweepFolder:
             os.close(descriptor)
 
     def _require_same_sweep(self, plan: SweepPlan) -> None:
+        """Check that the folder is empty, or contains a sweep of the same scenario and factors."""
         path = self.path / SWEEP
         if not path.exists():
             if next(self.path.iterdir(), None) is not None:
@@ -160,7 +161,7 @@ class SweepFolder:
             ) from error
 
     def error_conversion(self) -> Any:  # noqa: ANN401 (a context manager)
-        """Return a context manager that converts an `OSError` to an error with the command that continues."""
+        """Return a context manager that converts an `OSError` to an error; its remedy continues the sweep."""
         return self._converted_errors()
 
     def _write(self, path: Path, content: Mapping[str, Any]) -> None:
@@ -182,6 +183,7 @@ def _identity(run: SweepRun) -> dict[str, Any]:
 
 
 def _description(plan: SweepPlan) -> dict[str, Any]:
+    """Return the content of the file with the plan."""
     return {
         "fieldkit": version("fieldkit"),
         "scenario": plan.scenario.name,

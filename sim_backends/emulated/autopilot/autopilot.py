@@ -40,8 +40,8 @@ class Autopilot:
     """An autopilot and its vehicle.
 
     Args:
-        firmware: Family of the autopilot.
-        system: System id.
+        firmware: Behaviour of PX4 or of ArduCopter.
+        system: MAVLink system id.
         limits: Limits of the robot's profile.
         airframe_limits: Limits of its airframe.
         obstacles: Obstacles in the world, including the floor.

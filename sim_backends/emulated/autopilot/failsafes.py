@@ -27,7 +27,7 @@ class VehicleState:
     """State of the vehicle on which failsafes depend.
 
     Attributes:
-        now_ns: Time.
+        now_ns: The current time.
         is_armed: True if it is armed.
         has_landed: True if it is on the ground.
         mode: Its mode.
@@ -94,7 +94,7 @@ class ArduCopterFailsafes:
     heartbeat arrives.
 
     Args:
-        parameters: BATT_*, FS_GCS_*, SYSID_MYGCS.
+        parameters: The vehicle's parameters; these failsafes read BATT_*, FS_GCS_* and SYSID_MYGCS.
     """
 
     _STAGES: Final = (("LOW", "is low"), ("CRT", "is critical"))
@@ -199,7 +199,8 @@ class Px4Failsafes:
     failsafe.
 
     Args:
-        parameters: NAV_DLL_ACT, COM_DL_LOSS_T, COM_LOW_BAT_ACT, BAT_*_THR, COM_FAIL_ACT_T.
+        parameters: The vehicle's parameters; these failsafes read NAV_DLL_ACT, COM_DL_LOSS_T, COM_LOW_BAT_ACT,
+            BAT_*_THR and COM_FAIL_ACT_T.
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -307,7 +308,7 @@ class Fence:
     """Fence of one vehicle; positions are relative to home: metres east, north, up.
 
     Args:
-        parameters: GF_MAX_*, FENCE_ACTION.
+        parameters: The vehicle's parameters; the fence reads GF_MAX_* and FENCE_ACTION.
     """
 
     def __init__(self, parameters: Parameters) -> None:

@@ -62,9 +62,9 @@ class Firmware:
     """A family of autopilots.
 
     Attributes:
-        autopilot: MAV_AUTOPILOT.
+        autopilot: Its constant of MAV_AUTOPILOT.
         version: AUTOPILOT_VERSION.flight_sw_version: major, minor, patch, type.
-        capabilities: MAV_PROTOCOL_CAPABILITY.
+        capabilities: The bits of MAV_PROTOCOL_CAPABILITY that it reports.
         base_mode: Constant MAV_MODE_FLAG bits of its heartbeat.
         modes: Number of each mode, as in `custom_mode` of HEARTBEAT.
         names: Name of each mode in AVAILABLE_MODES.

@@ -46,7 +46,7 @@ class Airframe:
     Args:
         limits: Limits of the airframe.
         place_m: Position of its lowest point in the world, which is also home.
-        facing_rad: Heading.
+        facing_rad: Initial heading.
         obstacles: Obstacles in the world, including the floor.
         now_ns: Time of this state.
 
@@ -167,7 +167,7 @@ def limits_within(limits: QuadrotorLimits, parameters: Parameters) -> QuadrotorL
 
 
 def velocity_to(goal_m: Vector, body: Airframe, limits: QuadrotorLimits) -> Vector:
-    """Return the velocity towards a point relative to home, at which the drone can still stop at the point."""
+    """Return the velocity towards a point relative to home; the drone can still brake to a stop at the point."""
     east, north, up = (goal - current for goal, current in zip(goal_m, body.position_m, strict=True))
     distance_m = math.hypot(east, north)
     along_per_s, climb_per_s = limits.gains_per_s
@@ -222,7 +222,7 @@ class Guidance:
     """Goal and set-points of the vehicle; positions are relative to home.
 
     Args:
-        firmware: Family of the autopilot.
+        firmware: Family of the autopilot, PX4 or ArduCopter.
         parameters: Its parameters.
 
     Attributes:

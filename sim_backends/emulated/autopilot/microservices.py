@@ -22,6 +22,7 @@ _WARNING: Final = dialect.MAV_SEVERITY_WARNING
 
 _FTP_HEADER: Final = struct.Struct("<HBBBBBxI")
 _FTP_BYTES: Final = 251
+"""Length of the payload of FILE_TRANSFER_PROTOCOL."""
 _ACK, _NAK = 128, 129
 _OPEN_OPCODES: Final = frozenset({4, 11, 14})
 """Opcodes that open a file or compute its checksum: OpenFileRO, OpenFileWO, CalcFileCRC32."""
@@ -38,7 +39,7 @@ class ParameterService:
     cast, ignores the type in the client's message, and does not answer for an unknown name.
 
     Args:
-        firmware: Family of the autopilot.
+        firmware: Family of the autopilot, PX4 or ArduCopter.
         parameters: Its parameters.
         on_change: Called with the name of a parameter that was set.
         report: Called with the severity and the text of a STATUSTEXT message.

@@ -13,6 +13,7 @@ from sim_backends.emulated.autopilot.mavlink_frames import Message, dialect
 from sim_backends.emulated.ros.messages import EAST_RADIUS_M, NORTH_RADIUS_M
 
 MAX_ITEMS: Final = 500
+"""Maximum number of items of a mission."""
 
 WITH_HOLD_TIME: Final = frozenset(
     {dialect.MAV_CMD_NAV_WAYPOINT, dialect.MAV_CMD_NAV_LOITER_TIME, dialect.MAV_CMD_NAV_DELAY}
@@ -26,9 +27,11 @@ WITH_POSITION: Final = frozenset(
         dialect.MAV_CMD_NAV_LAND,
     }
 )
+"""Commands whose goal is a position."""
 SUPPORTED: Final = (
     WITH_HOLD_TIME | WITH_POSITION | {dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH, dialect.MAV_CMD_DO_CHANGE_SPEED}
 )
+"""Commands that the vehicle executes in a mission."""
 SKIPPED: Final = frozenset(
     {
         dialect.MAV_CMD_DO_MOUNT_CONTROL,
@@ -47,8 +50,8 @@ class Item:
     """One item, as in MISSION_ITEM_INT.
 
     Attributes:
-        frame: MAV_FRAME.
-        command: MAV_CMD.
+        frame: MAV_FRAME of the position.
+        command: MAV_CMD of the action.
         parameters: First four parameters of the command.
         x: Latitude, 1e-7 degrees.
         y: Longitude, 1e-7 degrees.

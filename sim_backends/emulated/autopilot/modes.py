@@ -26,8 +26,11 @@ class Mode(Enum):
 
 
 LANDING: Final = frozenset({Mode.LAND, Mode.HOMECOMING})
+"""Modes in which the drone descends to the ground."""
 RETURNING: Final = LANDING | {Mode.RTL}
+"""Modes in which the drone returns home or descends to the ground."""
 PILOTED: Final = frozenset({Mode.STABILIZE, Mode.ALT_HOLD, Mode.POSHOLD, Mode.BRAKE})
+"""Modes for a pilot with a remote control."""
 
 
 def reported_mode(mode: Mode) -> Mode:

@@ -7,6 +7,7 @@ from fieldkit.core.model import Vector
 CELL_V: Final = (3.5, 4.2)
 """Voltage of a lithium polymer cell, empty and full."""
 CELLS: Final = 3
+"""Number of cells in series."""
 FULL_V: Final = CELLS * CELL_V[1]
 _HOVER_A: Final = 10.0
 """Current while the motors turn."""
@@ -22,7 +23,7 @@ class Battery:
 
     Attributes:
         charge: Remaining charge, from 0 to 1.
-        current_a: Current.
+        current_a: Current that the drone draws.
         full_v: Voltage of the full battery (SIM_BATT_VOLTAGE of ArduPilot's simulator).
         flight_s: Flight time of a full charge (SIM_BAT_DRAIN of PX4's simulator).
         min_charge: Minimum of `charge` (SIM_BAT_MIN_PCT as a fraction).

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Final
 
 NAME_BYTES: Final = 16
+"""Length of a name in messages."""
 
 
 @dataclass(frozen=True)
@@ -17,8 +18,8 @@ class Parameter:
     Attributes:
         name: Name in the firmware; empty for an internal constant that is not listed.
         value: Value at power-on.
-        minimum: Minimum.
-        maximum: Maximum.
+        minimum: Smallest value that is accepted.
+        maximum: Largest value that is accepted.
         key: PX4's name, by which the vehicle reads it; empty if it equals `name`.
         scale: Number of its units per SI unit.
         integer: True if it is an integer (MAV_PARAM_TYPE_INT32); otherwise a float (REAL32).

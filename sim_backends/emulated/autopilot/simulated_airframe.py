@@ -24,7 +24,7 @@ class SimulatedAirframe(Airframe):
     Args:
         limits: Limits of the airframe.
         place_m: Position of its lowest point in the world, which is also home.
-        facing_rad: Heading.
+        facing_rad: Initial heading.
         now_ns: Time of this state.
         commands: Record of the autopilot's commands.
         flight_record: Record in which the physics simulator stores the flight.

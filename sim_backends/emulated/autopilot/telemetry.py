@@ -15,6 +15,7 @@ from sim_backends.emulated.autopilot.vehicle import Vehicle
 from sim_backends.world.motion import GRAVITY_M_S2
 
 _UNKNOWN_CELL: Final = 0xFFFF
+"""Voltage of a cell that the battery does not have."""
 _NAN: Final = math.nan
 _METADATA: Final = "mftp:///etc/extras/component_general.json.xz"
 """Location of PX4's metadata; the emulated file transfer refuses it."""
@@ -32,6 +33,7 @@ _SENSORS: Final = (
     | dialect.MAV_SYS_STATUS_GEOFENCE
     | dialect.MAV_SYS_STATUS_PREARM_CHECK
 )
+"""Sensors and checks that SYS_STATUS reports."""
 
 
 class Telemetry:

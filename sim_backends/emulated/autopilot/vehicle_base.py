@@ -26,7 +26,7 @@ class VehicleBase:
     """The components of one drone, and its state.
 
     Args:
-        firmware: Family of its autopilot.
+        firmware: Family of its autopilot, PX4 or ArduCopter.
         parameters: Its parameters; the vehicle reads the current values.
         limits: Limits of its airframe.
         obstacles: Obstacles in the world, including the floor.

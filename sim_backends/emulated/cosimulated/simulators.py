@@ -114,7 +114,7 @@ def start_physics(settings: LabSettings, states: Mapping[str, State]) -> Physics
     """Start the physics simulator with robots at rest.
 
     Args:
-        settings: The session.
+        settings: Settings of the session.
         states: State of the antenna of each robot.
 
     Raises:

@@ -31,7 +31,7 @@ class TimedCommand(NamedTuple):
 
     Attributes:
         time_ns: Its time, from the monotonic clock.
-        command: The command.
+        command: Velocity of a robot on wheels, or target of a drone's flight.
         is_idle: True if it switches the rotors off. Such a command need not be repeated, and is ignored if it is the
             first one after the lab has placed the robot.
     """

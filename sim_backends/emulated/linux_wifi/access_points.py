@@ -42,7 +42,9 @@ _BEACON_INTERVALS_TU: Final = (100, 101, 103, 107, 109, 113)
 from one clock: beacons of equal intervals would always collide."""
 _ENABLED: Final = "AP-ENABLED"
 _START_S: Final = 60.0
+"""Timeout for the start of all access points."""
 _EXIT_S: Final = 5.0
+"""Time for hostapd to exit at a signal before it is killed."""
 _POLL_S: Final = 0.1
 
 

@@ -27,6 +27,7 @@ from sim_backends.radio.world_channel import WorldChannel
 from sim_backends.world.world import World
 
 _FCS_BYTES: Final = 4
+"""Length of the frame check sequence, which frames from the kernel do not contain."""
 _LOWEST_SIGNAL_DBM: Final = -120
 _ABSENT: Final = ""
 """Station without a position: the receiver of frames to an address that no radio has."""
@@ -140,7 +141,7 @@ class _Channel:
     Args:
         seed: Seed of all random draws.
         options: Radio options.
-        antennas: The stations.
+        antennas: The radios, by name.
         world: Obstacles; None for open ground.
 
     Attributes:

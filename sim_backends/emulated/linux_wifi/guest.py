@@ -21,6 +21,7 @@ from sim_backends.emulated.linux_wifi.virtual_machine import (
 from sim_backends.emulated.process import worker
 
 _MAX_DURATION_S: Final = 7 * 24 * 3600.0
+"""Time limit of a command: a week."""
 _PROLOGUE: Final = """\
 mkdir -p /usr/local/sbin
 {links}

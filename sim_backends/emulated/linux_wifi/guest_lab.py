@@ -29,6 +29,7 @@ Answer = TypeVar("Answer")
 _START_S: Final = 1800.0
 """Maximum time until the robots can be reached. On an idle host with an emulated processor this takes 2 minutes."""
 _REPLY_S: Final = 15.0
+"""Timeout of a request."""
 _POLL_S: Final = 0.5
 _MAX_ANSWER_BYTES: Final = 8 << 20
 _LOGIN: Final = Codec(GuestLogin)

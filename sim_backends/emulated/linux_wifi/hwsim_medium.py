@@ -24,6 +24,7 @@ from sim_backends.radio.links import Pair
 
 MAX_FREQUENCY_MHZ: Final = 7_125
 MIN_FREQUENCY_MHZ: Final = 2_412
+"""Limits of the bands of Wi-Fi, from channel 1 at 2.4 GHz to the end of the 6 GHz band."""
 _MAX_ADDRESSES: Final = 64
 """Maximum number of addresses of a radio, because a robot can change the address of its interface at any time."""
 _RADIO_BIT: Final = 0x40

@@ -10,6 +10,7 @@ from sim_backends.emulated.linux_wifi.netlink import NetlinkFormatError, decode_
 FAMILY: Final = "MAC80211_HWSIM"
 _VERSION: Final = 1
 
+# Commands (HWSIM_CMD_*).
 CMD_REGISTER: Final = 1
 CMD_FRAME: Final = 2
 CMD_TX_INFO_FRAME: Final = 3
@@ -28,9 +29,11 @@ _COOKIE: Final = 8
 _FREQUENCY: Final = 19
 _TX_INFO_FLAGS: Final = 21
 
+# Flags of a frame (HWSIM_TX_CTL_NO_ACK, HWSIM_TX_STAT_ACK).
 FLAG_NO_ACK: Final = 2
 FLAG_ACKNOWLEDGED: Final = 4
 
+# Flags of a stage of a rate chain (MAC80211_HWSIM_TX_RC_*).
 RATE_MCS: Final = 1 << 3
 RATE_40_MHZ: Final = 1 << 5
 RATE_SHORT_GUARD_INTERVAL: Final = 1 << 7

@@ -23,7 +23,9 @@ CONNECTED: Final = b"+"
 """Answer to `connect ROBOT` before the bytes of the robot; anything else is an error message."""
 
 _REQUEST_S: Final = 20.0
+"""Timeout for the request on a stream, and for the lab's answer."""
 _START_S: Final = 600.0
+"""Timeout for the start of the lab."""
 _POLL_S: Final = 0.2
 _CHUNK_BYTES: Final = 1 << 15
 

@@ -20,6 +20,7 @@ NLM_F_REQUEST: Final = 1
 NLMSG_ERROR: Final = 2
 
 _NETLINK_GENERIC: Final = 16
+# The controller is the family that returns the identifiers of other families (linux/genetlink.h).
 _CONTROLLER_ID: Final = 0x10
 _CONTROLLER_GET_FAMILY: Final = 3
 _CONTROLLER_FAMILY_ID: Final = 1
@@ -33,7 +34,9 @@ _TYPE_MASK: Final = 0x3FFF
 
 _RECEIVE_BUFFER_BYTES: Final = 4 << 20
 _SO_RCVBUFFORCE: Final = 33
+"""asm-generic/socket.h; the module `socket` lacks it."""
 _TIMEOUT_S: Final = 60.0
+"""Timeout of the request for the identifier of the family."""
 _FIRST_PORT: Final = 1 << 30
 """Lowest port number that is above all process identifiers. The kernel uses the process identifier as port number of
 other netlink sockets, which for example `getaddrinfo` opens. hwsim ends the registration when any netlink socket with

@@ -23,6 +23,7 @@ _RETURN_S: Final = 5.0
 """Maximum time in which the kernel returns the radios of a network namespace, after its last process has exited."""
 _POLL_S: Final = 0.05
 _TIMEOUT_S: Final = 60.0
+"""Timeout of `iw`."""
 
 
 @dataclass(frozen=True)

@@ -89,7 +89,7 @@ def mode_of(stage: RateStage, frequency_mhz: int) -> WifiMode | None:
 
 
 def legacy_index(mode: WifiMode, frequency_mhz: int) -> int:
-    """Return the index of a mode in the rate list of the band.
+    """Return the index of a mode in the band's list of rates, which has no MCS (legacy rates).
 
     For an MCS this is the index of the rate with the same modulation and code rate, or of the fastest rate if no rate
     has them.

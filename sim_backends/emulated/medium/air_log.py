@@ -22,7 +22,7 @@ LIMIT_BYTES: Final = 64 << 20
 """Maximum size of both files together; later attempts are omitted."""
 
 _SNAP_BYTES: Final = 160
-"""Number of bytes of each frame that the capture contains at most (snapshot length)."""
+"""Maximum number of bytes of a frame that the capture contains (snapshot length)."""
 _PCAP_HEADER: Final = struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, _SNAP_BYTES, 105)
 _RECORD_HEADER: Final = struct.Struct("<IIII")
 # Frame control, duration, receiver, transmitter, BSSID, sequence control: as in an ad hoc network (IBSS).
@@ -33,6 +33,7 @@ _DATA, _RETRY = 0x08, 0x08
 # transmitter: IEEE 802.11-2020, 9.3.1.2 to 9.3.1.4.
 _CONTROL: Final = struct.Struct("<BBH6s")
 _FRAME_CONTROL: Final[dict[ControlFrame, int]] = {"ACK": 0xD4, "RTS": 0xB4, "CTS": 0xC4}
+# BSSID of all frames; the addresses of the stations begin with the same bytes.
 _BSSID: Final = b"\x02" + bytes(5)
 _BROADCAST: Final = b"\xff" * 6
 # LLC and SNAP headers before the packet's type: RFC 1042.

@@ -39,6 +39,7 @@ INTERFACE_POLL_NS: Final = 1_000_000
 """Polling interval of the robots' interfaces; a poll takes 0.6 us for three robots."""
 
 _OWNER_TIMEOUT_S: Final = 5.0
+"""Timeout of a message from or to the owner."""
 # The link sampler of a robot has the same sampling interval.
 _SAMPLE_NS: Final = 200_000_000
 _MAX_SAMPLES: Final = 10_000

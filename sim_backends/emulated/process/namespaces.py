@@ -38,6 +38,7 @@ _KERNEL_SETTINGS: Final = {
 allows them."""
 
 _TIMEOUT_S: Final = 10.0
+"""Timeout of a probe."""
 
 
 @dataclass(frozen=True)

@@ -97,7 +97,7 @@ class Worker:
     Args:
         name: Name for messages.
         module: The module; its arguments are the descriptor number of its socket, then `words`.
-        words: Further arguments.
+        words: Further arguments of the module.
         descriptors: Descriptors of this process that the worker process inherits, with the same numbers.
         command_prefix: Command prefix that runs the interpreter, for example `unshare ... --`.
         home: Value of `HOME`.

@@ -34,6 +34,7 @@ RESTART_S: Final = 0.1
 
 _POLL_S: Final = 0.005
 _HALT_S: Final = 5.0
+"""Timeout until all killed processes have exited."""
 _LOG_TAIL_LINES: Final = 3
 
 
@@ -132,6 +133,7 @@ START_S: Final = 30.0
 """Timeout for the start of a robot's programs; Debian's ROS takes a few seconds on a busy machine."""
 
 _MESSAGE_S: Final = 10.0
+"""Timeout of a message from or to the lab."""
 
 VOLATILE: Final = ("/tmp", "/run", "/dev/shm")  # noqa: S108 (in the robot)
 """Folders whose content is in the robot's memory, and is lost without power; other folders are on its SD card."""

@@ -31,7 +31,7 @@ def babeld_command(interface: str, address: str, hello_s: float, links: Mapping[
     Args:
         interface: The radio interface. It is declared wireless, because a TAP device has no wireless extensions.
         address: The robot's address with the prefix length; each robot announces its own address as a host route.
-        hello_s: Hello interval.
+        hello_s: Interval of the hello messages with which babeld measures its neighbours.
         links: Address with the prefix length of each further link, by its interface. If `LOOPBACK_INTERFACE` is one
             of them, the daemon also uses the other links, each with the cost `LINK_COST`, and announces the address
             of `LOOPBACK_INTERFACE` over all links. It announces the address on the radio only over the radio.
@@ -73,6 +73,7 @@ def _settings(interface: str, address: str, hello_s: float, *rules: str) -> tupl
 
 DEVICE: Final = "/dev/net/tun"
 QUEUE_PACKETS: Final = 4096
+"""Length of the queue of an interface."""
 
 # linux/if_tun.h
 _TUNSETIFF: Final = 0x400454CA
@@ -89,6 +90,7 @@ _NAME_BYTES: Final = 15
 
 MTU_BYTES: Final = 1500
 _TIMEOUT_S: Final = 5.0
+"""Timeout of `ip`."""
 
 
 def open_tun(name: str, *, ethernet: bool = False) -> int:

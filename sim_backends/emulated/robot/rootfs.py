@@ -74,6 +74,7 @@ _KEPT_WITH_BUSYBOX: Final = (
     "wpa_supplicant",
 )
 _TIMEOUT_S: Final = 5.0
+"""Timeout of `busybox --list`."""
 
 Layer = dict[str, str | None]
 """Link target per name in a folder of programs; None for a name that is removed."""

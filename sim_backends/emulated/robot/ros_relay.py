@@ -31,6 +31,7 @@ _CONNECT_S: Final = 5.0
 _SENSORS_S: Final = 20.0
 """Timeout for the restart of the sensors process."""
 _QUEUE_MESSAGES: Final = 100
+"""Length of the queue of a topic's publisher; a slow subscriber loses further messages."""
 _CHUNK_BYTES: Final = 1 << 16
 
 

@@ -10,6 +10,7 @@ HOST_KEY: Final = f"{STATE}/ssh_host_ed25519_key"
 
 _DROPBEAR_KEY: Final = f"{STATE}/dropbear_ed25519_host_key"
 _TIMEOUT_S: Final = 5.0
+"""Timeout of `dropbearconvert`."""
 
 
 def convert_key(spec: RobotSpec) -> None:

@@ -1,6 +1,6 @@
 """Record of the last velocity command to a robot's base. The physics simulator that moves the robot reads it.
 
-Only the standard library is imported, because programs under Debian's Python import this module, too.
+Only the standard library is imported, because programs under Debian's Python also import this module.
 """
 
 from pathlib import Path

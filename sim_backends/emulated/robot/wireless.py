@@ -26,6 +26,7 @@ _JOIN: Final = {
     "mesh point": ("mesh", "join", SSID, "freq", str(_FREQUENCY_MHZ), "HT20"),
 }
 _TIMEOUT_S: Final = 15.0
+"""Timeout of `iw` and `nft`."""
 _PRIORITY_RULE: Final = """\
 table inet fieldkit {
     chain output {

@@ -37,6 +37,7 @@ _STRUCT_FORMATS: Final = {
     "float64": "d",
 }
 _POINT_BYTES: Final = 16
+"""Length of a point in a PointCloud2: four float32 fields."""
 _FLOAT32: Final = 7  # sensor_msgs/PointField.FLOAT32
 
 Values = Mapping[str, bytes]

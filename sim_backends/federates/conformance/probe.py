@@ -148,7 +148,7 @@ class FederateProbe:
         reckoning_ns: int = 0,
         copy: int = 0,
     ) -> NetworkOutcomes:
-        """Advance a network."""
+        """Advance a network to `to_ns`, and return its answer."""
         body = AdvanceNetwork(to_ns, states, packets, self.last_ns, reckoning_ns).encode(self.agents)
         decode = partial(NetworkOutcomes.decode, agents=self.agents)
         outcomes: NetworkOutcomes = self.request(

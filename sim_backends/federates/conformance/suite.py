@@ -49,7 +49,7 @@ def run_checks(target: Target) -> Iterator[ConformanceResult]:
 
 
 def run_check(target: Target, name: str, check: Check) -> ConformanceResult:
-    """Run one check."""
+    """Run one check, and return its result."""
     meaning = (check.__doc__ or "").partition("\n")[0]
     failure = skipped = ""
     try:

@@ -67,7 +67,7 @@ class TransportAddress(Protocol):
 
 @dataclass(frozen=True)
 class FederateTransport:
-    """A transport.
+    """A kind of connection between coordinator and federate, for example TCP.
 
     Attributes:
         forms: Forms of its addresses, which begin with its schemes: `tcp:HOST:PORT`.

@@ -89,7 +89,7 @@ _PARTICIPANTS: Final = _Participants()
 
 
 class DdsBus:
-    """A reader and a writer.
+    """A reader of one topic and a writer of another; it implements `SampleBus`.
 
     Args:
         address: The address.

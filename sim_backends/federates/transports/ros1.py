@@ -40,7 +40,7 @@ _MESSAGE_HEAD: Final = struct.Struct("<III")
 
 
 class Ros1Bus:
-    """A node with a publisher and a subscriber.
+    """A node with a publisher and a subscriber; it implements `SampleBus`.
 
     Args:
         address: The address.

@@ -204,5 +204,5 @@ def test_a_window_during_a_direct_approach_ends_when_the_error_equals_the_bound(
 
 @pytest.mark.parametrize("values", [{"bound_m": 0.0}, {"bound_db": -1.0}, {"exponent": math.nan}])
 def test_a_bound_that_is_not_above_0_is_refused(values: dict[str, float]) -> None:
-    with pytest.raises(PolicyError, match=r"error_bounded: .* is not above 0"):
+    with pytest.raises(PolicyError, match=r"error_bounded: .* is not a finite number above 0"):
         ErrorBounded(**values)
