@@ -8,7 +8,7 @@ ping. These times are from kernel events (`benchmarks.lifetimes`) for both peers
 same command lines.
 
 Both peers are measured over control links without delay, and over control links with a round trip of 100 ms, as on
-bad Wi-Fi. On the latter, sequential round trips are counted too.
+bad Wi-Fi. Over the slow links, sequential round trips are counted too.
 
 The script is `trial_overhead.sh`, over persistent OpenSSH connections. It does less than fieldkit: it does not
 inspect bag and captures, computes no loss, and writes no journal, intervals or manifest.

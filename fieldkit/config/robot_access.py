@@ -35,7 +35,9 @@ def read_access(document: Document) -> dict[str, RobotAccess | ConfigurationErro
     data = document.data
     robots = data.get("robots") if isinstance(data, dict) else None
     if not isinstance(robots, dict):
-        raise ConfigurationError("it has no robots", where=document.where(("robots",)), remedy="add robots: to it")
+        raise ConfigurationError(
+            "the site file has no robots", where=document.where(("robots",)), remedy="add robots: to it"
+        )
     return {name: _access(document, name, entry) for name, entry in robots.items()}
 
 
