@@ -69,7 +69,7 @@ class SampledPhysics:
 
     def __init__(self, physics: PhysicsFederate, interval_ns: int) -> None:
         self._physics = physics
-        self._interval_ns = -(-interval_ns // physics.step_ns) * physics.step_ns
+        self._interval_ns = -(-interval_ns // physics.step_ns) * physics.step_ns  # rounded up
         self._next_ns = 0
         self._samples: list[Mapping[str, State]] = []
         self.step_ns = physics.step_ns
