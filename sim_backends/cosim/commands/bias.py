@@ -1,4 +1,7 @@
-"""The command `fieldkit cosim shootout --bias`, which computes the bias of each sync policy over seeds."""
+"""The command `fieldkit cosim shootout --bias`, which computes the bias of each sync policy.
+
+The bias is the mean difference from the exact reference over seeds.
+"""
 
 import argparse
 from collections.abc import Mapping, Sequence

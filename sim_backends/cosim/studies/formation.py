@@ -1,4 +1,7 @@
-"""Computes the position errors of followers, and the string stability of convoys."""
+"""Computes the position errors of followers, and the string stability of convoys.
+
+A convoy is string stable if disturbances do not grow along its row of vehicles.
+"""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
