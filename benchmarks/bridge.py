@@ -42,7 +42,7 @@ COUNT: Final = 200
 """Messages in a measurement of the delay, sent at `RATE_HZ`."""
 RATE_HZ: Final = 100.0
 BURST_S: Final = 1.0
-SETTLING_S: Final = 1.0
+SETTLING_S: Final = 1.0  # for discovery, and for the last messages of a stream
 _CDR: Final = bytes((0, 1, 0, 0)) + bytes(8) + SIZE.to_bytes(4, "little")
 """Bytes of a serialized message before its data: encapsulation header, empty layout, number of data bytes."""
 
@@ -348,7 +348,7 @@ def main() -> int:
     if options.json:
         print(json.dumps(measurements))
         return 0
-    print(f"{'path':22} {'delay, ms':>24} {'more than the reference':>32} {'messages/s':>26} {'of a burst':>10}")
+    print(f"{'path':22} {'delay, ms':>24} {'more than the reference':>32} {'messages/s':>26} {'burst arrived':>14}")
     references = {(row["path"], row["round"]): row["delay_ms"] for row in measurements}
     for message_path in PATHS:
         rows = [row for row in measurements if row["path"] == message_path.name]
@@ -360,7 +360,7 @@ def main() -> int:
         )
         received = sum(row["burst_received"] for row in rows) / sum(row["burst_sent"] for row in rows)
         rates = [row["per_s"] for row in rows]
-        print(f"{message_path.name:22} {spread(delays):>24} {spread(more):>32} {spread(rates):>26} {received:>10.0%}")
+        print(f"{message_path.name:22} {spread(delays):>24} {spread(more):>32} {spread(rates):>26} {received:>14.0%}")
     return 0
 
 

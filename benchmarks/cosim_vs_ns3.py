@@ -5,7 +5,7 @@ a wall, over 802.11g with the same power, noise, path loss, queue and slots in b
 is measured; TCP sends at full rate. The loss of the wall is computed here, and ns-3 gets the total path loss.
 
 There are three variants of ns-3: unchanged in 802.11g; unchanged in 802.11a, which has no signal extension (ns-3
-models it wrongly); and the latter with a corrected TCP, because ns-3's TCP deviates from the standards at the edge of
+models it wrongly); and 802.11a with a corrected TCP, because ns-3's TCP deviates from the standards at the edge of
 a link's range (`ns3_link.cc` lists the corrections). Each link is run with enough seeds for a narrow interval of the
 ratio. `--links g54` runs only the links with this text in their names.
 """

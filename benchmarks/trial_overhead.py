@@ -8,7 +8,7 @@ ping. These times are from kernel events (`benchmarks.lifetimes`) for both peers
 same command lines.
 
 Both peers are measured over control links without delay, and over control links with a round trip of 100 ms, as on
-bad Wi-Fi. On the latter, sequential round trips are counted too.
+bad Wi-Fi. Over the slow links, sequential round trips are counted too.
 
 The script is `trial_overhead.sh`, over persistent OpenSSH connections. It does less than fieldkit: it does not
 inspect bag and captures, computes no loss, and writes no journal, intervals or manifest.
@@ -75,7 +75,7 @@ steps:
         - transfer: {from: sender, to: receiver, idle: 1s}
   - ping: {from: sender, to: receiver, count: 3, interval: 20ms}
 """
-IDLE_S, PINGS, PING_INTERVAL_S = "1", "3", "0.02"
+IDLE_S, PINGS, PING_INTERVAL_S = "1", "3", "0.02"  # as in PROCEDURE
 
 PEERS: Final = ("fieldkit", "script")
 ROLES: Final = (Role.SENDER, Role.RECEIVER)
@@ -139,6 +139,7 @@ class AlternatingPeers:
         return 0 if self.slow is None else self.slow.trips
 
     def _store(self, peer: str, protocol: str, number: int, end_ns: int) -> tuple[Lifetime, ...]:
+        """Store the result of a repeat, and return the tools that ran; none if a tool was not identified."""
         trips = self._trips() - self._start_trips
         try:
             tools = self.watch.read(sum(TOOLS.values()), self._start_ns)

@@ -139,7 +139,7 @@ class Oracle(Protocol):
             for this flow.
 
         Raises:
-            LinkError: The medium did not answer.
+            LinkError: The process of the modelled radio did not answer.
         """
         ...
 
@@ -147,7 +147,7 @@ class Oracle(Protocol):
         """Return the lateness of packets relative to the model, over all packets since the testbed started.
 
         Raises:
-            LinkError: The medium did not answer.
+            LinkError: The process of the modelled radio did not answer.
         """
         ...
 
@@ -163,7 +163,7 @@ class Oracle(Protocol):
             Samples by robot in the order of time. Times are of the laptop's clock; stations are names of robots.
 
         Raises:
-            LinkError: The medium did not answer.
+            LinkError: The process of the modelled radio did not answer.
         """
         ...
 
@@ -174,7 +174,7 @@ class Oracle(Protocol):
             folder: Destination folder; None stops the recording.
 
         Raises:
-            LinkError: The medium did not answer.
+            LinkError: The process of the modelled radio did not answer.
             OSError: The files cannot be created.
         """
         ...

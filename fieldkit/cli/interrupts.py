@@ -29,7 +29,7 @@ def interruptible() -> Iterator[Stop]:
     next signal cancels that wait.
 
     While no robot moves, the first SIGINT during a repeat lets the repeat finish, and the second raises
-    `KeyboardInterrupt`. SIGINT between repeats, SIGTERM and SIGHUP raise it immediately, the latter two because the
+    `KeyboardInterrupt`. SIGINT between repeats, SIGTERM and SIGHUP raise it immediately: after SIGTERM or SIGHUP the
     system may kill this process before the repeat has finished. Later signals are ignored, because the clean-up that
     follows has deadlines.
 

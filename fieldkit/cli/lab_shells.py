@@ -25,7 +25,7 @@ def open_shells(folder: LabFolder) -> Iterator[dict[str, SshShell]]:
             user = re.search(r"^    User (\S+)$", folder.ssh_config.read_text(encoding="utf-8"), re.MULTILINE)
             if user is None:
                 raise ConfigurationError(
-                    "it has no line User", where=str(folder.ssh_config), remedy="fieldkit lab down"
+                    "this file has no line User", where=str(folder.ssh_config), remedy="fieldkit lab down"
                 )
             key = folder.key.read_text(encoding="utf-8")
             for line in folder.known_hosts.read_text(encoding="utf-8").splitlines():

@@ -35,7 +35,9 @@ def read_access(document: Document) -> dict[str, RobotAccess | ConfigurationErro
     data = document.data
     robots = data.get("robots") if isinstance(data, dict) else None
     if not isinstance(robots, dict):
-        raise ConfigurationError("it has no robots", where=document.where(("robots",)), remedy="add robots: to it")
+        raise ConfigurationError(
+            "the site file has no robots", where=document.where(("robots",)), remedy="add robots: to it"
+        )
     return {name: _access(document, name, entry) for name, entry in robots.items()}
 
 
@@ -46,6 +48,7 @@ def configured_backend(document: Document) -> str:
 
 
 def _access(document: Document, name: str, entry: Any) -> RobotAccess | ConfigurationError:  # noqa: ANN401 (any YAML)
+    """Return the access in the entry of a robot, or the error of its first wrong key."""
     if not isinstance(entry, dict):
         return ConfigurationError(
             "this entry is not a mapping", where=document.where(("robots", name)), remedy=_REMEDY

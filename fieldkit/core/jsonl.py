@@ -107,7 +107,9 @@ def read(path: Path, parse: Parse[Entry], *, remedy: str) -> list[Entry]:
     try:
         content = files.read(path, _LIMIT_BYTES)
     except OSError as error:
-        raise EvidenceError(f"no journal: {error.strerror}", where=str(path), remedy=remedy) from error
+        raise EvidenceError(
+            f"the journal cannot be read: {error.strerror}", where=str(path), remedy=remedy
+        ) from error
     lines = content.decode(errors="replace").removesuffix("\n").split("\n") if content else []
     entries = []
     for number, line in enumerate(lines, start=1):

@@ -137,7 +137,7 @@ class Lab(Protocol):
 
         Raises:
             ConfigurationError: The destination is not in the world.
-            LinkError: The radio does not answer.
+            LinkError: The process of the modelled radio does not answer.
         """
         ...
 
@@ -153,7 +153,7 @@ class Lab(Protocol):
         """Return the lateness of the co-simulation since the start was complete, or None without a co-simulation.
 
         Raises:
-            LinkError: The radio does not answer.
+            LinkError: The process of the modelled radio does not answer.
         """
         ...
 

@@ -112,6 +112,7 @@ def measure(role: Role, telemetry: TelemetrySection, evidence: AttemptEvidence, 
     for name, source in telemetry.sources.items():
         readings, reason = _read(evidence, role, name, source)
         samples += len(readings.values)
+        # Only the first source that declares a quantity is used for it.
         source_series = {
             quantity: _Series(
                 [values[quantity] for values in readings.values if quantity in values],

@@ -349,7 +349,7 @@ SourceName = Annotated[str, pattern_field(r"^[a-z][a-z0-9_]{0,19}$", "a short na
 class TelemetrySection(ProfileSection):
     """[Sources](telemetry.md) of the state of the robot's radio, in addition to `iw`.
 
-    A source that fails has no value. If several sources have a value, the value of the first source is used.
+    A source that fails has no value. If several sources declare a value, only the first of them is used.
 
     Attributes:
         sources: The sources by name.

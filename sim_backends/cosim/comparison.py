@@ -40,10 +40,10 @@ class Errors:
     Attributes:
         packets: Number of packets that arrived or were dropped in each of the two runs.
         delivery_error_s: Absolute difference of delivery times, over packets that arrived in both runs.
-        position_error_m: Largest error, at the time when a packet was sent, of the relative position that the network
-            assumed for two of the agents that transmit, forward or interfere in this run. The true positions are the
-            positions on the continuous trajectories. If the network uses the same state for a step of length h, its
-            mean error at speed v is therefore v h / 2.
+        position_error_m: Error of the positions that the network assumed when a packet was sent: the largest
+            error, over all pairs of agents that transmit, forward or interfere in this run, of the relative position.
+            The true positions are the positions on the continuous trajectories. If the network uses the same
+            state for a step of length h, its mean error at speed v is therefore v h / 2.
         path_error_m: Distance of agents from their positions in the reference, over time; above 0 only if programs
             steer by received data.
         fate_disagreement: Share of packets that arrived in one run only.

@@ -123,7 +123,8 @@ class Coordinator:
         if unmoved_agents:
             raise ConfigurationError(
                 f"the physics federate has no state of {', '.join(sorted(unmoved_agents))}, but agents that send, "
-                "receive or interfere need one"
+                "receive or interfere need one",
+                remedy="return the states of all agents from advance",
             )
         self._select_present()
         if observer is not None:

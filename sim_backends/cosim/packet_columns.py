@@ -21,6 +21,7 @@ _INTEGERS: Final[dict[str, Callable[[Fate], int | None]]] = {
     "counted_ns": lambda fate: fate.counted_ns,
     "late_ns": lambda fate: fate.late_ns,
 }
+"""Functions that return the integers of a packet, by column."""
 _TEXTS: Final[dict[str, Callable[[Fate], str]]] = {
     "flow": lambda fate: fate.packet.identity[0],
     "source": lambda fate: fate.packet.source,
@@ -28,6 +29,7 @@ _TEXTS: Final[dict[str, Callable[[Fate], str]]] = {
     "protocol": lambda fate: fate.packet.protocol,
     "reason": lambda fate: fate.reason,
 }
+"""Functions that return the texts of a packet, by column."""
 
 
 def columns(run: Run) -> dict[str, NDArray[Any]]:

@@ -80,7 +80,7 @@ class PacketLedger:
     A report of the network that cannot be true raises a `FederateError`.
 
     Args:
-        fates: Mapping to which the ledger adds the fate of every packet that enters the network, by flow and number.
+        fates: The ledger adds the fate of every packet to this mapping, by flow and number.
         step_ns: The physics step.
         measured_agents: Agents that the position error of every packet includes, in addition to its sender and
             receiver.

@@ -28,8 +28,9 @@ class Fate:
         late_ns: Time from `counted_ns` to the simulated time of the receiver at delivery, if that is later; otherwise
             0.
         reason: The reason why the packet was dropped; empty if it arrived or is under way.
-        position_error_m: Largest error of the relative position that the network assumed for two of the agents that
-            affect the packet; None if only its source and destination affect it (`packet_ledger.position_error_m`).
+        position_error_m: Largest error, over all pairs of agents that affect the packet, of the relative position
+            that the network assumed. None if only source and destination affect the packet: then
+            `packet_ledger.position_error_m` computes the error.
     """
 
     packet: Packet
@@ -157,8 +158,8 @@ class Window(NamedTuple):
             are updated, and are in `decided_fates` of a later window.
         decided_fates: Fates that were decided in it, in order.
         states: States of the agents at its end.
-        assumed_states: States that the network assumed throughout it, or at its beginning if it extrapolates
-            (`DeadReckoned`).
+        assumed_states: States that the network assumed during the whole window; if the network extrapolates, the
+            states at the beginning of the window (`DeadReckoned`).
         wall_s: Wall time that it took, by part, as in `Run`.
     """
 

@@ -8,6 +8,7 @@ from typing import Any, Final, Literal, Protocol, TypeVar, cast, runtime_checkab
 from sim_backends.cosim.federates import AnswerTimeoutError, NetworkFederate, PhysicsFederate, Program
 
 _PROGRESS_EVERY_S: Final = 0.2
+"""Shortest time between two progress reports, in wall time."""
 
 Progress = Callable[[int, float], None]
 """Called with the simulated nanoseconds so far, and the wall seconds since the run was started or continued."""
@@ -29,7 +30,7 @@ class HasWaitingTime(Protocol):
 class WallTime:
     """Stopwatch that adds each lap to one part of the wall time.
 
-    Time during which a federate of that part waited is added to `wait` instead.
+    Time in which a federate only waited is added to `wait`, not to the part of the federate.
 
     Args:
         total_s: The sums in seconds, by part; each call of `end_window` updates them.

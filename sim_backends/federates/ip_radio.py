@@ -40,12 +40,12 @@ class IpRadio:
         self._federate = federate
         self._names = tuple(names)
         self._entering_packets: list[Packet] = []
-        self._in_flight: dict[int, tuple[Fragment, str]] = {}
+        self._in_flight: dict[int, tuple[Fragment, str]] = {}  # fragment and receiver, by packet id
         self._last_packet_id = 0
         self._broadcasts = 0
         self._states: dict[str, State] = {}
         self._stations_off: Set[str] = frozenset()
-        self._parts: dict[int, ArrivalDelay] = {}
+        self._parts: dict[int, ArrivalDelay] = {}  # parts of the delay, by packet id
         self._log_loss: LossLog | None = None
         log_delays = getattr(federate, "log_arrival_delays", None)
         if log_delays is not None:

@@ -26,6 +26,7 @@ from sim_backends.world.world import World
 _SUPPORT_M: Final = 1e-3
 """Maximum distance between a quadrotor and the ground or obstacle that supports it."""
 _ALWAYS: Final[Mapping[str, Lifetime]] = MappingProxyType({})
+"""Lifetimes if all bodies exist during the whole run."""
 
 
 class Bodies:

@@ -24,6 +24,7 @@ from sim_backends.physics.robot_limits import DriveLimits
 from sim_backends.world.motion import GRAVITY_M_S2
 
 _LEVEL: Final = (0.0, 0.0)
+"""Grade of level ground."""
 _REACHED: Final = 1e-12
 """Tolerance for reaching a target, in m/s or rad/s: rounding errors are that large."""
 

@@ -59,7 +59,7 @@ ROTORS_OFF: Final = FlightTarget(Velocity(), 0.0, (0.0, 0.0), powered=False)
 
 
 class FlightStatus(NamedTuple):
-    """The values of a quadrotor that its sensors measure and that `State` does not contain.
+    """Values that the sensors of a quadrotor measure in addition to `State`.
 
     Attributes:
         place_m: Position of its lowest point, metres east, north, up.

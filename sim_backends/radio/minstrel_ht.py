@@ -121,16 +121,16 @@ class MinstrelHt(RateControl):
             for number, group in enumerate(self._groups)
             for mode in group
         }
-        self._group_best = [[group[0]] * _RANKED for group in self._groups]
+        self._group_best = [[group[0]] * _RANKED for group in self._groups]  # the ranking of each group
         self._aggregate_frames, self._aggregates, self._mean_length = 0, 0, 1.0
         self._updated_ns = self._sample_from_ns = 0
         self._samples: list[list[WifiMode]] = [[], [], []]
         self._sample_types = cycle(_SAMPLE_ORDER)
-        self._last_group = [0, 0, 0]
+        self._last_group = [0, 0, 0]  # group of the last mode of each kind
         self._order_counts = [0] * len(self._groups)  # random orders drawn for each group
-        self._orders: list[list[WifiMode]] = [[] for _ in self._groups]
+        self._orders: list[list[WifiMode]] = [[] for _ in self._groups]  # remaining modes of each random order
         self._best = self._second = self._robust = self._groups[0][0]
-        self._fallback: list[WifiMode] = []
+        self._fallback: list[WifiMode] = []  # the chain without the best mode
         self._chain = self._default_chain = _fill_chain([self._best])
         self.is_probing = False
         self._update(0)
@@ -156,6 +156,7 @@ class MinstrelHt(RateControl):
         statistics.acknowledged += acknowledged
         self._aggregate_frames += attempts
         self._aggregates += 1
+        # Replace a mode of the chain that fails by a mode of a lower group.
         is_failing = False
         for rank, chain_mode in enumerate((self._best, self._second)):
             statistics = self._statistics[chain_mode]

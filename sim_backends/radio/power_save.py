@@ -50,6 +50,7 @@ class PowerSave(Generic[Payload]):
         self._events = events
         self._release = release
         self._awake_until_ns = dict.fromkeys(timeouts_ns, 0)
+        # Buffered frames, each with its transmitter, by receiver; None for broadcasts.
         self._buffers: dict[int | None, list[tuple[Station[Payload], Frame[Payload]]]] = {}
         self.access_points: Collection[int] = ()
 

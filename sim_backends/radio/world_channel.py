@@ -94,11 +94,14 @@ class WorldChannel(RadioChannel):
         )
         self._positions: list[Vector | None] = [None] * count
         self._velocities: list[Vector] = [STILL] * count
-        self._in_motion = False
+        self._in_motion = False  # True if a station has a velocity
+        # True for each pair of stations that cannot receive each other at any distance.
         self._cut = np.zeros((count, count), dtype=bool)
+        # Losses of `use_path_losses`; NaN for paths whose losses are computed.
         self._specified_db: Floats | None = None
-        self._present = np.zeros(count, dtype=bool)
+        self._present = np.zeros(count, dtype=bool)  # True for each station that has a position
         self._positions_m, self._velocities_m_s = np.zeros((2, count, 3))
+        # Time of the positions, and time for which a fading gain is used.
         self._moved_ns, self._gain_valid_ns = 0, self._compute_gain_valid_ns()
         self._revision = 0  # increases with each change of positions, velocities or losses
         self.use_losses(np.full((count, count), np.inf))

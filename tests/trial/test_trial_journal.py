@@ -50,7 +50,7 @@ def test_a_damaged_line_in_the_middle_is_an_error_with_its_number(tmp_path: Path
 
 
 def test_a_missing_journal_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(EvidenceError, match="no journal"):
+    with pytest.raises(EvidenceError, match="the journal cannot be read"):
         journal.read(tmp_path)
 
 

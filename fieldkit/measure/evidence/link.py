@@ -2,7 +2,7 @@
 
 A radio can have several peers. For an access point, the columns describe the link to the station with which it
 exchanged the most packets. For a station, they describe its link to its access point, including the links after it
-roamed to another one.
+roamed to another one. As in the output of `iw`, a `StationSample` describes any peer, which may be an access point.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -138,12 +138,13 @@ def link_history(samples: Sequence[LinkSample]) -> list[tuple[int, StationSample
     if any(sample.cell for sample in samples):  # the radio is a station
         station_names = {station.station for sample in samples for station in sample.stations}
     else:
-        station_names = {_busiest_station(samples), ""}
+        station_names = {_busiest_peer(samples), ""}
     link = []
     for sample in samples:
         associated = sample.cell or associated
         candidates = [station for station in sample.stations if station.station in station_names]
-        # A sample of /proc/net/wireless has a signal, but no station name, so it is used if there is no other sample.
+        # The last candidate is used: the associated peer or, without it, another one. A sample of /proc/net/wireless
+        # has no name of a peer, and is used only if it is the only candidate.
         candidates.sort(key=lambda station: (station.station != "", station.station == associated))
         if candidates:
             link.append((sample.utc_ns, candidates[-1]))
@@ -178,6 +179,10 @@ def _is_new_link(before: StationSample, after: StationSample) -> bool:
 
 
 def _total_increment(counter: str, links: Sequence[Sequence[StationSample]]) -> int | None:
+    """Return the increment of a counter over successive links; None if it was not reported at least twice.
+
+    Only the first link may start from a count above 0.
+    """
     counts_by_link: list[list[int]] = [
         [count for station in link if (count := getattr(station, counter)) is not None] for link in links
     ]
@@ -186,8 +191,8 @@ def _total_increment(counter: str, links: Sequence[Sequence[StationSample]]) -> 
     return sum(counts[-1] for counts in counts_by_link if counts) - (counts_by_link[0][0] if counts_by_link[0] else 0)
 
 
-def _busiest_station(samples: Sequence[LinkSample]) -> str:
-    """Return the station with which the most packets were exchanged, or the first of several such stations."""
+def _busiest_peer(samples: Sequence[LinkSample]) -> str:
+    """Return the name of the peer with which the most packets were exchanged, or the first of several such peers."""
     names = dict.fromkeys(station.station for sample in samples for station in sample.stations)
 
     def packets(name: str) -> int:

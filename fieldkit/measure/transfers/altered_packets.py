@@ -42,6 +42,8 @@ def header_problem(packets: Packets) -> str | None:
 def incomparability_reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:
     """Return the reason why two complete captures cannot be compared, or None if they can.
 
+    The reason continues a sentence about the transfer, to which `its` refers.
+
     Args:
         sender: Packets of the sender's capture.
         receiver: Packets of the receiver's capture.
@@ -59,6 +61,7 @@ def incomparability_reason(sender: Packets, receiver: Packets, transfer: Transfe
         received.where(has_port[received.sport]),
         received.where(~has_port[received.sport]),
     )
+    # Packets from other source ports are earlier traffic if hardly any of them equals a sent packet.
     matches_sent = np.isin(_address_free_keys(from_other_ports), _address_free_keys(sent))
     is_earlier_traffic = matches_sent.sum() <= MAX_ALTERED_SHARE * len(from_other_ports)
     if is_earlier_traffic and len(from_other_ports) > _MAX_LATE_PACKETS and not len(from_same_port):
@@ -100,6 +103,7 @@ def _capture_problem(sent_forward: Packets, received_forward: Packets, sent: Pac
 
 def _truncated_count(packets: Packets) -> int:
     """Return the number of packets that were truncated before the end of their TCP or UDP header."""
+    # In a complete header, this field is above 0.
     last_field = np.where(packets.protocol == TCP, packets.tcp_flags, packets.udp_bytes)
     return int(((packets.fragment_offset == 0) & (last_field == 0)).sum())
 

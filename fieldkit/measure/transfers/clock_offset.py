@@ -123,6 +123,8 @@ def estimate(forward: StampPairs, reverse: StampPairs) -> Clocks | None:
     middle_ns = (int(times.min()) + int(times.max())) // 2
     base_ns = int(forward.receiver_ns[0] - forward.sender_ns[0])
     above, below = (_points(pairs, middle_ns, base_ns) for pairs in (forward, reverse))
+    # A ceiling is the lower hull of the offset's upper bounds. A floor is the lower hull of the negated lower bounds.
+    # The first of each contains all packets; each of the others omits one packet.
     ceilings, floors = _Hull.of_all_but_one(*above), _Hull.of_all_but_one(below[0], -below[1])
     ceiling, floor = ceilings[0], floors[0]
     if _polygon(ceiling, floor) is None:
@@ -133,7 +135,7 @@ def estimate(forward: StampPairs, reverse: StampPairs) -> Clocks | None:
     order = np.argsort(skews, kind="stable")
     skew = _best_skew(ceilings, floors, float(skews.min()), float(skews.max()))
     ends = _range_without_fastest(ceilings, floors, np.array([skew]))
-    if not np.isfinite(ends).all():
+    if not np.isfinite(ends).all():  # a direction has a single packet
         ends = _range(ceiling, floor, np.array([skew]))
     offset_s = float(ends[0][0] + ends[1][0]) / 2
     return Clocks(middle_ns, base_ns, offset_s, skew, skews[order], lowest_s[order], highest_s[order])

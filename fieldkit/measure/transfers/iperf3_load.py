@@ -157,7 +157,7 @@ JITTER_CROSS_CHECKS: Final = (
         against=("both captures: packets of the other direction, and the clock offset that fits all packets",),
         tolerance=(
             "an unknown clock drift of 0.1 ms per second; no other source records the time of a single datagram, but "
-            "because packets are captured in order, it can be wrong by at most 0.1 s"
+            "because packets are captured in order, this time can be wrong by at most 0.1 s"
         ),
         outcome=CheckOutcome.WITHHELD,
     ),

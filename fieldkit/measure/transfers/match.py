@@ -212,6 +212,7 @@ def usable_stamps(sent: Packets, received: Packets) -> tuple[Ints, Ints]:
 
 def connection_keys(packets: Packets) -> Keys:
     """Return a key of each packet, which is equal for packets with equal addresses and ports."""
+    # Adding 1 makes `NO_PORT` (-1) 0, so that the two ports do not overlap.
     return row_hashes(*packets.src.T, *packets.dst.T, packets.sport + 1 << 20 | packets.dport + 1)
 
 
@@ -235,7 +236,7 @@ def _match_pieces(sent: Packets, received: Packets, frames: Match) -> Payload:
     # Without a time stamp, a received frame that offload cut or joined may be a part of any sent frame.
     may_be_part = (received_frame == 0) & (received_stamp[received_pieces.frame] == NO_STAMP)
     may_be_part |= ~np.isin(row_hashes(received_key, received_frame), row_hashes(key, sent_frame))
-    received_frame = np.where(may_be_part, NOT_CAPTURED, received_frame)
+    received_frame = np.where(may_be_part, NOT_CAPTURED, received_frame)  # then `match_keys` does not compare frames
     pieces = match_keys(
         key,
         sent.time_ns[sent_pieces.frame],

@@ -164,6 +164,7 @@ class Connections:
 
     def _positions(self, ports: Ints, numbers: Ints) -> Ints:
         index = np.searchsorted(self.ports, ports)
+        # The position is negative for numbers before the first byte. Each connection has its own range of positions.
         relative = (numbers - self.first_seq[index] + LONGEST_BYTES) % 2**32 - LONGEST_BYTES
         positions: Ints = (index + 1 << _CONNECTION_BITS) + relative
         return positions

@@ -80,11 +80,11 @@ def _role(endpoint: str, scenario: CosimScenario, requested_role: str | None, de
             continue
         session.close()
         return role, session.name
-    raise FieldkitError(f"{endpoint} accepts no role")
+    raise FieldkitError(f"{endpoint} accepts no role", remedy="correct the command or --role")
 
 
 def _federate_change(endpoint: str) -> dict[str, str]:
-    """Return the change that makes a scenario use a named federate, so that its options are validated."""
+    """Return the change of a scenario that selects a named federate; the federate's options are then validated."""
     return {
         f"{ROLES[role]}.federate": endpoint for role in (PHYSICS, NETWORK) if _is_federate_with_role(endpoint, role)
     }

@@ -14,8 +14,7 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 BACKEND: Final = "cosim"
 
 _NOT_PROCEDURE: Final = frozenset({"name", "summary", "policy", "seeds", "duration", "trial"})
-"""Keys of a scenario that are not part of the procedure, so that runs which differ in them have the same hash of the
-procedure."""
+"""Keys of a scenario that are not part of the procedure: if only their values differ, its hash is the same."""
 
 
 def flow_rows(

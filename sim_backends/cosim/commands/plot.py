@@ -30,7 +30,7 @@ _LOCAL_ERRORS: Final = {
     "late_s": ("Arrivals in the past", "mean lateness (ms)", 1e3),
     "position_m": ("Assumed position", "mean error (mm)", 1e3),
     "path_m": ("Path of the agents", "mean error (mm)", 1e3),
-    "fates": ("Lost in only one of both runs", "packets (%)", 100.0),
+    "fates": ("Lost in only one run", "packets (%)", 100.0),
 }
 """Title, label and factor of the panel of each local error."""
 

@@ -184,7 +184,7 @@ def flow_results(run: Run) -> tuple[FlowResult, ...]:
 
 
 def _result(name: str, fates: Sequence[Fate], replies: Sequence[Fate] | None) -> FlowResult:
-    """Return the results of a flow from the fates of its packets; `replies` are None unless it is a ping."""
+    """Return the results of a flow from the fates of its packets; `replies` is None if the flow is not a ping."""
     packet = fates[0].packet
     decided_fates = [fate for fate in fates if fate.is_decided]
     times = [

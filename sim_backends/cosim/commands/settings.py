@@ -47,10 +47,11 @@ def progress_reporter(sink: Sink, unit: str = "runs") -> Callable[[str, float, f
 
 
 ENOUGH_SEEDS: Final = 20
-"""Number of seeds from which on commensurate periods are not reported.
+"""With at least this number of seeds, commensurate periods are not reported.
 
-The phase of a periodic event is the time within a window at which it occurs; each seed draws another phase. The mean
-over 20 phases has a standard error of 6.5 % of a window.
+A period is commensurate with a window if a few periods are a whole number of windows. The event then occurs only at a
+few times within a window (phases), which the seed determines. The mean over the phases of 20 seeds has a standard
+error of 6.5 % of a window.
 """
 
 

@@ -174,3 +174,4 @@ def _is_missing(value: Value) -> bool:
 FORMS: Final[Mapping[str, Callable[[Sheet], None]]] = MappingProxyType(
     {"table": _table, "csv": _csv, "json": _json, "markdown": _markdown}
 )
+"""Function that prints a table, by the name of the format."""

@@ -34,6 +34,7 @@ _KINDS: Final[tuple[type[SyncPolicy], ...]] = (
     VelocityAware,
     ErrorBounded,
 )
+"""The built-in policies, the exact ones first."""
 BUILTIN: Final[Mapping[str, PolicyKind]] = {kind.name: kind for kind in _KINDS}
 """Every built-in policy by its name; the exact ones are first."""
 

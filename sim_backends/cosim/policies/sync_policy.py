@@ -27,8 +27,8 @@ class Situation:
         limits_m_s2: Largest change of each agent's velocity per second.
         next_send_ns: Time before which no program sends, or None if no program will send; only set for policies that
             look ahead.
-        assumed_states: States of the agents that the network assumes now, and from which it extrapolates; only set
-            for policies that look ahead. None means that the agents stay at their positions.
+        assumed_states: The current states of the agents as assumed by the network, which extrapolates from them; only
+            set for policies that look ahead. None means that the agents stay at their positions.
         other_agents: Agents that forward or interfere, and agents that have sent packets but are not in `pairs`.
         fixed_emitters_m: Positions of sources of interference that are not agents.
     """
@@ -130,6 +130,7 @@ def looks_ahead(policy: SyncPolicy) -> TypeGuard[LookingAhead]:
 
 
 _MEMBERS: Final = ("name", "exact", "defers_sends", "uses_end_states", "defers_arrivals", "next_window")
+"""Members that every sync policy must have."""
 
 
 def missing_members(policy: object) -> list[str]:

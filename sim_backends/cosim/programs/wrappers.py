@@ -90,6 +90,7 @@ class Outage:
 
 
 _BILLION: Final = 10**9
+"""Nanoseconds per second."""
 
 
 @dataclass(frozen=True, slots=True)

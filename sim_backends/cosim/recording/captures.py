@@ -24,7 +24,9 @@ from sim_backends.network.wire import IpPacket
 from sim_backends.world.motion import State
 
 _ICMP, _TCP, _UDP = 1, 6, 17
+"""Numbers of the protocols in the IP header."""
 _FIRST_HOST: Final = int(IPv4Address("10.0.0.1"))
+"""Address of the first robot."""
 _MULTICAST: Final = IPv4Address("239.255.0.1").packed
 """Destination of packets for all hosts: the multicast group of DDS discovery (OMG DDSI-RTPS 2.5, 9.6.1.4)."""
 _TOPIC_PORT, _DISCOVERY_PORT = 7411, 7400
@@ -37,11 +39,15 @@ _PORTS: Final = 9_000
 """Number of ports that flows use before the first port is used again."""
 
 _IP: Final = struct.Struct(">BBHHHBBH4s4s")
+"""Version, service, size, id, fragment, time to live, protocol, checksum, source and destination (RFC 791)."""
 _UDP_HEADER: Final = struct.Struct(">HHHH")
+"""Source port, destination port, length and checksum (RFC 768)."""
 _TCP_HEADER: Final = struct.Struct(">HHIIBBHHH")
+"""Ports, sequence, acknowledgement, length, flags, window, checksum and urgent pointer (RFC 9293)."""
 _ECHO_HEADER: Final = struct.Struct(">BBHHH")
 """Type, code, checksum, identifier and sequence number (RFC 792)."""
 _SYN, _PUSH, _ACK = 0x02, 0x08, 0x10
+"""Flags in the TCP header."""
 _MORE_FRAGMENTS: Final = 0x2000
 """Flag of all fragments of a packet except the last one (RFC 791)."""
 _WINDOW_SCALE: Final = 7
@@ -219,10 +225,13 @@ def _checksum(data: bytes) -> int:
 
 
 _NANOSECONDS_MAGIC: Final = 0xA1B23C4D
+"""First number of a pcap file whose time stamps have nanoseconds."""
 _LINKTYPE_RAW: Final = 101
 """Packets begin with the IP header."""
 _FILE_HEADER: Final = struct.Struct("<IHHiIII")
+"""First number, version (2 numbers), 2 unused numbers, largest stored packet, link type."""
 _RECORD_HEADER: Final = struct.Struct("<IIII")
+"""Seconds, nanoseconds, stored bytes and original bytes of a packet."""
 
 
 class Captures:

@@ -27,6 +27,7 @@ from sim_backends.network.ip import Fragment
 from sim_backends.world.motion import State
 
 SAMPLING_INTERVAL_NS: Final = 100_000_000
+"""Default interval at which states are recorded, in simulated time."""
 
 
 class Sampling:

@@ -139,7 +139,9 @@ def emane_observer(scenario: CosimScenario, seed: int, observer: WindowObserver 
     try:
         nems = options.nems_of(scenario.agents)
     except ValueError as error:
-        raise ConfigurationError(f"scenario {scenario.name}: emane: {error}") from error
+        raise ConfigurationError(
+            f"scenario {scenario.name}: emane: {error}", remedy="correct the key emane.nems of the scenario"
+        ) from error
     has_losses = options.pathloss and not scenario.radio.is_fixed
     return EmaneObserver(options, nems, _losses(scenario, seed) if has_losses else None, observer)
 

@@ -32,6 +32,7 @@ _BUILT_IN_SUMMARIES: Final = {
     PHYSICS: "robots with differential drives and quadrotors, with limits of velocity and acceleration",
     NETWORK: "802.11g and 802.11n in the world of the scenario, with UDP, TCP, DDS and ROS 1",
 }
+"""Summary of the built-in physics and network, for lists of simulators."""
 
 
 def without_federates(scenario: CosimScenario) -> CosimScenario:
@@ -239,4 +240,6 @@ def _make_federate(federate: PythonFederate, name: str, hello: Hello) -> Any:  #
     try:
         return service.make(hello)
     except ValueError as error:
-        raise ConfigurationError(f"{ROLES[hello.role]} {name}: {error}") from error
+        raise ConfigurationError(
+            f"{ROLES[hello.role]} {name}: {error}", remedy="change the scenario, or use another simulator"
+        ) from error

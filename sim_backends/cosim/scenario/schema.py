@@ -345,7 +345,7 @@ class CosimScenario(Named):
             if isinstance(fault, ClockSkewFault):
                 if fault.agent in agents:
                     raise schema.validation_error(
-                        f"{fault.agent} has two clock-skew faults", "faults", number, "agent"
+                        f"{fault.agent} has two clock-skew faults; remove one of them", "faults", number, "agent"
                     )
                 agents.add(fault.agent)
         return self

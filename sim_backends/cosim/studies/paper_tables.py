@@ -143,9 +143,9 @@ EMANE: Final[Mapping[str, tuple[Printed, Printed]]] = MappingProxyType(
 """Section "Discussion": mean round trip and share of lost requests of 100 pings, before and after node 10 moved."""
 
 FIXED: Final = "fixed window"
-"""The compared system that is equal to the system of the paper, except that its window does not adapt."""
+"""A compared system: the system of the paper, but with a window that does not adapt."""
 MASTER: Final = "master-based"
-"""The compared system that uses a ROS 1 master, with TCP."""
+"""A compared system, which uses a ROS 1 master, with TCP."""
 
 CLAIMS: Final[Mapping[tuple[str, str], tuple[Printed, Printed]]] = MappingProxyType(
     {

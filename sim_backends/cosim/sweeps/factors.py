@@ -36,6 +36,7 @@ _SHORT_NAMES: Final = {
     "physics": "physics.federate",
     "network": "network.federate",
 }
+"""Short names of factors, and their keys in the scenario's file."""
 _NOT_SETTINGS: Final = frozenset({"name", "summary", "seeds"})
 """Keys of a scenario that cannot be factors."""
 _BETWEEN_VALUES: Final = re.compile(r",(?![^\[{]*[\]}])")

@@ -161,7 +161,7 @@ class SweepFolder:
             ) from error
 
     def error_conversion(self) -> Any:  # noqa: ANN401 (a context manager)
-        """Return a context manager that converts an `OSError` to an error with the command that continues."""
+        """Return a context manager that converts an `OSError` to an error; its remedy continues the sweep."""
         return self._converted_errors()
 
     def _write(self, path: Path, content: Mapping[str, Any]) -> None:

@@ -91,7 +91,7 @@ def execute(run: SweepRun, *, verify: bool = False) -> RunResult:
 
 
 def _settings_text(run: SweepRun) -> str:
-    """Return the settings that the name of the procedure contains, so that conditions have different names."""
+    """Return the settings as text for the name of the procedure, so that all conditions have different names."""
     scenario = run.setting.scenario
     text = settings.policy_text(scenario.policy.name, scenario)
     omitted = _IN_OTHER_COLUMNS | ({"window"} if settings.has_window(scenario.policy.name) else set())

@@ -144,8 +144,8 @@ class DatagramChannel:
         self._sent_s: dict[int, float] = {}  # only datagrams that were sent once
         self._timer = RetransmissionTimer()
         self._resend_s = 0.0
-        self._early_data: dict[int, bytes] = {}
-        self._data = bytearray()
+        self._early_data: dict[int, bytes] = {}  # received before earlier data
+        self._data = bytearray()  # received in order, and not read yet
         self._must_acknowledge = False
         self._last_received_s = time.monotonic()
         self._is_closed = self._is_closed_by_peer = False

@@ -45,7 +45,7 @@ class Receiver:
         self._timer = WireTimer(wire, host, self._send_ack)
         self._unacknowledged_segments = 0
         self._last_ack = int(is_open)
-        self._echo_ns = 0
+        self._echo_ns = 0  # the received timestamp that the next ACK echoes
         self._last_segment: Segment | None = None
         self.next_expected = int(is_open)
 

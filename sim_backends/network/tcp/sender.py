@@ -63,7 +63,7 @@ class Sender:
         self._timer = WireTimer(wire, host, self._on_timeout)
         self._reordering_timer = WireTimer(wire, host, self._on_reordering_timeout)
         self._is_open = False
-        self._echo_ns: int | None = None
+        self._echo_ns: int | None = None  # the last received timestamp, which later segments echo
         self._receive_window_bytes = 0
         # Consecutive timeouts without progress.
         self._timeouts = 0
@@ -177,7 +177,7 @@ class Sender:
             self._send()
 
     def _update_window(self, delivered_bytes: int) -> None:
-        """Increase the window for an ACK of new data, or end the recovery that it completes.
+        """Increase the window for an ACK of new data, or end the recovery that the ACK completes.
 
         Bytes that a SACK reported before are not counted again: after a timeout one ACK may cover much data that left
         the network long ago (RFC 3465, 2.3; Linux: acked_sacked).
