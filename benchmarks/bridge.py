@@ -42,7 +42,7 @@ COUNT: Final = 200
 """Messages in a measurement of the delay, sent at `RATE_HZ`."""
 RATE_HZ: Final = 100.0
 BURST_S: Final = 1.0
-SETTLING_S: Final = 1.0
+SETTLING_S: Final = 1.0  # for discovery, and for the last messages of a stream
 _CDR: Final = bytes((0, 1, 0, 0)) + bytes(8) + SIZE.to_bytes(4, "little")
 """Bytes of a serialized message before its data: encapsulation header, empty layout, number of data bytes."""
 

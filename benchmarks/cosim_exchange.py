@@ -46,7 +46,7 @@ COUNTS: Final = (3, 10, 50, 200)
 ROUNDS: Final = 15
 EXCHANGES: Final = 300
 """Exchanges per round."""
-PEER_ROUNDS: Final = 3
+PEER_ROUNDS: Final = 3  # of HELICS and mosaik
 STEPS: Final = 1000
 """Steps per round of a peer."""
 STEP_NS: Final = 1_000_000

@@ -28,7 +28,7 @@ AHEAD_M: Final = 6.0
 _RECORD_S: Final = 5.0
 _BOOT_S: Final = 90.0
 """A real autopilot needs about 30 s for a good position estimate."""
-_FLIGHT_S: Final = 240.0
+_FLIGHT_S: Final = 240.0  # time limit of a flight
 _RATES_US: Final = {"32": 100_000, "30": 100_000}
 """LOCAL_POSITION_NED and ATTITUDE at 10 Hz."""
 

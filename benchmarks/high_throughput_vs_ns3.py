@@ -36,7 +36,7 @@ STATIONS: Final = (2, 5, 10, 20)
 DSCPS: Final = {"background": 8, "video": 40, "voice": 48}
 QUEUED: Final = 300
 """Packets in the queue of each station; a packet that arrived is replaced by a new one."""
-SECONDS: Final = 2.0
+SECONDS: Final = 2.0  # simulated time
 HE_LTF_NS: Final = {800: 7_200, 1600: 8_000, 3200: 16_000}
 """Duration of one HE-LTF, by guard interval in ns."""
 

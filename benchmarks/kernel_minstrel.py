@@ -29,13 +29,13 @@ from sim_backends.emulated.linux_wifi.hwsim_socket import open_registered
 from sim_backends.emulated.linux_wifi.netlink import NLMSG_ERROR, FamilySocket
 from sim_backends.emulated.linux_wifi.radios import HwsimRadio, find_radios
 
-MAX_TRIES: Final = 7
+MAX_TRIES: Final = 7  # of a frame
 SIGNAL_DBM: Final = -50
 _PRIORITY: Final = 0x107
 """Access category VO, which has no block-ACK session: in a session minstrel_ht ignores the reports of hwsim."""
 _ETHERTYPE: Final = 0x88B5  # for experiments: IEEE 802
 _DATA: Final = 0x08  # type of data frames in the field frame control
-_JOIN_S: Final = 60.0
+_JOIN_S: Final = 60.0  # time limit for joining the cell
 _POLL_S: Final = 0.5  # interval between checks whether the radios have joined
 _IDLE_S: Final = 0.0002  # pause while no frame is due
 _CELL: Final = ("ibss", "join", "fieldkit", "2412", "HT20", "fixed-freq", "02:66:69:65:6c:64")

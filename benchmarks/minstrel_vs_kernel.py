@@ -52,7 +52,7 @@ _NEAR_M, _FAR_M, _EXPONENT, _NEAR_DB = 5.0, 80.0, 3.0, 40.0
 _LEVEL_DB, _LOWEST_DB, _LEVELS = 0.25, -10.0, 240
 """Step, lowest value and number of the signal-to-noise ratios for which a trace has packet errors."""
 _FADING_PATHS, _DOPPLER_HZ = 16, 8.0
-_LONGEST_S: Final = 1800.0
+_LONGEST_S: Final = 1800.0  # time limit of a recording
 _PHY: Final = PhyCapability("n", "2.4 GHz", 20, 2, 400)
 
 MODES: Final = {

@@ -23,7 +23,7 @@ from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.physics.body import Twist, Velocity
 from sim_backends.world.motion import State
 
-STEPS: Final = 10
+STEPS: Final = 10  # of MuJoCo in a window
 WINDOW_S: Final = 0.01
 STEP_NS: Final = 1_000_000
 START_NS: Final = 1_000_000_000

@@ -32,7 +32,7 @@ LIBRARIES: Final = (
     *("applications", "propagation", "traffic-control", "point-to-point"),
 )
 PAYLOAD_BYTES: Final = 1000
-SECONDS: Final = 10.0
+SECONDS: Final = 10.0  # simulated time
 TX_POWER_DBM, SENSITIVITY_DBM = 17.0, -82.0
 NOISE_DBM: Final = 10 * math.log10(1.3803e-23 * 290 * 20e6 * 1e3) + 6
 """-94.97 dBm, as ns-3 computes it: thermal noise of 20 MHz at 290 K, with its value of the Boltzmann constant, and a

@@ -21,7 +21,7 @@ from sim_backends.emulated.nodes import EmulatedRobot
 Connect = Callable[[float], socket.socket]
 
 _CHUNK: Final = 1 << 16
-_MAX_IN_FLIGHT: Final = 1 << 12
+_MAX_IN_FLIGHT: Final = 1 << 12  # chunks of a direction
 _CONNECT_S: Final = 10.0
 
 
@@ -109,6 +109,7 @@ class SlowLinks:
         self._wake_sender.send(b"x")
 
     def _run(self) -> None:
+        """Forward data until the links are closed."""
         while not self._closed:
             with self._lock:
                 sources = {
@@ -148,6 +149,7 @@ class SlowLinks:
         direction.in_flight.append((time.monotonic() + self._delay_s, trip, chunk))
 
     def _deliver(self, stream: _Stream, direction: _Direction) -> None:
+        """Write the chunks that are due, and count their round trips."""
         while direction.in_flight and direction.in_flight[0][0] <= time.monotonic():
             _, trip, chunk = direction.in_flight.popleft()
             if not chunk:

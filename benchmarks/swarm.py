@@ -38,7 +38,7 @@ from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import World
 
 SIZES: Final = (2, 10, 30, 50)
-TCP_SIZES: Final = (2, 10)
+TCP_SIZES: Final = (2, 10)  # numbers of robots with which TCP is measured
 RADIOS: Final = {"fixed": radio("0ms"), "wifi": RadioOptions(fading=False)}
 PINGS: Final = 300
 ONE_SENDER_PACKETS_S: Final = 2_000

@@ -34,7 +34,7 @@ DELAYS: Final = ("10ms", "50ms")
 RATE: Final = "100Mbit/s"
 KERNEL: Final = "cubic"
 MESSAGE_BYTES: Final = 10 * TcpOptions().segment_bytes
-_MAX_GOODPUT_BIT_S: Final = 100_000_000
+_MAX_GOODPUT_BIT_S: Final = 100_000_000  # as RATE
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,9 @@ from tests.helpers.scripted_wire import ScriptedWire, lose_packets
 RATE_MBIT_S: Final = 10
 DELAY_MS: Final = 10
 QUEUE_PACKETS: Final = 100
-SECONDS: Final = 10.0
+SECONDS: Final = 10.0  # simulated time
 SEEDS: Final = 40
-MAX_PACKETS: Final = 20_000
+MAX_PACKETS: Final = 20_000  # that a sender of the co-simulation has to send
 AT_S: Final = (0.2, 0.3, 0.5, 1.0, 2.0, 5.0)
 """Times at which the congestion window is printed."""
 SEGMENT_BYTES: Final = TcpOptions().segment_bytes

@@ -75,7 +75,7 @@ steps:
         - transfer: {from: sender, to: receiver, idle: 1s}
   - ping: {from: sender, to: receiver, count: 3, interval: 20ms}
 """
-IDLE_S, PINGS, PING_INTERVAL_S = "1", "3", "0.02"
+IDLE_S, PINGS, PING_INTERVAL_S = "1", "3", "0.02"  # as in PROCEDURE
 
 PEERS: Final = ("fieldkit", "script")
 ROLES: Final = (Role.SENDER, Role.RECEIVER)
@@ -139,6 +139,7 @@ class AlternatingPeers:
         return 0 if self.slow is None else self.slow.trips
 
     def _store(self, peer: str, protocol: str, number: int, end_ns: int) -> tuple[Lifetime, ...]:
+        """Store the result of a repeat, and return the tools that ran; none if a tool was not identified."""
         trips = self._trips() - self._start_trips
         try:
             tools = self.watch.read(sum(TOOLS.values()), self._start_ns)

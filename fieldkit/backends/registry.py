@@ -85,6 +85,7 @@ def cast_of(
 def _links_of(
     name: str, profile: RobotProfile, addresses: Mapping[str, str], document: Document | None
 ) -> dict[str, RobotLink]:
+    """Return a robot's ends of its further links, by the name of the link."""
     where = document.where(("robots", name)) if document else ""
     further_links = profile.further_links
     for link in addresses:

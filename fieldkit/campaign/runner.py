@@ -135,6 +135,7 @@ class CampaignRun:
         return CampaignOutcome(self._remaining_trials(), failed, unmet, folders)
 
     def _run_trials(self, trials: Sequence[PlannedTrial], operator: Operator, stop: Stop) -> None:
+        """Run trials in order. Consecutive trials of one topology use the robots without reopening them."""
         for topology, block in groupby(trials, key=lambda trial: trial.topology):
             topology_trials = list(block)
             cast = {role: robot for trial in topology_trials for role, robot in self._plans[trial].cast.items()}
@@ -152,12 +153,14 @@ class CampaignRun:
                     self._run(trial, cast, testbed, stop)
 
     def _set_up(self, topology: Topology, cast: Cast, operator: Operator) -> None:
+        """Ask the operator to set the robots up if the topology changes and people set them up."""
         if self._backend.by_hand and self._set_up_topology not in {None, topology}:
             roles = ", ".join(f"{robot.name} as {role}" for role, robot in cast.items())
             self._set_up_note = operator.ask(f"set the robots up for topology {topology}: {roles}").note
         self._set_up_topology = topology
 
     def _run(self, trial: PlannedTrial, cast: Cast, testbed: Testbed, stop: Stop) -> None:
+        """Place the robots, then run or resume the trial, unless the operator skips it."""
         total = len(self._trials)
         self._sink(CampaignTrial(str(trial), total - len(self._remaining_trials()) + 1, total))
         folder = self._journal.interrupted_folder(trial)

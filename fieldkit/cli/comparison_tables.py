@@ -173,6 +173,7 @@ _FORMATS: Final[Mapping[str, Callable[[Comparison], str]]] = MappingProxyType(
 
 
 def _lines(comparison: Comparison, pair: Pair) -> list[tuple[str, ...]]:
+    """Return the table rows of a condition: one per figure, then one per column of words."""
     figures: list[tuple[str, ...]] = [
         (
             wording.label(difference.quantity),

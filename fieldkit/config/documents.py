@@ -286,6 +286,7 @@ _REMEDIES: Final = {
 
 
 def _configuration_error(error: Exception, text: str, source: str, line: int) -> ConfigurationError:
+    """Return an error of PyYAML as an error with file, line and remedy."""
     if isinstance(error, yaml.reader.ReaderError):
         message = f"a text file cannot contain the character {error.character:#04x}"
         line = text.count("\n", 0, error.position) + 1
@@ -302,6 +303,7 @@ def _configuration_error(error: Exception, text: str, source: str, line: int) ->
 
 
 def _to_plain(loader: _Loader, node: yaml.Node, place: Location, lines: dict[Location, int]) -> Any:  # noqa: ANN401
+    """Return a node as plain values, and store the line of each part in `lines`."""
     lines.setdefault(place, node.start_mark.line + 1)
     if isinstance(node, yaml.SequenceNode):
         for index, item in enumerate(node.value):

@@ -79,6 +79,7 @@ class _Expander:
     def _append(
         self, result: list[Any], items: list[Any], location: Location, new_location: Location, values: Values
     ) -> None:
+        """Append a list of steps to `result` with its loops expanded; the arguments are those of `expand_steps`."""
         for index, item in enumerate(items):
             key_path = (*location, index)
             if isinstance(item, dict) and LOOP in item:
@@ -103,6 +104,7 @@ class _Expander:
         new_location: Location,
         values: Values,
     ) -> None:
+        """Append the steps of a loop to `result`, for each combination of its values."""
         if not isinstance(loop, dict) or set(loop) != set(_KEYS):
             unknown = [key for key in loop if key not in _KEYS] if isinstance(loop, dict) else []
             what = f"unknown key {unknown[0]} in for:" if unknown else "for: needs each: and during:"

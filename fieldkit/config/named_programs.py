@@ -44,6 +44,7 @@ def _require_valid_name(name: str) -> None:
 
 
 def _record(name: str, path: Path, folder: Path) -> dict[str, object]:
+    """Return the record of a file that was found in `folder`. A link must not lead out of the allowed folder."""
     lab, folder = Path.cwd().resolve(), folder.resolve()
     allowed_folder = lab if folder.is_relative_to(lab) else folder
     try:

@@ -48,6 +48,7 @@ def configured_backend(document: Document) -> str:
 
 
 def _access(document: Document, name: str, entry: Any) -> RobotAccess | ConfigurationError:  # noqa: ANN401 (any YAML)
+    """Return the access in the entry of a robot, or the error of its first wrong key."""
     if not isinstance(entry, dict):
         return ConfigurationError(
             "this entry is not a mapping", where=document.where(("robots", name)), remedy=_REMEDY

@@ -152,6 +152,7 @@ def _location(problem: Any) -> Location:  # noqa: ANN401 (an `ErrorDetails` of p
 
 
 def _message(problem: Mapping[str, Any], descriptions: Mapping[str, str]) -> str:
+    """Return the description of a problem, without its place."""
     message = _MESSAGES.get(problem["type"], problem["msg"])
     value, context = problem["input"], problem.get("ctx", {})
     match problem["type"]:

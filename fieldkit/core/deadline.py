@@ -8,7 +8,7 @@ from typing import Final, TypeVar
 
 T = TypeVar("T")
 
-_POLL_INTERVAL_S: Final = 0.1
+_POLL_INTERVAL_S: Final = 0.1  # interval between checks whether a call was cancelled
 _MIN_SUSPENDED_S: Final = 5.0
 """A wait that exceeds its timeout by this much means that this process was suspended, for example by Ctrl-Z."""
 

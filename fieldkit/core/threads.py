@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 Item = TypeVar("Item")
 T = TypeVar("T")
 
-_INTERRUPT_WAIT_S: Final = 10.0
-_POLL_INTERVAL_S: Final = 0.5
+_INTERRUPT_WAIT_S: Final = 10.0  # time in which the threads can return after Ctrl-C
+_POLL_INTERVAL_S: Final = 0.5  # longest time until Python handles Ctrl-C
 
 
 class StopSignal:

@@ -1,6 +1,7 @@
 """MCAP messages from the robots' recordings of one attempt. Times are by the clock of the recording robot.
 
-Each packet of a capture is a message, which contains the packet's fate if it is known.
+Each packet of a capture is a message. It contains the packet's fate if this is known: whether the packet was lost, or
+is a copy of another one.
 """
 
 import heapq
@@ -119,7 +120,7 @@ def packet_fates(captures: Mapping[str, Capture], transfers: Iterable[Transfer])
                 (sender_file, receiver_file, transfer.sender_address, transfer.receiver_address), []
             ).append(transfer)
     for (sender_file, receiver_file, sender, receiver), same_path in transfers_by_path.items():
-        matched = _matched(captures[sender_file], captures[receiver_file], same_path)
+        matched = _match_captures(captures[sender_file], captures[receiver_file], same_path)
         if matched is None:
             continue
         sent, received = marked[sender_file], marked[receiver_file]
@@ -137,7 +138,7 @@ def _with_unknown_fates(packets: Packets) -> MarkedPackets:
     return MarkedPackets(packets, lost, copy)
 
 
-def _matched(sender: Capture, receiver: Capture, same_path: Sequence[Transfer]) -> Match | None:
+def _match_captures(sender: Capture, receiver: Capture, same_path: Sequence[Transfer]) -> Match | None:
     """Match the packets of two captures. Return None if the packets of a transfer on this path cannot be matched."""
     sent, received = sender.packets, receiver.packets
     if sender.damage or receiver.damage:

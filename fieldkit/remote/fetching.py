@@ -40,7 +40,7 @@ _MAX_ARCHIVE_BYTES: Final = 2 * PIECE_BYTES
 _CHUNK_BYTES: Final = 1 << 20
 _LIST_CHUNKS: Final = 2
 """Maximum length of the lists of hashes and of sizes, in chunks of 64 KiB."""
-_REPORT_S: Final = 5.0
+_REPORT_S: Final = 5.0  # interval of progress reports
 
 # First words of two error messages of `pack` in the job script.
 _NO_FOLDER: Final = "no folder "

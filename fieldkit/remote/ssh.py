@@ -22,7 +22,7 @@ from fieldkit.remote.sockets import Connect, Timing
 CONNECT_S: Final = Timing.connect_s
 RECONNECT_TIMEOUT_S: Final = 60.0
 
-_MAX_OUTPUT_BYTES: Final = 16 << 20
+_MAX_OUTPUT_BYTES: Final = 16 << 20  # default limit of the standard output of a command
 _DISK_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
@@ -107,6 +107,8 @@ class SshShell:
         has_input: bool = False,
         until: bytes = b"",
     ) -> "SshSession":
+        """Start a command, again after each loss of the link, and return its session."""
+
         def attempt(attempt_deadline: Deadline) -> SshSession:
             link, channel = _start(
                 self._connection, argv, attempt_deadline, ends_on_request=ends_on_request, has_input=has_input

@@ -24,8 +24,8 @@ class ProgramFederate:
 
     Attributes:
         role: `PHYSICS` or `NETWORK`.
-        command: Returns its command line; it builds the program first if necessary. It raises `ConfigurationError` if
-            required software is not installed; the remedy is the command that installs it.
+        command: Builds the program if necessary, and returns its command line. It raises `ConfigurationError` if
+            required software is not installed; the remedy is the command that installs the software.
         summary: Description in one line.
         options: Model of its options in a scenario; None to accept any options without validation.
         writes_captures: True for a network that writes captures with the settings `captures` of its configuration.
@@ -43,12 +43,12 @@ class ProgramFederate:
 
 @dataclass(frozen=True)
 class PythonFederate:
-    """A federate that is a Python class. A run uses it in its own process.
+    """A federate that is a Python class. A run uses the class in the process of the coordinator.
 
     Attributes:
         role: `PHYSICS` or `NETWORK`.
         load: Imports the simulator, and returns the class with its properties. It raises `ConfigurationError` if
-            required software is not installed; the remedy is the command that installs it.
+            required software is not installed; the remedy is the command that installs the software.
         summary: Description in one line.
         options: Model of its options in a scenario; None to accept any options without validation.
     """

@@ -168,7 +168,7 @@ class RemoteNetwork(_RemoteFederate):
         self._log_delay = log
 
     def sample_links(self) -> dict[str, LinkSample]:
-        """Return a sample of the links of each radio, at its current time; empty if it has no radios.
+        """Return a sample of the links of each radio, at the network's current time; empty if there are no radios.
 
         Raises:
             FederateError: It failed, or sent a malformed answer.

@@ -68,8 +68,8 @@ class FederateSession:
     Attributes:
         name: The federate's role, its name if it has sent one, and its command or address.
         reached_ns: Last simulated time to which the federate has advanced, or None.
-        observer: If it is not None, it is called when a request is sent, with the request and None, and when the
-            answer arrives, with the request and the answer.
+        observer: Called with the request and None when a request is sent, and with the request and the answer when
+            the answer arrives; None for no observer.
         exchange_context: Context of each request and its answer.
     """
 

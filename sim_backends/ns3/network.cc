@@ -694,7 +694,7 @@ class Network
     WifiSetup m_setup;
     bool m_hasStandard = false;
     bool m_carriesTopics = false;
-    std::ofstream m_parts;
+    std::ofstream m_parts; // the file of the option `delay_parts`
     std::vector<Station> m_stations;
     std::vector<AgentEntry> m_agents;
     std::set<uint32_t> m_transmitters; // agents that forward or interfere
@@ -706,8 +706,8 @@ class Network
     std::unique_ptr<UdpTransport> m_udp;
     std::unique_ptr<TcpTransport> m_tcp;
     std::unique_ptr<IpCaptures> m_captures; // null if there are none
-    int64_t m_toNs = -1;
-    std::unordered_map<uint64_t, CoordinatorPacket> m_pending;
+    int64_t m_toNs = -1; // end of the last requested window
+    std::unordered_map<uint64_t, CoordinatorPacket> m_pending; // packets that have neither arrived nor been dropped
     protocol::Outcomes m_outcomes;
     uint64_t m_checksum = 0;
 };

@@ -47,7 +47,7 @@ class PeekScheduler : public MapScheduler
 
     Scheduler::Event RemoveNext() override
     {
-        if (++m_events % 1024 == 0)
+        if (++m_events % 1024 == 0) // seldom, because reading the clock takes time
         {
             g_heartbeat.SendIfDue(NowNs());
         }

@@ -89,7 +89,7 @@ class UdpTransport
             return;
         }
         auto datagram = Datagram(packet, -kIpAndUdpBytes);
-        BroadcastTag tag;
+        BroadcastTag tag; // its number contains the number of the packet and the source; see ReceiveBroadcast
         tag.number = static_cast<uint64_t>(packet.number) * m_sockets.size() + packet.source;
         datagram->AddPacketTag(tag);
         m_sockets[packet.source]->SendTo(datagram, 0, InetSocketAddress(Ipv4Address::GetBroadcast(), kUdpPort));
@@ -145,8 +145,9 @@ class UdpTransport
     const std::vector<Station>& m_stations;
     Fates m_fates;
     std::vector<Ptr<Socket>> m_sockets;
-    std::map<uint32_t, size_t> m_stationOf;                                           // by node
-    std::map<std::pair<size_t, int64_t>, std::map<size_t, uint64_t>> m_broadcasts; // receivers and their packets
+    std::map<uint32_t, size_t> m_stationOf; // index of a station, by the id of its node
+    // Packets of a broadcast by receiver, for each source and number of the broadcast.
+    std::map<std::pair<size_t, int64_t>, std::map<size_t, uint64_t>> m_broadcasts;
 };
 
 // Each flow has a connection, which its first message opens. A message arrives when its last byte has been read.

@@ -156,6 +156,7 @@ class MinstrelHt(RateControl):
         statistics.acknowledged += acknowledged
         self._aggregate_frames += attempts
         self._aggregates += 1
+        # Replace a mode of the chain that fails by a mode of a lower group.
         is_failing = False
         for rank, chain_mode in enumerate((self._best, self._second)):
             statistics = self._statistics[chain_mode]

@@ -154,7 +154,7 @@ class PacketDelivery(Generic[Payload]):
         return [names[index] for index in ends if index is not None]
 
     def peer(self, transmitter: int, receiver: int, category: int = 0) -> Peer[Payload]:
-        """Return the state of a link in an access category, which is created when it is first used."""
+        """Return the state of a link in an access category; the state is created when it is first requested."""
         pair = transmitter, receiver
         peer = self.peers.get(pair)
         if peer is None:

@@ -201,7 +201,7 @@ class Fades:
         self._share = 1 / np.sqrt(_ECHOES * (k + 1))
 
     def gains(self, after_s: float) -> Floats:
-        """Return the power gains, shape (n,), at `after_s` from the reference time; it may be slightly negative."""
+        """Return the power gains, shape (n,), at `after_s`, which is relative to the reference time."""
         initial_rad, rate_rad_s = self._echoes
         phases_rad = initial_rad + after_s * rate_rad_s
         echoes = np.cos(phases_rad).sum(axis=1) + 1j * np.sin(phases_rad).sum(axis=1)

@@ -158,7 +158,7 @@ class Reception(Generic[Payload]):
         self._emissions = current
 
     def is_jammed(self, index: int) -> bool:
-        """Return True if the jammer noise at a station is so strong that it does not send."""
+        """Return True if the jammer noise at a station is so strong that the station does not send."""
         emissions = self._emissions.values()
         return bool(emissions) and sum(emission.powers_mw[index] for emission in emissions) >= _ENERGY_DETECTION_MW
 

@@ -36,7 +36,7 @@ COLUMNS: Final = columns(
     (
         "roam_ping_pongs",
         "count",
-        "Handovers back to an access point that the robot had left at most the time `ping_pong` of the step before.",
+        "Handovers back to an access point within the time `ping_pong` of the step after the robot had left it.",
         Figure("ping-pong handovers", Kind.MEDIAN),
     ),
     (
@@ -114,7 +114,7 @@ def find_handovers(samples: Sequence[LinkSample]) -> list[Handover]:
 
 
 def count_ping_pongs(handovers: Sequence[Handover], within_s: float) -> int:
-    """Return the number of handovers back to an access point at most `within_s` after the handover from it."""
+    """Return the number of handovers back to an access point within `within_s` after the robot had left it."""
     return sum(
         later.new == earlier.old and later.joined_ns - earlier.joined_ns <= within_s * 1e9
         for earlier, later in pairwise(handovers)

@@ -64,7 +64,7 @@ class AnswerGap:
 
 
 def longest_gap(output: Ping, interval_s: float) -> AnswerGap | None:
-    """Return the longest time between the answers to consecutive answered requests; None without time stamps.
+    """Return the longest time between two answers with no answered request between them; None without time stamps.
 
     A gap in which ping started or ended is open. It is returned if it is at least as long as the longest gap between
     two answers, or at least `MIN_OPEN_GAP_S` long.
@@ -89,7 +89,10 @@ def longest_gap(output: Ping, interval_s: float) -> AnswerGap | None:
 
 
 def stamped_answers(output: Ping) -> Iterator[tuple[int, int]]:
-    """Yield the unwrapped sequence number and the time stamp of each answer that has a time stamp."""
+    """Yield the sequence number and the time stamp of each answer that has a time stamp.
+
+    The numbers are unwrapped: after 65,535, they continue with 65,536.
+    """
     previous: int | None = None
     for answer in output.answers:
         if answer.at_utc_ns is not None:

@@ -51,6 +51,7 @@ def measure(evidence: AttemptEvidence, names: Mapping[Role, str], measured: Meas
         _with_clock_reasons(measured, "; ".join(mark.reason for mark in clock_marks)) | clock_columns | radio_columns
     )
     for role in names:
+        # Declared columns without a value are missing.
         measured |= health.measure(role, *health_by_role[role]) | Measured.all_missing(
             declare_columns(role), _NO_SOURCE
         )
@@ -88,7 +89,7 @@ def _measure_clocks(
     has_source = any(CLOCK_SOURCES & snapshot.keys() for pair in snapshots_by_role.values() for snapshot in pair)
     if not has_source and not any(offset and exchanges.is_wrong(offset) for offset in offsets.values()):
         return result, [], False
-    from fieldkit.measure.robot_state import clock_states  # noqa: PLC0415 (see the docstring)
+    from fieldkit.measure.robot_state import clock_states  # noqa: PLC0415 (see the docstring of the module)
 
     robot_clocks = {}
     for role, name in names.items():
@@ -107,7 +108,7 @@ def _measure_radios(
     """Return the columns of the radios, their marks, and True if an airtime is known."""
     if not any(RADIO_SOURCES & snapshot.keys() for pair in snapshots_by_role.values() for snapshot in pair):
         return Measured(), [], False
-    from fieldkit.measure.robot_state import neighbourhood  # noqa: PLC0415 (see the docstring)
+    from fieldkit.measure.robot_state import neighbourhood  # noqa: PLC0415 (see the docstring of the module)
 
     radios = {role: tuple(map(neighbourhood.parse, pair)) for role, pair in snapshots_by_role.items()}
     result = Measured()

@@ -121,31 +121,38 @@ def tcp_rates(frames: tcp.TcpFrames, receiver: Packets, transfer: Transfer, coun
         return Rates(None, None)
     mss = frames.mss_bytes or int(payload.max())
     headers = received.ip_header_bytes + received.ip_payload_bytes - payload
-    extra_segments = np.maximum(-(-payload // mss) - 1, 0)
+    extra_segments = np.maximum(-(-payload // mss) - 1, 0)  # the number of segments is rounded up
     throughput = _throughput(received, payload > 0, _ip_bytes(received) + extra_segments * headers)
     closed_ns = _closed_ns(frames.sent, receiver, transfer, counts)
     return Rates(throughput, None if closed_ns is None else float(closed_ns - time_ns.min()) / 1e9)
 
 
 def _closed_ns(sent: Packets, receiver: Packets, transfer: Transfer, counts: tcp.TcpCounts) -> int | None:
-    """Return the time at which the receiver closed the connection after it had acknowledged every byte, or None.
+    """Return the time at which the receiver closed the connection after it had acknowledged every byte.
+
+    Return None if it did not, or if the time is unknown.
 
     netcat exits after it has read to the end of the connection. The FIN that its kernel then sends shows that it
     received every byte.
     """
     is_syn = sent.tcp_flags & SYN != 0
-    if len(np.unique(sent.sport)) != 1 or len(isn := np.unique(sent.tcp_seq[is_syn])) != 1:
-        return None
+    if len(np.unique(sent.sport)) != 1 or len(initial_seqs := np.unique(sent.tcp_seq[is_syn])) != 1:
+        return None  # there are several connections, or the start of the stream is unknown
     reverse = transfer.backward(receiver)
     closing = reverse.where(
         (reverse.sport == transfer.port) & (reverse.dport == sent.sport[0]) & (reverse.tcp_flags & FIN != 0)
     )
-    acked_beyond = (closing.tcp_ack - (int(isn[0]) + 1 + counts.unique_bytes)) % _SEQUENCE_NUMBERS
+    # A difference below half of the sequence numbers is not negative: every byte is acknowledged.
+    acked_beyond = (closing.tcp_ack - (int(initial_seqs[0]) + 1 + counts.unique_bytes)) % _SEQUENCE_NUMBERS
     times_ns = closing.time_ns[acked_beyond < _SEQUENCE_NUMBERS // 2]
     return None if not len(times_ns) or (times_ns == NO_TIME).any() else int(times_ns.min())
 
 
 def _throughput(received: Packets, carries_payload: Mask, ip_bytes: Ints) -> float | None:
+    """Return the bit/s from the first packet with payload to the last, without the bits of the first packet.
+
+    Return None if the two packets have the same time.
+    """
     order = np.argsort(received.time_ns, kind="stable")
     with_payload = np.flatnonzero(carries_payload[order])
     in_span = order[with_payload[0] : with_payload[-1] + 1]

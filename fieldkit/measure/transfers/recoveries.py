@@ -170,6 +170,7 @@ def find_recovery(stream: StreamDeliveries, began_ns: int, ended_ns: int | None)
     has_recovered = after < len(at_ns)
     if not has_recovered and stream.end_ns is None:
         raise EvidenceError("all payload of the flow arrived before the end of the cause")
+    # From the last delivery before the fault to the first one after the end of the cause.
     longest_gap_s = float(np.diff(at_ns[max(before - 1, 0) : after + 1]).max(initial=0)) / 1e9
     before_first_s = 0.0 if before else (int(at_ns[0]) - stream.begin_ns) / 1e9
     after_last_s = 0.0 if has_recovered else (last_ns - int(at_ns[-1])) / 1e9

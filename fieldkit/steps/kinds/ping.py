@@ -5,7 +5,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import product
 from typing import TYPE_CHECKING, Annotated, Final, Self
 
-import numpy as np
 from typing_extensions import override
 
 from fieldkit.backends.protocols import Testbed
@@ -16,11 +15,9 @@ from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.core.units import format_count
-from fieldkit.measure.captures.arrays import NO_TIME, Mask
-from fieldkit.measure.captures.packets import ECHO_REPLY, NO_ECHO, Packets
 from fieldkit.measure.checks import ping_checks
+from fieldkit.measure.checks.ping_captures import PingCaptures
 from fieldkit.measure.evidence import ping
-from fieldkit.measure.evidence.ping import Ping
 from fieldkit.measure.positions import position_columns
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
@@ -41,7 +38,6 @@ REPLY_TIMEOUT_S: Final = 2
 """Time that ping waits for the reply to its last request (option `-W`)."""
 MAX_SEQUENCE_COUNT: Final = 0xFFFF
 """Number of requests after which sequence numbers repeat."""
-_HEADER_BYTES: Final = 8
 """Size of the ICMP header of an echo request."""
 OLD_IPUTILS_MIN_INTERVAL_S: Final = 0.2
 """Shortest interval that iputils before 20210722 allows without root."""
@@ -242,48 +238,17 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
         # iputils reports 0 for a negative time, and "time of day goes back" in its log.
         if 0.0 in result.rtt_s:
             yield f"{self._file} has a round-trip time of 0: the clock was set back while ping waited"
+        yield from self._captures(view).find_problems(result, self.interval)
+
+    def _captures(self, view: View) -> PingCaptures:
         roles = (self.sender, self.receiver)
-        missing_packets = [
-            reason
-            for role in roles
-            if view.has_captures(role)
-            for reason in self._packets_missing_in_capture(result, role, view)
-        ]
-        yield from missing_packets or self._contradictions(result, view)
-        # If the captures lack packets of this ping, the origin of other packets cannot be determined.
-        if not missing_packets and view.has_captures(*roles) and (earlier_count := self._earlier_packets(view)):
-            packets_text = format_count(earlier_count, "packet")
-            yield (
-                f"packets of an earlier attempt were still in transit: {packets_text} of a ping that sent no request "
-                "in this attempt arrived"
-            )
-
-    def _contradictions(self, result: Ping, view: View) -> Iterator[str]:
-        """Yield the contradictions with each capture.
-
-        If several pings ran, the ping with the fewest contradictions is assumed to be this one.
-        """
-        source, destination = (view.scene.link(end, self.over).address for end in (self.sender, self.receiver))
-        for role in (self.sender, self.receiver):
-            capture = view.capture(role)
-            if capture is None or result.payload_bytes is None or (capture.packets.time_ns == NO_TIME).any():
-                continue
-            candidates = ping_checks.captured_pings(capture.packets, source, destination, result.payload_bytes)
-            is_sender = role == self.sender
-            reasons = [
-                list(ping_checks.compare_with_capture(result, candidate, self.interval, role, is_requester=is_sender))
-                for candidate in candidates
-            ]
-            yield from (f"{self._file}: {reason}" for reason in min(reasons, key=len, default=[]))
+        source, destination = (view.scene.link(role, self.over).address for role in roles)
+        return PingCaptures(
+            self._file, self.sender, {role: view.capture(role) for role in roles}, source, destination
+        )
 
     def _captured_echoes(self, view: View) -> "tuple[PingEchoes | None, ...]":
-        """Return the echoes in the captures of sender and receiver, with None for a missing or incomplete capture."""
-        from fieldkit.measure.checks.ping_duplicates import captured_echoes  # noqa: PLC0415 (only if needed)
-
-        source, destination = (view.scene.link(end, self.over).address for end in (self.sender, self.receiver))
-        size_bytes = self.payload_of(view.scene.protocol) + _HEADER_BYTES
-        captures = (view.capture(role) for role in (self.sender, self.receiver))
-        return tuple(captured_echoes(capture, source, destination, size_bytes) for capture in captures)
+        return self._captures(view).echoes(self.payload_of(view.scene.protocol))
 
     def _link_ends(self, view: View) -> "dict[str, LinkEnds]":
         """Return the indices of the interfaces of each link."""
@@ -296,54 +261,6 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
             link: LinkEnds(*(indices[role].get(view.scene.link(role, link).interface) for role in roles))
             for link in self.links
         }
-
-    def _packets_missing_in_capture(self, result: Ping, role: Role, view: View) -> Iterator[str]:
-        """Yield a reason if ping printed more answers, or more answered requests, than a capture contains.
-
-        The capture may contain other pings, with other identifiers or sizes. The printed number is compared with
-        the packet count of the most frequent identifier, so the identifier of this ping need not be known.
-        """
-        capture = view.capture(role)
-        if capture is None:
-            return
-        source, destination = (view.scene.link(end, self.over).address for end in (self.sender, self.receiver))
-        packets = capture.packets
-        echoes = packets.where((packets.echo != NO_ECHO) & _has_payload(packets, result.payload_bytes))
-        counts = (
-            (len(result.replies), "answer", _max_count(echoes.icmp(destination, source))),
-            (len(result.answers), "answered request", _max_count(echoes.icmp(source, destination))),
-        )
-        for printed_count, kind, captured_count in counts:
-            if printed_count > captured_count:
-                printed_text = format_count(printed_count, kind)
-                yield f"{self._file} has {printed_text}, but the {role}'s capture has only {captured_count}"
-                return
-
-    def _earlier_packets(self, view: View) -> int:
-        """Return the number of received packets of pings that sent no request during the captures.
-
-        Packets of another ping of this attempt do not count, because its requests were captured. Later fragments
-        whose first fragment is missing are counted only for requests: the sender's capture contains all requests of
-        this attempt, because it ends after the ping. The receiver's capture may lack late replies, so fragments of
-        replies cannot be attributed.
-        """
-        sender, receiver = (view.capture(role) for role in (self.sender, self.receiver))
-        if sender is None or receiver is None:
-            return 0
-        source, destination = (view.scene.link(role, self.over).address for role in (self.sender, self.receiver))
-        requests, arrivals = (capture.packets.icmp(source, destination) for capture in (sender, receiver))
-        replies = sender.packets.icmp(destination, source)
-        # `echo` is the identifier of a ping process; in replies, `ECHO_REPLY` is added to it.
-        is_request = (arrivals.echo != NO_ECHO) & (arrivals.echo < ECHO_REPLY)
-        was_sent = np.isin(arrivals.echo, requests.echo)
-        earlier_count = int((is_request & ~was_sent).sum())
-        is_earlier_reply = (replies.echo >= ECHO_REPLY) & ~np.isin(replies.echo - ECHO_REPLY, requests.echo)
-        earlier_count += int(is_earlier_reply.sum())
-        # Fragments are identified by their IP ids, unless a router has changed these.
-        if np.isin(arrivals.ip_id[is_request & was_sent], requests.ip_id).all():
-            is_earlier_fragment = (arrivals.fragment_offset > 0) & ~np.isin(arrivals.ip_id, requests.ip_id)
-            earlier_count += int(is_earlier_fragment.sum())
-        return earlier_count
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
@@ -410,18 +327,3 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
     @override
     def expected_s(self, protocol: Protocol) -> float:
         return (self.count - 1) * self.interval
-
-
-def _has_payload(packets: Packets, payload_bytes: int | None) -> Mask:
-    """Return a mask of the packets that can be echoes with this payload: unfragmented packets and first fragments."""
-    if payload_bytes is None:
-        return np.ones(len(packets), dtype=np.bool_)
-    size = payload_bytes + _HEADER_BYTES
-    mask: Mask = np.where(packets.more_fragments, packets.ip_payload_bytes < size, packets.ip_payload_bytes == size)
-    return mask
-
-
-def _max_count(echoes: Packets) -> int:
-    """Return the number of packets of the identifier with the most packets."""
-    _, counts = np.unique(echoes.echo, return_counts=True)
-    return int(counts.max(initial=0))

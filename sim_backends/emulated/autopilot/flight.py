@@ -167,7 +167,7 @@ def limits_within(limits: QuadrotorLimits, parameters: Parameters) -> QuadrotorL
 
 
 def velocity_to(goal_m: Vector, body: Airframe, limits: QuadrotorLimits) -> Vector:
-    """Return the velocity towards a point relative to home, at which the drone can still stop at the point."""
+    """Return the velocity towards a point relative to home; the drone can still brake to a stop at the point."""
     east, north, up = (goal - current for goal, current in zip(goal_m, body.position_m, strict=True))
     distance_m = math.hypot(east, north)
     along_per_s, climb_per_s = limits.gains_per_s

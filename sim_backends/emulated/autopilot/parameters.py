@@ -18,8 +18,8 @@ class Parameter:
     Attributes:
         name: Name in the firmware; empty for an internal constant that is not listed.
         value: Value at power-on.
-        minimum: Smallest value that a client can set.
-        maximum: Largest value that a client can set.
+        minimum: Smallest value that is accepted.
+        maximum: Largest value that is accepted.
         key: PX4's name, by which the vehicle reads it; empty if it equals `name`.
         scale: Number of its units per SI unit.
         integer: True if it is an integer (MAV_PARAM_TYPE_INT32); otherwise a float (REAL32).

@@ -5,8 +5,8 @@ requests as the process of a radio model, and two more: `simulate`, with simulat
 body of a robot.
 
 A session is one run of the coordinator, which advances physics and network together, in windows of simulated time.
-Its time is 0 when the session starts, and its windows end in real time. If
-the set of stations or the relay changes, a new session starts, and packets on the air of the old session are lost.
+Its time is 0 when the session starts, and its windows end in real time. If the set of stations or the relay changes,
+a new session starts, and packets on the air of the old session are lost.
 """
 
 import gc

@@ -22,7 +22,7 @@ LIMIT_BYTES: Final = 64 << 20
 """Maximum size of both files together; later attempts are omitted."""
 
 _SNAP_BYTES: Final = 160
-"""Number of bytes of each frame that the capture contains at most (snapshot length)."""
+"""Maximum number of bytes of a frame that the capture contains (snapshot length)."""
 _PCAP_HEADER: Final = struct.pack("<IHHiIII", 0xA1B23C4D, 2, 4, 0, 0, _SNAP_BYTES, 105)
 _RECORD_HEADER: Final = struct.Struct("<IIII")
 # Frame control, duration, receiver, transmitter, BSSID, sequence control: as in an ad hoc network (IBSS).

@@ -141,9 +141,8 @@ class Listener:
 
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, stop)
-        signal.pthread_sigmask(
-            signal.SIG_SETMASK, []
-        )  # `rosbag` has blocked the signals before it forks the recorder
+        # `rosbag` blocks the signals before it forks the recorder.
+        signal.pthread_sigmask(signal.SIG_SETMASK, [])
 
 
 def _header(payload: bytes, topic: str) -> Header:

@@ -73,8 +73,8 @@ class Ros1Options:
         reconnect: Times for reopening a lost connection to a publisher (roscpp, `transport_publisher_link.cpp`).
         silence_ns: Time without a message after which a subscriber probes the connection.
         probe_ns: Interval of these probes.
-        probes: Number of unanswered probes after which it gives up the connection. The defaults of `silence_ns`,
-            `probe_ns` and `probes` are those of ROS: `setKeepAlive(60, 10, 9)`.
+        probes: Number of unanswered probes after which the subscriber gives up the connection. The defaults of
+            `silence_ns`, `probe_ns` and `probes` are those of ROS: `setKeepAlive(60, 10, 9)`.
         datagram_bytes: Maximum size of a UDPROS datagram with its header of 8 bytes (`transport_udp.cpp`).
     """
 

@@ -19,8 +19,8 @@ LossCallback = Callable[[str], None]
 class TcpStreams:
     """Carries messages over TCP connections, and reports delivery and loss to the ends by callbacks.
 
-    It is the `Wire` of its TCP. On the wire below, segments are packets of the transport to which this object
-    belongs.
+    This object is the `Wire` of the TCP that it uses. On the wire below, segments are packets of the transport to
+    which this object belongs.
 
     Args:
         wire: The network below.

@@ -79,14 +79,18 @@ class RackScoreboard(Scoreboard):
         self._transmissions.append((segment, segment.transmissions))
 
     def detect_losses(self, now_ns: int, *, is_recovering: bool) -> int | None:
-        """Mark a segment as lost if it was sent before an arrived segment and longer ago than a limit.
+        """Mark each segment as lost that was sent before an arrived segment and longer ago than a limit.
 
         The limit is the sum of a round trip and the reordering window.
+
+        Returns:
+            The time at which the segments that were sent more recently exceed the limit; None if there are none.
         """
         limit_ns = self._round_trip_ns + self._reordering_window_ns(is_recovering=is_recovering)
         transmissions, undecided, due_ns = self._transmissions, list[tuple[SentSegment, int]](), None
         while transmissions:
             segment, transmission_count = transmissions[0]
+            # False if the segment has arrived, is marked as lost, or was sent again later.
             is_current = (
                 segment.copies
                 and segment.transmissions == transmission_count

@@ -177,7 +177,7 @@ class Sender:
             self._send()
 
     def _update_window(self, delivered_bytes: int) -> None:
-        """Increase the window for an ACK of new data, or end the recovery that it completes.
+        """Increase the window for an ACK of new data, or end the recovery that the ACK completes.
 
         Bytes that a SACK reported before are not counted again: after a timeout one ACK may cover much data that left
         the network long ago (RFC 3465, 2.3; Linux: acked_sacked).

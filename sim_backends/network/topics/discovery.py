@@ -86,12 +86,12 @@ class _RemoteParticipant:
     """The state of a remote participant at one participant.
 
     Attributes:
-        lease: Fires when the lease may have expired.
+        lease_timer: Fires when the lease may have expired.
         last_renewal_ns: Time of the last message from it.
         is_alive: True from its announcement until its lease expires.
     """
 
-    lease: WireTimer
+    lease_timer: WireTimer
     last_renewal_ns: int = 0
     is_alive: bool = False
 
@@ -133,7 +133,7 @@ class TopicDiscovery:
             wire.at(starts_ns, participant, partial(self._start, participant))
 
     def renew_lease(self, host: str, peer: str) -> None:
-        """Record that a message from `peer` arrived at `host`, which renews its lease."""
+        """Record that a message from `peer` arrived at `host`; it renews the lease of the peer."""
         remote_participant = self._remote_participants.get((host, peer))
         if remote_participant is not None and remote_participant.is_alive:
             remote_participant.last_renewal_ns = self._wire.now_ns
@@ -158,12 +158,13 @@ class TopicDiscovery:
             return
         remote_participant.is_alive = True
         remote_participant.last_renewal_ns = self._wire.now_ns
-        remote_participant.lease.bring_forward(self._wire.now_ns + self._discovery_timing.lease_ns)
+        remote_participant.lease_timer.bring_forward(self._wire.now_ns + self._discovery_timing.lease_ns)
         if not is_directed:
             self._respond(host, peer, _DIRECTED_RESPONSES)
         self._start_sedp(host, peer)
 
     def _start(self, participant: str) -> None:
+        """Announce a participant when it starts, and schedule its later announcements."""
         now_ns, timing = self._wire.now_ns, self._discovery_timing
         self._announce(participant)
         self._wire.at(now_ns + timing.second_announcement_ns, participant, partial(self._announce, participant))
@@ -264,7 +265,7 @@ class TopicDiscovery:
         remote_participant = self._remote_participants[host, peer]
         expires_ns = remote_participant.last_renewal_ns + self._discovery_timing.lease_ns
         if self._wire.now_ns < expires_ns:
-            remote_participant.lease.bring_forward(expires_ns)
+            remote_participant.lease_timer.bring_forward(expires_ns)
             return
         remote_participant.is_alive = False
         self._sedp_session(host, peer).writer.remove_reader(_LEASE_EXPIRED)

@@ -44,7 +44,7 @@ class _Response:
         kind: Kind of response; a silent response is not sent; a suppressed response acknowledges without requesting
             data.
         numbers: Requested samples.
-        missing_fragments: Requested fragments of the sample after them.
+        missing_fragments: Requested fragments of the first sample after `numbers`; None for none.
         is_timed_repeat: True if it repeats a request only because enough time has passed since that request.
     """
 

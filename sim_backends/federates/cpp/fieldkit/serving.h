@@ -38,7 +38,7 @@ class Heartbeat
         return m_last + m_interval;
     }
 
-    // Send `busy` with the time that the run has reached, if it is due.
+    // Send `busy` with the simulated time `at_ns` that the run has reached, if the next message is due.
     void SendIfDue(int64_t at_ns)
     {
         if (Clock::now() >= Due())
