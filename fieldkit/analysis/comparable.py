@@ -159,6 +159,7 @@ def _attempts(rows: Repeats) -> set[Key]:
 
 
 def _pair_concerns(a: Repeats, b: Repeats, varied: Collection[str]) -> Iterator[Concern]:
+    """Yield the concerns about one condition."""
     for name in SAME:
         is_varied = name in varied and all(len(set(rows.column(name))) == 1 for rows in (a, b))
         depends_on_backend = name in _KERNEL_COLUMNS and not set(a.column("backend")) & set(b.column("backend"))
@@ -173,6 +174,7 @@ def _pair_concerns(a: Repeats, b: Repeats, varied: Collection[str]) -> Iterator[
 
 
 def _compare_column(name: str, a: Repeats, b: Repeats, *, refuses: bool) -> Iterator[Concern]:
+    """Yield a concern if the values of a column in A and B differ."""
     text_a, text_b = _values(name, a), _values(name, b)
     is_unknown = UNKNOWN in {text_a, text_b}
     # A column that is missing in both runs is not a difference, unless it identifies robots or procedure.
@@ -181,11 +183,13 @@ def _compare_column(name: str, a: Repeats, b: Repeats, *, refuses: bool) -> Iter
 
 
 def _values(name: str, rows: Repeats) -> str:
+    """Return the different values of a column as text; `unknown` if there are none."""
     values = set(rows.column(name)) - {"", None}
     return ", ".join(sorted(map(cell_text, values))) or UNKNOWN
 
 
 def _file_sizes(a: Repeats, b: Repeats) -> Iterator[Concern]:
+    """Yield a concern if the median sizes of the sent files differ."""
     value_a, value_b = (_median(rows.numbers["sent_bytes"]) for rows in (a, b))
     message_a, message_b = (_bytes_per("bag_messages", rows) for rows in (a, b))
     tolerance = np.fmax(SIZE_TOLERANCE * min(value_a, value_b), _MESSAGES * np.fmax(message_a, message_b))
@@ -193,6 +197,7 @@ def _file_sizes(a: Repeats, b: Repeats) -> Iterator[Concern]:
 
 
 def _datagram_sizes(a: Repeats, b: Repeats) -> Iterator[Concern]:
+    """Yield a concern if the median sizes of datagrams differ."""
     value_a, value_b = (_bytes_per("datagrams_sent", rows) for rows in (a, b))
     yield from _compare_sizes("bytes per datagram", value_a, value_b, (DATAGRAM_FACTOR - 1) * min(value_a, value_b))
 
@@ -220,6 +225,7 @@ def _median(values: Numbers) -> float:
 
 
 def _offload_state(a: Repeats, b: Repeats) -> Iterator[Concern]:
+    """Yield a concern if the use of segmentation offload differs, or is known for only one run."""
     value_a, value_b = (_offload_text(rows) for rows in (a, b))
     if value_a != value_b:
         yield Concern("segmentation offload", value_a, value_b, (), refuses=UNKNOWN not in {value_a, value_b})

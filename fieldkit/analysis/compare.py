@@ -179,6 +179,7 @@ def _quantities(a: Repeats, b: Repeats) -> tuple[Quantity, ...]:
 
 
 def _cells(rows: Repeats, by: Sequence[str]) -> dict[Key, Cell]:
+    """Return the cells by their values of the columns `by`."""
     return {tuple(cell.key[name] for name in by): cell for cell in aggregate(rows, by)}
 
 
@@ -194,6 +195,7 @@ def _differences(
     compared: Iterable[Quantity],
     thresholds: Mapping[str, float],
 ) -> tuple[Difference, ...]:
+    """Return the differences of all quantities that A or B has under one condition."""
     differences = []
     for quantity in compared:
         a, b = (None if cell is None else cell.estimates.get(quantity.name) for cell in cells)
@@ -208,6 +210,7 @@ def _differences(
 
 
 def _values(rows: Repeats, quantity: Quantity) -> Numbers:
+    """Return the values of the repeats from which the estimate was computed."""
     has_all = np.isfinite([rows.numbers[name] for name in quantity.columns]).all(axis=0)  # same rows as in `cells`
     if quantity.at_least is not None:
         values, _ = rows.observed(quantity)
@@ -216,6 +219,7 @@ def _values(rows: Repeats, quantity: Quantity) -> Numbers:
 
 
 def _interval(a: Estimate, b: Estimate) -> Interval | None:
+    """Return the interval of B - A; None if one of the estimates has no interval."""
     if a.low is None or a.high is None or b.low is None or b.high is None:
         return None
     return significance.difference_interval(Interval(a.value, a.low, a.high), Interval(b.value, b.low, b.high))

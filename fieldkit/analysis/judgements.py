@@ -92,6 +92,7 @@ def judge_by_trial(cells: Iterable[tuple[Cell, Iterable[Expectation]]]) -> tuple
 
 
 def _judge_cells(expectation: Expectation, cells: Sequence[Cell]) -> Iterator[Judgement]:
+    """Yield a judgement for each cell whose protocol matches, or one judgement without a cell if none matches."""
     matching_cells = [cell for cell in cells if expectation.protocol in {None, cell.key.get("protocol")}]
     for cell in matching_cells:
         estimate = cell.estimates.get(expectation.quantity)
@@ -122,6 +123,7 @@ def _limitations(expectation: Expectation, estimate: Estimate, n_valid: int) -> 
 
 
 def _decide(expectation: Expectation, estimate: Estimate) -> _Decision:
+    """Return the ruling from the repeats that have a value."""
     if expectation.scope is Scope.FIGURE:
         return _decide_figure(expectation, estimate)
     if estimate.sample is None:

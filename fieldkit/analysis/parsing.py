@@ -99,6 +99,7 @@ def _numpy_type(column: Column) -> type[np.float64] | type[np.longdouble]:
 
 
 def _texts(column: pa.ChunkedArray) -> Texts:
+    """Return a column of texts; missing texts are empty."""
     encoded = column.unify_dictionaries().combine_chunks()
     distinct = np.array([*map(unescape_formula, encoded.dictionary.to_pylist()), ""], dtype=np.object_)
     codes = _buffer_values(encoded.indices, np.int32)
@@ -108,6 +109,7 @@ def _texts(column: pa.ChunkedArray) -> Texts:
 
 
 def _numbers(column: pa.ChunkedArray) -> Numbers:
+    """Return a column of numbers; missing numbers are NaN."""
     numbers: Numbers
     if column.type == pa.int64():
         numbers = _buffer_values(column.combine_chunks(), np.int64).astype(np.longdouble)
@@ -120,6 +122,7 @@ def _numbers(column: pa.ChunkedArray) -> Numbers:
 
 
 def _missing(column: pa.ChunkedArray) -> NDArray[np.bool_]:
+    """Return a mask of the missing values."""
     return np.asarray(_buffer_values(column.is_null().cast(pa.uint8()).combine_chunks(), np.uint8) != 0)
 
 

@@ -75,6 +75,7 @@ def to_json(by: Sequence[str], cells: Sequence[Cell], more: Sequence[Mapping[str
 
 
 def _cell_object(cell: Cell, more: Mapping[str, int] | None) -> dict[str, Any]:
+    """Return a cell in the form of `to_json`; `more` has the number of additional repeats by quantity."""
     counts = ("n_valid", "n_void", "n_failed")
     estimates = {}
     for row in estimate_rows(cell):

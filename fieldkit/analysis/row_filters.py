@@ -104,6 +104,7 @@ def _check(node: ast.expr, types: Mapping[str, type]) -> None:
 
 
 def _check_comparison(first: ast.expr, comparison: ast.cmpop, second: ast.expr, types: Mapping[str, type]) -> None:
+    """Raise ConfigurationError for a comparison that is not allowed."""
     kind = _type(first, types)
     if isinstance(comparison, _MEMBERSHIP) and isinstance(second, ast.List | ast.Tuple | ast.Set):
         others = {_type(element, types) for element in second.elts}
@@ -148,6 +149,7 @@ def _not_allowed(node: ast.expr) -> ConfigurationError:
 
 
 def _truth(node: ast.expr, rows: Repeats) -> Truth:
+    """Return the result of a condition for each row."""
     match node:
         case ast.BoolOp(op=connective, values=conditions):
             truths = [_truth(condition, rows) for condition in conditions]
@@ -174,6 +176,7 @@ def _truth(node: ast.expr, rows: Repeats) -> Truth:
 
 
 def _comparison(first: ast.expr, comparison: ast.cmpop, second: ast.expr, rows: Repeats) -> Truth:
+    """Return the result of one comparison for each row."""
     values, missing = _values(first, rows)
     if isinstance(comparison, _MEMBERSHIP) and isinstance(second, ast.List | ast.Tuple | ast.Set):
         result = np.zeros(len(rows), np.bool_)

@@ -42,6 +42,7 @@ def unmet_requirements(
 
 
 def _requirement(expectation: Expectation, quantity: Quantity, repeats: int) -> str:
+    """Return what an expectation needs, as text; empty if the planned repeats are enough."""
     available_text = f"this trial has {repeats}"
     if expectation.scope is Scope.PACKETS:
         packets = one_sided_bounds.packets_for(expectation.bound)

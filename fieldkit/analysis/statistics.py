@@ -229,6 +229,7 @@ def student(freedom: Floats) -> Floats:
 
 
 def _score_interval(share: Floats, trials: Floats, quantile: Floats) -> tuple[Floats, Floats]:
+    """Return the ends of the score interval of each share, for a normal or Student's quantile."""
     square = quantile**2 / trials
     centre = (share + square / 2) / (1 + square)
     half = np.sqrt(square * (share * (1 - share) + square / 4)) / (1 + square)

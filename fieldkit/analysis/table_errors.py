@@ -77,6 +77,7 @@ def first_problem(where: str, content: bytes, declared: Mapping[str, Column]) ->
 def _explain_row(
     where: str, names: Sequence[str], row: Sequence[str], declared: Mapping[str, Column]
 ) -> FieldkitError | None:
+    """Return the error of a row; None if the row is valid."""
     if len(row) != len(names):
         return EvidenceError(f"{len(row)} cells in a table of {len(names)} columns", where=where, remedy=_REMEDY)
     cells = dict(zip(names, row, strict=True))

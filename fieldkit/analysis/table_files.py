@@ -244,6 +244,7 @@ class _Batch:
             yield (columns or {}), [(path, -1 if columns is None else rows)]
 
     def _parse_single(self, path: Path, body: bytes, declared: Mapping[str, Column]) -> Repeats:
+        """Return the rows of one table, or raise the error of its first invalid line."""
         if (error := table_errors.first_problem(str(path), self.header + b"\n" + body, declared)) is not None:
             raise error
         try:
@@ -350,6 +351,11 @@ def _check_line_end(path: Path, body: bytes) -> None:
 
 
 def _header(path: Path, header: bytes) -> tuple[str, ...]:
+    """Return the names of the columns in a header.
+
+    Raises:
+        ConfigurationError: The header is not the header of a table of repeats.
+    """
     names = header_names(header)
     missing = [name for name in IDENTITY if name not in names]
     duplicates = sorted(name for name, count in Counter(names).items() if name and count > 1)

@@ -134,6 +134,7 @@ def lines(cells: Sequence[Cell], quantities: Iterable[Quantity] | None = None) -
 
 
 def _quantity_lines(quantity: Quantity, cells: Sequence[Cell]) -> Iterator[TableLine]:
+    """Yield the line of a quantity; for a round-trip time, a line for each payload size."""
     label = wording.label(quantity)
     cells_with_quantity = [
         cell for cell in cells if quantity.name in cell.estimates or quantity in cell.quantities_without_value

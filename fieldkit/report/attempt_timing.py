@@ -181,6 +181,7 @@ def _clock_offset(
 
 
 def _correct_clocks(packet_fates: Fates, transfer: Transfer, clock_offset_ns: Mapping[Role, int]) -> Fates:
+    """Return the packets with times on the clock of the first sending robot."""
     return replace(
         packet_fates,
         sent_ns=packet_fates.sent_ns - clock_offset_ns[transfer.source],

@@ -179,6 +179,7 @@ def _is_measured(cell: Cell, quantity: Quantity, cells: Iterable[Cell], evidence
 
 
 def _absences_of(cell: Cell, quantity: Quantity, evidence: Evidence) -> Iterator[Absence]:
+    """Yield the missing values of a quantity under one condition, one item per reason."""
     if not cell.n_valid:
         attempts = cell.n_void + cell.n_failed
         yield Absence(cell, NO_VALID_REPEAT, attempts, attempts)

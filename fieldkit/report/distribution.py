@@ -88,6 +88,7 @@ def _repeat_samples(name: str, cells: Sequence[Cell], evidence: Evidence) -> lis
 def _chart(
     name: str, title: str, unit_name: str, samples: Sequence[_Sample], identities: Identities
 ) -> Iterator[Chart]:
+    """Yield a chart with a panel per condition and distance; nothing if there are no times."""
     nonempty = [sample for sample in samples if len(sample.times_s)]
     if not nonempty:
         return

@@ -199,6 +199,7 @@ def _draw_links(figure: Figure, axes: Axes, lab: Overview) -> None:
 
 @contextmanager
 def _settings(points: float) -> Iterator[None]:
+    """Use fieldkit's settings of matplotlib in the body, with a font size in points."""
     with mpl.rc_context(), warnings.catch_warnings():
         # A user's matplotlibrc must not change the output.
         mpl.rcdefaults()

@@ -216,6 +216,7 @@ class _HeadlineWriter:
         return self.evidence.payloads(cells, quantity.step) if is_rtt else []
 
     def _headline(self, subject: str, variants: Sequence[Quantity], cells: Sequence[Cell]) -> Headline:
+        """Return the headline of a quantity in all its steps: missing values, then the worst and the best value."""
         values = [
             (cell, cell.estimates[quantity.name])
             for quantity in variants
@@ -291,6 +292,7 @@ def _first_places(places: Sequence[str]) -> str:
 
 
 def _subject(variants: Sequence[Quantity], protocol: str, has_topics: bool) -> str:
+    """Return the title of a headline. The protocol is omitted for topics, and if the label starts with it."""
     first_variant = variants[0]
     label = first_variant.label if len(variants) == 1 else first_variant.plain_label
     omit_protocol = has_topics or first_variant.plain_label.startswith(protocol.upper())

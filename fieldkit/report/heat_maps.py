@@ -82,6 +82,7 @@ def charts(
 
 
 def _labels(repeats: Repeats, name: str, text: str) -> dict[str | float | None, str]:
+    """Return the text that the user typed, for each value of the column `name`."""
     return {
         value: columns.cell_text(label)
         for value, label in zip(repeats.column(name), repeats.column(text), strict=True)
@@ -89,6 +90,7 @@ def _labels(repeats: Repeats, name: str, text: str) -> dict[str | float | None, 
 
 
 def _chart(quantity: Quantity, cells: Sequence[Cell], axes: Sequence[_Axis], others: Sequence[_Axis]) -> Chart:
+    """Return the chart of a quantity: a map for each combination of the values of the axes `others`."""
     groups: dict[str, list[Cell]] = {}
     for cell in cells:
         labels = [(axis.name, axis.labels[cell.key[axis.column]]) for axis in others]

@@ -102,6 +102,7 @@ def _marked_packets(cell: Cell, evidence: Evidence, max_lines: int) -> dict[tupl
 
 
 def _raster(place: str, lines: Sequence[Mask], width: int, what: str) -> Raster:
+    """Return the raster of a condition, with `width` packets per column."""
     columns = [np.logical_or.reduceat(line, np.arange(0, len(line), width)) for line in lines]
     longest = max((length for line in lines for _, length in _runs(line)), default=0)
     total, marked_count = sum(map(len, lines)), sum(int(line.sum()) for line in lines)

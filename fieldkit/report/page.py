@@ -176,6 +176,7 @@ def inline_svg(document: str, prefix: str, description: str) -> str:
 
 
 def _attribute(name: str, value: str, prefix: str) -> str:
+    """Return the value of an attribute of an SVG element for the page; see `inline_svg`."""
     if name == "id":
         return prefix + value
     if name == _HREF:

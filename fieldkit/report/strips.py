@@ -145,6 +145,7 @@ def _evenly(rows: NDArray[np.int64], max_count: int) -> NDArray[np.int64]:
 
 
 def _mark(row: int, heights: _Heights, evidence: Evidence) -> Mark:
+    """Return the mark of the attempt in a row."""
     texts, numbers = evidence.repeats.texts, evidence.repeats.numbers
     status = texts["status"][row]
     loss = float(numbers[heights.loss.name][row]) if heights.loss else np.nan

@@ -136,9 +136,9 @@ def _packets(transfer: Transfer, fates: Fates, zero_ns: int) -> Panel:
     first_sent_ns = int(fates.sent_ns.min())
     marked_text = _MARKED[transfer.protocol]
     kinds = (
-        ("sent", _SENT, fates.sent_ns[~fates.lost_or_repeated], fates.sent_bytes[~fates.lost_or_repeated]),
-        ("received", _RECEIVED, fates.received_ns, fates.received_bytes),
-        (marked_text, _MARK, fates.sent_ns[fates.lost_or_repeated], fates.sent_bytes[fates.lost_or_repeated]),
+        ("sent", _SENT, fates.sent_ns[~fates.lost_or_repeated], fates.sent_offset_bytes[~fates.lost_or_repeated]),
+        ("received", _RECEIVED, fates.received_ns, fates.received_offset_bytes),
+        (marked_text, _MARK, fates.sent_ns[fates.lost_or_repeated], fates.sent_offset_bytes[fates.lost_or_repeated]),
     )
     series = []
     for label, style, at_ns, at_bytes in kinds:

@@ -98,6 +98,7 @@ class Motions:
         self._done_event.set()
 
     def _stop(self, movers: tuple[Mover, ...], report: Report) -> None:
+        """Stop the robots at the same time, and wait for their confirmations."""
         threads = [
             threading.Thread(target=mover.stop, args=(report, self._cancel_event), daemon=True) for mover in movers
         ]

@@ -268,7 +268,7 @@ class TelemetrySource(Strict):
         else:
             self._require_locations(self.values)
         if self.wired and self.address is None:
-            raise schema.validation_error("only snmp and http have an address", "wired")
+            raise schema.validation_error("wired applies only to snmp and http, which have an address", "wired")
         credentials = self.credentials
         if credentials is not None and credentials.environment and self.at == "robot":
             raise schema.validation_error("only the laptop has environment variables; use file", self.kind)

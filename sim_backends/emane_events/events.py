@@ -190,6 +190,7 @@ def _decode_location(content: bytes) -> NemLocation:
 
 
 def _three_numbers(content: bytes) -> tuple[float, float, float]:
+    """Return the three numbers in a message, which must be finite."""
     values = fields_by_number(content, (1, 2, 3))
     first, second, third = (as_real(values[field]) for field in (1, 2, 3))
     if not math.isfinite(first + second + third):

@@ -67,6 +67,7 @@ class LocalFrame:
 
 
 def _ecef_m(latitude_rad: float, longitude_rad: float, height_m: float) -> Vector:
+    """Return the earth-centred, earth-fixed coordinates of a geodetic position, in metres."""
     sin, cos = math.sin(latitude_rad), math.cos(latitude_rad)
     radius_m = _A_M / math.sqrt(1 - _E2 * sin * sin)  # of curvature in the prime vertical
     axis_distance_m = (radius_m + height_m) * cos

@@ -94,6 +94,7 @@ class EmaneLocations:
         self._listener.close()
 
     def _wait_for_all(self, limit_s: float) -> None:
+        """Wait until a location of each agent has arrived."""
         while len(self._states) < len(self._agents):
             events = self._listener.receive(limit_s)
             if events is None:
@@ -108,6 +109,7 @@ class EmaneLocations:
             self._apply(events)
 
     def _apply(self, events: Sequence[SerializedEvent]) -> None:
+        """Store the locations and path losses in events; malformed events are ignored."""
         for event in events:
             with suppress(MalformedEventError):
                 if event.event == LOCATION:
@@ -123,6 +125,7 @@ class EmaneLocations:
                 self._states[name] = State(self._frame.position_m(geodetic_position), velocity)
 
     def _apply_losses(self, nem: int, losses: Sequence[NemPathloss]) -> None:
+        """Store the path losses in an event that the NEM `nem` receives."""
         receivers = self._agents.values() if nem == ALL_NEMS else filter(None, [self._agents.get(nem)])
         for receiver in receivers:
             for loss in losses:

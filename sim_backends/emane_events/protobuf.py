@@ -129,6 +129,7 @@ def as_real(value: Value) -> float:
 
 
 def _varint(message: bytes, offset: int) -> tuple[int, int]:
+    """Return the number at an offset of a message, and the offset after it."""
     number = 0
     for shift, byte in enumerate(message[offset : offset + _MAX_VARINT_BYTES]):
         number |= (byte & 0x7F) << 7 * shift

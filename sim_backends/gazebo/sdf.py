@@ -159,6 +159,7 @@ def _static_model(world: Element, name: str) -> Element:
 
 
 def _add_obstacle(world: Element, obstacle: Obstacle) -> None:
+    """Add a static model with the shapes of an obstacle."""
     link = _static_model(world, obstacle.name)
     if isinstance(obstacle, Ramp):
         _add_ramp(link, obstacle)
@@ -241,6 +242,7 @@ def _chassis_of(limits: DriveLimits) -> _Chassis:
 
 
 def _add_drive(model: Element, limits: DriveLimits, version: Version) -> None:
+    """Add the chassis, the wheels and the plugin of a robot with wheels."""
     chassis = _chassis_of(limits)
     size_m = (chassis.length_m, chassis.width_m, limits.height_m - chassis.clearance_m)
     link = SubElement(model, "link", name="chassis")

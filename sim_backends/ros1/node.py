@@ -206,6 +206,7 @@ class RosSubscriber:
                 self._streams.remove(stream)
 
     def _add(self, stream: socket.socket) -> None:
+        """Register the connection to a publisher; close it if the subscriber was closed meanwhile."""
         with self._lock:
             self._streams.append(stream)
         if self._is_closed:
@@ -295,6 +296,7 @@ class RosNode:
             return [str(uri) for uri in uris]
 
     def _accept(self) -> None:
+        """Serve each subscriber that connects, in its own thread, until the node is closed."""
         while not self._is_closed:
             try:
                 stream, _ = self._stream_server.accept()

@@ -94,8 +94,10 @@ def test_exactly_the_lost_packets_are_marked(tmp_path: Path) -> None:
     assert {2, 3, 7} <= set(missing)
     assert np.flatnonzero(packet_fates.lost_or_repeated).tolist() == missing
     assert len(packet_fates.received_ns) == len(packet_fates.sent_ns) - len(missing)
-    assert (np.diff(packet_fates.sent_bytes) > 0).all()
-    assert set(packet_fates.received_bytes) == set(packet_fates.sent_bytes[~packet_fates.lost_or_repeated])
+    assert (np.diff(packet_fates.sent_offset_bytes) > 0).all()
+    assert set(packet_fates.received_offset_bytes) == set(
+        packet_fates.sent_offset_bytes[~packet_fates.lost_or_repeated]
+    )
 
 
 def test_marked_tcp_frames_equal_the_count_of_retransmissions(tmp_path: Path) -> None:
@@ -107,7 +109,7 @@ def test_marked_tcp_frames_equal_the_count_of_retransmissions(tmp_path: Path) ->
         packet_fates.lost_or_repeated.sum()
         == tcp.count(tcp.match_transfer(sender, receiver, transfer)).retransmitted_frames
     )
-    assert packet_fates.sent_bytes[0] == packet_fates.sent_bytes.min()
+    assert packet_fates.sent_offset_bytes[0] == packet_fates.sent_offset_bytes.min()
 
 
 def test_damaged_capture_is_not_read(tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ def test_a_source_has_the_command_of_its_program() -> None:
         ("command: [x]\nvalues: {signal_dbm: {regex: 'a'}}", "with one group"),
         ("command: [x]\nvalues: {signal_dbm: {json: a, regex: '(a)'}}", "one of json:, regex: and oid:"),
         ("command: [x]\nvalues: {sinal_dbm: {json: a}}", "did you mean 'signal_dbm'"),
-        ("command: [x]\nvalues: {signal_dbm: {json: a}}\nwired: true", "only snmp and http have an address"),
+        ("command: [x]\nvalues: {signal_dbm: {json: a}}\nwired: true", "wired applies only to snmp and http"),
         ("http: {url: 'http://router/api'}\nvalues: {signal_dbm: {json: a}}", "not an IP address"),
         ("http: {url: 'http://admin:x@10.0.0.1/'}\nvalues: {signal_dbm: {json: a}}", "use credentials"),
         ("http: {url: 'ftp://10.0.0.1/'}\nvalues: {signal_dbm: {json: a}}", "not a URL"),

@@ -86,7 +86,7 @@ def _readers() -> Mapping[str, EntryPoint]:
 
 
 def to_placement_frame(samples: Samples, position_source: PositionSource) -> Samples:
-    """Transform odometry to the frame of the placement.
+    """Transform odometry to the frame of the placement, which states the planned positions of the robots.
 
     Args:
         samples: Odometry with times by the laptop's clock.

@@ -24,17 +24,17 @@ class Fates:
 
     Attributes:
         sent_ns: Time of sending by the sender's clock, in the order of the capture. Shape (n,).
-        sent_bytes: Offset of each sent packet in the payload, in bytes. Shape (n,).
+        sent_offset_bytes: Offset of each sent packet in the payload, in bytes. Shape (n,).
         lost_or_repeated: Mask of the sent packets that were lost (UDP), or that repeat bytes sent before (TCP).
         received_ns: Time of arrival by the receiver's clock. Shape (m,).
-        received_bytes: Offset of each received packet in the payload, in bytes. Shape (m,).
+        received_offset_bytes: Offset of each received packet in the payload, in bytes. Shape (m,).
     """
 
     sent_ns: Ints
-    sent_bytes: NDArray[np.int64]
+    sent_offset_bytes: NDArray[np.int64]
     lost_or_repeated: Mask
     received_ns: Ints
-    received_bytes: NDArray[np.int64]
+    received_offset_bytes: NDArray[np.int64]
 
 
 def packets_of_both_ends(evidence: AttemptEvidence, transfer: Transfer) -> tuple[Packets, Packets]:
@@ -86,10 +86,10 @@ def _udp_fates(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates 
     received = np.append(is_transfer_packet, False)[sent_index]  # `match.NONE` (-1) selects the appended False
     return Fates(
         sent_ns=packets.sent.time_ns[is_transfer_packet],
-        sent_bytes=offset_bytes[is_transfer_packet],
+        sent_offset_bytes=offset_bytes[is_transfer_packet],
         lost_or_repeated=~packets.match.arrived[is_transfer_packet],
         received_ns=packets.received.time_ns[received],
-        received_bytes=offset_bytes[sent_index[received]],
+        received_offset_bytes=offset_bytes[sent_index[received]],
     )
 
 
@@ -108,10 +108,10 @@ def _tcp_fates(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates:
     sent_up_to = np.maximum.accumulate(offset_bytes + sent.tcp_payload_bytes)
     return Fates(
         sent_ns=sent.time_ns,
-        sent_bytes=offset_bytes,
+        sent_offset_bytes=offset_bytes,
         lost_or_repeated=np.append(np.zeros(min(1, len(sent)), dtype=np.bool_), offset_bytes[1:] < sent_up_to[:-1]),
         received_ns=received.time_ns,
-        received_bytes=received_offset_bytes,
+        received_offset_bytes=received_offset_bytes,
     )
 
 

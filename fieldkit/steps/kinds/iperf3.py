@@ -141,6 +141,7 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
         self.prepare(scene, testbed)(announce)
 
     def _test(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
+        """Run the client, then wait until the server has exited."""
         server, client = self.jobs(scene)
         server_shell, client_shell = (testbed.shells[planned.role] for planned in (server, client))
         announce("iperf3", self.expected_s(scene.protocol))
@@ -249,6 +250,7 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
             yield f"{received_text} only {interface_bytes} in the whole attempt"
 
     def _flow(self, view: View, source_test: IperfTest | None, destination_test: IperfTest | None) -> LoadFlow:
+        """Return the data flow of the test, for totals and checks."""
         return LoadFlow(
             protocol=self.transport_protocol(view.scene.protocol),
             source_address=view.scene.link(self.source, self.over).address,
@@ -282,6 +284,7 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
         return source.packets if source else None, destination.packets if destination else None
 
     def _data_streams(self, view: View) -> LoadStreams:
+        """Return the packet filter of the streams, with the ports from the report of one end."""
         source_test, destination_test = (self._report(view, role) for role in (self.source, self.destination))
         swapped_ports = tuple((remote, local) for local, remote in destination_test.ports) if destination_test else ()
         ports = source_test.ports if source_test else swapped_ports

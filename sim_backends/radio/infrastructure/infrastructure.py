@@ -69,6 +69,7 @@ class Infrastructure:
         self._seed = seed
         self._options = options
         self._world = world
+        # The other stations have the radio of the first robot, without power save.
         first = next(iter(robots.values()))
         phy = None if first.phy is None else replace(first.phy, power_save_timeout_ns=None)
         stations: dict[str, AccessPointOptions | NeighbourNetworkOptions] = {
@@ -106,6 +107,7 @@ class Infrastructure:
             delivery.handler = self.roaming = Roaming(channel, exchange.events, delivery, options.roaming, phases_ns)
         if options.neighbours:
             duties = {index[name]: neighbour.duty for name, neighbour in options.neighbours.items()}
+            # The scheduled events keep a reference to the object.
             NeighbourTraffic(self._seed, channel.band, exchange.events, delivery, duties=duties, names=channel.names)
         if channel.band is BAND_2_4:
             self._ovens = [
