@@ -116,6 +116,7 @@ class Bodies:
         """
         if commands:
             self._pending_commands |= commands
+            # The first step at or after the time of the commands; the two minus signs round up.
             self._commands_step = -(-self._last_to_ns // self.step_ns)
         self._last_to_ns = to_ns
         step = to_ns // self.step_ns
@@ -226,9 +227,10 @@ class Bodies:
         if lifetime.appears_ns >= self.step_ns:
             yield lifetime.appears_ns // self.step_ns
         if lifetime.disappears_ns is not None:
-            yield -(-lifetime.disappears_ns // self.step_ns)
+            yield -(-lifetime.disappears_ns // self.step_ns)  # rounded up
 
     def _is_present(self, name: str) -> bool:
+        """Return True if a body exists at the current step: its lifetime includes the step, rounded outwards."""
         lifetime = self._lifetimes.get(name)
         if lifetime is None:
             return True

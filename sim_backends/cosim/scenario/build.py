@@ -217,7 +217,7 @@ class Simulation:
         self.close()
 
     def close(self) -> None:
-        """Stop the external federates; without this call they stop when they are no longer referenced."""
+        """Stop the external federates, which otherwise stop only when this object is deleted."""
         self.federates.close()
 
     def run(self, until_ns: int | None = None, progress: Progress | None = None) -> Run:

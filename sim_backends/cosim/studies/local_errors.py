@@ -41,7 +41,7 @@ class LocalErrors:
     """Local errors of one policy for several parameters, over windows that begin at the same times.
 
     Attributes:
-        window_s: Lengths of the windows, shape (parameters, begins).
+        window_s: Lengths of the windows, shape (parameters, times at which windows begin).
         sums: For each of `MEASURES`, the sum over the affected packets or agents, same shape.
         counts: The number of these packets or agents, same shape.
     """
