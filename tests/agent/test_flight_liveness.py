@@ -1,6 +1,5 @@
 """Pilot and guard detect whether the other program runs."""
 
-import os
 import signal
 import subprocess
 import sys
