@@ -1,13 +1,13 @@
 """Cost of the medium by the number of robots, with EMANE's figures: `python -m benchmarks.swarm [--json]`, as root.
 
 The medium is the process that carries packets between emulated robots. For each number of robots, over ideal fixed
-links, over Wi-Fi and over a bare veth pair, the benchmark measures round trips between two robots, the lateness of
-their packets in the medium, the rate of 64-byte UDP payloads, and the throughput of TCP. The other robots are silent
-and should not add cost; the processor time per frame is measured at 2,000 packets/s. Then all neighbours form pairs,
-in each of which one robot sends to the other: over fixed links at full rate, over Wi-Fi at 2,000 packets/s in total,
-about a third of the channel's capacity. These robots are network namespaces without services. Finally, it measures
-robots with SSH server and sensors: their start-up time and processor time, and the memory per robot without shared
-pages (`own`) and with a proportional part of them (`pss`).
+links and over Wi-Fi, the benchmark measures round trips between two robots, the lateness of their packets in the
+medium, the rate of 64-byte UDP payloads, and the throughput of TCP. A bare veth pair is measured once for
+comparison. The other robots are silent and should not add cost; the processor time per frame is measured at 2,000
+packets/s. Then all neighbours form pairs, in each of which one robot sends to the other: over fixed links at full
+rate, over Wi-Fi at 2,000 packets/s in total, about a third of the channel's capacity. These robots are network
+namespaces without services. Finally, it measures robots with SSH server and sensors: their start-up time and
+processor time, and the memory per robot without shared pages (`own`) and with a proportional part of them (`pss`).
 """
 
 import argparse
@@ -158,7 +158,10 @@ def measure_pairs(size: int, options: RadioOptions, seconds: float, packets_s: i
 
 
 def measure_startup(size: int) -> Figures:
-    """Return the start-up cost of `size` robots with their services and the lab, and the mean memory of a robot."""
+    """Return the cost of the start-up of `size` robots with their services, and the mean memory of a robot.
+
+    The processor time includes that of this process, which starts the robots.
+    """
     cast = EmulatedBackend(None, None).cast(Topology.MASTER)
     login, host_key = KeyPair.make(), KeyPair.make()
     spec = robot_spec(cast, Role.SENDER, ros=RosChoice.BUILTIN, login=login, host_key=host_key)

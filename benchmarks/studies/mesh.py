@@ -2,8 +2,9 @@
 
 The program runs trials of four layouts and two hello intervals in sequence, unless FOLDER already has them, on
 emulated robots without fading, with five repeats each. This takes 2 hours. Then it prints a table of `rtt_gap_s`,
-with the bound of 13.7 hello intervals (docs/studies/mesh.md), and draws a figure. The layout `row` has no other path,
-so its healing time starts when the robot is switched on again.
+with the bound of 13.7 hello intervals (docs/studies/mesh.md), and draws a figure. In each repeat a robot on
+the path is switched off, and the mesh must find another path. The layout `row` has no other path, so its healing time
+starts when the robot is switched on again.
 """
 
 import argparse
@@ -26,8 +27,8 @@ from fieldkit.report.theme import Style
 HERE: Final = Path(__file__).parent
 HELLOS_S: Final = (1, 4)
 BOUND_HELLOS: Final = 13.7
-"""A neighbour is lost after 12 missing hellos. babeld checks once per interval, and detects the first missing hello
-1.7 intervals after the last received one."""
+"""babeld detects the first missing hello 1.7 intervals after the last received one, checks again once per interval,
+and drops a neighbour 12 checks later."""
 
 SITE: Final = """\
 backend: emulated

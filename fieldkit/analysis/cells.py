@@ -118,8 +118,8 @@ class Cell:
         n_failed: Number of attempts that failed.
         estimates: Estimates by name of the quantity, in the order of `Repeats.quantities` or as requested.
             Quantities without a valid repeat are omitted.
-        tallies: Word counts by name of the column, in the order of `Repeats.word_columns` or as requested. Columns
-            without a valid repeat are omitted.
+        tallies: Counts of text values by name of the column, in the order of `Repeats.word_columns` or as requested.
+            Columns without a valid repeat are omitted.
         payload_bytes: ICMP payload sizes of the valid repeats, ascending, by the name of each quantity that depends
             on them; see `Quantity.payload`.
         quantities_without_value: Quantities that were measured in the valid repeats, but have no value in any of
@@ -149,7 +149,7 @@ def aggregate(
         repeats: Attempts of repeats, including void and failed attempts.
         by: Columns that identify a condition.
         quantities: Quantities to estimate; None for all that the repeats have.
-        words: Columns whose words are counted; None for all that the repeats have.
+        words: Text columns whose values are counted; None for all that the repeats have.
     """
     keys, cells = _conditions(repeats, by)
     status = repeats.texts["status"]

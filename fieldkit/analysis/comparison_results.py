@@ -15,7 +15,7 @@ from fieldkit.core.text import json_text
 from fieldkit.core.units import format_count
 
 NOT_JUDGED: Final = "words are counted, not judged"
-"""Verdict on word counts, whose comparison has no interval."""
+"""Verdict on a text column: the repeats with each value (word) are counted, and their comparison has no interval."""
 
 
 def difference_rows(comparison: Comparison) -> Iterator[tuple[Pair, DifferenceRow]]:
@@ -112,7 +112,7 @@ def verdict(difference: Difference, comparisons: int) -> str:
         interval_text = comparison_scale(difference).interval(low, high)
         text = f"B {_amount(abs(difference.value), difference)} {more} {interval_text}"
         if not is_significant(difference):
-            text += f"; may be chance among {comparisons}"
+            text += f"; may be chance among {comparisons} comparisons"
     else:
         largest = max(abs(difference.interval.low), abs(difference.interval.high))
         text = f"no difference seen; up to {_amount(largest, difference)} possible"
@@ -150,7 +150,7 @@ def conclusions(comparison: Comparison) -> Iterator[str]:
         yield f"not shown to be within {_limit(difference)}: {difference.quantity.name} in {name}"
     sides = (("A", [pair.a for pair in comparison.pairs]), ("B", [pair.b for pair in comparison.pairs]))
     for side, cells in sides:
-        # The texts of a comparison have no marks, so the mark at the start of each caution is omitted.
+        # A caution starts with the mark (`* ` or `! `) of the intervals that it explains. Comparisons print no marks.
         yield from (
             f"{side}: {caution[2:]}" for caution in wording.cautions([cell for cell in cells if cell is not None])
         )

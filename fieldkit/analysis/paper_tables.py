@@ -26,7 +26,7 @@ _LATEX_SPECIAL: Final = {
 
 
 def to_markdown(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quantity]) -> str:
-    """Return a Markdown table of the estimates with their intervals, followed by word counts.
+    """Return a Markdown table of the estimates with their intervals, followed by the counts of text values.
 
     Values that are equal in all cells are in a line above the table.
     """

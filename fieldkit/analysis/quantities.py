@@ -210,7 +210,7 @@ class Tally:
 
 
 def word_columns(columns: Iterable[Column]) -> tuple[Column, ...]:
-    """Return the columns whose words are counted, in their order."""
+    """Return the text columns whose values are counted, in their order."""
     return tuple(column for column in columns if column.figure is not None and column.figure.kind is Kind.WORDS)
 
 

@@ -48,7 +48,7 @@ class Repeats:
 
     @cached_property
     def word_columns(self) -> tuple[Column, ...]:
-        """The columns whose words are counted, in order."""
+        """The text columns whose values are counted, in the order in which tables list them."""
         return tuple(column for column in word_columns(self.columns) if column.name in self.texts)
 
     def __len__(self) -> int:

@@ -211,8 +211,8 @@ def key(cell: Cell, name: str) -> str:
 def varying_and_common(by: Sequence[str], cells: Sequence[Cell]) -> tuple[list[str], list[str]]:
     """Return the columns in which the cells differ, and the columns in which all cells are equal.
 
-    Redundant columns are omitted: the distance in metres if `by` contains the operator's text, and the procedure if
-    its name equals the scenario in all cells.
+    Redundant columns are omitted: `distance_m` if `by` also contains the distance as the operator typed it, and the
+    procedure if its name equals the scenario in all cells.
     """
     redundant = {"distance_m"} if "distance" in by else set()
     if {"procedure", "scenario"} <= set(by) and all(cell.key["procedure"] == cell.key["scenario"] for cell in cells):

@@ -131,7 +131,8 @@ class Trials:
 
         Args:
             by: One or more columns that define a condition.
-            quantities: One or more columns to aggregate, or whose words are counted; None for all.
+            quantities: One or more columns: numbers are aggregated, and the values of text columns are counted. None
+                for all.
 
         Raises:
             ConfigurationError: There is no such column, or it cannot be aggregated.
@@ -163,9 +164,10 @@ class Trials:
         differences = "; ".join(
             f"{name}: {', '.join(map(repr, distinct))}" for name, distinct in values.items() if len(distinct) > 1
         )
-        conditions = ", ".join(f"{name}={value!r}" for name, value in condition.items()) or "any condition"
+        conditions = ", ".join(f"{name}={value!r}" for name, value in condition.items())
+        text = f"{len(matches) or 'no'} cells have {conditions}" if conditions else f"there are {len(cells)} cells"
         raise ConfigurationError(
-            f"{len(matches) or 'no'} cells have {conditions}; exactly one must",
+            f"{text}; the condition must select exactly one",
             where=self._sources.where,
             remedy=f"they differ in {differences}" if differences else "there is one cell: leave out the condition",
         )

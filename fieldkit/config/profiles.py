@@ -309,13 +309,14 @@ class RobotProfile(catalog.Named, Sectioned):
     [Add a robot](add-a-robot.md) describes how to write one. A key described as "for information only" has no effect
     in this version.
 
-    An emulated robot has its setup files at their paths, except in the root folder, `/proc`, `/sys` and `/dev`;
-    files in `/run` and `/tmp` are lost at a reboot. It publishes topics of any type at their rates and sizes. For
-    `sensor_msgs/LaserScan` (needs `points`), `Imu`, `BatteryState`, `Range`, `NavSatFix`, `MagneticField`,
-    `FluidPressure`, `Temperature`, `nav_msgs/Odometry`, `tf2_msgs/TFMessage` and `geometry_msgs/PoseStamped` the
-    values are the measurements of such a sensor on [the moving robot](add-a-robot.md#messages-of-an-emulated-robot).
-    In messages of other types, strings are empty, numbers are 0, quaternions are the identity, and the first array of
-    numbers is noise of the size in the profile. Types with a `definition` need ROS 1.
+    On an emulated robot, fieldkit writes setup files of ROS at the paths in the profile. A path directly in `/`, or
+    below `/proc`, `/sys` or `/dev`, is rejected; files in `/run` and `/tmp` are lost at a reboot. It publishes
+    topics of any type at their rates and sizes. For `sensor_msgs/LaserScan` (needs `points`), `Imu`,
+    `BatteryState`, `Range`, `NavSatFix`, `MagneticField`, `FluidPressure`, `Temperature`, `nav_msgs/Odometry`,
+    `tf2_msgs/TFMessage` and `geometry_msgs/PoseStamped` the values are the measurements of such a sensor on [the
+    moving robot](add-a-robot.md#messages-of-an-emulated-robot). In messages of other types, strings are empty,
+    numbers are 0, quaternions are the identity, and the first array of numbers is noise of the size in the profile.
+    Types with a `definition` need ROS 1.
 
     Attributes:
         kind: `ugv` (ground), `uav` (air) or `usv` (water).

@@ -15,7 +15,8 @@ RESERVE_BYTES: Final = 100 << 20
 FETCHED_BYTES_PER_S: Final = 2.5e6
 """Assumed transfer rate of evidence. TCP over a good 802.11n link with one stream in 20 MHz has about 20 Mbit/s."""
 
-# Size of the host states before and after, logs, and the output of ping: about 20 kB on a robot with Wi-Fi.
+# The states of the host before and after the attempt, logs, and the output of ping take about 20 kB on a robot with
+# Wi-Fi; the rest is a margin.
 _TEXT_BYTES: Final = 100_000
 
 

@@ -46,7 +46,7 @@ class GazeboOptions(SimulatorOptions):
         reset: Reset the world before a run.
         place: Set the poses of the robots before a run.
         settle_s: Simulated time in which robots come to rest, before the reset and before time 0.
-        start_error_m: Largest distance of a robot from its start.
+        start_error_m: Largest permitted distance of a robot from its start position at the start of a run.
         velocity: Velocities are the difference of positions over the last `step`, or over the `window`, which takes
             one request to Gazebo per window instead of two.
         gravity_m_s2: Gravity that is compensated for robots that fly; 0 if their links have no gravity.

@@ -43,7 +43,7 @@ struct Options
         read("control_service", control_service), read("pose_service", pose_service);
         read("create_service", create_service), read("remove_service", remove_service);
         read("model_files", model_files);
-        const Json descriptions = configuration.value("sdf", Json::object()); // labs, whose robots never appear, have none
+        const Json descriptions = configuration.value("sdf", Json::object()); // a lab has none: its robots exist from the start
         for (const auto& [agent, versions] : descriptions.items())
         {
             sdf[agent] = versions.at(FIELDKIT_GAZEBO_PLUGINS);

@@ -1,7 +1,8 @@
 """802.11 stations on one channel: contention (DCF), hidden stations, ACKs, retries, relaying by an access point.
 
 The model is event-driven, computes with integer nanoseconds, and uses no clock and no socket. It implements
-`model.RadioModel`. Frames between stations with `phy` are aggregated, and may have RTS and CTS and access categories.
+`model.RadioModel`. Frames between stations whose radios have the section `phy` (802.11n and later) are
+aggregated, and may use RTS/CTS and access categories.
 Power save delays frames to stations of an access point. Beacons have airtime only if the option
 `access_points` is used; fragmentation is not modelled.
 """
@@ -75,7 +76,7 @@ class Wifi(Generic[Payload]):
             self._delivery.power_save = PowerSave(timeouts_ns, phase_ns, self._events, self._delivery.enqueue_now)
 
     def log_attempts(self, log: Callable[[TransmissionAttempt], None] | None) -> None:
-        """Pass every transmission attempt that ends later to `log`; None stops logging."""
+        """Pass every transmission attempt that ends from now on to `log`; None stops logging."""
         self._exchange.log = self._exchange.rts_cts.log = log
 
     def log_losses(self, log: LossLog | None) -> None:

@@ -31,7 +31,7 @@ def between(
         (between("ip_loss", Interval(-0.031, -0.05, -0.012), 0.01), "B 3.10 points less [1.20, 5.00]"),
         (
             between("ip_loss", Interval(0.031, 0.012, 0.05), 0.06),
-            "B 3.10 points more [1.20, 5.00]; may be chance among 20",
+            "B 3.10 points more [1.20, 5.00]; may be chance among 20 comparisons",
         ),
         (between("ip_loss", Interval(0.01, -0.01, 0.02), 1.0), "no difference seen; up to 2.00 points possible"),
         (between("ip_loss", Interval(-0.01, -0.02, 0.01), 1.0), "no difference seen; up to 2.00 points possible"),

@@ -317,10 +317,14 @@ def test_the_interval_of_a_single_repeat_is_infinite(recorded_trial: Path) -> No
     [
         (
             {},
-            "4 cells have any condition; exactly one must",
+            "there are 4 cells; the condition must select exactly one",
             "they differ in procedure: 'driveaway', 'los', 'selfheal'; ",
         ),
-        ({"protocol": "sctp"}, "no cells have protocol='sctp'; exactly one must", "protocol: 'tcp', 'udp'"),
+        (
+            {"protocol": "sctp"},
+            "no cells have protocol='sctp'; the condition must select exactly one",
+            "protocol: 'tcp', 'udp'",
+        ),
         ({"protocl": "udp"}, "cell: there is no column 'protocl'", "did you mean 'protocol'?"),
     ],
 )

@@ -27,7 +27,9 @@ _ALARM_DELAY_S = 4.0
 
 
 def rescue(plan: FlightPlan) -> None:
-    """Kill the pilot and the guard, and land the drone if it is still under their control. Orders are ignored.
+    """Kill the pilot and the guard, and land the drone if it is still in the mode that they have set.
+
+    The file with the laptop's orders to the pilot is not read.
 
     Args:
         plan: A plan with the liveness file that the pilot and the guard share.
@@ -66,7 +68,9 @@ def is_under_control(drone: AutopilotState) -> bool:
 
 
 def _open_session(connection: str, deadline_s: float) -> AutopilotSession:
-    """Open a session with the autopilot. A link server that has stopped is replaced.
+    """Open a session with the autopilot.
+
+    If the link server has stopped, the process that shares the connection between the programs, a new one is started.
 
     Raises:
         FlightError: The connection cannot be opened before `deadline_s`.

@@ -26,9 +26,9 @@ POSITION_CHECKS: Final = (
     CrossCheck(
         quantity="error of the robots' clocks",
         columns=("positions_clock_error_s",),
-        source="`positions.json`: clocks, read before and after",
+        source="`positions.json`: the robots' clocks, read before and after the recording",
         against=(),
-        tolerance="only the laptop reads them",
+        tolerance="no second source reads the clocks",
         outcome=CheckOutcome.UNCHECKED,
     ),
 )

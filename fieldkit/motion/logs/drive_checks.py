@@ -21,11 +21,12 @@ _ROUNDING_M: Final = 2e-3
 """Positions are rounded to 0.1 mm, the driven distance to 1 mm."""
 _JITTER_M: Final = 0.05
 _JITTER_SHARE: Final = 0.25
-"""Tolerance for jitter of the odometry, which makes the driven distance between two lines longer than the straight
-line."""
+"""Tolerance for jitter of the odometry, which makes the driven distance between two lines of the log longer than the
+distance between their positions."""
 _SPEED_SHARE: Final = 1.5
 _SPEED_M_S: Final = 0.1
-"""Tolerance of a speed over half a second, for one additional odometry message and for overshoot of the control."""
+"""Tolerance of a speed that is averaged over half a second: the control may overshoot, and the distance of one more
+odometry message may fall into this time."""
 _COMMAND_M_S: Final = 1e-3
 """Tolerance of a commanded speed, which the log has rounded."""
 _COAST_M: Final = 1.0
@@ -73,14 +74,14 @@ def contradictions(log: Sequence[DriveMoment], plan: DrivePlan) -> Iterator[str]
 
 
 def _jumps(before: DriveMoment, after: DriveMoment) -> bool:
-    """Return True if the positions of two lines do not agree with the driven distance between them."""
+    """Return True if the positions of two lines of the log do not agree with the driven distance between them."""
     straight_m = math.hypot(after.x_m - before.x_m, after.y_m - before.y_m)
     driven_m = after.driven_m - before.driven_m
     return not straight_m - _ROUNDING_M <= driven_m <= (1 + _JITTER_SHARE) * straight_m + _JITTER_M
 
 
 def _coasting_distance_m(log: Sequence[DriveMoment]) -> float:
-    """Return the distance driven between consecutive lines that both have a commanded speed of 0."""
+    """Return the distance driven between consecutive lines of the log that both have a commanded speed of 0."""
     return sum(
         math.hypot(after.x_m - before.x_m, after.y_m - before.y_m)
         for before, after in pairwise(log)

@@ -31,8 +31,8 @@ COLUMNS: Final = columns(
         "fly_height_median_m",
         "m",
         (
-            "Median height over the take-off position while the inner steps ran. All columns of a flight are values "
-            "that the autopilot reported."
+            "Median height over the take-off position while the steps inside `fly` ran. All columns of a flight are "
+            "values that the autopilot reported."
         ),
         Figure("flight height", Kind.MEDIAN),
         _HEIGHT_BOUNDS_M,

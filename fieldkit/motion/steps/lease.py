@@ -146,8 +146,8 @@ class LeaseKeeper:
         If orders are not renewed, the end of the program is noticed only after the body has finished.
 
         Args:
-            end: Aborts the operations that the body waits for. It is called at each renewal, because the body may
-                have started to wait for another operation.
+            end: Aborts the operations that the body waits for. After the program has ended, it is called at each
+                further renewal, because the body may have started to wait for another operation.
 
         Raises:
             RobotError: The program ended before the body. An error of the body is the cause of this error.

@@ -61,7 +61,7 @@ _GRACE_S: Final = 5
 _OVERHEAD_S: Final = 10.0
 """Time for the start of Python and the middleware, and for the publisher's wait at its end."""
 _RECORD_BYTES: Final = 32
-"""Size of the record of a sample or a read in a log."""
+"""Size of the record of a sample, or of a read of the newest sample, in a log."""
 _ENVELOPE_BYTES: Final = 100
 """Approximate size of the headers of middleware and IP per sample."""
 
@@ -282,7 +282,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
         ends: "tuple[TopicLog | None, TopicLog | None]",
         packets: "tuple[Packets | None, Packets | None]",
     ) -> Measured:
-        """Return the columns of the reads of the newest sample."""
+        """Return the columns of `reads`: ages of the samples when a program reads the newest one at a fixed rate."""
         if self.reads is None:
             return Measured()
         from fieldkit.ros.streams import sample_reads  # noqa: PLC0415 (needed only by this step)
@@ -293,7 +293,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
 
     @property
     def _reads_prefix(self) -> str:
-        """Prefix of the columns of reads."""
+        """Prefix of the columns of `reads`."""
         return "seen" if self.image else "used"
 
     def deliveries(self, view: View) -> "Sequence[StreamDeliveries]":

@@ -31,8 +31,8 @@ class TogetherStep(Nest, Prepares, DescribesActions):
 
     It ends when the last of them ends. If one fails, all others are stopped, including a `wait`. For a sequence
     inside it, use a step that has `during`, for example a `capture`. A step that may prompt the operator (`fault`,
-    `move`, `ask`, `wait` with `until`) must contain or precede it. If SSH uses the radio under test, the commands of
-    one step affect the measurement of another.
+    `move`, `ask`, `wait` with `until`) cannot be inside; it may contain this step, or come before or after it. If SSH
+    uses the radio under test, the commands of one step affect the measurement of another.
 
     Attributes:
         during: Two steps or more; at most 8 run at the same time.

@@ -64,7 +64,7 @@ class Sources:
 
     @cached_property
     def words(self) -> Mapping[str, Column]:
-        """The columns whose words are counted, by name and in order."""
+        """The text columns whose values are counted, by name and in order."""
         return {column.name: column for column in word_columns(self.columns)}
 
     def condition(self, text: str, *, option: str = "--by") -> tuple[str, ...]:

@@ -21,7 +21,7 @@ _POLICY: Final = (SheetColumn("policy", "policy", ""), SheetColumn("summary", "w
 
 
 def list_all(arguments: argparse.Namespace) -> int:
-    """Print each scenario, each simulator and each sync policy in one line."""
+    """Print each scenario, each simulator and each sync policy, one per line."""
     scenario_rows = []
     for name, path in scenario_files().items():
         try:

@@ -61,7 +61,7 @@ SCHEMAS: Final[Mapping[str, pa.Schema]] = {
                 "arrived_ns",
                 pa.int64(),
                 "ns",
-                "time of arrival in the network; empty if the packet never arrived",
+                "time at which the network delivered the packet; empty if the packet never arrived",
             ),
             _field(
                 "counted_ns",
@@ -252,7 +252,7 @@ class RecordingState:
 
 
 def state_rows(at_ns: int, states: Mapping[str, State]) -> list[Row]:
-    """Return the rows of `states` at a time."""
+    """Return one row of the table `states` per agent, for the time `at_ns`."""
     return [(at_ns, name, *_state_values(state)) for name, state in states.items()]
 
 

@@ -86,7 +86,7 @@ class VehicleBase:
         self.failsafes = self.firmware.failsafes(self._parameters)
 
     def place(self, place_m: Vector, facing_rad: float, now_ns: int) -> None:
-        """Put it on the ground at another position in the world, as if a person carried it. It keeps its mode."""
+        """Put the drone on the ground at another position, as if a person carried it. It keeps its mode."""
         self.body = self._make_airframe(place_m, facing_rad, now_ns)
         if self.estimate.origin_m is None:
             self.home_m = place_m

@@ -16,12 +16,13 @@ from sim_backends.network.wire import Wire, WireTimer
 from sim_backends.radio.random_streams import PacketIdentity
 
 Transmit = Callable[[tuple[Submessage, ...], PacketIdentity], None]
-"""Sends a message to the other end. Its random numbers are derived from the identity, which begins with the kind of
-message."""
+"""Sends a message to the other end. The radio derives its random numbers for the message from the identity, which
+begins with the kind of message."""
 
 EVICTED: Final = "evicted from the writer's history before it was acknowledged"
 OVERTAKEN: Final = "overtaken by a later sample"
-"""Reason for a best-effort sample that arrives after a later one; a loss is reported with the reason of the loss."""
+"""Why a best-effort sample that arrived was not delivered: a later one had been delivered before. A lost sample is
+reported with the reason of its loss."""
 BLOCKED: Final = "the writer was blocked for longer than max_blocking_time"
 _NEVER_NS: Final = -(10**18)
 """A time before the start of every run."""
@@ -39,7 +40,8 @@ class TopicWriter:
         flow: Publisher, subscriber and quality of service.
         timing: Times of the protocol.
         transmit: Sends a message to the reader.
-        give_up: Called with a sample that will not be sent or will not be retransmitted, and the reason.
+        give_up: Called with a sample that will not be sent or will not be retransmitted, and the reason to report if
+            it is never delivered.
 
     Attributes:
         on_reader_start: Called when its reader starts, or starts again.
@@ -158,7 +160,7 @@ class TopicWriter:
         if evicted_sample is not None:
             self._give_up(evicted_sample, EVICTED)
         if not self._is_reliable:
-            self._give_up(sample, OVERTAKEN)
+            self._give_up(sample, OVERTAKEN)  # it is sent once; the reason applies only if it arrives too late
 
     def _data(self, sample: Sample, first: int, count: int) -> Data:
         for fragment in range(first, first + count):
