@@ -219,7 +219,7 @@ class MujocoPhysics:
         self._active.add(row)
         self._due.add(row)
         mujoco.mj_step1(model, data)
-        self._states = SensedStates(self._rows, self._sensors.tolist())
+        self._states = SensedStates(self._present_rows(), self._sensors.tolist())
 
     def flight_status(self, name: str) -> FlightStatus:
         """Return attitude and support of a quadrotor."""

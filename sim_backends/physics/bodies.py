@@ -375,10 +375,10 @@ class BodyLimits(Mapping[str, float]):
 
     The extrapolation keeps the current velocity for a time t. A body that touches something stops immediately, with
     unbounded acceleration, but its position error is still bounded. Let A be the maximum acceleration by its drive, v
-    its speed, and c the minimum time to a contact. A contact only reduces its speed, which is at most v + A t; so
-    after c its velocity is wrong by at most 2 v + A t, and its position by at most A t^2 / 2 + 2 v (t - c), which is
-    at most (A + v / c) t^2 / 2. A body that may be about to touch something has an infinite limit: its extrapolation
-    is valid for one step.
+    its speed, and c the minimum time to a contact. A contact only reduces its speed, which is at most v + A t. After
+    c, its velocity is therefore wrong by at most 2 v + A t, and its position by at most A t^2 / 2 + 2 v (t - c). This
+    is at most (A + v / c) t^2 / 2. A body that may be about to touch something has an infinite limit: its
+    extrapolation is valid for one step.
     """
 
     def __init__(self, bodies: Bodies) -> None:

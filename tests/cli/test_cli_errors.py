@@ -44,6 +44,7 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("robots show turtlebot3_burgr", "did you mean 'turtlebot3_burger'?"),
         ("procedures show loss", "did you mean 'los'?"),
         ("columns show iploss", "did you mean 'ip_loss'?"),
+        ("columns ip_loss", "remedy: fieldkit columns show ip_loss"),
         ("rebuild .", "there is no trial.yaml"),
     ],
 )
@@ -178,6 +179,12 @@ def test_error_in_a_site_file_has_its_line(lab: Path, capsys: pytest.CaptureFixt
     error_text = capsys.readouterr().err
     assert "fieldkit.yaml:7" in error_text
     assert "in emulated.radio: unknown key los; did you mean 'loss'?" in error_text
+
+
+def test_unknown_backend_of_a_site_file_has_its_line(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (lab / "fieldkit.yaml").write_text(f"# a lab\nbackend: emulatd\n{SITE}", encoding="utf-8")
+    assert main(["trial", "los", "30ft", "--dry-run"]) == 2
+    assert "fieldkit.yaml:2: there is no backend 'emulatd'" in capsys.readouterr().err
 
 
 def test_junit_file_in_a_missing_folder_is_rejected_before_the_trial(capsys: pytest.CaptureFixture[str]) -> None:
