@@ -104,9 +104,11 @@ def _value(name: str, extracted: object, factor: float = 1) -> float | str | Non
     if isinstance(extracted, bool | list | dict) or extracted is None:
         return None
     if name in TEXTS:
-        text = shorten(" ".join(str(extracted)[:200].split()))
+        text = " ".join(str(extracted)[:200].split())
         # The replacement character stands for bytes that are not UTF-8.
-        return None if text.lower() in _MISSING_TEXTS or "\N{REPLACEMENT CHARACTER}" in text else text
+        if text.lower() in _MISSING_TEXTS or not text.isprintable() or "\N{REPLACEMENT CHARACTER}" in text:
+            return None
+        return shorten(text)
     if isinstance(extracted, str):
         match = _NUMBER.fullmatch(extracted.strip())
         if match is None or (match[2] and match[2] != _UNITS.get(name)):

@@ -119,6 +119,7 @@ HTTP = source(
         ({"lte": {"rsrp": 10**400}, "cells": []}, {"neighbours": 0.0}),
         ({"lte": {"rsrp": 0}, "cells": []}, {"neighbours": 0.0}),
         ({"lte": {"rsrp": -1e9, "band": float("nan")}, "cells": []}, {"neighbours": 0.0}),
+        ({"lte": {"rsrp": -97, "band": "\x1b[31mB7"}, "cells": []}, {"signal_dbm": -97.0, "neighbours": 0.0}),
         ({"lte": {"rsrp": -97, "band": "B\ufffd7"}, "cells": []}, {"signal_dbm": -97.0, "neighbours": 0.0}),
     ],
 )
