@@ -5,8 +5,8 @@ exchange with a physics simulator is a request without commands and an answer wi
 exchange with a network simulator is a request with these states and an answer without packets. The federate does
 nothing else. The duration of the coordinator's call is measured; the rounds of all transports alternate. The lower
 bound is a plain socket between two Python programs, over which the same number of bytes is sent and received without
-further processing. `to C` is `docs/examples/federates/carts.c`. The peers, HELICS and mosaik, exchange the same
-amount of data in each step (`cosim_peers`).
+further processing. Rows with `to C` use the federate `docs/examples/federates/carts.c`. The peers, HELICS and mosaik,
+exchange the same amount of data in each step (`cosim_peers`).
 
 Both processes share the machine's processors, so other load changes the wall time: its minimum over the rounds is the
 time on an idle machine, if one round was not disturbed. The processor time is that of both processes.

@@ -271,7 +271,7 @@ def main() -> None:
         metavar="TEXT",
         help="only links with this text in their names, for example g54",
     )
-    parser.add_argument("--json", action="store_true", help="print single values")
+    parser.add_argument("--json", action="store_true", help="print single values as JSON")
     parser.add_argument("--figure", type=Path, help="write goodputs and windows of both to this SVG file")
     arguments = parser.parse_args()
     measured_rows = []

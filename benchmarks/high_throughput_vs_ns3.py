@@ -179,7 +179,7 @@ def goodputs(ns3: Ns3) -> list[Row]:
 def main() -> None:
     """Run both and print the differences."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", action="store_true", help="print single values")
+    parser.add_argument("--json", action="store_true", help="print single values as JSON")
     arguments = parser.parse_args()
     ns3 = build()
     differences, curves, rows = airtime_differences(ns3), error_curves(ns3), goodputs(ns3)

@@ -71,7 +71,7 @@ Key = tuple[int, int]
 
 
 def fragments() -> Iterator[bytes]:
-    """Yield frames of datagrams of 8,192 bytes, headers and the first bytes of payload."""
+    """Yield frames with fragments of 8,192-byte datagrams: headers, and the first bytes of the payload."""
     for ip_id in range(PACKETS // 6 + 1):
         for offset, size in ((0, 1480), (1480, 1480), (2960, 1480), (4440, 1480), (5920, 1480), (7400, 800)):
             part = offset // 8 | (0x2000 if size == 1480 else 0)

@@ -171,7 +171,7 @@ def first_difference_ns(first: Run, second: Run) -> int | None:
 
 
 def paired_ratio(ours_mbit_s: np.ndarray, peers_mbit_s: np.ndarray) -> tuple[float, float]:
-    """Return the ratio of means of runs with equal losses, each of shape (runs,), and half of its 95 % interval."""
+    """Return the ratio of the mean goodputs, and half of its 95 % interval. Runs with equal losses are paired."""
     ratio = float(ours_mbit_s.mean() / peers_mbit_s.mean())
     error = float(
         (ours_mbit_s - ratio * peers_mbit_s).std(ddof=1) / peers_mbit_s.mean() / math.sqrt(len(ours_mbit_s))

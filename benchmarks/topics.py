@@ -1,11 +1,12 @@
 """Delay that the step `topics` adds to messages: `python -m benchmarks.topics [--json] [--rounds N]`, with rosmaster.
 
 The agent that the step starts on robots (`agent publish`, `agent subscribe`) is compared with plain pairs of
-CycloneDDS, Zenoh and rospy on loopback, one middleware after the other. Each round restarts all programs, because
-their placement on the processor cores has more effect than additional messages. The pairs of a middleware then send
-1,000 bytes at nearly 200 Hz, at the same time. Their rates differ slightly, so that the phases between the pairs vary
-within seconds. The rates are exchanged between rounds. Medians are over the time in which all pairs send; a ratio is
-the geometric mean over rounds. In every third round each pair then sends for a second at full rate, in sequence.
+CycloneDDS, Zenoh and rospy on loopback, one middleware after the other. Each round restarts all programs, because the
+delays depend more on the processor cores on which the programs run than on the number of messages. The pairs of a
+middleware then send 1,000 bytes at nearly 200 Hz, at the same time. Their rates differ slightly, so that the phases
+between the pairs vary within seconds. The rates are exchanged between rounds. Medians are over the time in which all
+pairs send; a ratio is the geometric mean over rounds. In every third round each pair then sends for a second at full
+rate, in sequence.
 
 A delay is the time from the creation of a sample until the subscriber's Python code has received it.
 """

@@ -343,10 +343,11 @@ def _check_line_end(path: Path, body: bytes) -> None:
         EvidenceError: The line feed is missing.
     """
     if body and not body.endswith(b"\n"):
+        rebuild = shell_command("fieldkit", "rebuild", path.parent if path.name == "trial.csv" else "TRIAL")
         raise EvidenceError(
             "the last line has no line feed: the table may be truncated",
             where=f"{path}:{1 + len(body.splitlines())}",
-            remedy="create the file again: fieldkit rebuild TRIAL; or add the line feed if the line is complete",
+            remedy=f"create the file again: {rebuild}; or add the line feed if the line is complete",
         )
 
 

@@ -1,6 +1,6 @@
 """SSH connections to the robots of a site file.
 
-Imports neither pydantic nor profiles, so that `fieldkit stop` starts quickly.
+This module imports neither pydantic nor profiles, so that `fieldkit stop` starts quickly.
 """
 
 from collections.abc import Callable

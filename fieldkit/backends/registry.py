@@ -23,7 +23,9 @@ def load_backend(name: str, site: Site | None, document: Document | None) -> Bac
     installed = {point.name: point for point in plugins.entry_points(plugins.BACKENDS)}
     if name not in installed:
         remedy = did_you_mean(name, installed, f"installed: {', '.join(installed)}")
-        raise ConfigurationError(f"there is no backend {name!r}", remedy=remedy)
+        is_in_site_file = site is not None and document is not None and site.backend == name
+        where = document.where(("backend",)) if document and is_in_site_file else ""
+        raise ConfigurationError(f"there is no backend {name!r}", where=where, remedy=remedy)
     factory: BackendFactory = plugins.load(installed[name])
     return factory(site, document)
 

@@ -1,5 +1,6 @@
 """Texts of events, as the display shows them."""
 
+import re
 import textwrap
 from typing import Final
 
@@ -24,6 +25,7 @@ from fieldkit.core.model import Status, Verdict
 from fieldkit.core.units import TimeEstimate
 
 _INDENT: Final = 8
+_BEFORE_UNIT: Final = re.compile(r"(?<=\d) (?=(?:%|[mu]?s)(?![^\s,;)]))")
 _STYLE: Final = {Status.VALID: "green", Status.VOID: "yellow", Status.FAILED: "red"}
 
 
@@ -82,12 +84,18 @@ def _repeat_words(event: RepeatEnded, width: int | None) -> Words:
 def _fold_below(text: str, width: int) -> str:
     """Return a text folded into indented lines that start below the current line."""
     indent = f"\n{' ' * _INDENT}"
-    return indent + indent.join(textwrap.wrap(text, max(width - _INDENT, _INDENT)))
+    return indent + indent.join(_wrap(text, max(width - _INDENT, _INDENT)))
 
 
 def _fold_after(text: str, start_column: int, width: int) -> str:
     """Return a text that starts in column `start_column` and continues on indented lines."""
-    lines = textwrap.wrap(
-        text, max(width, start_column + _INDENT), initial_indent=" " * start_column, subsequent_indent=" " * _INDENT
-    )
+    lines = _wrap(text, max(width, start_column + _INDENT), " " * start_column, " " * _INDENT)
     return "\n".join(lines)[start_column:]
+
+
+def _wrap(text: str, width: int, initial_indent: str = "", subsequent_indent: str = "") -> list[str]:
+    """Return the lines of a text. A line never ends between a number and its unit."""
+    # textwrap breaks lines only at ASCII white space.
+    joined = _BEFORE_UNIT.sub("\N{NO-BREAK SPACE}", text)
+    lines = textwrap.wrap(joined, width, initial_indent=initial_indent, subsequent_indent=subsequent_indent)
+    return [line.replace("\N{NO-BREAK SPACE}", " ") for line in lines]

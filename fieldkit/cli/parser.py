@@ -115,13 +115,15 @@ class Parser(argparse.ArgumentParser):
 
     def _unknown(self, word: str) -> ConfigurationError:
         """Return the error for an unknown word, with the most similar option."""
-        name = word.partition("=")[0]
+        name = word.partition("=")[0].lstrip("-")
         for parser in filter(None, (self, *map(self.command, self.subcommands()))):
-            if similar := difflib.get_close_matches(name, parser._options(), n=1):  # noqa: SLF001 (a method of this class)
+            # Names are compared without dashes, because equal dashes make different options similar.
+            options = {option.lstrip("-"): option for option in parser._options()}  # noqa: SLF001 (a method of this class)
+            if similar := difflib.get_close_matches(name, options, n=1):
                 command = "" if parser is self else f"{parser.prog} "
                 return ConfigurationError(
                     f"{self.prog} has no option or argument {word!r}",
-                    remedy=f"did you mean {command + similar[0]!r}?",
+                    remedy=f"did you mean {command + options[similar[0]]!r}?",
                 )
         return ConfigurationError(f"{self.prog} has no option or argument {word!r}", remedy=f"{self.prog} --help")
 

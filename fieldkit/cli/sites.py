@@ -1,4 +1,4 @@
-"""Find the site file for a command line. Imports little, for commands that must start quickly."""
+"""Find the site file for a command line. This module imports little, because some commands must start quickly."""
 
 import argparse
 from pathlib import Path

@@ -1,6 +1,6 @@
 """Names of files: the site file of a lab, and robots and procedures of the lab or of fieldkit itself.
 
-It imports no YAML reader, so that the command line can list and complete the names quickly.
+This module imports no YAML reader, so that the command line can list and complete the names quickly.
 """
 
 from pathlib import Path

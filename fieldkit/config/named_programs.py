@@ -1,4 +1,4 @@
-"""Paths of programs in procedures, and the search for the files.
+"""Paths of programs that procedures name, and the search for their files.
 
 When a procedure is read, a file that it names is searched first in the folder of the procedure file, then in
 the lab's folder (the current directory). `trial.yaml` stores its path and its hash.

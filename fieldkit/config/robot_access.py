@@ -1,7 +1,7 @@
-"""Read the SSH settings of the robots of a site file, for `fieldkit stop`. It does not import pydantic (80 ms).
+"""Read the SSH settings of the robots of a site file, for `fieldkit stop`.
 
-Only the keys that the connection needs are checked. An error elsewhere in the file, or in the entry of another robot,
-must not prevent a robot from being stopped.
+This module does not import pydantic, which takes 80 ms. Only the keys that the connection needs are checked. An error
+elsewhere in the file, or in the entry of another robot, must not prevent a robot from being stopped.
 """
 
 from dataclasses import dataclass

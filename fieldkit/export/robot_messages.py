@@ -37,7 +37,7 @@ from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
 
 UNKNOWN_FATE: Final = -1
-"""Value for a packet of which it is unknown whether it was lost, or is a copy."""
+"""Value of `lost` and `copy` for packets whose fate is unknown."""
 _SLICE: Final = 1 << 14
 """Number of packets that are converted to Python objects at a time."""
 

@@ -1,9 +1,10 @@
-# Sample the state of a robot's Wi-Fi link during an attempt, from the output of iw and the kernel.
+# Sample the state of a robot's Wi-Fi link during an attempt, from the output of iw and the kernel; and run the commands of
+# the telemetry sources in its profile (`poll`).
 #
 # An iteration needs no fork if the shell has a `read` with a timeout. iw is called only while this job has used less than
 # its share of a core, because a process takes milliseconds on a small computer. Nothing is sent over the radio.
 
-TICK=0.2
+TICK=0.2 # s between samples
 CHECK_INTERVAL=500 # interval of checks of the channel, the cell and the lock, in 10 ms
 SHARE=12 AHEAD=3000 # CPU budget in thousandths of a core, and initial credit in 10 us
 BLOCKS=8192 # limit of the file size, in blocks of 512 or 1,024 bytes

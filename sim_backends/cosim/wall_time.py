@@ -1,4 +1,4 @@
-"""Measures the wall time of each part of a run, limits the rate of progress reports, and can delay an answer."""
+"""Measures the wall time of each part of a run, limits the rate of reports, and delays an answer as a fault."""
 
 import time
 from collections.abc import Callable, Iterable, Sequence

@@ -100,7 +100,7 @@ HUSKY: Final = Chassis(
 )
 """Clearpath Husky A200: `husky_description/urdf/husky.urdf.xacro` (github.com/husky/husky), with its centre of mass
 in the plane of symmetry. Its controller multiplies the track by 1.875 (`husky_control/config/control.yaml`), because
-the wheels slide sideways when it turns: with equal friction in all directions, a wheelbase a and a track b, the yaw
+the wheels slide sideways when it turns. With equal friction in all directions, a wheelbase a and a track b, the yaw
 rate is b^2 / (a^2 + b^2) = 0.554 of the yaw rate of rolling wheels. The torque of its motors is not published; this
 value is twice the friction of a wheel, so that friction is the limit.
 """

@@ -44,7 +44,7 @@ class Registers:
 
 
 class Controller(Protocol):
-    """A controller on board."""
+    """The controller of a robot, which sets its motors so that the robot follows commands."""
 
     def command(self, command: object) -> None:
         """Set the command that is followed after the next tick.

@@ -95,7 +95,7 @@ class MujocoPhysics:
         limits_m_s2: Maximum acceleration of each agent: infinity, because a contact may change a velocity within a
             step.
         model: The model, for example for MuJoCo's viewer.
-        data: Its current state.
+        data: The current state of the model.
 
     Raises:
         ConfigurationError: The step is not positive, or a robot's body is invalid.
@@ -109,7 +109,7 @@ class MujocoPhysics:
         self.step_ns = hello.step_ns
         self.limits_m_s2: Mapping[str, float] = {agent.name: math.inf for agent in hello.agents}
         self._rows = {agent.name: row for row, agent in enumerate(hello.agents)}
-        self._substeps = -(-hello.step_ns // _LONGEST_STEP_NS)
+        self._substeps = -(-hello.step_ns // _LONGEST_STEP_NS)  # rounded up
         self._tick_steps = max(round(TICK_NS / hello.step_ns), 1)
         configuration = json.loads(hello.configuration)
         world = World.model_validate(configuration["world"]) if "world" in configuration else None
@@ -150,6 +150,7 @@ class MujocoPhysics:
         """
         if commands:
             self._pending_commands |= commands
+            # The first step at or after the time of the commands; the two minus signs round up.
             self._commands_step = -(-self._last_to_ns // self.step_ns)
         self._last_to_ns = to_ns
         step = to_ns // self.step_ns
@@ -218,7 +219,7 @@ class MujocoPhysics:
         self._active.add(row)
         self._due.add(row)
         mujoco.mj_step1(model, data)
-        self._states = SensedStates(self._rows, self._sensors.tolist())
+        self._states = SensedStates(self._present_rows(), self._sensors.tolist())
 
     def flight_status(self, name: str) -> FlightStatus:
         """Return attitude and support of a quadrotor."""
@@ -366,7 +367,8 @@ def _changes(lifetimes: Mapping[int, Lifetime], step_ns: int) -> Iterator[_Prese
         if lifetime.appears_ns >= step_ns:
             yield _PresenceChange(lifetime.appears_ns // step_ns, row, appears=True)
         if lifetime.disappears_ns is not None:
-            yield _PresenceChange(-(-lifetime.disappears_ns // step_ns), row, appears=False)
+            last_step = -(-lifetime.disappears_ns // step_ns)  # rounded up
+            yield _PresenceChange(last_step, row, appears=False)
 
 
 _MUJOCO_MEMBERS: Final = {"model", "data", "_sensors", "_registers"}

@@ -116,6 +116,7 @@ class Bodies:
         """
         if commands:
             self._pending_commands |= commands
+            # The first step at or after the time of the commands; the two minus signs round up.
             self._commands_step = -(-self._last_to_ns // self.step_ns)
         self._last_to_ns = to_ns
         step = to_ns // self.step_ns
@@ -226,9 +227,10 @@ class Bodies:
         if lifetime.appears_ns >= self.step_ns:
             yield lifetime.appears_ns // self.step_ns
         if lifetime.disappears_ns is not None:
-            yield -(-lifetime.disappears_ns // self.step_ns)
+            yield -(-lifetime.disappears_ns // self.step_ns)  # rounded up
 
     def _is_present(self, name: str) -> bool:
+        """Return True if a body exists at the current step: its lifetime includes the step, rounded outwards."""
         lifetime = self._lifetimes.get(name)
         if lifetime is None:
             return True
@@ -373,10 +375,10 @@ class BodyLimits(Mapping[str, float]):
 
     The extrapolation keeps the current velocity for a time t. A body that touches something stops immediately, with
     unbounded acceleration, but its position error is still bounded. Let A be the maximum acceleration by its drive, v
-    its speed, and c the minimum time to a contact. A contact only reduces its speed, which is at most v + A t; so
-    after c its velocity is wrong by at most 2 v + A t, and its position by at most A t^2 / 2 + 2 v (t - c), which is
-    at most (A + v / c) t^2 / 2. A body that may be about to touch something has an infinite limit: its extrapolation
-    is valid for one step.
+    its speed, and c the minimum time to a contact. A contact only reduces its speed, which is at most v + A t. After
+    c, its velocity is therefore wrong by at most 2 v + A t, and its position by at most A t^2 / 2 + 2 v (t - c). This
+    is at most (A + v / c) t^2 / 2. A body that may be about to touch something has an infinite limit: its
+    extrapolation is valid for one step.
     """
 
     def __init__(self, bodies: Bodies) -> None:

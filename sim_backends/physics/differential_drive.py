@@ -1,4 +1,4 @@
-"""Robots with differential drive: unicycles with limits.
+"""Robots with differential drive, modelled as unicycles with limited speeds and accelerations.
 
 Forward speed and yaw rate approach the commanded values as fast as their limits allow, independently of each other,
 as in ROS's `diff_drive_controller`. With a constant acceleration a and yaw rate w, the displacement in a time t is

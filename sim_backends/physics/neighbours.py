@@ -64,7 +64,7 @@ class ContactCandidates:
 
 
 class _Kinematics(NamedTuple):
-    """The current position, speed and limits of a body."""
+    """The current position and speed of a body, its maximum acceleration and its top speed."""
 
     name: str
     body: Body[Any]
@@ -75,7 +75,7 @@ class _Kinematics(NamedTuple):
 
 
 class Neighbours:
-    """A neighbour list.
+    """The possible contacts of all bodies until a horizon, after which the list expires.
 
     Args:
         bodies: All bodies.

@@ -121,9 +121,9 @@ IRIS: Final = QuadrotorLimits(
 5.84e-6 N/(rad/s)^2 up to 1100 rad/s, so 28.27 N; rotor drag 1.75e-4 N/(rad/s)/(m/s) at the 794 rad/s of hovering;
 0.47 m x 0.47 m x 0.11 m, rotors of 0.128 m around (0.13, 0.22) m. Limits and gains are PX4's defaults (parameter
 reference: MPC_TILTMAX_AIR, MC_ROLLRATE_MAX, MC_YAWRATE_MAX, 1 / MC_ROLL_P, MPC_XY_VEL_MAX, MPC_Z_VEL_MAX_DN and UP,
-MPC_ACC_HOR_MAX, MPC_ACC_DOWN_MAX and UP, MPC_XY_VEL_P_ACC, MPC_Z_VEL_P_ACC). The minimum thrust of a tenth is an
-assumption, and the drag of the body is the drag of a cube with a face of 0.47 m x 0.11 m: 1.225 kg/m^3 x 1.05 x 0.052
-m^2 / 2.
+MPC_ACC_HOR_MAX, MPC_ACC_DOWN_MAX and UP, MPC_XY_VEL_P_ACC, MPC_Z_VEL_P_ACC). The minimum thrust, a tenth of the
+maximum, is an assumption. The drag of the body is the drag of a cube with a face of 0.47 m x 0.11 m: 1.225 kg/m^3 x
+1.05 x 0.052 m^2 / 2.
 """
 
 DUCKIEDRONE: Final = QuadrotorLimits(

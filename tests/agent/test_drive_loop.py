@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -43,7 +44,7 @@ def odometry(pose: OdometryPose, *, cdr: bool, frame: str = "odom", child_frame:
     orientation = kinds["geometry_msgs/msg/Quaternion"](
         0.0, 0.0, math.sin(pose.yaw_rad / 2), math.cos(pose.yaw_rad / 2)
     )
-    zeros = __import__("numpy").zeros(36)
+    zeros = np.zeros(36)
     vector = kinds["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
     message = kinds["nav_msgs/msg/Odometry"](
         header,

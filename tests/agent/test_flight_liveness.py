@@ -1,6 +1,5 @@
 """Pilot and guard detect whether the other program runs."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -59,8 +58,7 @@ def test_other_process_with_the_same_pid_is_not_killed(tmp_path: Path) -> None:
     raw[8:16] = (1).to_bytes(8, "little")
     (tmp_path / "file").write_bytes(raw)
     assert guard.poll() == "has ended"
-    guard.kill_other()
-    assert os.getpid()
+    guard.kill_other()  # the pid in the file is that of this process, which must survive
 
 
 def test_file_that_cannot_be_created_prevents_the_flight() -> None:

@@ -19,7 +19,7 @@ from fieldkit.analysis.duplicates import deduplicated
 from fieldkit.analysis.repeats import Repeats, parse
 from fieldkit.analysis.table_files import read
 from fieldkit.core.columns import SCHEMA_VERSION
-from fieldkit.core.errors import ConfigurationError, EvidenceError
+from fieldkit.core.errors import ConfigurationError, EvidenceError, shell_command
 from fieldkit.trial.columns import trial_columns
 from fieldkit.trial.rows import to_csv
 from tests.helpers.tables import ROW, parsed, repeats, replace, write
@@ -186,6 +186,7 @@ def test_a_table_truncated_in_its_last_line_is_refused_or_lacks_that_line(tmp_pa
         ) as error_info:
             read([path], trial_columns())
         assert error_info.value.where == f"{path}:3"
+        assert shell_command("fieldkit", "rebuild", path.parent) in error_info.value.remedy
 
 
 def test_a_newer_schema_requires_a_newer_fieldkit(tmp_path: Path) -> None:

@@ -180,6 +180,12 @@ def test_error_in_a_site_file_has_its_line(lab: Path, capsys: pytest.CaptureFixt
     assert "in emulated.radio: unknown key los; did you mean 'loss'?" in error_text
 
 
+def test_unknown_backend_of_a_site_file_has_its_line(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (lab / "fieldkit.yaml").write_text(f"# a lab\nbackend: emulatd\n{SITE}", encoding="utf-8")
+    assert main(["trial", "los", "30ft", "--dry-run"]) == 2
+    assert "fieldkit.yaml:2: there is no backend 'emulatd'" in capsys.readouterr().err
+
+
 def test_junit_file_in_a_missing_folder_is_rejected_before_the_trial(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["trial", "los", "5m", "--junit", "no-such-folder/results.xml"]) == 2
     assert "there is no folder 'no-such-folder'" in capsys.readouterr().err

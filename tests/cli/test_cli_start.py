@@ -204,6 +204,7 @@ def test_every_command_has_its_module_and_run_function() -> None:
             "fieldkit aggregate has no option or argument '--zzz=1'",
             "fieldkit aggregate --help",
         ),
+        ("trial los 30ft --width 5%", "fieldkit trial has no option or argument '--width'", "fieldkit trial --help"),
         ("verify x y", "fieldkit verify has no option or argument 'y'", "fieldkit verify --help"),
         ("lab mvoe", "COMMAND cannot be 'mvoe'", "did you mean 'move'?"),
         ("lab move a --by -5m", "--by takes EAST NORTH [UP], not '-5m'", "fieldkit lab move ROBOT --to 20m 10m"),

@@ -58,6 +58,7 @@ def test_line_of_a_repeat_is_complete_at_any_width(parts: list[str], width: int,
     event = RepeatEnded("udp-07", 1, status, reason.strip(), ", ".join(parts), 7, 40, 0.0)
     text = "".join(part for part, _ in event_words(event, width))
     assert all(len(line) <= width for line in text.splitlines())
+    assert not re.search(r"[0-9]\n *(%|ms)", text)
     wide_text = "".join(part for part, _ in event_words(event))
     assert text.split() == wide_text.split()
 

@@ -13,7 +13,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import LinkSample, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import link, link_samples, program_output, robot_link_samples
-from fieldkit.measure.robot_state import attempt_states, state_columns
+from fieldkit.measure.robot_state import attempt_states, interfaces, state_columns
 from tests.fuzz.harness import Target
 from tests.helpers.paths import DATA
 
@@ -88,9 +88,11 @@ def _measure_states(data: bytes, place: Path) -> None:
     """Measure an attempt with mutated snapshots; all values must be valid in the table."""
     for when in ("before", "after"):
         (place / f"sender-sources-{when}.txt").write_bytes(data)
+    (place / "sender-sources-during.txt").write_bytes(b"==> next <==\n" + data + b"==> next <==\n" + data[::2])
     evidence, names = AttemptEvidence(place), {Role.SENDER: "rover"}
     measured = attempt_states.measure(evidence, names, Measured())
     list(attempt_states.problems(evidence, names, {}))
+    interfaces.read_indices(evidence, Role.SENDER)
     for column in (*state_columns.MARK_COLUMNS, *state_columns.declare_columns("sender")):
         assert column.invalid_value_reason(cell_text(measured.values.get(column.name))) is None, column.name
 
@@ -123,7 +125,7 @@ def radio_targets() -> Iterator[Target]:
         _snapshot(chrony="chrony/synchronized-4.3.csv", timesyncd="timedatectl/status-245.txt"),
         _snapshot(iw_info="iw/info-hwsim-station-6.txt", iw_scan="iw/scan-hwsim-5.txt", iw_reg="iw/reg-balena.txt"),
         b"==> health <==\n cpu  1 0 5 8 5 0 0 0 0 0\n temperature 48312\n battery 80 12300000\n disk 9\n code 0\n",
-        b"==> vcgencmd <==\n throttled=0x50005\n code 0\n",
+        b"==> vcgencmd <==\n throttled=0x50005\n code 0\n==> interfaces <==\n 7: wlan0@if6: <UP>\n code 0\n",
     )
     yield Target("robot-state", snapshots, _measure_states)
     yield Target("json-path", _PATHS, _evaluate_path)

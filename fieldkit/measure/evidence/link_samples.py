@@ -2,7 +2,7 @@
 
 The samples are from a script on the robot, the sampler (`robot_link_samples`), or from a testbed that models the
 radios (`Oracle.links`). A testbed's `link.csv` has a line per time and peer station. If the testbed has access
-points, the last column is `cell`.
+points, the last column, `cell`, is the access point with which the robot is associated.
 """
 
 import re
@@ -79,6 +79,7 @@ def read(path: Path) -> Mapping[Role, Sequence[LinkSample]]:
 def _parse_row(match: re.Match[str]) -> tuple[Role, LinkSample]:
     utc_ns, role, noise, active, busy, station, signal, *others = match.groups()
     numbers = [None if count is None else int(count) for count in others[:6]]
+    # The rates and counts are in the order of the attributes of `StationSample`.
     peer = StationSample(station, _parse_dbm(signal), *numbers) if station else None
     radio = LinkSample(
         int(utc_ns),

@@ -57,7 +57,7 @@ def count_messages(arrivals: Sequence[tuple[int, int]], end_us: int) -> MessageC
         elif step > NUMBERS // 2 and not is_silence:
             messages, lost = messages + 1, max(lost - 1, 0)  # the message is late, and was counted as lost
         else:
-            step = step or NUMBERS
+            step = step or NUMBERS  # after a silence, an equal number shows that the numbers wrapped
             wraps = max(round((rate_hz * interval_us / 1e6 - step) / NUMBERS), 0) if is_silence else 0
             messages, lost, last_number = messages + 1, lost + step - 1 + NUMBERS * wraps, number
     tail_us = max(end_us - arrivals[-1][0], 0)

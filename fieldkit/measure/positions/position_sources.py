@@ -131,7 +131,8 @@ def read(path: Path) -> PositionSources:
     except JSON_ERRORS as error:
         raise EvidenceError("is not a valid list of position sources", where=str(path)) from error
     if data or not isinstance(heights, bool):
-        raise EvidenceError("is not a valid list of position sources: it has unknown keys", where=str(path))
+        reason = "it has unknown keys" if data else "heights is not a boolean"
+        raise EvidenceError(f"is not a valid list of position sources: {reason}", where=str(path))
     return PositionSources(robots, clocks, heights)
 
 

@@ -126,7 +126,7 @@ def _with_other_address(
 
     Sent packets that arrived unaltered are not compared.
     """
-    # A candidate must have the address of at least one end of the transfer, or its port.
+    # A candidate must have the address of at least one end of the transfer, or its port, but not all three.
     is_from_sender, is_to_receiver = (
         receiver.are_from(transfer.sender_address),
         receiver.are_to(transfer.receiver_address),
@@ -138,6 +138,7 @@ def _with_other_address(
     candidates = receiver.where(is_candidate)
     if not len(candidates):
         return candidates
+    # Packets of other connections that are in the sender's capture were not altered.
     candidates = candidates.where(~np.isin(connection_keys(candidates), connection_keys(sender)))
     sent_keys, unaltered_keys, candidate_keys = (
         _address_free_keys(packets) for packets in (sent, from_same_port, candidates)

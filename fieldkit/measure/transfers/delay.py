@@ -109,7 +109,7 @@ def udp_pairs(packets: udp.UdpPackets) -> StampPairs:
 
 
 def udp_pair_indices(packets: udp.UdpPackets) -> tuple[Ints, Ints]:
-    """Return, for each pair of `udp_pairs`, its index among the sent and among the received packets."""
+    """Return the indices of the pairs of `udp_pairs` among the sent and among the received packets."""
     return _pair_indices(packets.match, packets.is_transfer_packet)
 
 
@@ -120,7 +120,7 @@ def tcp_pairs(frames: tcp.TcpFrames) -> StampPairs:
 
 
 def tcp_pair_indices(frames: tcp.TcpFrames) -> tuple[Ints, Ints]:
-    """Return, for each pair of `tcp_pairs`, its index among the sent and among the received frames.
+    """Return the indices of the pairs of `tcp_pairs` among the sent and among the received frames.
 
     A frame arrives with its last byte. If offload joined several frames, the joined frame matches the last of them.
     """

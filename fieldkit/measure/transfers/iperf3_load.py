@@ -323,7 +323,7 @@ def _steady_clocks(load: LoadStreams, sender: Packets, receiver: Packets) -> Clo
 
 
 def _transits_ns(load: LoadStreams, sender: Packets, receiver: Packets) -> Iterator[Ints]:
-    """Yield, for each stream, the delays of its datagrams in ns, in the order of arrival."""
+    """Yield an array for each stream: the delays of its datagrams in ns, in the order of arrival."""
     clocks = _steady_clocks(load, sender, receiver)
     if clocks is None:
         raise EvidenceError("no packet from receiver to sender is in both captures")

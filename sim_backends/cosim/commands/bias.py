@@ -1,4 +1,7 @@
-"""The command `fieldkit cosim shootout --bias`, which computes the bias of each sync policy over seeds."""
+"""The command `fieldkit cosim shootout --bias`, which computes the bias of each sync policy.
+
+The bias is the mean difference from the exact reference over seeds.
+"""
 
 import argparse
 from collections.abc import Mapping, Sequence
@@ -69,10 +72,10 @@ def _sheet(title: str, by_policy: Mapping[str, Mapping[str, Bias]], form: str) -
     columns = (
         SheetColumn("policy", "policy", ""),
         SheetColumn("measure", "measure", ""),
-        SheetColumn("mean", "mean", "over seeds"),
+        SheetColumn("mean", "mean", "mean over seeds"),
         SheetColumn("bias", "bias", f"mean of the differences from {EventDriven.name} with the same seed"),
         SheetColumn("bias_low", "low", "lower end of its 95 % interval"),
-        SheetColumn("bias_high", "high", "upper end"),
+        SheetColumn("bias_high", "high", "upper end of this interval"),
         SheetColumn("seeds_needed", "seeds", "number of seeds needed to detect this bias in four of five studies"),
     )
     return Sheet(columns, rows, [SheetPart(f"{title}: bias over seeds", [column.name for column in columns])])

@@ -24,17 +24,17 @@ from sim_backends.cosim.studies.seeds import Task, run_many
 
 _SEED: Final = SheetColumn("seed", "seed", "")
 _BOUND: Final = (
-    SheetColumn("largest_m", "largest (mm)", "position error with error_bounded", 1e3),
-    SheetColumn("exchanges", "exchanges", "with error_bounded"),
+    SheetColumn("largest_m", "largest (mm)", "largest position error with error_bounded", 1e3),
+    SheetColumn("exchanges", "exchanges", "number of exchanges with error_bounded"),
     SheetColumn("added_s", "added (ms)", "mean delay that error_bounded adds", 1e3),
     SheetColumn("all_window_s", "all runs (ms)", "longest fixed window that keeps the bound in all runs", 1e3),
-    SheetColumn("all_exchanges", "fixed", "exchanges with that window"),
-    SheetColumn("all_factor", "factor", "ratio of fixed to exchanges"),
+    SheetColumn("all_exchanges", "fixed", "number of exchanges with that window"),
+    SheetColumn("all_factor", "factor", "ratio of `fixed` to `exchanges`"),
 )
 _WINDOW_OF_RUN: Final = (
     SheetColumn("found_window_s", "this run (ms)", "longest fixed window that keeps the bound in this run", 1e3),
-    SheetColumn("found_exchanges", "fixed", "exchanges with that window"),
-    SheetColumn("found_factor", "factor", "ratio of fixed to exchanges"),
+    SheetColumn("found_exchanges", "fixed", "number of exchanges with that window"),
+    SheetColumn("found_factor", "factor", "ratio of `fixed` to `exchanges`"),
 )
 
 

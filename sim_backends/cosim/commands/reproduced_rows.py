@@ -84,7 +84,7 @@ class ReproducedRows:
         remedy = "change the scenario, or remove `trial` from it"
         if self._trial.scenario != self._scenario.line:
             raise ConfigurationError(
-                f"the procedure {procedure} is for {self._trial.scenario}, and the line of the scenario is "
+                f"the procedure {procedure} is for {self._trial.scenario}, but the line of the scenario is "
                 f"{self._scenario.line}",
                 where=f"scenario {self._scenario.name}: trial.procedure",
                 remedy=remedy,
@@ -93,7 +93,7 @@ class ReproducedRows:
             for setting_name, planned, simulated in _compared_settings(self._trial.exchange(repeat.protocol), repeat):
                 if planned != simulated:
                     raise ConfigurationError(
-                        f"{setting_name} is {simulated}, and {planned} in the procedure {procedure}",
+                        f"{setting_name} is {simulated}, but {planned} in the procedure {procedure}",
                         where=f"scenario {self._scenario.name}: trial.{repeat.protocol}",
                         remedy=remedy,
                     )
@@ -118,7 +118,9 @@ class ReproducedRows:
             if (transfer := flows.get(transfer_name)) is None:
                 continue
             ping = flows.get(ping_name)
-            reason = result.stop_reason or ("the run ended before the transfer" if transfer.packets_under_way else "")
+            reason = result.stop_reason or (
+                "the run ended before the transfer was complete" if transfer.packets_under_way else ""
+            )
             captures = self._captures(repeat, recording)
             values = self._values(repeat, transfer, ping)
             if repeat.protocol is Protocol.TCP and not reason and Role.RECEIVER in captures:

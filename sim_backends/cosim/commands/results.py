@@ -282,7 +282,7 @@ FORMATION: Final = (
     SheetColumn(
         "amplification",
         "amplified",
-        "ratio of a follower's acceleration to its leader's; a row of vehicles is string stable up to 1",
+        "ratio of a follower's acceleration to its leader's; at most 1 if disturbances do not grow along the row",
     ),
 )
 """Columns of a `Formation`, in the order of `formation_values`."""

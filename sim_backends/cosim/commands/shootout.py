@@ -26,7 +26,7 @@ from sim_backends.cosim.studies.shootout import Row, rows, run_outcomes
 _ROW: Final = (
     SheetColumn("policy", "policy", ""),
     SheetColumn("window_s", "w (ms)", "window", 1e3),
-    SheetColumn("seeds", "seeds", "number of runs in the means"),
+    SheetColumn("seeds", "seeds", "number of seeds in the means"),
 )
 _TIMES: Final = (
     SheetColumn(

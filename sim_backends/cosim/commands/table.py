@@ -91,7 +91,7 @@ def _columns(name: str, factor: float) -> list[SheetColumn]:
         SheetColumn(f"{name}_paper{suffix}", "paper", "as printed", factor, digits=6),
         SheetColumn(f"{name}{suffix}", "simulated", "mean over seeds", factor),
         SheetColumn(f"{name}_low{suffix}", "from", "lower end of its 95 % interval", factor),
-        SheetColumn(f"{name}_high{suffix}", "to", "upper end", factor),
+        SheetColumn(f"{name}_high{suffix}", "to", "upper end of this interval", factor),
         SheetColumn(f"{name}_seeds", "seeds", "number of seeds for which packets arrived" if name == "delay" else ""),
         SheetColumn(
             f"{name}_agreement",
@@ -147,7 +147,7 @@ def claim_sheet(title: str, claims: Sequence[Claim]) -> Sheet:
             100,
         ),
         SheetColumn("low", "from", "lower end of its 95 % interval", 100),
-        SheetColumn("high", "to", "upper end", 100),
+        SheetColumn("high", "to", "upper end of this interval", 100),
         SheetColumn("row_count", "n", "number of rows of the tables that the change is based on"),
         SheetColumn("agreement", "verdict", "agrees if the paper's statement is within the interval"),
     )

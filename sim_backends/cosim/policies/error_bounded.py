@@ -21,9 +21,8 @@ the error grows by u q between two steps. The step is the physics step if u q is
 bound; otherwise it is shorter.
 
 While no program sends and the network has no events, positions are not used, and the window extends to the last step
-before the next event. If a network cannot extrapolate, it assumes that agents do not move, and x is the distance that
-they have moved; if one physics step moves them farther than the bound, the bound cannot be kept, and the
-policy raises an error.
+before the next event. If a network cannot extrapolate, it assumes that agents do not move. Then x is the distance
+that they have moved. If one physics step moves them farther than the bound, the policy raises an error.
 
 The bound may be given in dB of path loss. By the log-distance law, the path loss at a distance d is a constant plus
 10 n log10(d). If two agents with the assumed distance d are nearer by x, their path loss is lower by

@@ -1,4 +1,7 @@
-"""The interface of a sync policy, and the data on which it decides."""
+"""The interface of a sync policy, and the data on which it decides.
+
+A sync policy determines how long physics and network run without an exchange of data (a window).
+"""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -100,7 +103,7 @@ class LookingAhead(SyncPolicy, Protocol):
     """
 
     def reckoning_step_ns(self, situation: Situation) -> int:
-        """Return the step of the network's dead reckoning in the window that begins now.
+        """Return the step of the network's dead reckoning (extrapolation of positions) in the window that begins now.
 
         Args:
             situation: The current situation; `assumed_states` has the velocities with which the network will

@@ -314,7 +314,7 @@ class FileTraffic(_Traffic):
 
     @override
     def packets(self, duration_s: float) -> float:
-        return len(self.to) * -(-self.size_bytes // self.piece_bytes)
+        return len(self.to) * -(-self.size_bytes // self.piece_bytes)  # rounded up
 
 
 class PingTraffic(_Traffic):

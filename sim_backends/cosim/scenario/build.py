@@ -217,7 +217,7 @@ class Simulation:
         self.close()
 
     def close(self) -> None:
-        """Stop the external federates; without this call they stop when they are no longer referenced."""
+        """Stop the external federates, which otherwise stop only when this object is deleted."""
         self.federates.close()
 
     def run(self, until_ns: int | None = None, progress: Progress | None = None) -> Run:
@@ -278,6 +278,7 @@ def build(
         captures_settings = None if network is not None or captures is None else _captures(scenario, captures)
         carrier = open_network(*federate_arguments, captures=captures_settings) if network is None else None
         federates.callback(getattr(carrier, "close", _nothing_to_close))
+        # With its own transports, the external network is the complete network; otherwise it only carries IP packets.
         if scenario.network.transports == "federate":
             network = network or carrier
         if physics is None:

@@ -1,4 +1,4 @@
-"""Checks of a scenario that need more than its file: its world, its robots and their speeds, this machine."""
+"""Checks of a scenario that need more than its file: the world, the robots, and the memory of this machine."""
 
 import math
 from collections.abc import Callable, Iterator

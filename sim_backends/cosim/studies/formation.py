@@ -1,4 +1,7 @@
-"""Computes the position errors of followers, and the string stability of convoys."""
+"""Computes the position errors of followers, and the string stability of convoys.
+
+A convoy is string stable if disturbances do not grow along its row of vehicles.
+"""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -69,7 +72,7 @@ class SampledPhysics:
 
     def __init__(self, physics: PhysicsFederate, interval_ns: int) -> None:
         self._physics = physics
-        self._interval_ns = -(-interval_ns // physics.step_ns) * physics.step_ns
+        self._interval_ns = -(-interval_ns // physics.step_ns) * physics.step_ns  # rounded up
         self._next_ns = 0
         self._samples: list[Mapping[str, State]] = []
         self.step_ns = physics.step_ns

@@ -26,9 +26,14 @@ from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.world.motion import State
 
 MEASURES: Final = ("delivery_s", "late_s", "position_m", "fates", "path_m")
-"""In this order: error of the delivery time; time by which an arrival was in the receiver's past; error of the
-relative position that the network assumed for sender and receiver; share of packets that arrived in only one of the
-two runs; position error of agents at the end of the window."""
+"""The measured errors.
+
+- `delivery_s`: error of the delivery time.
+- `late_s`: time by which an arrival was in the receiver's past.
+- `position_m`: error of the relative position that the network assumed for sender and receiver.
+- `fates`: share of packets that arrived in only one of the two runs.
+- `path_m`: position error of agents at the end of the window.
+"""
 
 TAIL_NS: Final = 200_000_000
 """Time for which forks continue after the window, so that the fates of the affected packets are decided."""
@@ -41,7 +46,7 @@ class LocalErrors:
     """Local errors of one policy for several parameters, over windows that begin at the same times.
 
     Attributes:
-        window_s: Lengths of the windows, shape (parameters, begins).
+        window_s: Lengths of the windows, shape (parameters, times at which windows begin).
         sums: For each of `MEASURES`, the sum over the affected packets or agents, same shape.
         counts: The number of these packets or agents, same shape.
     """

@@ -1,4 +1,4 @@
-"""Compares sync policies: cost and errors with one seed, and bias over seeds."""
+"""Compares sync policies: cost and errors with one seed, and bias (mean difference from the reference) over seeds."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Writes the results of a sweep as a dataset of Parquet files, partitioned by its factors (Hive style).
+"""Writes the results of a sweep as a dataset of Parquet files, with a folder per value of each factor (Hive style).
 
 Equal results give equal bytes: rows are in the order of the plan, not in the order in which the runs ended.
 """

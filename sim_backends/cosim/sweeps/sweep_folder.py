@@ -75,7 +75,7 @@ class SweepFolder:
             ConfigurationError: The folder contains other files or another sweep, another process runs the sweep, or
                 the folder cannot be written.
         """
-        with self._converted_errors():
+        with self.error_conversion():
             self.path.mkdir(parents=True, exist_ok=True)
             self._require_same_sweep(plan)
             for folder in (_RUNS, _FAILED):
@@ -149,8 +149,8 @@ class SweepFolder:
         self._write(self.path / _FAILED / f"{run.name}.json", _identity(run) | vars(failure))
 
     @contextmanager
-    def _converted_errors(self) -> Iterator[None]:
-        """Convert an `OSError` of the body to a `ConfigurationError`."""
+    def error_conversion(self) -> Iterator[None]:
+        """Convert an `OSError` of the body to a `ConfigurationError`, whose remedy continues the sweep."""
         try:
             yield
         except OSError as error:
@@ -160,12 +160,8 @@ class SweepFolder:
                 remedy=f"all finished runs are saved; free some space, then continue: {self._continue_command}",
             ) from error
 
-    def error_conversion(self) -> Any:  # noqa: ANN401 (a context manager)
-        """Return a context manager that converts an `OSError` to an error; its remedy continues the sweep."""
-        return self._converted_errors()
-
     def _write(self, path: Path, content: Mapping[str, Any]) -> None:
-        with self._converted_errors():
+        with self.error_conversion():
             files.write(path, json.dumps(content, indent=1).encode() + b"\n")
 
     def _read(self, path: Path) -> dict[str, Any]:

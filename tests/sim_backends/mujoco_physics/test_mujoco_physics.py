@@ -1,6 +1,7 @@
 """The physics federate in MuJoCo: time, commands, copies, errors, the conformance suite."""
 
 import copy
+import json
 import math
 import sys
 from dataclasses import replace
@@ -137,3 +138,13 @@ def test_the_entry_point_mujoco_is_a_python_federate() -> None:
     from sim_backends.federates.named import named_federate  # noqa: PLC0415 (its entry point is under test)
 
     assert isinstance(named_federate("mujoco", PHYSICS), PythonFederate)
+
+
+def test_an_absent_agent_stays_absent_when_another_is_put_elsewhere() -> None:
+    agents = [AgentStart("a", "husky", State((0.0, 0.0, 0.39)), antenna_m=0.39)]
+    agents.append(AgentStart("b", "husky", State((5.0, 0.0, 0.39)), antenna_m=0.39))
+    scenario = {"scenario": {"agents": {"a": {}, "b": {"appears": "2s"}}}}
+    physics = MujocoPhysics(Hello(PHYSICS, agents, step_ns=1_000_000, configuration=json.dumps(scenario).encode()))
+    assert physics.advance(0, {}).keys() == {"a"}
+    physics.put("a", (1.0, 1.0, 0.0), 0.0)
+    assert physics.advance(0, {}).keys() == {"a"}

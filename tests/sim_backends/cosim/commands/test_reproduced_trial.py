@@ -63,16 +63,20 @@ def test_a_run_that_ends_during_a_transfer_has_a_failed_row(tmp_path: Path) -> N
     result = run_here(tmp_path, "cosim", "run", "field_30ft", "--out", "short", "--duration", "600ms")
     assert result.code == 0, result.err
     (row,) = rows(tmp_path / "short")
-    assert (row["protocol"], row["status"], row["reason"]) == ("udp", "failed", "the run ended before the transfer")
+    assert (row["protocol"], row["status"], row["reason"]) == (
+        "udp",
+        "failed",
+        "the run ended before the transfer was complete",
+    )
     assert "rtt_loss" not in row
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"line": "nlos"}, "the procedure los is for los, and the line of the scenario is nlos"),
-        ({"traffic.1.count": "5"}, "the number of echo requests is 5, and 10 in the procedure los"),
-        ({"traffic.0.port": "1235"}, "the port of the transfer is 1235, and 1234 in the procedure los"),
+        ({"line": "nlos"}, "the procedure los is for los, but the line of the scenario is nlos"),
+        ({"traffic.1.count": "5"}, "the number of echo requests is 5, but 10 in the procedure los"),
+        ({"traffic.0.port": "1235"}, "the port of the transfer is 1235, but 1234 in the procedure los"),
         ({"trial.procedure": "topics"}, "a simulation cannot reproduce the procedure"),
         ({"trial.udp.ping": "ping"}, "there is no traffic 'ping'; did you mean"),
         ({"trial.udp.ping": "scan-udp"}, "scan-udp is not traffic of kind ping with protocol udp"),
