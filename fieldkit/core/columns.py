@@ -187,7 +187,7 @@ class Column:
         value: float = int(stripped) if is_integer and len(stripped) <= _MAX_INT_DIGITS else float(stripped)
         # A whole number equals `value // 1`. Infinity does not, but its error is that it is out of range.
         if self.type is int and not (is_integer if self.unit == "ns" else value in {math.inf, value // 1}):
-            return "not a whole number"
+            return f"not a whole number, which the unit {self.unit} requires"
         low, high = self.possible_range
         return None if low <= value <= high else f"not from {low:.9g} to {high:.9g}"
 

@@ -132,13 +132,14 @@ start_clock_sampler() {
 # Print a line `==> next <==` and the outputs of the clock sources at intervals of $2 s until this job is stopped, its folder
 # is deleted, or the lock of token $1 (-: none) is lost.
 sample_clock() {
+    token=$1
     while [ -e .began ]; do
         trap 'kill "$child"; exit 0' TERM INT HUP
         sleep "$2" &
         child=$!
         wait "$child"
         trap '' TERM INT HUP # signals do not interrupt a snapshot, which ends with its programs within SOURCE_S seconds
-        [ "$1" = - ] || owns_lock || return 0
+        [ "$token" = - ] || owns_lock || return 0
         echo "==> next <=="
         snapshot ".clock-$$" - ../.hung-sources clock
     done

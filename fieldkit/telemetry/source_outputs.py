@@ -5,7 +5,6 @@ absent, never 0.
 """
 
 import json
-import math
 import re
 from collections.abc import Iterator, Mapping
 from typing import Final
@@ -21,7 +20,13 @@ TEXTS: Final = frozenset({"band", "cell"})
 """Names of the values that are text; the others are numbers."""
 _NUMBER: Final = re.compile(r"([+-]?[0-9]{1,15}(?:\.[0-9]{1,9})?)(?: ?(dBm|dB))?", re.ASCII)
 _UNITS: Final = {"signal_dbm": "dBm", "noise_dbm": "dBm", "sinr_db": "dB"}
-_MISSING_TEXTS: Final = frozenset({"", "--", "unknown", "n/a", "none", "null"})
+_MISSING_TEXTS: Final = frozenset({"", "--", "unknown", "n/a", "none", "null", "nan"})
+
+_MIN_POWER_DBM: Final = -200.0
+_MAX_SINR_DB: Final = 100.0
+_MAX_NEIGHBOURS: Final = 1e6
+_MAX_RATE_BIT_S: Final = 1e12
+"""Bounds far outside the values of any radio; a number beyond them is not a measurement."""
 
 _MAX_AGE_S: Final = 10.0
 """A mesh node counts as a neighbour if it was heard within this time. Nodes announce themselves every second, and are
@@ -99,8 +104,11 @@ def _value(name: str, extracted: object, factor: float = 1) -> float | str | Non
     if isinstance(extracted, bool | list | dict) or extracted is None:
         return None
     if name in TEXTS:
-        text = shorten(" ".join(str(extracted)[:200].split()))
-        return None if text.lower() in _MISSING_TEXTS else text
+        text = " ".join(str(extracted)[:200].split())
+        # The replacement character stands for bytes that are not UTF-8.
+        if text.lower() in _MISSING_TEXTS or not text.isprintable() or "\N{REPLACEMENT CHARACTER}" in text:
+            return None
+        return shorten(text)
     if isinstance(extracted, str):
         match = _NUMBER.fullmatch(extracted.strip())
         if match is None or (match[2] and match[2] != _UNITS.get(name)):
@@ -112,9 +120,21 @@ def _value(name: str, extracted: object, factor: float = 1) -> float | str | Non
         except (TypeError, ValueError, OverflowError):
             return None
     number *= factor
-    # Drivers of modems and radios report 0 or a positive number for an unknown signal, as drivers of Wi-Fi do.
-    is_power = name in {"signal_dbm", "noise_dbm"}
-    return number if math.isfinite(number) and (number < 0 or not is_power) else None
+    return number if _is_possible(name, number) else None
+
+
+def _is_possible(name: str, number: float) -> bool:
+    """Return True if a radio can have a value; False for NaN."""
+    match name:
+        case "signal_dbm" | "noise_dbm":
+            # Drivers of modems and radios report 0 or a positive number for an unknown signal, as Wi-Fi drivers do.
+            return _MIN_POWER_DBM <= number < 0
+        case "sinr_db":
+            return abs(number) <= _MAX_SINR_DB
+        case "neighbours":
+            return 0 <= number <= _MAX_NEIGHBOURS and number.is_integer()
+        case _:  # tx_rate_bit_s, rx_rate_bit_s
+            return 0 <= number <= _MAX_RATE_BIT_S
 
 
 def _documents(output: str) -> Iterator[object]:

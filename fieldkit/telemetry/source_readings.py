@@ -75,7 +75,7 @@ def _content(path: Path) -> bytes:
     if not path.is_file() and path.with_name(f"{path.name}.gz").is_file():
         return reading.compressed(path.with_name(f"{path.name}.gz"))
     try:
-        return reading.text(path).encode()
+        return bytes(reading.mapped(path))  # not as text: the sizes in the file are numbers of bytes before decoding
     except EvidenceError as error:
         raise EvidenceError("it was not queried, or its output was not fetched", where=str(path)) from error
 

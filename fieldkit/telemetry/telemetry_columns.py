@@ -81,7 +81,7 @@ class TelemetryResult:
 
     Attributes:
         measured: Columns of `link` with the values of the sources, and the columns of `of_role`.
-        notes: A sentence for each source that gave no value.
+        notes: A sentence for each source that gave no value, or not all values that the profile locates.
     """
 
     measured: Measured
@@ -129,6 +129,8 @@ def measure(role: Role, telemetry: TelemetrySection, evidence: AttemptEvidence, 
             source_texts.append(f"{name} ({source.kind}{wired_text}): {' '.join(measured_quantities)}")
         if not readings.values:
             notes.append(f"telemetry {name} of the {role} gave no value: {reason or 'no query ended'}")
+        elif absent := source.absent_quantities(readings.values):
+            notes.append(f"telemetry {name} of the {role} gave no possible value of {', '.join(absent)}")
     source_columns = _measured(role, series)
     # The columns of the sources, with or without a value, replace those of `base`.
     remaining = base.without(dict.fromkeys(source_columns.values, "") | dict(source_columns.missing))

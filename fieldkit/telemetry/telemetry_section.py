@@ -295,6 +295,11 @@ class TelemetrySource(Strict):
         """Names of the values that it gives."""
         return _QUANTITIES_BY_KIND.get(self.kind) or tuple(name for name, _ in (self.values or Values()).items())
 
+    def absent_quantities(self, readings: Sequence[Mapping[str, float | str]]) -> tuple[str, ...]:
+        """Return the quantities located in the profile that none of some readings has."""
+        located_quantities = self.quantities if self.values is not None else ()
+        return tuple(name for name in located_quantities if not any(name in values for values in readings))
+
     @property
     def address(self) -> str | None:
         """IP address to which its queries are sent; None if they stay on the computer."""
@@ -343,7 +348,9 @@ class TelemetrySource(Strict):
         return (self.address or "-", tested_interface, *times, *self.argv(credentials_file))
 
 
-SourceName = Annotated[str, pattern_field(r"^[a-z][a-z0-9_]{0,19}$", "a short name in lower-case letters")]
+SourceName = Annotated[
+    str, pattern_field(r"^[a-z][a-z0-9_]{0,19}$", "up to 20 lower-case letters, digits and underscores")
+]
 
 
 class TelemetrySection(ProfileSection):

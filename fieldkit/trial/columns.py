@@ -148,6 +148,6 @@ def installed_columns() -> tuple[Column, ...]:
                     f"the kind of step {kind!r} declares a column {column.name!r}, "
                     + (f"but {declaration_error}" if declaration_error else "which exists already"),
                     where=f"{step.__module__}:{step.__name__}",
-                    remedy="rename it there, or uninstall its package",
+                    remedy=f"{'correct' if declaration_error else 'rename'} it there, or uninstall its package",
                 )
     return tuple(columns_by_name.values())

@@ -44,7 +44,7 @@ class StepErrors:
             what: The failed action, for example `the evidence of the step ping cannot be measured`.
             error: The exception.
         """
-        self.tracebacks.append("".join(traceback.format_exception(error)))
+        self.tracebacks.append("".join((f"{what}:\n", *traceback.format_exception(error))))
         return f"{what}: {describe_exception(error)}"
 
 

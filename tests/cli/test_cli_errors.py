@@ -44,6 +44,7 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("robots show turtlebot3_burgr", "did you mean 'turtlebot3_burger'?"),
         ("procedures show loss", "did you mean 'los'?"),
         ("columns show iploss", "did you mean 'ip_loss'?"),
+        ("columns ip_loss", "remedy: fieldkit columns show ip_loss"),
         ("rebuild .", "there is no trial.yaml"),
     ],
 )

@@ -100,8 +100,10 @@ def test_the_step_runs_and_its_evidence_is_checked_and_measured(lab_with_trial: 
     (folder / "repeats" / "tcp-01" / "route.txt").write_text("[]\n", encoding="ascii")
     assert fieldkit("rebuild", str(folder)).returncode == 4, "its checksum no longer matches"
     (folder / "MANIFEST.sha256").unlink()
-    assert fieldkit("rebuild", str(folder)).returncode == 0
+    rebuilt = fieldkit("rebuild", str(folder))
+    assert rebuilt.returncode == 0
     assert rows(folder)[0]["route_device"] == "", "a missing value is empty"
+    assert "tcp-01: route.txt: no route_device: " in rebuilt.stderr, "a value was lost"
 
 
 RAISING_METHODS = """

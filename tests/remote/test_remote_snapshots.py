@@ -79,7 +79,8 @@ def test_the_clock_is_reported_at_intervals_until_the_sampler_is_stopped(shell: 
         "esac\n"
         f"cat {shlex.quote(str(DATA))}/chrony/$file.csv",
     )
-    evidence.begin(shell, FOLDER, "sender", "wlan0")
+    script.call(shell, "lock", "mine", "600", "me", "trial", deadline=Deadline.after(30))
+    evidence.begin(shell, FOLDER, "sender", "wlan0", token="mine")
     wait_until(lambda: len(count.read_text().splitlines()) == 5, Deadline.after(60))
     (tmp_path / "local").mkdir()
     fetching.fetch(shell, FOLDER, "sender", "wlan0", tmp_path / "local")

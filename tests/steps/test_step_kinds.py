@@ -153,3 +153,18 @@ def test_error_of_unknown_kind_mentions_packages(install: Install) -> None:
 def test_versions_include_packages_that_add_kinds(install: Install) -> None:
     install(copy="fieldkit.steps.kinds.ping:PingStep")
     assert plugins.versions() == {"fieldkit": version("fieldkit"), "more-steps": "1.0"}
+
+
+def test_column_with_an_invalid_unit_is_to_be_corrected(
+    install: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "declares_no_unit.py").write_text(
+        "from fieldkit.core.columns import columns\nfrom fieldkit.steps.kinds.ping import PingStep\n"
+        "class Load(PingStep):\n    columns = columns(100, ('load', '', 'Processes that ran.'))\n",
+        encoding="utf-8",
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    install(load="declares_no_unit:Load")
+    with pytest.raises(ConfigurationError, match="but its unit is not 1 to 20 printable characters") as caught:
+        installed_columns()
+    assert caught.value.remedy == "correct it there, or uninstall its package"

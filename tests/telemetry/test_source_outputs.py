@@ -118,10 +118,22 @@ HTTP = source(
         ({"lte": {"rsrp": float("nan"), "band": None}, "cells": []}, {"neighbours": 0.0}),
         ({"lte": {"rsrp": 10**400}, "cells": []}, {"neighbours": 0.0}),
         ({"lte": {"rsrp": 0}, "cells": []}, {"neighbours": 0.0}),
+        ({"lte": {"rsrp": -1e9, "band": float("nan")}, "cells": []}, {"neighbours": 0.0}),
+        ({"lte": {"rsrp": -97, "band": "\x1b[31mB7"}, "cells": []}, {"signal_dbm": -97.0, "neighbours": 0.0}),
+        ({"lte": {"rsrp": -97, "band": "B\ufffd7"}, "cells": []}, {"signal_dbm": -97.0, "neighbours": 0.0}),
     ],
 )
 def test_values_of_json_have_the_type_of_their_column(printed: object, expected: Values) -> None:
     assert source_outputs.values(HTTP, json.dumps(printed)) == expected
+
+
+@pytest.mark.parametrize("printed", ["-1000000000", "200", "nan", "1e3"])
+def test_an_impossible_number_gives_no_value(printed: str) -> None:
+    command = source(
+        "command: [x]\nvalues:\n  sinr_db: {regex: '(.+)'}\n  tx_rate_bit_s: {regex: '(.+)', factor: -1e12}\n"
+        "  neighbours: {regex: '(.+)', factor: 0.003}"
+    )
+    assert source_outputs.values(command, printed) == {}
 
 
 @pytest.mark.parametrize("printed", ["<html>", "", "[" * 60_000, '{"cells": 1}', "1" * 60_000])

@@ -8,6 +8,7 @@ import pytest
 
 from fieldkit.config import schema
 from fieldkit.core.deadline import Deadline
+from fieldkit.core.model import Role
 from fieldkit.remote.script import SCRIPT
 from fieldkit.telemetry import source_readings
 from fieldkit.telemetry.source_readings import SourceReadings
@@ -121,3 +122,14 @@ def test_incomplete_and_altered_files_have_no_values(tmp_path: Path) -> None:
         b"==> 1 0 0 <==\n\n",
     ):
         assert source_readings.parse(altered_content, COMMAND).values == ()
+
+
+def test_bytes_of_the_laptop_that_are_not_utf8_do_not_shift_later_runs(tmp_path: Path) -> None:
+    text = "at: laptop\nhttp: {url: http://127.0.0.1/}\nvalues: {signal_dbm: {json: rsrp}}"
+    laptop_source = schema.validate(schema.parse(text, source="source.yaml"), TelemetrySource)
+    invalid = b'{"rsrp": -90, "name": "\xff\xfe"}\n'
+    valid = b'{"rsrp": -91}\n'
+    runs = [b"==> 1.00 0 %d <==\n%s\n" % (len(output), output) for output in (invalid, valid)]
+    (tmp_path / source_readings.file(Role.SENDER, "router", laptop_source)).write_bytes(b"".join(runs))
+    readings = source_readings.read(tmp_path, Role.SENDER, "router", laptop_source)
+    assert readings.values == ({"signal_dbm": -90.0}, {"signal_dbm": -91.0})

@@ -72,5 +72,5 @@ def test_wrong_sources_are_rejected(text: str, message: str) -> None:
 
 
 def test_the_section_needs_sources_with_short_names() -> None:
-    with pytest.raises(ConfigurationError, match="short name"):
+    with pytest.raises(ConfigurationError, match="lower-case letters, digits and underscores"):
         schema.validate(schema.parse("sources: {'a/b': {batctl: {}}}", source="s.yaml"), TelemetrySection)

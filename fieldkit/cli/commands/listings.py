@@ -95,10 +95,16 @@ def run_columns(arguments: argparse.Namespace) -> int:
 
 def _columns_of(procedure: str) -> int:
     """List the columns that the steps of a procedure fill. The procedure is given by its name or its file."""
-    from fieldkit.trial.columns import filled_columns
+    from fieldkit.trial.columns import filled_columns, installed_columns
     from fieldkit.trial.procedure import load_procedure, read_procedure
 
     path = Path(procedure)
+    if procedure not in locations.names("procedures") and any(
+        column.name == procedure for column in installed_columns()
+    ):
+        raise ConfigurationError(
+            f"{procedure} is a column, not a procedure", remedy=f"fieldkit columns show {procedure}"
+        )
     parsed_procedure = read_procedure(path) if path.suffix == ".yaml" else load_procedure(procedure)
     shown_columns = filled_columns(placed.step for placed in parsed_procedure.walk())
     rows = [

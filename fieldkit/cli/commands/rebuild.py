@@ -41,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     if len(folders) > 1:
         return _rebuild_many(folders, arguments)
     rebuilt = rebuild.rebuild(folders[0])
-    _note_missing_manifest(folders[0], rebuilt)
+    _show_notes(folders[0], rebuilt)
     _show_summary(rebuilt, show_all=arguments.all)
     print_text(_changes(rebuilt))
     return 0
@@ -72,7 +72,7 @@ def _rebuild_many(folders: Sequence[Path], arguments: argparse.Namespace) -> int
             sink(report(done=done))
             folder = folders[end.number]
             if end.result is not None:
-                _note_missing_manifest(folder, end.result)
+                _show_notes(folder, end.result)
                 print_text(f"{folder}: {_changes(end.result)}")
             elif isinstance(end.error, FieldkitError):
                 show_error(str(end.error) if end.error.where else f"{folder}: {end.error}")
@@ -82,9 +82,12 @@ def _rebuild_many(folders: Sequence[Path], arguments: argparse.Namespace) -> int
     return exit_code
 
 
-def _note_missing_manifest(folder: Path, rebuilt: "RebuildResult") -> None:
+def _show_notes(folder: Path, rebuilt: "RebuildResult") -> None:
     if not rebuilt.has_manifest:
         show_note(f"{folder}: there is no manifest to verify its evidence with")
+    if rebuilt.problems:
+        others = f" (and {len(rebuilt.problems) - 1} more)" if len(rebuilt.problems) > 1 else ""
+        show_note(f"{folder}: valid repeats may lack values now: {rebuilt.problems[0]}{others}")
 
 
 def _changes(rebuilt: "RebuildResult") -> str:

@@ -39,7 +39,11 @@ def check_sources(plan: Plan, role: Role, shell: Shell, probe_result: ProbeResul
             values_text = ", ".join(
                 f"{quantity} {cell_text(value)}" for quantity, value in readings.values[0].items()
             )
-            report.ok(f"telemetry {name}", values_text)
+            if absent := source.absent_quantities(readings.values):
+                detail = f"{values_text}; no possible value of {', '.join(absent)}"
+                report.warn(f"telemetry {name}", detail, _remedy(source.kind))
+            else:
+                report.ok(f"telemetry {name}", values_text)
         else:
             reason = readings.reason or "the query did not end"
             report.warn(f"telemetry {name}", f"no value: {reason}", _remedy(source.kind))

@@ -7,7 +7,7 @@ from typing import Final
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.measure.robot_clock import Offset, offset
-from fieldkit.measure.robot_state import clock_states, snapshots
+from fieldkit.measure.robot_state import clock_states, exchanges, snapshots
 from fieldkit.measure.robot_state.clock_report import ClockReport
 from fieldkit.remote import jobs, script
 from fieldkit.remote.shell import Shell
@@ -30,6 +30,9 @@ _REMEDIES: Final[Mapping[str, str]] = {
     "ptp4l": "sudo pmc -u -b 0 'GET PORT_DATA_SET'   # its network needs a PTP master",
 }
 """Remedy by problem, or by program."""
+_STEP: Final[Mapping[str, str]] = {"chrony": "sudo chronyc makestep"}
+_STEP_ANY: Final = "wait until the program has corrected the clock, or restart the program"
+"""Remedy for a clock that differs from its time source, by program."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +62,8 @@ def read_reports(shell: Shell) -> tuple[ClockReport, ...]:
 def read(shell: Shell) -> RobotTime:
     """Log in to a robot and return the state of its clock. Raises the same errors as `read_reports`."""
     jobs.install(shell, Deadline.after(contact.CONTACT_S))
-    exchanges = clock_exchanges.exchanges(shell, contact.CONTACT_S)
-    return RobotTime(offset(exchanges) if exchanges else None, read_reports(shell))
+    times = clock_exchanges.exchanges(shell, contact.CONTACT_S)
+    return RobotTime(offset(times) if times else None, read_reports(shell))
 
 
 def judge(reports: Sequence[ClockReport], report: Report, *, is_required: bool = False) -> None:
@@ -78,7 +81,10 @@ def judge(reports: Sequence[ClockReport], report: Report, *, is_required: bool =
         else:
             error = "" if clock_report.error_s is None else f" \N{PLUS-MINUS SIGN} {clock_report.error_s:.6f} s"
             detail = f"{clock_report.program} follows {clock_report.reference}, {clock_report.offset_s:+.6f} s{error}"
-            report.ok(CHECK, detail)
+            if exchanges.is_wrong(Offset(clock_report.offset_s or 0.0, clock_report.error_s or 0.0)):
+                report.warn(CHECK, detail, _STEP.get(clock_report.program, _STEP_ANY))
+            else:
+                report.ok(CHECK, detail)
     if not reports and is_required:
         report.warn(CHECK, _NO_PROGRAM, _INSTALL)
 

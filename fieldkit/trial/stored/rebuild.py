@@ -9,8 +9,9 @@ from pathlib import Path
 from fieldkit.analysis.cells import Cell
 from fieldkit.core import files
 from fieldkit.core.errors import EvidenceError, shell_command
+from fieldkit.core.model import Status
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.trial import journal, manifest, rows, store
+from fieldkit.trial import gates, journal, manifest, rows, store
 from fieldkit.trial.columns import Row
 from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.plan import Plan
@@ -26,12 +27,15 @@ class RebuildResult:
         changed: Files that changed or were missing.
         expected: Names of the quantities that have an expectation.
         has_manifest: True if there is a manifest, with which the evidence was compared.
+        problems: Problems that the installed code reports about attempts that were valid when they ended; because of
+            them, values may be missing.
     """
 
     cells: tuple[Cell, ...]
     changed: tuple[str, ...]
     expected: frozenset[str]
     has_manifest: bool
+    problems: tuple[str, ...] = ()
 
 
 def rebuild(folder: Path) -> RebuildResult:
@@ -54,7 +58,8 @@ def rebuild(folder: Path) -> RebuildResult:
     before = {name: _content(folder / name) for name in names}
     entries = journal.history(folder, plan)
     with journal.locked(folder):  # otherwise rows that a running trial adds would be lost
-        table = rows.to_csv(_rows(folder, plan, entries), plan.table)
+        measured_rows, problems = _measure(folder, plan, entries)
+        table = rows.to_csv(measured_rows, plan.table)
         rows.summary(folder, plan, table)  # raises errors before a file is written
         rows.write_table(folder, table)
         cells = rows.write_summary(folder, plan, table)
@@ -62,7 +67,9 @@ def rebuild(folder: Path) -> RebuildResult:
             manifest.Manifest(folder).renew(names)
     changed = tuple(name for name in names if _content(folder / name) != before[name])
     expected = frozenset(expectation.quantity for expectation in plan.procedure.expectations)
-    return RebuildResult(cells=cells, changed=changed, expected=expected, has_manifest=has_manifest)
+    return RebuildResult(
+        cells=cells, changed=changed, expected=expected, has_manifest=has_manifest, problems=tuple(problems)
+    )
 
 
 def measure_rows(folder: Path, plan: Plan) -> list[Row]:
@@ -71,15 +78,21 @@ def measure_rows(folder: Path, plan: Plan) -> list[Row]:
     Raises:
         EvidenceError: For the same reasons as `journal.history`.
     """
-    return _rows(folder, plan, journal.history(folder, plan))
+    measured_rows, _ = _measure(folder, plan, journal.history(folder, plan))
+    return measured_rows
 
 
-def _rows(folder: Path, plan: Plan, entries: list[JournalEntry]) -> list[Row]:
-    attempts = journal.ended_attempts(entries)
-    return [
-        rows.measure_row(plan, attempt, AttemptEvidence(store.attempt_folder(folder, attempt.folder)))
-        for attempt in attempts
-    ]
+def _measure(folder: Path, plan: Plan, entries: list[JournalEntry]) -> tuple[list[Row], list[str]]:
+    """Return the rows of a trial's attempts, and the problems of those that were valid when they ended."""
+    measured_rows: list[Row] = []
+    problems: list[str] = []
+    for attempt in journal.ended_attempts(entries):
+        evidence = AttemptEvidence(store.attempt_folder(folder, attempt.folder))
+        verdict = gates.judge(plan, attempt.repeat, evidence)
+        measured_rows.append(rows.build(plan, attempt, verdict.measured))
+        if attempt.status is Status.VALID:
+            problems += (f"{attempt.folder}: {problem}" for problem in verdict.problems)
+    return measured_rows, problems
 
 
 def _content(path: Path) -> bytes | None:

@@ -13,10 +13,11 @@ from fieldkit.config import schema
 from fieldkit.core.events import Finding
 from fieldkit.core.model import Control, Role, Verdict
 from fieldkit.measure.robot_clock import Offset
+from fieldkit.measure.robot_state.clock_report import ClockReport
 from fieldkit.steps.nest import with_record
 from fieldkit.steps.scene import CommandResult
 from fieldkit.trial import size
-from fieldkit.trial.check import contact, radio, software, system
+from fieldkit.trial.check import contact, radio, software, system, time_sources
 from fieldkit.trial.check.probe import Sections, parse
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.plan import Plan
@@ -467,3 +468,15 @@ def test_the_remedy_for_a_clock_uses_an_available_tool() -> None:
 def test_the_remedy_for_the_control_route_names_the_site_file() -> None:
     finding = only(judge_radio(SENDER, control=CommandResult("10.42.0.254 51000 10.42.0.1 22", 0)), "control")
     assert finding.remedy == "write control: radio in the site file, or set host to its address on another network"
+
+
+@pytest.mark.parametrize(
+    ("offset_s", "error_s", "status"),
+    [(-0.75, 0.001, WARN), (-0.75, 0.7, OK), (0.00001, None, OK), (0.2, None, WARN)],
+)
+def test_a_clock_that_differs_from_its_time_source_is_reported(
+    offset_s: float, error_s: float | None, status: Verdict
+) -> None:
+    report = Report("robot")
+    time_sources.judge((ClockReport("chrony", "10.9.0.2", offset_s, error_s),), report)
+    assert [finding.status for finding in report.findings] == [status]
