@@ -323,7 +323,8 @@ class Backend(Protocol):
 
         Args:
             cast: The result of `cast`.
-            seed: Seed of all random numbers of the lab.
+            seed: Seed of all random numbers of the lab. A resumed trial has another seed with the same
+                `fieldkit.core.seeds.place_seed`.
             sink: Receives the names of phases.
             operator: Performs actions that need a person.
 

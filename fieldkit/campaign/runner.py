@@ -12,7 +12,7 @@ from fieldkit.backends.protocols import Backend, Cast, Testbed, simulators_of
 from fieldkit.campaign.journal import CampaignJournal, TrialProgress
 from fieldkit.campaign.order import PlannedTrial, walk_m
 from fieldkit.campaign.plan import CampaignPlan
-from fieldkit.core import files
+from fieldkit.core import files, seeds
 from fieldkit.core.campaign_events import CampaignEnded, CampaignPlanned, CampaignTrial, CampaignWent
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.events import Note, Sink
@@ -140,12 +140,13 @@ class CampaignRun:
             topology_trials = list(block)
             cast = {role: robot for trial in topology_trials for role, robot in self._plans[trial].cast.items()}
             self._set_up(topology, cast, operator)
+            attempts = sum(map(journal.started_attempts, self._journal.folder.glob("*/")))
             with opened(
                 self._backend,
                 cast,
                 session=self._plan.session,
                 purpose=f"campaign {self._plan.campaign.name}",
-                seed=self._plan.campaign.seed,
+                seed=seeds.testbed_seed(self._plan.campaign.seed, attempts),
                 sink=self._sink,
                 operator=operator,
             ) as testbed:

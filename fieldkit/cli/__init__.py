@@ -24,7 +24,7 @@ INTERRUPTED: Final = 130
 EXIT_CODES: Final[Mapping[int, str]] = MappingProxyType(
     {
         0: "Done; for `trial`: every repeat is valid.",
-        1: "A threshold or an expectation is not met, or the operator skipped a request.",
+        1: "A threshold or an expectation is not met, a simulator failed, or the operator skipped a request.",
         INTERRUPTED: "Interrupted by Ctrl-C; all finished repeats are saved.",
     }
 )

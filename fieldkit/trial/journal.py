@@ -134,6 +134,15 @@ def read(folder: Path) -> list[JournalEntry]:
     return jsonl.read(folder / JOURNAL_FILE, _CODEC.parse, remedy="name the folder of a trial")
 
 
+def started_attempts(folder: Path) -> int:
+    """Return the number of attempts that have started in a trial; 0 if its journal is missing or damaged."""
+    try:
+        entries = read(folder)
+    except EvidenceError:
+        return 0
+    return sum(entry.status is Status.RUNNING for entry in entries)
+
+
 def history(folder: Path, plan: Plan) -> list[JournalEntry]:
     """Return the entries of a trial's journal after a check that their sequence is possible.
 

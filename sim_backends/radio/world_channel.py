@@ -10,6 +10,7 @@ from typing_extensions import override
 
 from fieldkit.config.wifi_phy import DscpMapping
 from fieldkit.core.model import Vector
+from fieldkit.core.seeds import place_seed
 from sim_backends.radio import propagation
 from sim_backends.radio.aggregation import AMPDU_LIMITS, TYPICAL_FRAMES, AmpduLimits
 from sim_backends.radio.antennas import Antenna, band_of, fixed_mode, modes_between
@@ -73,7 +74,7 @@ class WorldChannel(RadioChannel):
         self._fixed_mode = fixed_mode(options.mode, antennas)
         self._world = world
         self._shadowing = (
-            Shadowing(seed, options.shadowing_db, options.decorrelation) if options.shadowing_db else None
+            Shadowing(place_seed(seed), options.shadowing_db, options.decorrelation) if options.shadowing_db else None
         )
         count = len(self.names)
         # The first end of a link is the one whose name sorts first, for any order of the stations.

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.backends.protocols import Backend, Cast, Testbed, simulators_of
-from fieldkit.core import permissions, plugins
+from fieldkit.core import permissions, plugins, seeds
 from fieldkit.core.errors import ConfigurationError, shell_command
 from fieldkit.core.events import Note, Sink
 from fieldkit.core.prompts import Operator
@@ -47,8 +47,9 @@ def resume(
     require_backend(plan, name, folder)
     require_simulators(plan, simulators_of(backend), folder)
     require_cast(plan, backend.cast(plan.topology))
+    seed = seeds.testbed_seed(plan.seed, journal.started_attempts(folder))
     with opened(
-        backend, plan.cast, session=plan.session, purpose=plan.trial, seed=plan.seed, sink=sink, operator=operator
+        backend, plan.cast, session=plan.session, purpose=plan.trial, seed=seed, sink=sink, operator=operator
     ) as testbed:
         return resume_trial(folder, testbed, sink, stop, failed=failed)
 

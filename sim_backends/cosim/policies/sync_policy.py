@@ -24,8 +24,8 @@ class Situation:
         now_ns: Time that physics and network have reached.
         states: States of the agents now.
         pairs: Sender and receiver of each possible transmission.
-        next_wake_ns: Returns the next time at which a timer of a program fires, or None.
-        next_event_ns: Returns the time of the next event in the network, or None.
+        next_wake_ns: A function; returns the next time at which a timer of a program fires, or None.
+        next_event_ns: A function; returns the time of the next event in the network, or None.
         physics_step_ns: Time step of the physics simulator.
         limits_m_s2: Largest change of each agent's velocity per second.
         next_send_ns: Time before which no program sends, or None if no program will send; only set for policies that

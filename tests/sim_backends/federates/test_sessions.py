@@ -338,6 +338,19 @@ def test_no_connection_within_the_deadline_is_an_error() -> None:
             open_physics(f"{scheme}:127.0.0.1:{port}", HELLO, 0.2)
 
 
+def test_the_error_about_a_missing_connection_has_the_reason_of_the_last_rejection() -> None:
+    port = free_port()
+
+    def connect() -> None:
+        channel = TcpAddress("tcp", "127.0.0.1", port).connect(time.monotonic() + 20)
+        join(channel, "wrong", time.monotonic() + 20)
+
+    threading.Timer(0.1, connect).start()
+    message = r"no federate has connected to \S+ \(a program with a wrong token was rejected\) within 2 s"
+    with pytest.raises(UnansweredError, match=message):
+        open_physics(f"tcp-listen:127.0.0.1:{port}", HELLO, 2.0)
+
+
 def test_a_federate_of_the_other_role_is_named() -> None:
     with pytest.raises(FederateError, match="it is a physics federate, but a network federate was requested"):
         open_network(CARTS, replace(HELLO, role=NETWORK), 20.0)
