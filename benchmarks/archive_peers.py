@@ -1,4 +1,6 @@
-"""Aggregation of an archive without fieldkit: `python -m benchmarks.archive_peers NAME FOLDER` prints JSON.
+"""Aggregates all `trial.csv` below a folder with pandas or DuckDB, for comparison with `fieldkit aggregate`.
+
+The command `python -m benchmarks.archive_peers NAME FOLDER` prints the result as JSON.
 
 NAME is pandas, duckdb, parquet (DuckDB reads the Parquet file), or write, which writes the Parquet file.
 """
@@ -14,7 +16,7 @@ PARQUET: Final = "archive.parquet"
 
 
 def by_pandas(folder: Path) -> list[list[Any]]:
-    """Return conditions with number, mean and median."""
+    """Return a row per condition: its values, and the count, mean and median of `QUANTITY`."""
     import pandas as pd  # noqa: PLC0415 (a process imports only the library that it measures)
 
     tables = sorted(folder.glob("**/trial.csv"))
@@ -33,7 +35,7 @@ def _query(folder: Path, text: str) -> Any:  # noqa: ANN401 (a relation of DuckD
 
 
 def by_duckdb(folder: Path, source: str) -> list[list[Any]]:
-    """Return conditions with number, mean and median of a table that DuckDB reads."""
+    """Return the same rows as `by_pandas`, computed by DuckDB from a table that it reads."""
     keys = ", ".join(BY)
     query = (
         f"SELECT {keys}, count({QUANTITY}), avg({QUANTITY}), median({QUANTITY}) FROM {source} "
@@ -49,7 +51,7 @@ def by_duckdb(folder: Path, source: str) -> list[list[Any]]:
 
 
 def main() -> None:
-    """Print the figures."""
+    """Print the rows, or write the Parquet file."""
     name, folder = sys.argv[1], Path(sys.argv[2])
     tables = f"read_csv('{folder}/**/trial.csv', union_by_name=true, sample_size=-1)"
     parquet = folder.parent / PARQUET

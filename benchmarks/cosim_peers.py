@@ -1,9 +1,11 @@
-"""The exchange of `cosim_exchange` with HELICS and mosaik: `python -m benchmarks.cosim_peers PEER AGENTS STEPS`.
+"""The data exchange of the benchmark `cosim_exchange`, done by HELICS or mosaik for comparison.
+
+The command is `python -m benchmarks.cosim_peers PEER AGENTS STEPS`.
 
 In each step of one time unit, one federate publishes the states of all agents, and the other one a small message;
 each receives the data of the other one. With HELICS both publish bytes. With mosaik the states are numbers, because
 its interface is JSON. `PEER` is one of `PEERS`. The program prints the microseconds of wall time and of processor
-time per step, without the start.
+time per step, without the start-up.
 """
 
 import asyncio

@@ -2,11 +2,12 @@
 
 Needs ns-3 3.37 and a C++ compiler: `apt-get install libns3-dev g++`. For all modes, airtimes and packet errors of
 1000 bytes are compared. Known differences of airtimes are due to ns-3: it does not end the data of short guard
-intervals at multiples of 4 us (19.4.3, 21.4.3), omits VHT-SIG-B (4 us) of frames to one station, and uses 8 us for
-each HE-LTF at all guard intervals. Then goodput with A-MPDU is compared in one mode: for one station at
-signal-to-noise ratios down to the limit of its range; for several stations, also without ns-3's retry limit and
-BlockAckReq (`bare`: ns-3 3.37 does not reset the count of failed aggregates to a receiver after a successful one, and
-drops a whole aggregate at the seventh failure); with RTS; and with access categories.
+intervals at multiples of 4 us (IEEE 802.11-2020, 19.4.3, 21.4.3), omits VHT-SIG-B (4 us) of frames to one station,
+and uses 8 us for each HE-LTF at all guard intervals. Then goodput with A-MPDU is compared in one mode: for one
+station at signal-to-noise ratios down to the limit of its range; for several stations; with RTS; and with access
+categories. Rows `bare` are without ns-3's retry limit and BlockAckReq, because ns-3 3.37 does not reset its count
+of failed aggregates to a receiver after a successful one, and therefore drops a whole aggregate at the seventh
+failure.
 """
 
 import argparse

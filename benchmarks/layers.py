@@ -40,10 +40,10 @@ Figures = dict[str, float]
 
 @dataclass(frozen=True)
 class Layer:
-    """A radio.
+    """Options of the radio model, with one layer more than the options before.
 
     Attributes:
-        name: Its difference from the layer before.
+        name: The layer that is added.
         options: Its options, as in a site file.
         world: Name of the world around the stations, None for open ground.
     """

@@ -81,7 +81,7 @@ def runs_per_s(plan: SweepPlan, folder: Path, rounds: int) -> dict[str, list[flo
     for number in range(rounds):
         for count in COUNTS:
             out = folder / f"{number}-{count}"
-            # One worker of a sweep is this process. A bare pool of one process must start that process first.
+            # A sweep with one worker runs in this process. A bare pool of one process must start that process first.
             methods: list[tuple[str, Callable[[], object]]] = [
                 ("bare", lambda count=count: run_bare(plan, count)),  # type: ignore[misc]
                 ("sweep", lambda count=count, out=out: run_sweep_in(plan, Workers(count), out)),  # type: ignore[misc]

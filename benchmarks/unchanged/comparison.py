@@ -56,10 +56,10 @@ class Differences:
 
 
 def compare(item: Item, number: int, base: Tree, head: Tree) -> Differences:
-    """Compare the outputs of an item with both trees.
+    """Compare the outputs of a command that was run with the source tree before a change and with the one after it.
 
     Args:
-        item: The item.
+        item: The command, and what its output is.
         number: Its place in the list of items.
         base: The tree before, with recorded results.
         head: The tree after, with recorded results.
@@ -69,7 +69,9 @@ def compare(item: Item, number: int, base: Tree, head: Tree) -> Differences:
     code = (before / "exit_code").read_text(encoding="ascii").strip()
     if item.succeeds and code != "0":
         error = (before / "stderr").read_text(encoding="utf-8", errors="replace").strip()
-        differences.real.append(f"nothing is proved: exit code {code} with the base\n{error}")
+        differences.real.append(
+            f"it failed before the change (exit code {code}), so nothing can be compared\n{error}"
+        )
     names = [{str(path.relative_to(top)) for path in top.rglob("*") if path.is_file()} for top in (before, after)]
     if item.kind is ItemKind.TRIALS:
         differences.add(_compare_trials(before, after))

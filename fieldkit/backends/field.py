@@ -27,7 +27,7 @@ class FieldBackend:
 
     Args:
         site: The site file.
-        document: Its document, for messages with lines.
+        document: The parsed site file, which gives the lines in error messages.
         ask: Prompts the operator for a password without echo.
 
     Attributes:
@@ -36,7 +36,7 @@ class FieldBackend:
     """
 
     by_hand: Final = True
-    lab_bytes: Final = 0
+    lab_bytes: Final = 0  # the testbed writes no files of its own
 
     def __init__(
         self,
@@ -91,7 +91,7 @@ class FieldBackend:
         }
 
     def _abilities(self, profile: RobotProfile) -> frozenset[str]:
-        """Return the sections of a profile by which steps may move the robot with the given permissions."""
+        """Return the sections of a profile that steps may use to move the robot, with the given permissions."""
         sections = profile.sections.items()
         return frozenset(key for key, section in sections if section.permission in self.permissions)
 
@@ -152,7 +152,7 @@ class FieldTestbed:
         permissions: Actions that the operator has permitted; see `Attended`.
     """
 
-    oracle: Final = None
+    oracle: Final = None  # the true loss and delay of real radios are unknown
 
     def __init__(
         self,

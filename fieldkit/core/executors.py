@@ -1,6 +1,6 @@
 """Choose where tasks run: in processes of this machine, or on the workers of a Dask cluster.
 
-Both are a `concurrent.futures.Executor`, to which `tasks` submits the tasks.
+Either choice gives a `concurrent.futures.Executor`, to which the module `fieldkit.core.tasks` submits tasks.
 """
 
 import os

@@ -48,7 +48,7 @@ def log(t_ns: int, level: Level, text: str, *, name: str, file: str, line: int =
 
 
 def phase(t_ns: int, repeat: str, name: str) -> Json:
-    """Return a message with the schema `PHASE`: the phase that starts in the repeat whose folder is `repeat`."""
+    """Return a message with the schema `PHASE`: the phase that starts in the attempt whose folder is `repeat`."""
     return {"timestamp": time(t_ns), "repeat": repeat, "phase": name}
 
 
@@ -60,7 +60,7 @@ def rtt(t_ns: int, repeat: str, reply: Reply) -> Json:
 
 
 def link(repeat: str, sample: LinkSample) -> Json:
-    """Return a message with the schema `LINK`: a sample of a radio in the repeat whose folder is `repeat`."""
+    """Return a message with the schema `LINK`: a sample of a radio in the attempt whose folder is `repeat`."""
     radio = {
         "noise_dbm": sample.noise_dbm,
         "active_s": None if sample.active_ns is None else sample.active_ns / 1e9,
@@ -71,7 +71,7 @@ def link(repeat: str, sample: LinkSample) -> Json:
 
 
 def telemetry(repeat: str, sample: TelemetrySample) -> Json:
-    """Return a message with the schema `TELEMETRY`: values of a source in the repeat whose folder is `repeat`."""
+    """Return a message with the schema `TELEMETRY`: values of a source in the attempt whose folder is `repeat`."""
     return {"timestamp": time(sample.utc_ns), "repeat": repeat, **sample.values}
 
 
@@ -131,7 +131,10 @@ _TIME: Final = _object(
     "time",
     {"sec": {"type": "integer", "minimum": 0}, "nsec": {"type": "integer", "minimum": 0, "maximum": 999_999_999}},
 )
-_REPEAT: Final = _typed("string", "Folder of the attempt, with repeat and attempt: udp-07, or udp-07.void1.")
+_REPEAT: Final = _typed(
+    "string",
+    "Folder of an attempt. Its name is that of the repeat, udp-07; for a void attempt with its number, udp-07.void1.",
+)
 
 LOG: Final = _object(
     "foxglove.Log",

@@ -1,12 +1,12 @@
-# Jobs that continue without a connection, and the verbs.
+# Start, await and stop jobs, which continue if the connection is lost; and call the function of each verb.
 
-launch() { # start a job; $1 is start, run or serve
+launch() { # start a job; $1 is start (return when it is ready), run (return its result), or serve (first the one, then the other)
     how=$1 dir=$2 name=$3 limit=$4 ready=$5 within=$6 in=$7 out=$8 log=$9
     shift 9
     enter "$dir"
     meta=$PWD/.jobs/$name
     read_uptime
-    over_s=$((now + ${limit%.*} + within + 10)) # a caller that has not requested the end by then has lost its connection
+    over_s=$((now + ${limit%.*} + within + 10)) # a caller that has not closed standard input, to request the result, by then has lost its connection
     if [ -d "$meta" ]; then
         is_new=
     elif [ -e .ended ]; then
@@ -250,7 +250,7 @@ command_loop() { # run the commands from standard input in sequence, each a line
         echo "$nonce"
         (eval "main ${line#held }") </dev/null
         code=$?
-        case $line in "held "*) read -r _ || exit ;; esac # wait until the caller requests the end
+        case $line in "held "*) read -r _ || exit ;; esac # wait until the caller requests the result
         echo "$nonce $code" >&2
         echo "$nonce $code"
     done

@@ -182,7 +182,8 @@ def _draw_interval(
     if panel.x_log if panel.lanes else panel.log:
         low = max(low, panel.left if panel.lanes else panel.bottom or low)  # a logarithmic axis has no 0
     colour, is_sideways = LIGHT[style.colour], bool(panel.lanes)
-    # If nothing was lost, the interval shows only the number of repeats, so it is drawn faintly.
+    # If the value is 0, for example because nothing was lost, the width of the interval depends only on the number of
+    # repeats, so it is drawn as a dotted line.
     line: Any = "-" if value != 0 else (0, (1, 4))
     lines = axes.hlines if is_sideways else axes.vlines
     lines(position, low, min(high, top), color=colour, linewidth=1.1, linestyles=line)
@@ -227,7 +228,7 @@ def _draw_edge(axes: Axes, edge: EdgeMark, *, sideways: bool) -> None:
 
 
 def _wrap(text: str, max_length: int) -> str:
-    """Return a text from outside in at most two lines."""
+    """Return a text, which may contain any characters, sanitized and wrapped into at most two lines."""
     return "\n".join(textwrap.wrap(sanitized(text), max_length, max_lines=2, placeholder="…", break_on_hyphens=False))
 
 

@@ -47,7 +47,9 @@ def decode_links(body: bytes, agents: AgentTable, utc_ns: int) -> dict[str, Link
         index, reserved, noise_dbm, active_ns, busy_ns = reader.unpack(_RADIO)
         name = agents.name(index, position)
         if reserved or name in radios or not busy_ns >= 0 or active_ns < 0:
-            raise MalformedFrameError(position, f"the sample of {name} is repeated, or has a negative time")
+            raise MalformedFrameError(
+                position, f"the sample of {name} is repeated, or has a negative time or reserved bits"
+            )
         radios[name] = noise_dbm, active_ns, busy_ns
     links: defaultdict[str, list[StationSample]] = defaultdict(list)
     for _ in range(reader.count(_LINK.size)):
@@ -55,7 +57,10 @@ def decode_links(body: bytes, agents: AgentTable, utc_ns: int) -> dict[str, Link
         index, peer_index, signal_dbm, tx_rate_bit_s, rx_rate_bit_s, *counters = reader.unpack(_LINK)
         name, peer = agents.name(index, position), agents.name(peer_index, position + 4)
         if name not in radios or peer == name or max(counters) > _MAX_COUNT:
-            raise MalformedFrameError(position, f"the link of {name} to {peer} has no radio, or a wrong counter")
+            raise MalformedFrameError(
+                position,
+                f"the link from {name} to {peer} has no sample of its radio, equal ends, or a counter above 2^62",
+            )
         rates_bit_s = _or_none(tx_rate_bit_s), _or_none(rx_rate_bit_s)
         links[name].append(StationSample(peer, _or_none(signal_dbm), *rates_bit_s, *counters))
     reader.check_end()

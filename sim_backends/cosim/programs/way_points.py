@@ -210,7 +210,7 @@ def fly_towards(own_state: State, point_m: Vector, speed_m_s: float, *, stops: b
 def _check_path(points_m: Sequence[Sequence[float]], speed_m_s: float) -> None:
     if not points_m or not 0 < speed_m_s < math.inf:
         raise ConfigurationError(
-            f"{len(points_m)} points at {speed_m_s:g} m/s are not a path",
+            f"a path of {len(points_m)} points at {speed_m_s:g} m/s is impossible",
             remedy="add at least one point, and a speed above 0",
         )
 
@@ -242,7 +242,8 @@ class VelocityProfile(NeverSends):
     def __init__(self, legs: Sequence[ProfileLeg], *, begin_ns: int = 0) -> None:
         if not legs or any(leg.duration_ns <= 0 for leg in legs):
             raise ConfigurationError(
-                f"a velocity profile of {len(legs)} legs has no duration", remedy="add legs with a duration above 0"
+                "a velocity profile has no legs, or a leg without a duration",
+                remedy="give each leg a duration above 0",
             )
         stop = Twist() if isinstance(legs[-1].command, Twist) else Velocity()
         self._commands = [*(leg.command for leg in legs), stop]
@@ -277,7 +278,9 @@ class SpeedOscillation(NeverSends):
 
     def __init__(self, mean_m_s: float, amplitude_m_s: float, period_s: float, *, every_ns: int = 10_000_000) -> None:
         if not 0 < period_s < math.inf:
-            raise ConfigurationError(f"a period of {period_s:g} s is not above 0", remedy="set a period above 0")
+            raise ConfigurationError(
+                f"a period of {period_s:g} s is not above 0 and finite", remedy="set a period above 0"
+            )
         self._mean_m_s = mean_m_s
         self._amplitude_m_s = amplitude_m_s
         self._rate_rad_s = math.tau / period_s

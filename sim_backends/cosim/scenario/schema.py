@@ -46,9 +46,9 @@ class PolicyChoice(Strict):
 
     Attributes:
         name: The default policy of a run.
-        window: Length of a window, or the parameter w of the velocity-aware policies.
+        window: Length of a window, or the window w of two agents at rest of the velocity-aware policies.
         longest: Longest window of policies with variable windows.
-        bound: For `error_bounded`: largest error of the relative position that the network assumes for two agents.
+        bound: For `error_bounded`: largest error of the relative position of two agents, as the network assumes it.
         bound_db: Instead of `bound`: largest error of the path loss between them in free line of sight, in dB.
         exponent: Exponent of the log-distance law for `bound_db`.
     """
@@ -203,10 +203,10 @@ class CosimScenario(Named):
     """A scenario of the [co-simulation](cosim.md): one YAML file in `scenarios/` of the lab, or a shipped one.
 
     `fieldkit cosim schema` prints its JSON schema, with which an editor completes and checks it, see [the Python
-    API](cosim-api.md#scenario-files). `robot` is the name of a robot profile, which has a radio. Bodies of `husky`,
-    `iris`, `turtlebot3_burger` and `duckiedrone` are built in; another robot has the body of the TurtleBot, or of the
-    Duckiedrone, with the top speed of its profile. `radio` has the same keys as `emulated.radio` in the [site
-    file](reference/site-file.md).
+    API](cosim-api.md#scenario-files). `robot` of an agent is the name of a robot profile, or of a built-in body:
+    `husky`, `iris`, `turtlebot3_burger` or `duckiedrone`. Only a profile has a radio. A profile of another name has
+    the body of the TurtleBot, or of the Duckiedrone if it flies, with its own top speed. `radio` has the same keys
+    as `emulated.radio` in the [site file](reference/site-file.md).
 
     Attributes:
         name: The file's name without `.yaml`.
@@ -223,7 +223,8 @@ class CosimScenario(Named):
             the ROS 1 master, if any.
         relay: The agent whose access point relays packets.
         policy: The [sync policy](method-cosim.md#sync-policies).
-        emane: If given, a run publishes its positions to the network emulator EMANE.
+        emane: If given, a run publishes its positions to the network emulator [EMANE](emane.md) or, with the physics
+            federate `emane`, takes them from its events.
         agents: The agents by name.
         traffic: The traffic between the agents.
         faults: Faults during a run.

@@ -18,7 +18,7 @@ from sim_backends.physics.quadrotor import ROTORS_OFF, FlightStatus, FlightTarge
 from sim_backends.world.motion import STILL, State
 
 _REPORT_NS: Final = 10_000_000
-"""Interval of the records while a robot moves; the base controller in a robot uses 20 ms."""
+"""Interval of the entries in the record while a robot moves; the base controller in a robot uses 20 ms."""
 
 _PENDING_COMMANDS: Final = 1000
 """Maximum number of commands that are kept while the simulation lags (at most 1 s); older ones are dropped."""
@@ -53,7 +53,7 @@ class Steering(ABC):
         idle: The command that is applied if the last command has not been repeated for `TIMEOUT_NS`.
         is_driven: True if the robot has received a command since the lab last placed it.
         is_placed: True if the lab has placed it.
-        is_at_rest: True if its last record states that it is at rest, and no command is active.
+        is_at_rest: True if the last entry of its record states that it is at rest, and no command is active.
     """
 
     idle: Command
@@ -68,7 +68,7 @@ class Steering(ABC):
         self.is_placed = False
         # Time at which `idle` is applied unless another command arrives; None if no command is active.
         self._stop_due_ns: int | None = None
-        # Time and heading of the last record.
+        # Time and heading of the last entry.
         self._last_report: tuple[int, float] | None = None
         self.is_at_rest = True
 
@@ -77,9 +77,9 @@ class Steering(ABC):
         """Return the last command of the robot's programs, or None if there is none."""
 
     def poll_placement(self, now_ns: int) -> RobotMotionState | None:
-        """Return the motion at the position where the lab has placed the robot since the last call, or None.
+        """Return the state of the robot, at rest, if the lab has placed it elsewhere since the last call, or None.
 
-        The robot is at rest there, and earlier commands are dropped.
+        Earlier commands are dropped.
         """
         placement = self._reporter.poll_placement(now_ns)
         if placement is not None:
@@ -130,7 +130,8 @@ class Steering(ABC):
         Args:
             at_ns: Time of the state.
             state: Position of its antenna, velocity and heading.
-            flight: Attitude and support of a drone; None for other robots.
+            flight: Position and attitude of a drone, and whether it is on the ground or an obstacle; None for
+                other robots.
         """
         if not self.is_report_due(at_ns):
             return

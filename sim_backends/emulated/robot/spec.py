@@ -27,9 +27,10 @@ STATE: Final = "/run/robot"
 """Folder in the robot that its init process writes to: files mounted over `/etc`, logs, readiness files."""
 
 LOOPBACK_INTERFACE: Final = "lo"
-"""Interface of a link that is only an address: the routing daemon announces this address over every other link."""
+"""Interface of a link without a device of its own: the robot has an address on its loopback interface, which the
+routing daemon announces over every other link."""
 SHARED_NETWORK: Final = IPv4Network("10.42.255.0/24")
-"""Addresses of the robots on such a link."""
+"""Addresses of the robots on a link with the interface `LOOPBACK_INTERFACE`."""
 LOOPBACK: Final = "127.0.0.1"
 
 ANTENNA_M: Final = 0.2
@@ -121,7 +122,7 @@ class RobotSpec:
         hosts: Addresses of all robots of the lab by name.
         host_key: Private host key of its SSH server, OpenSSH PEM.
         authorized_key: Public key that may log in.
-        ros: `builtin` or `debian`.
+        ros: Source of its ROS programs: `builtin` for those of this package, `debian` for Debian's.
         ros_version: 1 or 2.
         distribution: ROS distribution that its profile names.
         setup: Setup files that its profile names.

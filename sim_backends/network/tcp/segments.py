@@ -148,9 +148,9 @@ class MessageStream:
     def number(self, first: int) -> int:
         """Return the number of the segment that starts with the byte `first`, which must not decrease between calls.
 
-        A segment ends when it is full or at the end of a message. Therefore at most one segment starts in each
-        segment-sized part of a message. The number of these parts before it is unique, and does not depend on earlier
-        segments.
+        A message is divided into parts of the size of a segment. A segment ends when it is full or at the end of a
+        message, so at most one segment starts in each part. Its number is the count of all earlier parts, which is
+        unique and does not depend on the sizes of earlier segments.
         """
         while self._unsent[0].end <= first:
             self._unsent.popleft()
@@ -158,12 +158,12 @@ class MessageStream:
         return message.number + (first - message.first) // self._segment_bytes
 
     def read(self, end: int) -> list[int]:
-        """Return the packets that end at or before `end` and have not been returned before."""
+        """Return the ids of the messages that end at or before `end` and have not been returned before."""
         packet_ids = []
         while self._unread and self._unread[0].end <= end:
             packet_ids.append(self._unread.popleft().packet_id)
         return packet_ids
 
     def unread(self) -> list[int]:
-        """Return the packets that have not been read."""
+        """Return the ids of the messages that have not been read."""
         return [message.packet_id for message in self._unread]

@@ -152,5 +152,5 @@ def test_a_profile_commands_its_legs_in_order_and_stops() -> None:
         _, states = agents.advance((at_s - 1) * S, at_s * S - 1, at_s * S)
         speeds_m_s.append(math.hypot(*states["a"].velocity_m_s))
     assert speeds_m_s == pytest.approx([0.0, 0.0, 0.9, 0.9, 0.3, 0.0])
-    with pytest.raises(ConfigurationError, match="has no duration"):
+    with pytest.raises(ConfigurationError, match="a leg without a duration"):
         VelocityProfile([])
