@@ -46,11 +46,13 @@ class Drone:
         bench: The bench.
         autopilot: The autopilot.
         reporter: Reads the placements of the drone and reports its motion.
+        advanced_ns: Time before the last advance of the autopilot, and thus before its last command.
     """
 
     bench: CosimBench
     autopilot: Autopilot
     reporter: DroneMotionReporter
+    advanced_ns: int = 0
 
     @property
     def vehicle(self) -> Vehicle:
@@ -62,7 +64,8 @@ class Drone:
         while not until():
             assert not deadline.expired, f"{self.vehicle.mode} at {self.vehicle.body.place_m}"
             self.reporter.read_placement(time.monotonic_ns())
-            list(self.autopilot.advance(time.monotonic_ns()))
+            self.advanced_ns = time.monotonic_ns()
+            list(self.autopilot.advance(self.advanced_ns))
             time.sleep(0.02)
 
     def take_off(self) -> None:
@@ -137,7 +140,7 @@ def test_a_wall_stops_the_drone_and_without_its_autopilot_the_drone_falls(physic
         assert vehicle.body.place_m[0] < nearest_m + 0.02
         assert not vehicle.body.on_ground
 
-        last_ns = time.monotonic_ns()
+        last_ns = simulated_drone.advanced_ns
         flights = simulated_drone.fall_to_ground()
         contact = next(flight for flight in flights if flight.is_supported)
         fall_s = math.sqrt(2 * flights[0].place_m[2] / GRAVITY_M_S2)
