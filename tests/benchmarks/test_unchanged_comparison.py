@@ -112,7 +112,7 @@ def test_everything_else_is_a_difference(tmp_path: Path, item: Item, before: Fil
 def test_failure_at_the_base_commit_proves_nothing(tmp_path: Path) -> None:
     failed_output: Files = {"exit_code": "3\n", "stderr": "error: no namespaces"}
     (difference,) = compare_outputs(tmp_path, Item(ItemKind.TRIALS), failed_output, failed_output).real
-    assert difference.startswith("nothing is proved: exit code 3")
+    assert difference.startswith("it failed before the change (exit code 3)")
 
 
 def test_emulated_trials_may_differ_in_numbers_but_not_in_fields_files_and_columns(tmp_path: Path) -> None:

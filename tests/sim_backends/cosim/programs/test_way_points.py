@@ -45,5 +45,5 @@ def test_a_program_that_steers_requires_states_with_a_heading() -> None:
 
 @pytest.mark.parametrize(("points", "speed"), [([], 1.0), ([(0.0, 1.0)], 0.0), ([(0.0, 1.0)], math.inf)])
 def test_a_path_without_points_or_speed_is_refused(points: list[tuple[float, float]], speed: float) -> None:
-    with pytest.raises(ConfigurationError, match="not a path"):
+    with pytest.raises(ConfigurationError, match="is impossible"):
         DriveThrough(points, speed)
