@@ -20,7 +20,7 @@ from sim_backends.emulated.mobility import STEP_M, Mobility
 from sim_backends.emulated.nodes import EmulatedRobot
 from sim_backends.emulated.ros.motion_record import RecordedMotion
 from sim_backends.emulated.ros.robot_motion import AssignedPath
-from sim_backends.world.motion import STILL
+from sim_backends.world.motion import STILL, Attitude
 from sim_backends.world.world import load_world
 from tests.helpers.casts import CAST
 from tests.helpers.sshd import wait_until
@@ -34,15 +34,22 @@ class RecordingMedium:
     """A medium that records its calls."""
 
     calls: list[tuple[Mapping[str, Vector], Mapping[str, Vector]]] = field(default_factory=list)
+    attitudes: Mapping[str, Attitude] = field(default_factory=dict)
     fails: bool = False
 
     def place(
-        self, positions_m: Mapping[str, Vector], *, relay: str | None, velocities_m_s: Mapping[str, Vector]
+        self,
+        positions_m: Mapping[str, Vector],
+        *,
+        relay: str | None,
+        velocities_m_s: Mapping[str, Vector],
+        attitudes: Mapping[str, Attitude],
     ) -> None:
         if self.fails:
             raise LinkError("does not answer", where="medium", remedy="start the lab again")
         assert relay is None or relay in positions_m
         self.calls.append((dict(positions_m), dict(velocities_m_s)))
+        self.attitudes = attitudes
 
     def positions_of(self, role: Role) -> list[Vector | None]:
         return [positions.get(CAST[role].name) for positions, _ in self.calls]
