@@ -1,11 +1,13 @@
 """Reception of transmissions: carrier sense, synchronization to a preamble, and decoding."""
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import ge
 from typing import Final, Generic
 
 from sim_backends.radio.aggregation import QOS_HEADER_BYTES, Aggregate
+from sim_backends.radio.amsdu import frame_bytes, frames_of
 from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.contention import CCA_TIME_NS, EventQueue
 from sim_backends.radio.frames import (
@@ -18,6 +20,7 @@ from sim_backends.radio.frames import (
 )
 from sim_backends.radio.links import Payload
 from sim_backends.radio.modes import ENERGY_DETECTION_DBM, ack_ns, basic_mode
+from sim_backends.radio.overhearing import decoding_probability, is_decoded_by_all
 from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.stations import Station
 
@@ -33,10 +36,12 @@ class _Reach:
     Attributes:
         powers_mw: The list returned by `RadioChannel.powers_mw`.
         detected_by: Indices of the stations that detect its frames and therefore do not send.
+        weakest_ratio: Smallest ratio of its power to the noise at these stations.
     """
 
     powers_mw: list[float]
     detected_by: Sequence[int]
+    weakest_ratio: float
 
 
 class Reception(Generic[Payload]):
@@ -67,12 +72,17 @@ class Reception(Generic[Payload]):
         self._emissions: dict[str, Emission] = {}
         self._draws: dict[tuple[int, int, str], PacketDraws] = {}
         self._reaches: dict[int, _Reach] = {}
+        # Stations whose last frame was not decoded; their EIFS may have expired.
+        self._deferring: set[int] = set()
+        # Stations that have decoded, or not, the frame that ends now.
+        self._results: dict[int, bool] = {}
 
     def start(self, transmission: Transmission, reserved_ns: int) -> None:
         """Start a transmission; stations that detect it do not send until `reserved_ns`."""
         station, now_ns, end_ns = self._stations[transmission.transmitter], transmission.start_ns, transmission.end_ns
         reach = self._reach(transmission.transmitter, now_ns)
         transmission.powers_mw, transmission.detected_by = reach.powers_mw, reach.detected_by
+        transmission.weakest_ratio = reach.weakest_ratio
         on_air = self._on_air
         for other in on_air:
             other.interferers.append(transmission)
@@ -106,30 +116,78 @@ class Reception(Generic[Payload]):
                 events.schedule_start(neighbour.contention.postpone(now_ns, reserved_ns), index)
         on_air.append(transmission)
 
-    def end(self, now_ns: int, transmission: Transmission) -> None:
-        """End a transmission; stations that detected it without receiving it defer (EIFS)."""
+    def end(self, now_ns: int, transmission: Transmission, *, reserved_ns: int = 0) -> None:
+        """End a transmission.
+
+        Stations that detected it and did not decode it defer their next frame (EIFS). At a station that decoded it,
+        an earlier EIFS ends, and the channel is reserved.
+
+        Args:
+            now_ns: Current time.
+            transmission: The transmission.
+            reserved_ns: End of the reservation; 0 if `start` has made it.
+        """
         self._on_air.remove(transmission)
-        for index in transmission.receivers:
+        receivers = transmission.receivers
+        for index in receivers:
             self._stations[index].receiving = None
         if transmission.interferers:
-            until_ns = now_ns + self._eifs_extra_ns
             for index in transmission.detected_by:
-                neighbour = self._stations[index]
-                if index not in transmission.receivers and neighbour.sending_until_ns < now_ns:
-                    neighbour.contention.defer_until(until_ns + neighbour.contention.ifs_ns)
-                    if index in self._events.starts:
-                        self._events.schedule_start(neighbour.contention.earliest_start_ns(now_ns), index)
-            transmission.interferers.clear()
+                if index not in receivers and self._stations[index].sending_until_ns < now_ns:
+                    self._defer(now_ns, index)
+        undecoded = self._undecoded(transmission)
+        for index in undecoded:
+            self._defer(now_ns, index)
+        if reserved_ns or self._deferring:
+            decoding = receivers.difference(undecoded)
+            for index in sorted(decoding & self._deferring):
+                self._deferring.remove(index)
+                self._stations[index].contention.end_eifs()
+                if not reserved_ns:
+                    self._reschedule(now_ns, index)
+            if reserved_ns:
+                self._reserve(now_ns, decoding, reserved_ns)
+        transmission.interferers.clear()
+        self._results.clear()
 
-    def reserve(self, now_ns: int, transmission: Transmission, until_ns: int) -> None:
-        """Make the receivers of a transmission that ends now wait until `until_ns`. Call it before `end`."""
-        if transmission.interferers:
-            return
-        for index in transmission.receivers:
-            contention = self._stations[index].contention
-            contention.set_busy_until(until_ns)
-            if index in self._events.starts:
-                self._events.schedule_start(contention.earliest_start_ns(now_ns), index)
+    def _defer(self, now_ns: int, index: int) -> None:
+        """Start EIFS of a station: the inter-frame space of its queue after SIFS and an ACK at the basic rate."""
+        contention = self._stations[index].contention
+        contention.defer_until(now_ns + self._eifs_extra_ns + contention.ifs_ns)
+        self._deferring.add(index)
+        self._reschedule(now_ns, index)
+
+    def _reschedule(self, now_ns: int, index: int) -> None:
+        """Schedule the start of a station again if it waits for the channel."""
+        if index in self._events.starts:
+            self._events.schedule_start(self._stations[index].contention.earliest_start_ns(now_ns), index)
+
+    def _undecoded(self, transmission: Transmission) -> list[int]:
+        """Return the stations that are synchronized to a transmission and did not decode it."""
+        results = self._results
+        if is_decoded_by_all(transmission):
+            return [index for index, is_decoded in results.items() if not is_decoded]
+        undecoded = []
+        for index in sorted(transmission.receivers):
+            is_decoded = results.get(index)
+            if is_decoded is None:
+                probability = decoding_probability(transmission, index, self._channel.noise_mw[index])
+                is_decoded = probability >= 1 or (
+                    probability > 0
+                    and self._link_draws(transmission.transmitter, index, "overheard").draw(
+                        transmission.packet, transmission.attempt
+                    )
+                    < probability
+                )
+            if not is_decoded:
+                undecoded.append(index)
+        return undecoded
+
+    def _reserve(self, now_ns: int, receivers: Iterable[int], until_ns: int) -> None:
+        """Make stations that decoded a frame wait until `until_ns`."""
+        for index in sorted(receivers):
+            self._stations[index].contention.set_busy_until(until_ns)
+            self._reschedule(now_ns, index)
 
     def abort(self, index: int, now_ns: int) -> None:
         """Abort the transmission of a station, so that no station decodes it, and abort the station's reception."""
@@ -175,7 +233,9 @@ class Reception(Generic[Payload]):
         draw = self._link_draws(transmission.transmitter, index, purpose).draw(
             transmission.packet, transmission.attempt
         )
-        return draw < success_probability(transmission, index, self._channel.noise_mw[index])
+        is_decoded = draw < success_probability(transmission, index, self._channel.noise_mw[index])
+        self._results[index] = is_decoded
+        return is_decoded
 
     def decode_frames(
         self, index: int, transmission: Transmission, aggregate: Aggregate[Payload]
@@ -186,10 +246,13 @@ class Reception(Generic[Payload]):
         noise_mw, draws = self._channel.noise_mw[index], self._link_draws(transmission.transmitter, index, "data")
         start_ns = transmission.start_ns + transmission.mode.preamble_ns
         ns_per_byte = (transmission.end_ns - start_ns) / aggregate.size_bytes
-        decoded_frames, before_bytes = [], 0
+        decoded_frames: list[Frame[Payload]] = []
+        before_bytes = 0
         probabilities: dict[int, float] = {}
-        for frame in aggregate.frames:
-            size_bytes = frame.size_bytes + QOS_HEADER_BYTES
+        has_amsdus = aggregate.frame_count < len(aggregate.frames)
+        amsdus = [*frames_of(aggregate.frames)] if has_amsdus else []
+        for number, frame in enumerate([packets[0] for packets in amsdus] or aggregate.frames):
+            size_bytes = frame_bytes(amsdus[number]) if has_amsdus else frame.size_bytes + QOS_HEADER_BYTES
             probability = None if transmission.interferers else probabilities.get(size_bytes)
             if probability is None:
                 frame_start_ns = start_ns + round(before_bytes * ns_per_byte)
@@ -199,7 +262,8 @@ class Reception(Generic[Payload]):
                 )
             before_bytes += size_bytes
             if draws.draw(frame.packet, frame.attempts) < probability:
-                decoded_frames.append(frame)
+                decoded_frames.extend(amsdus[number] if has_amsdus else (frame,))
+        self._results[index] = bool(decoded_frames)
         return decoded_frames
 
     def _reach(self, transmitter: int, now_ns: int) -> _Reach:
@@ -210,7 +274,9 @@ class Reception(Generic[Payload]):
             return reach
         is_detected = map(ge, powers_mw, self._channel.sensitivity_mw)
         detected_by = [index for index, is_strong in enumerate(is_detected) if is_strong and index != transmitter]
-        reach = self._reaches[transmitter] = _Reach(powers_mw, detected_by)
+        noise_mw = self._channel.noise_mw
+        weakest_ratio = min([powers_mw[index] / noise_mw[index] for index in detected_by], default=math.inf)
+        reach = self._reaches[transmitter] = _Reach(powers_mw, detected_by, weakest_ratio)
         return reach
 
     def _link_draws(self, transmitter: int, receiver: int, purpose: str) -> PacketDraws:

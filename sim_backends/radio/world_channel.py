@@ -13,6 +13,7 @@ from fieldkit.config.wifi_phy import DscpMapping
 from fieldkit.core.model import Vector
 from fieldkit.core.seeds import place_seed
 from sim_backends.radio.aggregation import AMPDU_LIMITS, TYPICAL_FRAMES, AmpduLimits
+from sim_backends.radio.amsdu import limits_with_amsdu
 from sim_backends.radio.antennas import Antenna, band_of, fixed_mode, modes_between
 from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.error_rates import packet_error
@@ -355,7 +356,9 @@ class WorldChannel(RadioChannel):
         ):
             return None
         mode = self._fixed_mode or common_modes(first.phy, second.phy)[0]
-        return AMPDU_LIMITS[mode.phy_format]
+        if first.phy.amsdu_max_bytes is None or second.phy.amsdu_max_bytes is None:
+            return AMPDU_LIMITS[mode.phy_format]
+        return limits_with_amsdu(mode.phy_format, min(first.phy.amsdu_max_bytes, second.phy.amsdu_max_bytes))
 
     @override
     def rate_control(self, transmitter: int, receiver: int) -> RateControl:
