@@ -298,7 +298,7 @@ std::vector<double> PairGoodputs(const Options& options)
     internet.Install(nodes);
     Ipv4AddressHelper addresses("10.0.0.0", "255.255.255.0");
     auto interfaces = addresses.Assign(devices);
-    NeighborCacheHelper().PopulateNeighborCache();
+    NeighborCacheHelper().PopulateNeighborCache(interfaces);
     std::vector<Ptr<PacketSink>> sinks;
     for (uint32_t sender : {0, 2})
     {

@@ -12,7 +12,7 @@ from sim_backends.radio.error_rates import log_success
 from sim_backends.radio.frames import Transmission, part_success_probability
 from sim_backends.radio.modes import WifiMode
 
-_CERTAIN: Final = 1e-9
+_CERTAIN: Final = 1e-6
 """Error probability, or success probability, that counts as 0."""
 
 # Search range of the thresholds in dB, and the number of bisections (0.0001 dB).
