@@ -46,12 +46,9 @@ def _threshold_db(mode: WifiMode, size_bytes: int, logarithm: float) -> float:
     return high_db
 
 
-def is_decoded_by_all(transmission: Transmission) -> bool:
-    """Return True if every station that is synchronized to a frame decodes it."""
-    if transmission.interferers:
-        return False
-    _, always = certain_ratios(transmission.mode, _magnitude(transmission))
-    return transmission.weakest_ratio >= always
+def always_decoded_ratio(transmission: Transmission) -> float:
+    """Return the ratio of signal to noise in 20 MHz at which a station certainly decodes a frame."""
+    return certain_ratios(transmission.mode, _magnitude(transmission))[1]
 
 
 def decoding_probability(transmission: Transmission, station: int, noise_mw: float) -> float:

@@ -1,9 +1,9 @@
 """Reception of transmissions: carrier sense, synchronization to a preamble, and decoding."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
-from operator import ge
+from operator import ge, truediv
 from typing import Final, Generic
 
 from sim_backends.radio.aggregation import QOS_HEADER_BYTES, Aggregate
@@ -20,7 +20,7 @@ from sim_backends.radio.frames import (
 )
 from sim_backends.radio.links import Payload
 from sim_backends.radio.modes import ENERGY_DETECTION_DBM, ack_ns, basic_mode
-from sim_backends.radio.overhearing import decoding_probability, is_decoded_by_all
+from sim_backends.radio.overhearing import always_decoded_ratio, decoding_probability
 from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.stations import Station
 
@@ -72,8 +72,9 @@ class Reception(Generic[Payload]):
         self._emissions: dict[str, Emission] = {}
         self._draws: dict[tuple[int, int, str], PacketDraws] = {}
         self._reaches: dict[int, _Reach] = {}
-        # Stations whose last frame was not decoded; their EIFS may have expired.
-        self._deferring: set[int] = set()
+        # Latest end of EIFS, and the end for each station that did not decode a frame, without inter-frame space.
+        self._eifs_ends_ns = 0
+        self._deferring: dict[int, int] = {}
         # Stations that have decoded, or not, the frame that ends now.
         self._results: dict[int, bool] = {}
 
@@ -128,66 +129,80 @@ class Reception(Generic[Payload]):
             reserved_ns: End of the reservation; 0 if `start` has made it.
         """
         self._on_air.remove(transmission)
-        receivers = transmission.receivers
+        receivers: Set[int] = transmission.receivers
         for index in receivers:
             self._stations[index].receiving = None
         if transmission.interferers:
-            for index in transmission.detected_by:
-                if index not in receivers and self._stations[index].sending_until_ns < now_ns:
-                    self._defer(now_ns, index)
-        undecoded = self._undecoded(transmission)
+            undetermined = self._defer_unsynchronized(now_ns, transmission)
+            if not reserved_ns:
+                receivers = receivers - undetermined
+        undecoded = self._undecoded(transmission, receivers)
         for index in undecoded:
             self._defer(now_ns, index)
-        if reserved_ns or self._deferring:
-            decoding = receivers.difference(undecoded)
-            for index in sorted(decoding & self._deferring):
-                self._deferring.remove(index)
-                self._stations[index].contention.end_eifs()
-                if not reserved_ns:
-                    self._reschedule(now_ns, index)
-            if reserved_ns:
-                self._reserve(now_ns, decoding, reserved_ns)
+        if reserved_ns or self._eifs_ends_ns > now_ns:
+            self._use_decoded(now_ns, receivers.difference(undecoded), reserved_ns)
         transmission.interferers.clear()
         self._results.clear()
+
+    def _defer_unsynchronized(self, now_ns: int, transmission: Transmission) -> Set[int]:
+        """Start EIFS of the stations that detected a transmission with interference and were not synchronized to it.
+
+        Returns:
+            The stations that still detect another transmission, for which its end will determine EIFS.
+        """
+        undetermined = {index for other in self._on_air for index in other.detected_by}
+        for index in transmission.detected_by:
+            if (
+                index not in transmission.receivers
+                and index not in undetermined
+                and self._stations[index].sending_until_ns < now_ns
+            ):
+                self._defer(now_ns, index)
+        return undetermined
 
     def _defer(self, now_ns: int, index: int) -> None:
         """Start EIFS of a station: the inter-frame space of its queue after SIFS and an ACK at the basic rate."""
         contention = self._stations[index].contention
-        contention.defer_until(now_ns + self._eifs_extra_ns + contention.ifs_ns)
-        self._deferring.add(index)
-        self._reschedule(now_ns, index)
-
-    def _reschedule(self, now_ns: int, index: int) -> None:
-        """Schedule the start of a station again if it waits for the channel."""
+        self._eifs_ends_ns = self._deferring[index] = ends_ns = now_ns + self._eifs_extra_ns
+        contention.defer_until(ends_ns + contention.ifs_ns)
         if index in self._events.starts:
-            self._events.schedule_start(self._stations[index].contention.earliest_start_ns(now_ns), index)
+            self._events.schedule_start(contention.earliest_start_ns(now_ns), index)
 
-    def _undecoded(self, transmission: Transmission) -> list[int]:
-        """Return the stations that are synchronized to a transmission and did not decode it."""
-        results = self._results
-        if is_decoded_by_all(transmission):
-            return [index for index, is_decoded in results.items() if not is_decoded]
-        undecoded = []
-        for index in sorted(transmission.receivers):
-            is_decoded = results.get(index)
-            if is_decoded is None:
-                probability = decoding_probability(transmission, index, self._channel.noise_mw[index])
-                is_decoded = probability >= 1 or (
-                    probability > 0
-                    and self._link_draws(transmission.transmitter, index, "overheard").draw(
-                        transmission.packet, transmission.attempt
-                    )
-                    < probability
-                )
-            if not is_decoded:
-                undecoded.append(index)
-        return undecoded
+    def _undecoded(self, transmission: Transmission, receivers: Set[int]) -> list[int]:
+        """Return the stations among `receivers`, which are synchronized to a transmission, that did not decode it."""
+        results, powers_mw, noise_mw = self._results, transmission.powers_mw, self._channel.noise_mw
+        undecoded = [index for index, is_decoded in results.items() if not is_decoded and index in receivers]
+        uncertain: Iterable[int] = receivers
+        if not transmission.interferers:
+            always = always_decoded_ratio(transmission)
+            if transmission.weakest_ratio >= always:
+                return undecoded
+            uncertain = [index for index in receivers if powers_mw[index] < always * noise_mw[index]]
+        for index in uncertain:
+            if index not in results:
+                probability = decoding_probability(transmission, index, noise_mw[index])
+                if probability < 1 and (not probability or self._draw_overheard(transmission, index) >= probability):
+                    undecoded.append(index)
+        return sorted(undecoded)
 
-    def _reserve(self, now_ns: int, receivers: Iterable[int], until_ns: int) -> None:
-        """Make stations that decoded a frame wait until `until_ns`."""
-        for index in sorted(receivers):
-            self._stations[index].contention.set_busy_until(until_ns)
-            self._reschedule(now_ns, index)
+    def _draw_overheard(self, transmission: Transmission, index: int) -> float:
+        draws = self._link_draws(transmission.transmitter, index, "overheard")
+        return draws.draw(transmission.packet, transmission.attempt)
+
+    def _use_decoded(self, now_ns: int, stations: Set[int], reserved_ns: int) -> None:
+        """End EIFS of stations that decoded a frame, and reserve the channel until `reserved_ns`, unless it is 0."""
+        for index in sorted(stations):
+            ends_eifs = self._deferring.get(index, 0) > now_ns
+            if not ends_eifs and not reserved_ns:
+                continue
+            contention = self._stations[index].contention
+            if ends_eifs:
+                del self._deferring[index]
+                contention.end_eifs()
+            if reserved_ns:
+                contention.set_busy_until(reserved_ns)
+            if index in self._events.starts:
+                self._events.schedule_start(contention.earliest_start_ns(now_ns), index)
 
     def abort(self, index: int, now_ns: int) -> None:
         """Abort the transmission of a station, so that no station decodes it, and abort the station's reception."""
@@ -275,7 +290,8 @@ class Reception(Generic[Payload]):
         is_detected = map(ge, powers_mw, self._channel.sensitivity_mw)
         detected_by = [index for index, is_strong in enumerate(is_detected) if is_strong and index != transmitter]
         noise_mw = self._channel.noise_mw
-        weakest_ratio = min([powers_mw[index] / noise_mw[index] for index in detected_by], default=math.inf)
+        ratios = map(truediv, map(powers_mw.__getitem__, detected_by), map(noise_mw.__getitem__, detected_by))
+        weakest_ratio = min(ratios, default=math.inf)
         reach = self._reaches[transmitter] = _Reach(powers_mw, detected_by, weakest_ratio)
         return reach
 

@@ -255,6 +255,26 @@ def test_the_medium_follows_a_robot_that_steers_itself_until_the_lab_places_it(
     assert track[0] == track[-1] == place
 
 
+def test_the_medium_receives_the_attitudes_of_robots(
+    medium: RecordingMedium, flying_drone: tuple[Mobility, SteeringRobot]
+) -> None:
+    mobility, robot = flying_drone
+    drone, sender, receiver = (CAST[role].name for role in (Role.RELAY, Role.SENDER, Role.RECEIVER))
+    east, west = Attitude(0.0), Attitude(math.pi)
+    assert [medium.attitudes[name].yaw_rad for name in (sender, receiver)] == pytest.approx(
+        [west.yaw_rad, east.yaw_rad]
+    ), "they face away from each other"
+    start_ns = robot.paths[-1].start_ns
+    robot.last_recorded_motion = RecordedMotion(
+        time.monotonic_ns(), start_ns, (7.0, 8.0, 9.0), heading_rad=1.0, tilt_rad=(0.1, 0.2)
+    )
+    with mobility.moving(Move(Role.SENDER, (Leg(left_m=0.2),), 2.0)):
+        wait(lambda: not motion_threads())
+        assert medium.attitudes[drone] == Attitude(yaw_rad=1.0, pitch_rad=0.2, roll_rad=0.1)
+        assert medium.attitudes[sender].yaw_rad == pytest.approx(-math.pi / 2), "left of west, also after the move"
+    assert medium.attitudes[sender].yaw_rad == pytest.approx(west.yaw_rad)
+
+
 def test_the_time_of_the_track_is_that_of_the_positions(
     medium: RecordingMedium, flying_drone: tuple[Mobility, SteeringRobot], monkeypatch: pytest.MonkeyPatch
 ) -> None:
