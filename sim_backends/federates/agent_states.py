@@ -250,6 +250,7 @@ def unpack_states(data: bytes, begin: int, agents: AgentTable) -> ReceivedStates
     agents.valid_limits = limits
     if indices == agents.all_indices:
         return ReceivedStates(agents.indices, data, limits)
+    # The indices have another order, or a reserved field is not 0, which is an error.
     _check_each(data, begin)
     rows: dict[str, int] = {}
     for row, index in enumerate(indices):

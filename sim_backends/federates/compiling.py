@@ -54,7 +54,7 @@ class CompiledProgram:
     def path(self) -> Path:
         """Return the path of the program, and compile it if necessary.
 
-        It is compiled if the cache has no program of this source, compiler and versions of libraries.
+        It is compiled unless the cache contains a program for this source, compiler, and versions of the libraries.
 
         Raises:
             ConfigurationError: The compiler or a library is not installed, or the compilation failed.

@@ -47,7 +47,7 @@ class _RemoteFederate:
         """Stop the federate."""
         self.session.close()
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> Any:  # noqa: ANN401 (of the subclass)
+    def __deepcopy__(self, memo: dict[int, Any]) -> Any:  # noqa: ANN401 (an object of the subclass)
         """Copy the federate in its process, in its current state, and return the proxy of the copy.
 
         Raises:

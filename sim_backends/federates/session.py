@@ -37,7 +37,7 @@ from sim_backends.federates.transports.transport_table import FORMS, parse_addre
 BUSY_DEADLINE_FACTOR: Final = 20
 """A federate that sends `busy` may take this multiple of the deadline for an answer."""
 _FOREVER_S: Final = 1e9
-"""Deadline of a session without a deadline: about 30 years."""
+"""Value that replaces a deadline of None: about 30 years."""
 _BYE_S: Final = 0.2
 """Longest wait until `bye` is sent."""
 _MAX_SHOWN: Final = 400
@@ -256,7 +256,7 @@ class FederateSession:
             self._child.kill()
         self._channel.close()
 
-    def say_bye(self, limit_s: float) -> None:
+    def send_bye(self, limit_s: float) -> None:
         """End the session, and wait until the federate closes the connection.
 
         Args:

@@ -70,7 +70,7 @@ class Connection
         return publishers.empty() ? "" : publishers.front().PUuid();
     }
 
-    // Set for each agent with a lifetime whether it has a model now; the other agents must have one.
+    // Set `is_present` of each agent: always true without a lifetime, otherwise true if the agent has a model now.
     void SetPresence()
     {
         for (Agent& agent : m_agents)

@@ -47,7 +47,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
 
 _NEAREST_M: Final = 1.0
-"""At smaller distances the path loss is constant (`radio.propagation.NEAREST_M`)."""
+"""At smaller distances the path loss is constant (`radio.propagation.path_loss.NEAREST_M`)."""
 _STEP_SHARE: Final = 1 / 8
 """Share of the bound that is used for the motion between two steps of dead reckoning."""
 _GROUND_M: Final = (STILL,)

@@ -88,8 +88,8 @@ class Odometer:
         self._record = None if motion_record is None else MotionRecord.open(motion_record)
         self._read_bytes = 0
         self._path: AssignedPath | None = None
-        # Motion of the robot when its last path started. `_read_paths` needs it and changes it; it is then reset,
-        # because odometry does not include motion before its start.
+        # Motion of the robot when its last path started. `_read_paths` reads and changes this value. It is reset
+        # afterwards, because the odometry does not include motion before the creation of this object.
         self._base = AT_REST
         self._read_paths(now_ns)
         self._base = AT_REST
@@ -116,7 +116,7 @@ class Odometer:
         if last is None or last.path_start_ns != self.path_start_ns:
             return None
         current = last.at(now_ns)
-        # `RecordedMotion.at` turns the heading but not the velocity, so the speed is computed from the record.
+        # `RecordedMotion.at` turns the heading but not the velocity, so the speed is read from the record.
         speed_m_s = last.speed_m_s if current.is_moving else 0.0
         return RobotMotionState(
             *current.odometry, speed_m_s, current.position_m, current.heading_rad, current.turn_rad_s
@@ -148,7 +148,7 @@ class Odometer:
 def _motion_on(path: AssignedPath, base: RobotMotionState, now_ns: int) -> RobotMotionState:
     """Return a robot's motion on a path at a time; `base` is its motion when the path started."""
     elapsed_ns = now_ns - path.start_ns
-    points_m = [(point_m[0], point_m[1], 0.0) for point_m in path.points_m]  # the speed is that over the ground
+    points_m = [(point_m[0], point_m[1], 0.0) for point_m in path.points_m]  # `speed_m_s` is the horizontal speed
     (east_m, north_m, _), velocity_m_s, _ = WayPoints("", points_m, path.speed_m_s).at(elapsed_ns)[""]
     heading_rad = path.facing_rad
     if velocity_m_s != STILL:
@@ -186,7 +186,7 @@ def _rotate(x: float, y: float, angle_rad: float) -> tuple[float, float]:
 class MotionReporter:
     """Reads the placements of a robot by the lab, and records the motion of the robot.
 
-    Only the process that steers the robot may have one.
+    Only the process that steers the robot may create one.
 
     Args:
         paths: The file of the paths that the lab assigns (`robot_motion.append_path`).

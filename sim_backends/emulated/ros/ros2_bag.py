@@ -1,4 +1,4 @@
-"""The `ros2` command of an emulated robot without ROS: `ros2 bag record` writes bags like ROS 2's own.
+"""The `ros2` command of an emulated robot without ROS: `ros2 bag record` writes bags as ROS 2 does.
 
 It does not use DDS. It reads the robot's sensors as the built-in `rosbag` does, converts each message to CDR (the
 serialization of ROS 2), and stores it with the requested rosbag2 plugin and the quality of service that the publisher
@@ -40,8 +40,8 @@ _TICK_S: Final = 0.1
 # The default format of rosbag2 is MCAP since Iron (ros2/rosbag2#1160).
 _SQLITE3_ONLY: Final = {"dashing", "eloquent", "foxy"}
 _SQLITE3_IS_DEFAULT: Final = _SQLITE3_ONLY | {"galactic", "humble"}
-# Format 9 (Jazzy) has the QoS profiles as a list with named values. An older rosbag2 reads them as text with numbers,
-# as in format 8, the oldest that rosbags writes (rosbags.rosbag2.metadata).
+# Format 9 (Jazzy) stores the QoS profiles as a list with named values. An older rosbag2 expects a text with numbers,
+# as in format 8. This is the oldest format that the package rosbags writes (rosbags.rosbag2.metadata).
 _BEFORE_JAZZY: Final = _SQLITE3_IS_DEFAULT | {"iron"}
 # Until rosbag2 0.10 KeyboardInterrupt reached the command line, which returned exit code 2 (ros2/rosbag2#787).
 _SIGINT_EXITS_2: Final = _SQLITE3_ONLY | {"galactic"}
@@ -71,7 +71,7 @@ class Rosbag2Recorder:
         self._reported_topics: set[str] = set()
 
     def run(self) -> int:
-        """Record; return the number of the signal that stopped it.
+        """Record; return the number of the signal that stopped the recording.
 
         Raises:
             WriterError: The folder exists.

@@ -42,7 +42,7 @@ class Opener(Protocol):
     """Starts or connects to a new federate."""
 
     def __call__(self, hello: Hello) -> tuple[FederateSession, Hello, Welcome]:
-        """Return its session, like `open_session`."""
+        """Return its session, the hello that was sent, and its answer, like `open_session`."""
         ...
 
 
@@ -113,7 +113,7 @@ class FederateProbe:
 
     def request(
         self, kind: MessageKind, body: bytes, answer: MessageKind, decode: Callable[[bytes], Any], *, copy: int = 0
-    ) -> Any:  # noqa: ANN401 (of `decode`)
+    ) -> Any:  # noqa: ANN401 (the result of `decode`)
         """Send a request, and return the decoded answer. Raises the errors of `FederateSession.request`."""
         request_name = kind.name.lower().replace("_", " ")
         return self._session.request(kind, copy, body, answer, decode=decode, describe=lambda: request_name)
@@ -192,7 +192,7 @@ class FederateProbe:
             CheckError: It does not close the connection.
         """
         try:
-            self._session.say_bye(_CLOSE_S)
+            self._session.send_bye(_CLOSE_S)
         except DeadlineError as error:
             raise CheckError(f"it has not closed the connection {_CLOSE_S:g} s after bye") from error
         except ClosedError:

@@ -96,7 +96,7 @@ def read_token(address: TransportAddress) -> str:
 
 
 def is_same_token(first: str, second: str) -> bool:
-    """Return True if two tokens are equal, in constant time."""
+    """Return True if two tokens are equal. The comparison takes constant time, so that it reveals no token."""
     return hmac.compare_digest(first.encode(), second.encode())
 
 
