@@ -25,7 +25,7 @@ class SimulatorOptions(Strict):
         return cls.model_validate(json.loads(hello.configuration).get("options", {}))
 
     def agent_names(self) -> Iterator[tuple[str, Location]]:
-        """Yield the agent's name and the option's location for each option that refers to an agent of the scenario."""
+        """Yield the agent and the location of each option that refers to an agent of the scenario."""
         yield from ()
 
     def unsupported(self, scenario: Mapping[str, Any]) -> Iterator[tuple[str, Location]]:
