@@ -272,7 +272,7 @@ class Network
         RunUntil(-1);
     }
 
-    // Links with the parameters of the configuration, which Python has computed.
+    // Create links with the parameters in the configuration, which `ns3_options.py` has computed.
     void AddFixedLinks(uint64_t seed, const Json& link)
     {
         m_links = CreateObject<FixedLinks>();

@@ -1,4 +1,4 @@
-"""Channel of a robot's radio before and after an attempt, and other networks and other users' airtime on this channel.
+"""Channel of a robot's radio before and after an attempt, with other networks and airtime of others on this channel.
 
 `iw dev INTERFACE scan freq MHZ passive` lists the networks that the radio receives on its channel (scan.c of iw),
 without sending packets. A network with the state `associated` or `joined`, or with the address of the radio, is the
