@@ -209,7 +209,7 @@ class FrameReader:
         """Return the next text.
 
         Raises:
-            MalformedFrameError: It is too long, the frame ends too early, or it is not UTF-8.
+            MalformedFrameError: The text is too long or not UTF-8, or the frame ends too early.
         """
         position = self.position
         (length,) = self.unpack(_LENGTH)
@@ -259,7 +259,7 @@ def text_bytes(text: str) -> bytes:
     """Return a text with its length as bytes.
 
     Raises:
-        ValueError: It is too long.
+        ValueError: The text is too long.
     """
     encoded = text.encode(errors="replace")
     if len(encoded) > MAX_TEXT_BYTES:

@@ -287,7 +287,7 @@ def _child(endpoint: str, role: int) -> Child:
     """Start a federate by its name or its command.
 
     Raises:
-        ConfigurationError: It cannot be started; `endpoint` may be an address of a transport that does not exist.
+        ConfigurationError: The federate cannot be started; `endpoint` may be an address of an unknown transport.
     """
     command = command_line(endpoint, role)
     try:

@@ -147,7 +147,7 @@ class Bodies:
         """Return attitude and support of a quadrotor.
 
         Raises:
-            ConfigurationError: It is not a quadrotor.
+            ConfigurationError: The body is not a quadrotor.
         """
         body, pose = self._bodies[name], self._tracks[name].pose(self._step)
         if not isinstance(pose, FlightPose):

@@ -39,7 +39,7 @@ _KIND_OFFSET: Final = _RUN.size + KIND_POSITION
 _CHECK_S: Final = 0.5
 """Interval at which a channel that waits checks that the other side exists."""
 _PEER_S: Final = 10.0
-"""Longest time for which the accepting side waits until its peer is discovered. An earlier answer may be lost."""
+"""Longest wait of the accepting side until its peer is discovered. An answer that is sent before may be lost."""
 _MAX_WAITING: Final = 16
 """Largest number of runs that wait for the end of the current run."""
 _POLL_S: Final = 0.01
