@@ -1,6 +1,6 @@
 """The trial folders of the rows of a table, if available: plan, raw files, links.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 from collections import Counter
