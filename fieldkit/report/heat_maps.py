@@ -57,8 +57,8 @@ def charts(
         sweep: The columns of the flow and of the factors, each with the column that contains its values as the user
             typed them; see `datasets.condition`.
         requested: Names of quantities that are drawn even if all their values are equal.
-        one_factor: Whether one factor with several values is enough: the other axis is then the flow. Otherwise two
-            factors with several values are needed.
+        one_factor: True if one factor with several values is enough: the other axis is then the flow. Otherwise at
+            least two factors with several values are needed.
     """
     flow, *factors = sweep
     varied_factors = [name for name in factors if len(set(repeats.column(name))) > 1]

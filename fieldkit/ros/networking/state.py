@@ -17,6 +17,7 @@ from fieldkit.trial.check.probe import MISSING_SECTION, Sections
 STATE_S: Final = 30.0
 """Timeout of the script; setup files of a large workspace take seconds on a small computer."""
 MAX_PROGRAMS: Final = 500
+"""Maximum number of running ROS programs that are evaluated; further ones are ignored."""
 
 SCRIPT: Final = resources.files("fieldkit.ros.networking").joinpath("state.sh").read_text(encoding="ascii")
 _ROUTE: Final = re.compile(r"\bdev (?P<interface>\S{1,30})")
