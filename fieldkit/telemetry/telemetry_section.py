@@ -296,13 +296,17 @@ class TelemetrySource(Strict):
         return _QUANTITIES_BY_KIND.get(self.kind) or tuple(name for name, _ in (self.values or Values()).items())
 
     def absent_quantities(self, readings: Sequence[Mapping[str, float | str]]) -> tuple[str, ...]:
-        """Return the quantities located in the profile that none of some readings has."""
+        """Return the quantities whose location is in the profile, but which are missing from all readings.
+
+        Args:
+            readings: Values of each reading, by quantity.
+        """
         located_quantities = self.quantities if self.values is not None else ()
         return tuple(name for name in located_quantities if not any(name in values for values in readings))
 
     @property
     def address(self) -> str | None:
-        """IP address to which its queries are sent; None if they stay on the computer."""
+        """IP address to which its queries are sent; None unless its kind is `snmp` or `http`."""
         device = self.snmp or self.http
         return device.address if device is not None else None
 
@@ -340,7 +344,7 @@ class TelemetrySource(Strict):
         """Return the words `ADDRESS INTERFACE INTERVAL LIMIT ARGV...` of `poll` in telemetry.sh.
 
         Args:
-            radio: The interface under test, over which nothing may be sent; `-` on another computer.
+            radio: The interface under test, over which nothing may be sent; `-` if the laptop runs the query.
             credentials_file: File with the credentials of the command; see `argv`.
         """
         tested_interface = "-" if self.wired else radio

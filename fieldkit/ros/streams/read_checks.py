@@ -11,8 +11,8 @@ from fieldkit.measure.captures.arrays import Ints
 from fieldkit.ros.streams.topic_checks import MAX_SLEW_NS
 from fieldkit.ros.streams.topic_samples import TopicLog
 
-SEEN: Final = "frames that are seen"
-"""Exclusive resource of the steps that have the columns `seen_*`."""
+SEEN: Final = "a display of frames"
+"""Exclusive resource of the steps that have the columns `seen_*`: a repeat has only one such step without a name."""
 _MAX_READ_DELAY_NS: Final = 200_000_000
 """Maximum time from the arrival of a sample until a read returns it, on a busy robot."""
 
