@@ -317,6 +317,6 @@ def _existing_quantities(quantities: Sequence[Quantity], names: Sequence[str]) -
 
 
 def _quantities_named(quantities: Sequence[Quantity], name: str) -> list[Quantity]:
-    """Return the quantity called `name` of the step without a name, or, if there is none, those of named steps."""
+    """Return the quantity called `name` of the step without a name, or otherwise the quantities of named steps."""
     matching = with_plain_name(quantities, name)
     return matching[:1] if matching and not matching[0].step else matching

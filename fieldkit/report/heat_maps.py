@@ -104,7 +104,7 @@ def _chart(quantity: Quantity, cells: Sequence[Cell], axes: Sequence[_Axis], oth
         for title, group in list(groups.items())[:_MAX_PANELS]
     ]
     omitted_count = len(groups) - len(panels)
-    caption = "Estimates over the valid seeds; the table has their intervals."
+    caption = "Each value is an estimate over the valid runs, one per seed; the table has its interval."
     if omitted_count:
         caption += f" {omitted_count} more maps are left out."
     title = f"{scale.head(quantity.label)} over {axes[0].name} and {axes[1].name}"

@@ -42,7 +42,7 @@ class Caution:
 
 
 def paragraph(cells: Sequence[Cell], evidence: Evidence, sweep: Mapping[str, str]) -> str:
-    """Return a sentence about the trials: procedures, times, distances and numbers of attempts.
+    """Return a paragraph about the trials: procedures, times, distances and numbers of attempts.
 
     Args:
         cells: Conditions.

@@ -62,8 +62,8 @@ class Place(PathLeg):
     Attributes:
         near: Role of the reference robot: `sender`, `receiver` or `relay`. At least one of `away`, `towards`, `left`
             and `right` is also required.
-        away: Distance from the reference robot, in the direction away from the robot at the other end of its link
-            (for the relay: away from the sender).
+        away: Distance from the reference robot, which is the robot in the role `near`, in the direction away from the
+            robot at the other end of its link (for the relay: away from the sender).
         towards: Distance from the reference robot, in the direction of the robot at the other end of its link.
         left: Distance from the reference robot to the left, seen by an observer who stands at the reference robot and
             looks in the direction of `away`. With `away: 3m` and `left: 4m`, the place is 5 m from the reference
@@ -218,7 +218,7 @@ class Procedure(catalog.Named, Sectioned):
 
     @property
     def figures(self) -> tuple[Quantity, ...]:
-        """The figures that can be aggregated from the columns of the steps."""
+        """The quantities that can be aggregated over repeats, from the columns of the steps."""
         return quantities(columns.filled_columns(placed.step for placed in self.walk()))
 
     def _expectation(self, index: int) -> "Expectation":

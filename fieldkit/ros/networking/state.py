@@ -1,4 +1,4 @@
-"""State of a robot that determines whether its ROS programs reach those of other robots, read in one round trip."""
+"""Read the state of a robot that determines if its ROS programs reach other robots, in one round trip."""
 
 import re
 from collections.abc import Iterator, Mapping

@@ -83,7 +83,7 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
         sender: Role that sends the requests.
         receiver: Role that answers.
         count: Number of echo requests.
-        interval: Time between requests; below `200ms` iputils before 20210722 needs root.
+        interval: Time between requests. For less than `200ms`, iputils before 20210722 needs root.
         payload_bytes: ICMP payload per protocol; one number sets both.
         gap: Whether columns report the longest time without an answer, `rtt_gap_s`, and the requests lost in it,
             `rtt_gap_lost`. If the ping started or ended in the gap, the columns have lower bounds
