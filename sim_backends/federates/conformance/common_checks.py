@@ -50,7 +50,7 @@ def check_counts(target: Target) -> None:
 
 
 def check_fork_absence(target: Target) -> None:
-    """A federate that does not declare fork refuses it."""
+    """A federate that does not declare fork refuses a request to fork."""
     probe = target.open()
     if probe.has(FederateCapability.FORK):
         raise NotDeclaredError("it declares FORK")

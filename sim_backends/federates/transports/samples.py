@@ -110,7 +110,8 @@ class SampleChannel:
             raise MalformedFrameError(len(sample) - _RUN.size, "the sample ends within a header")
         header = read_header(sample[_RUN.size : body_offset], max_bytes)
         if len(sample) != body_offset + header.size:
-            raise MalformedFrameError(0, f"a sample with {len(sample) - body_offset} bytes, not {header.size}")
+            received_bytes = len(sample) - body_offset
+            raise MalformedFrameError(0, f"the body has {received_bytes} bytes, but its header states {header.size}")
         return ProtocolFrame(header, sample[body_offset:])
 
     def _next_sample(self, deadline_s: float | None) -> bytes:
