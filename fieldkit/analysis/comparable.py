@@ -32,8 +32,8 @@ too many conditions.
 """
 
 _KERNEL_COLUMNS: Final = frozenset({"tcp_congestion_control"})
-"""Columns of the operating systems. They may differ in a comparison of backends, which have the kernels of real
-robots, the kernel of the laptop that emulates robots, or the TCP of a simulation."""
+"""Columns that depend on the operating system's kernel. They may differ in a comparison of backends, which use the
+kernels of real robots, the kernel of the laptop that emulates robots, or the TCP of a simulation."""
 
 _IDENTITY_COLUMNS: Final = frozenset({"profiles_sha256", "procedure_sha256"})
 

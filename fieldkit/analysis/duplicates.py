@@ -19,18 +19,19 @@ def deduplicated(repeats: Repeats) -> tuple[Repeats, tuple[str, ...]]:
     # Attempts without the name of a trial cannot be identified, so all of them are kept.
     unnamed = repeats.texts["trial"] == ""
     attempts[unnamed] = len(repeats) + np.flatnonzero(unnamed)
-    _, index, inverse = np.unique(attempts, return_index=True, return_inverse=True)
-    firsts = index[inverse]
-    duplicates = np.flatnonzero(firsts != np.arange(len(repeats)))
+    _, kept_rows, attempt_of_row = np.unique(attempts, return_index=True, return_inverse=True)
+    first_row_of_attempt = kept_rows[attempt_of_row]
+    duplicates = np.flatnonzero(first_row_of_attempt != np.arange(len(repeats)))
     if not len(duplicates):
         return repeats, ()
-    _check_equal(repeats.where(firsts[duplicates]), repeats.where(duplicates))
-    pairs = Counter(zip(repeats.texts[SOURCE][duplicates], repeats.texts[SOURCE][firsts[duplicates]], strict=True))
+    originals = first_row_of_attempt[duplicates]
+    _check_equal(repeats.where(originals), repeats.where(duplicates))
+    pairs = Counter(zip(repeats.texts[SOURCE][duplicates], repeats.texts[SOURCE][originals], strict=True))
     notes = tuple(
         f"{source}: {format_count(rows, 'row')} also in {kept}, counted once"
         for (source, kept), rows in pairs.items()
     )
-    return repeats.where(np.sort(index)), notes
+    return repeats.where(np.sort(kept_rows)), notes
 
 
 def _check_equal(kept: Repeats, other: Repeats) -> None:

@@ -212,7 +212,8 @@ def medians(
 def guaranteed_coverage(n: int) -> float:
     """Return the coverage of the interval of a median of n repeats for any distribution.
 
-    The range of all repeats does not contain the median only if all repeats are on one side of it.
+    The median is outside of the range of the repeats only if all repeats are on the same side of it. The probability
+    of this is 2 * 0.5^n.
     """
     return CONFIDENCE if n >= MIN_FOR_ORDER_STATISTICS else 1 - 2.0 ** (1 - n)
 

@@ -282,7 +282,7 @@ _REMEDIES: Final = {
     "expected <block end>": "indent this line with as many spaces as the other lines of its list or mapping",
     "mapping values are not allowed": "quote text that contains a colon; indent all keys of a mapping equally",
 }
-"""Remedy for each error message of PyYAML."""
+"""Remedies by a part of the message of an error, of PyYAML or of this module."""
 
 
 def _configuration_error(error: Exception, text: str, source: str, line: int) -> ConfigurationError:

@@ -31,7 +31,7 @@ class PublishedTopic(Strict):
         frame: `frame_id` of the header.
         child_frame: For `nav_msgs/Odometry` and `tf2_msgs/TFMessage`, the frame of the robot, which moves in `frame`.
             Emulated robots use `base_link` if it is empty.
-        points: For a laser scan, beams per turn; for a point cloud, points of 16 bytes.
+        points: For a laser scan, beams per turn; for a point cloud, number of points, each of 16 bytes.
         width: For an image, width in pixels of 3 bytes.
         height: For an image, height in pixels.
         size: For any other type, size of the first array of numbers in each message, `100kB`.
@@ -53,7 +53,7 @@ class PublishedTopic(Strict):
 
     @property
     def payload_bytes(self) -> int:
-        """Size of the list in each message in bytes, or 0 if the profile does not give it."""
+        """Size of the data array in each message in bytes, or 0 if the profile does not give it."""
         if self.type == "sensor_msgs/PointCloud2":
             return 16 * (self.points or 0)
         return round(self.size or 3 * (self.width or 0) * (self.height or 0))

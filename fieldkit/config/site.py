@@ -82,9 +82,9 @@ class Site(Strict):
     The emulated backend ignores `host`, `port`, `user`, `key`, `host_key` and `address`: its robots have addresses
     from 10.42.0.1 on, in the order of the file, and generated keys. With `control: radio` the operator's laptop is
     also a station, `laptop` at 10.42.0.254: it is 2 m from the relay in `master` and from the receiver in
-    `masterless`, and never behind the wall. It has the same radio as the robots, and every packet of SSH is subject
-    to the radio model. In `master`, packets from sender to receiver cross two links, so `loss` and `delay` apply
-    twice. [Method](method-radio.md#the-emulated-radio) describes the radio model.
+    `masterless`, and never behind the wall of `nlos`. It has the same radio as the robots, and every packet of SSH is
+    subject to the radio model. In `master`, packets from sender to receiver cross two links, so `loss` and `delay`
+    apply twice. [Method](method-radio.md#the-emulated-radio) describes the radio model.
 
     Attributes:
         backend: Backend used if the command line gives none.

@@ -1,4 +1,4 @@
-"""Describe errors in YAML files, with hints about wrong indentation, for users who do not know the classes."""
+"""Describe errors in YAML files for users, with hints about wrong indentation and without names of classes."""
 
 import difflib
 import re

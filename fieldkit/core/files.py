@@ -89,7 +89,7 @@ def _remove_unlocked(path: Path) -> None:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError:
         with suppress(OSError):  # the file may not exist
-            path.unlink()  # a link, for example of an attacker to another file
+            path.unlink()  # it may be a symbolic link that an attacker created
         return
     try:
         with suppress(OSError):  # another process has locked it

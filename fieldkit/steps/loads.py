@@ -108,7 +108,7 @@ class LoadOptions(OverLink):
             count=self.streams,
             payload_bytes=self.payload_bytes,
             ports=ports,
-            expected=FlowSchedule(
+            schedule=FlowSchedule(
                 interval_s=self.interval_s(scene.protocol),
                 # A TCP stream from the client starts with iperf3's cookie.
                 head_bytes=0 if reverse or transport is Protocol.UDP else COOKIE_BYTES,

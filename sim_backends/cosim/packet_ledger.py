@@ -183,7 +183,7 @@ class PacketLedger:
     def withdraw(self, names: Container[str]) -> list[Fate]:
         """Drop all packets under way from or to these agents, and return their fates.
 
-        The network does not know of this, and may report these packets later (`discard_withdrawn`).
+        The network is not notified, so it may still report these packets later (`discard_withdrawn`).
         """
         packet_ids = [
             packet_id
@@ -197,7 +197,10 @@ class PacketLedger:
         return fates
 
     def discard_withdrawn(self, packet_id: int) -> bool:
-        """Return True if a packet was withdrawn, and forget it, because the network reports each packet only once."""
+        """Return True if a packet was withdrawn. The ledger then deletes its number.
+
+        The number is not needed again, because the network reports each packet only once.
+        """
         if packet_id not in self._withdrawn_ids:
             return False
         self._withdrawn_ids.remove(packet_id)

@@ -88,9 +88,9 @@ class SerializedEvent:
     """An event within a datagram.
 
     Attributes:
-        nem: NEM that receives it, or `ALL_NEMS`.
-        event: `LOCATION`, `PATHLOSS` or another identifier.
-        content: Its message.
+        nem: NEM that receives the event, or `ALL_NEMS`.
+        event: Identifier of the kind of event: `LOCATION`, `PATHLOSS` or another one.
+        content: The event as an encoded message, for example `LocationEvent`.
     """
 
     nem: int

@@ -108,7 +108,7 @@ def decode_advance_physics(body: bytes, agents: AgentTable) -> tuple[int, int, d
     """Return the two times and the commands of a request to a physics federate.
 
     Raises:
-        MalformedFrameError: It is malformed.
+        MalformedFrameError: The body is malformed.
     """
     if len(body) == _NO_COMMANDS.size:
         to_ns, from_ns, count = _NO_COMMANDS.unpack(body)
@@ -132,7 +132,7 @@ def decode_states(body: bytes, agents: AgentTable) -> tuple[int, ReceivedStates]
     """Return time and states of a physics federate's answer; the states include the acceleration limits.
 
     Raises:
-        MalformedFrameError: It is malformed.
+        MalformedFrameError: The body is malformed.
     """
     if len(body) >= _STATES_HEAD.size:
         at_ns, new_count, count = _STATES_HEAD.unpack_from(body)
@@ -183,7 +183,7 @@ class AdvanceNetwork(NamedTuple):
         """Return the message of a body.
 
         Raises:
-            MalformedFrameError: It is malformed.
+            MalformedFrameError: The body is malformed.
         """
         reader = FrameReader(body)
         to_ns, since_ns, reckoning_ns = reader.unpack(_THREE_TIMES)
@@ -227,7 +227,7 @@ class NetworkOutcomes(NamedTuple):
         """Return the message of a body.
 
         Raises:
-            MalformedFrameError: It is malformed.
+            MalformedFrameError: The body is malformed.
         """
         if len(body) == _NO_OUTCOMES.size:
             at_ns, next_event_ns, both_counts = _NO_OUTCOMES.unpack(body)
@@ -250,7 +250,7 @@ def decode_number(body: bytes) -> int:
     """Return the number in `ping`, `pong` and `busy`.
 
     Raises:
-        MalformedFrameError: It is malformed.
+        MalformedFrameError: The body is malformed.
     """
     reader = FrameReader(body)
     (number,) = reader.unpack(_TIME)
@@ -267,7 +267,7 @@ def decode_fork(body: bytes) -> int:
     """Return the number of the new copy.
 
     Raises:
-        MalformedFrameError: It is malformed.
+        MalformedFrameError: The body is malformed.
     """
     reader = FrameReader(body)
     (copy,) = reader.unpack(_U32)
@@ -279,7 +279,7 @@ def decode_text(body: bytes) -> str:
     """Return the text of `error`.
 
     Raises:
-        MalformedFrameError: It is malformed.
+        MalformedFrameError: The body is malformed.
     """
     reader = FrameReader(body)
     text = reader.text()

@@ -93,15 +93,15 @@ class FlightRecorder:
 
     @property
     def ready(self) -> bool:
-        """Whether each requested message was received, or refused by the autopilot; then it stays True."""
+        """Whether each requested message was received, or refused by the autopilot. Once True, it stays True."""
         self._was_ready |= self._autopilot is not None and self._missing_kinds <= set(self._refusals)
         return self._was_ready
 
     def check(self) -> None:
-        """Check that the requested messages arrive in time.
+        """Check that the requested messages arrive within `_TIMEOUT_S` after the first heartbeat of the autopilot.
 
         Raises:
-            MissingMessageError: A message has not arrived in time.
+            MissingMessageError: A message has not arrived in this time.
         """
         if not self.ready and self._autopilot is not None and time.monotonic() - self._first_heartbeat_s > _TIMEOUT_S:
             missing_ids = ", ".join(str(kind) for kind in sorted(self._missing_kinds - set(self._refusals)))

@@ -179,15 +179,15 @@ class Driver:
         task = self._task
         if self._origin is None:
             self._origin = pose  # the laptop records it
-        relative_pose, last = self.relative_pose, task.last
+        relative_pose, last_pose = self.relative_pose, task.last
         assert relative_pose is not None
         distance_m, angle_rad = math.hypot(relative_pose.x_m, relative_pose.y_m), abs(relative_pose.yaw_rad)
-        if last is not None and (
-            math.dist(pose[:2], last[:2]) > START_M or abs(wrap_angle(pose.yaw_rad - last[2])) > START_RAD
+        if last_pose is not None and (
+            math.dist(pose[:2], last_pose[:2]) > START_M or abs(wrap_angle(pose.yaw_rad - last_pose[2])) > START_RAD
         ):
             self.refuse(
-                f"its odometry is {math.dist(pose[:2], last[:2]):.2f} m and "
-                f"{abs(wrap_angle(pose.yaw_rad - last[2])):.2f} rad from the end of its last motion"
+                f"its odometry is {math.dist(pose[:2], last_pose[:2]):.2f} m and "
+                f"{abs(wrap_angle(pose.yaw_rad - last_pose[2])):.2f} rad from the end of its last motion"
             )
         elif distance_m > task.fence_m:
             self.refuse(f"it is {distance_m:.2f} m from its origin, outside its fence of {task.fence_m:g} m")

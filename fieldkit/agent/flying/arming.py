@@ -127,7 +127,7 @@ class ArmingCheck:
 
     @property
     def is_complete(self) -> bool:
-        """Whether all reports were received, or their timeout has expired."""
+        """Whether all reports were received, their timeout has expired, or the family of the autopilot is unknown."""
         drone, elapsed_s = self._drone, time.monotonic() - self._start_s
         if drone.dialect is None or elapsed_s > _TIMEOUT_S:
             return True

@@ -182,7 +182,7 @@ def hide_type_description(topic: DdsTopic) -> Any:  # noqa: ANN401 (ctypes decla
     layout.
 
     Returns:
-        The table, which must live as long as the topic; None if nothing was changed.
+        The table, which must not be freed before the topic; None if nothing was changed.
     """
     library = loaded_library()
     sertype = ctypes.POINTER(ctypes.c_void_p)()
@@ -257,7 +257,7 @@ class DdsMiddleware:
         return lambda: len(reader.get_matched_publications())
 
     def other_types(self, topic: Topic) -> set[str]:
-        """Return the types of the topic at discovered endpoints, without the topic's own type."""
+        """Return the types of the discovered endpoints of a topic that differ from the type of `topic`."""
         own_type = topic.dds_types[topic.type]
         return {
             endpoint.type_name

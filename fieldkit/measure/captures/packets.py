@@ -164,7 +164,8 @@ _STORAGE_TYPES: Final[Mapping[str, type[np.integer[Any]]]] = MappingProxyType(
 )
 """Columns stored in fewer than eight bytes. Each type can store the header field and the negative special values."""
 
-# The columns are set after `dataclass` has read the fields, because it would use them as default values.
+# The narrow columns are set after `dataclass` has read the fields, because `dataclass` would use them as default
+# values.
 for _name, _storage_type in _STORAGE_TYPES.items():
     _column = NarrowColumn(_storage_type)
     _column.__set_name__(Packets, _name)
@@ -226,7 +227,7 @@ def _time_stamps(integers: Integers, tcp: Mask, transport: Ints, end: Ints) -> I
     if not tcp.any():
         return stamps
     is_aligned = tcp & (transport + 32 <= end)
-    # Of the packets that are long enough, keep those whose options begin with the time stamp.
+    # Keep only the packets whose options begin with the time stamp.
     is_aligned[is_aligned] = integers.u32(transport[is_aligned] + 20) == _ALIGNED_STAMP
     stamps[is_aligned] = integers.u32(transport[is_aligned] + 24)
     others = np.flatnonzero(tcp & ~is_aligned & (transport + 30 <= end))

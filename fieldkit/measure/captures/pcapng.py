@@ -42,7 +42,7 @@ _MAX_DEFINITIONS: Final = 1_000
 
 @dataclass(frozen=True)
 class _Section:
-    """Byte order and interfaces of the packets of a section, up to the next interface description."""
+    """Byte order of a section, and the interfaces that were described before the current position."""
 
     order: Order
     interfaces: tuple["Interface", ...] = ()

@@ -177,10 +177,11 @@ def check_output(output: Ping, count: int, payload_bytes: int, window: tuple[int
     """Yield the contradictions within the output and its differences from the procedure.
 
     Args:
-        output: The output.
+        output: Parsed output of ping.
         count: Number of requests in the procedure.
-        payload_bytes: Payload in the procedure.
-        window: The robot's clock before and after the attempt, nanoseconds since 1970 UTC; None if unknown.
+        payload_bytes: Payload of a request in the procedure.
+        window: Readings of the robot's clock before and after the attempt, nanoseconds since 1970 UTC; None if
+            unknown.
     """
     if output.transmitted is not None and output.transmitted > count:
         yield f"ping sent {output.transmitted} requests instead of {count}"
@@ -191,7 +192,7 @@ def check_output(output: Ping, count: int, payload_bytes: int, window: tuple[int
         reply.seq for reply in output.replies if last is not None and not output.first_seq <= reply.seq <= last
     ]
     if unexpected and last is not None and last <= _MAX_SEQUENCE:
-        yield f"ping has a reply to request {unexpected[0]} of {output.transmitted}"
+        yield f"ping printed a reply to request {unexpected[0]}, but its last request was {last}"
     yield from _check_summary(output)
     times_ns = [reply.at_utc_ns for reply in output.replies if reply.at_utc_ns is not None]
     if window is not None and times_ns:
@@ -221,7 +222,7 @@ def compare_with_capture(
     """Yield the contradictions between the output and one ping in a capture.
 
     Args:
-        output: The output.
+        output: Parsed output of ping.
         captured: The echoes of one identifier.
         interval_s: Time between requests.
         role: Role of the capturing robot.

@@ -28,7 +28,8 @@ CPU_S: Final = 10
 MEMORY_PER_BYTE: Final = 16
 DISK_PER_BYTE: Final = 1
 BYTES_PER_CPU_S: Final = 1 << 20
-"""Additional limits per byte of the file; an index entry of 12 bytes in a bag becomes an object of 170 bytes."""
+"""Additional limits: memory and disk per byte of the file, and one second of CPU time per this number of bytes. For
+example, an index entry of 12 bytes in a bag becomes an object of 170 bytes in memory."""
 ANSWER_BYTES: Final = 16 << 20
 ANSWER_PER_BYTE: Final = 4
 """Limit of an answer's length: a base, and an addition per byte of the file."""
@@ -44,7 +45,7 @@ _EXIT_WAIT_S: Final = 5.0
 ERROR_KEY: Final = "unanswered"
 """Key of the error message in the answer to a query that failed."""
 _TIMED_OUT: Final = -signal.SIGXCPU
-"""Exit code after a limit of time: the kernel sends SIGXCPU at the limit of CPU time."""
+"""Exit code of a process that exceeded a time limit: the kernel sends SIGXCPU at the limit of CPU time."""
 # Exit codes that the file did not cause: 0 after the idle time; signals of the kernel's out-of-memory killer, a
 # service manager or a person.
 _EXTERNAL_EXIT_CODES: Final = {0, -signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP, -signal.SIGINT}

@@ -29,7 +29,7 @@ _LINE: Final = re.compile(rf"([0-9]{{1,19}}),({Role.PATTERN}),{_POSITION},{_NUMB
 
 @dataclass(frozen=True)
 class Separation:
-    """Distance and speeds of two robots during a time span. Names of columns end with the names of the attributes.
+    """Distance and speeds of two robots during a time span. The name of each column ends with an attribute's name.
 
     Attributes:
         distance_start_m: Distance at the start; None if a robot had no position at this time.

@@ -1,4 +1,4 @@
-"""Channel of a robot's radio before and after an attempt, and the networks and the airtime of others on this channel.
+"""Channel of a robot's radio before and after an attempt, with other networks and airtime of others on this channel.
 
 `iw dev INTERFACE scan freq MHZ passive` lists the networks that the radio receives on its channel (scan.c of iw),
 without sending packets. A network with the state `associated` or `joined`, or with the address of the radio, is the
@@ -102,7 +102,7 @@ class RadioState:
 
     @property
     def settings(self) -> Mapping[str, str]:
-        """Its known settings, by the names in `SETTINGS`."""
+        """The known settings of the radio, by the names in `SETTINGS`."""
         values = (str(self.channel or ""), self.country or "")
         return {name: value for name, value in zip(SETTINGS, values, strict=True) if value}
 
@@ -190,7 +190,7 @@ def setting_problem(states: Sequence[RadioState], at_start: Mapping[str, str]) -
 
     Args:
         states: The radio before and after an attempt.
-        at_start: Its settings at the start of the trial; a missing one is not compared.
+        at_start: Settings of the radio at the start of the trial; a missing setting is not compared.
     """
     for name in SETTINGS:
         label = name.replace("_", " ")

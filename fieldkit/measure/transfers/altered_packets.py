@@ -156,7 +156,7 @@ def _were_sent(sent: Packets, received: Packets) -> Mask:
     # Offload cuts and joins frames, but does not change their time stamps and the range of sequence numbers.
     sent_stamps, received_stamps = usable_stamps(sent, received)
     base = np.zeros(1 << 16, dtype=np.int64)
-    # If an index occurs several times, numpy stores the last value, which is the earliest one in reversed order.
+    # If an index occurs several times, numpy stores the last value: the first frame, because the order is reversed.
     base[sent.sport[::-1]] = sent.tcp_seq[::-1]
     has_syn = np.zeros(1 << 16, dtype=np.bool_)
     has_syn[sent.sport[sent.tcp_flags & SYN != 0]] = True

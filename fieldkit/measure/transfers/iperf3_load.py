@@ -178,7 +178,7 @@ class LoadStreams:
         payload_bytes: Payload of a UDP datagram.
         ports: Sender's and receiver's port of each stream as reported by iperf3. If empty, they are determined from
             the packets.
-        expected: Known properties of each stream.
+        schedule: Known properties of each stream.
     """
 
     protocol: Protocol
@@ -189,7 +189,7 @@ class LoadStreams:
     count: int
     payload_bytes: int
     ports: tuple[tuple[int, int], ...]
-    expected: FlowSchedule
+    schedule: FlowSchedule
 
     def forward(self, packets: Packets) -> Packets:
         """Return the packets of the load's protocol from sender to receiver, with any ports."""
@@ -259,7 +259,7 @@ def read_deliveries(load: LoadStreams, sender: Packets | None, receiver: Packets
     if load.protocol is Protocol.UDP:
         packets = _udp_packets(load, sender, receiver)
         masks = load.datagram_masks(packets.sent.where(packets.first))
-        return [deliveries.udp_stream_deliveries(packets, mask, load.expected) for mask in masks]
+        return [deliveries.udp_stream_deliveries(packets, mask, load.schedule) for mask in masks]
     sent, received, reverse = load.forward(sender), load.forward(receiver), load.backward(sender)
     return [
         deliveries.tcp_stream_deliveries(
@@ -270,7 +270,7 @@ def read_deliveries(load: LoadStreams, sender: Packets | None, receiver: Packets
                 )
             ),
             reverse.where((reverse.sport == destination_port) & (reverse.dport == source_port)),
-            load.expected,
+            load.schedule,
         )
         for source_port, destination_port in load.stream_ports(sent)
     ]

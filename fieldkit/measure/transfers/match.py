@@ -101,7 +101,7 @@ def match(sent: Packets, received: Packets) -> Match:
         (payload.sent, payload.received, frames.received_index, payload.match.received_index),
         (payload.received, payload.sent, frames.sent_index, payload.match.sent_index),
     ):
-        # A frame takes the match of its first piece; the index `NONE` (-1) selects the appended `NONE`.
+        # The match of a frame is that of its first piece; the index `NONE` (-1) selects the appended `NONE`.
         frame, first = np.unique(from_pieces.frame, return_index=True)
         index[frame] = np.append(to_pieces.frame, NONE)[piece_index[first]]
     frames.ambiguous[payload.sent.frame[payload.match.ambiguous]] = True

@@ -42,7 +42,7 @@ class TcpCounts:
         frames_received: Frames in the receiver's capture. Offload may change the number of frames.
         sent_bytes: Sent payload bytes, including retransmissions.
         unique_bytes: Sent payload bytes; each sequence number is counted once.
-        received_bytes: Sent payload bytes that arrived; copies that were not sent are not counted.
+        received_bytes: Sent payload bytes that arrived; copies that the network created are not counted.
         lost_bytes: Unique bytes that never reached the receiver.
         duplicated_bytes: Received payload bytes without the first copy of each sequence number.
         retransmitted_frames: Frames with bytes that had been sent before.

@@ -182,7 +182,7 @@ def _layers(
             stall_columns = stalls.measure("transfer", lambda: stalls.tcp_deliveries(frames, reverse, schedule))
         ambiguous = bool(counts.get("ip_packets_doubtful") or counts.get("tcp_doubtful_segments"))
         delays = delay.measure(pairs, sender.packets, receiver.packets, transfer, sent=sent or 0, ambiguous=ambiguous)
-    except EvidenceError as error:  # the captures cannot be evaluated, as if they were damaged
+    except EvidenceError as error:  # captures that cannot be evaluated are treated like damaged captures
         return Measured.all_missing(all_columns, error.what)
     rate_values = transfer_rates.values(files.values.get("received_bytes"))
     if delays.values.get("one_way_withheld") == delay.UNSTEADY:

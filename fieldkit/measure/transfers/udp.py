@@ -11,7 +11,7 @@ from fieldkit.measure.transfers.match import Match, match, reordered
 from fieldkit.measure.transfers.transfer_spec import Transfer, span_s
 
 NO_DATAGRAM: Final = -1
-"""Datagram index of a fragment without a first fragment."""
+"""Datagram index of a fragment whose first fragment was not captured."""
 
 
 def datagrams(packets: Packets) -> tuple[Ints, Ints]:

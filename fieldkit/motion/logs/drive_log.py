@@ -79,7 +79,7 @@ class DriveMoment:
     Attributes:
         at_s: Time since the start of the program.
         phase: Phase of the drive: `waits` before the start, `returns` if the robot first drives to its origin, `out`
-            on the path, `there` at its end, `back` on the way back, or `home`.
+            on the path, `there` at its end, `back` on the return path, or `home`.
         x_m: Position ahead of the start.
         y_m: Position to the left of the start.
         yaw_rad: Heading relative to the start, positive to the left.

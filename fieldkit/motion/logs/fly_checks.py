@@ -29,7 +29,8 @@ class FlyPlan:
         highest_m: Largest height.
         farthest_m: Largest horizontal distance from the take-off position.
         fastest_m_s: Speed limit.
-        window: Its computer's clock before and after the attempt, nanoseconds since 1970 UTC; None if unknown.
+        window: Readings of the clock of the drone's computer before and after the attempt, nanoseconds since 1970
+            UTC; None if unknown.
     """
 
     highest_m: float

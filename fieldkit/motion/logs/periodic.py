@@ -24,9 +24,9 @@ _MIN_MESSAGES: Final = 10
 _MIN_INTERVALS: Final = 3
 """Minimum number of intervals without a missing sequence number that are needed to estimate a period."""
 _REQUEST_TOLERANCE: Final = 0.25
-"""Maximum relative difference between the observed and the requested period of a granted request. A station that
-changes the rate changes it by more than this. The observed mean is too short, because long intervals, which contain a
-missing number more often, are omitted."""
+"""Maximum relative difference between the observed and the requested period. A larger difference shows that another
+station changed the rate. Without such a change, the observed mean is still too short, because long intervals, which
+contain a missing sequence number more often, are omitted."""
 _RATE_TOLERANCE: Final = 0.08
 """Maximum relative difference between the observed rate and an integer rate, for a stream without a request."""
 _MAX_RATE_HZ: Final = 10

@@ -260,7 +260,8 @@ def contradictions(
         log: The log.
         summary: Summary of the recorder.
         file_crc32: CRC-32 of the log's file.
-        window: The recorder's clock before and after the attempt, nanoseconds since 1970 UTC; None if unknown.
+        window: Readings of the recorder's clock before and after the attempt, nanoseconds since 1970 UTC; None if
+            unknown.
     """
     if summary.crc32 is not None and summary.crc32 != file_crc32:
         yield "was changed: its checksum differs from the one that its recorder wrote"

@@ -52,7 +52,7 @@ _SLACK_S: Final = 30.0
 _SLOWEST_M_S: Final = 0.3
 """Lower bound of the landing speed. PX4 lands at 0.7 m/s (MPC_LAND_SPEED), slower near the ground (MPC_LAND_CRWL)."""
 _LIMIT_S: Final = 3600.0
-"""Time that the limit of the pilot's job exceeds the expected duration of the flight."""
+"""Time by which the limit of the pilot's job exceeds the expected duration of the flight."""
 _AT_REST_S: Final = 3.0
 """Approximate time that the log covers before the take-off and after the landing."""
 _LOG_BYTES_PER_S: Final = 2200.0

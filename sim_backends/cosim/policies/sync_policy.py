@@ -115,9 +115,9 @@ class LookingAhead(SyncPolicy, Protocol):
         """Return the time to which the current window can be extended; the agents have reached `situation.now_ns`.
 
         Args:
-            situation: The current situation, except for the network, which is still at the beginning of the window:
-                its next event is the next one after that time. If a program has sent in the window, the network may
-                need positions immediately.
+            situation: The current situation of physics and programs. The network is still at the beginning of the
+                window, so `next_event_ns` returns its first event after the beginning. If a program has sent a packet
+                in the window, `next_use_ns` is `now_ns`, because the network may need positions immediately.
 
         Returns:
             The time up to which the agents may advance before the next call; `situation.now_ns` if the window must
@@ -146,7 +146,7 @@ class PolicyError(ConfigurationError):
 
 
 _MAX_EMPTY_WINDOWS: Final = 1000
-"""Number of successive windows of length 0 after which the policy has failed."""
+"""Largest number of successive windows of length 0; after more, the run fails."""
 
 
 class EmptyWindows:

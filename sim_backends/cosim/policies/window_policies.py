@@ -41,11 +41,11 @@ class FixedWindow:
     """Base class of the policies whose windows all have the same length.
 
     Args:
-        window_s: Their length in seconds. Windows end at whole nanoseconds; the remaining fractions are carried over
-            to later windows.
+        window_s: Length of the windows in seconds. Windows end at whole nanoseconds; the remaining fractions are
+            added to later windows.
 
     Raises:
-        PolicyError: It is not a positive time.
+        PolicyError: The length is not a positive time.
     """
 
     name: str

@@ -182,7 +182,7 @@ class _Traffic(Strict, ABC):
     start: Duration = 0.0
 
     @schema.model_validator(mode="after")
-    def _ends_are_different(self) -> "_Traffic":
+    def _qos_and_ends_are_valid(self) -> "_Traffic":
         if self.qos is not None and self.protocol != "topic":
             raise schema.validation_error(
                 f"only the protocol topic has a qos, but the protocol is {self.protocol}", "qos"

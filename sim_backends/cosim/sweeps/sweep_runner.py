@@ -25,8 +25,8 @@ ATTEMPTS: Final = 3
 """Largest number of attempts at a run."""
 
 _TRANSIENT: Final = (LinkError, FederateError, WorkerDiedError, OSError, MemoryError)
-"""Errors after which a run is tried again: a worker or simulator died or did not answer, or a resource was exhausted.
-Other errors occur again, because a run depends only on its settings and seed."""
+"""Errors after which a run is tried again: a worker or simulator terminated or did not answer, or a resource was
+exhausted. Other errors would occur again, because a run depends only on its settings and seed."""
 
 _IN_OTHER_COLUMNS: Final = frozenset({"policy", DISTANCE, "line", "topology"})
 """Factors that the name of the procedure does not contain, because they are in other columns."""

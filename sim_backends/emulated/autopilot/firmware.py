@@ -50,7 +50,7 @@ class ModeRefusal(NamedTuple):
 
     Attributes:
         text: Text of the refusal.
-        reason: Text that is sent before it; empty if there is none.
+        reason: Text with the reason, which is sent before `text`; empty if the firmware sends only `text`.
     """
 
     text: str

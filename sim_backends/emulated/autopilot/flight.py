@@ -181,8 +181,8 @@ def velocity_to(goal_m: Vector, body: Airframe, limits: QuadrotorLimits) -> Vect
 def stop_m(body: Airframe, limits: QuadrotorLimits) -> Vector:
     """Return the position, relative to home, at which the drone stops if it brakes now.
 
-    A drone that is not below home is assumed not to sink below home.
-    The stopping distance is the distance during the lags of attitude and velocity control, plus v^2 / 2a.
+    The stopping distance is the distance during the lags of attitude and velocity control, plus v^2 / (2 a). The
+    returned height is at least 0 or, if the drone is below home, at least the current height of the drone.
     """
     (x, y, z), (east, north, up) = body.position_m, body.velocity_m_s
     brake_s = limits.lag_s + 1 / limits.gains_per_s[0] + math.hypot(east, north) / 2 / limits.acceleration_m_s2

@@ -77,7 +77,7 @@ _KINDS: Final = {int(kind): kind for kind in DatagramKind}
 
 
 def pack_datagram(header: DatagramHeader, data: bytes | memoryview = b"") -> bytes:
-    """Return a datagram."""
+    """Return the bytes of a datagram."""
     kind, connection, cookie, number, expected = header
     return _HEADER.pack(_MAGIC, DATAGRAM_VERSION, kind, 0, connection, cookie, number, expected) + data
 
@@ -141,7 +141,7 @@ class DatagramChannel:
         # Number of the next datagram with data to send, and of the next one to receive.
         self._number = self._expected = 0
         self._unacknowledged: dict[int, bytes] = {}
-        self._sent_s: dict[int, float] = {}  # only datagrams that were sent once
+        self._sent_s: dict[int, float] = {}  # times of sending, without datagrams that were sent again
         self._timer = RetransmissionTimer()
         self._resend_s = 0.0
         self._early_data: dict[int, bytes] = {}  # received before earlier data
