@@ -81,7 +81,7 @@ def _octal(field: bytes) -> int | None:
 
 def _content(file: IO[bytes], size: int, robot: str) -> Iterator[bytes]:
     while size > 0:
-        # In the archive the content is filled up to whole blocks.
+        # In the archive the content is padded to whole blocks.
         requested = min(-(-size // _BLOCK), _CHUNK_BLOCKS) * _BLOCK
         chunk = file.read(requested)
         if len(chunk) < requested:

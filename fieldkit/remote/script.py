@@ -139,7 +139,7 @@ def require_success(shell: Shell, completed: Completed, *, remedy: str = "") -> 
 
 
 def word(text: str) -> str:
-    """Return `text` as one word for the record of a lock; other characters are replaced by `_`."""
+    """Return `text` as one word for the record of a lock; characters that are not allowed are replaced by `_`."""
     return re.sub(r"[^A-Za-z0-9._@-]", "_", text)[:80] or "-"
 
 

@@ -222,7 +222,7 @@ def _activities_of_jobs(times: AttemptTimes) -> Iterator[Activity]:
     names = dict.fromkeys(name for _, name in times.jobs)
     for name in names:
         what = plain_name(name)
-        # The job `listen` is shown as `receive`. If there is a `receive`, the other jobs have their own activities.
+        # The activity of the job `listen` is named `receive`. If it exists, the evidence shows the other jobs, too.
         if what.startswith("fault-") or (what in _SHOWN_BY_EVIDENCE and {what, "receive"} & names_with_evidence):
             continue
         spans = [span for (_, job), span in times.jobs.items() if job == name]

@@ -171,7 +171,7 @@ class RemoteNetwork(_RemoteFederate):
         """Return a sample of the links of each radio, at the network's current time; empty if there are no radios.
 
         Raises:
-            FederateError: It failed, or sent a malformed answer.
+            FederateError: The network failed, or sent a malformed answer.
         """
         if not self.welcome.capabilities & FederateCapability.SAMPLES_LINKS:
             return {}

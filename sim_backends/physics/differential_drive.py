@@ -252,7 +252,7 @@ def require_twist(command: object) -> Twist:
     """Return a command to a robot on wheels; None means a twist of 0.
 
     Raises:
-        ConfigurationError: It is not a `Twist` of finite numbers.
+        ConfigurationError: The command is not a `Twist` of finite numbers.
     """
     if command is None:
         return Twist()

@@ -74,7 +74,7 @@ class Minstrel(RateControl):
     often as fits into 6 ms, but at most twice if its success share is above 95 % or below 10 %. All attempts together
     do not exceed the retry limit of the standard. A tenth of the frames are samples: a mode that is faster than the
     best, or was not used for 20 updates, is tried before the best, at most four times per update if its share is
-    above 95 % or below 10 %. If there is no such mode, a slower mode replaces the second best, which costs nothing
+    above 95 % or below 10 %. If there is no such mode, a slower mode replaces the second best; this mode is not used
     while the best succeeds. This follows Linux's rc80211_minstrel.c (kernels 2.6.28 to 5.11) and the documentation of
     mac80211's minstrel.
 

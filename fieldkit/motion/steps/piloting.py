@@ -186,7 +186,7 @@ class FlightLease(LeaseKeeper):
 
     @property
     def _reported_reason(self) -> str:
-        """The reason why the program ended the flight, from its log; empty if it did not end it."""
+        """The reason why the program ended the flight, from its log; empty if it did not end the flight."""
         match = next(filter(None, map(_END_LINE.match, self._lines)), None)
         return shorten(match["reason"]) if match else ""
 

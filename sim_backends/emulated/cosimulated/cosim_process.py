@@ -133,7 +133,7 @@ class CosimulatedMedium(MediumServer):
         return self._queue[0].at_ns if self._queue else None
 
     def pop_packets(self, last_ns: int) -> list[RealPacket]:
-        """Implement `Devices.pop_packets`: take the packets up to a time from the queue."""
+        """Implement `Devices.pop_packets`: remove the packets up to a time from the queue, and return them."""
         packets, queue = [], self._queue
         while queue and queue[0].at_ns <= last_ns:
             packets.append(queue.popleft())
@@ -350,7 +350,7 @@ def main() -> None:
     try:
         medium.run()
     except FieldkitError as error:
-        # The lab shows the last line.
+        # The lab shows the last line of the standard error output.
         sys.exit(f"{error.what}; {error.remedy}" if error.remedy else error.what)
 
 

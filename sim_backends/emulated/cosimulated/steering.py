@@ -98,7 +98,8 @@ class Steering(ABC):
         """Yield the commands up to a time, each with its time.
 
         `idle` is yielded at the time at which the last command has not been repeated for `TIMEOUT_NS`. If the
-        simulation lags behind real time, it may read commands with later times, which are kept for later calls.
+        simulation lags behind real time, the programs may have sent commands with times after `until_ns`. These are
+        kept for later calls.
         """
         newest = self._read_command()
         if newest is not None and self._last_command_ns < newest.time_ns and self.is_placed:

@@ -93,7 +93,10 @@ class AccessPoints:
             raise TestbedLostError(f"hostapd of the access points has ended: {self._last_line()}", remedy="try again")
 
     def close(self) -> None:
-        """Stop hostapd and wait until it has exited; the kernel returns the radios. A second call does nothing."""
+        """Stop hostapd and wait until it has exited; a second call does nothing.
+
+        The kernel then moves the radios to the initial network namespace.
+        """
         if self._process.poll() is None:
             self._process.terminate()
             try:

@@ -52,7 +52,7 @@ def run_command(argv: Sequence[str], results: Path, *, radios: int) -> int:
     kernel = require_machine()
     results.mkdir(parents=True, exist_ok=True)
     # Ctrl-C interrupts the command in the machine, which finishes its repeat. A second Ctrl-C ends the machine.
-    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    previous_handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         result = run_in_machine(
             kernel,
@@ -63,7 +63,7 @@ def run_command(argv: Sequence[str], results: Path, *, radios: int) -> int:
             on_output=_write,
         )
     finally:
-        signal.signal(signal.SIGINT, previous)
+        signal.signal(signal.SIGINT, previous_handler)
     return result.code
 
 

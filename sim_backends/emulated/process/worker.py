@@ -119,7 +119,7 @@ class Worker:
         self.name = name
         self._lock = threading.Lock()
         self._channel, worker_end = socket.socketpair()
-        self._log = tempfile.TemporaryFile()  # noqa: SIM115 (lives as long as the process; `close` closes it)
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115 (open while the process runs; `close` closes it)
         python = command(module)
         argv = ["setpriv", "--pdeathsig", "KILL", "--", *command_prefix, *python, str(worker_end.fileno()), *words]
         try:

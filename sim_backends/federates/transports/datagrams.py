@@ -77,7 +77,7 @@ _KINDS: Final = {int(kind): kind for kind in DatagramKind}
 
 
 def pack_datagram(header: DatagramHeader, data: bytes | memoryview = b"") -> bytes:
-    """Return a datagram."""
+    """Return the bytes of a datagram."""
     kind, connection, cookie, number, expected = header
     return _HEADER.pack(_MAGIC, DATAGRAM_VERSION, kind, 0, connection, cookie, number, expected) + data
 
