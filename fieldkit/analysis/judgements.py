@@ -68,7 +68,7 @@ class _Decision:
 
 
 def judge(expectations: Sequence[Expectation], cells: Sequence[Cell]) -> tuple[Judgement, ...]:
-    """Return the judgements of expectations, in their order. They are undecided without cells."""
+    """Return the judgements of expectations, in their order. If there are no cells, all of them are undecided."""
     return tuple(judgement for expectation in expectations for judgement in _judge_cells(expectation, cells))
 
 

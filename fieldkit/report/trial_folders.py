@@ -1,4 +1,4 @@
-"""The trial folders of the rows of a table, if available: plan, raw files, links.
+"""Plans and raw evidence of the trials in a table, which are read from the trials' folders if these are available.
 
 A cell contains the repeats under one condition, and their estimates.
 """
