@@ -17,7 +17,7 @@ from fieldkit.measure.evidence import robot_link_samples
 from fieldkit.remote.command import quote, with_environment
 from fieldkit.remote.shell import Completed, Shell
 
-# The program replaces the inner shell (`exec`), so it has the process ID to which the signals are sent. SIGINT, as from
+# The program replaces the inner shell (`exec`), so it has the process ID to which the signals are sent. SIGINT, as by
 # Ctrl-C, is sent when standard input is closed, also if this process was killed. The outer shell returns an exit code
 # even if a signal terminates the program.
 _UNTIL_CLOSED: Final = (

@@ -1,4 +1,4 @@
-"""Draw panels on axes of matplotlib. `figures` creates pages and files from them."""
+"""Draw panels on axes of matplotlib. The module `figures` creates the figures that contain the axes."""
 
 import math
 import textwrap
@@ -39,9 +39,10 @@ _DARK: Final = 0.6
 """Position on the colour scale of a heat map, 0 to 1, from which texts are light."""
 _ON_LIGHT: Final = "#111111"
 _ON_DARK: Final = "#fefefe"
-"""Colours of texts in a heat map, on light and on dark colours. They are the same in both themes, as its colours."""
+"""Colours of texts in a heat map, on light and on dark colours. They are the same in both themes, because the colours
+of a heat map are."""
 _LEVEL_CHARACTERS: Final = 40
-"""Labels below a heat map are vertical if they need more than this number of characters in total."""
+"""Labels below a heat map are vertical if their number times the length of the longest exceeds this value."""
 _NOTE_COLUMNS: Final = 12
 """The texts of a heat map are smaller if it has more than this number of columns."""
 _SMALLEST: Final = 3.5
@@ -250,6 +251,6 @@ def _line_options(style: Style) -> dict[str, Any]:
         "markerfacecolor": LIGHT["paper"] if style.is_hollow else colour,
         "linestyle": style.line,
         "markersize": _POINT if style.line == "none" and style.marker != "x" else _MARKER,
-        # Hollow markers hide the line behind them.
+        # Above lines, whose zorder is 2 in matplotlib, so that a hollow marker hides the line behind it.
         "zorder": 3,
     }

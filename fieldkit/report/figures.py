@@ -44,7 +44,7 @@ _PAPER_LEGEND_INCHES: Final = 0.3
 _MATERIALS: Final[dict[str, Colour]] = {"foliage": "green", "wood": "orange", "brick": "red", "ground": "orange"}
 """Colours of obstacles that are not grey."""
 _SNR_DB: Final = (0.0, 60.0)
-"""Range of the colour scale: from almost no reception to more than any mode needs. It is equal in all figures."""
+"""Range of the colour scale, the same in all figures: from almost no reception to more than any data rate needs."""
 _LABEL_BACKGROUND: Final = {"facecolor": LIGHT["paper"], "edgecolor": "none", "pad": 0.5}
 _EDGE: Final = 0.15
 """Width of the zone at each edge in which labels are aligned inwards, as a share of the world."""
@@ -52,14 +52,15 @@ _EDGE: Final = 0.15
 _MAX_LABELLED: Final = 15
 """Maximum number of links that are labelled with their SNR: the number of pairs of six robots."""
 _MIN_LABELLED: Final = 0.1
-"""Minimum length of a labelled link, as a share of the drawing's width."""
+"""Minimum length of a labelled link, as a share of the longer side of the world."""
 
 
 class _Figure(Figure):
-    """A figure that is drawn once when it is saved.
+    """A figure that is drawn only once when it is saved.
 
-    To compute the constrained layout, `savefig` first draws the figure with a renderer that has no output. The layout
-    does not need that drawing, which would take a quarter of the time. The second call has no layout engine.
+    For a constrained layout, `savefig` calls `draw` twice: first with a layout engine and a renderer without output,
+    then without a layout engine to draw the output. Here the first call only computes the layout. It does not need
+    to draw the figure for that, which would take a quarter of the time.
     """
 
     @override
@@ -72,7 +73,10 @@ class _Figure(Figure):
 
 
 def panel_svg(panel: Panel) -> str:
-    """Return one panel as an SVG document for the page: transparent, with text as text, in light colours."""
+    """Return one panel as an SVG document for the page.
+
+    The background is transparent, texts remain texts, and the colours are those of the light theme.
+    """
     with _settings(9.0):
         width, height = _inches(panel)
         figure = _Figure(figsize=(width, height), layout=None if panel.is_strip else "constrained")
@@ -148,7 +152,8 @@ def overview(lab: Overview, file_format: Format) -> bytes:
         east_m, north_m = zip(*lab.robots.values(), strict=True)
         axes.plot(east_m, north_m, "o", color=LIGHT["ink"], markersize=_MARKER, zorder=4, clip_on=False)
         for name, place_m in lab.robots.items():
-            # Labels are away from the links, which are in the middle, but inside of the world.
+            # Most links are in the middle of the drawing, so labels are on the outer side of their robots, unless
+            # they would then be outside of the world.
             share = place_m[1] / lab.area_m[1]
             is_above = share < _EDGE or (place_m[1] >= fmean(north_m) and share <= 1 - _EDGE)
             axes.annotate(
@@ -204,7 +209,8 @@ def _settings(points: float) -> Iterator[None]:
         # A user's matplotlibrc must not change the output.
         mpl.rcdefaults()
         mpl.rcParams.update(SETTINGS | {"font.size": points, "axes.titlesize": points, "axes.labelsize": points})
-        # A character that DejaVu lacks is still text in SVG, and a box elsewhere.
+        # A character that the font DejaVu lacks is correct text in SVG. In the other formats it is a box, which is
+        # better than a warning without a remedy.
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
         yield
 

@@ -33,7 +33,7 @@ _XLINK: Final = "http://www.w3.org/1999/xlink"
 _HREF: Final = f"{{{_XLINK}}}href"
 # The style is the same in all figures, and the page defines it.
 _REMOVED_TAGS: Final = frozenset((f"{{{_SVG}}}metadata", f"{{{_SVG}}}style"))
-# More than two decimals of a point are invisible, but make up half of the page's size.
+# Coordinates are in points. Decimals after the second are invisible, but make up half of the page's size.
 _GEOMETRY: Final = frozenset(("d", "x", "y", "width", "height", "transform"))
 _DECIMALS: Final = re.compile(r"(\.\d{2})\d+")
 _OTHER_FORMATS: Final = frozenset({".csv", ".json", ".md", ".pdf", ".png", ".svg", ".tex"})
@@ -88,7 +88,7 @@ def _is_page(out: Path) -> bool:
 
 @contextmanager
 def explaining_write_errors(path: Path, option: str) -> Iterator[None]:
-    """Turn an OSError of the body into a ConfigurationError with the path and the option."""
+    """Raise a ConfigurationError with the path and the option if the body of the `with` statement raises OSError."""
     try:
         yield
     except OSError as error:

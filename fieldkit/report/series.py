@@ -1,6 +1,6 @@
 """Series of figures: panels of conditions, the style of each series in all figures, and estimates as points.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 import math
@@ -112,7 +112,7 @@ _MARGIN: Final = 0.25
 _LOG_FROM_DECADES: Final = 1.5
 """Range of values, in decades, above which an axis is logarithmic."""
 _VAGUE_FROM: Final = 0.5
-"""Minimum width at which an interval is too wide for a curve, as a share of the axis."""
+"""Width of an interval as a share of the axis. A point with a wider interval is too uncertain for a curve."""
 
 
 @dataclass(frozen=True)
@@ -121,12 +121,12 @@ class Point:
 
     Attributes:
         cell: The condition.
-        value: The figure.
+        value: The estimate.
         low: Lower end of its 95 % interval; None if it has none.
         high: Upper end; None if it has no interval.
         repeats: Values of single repeats; if there are many, only some of them.
         bounds: True for each value in `repeats` that is only a lower bound.
-        is_bound: True if the figure is only a lower bound because of such values.
+        is_bound: True if the estimate is only a lower bound because of such values.
         note: Number of valid repeats with a value, if not all have one: `2 of 3`.
     """
 
@@ -160,7 +160,7 @@ class Point:
         return min(self.value, *self.repeats, *([] if self.low is None else [self.low]))
 
     def singles(self, are_bounds: bool) -> list[float]:
-        """Return the values of single repeats that are only lower bounds, or the values that are not."""
+        """Return the values of single repeats: those that are only lower bounds if `are_bounds`, else the others."""
         return [value for value, is_bound in zip(self.repeats, self.bounds, strict=True) if is_bound is are_bounds]
 
     def is_vague(self, ends: tuple[float, float]) -> bool:

@@ -1,6 +1,6 @@
-"""The first part of a report: description of the trials, warnings for readers who quote figures, and provenance.
+"""The first part of a report: description of the trials, warnings for readers who quote numbers, and provenance.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 from collections import Counter
@@ -23,9 +23,9 @@ from fieldkit.report import wording
 from fieldkit.report.trial_folders import Evidence
 
 _MAX_LISTED: Final = 20
-"""Maximum number of sentences about evidence that is left out."""
+"""Maximum number of warnings about evidence that is not available (`Evidence.limitations`)."""
 _MAX_REASONS: Final = 50
-"""Maximum number of different reasons."""
+"""Maximum number of different reasons in one warning."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Caution:
 
 
 def paragraph(cells: Sequence[Cell], evidence: Evidence, sweep: Mapping[str, str]) -> str:
-    """Return a sentence about the trials: procedures, times, distances and numbers of attempts.
+    """Return a paragraph about the trials: procedures, times, distances and numbers of attempts.
 
     Args:
         cells: Conditions.
@@ -196,7 +196,7 @@ _HASHES: Final = ("code_sha256", "procedure_sha256", "profiles_sha256")
 
 
 def trial_provenance(evidence: Evidence) -> Iterator[Provenance]:
-    """Yield every trial in the table, in the order of its rows."""
+    """Yield the provenance of every trial in the table, in the order of the rows."""
     texts = evidence.repeats.texts
     rows: dict[tuple[str, str], list[int]] = {}
     for row, key in enumerate(zip(texts["trial"].tolist(), texts["source"].tolist(), strict=True)):

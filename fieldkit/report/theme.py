@@ -97,7 +97,7 @@ def format_of(path: Path, option: str) -> Format:
 
     Args:
         path: The file.
-        option: The option of the path, for the message.
+        option: The option with which the user gave the path, for the message.
 
     Raises:
         ConfigurationError: The suffix is not one of `FORMATS`.

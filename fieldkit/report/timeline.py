@@ -39,9 +39,9 @@ _MARGIN: Final = 0.01
 
 
 def charts(row: int, data: Evidence) -> Iterator[Chart]:
-    """Yield the time line of the attempt in a row with available evidence, and a chart of its packets.
+    """Yield the time line of the attempt in a row, and a chart of its packets if it has transfers.
 
-    Yield nothing if no evidence has times.
+    Yield nothing if the evidence of the attempt is not available, or contains no times.
     """
     evidence, plan = data.attempt(row), data.plan(row)
     if evidence is None or plan is None:
@@ -83,7 +83,10 @@ def charts(row: int, data: Evidence) -> Iterator[Chart]:
 
 
 def _stack(panels: Sequence[Panel], end_s: float) -> list[Panel]:
-    """Return panels with a shared time axis, labelled in the lowest panel; points outside of it are removed."""
+    """Return panels with a shared time axis, which has a label in the lowest panel.
+
+    Points outside of the axis are removed.
+    """
     last_index, right_s = len(panels) - 1, (1 + _MARGIN) * end_s or 1.0
     return [
         replace(
@@ -155,7 +158,7 @@ def _packets(transfer: Transfer, fates: Fates, zero_ns: int) -> Panel:
 
 
 def _round_trips(name: str, role: Role, output: ping.Ping, times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
-    """Yield the round-trip times, and the requests without a reply, by the time of sending."""
+    """Yield a panel of round-trip times and of requests without a reply, by the time of sending, if there are any."""
     clock_offset_ns = times.clock_offset_ns[role]
     answered_requests = [
         (reply.seq, reply.at_utc_ns - clock_offset_ns - zero_ns, reply.rtt_s)
@@ -223,7 +226,7 @@ def estimate_send_times(
 
 
 def _links(times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
-    """Yield the signal, the PHY rate and the SINR of both radios over time.
+    """Yield a panel each for the signal, the PHY rate and the SINR of both radios over time.
 
     Values of telemetry sources replace the values of `iw`, as in the columns (`telemetry_columns`).
     """
@@ -249,7 +252,7 @@ def _radio_panel(
     *,
     bottom: float | None,
 ) -> Iterator[Panel]:
-    """Yield a quantity of each radio over time, the sending radio first, if any radio has values."""
+    """Yield a panel of one quantity of both radios over time, the sending radio first, if any radio has values."""
     series, ranges = [], []
     for (role, samples), style in zip(values.items(), _LINKS, strict=True):
         points = [((at_ns - zero_ns) / 1e9, value) for at_ns, value in samples if value is not None]
@@ -269,7 +272,7 @@ def _radio_panel(
 
 
 def _distance(times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
-    """Yield the distance between sender and receiver over time, if it changed."""
+    """Yield a panel of the distance between sender and receiver over time, if it changed."""
     changes = [(max(utc_ns - zero_ns, 0) / 1e9, metres) for utc_ns, metres in times.distances_m]
     known_distances_m = [metres for _, metres in changes if metres is not None]
     if len(set(known_distances_m)) < 2:

@@ -215,7 +215,7 @@ def states_bytes(states: Mapping[str, State], agents: AgentTable, limits_m_s2: M
 
 
 def read_states(reader: FrameReader, agents: AgentTable) -> ReceivedStates:
-    """Return states of agents, by name.
+    """Return the next list of states in a frame, by name of the agent.
 
     Raises:
         MalformedFrameError: A state is invalid, or an agent has two states.

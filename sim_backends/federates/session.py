@@ -135,7 +135,7 @@ class FederateSession:
         kind: MessageKind,
         copy: int,
         body: bytes,
-        answer: MessageKind,
+        answer_kind: MessageKind,
         *,
         decode: Callable[[bytes], Answer],
         describe: Callable[[], str],
@@ -146,7 +146,7 @@ class FederateSession:
             kind: Kind of the request.
             copy: Copy of the federate.
             body: Body of the request.
-            answer: Kind of the answer.
+            answer_kind: Kind of the answer.
             decode: Decodes the body of the answer.
             describe: Returns a description of the request, for error messages.
 
@@ -161,7 +161,7 @@ class FederateSession:
                 self._channel.send(encode(MessageKind.RELEASE, 0, number), time.monotonic() + self._deadline_s)
             self._released_copies.clear()
             self._request_number = (self._request_number + 1) % _REQUEST_NUMBERS
-            expected_header = Header(0, answer, self._request_number, copy)
+            expected_header = Header(0, answer_kind, self._request_number, copy)
             with self.exchange_context:
                 frame = self._exchange(encode(kind, self._request_number, copy, body), expected_header)
             if frame.header.kind is MessageKind.ERROR:

@@ -237,7 +237,7 @@ class Connection
         {
             if (Clock::now() >= limit)
             {
-                m_monitor.Fail("another run of this machine uses it");
+                m_monitor.Fail("another run on this machine uses it");
             }
             m_monitor.Beat();
             std::this_thread::sleep_for(std::chrono::milliseconds(20));

@@ -134,7 +134,7 @@ def bridge_topics(
     """Bridge topics between two sides while the body runs.
 
     Args:
-        near: The first side. It is the source of topics, except for those with `Crossing.back`, whose target it is.
+        near: The first side, which is the source of the topics without `Crossing.back`, and the target of the others.
         far: The second side.
         crossings: The topics.
         types: The message types.

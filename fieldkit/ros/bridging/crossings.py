@@ -22,8 +22,8 @@ _NAME: Final = re.compile(r"(/[A-Za-z]\w*)+", re.ASCII)
 DDS")."""
 
 _BUCKET: Final = math.log(1.01)
-"""Logarithmic width of the buckets in the histogram of delays: 1 %. A histogram needs constant memory, even if a
-bridge runs for months."""
+"""Natural logarithm of the ratio between adjacent buckets in the histogram of delays: each is 1 % above the previous
+one. A histogram needs constant memory, even if a bridge runs for months."""
 
 
 @dataclass(frozen=True)

@@ -87,7 +87,7 @@ def exchange(cast: Cast, shells: Shells, domain: int, trial: str) -> dict[tuple[
 
 
 class _Exchange:
-    """The steps of an exchange on each robot; the arguments are those of `exchange`."""
+    """An exchange in progress. The arguments are those of the function `exchange`."""
 
     def __init__(self, cast: Cast, shells: Shells, domain: int, trial: str) -> None:
         self._cast = cast

@@ -16,7 +16,7 @@ from fieldkit.ros.networking.state import RosState
 from fieldkit.trial.check.report import Report
 
 MIN_ARRIVED: Final = 18
-"""Minimum number of arrived datagrams, out of `COUNT`, on a good link: 10 % loss."""
+"""Minimum number of arrived datagrams, out of `COUNT`, on a good link. It corresponds to a loss of 10 %."""
 
 _RESOLVE_S: Final = 15.0
 """Timeout for the resolution of a name."""

@@ -1,4 +1,4 @@
-"""A criterion for a middleware on a link, and the repeats measured with one sample size at one place."""
+"""The criterion that a middleware must meet on a link, and the repeats measured with one sample size at one place."""
 
 import math
 from collections.abc import Sequence

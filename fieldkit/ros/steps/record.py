@@ -78,7 +78,7 @@ SUBSCRIBED: Final = "log:Subscribed to topic"
 
 
 class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpace, Records, Summarizes):
-    """Records a ROS bag, by the record command of the robot's profile.
+    """Records a ROS bag with the record command of the robot's profile.
 
     A robot may record several bags with different names, one after the other; the `file` of a `transfer` selects one.
 

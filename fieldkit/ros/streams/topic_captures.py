@@ -98,6 +98,7 @@ def check_captures(
         subscriber_log: Complete log of the subscriber.
         captured: The topic in both captures.
     """
+    # A capture in which packets lack a time cannot be compared with a log.
     if any(
         flow is not None and (flow.packets.time_ns == NO_TIME).any()
         for flow in (captured.publisher, captured.subscriber)
@@ -182,7 +183,14 @@ def _quantile_of_sent(latency_s: Floats, values: Mapping[str, Value], share: flo
 def _content_contradictions(
     heads: SampleHeads, samples: TopicSamples, numbers: Ints | None, name: str
 ) -> Iterator[str]:
-    """Yield differences in the time of sending between capture and log, and captured samples without a record."""
+    """Yield contradictions between the heads in a capture and the log of the same robot.
+
+    Args:
+        heads: Heads of samples in the capture.
+        samples: Samples in the log. Their times of sending must be those in the heads.
+        numbers: Numbers of the samples in the log, if it must contain every captured sample; otherwise None.
+        name: `publisher` or `subscriber`.
+    """
     if numbers is not None and (unlogged_count := int((~np.isin(heads.sequence, numbers)).sum())):
         yield f"{format_count(unlogged_count, 'sample')} in the {name}'s capture are not in its log"
     first_heads = heads.first()

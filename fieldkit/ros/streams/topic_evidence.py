@@ -126,7 +126,10 @@ def without_contradicted_times(
 
 
 def read(step: StreamOptions, view: View, files: Mapping[Role, str]) -> tuple[dict[Role, TopicLog], list[str]]:
-    """Return the complete logs by role, and an error message for each other log and for samples of other programs."""
+    """Return the complete logs by role, and error messages.
+
+    There is a message for each log that is incomplete or unreadable, and for each log with samples of other programs.
+    """
     logs, errors = read_logs(view, files)
     for name in files.values():
         log = view.evidence.read_or_none(topic_samples.read_log, name)
@@ -136,7 +139,7 @@ def read(step: StreamOptions, view: View, files: Mapping[Role, str]) -> tuple[di
 
 
 def read_logs(view: View, files: Mapping[Role, str]) -> tuple[dict[Role, TopicLog], list[str]]:
-    """Return the complete logs by role, and an error message for each other log."""
+    """Return the complete logs by role, and an error message for each log that is incomplete or unreadable."""
     logs, errors = dict[Role, TopicLog](), list[str]()
     for role, name in files.items():
         try:

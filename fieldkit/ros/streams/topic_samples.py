@@ -321,7 +321,10 @@ def find_heads(path: Path, size_bytes: int, width: int = 0) -> Occurrences:
 
 
 def _before_head(size_bytes: int, width: int) -> bytes:
-    """Return the last fields of a message before its data: an empty layout, or an image's bytes per row, and size."""
+    """Return the last fields of a message before its data.
+
+    For an array these are an empty layout and the size of the data, for an image the bytes per row and this size.
+    """
     return struct.pack("<II", width, size_bytes) if width else struct.pack("<III", 0, 0, size_bytes)
 
 

@@ -238,7 +238,8 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
         starts: list[Callable[[], None]] = [
             partial(jobs.start, testbed.shells[capture.role], capture.job) for capture in captures
         ]
-        # sudo may take seconds if its host name cannot be resolved, which is too long for a waiting UDP listener.
+        # With sudo the first step is prepared after the captures have started. sudo may take seconds if the robot's
+        # host name cannot be resolved, and a UDP listener that the first step has started would stop waiting.
         rounds = ([*starts], [prepare]) if any(capture.job.as_root for capture in captures) else ([*starts, prepare],)
         announce("start captures", None)
         try:

@@ -50,7 +50,7 @@ _KINDS_WITH_DURATION: Final = frozenset({FaultKind.LINK_DOWN, FaultKind.OUT_OF_R
 
 
 class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
-    """Causes a fault of a robot while the steps in `during` run. Their losses are a result, not an error.
+    """Causes a fault of a robot while the steps in `during` run. Losses in these steps are a result, not an error.
 
     The backend of simulated robots causes the fault. In the field the operator is asked to cause it; with `--yes` no
     operator is asked, and the attempts are void.

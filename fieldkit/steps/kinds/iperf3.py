@@ -57,9 +57,10 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
 
     Attributes:
         duration: Duration of the test in whole seconds; 10 s without `size`.
-        size: Amount of data to send, `10MB`, instead of `duration`.
+        size: Amount of data to send, such as `10MB`, instead of `duration`.
         reverse: Whether the server sends and the client receives.
-        limit: A test that takes longer is stopped, and the repeat is void. With `along` it is added to the duration.
+        limit: Maximum duration. A test that takes longer is stopped, and the repeat is void. With `along` the maximum
+            is the duration of the path plus this value.
     """
 
     flow_kind: ClassVar[str] = "iperf3"

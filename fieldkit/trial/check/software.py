@@ -27,6 +27,7 @@ from fieldkit.trial.check.report import Report
 from fieldkit.trial.plan import Plan
 
 BASE_PROGRAMS: Final = ("setsid", "mkfifo", "timeout", "awk", "tar", "sha256sum")
+"""Programs that fieldkit needs on every robot, for all procedures."""
 
 # Package names in Debian.
 _PACKAGES: Final = {

@@ -134,11 +134,15 @@ def check(sensor: Sensor) -> None:
         )
     if sensor.rate_hz <= 0:
         raise ConfigurationError(
-            "a topic with rate 0Hz publishes nothing", where=f"topic {sensor.topic}", remedy="write 5Hz"
+            "a topic with rate 0Hz publishes nothing",
+            where=f"topic {sensor.topic}",
+            remedy="write a rate above 0Hz, for example 5Hz",
         )
     if sensor.type == LASER_SCAN and sensor.points is None:
         raise ConfigurationError(
-            "a laser scan needs `points`, beams per turn", where=f"topic {sensor.topic}", remedy="write points: 360"
+            "a laser scan needs `points`, the number of beams per turn",
+            where=f"topic {sensor.topic}",
+            remedy="write for example points: 360",
         )
 
 
