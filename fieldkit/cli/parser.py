@@ -144,7 +144,7 @@ class Parser(argparse.ArgumentParser):
         raise ConfigurationError(message, remedy=f"{self.prog} --help")
 
     def add_choice(self, name: str, choices: Iterable[str], **options: Any) -> None:  # noqa: ANN401 (passed to argparse unchanged)
-        """Add an argument with one of `choices` as its value; the error for another value suggests a similar choice."""
+        """Add an argument whose value is one of `choices`; the error for another value suggests a similar choice."""
         values = tuple(choices)
         self.add_argument(
             name, choices=values, type=self._choice_converter(options.get("metavar", name), values), **options
