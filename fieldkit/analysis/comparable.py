@@ -177,7 +177,7 @@ def _compare_column(name: str, a: Repeats, b: Repeats, *, refuses: bool) -> Iter
     """Yield a concern if the values of a column in A and B differ."""
     text_a, text_b = _values(name, a), _values(name, b)
     is_unknown = UNKNOWN in {text_a, text_b}
-    # A column that is missing in both runs is not a difference, unless it identifies robots or procedure.
+    # If a column is missing in both runs, this is a concern only for columns that identify robots or procedure.
     if text_a != text_b or (is_unknown and name in _IDENTITY_COLUMNS):
         yield Concern(name, text_a, text_b, (), refuses and (not is_unknown or name in _IDENTITY_COLUMNS))
 

@@ -156,9 +156,9 @@ def means(values: ArrayLike) -> Intervals:
     skew = (deviations**3).mean(axis=1) / np.where(squares > 0, squares / n, 1) ** 1.5
     skew = np.where(np.abs(skew) < 1e-6, 1e-6, skew)  # approximates the limit at 0 and prevents 0/0
     deviation = scale * np.sqrt(squares / (n - 1))
-    reach = student(freedom) / math.sqrt(n)
+    quantile = student(freedom) / math.sqrt(n)
     low, high = (
-        value - deviation * (np.cbrt(1 + skew * (w - skew / (6 * n))) - 1) / (skew / 3) for w in (reach, -reach)
+        value - deviation * (np.cbrt(1 + skew * (w - skew / (6 * n))) - 1) / (skew / 3) for w in (quantile, -quantile)
     )
     return Intervals(value, low, high)
 

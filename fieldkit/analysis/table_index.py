@@ -68,7 +68,7 @@ TableStamp = tuple[FileStamp, FileStamp | None]
 
 
 def stamp(table: Path, plan: Path) -> TableStamp | None:
-    """Return the stamps of a table and its plan, or None if one is not a regular file, so that it is not indexed."""
+    """Return the stamps of a table and its plan; None, so that it is not indexed, if one is not a regular file."""
     try:
         table_status = table.stat()
     except OSError:

@@ -117,8 +117,8 @@ class Oracle(Protocol):
         `since_utc_ns` must not decrease from call to call, because older positions may be deleted.
 
         Returns:
-            Positions in the order of time. The first one of each robot is valid at `since_utc_ns`; its time is when
-            the robot arrived there.
+            Positions in the order of time. The first position of each robot is its position at `since_utc_ns`; the
+            time of this entry is the robot's arrival there.
         """
         ...
 

@@ -80,7 +80,7 @@ class _Loader(Reader, Scanner, Parser, Composer, SafeConstructor, Resolver):
         return node
 
     def _require_one_item(self, node: yaml.ScalarNode) -> None:
-        """Raise an error if an item continues with a line that begins with a dash, because YAML joins the two."""
+        """Raise an error if an item continues with a line that begins with a dash, which YAML adds to the item."""
         if not node.style:
             lines = self._text.splitlines()[node.start_mark.line : node.end_mark.line + 1]
             for number, line in enumerate(lines[1:], start=node.start_mark.line + 2):

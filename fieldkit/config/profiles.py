@@ -119,7 +119,7 @@ class RobotBridge(Strict):
     Attributes:
         to: `dds` or `zenoh`.
         topics: Topics carried to this middleware, each `NAME:TYPE` or `NAME:TYPE:QOS`, as in `fieldkit bridge`.
-        back: Topics carried in the other direction.
+        back: Topics carried from this middleware to ROS 1.
         domain: ROS 2 domain, 0 to 101.
         router: Host of a Zenoh router, and its port if it is not 7447; without it, peers are found by scouting.
         program: The robot's fieldkit, a name or a path.
@@ -218,7 +218,7 @@ class Tools(Strict):
     Attributes:
         netcat: Its netcat: traditional, OpenBSD, ncat or busybox. The variant is
             [detected](method-loss.md#tools-that-differ) before each trial; a dry run derives it from the name and
-            treats `nc` as the traditional one.
+            treats `nc` as traditional.
         capture: Its tcpdump.
         ping: Its ping: iputils (old or new) or busybox.
         python: Its Python, 3.8 or later, for the step `topics`; searched after the setup files of ROS are sourced.
@@ -306,8 +306,8 @@ class ProfileSection(Strict):
 class RobotProfile(catalog.Named, Sectioned):
     """A robot model: one YAML file in `robots/`.
 
-    [Add a robot](add-a-robot.md) describes how to write one. A key described as "for information only" has no effect
-    in this version.
+    [Add a robot](add-a-robot.md) describes how to write a profile. A key described as "for information only" has no
+    effect in this version.
 
     On an emulated robot, fieldkit writes setup files of ROS at the paths in the profile. A path directly in `/`, or
     below `/proc`, `/sys` or `/dev`, is rejected; files in `/run` and `/tmp` are lost at a reboot. It publishes

@@ -70,9 +70,9 @@ def _with_key(text: str, robot: str, host_key: str) -> str:
         return text
 
 
-def _is_pinned(text: str, old: Any, robot: str, host_key: str) -> bool:  # noqa: ANN401 (plain values of YAML)
-    """Return True if `text` has the values of `old`, and the host key."""
-    expected = {**old, "robots": {**old["robots"], robot: {**old["robots"][robot], _KEY: host_key}}}
+def _is_pinned(text: str, data: Any, robot: str, host_key: str) -> bool:  # noqa: ANN401 (plain values of YAML)
+    """Return True if `text` has the values of `data`, and the host key."""
+    expected = {**data, "robots": {**data["robots"], robot: {**data["robots"][robot], _KEY: host_key}}}
     try:
         return bool(documents.parse(text, source="").data == expected)
     except ConfigurationError:

@@ -289,7 +289,7 @@ class Measured:
         return type(self)(values, {**self.missing, **reasons})
 
     def __or__(self, other: "Measured") -> "Measured":
-        """Return the union of both.
+        """Return the values and the missing columns of both results. A column with a value in one is not missing.
 
         Raises:
             ValueError: A column has a value in both.

@@ -24,8 +24,8 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     An existing file keeps its mode, and is unchanged if the body raises an exception. An existing symbolic link is
     replaced, and its target is not changed. A device (such as /dev/null), a pipe or a socket is not replaced.
 
-    If several processes replace a file at the same time, each of them writes complete content, and the last one
-    remains.
+    If several processes replace a file at the same time, each of them writes complete content, and the content of the
+    last process remains.
 
     Raises:
         OSError: The file cannot be written; an existing file is unchanged.

@@ -83,7 +83,7 @@ def completed(
 
 
 class _Submission(Generic[Task, Result]):
-    """Runs the tasks of one call of `completed` on an executor; the arguments are those of `completed`."""
+    """Runs the tasks of one call of `completed` on an executor; see `completed` for the arguments."""
 
     def __init__(
         self, work: Callable[[Task], Result], tasks: Sequence[Task], workers: Workers, note: Callable[[str], None]

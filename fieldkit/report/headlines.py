@@ -1,6 +1,6 @@
 """Headlines of a report: first the missing results, then each quantity, its worst condition first.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence

@@ -1,6 +1,6 @@
 """Series of figures: panels of conditions, the style of each series in all figures, and estimates as points.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 import math

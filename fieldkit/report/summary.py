@@ -1,6 +1,6 @@
 """The first part of a report: description of the trials, warnings for readers who quote numbers, and provenance.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 from collections import Counter

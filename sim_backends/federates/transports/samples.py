@@ -4,13 +4,13 @@ The coordinator writes `requests` and reads `answers`; the federate does the rev
 a random u64 that the coordinator draws, and one frame. The first frame is `hello`; a sample without a frame ends the
 run.
 
-DDS: topics `fieldkit/NAME/requests` and `fieldkit/NAME/answers`, final type
-`fieldkit::Frame { sequence<octet> data; }` in plain CDR, reliable, keep all, transient local; the durability service
-of a writer keeps the last two samples. A volatile writer does not match. A volatile reader matches, but misses
-`hello` if it discovers the writer too late.
+DDS: the topics are `fieldkit/NAME/requests` and `fieldkit/NAME/answers`. Their type is the final type
+`fieldkit::Frame { sequence<octet> data; }` in plain CDR. Their quality of service is reliable, keep all and transient
+local; the durability service of a writer keeps the last two samples. A volatile writer does not match. A volatile
+reader matches, but misses `hello` if it discovers the writer too late.
 
-ROS 1: topics `/fieldkit/NAME/requests` and `/fieldkit/NAME/answers`, type `std_msgs/UInt8MultiArray` without
-dimensions.
+ROS 1: the topics are `/fieldkit/NAME/requests` and `/fieldkit/NAME/answers`. Their type is `std_msgs/UInt8MultiArray`
+without dimensions.
 """
 
 import secrets
