@@ -1,6 +1,6 @@
 """Comparison of two runs A and B: differences per condition and quantity.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence

@@ -1,6 +1,6 @@
 """Judgements of expectations by measured figures. If repeats are missing or censored, the ruling is never `holds`.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 import math

@@ -2,7 +2,7 @@
 
 Expectations are checked before the trial runs. Additional repeats narrow the interval of a cell to a requested width.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 import math

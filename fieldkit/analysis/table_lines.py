@@ -1,6 +1,6 @@
 """Lines of tables: their quantities and labels, and the texts of the figures of cells.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence

@@ -1,6 +1,6 @@
 """Texts about estimates: numbers with units, intervals, verdicts, cautions.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 import math

@@ -28,7 +28,7 @@ _SECTION: Final = "fieldkit evidence"
 
 
 class EvidenceFolder:
-    """The evidence folder of one test, or of several that share a set-up; created when it is first used.
+    """The evidence folder of one test, or of several tests that share a set-up; created when it is first used.
 
     Attributes:
         has_failed: Whether one of its tests failed.

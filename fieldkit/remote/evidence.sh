@@ -124,9 +124,9 @@ pack() {
     printf '' >".large-$$" || fail_to_write ".large-$$"
     exec 6<".sizes-$$"
     # Each iteration removes the first argument, and appends it again if the file is small.
-    remaining=$# small=0
-    while [ "$remaining" -gt 0 ]; do
-        file=$1 remaining=$((remaining - 1))
+    unsorted=$# small=0
+    while [ "$unsorted" -gt 0 ]; do
+        file=$1 unsorted=$((unsorted - 1))
         shift
         read -r size _ <&6
         if [ $((small + size)) -le "$PIECE" ]; then

@@ -1,7 +1,7 @@
 """Times and flows in one attempt on the clock of the first sending robot.
 
 The times are of packets, pings, jobs, faults and moves. Flows are drawn as panels over time: the payload rate that
-iperf3 measured, and the panels of steps that draw their own (`DrawsPanels`).
+iperf3 measured, and the panels of steps that implement `DrawsPanels`.
 """
 
 import math
@@ -301,7 +301,7 @@ _ENDS: Final = (Style("blue", line="solid"), Style("green", line="dashed"))
 
 
 def flow_panels(evidence: AttemptEvidence, plan: Plan, times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
-    """Yield the panels of steps whose evidence has times: iperf3 tests, and steps that draw panels themselves.
+    """Yield the panels of steps whose evidence has times: iperf3 tests, and steps that implement `DrawsPanels`.
 
     Args:
         evidence: Evidence of the attempt.

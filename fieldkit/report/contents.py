@@ -1,6 +1,6 @@
 """Contents of a report, made from a table of repeats and the evidence that belongs to it.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 import shlex

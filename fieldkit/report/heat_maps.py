@@ -2,7 +2,7 @@
 
 A sweep runs a simulation with several values of each factor. A flow is a stream of packets and its receiver.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 import math

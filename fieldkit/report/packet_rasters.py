@@ -1,6 +1,6 @@
 """Packet rasters: the packets of each repeat in the order of sending, with losses and retransmissions marked.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 import math

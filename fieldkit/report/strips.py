@@ -1,6 +1,6 @@
 """Strip charts: one mark per attempt, in order of time, with the loss as its height.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 from collections.abc import Iterator, Sequence

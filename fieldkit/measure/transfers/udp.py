@@ -17,8 +17,9 @@ NO_DATAGRAM: Final = -1
 def datagrams(packets: Packets) -> tuple[Ints, Ints]:
     """Return the index of the first packet of each datagram, and the datagram index of each packet.
 
-    A later fragment belongs to the nearest earlier first fragment with the same addresses and id. If there is none,
-    it belongs to the nearest later one. If there is none either, its datagram is `NO_DATAGRAM`.
+    A later fragment belongs to the datagram of the nearest first fragment before it with the same addresses and id.
+    If all such first fragments are after it, it belongs to the nearest of them. If there are none, its datagram is
+    `NO_DATAGRAM`.
     """
     is_fragment = packets.more_fragments | (packets.fragment_offset > 0)
     # An unfragmented packet has no other fragments, even if another packet has the same id.

@@ -159,7 +159,10 @@ def measure(log: Sequence[DriveMoment] | None) -> Measured:
 
 
 def speeds_m_s(log: Sequence[DriveMoment]) -> list[float]:
-    """Return the speeds over half a second in m/s, one per line if the robot was commanded to move at both ends."""
+    """Return the speeds over half a second in m/s, one for each line at which the half second starts.
+
+    A speed is omitted if the robot was not commanded to move at the start or at the end of the half second.
+    """
     times_s = [record.at_s for record in log]
     pairs = ((record, bisect_left(times_s, record.at_s + _SPEED_INTERVAL_S)) for record in log if record.forward_m_s)
     return [

@@ -53,7 +53,7 @@ class LoggedFrame:
 
     @property
     def source(self) -> Source:
-        """The sender. The positions of its IDs are those of MAVLink 1 or of MAVLink 2."""
+        """System ID and component ID of the sender. Their positions differ between MAVLink 1 and MAVLink 2."""
         system_index = 3 if self.data[0] == _MAGIC_1 else 5
         return self.data[system_index], self.data[system_index + 1]
 

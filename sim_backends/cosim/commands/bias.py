@@ -1,6 +1,6 @@
 """The command `fieldkit cosim shootout --bias`, which computes the bias of each sync policy.
 
-The bias is the mean difference from the exact reference over seeds.
+The bias of a measure, for example of the loss, is the mean over seeds of its difference from the exact reference.
 """
 
 import argparse

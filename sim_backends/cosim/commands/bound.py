@@ -1,4 +1,7 @@
-"""The command `fieldkit cosim shootout --bound`, which compares exchanges of fixed windows and `error_bounded`."""
+"""The command `fieldkit cosim shootout --bound`, which compares the policy `error_bounded` with fixed windows.
+
+It compares the numbers of exchanges that are needed to keep a bound on position errors.
+"""
 
 import argparse
 import math
