@@ -123,7 +123,7 @@ class Script(prompts.Operator):
         line = next(self._lines, None)
         if line is None:
             raise ConfigurationError(
-                f"no answer left to: {request}", where=self._where, remedy="add a line per request"
+                f"there is no further answer for: {request}", where=self._where, remedy="add a line per request"
             )
         return line
 
