@@ -123,8 +123,7 @@ class PhysicsStation(GroundStation):
     """A ground station of a drone that a physics simulator moves.
 
     Args:
-        folder: Folder of the files between the autopilot and the physics simulator.
-        files: These files; the drone is placed at `START_M`.
+        files: Files between the autopilot and the physics simulator; the drone is placed at `START_M`.
         simulator: The physics simulator, as in `starter`.
         firmware: Family of the autopilot.
     """
@@ -151,8 +150,19 @@ class PhysicsStation(GroundStation):
 
 
 @contextmanager
-def physics_station(folder: Path, simulator: str, firmware: Firmware) -> Iterator[PhysicsStation]:
-    """Yield a ground station, 2 s after its drone was switched on."""
+def physics_station(folder: Path, simulator: str, firmware: Firmware) -> Iterator[GroundStation]:
+    """Yield a ground station, 2 s after its drone was switched on.
+
+    Args:
+        folder: An empty folder.
+        simulator: The physics simulator, as in `starter`; `none` if the autopilot moves the drone itself.
+        firmware: Family of the autopilot.
+    """
+    if simulator == "none":
+        own_station = GroundStation(firmware=firmware)
+        own_station.wait(2)
+        yield own_station
+        return
     files = ControlFiles.make(folder / NAME, "flight_command", "flown")
     files.assign(START_M, math.pi / 2)
     try:

@@ -21,7 +21,7 @@ from sim_backends.world.motion import GRAVITY_M_S2, State
 from tests.helpers.ground_station import HOME_M, GroundStation, item, upload
 from tests.helpers.simulated_drones import NAME, START_M, VelocityPhysics, physics_station
 
-SIMULATORS = ("kinematic", "mujoco", "velocities")
+SIMULATORS = ("none", "kinematic", "mujoco", "velocities")
 FIRMWARES = pytest.mark.parametrize("firmware", [PX4, ARDUCOPTER], ids=["px4", "arducopter"])
 OK = d.MAV_RESULT_ACCEPTED
 HEIGHT_M = 2.0
@@ -91,9 +91,9 @@ def test_a_mission_is_uploaded_and_flown(simulator: str, firmware: Firmware, tmp
 
 
 @pytest.mark.parametrize("simulator", SIMULATORS)
-@pytest.mark.parametrize("action", [2, 3])
+@pytest.mark.parametrize(("action", "text"), [(2, "hold"), (3, "return")])
 def test_px4_does_not_cross_its_fence_and_acts_as_its_parameter_requires(
-    simulator: str, action: int, tmp_path: Path
+    simulator: str, action: int, text: str, tmp_path: Path
 ) -> None:
     with physics_station(tmp_path, simulator, PX4) as station:
         station.set("GF_MAX_HOR_DIST", 6.0)
@@ -110,7 +110,7 @@ def test_px4_does_not_cross_its_fence_and_acts_as_its_parameter_requires(
         push()
         vehicle.change_mode(Mode.OFFBOARD)
         wait_until(station, push)
-        assert (d.MAV_SEVERITY_CRITICAL, f"Geofence: {({2: 'hold', 3: 'return'})[action]}") in station.texts()
+        assert (d.MAV_SEVERITY_CRITICAL, f"Geofence: {text}") in station.texts()
         if action == 2:
             station.wait(4)
             assert 5.0 < place_m(station)[0] < 6.1
