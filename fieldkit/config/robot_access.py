@@ -4,11 +4,11 @@ This module does not import pydantic, which takes 80 ms. Only the keys that the 
 elsewhere in the file, or in the entry of another robot, must not prevent a robot from being stopped.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
 from fieldkit.config.documents import Document
+from fieldkit.config.locations import default_backend
 from fieldkit.core.errors import ConfigurationError
 
 _PASSWORDS: Final = (None, "ask", "keyring")
@@ -46,15 +46,6 @@ def configured_backend(document: Document) -> str:
     """Return the name of the backend in a site file, or the default."""
     name = document.data.get("backend", default_backend(document.data)) if isinstance(document.data, dict) else None
     return name if isinstance(name, str) else "field"
-
-
-def default_backend(data: Mapping[str, Any]) -> str:
-    """Return the backend of a site file that names none.
-
-    A file with the section `emulated`, but without `robots` and `roles`, is for the default robots of the emulated
-    backend.
-    """
-    return "emulated" if "emulated" in data and "robots" not in data and "roles" not in data else "field"
 
 
 def _access(document: Document, name: str, entry: Any) -> RobotAccess | ConfigurationError:  # noqa: ANN401 (any YAML)

@@ -4,7 +4,8 @@ import ipaddress
 from pathlib import Path
 from typing import Annotated
 
-from fieldkit.config import robot_access, schema
+from fieldkit.config import schema
+from fieldkit.config.locations import default_backend
 from fieldkit.config.schema import AfterValidator, BeforeValidator, Duration, Field, Int, Strict
 from fieldkit.core.errors import did_you_mean
 from fieldkit.core.model import FIXED_ROLES, Control, Role, Topology
@@ -113,29 +114,24 @@ class Site(Strict):
 
     @property
     def has_default_robots(self) -> bool:
-        """True if the file has neither robots nor roles, so that the backend must provide them."""
+        """True if the file has neither robots nor roles, so that the backend must provide both."""
         return not {"robots", "roles"} & self.model_fields_set
 
     @schema.model_validator(mode="before")
     @classmethod
     def _choose_backend(cls, data: object) -> object:
-        return {"backend": robot_access.default_backend(data), **data} if isinstance(data, dict) else data
+        return {"backend": default_backend(data), **data} if isinstance(data, dict) else data
 
     @schema.model_validator(mode="after")
     def _has_robots_and_roles(self) -> "Site":
-        missing = next((key for key in ("robots", "roles") if key not in self.model_fields_set), None)
-        if missing is None or (self.has_default_robots and self.backend == "emulated"):
-            return self
-        remedy = f"add {missing}: to it"
-        if self.has_default_robots:
-            reason = f"the backend {self.backend!r} has no default robots, the backend 'emulated' has"
-            remedy = "add robots: and roles: to it, or write backend: emulated"
-        elif missing == "robots":
-            reason = "the roles are those of robots"
-        else:
-            reason = "a trial finds its robots by their roles"
-            remedy += ", for example roles: {masterless: {sender: ROBOT, receiver: ROBOT}}"
-        raise schema.validation_error(f"required key {missing!r} is missing: {reason}", remedy=remedy)
+        missing = [key for key in ("robots", "roles") if key not in self.model_fields_set]
+        if missing and not (self.has_default_robots and self.backend == "emulated"):
+            raise schema.validation_error(
+                f"required key {missing[0]!r} is missing; only the backend emulated has default robots and roles, which "
+                "it uses if both are missing",
+                remedy=f"add {': and '.join(missing)}: to it",
+            )
+        return self
 
     @schema.model_validator(mode="after")
     def _robots_are_different_machines(self) -> "Site":
