@@ -20,7 +20,7 @@ from fieldkit.trial.plan import Plan
 
 _USER_DEFINED_KINDS: Final = frozenset(("ask", "run"))
 """Kinds of step whose columns are defined by the user in the procedure."""
-_MORE_IS_BETTER: Final = frozenset(("bit/s", "dBm", "dB"))
+_MORE_IS_BETTER_UNITS: Final = frozenset(("bit/s", "dBm", "dB"))
 _LOSSES: Final = frozenset((*LOSSES, "topic_loss", "video_loss", "iperf3_loss", "iperf3_captured_loss"))
 
 
@@ -59,7 +59,7 @@ class Ranking:
             return expectation.is_below
         if quantity.name in self._user_defined_columns or quantity.kind is Kind.FLAG:
             return None
-        if quantity.unit in _MORE_IS_BETTER:
+        if quantity.unit in _MORE_IS_BETTER_UNITS:
             return False
         return True if quantity.unit == "s" or plain_name(quantity.name) in _LOSSES else None
 
@@ -76,7 +76,7 @@ _TOPIC_QUANTITIES: Final = ("topic_loss", "topic_delay_median_s", "video_loss", 
 
 In these trials pings serve only to measure the clock offset, and transfers only to generate load.
 """
-_MAX_FIRST: Final = 6
+_MAX_FIRST_HEADLINES: Final = 6
 """Maximum number of headlines of expected and user-defined quantities."""
 _MAX_PLACES: Final = 3
 """Maximum number of conditions that a line names."""
@@ -134,7 +134,7 @@ def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[st
     """
     writer = _HeadlineWriter(evidence, Ranking(evidence), wording.differing(cells))
     yield writer.repeats_headline(cells, unmeasured)
-    first_quantities = writer.ranking.first_quantities(measured(cells))[:_MAX_FIRST]
+    first_quantities = writer.ranking.first_quantities(measured(cells))[:_MAX_FIRST_HEADLINES]
     for quantity in first_quantities:
         protocols = {cell.key["protocol"] for cell in cells if quantity.name in cell.estimates}
         group_cells = [cell for cell in cells if cell.key["protocol"] in protocols]

@@ -22,7 +22,7 @@ from fieldkit.core.units import format_count
 from fieldkit.report import wording
 from fieldkit.report.trial_folders import Evidence
 
-_MAX_LISTED: Final = 20
+_MAX_LIMITATIONS: Final = 20
 """Maximum number of warnings about evidence that is not available (`Evidence.limitations`)."""
 _MAX_REASONS: Final = 50
 """Maximum number of different reasons in one warning."""
@@ -99,8 +99,8 @@ def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Caution]:
             f"{version_count} versions of the tables: columns that an older version lacks are missing unless tables "
             "are rebuilt."
         )
-    yield from map(Caution, evidence.limitations[:_MAX_LISTED])
-    if (more_count := len(evidence.limitations) - _MAX_LISTED) > 0:
+    yield from map(Caution, evidence.limitations[:_MAX_LIMITATIONS])
+    if (more_count := len(evidence.limitations) - _MAX_LIMITATIONS) > 0:
         yield Caution(
             f"{more_count} further notes of this kind are not shown; fieldkit verify lists them for a trial."
         )

@@ -97,7 +97,7 @@ class Agents:
     Attributes:
         physics: The physics federate.
         programs: The programs by agent name, sorted.
-        absent: The agents that are absent now.
+        absent: The absence of each agent that is absent now, by name.
         has_changed: True if an agent has ever been absent, or was added by the physics federate.
     """
 

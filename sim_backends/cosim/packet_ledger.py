@@ -133,7 +133,8 @@ class PacketLedger:
                 name in absences and absences[name].since_ns <= enters_ns for name in (source, destination)
             )
             last_states = {name: absence.state for name, absence in absences.items()}
-            # A missing state of an agent is replaced by its last state or by its state in the other mapping.
+            # A state that is missing in one mapping is replaced by the agent's last state, or by the state in the
+            # other mapping.
             assumed_states, true_states = (
                 {**true_states, **last_states, **assumed_states},
                 {**assumed_states, **last_states, **true_states},

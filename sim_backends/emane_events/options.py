@@ -45,7 +45,7 @@ class EmaneOptions(SimulatorOptions):
         interval: Smallest time between two events of a run, in simulated time.
         pathloss: Publish the mean path loss between all agents, with obstacles, for `precomputed` propagation; or, if
             the run reads positions from events, use the path losses in them.
-        real_time: True if a run is not faster than the wall clock, because EMANE uses the wall clock.
+        real_time: True if a run is at most as fast as the wall clock, because EMANE uses the wall clock.
         wait: Maximum wait for the first location of each agent, if the run reads positions from events.
     """
 

@@ -28,11 +28,11 @@ from fieldkit.ros.interfaces.types import MessageTypes
 
 Convert = Callable[[bytes], bytes]
 
-_PACKAGES: Final = "python3 -m pip install 'fieldkit[ros2]', and give an address of this machine"
+_PACKAGES_REMEDY: Final = "python3 -m pip install 'fieldkit[ros2]', and give an address of this machine"
 _REMEDIES: Final = {
     "ros1": "start roscore, or give its address; if rospy is missing here: apt-get install python3-rospy",
-    "dds": _PACKAGES,
-    "zenoh": _PACKAGES,
+    "dds": _PACKAGES_REMEDY,
+    "zenoh": _PACKAGES_REMEDY,
 }
 
 

@@ -237,7 +237,7 @@ def _uncaptured_samples(plan: TopicPlan, arrivals: TopicSamples, subscriber: Sam
     headless_count = int((~np.isin(arrivals.sequence, subscriber.heads.sequence)).sum())
     payload_bytes = packets.tcp_payload_bytes + np.maximum(packets.udp_bytes - UDP_HEADER_BYTES, 0)
     # `capacity` is the number of samples without a captured head that fit into the captured bytes.
-    if subscriber.is_tcp or size_bytes > _DATAGRAM_BYTES:
+    if subscriber.is_tcp or size_bytes > _MAX_UNDIVIDED_BYTES:
         capacity = int(payload_bytes.sum()) // size_bytes - len(subscriber.heads.first())
     else:
         capacity = int((payload_bytes // size_bytes).sum()) - len(subscriber.heads)
@@ -248,7 +248,7 @@ def _uncaptured_samples(plan: TopicPlan, arrivals: TopicSamples, subscriber: Sam
         yield from _early_samples(arrivals, packets.time_ns, payload_bytes, size_bytes)
 
 
-_DATAGRAM_BYTES: Final = 1_200
+_MAX_UNDIVIDED_BYTES: Final = 1_200
 """A DDS sample larger than this may be divided into several messages, each smaller than the sample."""
 
 

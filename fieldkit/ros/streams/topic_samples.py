@@ -44,7 +44,7 @@ SUBSCRIBER: Final = 2
 _HAS_CHECKSUM: Final = 1
 """Value of `sent_ns` in an end record whose size field is a checksum. Older logs, without writer records, have
 none."""
-_SIZE_AT: Final = 4
+_SIZE_OFFSET: Final = 4
 """Offset of the size field in a record."""
 
 
@@ -173,7 +173,7 @@ def _is_intact(content: bytes | mmap, end_record: np.void, *, required: bool) ->
         return not required
     record = end_record.tobytes()
     starts_at = content.rfind(record)
-    without_checksum = record[:_SIZE_AT] + bytes(4) + record[_SIZE_AT + 4 :]
+    without_checksum = record[:_SIZE_OFFSET] + bytes(4) + record[_SIZE_OFFSET + 4 :]
     return zlib.crc32(without_checksum, zlib.crc32(memoryview(content)[:starts_at])) == int(end_record["size"])
 
 

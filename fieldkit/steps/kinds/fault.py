@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 PATIENCE_S: Final = 600.0
 """Time allowed for the operator to cause a fault."""
 
-_CLOCK_S: Final = 5.0
+_CLOCK_TIMEOUT_S: Final = 5.0
 """Timeout of a time query."""
 
 _START_S: Final = 0.3
@@ -190,7 +190,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
 
         def query(role: Role) -> Offset | None:
             with suppress(LinkError):
-                if exchanges := clocks.exchanges(testbed.shells[role], _CLOCK_S):
+                if exchanges := clocks.exchanges(testbed.shells[role], _CLOCK_TIMEOUT_S):
                     return offset(exchanges)
             return None
 

@@ -26,16 +26,16 @@ FILE: Final = "send.bin"
 # Prints numbers of the generator of Park and Miller (1988, Communications of the ACM 31, 10), which every awk
 # represents exactly. The text does not repeat, so that packets can be distinguished in captures, and it depends only
 # on the seed.
-_GENERATE: Final = (
+_GENERATE_SCRIPT: Final = (
     "BEGIN { x = seed; for (n = 0; n < bytes; n += 64) { "
     'line = ""; for (i = 0; i < 8; i++) { x = (x * 16807) % 2147483647; line = line sprintf("%08x", x) } '
     'printf "%s", substr(line, 1, bytes - n) } }'
 )
 # Makes the path in $1 absolute; a relative path is in the home of the user.
 _ABSOLUTE_PATH: Final = 'case $1 in /*) ;; *) set -- "$HOME/$1" "$2" ;; esac; '
-_COPY: Final = f'{_ABSOLUTE_PATH}exec cp -- "$1" "$2"'
-_COUNT: Final = f'{_ABSOLUTE_PATH}exec wc -c <"$1"'
-_SIZE: Final = re.compile(r"[0-9]{1,15}")
+_COPY_SCRIPT: Final = f'{_ABSOLUTE_PATH}exec cp -- "$1" "$2"'
+_SIZE_SCRIPT: Final = f'{_ABSOLUTE_PATH}exec wc -c <"$1"'
+_SIZE_TEXT: Final = re.compile(r"[0-9]{1,15}")
 
 _CREATED_BYTES_PER_S: Final = 1e6
 """Rate at which a small robot generates or copies bytes; busybox awk generates 1.5 MB/s on a laptop of 2026."""
@@ -84,9 +84,9 @@ class SendStep(TransferStep):
         """Return the job that creates the file to send. It is in the attempt's folder, so the laptop can fetch it."""
         sent_file = self._file_to_send(scene).name
         if self.file is None:
-            argv = ("awk", "-v", f"seed={self.seed}", "-v", f"bytes={self.size:.0f}", _GENERATE)
+            argv = ("awk", "-v", f"seed={self.seed}", "-v", f"bytes={self.size:.0f}", _GENERATE_SCRIPT)
         else:
-            argv = ("sh", "-c", _COPY, "sh", self._path, sent_file)
+            argv = ("sh", "-c", _COPY_SCRIPT, "sh", self._path, sent_file)
         job = Job(
             folder=scene.folder,
             name=self.prefixed_name("make"),
@@ -110,11 +110,13 @@ class SendStep(TransferStep):
         """Yield the checks of a transfer, and the check of the file to send."""
         yield from super().needs(scene)
         if self.file is not None:
-            yield Need(self.sender, f"file {self.file}", ("sh", "-c", _COUNT, "sh", self._path, "-"), self._judge)
+            yield Need(
+                self.sender, f"file {self.file}", ("sh", "-c", _SIZE_SCRIPT, "sh", self._path, "-"), self._judge
+            )
 
     def _judge(self, answer: CommandResult) -> tuple[Verdict, str, str]:
         """Return verdict, detail and remedy for the existence and the size of the file."""
-        if not answer.ok or not _SIZE.fullmatch(answer.text.strip()):
+        if not answer.ok or not _SIZE_TEXT.fullmatch(answer.text.strip()):
             remedy = f"copy {quote((self.file or '',))} to the robot with scp, or correct file: in the procedure"
             return Verdict.FAIL, answer.text, remedy
         size_bytes = int(answer.text)

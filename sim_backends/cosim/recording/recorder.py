@@ -204,7 +204,7 @@ class RunRecorder:
             self._finish(error)
 
     def _finish(self, error: BaseException | None) -> None:
-        """Write the remaining windows and the end of the run; `error` is what ended the run early, or None."""
+        """Write the remaining windows and the end of the run; `error` is the exception that stopped it, or None."""
         ending = RunEnding.COMPLETE
         if error is not None:
             ending = RunEnding.INTERRUPTED if isinstance(error, KeyboardInterrupt) else RunEnding.FAILED

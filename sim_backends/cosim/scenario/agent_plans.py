@@ -106,7 +106,8 @@ class FollowPlan(Strict):
     Attributes:
         kind: `follow`.
         leader: The agent that it follows or, if it flies, a list of several agents.
-        distance: Distance behind the leader at standstill, or height above it; from antenna to antenna.
+        distance: Distance behind the leader at standstill or, if the agent flies, height above the leaders; from
+            antenna to antenna.
         headway: Time headway behind the leader, in addition to the distance.
         timeout: Time without a state after which it stops.
     """

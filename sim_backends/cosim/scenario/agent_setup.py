@@ -52,8 +52,8 @@ def list_robots() -> list[str]:
 def limits_of(robot: str) -> DriveLimits | QuadrotorLimits:
     """Return the limits of a robot's body.
 
-    A robot profile has only a top speed. Its other limits are those of the TurtleBot3 Burger or, if the robot flies,
-    of the quadrotor with the name of the profile (`quadrotor`), which is the Duckiedrone for most names.
+    A robot profile contains only the top speed. The other limits are those of the TurtleBot3 Burger or, if the robot
+    flies, of the Duckiedrone.
     """
     if robot in BODIES:
         return BODIES[robot]
@@ -115,8 +115,8 @@ def make_controllers(scenario: CosimScenario, bodies: Mapping[str, Body[Any]], s
     Args:
         scenario: The scenario.
         bodies: The body of each agent.
-        seed: Seed of the phases (times of first commands) that the scenario does not set; the controllers of
-            different robots do not run at the same times.
+        seed: Seed of the phases (times of first commands) that the scenario does not set. They are random, because
+            the controllers of different robots do not run at the same times.
     """
     programs = {
         name: _controller(plan, bodies[name], plan.lifetime.appears_ns, _phase_ns(name, plan, seed))

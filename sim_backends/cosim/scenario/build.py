@@ -109,7 +109,10 @@ def captured_flows(traffic: Iterable[Traffic]) -> dict[str, CapturedFlow]:
 
 
 def _captures(scenario: CosimScenario, folder: Path) -> dict[str, Any] | None:
-    """Return the settings for captures with the same headers as in `Captures`; None if the network writes none."""
+    """Return the settings with which an external network writes captures like those of the class `Captures`.
+
+    The result is None if the network writes no captures.
+    """
     if not writes_captures(scenario):
         return None
     flows = captured_flows(scenario.traffic)

@@ -1,4 +1,4 @@
-"""The section of a scenario file that names a trial of robots, which the scenario reproduces to compare both."""
+"""The section of a scenario file that names a trial of robots, which the scenario reproduces for a comparison."""
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise

@@ -37,8 +37,8 @@ class RunResult:
     """The result of a run, as a worker returns it.
 
     Attributes:
-        content: The content of its file.
-        error: The error that ended it early; None if it is complete.
+        content: The content of the file with the result.
+        error: The error that ended the run early; None if the run is complete.
     """
 
     content: Mapping[str, Any]

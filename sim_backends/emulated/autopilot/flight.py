@@ -34,7 +34,7 @@ _SUPPORT_GAP_M: Final = 1e-3
 _MAX_REST_CLIMB_M_S: Final = 1e-3
 """A supported drone that climbs faster is not on the ground, because it is lifting off."""
 _SEARCH_M: Final = 2.0
-"""Distance within which obstacles are considered; the search is repeated after half of that distance."""
+"""Distance within which obstacles are considered; the search is repeated when the drone has moved half of it."""
 
 
 class Airframe:
@@ -48,7 +48,7 @@ class Airframe:
         place_m: Position of its lowest point in the world, which is also home.
         facing_rad: Initial heading.
         obstacles: Obstacles in the world, including the floor.
-        now_ns: Time of this state.
+        now_ns: Time of the initial state.
 
     Attributes:
         home_m: Position of home in the world; `position_m` is relative to it.
@@ -152,7 +152,7 @@ class Airframe:
 
 
 MakeAirframe = Callable[[Vector, float, int], Airframe]
-"""Creates a drone; arguments: position of its lowest point in the world, heading, time."""
+"""Creates the airframe of a drone; arguments: position of its lowest point in the world, heading, time."""
 
 
 def limits_within(limits: QuadrotorLimits, parameters: Parameters) -> QuadrotorLimits:

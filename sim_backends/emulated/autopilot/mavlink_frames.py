@@ -81,7 +81,7 @@ def protocol_version() -> Message:
 
 
 def component_metadata(boot_ms: int, uri: str) -> Message:
-    """Return COMPONENT_METADATA with the URI of the general metadata file; 0 means that its checksum is unknown."""
+    """Return COMPONENT_METADATA with the URI of the general metadata file, and with the checksum 0 (unknown)."""
     payload = struct.pack("<II100s", boot_ms, 0, uri.encode("ascii"))
     return _RawMessage(COMPONENT_METADATA, "COMPONENT_METADATA", payload, 182)
 

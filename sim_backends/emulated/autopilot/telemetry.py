@@ -15,7 +15,7 @@ from sim_backends.emulated.autopilot.vehicle import Vehicle
 from sim_backends.world.motion import GRAVITY_M_S2
 
 _UNKNOWN_CELL: Final = 0xFFFF
-"""Value of the voltage of each further cell, which the battery does not have."""
+"""Voltage value that means that the battery does not have this cell."""
 _NAN: Final = math.nan
 _METADATA: Final = "mftp:///etc/extras/component_general.json.xz"
 """Location of PX4's metadata; the emulated file transfer answers that this file does not exist."""

@@ -36,7 +36,10 @@ table netdev fieldkit {{
     }}
 }}
 """
-"""nftables rules for frames that the bridge forwards, which do not pass the hook `output` of the robots' rules."""
+"""nftables rules that assign the frames that the bridge forwards to access category VO.
+
+On robots, `wireless` has the same rule with the hook `output`, which forwarded frames do not pass.
+"""
 _BEACON_INTERVALS_TU: Final = (100, 101, 103, 107, 109, 113)
 """Intervals of the beacons in time units (1024 us). They differ because mac80211_hwsim derives the times of beacons
 from one clock: beacons of equal intervals would always collide."""
@@ -68,7 +71,8 @@ class AccessPoints:
         for number, radio in enumerate(radios.values()):
             files.append(f"{number}.conf")
             (folder / files[-1]).write_text(configuration(radio.interface, wifi, number), encoding="ascii")
-        (folder / "rules").write_text(_RULES.format(interfaces=", ".join(r.interface for r in radios.values())))
+        interfaces = ", ".join(radio.interface for radio in radios.values())
+        (folder / "rules").write_text(_RULES.format(interfaces=interfaces))
         self._log = folder / "hostapd.log"
         argv = ("setpriv", "--pdeathsig", "KILL", "--", "unshare", "--net", "--", "sh", "-c")
         with self._log.open("wb") as log:

@@ -69,7 +69,8 @@ def run_command(argv: Sequence[str], results: Path, *, radios: int) -> int:
 
 def prologue(folder: Path) -> str:
     """Return the part of a shell script that prepares the machine for programs of fieldkit in a folder."""
-    # If packages were extracted to a folder, their programs are not on the PATH of the robots, so they get links.
+    # If packages were extracted to a folder, their programs are not in a folder of the robots' PATH. Links to them
+    # are created in /usr/local/sbin, which is in this PATH.
     links = [
         shlex.join(("ln", "-sf", path, f"/usr/local/sbin/{name}"))
         for name in PACKAGE_OF
