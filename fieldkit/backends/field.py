@@ -243,7 +243,7 @@ class FieldTestbed:
             try:
                 self._bring_back(name)
             except ConfigurationError as operator_error:
-                operator_error.what += f"; before, the move failed: {describe_exception(error)}"
+                operator_error.what += f"; before that, the move failed: {describe_exception(error)}"
                 raise
             raise
         self._bring_back(name)

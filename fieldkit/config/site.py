@@ -20,7 +20,7 @@ def _no_plain_password(value: object) -> object:
 
 
 def is_ipv4(text: str) -> bool:
-    """Return True if a text is an IPv4 address in the notation of the tools on robots."""
+    """Return True if a text is an IPv4 address in dotted-decimal notation without leading zeros."""
     try:
         return str(ipaddress.IPv4Address(text)) == text
     except ValueError:
@@ -83,9 +83,9 @@ class Site(Strict):
     The emulated backend ignores `host`, `port`, `user`, `key`, `host_key` and `address`: its robots have addresses
     from 10.42.0.1 on, in the order of the file, and generated keys. With `control: radio` the operator's laptop is
     also a station, `laptop` at 10.42.0.254: it is 2 m from the relay in `master` and from the receiver in
-    `masterless`, and never behind the wall. It has the same radio as the robots, and every packet of SSH is subject
-    to the radio model. In `master`, packets from sender to receiver cross two links, so `loss` and `delay` apply
-    twice. [Method](method-radio.md#the-emulated-radio) describes the radio model.
+    `masterless`, and never behind the wall of `nlos`. It has the same radio as the robots, and every packet of SSH is
+    subject to the radio model. In `master`, packets from sender to receiver cross two links, so `loss` and `delay`
+    apply twice. [Method](method-radio.md#the-emulated-radio) describes the radio model.
 
     Attributes:
         backend: Backend used if the command line gives none. The default is `emulated` if the file has the section
@@ -127,8 +127,8 @@ class Site(Strict):
         missing = [key for key in ("robots", "roles") if key not in self.model_fields_set]
         if missing and not (self.has_default_robots and self.backend == "emulated"):
             raise schema.validation_error(
-                f"required key {missing[0]!r} is missing; only the backend emulated has default robots and roles, which "
-                "it uses if both are missing",
+                f"required key {missing[0]!r} is missing; only the backend emulated has default robots and roles, "
+                "for a file without both keys",
                 remedy=f"add {': and '.join(missing)}: to it",
             )
         return self

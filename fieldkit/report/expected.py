@@ -1,6 +1,6 @@
 """Judgements of the expectations of trials, for reports.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence

@@ -131,10 +131,10 @@ class EmulatedBackend:
         """Implement `Relocating.run_elsewhere`: the command runs in a virtual machine."""
         from sim_backends.emulated.linux_wifi import guest  # noqa: PLC0415 (as above)
 
-        return guest.run_command(argv, results, radios=self._radios)
+        return guest.run_command(argv, results, radios=self._radio_count)
 
     @property
-    def _radios(self) -> int:
+    def _radio_count(self) -> int:
         """Number of radios of robots and access points."""
         return len(self._site.robots) + len(self._options.radio.access_points)
 
@@ -244,7 +244,9 @@ class EmulatedBackend:
 
             sink(Note("starting a virtual machine, because this kernel has no mac80211_hwsim"))
             draw = partial(interactive_lab.overview, members, options=self._options, world=self._world)
-            with guest_lab.bring_up(members, self._site_of_guest(), seed=seed, radios=self._radios, draw=draw) as lab:
+            with guest_lab.bring_up(
+                members, self._site_of_guest(), seed=seed, radios=self._radio_count, draw=draw
+            ) as lab:
                 yield lab
             return
         ros = self._find_ros(members)

@@ -147,7 +147,7 @@ class Bodies:
         """Return attitude and support of a quadrotor.
 
         Raises:
-            ConfigurationError: It is not a quadrotor.
+            ConfigurationError: The body is not a quadrotor.
         """
         body, pose = self._bodies[name], self._tracks[name].pose(self._step)
         if not isinstance(pose, FlightPose):
@@ -336,7 +336,9 @@ class Bodies:
         for name in names:
             place_m = self._initial_pose(name).place_m
             if not all(map(math.isfinite, place_m)):
-                raise ConfigurationError(f"{name} starts at {place_m}", remedy="use finite coordinates in metres")
+                raise ConfigurationError(
+                    f"{name} starts at {place_m}, which is not finite", remedy="use finite coordinates in metres"
+                )
             self._check_free(name, place_m, self._grounds[name].obstacles)
 
     def _check_no_overlap(self, new_names: Collection[str]) -> None:

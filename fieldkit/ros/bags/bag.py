@@ -14,7 +14,8 @@ METADATA: Final = "metadata.yaml"
 ROS2: Final = {".db3", ".mcap"}
 """Suffixes of the data files of ROS 2 bags."""
 
-# Largest value that is a fraction and not a percentage: a full three-cell battery has 12.6 V / 11.1 V.
+# A larger value is a percentage. Fractions above 1 occur, because the TurtleBot3 publishes the ratio of the voltage
+# to the nominal voltage: 12.6 V / 11.1 V for a full three-cell battery.
 _MAX_FRACTION: Final = 1.5
 
 _READER: Final = SandboxedReader("fieldkit.ros.bags.bag_reader")

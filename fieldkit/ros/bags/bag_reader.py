@@ -77,7 +77,7 @@ def contents(reader: "rosbag1.Reader | rosbag2.Reader") -> Json:
 
 
 def topic_stats(reader: "rosbag1.Reader | rosbag2.Reader") -> Json:
-    """Return number and times of the messages by topic, keyed by the attributes of `TopicStats`."""
+    """Return the number and the times of the messages of each topic, keyed by the attributes of `TopicStats`."""
     by_topic: dict[str, dict[str, int]] = {}
     with reader:
         for connection, stamp_ns, _ in reader.messages():
@@ -174,7 +174,7 @@ def _pose(msgtype: str, message: Any, child: str) -> tuple[float, float, float, 
 
 
 def _check_database(path: Path) -> None:
-    """Check every page, because the message count can be correct even if messages are truncated."""
+    """Check every page of an SQLite database, because the message count can be correct even if pages are damaged."""
     import sqlite3  # noqa: PLC0415 (needed only for bags in SQLite)
 
     with closing(sqlite3.connect(f"{path.absolute().as_uri()}?immutable=1", uri=True)) as database:

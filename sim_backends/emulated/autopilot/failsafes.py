@@ -64,7 +64,7 @@ class Failsafes(Protocol):
 
     Attributes:
         active: True if a failsafe is triggered; HEARTBEAT then has MAV_STATE_CRITICAL.
-        arming_errors: Reasons why they prevent arming.
+        arming_errors: Reasons why the failsafes prevent arming; empty if they permit it.
     """
 
     @property
@@ -73,7 +73,7 @@ class Failsafes(Protocol):
 
     @property
     def arming_errors(self) -> list[str]:
-        """Reasons why they prevent arming."""
+        """Reasons why the failsafes prevent arming; empty if they permit it."""
 
     def on_heartbeat(self, system: int, kind: int, now_ns: int) -> None:
         """Process a heartbeat: system id and MAV_TYPE of its sender."""

@@ -34,7 +34,7 @@ _SUPPORT_GAP_M: Final = 1e-3
 _MAX_REST_CLIMB_M_S: Final = 1e-3
 """A supported drone that climbs faster is not on the ground, because it is lifting off."""
 _SEARCH_M: Final = 2.0
-"""Distance within which obstacles are considered; the search is repeated after half of that distance."""
+"""Distance within which obstacles are considered; the search is repeated when the drone has moved half of it."""
 
 
 class Airframe:
@@ -48,7 +48,7 @@ class Airframe:
         place_m: Position of its lowest point in the world, which is also home.
         facing_rad: Initial heading.
         obstacles: Obstacles in the world, including the floor.
-        now_ns: Time of this state.
+        now_ns: Time of the initial state.
 
     Attributes:
         home_m: Position of home in the world; `position_m` is relative to it.
@@ -149,7 +149,7 @@ class Airframe:
 
 
 MakeAirframe = Callable[[Vector, float, int], Airframe]
-"""Creates a drone; arguments: position of its lowest point in the world, heading, time."""
+"""Creates the airframe of a drone; arguments: position of its lowest point in the world, heading, time."""
 
 
 def limits_within(limits: QuadrotorLimits, parameters: Parameters) -> QuadrotorLimits:
@@ -178,8 +178,8 @@ def velocity_to(goal_m: Vector, body: Airframe, limits: QuadrotorLimits) -> Vect
 def stop_m(body: Airframe, limits: QuadrotorLimits) -> Vector:
     """Return the position, relative to home, at which the drone stops if it brakes now.
 
-    A drone that is not below home is assumed not to sink below home.
-    The stopping distance is the distance during the lags of attitude and velocity control, plus v^2 / 2a.
+    The stopping distance is the distance during the lags of attitude and velocity control, plus v^2 / (2 a). The
+    returned height is at least 0 or, if the drone is below home, at least the current height of the drone.
     """
     (x, y, z), (east, north, up) = body.position_m, body.velocity_m_s
     brake_s = limits.lag_s + 1 / limits.gains_per_s[0] + math.hypot(east, north) / 2 / limits.acceleration_m_s2

@@ -164,7 +164,7 @@ class Vehicle(VehicleBase):
                 break
             self._check_flight_state()
             self.body.motors_on = self.is_armed
-            target_m_s = self._target_m_s()  # it may change the mode
+            target_m_s = self._target_m_s()  # this call may change the mode
             self.body.step(target_m_s, self.limits, self.guidance.yaw_rad(self.mode, self.body))
         self._update_boot_state()
         self._run_failsafes()

@@ -182,7 +182,7 @@ def start_network(settings: LabSettings, states: Mapping[str, State]) -> remote.
     """Start the program of a network.
 
     Args:
-        settings: Settings of the lab.
+        settings: Settings of the session.
         states: State of the antenna of each station.
 
     Raises:
