@@ -19,7 +19,7 @@ def _no_plain_password(value: object) -> object:
 
 
 def is_ipv4(text: str) -> bool:
-    """Return True if a text is an IPv4 address in the notation of the tools on robots."""
+    """Return True if a text is an IPv4 address in dotted-decimal notation without leading zeros."""
     try:
         return str(ipaddress.IPv4Address(text)) == text
     except ValueError:

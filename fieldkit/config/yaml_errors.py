@@ -72,7 +72,7 @@ def _is_opaque_mapping(kind: Any) -> bool:  # noqa: ANN401 (any type annotation)
 _WORDS: Final = re.compile(r"\^\(([A-Za-z0-9_|]+)\)\$")
 """Matches the pattern of a key that allows only some words, such as `^(ros1|ros2)$`."""
 _MAX_SHOWN: Final = 60
-"""Number of characters of a wrong text that a message shows."""
+"""Maximum number of characters of a wrong text that a message shows."""
 _NO_KEYS_HINT: Final = ", and there are none; indent the keys that belong to this line more than this line"
 _MESSAGES: Final = MappingProxyType({"tuple_type": "a list is needed here", "missing": "this list needs more values"})
 

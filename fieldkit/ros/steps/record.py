@@ -46,7 +46,7 @@ from fieldkit.steps.view import View
 
 DEFAULT_BAG: Final = "scan"
 
-# Measured: rosbag took 0.6 to 0.8 s longer than its duration, and 3.2 s longer on a lossy interface.
+# Time that a recorder may take in addition to its duration. rosbag took 0.6 to 0.8 s, and 3.2 s on a lossy interface.
 START_AND_CLOSE_S: Final = 20.0
 
 # A recorder needs up to a second to subscribe, and more on a small computer under load. A recording has failed if the

@@ -64,11 +64,7 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
     """
 
     flow_kind: ClassVar[str] = "iperf3"
-    cross_checks = (
-        *iperf3_checks.CROSS_CHECKS,
-        *iperf3_load.JITTER_CROSS_CHECKS,
-        *stalls.cross_checks("iperf3"),
-    )
+    cross_checks = (*iperf3_checks.CROSS_CHECKS, *iperf3_load.JITTER_CROSS_CHECKS, *stalls.cross_checks("iperf3"))
 
     duration: Annotated[Duration, Field(ge=1)] | None = None
     size: Bytes | None = None
