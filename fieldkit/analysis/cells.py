@@ -258,7 +258,7 @@ def _estimates(repeats: Repeats, quantity: Quantity, rows: Indices, cells: Indic
         cells: Cell of each row of `repeats`.
     """
     rows = rows[np.isfinite(repeats.observed(quantity)[0][rows])]
-    for name in quantity.columns[1:]:  # omit shares without counts, because they cannot be summed over repeats
+    for name in quantity.columns[1:]:  # omit repeats with a share but no counts, which cannot be summed over repeats
         rows = rows[np.isfinite(repeats.numbers[name][rows])]
     cell_of_row = cells[rows]
     starts = np.flatnonzero(np.diff(cell_of_row, prepend=-1))

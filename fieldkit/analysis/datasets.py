@@ -2,8 +2,8 @@
 
 A sweep runs a simulation with several values of each factor. A flow is a stream of packets and its receiver.
 
-The metadata of each file has the names of the columns that are folders (`partitions`), the columns that identify a
-condition (`by`), and declarations of columns that trials do not have.
+The metadata of each file has the names of the columns whose values are names of folders (`partitions`), the columns
+that identify a condition (`by`), and declarations of columns that trials do not have.
 """
 
 import json

@@ -104,7 +104,8 @@ def shares(lost: ArrayLike, sent: ArrayLike) -> Intervals:
         # Repeats with equal shares have variance 0, but the share is not certain. Losses are then treated as
         # independent.
         trials = np.where(squares > 0, trials, total)
-        repeats = total**2 / (sent**2).sum(axis=1)  # Kish 1965, Survey Sampling, 11.7: n if all sent the same number
+        # Effective number of repeats (Kish 1965, Survey Sampling, 11.7): n if all repeats sent the same number.
+        repeats = total**2 / (sent**2).sum(axis=1)
         is_mixed = (value > 0) & (value < 1)
         quantile = np.where(is_mixed, student(freedom), NORMAL)
         low, high = _score_interval(value, np.where(is_mixed, trials, repeats), quantile)

@@ -68,7 +68,7 @@ class Parser(argparse.ArgumentParser):
         return tuple(self._commands.choices) if self._commands else ()
 
     def command(self, name: str) -> "Parser | None":
-        """Return the parser of a subcommand, or None if there is none of this name.
+        """Return the parser of a subcommand, or None if there is no such subcommand.
 
         Its arguments are declared, unless another package declares them.
         """

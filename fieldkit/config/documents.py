@@ -1,4 +1,4 @@
-"""Read YAML documents with the line of each value, write them, and edit single values.
+"""Read YAML documents with the line of each value, write values as YAML, and return syntax trees for edits.
 
 This is the only module that imports PyYAML.
 """

@@ -86,7 +86,7 @@ class LinkLostError(LinkError):
 
 
 class TestbedLostError(LinkError):
-    """A process that the robots need has exited permanently: the trial stops, and its repeat is run again later."""
+    """A process that the robots need has exited permanently. The trial stops; `resume` runs the repeat again."""
 
     ends_trial = True
 

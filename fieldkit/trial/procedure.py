@@ -172,11 +172,8 @@ class Procedure(catalog.Named, Sectioned):
             step = placed.step
             completed = [other.step for other in earlier_steps if not placed.runs_at_same_time_as(other)]
             with step_errors.before_trial(f"{placed.label} cannot be planned"):
-                resources, file_names, step_columns = (
-                    step.exclusive_resources(),
-                    step.files(),
-                    columns.columns_of_step(step),
-                )
+                resources, file_names = step.exclusive_resources(), step.files()
+                step_columns = columns.columns_of_step(step)
             if isinstance(step, ChecksPlacement) and (reason := step.placement_error(completed, placed.within)):
                 raise schema.validation_error(reason, *placed.at)
             for resource in resources:

@@ -281,7 +281,7 @@ class OffboardPilot:
         )
 
     def _start_phase(self, phase: str) -> None:
-        """Start a phase of the flight: set it for the log file and write it to the log."""
+        """Start a phase of the flight: set it for the lines of the flight log, and report it by `log_line`."""
         self._log.phase = phase
         log_line(phase)
 

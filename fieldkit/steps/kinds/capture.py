@@ -139,22 +139,13 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
 
     def _planned_job(self, scene: Scene, role: Role) -> Planned:
         profile = scene.robot(role).profile
+        interface = self.capture_interface(scene, role)
         immediate = ("--immediate-mode",) if scene.tools(role).immediate_mode else ()
         options = ("-n", "-U", *immediate, "-s", str(self._snap_bytes), "-B", str(self._buffer_kib))
         job = Job(
             folder=scene.folder,
             name=self.prefixed_name("capture"),
-            argv=(
-                *(
-                    profile.tools.capture,
-                    "-i",
-                    self.capture_interface(scene, role),
-                    *options,
-                    "-w",
-                    self._file(role),
-                ),
-                self._filter(scene),
-            ),
+            argv=(profile.tools.capture, "-i", interface, *options, "-w", self._file(role), self._filter(scene)),
             # The limit exceeds the captured jobs, because a capture that was stopped at its limit looks complete.
             limit_s=LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene)),
             log=self._log(role),

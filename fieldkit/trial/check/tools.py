@@ -78,11 +78,8 @@ def probe(profile: RobotProfile, tools: Iterable[Tool] = Tool) -> tuple[str, ...
         (_USER, ("id", "-u")),
         *(command for tool in probed_tools for command in commands_by_tool[tool]),
     ]
-    return (
-        "sh",
-        "-c",
-        _PROBE_FUNCTION + "".join(f"run_tool {name} {quote(argv)}\n" for name, argv in named_commands),
-    )
+    calls = "".join(f"run_tool {name} {quote(argv)}\n" for name, argv in named_commands)
+    return ("sh", "-c", _PROBE_FUNCTION + calls)
 
 
 def parse(output: bytes, profile: RobotProfile) -> Variants:
