@@ -82,18 +82,18 @@ def receive(ports: DatagramPorts, stop_event: threading.Event, limit_s: float) -
     Raises:
         OSError: Another program uses a port and does not share it, or this robot does not have the address.
     """
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as group, socket.socket(
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as multicast, socket.socket(
         socket.AF_INET, socket.SOCK_DGRAM
     ) as unicast:
         for option in (socket.SO_REUSEADDR, socket.SO_REUSEPORT):
-            group.setsockopt(socket.SOL_SOCKET, option, 1)
-        group.bind(("", ports.multicast_port))
+            multicast.setsockopt(socket.SOL_SOCKET, option, 1)
+        multicast.bind(("", ports.multicast_port))
         membership = socket.inet_aton(ports.group) + socket.inet_aton(ports.address)
-        group.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+        multicast.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
         unicast.bind((ports.address, ports.unicast_port))
         sys.stderr.write("up\n")
         sys.stderr.flush()
-        return _count([group, unicast], ports.token, stop_event, time.monotonic() + limit_s)
+        return _count([multicast, unicast], ports.token, stop_event, time.monotonic() + limit_s)
 
 
 def _count(

@@ -58,8 +58,8 @@ class Estimate:
         high: Upper end of the interval; None for a single repeat, and if it is open because of censored repeats.
         assured: Coverage of the interval for any distribution of the repeats; None unless the estimate is a median of
             at least two repeats.
-        p_order: p-value of the independence of the repeats in time (`independence.p_values`), corrected for the
-            number of all estimates; None if it was not tested.
+        p_order: p-value of the hypothesis that the repeats are independent in time (`independence.p_values`),
+            corrected for the number of all estimates; None if it was not tested.
         wilson_low: Lower end of the 95 % Wilson interval, which assumes that all counted items are independent; None
             unless counted.
         wilson_high: Upper end of the Wilson interval.
@@ -224,14 +224,14 @@ def _correct_p_values(estimates: Sequence[dict[str, Estimate]]) -> None:
 
 def _conditions(repeats: Repeats, by: Sequence[str]) -> tuple[list[Key], Indices]:
     """Return the sorted keys of all cells, and the index of the cell of each row."""
-    _, firsts, condition = np.unique(repeats.codes(by), return_index=True, return_inverse=True)
-    keys = repeats.where(firsts).keys(by)
+    _, first_rows, condition_of_row = np.unique(repeats.codes(by), return_index=True, return_inverse=True)
+    keys = repeats.where(first_rows).keys(by)
     ordered = sorted(
         range(len(keys)), key=lambda index: [_sort_key(*part) for part in zip(by, keys[index], strict=True)]
     )
     position = np.zeros(len(keys), np.int64)
     position[ordered] = np.arange(len(keys))
-    return [keys[index] for index in ordered], position[condition]
+    return [keys[index] for index in ordered], position[condition_of_row]
 
 
 def _sort_key(name: str, value: str | float | None) -> tuple[bool, float, str]:
@@ -258,7 +258,7 @@ def _estimates(repeats: Repeats, quantity: Quantity, rows: Indices, cells: Indic
         cells: Cell of each row of `repeats`.
     """
     rows = rows[np.isfinite(repeats.observed(quantity)[0][rows])]
-    for name in quantity.columns[1:]:  # omit shares without counts, because they cannot be summed over repeats
+    for name in quantity.columns[1:]:  # omit repeats with a share but no counts, which cannot be summed over repeats
         rows = rows[np.isfinite(repeats.numbers[name][rows])]
     cell_of_row = cells[rows]
     starts = np.flatnonzero(np.diff(cell_of_row, prepend=-1))
@@ -342,7 +342,10 @@ def _mean_or_median(quantity: Quantity, values: NDArray[np.float64], upper: NDAr
 
 
 def _p_order(repeats: Repeats, quantity: Quantity, cell_rows: Indices) -> NDArray[np.float64]:
-    """Return the p-value of the independence in time of each cell; NaN for flags, or if a start time is unknown."""
+    """Return the p-value of each cell for independence in time.
+
+    It is NaN for flags, for fewer than `MIN_FOR_INDEPENDENCE_TESTS` repeats, and if a start time is unknown.
+    """
     if quantity.kind is Kind.FLAG or "started_utc_ns" not in repeats.numbers:
         return np.full(len(cell_rows), np.nan)
     if cell_rows.shape[1] < MIN_FOR_INDEPENDENCE_TESTS:
@@ -354,11 +357,11 @@ def _p_order(repeats: Repeats, quantity: Quantity, cell_rows: Indices) -> NDArra
 
 
 def _counts(repeats: Repeats, quantity: Quantity, cell_rows: Indices) -> tuple[NDArray[np.float64], ...] | None:
-    """Return the numbers of lost and of sent items of each repeat. For a flag, these are its values and ones.
+    """Return the numbers of lost and of sent items of each repeat; None for a quantity that is not counted.
 
-    The result is None for other quantities. A number of lost items can be negative: `paper_received` can be larger
-    than `paper_packets`, because the two captures contain different frames with the same data if a network card
-    splits or merges frames (segmentation offload).
+    For a flag, the first number is its value (0 or 1), and the second is 1. A number of lost items can be negative:
+    `paper_received` can be larger than `paper_packets`, because the two captures contain different frames with the
+    same data if a network card splits or merges frames (segmentation offload).
     """
     if quantity.kind is Kind.FLAG:
         flags = repeats.numbers[quantity.name][cell_rows]

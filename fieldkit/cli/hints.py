@@ -42,7 +42,7 @@ class CliOptions:
             self._options += [(permissions.option(name), "") for name in permissions.repeated(granted_names)]
 
     def add_to_command(self, match: re.Match[str]) -> str:
-        """Return the matched command with those of the stored options that it accepts."""
+        """Return the matched command with the stored options that it accepts and does not contain."""
         parser, words = self._parser, list[str]()
         for word in match["words"].split():
             subparser = parser.command(word)

@@ -1,4 +1,7 @@
-"""Requests to the process of a lab: their messages, one JSON document per request and answer, and their client."""
+"""Messages between the process of a lab and its client, and the client.
+
+A request is a line of text, and its answer is one JSON document.
+"""
 
 import json
 import os
@@ -48,9 +51,9 @@ class LabState:
 
     Attributes:
         pid: Process id.
-        up_s: Time since its start was complete.
+        up_s: Time in seconds since the start of the lab was complete.
         robots: Its robots.
-        lateness: Lateness of its co-simulation; None without one.
+        lateness: Lateness of its co-simulation; None if the lab does not run on a co-simulation.
     """
 
     pid: int
@@ -99,7 +102,7 @@ def pack_place(place_m: Vector) -> bytes:
 
 
 def pack_error(error: FieldkitError) -> bytes:
-    """Return an error as JSON, which the client raises."""
+    """Return an error as JSON. The client raises it, as a `LinkError` if its class is not in `_ERROR_CLASSES`."""
     error_class = type(error).__name__ if type(error).__name__ in _ERROR_CLASSES else LinkError.__name__
     return json.dumps(_ERROR_ANSWER.dump(_ErrorAnswer(error_class, error.what, error.remedy))).encode()
 
@@ -111,17 +114,17 @@ def unpack_state(answer: bytes) -> LabState:
         FieldkitError: The answer is an error.
         ValueError: The answer is invalid.
     """
-    return _STATE.parse(_read(answer))
+    return _STATE.parse(_parse_answer(answer))
 
 
 def unpack_place_m(answer: bytes) -> Vector:
     """Return the position in an answer. Raises the same errors as `unpack_state`."""
-    return _PLACE.parse(_read(answer)).place_m
+    return _PLACE.parse(_parse_answer(answer)).place_m
 
 
 def unpack_overview(answer: bytes) -> Overview:
     """Return the plan view of the lab in an answer. Raises the same errors as `unpack_state`."""
-    return _OVERVIEW.parse(_read(answer))
+    return _OVERVIEW.parse(_parse_answer(answer))
 
 
 def unpack_destination(request: str) -> Destination:
@@ -133,7 +136,8 @@ def unpack_destination(request: str) -> Destination:
     return _DESTINATION.parse(json.loads(request))
 
 
-def _read(answer: bytes) -> object:
+def _parse_answer(answer: bytes) -> object:
+    """Return the JSON content of an answer, or raise the error that it contains."""
     content = json.loads(answer)
     if isinstance(content, dict) and "error" in content:
         error_answer = _ERROR_ANSWER.parse(content)
@@ -156,8 +160,9 @@ def state(folder: LabFolder) -> LabState:
     """Return the state of the lab.
 
     Raises:
-        NoLabError: No lab is up.
-        LinkError: It does not answer.
+        NoLabError: No lab is running in this directory.
+        LinkError: The lab does not answer, or its answer is invalid.
+        FieldkitError: The answer of the lab is an error.
     """
     return _request(folder, "state", unpack_state)
 
@@ -181,8 +186,8 @@ def end(folder: LabFolder) -> None:
     """Terminate the lab's process with its robots; return when it has exited.
 
     Raises:
-        NoLabError: No lab is up.
-        LinkError: It does not exit.
+        NoLabError: No lab is running in this directory.
+        LinkError: The process does not exit.
     """
     with _lab_connection(folder) as lab:
         # The kernel reports which process listens on the socket, so that no other process is killed.
@@ -198,12 +203,12 @@ def end(folder: LabFolder) -> None:
     raise LinkError("the lab does not exit, not even after SIGKILL", remedy="find the process that blocks it: ps axf")
 
 
-def _request(folder: LabFolder, request: str, read: Callable[[bytes], Answer]) -> Answer:
+def _request(folder: LabFolder, request: str, unpack: Callable[[bytes], Answer]) -> Answer:
     with _lab_connection(folder) as lab:
         try:
             lab.sendall(f"{request}\n".encode())
             # The lab closes the connection after its answer, so an empty chunk is the end.
-            return read(b"".join(iter(lambda: lab.recv(1 << 16), b"")))
+            return unpack(b"".join(iter(lambda: lab.recv(1 << 16), b"")))
         except (OSError, ValueError) as error:
             raise LinkError(f"the lab does not answer: {error}", remedy="fieldkit lab down") from error
 

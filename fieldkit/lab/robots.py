@@ -24,10 +24,10 @@ class LabRobot:
 
 @dataclass(frozen=True)
 class Destination:
-    """Destination of a robot, as a position of its antenna.
+    """Destination of a robot: the position of its antenna.
 
     Attributes:
-        east_m: Metres east of the world's corner, or of the robot if `relative`.
+        east_m: Metres east of the world's south-western corner, or of the robot if `relative`.
         north_m: Metres north of the same point.
         up_m: Height of the antenna in the world, or change of its height above the ground if `relative`. None keeps
             the height above the ground if `relative`, and puts the robot on the ground otherwise.

@@ -94,9 +94,10 @@ class AttemptEvidence:
         return (self.folder / name).is_file()
 
     def links(self, role: Role) -> Sequence[LinkSample]:
-        """Return link samples of a robot in the order of time.
+        """Return the link samples of a robot in the order of time.
 
-        They are from the file of a testbed that models the radios or, without it, from the robot's own samples.
+        They are read from the testbed's file, which a testbed with modelled radios writes. If there are none, they
+        are read from the files that the robot's sampler wrote.
         """
         testbed_samples = self.read_or_none(link_samples.read, link_samples.FILE) or {}
         if samples := testbed_samples.get(role):

@@ -79,7 +79,7 @@ class MeshOptions(Strict):
 
     Attributes:
         daemon: `babeld`, which implements Babel (RFC 8966).
-        hello: Hello interval; the daemon's default is 4 s. A lost route is replaced within a multiple of it.
+        hello: Hello interval; the daemon's default is 4 s. A lost route is replaced after several hello intervals.
     """
 
     daemon: Literal["babeld"]

@@ -163,7 +163,7 @@ class EmulatedTestbed:
         return 0.0
 
     def bring_back(self, role: Role, *, has_returned: bool) -> None:  # noqa: ARG002 (all repeats must start in the same way)
-        """Implement `Testbed.bring_back`; the robot returns exactly, independently of its odometry."""
+        """Implement `Testbed.bring_back`; the robot returns exactly to its place, independently of its odometry."""
         self._mobility.return_to_place(role)
 
     def watching(self) -> AbstractContextManager[object]:
@@ -238,8 +238,8 @@ def bring_up(
         for role in running.robots:
             shell = _shell(running, role, laptop, reconnect_timeout_s, on_notice)
             shells[role] = stack.enter_context(closing(shell))
-        kind = LinuxWifiTestbed if options.has_linux_wifi else EmulatedTestbed
-        testbed = kind(cast, running, shells, options=options, world=world, laptop=laptop, operator=operator)
+        testbed_class = LinuxWifiTestbed if options.has_linux_wifi else EmulatedTestbed
+        testbed = testbed_class(cast, running, shells, options=options, world=world, laptop=laptop, operator=operator)
         stack.enter_context(testbed.watching())
         yield testbed
 

@@ -215,7 +215,7 @@ def states_bytes(states: Mapping[str, State], agents: AgentTable, limits_m_s2: M
 
 
 def read_states(reader: FrameReader, agents: AgentTable) -> ReceivedStates:
-    """Return states of agents, by name.
+    """Return the next list of states in a frame, by name of the agent.
 
     Raises:
         MalformedFrameError: A state is invalid, or an agent has two states.
@@ -250,6 +250,7 @@ def unpack_states(data: bytes, begin: int, agents: AgentTable) -> ReceivedStates
     agents.valid_limits = limits
     if indices == agents.all_indices:
         return ReceivedStates(agents.indices, data, limits)
+    # The indices have another order, or a reserved field is not 0, which is an error.
     _check_each(data, begin)
     rows: dict[str, int] = {}
     for row, index in enumerate(indices):

@@ -16,7 +16,7 @@ from sim_backends.federates.channels import StreamChannel
 _EXIT_S: Final = 1.0
 """Time for a process to exit after its input was closed, and again after SIGTERM."""
 _POLL_S: Final = 0.005
-"""Interval at which it is checked whether the process has exited."""
+"""Polling interval while waiting for the exit of the process."""
 _SHOWN_BYTES: Final = 4096
 """Largest number of bytes of standard error that are read for a message."""
 _SHOWN_LINES: Final = 10
@@ -38,7 +38,7 @@ class Child:
         pid: Its process id.
 
     Raises:
-        ConfigurationError: It cannot be started.
+        ConfigurationError: The process cannot be started.
     """
 
     def __init__(self, command: str) -> None:

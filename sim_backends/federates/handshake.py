@@ -83,7 +83,7 @@ def decode_join(body: bytes) -> str:
     """Return the token of `join`.
 
     Raises:
-        MalformedFrameError: It is malformed, or of another version.
+        MalformedFrameError: The body is malformed, or has another protocol version.
     """
     reader = FrameReader(body)
     _read_prefix(reader)
@@ -189,7 +189,7 @@ class Hello:
         """Return the message of a body.
 
         Raises:
-            MalformedFrameError: It is malformed, or of another version.
+            MalformedFrameError: The body is malformed, or has another protocol version.
         """
         reader = FrameReader(body)
         _read_prefix(reader)
@@ -268,7 +268,7 @@ class Welcome:
         """Return the message of a body.
 
         Raises:
-            MalformedFrameError: It is malformed, or of another version.
+            MalformedFrameError: The body is malformed, or has another protocol version.
         """
         reader = FrameReader(body)
         version, role, _, bits, step_ns, next_event_ns, configuration_hash = reader.unpack(_WELCOME)

@@ -38,7 +38,7 @@ def decode_links(body: bytes, agents: AgentTable, utc_ns: int) -> dict[str, Link
         utc_ns: Time of the samples.
 
     Raises:
-        MalformedFrameError: It is malformed.
+        MalformedFrameError: The body is malformed.
     """
     reader = FrameReader(body)
     radios: dict[str, tuple[float, int, int]] = {}

@@ -1,7 +1,7 @@
 """One processor for this thread and a child process that compute in turns.
 
 If two processes on two processors exchange messages and never compute at the same time, each message resumes a
-process on an idle processor with cold caches. On one processor the same messages cost less than half.
+process on an idle processor with cold caches. On one processor the same messages take less than half of the time.
 """
 
 import os
@@ -13,7 +13,7 @@ from typing import Final
 
 _STAT: Final = Path("/proc/thread-self/stat")
 _PROCESSOR_FIELD: Final = 36
-"""Index of field 39 of `/proc/PID/stat` (proc(5)), the processor, in the fields after the name in parentheses."""
+"""Index of the processor in the fields of `/proc/PID/stat` after the name in parentheses; field 39 in proc(5)."""
 _PERIOD_S: Final = 0.1
 """Time for which both processes stay on the same processor."""
 

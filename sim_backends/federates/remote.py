@@ -47,7 +47,7 @@ class _RemoteFederate:
         """Stop the federate."""
         self.session.close()
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> Any:  # noqa: ANN401 (of the subclass)
+    def __deepcopy__(self, memo: dict[int, Any]) -> Any:  # noqa: ANN401 (an object of the subclass)
         """Copy the federate in its process, in its current state, and return the proxy of the copy.
 
         Raises:
@@ -171,7 +171,7 @@ class RemoteNetwork(_RemoteFederate):
         """Return a sample of the links of each radio, at the network's current time; empty if there are no radios.
 
         Raises:
-            FederateError: It failed, or sent a malformed answer.
+            FederateError: The network failed, or sent a malformed answer.
         """
         if not self.welcome.capabilities & FederateCapability.SAMPLES_LINKS:
             return {}

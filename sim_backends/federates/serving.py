@@ -17,7 +17,7 @@ _HELLO_S: Final = 10.0
 """Maximum wait for the first message after a program connects; other programs are queued meanwhile."""
 
 
-def serve(make: MakeFederate, *, address: str | None = None, runs: int | None = None, **properties: Any) -> None:  # noqa: ANN401 (of `FederateService`)
+def serve(make: MakeFederate, *, address: str | None = None, runs: int | None = None, **properties: Any) -> None:  # noqa: ANN401 (see `FederateService`)
     """Serve a physics or network class.
 
     Args:
@@ -64,7 +64,7 @@ def _listen(address: TransportAddress, service: FederateService, runs: int | Non
                 with closing(listener.accept(None)) as channel:
                     succeeded = serve_channel(channel, service, token, _HELLO_S)
                 finished_runs += 1
-    except DeadlineError as error:  # of the transport over ROS 1, if the master does not answer
+    except DeadlineError as error:  # only the transport over ROS 1 raises it, if the master does not answer
         raise SystemExit(str(error)) from error
     return succeeded
 

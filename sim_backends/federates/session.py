@@ -37,7 +37,7 @@ from sim_backends.federates.transports.transport_table import FORMS, parse_addre
 BUSY_DEADLINE_FACTOR: Final = 20
 """A federate that sends `busy` may take this multiple of the deadline for an answer."""
 _FOREVER_S: Final = 1e9
-"""Deadline of a session without a deadline: about 30 years."""
+"""Value that replaces a deadline of None: about 30 years."""
 _BYE_S: Final = 0.2
 """Longest wait until `bye` is sent."""
 _MAX_SHOWN: Final = 400
@@ -135,7 +135,7 @@ class FederateSession:
         kind: MessageKind,
         copy: int,
         body: bytes,
-        answer: MessageKind,
+        answer_kind: MessageKind,
         *,
         decode: Callable[[bytes], Answer],
         describe: Callable[[], str],
@@ -146,7 +146,7 @@ class FederateSession:
             kind: Kind of the request.
             copy: Copy of the federate.
             body: Body of the request.
-            answer: Kind of the answer.
+            answer_kind: Kind of the answer.
             decode: Decodes the body of the answer.
             describe: Returns a description of the request, for error messages.
 
@@ -161,7 +161,7 @@ class FederateSession:
                 self._channel.send(encode(MessageKind.RELEASE, 0, number), time.monotonic() + self._deadline_s)
             self._released_copies.clear()
             self._request_number = (self._request_number + 1) % _REQUEST_NUMBERS
-            expected_header = Header(0, answer, self._request_number, copy)
+            expected_header = Header(0, answer_kind, self._request_number, copy)
             with self.exchange_context:
                 frame = self._exchange(encode(kind, self._request_number, copy, body), expected_header)
             if frame.header.kind is MessageKind.ERROR:
@@ -256,7 +256,7 @@ class FederateSession:
             self._child.kill()
         self._channel.close()
 
-    def say_bye(self, limit_s: float) -> None:
+    def send_bye(self, limit_s: float) -> None:
         """End the session, and wait until the federate closes the connection.
 
         Args:
@@ -287,7 +287,7 @@ def _child(endpoint: str, role: int) -> Child:
     """Start a federate by its name or its command.
 
     Raises:
-        ConfigurationError: It cannot be started; `endpoint` may be an address of a transport that does not exist.
+        ConfigurationError: The federate cannot be started; `endpoint` may be an address of an unknown transport.
     """
     command = command_line(endpoint, role)
     try:

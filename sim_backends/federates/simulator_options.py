@@ -25,11 +25,11 @@ class SimulatorOptions(Strict):
         return cls.model_validate(json.loads(hello.configuration).get("options", {}))
 
     def agent_names(self) -> Iterator[tuple[str, Location]]:
-        """Yield every reference to an agent of the scenario, with its keys."""
+        """Yield the agent and the location of each option that refers to an agent of the scenario."""
         yield from ()
 
     def unsupported(self, scenario: Mapping[str, Any]) -> Iterator[tuple[str, Location]]:
-        """Yield a message for each part of a scenario that the simulator does not support, and its keys.
+        """Yield a message for each part of a scenario that the simulator does not support, and the part's location.
 
         Args:
             scenario: The scenario as in the configuration of hello, in JSON values.

@@ -1,6 +1,6 @@
 // The physics federate `gazebo`, which couples a running Gazebo (docs/gazebo.md) to fieldkit's coordinator.
 //
-// Standard input and output carry the protocol of docs/federates.md; Gazebo Transport connects Gazebo.
+// Standard input and output carry the protocol of docs/federates.md. Gazebo is reached over Gazebo Transport.
 
 #include "fieldkit/commands.h"
 #include "fieldkit/handshake.h"

@@ -70,7 +70,7 @@ class Connection
         return publishers.empty() ? "" : publishers.front().PUuid();
     }
 
-    // Set for each agent with a lifetime whether it has a model now; the other agents must have one.
+    // Set `is_present` of each agent: always true without a lifetime, otherwise true if the agent has a model now.
     void SetPresence()
     {
         for (Agent& agent : m_agents)
@@ -237,7 +237,7 @@ class Connection
         {
             if (Clock::now() >= limit)
             {
-                m_monitor.Fail("another run of this machine uses it");
+                m_monitor.Fail("another run on this machine uses it");
             }
             m_monitor.Beat();
             std::this_thread::sleep_for(std::chrono::milliseconds(20));

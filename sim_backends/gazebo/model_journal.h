@@ -16,7 +16,7 @@
 namespace fieldkit
 {
 
-// A model that existed before a run.
+// A model with its initial pose and the description from which it can be created.
 struct InitialModel
 {
     std::string name;

@@ -32,14 +32,14 @@ struct Pose
         return {{}, std::cos(yaw / 2), 0, 0, std::sin(yaw / 2)};
     }
 
-    // A vector in the axes of the model, in the axes of the world: v + 2 w (q x v) + 2 q x (q x v).
+    // Convert a vector from the axes of the model to the axes of the world: v + 2 w (q x v) + 2 q x (q x v).
     Vector Rotated(const Vector& v) const
     {
         double a = 2 * (y * v.z - z * v.y), b = 2 * (z * v.x - x * v.z), c = 2 * (x * v.y - y * v.x);
         return {v.x + w * a + y * c - z * b, v.y + w * b + z * a - x * c, v.z + w * c + x * b - y * a};
     }
 
-    // A vector in the axes of the world, in the axes of the model.
+    // Convert a vector from the axes of the world to the axes of the model.
     Vector InverseRotated(const Vector& v) const
     {
         return Pose{{}, w, -x, -y, -z}.Rotated(v);

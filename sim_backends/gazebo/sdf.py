@@ -30,6 +30,7 @@ _SLAB_M: Final = 0.1
 """Thickness of the slab of a ramp."""
 _WHEEL_MASS_SHARE: Final = 0.05
 """Mass of a wheel as a share of the robot's mass."""
+_ORIGIN_M: Final = (0.0, 0.0, 0.0)
 _UPRIGHT: Final = (0.0, 0.0, 0.0)
 _WHEEL_AXIS: Final = (-math.pi / 2, 0.0, 0.0)
 """Roll, pitch and yaw of an upright body, and of a wheel, whose axle is the z axis of its link."""
@@ -86,7 +87,7 @@ _TURTLEBOT: Final = _Chassis(0.138, 0.13, 0.01, 0.033, 0.018, 0.16, 0.0, 1.0, 0.
 def world_sdf(
     world: World, robots: Mapping[str, SdfRobot], *, step_ns: int = 1_000_000, version: Version = "fortress"
 ) -> str:
-    """Return an SDF file.
+    """Return the text of an SDF file with a world and its robots.
 
     Args:
         world: The world.
@@ -121,12 +122,12 @@ def world_sdf(
 
 
 def model_sdf(name: str, limits: DriveLimits | QuadrotorLimits, *, step_ns: int, version: Version) -> str:
-    """Return an SDF file with one robot at the origin; Gazebo creates its model from it.
+    """Return the text of an SDF file with one robot at the origin, from which Gazebo creates the robot's model.
 
     The arguments are those of `world_sdf`.
     """
     root = Element("sdf", version="1.9")
-    _add_robot(root, name, SdfRobot(limits, _UPRIGHT, 0.0), version, step_ns)
+    _add_robot(root, name, SdfRobot(limits, _ORIGIN_M, 0.0), version, step_ns)
     return tostring(root, encoding="unicode")
 
 
@@ -250,7 +251,7 @@ def _add_drive(model: Element, limits: DriveLimits, version: Version) -> None:
     chassis_kg = chassis.mass_kg - _WHEEL_MASS_SHARE * chassis.mass_kg * len(wheels)
     # The centre of mass is at a quarter of the box's height, because batteries and motors are at the bottom.
     _add_inertia(link, chassis_kg, size_m, (0.0, 0.0, chassis.clearance_m + size_m[2] / 4))
-    _add_shape(link, "box", Box(_UPRIGHT, size_m), (0.0, 0.0, chassis.clearance_m + size_m[2] / 2))
+    _add_shape(link, "box", Box(_ORIGIN_M, size_m), (0.0, 0.0, chassis.clearance_m + size_m[2] / 2))
     if not chassis.base_m:
         _add_casters(link, chassis)
     for side, end in wheels:
@@ -292,8 +293,8 @@ def _add_wheel(model: Element, chassis: _Chassis, friction: float, side: int, en
     _add_pose(link, (end * chassis.base_m / 2, side * chassis.track_m / 2, radius_m), _WHEEL_AXIS)
     # A box whose edge is sqrt(3) = 1.7 times the radius has the inertia of the cylinder.
     _add_inertia(link, _WHEEL_MASS_SHARE * chassis.mass_kg, (1.7 * radius_m, 1.7 * radius_m, width_m))
-    cylinder = Cylinder(_UPRIGHT, radius_m, width_m)
-    _add_shape(link, "tire", cylinder, _UPRIGHT, frictions=(chassis.lateral_friction, friction))
+    cylinder = Cylinder(_ORIGIN_M, radius_m, width_m)
+    _add_shape(link, "tire", cylinder, _ORIGIN_M, frictions=(chassis.lateral_friction, friction))
     joint = SubElement(model, "joint", name=name, type="revolute")
     _add_texts(joint, parent="chassis", child=f"{name}-link")
     axis = SubElement(joint, "axis")
@@ -317,7 +318,7 @@ def _add_quadrotor(model: Element, limits: QuadrotorLimits, version: Version, st
     link = SubElement(model, "link", name="body")
     centre_m = (0.0, 0.0, limits.height_m / 2)
     _add_inertia(link, limits.mass_kg, (edge_m, edge_m, limits.height_m), centre_m)
-    _add_shape(link, "hull", Cylinder(_UPRIGHT, limits.radius_m, limits.height_m), centre_m)
+    _add_shape(link, "hull", Cylinder(_ORIGIN_M, limits.radius_m, limits.height_m), centre_m)
     plugin = _add_plugin(model, version, "VelocityControl", "velocity-control")
     # The plugin sets the velocity before each step, and gravity reduces it within the step.
     _add_texts(plugin, initial_linear=f"0 0 {GRAVITY_M_S2 * step_ns / 1e9:.9g}")

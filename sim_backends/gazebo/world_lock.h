@@ -15,7 +15,7 @@
 namespace fieldkit
 {
 
-// Only one process can have a name of an abstract socket, and the name is free when that process exits.
+// The lock is the name of an abstract socket: only one process can bind it, and it is free when that process exits.
 class WorldLock
 {
   public:

@@ -1,4 +1,4 @@
-// The clock and the poses of models that a world of Gazebo has published, and waits for them.
+// Receives the clock and the poses of models that a world of Gazebo publishes, and waits for them.
 
 #ifndef FIELDKIT_GAZEBO_WORLD_MONITOR_H
 #define FIELDKIT_GAZEBO_WORLD_MONITOR_H

@@ -36,8 +36,8 @@ relaxation)."""
 _BODY_FRICTION: Final = 0.3
 """Friction of a robot that has fallen over; an estimate without a source."""
 _IMPEDANCE_RATIO: Final = 10_000.0
-"""Ratio of softness across and along a contact. It limits the sliding of a robot at rest down a slope of 20 degrees
-to 0.02 mm/s."""
+"""MuJoCo's `impratio`: impedance of the friction divided by impedance of the normal force of a contact. With this
+value a robot at rest on a slope of 20 degrees slides by at most 0.02 mm/s."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def _text(numbers: Iterable[float]) -> str:
 
 
 class _Document:
-    """The XML document.
+    """The XML document of a model, to which elements are added.
 
     Args:
         timestep_s: MuJoCo's time step.

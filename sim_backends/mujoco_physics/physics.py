@@ -198,7 +198,7 @@ class MujocoPhysics:
         mujoco.mj_step1(self.model, self.data)
 
     def put(self, name: str, place_m: Vector, heading_rad: float) -> None:
-        """Put an agent at a position, at rest and without a command. Whether it overlaps something is not checked.
+        """Put an agent at a position, at rest and without a command. Overlaps with other bodies are not checked.
 
         Args:
             name: The agent.
@@ -271,7 +271,7 @@ class MujocoPhysics:
         other._use_data(data)
         return other
 
-    def _use_data(self, data: Any) -> None:  # noqa: ANN401 (MuJoCo has no type)
+    def _use_data(self, data: Any) -> None:  # noqa: ANN401 (MuJoCo has no type annotations)
         """Set the simulation's state, and create views of its arrays; reading its attributes each time is slow."""
         self.data = data
         self._sensors = memoryview(data.sensordata)
@@ -324,7 +324,7 @@ class MujocoPhysics:
         self._states = SensedStates(self._present_rows(), numbers)
 
     def _integrate(self, count: int) -> None:
-        """Take steps of MuJoCo, and compute the derived quantities of the new state."""
+        """Make `count` steps of MuJoCo, and compute the derived quantities of the new state."""
         model, data = self.model, self.data
         mujoco.mj_step2(model, data)
         if count > 1:

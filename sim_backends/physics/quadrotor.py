@@ -292,7 +292,7 @@ class Quadrotor:
         """Return a command limited to the quadrotor's limits; None means a velocity of 0.
 
         Raises:
-            ConfigurationError: It is not a `Velocity` of finite numbers.
+            ConfigurationError: The command is not a `Velocity` of finite numbers.
         """
         if command is None:
             return Velocity()

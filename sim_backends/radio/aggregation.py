@@ -82,7 +82,8 @@ class BlockAckSession(Generic[Payload]):
     def __init__(self, limits: AmpduLimits) -> None:
         self._limits = limits
         self._next_sequence = 0
-        # The next sequence number that the recipient passes up; decoded frames after it; numbers that were given up.
+        # At the recipient: the next sequence number that it passes up, the decoded frames after this number, and the
+        # sequence numbers after it that the originator has given up.
         self._next_passed_up = 0
         self._frames_waiting: dict[int, Frame[Payload]] = {}
         self._skipped_sequences: set[int] = set()

@@ -11,7 +11,6 @@ from typing_extensions import override
 from fieldkit.config.wifi_phy import DscpMapping
 from fieldkit.core.model import Vector
 from fieldkit.core.seeds import place_seed
-from sim_backends.radio import propagation
 from sim_backends.radio.aggregation import AMPDU_LIMITS, TYPICAL_FRAMES, AmpduLimits
 from sim_backends.radio.antennas import Antenna, band_of, fixed_mode, modes_between
 from sim_backends.radio.channel import RadioChannel
@@ -19,10 +18,11 @@ from sim_backends.radio.error_rates import packet_error
 from sim_backends.radio.firmware_rate import FirmwareRate
 from sim_backends.radio.frames import decibel
 from sim_backends.radio.high_throughput import common_modes, mode_groups
-from sim_backends.radio.link_caches import GainCache, LinkRow
 from sim_backends.radio.minstrel_ht import MinstrelHt
 from sim_backends.radio.modes import OFDM_MODES
-from sim_backends.radio.propagation import Fading, Shadowing
+from sim_backends.radio.propagation import path_loss
+from sim_backends.radio.propagation.fading import Fading, Shadowing
+from sim_backends.radio.propagation.link_caches import GainCache, LinkRow
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.rate_control import FixedRate, Minstrel, RateControl
@@ -265,11 +265,11 @@ class WorldChannel(RadioChannel):
     def _open_db(self, start_m: Floats, end_m: Floats) -> Floats:
         match self._options.propagation:
             case "free-space":
-                loss_db = propagation.free_space_db(start_m, end_m, self.band.carrier_hz)
+                loss_db = path_loss.free_space_db(start_m, end_m, self.band.carrier_hz)
             case "two-ray":
-                loss_db = propagation.two_ray_db(start_m, end_m, self.band.carrier_hz)
+                loss_db = path_loss.two_ray_db(start_m, end_m, self.band.carrier_hz)
             case _:
-                loss_db = propagation.log_distance_db(start_m, end_m, self.band.carrier_hz, self._options.exponent)
+                loss_db = path_loss.log_distance_db(start_m, end_m, self.band.carrier_hz, self._options.exponent)
         return loss_db if self._shadowing is None else loss_db + self._shadowing.loss_db(start_m, end_m)
 
     def _obstacles_db(self, start_m: Floats, end_m: Floats) -> Floats:

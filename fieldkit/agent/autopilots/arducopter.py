@@ -76,7 +76,10 @@ class ArduCopter:
         return mode == _GUIDED
 
     def is_program_controlled(self, mode: int) -> bool:
-        """Return True in AUTO and GUIDED. In LOITER and the other modes, a person flies the drone."""
+        """Return True in AUTO and GUIDED.
+
+        LOITER is not included, because a person flies the drone in this mode (AUTO.LOITER of PX4 differs).
+        """
         return mode in (_AUTO, _GUIDED)
 
     def lands_or_returns(self, mode: int) -> bool:

@@ -82,7 +82,9 @@ class SystemStatus:
 
 
 class AutopilotCommands:
-    """Sends commands and requests to an autopilot. Before its first heartbeat, only heartbeats are sent.
+    """Sends commands and requests to an autopilot.
+
+    Until the first heartbeat of the autopilot arrives, it sends only the heartbeats of this program.
 
     Args:
         link: The connection.

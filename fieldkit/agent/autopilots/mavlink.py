@@ -53,7 +53,7 @@ class FlightRecording:
     Attributes:
         connection: Name of the connection to the autopilot; see `mavlink_links.open_link`.
         intervals_us: Requested interval by message id, which is a string because keys of JSON objects are strings.
-        system: System id of the autopilot; 0 for the first one whose heartbeat arrives.
+        system: System id of the autopilot; 0 for the autopilot whose heartbeat arrives first.
     """
 
     connection: str
@@ -93,15 +93,15 @@ class FlightRecorder:
 
     @property
     def ready(self) -> bool:
-        """Whether each requested message was received, or refused by the autopilot; then it stays True."""
+        """Whether each requested message was received, or refused by the autopilot. Once True, it stays True."""
         self._was_ready |= self._autopilot is not None and self._missing_kinds <= set(self._refusals)
         return self._was_ready
 
     def check(self) -> None:
-        """Check that the requested messages arrive in time.
+        """Check that the requested messages arrive within `_TIMEOUT_S` after the first heartbeat of the autopilot.
 
         Raises:
-            MissingMessageError: A message has not arrived in time.
+            MissingMessageError: A message has not arrived in this time.
         """
         if not self.ready and self._autopilot is not None and time.monotonic() - self._first_heartbeat_s > _TIMEOUT_S:
             missing_ids = ", ".join(str(kind) for kind in sorted(self._missing_kinds - set(self._refusals)))

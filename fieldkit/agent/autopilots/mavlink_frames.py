@@ -64,10 +64,10 @@ def frame_bytes(buffer: bytes | bytearray) -> int | None:
 
 
 def frames(buffer: bytearray) -> Iterator[bytes]:
-    """Yield the complete frames of a buffer, and delete them and all other bytes from it.
+    """Yield the complete frames of a buffer. The frames, and bytes outside of frames, are deleted from the buffer.
 
     A frame is accepted only if another frame or the end of the buffer follows, because a stream may start in the
-    middle of a frame. An incomplete frame stays in the buffer.
+    middle of a frame. An incomplete frame at the end stays in the buffer.
     """
     while buffer:
         is_start = buffer[0] in (_MAGIC_1, _MAGIC_2)

@@ -24,13 +24,13 @@ GAP_S = 0.5
 """Maximum time between two iterations of the loop. After a longer gap (a suspended program) the drive ends."""
 
 ARRIVAL_TOLERANCE_M = 0.02
-"""A corner is reached at this distance."""
+"""A leg is finished when at most this distance to its corner remains."""
 HEADING_TOLERANCE_RAD = 0.05
-"""A heading is reached at this angle."""
+"""A turn is finished when at most this angle to the desired heading remains."""
 TURN_RAMP_S = 0.5
 """Time in which the turn rate rises from 0 to its limit."""
 _TURN_GAIN_PER_S = 2.0
-"""Turn rate per remaining angle near the end of a turn."""
+"""Turn rate in rad/s per radian of the remaining angle near the end of a turn."""
 _STEP_S = 0.01
 """Time step of the simulation in `_turn_duration_s`."""
 
@@ -110,7 +110,11 @@ def _leg_duration_s(length_m: float, task: DriveTask) -> float:
 
 
 def turn_rate_rad_s(remaining_rad: float, turn_rad_s: float) -> float:
-    """Return the turn rate for a remaining angle, at which half of the angular acceleration suffices to stop."""
+    """Return the turn rate for a remaining angle.
+
+    It is the maximum rate at which half of the angular acceleration suffices to stop in time. Near the end of the
+    turn, it is proportional to the remaining angle (`_TURN_GAIN_PER_S`).
+    """
     return min(_TURN_GAIN_PER_S * remaining_rad, math.sqrt(turn_rad_s / TURN_RAMP_S * remaining_rad))
 
 

@@ -86,7 +86,7 @@ def frame_id(computer: str, boot_time_s: float) -> str:
 
 
 def is_same_frame(identifier: str, other_identifier: str) -> bool:
-    """Return True if two identifiers from `frame_id` denote the same frame, without a reboot between them."""
+    """Return True if two identifiers from `frame_id` denote the same frame: the autopilot has not rebooted."""
     (computer, _, boot_time), (other_computer, _, other_boot_time) = (
         identifier.rpartition(" "),
         other_identifier.rpartition(" "),

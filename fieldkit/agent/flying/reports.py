@@ -16,23 +16,23 @@ class AutopilotTexts:
 
     def __init__(self) -> None:
         self._texts: list[tuple[int, str]] = []
-        self._number = self._count = self._read_count = 0
+        self._last_id = self._count = self._read_count = 0
 
     def add_message(self, payload: bytes) -> None:
-        """Add a message; the chunks of a long text have the same number (STATUSTEXT, id and chunk_seq)."""
+        """Add a message. A long text arrives in chunks with the same id (STATUSTEXT, id and chunk_seq)."""
         # The payload has the severity (1 byte), a text of 50 bytes, the id and chunk_seq.
         text = printable(payload[1:51].split(b"\0")[0].decode("utf-8", "replace"))
-        number, chunk_index = _CHUNK.unpack_from(payload, 51)
+        message_id, chunk_index = _CHUNK.unpack_from(payload, 51)
         severity = payload[0]
         if severity > NOTICE:
             return
-        if chunk_index and number == self._number and self._texts:
+        if chunk_index and message_id == self._last_id and self._texts:
             severity, previous = self._texts[-1]
             self._texts[-1] = severity, (previous + text)[:_MAX_CHARACTERS]
         elif not chunk_index:
             self._texts = [*self._texts[1 - _MAX_TEXTS :], (severity, text)]
             self._count += 1
-        self._number = number
+        self._last_id = message_id
 
     def unread(self) -> list[str]:
         """Return the texts that have arrived since the last call."""

@@ -70,7 +70,7 @@ def is_under_control(drone: AutopilotState) -> bool:
 def _open_session(connection: str, deadline_s: float) -> AutopilotSession:
     """Open a session with the autopilot.
 
-    If the link server has stopped, the process that shares the connection between the programs, a new one is started.
+    If the link server (the process that shares the connection between programs) has stopped, a new one is started.
 
     Raises:
         FlightError: The connection cannot be opened before `deadline_s`.

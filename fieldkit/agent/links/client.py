@@ -26,8 +26,9 @@ _ROOT = os.path.abspath(os.path.join(os.path.dirname(__file__), "..", "..", ".."
 """The archive of the agent, or the parent folder of `fieldkit`; absolute, because the working folder may change."""
 _POLL_S = 0.1
 _SUSPENDED_TIMEOUT_S = 0.5
+"""A server that does not answer for this time is replaced if it is suspended."""
 _TIMEOUT_S = 2.0
-"""A server that does not answer for this time is replaced, even if it is not reported as suspended."""
+"""A server that does not answer for this time is replaced in any case."""
 _START_TIMEOUT_S = 15.0
 """Timeout for the start of a server: a busy robot takes seconds to start Python."""
 _RETRY_S = 0.1
@@ -41,7 +42,7 @@ class MessageRate:
     """State of the request for a message.
 
     Attributes:
-        interval_us: The interval that the server set for all clients, in microseconds.
+        interval_us: The interval that the server requests for all clients, in microseconds.
         result: MAV_RESULT of the autopilot; None before its answer.
         hz: Recent rate of the message.
     """
@@ -98,7 +99,7 @@ class SharedLink:
         return self._dropped_by_client + self._dropped_by_earlier_servers + self._dropped_by_server
 
     def open(self) -> None:
-        """Wait until the connection is open.
+        """Connect to the link server, and wait until the connection to the autopilot is open.
 
         Raises:
             OSError: It cannot be opened within `OPEN_TIMEOUT_S`.
@@ -113,7 +114,7 @@ class SharedLink:
             self._stop_event.wait(0.01)
 
     def fileno(self) -> int:
-        """Return a file descriptor that is readable when frames have arrived. It never changes."""
+        """Return a file descriptor that is readable when frames have arrived. A reconnection does not change it."""
         return self._frames_out.fileno()
 
     def receive(self) -> Iterator[bytes]:
@@ -209,7 +210,7 @@ class SharedLink:
             return True  # the process does not exist any more
 
     def _kill_server(self) -> None:
-        """Kill the server. Its socket is open, so no other process can have its pid."""
+        """Kill the server. Its end of the socket is still open, so no other process has reused its pid."""
         assert self._server is not None
         pid, uid = link_files.peer_credentials(self._server)
         if pid > 1 and uid == os.geteuid():
@@ -263,7 +264,7 @@ class SharedLink:
         return server
 
     def _start(self) -> None:
-        """Start a server; return when it or another server is ready."""
+        """Start a server, unless the connection has a server; return when it is ready or has failed."""
         request = json.dumps({"connection": self._connection})
         path = os.pathsep.join(filter(None, (_ROOT, os.environ.get("PYTHONPATH", ""))))
         completed = subprocess.run(

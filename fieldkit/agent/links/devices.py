@@ -91,7 +91,7 @@ def open_device(connection: str) -> FlightDevice:
 
 
 class UdpDevice:
-    """UDP. Each datagram contains complete frames, so that a truncated one does not damage the next.
+    """UDP. Each datagram contains complete frames, so a truncated frame does not affect the next datagram.
 
     Args:
         address: The destination, or the local address if `listens`.

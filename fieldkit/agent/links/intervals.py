@@ -63,7 +63,10 @@ class MessageInterval:
 
     @property
     def interval_us(self) -> int:
-        """The interval that satisfies all clients."""
+        """The interval for all clients: the smallest positive interval that a client requests.
+
+        If no client requests a positive interval, it is `_OFF` if a client requests this, otherwise `DEFAULT`.
+        """
         positive_us = [interval_us for interval_us in self.requested_us.values() if interval_us > 0]
         if positive_us:
             return min(positive_us)
@@ -157,7 +160,7 @@ class MessageIntervals:
             message.requested_us.pop(client, None)
 
     def on_reopened(self) -> None:
-        """Repeat all requests after the connection was reopened, because the autopilot's port may be another one."""
+        """Repeat all requests after the connection was reopened, because it may use another port of the autopilot."""
         self._pending = None
         for message in self._messages.values():
             message.set_us, message.tries = None, 0
@@ -184,7 +187,7 @@ class MessageIntervals:
             del self._messages[key]
 
     def advance(self, now_s: float) -> None:
-        """Send the next request that is due."""
+        """Send the next request that is due, unless the answer to the previous one may still arrive."""
         if self._pending is not None:
             key, _, timeout_s = self._pending
             if now_s < timeout_s:

@@ -38,9 +38,9 @@ def folder() -> str:
 def name(connection: str) -> str:
     """Return the file name of a connection, without suffix."""
     with open("/proc/sys/kernel/random/boot_id", encoding="ascii") as file:  # noqa: PTH123
-        boot = file.read().strip()
-    network = os.stat("/proc/self/ns/net").st_ino  # noqa: PTH116
-    return hashlib.sha256(f"{boot} {network} {connection}".encode()).hexdigest()[:16]
+        boot_id = file.read().strip()
+    network_namespace = os.stat("/proc/self/ns/net").st_ino  # noqa: PTH116
+    return hashlib.sha256(f"{boot_id} {network_namespace} {connection}".encode()).hexdigest()[:16]
 
 
 @contextmanager

@@ -70,7 +70,7 @@ class SharedDevice:
         self._device: FlightDevice | None = None
         self._open_thread: threading.Thread | None = None
         self._open_results: list[FlightDevice | OSError] = []
-        self._next_s, self._pause_s = 0.0, _FIRST_PAUSE_S
+        self._next_open_s, self._pause_s = 0.0, _FIRST_PAUSE_S
         self._buffer = bytearray()
         self._received_s = 0.0
         self.error = (0, "")
@@ -86,7 +86,7 @@ class SharedDevice:
             if self._connection.startswith("tcp:") and now_s > self._received_s + _SILENT_S:
                 self._disconnect(TimeoutError(errno.ETIMEDOUT, f"no byte in {_SILENT_S:g} s"))
             return False
-        if self._open_thread is None and now_s >= self._next_s:
+        if self._open_thread is None and now_s >= self._next_open_s:
             self._open_thread = threading.Thread(target=self._open, daemon=True)
             self._open_thread.start()
         if not self._open_results:
@@ -94,7 +94,7 @@ class SharedDevice:
         result, self._open_thread = self._open_results.pop(), None
         if isinstance(result, OSError):
             self.error = result.errno or errno.EIO, result.strerror or str(result)
-            self._next_s, self._pause_s = now_s + self._pause_s, min(2 * self._pause_s, _MAX_PAUSE_S)
+            self._next_open_s, self._pause_s = now_s + self._pause_s, min(2 * self._pause_s, _MAX_PAUSE_S)
             return False
         self._device, self.lost_since_s, self._pause_s = result, None, _FIRST_PAUSE_S
         self._received_s = now_s
@@ -143,7 +143,7 @@ class SharedDevice:
         self.error = error.errno or errno.EIO, error.strerror or str(error)
         self.close()
         self.lost_since_s = time.monotonic()
-        self._next_s = 0.0
+        self._next_open_s = 0.0
 
     def close(self) -> None:
         """Close the connection."""
@@ -310,7 +310,9 @@ class LinkServer:
 
 
 def serve(connection: str, stop_event: threading.Event) -> None:
-    """Start a server in a separate process; return when this or another server of the connection is ready.
+    """Start a server in a separate process, and return when it is ready or has failed.
+
+    If the connection already has a server, do nothing.
 
     Raises:
         OSError: The folder of sockets cannot be used.

@@ -39,7 +39,7 @@ def _open_ports(protocol: str) -> set[int]:
 
 
 def survey(connection: str, stop_event: threading.Event) -> int:
-    """Test a connection through the link server, and print the result as a line of JSON; return the exit code.
+    """Test a connection through the link server; print the result and the candidates as a line of JSON; return 0.
 
     Raises:
         ValueError: The name of the connection is invalid.

@@ -2,7 +2,7 @@
 
 DDS has participants and endpoints; ROS 2 has nodes with endpoints. Each participant publishes which of its endpoints
 belong to which node, in a message of rmw_dds_common that every RMW over DDS reads (design.ros2.org, "Node to
-Participant mapping"). The message is small and of one type, so it is packed here.
+Participant mapping"). The message has few fields, so it is serialized here without a library.
 """
 
 from __future__ import annotations

@@ -152,7 +152,7 @@ class Middleware(Protocol):
         """
 
     def other_types(self, topic: Topic) -> set[str]:
-        """Return the types that other participants announce for the topic, without the topic's own type."""
+        """Return the types that other participants announce for the topic, except its type in `topic`."""
 
     def close(self) -> None:
         """Close all endpoints and stop the middleware."""

@@ -61,9 +61,9 @@ def message_type(name: str) -> Any:  # noqa: ANN401 (a generated class)
     Raises:
         MiddlewareError: This ROS 2 has no such type.
     """
-    package, package_part, short = name.split("/")
+    package, subpackage, class_name = name.split("/")
     try:
-        return getattr(importlib.import_module(f"{package}.{package_part}"), short)
+        return getattr(importlib.import_module(f"{package}.{subpackage}"), class_name)
     except (ImportError, AttributeError) as error:
         raise MiddlewareError(f"this ROS 2 has no {name}: {error}") from error
 
@@ -81,7 +81,7 @@ class Ros2Middleware:
         # With a separate context rclpy installs no signal handlers.
         self._context = Context()
         try:
-            # Without this, each run leaves a file in the robot's ~/.ros/log.
+            # Without the second argument, each run leaves a file in the robot's ~/.ros/log.
             rclpy.init(args=["--ros-args", "--disable-external-lib-logs"], context=self._context)
             self._node = rclpy.create_node(
                 network.node,
@@ -133,7 +133,7 @@ class Ros2Middleware:
             self._executor.spin_once(timeout_sec=_SPIN_S)
 
     def other_types(self, topic: Topic) -> set[str]:
-        """Return the types of the topic at other nodes, without the topic's own type."""
+        """Return the types that nodes use for the topic, except its type in `topic`."""
         return set(dict(self._node.get_topic_names_and_types()).get(topic.name, ())) - {topic.type}
 
     def close(self) -> None:

@@ -63,7 +63,7 @@ class Video:
         return self.width * self.height * 3 // 2
 
     def code(self) -> FrameCode:
-        """Return the code of its frames."""
+        """Return the code that writes the number and the time into its frames, and reads them."""
         return FrameCode(self.width, self.height, self.noise_rows)
 
 

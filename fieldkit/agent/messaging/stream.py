@@ -176,7 +176,7 @@ def subscribe(middleware: Middleware, topic: Topic, stream: Stream, log: Log, st
             else:
                 log.note(records.SAMPLE, at_ns, size=len(data), sequence=header[0], sent_ns=header[1])
         except LogError as error:
-            # An exception in a thread of the middleware would be lost, and would look like an end of the stream.
+            # An exception in a thread of the middleware would be lost, and the stream would seem to have ended.
             errors.append(error)
             stop_event.set()
 

@@ -133,7 +133,7 @@ class ZenohMiddleware:
         return lambda: -1
 
     def other_types(self, topic: Topic) -> set[str]:
-        """Return the types of the topic in liveliness tokens, without the topic's own type.
+        """Return the types of the topic in liveliness tokens, except its type in `topic`.
 
         A token ends with topic, type, hash and QoS.
         """

@@ -50,8 +50,8 @@ def run(arguments: argparse.Namespace) -> int:
 def _show_summary(rebuilt: "RebuildResult", *, show_all: bool) -> None:
     from fieldkit.cli import results
 
-    if left_out := results.show_summary(rebuilt.cells, show_all=show_all, expected=rebuilt.expected):
-        print_folded(f"{results.more_rows_note(left_out)}: add --all")
+    if omitted_count := results.show_summary(rebuilt.cells, show_all=show_all, expected=rebuilt.expected):
+        print_folded(f"{results.more_rows_note(omitted_count)}: add --all")
 
 
 def _rebuild_many(folders: Sequence[Path], arguments: argparse.Namespace) -> int:

@@ -15,7 +15,7 @@ NO_HEADER: Final = -1
 """Position for a frame without an IP header."""
 
 NO_INTERFACE: Final = -1
-"""Index of an interface that a capture does not contain."""
+"""Interface index of a frame whose link-layer header contains no interface index."""
 
 COOKED_V2: Final = 276
 """Link type of captures on all interfaces by tcpdump 4.99 and later (LINKTYPE_LINUX_SLL2)."""
@@ -196,8 +196,8 @@ def _has_wrong_checksum(integers: Integers, head: Fields, at: Ints, header: Ints
 
     The one's complement sum of the words of a valid header is 0xFFFF (-0).
 
-    A checksum of 0 is not wrong: on some systems the network adapter computes it after the capture. Linux computes
-    it before the capture, even with offload, and drops received packets with a wrong one.
+    A checksum of 0 is accepted, because on some systems the network adapter computes the checksum after the capture.
+    Linux computes it before the capture, even with offload, and drops received packets with a wrong checksum.
 
     Args:
         integers: Reader of integers in the file.

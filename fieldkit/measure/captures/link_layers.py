@@ -62,7 +62,7 @@ def _cooked_v2(integers: Integers, frames: Frames) -> Ints:
 
 
 def _null(integers: Integers, frames: Frames) -> Ints:
-    """Return the positions after the address family.
+    """Return the positions of the IP headers, which follow the address family in loopback frames.
 
     The address family has the byte order of the capturing machine, so both orders are accepted.
     """
@@ -113,8 +113,8 @@ def _after_mac_header(integers: Integers, frames: Frames, mac: Ints, *, padded: 
     aggregated = qos & (integers.u8(mac + header - 2) & 0x80 != 0)
     header += 4 * (qos & (flags & 0x80 != 0))  # HT control
     llc = mac + np.where(padded, (header + 3) // 4 * 4, header)
-    # These are the data frames of version 0, except null frames, encrypted frames, later fragments and A-MSDUs, which
-    # contain several packets.
+    # The mask selects data frames of version 0, except null frames, encrypted frames, later fragments, and A-MSDUs,
+    # which contain several packets.
     readable = (kind & 0x4F == 0x08) & (flags & 0x40 == 0) & (integers.u8(mac + 22) & 0x0F == 0) & ~aggregated
     readable &= (integers.u32(llc) == _SNAP) & (integers.u16(llc + 4) == 0)
     return np.where(readable, _after_ethertype(integers, frames, llc + 6, llc + 8), NO_HEADER)

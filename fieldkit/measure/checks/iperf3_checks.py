@@ -175,8 +175,8 @@ def _datagram_bytes(test: IperfTest, payload_bytes: int) -> Iterator[str]:
     received_bytes = _sum(test.intervals, "payload_bytes")
     if datagrams is None or lost is None or received_bytes is None:
         return
-    extra = received_bytes - (datagrams - lost) * payload_bytes
-    if not 0 <= extra <= test.totals.out_of_order * payload_bytes:
+    duplicate_bytes = received_bytes - (datagrams - lost) * payload_bytes
+    if not 0 <= duplicate_bytes <= test.totals.out_of_order * payload_bytes:
         datagrams_text = f"{datagrams} datagrams of {payload_bytes} bytes with {lost} lost"
         yield f"it received {received_bytes} bytes, but counts {datagrams_text}"
 
@@ -228,9 +228,9 @@ def _totals(client: IperfTest, sender: IperfTest, receiver: IperfTest, settings:
         ("datagrams lost", totals.lost, (_sum(receiver.intervals, "lost"),)),
     )
     for quantity, total, candidates in comparisons:
-        known_counts = [count for count in candidates if count is not None]
-        if total is not None and known_counts and total not in known_counts:
-            yield f"the client's summary has {total} {quantity}, but the intervals have {known_counts[0]}"
+        interval_counts = [count for count in candidates if count is not None]
+        if total is not None and interval_counts and total not in interval_counts:
+            yield f"the client's summary has {total} {quantity}, but the intervals have {interval_counts[0]}"
     if settings.protocol is Protocol.TCP:
         return
     jitters_s = [test.totals.jitter_s for test in (client, receiver) if test.totals.jitter_s is not None]
@@ -248,7 +248,8 @@ def date_problem(test: IperfTest, window: tuple[int, int] | None) -> str | None:
 
     Args:
         test: The test.
-        window: The robot's clock before and after the attempt, nanoseconds since 1970 UTC; None if unknown.
+        window: Readings of the robot's clock before and after the attempt, nanoseconds since 1970 UTC; None if
+            unknown.
     """
     if window is None or test.start.start_utc_s is None:
         return None

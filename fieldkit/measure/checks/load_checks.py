@@ -25,7 +25,8 @@ from fieldkit.measure.transfers.tcp_streams import LONGEST_BYTES
 
 EARLY_NS: Final = 300_000_000
 LATE_NS: Final = 500_000_000
-"""Largest differences between times in the JSON and in the capture; iperf3 reads late on a busy robot."""
+"""Tolerances of times: a time in the JSON may be up to `EARLY_NS` earlier or `LATE_NS` later than in the capture,
+because iperf3 reads late on a busy robot."""
 
 _BUFFERED_BYTES: Final = 256 << 10
 _BUFFERED_WINDOWS: Final = 3
@@ -276,15 +277,16 @@ def _check_datagrams(
     sent_count, expected, lost = map(sum, counts)
     captured, arrived = sum(map(len, sent_streams)), sum(map(_distinct_datagrams, received_streams))
     # From version 3.16 on, each stream has a thread, which may continue to send while the other streams are counted.
-    race = _RACE_DATAGRAMS * len(sent_streams) + round(_RACE_SHARE * sent_count)
-    if sent_count + race < captured:
+    race_tolerance = _RACE_DATAGRAMS * len(sent_streams) + round(_RACE_SHARE * sent_count)
+    if sent_count + race_tolerance < captured:
         yield f"iperf3 sent {sent_count} datagrams, but {captured} are in the sender's capture"
     refused = evidence.sender_counters.udp_send_errors or 0
-    # `tail` are the datagrams after the last one that iperf3's receiver expected; `missed` those lost on the way.
+    # `tail` is the number of datagrams that were sent after the last one that iperf3's receiver expected. `missed` is
+    # the number of datagrams that only the sender's capture contains.
     tail, missed = max(sent_count - expected, 0), max(captured - arrived, 0)
     # iperf3 may count datagrams that are not in the sender's capture: those that the socket refused, and those that
-    # the queue dropped before the capture. The receiver expects the dropped ones, because their sequence numbers are
-    # missing, so the tail is short.
+    # the queue dropped before the capture. The receiver counts the dropped ones as expected, because their sequence
+    # numbers are missing, so the tail is short.
     is_plausible = captured + refused >= sent_count or tail <= missed + _TAIL_SHARE * sent_count + _TAIL_DATAGRAMS
     if not is_plausible:
         capture_text = f"the sender's capture contains {captured}"
@@ -294,15 +296,15 @@ def _check_datagrams(
     if not any(stream.more_fragments.any() for stream in received_streams):
         # Each copy reduces the number of losses that iperf3 reports by one.
         copies = sum(map(len, received_streams)) - arrived
-        if not missed - tail - copies - race <= lost <= max_lost + race:
-            missing_text = f"the receiver's capture lacks {missed} of those in the sender's"
-            yield f"iperf3 lost {lost} datagrams, but {missing_text}, and its kernel dropped {undelivered}"
+        if not missed - tail - copies - race_tolerance <= lost <= max_lost + race_tolerance:
+            missing_text = f"the receiver's capture lacks {missed} datagrams of the sender's capture"
+            yield f"iperf3 lost {lost} datagrams, but {missing_text}, and the receiver's kernel dropped {undelivered}"
 
 
 def _distinct_datagrams(stream: Packets) -> int:
-    """Return the number of datagrams without duplicates.
+    """Return the number of datagrams without duplicates, or with them if the content of a datagram was not captured.
 
-    Each datagram of iperf3 starts with a unique number and time.
+    Each datagram of iperf3 starts with a unique number and time, so only duplicates have equal content.
     """
     if (stream.content == NOT_CAPTURED).any():
         return len(stream)

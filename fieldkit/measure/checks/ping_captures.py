@@ -23,13 +23,13 @@ _HEADER_BYTES: Final = 8
 
 @dataclass(frozen=True)
 class PingCaptures:
-    """Captures around a ping.
+    """Captures that started before a ping and ended after it.
 
     Attributes:
         file: Name of the file with the output of ping, for messages.
         sender: Role of the robot that sends the requests.
-        by_role: Capture of the sender and then of the receiver; None if a robot did not capture, or if its capture is
-            incomplete.
+        by_role: Captures by role, first the sender's and then the receiver's; None if a robot did not capture, or if
+            its capture is incomplete.
         source: Source address of the requests.
         destination: Their destination address.
     """
@@ -41,7 +41,7 @@ class PingCaptures:
     destination: str
 
     def echoes(self, payload_bytes: int) -> "tuple[PingEchoes | None, ...]":
-        """Return the echoes with a payload in each capture, with None for a missing or incomplete capture."""
+        """Return the echoes with this payload in each capture; None for a missing or incomplete capture."""
         from fieldkit.measure.checks.ping_duplicates import captured_echoes  # noqa: PLC0415 (only with several links)
 
         size_bytes = payload_bytes + _HEADER_BYTES
@@ -52,7 +52,7 @@ class PingCaptures:
         """Yield each reason why the captures contradict the output of ping.
 
         Args:
-            result: The output.
+            result: Parsed output of ping.
             interval_s: Time between requests.
         """
         missing_packets = [reason for role in self.by_role for reason in self._missing_packets(result, role)]
@@ -87,7 +87,7 @@ class PingCaptures:
                 return
 
     def _contradictions(self, result: Ping, interval_s: float) -> Iterator[str]:
-        """Yield the contradictions with each capture.
+        """Yield the contradictions between the output and each capture.
 
         If several pings ran, the ping with the fewest contradictions is assumed to be this one.
         """

@@ -61,7 +61,7 @@ def captured_echoes(capture: Capture | None, source: str, destination: str, size
         capture: The capture.
         source: Source address of the requests.
         destination: Their destination address.
-        size_bytes: Their ICMP size; echoes of another size belong to another ping.
+        size_bytes: Length of an echo with its ICMP header; echoes of another length belong to another ping.
     """
     if capture is None:
         return None
@@ -72,7 +72,7 @@ def captured_echoes(capture: Capture | None, source: str, destination: str, size
 
 
 def _sized(echoes: Packets, size_bytes: int) -> Packets:
-    """Return the echoes of an ICMP size, and the first fragments of fragmented echoes."""
+    """Return the unfragmented echoes of this length, and the first fragments of fragmented echoes."""
     return echoes.where(echoes.more_fragments | (echoes.ip_payload_bytes == size_bytes))
 
 
@@ -99,7 +99,10 @@ def echoes_by_interface(
     if sender.are_fragmented or receiver.are_fragmented:
         return "the requests are fragmented"
     if any((echoes.interface == NO_INTERFACE).any() for echoes in (*sender, *receiver)):
-        return "a capture does not contain interfaces: ping over a link with the interface lo, and use tcpdump 4.99"
+        return (
+            "a capture does not contain the interface of each packet: ping over a link with the interface lo, and "
+            "use tcpdump 4.99 or later"
+        )
     return sender, receiver
 
 
@@ -110,7 +113,7 @@ def count_copies(echoes: Packets) -> int:
 
 
 def echo_keys(echoes: Packets) -> Ints:
-    """Return a number for the identifier and the sequence number of each echo."""
+    """Return a number for each echo that combines its identifier and its sequence number."""
     return (echoes.echo << 16) | echoes.echo_seq
 
 
@@ -120,7 +123,7 @@ def contradictions(
     """Yield the contradictions between the captured copies and the output of ping, and between requests and answers.
 
     Args:
-        output: The output.
+        output: Parsed output of ping.
         interval_s: Time between requests.
         sender: Echoes in the sender's capture; None if the capture is missing or incomplete.
         receiver: Echoes in the receiver's capture; None if the capture is missing or incomplete.

@@ -117,26 +117,26 @@ def _udp_contradictions(
         packets.where((packets.dport == transfer.port) | (packets.dport == NO_PORT) & np.isin(packets.ip_id, ids))
         for packets in both
     )
-    first, first_received = sent.dport == transfer.port, received.dport == transfer.port
+    is_first, is_first_received = sent.dport == transfer.port, received.dport == transfer.port
     keys, keys_received = _packet_keys(sent), _packet_keys(received)
-    if unsent := int((~np.isin(keys_received[first_received], keys[first])).sum()):
+    if unsent := int((~np.isin(keys_received[is_first_received], keys[is_first])).sum()):
         yield f"the {transfer.source}'s capture lacks {format_count(unsent, 'datagram')} that arrived"
     if files is None:
         return
     # The number of arrived bytes is at most the sum of the UDP lengths in the first fragments, and at most the sum of
     # the payloads of all fragments.
-    udp_bytes = received.udp_bytes[first_received]
+    udp_bytes = received.udp_bytes[is_first_received]
     arrived_bytes = min(int(udp_bytes.sum()), int(received.ip_payload_bytes.sum())) - UDP_HEADER_BYTES * len(
         udp_bytes
     )
-    sent_bytes = int((sent.udp_bytes[first] - UDP_HEADER_BYTES).sum())
+    sent_bytes = int((sent.udp_bytes[is_first] - UDP_HEADER_BYTES).sum())
     yield from _byte_count_contradictions(files, sent_bytes, arrived_bytes, transfer)
     # Copies can compensate for missing packets in the sum of bytes, so the packets are also compared individually.
     # A later fragment cannot be assigned if another transfer uses the same id.
     other_ids = np.concatenate(
         [packets.ip_id[(packets.dport != transfer.port) & (packets.dport != NO_PORT)] for packets in both]
     )
-    is_assignable = first | ~np.isin(sent.ip_id, other_ids)
+    is_assignable = is_first | ~np.isin(sent.ip_id, other_ids)
     missing = int((~np.isin(keys[is_assignable], keys_received)).sum())
     if missing and files.are_equal and files.received_bytes <= arrived_bytes:
         missing_text = f"lacks {format_count(missing, 'packet')} of it"
@@ -198,7 +198,7 @@ def _tcp_contradictions(
 def _is_refused(sent: Packets, answers: Packets) -> bool:
     """Return True if the receiver refused the only SYN and accepted no connection.
 
-    A repeated SYN shows nothing, because the link may have caused it.
+    A reset after several SYNs is not a refusal, because the link may have lost the first SYN or its answer.
     """
     resets = answers.where(answers.tcp_flags & RST != 0)
     if not len(resets) or (answers.tcp_flags & SYN != 0).any():

@@ -62,14 +62,14 @@ def find_contradictions(
     arrival = _blocks(transfer.forward(sender), transfer.forward(receiver), transfer.port, len(sent_file))
     if arrival is None:
         return
-    blocks, has_no_copies = arrival
+    blocks, has_copies = arrival
     counters = evidence.counters(transfer.destination)
     # `dropped` is None if the number of datagrams that did not reach the file is unknown.
     dropped = None
     if not was_stopped and counters.udp_undelivered is not None:
         dropped = counters.udp_undelivered + (counters.reassembly_failures or 0) + (counters.udp_no_ports or 0)
     arrived_text = f"{format_count(len(blocks), 'datagram')} arrived completely"
-    if not has_no_copies:
+    if has_copies:
         # Copies may also be delivered, so only sizes are compared, not positions in the file.
         min_bytes = sum(sorted(block.stop - block.start for block in blocks)[: len(blocks) - (dropped or 0)])
         if dropped is not None and len(received_file) < min_bytes:
@@ -78,7 +78,7 @@ def find_contradictions(
         return
     at, remaining = 0, list(blocks)
     while at < len(received_file):
-        # With two processors, the order of delivery may differ from the order in the capture.
+        # On a robot with several processors, the order of delivery may differ from the order in the capture.
         matches = (_is_block_at(received_file, at, sent_file, block, was_stopped) for block in remaining)
         index = next((position for position, is_match in enumerate(matches) if is_match), -1)
         if index < 0:
@@ -108,7 +108,7 @@ def _is_block_at(
 
 
 def _blocks(sent: Packets, received: Packets, port: int, size_bytes: int) -> tuple[Sequence[_Block], bool] | None:
-    """Return the datagrams that arrived completely, in the order of arrival, and True if no fragment arrived twice.
+    """Return the datagrams that arrived completely, in the order of arrival, and True if a fragment arrived twice.
 
     Return None if the datagrams cannot be identified.
     """
@@ -126,16 +126,16 @@ def _blocks(sent: Packets, received: Packets, port: int, size_bytes: int) -> tup
     if is_ambiguous.any():
         return None
     _, earliest = np.unique(np.stack((fragments.ip_id, fragments.fragment_offset)), axis=1, return_index=True)
-    has_no_copies = len(earliest) == len(fragments)
+    has_copies = len(earliest) < len(fragments)
     fragments = fragments.where(np.sort(earliest))
     order = np.argsort(fragments.ip_id, kind="stable")
     ids, starts = np.unique(fragments.ip_id[order], return_index=True)
     if not len(ids):
-        return [], True
+        return [], False
     fragment_bytes = np.add.reduceat(fragments.ip_payload_bytes[order], starts)
     complete_ns = np.maximum.reduceat(fragments.time_ns[order], starts)
     index = np.array([index_by_id[int(ip_id)] for ip_id in ids])
     is_complete = fragment_bytes == first.udp_bytes[index]
     order = np.argsort(complete_ns[is_complete], kind="stable")
     blocks = [_Block(int(stops[at] - sizes[at]), int(stops[at])) for at in index[is_complete][order]]
-    return blocks, has_no_copies
+    return blocks, has_copies

@@ -17,7 +17,7 @@ _DBM: Final = (-300.0, 100.0)
 """Valid range of a signal or noise."""
 _NOT_SAMPLED: Final = "the robot's radio was not sampled: the robot has no Wi-Fi or no iw, or was not associated"
 _NOT_REPORTED: Final = "the robot's radio does not report it"
-_RESET: Final = "the link was established again, and the last counts before were not sampled"
+_RESET: Final = "the link was established again, and the last counts of the earlier link were not sampled"
 _COUNTERS: Final = {
     "radio_tx_packets": "tx_packets",
     "radio_rx_packets": "rx_packets",

@@ -34,13 +34,13 @@ def size(path: Path) -> int:
 
 
 def have_equal_bytes(folder: Path, first: str, second: str) -> bool:
-    """Return True if two evidence files have the same bytes; raises `EvidenceError` as `size`."""
+    """Return True if two evidence files have the same bytes. Raises the same errors as `size`."""
     size_bytes = size(folder / first)
     return size_bytes == size(folder / second) and common_prefix_bytes(folder, first, second) == size_bytes
 
 
 def mapped(path: Path) -> bytes | mmap:
-    """Return the bytes of an evidence file; raises `EvidenceError` as `size`.
+    """Return the bytes of an evidence file. Raises the same errors as `size`.
 
     A large file is mapped into memory. If it is truncated while it is used, or its disk fails, the kernel kills this
     process (SIGBUS).
@@ -134,9 +134,9 @@ def read_counted_csv(path: Path, header: str, pattern: re.Pattern[str], error: s
     """
     content = text(path)
     count = _COUNT.match(content)
-    first, *lines = content[count.end() if count else 0 :].split("\n")
+    first_line, *lines = content[count.end() if count else 0 :].split("\n")
     matches = [match for line in lines[:-1] if (match := pattern.fullmatch(line)) is not None]
-    if first != header or lines[-1:] != [""] or len(matches) < len(lines) - 1:
+    if first_line != header or lines[-1:] != [""] or len(matches) < len(lines) - 1:
         raise EvidenceError(error, where=str(path))
     if count and int(count[1]) != len(matches):
         raise EvidenceError(f"is truncated: it has {len(matches)} of {count[1]} lines", where=str(path))

@@ -5,7 +5,8 @@ During an attempt, a script on each robot, the sampler, reads the state of the l
 output at this time: `link`, `survey` and `station` of iw, or `wireless` of /proc/net/wireless. The seconds are
 counted from boot; the time of boot is computed from the host state before the attempt.
 
-The source files station.c, link.c and survey.c of iw document its lines; versions 3 to 6 differ only in added lines.
+The format of iw's lines is defined in its source files station.c, link.c and survey.c. Versions 3 to 6 differ only in
+added lines.
 Drivers omit values that they do not support. A received power of 0 dBm or more is invalid: some drivers print 0 or a
 percentage.
 """

@@ -28,7 +28,8 @@ CPU_S: Final = 10
 MEMORY_PER_BYTE: Final = 16
 DISK_PER_BYTE: Final = 1
 BYTES_PER_CPU_S: Final = 1 << 20
-"""Additional limits per byte of the file; an index entry of 12 bytes in a bag becomes an object of 170 bytes."""
+"""Additional limits: memory and disk per byte of the file, and one second of CPU time per this number of bytes. For
+example, an index entry of 12 bytes in a bag becomes an object of 170 bytes in memory."""
 ANSWER_BYTES: Final = 16 << 20
 ANSWER_PER_BYTE: Final = 4
 """Limit of an answer's length: a base, and an addition per byte of the file."""
@@ -40,11 +41,11 @@ MAX_CPU_S: Final = 3600
 # limit is larger than the CPU time, because other processes may use the CPU.
 _WALL_PER_CPU_S: Final = 6
 _EXIT_WAIT_S: Final = 5.0
-"""Time within which a process that has closed its output must exit; then it is killed."""
+"""Time within which a process that has closed its output must exit; otherwise it is killed."""
 ERROR_KEY: Final = "unanswered"
 """Key of the error message in the answer to a query that failed."""
 _TIMED_OUT: Final = -signal.SIGXCPU
-"""Exit code after a limit of time: the kernel sends SIGXCPU at the limit of CPU time."""
+"""Exit code of a process that exceeded a time limit: the kernel sends SIGXCPU at the limit of CPU time."""
 # Exit codes that the file did not cause: 0 after the idle time; signals of the kernel's out-of-memory killer, a
 # service manager or a person.
 _EXTERNAL_EXIT_CODES: Final = {0, -signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP, -signal.SIGINT}
@@ -113,7 +114,8 @@ class SandboxedReader:
         except TimeoutError:
             self._kill(process)
             return {}, _TIMED_OUT
-        except BaseException:  # after Ctrl-C, the next query would otherwise read this answer
+        except BaseException:  # for example KeyboardInterrupt
+            # Otherwise the next query would read the answer to this query.
             self._kill(process)
             raise
         if len(line) > max_bytes:

@@ -29,7 +29,7 @@ _LINE: Final = re.compile(rf"([0-9]{{1,19}}),({Role.PATTERN}),{_POSITION},{_NUMB
 
 @dataclass(frozen=True)
 class Separation:
-    """Distance and speeds of two robots during a time span. Names of columns end with the names of the attributes.
+    """Distance and speeds of two robots during a time span. The name of each column ends with an attribute's name.
 
     Attributes:
         distance_start_m: Distance at the start; None if a robot had no position at this time.
@@ -88,7 +88,7 @@ def _vector(values: Sequence[float | None]) -> Vector | None:
 
 
 def distances_m(track: Sequence[TrackPoint], source: Role, destination: Role) -> Iterator[tuple[int, float | None]]:
-    """Yield the time in ns and the distance between two robots for each entry of either robot."""
+    """Yield the time in ns and the distance between two robots (None if unknown) for each entry of either robot."""
     for utc_ns, sender, receiver in _joint_states(track, source, destination):
         yield utc_ns, _distance_m(sender, receiver)
 

@@ -35,7 +35,7 @@ class PositionSource:
     Attributes:
         place: Fixed place; None if a file is the source.
         frame: Frame of the place.
-        file: Path next to `positions.json`: a bag, telemetry log, GPX or CSV file.
+        file: Path, relative to the folder of `positions.json`, of a bag, telemetry log, GPX or CSV file.
         topic: Topic in a bag, or message type in a telemetry log.
         child: Child frame of the robot in a tree of transforms.
         stamps: `header` for the time stamps in messages, `received` for the recorder's times of reception.
@@ -46,7 +46,7 @@ class PositionSource:
         heading_rad: Heading at the start of the odometry, from the frame's first axis towards its second; None if
             unknown.
         began_utc_ns: Start of the odometry by the laptop's clock, nanoseconds since 1970 UTC.
-        clock: Role of the robot whose clock gives the times; empty if it is this robot.
+        clock: Role of the robot whose clock gives the times; empty if this robot's clock gives them.
         system: MAVLink system ID of the autopilot in a telemetry log; 0 if the log has only one.
     """
 
@@ -72,7 +72,7 @@ class PositionSource:
         return (
             self.frame
             if self.frame == PLACED
-            else f"{', '.join(f'{metres:.9g}' for metres in self.place if metres is not None)} in {self.frame}"
+            else f"{', '.join(f'{number:.9g}' for number in self.place if number is not None)} in {self.frame}"
         )
 
 

@@ -268,11 +268,11 @@ def travel_contradiction(
             and sample.position_m is not None
             and log_span_ns[0] - _MARGIN_S * 1e9 <= sample.utc_ns <= log_span_ns[1] + _MARGIN_S * 1e9
         ]
-        other_m = _max_distance_m(np.array(places_m, dtype=float)) if len(places_m) > 1 else None
+        track_m = _max_distance_m(np.array(places_m, dtype=float)) if len(places_m) > 1 else None
         tolerance_m = PLACE_M + DRIFT * farthest_m + speed_m_s * _MARGIN_S
-        if other_m is not None and abs(other_m - farthest_m) > tolerance_m:
-            other_text = f"{other_m:.1f} m according to {track.FILE}"
-            return f"it was {farthest_m:.1f} m from its start according to its odometry, but {other_text}"
+        if track_m is not None and abs(track_m - farthest_m) > tolerance_m:
+            track_text = f"{track_m:.1f} m according to {track.FILE}"
+            return f"it was {farthest_m:.1f} m from its start according to its odometry, but {track_text}"
     return _recorded_contradiction(evidence, role, farthest_m)
 
 
@@ -293,10 +293,10 @@ def _recorded_contradiction(evidence: AttemptEvidence, role: Role, farthest_m: f
     if is_geodetic:
         latitude_deg, longitude_deg, height_m = samples.values.T
         places_m = ecef_m(latitude_deg, longitude_deg, np.zeros(len(height_m)))
-    other_m = _max_distance_m(places_m)
-    if farthest_m - other_m > (SATELLITE_M if is_geodetic else PLACE_M) + DRIFT * farthest_m:
-        other_text = f"{other_m:.1f} m according to {position_source.description}"
-        return f"it was {farthest_m:.1f} m from its start according to its odometry, but {other_text}"
+    recorded_m = _max_distance_m(places_m)
+    if farthest_m - recorded_m > (SATELLITE_M if is_geodetic else PLACE_M) + DRIFT * farthest_m:
+        recorded_text = f"{recorded_m:.1f} m according to {position_source.description}"
+        return f"it was {farthest_m:.1f} m from its start according to its odometry, but {recorded_text}"
     return None
 
 

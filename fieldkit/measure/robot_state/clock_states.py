@@ -38,7 +38,7 @@ class RobotClock:
 
     @property
     def report(self) -> ClockReport | None:
-        """The less favourable report: a report with a problem, or the one with the larger possible offset."""
+        """The first report with a problem or, without one, the report with the largest possible offset."""
         problems = [report for report in self.reports if not report.is_synchronized]
         return problems[0] if problems else max(self.reports, key=_largest_offset_s, default=None)
 

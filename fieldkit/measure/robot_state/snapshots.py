@@ -21,9 +21,10 @@ _CODE: Final = re.compile(r" code ([0-9]{1,3})", re.ASCII)
 _FAILURES: Final = {None: "was interrupted", 137: "did not answer in time", 153: "printed too much"}
 """Failure by exit code. 137 and 153 are 128 plus SIGKILL and SIGXFSZ."""
 _NOT_EXECUTABLE: Final = (126, 127)
-"""Exit codes of a program that cannot be started. 126 occurs because BusyBox finds files that are not executable."""
+"""Exit codes of a program that cannot be started. 126 occurs because `command -v` of BusyBox also finds files that
+are not executable."""
 MAX_SOURCES: Final = 50
-"""Further sources in a snapshot are ignored."""
+"""Maximum number of sources in a snapshot; further sources are ignored."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,9 @@ def read(path: Path) -> Snapshot:
 
 
 def read_series(path: Path) -> tuple[Snapshot, ...]:
-    """Return the snapshots in a file with a line `==> next <==` before each of them, except for an interrupted one.
+    """Return the snapshots in a file that has a line `==> next <==` before each of them.
+
+    The last snapshot is omitted if it was interrupted.
 
     Raises:
         EvidenceError: The file is missing or cannot be read.
@@ -95,7 +98,7 @@ def parse(text: str) -> Snapshot:
     outputs: dict[str, SourceOutput] = {}
     name, lines = "", list[str]()
 
-    def end_source() -> None:
+    def store_output() -> None:
         code = _CODE.fullmatch(lines[-1]) if lines else None
         is_missing = code is not None and int(code[1]) in _NOT_EXECUTABLE
         if name and name not in outputs and len(outputs) < MAX_SOURCES and not is_missing:
@@ -104,9 +107,9 @@ def parse(text: str) -> Snapshot:
 
     for line in text.split("\n"):
         if header := _HEADER.fullmatch(line):
-            end_source()
+            store_output()
             name, lines = header[1], []
         elif line.startswith(" "):
             lines.append(line)
-    end_source()
+    store_output()
     return outputs

@@ -1,8 +1,8 @@
-"""Motion of an emulated robot as its sensors need it: wheel odometry and position.
+"""Motion of an emulated robot, which its sensors measure: wheel odometry and position.
 
-The lab sends a path only once, when the motion starts, and the robot computes its position on the path itself, so no
-position message can be late. The wheels do not turn when the lab puts a robot back, so the odometry continues from
-its last value.
+The lab sends a path only once, when the motion starts. The robot then computes its position on the path, so no
+position message can be late. The wheels do not turn when the lab moves a robot back to its place, so the odometry
+continues from its last value.
 
 Some robots steer themselves. The process that steers such a robot (a base controller or an autopilot) uses a
 `MotionReporter`: it reads the position at which the lab has last placed the robot, computes the motion from there,
@@ -25,14 +25,14 @@ from sim_backends.world.motion import STILL, WayPoints
 
 @dataclass(frozen=True)
 class AssignedPath:
-    """Path on which the lab moves a robot, which stops at its end.
+    """Path on which the lab moves a robot. The robot stops at the end of the path.
 
     On a path of one point, the robot stays at this point.
 
     Attributes:
         start_ns: Start of the motion, as a time of the monotonic clock, which is common to all robots on one machine.
         points_m: Points of the path, metres east, north, up.
-        speed_m_s: Speed along the path.
+        speed_m_s: Horizontal speed.
         facing_rad: Heading of the robot before the start, from east towards north.
     """
 
@@ -53,7 +53,7 @@ class RobotMotionState:
         speed_m_s: Forward speed.
         position_m: Position, metres east, north, up.
         heading_rad: Heading, from east towards north.
-        turn_rad_s: Turn rate to the left; a robot on an assigned path turns in zero time, with a rate of 0.
+        turn_rad_s: Turn rate to the left; 0 on an assigned path, where the robot turns in zero time.
     """
 
     x_m: float = 0.0
@@ -88,8 +88,8 @@ class Odometer:
         self._record = None if motion_record is None else MotionRecord.open(motion_record)
         self._read_bytes = 0
         self._path: AssignedPath | None = None
-        # Motion of the robot when its last path started. `_read_paths` needs it and changes it; it is then reset,
-        # because odometry does not include motion before its start.
+        # Motion of the robot when its last path started. `_read_paths` reads and changes this value. It is reset
+        # afterwards, because the odometry does not include motion before the creation of this object.
         self._base = AT_REST
         self._read_paths(now_ns)
         self._base = AT_REST
@@ -101,7 +101,7 @@ class Odometer:
             self._base = RobotMotionState(-x_m, -y_m, yaw_rad)
 
     def at(self, now_ns: int) -> RobotMotionState:
-        """Return the robot's motion at a time, which must not be earlier than that of the last call."""
+        """Return the robot's motion at a time, which must not be earlier than the time of the last call."""
         self._read_paths(now_ns)
         return self._recorded_motion(now_ns) or self._assigned_motion(now_ns)
 
@@ -116,7 +116,7 @@ class Odometer:
         if last is None or last.path_start_ns != self.path_start_ns:
             return None
         current = last.at(now_ns)
-        # `RecordedMotion.at` turns the heading but not the velocity, so the speed is computed from the record.
+        # `RecordedMotion.at` turns the heading but not the velocity, so the speed is read from the record.
         speed_m_s = last.speed_m_s if current.is_moving else 0.0
         return RobotMotionState(
             *current.odometry, speed_m_s, current.position_m, current.heading_rad, current.turn_rad_s
@@ -148,7 +148,7 @@ class Odometer:
 def _motion_on(path: AssignedPath, base: RobotMotionState, now_ns: int) -> RobotMotionState:
     """Return a robot's motion on a path at a time; `base` is its motion when the path started."""
     elapsed_ns = now_ns - path.start_ns
-    points_m = [(point_m[0], point_m[1], 0.0) for point_m in path.points_m]  # the speed is that over the ground
+    points_m = [(point_m[0], point_m[1], 0.0) for point_m in path.points_m]  # `speed_m_s` is the horizontal speed
     (east_m, north_m, _), velocity_m_s, _ = WayPoints("", points_m, path.speed_m_s).at(elapsed_ns)[""]
     heading_rad = path.facing_rad
     if velocity_m_s != STILL:
@@ -184,9 +184,9 @@ def _rotate(x: float, y: float, angle_rad: float) -> tuple[float, float]:
 
 
 class MotionReporter:
-    """Reads the placements of a robot by the lab, and records the motion of the robot.
+    """Reads the positions at which the lab places a robot, and records the motion of the robot.
 
-    Only the process that steers the robot may have one.
+    Only the process that steers the robot may create one.
 
     Args:
         paths: The file of the paths that the lab assigns (`robot_motion.append_path`).

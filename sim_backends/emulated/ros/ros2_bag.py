@@ -1,4 +1,4 @@
-"""The `ros2` command of an emulated robot without ROS: `ros2 bag record` writes bags like ROS 2's own.
+"""The `ros2` command of an emulated robot without ROS: `ros2 bag record` writes bags as ROS 2 does.
 
 It does not use DDS. It reads the robot's sensors as the built-in `rosbag` does, converts each message to CDR (the
 serialization of ROS 2), and stores it with the requested rosbag2 plugin and the quality of service that the publisher
@@ -40,8 +40,8 @@ _TICK_S: Final = 0.1
 # The default format of rosbag2 is MCAP since Iron (ros2/rosbag2#1160).
 _SQLITE3_ONLY: Final = {"dashing", "eloquent", "foxy"}
 _SQLITE3_IS_DEFAULT: Final = _SQLITE3_ONLY | {"galactic", "humble"}
-# Format 9 (Jazzy) has the QoS profiles as a list with named values. An older rosbag2 reads them as text with numbers,
-# as in format 8, the oldest that rosbags writes (rosbags.rosbag2.metadata).
+# Format 9 (Jazzy) stores the QoS profiles as a list with named values. An older rosbag2 expects a text with numbers,
+# as in format 8. This is the oldest format that the package rosbags writes (rosbags.rosbag2.metadata).
 _BEFORE_JAZZY: Final = _SQLITE3_IS_DEFAULT | {"iron"}
 # Until rosbag2 0.10 KeyboardInterrupt reached the command line, which returned exit code 2 (ros2/rosbag2#787).
 _SIGINT_EXITS_2: Final = _SQLITE3_ONLY | {"galactic"}
@@ -71,7 +71,7 @@ class Rosbag2Recorder:
         self._reported_topics: set[str] = set()
 
     def run(self) -> int:
-        """Record; return the number of the signal that stopped it.
+        """Record; return the number of the signal that stopped the recording.
 
         Raises:
             WriterError: The folder exists.
@@ -173,7 +173,7 @@ def _parser(distribution: str) -> argparse.ArgumentParser:
     record.add_argument("positional", nargs="*", metavar="Topic", help="topics to record")
     record.add_argument("--topics", nargs="+", default=[], metavar="Topic", help="topics to record")
     record.add_argument("-a", "--all", action="store_true", help="record every topic")
-    record.add_argument("-o", "--output", help="folder of the bag; else one with the date")
+    record.add_argument("-o", "--output", help="folder of the bag; by default its name has the date")
     record.add_argument(
         "-s",
         "--storage",
@@ -189,7 +189,7 @@ def main(argv: Sequence[str], distribution: str) -> int | str:
     """Run a command line; return its exit code, or the original's error message, for exit code 1."""
     options = _parser(distribution).parse_args(argv)
     topics = [f"/{topic.lstrip('/')}" for topic in (*options.positional, *options.topics)]
-    if bool(topics) is options.all:  # both, or neither
+    if bool(topics) is options.all:  # both were given, or neither
         return "[ERROR] [ros2bag]: Need to specify either topics or --all"
     folder = Path(options.output or datetime.now().astimezone().strftime("rosbag2_%Y_%m_%d-%H_%M_%S"))
     if folder.exists():

@@ -1,9 +1,8 @@
-"""The `rosbag` command of an emulated robot without ROS: `record` and `info`, with the behaviour of ROS's own (1.15).
+"""The `rosbag` command of an emulated robot without ROS: `record` and `info`, which behave as in ROS (rosbag 1.15).
 
 Like the original, `record` is a wrapper around a recorder process. The wrapper rejects wrong options with exit code
-2. Otherwise it forwards SIGINT and SIGTERM, and always returns 0. If only the wrapper is killed with SIGKILL, the
-recorder continues.
-Options of the original that no trial uses are rejected as unknown.
+2. Otherwise it forwards SIGINT and SIGTERM to the recorder, and always returns 0. If only the wrapper is killed with
+SIGKILL, the recorder continues. Options of the original that no trial uses are rejected as unknown.
 """
 
 import errno
@@ -235,7 +234,7 @@ def main() -> int:
     commands = "".join(f"   {name}  \t{run.__doc__}\n" for name, run in _COMMANDS.items())
     if command in {"-h", "--help", "help"}:
         sys.stdout.write(
-            "This is fieldkit's own rosbag, not that of ROS (emulated: ros: builtin).\n"
+            "This is the rosbag of fieldkit, not the rosbag of ROS (emulated: ros: builtin).\n"
             f"Usage: rosbag <subcommand> [options] [args]\n\nAvailable subcommands:\n{commands}\n"
         )
     else:

@@ -87,7 +87,7 @@ class LaserTarget:
     """An upright solid that reflects beams.
 
     Attributes:
-        outline_m: Corners of the outline from above, in order, metres east and north; the centre of a cylinder.
+        outline_m: Corners of the outline from above, in order, metres east and north. For a cylinder, its centre.
         radius_m: Radius of a cylinder, 0 for other solids.
         base_m: Height of the bottom.
         top_m: Height of the top.
@@ -107,7 +107,7 @@ class Neighbour(NamedTuple):
     """Body of another robot: an upright cylinder around its antenna.
 
     Attributes:
-        number: Its position among the robots of the lab, from 0.
+        number: Index of the robot in the lab's list of robots, from 0.
         radius_m: Radius of the cylinder.
         below_m: Height of the antenna above the bottom of the cylinder.
         above_m: Height of the top above the antenna.
@@ -134,11 +134,15 @@ def check(sensor: Sensor) -> None:
         )
     if sensor.rate_hz <= 0:
         raise ConfigurationError(
-            "a topic with rate 0Hz publishes nothing", where=f"topic {sensor.topic}", remedy="write 5Hz"
+            "a topic with rate 0Hz publishes nothing",
+            where=f"topic {sensor.topic}",
+            remedy="write a rate above 0Hz, for example 5Hz",
         )
     if sensor.type == LASER_SCAN and sensor.points is None:
         raise ConfigurationError(
-            "a laser scan needs `points`, beams per turn", where=f"topic {sensor.topic}", remedy="write points: 360"
+            "a laser scan needs `points`, the number of beams per turn",
+            where=f"topic {sensor.topic}",
+            remedy="write for example points: 360",
         )
 
 

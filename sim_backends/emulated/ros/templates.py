@@ -111,7 +111,7 @@ def _types(kind: str, definition: str) -> "Typestore":
 def _unknown_type_error(topic: PublishedTopic) -> ConfigurationError:
     remedy = f"write what `rosmsg show -r {topic.type}` prints under definition: of the topic"
     return ConfigurationError(
-        f"an emulated robot cannot publish {topic.type}: ROS 1 itself has no definition of it, or of a type in it",
+        f"an emulated robot cannot publish {topic.type}: ROS 1 has no definition of this type, or of a type in it",
         where=f"topic {topic.name}",
         remedy=f"{did_you_mean(topic.type, GENERATED_TYPES, remedy)}",
     )

@@ -71,7 +71,9 @@ def _states_under_commands(
 
 
 def _displacement_m(before: State, after: State) -> tuple[float, float, float]:
-    east_m, north_m, up_m = (to - at for to, at in zip(after.position_m, before.position_m, strict=True))
+    east_m, north_m, up_m = (
+        end_m - start_m for end_m, start_m in zip(after.position_m, before.position_m, strict=True)
+    )
     return east_m, north_m, up_m
 
 

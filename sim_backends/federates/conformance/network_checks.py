@@ -56,7 +56,7 @@ def _packets(probe: FederateProbe, times_ns: Sequence[int]) -> list[Packet]:
 
 
 def _times_ns() -> list[int]:
-    """Return times of packets: in some windows at the start, 1 ns later, and 0.5 ms later."""
+    """Return the times of the packets: the start of every fourth window, 1 ns later, and 0.5 ms later."""
     return [number * _WINDOW_NS + offset_ns for number in range(0, 60, 4) for offset_ns in (0, 1, 500_000)]
 
 
@@ -139,7 +139,7 @@ class _FateAccount:
 
 
 def _run(probe: FederateProbe, window_ns: int, until_ns: int = _END_NS) -> _FateAccount:
-    """Carry packets in windows of equal length; after all have entered, windows are 100 times as long."""
+    """Send packets in windows of length `window_ns`; after the last packet, windows are 100 times as long."""
     account, states = _FateAccount(probe), _states(probe)
     remaining_packets = _packets(probe, _times_ns())
     to_ns = -1

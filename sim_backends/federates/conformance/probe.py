@@ -42,7 +42,7 @@ class Opener(Protocol):
     """Starts or connects to a new federate."""
 
     def __call__(self, hello: Hello) -> tuple[FederateSession, Hello, Welcome]:
-        """Return its session, like `open_session`."""
+        """Return its session, the hello that was sent, and its answer, like `open_session`."""
         ...
 
 
@@ -112,11 +112,17 @@ class FederateProbe:
             raise NotDeclaredError(f"it does not declare {capability.name}")
 
     def request(
-        self, kind: MessageKind, body: bytes, answer: MessageKind, decode: Callable[[bytes], Any], *, copy: int = 0
-    ) -> Any:  # noqa: ANN401 (of `decode`)
+        self,
+        kind: MessageKind,
+        body: bytes,
+        answer_kind: MessageKind,
+        decode: Callable[[bytes], Any],
+        *,
+        copy: int = 0,
+    ) -> Any:  # noqa: ANN401 (the result of `decode`)
         """Send a request, and return the decoded answer. Raises the errors of `FederateSession.request`."""
         request_name = kind.name.lower().replace("_", " ")
-        return self._session.request(kind, copy, body, answer, decode=decode, describe=lambda: request_name)
+        return self._session.request(kind, copy, body, answer_kind, decode=decode, describe=lambda: request_name)
 
     def advance_physics(
         self, to_ns: int, commands: Mapping[str, Any] | None = None, *, from_ns: int | None = None, copy: int = 0
@@ -166,7 +172,7 @@ class FederateProbe:
         number: int = self.request(MessageKind.PING, encode_number(value), MessageKind.PONG, decode_number)
         return number
 
-    def expect_error(self, kind: MessageKind, body: bytes, answer: MessageKind, request_text: str) -> None:
+    def expect_error(self, kind: MessageKind, body: bytes, answer_kind: MessageKind, request_text: str) -> None:
         """Send a request that the federate must refuse.
 
         Raises:
@@ -174,7 +180,7 @@ class FederateProbe:
         """
         start_s = time.monotonic()
         try:
-            self.request(kind, body, answer, bytes)
+            self.request(kind, body, answer_kind, bytes)
         except FederateError as error:
             # The federate answered with an error, or closed the connection. A missing answer has another exit code,
             # and a malformed or wrong answer has another message.
@@ -192,7 +198,7 @@ class FederateProbe:
             CheckError: It does not close the connection.
         """
         try:
-            self._session.say_bye(_CLOSE_S)
+            self._session.send_bye(_CLOSE_S)
         except DeadlineError as error:
             raise CheckError(f"it has not closed the connection {_CLOSE_S:g} s after bye") from error
         except ClosedError:

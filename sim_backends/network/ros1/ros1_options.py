@@ -20,7 +20,7 @@ REGISTER_SUBSCRIBER_BYTES: Final = 516
 SUBSCRIBER_REGISTERED_BYTES: Final = 402
 """Size without the address of a publisher, which the captured response contained."""
 PUBLISHER_UPDATE_BYTES: Final = 425
-"""Size without the address of a publisher, as captured."""
+"""Size without the address of a publisher; the captured call contained no address."""
 PUBLISHER_UPDATED_BYTES: Final = 364
 GET_KEEPALIVE_BYTES: Final = 370
 KEEPALIVE_BYTES: Final = 402
@@ -31,7 +31,8 @@ REQUEST_TOPIC_BYTES: Final = 508
 TOPIC_REQUESTED_BYTES: Final = 518
 REQUEST_UDPROS_BYTES: Final = 508 + 288
 UDPROS_REQUESTED_BYTES: Final = 518 + 246
-"""Sizes for TCPROS, plus the connection header of 110 bytes in base 64, the address, and the datagram size."""
+"""Sizes of request and response for UDPROS: the sizes for TCPROS, plus the connection header of 110 bytes in base 64,
+the address, and the datagram size."""
 
 _REGISTER: Final = CallRetry(50 * _MS, 50 * _MS)
 _REQUEST: Final = CallRetry(500 * _MS, 32 * _SECOND)
@@ -64,7 +65,7 @@ class Ros1Options:
 
     Attributes:
         tcp: Options of every TCP connection.
-        starts_ns: Start times of the nodes of an agent, by its name; others start at 0.
+        starts_ns: Start time of the nodes of an agent, by name of the agent; the nodes of other agents start at 0.
         register: Retries of calls to the master (roscpp, `master.cpp`).
         update: Retries of the master's calls to a subscriber; None for no retry, as in rosmaster (`master_api.py`): a
             subscriber that such a call does not reach never receives the address of its publisher.

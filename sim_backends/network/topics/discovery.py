@@ -247,7 +247,7 @@ class TopicDiscovery:
         for name, flow in self._flows.items():
             for agent, is_publisher in ((flow.publisher, True), (flow.subscriber, False)):
                 if agent == host:
-                    size_bytes = _endpoint_bytes(flow, writer=is_publisher)
+                    size_bytes = _endpoint_bytes(flow, is_writer=is_publisher)
                     writer.add_historical(Sample(size_bytes, writer.last + 1, endpoint_flow=name))
 
     def _on_endpoint(self, host: str, peer: str, sample: Sample) -> None:
@@ -281,7 +281,7 @@ def _ignore_loss(sample: Sample, reason: str) -> None:
     """Ignore the loss of a sample of the discovery; no statistics include it."""
 
 
-def _endpoint_bytes(flow: TopicFlow, *, writer: bool) -> int:
+def _endpoint_bytes(flow: TopicFlow, *, is_writer: bool) -> int:
     """Return the SEDP size of an endpoint; names end with a zero byte and are padded to multiples of 4 bytes."""
     names = sum(-(-(len(name.encode()) + 1) // 4) * 4 for name in (flow.topic, flow.type_name))
-    return names + (_WRITER_BYTES if writer else _READER_BYTES)
+    return names + (_WRITER_BYTES if is_writer else _READER_BYTES)

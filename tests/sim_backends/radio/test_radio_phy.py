@@ -9,10 +9,10 @@ import scipy
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.radio import propagation
 from sim_backends.radio.error_rates import bit_error, decoded_bit_error, packet_error
 from sim_backends.radio.modes import G_MODES, N_MODES, WifiMode, ack_ns, control_mode
-from sim_backends.radio.propagation import Fading, Shadowing
+from sim_backends.radio.propagation import path_loss
+from sim_backends.radio.propagation.fading import Fading, Shadowing
 from sim_backends.world.materials import SPEED_OF_LIGHT_M_S
 
 MODES = pytest.mark.parametrize("mode", [*G_MODES, *N_MODES], ids=lambda mode: mode.name)
@@ -102,17 +102,17 @@ PLACES = st.tuples(st.floats(1, 300), st.floats(0.1, 3), st.floats(0.1, 3))
 def test_two_ray_loss_is_near_the_direct_path_and_symmetric(heights_and_distance: tuple[float, ...]) -> None:
     distance_m, start_height_m, end_height_m = heights_and_distance
     start, end = np.array([[0, 0, start_height_m]]), np.array([[distance_m, 0, end_height_m]])
-    direct_db = propagation.free_space_db(start, end, WIFI_HZ)[0]
-    two_ray_db = propagation.two_ray_db(start, end, WIFI_HZ)[0]
+    direct_db = path_loss.free_space_db(start, end, WIFI_HZ)[0]
+    two_ray_db = path_loss.two_ray_db(start, end, WIFI_HZ)[0]
     assert direct_db - 6.03 <= two_ray_db <= direct_db + 40.01
-    assert two_ray_db == pytest.approx(propagation.two_ray_db(end, start, WIFI_HZ)[0])
+    assert two_ray_db == pytest.approx(path_loss.two_ray_db(end, start, WIFI_HZ)[0])
 
 
 def test_far_two_ray_loss_is_40_db_per_decade() -> None:
     """Far means beyond 4 pi h1 h2 / wavelength (Rappaport, eq. 4.52)."""
     start = np.array([[0, 0, 0.5]] * 2)
     end = np.array([[100, 0, 0.5], [1000, 0, 0.5]])
-    near_db, far_db = propagation.two_ray_db(start, end, WIFI_HZ)
+    near_db, far_db = path_loss.two_ray_db(start, end, WIFI_HZ)
     assert far_db - near_db == pytest.approx(40, abs=1)
     plane_earth = 40 * math.log10(1000) - 20 * math.log10(0.25)
     assert far_db == pytest.approx(plane_earth, abs=1.5)
@@ -120,9 +120,9 @@ def test_far_two_ray_loss_is_40_db_per_decade() -> None:
 
 def test_free_space_and_log_distance_losses_equal_those_computed_by_hand() -> None:
     start, end = np.zeros((2, 3)), np.array([[1.0, 0, 0], [10, 0, 0]])
-    assert propagation.free_space_db(start, end, WIFI_HZ) == pytest.approx([40.18, 60.18], abs=0.01)
-    assert propagation.log_distance_db(start, end, WIFI_HZ, 3.0) == pytest.approx([40.18, 70.18], abs=0.01)
-    inside = propagation.free_space_db(start, end * 0.01, WIFI_HZ)
+    assert path_loss.free_space_db(start, end, WIFI_HZ) == pytest.approx([40.18, 60.18], abs=0.01)
+    assert path_loss.log_distance_db(start, end, WIFI_HZ, 3.0) == pytest.approx([40.18, 70.18], abs=0.01)
+    inside = path_loss.free_space_db(start, end * 0.01, WIFI_HZ)
     assert inside == pytest.approx([40.18, 40.18], abs=0.01), "constant below 1 m"
 
 

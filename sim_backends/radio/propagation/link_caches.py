@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.radio.propagation import Echoes, Fades
+from sim_backends.radio.propagation.fading import Echoes, Fades
 from sim_backends.world.shapes import Floats
 
 

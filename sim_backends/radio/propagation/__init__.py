@@ -1,0 +1,1 @@
+"""Propagation between radios: path loss, fading, antenna patterns."""
