@@ -103,7 +103,7 @@ def explain(problems: Sequence[Any], document: Document, descriptions: Mapping[s
     else:
         message = _message(first, descriptions)
     path = ".".join(str(part) for part in (*document.place, *document.existing_part(place)))
-    remedy = f"add {missing}: to it" if missing else "correct this line"
+    remedy = f"add {missing}: to it" if missing else first.get("ctx", {}).get("remedy") or "correct this line"
     # A value with several valid forms has one problem per form at the same location.
     other_count = (
         len({(document.existing_part(_location(problem)), _missing_key(problem)) for problem in problems}) - 1

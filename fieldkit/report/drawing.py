@@ -30,7 +30,7 @@ _MAX_TICK_LENGTH: Final = 20
 _MAX_LANE_LENGTH: Final = 26
 """Maximum numbers of characters of titles, tick labels and names of lanes."""
 _BOUND_MARKER_SIZE: Final = 4.0
-"""Size of the triangles of single repeats that are lower bounds."""
+"""Size of the triangles of single repeats whose values are only lower bounds."""
 _ARROW_POINTS: Final = 14.0
 """Length of the arrow of a lower bound, in points."""
 _STRIP_LANE_FONT_SIZE: Final = 7.5
@@ -48,7 +48,7 @@ _FULL_SIZE_COLUMNS: Final = 12
 _MIN_FONT_SIZE: Final = 3.5
 """Smallest font size of texts in a heat map."""
 _MAX_EDGE_TEXT_LENGTH: Final = 34
-"""Maximum number of characters of a text at the edge."""
+"""Maximum number of characters of the reason next to an `EdgeMark`."""
 
 
 def draw(axes: Axes, panel: Panel) -> None:

@@ -15,7 +15,7 @@ from typing import Any, Final
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.core.model import Vector
 from sim_backends.physics.body import NEVER, Body, Pose, Snapshot, Track
-from sim_backends.physics.collisions import Collision, Footprint, cylinder_footprint, move, overlaps
+from sim_backends.physics.collisions import Collision, Footprint, cylinder_footprint, is_supported, move, overlaps
 from sim_backends.physics.ground import Ground
 from sim_backends.physics.neighbours import HORIZON_S, CellGrid, ContactCandidates, Neighbours
 from sim_backends.physics.paths import STEP_NS
@@ -166,9 +166,7 @@ class Bodies:
                 for other in candidates.bodies
             ),
         ]
-        east, north, up = place_m
-        stop = move(body, place_m, (east, north, up - _SUPPORT_M), footprints)
-        return stop is not None and any(contact.normal[2] > 0 for contact in stop.contacts)
+        return is_supported(body, place_m, footprints, _SUPPORT_M)
 
     def overlap(self, name: str) -> str:
         """Return the name of an obstacle or body that a body overlaps now; empty if there is none."""

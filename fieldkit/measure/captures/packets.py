@@ -57,7 +57,7 @@ NO_ECHO: Final = -1
 """Identifier of a packet that is not an ICMP echo, or was truncated before it."""
 
 ECHO_REPLY: Final = 1 << 16
-"""Added to the identifier of an ICMP echo reply."""
+"""Added to the identifier of an ICMP echo reply, to distinguish it from a request."""
 
 NOT_CAPTURED: Final = -1
 """Content hash of a packet that was truncated before `CONTENT_BYTES` of content."""

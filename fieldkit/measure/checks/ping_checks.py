@@ -86,7 +86,7 @@ def _complete_ns(packets: Packets, first: Packets, size_bytes: int) -> Ints:
 
 
 def _earliest_by_number(numbers: Ints, times_ns: Ints) -> dict[int, int]:
-    """Return the earliest time of each number."""
+    """Return the earliest time of each sequence number."""
     # The latest times are first, because a dictionary keeps the last value of a key.
     order = np.argsort(-times_ns, kind="stable")
     return dict(zip(numbers[order].tolist(), times_ns[order].tolist(), strict=True))

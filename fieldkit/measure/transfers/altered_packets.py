@@ -30,7 +30,7 @@ _DUPLICATE_NS: Final = 1_000_000
 
 
 def header_problem(packets: Packets) -> str | None:
-    """Return the reason if a capture contains altered packets; None if all checksums of IPv4 headers are correct."""
+    """Return a description of the altered packets, or None if all checksums of IPv4 headers are correct."""
     if not (wrong := int(packets.wrong_checksum.sum())):
         return None
     return (

@@ -103,7 +103,7 @@ def _loss(flow: LoadFlow, sent: list[Packets], received: list[Packets]) -> float
 
 
 def _rate(flow: LoadFlow, received: list[Packets]) -> float | None:
-    """Return the rate of received payload, each byte once; None if it cannot be computed."""
+    """Return the rate of received payload, in which each byte is counted once; None if it cannot be computed."""
     is_udp = flow.protocol is Protocol.UDP
     data = [packets if is_udp else packets.where(packets.tcp_payload_bytes > COOKIE_BYTES) for packets in received]
     times_ns: Ints = np.concatenate([packets.time_ns for packets in data]) if data else np.array([], dtype=np.int64)

@@ -44,7 +44,7 @@ def paper_frames_to(packets: Packets, address: str, port: int) -> int:
 
 
 def paper_transfer_s(packets: int, delay_s: float) -> float:
-    """Return the paper's transfer time: number of packets times the mean RTT of pings with the window as payload."""
+    """Return the paper's transfer time: number of packets times the mean RTT of pings with `PAPER_WINDOW_BYTES`."""
     return packets * delay_s
 
 

@@ -1,7 +1,7 @@
 """Log of an autonomous drive of a ground robot, and its columns.
 
 fieldkit's agent on the robot writes a JSON object per line, ten times a second (`fieldkit.agent.driving.drive`):
-time, pose by its odometry in the frame of the start, and driven distance. The last line contains the reason for the
+time, pose from odometry in the frame of the start, and driven distance. The last line contains the reason for the
 end. All values are measurements of the robot.
 """
 

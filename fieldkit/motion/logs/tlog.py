@@ -146,8 +146,8 @@ class RecorderSummary:
         ended_us: End of the recording, microseconds since 1970 UTC by its robot's clock.
         refusals: MAV_RESULT by message ID, for messages whose rate the autopilot did not set.
         crc32: CRC-32 of the log; None for a recorder of an older version.
-        slow_s: Longest time for which a requested message was too slow; None if no message was requested, or for a
-            recorder of an older version.
+        slow_s: Longest time for which the rate of a requested message was too low; None if no message was requested,
+            or for a recorder of an older version.
     """
 
     frames: int
@@ -200,7 +200,7 @@ class Tlog:
     Attributes:
         frames: Number of frames of all senders.
         kinds: Number of messages of the autopilot by message name.
-        values: Values of columns.
+        values: Values of the columns by name.
         first_us: Earliest time of a frame, microseconds since 1970 UTC by the recorder's clock.
         last_us: Latest time of a frame.
         back_us: Largest backward step between the times of consecutive frames.

@@ -36,7 +36,7 @@ _RADIO: Final = "RADIO_STATUS"
 """Status of a telemetry radio's link; the radio has a separate system ID."""
 
 Source = tuple[int, int]
-"""IDs of a system and its component."""
+"""IDs of a system and of one of its components."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class LoggedFrame:
 
     @property
     def number(self) -> int:
-        """Sequence number of its sender, from 0 to 255."""
+        """Sequence number that the sender assigned, from 0 to 255."""
         return self.data[2 if self.data[0] == _MAGIC_1 else 4]
 
     @property

@@ -14,7 +14,7 @@ from sim_backends.emulated.autopilot.firmware import Firmware
 from sim_backends.emulated.autopilot.modes import LANDING, PILOTED, Mode
 from sim_backends.emulated.autopilot.parameters import Parameters
 from sim_backends.physics.body import Velocity
-from sim_backends.physics.collisions import Footprint, gap_m, move
+from sim_backends.physics.collisions import Footprint, gap_m, is_supported, move
 from sim_backends.physics.quadrotor import FlightPose, Quadrotor
 from sim_backends.physics.robot_limits import QuadrotorLimits
 
@@ -121,7 +121,9 @@ class Airframe:
             pose = body.after_contact(pose, stop, None)
         self.turn_rad_s = math.remainder(pose.heading_rad - self._pose.heading_rad, math.tau) / _STEP_S
         self._pose = pose
-        self.on_ground = pose.velocity_m_s[2] <= _MAX_REST_CLIMB_M_S and self._is_supported(obstacles)
+        self.on_ground = pose.velocity_m_s[2] <= _MAX_REST_CLIMB_M_S and is_supported(
+            self._quadrotor, pose.place_m, obstacles, _SUPPORT_GAP_M
+        )
         if self.on_ground and (not self.motors_on or target_m_s[2] <= 0):
             # At rest it neither slides nor tilts nor turns.
             self._pose, self.turn_rad_s = FlightPose(pose.place_m, heading_rad=pose.heading_rad), 0.0
@@ -129,11 +131,6 @@ class Airframe:
     def rest(self, now_ns: int) -> None:
         """Stay on the ground without power until this time, in whole steps."""
         self.now_ns += (now_ns - self.now_ns) // STEP_NS * STEP_NS
-
-    def _is_supported(self, obstacles: Sequence[Footprint]) -> bool:
-        east, north, up = self._pose.place_m
-        stop = move(self._quadrotor, self._pose.place_m, (east, north, up - _SUPPORT_GAP_M), obstacles)
-        return stop is not None and any(contact.normal[2] > 0 for contact in stop.contacts)
 
     def _nearby_obstacles(self, place_m: Vector) -> Sequence[Footprint]:
         """Return the obstacles that the drone may hit in this step."""

@@ -274,9 +274,8 @@ class Vehicle(VehicleBase):
             self.report(_CRITICAL, "Failsafe activated")
             self._switch_automatically(_OFFBOARD_LOST.get(int(self._parameters["COM_OBL_RC_ACT"]), Mode.LOITER))
             self.failsafes.on_lost_set_points()
-        elif self.fence.is_crossed(self.body.position_m, stop_m(self.body, self.limits)):
-            self.report(_CRITICAL, "Geofence: hold")
-            self._switch_automatically(Mode.LOITER)
+        elif breach := self.fence.before_crossing(self.body.position_m, stop_m(self.body, self.limits)):
+            self._react(breach)
 
     def _must_stay_on_ground(self) -> bool:
         """Return True if it is on the ground and cannot lift off now.
