@@ -1,7 +1,7 @@
 """A pytest plugin that gives the tests of real programs priority for the processors in a run with several workers.
 
-Programs on emulated robots have time limits, for example the lease of a robot that drives. The other tests only become
-slower if they wait for a processor.
+Programs on emulated robots have time limits, for example the lease of a robot that drives. The other tests only
+become slower if they wait for a processor.
 """
 
 import os
