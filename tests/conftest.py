@@ -1,4 +1,4 @@
-"""Shared fixtures, and settings of all tests: examples have no time limit, and long test files run first."""
+"""Shared fixtures, and settings of all tests: examples have no time limit, and the order of test files."""
 
 import gc
 import signal
@@ -10,11 +10,12 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from fieldkit.measure.positions import position_files
+from tests.helpers.priority import interleaved
 from tests.helpers.sshd import server
 
 __all__ = ["server"]
 
-pytest_plugins = ("pytester", "tests.helpers.leaks", "tests.helpers.reruns")
+pytest_plugins = ("pytester", "tests.helpers.leaks", "tests.helpers.priority", "tests.helpers.reruns")
 
 # Tests that a shell starts in the background ignore SIGINT, and the programs that they start would also ignore it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -144,8 +145,9 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Move long files to the front, without a change of the order of the others."""
+    """Move long files to the front, and distribute those with real programs evenly."""
     items.sort(key=lambda item: _LONG.index(item.path.stem) if item.path.stem in _LONG else len(_LONG))
+    items[:] = interleaved(items)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
