@@ -1,9 +1,10 @@
 """Aggregate thousands of trial.csv files into one table, compared with pandas: `python -m benchmarks.aggregate`.
 
-The tables have 40 repeats each and 160 conditions in all, with random values of a fixed seed in every column. Each
-round runs `fieldkit aggregate` as a user would, once per number of tables, to show whether the cost grows linearly.
-The peer reads the smallest number of tables in the same round: pandas concatenates and groups them, and scipy
-computes a bootstrap interval per condition and quantity. The benchmark stops if their means and medians differ.
+Each table has 40 repeats; all tables together have 160 conditions. The values are random, from a generator with a
+fixed seed. Each round runs the command `fieldkit aggregate` once for each number of tables, which shows if the cost
+grows linearly. In the same round a peer program (`pandas_peer`) reads the smallest number of tables: pandas
+concatenates and groups them, and scipy computes a bootstrap interval per condition and quantity. The benchmark stops
+if the counts, means, medians or 95th percentiles of the two programs differ.
 
 `--rows N` adds one table of N repeats, like the CSV that `fieldkit export` writes for a campaign.
 """
@@ -131,7 +132,7 @@ def run(argv: Sequence[str], out: Path) -> Run:
     """Run a program until it exits, with its output in a file.
 
     Raises:
-        RuntimeError: It failed.
+        RuntimeError: The program failed.
     """
     started = time.perf_counter()
     with out.open("wb") as file:
@@ -156,7 +157,7 @@ def check(fieldkit_output: Path, peer_output: Path) -> None:
     """Compare counts, means, medians and percentiles.
 
     Raises:
-        RuntimeError: They differ.
+        RuntimeError: The figures of fieldkit and of the peer differ.
     """
     our_figures: Figures = {
         (tuple(map(str, cell["key"].values())), name): tuple(
@@ -203,7 +204,7 @@ def run_rounds(base: Path, counts: Sequence[int], rounds: int, rows: int) -> dic
 
 def show(runs_by_name: Mapping[str, Sequence[Run]]) -> None:
     """Print a table."""
-    print("| | s, median (lowest to highest) | processor time (s) | repeats/s | peak memory (MB) |")
+    print("| | wall time (s), median (lowest to highest) | processor time (s) | repeats/s | peak memory (MB) |")
     print("| --- | --- | --- | --- | --- |")
     for name, runs in runs_by_name.items():
         walls = [run_result.wall_s for run_result in runs]

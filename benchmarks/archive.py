@@ -24,7 +24,7 @@ from benchmarks.archive_trials import write_archive
 
 WHERE: Final = 'distance_m < 20 and topology == "master"'
 AGE_S: Final = 3.0
-"""Minimum age of a table before the runs: fieldkit writes no index entry for a newer one."""
+"""Minimum age of the tables at the first run: fieldkit writes no index entry for a table that is newer."""
 
 
 def _fieldkit(archive: Path, out: Path, *options: str) -> Run:
@@ -54,7 +54,7 @@ def check(fieldkit_output: Path, peer_output: Path) -> None:
     """Compare the figures of two outputs.
 
     Raises:
-        RuntimeError: They differ.
+        RuntimeError: The figures differ.
     """
     our_figures, peer_figures = figures(fieldkit_output), figures(peer_output)
     is_equal = our_figures.keys() == peer_figures.keys() and all(
@@ -98,7 +98,8 @@ def show(rounds: Sequence[Mapping[str, Run]]) -> None:
     """Print a table. A ratio is computed in each round, and the median of all rounds is printed."""
     names = list(rounds[0])
     print(
-        "| | s, median (lowest to highest) | processor time (s) | peak memory (MB) | time / pandas | time / DuckDB |"
+        "| | wall time (s), median (lowest to highest) | processor time (s) | peak memory (MB) "
+        "| wall time / pandas | wall time / DuckDB |"
     )
     print("| --- | --- | --- | --- | --- | --- |")
     for name in names:

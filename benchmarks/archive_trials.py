@@ -1,7 +1,8 @@
 """A synthetic lab archive: trials in the real format, made from the trials in `tests/data`.
 
 Each trial has the `trial.yaml` of a stored trial and a `trial.csv` with its columns. Names, distances and times
-differ; durations are scaled and ping losses are drawn at random, with a fixed seed.
+differ; durations are scaled and ping losses are drawn at random, with a fixed seed. About 2 % of the rows are marked
+as failed.
 """
 
 import csv
@@ -22,9 +23,9 @@ _PINGS: Final = 10
 _SCALED: Final = ("rtt_min_s", "rtt_median_s", "rtt_mean_s", "rtt_p95_s", "rtt_max_s", "rtt_jitter_s", "delay_s")
 """Columns that are multiplied by a random factor."""
 _KINDS: Final = (*("_los_",) * 7, "evidence", "selfheal", "driveaway")
-"""Parts of the names of the stored trials that are copied in turn: seven of ten have the procedure los.
+"""Parts of names of stored trials: trial n of the archive copies a stored trial whose name contains element n % 10.
 
-The plan of an evidence trial declares 42 columns.
+Seven of ten trials therefore have the procedure los. The plan of the trial `evidence` declares many columns (42).
 """
 
 

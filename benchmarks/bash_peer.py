@@ -26,7 +26,8 @@ DONE: Final = "done"
 
 _KILLED_WITH_PARENT: Final = ("setpriv", "--pdeathsig", "KILL", "--")
 _CONNECT_S: Final = 10.0
-# ProxyCommand: without its master connection a client must not connect to the SSH server of this machine.
+# `ProxyCommand false`: a client without its master connection fails. Otherwise it would connect to the SSH server of
+# this machine.
 _SSH_CONFIG: Final = """\
 Host *
   HostName 127.0.0.1
@@ -98,10 +99,10 @@ class BashPeer:
 
 @contextmanager
 def connected(testbed: EmulatedTestbed, roles: Sequence[Role], slow: SlowLinks | None) -> Iterator[Path]:
-    """Open an OpenSSH master connection to each robot, which clients share; yield their configuration.
+    """Open an OpenSSH master connection to each robot, which clients share; yield the file with their configuration.
 
-    The connection is opened inside of the robot's network namespace, so that there is only SSH between script and
-    robot, unless slow links are used.
+    The connection is opened inside of the robot's network namespace, so that no other program forwards data between
+    script and robot, unless slow links are used.
     """
     login = KeyPair.make()
     with ExitStack() as stack:

@@ -3,9 +3,9 @@
 Publishers and subscribers are separate programs on loopback. Plain pairs use the binding of each middleware as its
 documentation shows; `attached` adds the attachment and the time stamp that rmw_zenoh requires; `agent` uses
 fieldkit's adapters of the same library. Each path over `fieldkit bridge` has a plain publisher or subscriber of ROS
-1, and the plain pair of ROS 1 is its reference. All paths run in sequence: first messages at a fixed rate to measure
-the delay, then as many messages as possible for one second. Each message starts with the time of its creation on the
-machine's clock.
+1, and the plain pair of ROS 1 is its reference. The paths are measured in sequence. Each first carries messages at a
+fixed rate, to measure the delay, and then as many messages as possible for one second. Each message starts with the
+time of its creation on the machine's clock.
 """
 
 import argparse
@@ -115,7 +115,7 @@ def dds_plain(name: str, deliver: Deliver | None) -> Write:
     return lambda _: domain
 
 
-def zenoh_plain(name: str, deliver: Deliver | None, where: str, *, attached: bool) -> Write:
+def zenoh_plain(name: str, deliver: Deliver | None, endpoint_spec: str, *, attached: bool) -> Write:
     """Start a publisher or subscriber with the binding of Zenoh.
 
     `attached` adds the attachment and the time stamp of rmw_zenoh.
@@ -126,7 +126,7 @@ def zenoh_plain(name: str, deliver: Deliver | None, where: str, *, attached: boo
 
     config = zenoh.Config()
     config.insert_json5("scouting/multicast/enabled", "false")
-    config.insert_json5(*endpoint(where))
+    config.insert_json5(*endpoint(endpoint_spec))
     config.insert_json5("timestamping/enabled", json.dumps(attached))
     session = zenoh.open(config)
     if deliver is None:
@@ -159,15 +159,15 @@ def ros1_plain(name: str, deliver: Deliver | None) -> Write:
     return lambda _: subscriber
 
 
-def endpoint(where: str) -> tuple[str, str]:
+def endpoint(endpoint_spec: str) -> tuple[str, str]:
     """Return the name and value of Zenoh's setting for `listen:PORT` or `connect:PORT`."""
-    verb, _, port = where.partition(":")
+    verb, _, port = endpoint_spec.partition(":")
     return f"{verb}/endpoints", json.dumps([f"tcp/{HOST}:{port}"])
 
 
-def agent(middleware_name: str, name: str, deliver: Deliver | None, where: str) -> Write:
+def agent(middleware_name: str, name: str, deliver: Deliver | None, endpoint_spec: str) -> Write:
     """Start a publisher or subscriber with fieldkit's adapter."""
-    settings = dict([endpoint(where)]) if middleware_name == "zenoh" else {}
+    settings = dict([endpoint(endpoint_spec)]) if middleware_name == "zenoh" else {}
     running = middleware.adapter(middleware_name)(
         Network(HOST, discovery="peers", peers=(HOST,), domain=DOMAIN, settings=settings)
     )
@@ -181,7 +181,7 @@ def agent(middleware_name: str, name: str, deliver: Deliver | None, where: str) 
     return lambda _: running
 
 
-def run_end(kind: str, name: str, where: str, *, is_subscriber: bool) -> int:
+def run_end(kind: str, name: str, endpoint_spec: str, *, is_subscriber: bool) -> int:
     """Run a publisher or subscriber, controlled by the lines of standard input.
 
     After a line `SECONDS RATE` a publisher sends; after any line a subscriber prints the messages that it received.
@@ -195,9 +195,9 @@ def run_end(kind: str, name: str, where: str, *, is_subscriber: bool) -> int:
     middleware_name, binding = kind.split()
     callback = deliver if is_subscriber else None
     if binding == "agent":
-        write = agent(middleware_name, name, callback, where)
+        write = agent(middleware_name, name, callback, endpoint_spec)
     elif middleware_name == "zenoh":
-        write = zenoh_plain(name, callback, where, attached=binding == "attached")
+        write = zenoh_plain(name, callback, endpoint_spec, attached=binding == "attached")
     else:
         write = {"dds": dds_plain, "ros1": ros1_plain}[middleware_name](name, callback)
     print("up", flush=True)
@@ -342,25 +342,26 @@ def main() -> int:
     parser.add_argument("--end", nargs=4, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.end:
-        kind, name, where, verb = options.end
-        return run_end(kind, name, where, is_subscriber=verb == "subscribe")
+        kind, name, endpoint_spec, verb = options.end
+        return run_end(kind, name, endpoint_spec, is_subscriber=verb == "subscribe")
     measurements = measure(options.rounds)
     if options.json:
         print(json.dumps(measurements))
         return 0
-    print(f"{'path':22} {'delay, ms':>24} {'more than the reference':>32} {'messages/s':>26} {'burst arrived':>14}")
+    print(f"{'path':22} {'delay, ms':>24} {'above the reference, ms':>32} {'messages/s':>26} {'burst arrived':>14}")
     references = {(row["path"], row["round"]): row["delay_ms"] for row in measurements}
     for message_path in PATHS:
         rows = [row for row in measurements if row["path"] == message_path.name]
         delays = [row["delay_ms"] for row in rows]
-        more = (
+        differences_ms = (
             [row["delay_ms"] - references[message_path.reference, row["round"]] for row in rows]
             if message_path.reference
             else []
         )
         received = sum(row["burst_received"] for row in rows) / sum(row["burst_sent"] for row in rows)
         rates = [row["per_s"] for row in rows]
-        print(f"{message_path.name:22} {spread(delays):>24} {spread(more):>32} {spread(rates):>26} {received:>14.0%}")
+        cells = f"{spread(delays):>24} {spread(differences_ms):>32} {spread(rates):>26} {received:>14.0%}"
+        print(f"{message_path.name:22} {cells}")
     return 0
 
 

@@ -150,7 +150,14 @@ def plain_socket(request_bytes: int, answer_bytes: int) -> Iterator[ExchangePeer
 
 @contextmanager
 def open_federate(role: str, address: str, count: int, pids: Sequence[int] = ()) -> Iterator[ExchangePeer]:
-    """Yield an exchange with an external federate; `role` is `physics` or `network`."""
+    """Yield an exchange with an external federate.
+
+    Args:
+        role: `physics` or `network`.
+        address: Address or command of the federate.
+        count: Number of agents.
+        pids: Process of the federate if it is already running; otherwise the processes that opening it starts.
+    """
     before = child_pids()
     if role == "physics":
         with closing(open_physics(address, make_hello(PHYSICS, count), 60.0)) as physics:
@@ -263,7 +270,7 @@ def measure(peers: Mapping[str, ExchangePeer]) -> dict[str, Times]:
 
 
 def results(count: int, program: Path | None, *, has_ros: bool) -> dict[str, Times]:
-    """Return the times for `count` agents, by role and transport, and those of the peers."""
+    """Return the times for `count` agents, by role and transport, and the times of the peers."""
     inproc = StationaryPhysics(make_hello(PHYSICS, count))
     with ExitStack() as stack:
         peers = {"physics inproc": ExchangePeer(lambda to_ns: inproc.advance(to_ns, {}))}

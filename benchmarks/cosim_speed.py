@@ -4,9 +4,10 @@ Driving robots, 5 m apart, send 10 packets of 100 bytes per second to the next r
 `sliding_window` with windows of 1.1 ms. The figures per number of robots are medians of several rounds: the real-time
 factor; exchanges between the physics and the network simulator per second; the cost of an exchange without the time
 of both simulators and of the programs; and the cost of the coordinator relative to a plain loop that steps the same
-programs and simulators through the same windows, without policies, record of packets (ledger) or event hash. If the
-two deliver different packets, or at different times, the benchmark raises an error. Shipped scenarios follow; then
-robots that drive and fly in MuJoCo, in windows of 10 ms, relative to MuJoCo's own steps.
+programs and simulators through the same windows, without policies, record of packets (ledger) or event hash. If
+coordinator and loop deliver different packets, or at different times, the benchmark raises an error. Then scenarios
+that ship with fieldkit are measured, and robots that drive and fly in MuJoCo, in windows of 10 ms; their cost is
+relative to the steps of MuJoCo alone.
 
 The benchmark runs in one thread without waiting, so all times are processor times. Other load still slows it down
 through shared caches and a lower clock.

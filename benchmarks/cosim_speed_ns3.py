@@ -5,10 +5,10 @@ with windows of 10 ms. *Alone* is the same program of ns-3 with the same packets
 simulated in one `Run()`. *Minimal* passes the same requests through a pipe, one per window, and ignores the answers;
 unlike the co-simulation, it does not keep both processes on one processor (`ProcessorSharing`). *Coupled* is the
 co-simulation: processor time of both processes, without the time of physics simulator and programs. The built-in
-physics simulator usually computes states when they are read; here it computes them in `advance`, so that their time
-is excluded too. All three write the parts of every delay to a file. *Built-in* is the co-simulation with the built-in
-network. Figures are medians of several rounds; in each round the variants alternate. An error is raised if the delays
-differ.
+physics simulator usually computes states when they are read; in this benchmark it computes them in its method
+`advance`, so that their time is excluded too. All three write the parts of every delay to a file. *Built-in* is the
+co-simulation with the built-in network. Figures are medians of several rounds; in each round the variants alternate.
+An error is raised if the delays differ.
 
 `taskset -c 0 python -m benchmarks.cosim_speed_ns3` shows the costs on one processor.
 """

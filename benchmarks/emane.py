@@ -32,7 +32,7 @@ RADIOS: Final = {
     "Wi-Fi, exponent 2.5": "{exponent: 2.5, fading: false}",
     "Wi-Fi, exponent 3": "{fading: false}",
 }
-"""Radios by name, as values of `emulated.radio`, without fading. The first equals EMANE's RF Pipe."""
+"""Radios by name, as values of `emulated.radio`, without fading. The first equals the model RF Pipe of EMANE."""
 
 SITE: Final = """\
 robots: {{}}
@@ -46,7 +46,8 @@ REFERENCES: Final = {
     "paper": {"mean": (5.377, 54.309), "loss": (0.0, 0.0)},
     "EMANE 1.5.3, RF Pipe": {"mean": (2.26, 2.26), "median": (2.12, 2.12), "loss": (0.0, 0.0)},
 }
-"""Results of the paper, and of EMANE on 2 idle cores, before and after the move. The move did not change EMANE's."""
+"""Results of the paper, and of EMANE on 2 idle cores, before and after the move, which did not change EMANE's
+results."""
 
 Figures = dict[str, float | None]
 

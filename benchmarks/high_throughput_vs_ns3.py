@@ -5,9 +5,9 @@ Needs ns-3 3.37 and a C++ compiler: `apt-get install libns3-dev g++`. For all mo
 intervals at multiples of 4 us (IEEE 802.11-2020, 19.4.3, 21.4.3), omits VHT-SIG-B (4 us) of frames to one station,
 and uses 8 us for each HE-LTF at all guard intervals. Then goodput with A-MPDU is compared in one mode: for one
 station at signal-to-noise ratios down to the limit of its range; for several stations; with RTS; and with access
-categories. Rows `bare` are without ns-3's retry limit and BlockAckReq, because ns-3 3.37 does not reset its count
-of failed aggregates to a receiver after a successful one, and therefore drops a whole aggregate at the seventh
-failure.
+categories. In rows `bare` and in rows with an access category, ns-3 has no retry limit and sends no BlockAckReq: ns-3
+3.37 does not reset its count of failed aggregates to a receiver when an aggregate succeeds, so it drops a whole
+aggregate at the seventh failure.
 """
 
 import argparse

@@ -42,7 +42,7 @@ _CELL: Final = ("ibss", "join", "fieldkit", "2412", "HT20", "fixed-freq", "02:66
 
 
 def is_received(trace: dict[str, Any], frame: int, attempt: int, mode: str | None) -> bool:
-    """Return the result of a try; its random draw depends on frame and attempt only. 802.11b (None) always fails."""
+    """Return True if a try succeeds, never with 802.11b (None). The random draw depends on frame and attempt only."""
     if mode is None:
         return False
     error: float = trace["errors"][mode][trace["levels"][frame]]

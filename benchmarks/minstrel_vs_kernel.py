@@ -3,8 +3,8 @@
 A sender moves away from its receiver and back, on open ground, without and with fading. Both algorithms send the same
 frames at the same times. The probability that a try fails is the packet error rate of its mode at the signal-to-noise
 ratio of the frame; both algorithms use the same random draws. The kernel's choices were recorded in a virtual machine
-(`kernel_minstrel`). Its clock counts instructions, so a busy host does not change the choices. `--record` records
-them again, as root. The choices of fieldkit are computed here, for several seeds of its sampling.
+(`kernel_minstrel`). The virtual machine's clock counts instructions, so a busy host does not change the choices.
+`--record` records them again, as root. The choices of fieldkit are computed here, for several seeds of its sampling.
 """
 
 import argparse
@@ -104,7 +104,7 @@ def signal_to_noise_db(frames: int, *, fading: bool) -> list[float]:
 
 
 def trace(frames: int, *, fading: bool) -> dict[str, Any]:
-    """Return the trace for `kernel_minstrel`: level of each frame, and errors of each mode by level."""
+    """Return the trace for `kernel_minstrel`: errors by signal-to-noise level, and the level of each frame."""
     levels_db = [_LOWEST_DB + number * _LEVEL_DB for number in range(_LEVELS)]
     levels = [
         min(max(round((ratio_db - _LOWEST_DB) / _LEVEL_DB), 0), _LEVELS - 1)
@@ -173,7 +173,10 @@ def fieldkit_frames(content: dict[str, Any], times_ns: Sequence[int], seed: int)
 
 
 def goodput_bit_s(frames: Sequence[SelectedFrame]) -> float:
-    """Return the received payload per time on the air, with times between frames and ACKs, without backoffs."""
+    """Return the received payload per time on the air, in bit/s.
+
+    The time includes ACKs and interframe spaces, but no backoffs.
+    """
     air_ns = 0
     for frame in frames:
         for mode in frame.modes:

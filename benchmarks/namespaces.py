@@ -40,7 +40,7 @@ class Namespace:
 
     @property
     def pid(self) -> int:
-        """The process that holds the namespace."""
+        """The process that keeps the namespace open."""
         return self._holder.pid
 
     def inside(self, argv: Sequence[str]) -> list[str]:
@@ -70,7 +70,7 @@ class Namespace:
         return fd
 
     def _open_tun(self, name: str) -> int:
-        """Create a TUN interface, in a thread that exits afterwards, because it joins the namespace."""
+        """Create a TUN interface. The calling thread joins the namespace, so it must exit afterwards."""
         with Path(f"/proc/{self.pid}/ns/net").open("rb") as namespace:
             if _LIBC.setns(namespace.fileno(), _CLONE_NEWNET):
                 number = ctypes.get_errno()

@@ -5,7 +5,8 @@
 // - `link`: goodput in Mbit/s, by traffic class, of saturated stations that send UDP to one receiver, all with the same
 //   distance from each other;
 // - `pairs`: goodput in Mbit/s of two pairs of stations, each with a saturated sender and a receiver;
-// - `udp` and `tcp`: goodput and loss of a stream at a rate, or at the full rate of TCP, and the events of the TCP sender.
+// - `udp`: goodput and loss of a stream at a fixed rate;
+// - `tcp`: goodput of a stream at full rate, and the events of its sender.
 
 #include "ns3/applications-module.h"
 #include "ns3/core-module.h"
@@ -25,9 +26,9 @@ const double kTxPowerDbm = 17;
 const double kNoiseFigureDb = 6;
 const double kWarmUpS = 1;
 
-// A congestion control whose window grows only by newly acknowledged data. ns-3 counts SACKed data again when it is ACKed,
-// so its window jumps after a timeout (RFC 3465, 2.3: at most a segment) and at the end of a recovery (RFC 6937, 3: at the
-// threshold), and its CUBIC continues slow start beyond the threshold (RFC 5681, 3.1).
+// A congestion control whose window grows only by newly acknowledged data. ns-3 counts SACKed data again when it is ACKed.
+// So its window jumps after a timeout, when it may grow by at most a segment (RFC 3465, 2.3), and at the end of a recovery,
+// when it must equal the threshold (RFC 6937, 3); and its CUBIC continues slow start beyond the threshold (RFC 5681, 3.1).
 template <class Control> class Counting : public Control
 {
   public:
@@ -519,12 +520,12 @@ int main(int argc, char** argv)
     CommandLine command;
     command.AddValue("what", "errors, durations, link, pairs, udp or tcp", options.what);
     command.AddValue("mode", "ns-3's name of the mode", options.mode);
-    command.AddValue("stations", "that send", options.stations);
-    command.AddValue("payload", "bytes", options.payload);
+    command.AddValue("stations", "number of stations that send", options.stations);
+    command.AddValue("payload", "UDP payload of a packet, bytes", options.payload);
     command.AddValue("seconds", "duration of the measurement", options.seconds);
     command.AddValue("loss", "path loss between any two stations, dB", options.loss_db);
-    command.AddValue("width", "of the channel, MHz", options.width);
-    command.AddValue("streams", "spatial streams", options.streams);
+    command.AddValue("width", "width of the channel, MHz", options.width);
+    command.AddValue("streams", "number of spatial streams", options.streams);
     command.AddValue("guard", "guard interval, ns", options.guard_ns);
     command.AddValue("ampdu", "maximum size of an A-MPDU, bytes; 0 for none", options.ampdu);
     command.AddValue("amsdu", "maximum size of an A-MSDU, bytes; 0 for none", options.amsdu);
@@ -545,7 +546,7 @@ int main(int argc, char** argv)
     command.AddValue("lost-data", "numbers of the packets to the receiver that the cable drops", options.lost_data);
     command.AddValue("lost-acks", "numbers of the packets to the sender that the cable drops", options.lost_acks);
     command.Parse(argc, argv);
-    // A device registers the modes.
+    // ns-3 registers the modes when a device is created.
     NodeContainer none;
     none.Create(1);
     Install(options, none);

@@ -44,7 +44,7 @@ def overhead_ms(start_ns: int, phases: dict[str, int], end_ns: int, tools: Seque
     by_name = {tool.program: tool for tool in tools}
     record, ping = by_name["rosbag"], by_name["ping"]
     listen, send = listener_and_sender(tools)
-    sent_ns = max(tool.end_ns for tool in tools if tool.program == "tar")
+    fetched_ns = max(tool.end_ns for tool in tools if tool.program == "tar")
     own_ns = {
         "begin": phases["record"] - start_ns,
         "record": phases["start captures"] - phases["record"] - (record.end_ns - record.start_ns),
@@ -53,8 +53,8 @@ def overhead_ms(start_ns: int, phases: dict[str, int], end_ns: int, tools: Seque
         "end transfer": phases["drain captures"] - listen.end_ns,
         "drain captures": phases["ping"] - phases["drain captures"],
         "ping": phases["collect evidence"] - phases["ping"] - (ping.end_ns - ping.start_ns),
-        "collect": sent_ns - phases["collect evidence"],
-        "check, write": end_ns - sent_ns,
+        "collect": fetched_ns - phases["collect evidence"],
+        "check, write": end_ns - fetched_ns,
     }
     return {name: own / 1e6 for name, own in own_ns.items()}
 

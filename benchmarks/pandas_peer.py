@@ -1,4 +1,4 @@
-"""Aggregation without fieldkit, as a researcher would write it.
+"""Aggregation with pandas and scipy, as a researcher would write it; only the list of quantities is from fieldkit.
 
 `python -m benchmarks.pandas_peer FOLDER` prints the result as JSON.
 """

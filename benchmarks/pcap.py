@@ -277,7 +277,7 @@ def main() -> None:
         print(json.dumps({"load": load, "packets_s": rates_by_peer, "big": big}))
         return
     print(f"load average before: {load:.2f} on {os.cpu_count()} cores\n")
-    print("| | packets/s, median (lowest to highest) | fieldkit is faster by |\n| --- | --- | --- |")
+    print("| | packets/s, median (lowest to highest) | fieldkit's speed / reader's speed |\n| --- | --- | --- |")
     for peer, values in rates_by_peer.items():
         ratios = [
             fieldkit_rate / peer_rate

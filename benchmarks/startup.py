@@ -1,9 +1,9 @@
 """Start-up time of commands: `python -m benchmarks.startup`; needs no root.
 
 Each command of fieldkit runs alternately with its references: Python that does nothing, `git --version`, and Python
-that only imports the libraries of the command. It measures wall time, processor time and the peak memory of the
-process, which is at least the 16 MB of this benchmark. The main figure is fieldkit's processor time minus that of its
-libraries. `--peer PYTHON` runs fieldkit of another checkout with that Python.
+that only imports the libraries of the command. The benchmark measures wall time, processor time and the peak memory
+of the process, which is at least the 16 MB of the benchmark. The main figure is the command's processor time minus
+the time to import its libraries. `--peer PYTHON` runs fieldkit of another checkout with that Python.
 """
 
 import argparse
@@ -30,6 +30,7 @@ _TAB: Final = {
     "COMP_LINE": _LINE,
     "COMP_POINT": str(len(_LINE)),
 }
+"""Variables with which a shell requests the completion of `_LINE` from argcomplete."""
 # By default OpenBLAS starts a thread per core that spins. fieldkit disables this, so the reference must, too.
 _ONE_THREAD: Final = {"OPENBLAS_NUM_THREADS": "1"}
 _DISPLAY_LIBRARIES: Final = "rich.console, rich.live, rich.table, rich.text"

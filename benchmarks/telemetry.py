@@ -5,7 +5,7 @@ the kernel `iw` fails early, and the sampler gets a stored station text instead;
 added. The reference is a loop in the same shell that calls `iw` three times and sleeps 0.2 s. Processor time is the
 kernel's count for the shell and its children, per second.
 
-The row `a source` is a telemetry source of a profile: a program that prints a line every 2 s.
+The row `a source` is a telemetry source of a profile, in this case a program that is run every 2 s.
 
 A slower computer is simulated by an `iw` that runs several times. The sampler must then call it less often to stay
 within its share of the processor time.

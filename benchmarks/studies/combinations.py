@@ -172,7 +172,8 @@ def simulator_table(rows: Sequence[StudyRow]) -> Iterator[str]:
     by_pair = by_pair_and_policy(rows)
     bases = {run.seed: run for run in by_pair.get(((BUILT_IN, BUILT_IN), REFERENCE), [])}
     yield (
-        "| physics | network | loss (%) | mean delay (ms) | difference (ms) | mean distance (m) | difference (mm) |"
+        "| physics | network | loss (%) | mean delay (ms) | difference (ms) | mean distance of robots (m) "
+        "| difference (mm) |"
     )
     yield "| --- | --- | --- | --- | --- | --- | --- |"
     for (pair, policy), runs in by_pair.items():

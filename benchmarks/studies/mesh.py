@@ -1,10 +1,10 @@
 """Time that a mesh takes to heal: `python -m benchmarks.studies.mesh --out FOLDER [--figure FILE.svg]`, as root.
 
 The program runs trials of four layouts and two hello intervals in sequence, unless FOLDER already has them, on
-emulated robots without fading, with five repeats each. This takes 2 hours. Then it prints a table of `rtt_gap_s`,
-with the bound of 13.7 hello intervals (docs/studies/mesh.md), and draws a figure. In each repeat a robot on
-the path is switched off, and the mesh must find another path. The layout `row` has no other path, so its healing time
-starts when the robot is switched on again.
+emulated robots without fading, with five repeats each. This takes 2 hours. Then it prints a table of the gap
+(`rtt_gap_s`: the longest time without a reply to a ping), with its upper bound of 13.7 hello intervals
+(docs/studies/mesh.md), and draws a figure. In each repeat a robot on the path is switched off, and the mesh must find
+another path. The layout `row` has no other path, so its healing time starts when the robot is switched on again.
 """
 
 import argparse
@@ -100,7 +100,10 @@ def _make_lab(lab: Path, layout: Layout, hello_s: int) -> None:
 
 def table(gaps_by_layout: Mapping[tuple[str, int], list[float]]) -> str:
     """Return a Markdown table, a line per layout and hello interval."""
-    lines = ["| layout | hello | repeats | least | median | most | bound |", "| --- " * 7 + "|"]
+    lines = [
+        "| layout | hello interval | repeats | shortest gap | median gap | longest gap | bound |",
+        "| --- " * 7 + "|",
+    ]
     for (name, hello_s), gaps in gaps_by_layout.items():
         seconds = (
             f"{gap_s:.1f} s" for gap_s in (min(gaps), statistics.median(gaps), max(gaps), BOUND_HELLOS * hello_s)

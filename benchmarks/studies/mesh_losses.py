@@ -1,10 +1,11 @@
 """Time that a mesh takes to find another path: `python -m benchmarks.studies.mesh_losses [--losses N]`, as root.
 
-Three labs run at the same time. Each has a path of three hops from the sender to the receiver, and a second path: in
-the first lab of four hops without fading, in the second of four hops with fading, in the third of three hops with
-fading. The first robot on the used path is switched off until the receiver answers a ping of the sender again, or for
-at most `PATIENCE_S`. Then it is switched on again. The next loss follows when packets use this robot again. At the
-end the program prints a table of the times without an answer. 40 losses take about half an hour.
+Three labs run at the same time. Each has a path of three hops from the sender to the receiver, and a second path. The
+second path has four hops in the first lab, which has no fading, three hops in the second lab, and four hops in the
+third lab; these two have fading. The first robot on the used path is switched off until the receiver answers a ping
+of the sender again, or for at most `PATIENCE_S`. Then it is switched on again. The next loss (a robot that is
+switched off) follows when packets use this robot again. At the end the program prints a table of the times without an
+answer. 40 losses take about half an hour.
 """
 
 import argparse
@@ -169,14 +170,15 @@ def row(detour: Detour, times_s: Sequence[float | None]) -> str:
 def main() -> None:
     """Switch robots off in all labs, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--losses", type=int, default=40, help="losses per lab")
+    parser.add_argument("--losses", type=int, default=40, help="how often a robot is switched off in each lab")
     options = parser.parse_args()
     load_before = os.getloadavg()[0]
     with ExitStack() as stack:
         labs = [stack.enter_context(lab(detour)) for detour in DETOURS]
         pool = stack.enter_context(ThreadPoolExecutor(len(labs)))
         times_by_lab = list(pool.map(healing_times_s, labs, DETOURS, [options.losses] * len(labs)))
-    print(f"| detour | fading | losses | median | most | above {BOUND_HELLOS * HELLO_S:.2f} s |")
+    bound_s = BOUND_HELLOS * HELLO_S
+    print(f"| paths | fading | losses | median time | longest time | losses with more than {bound_s:.2f} s |")
     print("| --- " * 6 + "|")
     print("\n".join(map(row, DETOURS, times_by_lab)))
     print(f"load {load_before:.1f} before, {os.getloadavg()[0]:.1f} after")

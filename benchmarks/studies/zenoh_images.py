@@ -212,7 +212,8 @@ def table(lost_images: Mapping[str, Sequence[Sequence[int]]], conditions: str) -
     """Yield a table with the number of lost images in each repeat, in the order of the repeats."""
     yield conditions
     yield ""
-    yield f"| pair and settings | images lost of {SAMPLES}, a number for each repeat | first image lost |"
+    lost_header = f"images lost of {SAMPLES}, a number for each repeat"
+    yield f"| pair and settings | {lost_header} | repeats that lost the first image |"
     yield "| --- | --- | --- |"
     for label, repeats in lost_images.items():
         first = sum(0 in lost for lost in repeats)

@@ -15,7 +15,8 @@ from sim_backends.federates.transports.datagrams import DatagramHeader, Datagram
 
 _NUMBERS: Final = (
     "Numbers are little endian, without padding: `i64` signed, `u32` unsigned, `f64` an IEEE 754 double; `text` is a "
-    "`u16` with the number of bytes, then UTF-8. A frame has a header of 16 bytes: `size` u32 (bytes after it), "
+    "`u16` with the number of bytes, then UTF-8. A list is a number of items, then the items: `commands` u32, each a "
+    "command. A frame has a header of 16 bytes: `size` u32 (bytes after it), "
     "`kind` u16, `reserved` u16 (0), `request` u32 (its number), `copy` u32 (the copy of the federate that the "
     "request is for; 0 is the original). The answer repeats `request` and `copy`, also to `fork`."
 )

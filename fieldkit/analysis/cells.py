@@ -258,7 +258,7 @@ def _estimates(repeats: Repeats, quantity: Quantity, rows: Indices, cells: Indic
         cells: Cell of each row of `repeats`.
     """
     rows = rows[np.isfinite(repeats.observed(quantity)[0][rows])]
-    for name in quantity.columns[1:]:  # omit shares without counts, because they cannot be summed over repeats
+    for name in quantity.columns[1:]:  # omit repeats with a share but no counts, which cannot be summed over repeats
         rows = rows[np.isfinite(repeats.numbers[name][rows])]
     cell_of_row = cells[rows]
     starts = np.flatnonzero(np.diff(cell_of_row, prepend=-1))
@@ -357,11 +357,11 @@ def _p_order(repeats: Repeats, quantity: Quantity, cell_rows: Indices) -> NDArra
 
 
 def _counts(repeats: Repeats, quantity: Quantity, cell_rows: Indices) -> tuple[NDArray[np.float64], ...] | None:
-    """Return the numbers of lost and of sent items of each repeat. For a flag, these are its values and ones.
+    """Return the numbers of lost and of sent items of each repeat; None for a quantity that is not counted.
 
-    The result is None for other quantities. A number of lost items can be negative: `paper_received` can be larger
-    than `paper_packets`, because the two captures contain different frames with the same data if a network card
-    splits or merges frames (segmentation offload).
+    For a flag, the first number is its value (0 or 1), and the second is 1. A number of lost items can be negative:
+    `paper_received` can be larger than `paper_packets`, because the two captures contain different frames with the
+    same data if a network card splits or merges frames (segmentation offload).
     """
     if quantity.kind is Kind.FLAG:
         flags = repeats.numbers[quantity.name][cell_rows]

@@ -32,8 +32,8 @@ too many conditions.
 """
 
 _KERNEL_COLUMNS: Final = frozenset({"tcp_congestion_control"})
-"""Columns of the operating systems. They may differ in a comparison of backends, which have the kernels of real
-robots, the kernel of the laptop that emulates robots, or the TCP of a simulation."""
+"""Columns that depend on the operating system's kernel. They may differ in a comparison of backends, which use the
+kernels of real robots, the kernel of the laptop that emulates robots, or the TCP of a simulation."""
 
 _IDENTITY_COLUMNS: Final = frozenset({"profiles_sha256", "procedure_sha256"})
 
@@ -177,7 +177,7 @@ def _compare_column(name: str, a: Repeats, b: Repeats, *, refuses: bool) -> Iter
     """Yield a concern if the values of a column in A and B differ."""
     text_a, text_b = _values(name, a), _values(name, b)
     is_unknown = UNKNOWN in {text_a, text_b}
-    # A column that is missing in both runs is not a difference, unless it identifies robots or procedure.
+    # If a column is missing in both runs, this is a concern only for columns that identify robots or procedure.
     if text_a != text_b or (is_unknown and name in _IDENTITY_COLUMNS):
         yield Concern(name, text_a, text_b, (), refuses and (not is_unknown or name in _IDENTITY_COLUMNS))
 

@@ -1,6 +1,6 @@
 """Comparison of two runs A and B: differences per condition and quantity.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -56,7 +56,10 @@ class Difference:
 
     @property
     def within(self) -> bool | None:
-        """True if the whole interval is within plus or minus the threshold; None without a threshold."""
+        """True if the whole interval is within plus or minus the threshold; None without a threshold.
+
+        False without an interval.
+        """
         if self.threshold is None:
             return None
         return self.interval is not None and max(-self.interval.low, self.interval.high) <= self.threshold
@@ -124,7 +127,10 @@ class Comparison:
 
     @property
     def varied(self) -> tuple[Concern, ...]:
-        """Variables of the comparison: columns that have one value in each run, and do not identify conditions."""
+        """Columns of `comparable.VARIED` that are the variable of the comparison, with their values in A and B.
+
+        Such a column has one value in each run, and does not identify conditions.
+        """
         return tuple(
             concern
             for concern in self.concerns

@@ -116,7 +116,7 @@ def verdict(difference: Difference, comparisons: int) -> str:
     else:
         largest = max(abs(difference.interval.low), abs(difference.interval.high))
         text = f"no difference seen; up to {_amount(largest, difference)} possible"
-    return text + _threshold(difference)
+    return text + _threshold_text(difference)
 
 
 def is_significant(difference: Difference) -> bool:
@@ -143,11 +143,11 @@ def conclusions(comparison: Comparison) -> Iterator[str]:
         for difference in pair.differences
         if difference.within is not None
     ]
-    missed = [(name, difference) for name, difference in limited if not difference.within]
+    not_within = [(name, difference) for name, difference in limited if not difference.within]
     if limited:
-        yield f"shown to be within its threshold: {len(limited) - len(missed)} of {len(limited)}"
-    for name, difference in missed:
-        yield f"not shown to be within {_limit(difference)}: {difference.quantity.name} in {name}"
+        yield f"shown to be within its threshold: {len(limited) - len(not_within)} of {len(limited)}"
+    for name, difference in not_within:
+        yield f"not shown to be within {_threshold_amount(difference)}: {difference.quantity.name} in {name}"
     sides = (("A", [pair.a for pair in comparison.pairs]), ("B", [pair.b for pair in comparison.pairs]))
     for side, cells in sides:
         # A caution starts with the mark (`* ` or `! `) of the intervals that it explains. Comparisons print no marks.
@@ -156,10 +156,10 @@ def conclusions(comparison: Comparison) -> Iterator[str]:
         )
 
 
-def _threshold(difference: Difference) -> str:
+def _threshold_text(difference: Difference) -> str:
     if difference.within is None:
         return ""
-    return f"; {'within' if difference.within else 'may exceed'} {_limit(difference)}"
+    return f"; {'within' if difference.within else 'may exceed'} {_threshold_amount(difference)}"
 
 
 def comparison_scale(difference: Difference) -> wording.Scale:
@@ -167,7 +167,7 @@ def comparison_scale(difference: Difference) -> wording.Scale:
     return wording.scale_of(difference.quantity, [side.value for side in (difference.a, difference.b) if side])
 
 
-def _limit(difference: Difference) -> str:
+def _threshold_amount(difference: Difference) -> str:
     limit = comparison_scale(difference).factor * (difference.threshold or 0)
     return f"{limit:.6g} {_unit(difference)}".rstrip()
 

@@ -2,8 +2,8 @@
 
 A sweep runs a simulation with several values of each factor. A flow is a stream of packets and its receiver.
 
-The metadata of each file has the names of the columns that are folders (`partitions`), the columns that identify a
-condition (`by`), and declarations of columns that trials do not have.
+The metadata of each file has the names of the columns whose values are names of folders (`partitions`), the columns
+that identify a condition (`by`), and declarations of columns that trials do not have.
 """
 
 import json
@@ -49,7 +49,7 @@ def condition(folder: Path) -> dict[str, str]:
         For each column, in order, the name of the column that contains its values as the user typed them.
     """
     by, partitions = ([*map(str, _metadata(folder, key))] for key in ("by", "partitions"))  # type: ignore[call-overload]
-    return dict(zip(by, (*by[:1], *partitions), strict=True))  # the flow's column has the typed names itself
+    return dict(zip(by, (*by[:1], *partitions), strict=True))  # the column of the flow contains the typed names
 
 
 def declared_columns(folder: Path) -> tuple[Column, ...]:
@@ -84,14 +84,14 @@ def read(folder: Path, declared: Mapping[str, Column]) -> tuple[dict[str, Number
             partition_base_dir=str(base),
         )
         table = dataset.to_table([name for name in dataset.schema.names if name in declared])
-        present = {
+        columns = {
             name: table.column(name).cast(arrow_type(declared[name]))
             for name in table.column_names
             if name in declared
         }
     except (OSError, pa.ArrowException) as error:
         raise EvidenceError(f"cannot be read: {error}", where=str(folder), remedy=_REMEDY) from error
-    return *arrow_columns(present, declared, len(table)), len(table)
+    return *arrow_columns(columns, declared, len(table)), len(table)
 
 
 def _column(field: pa.Field) -> Column:

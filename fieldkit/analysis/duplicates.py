@@ -19,30 +19,32 @@ def deduplicated(repeats: Repeats) -> tuple[Repeats, tuple[str, ...]]:
     # Attempts without the name of a trial cannot be identified, so all of them are kept.
     unnamed = repeats.texts["trial"] == ""
     attempts[unnamed] = len(repeats) + np.flatnonzero(unnamed)
-    _, index, inverse = np.unique(attempts, return_index=True, return_inverse=True)
-    firsts = index[inverse]
-    duplicates = np.flatnonzero(firsts != np.arange(len(repeats)))
+    _, kept_rows, attempt_of_row = np.unique(attempts, return_index=True, return_inverse=True)
+    first_row_of_attempt = kept_rows[attempt_of_row]
+    duplicates = np.flatnonzero(first_row_of_attempt != np.arange(len(repeats)))
     if not len(duplicates):
         return repeats, ()
-    _check_equal(repeats.where(firsts[duplicates]), repeats.where(duplicates))
-    pairs = Counter(zip(repeats.texts[SOURCE][duplicates], repeats.texts[SOURCE][firsts[duplicates]], strict=True))
+    originals = first_row_of_attempt[duplicates]
+    _check_equal(repeats.where(originals), repeats.where(duplicates))
+    pairs = Counter(zip(repeats.texts[SOURCE][duplicates], repeats.texts[SOURCE][originals], strict=True))
     notes = tuple(
-        f"{source}: {format_count(rows, 'row')} also in {kept}, counted once"
-        for (source, kept), rows in pairs.items()
+        f"{source}: {format_count(rows, 'row')} also in {first_source}, counted once"
+        for (source, first_source), rows in pairs.items()
     )
-    return repeats.where(np.sort(index)), notes
+    return repeats.where(np.sort(kept_rows)), notes
 
 
-def _check_equal(kept: Repeats, other: Repeats) -> None:
-    """Raise an error if two tables have different values in the same row."""
-    differ = {name: column != other.texts[name] for name, column in kept.texts.items() if name != SOURCE}
-    for name, column in kept.numbers.items():
-        differ[name] = (column != other.numbers[name]) & ~(np.isnan(column) & np.isnan(other.numbers[name]))
-    for name, column in differ.items():
+def _check_equal(originals: Repeats, duplicates: Repeats) -> None:
+    """Raise an error if a duplicate row has another value than its original, the row with the same index."""
+    differs = {name: column != duplicates.texts[name] for name, column in originals.texts.items() if name != SOURCE}
+    for name, column in originals.numbers.items():
+        duplicate = duplicates.numbers[name]
+        differs[name] = (column != duplicate) & ~(np.isnan(column) & np.isnan(duplicate))
+    for name, column in differs.items():
         for index in np.flatnonzero(column)[:1]:
             raise ConfigurationError(
-                f"{kept.name(index)} of {kept.texts['trial'][index]} has another {name} "
-                f"than in {kept.texts[SOURCE][index]}",
-                where=other.texts[SOURCE][index],
+                f"{originals.name(index)} of {originals.texts['trial'][index]} has another {name} "
+                f"than in {originals.texts[SOURCE][index]}",
+                where=duplicates.texts[SOURCE][index],
                 remedy="name only one of these two sources",
             )

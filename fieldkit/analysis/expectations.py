@@ -17,7 +17,7 @@ _TEXT: Final = re.compile(
     r"(?P<name>[a-z][a-z0-9_.]{0,100})\s*(?P<sign><=|>=|<|>)\s*(?P<amount>[^<>=]+?)(?P<packets>\s+of\s+all\s+packets)?",
     re.ASCII,
 )
-_FORMS: Final = "ip_loss < 2 %; every rtt_gap_s < 300 ms; 90 % of rtt_gap_s < 300 ms; ip_loss < 2 % of all packets"
+_EXAMPLES: Final = "ip_loss < 2 %; every rtt_gap_s < 300 ms; 90 % of rtt_gap_s < 300 ms; ip_loss < 2 % of all packets"
 MAX_SHARE: Final = 0.9999
 """Maximum share of all repeats that an expectation may require."""
 _MIN_LOSS: Final = 1e-9
@@ -84,7 +84,7 @@ def parse(text: str, quantities: Iterable[Quantity]) -> Expectation:
     quantities_by_name = {quantity.name: quantity for quantity in quantities}
     match = _TEXT.fullmatch(text.strip())
     if match is None:
-        raise ConfigurationError(f"{text[:60]!r} is not an expectation", remedy=f"write for example: {_FORMS}")
+        raise ConfigurationError(f"{text[:60]!r} is not an expectation", remedy=f"write for example: {_EXAMPLES}")
     if (name := match["name"]) not in quantities_by_name:
         raise ConfigurationError(
             f"the expected figure {name!r} does not exist",

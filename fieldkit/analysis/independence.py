@@ -74,7 +74,7 @@ def _von_neumann(centred: Floats) -> tuple[Floats, Floats]:
 
     The variance is computed over all permutations of the centred ranks x; s and q are the sums of their squares and
     of their fourth powers. Products of two terms (x_i - x_j)^2 are grouped by the number of common indices: two, one
-    or none.
+    or none. Each group is its mean product times the number of products.
     """
     n = centred.shape[1]
     s, q = (centred**2).sum(axis=1), (centred**4).sum(axis=1)
@@ -82,10 +82,10 @@ def _von_neumann(centred: Floats) -> tuple[Floats, Floats]:
     two, three, four = n * (n - 1), n * (n - 1) * (n - 2), n * (n - 1) * (n - 2) * (n - 3)
     squares, cubes = (s**2 - q) / two, -q / two  # means of x^2 y^2 and x^3 y over different ranks
     pairs, all_four = (2 * q - s**2) / three, (3 * s**2 - 6 * q) / four  # means of x^2 y z and x y z w
-    share_both = 2 * q / n - 8 * cubes + 6 * squares
-    share_one = 3 * squares + q / n - 4 * cubes
-    share_none = 4 * (squares - 2 * pairs + all_four)
-    second_moment = (n - 1) * share_both + 2 * (n - 2) * share_one + (n - 2) * (n - 3) * share_none
+    mean_two_common = 2 * q / n - 8 * cubes + 6 * squares
+    mean_one_common = 3 * squares + q / n - 4 * cubes
+    mean_none_common = 4 * (squares - 2 * pairs + all_four)
+    second_moment = (n - 1) * mean_two_common + 2 * (n - 2) * mean_one_common + (n - 2) * (n - 3) * mean_none_common
     ratio = (np.diff(centred, axis=1) ** 2).sum(axis=1) / s
     return 1 - ratio / 2, (second_moment / s**2 - 4) / 4
 

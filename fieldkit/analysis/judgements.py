@@ -1,6 +1,6 @@
 """Judgements of expectations by measured figures. If repeats are missing or censored, the ruling is never `holds`.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 import math
@@ -68,7 +68,7 @@ class _Decision:
 
 
 def judge(expectations: Sequence[Expectation], cells: Sequence[Cell]) -> tuple[Judgement, ...]:
-    """Return the judgements of expectations, in their order. They are undecided without cells."""
+    """Return the judgements of expectations, in their order. If there are no cells, all of them are undecided."""
     return tuple(judgement for expectation in expectations for judgement in _judge_cells(expectation, cells))
 
 

@@ -17,7 +17,7 @@ bursts that are too rare to occur during the run, the true loss can be above the
 """
 
 ROUNDING: Final = 1e-12
-"""Relative rounding error up to which a bound equals a required share."""
+"""A bound that is below a required share by at most this relative rounding error counts as equal to it."""
 
 _BISECTIONS: Final = 60
 """Number of bisections of the range 0 to 1. The result is then as exact as a double can be."""

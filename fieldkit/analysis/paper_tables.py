@@ -34,8 +34,8 @@ def to_markdown(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Q
     shown = [(line, line.scale(cells)) for line in lines(cells, quantities)]
     words = wording.word_labels(cells)
     head = [*varying, "repeats", *(scale.head(line.label) for line, scale in shown), *words.values()]
-    marks = ["---"] * (len(varying) + 1) + ["---:"] * len(shown) + ["---"] * len(words)
-    rows = [markdown_line(head), markdown_line(marks)]
+    alignments = ["---"] * (len(varying) + 1) + ["---:"] * len(shown) + ["---"] * len(words)
+    rows = [markdown_line(head), markdown_line(alignments)]
     for cell in cells:
         conditions = (wording.key(cell, name) for name in varying)
         figures = (line.number(cell, scale) for line, scale in shown)

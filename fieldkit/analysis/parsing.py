@@ -82,8 +82,8 @@ def arrow_columns(
 
 def codes(column: Texts) -> NDArray[np.int64]:
     """Return the index of the first row with an equal text, for each row of a column."""
-    first: dict[str, int] = {}
-    return np.fromiter(map(first.setdefault, column, count()), np.int64, len(column))
+    row_by_text: dict[str, int] = {}
+    return np.fromiter(map(row_by_text.setdefault, column, count()), np.int64, len(column))
 
 
 def arrow_type(column: Column) -> pa.DataType:

@@ -136,7 +136,7 @@ def in_order(quantities: Iterable[Quantity]) -> tuple[Quantity, ...]:
 
 
 def symbols(unit: str) -> tuple[str, ...]:
-    """Return the symbols with which values of a unit, and their differences, are written."""
+    """Return the symbols with which a value of a unit, or a difference of two values, can be written."""
     return (
         tuple(PER_UNIT[unit]) if unit in PER_UNIT else tuple(dict.fromkeys((unit, DIFFERENCE_UNITS.get(unit, unit))))
     )

@@ -2,7 +2,7 @@
 
 Expectations are checked before the trial runs. Additional repeats narrow the interval of a cell to a requested width.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 import math
@@ -84,14 +84,15 @@ def _repeats_for_interval(expectation: Expectation, quantity: Quantity) -> int:
     """Return the smallest number of repeats with which the 95 % interval of a figure can be within the bound.
 
     For a share, it is computed with the score interval of repeats without loss (Wilson 1927), whose end is
-    z²/(n + z²). Because of the factor 1 + 1e-12, rounding errors do not reduce the number.
+    z²/(n + z²). Because of the factor 1 + 1e-12, rounding errors do not reduce the number. Other quantities need two
+    repeats, because a single repeat has no interval.
     """
     if quantity.unit != "share" or quantity.kind is Kind.MEDIAN:
         return 2
-    width = expectation.bound if expectation.is_below else 1 - expectation.bound
-    if not 0 < width < 1 or (quantity.kind is not Kind.FLAG and not expectation.is_below):
+    max_end = expectation.bound if expectation.is_below else 1 - expectation.bound
+    if not 0 < max_end < 1 or (quantity.kind is not Kind.FLAG and not expectation.is_below):
         return 2
-    return max(math.floor(NORMAL**2 * (1 / width - 1) * (1 + 1e-12)) + 1, 2)
+    return max(math.floor(NORMAL**2 * (1 / max_end - 1) * (1 + 1e-12)) + 1, 2)
 
 
 _BISECTIONS: Final = 60  # enough for every number of repeats that a float represents exactly
@@ -155,18 +156,18 @@ def additional_repeats(
             bounded, _inverse_trials(value, half) / _inverse_trials(value, requested), (half / requested) ** 2
         )
     ratio = np.maximum(ratio, 1)
-    # Intervals that use no estimated variance have the normal quantile instead of Student's.
+    # Intervals without an estimated variance use the normal quantile instead of Student's.
     if is_share:
-        estimated = (kind is not Kind.FLAG) & (value > 0) & (value < 1)
+        uses_student = (kind is not Kind.FLAG) & (value > 0) & (value < 1)
     else:
-        estimated = (n < MIN_FOR_ORDER_STATISTICS) | (kind is Kind.MEAN)
+        uses_student = (n < MIN_FOR_ORDER_STATISTICS) | (kind is Kind.MEAN)
     with_normal = np.ceil(n * ratio * (1 - 1e-12))  # rounding must not increase the result for a ratio of 1
-    total = np.where(estimated, _with_student(n, ratio, with_normal), with_normal)
+    total = np.where(uses_student, _with_student(n, ratio, with_normal), with_normal)
     return np.asarray(total - n)
 
 
 def _inverse_trials(share: NDArray[np.float64], half: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return quantile²/trials of a score interval with the half-width `half`, which must be below 1/2."""
+    """Return quantile²/trials of a score interval with the half-width `half`; infinity for 1/2 and more."""
     spread, square = share * (1 - share), half**2
     a, b = 0.25 - square, spread - 2 * square
     return np.where(half < 0.5, (np.sqrt(b * b + 4 * a * square) - b) / (2 * a), np.inf)

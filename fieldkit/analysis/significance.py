@@ -54,7 +54,7 @@ def holm(p_values: ArrayLike) -> tuple[float, ...]:
 def cliffs_delta(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     """Return the share of pairs in which the value of `b` is larger, minus the share in which it is smaller.
 
-    The result is -1 or 1 if the samples do not overlap, and 0 if both are larger equally often (Cliff 1993, Psychol.
+    The result is -1 or 1 if the samples do not overlap, and 0 if each is larger equally often (Cliff 1993, Psychol.
     Bull. 114:494).
 
     Args:

@@ -104,7 +104,8 @@ def shares(lost: ArrayLike, sent: ArrayLike) -> Intervals:
         # Repeats with equal shares have variance 0, but the share is not certain. Losses are then treated as
         # independent.
         trials = np.where(squares > 0, trials, total)
-        repeats = total**2 / (sent**2).sum(axis=1)  # Kish 1965, Survey Sampling, 11.7: n if all sent the same number
+        # Effective number of repeats (Kish 1965, Survey Sampling, 11.7): n if all repeats sent the same number.
+        repeats = total**2 / (sent**2).sum(axis=1)
         is_mixed = (value > 0) & (value < 1)
         quantile = np.where(is_mixed, student(freedom), NORMAL)
         low, high = _score_interval(value, np.where(is_mixed, trials, repeats), quantile)
@@ -156,9 +157,9 @@ def means(values: ArrayLike) -> Intervals:
     skew = (deviations**3).mean(axis=1) / np.where(squares > 0, squares / n, 1) ** 1.5
     skew = np.where(np.abs(skew) < 1e-6, 1e-6, skew)  # approximates the limit at 0 and prevents 0/0
     deviation = scale * np.sqrt(squares / (n - 1))
-    reach = student(freedom) / math.sqrt(n)
+    quantile = student(freedom) / math.sqrt(n)
     low, high = (
-        value - deviation * (np.cbrt(1 + skew * (w - skew / (6 * n))) - 1) / (skew / 3) for w in (reach, -reach)
+        value - deviation * (np.cbrt(1 + skew * (w - skew / (6 * n))) - 1) / (skew / 3) for w in (quantile, -quantile)
     )
     return Intervals(value, low, high)
 
@@ -212,7 +213,8 @@ def medians(
 def guaranteed_coverage(n: int) -> float:
     """Return the coverage of the interval of a median of n repeats for any distribution.
 
-    The range of all repeats does not contain the median only if all repeats are on one side of it.
+    The median is outside of the range of the repeats only if all repeats are on the same side of it. The probability
+    of this is 2 * 0.5^n.
     """
     return CONFIDENCE if n >= MIN_FOR_ORDER_STATISTICS else 1 - 2.0 ** (1 - n)
 

@@ -37,7 +37,7 @@ def read(
     content: Callable[[Path], bytes] = Path.read_bytes,
     indexed: "IndexedRows | None" = None,
 ) -> Repeats:
-    """Return the rows of many tables, in the order of `paths`. Columns that a table does not have are missing.
+    """Return the rows of many tables, in the order of `paths`. Values of columns that a table lacks are missing.
 
     Tables with the same header are parsed together, some tens of megabytes at a time, because starting pyarrow's
     parser takes longer than parsing the 40 rows of a trial.
@@ -59,31 +59,31 @@ def read(
     }
     batches: dict[bytes, _Batch] = {}
     parts: list[Repeats] = []
-    order: list[NDArray[np.int64]] = []
+    table_numbers: list[NDArray[np.int64]] = []  # for each part, the index in `paths` of the table of each row
 
     def parse_batch(batch: _Batch) -> None:
         part, counts = batch.parse(columns_by_name)
         parts.append(part)
-        order.append(np.repeat(batch.numbers, counts))
+        table_numbers.append(np.repeat(batch.numbers, counts))
 
     indexed_paths = frozenset[Path]()
     paths = list(paths)
     if indexed is not None and (from_index := _read_indexed(indexed, paths, columns_by_name)) is not None:
         indexed_paths = indexed.tables
         parts.append(from_index[0])
-        order.append(from_index[1])
+        table_numbers.append(from_index[1])
     for number, path in enumerate(paths):
         if path in indexed_paths:
             continue
         if path.is_dir():
             dataset = _read_dataset(path, columns_by_name)
             parts.append(dataset)
-            order.append(np.full(len(dataset), number))
+            table_numbers.append(np.full(len(dataset), number))
             continue
         # A large table is read in blocks, unless `content` reads its bytes in another way.
         if content == Path.read_bytes and (large := _read_large(path, columns_by_name)) is not None:
             parts.append(large)
-            order.append(np.full(len(large), number))
+            table_numbers.append(np.full(len(large), number))
             continue
         header, body = _split(path, content)
         if header not in batches:
@@ -95,8 +95,8 @@ def read(
     for batch in batches.values():
         parse_batch(batch)
     rows = _concatenated(parts or [parse_rows((), b"", columns_by_name)])
-    numbers = np.concatenate(order) if order else np.empty(0, np.int64)
-    return rows if (np.diff(numbers) >= 0).all() else rows.where(np.argsort(numbers, kind="stable"))
+    number_of_row = np.concatenate(table_numbers) if table_numbers else np.empty(0, np.int64)
+    return rows if (np.diff(number_of_row) >= 0).all() else rows.where(np.argsort(number_of_row, kind="stable"))
 
 
 class IndexedRows(Protocol):
@@ -254,15 +254,15 @@ class _Batch:
 
 
 def _typed(
-    names: Sequence[str], body: bytes, declared: Mapping[str, Column], rows: int
+    names: Sequence[str], body: bytes, declared: Mapping[str, Column], line_count: int
 ) -> Mapping[str, parsing.ArrowColumn] | None:
-    """Return the Arrow columns of lines, or None if a value is invalid or a line is not a row."""
+    """Return the Arrow columns of lines, or None if a value is invalid or the lines are not one row each."""
     try:
         columns, row_count = parsing.csv_columns(names, body, declared)
         values, texts = parsing.arrow_columns(columns, declared, row_count)
     except ValueError:
         return None
-    is_valid = row_count == rows and _is_valid(Repeats(values, texts, tuple(declared.values())), declared)
+    is_valid = row_count == line_count and _is_valid(Repeats(values, texts, tuple(declared.values())), declared)
     return columns if is_valid else None
 
 

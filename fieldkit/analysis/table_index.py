@@ -68,7 +68,7 @@ TableStamp = tuple[FileStamp, FileStamp | None]
 
 
 def stamp(table: Path, plan: Path) -> TableStamp | None:
-    """Return the stamps of a table and its plan, or None if one is not a regular file, so that it is not indexed."""
+    """Return the stamps of a table and its plan; None, so that it is not indexed, if one is not a regular file."""
     try:
         table_status = table.stat()
     except OSError:
@@ -150,7 +150,7 @@ class TableIndex:
         table = file.read(columns=present, use_threads=True)
         columns_by_name = {name: table.column(name).cast(arrow_type(declared[name])) for name in present}
         numbers, texts = arrow_columns(columns_by_name, declared, len(table))
-        selection = _ranges(entries)
+        selection = _row_indices(entries)
         if len(selection) == len(table) and (selection == np.arange(len(table))).all():
             return numbers, texts
         return (
@@ -159,7 +159,7 @@ class TableIndex:
         )
 
 
-def _ranges(entries: Iterable[Entry]) -> NDArray[np.int64]:
+def _row_indices(entries: Iterable[Entry]) -> NDArray[np.int64]:
     return np.concatenate(
         [np.arange(entry.start, entry.start + entry.rows) for entry in entries] or [np.empty(0, np.int64)]
     )
@@ -239,12 +239,18 @@ def _entries(description: Mapping[str, Any]) -> Iterator[tuple[TableStamp, Entry
 
 def _description(entries: Iterable[Entry], types: Mapping[str, str]) -> bytes:
     """Return the JSON description of the tables; equal facts of several tables are stored once."""
-    numbers: dict[TableFacts, int] = {}
+    number_by_facts: dict[TableFacts, int] = {}
     tables = [
-        (entry.path, *entry.stamp, numbers.setdefault(entry.facts, len(numbers)), entry.start, entry.rows)
+        (
+            entry.path,
+            *entry.stamp,
+            number_by_facts.setdefault(entry.facts, len(number_by_facts)),
+            entry.start,
+            entry.rows,
+        )
         for entry in entries
     ]
-    facts = [(fact.names, fact.declarations, fact.expected) for fact in numbers]
+    facts = [(fact.names, fact.declarations, fact.expected) for fact in number_by_facts]
     return json.dumps({"version": _version(), "types": types, "facts": facts, "tables": tables}).encode()
 
 
@@ -264,7 +270,7 @@ class IndexWriter:
         self._rows = 0
 
     def add(self, columns: Mapping[str, pa.ChunkedArray], tables: Iterable[Entry]) -> None:
-        """Add the rows of some tables. Columns that they do not have are missing.
+        """Add the rows of some tables. Values of columns that the tables lack are missing.
 
         Args:
             columns: Arrow columns with the types of `arrow_type`.
@@ -284,7 +290,7 @@ class IndexWriter:
     def copy(self, index: TableIndex, entries: Collection[Entry]) -> None:
         """Add tables of another index whose columns have the same types."""
         ordered = sorted(entries, key=lambda entry: entry.start)
-        rows = pa.array(_ranges(entry for entry in ordered if entry.rows > 0))
+        rows = pa.array(_row_indices(entry for entry in ordered if entry.rows > 0))
         table = pa.parquet.ParquetFile(pa.BufferReader(index.content)).read().take(rows)
         columns = {
             item.name: table.column(item.name).cast(item.type) for item in self._schema if item.name in index.types

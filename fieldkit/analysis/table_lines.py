@@ -1,6 +1,6 @@
 """Lines of tables: their quantities and labels, and the texts of the figures of cells.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -156,8 +156,8 @@ def _payload_label(quantity: Quantity, sizes: Sequence[int]) -> str:
 def operator_lines(cells: Sequence[Cell], expected: Collection[str] = ()) -> list[TableLine]:
     """Return the lines for an operator during a trial, in order, or all lines if there are no such lines.
 
-    These are losses, delays, throughput and signal; quantities with an expectation; and quantities that the lab added
-    to a procedure.
+    These are losses, delays, throughput and signal; the recovery from faults; quantities with an expectation; and
+    quantities that a lab or another package declares.
 
     Args:
         cells: The cells of the table.
@@ -185,13 +185,13 @@ def with_radio_loss(lines: Sequence[TableLine], cells: Sequence[Cell]) -> list[T
 
 
 def _with_radio_loss(lines: Sequence[TableLine], cells: Sequence[Cell]) -> Iterator[TableLine]:
-    radio: dict[str, list[TableLine]] = {}
+    radio_lines_by_step: dict[str, list[TableLine]] = {}
     for line in lines:
         if plain_name(line.quantities[0].name) in _RADIO:
-            radio.setdefault(line.quantities[0].step, []).append(line)
+            radio_lines_by_step.setdefault(line.quantities[0].step, []).append(line)
     for line in lines:
         step = line.quantities[0].step
-        losses = radio.get(step, [])
+        losses = radio_lines_by_step.get(step, [])
         can_merge = all(sum(loss.estimate(cell) is not None for loss in losses) < 2 for cell in cells)
         if line not in losses or not can_merge:
             yield line

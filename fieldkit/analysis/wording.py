@@ -1,6 +1,6 @@
 """Texts about estimates: numbers with units, intervals, verdicts, cautions.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 import math
@@ -72,17 +72,17 @@ def interval(scale: Scale, estimate: Estimate) -> str:
     return text and text + ("*" if assumes_normal(estimate) else "") + ("!" if is_dependent(estimate) else "")
 
 
-def number(scale: Scale, estimate: Estimate, other: float | None = None) -> str:
+def number(scale: Scale, estimate: Estimate, statistic: float | None = None) -> str:
     """Return the value of an estimate without its unit; a lower bound is written as `>= 2.30`.
 
     Args:
         scale: Scale of the number.
         estimate: The estimate.
-        other: Mean or 95th percentile of the estimate, which is used instead of its value. It is a lower bound if a
-            repeat is censored.
+        statistic: Mean or 95th percentile of the estimate, which is written instead of its value. It is a lower bound
+            if a repeat is censored.
     """
-    if other is not None:
-        return f"{at_least(estimate.n_censored > 0)}{scale.number(other)}"
+    if statistic is not None:
+        return f"{at_least(estimate.n_censored > 0)}{scale.number(statistic)}"
     return f"{at_least(estimate.is_lower_bound)}{scale.number(estimate.value)}"
 
 

@@ -49,6 +49,12 @@ class FieldBackend:
                 "the field backend needs a site file",
                 remedy="fieldkit init, then fill it in; or name a site file with --site",
             )
+        if site.has_default_robots:
+            raise ConfigurationError(
+                "the field backend needs robots and roles, and the site file has none",
+                where=document.where(()),
+                remedy="add robots: and roles: to it, as in the file of fieldkit init --out example.yaml",
+            )
         for name, robot in site.robots.items():
             for key in ("host", "user", "host_key"):
                 if getattr(robot, key) is None:
@@ -237,7 +243,7 @@ class FieldTestbed:
             try:
                 self._bring_back(name)
             except ConfigurationError as operator_error:
-                operator_error.what += f"; before, the move failed: {describe_exception(error)}"
+                operator_error.what += f"; before that, the move failed: {describe_exception(error)}"
                 raise
             raise
         self._bring_back(name)

@@ -52,7 +52,7 @@ class Robot(Strict):
         name: Its name in the lab, `turtlebot-1`.
         address: Its IPv4 address on the radio under test.
         profile: Its profile.
-        links: Its ends of further links than the radio under test, by the name of the link.
+        links: Its ends of the links other than the radio under test, by the name of the link.
         control: The network that SSH uses to reach it, from the site file.
         ros_master: Address on the radio of the robot that runs its ROS master; empty if its setup files define it.
         abilities: Sections of its profile by which steps may move it, for example `drive`.
@@ -76,7 +76,7 @@ class Robot(Strict):
         return {key: value for key, value in data.items() if key not in _FORMER_KEYS} | {"abilities": abilities}
 
     def link(self, name: str = "") -> RobotLink | None:
-        """Return its end of a link, of the radio under test if the name is empty; None if it has no such link."""
+        """Return its end of a link, or None if it has no such link. An empty name is the radio under test."""
         radio = self.profile.radio.interface
         if not name or self.profile.links.get(name) == radio:
             return RobotLink(interface=radio, address=self.address)
@@ -117,8 +117,8 @@ class Oracle(Protocol):
         `since_utc_ns` must not decrease from call to call, because older positions may be deleted.
 
         Returns:
-            Positions in the order of time. The first one of each robot is valid at `since_utc_ns`; its time is when
-            the robot arrived there.
+            Positions in the order of time. The first position of each robot is its position at `since_utc_ns`; the
+            time of this entry is the robot's arrival there.
         """
         ...
 

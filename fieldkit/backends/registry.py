@@ -51,15 +51,16 @@ def cast_of(
         link_addresses: Addresses on further links.
 
     Raises:
-        ConfigurationError: The site file has no roles for the topology, names a profile that does not exist, or gives
-            no address for a link of a profile, or one for a link that the profile does not have.
+        ConfigurationError: The site file has no roles for the topology, or names a profile that does not exist. It
+            lacks the address of a robot on a link of its profile, or has an address on a link that the profile does
+            not have. The role of the ROS master is assigned to a robot without ROS 1.
     """
     if topology not in site.roles:
-        other = "".join(f", or use --topology {name}" for name in list(site.roles)[:1])
+        alternative = "".join(f", or use --topology {name}" for name in list(site.roles)[:1])
         raise ConfigurationError(
             f"the site file gives no roles for topology {topology}",
             where=document.where(("roles",)) if document else "",
-            remedy=f"add roles.{topology}{other}",
+            remedy=f"add roles.{topology}{alternative}",
         )
     names = site.roles[topology]
     profiles = profiles_of(site, document, names.values())

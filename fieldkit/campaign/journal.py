@@ -112,7 +112,10 @@ class CampaignJournal:
         return end_entries
 
     def interrupted_folder(self, planned: PlannedTrial) -> Path | None:
-        """Return the folder of a trial that started and has not ended, or None if there is nothing to resume."""
+        """Return the folder in which a trial was last started, or None if there is nothing to resume.
+
+        The caller must check that the trial has not ended.
+        """
         entries = (entry for entry in self._entries if entry.planned == str(planned))
         folder_names = [entry.trial for entry in entries if entry.progress is TrialProgress.STARTED]
         folder = self.folder / folder_names[-1] if folder_names else None

@@ -1,9 +1,9 @@
 """The order of a campaign: random, within a limit on the walking distance.
 
-Slow changes during a day (sun, batteries, other Wi-Fi networks) must not look like an effect of distance, so the
-order is random. Setting up robots for another topology takes longest, and carrying robots takes long. Therefore the
-order is random within nested blocks. A block has all trials of one topology. Within it, a block has all trials of one
-scenario; within that, a block has all trials at one distance. The total path is limited.
+Slow changes during a day (sun, batteries, other Wi-Fi networks) must not be mistaken for an effect of distance, so
+the order is random. Setting up robots for another topology takes longest, and carrying robots takes long. Therefore
+the order is random within nested blocks. A block has all trials of one topology. Within it, a block has all trials of
+one scenario; within that, a block has all trials at one distance. The total path is limited.
 """
 
 import random

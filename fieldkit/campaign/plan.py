@@ -61,7 +61,7 @@ class Exclusion(Strict):
 class CampaignFile(Strict):
     """The file of `fieldkit campaign`: trials of every procedure at every distance in every topology.
 
-    How to write one: [campaign](campaign.md).
+    How to write a campaign file: [campaign](campaign.md).
 
     Attributes:
         name: Letters, digits, `-` and `_`; the folder is `campaign_NAME`.

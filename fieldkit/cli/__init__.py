@@ -46,9 +46,9 @@ _EPILOG: Final = """\
 start with emulated robots:  fieldkit trial los 30ft --repeats 1 --record 1s
 start with real robots:      fieldkit init
 
-exit codes: 0 valid, 1 threshold missed or something not done, 2 usage or
-configuration, 3 robot or link, 4 evidence not valid, 130 interrupted with the
-state saved"""
+exit codes: 0 valid, 1 threshold or expectation not met, or request skipped,
+2 usage or configuration, 3 robot or link, 4 evidence not valid, 130
+interrupted with the state saved"""
 
 
 def parser() -> Parser:
@@ -103,8 +103,8 @@ def _run_with_error_messages(top: Parser, argv: Sequence[str] | None, options: h
         _show_error(str(error))
         return error.exit_code
     except BrokenPipeError:
-        # The reader of our output has exited, so an error message cannot be delivered. At its exit Python writes the
-        # rest of the buffer. Without this redirection the write would fail and change the exit code.
+        # The program that reads the output has exited, so an error message would not be read. Python writes the rest
+        # of the buffer when it exits. Without this redirection the write would fail and change the exit code.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.stderr.close()
         return 0

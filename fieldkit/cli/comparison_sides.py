@@ -30,7 +30,7 @@ class Sides:
         a: Attempts of A.
         b: Attempts of B.
         by: Columns that identify a condition.
-        sources: Columns and quantities of both.
+        sources: The tables of A. They declare the columns and quantities of both runs.
         varied: Columns that may differ, because they are the variable of the comparison.
     """
 
@@ -65,7 +65,7 @@ def read(arguments: argparse.Namespace) -> Sides:
     (name,) = a.condition(column, option="--between")
     varied = next((names for names in (_DISTANCE, *_columns_by_factor(a)) if name in names), frozenset({name}))
     if is_default:
-        by = tuple(other for other in by if other not in varied)
+        by = tuple(condition_column for condition_column in by if condition_column not in varied)
     rows = [run.read(also=(*by, name)) for run in (a, b)]
     value_a, value_b = _parse_two_values(rows, name, values)
     is_sweep = bool(a.sweep_condition) and paths[0] == paths[1]
@@ -81,7 +81,7 @@ def read(arguments: argparse.Namespace) -> Sides:
 def _columns_by_factor(run: Sources) -> list[frozenset[str]]:
     """Return the columns of each factor (a setting that a sweep varies).
 
-    One column has its values as in the command, and one has them as numbers.
+    The first column has the values as text, as written in the command; the second has them as numbers.
     """
     return [frozenset(names) for names in run.sweep_columns.items()]
 

@@ -34,7 +34,10 @@ _RULE: Final = " ─"
 
 
 class _Output(Console):
-    """A console that raises `BrokenPipeError` if the reader of its stream exits, as `print` does; rich would exit."""
+    """A console that raises `BrokenPipeError` if the program that reads its stream has exited, as `print` does.
+
+    The console of rich would exit without an exception.
+    """
 
     @override
     def on_broken_pipe(self) -> None:
@@ -239,7 +242,7 @@ def _serialize(sink: Sink) -> Sink:
 
     A measurement must not stop because its progress cannot be displayed.
     """
-    lock = threading.RLock()  # reentrant: a signal handler may interrupt the holder
+    lock = threading.RLock()  # reentrant: a signal handler may interrupt the thread while it holds the lock
 
     def show(event: Event) -> None:
         try:

@@ -71,14 +71,14 @@ def _repeat_words(event: RepeatEnded, width: int | None) -> Words:
     head, status = f"{event.done:3d}/{event.total}  {event.repeat:7} ", f"{event.status:6} "
     measured = f"measured: {event.summary}" if event.reason and event.summary else event.summary
     text = "; ".join(filter(None, (event.reason, measured)))
-    left = f"  ({TimeEstimate(event.left_s, event.left_most_s)} left)" if event.left_s > 0 else ""
+    remaining_time = f"  ({TimeEstimate(event.left_s, event.left_most_s)} left)" if event.left_s > 0 else ""
     if width is not None:  # the live line shows the remaining time
-        left, available = "", width - len(head) - len(status)
+        remaining_time, available = "", width - len(head) - len(status)
         if cell_len(text) > available:
             text = _fold_below(text, width) if event.reason else _fold_after(text, width - available, width)
     remedy = f"\n{' ' * _INDENT}remedy: {event.remedy}" if event.remedy else ""
     style = _STYLE[Status.FAILED] if event.summary.startswith(NOTHING_ARRIVED) else ""
-    return ((head, ""), (status, _STYLE[event.status]), (text, style), (left, "dim"), (remedy, ""))
+    return ((head, ""), (status, _STYLE[event.status]), (text, style), (remaining_time, "dim"), (remedy, ""))
 
 
 def _fold_below(text: str, width: int) -> str:

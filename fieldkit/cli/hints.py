@@ -18,7 +18,7 @@ _REPEATED_OPTIONS: Final = ("site", "backend", "topology", "protocol", "repeats"
 """Options that select robots and measurements, by their names in the namespace of argparse."""
 
 # Words in lower case: a command of fieldkit, and perhaps its subcommand, such as `lab up`.
-_COMMAND: Final = re.compile(r"\bfieldkit(?P<words>(?: [a-z][a-z-]*)+)(?P<rest>[^;\n`]*)")
+_COMMAND: Final = re.compile(r"\bfieldkit(?P<words>(?: [a-z][a-z-]*)+)[^;\n`]*")
 
 
 class CliOptions:
@@ -42,7 +42,7 @@ class CliOptions:
             self._options += [(permissions.option(name), "") for name in permissions.repeated(granted_names)]
 
     def add_to_command(self, match: re.Match[str]) -> str:
-        """Return the matched command with those of the stored options that it accepts."""
+        """Return the matched command with the stored options that it accepts and does not contain."""
         parser, words = self._parser, list[str]()
         for word in match["words"].split():
             subparser = parser.command(word)

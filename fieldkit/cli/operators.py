@@ -70,7 +70,7 @@ def confirm(question: str, *, remedy: str) -> bool:
 
 
 def _read_line() -> str:
-    """Return a line from the terminal. The prompt goes to standard error, apart from the output."""
+    """Return a line from the terminal. The prompt is written to standard error, so it is not part of the output."""
     print("> ", end="", file=sys.stderr, flush=True)
     try:
         return input()
@@ -123,7 +123,7 @@ class Script(prompts.Operator):
         line = next(self._lines, None)
         if line is None:
             raise ConfigurationError(
-                f"no answer left to: {request}", where=self._where, remedy="add a line per request"
+                f"there is no further answer for: {request}", where=self._where, remedy="add a line per request"
             )
         return line
 

@@ -31,8 +31,8 @@ class Parser(argparse.ArgumentParser):
         takes_lengths: True if `-5m` is a length. Otherwise argparse parses a word that begins with a dash as an
             option, unless it is a number without a unit.
         declare: Function that declares the arguments at first use; None if they are declared already.
-        is_foreign: True if another package declares the arguments. They are declared only when this command is used,
-            so that other commands neither load the package nor fail with it.
+        is_foreign: True if another package declares the arguments. They are declared only when this command is used.
+            Other commands therefore do not load the package, and an error in it does not affect them.
     """
 
     def __init__(self, *words: Any, **options: Any) -> None:  # noqa: ANN401 (passed to argparse unchanged)
@@ -68,7 +68,7 @@ class Parser(argparse.ArgumentParser):
         return tuple(self._commands.choices) if self._commands else ()
 
     def command(self, name: str) -> "Parser | None":
-        """Return the parser of a subcommand, or None if there is none of this name.
+        """Return the parser of a subcommand, or None if there is no such subcommand.
 
         Its arguments are declared, unless another package declares them.
         """
@@ -144,7 +144,7 @@ class Parser(argparse.ArgumentParser):
         raise ConfigurationError(message, remedy=f"{self.prog} --help")
 
     def add_choice(self, name: str, choices: Iterable[str], **options: Any) -> None:  # noqa: ANN401 (passed to argparse unchanged)
-        """Add an argument with one of `choices` as its value. An error about another value suggests a similar one."""
+        """Add an argument whose value is one of `choices`; the error for another value suggests a similar choice."""
         values = tuple(choices)
         self.add_argument(
             name, choices=values, type=self._choice_converter(options.get("metavar", name), values), **options

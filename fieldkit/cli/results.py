@@ -92,7 +92,7 @@ def report(outcomes: Sequence[Outcome | None], arguments: argparse.Namespace) ->
     """Print the table of each trial that was not skipped, and return the exit code for all trials.
 
     Args:
-        outcomes: The outcomes of trials, None for each skipped one.
+        outcomes: The outcomes of trials, None for each skipped trial.
         arguments: The arguments of the command: `json` prints no table, `all` prints all quantities, and `junit` is a
             file to which the results are also written.
     """

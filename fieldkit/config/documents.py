@@ -1,4 +1,4 @@
-"""Read YAML documents with the line of each value, write them, and edit single values.
+"""Read YAML documents with the line of each value, write values as YAML, and return syntax trees for edits.
 
 This is the only module that imports PyYAML.
 """
@@ -80,7 +80,7 @@ class _Loader(Reader, Scanner, Parser, Composer, SafeConstructor, Resolver):
         return node
 
     def _require_one_item(self, node: yaml.ScalarNode) -> None:
-        """Raise an error if an item continues with a line that begins with a dash, because YAML joins the two."""
+        """Raise an error if an item continues with a line that begins with a dash, which YAML adds to the item."""
         if not node.style:
             lines = self._text.splitlines()[node.start_mark.line : node.end_mark.line + 1]
             for number, line in enumerate(lines[1:], start=node.start_mark.line + 2):
@@ -282,7 +282,7 @@ _REMEDIES: Final = {
     "expected <block end>": "indent this line with as many spaces as the other lines of its list or mapping",
     "mapping values are not allowed": "quote text that contains a colon; indent all keys of a mapping equally",
 }
-"""Remedy for each error message of PyYAML."""
+"""Remedies by a part of the message of an error, of PyYAML or of this module."""
 
 
 def _configuration_error(error: Exception, text: str, source: str, line: int) -> ConfigurationError:

@@ -40,9 +40,9 @@ class Codec(Generic[Record]):
             text = json.dumps(data, ensure_ascii=False).encode(errors="replace")
             return self._adapter.validate_json(text, strict=True)
         except ValidationError as error:
-            first = error.errors()[0]
-            place = ".".join(map(str, first["loc"]))
-            raise ValueError(f"{place}: {first['msg']}" if place else first["msg"]) from error
+            first_error = error.errors()[0]
+            place = ".".join(map(str, first_error["loc"]))
+            raise ValueError(f"{place}: {first_error['msg']}" if place else first_error["msg"]) from error
 
     def dump(self, record: Record) -> Any:  # noqa: ANN401 (any JSON value)
         """Return the JSON value that `parse` converts back to an equal record."""

@@ -3,8 +3,9 @@
 This module imports no YAML reader, so that the command line can list and complete the names quickly.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 
@@ -12,6 +13,14 @@ Kind = Literal["robots", "procedures"]
 
 SITE_FILE: Final = "fieldkit.yaml"
 _PACKAGE: Final = Path(__file__).resolve().parents[1]
+
+
+def default_backend(site: Mapping[str, Any]) -> str:
+    """Return the backend of a site file that names none.
+
+    A file with the section `emulated`, but without robots and roles, is for the emulated backend's default robots.
+    """
+    return "emulated" if "emulated" in site and "robots" not in site and "roles" not in site else "field"
 
 
 def folders(kind: Kind) -> tuple[Path, ...]:

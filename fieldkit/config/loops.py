@@ -79,7 +79,7 @@ class _Expander:
     def _append(
         self, result: list[Any], items: list[Any], location: Location, new_location: Location, values: Values
     ) -> None:
-        """Append a list of steps to `result` with its loops expanded; the arguments are those of `expand_steps`."""
+        """Append a list of steps to `result` with its loops expanded; see `expand_steps` for the other arguments."""
         for index, item in enumerate(items):
             key_path = (*location, index)
             if isinstance(item, dict) and LOOP in item:

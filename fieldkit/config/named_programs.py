@@ -44,7 +44,11 @@ def _require_valid_name(name: str) -> None:
 
 
 def _record(name: str, path: Path, folder: Path) -> dict[str, object]:
-    """Return the record of a file that was found in `folder`. A link must not lead out of the allowed folder."""
+    """Return the record of a file that was found in `folder`.
+
+    If the file is a link, its target must be in the lab's folder; if `folder` is outside of the lab's folder, the
+    target must be in `folder`.
+    """
     lab, folder = Path.cwd().resolve(), folder.resolve()
     allowed_folder = lab if folder.is_relative_to(lab) else folder
     try:

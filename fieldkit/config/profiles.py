@@ -32,7 +32,7 @@ class PublishedTopic(Strict):
         frame: `frame_id` of the header.
         child_frame: For `nav_msgs/Odometry` and `tf2_msgs/TFMessage`, the frame of the robot, which moves in `frame`.
             Emulated robots use `base_link` if it is empty.
-        points: For a laser scan, beams per turn; for a point cloud, points of 16 bytes.
+        points: For a laser scan, beams per turn; for a point cloud, number of points, each of 16 bytes.
         width: For an image, width in pixels of 3 bytes.
         height: For an image, height in pixels.
         size: For any other type, size of the first array of numbers in each message, `100kB`.
@@ -54,7 +54,7 @@ class PublishedTopic(Strict):
 
     @property
     def payload_bytes(self) -> int:
-        """Size of the list in each message in bytes, or 0 if the profile does not give it."""
+        """Size of the data array in each message in bytes, or 0 if the profile does not give it."""
         if self.type == "sensor_msgs/PointCloud2":
             return 16 * (self.points or 0)
         return round(self.size or 3 * (self.width or 0) * (self.height or 0))
@@ -120,7 +120,7 @@ class RobotBridge(Strict):
     Attributes:
         to: `dds` or `zenoh`.
         topics: Topics carried to this middleware, each `NAME:TYPE` or `NAME:TYPE:QOS`, as in `fieldkit bridge`.
-        back: Topics carried in the other direction.
+        back: Topics carried from this middleware to ROS 1.
         domain: ROS 2 domain, 0 to 101.
         router: Host of a Zenoh router, and its port if it is not 7447; without it, peers are found by scouting.
         program: The robot's fieldkit, a name or a path.
@@ -219,7 +219,7 @@ class Tools(Strict):
     Attributes:
         netcat: Its netcat: traditional, OpenBSD, ncat or busybox. The variant is
             [detected](method-loss.md#tools-that-differ) before each trial; a dry run derives it from the name and
-            treats `nc` as the traditional one.
+            treats `nc` as traditional.
         capture: Its tcpdump.
         ping: Its ping: iputils (old or new) or busybox.
         python: Its Python, 3.8 or later, for the step `topics`; searched after the setup files of ROS are sourced.
@@ -309,8 +309,8 @@ class ProfileSection(Strict):
 class RobotProfile(catalog.Named, Sectioned):
     """A robot model: one YAML file in `robots/`.
 
-    [Add a robot](add-a-robot.md) describes how to write one. A key described as "for information only" has no effect
-    in this version.
+    [Add a robot](add-a-robot.md) describes how to write a profile. A key described as "for information only" has no
+    effect in this version.
 
     On an emulated robot, fieldkit writes setup files of ROS at the paths in the profile. A path directly in `/`, or
     below `/proc`, `/sys` or `/dev`, is rejected; files in `/run` and `/tmp` are lost at a reboot. It publishes

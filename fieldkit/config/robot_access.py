@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from fieldkit.config.documents import Document
+from fieldkit.config.locations import default_backend
 from fieldkit.core.errors import ConfigurationError
 
 _PASSWORDS: Final = (None, "ask", "keyring")
@@ -43,7 +44,7 @@ def read_access(document: Document) -> dict[str, RobotAccess | ConfigurationErro
 
 def configured_backend(document: Document) -> str:
     """Return the name of the backend in a site file, or the default."""
-    name = document.data.get("backend", "field") if isinstance(document.data, dict) else None
+    name = document.data.get("backend", default_backend(document.data)) if isinstance(document.data, dict) else None
     return name if isinstance(name, str) else "field"
 
 

@@ -95,14 +95,15 @@ _PATTERN_DESCRIPTIONS: Final[dict[str, str]] = {}
 _FOLDER: ContextVar[Path] = ContextVar("_FOLDER", default=Path())
 
 
-def validation_error(text: str, *at: str | int) -> Exception:
+def validation_error(text: str, *at: str | int, remedy: str = "") -> Exception:
     """Return the exception that a validator raises. The message to the user contains `text`, file and line.
 
     Args:
         text: Description of the error.
         at: Keys and indices from the validated value to the invalid part, for the line.
+        remedy: The remedy, unless it is the correction of that line.
     """
-    return PydanticCustomError("fieldkit_error", "{text}", {"text": text, "at": at})
+    return PydanticCustomError("fieldkit_error", "{text}", {"text": text, "at": at, "remedy": remedy})
 
 
 def pattern_field(pattern: str, description: str) -> Any:  # noqa: ANN401 (pydantic's `Field` also returns Any)

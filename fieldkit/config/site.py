@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 from fieldkit.config import schema
+from fieldkit.config.locations import default_backend
 from fieldkit.config.schema import AfterValidator, BeforeValidator, Duration, Field, Int, Strict
 from fieldkit.core.errors import did_you_mean
 from fieldkit.core.model import FIXED_ROLES, Control, Role, Topology
@@ -19,7 +20,7 @@ def _no_plain_password(value: object) -> object:
 
 
 def is_ipv4(text: str) -> bool:
-    """Return True if a text is an IPv4 address in the notation of the tools on robots."""
+    """Return True if a text is an IPv4 address in dotted-decimal notation without leading zeros."""
     try:
         return str(ipaddress.IPv4Address(text)) == text
     except ValueError:
@@ -76,38 +77,61 @@ class SiteRobot(Strict):
 class Site(Strict):
     """A lab: its robots and their roles, in the file `fieldkit.yaml` of the current folder.
 
-    For real robots see [field](field.md). Without a site file the emulated backend uses two TurtleBots and a
-    Duckiedrone.
+    For real robots see [field](field.md). Without a site file, or with one that has neither `robots` nor `roles`, the
+    emulated backend uses two TurtleBots and a Duckiedrone.
 
     The emulated backend ignores `host`, `port`, `user`, `key`, `host_key` and `address`: its robots have addresses
     from 10.42.0.1 on, in the order of the file, and generated keys. With `control: radio` the operator's laptop is
     also a station, `laptop` at 10.42.0.254: it is 2 m from the relay in `master` and from the receiver in
-    `masterless`, and never behind the wall. It has the same radio as the robots, and every packet of SSH is subject
-    to the radio model. In `master`, packets from sender to receiver cross two links, so `loss` and `delay` apply
-    twice. [Method](method-radio.md#the-emulated-radio) describes the radio model.
+    `masterless`, and never behind the wall of `nlos`. It has the same radio as the robots, and every packet of SSH is
+    subject to the radio model. In `master`, packets from sender to receiver cross two links, so `loss` and `delay`
+    apply twice. [Method](method-radio.md#the-emulated-radio) describes the radio model.
 
     Attributes:
-        backend: Backend used if the command line gives none.
+        backend: Backend used if the command line gives none. The default is `emulated` if the file has the section
+            `emulated`, but neither `robots` nor `roles`.
         control: `separate`: SSH has a separate network. `radio`: SSH uses the radio under test, see [two ways of
             control](field.md#two-ways-of-control).
         ros_master: Role of the robot that runs the ROS master of all robots with ROS 1, in topologies that have this
             role: [one ROS master](ros-master.md). Without it, each robot uses the master that its setup files name.
         patience: How long a command waits for a lost control connection before it fails. The first connection of a
             run is not retried.
-        robots: The robots of the lab by name: lower-case letters, digits and hyphens.
+        robots: The robots of the lab by name: lower-case letters, digits and hyphens. Only the backend `emulated` has
+            default robots, which it uses if `roles` is also missing.
         roles: Robot by role, per topology. `master` needs `sender`, `receiver` and `relay`; `masterless` needs the
             first two. Further roles are for procedures that have `places` for them; trials of other procedures do not
-            use their robots.
+            use their robots. Required if there are `robots`.
         emulated: Options of the emulated backend; other backends ignore them.
     """
 
     backend: str = "field"
     control: Control = Control.SEPARATE
     patience: Duration = 60.0
-    robots: dict[RobotName, SiteRobot]
-    roles: dict[Topology, dict[Role, str]]
+    robots: dict[RobotName, SiteRobot] = Field(default_factory=dict)
+    roles: dict[Topology, dict[Role, str]] = Field(default_factory=dict)
     ros_master: Role | None = None
     emulated: dict[str, object] | None = None
+
+    @property
+    def has_default_robots(self) -> bool:
+        """True if the file has neither robots nor roles, so that the backend must provide both."""
+        return not {"robots", "roles"} & self.model_fields_set
+
+    @schema.model_validator(mode="before")
+    @classmethod
+    def _choose_backend(cls, data: object) -> object:
+        return {"backend": default_backend(data), **data} if isinstance(data, dict) else data
+
+    @schema.model_validator(mode="after")
+    def _has_robots_and_roles(self) -> "Site":
+        missing = [key for key in ("robots", "roles") if key not in self.model_fields_set]
+        if missing and not (self.has_default_robots and self.backend == "emulated"):
+            raise schema.validation_error(
+                f"required key {missing[0]!r} is missing; only the backend emulated has default robots and roles, "
+                "for a file without both keys",
+                remedy=f"add {': and '.join(missing)}: to it",
+            )
+        return self
 
     @schema.model_validator(mode="after")
     def _robots_are_different_machines(self) -> "Site":
@@ -137,6 +161,8 @@ class Site(Strict):
 
     @schema.model_validator(mode="after")
     def _ros_master_has_a_robot(self) -> "Site":
+        if self.has_default_robots:  # they have all fixed roles
+            return self
         # A role of a procedure exists only in trials of that procedure, so it cannot be the master.
         assigned = [
             role for role in FIXED_ROLES if any(role in robot_by_role for robot_by_role in self.roles.values())

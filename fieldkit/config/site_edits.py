@@ -42,18 +42,18 @@ def pin_host_key(path: Path, robot: str, host_key: str) -> None:
     Raises:
         ConfigurationError: The file cannot be read or written, or its layout does not allow the edit.
     """
-    old = documents.read(path)
+    document = documents.read(path)
     try:
         path = path.resolve()  # a link to a file in a repository remains a link
         text = path.read_bytes().decode()
-        new = _with_key(text, robot, host_key)
-        if not _is_pinned(new, old.data, robot, host_key):
+        new_text = _with_key(text, robot, host_key)
+        if not _is_pinned(new_text, document.data, robot, host_key):
             raise ConfigurationError(
                 f"{_KEY} of {robot!r} cannot be inserted, because of the layout of this file",
-                where=old.where(("robots", robot)),
+                where=document.where(("robots", robot)),
                 remedy=f"add it in an editor: {_KEY}: {host_key}",
             )
-        files.write(path, new.encode())
+        files.write(path, new_text.encode())
     except OSError as error:
         raise ConfigurationError(
             f"cannot be written: {error.strerror}",
@@ -70,9 +70,9 @@ def _with_key(text: str, robot: str, host_key: str) -> str:
         return text
 
 
-def _is_pinned(text: str, old: Any, robot: str, host_key: str) -> bool:  # noqa: ANN401 (plain values of YAML)
-    """Return True if `text` has the values of `old`, and the host key."""
-    expected = {**old, "robots": {**old["robots"], robot: {**old["robots"][robot], _KEY: host_key}}}
+def _is_pinned(text: str, data: Any, robot: str, host_key: str) -> bool:  # noqa: ANN401 (plain values of YAML)
+    """Return True if `text` has the values of `data`, and the host key."""
+    expected = {**data, "robots": {**data["robots"], robot: {**data["robots"][robot], _KEY: host_key}}}
     try:
         return bool(documents.parse(text, source="").data == expected)
     except ConfigurationError:

@@ -1,4 +1,4 @@
-"""Describe errors in YAML files, with hints about wrong indentation, for users who do not know the classes."""
+"""Describe errors in YAML files for users, with hints about wrong indentation and without names of classes."""
 
 import difflib
 import re
@@ -72,7 +72,7 @@ def _is_opaque_mapping(kind: Any) -> bool:  # noqa: ANN401 (any type annotation)
 _WORDS: Final = re.compile(r"\^\(([A-Za-z0-9_|]+)\)\$")
 """Matches the pattern of a key that allows only some words, such as `^(ros1|ros2)$`."""
 _MAX_SHOWN: Final = 60
-"""Number of characters of a wrong text that a message shows."""
+"""Maximum number of characters of a wrong text that a message shows."""
 _NO_KEYS_HINT: Final = ", and there are none; indent the keys that belong to this line more than this line"
 _MESSAGES: Final = MappingProxyType({"tuple_type": "a list is needed here", "missing": "this list needs more values"})
 
@@ -103,7 +103,7 @@ def explain(problems: Sequence[Any], document: Document, descriptions: Mapping[s
     else:
         message = _message(first, descriptions)
     path = ".".join(str(part) for part in (*document.place, *document.existing_part(place)))
-    remedy = f"add {missing}: to it" if missing else "correct this line"
+    remedy = f"add {missing}: to it" if missing else first.get("ctx", {}).get("remedy") or "correct this line"
     # A value with several valid forms has one problem per form at the same location.
     other_count = (
         len({(document.existing_part(_location(problem)), _missing_key(problem)) for problem in problems}) - 1

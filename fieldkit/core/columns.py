@@ -185,7 +185,7 @@ class Column:
         # Nanoseconds since 1970 need more digits than a float has, so short integers are read as int.
         is_integer = stripped.removeprefix("-").isdigit()
         value: float = int(stripped) if is_integer and len(stripped) <= _MAX_INT_DIGITS else float(stripped)
-        # A whole number equals `value // 1`. Infinity does not, but its error is that it is out of range.
+        # A whole number equals `value // 1`. Infinity passes; it is reported as out of range below.
         if self.type is int and not (is_integer if self.unit == "ns" else value in {math.inf, value // 1}):
             return f"not a whole number, which the unit {self.unit} requires"
         low, high = self.possible_range
@@ -289,7 +289,7 @@ class Measured:
         return type(self)(values, {**self.missing, **reasons})
 
     def __or__(self, other: "Measured") -> "Measured":
-        """Return the union of both.
+        """Return the values and the missing columns of both results. A column with a value in one is not missing.
 
         Raises:
             ValueError: A column has a value in both.

@@ -1,4 +1,4 @@
-"""A deadline that the caller creates and every function below receives, so that each wait is limited."""
+"""A deadline that a caller creates and passes to each function that waits, so that every wait is limited."""
 
 import threading
 import time

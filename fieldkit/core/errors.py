@@ -67,7 +67,7 @@ class MotionHeldError(RobotError):
 
 
 class HostKeyError(RobotError):
-    """The robot's SSH host key is not the pinned one; a person must check it.
+    """The robot's SSH host key differs from the pinned key; a person must check it.
 
     The key changes if another machine has the address, or after a new installation.
     """
@@ -86,7 +86,7 @@ class LinkLostError(LinkError):
 
 
 class TestbedLostError(LinkError):
-    """A process that the robots need has exited permanently: the trial stops, and its repeat is run again later."""
+    """A process that the robots need has exited permanently. The trial stops; `resume` runs the repeat again."""
 
     ends_trial = True
 

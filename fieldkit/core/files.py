@@ -24,8 +24,8 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     An existing file keeps its mode, and is unchanged if the body raises an exception. An existing symbolic link is
     replaced, and its target is not changed. A device (such as /dev/null), a pipe or a socket is not replaced.
 
-    If several processes replace a file at the same time, each of them writes complete content, and the last one
-    remains.
+    If several processes replace a file at the same time, each of them writes complete content, and the content of the
+    last process remains.
 
     Raises:
         OSError: The file cannot be written; an existing file is unchanged.
@@ -89,7 +89,7 @@ def _remove_unlocked(path: Path) -> None:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError:
         with suppress(OSError):  # the file may not exist
-            path.unlink()  # a link, for example of an attacker to another file
+            path.unlink()  # it may be a symbolic link that an attacker created
         return
     try:
         with suppress(OSError):  # another process has locked it

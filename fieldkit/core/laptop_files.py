@@ -23,7 +23,7 @@ FAULT: Final = "fault-"
 FAULT_TIMES: Final = "-times.txt"
 """File of each fault: `fault-KIND-times.txt`."""
 TELEMETRY: Final = ("-telemetry-", "-laptop.txt")
-"""Around the name of a telemetry source that the laptop queries: `ROLE-telemetry-NAME-laptop.txt`."""
+"""Texts before and after the name of a telemetry source that the laptop queries: `ROLE-telemetry-NAME-laptop.txt`."""
 PLAN: Final = "trial.yaml"
 JOURNAL: Final = "journal.jsonl"
 CAMPAIGN: Final = "campaign.yaml"

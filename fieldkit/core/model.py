@@ -179,7 +179,7 @@ class Fault:
         role: Role of the affected robot.
         duration_s: Duration in seconds; 0 for a reboot or a kill, whose duration is not controlled.
         process: Name of the process that is killed; empty for other kinds.
-        link: Name of the link that is down; empty for the radio under test and the other kinds.
+        link: Name of the link that is down; empty for the radio under test, and for other kinds of fault.
     """
 
     kind: FaultKind

@@ -21,7 +21,7 @@ RECORDINGS: Final = "fieldkit.recordings"
 """Entry point group of readers of recordings: `SUFFIX = "package.module:function"`, without the dot; see
 `fieldkit.measure.evidence.recordings`."""
 SESSION_JOBS: Final = "fieldkit.session_jobs"
-"""Entry point group of jobs that run during a session, one run of fieldkit: `NAME = "package.module:function"`; see
+"""Entry point group of jobs that run during a session (one run of fieldkit): `NAME = "package.module:function"`; see
 `fieldkit.trial.session_jobs`."""
 CHECKS: Final = "fieldkit.checks"
 """Entry point group of checks of a robot: `NAME = "package.module:function"`; see

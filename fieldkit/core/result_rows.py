@@ -21,7 +21,7 @@ class EstimateRow:
     quantity: str | None = _column(
         "text", "Column of trial.csv that was summarized; for a text column one row per word: `grass=wet`."
     )
-    unit: str | None = _column("text", "Unit of all numbers except counts: s, bit/s, share, or that of the column.")
+    unit: str | None = _column("text", "Unit of all numbers except counts, for example s, bit/s or share.")
     n_valid: int | None = _column("count", "Valid repeats.")
     n_void: int | None = _column("count", "Attempts with incomplete evidence.")
     n_failed: int | None = _column("count", "Attempts that failed.")
@@ -86,7 +86,7 @@ class DifferenceRow:
 
     missing_in: str | None = _column("text", "A or B if that run has no such condition; empty if both have it.")
     quantity: str | None = _column("text", "Column of trial.csv that was compared.")
-    unit: str | None = _column("text", "Unit of all numbers except counts: s, bit/s, share, or that of the column.")
+    unit: str | None = _column("text", "Unit of all numbers except counts, for example s, bit/s or share.")
     estimate: str | None = _column("text", "How a and b were estimated: `counted`, `mean`, `median`, or `flag`.")
     n_a: int | None = _column("count", "Valid repeats of A that have a value of the quantity.")
     n_b: int | None = _column("count", "Valid repeats of B that have a value of the quantity.")

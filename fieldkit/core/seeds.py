@@ -6,7 +6,10 @@ _SEEDS: Final = 10**15
 """Number of seeds that a person can choose: a seed has at most 15 digits."""
 
 _OPENINGS: Final = 18_000
-"""With it, the largest seed of a testbed is below 2^64, because federates receive the seed as u64."""
+"""Number of attempts after which the seeds of testbeds repeat.
+
+The largest seed, 18,000 * 10^15, is below 2^64, because federates receive the seed as an unsigned 64-bit integer.
+"""
 
 
 def testbed_seed(seed: int, attempts: int) -> int:

@@ -1,4 +1,4 @@
-"""Run many tasks on an executor. A bounded number is submitted, and results are returned as they complete.
+"""Run many tasks on an executor. A limited number is submitted at a time; results are returned as they complete.
 
 A task whose worker died is run again. If a process of this machine dies, all submitted tasks are lost, and it is
 unknown which of them is the cause; a task that was lost repeatedly is therefore run alone.
@@ -83,7 +83,7 @@ def completed(
 
 
 class _Submission(Generic[Task, Result]):
-    """Runs the tasks of one call of `completed` on an executor; the arguments are those of `completed`."""
+    """Runs the tasks of one call of `completed` on an executor; see `completed` for the arguments."""
 
     def __init__(
         self, work: Callable[[Task], Result], tasks: Sequence[Task], workers: Workers, note: Callable[[str], None]

@@ -10,7 +10,7 @@ JSON_ERRORS: Final = (ValueError, KeyError, TypeError, AttributeError, OverflowE
 float, or nesting that is too deep for Python."""
 
 
-# A text that already has quotes before the formula gets another one, so that `unescape_formula` returns the original.
+# If a text already has quotes before the formula, another quote is added, so that `unescape_formula` is the inverse.
 _FORMULA: Final = re.compile(r"'*[=+@-].")
 _NUMBER: Final = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 

@@ -89,7 +89,7 @@ def format_distance(distance: Distance) -> str:
 
 
 def parse_duration_s(text: str, what: str = "duration") -> float:
-    """Return a duration in seconds; `what` and the errors are those of `parse_quantity`."""
+    """Return a duration in seconds; see `parse_quantity` for `what` and the errors."""
     return parse_quantity(text, SECONDS_PER_UNIT, what)
 
 

@@ -105,7 +105,7 @@ _LARGEST_PAYLOAD_BYTES: Final = 1480
 def packet_fates(captures: Mapping[str, Capture], transfers: Iterable[Transfer]) -> Mapping[str, MarkedPackets]:
     """Return the packets of each capture, with their fates.
 
-    A fate is known only if the packet belongs to a transfer that both ends captured.
+    A fate is known only if the packet belongs to a transfer that both its sender and its receiver captured.
 
     Args:
         captures: The captures by file.
@@ -155,7 +155,7 @@ def _match_captures(sender: Capture, receiver: Capture, same_path: Sequence[Tran
 
 
 def _is_offloaded(captured: Packets) -> bool:
-    """Return True if a capture has frames of several segments, which differ between the two ends."""
+    """Return True if a capture has frames of several segments. Such frames differ between sender and receiver."""
     return bool((captured.ip_payload_bytes > _LARGEST_PAYLOAD_BYTES).any())
 
 
@@ -206,7 +206,7 @@ def read(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> AttemptReco
 
 
 def omissions(record: AttemptRecord) -> Iterator[Json]:
-    """Yield a log message for each part of the evidence that the other messages do not contain."""
+    """Yield a log message for each part of the recordings that `messages` omits."""
 
     def log_message(text: str, file: str) -> Json:
         name, t_ns = str(record.attempt.repeat), record.attempt.started_utc_ns

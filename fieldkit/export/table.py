@@ -30,7 +30,7 @@ _TYPES: Final[Mapping[type, pa.DataType]] = {
 
 
 def write_csv(file: BinaryIO, repeats: Repeats) -> None:
-    """Write all columns. The first ones are the columns that every trial has.
+    """Write all columns. The columns that every trial has are first.
 
     Raises:
         OSError: The file cannot be written.
@@ -52,7 +52,7 @@ def write_parquet(file: BinaryIO, repeats: Repeats) -> None:
 def repeats_table(repeats: Repeats) -> Table:
     """Return all columns except `source`, the file that a row was read from. Units and meanings are metadata.
 
-    The first ones are the columns that every trial has.
+    The columns that every trial has are first.
     """
     arrays = [
         _texts(repeats.texts[column.name])

@@ -27,7 +27,7 @@ from fieldkit.trial.journal import Attempt, JournalEntry
 from fieldkit.trial.plan import Plan
 
 _Evidence = Callable[[Attempt], AttemptEvidence]
-"""Function that returns the evidence of an attempt. It returns the same object for attempts that are in use."""
+"""Function that returns the evidence of an attempt. It keeps the evidence of the last `_OPEN_ATTEMPTS` attempts."""
 
 _OPEN_ATTEMPTS: Final = 2
 """Number of attempts whose evidence is in memory."""
@@ -123,7 +123,10 @@ def _places(plan: Plan, t_ns: int) -> Iterator[Message]:
 
 
 def _tracks(plan: Plan, evidence: _Evidence, attempts: Iterable[tuple[Attempt, int]]) -> Iterator[Message]:
-    """Yield the positions of robots, attempt by attempt: recorded positions or, without these, the testbed's."""
+    """Yield the positions of robots, attempt by attempt.
+
+    These are the recorded positions of a robot or, if it has none, its positions from the testbed.
+    """
     for attempt, ended_ns in attempts:
         samples_by_role = recorded_positions.readable_samples(evidence(attempt))
         # A position from before the start of the attempt is reported at the start.
@@ -138,7 +141,10 @@ def _tracks(plan: Plan, evidence: _Evidence, attempts: Iterable[tuple[Attempt, i
 
 
 def _sampled(plan: Plan, role: Role, samples: Samples, started_ns: int, ended_ns: int) -> Iterator[Message]:
-    """Yield the sampled positions of a robot during an attempt."""
+    """Yield the sampled positions of a robot during an attempt.
+
+    Positions in a local frame are omitted if their height is unknown.
+    """
     first = max(int(samples.times_ns.searchsorted(started_ns, side="right")) - 1, 0)
     last = int(samples.times_ns.searchsorted(ended_ns, side="right"))
     for at_ns, place in zip(samples.times_ns[first:last].tolist(), samples.values[first:last].tolist(), strict=True):

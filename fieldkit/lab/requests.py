@@ -1,4 +1,7 @@
-"""Client of a lab's process, and their messages. A request is a line of text; its answer is one JSON document."""
+"""Messages between the process of a lab and its client, and the client.
+
+A request is a line of text, and its answer is one JSON document.
+"""
 
 import json
 import os

@@ -24,7 +24,7 @@ class LabRobot:
 
 @dataclass(frozen=True)
 class Destination:
-    """Destination of a robot, as a position of its antenna.
+    """Destination of a robot: the position of its antenna.
 
     Attributes:
         east_m: Metres east of the world's south-western corner, or of the robot if `relative`.

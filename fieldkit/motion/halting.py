@@ -17,7 +17,7 @@ _LINE: Final = re.compile(r"(?P<program>\S+/\.jobs/\S+) (?P<state>[a-z]+)")
 
 @dataclass(frozen=True)
 class HaltResult:
-    """Result of a function of this module on a robot.
+    """Result of a stop, or of a query of the states, on one robot.
 
     Attributes:
         programs: State of each program that was stopped, by `TRIAL/ATTEMPT/.jobs/NAME` below the robot's home.

@@ -36,7 +36,7 @@ class Mavlink(ProfileSection):
         port: UDP port on which the autopilot listens on the radio.
         connection: Connection from the robot's computer, for the step `mavlink`: `udpout:HOST:PORT` (sends first),
             `udpin:HOST:PORT`, `tcp:HOST:PORT` or `/dev/ttyAMA0:921600`; by default UDP `port` of the robot itself.
-        autopilot: Firmware of an emulated autopilot: `px4` or `ardupilot`. A real one reports its own.
+        autopilot: Firmware of an emulated autopilot: `px4` or `ardupilot`. A real autopilot reports its firmware.
         system: System id of an emulated autopilot after power-on, 1 to 250.
         boot_s: Time from power-on until the position estimate of an emulated autopilot has an origin, 0 to 120 s; a
             real one takes about 30 s.

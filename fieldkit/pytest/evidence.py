@@ -28,7 +28,7 @@ _SECTION: Final = "fieldkit evidence"
 
 
 class EvidenceFolder:
-    """The evidence folder of one test, or of several that share a set-up; created when it is first used.
+    """The evidence folder of one test, or of several tests that share a set-up; created when it is first used.
 
     Attributes:
         has_failed: Whether one of its tests failed.
@@ -190,7 +190,7 @@ def _folder_name(text: str) -> str:
 
 
 def _new_folder(requested_path: Path) -> Path:
-    """Create a folder; its name gets a number if a rerun of the same test has left one."""
+    """Create a folder; a number is appended to its name if an earlier run of the same test left a folder."""
     path, number = requested_path, 1
     while True:
         with suppress(FileNotFoundError):  # another worker removed the empty parent folder

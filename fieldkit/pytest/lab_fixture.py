@@ -178,7 +178,7 @@ class OpenedLab:
             self.log(f"note: {note}")
 
     def fault(self, kind: str, robot: str, *, lasts: str = "", process: str = "") -> float | None:
-        """Inject a fault into a robot; return when its cause has ended, before the robot has necessarily recovered.
+        """Inject a fault into a robot; return when its cause has ended. The robot may recover later.
 
         Args:
             kind: `link-down`, `out-of-range`, `reboot`, or `kill`.

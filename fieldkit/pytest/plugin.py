@@ -22,11 +22,15 @@ _STAMP: Final = pytest.StashKey[str]()  # the name of the folder of this run, wh
 _RUN: Final = "fieldkit_run"  # key of this folder name in the input of a worker of pytest-xdist
 
 OPTIONS: Final[dict[str, tuple[str, str, tuple[str, ...] | None]]] = {
-    "backend": ("NAME", "backend of the robots: emulated, field or another; default: that of the site file", None),
+    "backend": (
+        "NAME",
+        "backend of the robots: emulated, field or another; default: the backend of the site file",
+        None,
+    ),
     "site": ("FILE", "the lab's site file; default: fieldkit.yaml in the current folder, if there is one", None),
     "topology": (
         "NAME",
-        "topology of the robots; default: the first of the site file, for a trial that of its procedure",
+        "topology of the robots; default: the first topology of the site file, or of a trial's procedure",
         ("master", "masterless"),
     ),
     "output": ("DIR", "folder for the evidence of all runs; default: fieldkit-results in pytest's root folder", None),

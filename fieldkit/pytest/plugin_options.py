@@ -93,7 +93,7 @@ def _text(config: pytest.Config, name: str) -> str | None:
 
 
 def _path(config: pytest.Config, name: str) -> Path | None:
-    """Return a path; command-line paths start at the current folder, configured ones at the root folder."""
+    """Return a path. On the command line it is relative to the current folder, in the configuration to the root."""
     option, configured = config.getoption(f"fieldkit_{name}"), config.getini(f"fieldkit_{name}")
     if option:
         return Path(config.invocation_params.dir, option)

@@ -17,9 +17,9 @@ from fieldkit.measure.evidence import robot_link_samples
 from fieldkit.remote.command import quote, with_environment
 from fieldkit.remote.shell import Completed, Shell
 
-# The inner shell becomes the program, which therefore receives SIGINT as from Ctrl-C. The signal is sent when
-# standard input is closed, also if this process was killed. The outer shell returns an exit code even if a signal
-# terminates the program.
+# The program replaces the inner shell (`exec`), so it has the process ID to which the signals are sent. SIGINT, as by
+# Ctrl-C, is sent when standard input is closed, also if this process was killed. The outer shell returns an exit code
+# even if a signal terminates the program.
 _UNTIL_CLOSED: Final = (
     'exec 3<&0; { cat <&3 >/dev/null; kill -INT "$$"; sleep 2; kill -TERM "$$"; sleep 2; kill -KILL "$$"; } '
     '>/dev/null 2>&1 & exec "$@" 3<&- </dev/null'

@@ -14,7 +14,7 @@ from fieldkit.remote.command import printable
 MAX_FILES: Final = 500
 
 _BLOCK: Final = 512  # bytes: the unit of the format
-_CHUNK_BLOCKS: Final = 128  # blocks that are read at once: 64 KiB
+_CHUNK_BLOCKS: Final = 128  # blocks that are read together: 64 KiB
 _NAME: Final = slice(0, 100)
 _SIZE: Final = slice(124, 136)
 _CHECKSUM: Final = slice(148, 156)
@@ -81,7 +81,7 @@ def _octal(field: bytes) -> int | None:
 
 def _content(file: IO[bytes], size: int, robot: str) -> Iterator[bytes]:
     while size > 0:
-        # In the archive the content is filled up to whole blocks.
+        # In the archive the content is padded to whole blocks.
         requested = min(-(-size // _BLOCK), _CHUNK_BLOCKS) * _BLOCK
         chunk = file.read(requested)
         if len(chunk) < requested:

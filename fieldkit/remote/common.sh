@@ -70,7 +70,7 @@ umask 022
 case $0 in /*) self=$0 ;; *) self=$PWD/$0 ;; esac
 base=${self%/*}
 
-# Exit codes: other error, disk full, locked by another trial, own lock lost, robot rebooted.
+# Exit codes: other error, disk full, locked by another trial, lock of this trial lost, robot rebooted.
 GENERAL=125 DISK=28 HELD=75 LOST=76 REBOOTED=77
 
 fail() { # print message $1 and exit with code $2

@@ -184,7 +184,7 @@ class Connection:
         """Wait until packets may be sent again.
 
         Returns:
-            The longest wait that was expected at its start, in seconds.
+            The expected duration of the silence when the wait started, in seconds.
         """
         initial_s = self._silence_s()
         if initial_s and notify:

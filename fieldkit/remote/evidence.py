@@ -81,7 +81,10 @@ def boot_id(shell: Shell) -> str:
 
 
 def end_jobs(shell: Shell, folder: str) -> None:
-    """Stop all running jobs of the attempt, and block the start of others. Raises the same errors as `begin`."""
+    """Stop all running jobs of the attempt, and prevent the start of further jobs.
+
+    Raises the same errors as `begin`.
+    """
     call(shell, "end", folder, deadline=Deadline.after(2 * REPLY_S))
 
 

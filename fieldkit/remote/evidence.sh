@@ -124,9 +124,9 @@ pack() {
     printf '' >".large-$$" || fail_to_write ".large-$$"
     exec 6<".sizes-$$"
     # Each iteration removes the first argument, and appends it again if the file is small.
-    left=$# small=0
-    while [ "$left" -gt 0 ]; do
-        file=$1 left=$((left - 1))
+    unsorted=$# small=0
+    while [ "$unsorted" -gt 0 ]; do
+        file=$1 unsorted=$((unsorted - 1))
         shift
         read -r size _ <&6
         if [ $((small + size)) -le "$PIECE" ]; then

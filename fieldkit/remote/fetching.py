@@ -259,14 +259,14 @@ class _LargeFile:
         part.rename(path)
 
     def _piece(self, start: int, path: Path) -> bytes:
-        number, expected = start // PIECE_BYTES, min(PIECE_BYTES, self.size_bytes - start)
+        number, expected_bytes = start // PIECE_BYTES, min(PIECE_BYTES, self.size_bytes - start)
         command = (*CALL, "piece", self.folder, self.name, str(number), str(PIECE_BYTES))
         self.shell.fetch(command, path, deadline=Deadline.after(_PIECE_S), limit_bytes=PIECE_BYTES)
         content = path.read_bytes()
-        if len(content) < expected:
-            what = f"sent {len(content)} bytes of {self.name} from byte {start} on, instead of {expected}"
+        if len(content) < expected_bytes:
+            what = f"sent {len(content)} bytes of {self.name} from byte {start} on, instead of {expected_bytes}"
             raise EvidenceError(what, where=self.shell.robot)
-        return content[:expected]
+        return content[:expected_bytes]
 
     def _remote_hash(self) -> str | None:
         deadline = Deadline.after(_PIECE_S + self.size_bytes / _MIN_HASH_BYTES_PER_S)

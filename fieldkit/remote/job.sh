@@ -1,12 +1,12 @@
 # Start, await and stop jobs, which continue if the connection is lost; and call the function of each verb.
 
-launch() { # start a job; $1 is start (return when it is ready), run (return its result), or serve (first the one, then the other)
+launch() { # start a job; $1 is start (return when it is ready), run (return its result) or serve (print `up` when it is ready, then return its result)
     how=$1 dir=$2 name=$3 limit=$4 ready=$5 within=$6 in=$7 out=$8 log=$9
     shift 9
     enter "$dir"
     meta=$PWD/.jobs/$name
     read_uptime
-    over_s=$((now + ${limit%.*} + within + 10)) # a caller that has not closed standard input, to request the result, by then has lost its connection
+    over_s=$((now + ${limit%.*} + within + 10)) # at this time, a caller that has not requested the result by closing standard input is not connected any more
     if [ -d "$meta" ]; then
         is_new=
     elif [ -e .ended ]; then
@@ -20,7 +20,7 @@ launch() { # start a job; $1 is start (return when it is ready), run (return its
         is_new=
         [ -d "$meta" ] || fail "cannot start job $name: $reason"
     fi
-    # is_new is 1 if this call has created the job, and empty if an earlier call has.
+    # is_new is 1 if this call has created the job, and empty if an earlier call has created it.
     case $how$is_new in
         run1)
             setsid sh "$self" supervise - "$@" </dev/null
@@ -152,7 +152,7 @@ signal() { # send signal $1 to the process group from `alive`; with sudo for cap
     kill "-$1" "-$pid" 2>/dev/null || sudo -n sh -c 'kill "-$1" "-$2"' sh "$1" "$pid" 2>/dev/null || ! alive "$meta"
 }
 
-remove() { # delete folder $1; it is tried twice, because a concurrent abort may create a file in the folder
+remove() { # delete folder $1; the deletion is tried twice, because a concurrent abort may create a file in the folder
     rm -rf -- "$1" 2>/dev/null || rm -rf -- "$1" 2>/dev/null || sudo -n sh -c 'rm -rf -- "$1"' sh "$1" || fail "cannot remove $1"
 }
 

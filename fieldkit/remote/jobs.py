@@ -172,7 +172,9 @@ def start(shell: Shell, job: Job) -> None:
 
 @dataclass(frozen=True)
 class PendingJob:
-    """A started job, or a wait for one. The control connection is silent until `end` is called.
+    """A started job, or a wait for the end of a job that was started before.
+
+    The control connection is silent until `end` is called.
 
     Attributes:
         shell: The robot.
@@ -332,7 +334,7 @@ def abort(shell: Shell, user: str, deadline: Deadline) -> AbortResult:
 
 
 def _lines(output: bytes) -> tuple[str, ...]:
-    # Only the end of the command is lost, because a line starts with the identification of the job.
+    # A shortened line lacks only the end of the command, because it starts with the identification of the job.
     return tuple(printable(line[:_MAX_LINE_BYTES]) for line in output.splitlines() if _JOB_LINE.match(line))
 
 

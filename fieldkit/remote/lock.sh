@@ -10,7 +10,7 @@
 # and the previous record exists until then: neither a full disk nor a power failure leaves a robot without a valid record.
 TTL=3600 # lifetime of a lock that is not renewed, in seconds; as TTL_S in locks.py
 
-read_newest() { # read the newest complete record; set n to the highest number (0: none), incomplete to the number of incomplete ones
+read_newest() { # read the newest complete record; set n to the highest number (0: none), incomplete to the number of incomplete records
     n=0 best=0 incomplete=0 kind=free holder=- record_boot=- from=0 to=0 since=0 until=0 who=- what=-
     for record in "$base"/lock.*; do
         number=${record##*.}
@@ -64,24 +64,24 @@ read_wall_clock() { # set wall to the clock in seconds, or to 0 if `date` fails
     wall=${wall:-0}
 }
 
-read_age() { # set age and rest: seconds since the record was written, and until it expires; false if it has expired
+read_age() { # set age to the seconds since the record was written, and remaining to those until it expires; false if it has expired
     read_uptime
     read -r boot </proc/sys/kernel/random/boot_id
     if [ "$record_boot" = "$boot" ]; then
-        age=$((now - from)) rest=$((to - now)) # independent of changes of the clock
+        age=$((now - from)) remaining=$((to - now)) # independent of changes of the clock
     else
         read_wall_clock
-        age=$((wall - since)) rest=$((until - wall))
+        age=$((wall - since)) remaining=$((until - wall))
     fi
     # After a boot, a clock without a battery may show a time in the past.
-    [ "$rest" -gt 0 ] && [ "$age" -ge 0 ]
+    [ "$remaining" -gt 0 ] && [ "$age" -ge 0 ]
 }
 
 lock() {
     for try in 1 2 3 4 5 6 7 8; do
         read_newest
         if [ "$kind" = held ] && [ "$holder" != "$1" ] && read_age; then
-            fail "held $age $rest $since $who $what" "$HELD"
+            fail "held $age $remaining $since $who $what" "$HELD"
         fi
         # An older version of this script creates the file before it writes the record.
         [ "$incomplete" -gt 0 ] && [ "$try" -lt 4 ] && sleep_for 0.05 && continue
@@ -94,7 +94,7 @@ renew() { # extend the lock of token $1 to at least $2 s + 30 min, if half of it
     read_newest
     case $kind:$holder in
         held:"$1")
-            read_age && [ "$rest" -gt "$age" ] && [ "$rest" -gt "$2" ] && return
+            read_age && [ "$remaining" -gt "$age" ] && [ "$remaining" -gt "$2" ] && return
             span=$((until - since))
             [ "$span" -gt $(($2 + TTL / 2)) ] || span=$(($2 + TTL / 2))
             lock "$1" "$span" "$who" "$what"
@@ -117,7 +117,7 @@ unlock() {
 
 holder() {
     read_newest
-    [ "$kind" = held ] && read_age && echo "$holder $rest $who $what"
+    [ "$kind" = held ] && read_age && echo "$holder $remaining $who $what"
     return 0
 }
 

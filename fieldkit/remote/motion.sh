@@ -11,7 +11,7 @@ is_motion_program() { # true if the job in $1 is a motion program; sets program 
     esac
 }
 
-halt_motion() { # stop the programs in the name of $1; only those of folder $2 if it is given
+halt_motion() { # stop the motion programs in the name of user $1; if folder $2 is given, only the programs of this folder
     by=$1 programs=
     # The signals are sent first: they need no disk space and no wait.
     if [ -n "${2-}" ]; then

@@ -12,10 +12,12 @@ class MotionState(StrEnum):
         NOTHING: No program of fieldkit moves it; nothing is sent to it.
         STATIONARY: Its odometry shows no motion.
         LANDED: Its motors have stopped.
-        ENDED: The program has ended without a report about the robot, because it had not started to move the robot.
+        ENDED: The program has exited and did not report that the robot is stationary or on the ground, for example
+            because it had not started to move the robot.
         LAND: A drone is landing at its position.
         RETURN: A drone is returning, and will then land.
-        SILENT: The program received a signal and has not confirmed anything. A driving program was killed.
+        SILENT: The program received a signal and has not reported a state. A program that drives the robot was then
+            killed.
         ALARM: The program cannot land its drone now: the autopilot sends no heartbeat, or a person or another program
             flies it.
     """

@@ -331,12 +331,12 @@ class _Stream:
             if not start_mark:
                 self._incomplete = before_start[-len(self._nonce) :]
                 return
-        output, nonce, rest = data.partition(self._nonce)
+        output, nonce, after_nonce = data.partition(self._nonce)
         if nonce:
-            self._incomplete = nonce + rest
-            if _END.match(rest):
-                self.code = int(rest.partition(b"\n")[0])
-            elif len(rest) >= _MAX_END_BYTES:
+            self._incomplete = nonce + after_nonce
+            if _END.match(after_nonce):
+                self.code = int(after_nonce.partition(b"\n")[0])
+            elif len(after_nonce) >= _MAX_END_BYTES:
                 raise UnfitServerError("the answer to a command has no valid exit code")
         else:
             # Only a possible start of the nonce is kept, because a caller may wait for the output before it.

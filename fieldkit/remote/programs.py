@@ -41,7 +41,7 @@ def copy(shell: Shell, folder: str, program_path: str, content: bytes, sha256: s
 
     Raises:
         LinkError: The robot did not answer.
-        RobotError: It cannot be written there.
+        RobotError: The program cannot be written to the folder, or the copy is incomplete.
     """
     program_folder, _, name = program_path.rpartition("/")
     argv = (

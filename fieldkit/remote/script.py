@@ -56,7 +56,7 @@ HELD_REMEDY: Final = "wait, resume that trial if it is yours, or end it: fieldki
 
 _MESSAGE_PREFIX: Final = b"job.sh: "
 _HELD: Final = re.compile(
-    r"held (?P<age>-?\d{1,11}) (?P<rest>-?\d{1,11}) (?P<since>\d{1,11}) (?P<user>\S+) (?P<purpose>.+)", re.ASCII
+    r"held (?P<age>-?\d{1,11}) (?P<remaining>-?\d{1,11}) (?P<since>\d{1,11}) (?P<user>\S+) (?P<purpose>.+)", re.ASCII
 )
 _LOST: Final = re.compile(
     r"(?P<kind>aborted|stopped|held|gone) (?P<since>\d{1,11}) (?P<user>\S+) (?P<purpose>.+)", re.ASCII
@@ -122,7 +122,7 @@ def require_success(shell: Shell, completed: Completed, *, remedy: str = "") -> 
     )
     match completed.exit_code:
         case 75 if match := _HELD.match(what):  # HELD; the script's exit codes are defined in common.sh
-            age, remaining = (format_duration(float(match[name])) for name in ("age", "rest"))
+            age, remaining = (format_duration(float(match[name])) for name in ("age", "remaining"))
             holder = f"{match['user']} locked it at {_start_time(match)}, {age} ago, for {match['purpose']}"
             what = f"{holder}; the lock expires in {remaining}"
             remedy = HELD_REMEDY
@@ -139,7 +139,7 @@ def require_success(shell: Shell, completed: Completed, *, remedy: str = "") -> 
 
 
 def word(text: str) -> str:
-    """Return `text` as one word for the record of a lock; other characters are replaced by `_`."""
+    """Return `text` as one word for the record of a lock; characters that are not allowed are replaced by `_`."""
     return re.sub(r"[^A-Za-z0-9._@-]", "_", text)[:80] or "-"
 
 

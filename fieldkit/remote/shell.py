@@ -38,7 +38,7 @@ class Session(Protocol):
         """Close the command's standard input, if it is open, and wait for its end; both streams are read.
 
         Args:
-            deadline: When to give up.
+            deadline: Time limit.
             check: Whether to raise if the exit code is not 0.
 
         Raises:
@@ -71,7 +71,7 @@ class Shell(Protocol):
 
         Args:
             argv: Argument list; the Shell quotes it.
-            deadline: When to give up.
+            deadline: Time limit.
             until: Return when the command has written this output, or has ended. The robot then reports the end of
                 the command without a request. If it is None, the end is reported only when `Session.end` requests it.
 
@@ -85,7 +85,7 @@ class Shell(Protocol):
 
         Args:
             argv: Argument list; the Shell quotes it.
-            deadline: When to give up.
+            deadline: Time limit.
             stdin: Standard input of the command.
             check: Whether to raise if the exit code is not 0.
 

@@ -20,7 +20,7 @@ start_source() { # start the source $1 with the command in the other arguments; 
     fi
     shift
     {
-        # In another folder, because the timeout of busybox may run a second longer, and this folder is deleted.
+        # Run in another folder, because the timeout of busybox may run a second longer, and this folder is deleted.
         (ulimit -f "$SOURCE_BLOCKS"; cd / && exec setsid timeout -s KILL "$SOURCE_S" "$@") 2>&1 &
         wait "$!"
         code=$?
@@ -82,7 +82,7 @@ start_radio_sources() { # start the sources for the radio with interface $1
     # is passive, so the difference shows the load by other transmitters.
     start_source iw-survey sh -c 'iw dev "$1" survey dump && { sleep 0.5 || sleep 1; } && echo == && iw dev "$1" survey dump' sh "$1"
     case $info in *"channel "*" ("*" MHz"*) ;; *) return 0 ;; esac
-    info=${info#*channel *" ("} # of `channel 6 (2437 MHz), ...` the frequency remains
+    info=${info#*channel *" ("} # keep only the frequency of `channel 6 (2437 MHz), ...`
     info=${info%%" MHz"*}
     set -- iw dev "$1" scan freq "${info%.*}" passive
     [ "$(id -u)" = 0 ] || set -- sudo -n "$@"
@@ -90,8 +90,8 @@ start_radio_sources() { # start the sources for the radio with interface $1
 }
 
 # Print the outputs of all sources. $1: new folder for temporary files; $2: interface of the radio, or -; $3: file with the
-# names of sources that hung before, to which the names of others are added, or -; $4: `clock` for the sources of the clock
-# only, otherwise empty.
+# names of sources that hung before, to which the names of sources that hang now are added, or -; $4: `clock` for the sources
+# of the clock only, otherwise empty.
 snapshot() {
     folder=$1 hung_sources=:
     [ ! -s "$3" ] || while read -r name; do hung_sources=$hung_sources$name:; done <"$3"

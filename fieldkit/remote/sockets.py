@@ -13,8 +13,8 @@ class Timing:
     """Timeouts of an SSH connection. The kernel closes a connection after about `probe_s` + `dead_s` without answers.
 
     Attributes:
-        connect_s: Timeout from name resolution to the end of the login. A lost link must be reported within 10 s.
-            This timeout is shorter, because an unused link may have been lost earlier.
+        connect_s: Timeout from name resolution to the end of the login. It is shorter than the 10 s within which a
+            lost link must be reported, because the loss of an unused link is detected late.
         probe_s: Silence after which the kernel sends keepalive probes, in whole seconds.
         dead_s: Age of unacknowledged data at which the connection is lost. With SSH keepalives alone, paramiko
             reported a dead connection as active for more than 25 s in field tests.

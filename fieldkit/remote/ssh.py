@@ -179,7 +179,7 @@ class SshSession:
         """Wait for the end of the command; see `Session.end`, `Shell.run` and `Shell.fetch`.
 
         Args:
-            deadline: When to give up.
+            deadline: Time limit.
             check: Whether to raise if the exit code is not 0.
             stdin: Standard input of the command.
             out: File for standard output; None to return it in the result.

@@ -5,8 +5,8 @@
 # its share of a core, because a process takes milliseconds on a small computer. Nothing is sent over the radio.
 
 TICK=0.2 # s between samples
-CHECK_INTERVAL=500 # interval of checks of the channel, the cell and the lock, in 10 ms
-SHARE=12 AHEAD=3000 # CPU budget in thousandths of a core, and initial credit in 10 us
+CHECK_INTERVAL=500 # interval of checks of the channel, the access point and the lock, in units of 10 ms
+SHARE=12 AHEAD=3000 # CPU budget in thousandths of a core, and initial credit in units of 10 us
 BLOCKS=8192 # limit of the file size, in blocks of 512 or 1,024 bytes
 
 # Start a job that samples interface $2 of role $1. Do nothing without iw, or if it was started before.
@@ -141,7 +141,7 @@ sample() {
                 echo "$link_text"
                 print_heading survey
                 iw dev "$interface" survey dump
-                # With some drivers (brcmfmac, Realtek) `station get` of the own cell reports more than `station dump`.
+                # With some drivers (brcmfmac, Realtek) `station get` of the access point reports more than `station dump`.
                 cell=${link_text#Connected to }
                 [ "$cell" = "$link_text" ] && set -- station dump || set -- station get "${cell%% *}"
             fi
@@ -150,7 +150,7 @@ sample() {
             read_cpu_time
             next_query=$((first + ((used - used_before) * 1000 - AHEAD) / SHARE))
         fi
-        # A short pause only if the kernel reports a link quality, or if iw must be called again.
+        # The pause is short only if the kernel reports a link quality, or if iw must be called again.
         [ -n "$has_quality" ] || [ "$at" -ge "$next_query" ] && pause=$TICK || pause=1
         if [ -n "$has_read_timeout" ]; then read -r -t "$pause" _ <&8; else sleep_for 1; fi
     done

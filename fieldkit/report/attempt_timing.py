@@ -1,7 +1,7 @@
 """Times and flows in one attempt on the clock of the first sending robot.
 
 The times are of packets, pings, jobs, faults and moves. Flows are drawn as panels over time: the payload rate that
-iperf3 measured, and the panels of steps that draw their own (`DrawsPanels`).
+iperf3 measured, and the panels of steps that implement `DrawsPanels`.
 """
 
 import math
@@ -222,7 +222,7 @@ def _activities_of_jobs(times: AttemptTimes) -> Iterator[Activity]:
     names = dict.fromkeys(name for _, name in times.jobs)
     for name in names:
         what = plain_name(name)
-        # The job `listen` is shown as `receive`. If there is a `receive`, the other jobs have their own activities.
+        # The activity of the job `listen` is named `receive`. If it exists, the evidence shows the other jobs, too.
         if what.startswith("fault-") or (what in _SHOWN_BY_EVIDENCE and {what, "receive"} & names_with_evidence):
             continue
         spans = [span for (_, job), span in times.jobs.items() if job == name]
@@ -301,7 +301,7 @@ _ENDS: Final = (Style("blue", line="solid"), Style("green", line="dashed"))
 
 
 def flow_panels(evidence: AttemptEvidence, plan: Plan, times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
-    """Yield the panels of steps whose evidence has times: iperf3 tests, and steps that draw panels themselves.
+    """Yield the panels of steps whose evidence has times: iperf3 tests, and steps that implement `DrawsPanels`.
 
     Args:
         evidence: Evidence of the attempt.

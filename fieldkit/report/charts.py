@@ -27,7 +27,7 @@ class Series:
         join: Type of line between the points.
         behind: Single values, as (x, y), which are drawn faintly behind the points.
         breaks: Indices of points after which the line is interrupted.
-        notes: A short text next to each point, empty for none; an empty sequence if no point has one.
+        notes: A short text next to each point, empty for a point without text; an empty sequence if no point has one.
         bounds: True for each value that is only a lower bound; empty if no value is one.
         behind_bounds: Like `behind`, for values that are only lower bounds.
     """

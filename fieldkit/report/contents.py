@@ -1,6 +1,6 @@
 """Contents of a report, made from a table of repeats and the evidence that belongs to it.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 import shlex
@@ -170,9 +170,9 @@ def build_contents(
     Args:
         repeats: Attempts, with the column `source`.
         title: Its title; empty for a generated one.
-        repeat: Repeat for the time line, in the form of `repeat_to_draw`.
+        repeat: Repeat for the time line, as the argument `requested` of `repeat_to_draw`.
         command: The words of the operator's command, without `--rebuild`.
-        paths: The paths in it.
+        paths: The paths in this command.
         quantities: Names of quantities to draw in addition to the default ones.
         unmeasured: Planned conditions without any attempt, in words.
         sweep: If the repeats are runs of sweeps, the result of `datasets.condition`: columns of the flow and of the

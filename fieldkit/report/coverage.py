@@ -1,6 +1,6 @@
 """Number of repeats with a value of a quantity under each condition, and reasons for missing values.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 from collections.abc import Iterable, Iterator, Sequence

@@ -1,6 +1,6 @@
 """Charts against distance: one per quantity, with panels for protocols, topologies and named steps.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -1,6 +1,6 @@
 """Distribution functions of all round-trip times if outputs of ping are available, otherwise of values of repeats.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 from collections.abc import Iterator, Sequence

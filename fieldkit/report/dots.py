@@ -1,6 +1,6 @@
 """Dot plots of quantities that were measured at one distance: a lane per quantity, a panel per unit.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 from collections.abc import Iterator, Sequence

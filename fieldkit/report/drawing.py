@@ -1,4 +1,4 @@
-"""Draw panels on axes of matplotlib. `figures` creates pages and files from them."""
+"""Draw panels on axes of matplotlib. The module `figures` creates the figures that contain the axes."""
 
 import math
 import textwrap
@@ -16,45 +16,46 @@ from fieldkit.core.text import sanitized
 from fieldkit.report.charts import EdgeMark, HeatMap, Panel, Series
 from fieldkit.report.theme import LIGHT, Style
 
-_MARKER: Final = 5.0
-_POINT: Final = 3.0
+_MARKER_SIZE: Final = 5.0
+_SMALL_MARKER_SIZE: Final = 3.0
 """Sizes of normal and of small markers."""
-_NOTE: Final = 6.5
+_NOTE_FONT_SIZE: Final = 6.5
 """Font size of texts next to points."""
-_FAINT: Final = 0.3
+_FAINT_OPACITY: Final = 0.3
 """Opacity of single repeats behind their estimate."""
-_STEPS: Final = (1, 2, 5, 10)
+_TICK_STEPS: Final = (1, 2, 5, 10)
 """Multiples of a power of ten for the distance of ticks."""
-_TITLE: Final = 48
-_TICK: Final = 20
-_LANE: Final = 26
+_MAX_TITLE_LENGTH: Final = 48
+_MAX_TICK_LENGTH: Final = 20
+_MAX_LANE_LENGTH: Final = 26
 """Maximum numbers of characters of titles, tick labels and names of lanes."""
-_BOUND: Final = 4.0
-"""Size of the triangles of single repeats that are lower bounds."""
-_ARROW: Final = 14.0
+_BOUND_MARKER_SIZE: Final = 4.0
+"""Size of the triangles of single repeats whose values are only lower bounds."""
+_ARROW_POINTS: Final = 14.0
 """Length of the arrow of a lower bound, in points."""
-_STRIP_LANE: Final = 7.5
+_STRIP_LANE_FONT_SIZE: Final = 7.5
 """Font size of lane names in panels of a fixed height."""
-_DARK: Final = 0.6
+_LIGHT_TEXT_FROM: Final = 0.6
 """Position on the colour scale of a heat map, 0 to 1, from which texts are light."""
-_ON_LIGHT: Final = "#111111"
-_ON_DARK: Final = "#fefefe"
-"""Colours of texts in a heat map, on light and on dark colours. They are the same in both themes, as its colours."""
-_LEVEL_CHARACTERS: Final = 40
-"""Labels below a heat map are vertical if they need more than this number of characters in total."""
-_NOTE_COLUMNS: Final = 12
+_TEXT_ON_LIGHT: Final = "#111111"
+_TEXT_ON_DARK: Final = "#fefefe"
+"""Colours of texts in a heat map, on light and on dark colours. They are the same in both themes, because the colours
+of a heat map are."""
+_MAX_LEVEL_CHARACTERS: Final = 40
+"""Labels below a heat map are vertical if their number times the length of the longest exceeds this value."""
+_FULL_SIZE_COLUMNS: Final = 12
 """The texts of a heat map are smaller if it has more than this number of columns."""
-_SMALLEST: Final = 3.5
+_MIN_FONT_SIZE: Final = 3.5
 """Smallest font size of texts in a heat map."""
-_EDGE_TEXT: Final = 34
-"""Maximum number of characters of a text at the edge."""
+_MAX_EDGE_TEXT_LENGTH: Final = 34
+"""Maximum number of characters of the reason next to an `EdgeMark`."""
 
 
 def draw(axes: Axes, panel: Panel) -> None:
     """Draw a panel on axes."""
-    axes.set_title(_shorten(panel.title, _TITLE))
-    axes.set_xlabel(_shorten(panel.x_label, _TITLE))
-    axes.set_ylabel(_shorten(panel.y_label, _TITLE))
+    axes.set_title(_shorten(panel.title, _MAX_TITLE_LENGTH))
+    axes.set_xlabel(_shorten(panel.x_label, _MAX_TITLE_LENGTH))
+    axes.set_ylabel(_shorten(panel.y_label, _MAX_TITLE_LENGTH))
     if panel.heat is not None:
         _draw_heat(axes, panel.heat)
         return
@@ -73,17 +74,23 @@ def _draw_heat(axes: Axes, heat: HeatMap) -> None:
     low, high = heat.limits
     axes.pcolormesh(heat.values, cmap="Blues", vmin=low, vmax=high, edgecolors=LIGHT["paper"], linewidth=1.0)
     columns = len(heat.columns)
-    font_size = _NOTE if columns <= _NOTE_COLUMNS else max(_NOTE * _NOTE_COLUMNS / columns, _SMALLEST)
+    font_size = (
+        _NOTE_FONT_SIZE
+        if columns <= _FULL_SIZE_COLUMNS
+        else max(_NOTE_FONT_SIZE * _FULL_SIZE_COLUMNS / columns, _MIN_FONT_SIZE)
+    )
     for row, texts in enumerate(heat.texts):
         for column, text in enumerate(texts):
-            is_dark = heat.values[row][column] > low + _DARK * (high - low)
-            colour = _ON_DARK if is_dark else _ON_LIGHT
+            is_dark = heat.values[row][column] > low + _LIGHT_TEXT_FROM * (high - low)
+            colour = _TEXT_ON_DARK if is_dark else _TEXT_ON_LIGHT
             axes.text(column + 0.5, row + 0.5, text, color=colour, ha="center", va="center", fontsize=font_size)
-    labels = [_shorten(label, _TICK) for label in heat.columns]
+    labels = [_shorten(label, _MAX_TICK_LENGTH) for label in heat.columns]
     axes.set_xticks([index + 0.5 for index in range(len(labels))], labels)
-    if len(labels) * max(map(len, labels)) > _LEVEL_CHARACTERS:
+    if len(labels) * max(map(len, labels)) > _MAX_LEVEL_CHARACTERS:
         axes.tick_params(axis="x", rotation=90)
-    axes.set_yticks([index + 0.5 for index in range(len(heat.rows))], [_shorten(y, _LANE) for y in heat.rows])
+    axes.set_yticks(
+        [index + 0.5 for index in range(len(heat.rows))], [_shorten(y, _MAX_LANE_LENGTH) for y in heat.rows]
+    )
     axes.grid(visible=False)
 
 
@@ -94,9 +101,9 @@ def _set_axes(axes: Axes, panel: Panel) -> None:
     if panel.x_log:
         axes.set_xscale("log")
     if panel.lanes:
-        axes.set_yticks(range(len(panel.lanes)), [_wrap(lane, _LANE) for lane in panel.lanes])
+        axes.set_yticks(range(len(panel.lanes)), [_wrap(lane, _MAX_LANE_LENGTH) for lane in panel.lanes])
         if panel.is_strip:
-            axes.tick_params(axis="y", labelsize=_STRIP_LANE)
+            axes.tick_params(axis="y", labelsize=_STRIP_LANE_FONT_SIZE)
         axes.set_ylim(-0.6, len(panel.lanes) - 0.4)
         axes.grid(visible=False, axis="y")
     else:
@@ -105,7 +112,9 @@ def _set_axes(axes: Axes, panel: Panel) -> None:
     if panel.right is not None:
         axes.set_xlim(panel.left, panel.right)
     if panel.x_ticks:
-        axes.set_xticks([at for at, _ in panel.x_ticks], [_shorten(label, _TICK) for _, label in panel.x_ticks])
+        axes.set_xticks(
+            [at for at, _ in panel.x_ticks], [_shorten(label, _MAX_TICK_LENGTH) for _, label in panel.x_ticks]
+        )
         axes.grid(visible=False, axis="x")
     else:
         _set_ticks(axes.xaxis, is_log=panel.x_log, ticks=6)
@@ -114,7 +123,7 @@ def _set_axes(axes: Axes, panel: Panel) -> None:
 def _set_ticks(axis: Axis, *, is_log: bool, ticks: int) -> None:
     """Set a small number of ticks with plain numbers."""
     if not is_log:
-        axis.set_major_locator(MaxNLocator(nbins=ticks, steps=_STEPS))
+        axis.set_major_locator(MaxNLocator(nbins=ticks, steps=_TICK_STEPS))
         return
     # The default formatter writes powers of ten as formulas, which are not plain text in SVG.
     axis.set_major_formatter(FormatStrFormatter("%g"))
@@ -142,7 +151,7 @@ def _draw_series(axes: Axes, series: Series, panel: Panel) -> None:
     for x, y, note in zip(series.x, series.y, series.notes, strict=False):
         if note:
             text = axes.annotate(
-                note, (x, y), (5, 5), textcoords="offset points", fontsize=_NOTE, color=LIGHT["lost"]
+                note, (x, y), (5, 5), textcoords="offset points", fontsize=_NOTE_FONT_SIZE, color=LIGHT["lost"]
             )
             text.set_in_layout(False)
 
@@ -152,11 +161,11 @@ def _draw_singles(axes: Axes, series: Series, panel: Panel) -> None:
     is_sideways, top = bool(panel.lanes), _value_limit(panel)
     colour = LIGHT[series.style.colour]
     for points, marker, size in (
-        (series.behind, "o", _POINT),
-        (series.behind_bounds, ">" if is_sideways else "^", _BOUND),
+        (series.behind, "o", _SMALL_MARKER_SIZE),
+        (series.behind_bounds, ">" if is_sideways else "^", _BOUND_MARKER_SIZE),
     ):
         visible_points = [point for point in points if point[0 if is_sideways else 1] <= top]
-        faint: dict[str, Any] = {"color": colour, "alpha": _FAINT, "markersize": size, "markeredgewidth": 0}
+        faint: dict[str, Any] = {"color": colour, "alpha": _FAINT_OPACITY, "markersize": size, "markeredgewidth": 0}
         axes.plot([x for x, _ in visible_points], [y for _, y in visible_points], marker, **faint)
 
 
@@ -167,7 +176,7 @@ def _draw_bound(axes: Axes, at: tuple[float, float], style: Style, *, is_sideway
     arrow = axes.annotate(
         "",
         at,
-        (_ARROW, 0) if is_sideways else (0, _ARROW),
+        (_ARROW_POINTS, 0) if is_sideways else (0, _ARROW_POINTS),
         textcoords="offset points",
         arrowprops={"arrowstyle": "<-", "color": options["color"], "linewidth": 1.1},
     )
@@ -190,7 +199,7 @@ def _draw_interval(
     if high > top:
         end = (top, position) if is_sideways else (position, top)
         marker = CARETRIGHT if is_sideways else CARETUP
-        axes.plot(*end, marker=marker, color=colour, markersize=_MARKER, clip_on=False)
+        axes.plot(*end, marker=marker, color=colour, markersize=_MARKER_SIZE, clip_on=False)
 
 
 def _value_limit(panel: Panel) -> float:
@@ -210,15 +219,17 @@ def _draw_edge(axes: Axes, edge: EdgeMark, *, sideways: bool) -> None:
     end = 1.0 if edge.is_high else 0.0
     at = (end, edge.at) if sideways else (edge.at, end)
     transform = axes.get_yaxis_transform() if sideways else axes.get_xaxis_transform()
-    axes.plot(*at, "x", color=LIGHT[edge.colour], markersize=_MARKER, clip_on=False, transform=transform, zorder=4)
+    axes.plot(
+        *at, "x", color=LIGHT[edge.colour], markersize=_MARKER_SIZE, clip_on=False, transform=transform, zorder=4
+    )
     inwards = -6 if edge.is_high else 6
     text = axes.annotate(
-        _shorten(edge.text, _EDGE_TEXT),
+        _shorten(edge.text, _MAX_EDGE_TEXT_LENGTH),
         at,
         (inwards, 0) if sideways else (0, inwards),
         xycoords=transform,
         textcoords="offset points",
-        fontsize=_NOTE,
+        fontsize=_NOTE_FONT_SIZE,
         color=LIGHT["lost"],
         rotation=0 if sideways else 90,
         ha=("right" if edge.is_high else "left") if sideways else "center",
@@ -239,7 +250,7 @@ def _shorten(text: str, max_length: int) -> str:
 
 def handle(label: str, style: Style) -> Line2D:
     """Return the legend handle of a series."""
-    return Line2D([], [], label=_shorten(label, _TITLE), **_line_options(style))
+    return Line2D([], [], label=_shorten(label, _MAX_TITLE_LENGTH), **_line_options(style))
 
 
 def _line_options(style: Style) -> dict[str, Any]:
@@ -249,7 +260,7 @@ def _line_options(style: Style) -> dict[str, Any]:
         "marker": style.marker or None,
         "markerfacecolor": LIGHT["paper"] if style.is_hollow else colour,
         "linestyle": style.line,
-        "markersize": _POINT if style.line == "none" and style.marker != "x" else _MARKER,
-        # Hollow markers hide the line behind them.
+        "markersize": _SMALL_MARKER_SIZE if style.line == "none" and style.marker != "x" else _MARKER_SIZE,
+        # Above lines, whose zorder is 2 in matplotlib, so that a hollow marker hides the line behind it.
         "zorder": 3,
     }

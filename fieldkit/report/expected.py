@@ -1,6 +1,6 @@
-"""Judgements of the expectations of trials, for reports.
+"""Texts that show in a report if the measured values meet the expectations of the trials.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence

@@ -24,7 +24,7 @@ from fieldkit.report import drawing
 from fieldkit.report.charts import Chart, Panel
 from fieldkit.report.theme import FORMATS, LIGHT, METADATA, SETTINGS, Colour, Format
 
-_MARKER: Final = 5.0
+_MARKER_SIZE: Final = 5.0
 _PANEL_INCHES: Final = (4.4, 2.75)
 _STRIP_INCHES: Final = (5.8, 1.25)
 """Size of a strip without lanes."""
@@ -41,25 +41,31 @@ _PAPER_PANEL_INCHES: Final = 2.3
 _PAPER_LEGEND_INCHES: Final = 0.3
 """Heights of a panel and of the legend in a figure for a paper."""
 
-_MATERIALS: Final[dict[str, Colour]] = {"foliage": "green", "wood": "orange", "brick": "red", "ground": "orange"}
+_MATERIAL_COLOURS: Final[dict[str, Colour]] = {
+    "foliage": "green",
+    "wood": "orange",
+    "brick": "red",
+    "ground": "orange",
+}
 """Colours of obstacles that are not grey."""
-_SNR_DB: Final = (0.0, 60.0)
-"""Range of the colour scale: from almost no reception to more than any mode needs. It is equal in all figures."""
+_SNR_RANGE_DB: Final = (0.0, 60.0)
+"""Range of the colour scale, the same in all figures: from almost no reception to more than any data rate needs."""
 _LABEL_BACKGROUND: Final = {"facecolor": LIGHT["paper"], "edgecolor": "none", "pad": 0.5}
-_EDGE: Final = 0.15
+_EDGE_SHARE: Final = 0.15
 """Width of the zone at each edge in which labels are aligned inwards, as a share of the world."""
 
-_MAX_LABELLED: Final = 15
+_MAX_LABELLED_LINKS: Final = 15
 """Maximum number of links that are labelled with their SNR: the number of pairs of six robots."""
-_MIN_LABELLED: Final = 0.1
-"""Minimum length of a labelled link, as a share of the drawing's width."""
+_MIN_LABELLED_SHARE: Final = 0.1
+"""Minimum length of a labelled link, as a share of the longer side of the world."""
 
 
 class _Figure(Figure):
-    """A figure that is drawn once when it is saved.
+    """A figure that is drawn only once when it is saved.
 
-    To compute the constrained layout, `savefig` first draws the figure with a renderer that has no output. The layout
-    does not need that drawing, which would take a quarter of the time. The second call has no layout engine.
+    For a constrained layout, `savefig` calls `draw` twice: first with a layout engine and a renderer without output,
+    then without a layout engine to draw the output. Here the first call only computes the layout. It does not need
+    to draw the figure for that, which would take a quarter of the time.
     """
 
     @override
@@ -72,7 +78,10 @@ class _Figure(Figure):
 
 
 def panel_svg(panel: Panel) -> str:
-    """Return one panel as an SVG document for the page: transparent, with text as text, in light colours."""
+    """Return one panel as an SVG document for the page.
+
+    The background is transparent, texts remain texts, and the colours are those of the light theme.
+    """
     with _settings(9.0):
         width, height = _inches(panel)
         figure = _Figure(figsize=(width, height), layout=None if panel.is_strip else "constrained")
@@ -140,17 +149,18 @@ def overview(lab: Overview, file_format: Format) -> bytes:
         for outline in lab.outlines:
             axes.fill(
                 *zip(*outline.corners, strict=True),
-                color=LIGHT[_MATERIALS.get(outline.material, "muted")],
+                color=LIGHT[_MATERIAL_COLOURS.get(outline.material, "muted")],
                 alpha=0.45,
             )
         if lab.links:
             _draw_links(figure, axes, lab)
         east_m, north_m = zip(*lab.robots.values(), strict=True)
-        axes.plot(east_m, north_m, "o", color=LIGHT["ink"], markersize=_MARKER, zorder=4, clip_on=False)
+        axes.plot(east_m, north_m, "o", color=LIGHT["ink"], markersize=_MARKER_SIZE, zorder=4, clip_on=False)
         for name, place_m in lab.robots.items():
-            # Labels are away from the links, which are in the middle, but inside of the world.
+            # Most links are in the middle of the drawing, so labels are on the outer side of their robots, unless
+            # they would then be outside of the world.
             share = place_m[1] / lab.area_m[1]
-            is_above = share < _EDGE or (place_m[1] >= fmean(north_m) and share <= 1 - _EDGE)
+            is_above = share < _EDGE_SHARE or (place_m[1] >= fmean(north_m) and share <= 1 - _EDGE_SHARE)
             axes.annotate(
                 sanitized(name),
                 place_m,
@@ -167,7 +177,7 @@ def overview(lab: Overview, file_format: Format) -> bytes:
 def _side(east_m: float, width_m: float) -> Literal["left", "center", "right"]:
     """Return the alignment of a label, so that it stays inside of the world."""
     share = east_m / width_m
-    return "left" if share < _EDGE else "right" if share > 1 - _EDGE else "center"
+    return "left" if share < _EDGE_SHARE else "right" if share > 1 - _EDGE_SHARE else "center"
 
 
 def _draw_links(figure: Figure, axes: Axes, lab: Overview) -> None:
@@ -177,14 +187,14 @@ def _draw_links(figure: Figure, axes: Axes, lab: Overview) -> None:
         array=[link.snr_db for link in lab.links],
         cmap="viridis",
         linestyles=["solid" if link.linked else "dotted" for link in lab.links],
-        linewidths=1.2 if len(lines) <= _MAX_LABELLED else 0.4,
+        linewidths=1.2 if len(lines) <= _MAX_LABELLED_LINKS else 0.4,
         zorder=2,
     )
-    line_collection.set_clim(*_SNR_DB)
+    line_collection.set_clim(*_SNR_RANGE_DB)
     axes.add_collection(line_collection)
     figure.colorbar(line_collection, ax=axes, label="SNR (dB)", shrink=0.7)
     for (place_m, other_m), link in zip(lines, lab.links, strict=True):
-        if len(lines) <= _MAX_LABELLED and math.dist(place_m, other_m) > _MIN_LABELLED * max(lab.area_m):
+        if len(lines) <= _MAX_LABELLED_LINKS and math.dist(place_m, other_m) > _MIN_LABELLED_SHARE * max(lab.area_m):
             middle_m = (place_m[0] + other_m[0]) / 2, (place_m[1] + other_m[1]) / 2
             axes.annotate(
                 sanitized(", ".join((f"{link.snr_db:.0f} dB", *link.through))),
@@ -204,7 +214,8 @@ def _settings(points: float) -> Iterator[None]:
         # A user's matplotlibrc must not change the output.
         mpl.rcdefaults()
         mpl.rcParams.update(SETTINGS | {"font.size": points, "axes.titlesize": points, "axes.labelsize": points})
-        # A character that DejaVu lacks is still text in SVG, and a box elsewhere.
+        # A character that the font DejaVu lacks is correct text in SVG. In the other formats it is a box, which is
+        # better than a warning without a remedy.
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
         yield
 

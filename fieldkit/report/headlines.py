@@ -1,6 +1,6 @@
 """Headlines of a report: first the missing results, then each quantity, its worst condition first.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -20,7 +20,7 @@ from fieldkit.trial.plan import Plan
 
 _USER_DEFINED_KINDS: Final = frozenset(("ask", "run"))
 """Kinds of step whose columns are defined by the user in the procedure."""
-_MORE_IS_BETTER: Final = frozenset(("bit/s", "dBm", "dB"))
+_MORE_IS_BETTER_UNITS: Final = frozenset(("bit/s", "dBm", "dB"))
 _LOSSES: Final = frozenset((*LOSSES, "topic_loss", "video_loss", "iperf3_loss", "iperf3_captured_loss"))
 
 
@@ -51,12 +51,15 @@ class Ranking:
         return name in self._user_defined_columns
 
     def more_is_worse(self, quantity: Quantity) -> bool | None:
-        """Return True if larger values are worse, by the expectation or otherwise by the unit; None if unknown."""
+        """Return True if larger values are worse, or None if that is unknown.
+
+        The expectation on the quantity determines the result. Without an expectation, the unit or the name does.
+        """
         if (expectation := self._expected.get(quantity.name)) is not None:
             return expectation.is_below
         if quantity.name in self._user_defined_columns or quantity.kind is Kind.FLAG:
             return None
-        if quantity.unit in _MORE_IS_BETTER:
+        if quantity.unit in _MORE_IS_BETTER_UNITS:
             return False
         return True if quantity.unit == "s" or plain_name(quantity.name) in _LOSSES else None
 
@@ -73,7 +76,7 @@ _TOPIC_QUANTITIES: Final = ("topic_loss", "topic_delay_median_s", "video_loss", 
 
 In these trials pings serve only to measure the clock offset, and transfers only to generate load.
 """
-_MAX_FIRST: Final = 6
+_MAX_FIRST_HEADLINES: Final = 6
 """Maximum number of headlines of expected and user-defined quantities."""
 _MAX_PLACES: Final = 3
 """Maximum number of conditions that a line names."""
@@ -92,8 +95,8 @@ class HeadlineLine:
 
     Attributes:
         extreme: `least` or `most`; empty if there is nothing to compare.
-        value: The figure with its unit, or the missing result.
-        interval: Its 95 % interval, and the number of repeats with a value if not all have one; may be empty.
+        value: The value with its unit, or the missing result.
+        interval: The 95 % interval, and the number of repeats with a value if not all have one; may be empty.
         place: The condition.
         is_missing: True if it reports something missing or lost.
     """
@@ -131,7 +134,7 @@ def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[st
     """
     writer = _HeadlineWriter(evidence, Ranking(evidence), wording.differing(cells))
     yield writer.repeats_headline(cells, unmeasured)
-    first_quantities = writer.ranking.first_quantities(measured(cells))[:_MAX_FIRST]
+    first_quantities = writer.ranking.first_quantities(measured(cells))[:_MAX_FIRST_HEADLINES]
     for quantity in first_quantities:
         protocols = {cell.key["protocol"] for cell in cells if quantity.name in cell.estimates}
         group_cells = [cell for cell in cells if cell.key["protocol"] in protocols]
@@ -195,7 +198,10 @@ class _HeadlineWriter:
     def quantity_headlines(
         self, subject: str, variants: Sequence[Quantity], cells: Sequence[Cell]
     ) -> Iterator[Headline]:
-        """Yield the headline of a quantity, or of its variants in several steps; one per payload size of pings."""
+        """Yield the headline of a quantity, or one headline of its variants in several steps.
+
+        The median RTT of a single step has a headline for each payload size of its pings.
+        """
         if len(variants) > 1 or plain_name(variants[0].name) != "rtt_median_s":
             sizes = {size: None for quantity in variants for size in self._sizes(quantity, cells)}
             yield self._headline(", ".join((subject, *sizes)), variants, cells)
@@ -203,7 +209,8 @@ class _HeadlineWriter:
         step = variants[0].step
         for size in self._sizes(variants[0], cells) or [""]:
             protocols = {cell.key["protocol"] for cell in cells if self.evidence.payload(cell, step) == size}
-            # Cells without any reply have an unknown size, and are assigned by their protocol.
+            # The payload size of a cell without any reply is unknown. Such a cell belongs to each size that another
+            # cell of its protocol has.
             matching = [
                 cell
                 for cell in cells
@@ -300,13 +307,16 @@ def _subject(variants: Sequence[Quantity], protocol: str, has_topics: bool) -> s
 
 
 def _existing_quantities(quantities: Sequence[Quantity], names: Sequence[str]) -> list[list[Quantity]]:
-    """Return the quantities called `names`, or the first ones if none exists, with variants in other steps."""
+    """Return the quantity of each name, with its variants in other steps.
+
+    Names that no quantity has are omitted. If none exists, the first quantities are returned, as many as `names`.
+    """
     existing = [matching for name in names if (matching := _quantities_named(quantities, name))]
     first_names = dict.fromkeys(plain_name(quantity.name) for quantity in quantities)
     return existing or [_quantities_named(quantities, name) for name in list(first_names)[: len(names)]]
 
 
 def _quantities_named(quantities: Sequence[Quantity], name: str) -> list[Quantity]:
-    """Return the quantity called `name`, or the quantities of named steps if no other step measures it."""
+    """Return the quantity called `name` of the step without a name, or otherwise the quantities of named steps."""
     matching = with_plain_name(quantities, name)
     return matching[:1] if matching and not matching[0].step else matching

@@ -2,7 +2,7 @@
 
 A sweep runs a simulation with several values of each factor. A flow is a stream of packets and its receiver.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 import math
@@ -57,8 +57,8 @@ def charts(
         sweep: The columns of the flow and of the factors, each with the column that contains its values as the user
             typed them; see `datasets.condition`.
         requested: Names of quantities that are drawn even if all their values are equal.
-        one_factor: Whether one factor with several values is enough: the other axis is then the flow. Otherwise two
-            factors with several values are needed.
+        one_factor: True if one factor with several values is enough: the other axis is then the flow. Otherwise at
+            least two factors with several values are needed.
     """
     flow, *factors = sweep
     varied_factors = [name for name in factors if len(set(repeats.column(name))) > 1]
@@ -104,7 +104,7 @@ def _chart(quantity: Quantity, cells: Sequence[Cell], axes: Sequence[_Axis], oth
         for title, group in list(groups.items())[:_MAX_PANELS]
     ]
     omitted_count = len(groups) - len(panels)
-    caption = "Estimates over the valid seeds; the table has their intervals."
+    caption = "Each value is an estimate over the valid runs, one per seed; the table has its interval."
     if omitted_count:
         caption += f" {omitted_count} more maps are left out."
     title = f"{scale.head(quantity.label)} over {axes[0].name} and {axes[1].name}"

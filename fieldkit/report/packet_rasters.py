@@ -1,6 +1,6 @@
 """Packet rasters: the packets of each repeat in the order of sending, with losses and retransmissions marked.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 import math
@@ -87,7 +87,10 @@ def groups(cells: Sequence[Cell], evidence: Evidence) -> Iterator[RasterGroup]:
 
 
 def _marked_packets(cell: Cell, evidence: Evidence, max_lines: int) -> dict[tuple[str, Protocol], list[Mask]]:
-    """Return the mask of marked packets of each of the first valid repeats, by name and protocol of the transfer."""
+    """Return masks of the marked packets, one mask per valid repeat, by name and protocol of the transfer.
+
+    Only the first `max_lines` valid repeats with captures are read.
+    """
     masks: dict[tuple[str, Protocol], list[Mask]] = {}
     for row in evidence.rows(cell).tolist():
         attempt, plan = evidence.attempt(row), evidence.plan(row)

@@ -25,23 +25,23 @@ from fieldkit.report.charts import Panel
 from fieldkit.report.contents import Contents
 
 DEFAULT_NAME: Final = "report.html"
-_START: Final = b"<!DOCTYPE html>"
+_FIRST_BYTES: Final = b"<!DOCTYPE html>"
 """First bytes of a report; other files are not overwritten."""
 _TEMPLATE: Final = "report.html"
-_SVG: Final = "http://www.w3.org/2000/svg"
-_XLINK: Final = "http://www.w3.org/1999/xlink"
-_HREF: Final = f"{{{_XLINK}}}href"
+_SVG_NAMESPACE: Final = "http://www.w3.org/2000/svg"
+_XLINK_NAMESPACE: Final = "http://www.w3.org/1999/xlink"
+_XLINK_HREF: Final = f"{{{_XLINK_NAMESPACE}}}href"
 # The style is the same in all figures, and the page defines it.
-_REMOVED_TAGS: Final = frozenset((f"{{{_SVG}}}metadata", f"{{{_SVG}}}style"))
-# More than two decimals of a point are invisible, but make up half of the page's size.
-_GEOMETRY: Final = frozenset(("d", "x", "y", "width", "height", "transform"))
+_REMOVED_TAGS: Final = frozenset((f"{{{_SVG_NAMESPACE}}}metadata", f"{{{_SVG_NAMESPACE}}}style"))
+# Coordinates are in points. Decimals after the second are invisible, but make up half of the page's size.
+_GEOMETRY_ATTRIBUTES: Final = frozenset(("d", "x", "y", "width", "height", "transform"))
 _DECIMALS: Final = re.compile(r"(\.\d{2})\d+")
 _OTHER_FORMATS: Final = frozenset({".csv", ".json", ".md", ".pdf", ".png", ".svg", ".tex"})
 """Suffixes of files that programs would not open as a page."""
 _LOCAL_URL: Final = re.compile(r"url\(#")
 
-ET.register_namespace("", _SVG)
-ET.register_namespace("xlink", _XLINK)
+ET.register_namespace("", _SVG_NAMESPACE)
+ET.register_namespace("xlink", _XLINK_NAMESPACE)
 
 
 def write(contents: Contents, out: Path) -> None:
@@ -83,12 +83,12 @@ def _is_page(out: Path) -> bool:
     if not out.is_file():
         return False
     with explaining_write_errors(out, "-o"), out.open("rb") as file:
-        return file.read(len(_START)) in {b"", _START}
+        return file.read(len(_FIRST_BYTES)) in {b"", _FIRST_BYTES}
 
 
 @contextmanager
 def explaining_write_errors(path: Path, option: str) -> Iterator[None]:
-    """Turn an OSError of the body into a ConfigurationError with the path and the option."""
+    """Raise a ConfigurationError with the path and the option if the body of the `with` statement raises OSError."""
     try:
         yield
     except OSError as error:
@@ -179,8 +179,8 @@ def _attribute(name: str, value: str, prefix: str) -> str:
     """Return the value of an attribute of an SVG element for the page; see `inline_svg`."""
     if name == "id":
         return prefix + value
-    if name == _HREF:
+    if name == _XLINK_HREF:
         return f"#{prefix}{value.removeprefix('#')}"
-    if name in _GEOMETRY:
+    if name in _GEOMETRY_ATTRIBUTES:
         return _DECIMALS.sub(r"\1", value)
     return theme.use_variables(_LOCAL_URL.sub(f"url(#{prefix}", value))

@@ -1,6 +1,6 @@
 """Series of figures: panels of conditions, the style of each series in all figures, and estimates as points.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 import math
@@ -103,16 +103,16 @@ _MAX_BEHIND_IN_CHART: Final = 2000
 """Maximum number of single repeats in the chart of a quantity, divided equally among its conditions."""
 _MIN_TOP_PERCENT: Final = 1.0
 """Smallest upper end of an axis of percentages."""
-_HEADROOM: Final = 1.08
+_TOP_FACTOR: Final = 1.08
 """Ratio between the upper end of an axis that starts at 0 and the largest value."""
-_MAX_LENGTH: Final = 2.0
+_MAX_AXIS_FACTOR: Final = 2.0
 """Maximum length of the axis, as a multiple of the largest value. Wider intervals are cut there."""
-_MARGIN: Final = 0.25
+_MARGIN_SHARE: Final = 0.25
 """Margins of an axis that does not start at 0, as a share of the range of values."""
 _LOG_FROM_DECADES: Final = 1.5
 """Range of values, in decades, above which an axis is logarithmic."""
-_VAGUE_FROM: Final = 0.5
-"""Minimum width at which an interval is too wide for a curve, as a share of the axis."""
+_MAX_INTERVAL_SHARE: Final = 0.5
+"""Width of an interval as a share of the axis. A point with a wider interval is too uncertain for a curve."""
 
 
 @dataclass(frozen=True)
@@ -121,12 +121,12 @@ class Point:
 
     Attributes:
         cell: The condition.
-        value: The figure.
+        value: The estimate.
         low: Lower end of its 95 % interval; None if it has none.
         high: Upper end; None if it has no interval.
         repeats: Values of single repeats; if there are many, only some of them.
         bounds: True for each value in `repeats` that is only a lower bound.
-        is_bound: True if the figure is only a lower bound because of such values.
+        is_bound: True if the estimate is only a lower bound because of such values.
         note: Number of valid repeats with a value, if not all have one: `2 of 3`.
     """
 
@@ -160,14 +160,14 @@ class Point:
         return min(self.value, *self.repeats, *([] if self.low is None else [self.low]))
 
     def singles(self, are_bounds: bool) -> list[float]:
-        """Return the values of single repeats that are only lower bounds, or the values that are not."""
+        """Return the values of single repeats: those that are only lower bounds if `are_bounds`, else the others."""
         return [value for value, is_bound in zip(self.repeats, self.bounds, strict=True) if is_bound is are_bounds]
 
     def is_vague(self, ends: tuple[float, float]) -> bool:
         """Return True if the point has no interval, or its interval is open or wider than half of the axis."""
         if self.low is None or self.high is None or self.is_bound:
             return True
-        return self.high - self.low > _VAGUE_FROM * (ends[1] - ends[0])
+        return self.high - self.low > _MAX_INTERVAL_SHARE * (ends[1] - ends[0])
 
 
 def max_behind(evidence: Evidence) -> int:
@@ -203,11 +203,11 @@ def axis_limits(points: Sequence[Point], unit: str) -> tuple[float, float]:
     if min(point.bottom for point in points) < 0:
         values = [value for point in points for value in (point.value, *point.repeats)]
         low, high = min(values), max(values)
-        margin = _MARGIN * (high - low) or 1.0
+        margin = _MARGIN_SHARE * (high - low) or 1.0
         return low - margin, high + margin
     largest_value, highest_top = max(point.value for point in points), max(point.top for point in points)
-    top = min(highest_top, _MAX_LENGTH * largest_value) if largest_value > 0 else highest_top
-    return 0.0, max(_HEADROOM * top, _MIN_TOP_PERCENT if unit == "%" else 0.0) or 1.0
+    top = min(highest_top, _MAX_AXIS_FACTOR * largest_value) if largest_value > 0 else highest_top
+    return 0.0, max(_TOP_FACTOR * top, _MIN_TOP_PERCENT if unit == "%" else 0.0) or 1.0
 
 
 def needs_log(values: Iterable[float]) -> bool:

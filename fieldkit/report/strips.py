@@ -1,6 +1,6 @@
 """Strip charts: one mark per attempt, in order of time, with the loss as its height.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,8 +19,8 @@ from fieldkit.report.theme import Colour
 from fieldkit.report.trial_folders import Evidence
 
 MAX_MARKS: Final = 2000
-"""Maximum number of marks on a page, divided equally among its strips. If a strip has more valid attempts, every
-k-th has a mark, approximately."""
+"""Maximum number of marks on a page, divided equally among its strips. If a strip has more valid attempts, about
+every k-th of them has a mark."""
 MAX_OTHER_MARKS: Final = 2000
 """Maximum number of marks of void and failed attempts on a page; see `MAX_MARKS`."""
 MIN_MARKS: Final = 20
@@ -109,7 +109,12 @@ def groups(cells: Sequence[Cell], identities: Identities, evidence: Evidence) ->
 
 @dataclass(frozen=True)
 class _Heights:
-    """The scale of the marks' heights: the first measured loss, if any, and its value at full height."""
+    """The scale of the marks' heights.
+
+    Attributes:
+        loss: The first quantity of `LOSSES` that is measured; None if none is.
+        full_height_loss: The loss at which a mark has its full height, 0 to 1.
+    """
 
     loss: Quantity | None
     full_height_loss: float

@@ -1,6 +1,6 @@
-"""The first part of a report: description of the trials, warnings for readers who quote figures, and provenance.
+"""The first part of a report: description of the trials, warnings for readers who quote numbers, and provenance.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 from collections import Counter
@@ -22,10 +22,10 @@ from fieldkit.core.units import format_count
 from fieldkit.report import wording
 from fieldkit.report.trial_folders import Evidence
 
-_MAX_LISTED: Final = 20
-"""Maximum number of sentences about evidence that is left out."""
+_MAX_LIMITATIONS: Final = 20
+"""Maximum number of warnings about evidence that is not available (`Evidence.limitations`)."""
 _MAX_REASONS: Final = 50
-"""Maximum number of different reasons."""
+"""Maximum number of different reasons in one warning."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Caution:
 
 
 def paragraph(cells: Sequence[Cell], evidence: Evidence, sweep: Mapping[str, str]) -> str:
-    """Return a sentence about the trials: procedures, times, distances and numbers of attempts.
+    """Return a paragraph about the trials: procedures, times, distances and numbers of attempts.
 
     Args:
         cells: Conditions.
@@ -99,8 +99,8 @@ def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Caution]:
             f"{version_count} versions of the tables: columns that an older version lacks are missing unless tables "
             "are rebuilt."
         )
-    yield from map(Caution, evidence.limitations[:_MAX_LISTED])
-    if (more_count := len(evidence.limitations) - _MAX_LISTED) > 0:
+    yield from map(Caution, evidence.limitations[:_MAX_LIMITATIONS])
+    if (more_count := len(evidence.limitations) - _MAX_LIMITATIONS) > 0:
         yield Caution(
             f"{more_count} further notes of this kind are not shown; fieldkit verify lists them for a trial."
         )
@@ -196,7 +196,7 @@ _HASHES: Final = ("code_sha256", "procedure_sha256", "profiles_sha256")
 
 
 def trial_provenance(evidence: Evidence) -> Iterator[Provenance]:
-    """Yield every trial in the table, in the order of its rows."""
+    """Yield the provenance of every trial in the table, in the order of the rows."""
     texts = evidence.repeats.texts
     rows: dict[tuple[str, str], list[int]] = {}
     for row, key in enumerate(zip(texts["trial"].tolist(), texts["source"].tolist(), strict=True)):

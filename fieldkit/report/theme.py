@@ -97,7 +97,7 @@ def format_of(path: Path, option: str) -> Format:
 
     Args:
         path: The file.
-        option: The option of the path, for the message.
+        option: The option with which the user gave the path, for the message.
 
     Raises:
         ConfigurationError: The suffix is not one of `FORMATS`.
@@ -144,13 +144,13 @@ without line of sight; the others are assigned to further procedures."""
 LINES: Final[tuple[Line, ...]] = ("solid", "dashed", "dotted", "dashdot")
 """Lines of backends, in order: the field backend is the first."""
 
-_NAMES: Final = {value: name for name, value in LIGHT.items()}
-_HEX: Final = re.compile("|".join(_NAMES))
+_NAME_BY_HEX: Final = {value: name for name, value in LIGHT.items()}
+_HEX: Final = re.compile("|".join(_NAME_BY_HEX))
 
 
 def use_variables(css: str) -> str:
     """Return CSS with each colour of the light theme replaced by the page's variable."""
-    return _HEX.sub(lambda match: f"var(--{_NAMES[match[0]]})", css)
+    return _HEX.sub(lambda match: f"var(--{_NAME_BY_HEX[match[0]]})", css)
 
 
 def variables(colours: Mapping[Colour, str]) -> str:

@@ -22,26 +22,26 @@ from fieldkit.report.trial_folders import Evidence
 MAX_PACKETS: Final = 1500
 """Maximum number of packets of each kind in a panel. If there are more, every k-th is drawn."""
 
-_MARKED: Final = {Protocol.UDP: "lost", Protocol.TCP: "retransmitted"}
-_SENT: Final = Style("blue", "o", "none")
-_RECEIVED: Final = Style("green", "^", "none")
-_MARK: Final = Style("lost", "x", "none")
-_ROUND_TRIP: Final = Style("pink", "D", "none")
-_DISTANCE: Final = Style("orange", line="solid")
-_LINKS: Final = (Style("blue", line="solid"), Style("green", line="dashed"))
+_MARK_WORDS: Final = {Protocol.UDP: "lost", Protocol.TCP: "retransmitted"}
+_SENT_STYLE: Final = Style("blue", "o", "none")
+_RECEIVED_STYLE: Final = Style("green", "^", "none")
+_MARK_STYLE: Final = Style("lost", "x", "none")
+_ROUND_TRIP_STYLE: Final = Style("pink", "D", "none")
+_DISTANCE_STYLE: Final = Style("orange", line="solid")
+_LINK_STYLES: Final = (Style("blue", line="solid"), Style("green", line="dashed"))
 """Styles of the sending robot and of the other robot."""
 _DEFAULT_PING_INTERVAL_S: Final = 1.0
-_MIN_BAR: Final = 0.004
+_MIN_BAR_SHARE: Final = 0.004
 """Minimum length of a bar, as a share of the axis; a shorter one would be invisible."""
-_TIME: Final = "time [s]"
-_MARGIN: Final = 0.01
+_TIME_LABEL: Final = "time [s]"
+_MARGIN_SHARE: Final = 0.01
 """Margin at the right end of the axis, as a share of the axis."""
 
 
 def charts(row: int, data: Evidence) -> Iterator[Chart]:
-    """Yield the time line of the attempt in a row with available evidence, and a chart of its packets.
+    """Yield the time line of the attempt in a row, and a chart of its packets if it has transfers.
 
-    Yield nothing if no evidence has times.
+    Yield nothing if the evidence of the attempt is not available, or contains no times.
     """
     evidence, plan = data.attempt(row), data.plan(row)
     if evidence is None or plan is None:
@@ -83,15 +83,18 @@ def charts(row: int, data: Evidence) -> Iterator[Chart]:
 
 
 def _stack(panels: Sequence[Panel], end_s: float) -> list[Panel]:
-    """Return panels with a shared time axis, labelled in the lowest panel; points outside of it are removed."""
-    last_index, right_s = len(panels) - 1, (1 + _MARGIN) * end_s or 1.0
+    """Return panels with a shared time axis, which has a label in the lowest panel.
+
+    Points outside of the axis are removed.
+    """
+    last_index, right_s = len(panels) - 1, (1 + _MARGIN_SHARE) * end_s or 1.0
     return [
         replace(
             panel,
             is_strip=True,
             left=0.0,
             right=right_s,
-            x_label=_TIME if index == last_index else "",
+            x_label=_TIME_LABEL if index == last_index else "",
             series=[_clip_series(series, right_s) for series in panel.series],
         )
         for index, panel in enumerate(panels)
@@ -116,10 +119,10 @@ def _bars(times: AttemptTimes, zero_ns: int) -> Panel:
         (activity, (activity.start_ns - zero_ns) / 1e9, (activity.stop_ns - zero_ns) / 1e9)
         for activity in times.activities
     ]
-    min_length_s = _MIN_BAR * max(stop for *_, stop in spans)
+    min_length_s = _MIN_BAR_SHARE * max(stop for *_, stop in spans)
     return Panel(
         title="activities",
-        x_label=_TIME,
+        x_label=_TIME_LABEL,
         y_label="",
         series=[],
         description="; ".join(f"{activity.name} from {start:.3f} to {stop:.3f} s" for activity, start, stop in spans),
@@ -134,11 +137,21 @@ def _bars(times: AttemptTimes, zero_ns: int) -> Panel:
 def _packets(transfer: Transfer, fates: Fates, zero_ns: int) -> Panel:
     """Return the offset of each packet in the payload over time, at both ends."""
     first_sent_ns = int(fates.sent_ns.min())
-    marked_text = _MARKED[transfer.protocol]
+    marked_text = _MARK_WORDS[transfer.protocol]
     kinds = (
-        ("sent", _SENT, fates.sent_ns[~fates.lost_or_repeated], fates.sent_offset_bytes[~fates.lost_or_repeated]),
-        ("received", _RECEIVED, fates.received_ns, fates.received_offset_bytes),
-        (marked_text, _MARK, fates.sent_ns[fates.lost_or_repeated], fates.sent_offset_bytes[fates.lost_or_repeated]),
+        (
+            "sent",
+            _SENT_STYLE,
+            fates.sent_ns[~fates.lost_or_repeated],
+            fates.sent_offset_bytes[~fates.lost_or_repeated],
+        ),
+        ("received", _RECEIVED_STYLE, fates.received_ns, fates.received_offset_bytes),
+        (
+            marked_text,
+            _MARK_STYLE,
+            fates.sent_ns[fates.lost_or_repeated],
+            fates.sent_offset_bytes[fates.lost_or_repeated],
+        ),
     )
     series = []
     for label, style, at_ns, at_bytes in kinds:
@@ -155,7 +168,7 @@ def _packets(transfer: Transfer, fates: Fates, zero_ns: int) -> Panel:
 
 
 def _round_trips(name: str, role: Role, output: ping.Ping, times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
-    """Yield the round-trip times, and the requests without a reply, by the time of sending."""
+    """Yield a panel of round-trip times and of requests without a reply, by the time of sending, if there are any."""
     clock_offset_ns = times.clock_offset_ns[role]
     answered_requests = [
         (reply.seq, reply.at_utc_ns - clock_offset_ns - zero_ns, reply.rtt_s)
@@ -164,7 +177,7 @@ def _round_trips(name: str, role: Role, output: ping.Ping, times: AttemptTimes, 
     ]
     lost_numbers = np.array(output.unanswered_seqs)
     seq, at_ns, rtt_s = np.array(answered_requests).T if answered_requests else np.empty((3, 0))
-    series = [Series("round trip", _ROUND_TRIP, at_ns / 1e9, 1e3 * rtt_s)]
+    series = [Series("round trip", _ROUND_TRIP_STYLE, at_ns / 1e9, 1e3 * rtt_s)]
     if len(lost_numbers):
         lost_s = (
             estimate_send_times(lost_numbers, seq, at_ns / 1e9)
@@ -173,13 +186,13 @@ def _round_trips(name: str, role: Role, output: ping.Ping, times: AttemptTimes, 
         )
         if lost_s is None:
             return
-        series.append(Series("no reply", _MARK, np.maximum(lost_s, 0.0), np.zeros(len(lost_numbers))))
+        series.append(Series("no reply", _MARK_STYLE, np.maximum(lost_s, 0.0), np.zeros(len(lost_numbers))))
     elif not answered_requests:
         return
     median_text = f", median {1e3 * np.median(rtt_s):.2f} ms" if answered_requests else ""
     yield Panel(
         title=f"round trips of {name}" if name else "round trips",
-        x_label=_TIME,
+        x_label=_TIME_LABEL,
         y_label="RTT [ms]",
         series=series,
         description=f"{len(answered_requests)} round trips{median_text}; {len(lost_numbers)} without a reply",
@@ -223,7 +236,7 @@ def estimate_send_times(
 
 
 def _links(times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
-    """Yield the signal, the PHY rate and the SINR of both radios over time.
+    """Yield a panel each for the signal, the PHY rate and the SINR of both radios over time.
 
     Values of telemetry sources replace the values of `iw`, as in the columns (`telemetry_columns`).
     """
@@ -249,9 +262,9 @@ def _radio_panel(
     *,
     bottom: float | None,
 ) -> Iterator[Panel]:
-    """Yield a quantity of each radio over time, the sending radio first, if any radio has values."""
+    """Yield a panel of one quantity of both radios over time, the sending radio first, if any radio has values."""
     series, ranges = [], []
-    for (role, samples), style in zip(values.items(), _LINKS, strict=True):
+    for (role, samples), style in zip(values.items(), _LINK_STYLES, strict=True):
         points = [((at_ns - zero_ns) / 1e9, value) for at_ns, value in samples if value is not None]
         if points:
             at_s, heights = zip(*points, strict=True)
@@ -260,7 +273,7 @@ def _radio_panel(
     if series:
         yield Panel(
             title=f"{what} of the radios",
-            x_label=_TIME,
+            x_label=_TIME_LABEL,
             y_label=y_label,
             series=series,
             description=f"{what} {y_label}: {', '.join(ranges)}",
@@ -269,7 +282,7 @@ def _radio_panel(
 
 
 def _distance(times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
-    """Yield the distance between sender and receiver over time, if it changed."""
+    """Yield a panel of the distance between sender and receiver over time, if it changed."""
     changes = [(max(utc_ns - zero_ns, 0) / 1e9, metres) for utc_ns, metres in times.distances_m]
     known_distances_m = [metres for _, metres in changes if metres is not None]
     if len(set(known_distances_m)) < 2:
@@ -277,8 +290,8 @@ def _distance(times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
     at_s, distance_m = zip(*((at, math.nan if metres is None else metres) for at, metres in changes), strict=True)
     yield Panel(
         title="distance between sender and receiver",
-        x_label=_TIME,
+        x_label=_TIME_LABEL,
         y_label="[m]",
-        series=[Series("distance", _DISTANCE, at_s, distance_m, join="steps")],
+        series=[Series("distance", _DISTANCE_STYLE, at_s, distance_m, join="steps")],
         description=f"{min(known_distances_m):.1f} to {max(known_distances_m):.1f} m",
     )

@@ -1,6 +1,6 @@
-"""The trial folders of the rows of a table, if available: plan, raw files, links.
+"""Plans and raw evidence of the trials in a table, which are read from the trials' folders if these are available.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 from collections import Counter

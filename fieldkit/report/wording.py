@@ -1,6 +1,6 @@
 """Numbers, conditions and quantities as text, the same in the summary, in tables and below figures.
 
-A cell is the repeats under one condition, with their estimates.
+A cell contains the repeats under one condition, and their estimates.
 """
 
 import re

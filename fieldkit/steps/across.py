@@ -1,4 +1,4 @@
-"""Measure how data flows recover from faults, if the step of one of them contains the step of the other."""
+"""Measure how data flows recover from faults, for a flow whose step contains the step of a fault, or vice versa."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -75,7 +75,10 @@ class _Pair:
 
 
 def recovery_columns(nest: Nest) -> tuple[Column, ...]:
-    """Return the columns of the recoveries of a step, without the prefix of its name."""
+    """Return the columns of the recoveries in `nest`, without the prefix of its name.
+
+    There is a recovery for each pair of a flow and a fault of which one is `nest` and the other is inside it.
+    """
     from fieldkit.measure.transfers import recoveries  # noqa: PLC0415 (numpy, which most commands do not need)
 
     all_columns: list[Column] = []

@@ -1,9 +1,9 @@
 """Optional capabilities of a step, in addition to the contract of `Step`.
 
-Each capability is a class with one method, or with several that belong together. The harness queries it by
-`isinstance`; a step without the capability contributes nothing. A kind that ships with fieldkit derives from its
-capabilities, so that mypy checks the signatures of its methods. For a kind of another package it is enough to define
-the methods.
+Each capability is a class with one method, or with several that belong together. The code that plans, runs and
+evaluates trials uses `isinstance` to find the steps with a capability, and ignores other steps. A kind that ships
+with fieldkit derives from its capabilities, so that mypy checks the signatures of its methods. For a kind of another
+package it is enough to define the methods.
 """
 
 from abc import ABC, abstractmethod
@@ -29,7 +29,7 @@ class Capability(ABC):  # noqa: B024 (its subclasses have the abstract methods)
     @classmethod
     @override
     def __subclasshook__(cls, candidate: type) -> bool:
-        # A step that derives from a capability inherits this method.
+        # Classes of steps inherit this method, but it applies to the capabilities only.
         if Capability in cls.__bases__ and not _undefined_methods(cls, candidate):
             return True
         return NotImplemented  # type: ignore[no-any-return]
@@ -263,7 +263,7 @@ CAPABILITIES: Final[tuple[type[Capability], ...]] = tuple(Capability.__subclasse
 def missing_methods(kind: type) -> tuple[str, ...]:
     """Return the missing methods of all capabilities that a class defines only in part, sorted.
 
-    The harness calls no method of such a capability.
+    fieldkit never calls the methods of a capability that is defined only in part.
     """
     missing = set[str]()
     for capability in CAPABILITIES:

@@ -11,7 +11,7 @@ EXCHANGES = 5
 
 
 def exchanges(shell: Shell, within_s: float) -> list[Exchange]:
-    """Query the time of a robot several times; return an empty list if the output of its `date` is invalid.
+    """Query the time of a robot several times. Exchanges with an invalid output of `date` are omitted.
 
     Args:
         shell: Connection to the robot.

@@ -1,7 +1,7 @@
 """Displacements in a procedure, such as `away: 5m`: segments of a path, and positions relative to another robot."""
 
 import math
-from typing import Annotated
+from typing import Annotated, ClassVar, Self
 
 from fieldkit.config import schema
 from fieldkit.config.schema import Field, Length, Strict
@@ -15,12 +15,19 @@ class PathLeg(Strict):
 
     Attributes:
         away: Distance away from the robot at the other end of the link, along the line between them (for the
-            relay: away from the sender). For a drone: forward.
-        towards: Distance towards that robot. For a drone: backward.
+            relay: away from the sender).
+        towards: Distance towards that robot.
         left: Distance to the left, seen by an observer who looks away from that robot. Combined with `away` or
             `towards` the segment is diagonal.
         right: Distance to the right.
+        opposites: The keys in pairs of opposite directions.
+        noun: The word for such a displacement in messages.
+        split_hint: Remedy in the message about two keys of opposite directions; empty if there is none.
     """
+
+    opposites: ClassVar[tuple[tuple[str, str], ...]] = (("away", "towards"), ("left", "right"))
+    noun: ClassVar[str] = "segment"
+    split_hint: ClassVar[str] = "; make two segments"
 
     away: _Distance = None
     towards: _Distance = None
@@ -28,14 +35,15 @@ class PathLeg(Strict):
     right: _Distance = None
 
     @schema.model_validator(mode="after")
-    def _has_one_direction(self) -> "PathLeg":
-        for key, opposite in (("away", "towards"), ("left", "right")):
+    def _has_one_direction(self) -> Self:
+        for key, opposite in self.opposites:
             if getattr(self, key) is not None and getattr(self, opposite) is not None:
                 raise schema.validation_error(
-                    f"a segment has {key} or {opposite}, not both; make two segments", opposite
+                    f"a {self.noun} has {key} or {opposite}, not both{self.split_hint}", opposite
                 )
-        if not any((self.away, self.towards, self.left, self.right)):
-            raise schema.validation_error("a segment needs a distance: away, towards, left or right")
+        keys = [key for pair in self.opposites for key in pair]
+        if not any(getattr(self, key) for key in keys):
+            raise schema.validation_error(f"a {self.noun} needs a distance: {', '.join(keys[:-1])} or {keys[-1]}")
         return self
 
     @classmethod

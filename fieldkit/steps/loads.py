@@ -16,7 +16,7 @@ from fieldkit.steps.scene import GOOD_BIT_S, Flow, Scene, frames
 PROGRAM: Final = "iperf3"
 
 DEFAULT_UDP_BIT_S: Final = 1e6
-"""Default rate of iperf3."""
+"""Default rate of iperf3 for UDP."""
 
 _BLOCK_BYTES: Final = 8192
 """Block size of TCP with a rate. With iperf3's default of 128 KiB, 2 Mbit/s would be two bursts per second."""
@@ -29,8 +29,8 @@ class LoadOptions(OverLink):
         sender: Role that runs the client, and sends.
         receiver: Role that runs the server, and receives.
         protocol: `tcp` or `udp`; without it, the protocol of the repeat.
-        rate: Maximum rate of each stream, `5Mbit/s`; without it, UDP sends 1 Mbit/s and TCP as much as the link
-            carries.
+        rate: Maximum rate of each stream, such as `5Mbit/s`. Without it, UDP sends 1 Mbit/s, and TCP as much as the
+            link can carry.
         streams: Number of parallel streams.
         payload_bytes: UDP payload of a datagram.
         port: Port that the server listens on.
@@ -108,7 +108,7 @@ class LoadOptions(OverLink):
             count=self.streams,
             payload_bytes=self.payload_bytes,
             ports=ports,
-            expected=FlowSchedule(
+            schedule=FlowSchedule(
                 interval_s=self.interval_s(scene.protocol),
                 # A TCP stream from the client starts with iperf3's cookie.
                 head_bytes=0 if reverse or transport is Protocol.UDP else COOKIE_BYTES,

@@ -47,14 +47,8 @@ def listen(netcat: Netcat, program: str, protocol: Protocol, port: int, idle_s: 
         case Netcat.BUSYBOX:
             return (*_ENDLESS_INPUT, program, *(("-u",) if is_udp else ()), "-l", "-p", str(port))
         case Netcat.TRADITIONAL:
-            return (
-                program,
-                *(("-u",) if is_udp else ()),
-                "-l",
-                "-p",
-                str(port),
-                *(("-w", str(idle_s)) if is_udp else ()),
-            )
+            idle_options = ("-w", str(idle_s)) if is_udp else ()
+            return (program, *(("-u",) if is_udp else ()), "-l", "-p", str(port), *idle_options)
 
 
 def send(netcat: Netcat, program: str, protocol: Protocol, address: str, port: int) -> tuple[str, ...]:

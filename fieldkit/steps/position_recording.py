@@ -27,7 +27,7 @@ LIMIT_S: Final = 900.0
 """Time limit of a recording in addition to the limits of the steps inside."""
 CLOSE_S: Final = 10.0
 """Time that a stopped recorder has to close its file."""
-_QUERY_S: Final = 15.0
+_QUERY_TIMEOUT_S: Final = 15.0
 """Timeout of a query of a robot's clock."""
 _ROUNDING_M: Final = 1e-3
 """Maximum difference between the recorded and the planned position that rounding causes."""
@@ -73,7 +73,7 @@ def run_while_recording(
     exchanges: dict[Role, list[Exchange]] = {role: [] for role in nest.roles()} if make_sources else {}
 
     def query_clock(role: Role) -> None:
-        exchanges[role] += clocks.exchanges(testbed.shells[role], _QUERY_S)
+        exchanges[role] += clocks.exchanges(testbed.shells[role], _QUERY_TIMEOUT_S)
 
     def wait(recording: Planned) -> None:
         seconds = extra_s(recording)

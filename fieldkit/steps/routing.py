@@ -11,7 +11,7 @@ DAEMONS: Final = ("babeld", "bird", "olsrd", "olsrd2", "bmx7", "batmand")
 
 # Two other routing protocols have no process: batman-adv is a kernel module, and in 802.11s the driver forwards
 # packets.
-_SEARCH: Final = """
+_SEARCH_SCRIPT: Final = """
 for file in /proc/[0-9]*/comm; do
     { read -r name <"$file"; } 2>/dev/null || continue
     for daemon; do [ "$name" = "$daemon" ] && echo "$name"; done
@@ -26,7 +26,7 @@ true
 def needs(scene: Scene) -> Iterator[Need]:
     """Yield the check for a routing protocol on each robot of the scene, including robots without a step."""
     for role, robot in scene.cast.items():
-        script = f"interface=$1; shift{_SEARCH}"
+        script = f"interface=$1; shift{_SEARCH_SCRIPT}"
         yield Need(role, "routing", ("sh", "-c", script, "sh", robot.profile.radio.interface, *DAEMONS), judge)
 
 

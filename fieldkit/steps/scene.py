@@ -42,8 +42,8 @@ BY_EXIT: Final = frozenset({Cause.EXITED})
 BY_LIMIT: Final = frozenset({Cause.LIMIT})
 BY_EXIT_OR_LIMIT: Final = BY_EXIT | BY_LIMIT
 BY_FIELDKIT: Final = frozenset({Cause.STOPPED})
-"""Values of `Planned.permitted_causes`: the job exits by itself, is stopped at its time limit, or is stopped by
-fieldkit."""
+"""Values of `Planned.permitted_causes`: the job exits without being stopped, is stopped at its time limit, or is
+stopped by fieldkit."""
 
 
 @dataclass(frozen=True)

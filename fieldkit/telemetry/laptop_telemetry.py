@@ -18,7 +18,7 @@ from fieldkit.remote.script import SCRIPT
 from fieldkit.telemetry import source_readings, telemetry_queries
 from fieldkit.telemetry.telemetry_section import TelemetrySource
 
-_END_S: Final = 2.0
+_EXIT_TIMEOUT_S: Final = 2.0
 """Time after SIGTERM within which a query must exit; then it is killed."""
 _MARGIN_S: Final = 10.0
 """Time in addition to the limit of a query, in which the shell starts and exits."""
@@ -97,7 +97,7 @@ def query_once(source: TelemetrySource, environment: Mapping[str, str]) -> bytes
 def _wait_or_kill(process: "subprocess.Popen[bytes]") -> None:
     """Wait until a terminated query has exited. After a timeout, kill it together with its running command."""
     with suppress(subprocess.TimeoutExpired):
-        process.wait(_END_S)
+        process.wait(_EXIT_TIMEOUT_S)
         return
     with suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)

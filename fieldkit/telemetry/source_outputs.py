@@ -1,7 +1,8 @@
-"""Values in an output of a telemetry source: mmcli, batctl, or another one, for which the profile locates values.
+"""Extract the values from an output of a telemetry source.
 
-Outputs are not trusted: JSON may have any shape and any numbers. A value that is missing, or has another type, is
-absent, never 0.
+The outputs of mmcli and batctl have known formats. For every other program, the profile gives the location of each
+value in the output. Outputs are not trusted: JSON may have any shape and any numbers. A value that is missing or of
+the wrong type is omitted from the result; it is never 0.
 """
 
 import json

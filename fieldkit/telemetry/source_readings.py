@@ -23,7 +23,7 @@ from fieldkit.telemetry.telemetry_section import MAX_OUTPUT_BYTES, TelemetrySour
 _HEAD: Final = re.compile(rb"==> ([0-9]{1,10})\.([0-9]{2}) ([0-9]{1,3}|large|interface) ([0-9]{1,5}) <==\n")
 _HUNDREDTH_NS: Final = 10_000_000
 _TOO_LONG: Final = f"its output was longer than {MAX_OUTPUT_BYTES >> 10} KiB"
-_CURL: Final = {
+_CURL_REASONS: Final = {
     "7": "connection refused",
     "22": "HTTP error",
     "28": "no answer in time",
@@ -111,7 +111,7 @@ def _failure_reason(code: str, output: bytes, source: TelemetrySource) -> str:
     reasons |= {"137": f"no answer in {source.limit:.0f} s"}
     reasons |= {"interface": f"its address {source.address} is reached over the interface under test"}
     if source.http is not None:
-        reasons |= _CURL
+        reasons |= _CURL_REASONS
     error_text = printable(output, 120)
     return reasons.get(
         code, f"{source.program} failed with exit code {code}" + (f": {error_text}" if error_text else "")

@@ -70,8 +70,9 @@ class CredentialsReference(Strict):
     `user = "admin:PASSWORD"`. For `snmp` they are lines of an `snmp.conf`, such as `defCommunity NAME`.
 
     Attributes:
-        file: Absolute path of a file that only its owner can read; for `snmp` its name must be `snmp.conf`.
-        environment: Environment variable with these lines, on the laptop only.
+        file: Absolute path of a file with the lines of a curl config (for `http`) or of an `snmp.conf` (for `snmp`,
+            the required file name). Only its owner may have permission to read it.
+        environment: Environment variable with such lines, instead of a file; on the laptop only.
     """
 
     file: Annotated[str, pattern_field(r"^/[^\x00-\x1f]{1,200}$", "an absolute path")] | None = None
@@ -120,7 +121,7 @@ class Snmp(Strict):
         address: Its IP address.
         port: Its UDP port.
         version: `1`, `2c` or `3`.
-        credentials: Community or user.
+        credentials: Reference to the community or the user.
     """
 
     address: Annotated[str, AfterValidator(_require_address)]
@@ -143,7 +144,7 @@ class Http(Strict):
 
     Attributes:
         url: URL whose host is an IP address.
-        credentials: Header or user for the request.
+        credentials: Reference to a header or a user for the request.
     """
 
     url: Annotated[str, AfterValidator(_require_url)]
@@ -166,11 +167,11 @@ class Extraction(Strict):
     """Location of a value in the output of a source.
 
     Attributes:
-        path: Location in JSON output, `lte.rsrp`: a [JMESPath](https://jmespath.org).
-        expression: In place of `json`, a regular expression ([RE2](https://github.com/google/re2/wiki/Syntax)) with
+        path: Location in JSON output, such as `lte.rsrp`: a [JMESPath](https://jmespath.org).
+        expression: Instead of `json`, a regular expression ([RE2](https://github.com/google/re2/wiki/Syntax)) with
             one group.
         oid: For `snmp`, the numeric OID of the object.
-        factor: Multiplier that gives the unit of the value: 1000000 if the output is in Mbit/s.
+        factor: Factor that converts the number in the output to the unit of the value: 1000000 from Mbit/s to bit/s.
     """
 
     path: Annotated[str, AfterValidator(_require_path)] | None = Field(default=None, alias="json")
@@ -296,13 +297,17 @@ class TelemetrySource(Strict):
         return _QUANTITIES_BY_KIND.get(self.kind) or tuple(name for name, _ in (self.values or Values()).items())
 
     def absent_quantities(self, readings: Sequence[Mapping[str, float | str]]) -> tuple[str, ...]:
-        """Return the quantities located in the profile that none of some readings has."""
+        """Return the quantities whose location is in the profile, but which are missing from all readings.
+
+        Args:
+            readings: Values of each reading, by quantity.
+        """
         located_quantities = self.quantities if self.values is not None else ()
         return tuple(name for name in located_quantities if not any(name in values for values in readings))
 
     @property
     def address(self) -> str | None:
-        """IP address to which its queries are sent; None if they stay on the computer."""
+        """IP address to which its queries are sent; None unless its kind is `snmp` or `http`."""
         device = self.snmp or self.http
         return device.address if device is not None else None
 
@@ -340,7 +345,7 @@ class TelemetrySource(Strict):
         """Return the words `ADDRESS INTERFACE INTERVAL LIMIT ARGV...` of `poll` in telemetry.sh.
 
         Args:
-            radio: The interface under test, over which nothing may be sent; `-` on another computer.
+            radio: The interface under test, over which nothing may be sent; `-` if the laptop runs the query.
             credentials_file: File with the credentials of the command; see `argv`.
         """
         tested_interface = "-" if self.wired else radio

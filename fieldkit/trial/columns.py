@@ -47,7 +47,7 @@ IDENTITY: Final = columns.columns(
 """Columns that identify an attempt. The columns of measured values follow them."""
 
 OTHERS: Final = Column("others", "text", "Robots in further roles of the procedure: ROLE=ROBOT, separated by spaces.")
-"""Column that is in a table only if the procedure has such roles."""
+"""Column that is in a table only if the procedure has further roles."""
 
 ALWAYS: Final = (*oracle_delays.LATENESS_COLUMNS, *link.COLUMNS, *oracle_delays.WINDOW_COLUMNS)
 """Columns that are measured in every trial, independent of its steps."""
@@ -64,7 +64,7 @@ Row = Mapping[str, Value]
 
 @cache
 def measured_columns() -> tuple[Column, ...]:
-    """Return the columns of measured values in every trial: those of the testbed and of `_KINDS_WITH_COLUMNS`."""
+    """Return the columns of measured values in every trial: of the testbed, faults and `_KINDS_WITH_COLUMNS`."""
     kind_columns = (column for kind in _KINDS_WITH_COLUMNS for column in step_types()[kind].columns)
     unique_columns = dict.fromkeys((*ALWAYS, *kind_columns, *outage_columns.COLUMNS))
     return tuple(sorted(unique_columns, key=lambda column: column.rank))
@@ -91,9 +91,9 @@ def columns_of_step(step: Step) -> tuple[Column, ...]:
 
 
 def additional_columns(steps: Iterable[Step]) -> tuple[Column, ...]:
-    """Return the columns of steps that are not in every trial, in the order of the steps.
+    """Return the columns of these steps, without the columns that every trial has, in the order of the steps.
 
-    These are columns of named steps, further columns that a step declares, and columns of kinds of other packages.
+    They are columns of named steps, further columns that a step declares, and columns of kinds of other packages.
     """
     return tuple(column for step in steps for column in columns_of_step(step) if column.name not in _common_columns())
 
@@ -132,7 +132,7 @@ def column_conflict(column: Column, names: Collection[str]) -> str | None:
 
 @cache
 def installed_columns() -> tuple[Column, ...]:
-    """Return the columns of every trial, of robots in fixed roles, and of step kinds of other packages.
+    """Return the columns of every trial, of robots in fixed roles, and of all installed kinds of step.
 
     Raises:
         ConfigurationError: For the same reasons as `step_types`, or because a kind declares an invalid column or a

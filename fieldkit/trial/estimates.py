@@ -1,7 +1,7 @@
 """Estimates of the duration of repeats, based on finished repeats.
 
-Without finished repeats, they are based on the procedure: the likely duration is that of a good link, the upper bound
-that of a link over which no packet arrives.
+Without finished repeats, they are based on the procedure. The likely duration then assumes a good link, and the upper
+bound assumes that no packet arrives.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -44,7 +44,7 @@ def dead_link_s(procedure: Procedure, protocol: Protocol) -> float:
 
 
 def finished_repeats(plan: Plan, entries: Iterable[JournalEntry]) -> list[FinishedRepeat]:
-    """Return the finished repeats of a journal with their durations, without those of interrupted attempts."""
+    """Return the finished repeats of a journal. Their durations do not include interrupted attempts."""
     start_ns: dict[RepeatId, int] = {}
     duration_s: dict[RepeatId, float] = {}
     finished: dict[RepeatId, None] = {}

@@ -13,7 +13,7 @@ from fieldkit.steps.scene import Planned, Scene
 from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.step_errors import StepErrors
 
-_LOST: Final = "the section {} is missing in its state before or in its state after the attempt"
+_LOST_SECTION: Final = "the section {} is missing in its state before or in its state after the attempt"
 REBOOTED: Final = "the robot rebooted during the repeat"
 
 
@@ -40,7 +40,9 @@ def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence, step
             if state is None:
                 yield f"{name}: {file} is missing, or cannot be read"
         if before is not None and after is not None:
-            yield from (f"{name}: {_LOST.format(section)}" for section in host.incomplete_sections(before, after))
+            yield from (
+                f"{name}: {_LOST_SECTION.format(section)}" for section in host.incomplete_sections(before, after)
+            )
         if before is not None and after is not None and role not in restarted:
             if has_rebooted(before.boot, after.boot):
                 yield f"{name}: {REBOOTED}"

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final
 
 from typing_extensions import override
 
@@ -57,12 +57,22 @@ Repeats = Annotated[Int, Field(gt=0, le=MAX_REPEATS)]
 
 
 class Place(PathLeg):
-    """Place of a robot in a role that the procedure defines. The keys for directions are those of a path's segment.
+    """Place of a robot in a role that the procedure defines, relative to a reference robot.
 
     Attributes:
-        near: Role of the robot that the place is relative to: `sender`, `receiver` or `relay`. `away`, `towards`,
-            `left` or `right` is also required.
+        near: Role of the reference robot: `sender`, `receiver` or `relay`. At least one of `away`, `towards`, `left`
+            and `right` is also required.
+        away: Distance from the reference robot, which is the robot in the role `near`, in the direction away from the
+            robot at the other end of its link (for the relay: away from the sender).
+        towards: Distance from the reference robot, in the direction of the robot at the other end of its link.
+        left: Distance from the reference robot to the left, seen by an observer who stands at the reference robot and
+            looks in the direction of `away`. With `away: 3m` and `left: 4m`, the place is 5 m from the reference
+            robot.
+        right: Distance from the reference robot to the right, seen by the same observer.
     """
+
+    noun: ClassVar[str] = "place"
+    split_hint: ClassVar[str] = ""
 
     near: Role
 
@@ -162,11 +172,8 @@ class Procedure(catalog.Named, Sectioned):
             step = placed.step
             completed = [other.step for other in earlier_steps if not placed.runs_at_same_time_as(other)]
             with step_errors.before_trial(f"{placed.label} cannot be planned"):
-                resources, file_names, step_columns = (
-                    step.exclusive_resources(),
-                    step.files(),
-                    columns.columns_of_step(step),
-                )
+                resources, file_names = step.exclusive_resources(), step.files()
+                step_columns = columns.columns_of_step(step)
             if isinstance(step, ChecksPlacement) and (reason := step.placement_error(completed, placed.within)):
                 raise schema.validation_error(reason, *placed.at)
             for resource in resources:
@@ -208,7 +215,7 @@ class Procedure(catalog.Named, Sectioned):
 
     @property
     def figures(self) -> tuple[Quantity, ...]:
-        """The figures that can be aggregated from the columns of the steps."""
+        """The quantities that can be aggregated over repeats, from the columns of the steps."""
         return quantities(columns.filled_columns(placed.step for placed in self.walk()))
 
     def _expectation(self, index: int) -> "Expectation":

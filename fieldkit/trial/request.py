@@ -140,7 +140,8 @@ def _telemetry_columns(cast: Cast) -> Iterator[Column]:
 
 def _robot_data(cast: Cast) -> dict[str, object]:
     """Return the data that distinguishes the robots of this trial from the robots of other trials."""
-    # The key "mavlink" keeps the hash equal to that of trials of earlier versions, whose profiles all had this key.
+    # In earlier versions all profiles had the key "mavlink". With this key, the hash is equal to the hash that these
+    # versions computed.
     data: dict[str, object] = {
         role: {"mavlink": None, **robot.profile.model_dump(mode="json")} for role, robot in cast.items()
     }

@@ -76,7 +76,7 @@ def measure_row(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> Row:
 def describe(plan: Plan, row: Row) -> str:
     """Return the most important numbers of a row for display: `IP packet loss 3.2 %, RTT 12.1 ms`.
 
-    Losses are first. The numbers of steps inside a fault precede the numbers of the fault.
+    Losses come first, then other numbers. In both groups, the numbers of faults are the last.
     """
     steps = sorted(
         (placed.step for placed in plan.procedure.walk()), key=lambda step: isinstance(step, Nest) and step.disturbs

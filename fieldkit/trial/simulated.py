@@ -179,7 +179,9 @@ class SimulatedTrial:
             status, reason = Status.FAILED, f"captures and simulation disagree: {contradictions}"
         row = rows.build(self._plan, Attempt(simulated.repeat, 1, 0, status, reason), measured)
         row = {**row, **simulated.values}
-        return {key: value for key, value in {**row, **_goodput(row), **identity}.items() if key not in _NO_CLOCK}
+        return {
+            key: value for key, value in {**row, **_goodput(row), **identity}.items() if key not in _CLOCK_COLUMNS
+        }
 
     def _write(self, simulated: SimulatedRepeat, folder: Path) -> None:
         """Write the evidence of a repeat."""
@@ -221,5 +223,5 @@ def _goodput(row: Mapping[str, Value]) -> dict[str, Value]:
     return {"goodput_bit_s": 8 * max(received_bytes - head_bytes, 0) / completion_s}
 
 
-_NO_CLOCK: Final = frozenset({"started_utc_ns"})
+_CLOCK_COLUMNS: Final = frozenset({"started_utc_ns"})
 """Columns of a trial's clock, which a simulation does not have."""

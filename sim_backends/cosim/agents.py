@@ -11,6 +11,7 @@ from sim_backends.cosim.federates import (
     FederateError,
     PhysicsFederate,
     Program,
+    advance_text,
     federate_error,
     next_send_ns,
     seconds_text,
@@ -40,7 +41,8 @@ class AgentAbsence(NamedTuple):
 
     Attributes:
         since_ns: Beginning of the absence.
-        state: The last position of its body, at rest; before it appears, its start state.
+        state: The state that is used for the agent while physics has none. Before the agent appears, it is its start
+            state. After the agent has disappeared, it is its last position with a velocity of 0.
     """
 
     since_ns: int
@@ -71,7 +73,7 @@ class _PresentStates(Mapping[str, State]):
 
 
 _MAX_WAKES_AT_ONE_TIME: Final = 1000
-"""Number of wakes of a program without an advance of time; with more, the program has failed."""
+"""Largest number of times that a program may wake again at the same simulated time; after more, the run fails."""
 _NO_LIFETIMES: Final[Mapping[str, Lifetime]] = MappingProxyType({})
 _CHANGE: Final = ""
 """Name of the queue entry for the next beginning or end of a lifetime; it sorts before all names of agents."""
@@ -86,7 +88,7 @@ class Agents:
 
     Args:
         physics: Moves the bodies.
-        programs: Programs by agent name; agents without a program are missing.
+        programs: Programs by agent name; agents without a program are omitted.
         lifetimes: The lifetimes of the agents that exist only during a part of the run.
         starts: The start states of agents that are absent at time 0; None if there are no such agents.
 
@@ -96,7 +98,7 @@ class Agents:
     Attributes:
         physics: The physics federate.
         programs: The programs by agent name, sorted.
-        absent: The agents that are absent now.
+        absent: The absence of each agent that is absent now, by name.
         has_changed: True if an agent has ever been absent, or was added by the physics federate.
     """
 
@@ -149,7 +151,7 @@ class Agents:
         try:
             states = self.physics.advance(now_ns, commands)
         except Exception as error:
-            request = f"advance from {seconds_text(self._states_ns)} to {seconds_text(now_ns)}"
+            request = advance_text(self._states_ns, now_ns)
             raise federate_error(error, "physics", request) from error
         self._states_ns = now_ns
         try:
@@ -219,7 +221,8 @@ class Agents:
         new_names = states.keys() - self._names
         for name in new_names:
             self.absent.pop(name, None)
-        if self._states:  # the first states include the agents without a program
+        # Before the first states, `_names` has only the agents with a program, so the other agents are not new.
+        if self._states:
             self._new_agents |= new_names
             self.has_changed |= bool(lost_names or new_names)
         self._names = frozenset(states)
@@ -247,7 +250,7 @@ class Agents:
         return {**added_states, **begin} if added_states else begin
 
     def next_wake_ns(self) -> int | None:
-        """Return the next time at which a program's timer wakes it, or None if no timer is set."""
+        """Return the next time at which a timer wakes a program, or a lifetime begins or ends; None without one."""
         return self._next_ns
 
     def next_send_ns(self) -> int | None:

@@ -14,6 +14,7 @@ from sim_backends.cosim.agents import Agents, SentDatagram
 from sim_backends.cosim.federates import (
     FederateError,
     NetworkFederate,
+    advance_text,
     check_physics,
     check_states,
     federate_error,
@@ -90,14 +91,14 @@ class Coordinator:
         self.run = Run()
         self.is_committing = self.is_interrupted = False
         other_agents, emitters_m = transmitters(network), fixed_emitters_m(network)
-        in_pairs = {name for pair in pairs for name in pair}
+        paired_agents = {name for pair in pairs for name in pair}
         # With only two agents, every packet is between these two, and the ledger always includes its two ends.
-        measured_agents = {*other_agents, *(in_pairs if measures_all and len(in_pairs) > 2 else ())}
+        measured_agents = {*other_agents, *(paired_agents if measures_all and len(paired_agents) > 2 else ())}
         self._ledger = PacketLedger(
             self.run.fates, agents.physics.step_ns, measured_agents, has_fixed_emitters=bool(emitters_m)
         )
         # Agents whose positions affect packets: they send, receive, forward or interfere.
-        self._active = in_pairs | {*other_agents}
+        self._active = paired_agents | {*other_agents}
         self._pairs, self._other_agents = tuple(pairs), other_agents
         self._deferred: Sequence[SentDatagram] = ()
         self._empty_windows = EmptyWindows()
@@ -202,7 +203,7 @@ class Coordinator:
             try:
                 arrivals, drops = network.advance(last_ns, packets, assumed_states)
             except Exception as error:
-                request = f"advance from {seconds_text(begin_ns)} to {seconds_text(last_ns)}"
+                request = advance_text(begin_ns, last_ns)
                 raise federate_error(error, "network", request) from error
             lap("network")
             self.is_committing = is_observed
@@ -261,17 +262,19 @@ class Coordinator:
             network assumes.
         """
         agents, situation = self._agents, self.situation
-        begin = situation.states
+        begin_states = situation.states
         # The window ends when an agent appears or disappears, because the set of states for the network then changes.
         to_ns = min(to_ns, agents.next_change_ns() or to_ns)
         # A network that does not extrapolate velocities (dead reckoning) assumes that agents do not move.
-        moving = begin if self._extrapolates else {name: State(state.position_m) for name, state in begin.items()}
+        moving_states = begin_states
+        if not self._extrapolates:
+            moving_states = {name: State(state.position_m) for name, state in begin_states.items()}
         step_ns = situation.physics_step_ns
         # The states are from the last physics step, which may be before the beginning of the window.
         since_ns = begin_ns // step_ns * step_ns
-        self._update_situation(begin_ns, begin, moving, sent_datagrams=())
+        self._update_situation(begin_ns, begin_states, moving_states, sent_datagrams=())
         reckoning_step_ns = policy.reckoning_step_ns(situation)
-        assumed_states = DeadReckoned(moving, since_ns, reckoning_step_ns)
+        assumed_states = DeadReckoned(moving_states, since_ns, reckoning_step_ns)
         end_ns = self._next_window(begin_ns, to_ns)
         lap = self._wall_time.lap
         lap("exchange")
@@ -291,11 +294,13 @@ class Coordinator:
             lap("agents")
             sent_datagrams += later_datagrams
             end_ns = later_ns
-        if agents.has_changed and (states_with_changes := agents.with_changes(begin, end=states)) is not begin:
-            begin = states_with_changes
-            stationary = {name: State(state.position_m) for name, state in begin.items()}
-            assumed_states = DeadReckoned({**stationary, **moving}, since_ns, reckoning_step_ns)
-        return end_ns, sent_datagrams, states, assumed_states if self._extrapolates else begin
+        if agents.has_changed:
+            states_with_changes = agents.with_changes(begin_states, end=states)
+            if states_with_changes is not begin_states:
+                begin_states = states_with_changes
+                stationary_states = {name: State(state.position_m) for name, state in begin_states.items()}
+                assumed_states = DeadReckoned({**stationary_states, **moving_states}, since_ns, reckoning_step_ns)
+        return end_ns, sent_datagrams, states, assumed_states if self._extrapolates else begin_states
 
     def _update_situation(
         self,

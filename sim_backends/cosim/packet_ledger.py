@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from fieldkit.core.model import Vector
 from sim_backends.cosim.agents import AgentAbsence, SentDatagram
-from sim_backends.cosim.federates import FederateError, seconds_text
+from sim_backends.cosim.federates import FederateError, advance_text, seconds_text
 from sim_backends.cosim.run_record import Fate
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.radio.random_streams import PacketIdentity
@@ -133,7 +133,8 @@ class PacketLedger:
                 name in absences and absences[name].since_ns <= enters_ns for name in (source, destination)
             )
             last_states = {name: absence.state for name, absence in absences.items()}
-            # A missing state of an agent is replaced by its last state or by its state in the other mapping.
+            # A state that is missing in one mapping is replaced by the agent's last state, or by the state in the
+            # other mapping.
             assumed_states, true_states = (
                 {**true_states, **last_states, **assumed_states},
                 {**assumed_states, **last_states, **true_states},
@@ -183,7 +184,7 @@ class PacketLedger:
     def withdraw(self, names: Container[str]) -> list[Fate]:
         """Drop all packets under way from or to these agents, and return their fates.
 
-        The network does not know of this, and may report these packets later (`discard_withdrawn`).
+        The network is not notified, so it may still report these packets later (`discard_withdrawn`).
         """
         packet_ids = [
             packet_id
@@ -197,7 +198,10 @@ class PacketLedger:
         return fates
 
     def discard_withdrawn(self, packet_id: int) -> bool:
-        """Return True if a packet was withdrawn, and forget it, because the network reports each packet only once."""
+        """Return True if a packet was withdrawn. The ledger then deletes its number.
+
+        The number is not needed again, because the network reports each packet only once.
+        """
         if packet_id not in self._withdrawn_ids:
             return False
         self._withdrawn_ids.remove(packet_id)
@@ -219,7 +223,7 @@ class PacketLedger:
             )
         if not max(begin_ns, packet.enters_ns) <= arrival.at_ns <= last_ns:
             raise FederateError(
-                f"the network, requested to advance from {seconds_text(begin_ns)} to {seconds_text(last_ns)}, "
+                f"the network, requested to {advance_text(begin_ns, last_ns)}, "
                 f"delivered packet {packet.packet_id}, which entered at {seconds_text(packet.enters_ns)}, at "
                 f"{seconds_text(arrival.at_ns)}",
                 remedy=_CORRECT_NETWORK,

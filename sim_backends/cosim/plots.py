@@ -52,7 +52,7 @@ _LEADER_POINTS: Final = 5.0
 """Minimum distance of a label from its point at which a line connects them."""
 _BACKGROUND: Final = {"facecolor": LIGHT["paper"], "edgecolor": "none", "pad": 0.3}
 _TEXT_BRIGHTNESS: Final = 0.75
-"""Factor between the brightness of a curve and of its label."""
+"""Ratio of the brightness of a label to the brightness of its curve."""
 _LETTER_WIDTH: Final = 0.58
 """Mean width of a letter of DejaVu Sans, relative to the font size."""
 
@@ -108,7 +108,7 @@ def run_figure(
     Args:
         title: Title above the figure.
         paths_m: Positions of each agent over time, metres east and north, at least one each.
-        flows: Its flows.
+        flows: The flows of the run.
         form: File format.
         outlines: Obstacles around the agents.
     """

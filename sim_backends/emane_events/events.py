@@ -88,9 +88,9 @@ class SerializedEvent:
     """An event within a datagram.
 
     Attributes:
-        nem: NEM that receives it, or `ALL_NEMS`.
-        event: `LOCATION`, `PATHLOSS` or another identifier.
-        content: Its message.
+        nem: NEM that receives the event, or `ALL_NEMS`.
+        event: Identifier of the kind of event: `LOCATION`, `PATHLOSS` or another one.
+        content: The event as an encoded message, for example `LocationEvent`.
     """
 
     nem: int
@@ -137,7 +137,7 @@ class EventDatagram:
             MalformedEventError: The bytes are not a datagram.
         """
         if len(datagram) < _SIZE.size or _SIZE.unpack_from(datagram)[0] != len(datagram) - _SIZE.size:
-            raise MalformedEventError("the datagram has another size than it announces")
+            raise MalformedEventError("the size of the datagram differs from the size in its header")
         values = fields_by_number(datagram[_SIZE.size :], (1, 2, 3))
         publisher = as_bytes(values[1])
         if len(publisher) != _UUID_BYTES:

@@ -77,7 +77,7 @@ class EmaneLocations:
         """
         if commands:
             raise FederateError(
-                f"the emane physics federate does not move robots, and {', '.join(commands)} has a command",
+                f"the emane physics federate does not move robots, but there is a command for {', '.join(commands)}",
                 remedy="remove the motion of the agents from the scenario",
             )
         start_s = time.monotonic()

@@ -44,9 +44,9 @@ class EmaneOptions(SimulatorOptions):
         reference: Latitude and longitude in degrees, and height above the ellipsoid in metres, of the world's origin.
         interval: Smallest time between two events of a run, in simulated time.
         pathloss: Publish the mean path loss between all agents, with obstacles, for `precomputed` propagation; or, if
-            the run takes positions from events, use the path losses in them.
-        real_time: True if the run waits for the wall clock, because EMANE uses the wall clock.
-        wait: Maximum wait for the first location of each agent, if the run takes positions from events.
+            the run reads positions from events, use the path losses in them.
+        real_time: True if a run is at most as fast as the wall clock, because EMANE uses the wall clock.
+        wait: Maximum wait for the first location of each agent, if the run reads positions from events.
     """
 
     channel: Annotated[str, AfterValidator(_check_channel)] = "224.1.2.8:45703"

@@ -45,7 +45,7 @@ class EmulatedBackend:
     """Backend that runs each robot in namespaces of this machine.
 
     Args:
-        site: The site file; None for the paper's lab.
+        site: The site file; None for the paper's lab. A site file without robots has the robots of the paper's lab.
         document: The document of the site file, for error messages with line numbers.
 
     Raises:
@@ -61,6 +61,9 @@ class EmulatedBackend:
     def __init__(self, site: Site | None, document: Document | None) -> None:
         if site is None:
             site, document = load_site(DEFAULT_SITE)
+        elif site.has_default_robots:
+            default_site, _ = load_site(DEFAULT_SITE)
+            site = site.model_copy(update={"robots": default_site.robots, "roles": default_site.roles})
         self._site = site
         self._document = document
         self._options = load_options(document)
@@ -128,10 +131,10 @@ class EmulatedBackend:
         """Implement `Relocating.run_elsewhere`: the command runs in a virtual machine."""
         from sim_backends.emulated.linux_wifi import guest  # noqa: PLC0415 (as above)
 
-        return guest.run_command(argv, results, radios=self._radios)
+        return guest.run_command(argv, results, radios=self._radio_count)
 
     @property
-    def _radios(self) -> int:
+    def _radio_count(self) -> int:
         """Number of radios of robots and access points."""
         return len(self._site.robots) + len(self._options.radio.access_points)
 
@@ -145,7 +148,7 @@ class EmulatedBackend:
         emulated = content.get("emulated") or {}
         assert isinstance(emulated, dict)
         site = self._site.model_dump(mode="json", exclude_defaults=True)
-        return site | {"backend": "emulated", "emulated": emulated | {"wifi": self._options.wifi}}
+        return {"roles": {}} | site | {"backend": "emulated", "emulated": emulated | {"wifi": self._options.wifi}}
 
     @property
     def lab_bytes(self) -> int:
@@ -241,7 +244,9 @@ class EmulatedBackend:
 
             sink(Note("starting a virtual machine, because this kernel has no mac80211_hwsim"))
             draw = partial(interactive_lab.overview, members, options=self._options, world=self._world)
-            with guest_lab.bring_up(members, self._site_of_guest(), seed=seed, radios=self._radios, draw=draw) as lab:
+            with guest_lab.bring_up(
+                members, self._site_of_guest(), seed=seed, radios=self._radio_count, draw=draw
+            ) as lab:
                 yield lab
             return
         ros = self._find_ros(members)
@@ -297,19 +302,9 @@ class EmulatedBackend:
 
     def _check_profiles(self, robots: "Mapping[RobotKey, Robot | LabRobot]") -> None:
         for robot in robots.values():
-            self._check_flight(robot)
             _check_ros(robot, self._options)
             for sensor in sensors_of(robot):
                 sensor_specs.check(sensor)
-
-    def _check_flight(self, robot: "Robot | LabRobot") -> None:
-        """Raise ConfigurationError for a drone in Gazebo, whose robots have no thrust."""
-        if self._options.physics == "gazebo" and mavlink_of(robot.profile) is not None:
-            raise ConfigurationError(
-                f"an autopilot cannot fly the drone {robot.name} in Gazebo",
-                where=self._document.where(("emulated", "physics")) if self._document else "",
-                remedy="write physics: mujoco or physics: kinematic, or remove the drone from the site file",
-            )
 
     def _note_simulators(self, sink: Sink) -> None:
         if self.simulators:

@@ -130,12 +130,12 @@ class EmulatedLab:
 
     def lateness(self) -> LabLateness | None:
         """Implement `Lab.lateness`: the lateness of packets and windows since the lab was ready."""
-        before = self._first_stats
-        if before is None:
+        first_stats = self._first_stats
+        if first_stats is None:
             return None
-        now, bound_ns = self._running.medium.stats(), round(self._options.late_bound * 1e9)
-        packets = _new_counts(before.packet_lateness_counts, now.packet_lateness_counts)
-        windows = _new_counts(before.window_lateness_counts, now.window_lateness_counts)
+        stats, bound_ns = self._running.medium.stats(), round(self._options.late_bound * 1e9)
+        packets = _new_counts(first_stats.packet_lateness_counts, stats.packet_lateness_counts)
+        windows = _new_counts(first_stats.window_lateness_counts, stats.window_lateness_counts)
         return LabLateness(
             bound_s=self._options.late_bound,
             packet_max_s=max(packets) / 1e9 if packets else None,

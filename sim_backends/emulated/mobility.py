@@ -26,7 +26,7 @@ from sim_backends.world.world import World
 STEP_M: Final = 0.1
 """Distance that a robot may move between two updates of the medium.
 
-At the distance d, the path loss increases by 10 n / (ln 10 d) dB per metre, with the path-loss exponent n. At 10 m
+At the distance d, the path loss increases by 10 n / (d ln 10) dB per metre, with the path-loss exponent n. At 10 m
 and n = 3 this is 1.3 dB/m, so a step changes it by 0.13 dB. Fading, which changes within a wavelength (0.12 m),
 continues between the updates.
 """
@@ -275,10 +275,11 @@ class Mobility:
             relay = positions.relay(self._cast, placement)
             if self._laptop is not None:
                 states[self._laptop.name] = State(positions.laptop_m(self._cast, placement, self._world))
-            hidden = None if self._out_of_range_role is None else self._cast[self._out_of_range_role].name
-            self._write_positions({name: state.position_m for name, state in states.items() if name != hidden})
-            if hidden is not None:
-                states = {} if hidden == relay else {name: state for name, state in states.items() if name != hidden}
+            hidden_robot = None if self._out_of_range_role is None else self._cast[self._out_of_range_role].name
+            visible_states = {name: state for name, state in states.items() if name != hidden_robot}
+            self._write_positions({name: state.position_m for name, state in visible_states.items()})
+            if hidden_robot is not None:
+                states = {} if hidden_robot == relay else visible_states
             self._attitudes = {
                 name: attitude_of(state, before=self._attitudes.get(name, Attitude()))
                 for name, state in states.items()
@@ -294,13 +295,13 @@ class Mobility:
 
     def _extend_track(self, utc_ns: int, states: Mapping[str, State]) -> None:
         """Append a point for each robot whose position or velocity has changed; `utc_ns` is the time of `states`."""
-        last = {point.role: point for point in self._track}
+        last_points = {point.role: point for point in self._track}
         for role, robot in self._cast.items():
             state = states.get(robot.name)
-            now = (None, STILL) if state is None else (state.position_m, state.velocity_m_s)
-            before = last.get(role)
-            if before is None or (before.position_m, before.velocity_m_s) != now:
-                self._track.append(TrackPoint(utc_ns, role, *now))
+            current = (None, STILL) if state is None else (state.position_m, state.velocity_m_s)
+            last_point = last_points.get(role)
+            if last_point is None or (last_point.position_m, last_point.velocity_m_s) != current:
+                self._track.append(TrackPoint(utc_ns, role, *current))
 
     def _self_steered_state(self, role: Role, motion: RecordedMotion) -> State:
         """Return the state of a robot that steers itself; a ground robot is at the height of the ground."""

@@ -178,9 +178,10 @@ class EmulatedRobot(Node):
     def build(self) -> None:
         """Give the robot its host name and its file system. Raises the errors of `open_radio`."""
         shared_fds = () if self._positions_fd is None else (self._positions_fd,)
-        _, (fd, *others) = self._worker.request({"do": "build", "robot": asdict(self.spec)}, descriptors=shared_fds)
-        self._record = MotionRecord(fd)
-        self.physics_fds = (fd, *others) if others else ()
+        request = {"do": "build", "robot": asdict(self.spec)}
+        _, (motion_record_fd, *simulator_fds) = self._worker.request(request, descriptors=shared_fds)
+        self._record = MotionRecord(motion_record_fd)
+        self.physics_fds = (motion_record_fd, *simulator_fds) if simulator_fds else ()
 
     def open_wifi(self, device: str) -> None:
         """Bring up the Wi-Fi interface `device` in the robot's namespace. Raises the errors of `open_radio`."""

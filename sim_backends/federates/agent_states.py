@@ -118,7 +118,7 @@ def read_announcements(reader: FrameReader, agents: AgentTable) -> None:
     """Add announced agents to the table.
 
     Raises:
-        MalformedFrameError: An index is not the next one, or a name is already in use.
+        MalformedFrameError: An index is not the next free index, or a name is empty or already in use.
     """
     count = reader.count(_NEW_AGENT_BYTES)
     if not count:
@@ -215,7 +215,7 @@ def states_bytes(states: Mapping[str, State], agents: AgentTable, limits_m_s2: M
 
 
 def read_states(reader: FrameReader, agents: AgentTable) -> ReceivedStates:
-    """Return states of agents, by name.
+    """Return the next list of states in a frame, by name of the agent.
 
     Raises:
         MalformedFrameError: A state is invalid, or an agent has two states.

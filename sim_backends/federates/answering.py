@@ -214,8 +214,8 @@ class _Run:
             self.copies.pop(copy_number, None)
             return True
         try:
-            answer, body = self._answer(frame)
-            answer_frame = encode(answer, request, copy_number, body)
+            answer_kind, body = self._answer(frame)
+            answer_frame = encode(answer_kind, request, copy_number, body)
         except Exception as error:  # noqa: BLE001 (every error is reported to the coordinator)
             traceback.print_exc()
             text = f"{type(error).__name__}: {error}".encode(errors="replace")[:MAX_TEXT_BYTES]

@@ -38,7 +38,7 @@ class Child:
         pid: Its process id.
 
     Raises:
-        ConfigurationError: It cannot be started.
+        ConfigurationError: The process cannot be started.
     """
 
     def __init__(self, command: str) -> None:

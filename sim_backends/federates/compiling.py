@@ -78,7 +78,7 @@ class CompiledProgram:
         """Return the versions of the compiler and of the libraries.
 
         Raises:
-            ConfigurationError: One of them is not installed.
+            ConfigurationError: The compiler or a library is not installed.
         """
         for tool in ("g++", "pkg-config"):
             if shutil.which(tool) is None:
@@ -94,7 +94,9 @@ class CompiledProgram:
         return _run("g++", "--version").stdout.partition("\n")[0], libraries
 
     def _compile(self, program: Path) -> None:
-        sys.stderr.write(f"note: compiling {self.name}; this takes {self.duration_text}, once for these libraries\n")
+        sys.stderr.write(
+            f"note: compiling {self.name}; this takes {self.duration_text}, once per version of its libraries\n"
+        )
         options = self.libraries
         if options is None:
             arguments = ("--cflags", "--libs", *self.packages)
@@ -159,7 +161,7 @@ def _locked(path: Path, name: str) -> Iterator[None]:
                     raise ConfigurationError(
                         f"another process has been compiling {name} for {_LIMIT_S:g} s",
                         where=str(path),
-                        remedy="wait until it has finished, or end it",
+                        remedy="wait until it has finished, or terminate it",
                     ) from error
                 time.sleep(_POLL_S)
         yield

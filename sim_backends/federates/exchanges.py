@@ -5,19 +5,19 @@ later gets the next index in the first message that mentions it. The coordinator
 index is valid in the copy that the message is for, and in copies that are made of this copy later.
 
 - **Handshake.** The coordinator sends hello; the federate answers with welcome or error. `welcome` repeats the
-  configuration hash, which is the SHA-256 of the JSON. `name` is the scenario's name in hello, and the federate's
-  name in welcome. The side that accepts a connection checks the token of join or hello.
+  configuration hash, which is the SHA-256 of `configuration`. `name` is the scenario's name in hello, and the
+  federate's name in welcome. The side that accepts a connection checks the token of join or hello.
 - **Transports.** Welcome lists the values of a packet's `protocol` that the network carries: `udp`, `tcp`, `topic`,
-  `ros1`; an empty list means all. The network refuses others with an error. [Real programs](lab-cosim.md) send `ip`,
-  whose size includes the IP header, and `ip-broadcast`: one packet per receiver, with equal source, number and time.
-  With the key `network.transports: builtin` the network needs only these two and the capability *next event*, because
-  fieldkit's UDP, TCP, topics and ROS 1 send IP packets.
+  `ros1`; an empty list means all. The network refuses others with an error. [Real programs](lab-cosim.md) send
+  packets of the transport `ip`, whose size includes the IP header, and `ip-broadcast`: one packet per receiver, with
+  equal source, number and time. With the key `network.transports: builtin` the network needs only these two
+  transports and the capability *next event*, because fieldkit's UDP, TCP, topics and ROS 1 send IP packets.
 - **Configuration.** The JSON has `scenario` (keys as in [a scenario file](reference/scenario-file.md)), `world` ([a
   world file](reference/world-file.md)), `robots` (limits of each agent's body, and its radio) and `options`. A simple
   federate ignores it and uses the agents of hello. If the run has an output folder, a network that is declared with
   `writes_captures` also gets `captures`: the `folder` in which it writes an `AGENT.pcap` of raw IP for each agent;
   `addresses` by agent; and `flows` by name: `port` of the destination (0: the network chooses it), `ping` (identifier
-  of ICMP echo; 0: none), `reply`.
+  of ICMP echo; 0: none), `reply` (true: the flow consists of echo replies).
 - **Physics: states.** `at_ns` is `to_ns` rounded down to a multiple of the `step_ns` in welcome; the states are valid
   at this time. Positions are of the antenna. `heading_rad` is from east towards north, NaN if undefined. `limit_m_s2`
   is the largest change of velocity per second after this time, infinity if unknown; in requests to a network it has
@@ -29,11 +29,11 @@ index is valid in the copy that the message is for, and in copies that are made 
 - **Network.** It simulates up to and including `to_ns`, and returns each packet exactly once: as an arrival with
   `enters_ns` <= `at_ns` <= `to_ns`, and `at_ns` not before the previous `to_ns`; or as a drop with its reason. Both
   lists are in order of time. `at_ns` of outcomes is `to_ns`. Packets are in order of `enters_ns`, which may equal the
-  previous `to_ns`. In a window of length 0 at the start, `to_ns` is -1. Random draws depend on the seed; derive each
+  previous `to_ns`. If the first window has length 0, its `to_ns` is -1. Random draws depend on the seed; derive each
   draw from the seed, `flow` and `number`, so that runs can be compared.
-- **Dead reckoning.** If `reckoning_ns` is above 0, which needs the capability *extrapolates*, the position at t is
-  `position_m` + n `reckoning_ns` `velocity_m_s`, where n is (t - `since_ns`) / `reckoning_ns`, rounded down.
-  Otherwise agents stay at their positions until the next request.
+- **Dead reckoning.** If `reckoning_ns` is above 0, which needs the capability *extrapolates*, the position at the
+  time t is `position_m` + n `reckoning_ns` / 10^9 `velocity_m_s`, where n is (t - `since_ns`) / `reckoning_ns`,
+  rounded down. Otherwise agents stay at their positions until the next request.
 - **Absent agents** have no state. A physics federate with the capability *agents disappear* omits agents that it has
   removed; they may return. With the scenario's keys `appears` and `disappears` the coordinator ignores states of
   absent agents, sends them no commands, and drops their packets as `agent absent`; the network still reports the

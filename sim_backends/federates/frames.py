@@ -131,7 +131,7 @@ class ProtocolFrame(NamedTuple):
 
 
 def encode(kind: MessageKind, request: int, copy: int, body: bytes = b"") -> bytes:
-    """Return a frame.
+    """Return the bytes of a frame.
 
     Raises:
         ValueError: The body is too long.
@@ -184,7 +184,7 @@ class FrameReader:
         return len(self._body) - self._offset
 
     def unpack(self, layout: struct.Struct) -> tuple[Any, ...]:
-        """Return the next values.
+        """Return the next values of the body, which have this layout.
 
         Raises:
             MalformedFrameError: The frame ends too early.
@@ -195,7 +195,7 @@ class FrameReader:
         return layout.unpack_from(self._body, offset)
 
     def read_bytes(self, size: int) -> bytes:
-        """Return the next bytes.
+        """Return the next bytes of the body.
 
         Raises:
             MalformedFrameError: The frame ends too early.
@@ -206,10 +206,10 @@ class FrameReader:
         return self._body[offset : self._offset]
 
     def text(self) -> str:
-        """Return the next text.
+        """Return the next text of the body.
 
         Raises:
-            MalformedFrameError: It is too long, the frame ends too early, or it is not UTF-8.
+            MalformedFrameError: The text is too long or not UTF-8, or the frame ends too early.
         """
         position = self.position
         (length,) = self.unpack(_LENGTH)
@@ -259,7 +259,7 @@ def text_bytes(text: str) -> bytes:
     """Return a text with its length as bytes.
 
     Raises:
-        ValueError: It is too long.
+        ValueError: The text is too long.
     """
     encoded = text.encode(errors="replace")
     if len(encoded) > MAX_TEXT_BYTES:

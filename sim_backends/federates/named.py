@@ -69,7 +69,7 @@ def federates() -> dict[str, NamedFederate]:
     Raises:
         ConfigurationError: The package of a federate cannot be loaded.
     """
-    return {point.name: _load(point) for point in plugins.entry_points(plugins.FEDERATES)}
+    return {entry_point.name: _load(entry_point) for entry_point in plugins.entry_points(plugins.FEDERATES)}
 
 
 def named_federate(endpoint: str, role: int) -> NamedFederate | None:
@@ -82,10 +82,11 @@ def named_federate(endpoint: str, role: int) -> NamedFederate | None:
     Raises:
         ConfigurationError: The package of the federate cannot be loaded, or the federate has another role.
     """
-    point = next((point for point in plugins.entry_points(plugins.FEDERATES) if point.name == endpoint), None)
-    if point is None:
+    entry_points = plugins.entry_points(plugins.FEDERATES)
+    entry_point = next((candidate for candidate in entry_points if candidate.name == endpoint), None)
+    if entry_point is None:
         return None
-    federate = _load(point)
+    federate = _load(entry_point)
     if federate.role != role:
         raise ConfigurationError(
             f"{endpoint} is a {ROLES[federate.role]} federate, not a {ROLES[role]} federate",
@@ -104,12 +105,12 @@ def default_options(endpoint: str, role: int) -> dict[str, Any]:
     return {} if federate is None or federate.options is None else federate.options().to_json()
 
 
-def _load(point: EntryPoint) -> NamedFederate:
-    federate = plugins.load(point)
+def _load(entry_point: EntryPoint) -> NamedFederate:
+    federate = plugins.load(entry_point)
     if isinstance(federate, NamedFederate):
         return federate
     raise ConfigurationError(
-        "it is not a ProgramFederate or PythonFederate", where=plugins.location(point), remedy=plugins.REMEDY
+        "it is not a ProgramFederate or PythonFederate", where=plugins.location(entry_point), remedy=plugins.REMEDY
     )
 
 
@@ -136,7 +137,7 @@ def command_line(endpoint: str, role: int) -> str:
         federate.load()
         return shlex.join((sys.executable, "-P", "-m", "sim_backends.federates.serve_named", ROLES[role], endpoint))
     if _WORD.fullmatch(endpoint) and shutil.which(endpoint) is None:
-        names = [point.name for point in plugins.entry_points(plugins.FEDERATES)]
+        names = [entry_point.name for entry_point in plugins.entry_points(plugins.FEDERATES)]
         choices = f"simulators: {', '.join(names)}; or a command, or an address: fieldkit docs federates"
         raise ConfigurationError(
             f"there is no {ROLES[role]} federate and no program with the name {endpoint!r}",

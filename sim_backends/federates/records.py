@@ -80,7 +80,7 @@ def _command(name: str, command: object) -> tuple[int, bytes]:
 
 
 def read_commands(reader: FrameReader, agents: AgentTable) -> dict[str, Twist | Velocity]:
-    """Return commands by agent.
+    """Return the next list of commands in a frame, by agent.
 
     Raises:
         MalformedFrameError: A command is invalid, or its type is unknown.
@@ -113,7 +113,7 @@ def packets_bytes(packets: Iterable[Packet], agents: AgentTable) -> bytes:
 
 
 def read_packets(reader: FrameReader, agents: AgentTable) -> list[Packet]:
-    """Return packets.
+    """Return the next list of packets in a frame.
 
     Raises:
         MalformedFrameError: A packet is invalid.
@@ -143,7 +143,7 @@ def arrivals_bytes(arrivals: Iterable[Arrival], agents: AgentTable) -> bytes:
 
 
 def read_arrivals(reader: FrameReader, agents: AgentTable) -> list[Arrival]:
-    """Return arrivals.
+    """Return the next list of arrivals in a frame.
 
     Raises:
         MalformedFrameError: An arrival is invalid.
@@ -168,7 +168,7 @@ def drops_bytes(drops: Iterable[Drop]) -> bytes:
 
 
 def read_drops(reader: FrameReader) -> list[Drop]:
-    """Return drops.
+    """Return the next list of drops in a frame.
 
     Raises:
         MalformedFrameError: A drop is invalid.

@@ -43,7 +43,7 @@ _BYE_S: Final = 0.2
 _MAX_SHOWN: Final = 400
 """Largest number of characters of a federate's text in a message."""
 _REQUEST_NUMBERS: Final = 1 << 32
-"""Number of request numbers, which have 32 bits; then they begin again at 0."""
+"""Number of different request numbers, which have 32 bits; the number after the last one is 0."""
 _ADDRESS_PATTERN: Final = re.compile(r"[a-z][a-z0-9+.-]*:\S*")
 
 Answer = TypeVar("Answer")
@@ -135,7 +135,7 @@ class FederateSession:
         kind: MessageKind,
         copy: int,
         body: bytes,
-        answer: MessageKind,
+        answer_kind: MessageKind,
         *,
         decode: Callable[[bytes], Answer],
         describe: Callable[[], str],
@@ -146,7 +146,7 @@ class FederateSession:
             kind: Kind of the request.
             copy: Copy of the federate.
             body: Body of the request.
-            answer: Kind of the answer.
+            answer_kind: Kind of the answer.
             decode: Decodes the body of the answer.
             describe: Returns a description of the request, for error messages.
 
@@ -161,7 +161,7 @@ class FederateSession:
                 self._channel.send(encode(MessageKind.RELEASE, 0, number), time.monotonic() + self._deadline_s)
             self._released_copies.clear()
             self._request_number = (self._request_number + 1) % _REQUEST_NUMBERS
-            expected_header = Header(0, answer, self._request_number, copy)
+            expected_header = Header(0, answer_kind, self._request_number, copy)
             with self.exchange_context:
                 frame = self._exchange(encode(kind, self._request_number, copy, body), expected_header)
             if frame.header.kind is MessageKind.ERROR:
@@ -287,7 +287,7 @@ def _child(endpoint: str, role: int) -> Child:
     """Start a federate by its name or its command.
 
     Raises:
-        ConfigurationError: It cannot be started; `endpoint` may be an address of a transport that does not exist.
+        ConfigurationError: The federate cannot be started; `endpoint` may be an address of an unknown transport.
     """
     command = command_line(endpoint, role)
     try:

@@ -35,7 +35,8 @@ class LockStep
         return m_stepNs;
     }
 
-    // Connect, stop the robots, reset the world, place the robots, and wait until they are at rest, which is time 0.
+    // Connect, stop the robots, reset the world, and place the robots. Then advance by `settle_s`, in which they come to
+    // rest; the end of this interval is time 0.
     void Start()
     {
         m_connection.Open();
@@ -330,8 +331,8 @@ class LockStep
         return names;
     }
 
-    // Advance until the robots are at rest (0.1 mm, 0.1 mrad), at most 20 times. They may still move because of an
-    // earlier run, and setting a position does not stop them.
+    // Advance in intervals until no robot moves by 0.1 mm or turns by 0.1 mrad in an interval, for at most 20 intervals.
+    // Robots may still move because of an earlier run, and setting a position does not stop them.
     void ComeToRest(int64_t steps)
     {
         Step(steps);
@@ -367,7 +368,7 @@ class LockStep
             lock, [&] { return m_monitor.pose_ns == 0; },
             [] { return std::string("no poses have arrived after a reset"); });
         m_nowNs = 0;
-        // Newer versions create the models and plugins again, so the plugins subscribe again.
+        // Newer versions of Gazebo create the models and plugins again at a reset, so the plugins subscribe again.
         m_connection.SetPresence();
         m_connection.WaitForSubscribers(lock);
     }

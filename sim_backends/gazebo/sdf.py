@@ -87,7 +87,7 @@ _TURTLEBOT: Final = _Chassis(0.138, 0.13, 0.01, 0.033, 0.018, 0.16, 0.0, 1.0, 0.
 def world_sdf(
     world: World, robots: Mapping[str, SdfRobot], *, step_ns: int = 1_000_000, version: Version = "fortress"
 ) -> str:
-    """Return an SDF file.
+    """Return the text of an SDF file with a world and its robots.
 
     Args:
         world: The world.
@@ -122,7 +122,7 @@ def world_sdf(
 
 
 def model_sdf(name: str, limits: DriveLimits | QuadrotorLimits, *, step_ns: int, version: Version) -> str:
-    """Return an SDF file with one robot at the origin; Gazebo creates its model from it.
+    """Return the text of an SDF file with one robot at the origin, from which Gazebo creates the robot's model.
 
     The arguments are those of `world_sdf`.
     """

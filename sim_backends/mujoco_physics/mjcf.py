@@ -96,7 +96,7 @@ def _text(numbers: Iterable[float]) -> str:
 
 
 class _Document:
-    """The XML document.
+    """The XML document of a model, to which elements are added.
 
     Args:
         timestep_s: MuJoCo's time step.

@@ -52,7 +52,7 @@ class Jammer:
         agent: The agent that carries it; empty if it has a fixed position.
 
     Raises:
-        ValueError: It has neither a position nor an agent, or both.
+        ValueError: The jammer has neither a position nor an agent, or both.
     """
 
     power_dbm: float

@@ -176,7 +176,7 @@ class RadioNetwork:
             ValueError: The time is in the past.
         """
         if at_ns < self.now_ns:
-            raise ValueError(f"a timer for {at_ns} ns was set at {self.now_ns} ns")
+            raise ValueError(f"a timer was set for {at_ns} ns, which is before the current time, {self.now_ns} ns")
         self._schedule(at_ns, host, call)
 
     def deliver(self, packet_id: int) -> None:

@@ -23,7 +23,7 @@ struct LinkParameters
     int64_t delay_ns = 0;
     int64_t jitter_ns = 0;
     double loss = 0;
-    size_t queue_packets = 0; // without the one that is being sent
+    size_t queue_packets = 0; // without the packet that is being sent
 
     // The time for which a packet occupies a link, rounded up.
     int64_t SerializationNs(uint64_t size_bytes) const

@@ -143,18 +143,19 @@ class Network
             }
             m_agents[agent].is_present = present[agent];
             int station = m_agents[agent].station;
-            int by = present[agent] ? -1 : 1;
+            int change = present[agent] ? -1 : 1;
             if (station < 0)
             {
                 continue; // it has no radio
             }
             if (is_ahead && from_ns > NowNs())
             {
-                Simulator::Schedule(NanoSeconds(from_ns - NowNs()), [this, station, by] { SwitchOff(station, by); });
+                Simulator::Schedule(NanoSeconds(from_ns - NowNs()),
+                                    [this, station, change] { SwitchOff(station, change); });
             }
             else
             {
-                SwitchOff(station, by);
+                SwitchOff(station, change);
             }
         }
         for (const protocol::Packet& packet : request.packets)
@@ -272,7 +273,7 @@ class Network
         RunUntil(-1);
     }
 
-    // Links with the parameters of the configuration, which Python has computed.
+    // Create links with the parameters in the configuration, which `ns3_options.py` has computed.
     void AddFixedLinks(uint64_t seed, const Json& link)
     {
         m_links = CreateObject<FixedLinks>();
@@ -380,11 +381,11 @@ class Network
         return sample;
     }
 
-    // Add `by` to the number of reasons why the radio of a station is off; it is on if there are none.
-    void SwitchOff(size_t station, int by)
+    // Add `change` to the number of reasons why the radio of a station is off; it is on if there are none.
+    void SwitchOff(size_t station, int change)
     {
-        m_stations[station].off += by;
-        if (m_links != nullptr && by > 0 && m_stations[station].off == 1)
+        m_stations[station].off += change;
+        if (m_links != nullptr && change > 0 && m_stations[station].off == 1)
         {
             m_links->SwitchOff(station);
         }
@@ -392,20 +393,20 @@ class Network
         {
             if (other != station)
             {
-                m_channel->Cut(station, other, by);
+                m_channel->Cut(station, other, change);
             }
         }
     }
 
-    void Cut(size_t first, size_t second, int by)
+    void Cut(size_t first, size_t second, int change)
     {
         if (m_links != nullptr)
         {
-            m_links->Cut(first, second, by);
+            m_links->Cut(first, second, change);
         }
         else
         {
-            m_channel->Cut(first, second, by);
+            m_channel->Cut(first, second, change);
         }
     }
 
@@ -536,25 +537,25 @@ class Network
 
     void AddFault(const std::string& kind, const Json& fault)
     {
-        std::function<void(int)> change;
+        std::function<void(int)> add_reason;
         if (kind == "link-cut")
         {
             size_t first = StationNamed(fault.at("between")[0]), second = StationNamed(fault.at("between")[1]);
-            change = [this, first, second](int by) { Cut(first, second, by); };
+            add_reason = [this, first, second](int change) { Cut(first, second, change); };
         }
         else if (kind == "node-loss")
         {
             size_t station = StationNamed(fault.at("agent"));
-            change = [this, station](int by) { SwitchOff(station, by); };
+            add_reason = [this, station](int change) { SwitchOff(station, change); };
         }
         else
         {
             return; // the fault does not affect radios
         }
-        Simulator::Schedule(At(fault.at("from")), [change] { change(1); });
+        Simulator::Schedule(At(fault.at("from")), [add_reason] { add_reason(1); });
         if (fault.contains("to"))
         {
-            Simulator::Schedule(At(fault.at("to")), [change] { change(-1); });
+            Simulator::Schedule(At(fault.at("to")), [add_reason] { add_reason(-1); });
         }
     }
 

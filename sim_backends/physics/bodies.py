@@ -15,7 +15,7 @@ from typing import Any, Final
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.core.model import Vector
 from sim_backends.physics.body import NEVER, Body, Pose, Snapshot, Track
-from sim_backends.physics.collisions import Collision, Footprint, cylinder_footprint, move, overlaps
+from sim_backends.physics.collisions import Collision, Footprint, cylinder_footprint, is_supported, move, overlaps
 from sim_backends.physics.ground import Ground
 from sim_backends.physics.neighbours import HORIZON_S, CellGrid, ContactCandidates, Neighbours
 from sim_backends.physics.paths import STEP_NS
@@ -147,7 +147,7 @@ class Bodies:
         """Return attitude and support of a quadrotor.
 
         Raises:
-            ConfigurationError: It is not a quadrotor.
+            ConfigurationError: The body is not a quadrotor.
         """
         body, pose = self._bodies[name], self._tracks[name].pose(self._step)
         if not isinstance(pose, FlightPose):
@@ -166,9 +166,7 @@ class Bodies:
                 for other in candidates.bodies
             ),
         ]
-        east, north, up = place_m
-        stop = move(body, place_m, (east, north, up - _SUPPORT_M), footprints)
-        return stop is not None and any(contact.normal[2] > 0 for contact in stop.contacts)
+        return is_supported(body, place_m, footprints, _SUPPORT_M)
 
     def overlap(self, name: str) -> str:
         """Return the name of an obstacle or body that a body overlaps now; empty if there is none."""
@@ -230,7 +228,7 @@ class Bodies:
             yield -(-lifetime.disappears_ns // self.step_ns)  # rounded up
 
     def _is_present(self, name: str) -> bool:
-        """Return True if a body exists at the current step: its lifetime includes the step, rounded outwards."""
+        """Return True if the lifetime of a body, extended to whole steps, includes the current step."""
         lifetime = self._lifetimes.get(name)
         if lifetime is None:
             return True
@@ -338,7 +336,9 @@ class Bodies:
         for name in names:
             place_m = self._initial_pose(name).place_m
             if not all(map(math.isfinite, place_m)):
-                raise ConfigurationError(f"{name} starts at {place_m}", remedy="use finite coordinates in metres")
+                raise ConfigurationError(
+                    f"{name} starts at {place_m}, which is not finite", remedy="use finite coordinates in metres"
+                )
             self._check_free(name, place_m, self._grounds[name].obstacles)
 
     def _check_no_overlap(self, new_names: Collection[str]) -> None:

@@ -216,6 +216,13 @@ def move(
     return ContactStop(place_m, tuple(contacts))
 
 
+def is_supported(extent: Extent, place_m: Vector, footprints: Sequence[Footprint], gap_m: float) -> bool:
+    """Return True if a cylinder would be stopped by a surface within a gap below it."""
+    east_m, north_m, up_m = place_m
+    stop = move(extent, place_m, (east_m, north_m, up_m - gap_m), footprints)
+    return stop is not None and any(contact.normal[2] > 0 for contact in stop.contacts)
+
+
 def _move_in_pieces(
     extent: Extent, from_m: Vector, to_m: Vector, footprints: Sequence[Footprint], edge: Edge | None
 ) -> tuple[Vector, list[Contact]]:

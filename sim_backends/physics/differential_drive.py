@@ -9,7 +9,8 @@ the mean speed v, the mean heading h and x = w t / 2, it is
     a t^2 / 2 (sin(x) - x cos(x)) / x^2       to the left of h.
 
 If the yaw rate changes while the robot moves, the displacement is a Fresnel integral; a single step with the mean yaw
-rate is then used, with an error below v (dw/dt) t^3 / 12.
+rate is then used, with an error below v (dw/dt) t^3 / 12. A turn on a slope is also computed in single steps, because
+the horizontal speed depends on the heading.
 """
 
 import math
@@ -264,7 +265,7 @@ def require_twist(command: object) -> Twist:
     """Return a command to a robot on wheels; None means a twist of 0.
 
     Raises:
-        ConfigurationError: It is not a `Twist` of finite numbers.
+        ConfigurationError: The command is not a `Twist` of finite numbers.
     """
     if command is None:
         return Twist()

@@ -19,7 +19,7 @@ from sim_backends.world.world import World
 _LEVEL_M: Final = 1e-3
 """Smaller differences in height count as level: a robot rolls over them."""
 _ON_AREA_M: Final = 1e-6
-"""Maximum distance of a point from an area in which it is, because the distance has a rounding error."""
+"""A point up to this distance from an area counts as on it, because the computed distance has a rounding error."""
 _FLOOR: Final = Footprint("ground", lambda east_m, north_m: (east_m, north_m), 0.0, -math.inf, 0.0)
 """The flat ground as an obstacle for flying bodies."""
 

@@ -54,7 +54,8 @@ AMPDU_LIMITS: Final[dict[PhyFormat, AmpduLimits]] = {
     "VHT": AmpduLimits(64, 1_048_575),
     "HE": AmpduLimits(256, 4_194_303),
 }
-"""Largest exponents of the maximum A-MPDU length: 9.4.2.55.3, 9.4.2.157.2 and 9.4.2.248 (without its extension)."""
+"""Limits for the largest exponents of the A-MPDU length: 9.4.2.55.3, 9.4.2.157.2 and 9.4.2.248 (without its
+extension)."""
 
 
 @dataclass(eq=False, slots=True)
@@ -86,7 +87,8 @@ class BlockAckSession(Generic[Payload]):
     def __init__(self, limits: AmpduLimits) -> None:
         self._limits = limits
         self._next_sequence = 0
-        # The next sequence number that the recipient passes up; decoded frames after it; numbers that were given up.
+        # At the recipient: the next sequence number that it passes up, the decoded frames after this number, and the
+        # sequence numbers after it that the originator has given up.
         self._next_passed_up = 0
         self._frames_waiting: dict[int, Frame[Payload]] = {}
         self._skipped_sequences: set[int] = set()

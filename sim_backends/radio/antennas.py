@@ -105,7 +105,7 @@ def band_of(antennas: Mapping[str, Antenna]) -> Band:
     """Return the band of all stations; 2.4 GHz if there are none.
 
     Raises:
-        ConfigurationError: They have different bands.
+        ConfigurationError: The stations have different bands.
     """
     bands = {antenna.band.name: name for name, antenna in antennas.items()}
     if len(bands) > 1:

@@ -102,7 +102,7 @@ class PhyCapability:
 
     @property
     def band(self) -> Band:
-        """The band."""
+        """The band in which the station sends."""
         return BANDS[self.band_name]
 
     def supports(self, mode: WifiMode) -> bool:

@@ -82,8 +82,8 @@ class RadioOptions(Strict):
             sight. IEEE 802.11-03/940r4 (TGn channel models) has 6 dB for model F, large spaces indoors and outdoors.
         stir_m_s: Speed of moving objects around the robots (leaves, people), in m/s: a link between two robots at
             rest fades as if one moved at this speed. The TGn models have 1.2 km/h (0.33 m/s), the TGac models (IEEE
-            802.11-09/0308r12) have 0.089 km/h (0.025 m/s); 0.1 m/s lies between, and gives a coherence time of about
-            0.5 s.
+            802.11-09/0308r12) have 0.089 km/h (0.025 m/s). The default is between these values, and gives a coherence
+            time of about 0.5 s.
         noise_floor_dbm: Noise and interference at a receiver, in dBm. -95 dBm is thermal noise in 20 MHz (-101 dBm)
             and a noise figure of 6 dB.
         mode: Fixed transmission mode: `g6` to `g54` (Mbit/s), `a6` to `a54` above 2.4 GHz, `n0` to `n7` (MCS). If the

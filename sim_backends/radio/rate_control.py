@@ -69,14 +69,17 @@ class Minstrel(RateControl):
     """Sends in the mode with the highest throughput, falls back to others, and samples other modes occasionally.
 
     Each mode has an exponentially weighted mean of the share of acknowledged attempts: weight 75 % for the old value,
-    updated every 100 ms. A frame is sent first in the mode with the highest throughput, then in the second best, then
-    in the most robust (the fastest with at least 95 % success), and finally in the slowest. Each mode is tried as
-    often as fits into 6 ms, but at most twice if its success share is above 95 % or below 10 %. All attempts together
-    do not exceed the retry limit of the standard. A tenth of the frames are samples: a mode that is faster than the
-    best, or was not used for 20 updates, is tried before the best, at most four times per update if its share is
-    above 95 % or below 10 %. If there is no such mode, a slower mode replaces the second best, which costs nothing
-    while the best succeeds. This follows Linux's rc80211_minstrel.c (kernels 2.6.28 to 5.11) and the documentation of
-    mac80211's minstrel.
+    updated every 100 ms. A frame is sent first in the mode with the highest throughput, then in the second best mode,
+    then in the most robust mode, and finally in the slowest mode. The most robust mode has the highest throughput
+    among the modes with at least 95 % success. Each mode is tried as often as fits into 6 ms, but at most twice if
+    its success share is above 95 % or below 10 %. All attempts together do not exceed the retry limit of the
+    standard.
+
+    A tenth of the frames are samples. A sample is tried in another mode before the best mode. This mode is faster
+    than the best mode, or was not used for 20 updates. If its share is above 95 % or below 10 %, it is sampled at
+    most four times per update. If no mode meets these conditions, a random other mode replaces the second best mode,
+    and is used only if the best mode fails. This follows Linux's rc80211_minstrel.c (kernels 2.6.28 to 5.11) and the
+    documentation of mac80211's minstrel.
 
     The model differs in three ways. The initial shares are computed from the signal-to-noise ratio, as in drivers
     that start from RSSI. A random draw per frame, and not a counter, selects sampling frames and their modes, so that

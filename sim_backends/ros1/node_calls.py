@@ -58,7 +58,7 @@ def call(uri: str, method: str, *arguments: object) -> Any:  # noqa: ANN401 (a v
 
     Raises:
         OSError: The master or node cannot be reached.
-        MasterError: It refused the call, or its answer is not valid in ROS 1.
+        MasterError: The master or node refused the call, or its answer is not valid in ROS 1.
     """
     try:
         answer = getattr(ServerProxy(uri, transport=_TimedTransport()), method)(*arguments)

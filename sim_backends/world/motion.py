@@ -116,7 +116,9 @@ class WayPoints:
 
     def __init__(self, name: str, points_m: Sequence[Vector], speed_m_s: float) -> None:
         if not points_m or not speed_m_s > 0:
-            raise ValueError(f"not a path: {len(points_m)} points at {speed_m_s} m/s")
+            raise ValueError(
+                f"a path of {len(points_m)} points at {speed_m_s} m/s is invalid: use a point and a speed above 0"
+            )
         self.name = name
         self._speed_m_s = speed_m_s
         self._points_m = tuple(points_m)

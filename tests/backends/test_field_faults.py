@@ -95,12 +95,12 @@ def test_a_failed_move_is_reported_even_if_the_operator_does_not_bring_the_robot
     class Leaving(RecordingOperator):
         def ask(self, request: str, *, may_skip: bool = False) -> Answer:
             if request.startswith("bring"):
-                raise ConfigurationError(f"no answer left to: {request}")
+                raise ConfigurationError(f"there is no further answer for: {request}")
             return super().ask(request, may_skip=may_skip)
 
     with pytest.raises(ConfigurationError) as error_info, FieldTestbed(CAST, {}, Leaving()).moving(MOVE):
         raise RobotError("its wheel is blocked", remedy="y")
     assert error_info.value.what.startswith(
-        "no answer left to: bring turtlebot-1 back to its place; before, the move failed"
+        "there is no further answer for: bring turtlebot-1 back to its place; before that, the move failed"
     )
     assert "its wheel is blocked" in error_info.value.what

@@ -145,6 +145,22 @@ def test_error_in_a_procedure_has_line_and_suggestion(tmp_path: Path, old: str, 
     assert abs(line - line_of(PROCEDURE, old.splitlines()[0])) <= 1
 
 
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [
+        ("{near: sender, away: 1m, towards: 1m}", "a place has away or towards, not both"),
+        ("{near: sender}", "a place needs a distance: away, towards, left or right"),
+        ("{near: other, left: 1m}", "near must be one of: sender, receiver, relay"),
+    ],
+)
+def test_an_error_in_a_place_is_described_as_such(place: str, message: str) -> None:
+    text = PROCEDURE.replace("\nsteps:", f"\nplaces: {{other: {place}}}\nsteps:", 1)
+    with pytest.raises(ConfigurationError) as error_info:
+        schema.validate(schema.parse(text, source="los.yaml"), Procedure)
+    assert message in error_info.value.what
+    assert "segment" not in str(error_info.value)
+
+
 def test_bags_of_two_robots_need_different_names() -> None:
     other_recording = "\nsteps:\n  - record: {robot: relay, topics: [/scan], duration: 1s, name: NAME}"
     two_recordings = PROCEDURE.replace("\nsteps:", other_recording.replace("NAME", "theirs"), 1)
@@ -202,7 +218,7 @@ def test_a_value_that_is_not_a_number_is_named(old: str, new: str, message: str)
 def test_part_of_a_document_keeps_lines_and_path() -> None:
     document = schema.parse("a:\n  b:\n    robots: 1\n", source="x.yaml").part("a", "b")
     assert document.where(("robots",)) == "x.yaml:3"
-    with pytest.raises(ConfigurationError, match=r"in a\.b: "):
+    with pytest.raises(ConfigurationError, match=r"in a\.b\.robots: "):
         schema.validate(document, Site)
 
 

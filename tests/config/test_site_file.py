@@ -10,10 +10,13 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fieldkit.backends.registry import load_backend
 from fieldkit.config import profiles
+from fieldkit.config.robot_access import configured_backend
 from fieldkit.config.site import load_site
 from fieldkit.config.site_edits import _with_value, create_site_file, pin_host_key
 from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Role, Topology
 
 KEY = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIJcfoHM2b/TjeUycyd/kMkG5id0whvOnW10xYBLAo4SR"
 OTHER = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIEnG9vvsSAQ0YOb9EkhjAcC5JgnnZohCQzEpuN6gbFXp"
@@ -138,3 +141,21 @@ def test_a_site_file_is_never_overwritten(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="not overwritten"):
         create_site_file(path)
     assert path.read_text(encoding="utf-8") == "mine"
+
+
+@pytest.mark.parametrize("text", ["emulated: {physics: kinematic}\n", "backend: emulated\nros_master: relay\n"])
+def test_a_site_file_without_robots_has_the_default_robots_of_the_emulated_backend(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "fieldkit.yaml"
+    path.write_text(text, encoding="utf-8")
+    site, document = load_site(path)
+    assert site.backend == configured_backend(document) == "emulated"
+    cast = load_backend(site.backend, site, document).cast(Topology.MASTER)
+    assert {role: robot.name for role, robot in cast.items()} == {
+        Role.SENDER: "turtlebot-1",
+        Role.RECEIVER: "turtlebot-2",
+        Role.RELAY: "duckiedrone-1",
+    }
+    assert cast[Role.SENDER].ros_master == (cast[Role.RELAY].address if site.ros_master else "")
+    with pytest.raises(ConfigurationError, match="the field backend needs robots and roles") as error_info:
+        load_backend("field", site, document)
+    assert error_info.value.where == f"{path}:1"

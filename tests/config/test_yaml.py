@@ -131,6 +131,10 @@ def test_devices_and_folders_are_rejected(path: str) -> None:
     ("text", "location", "message"),
     [
         ("# lab\n\nbackend: field\n", "x:3", "required key 'robots' is missing"),
+        ("# lab\n\npatience: 5s\n", "x:3", "only the backend emulated has default robots and roles"),
+        ("backend: field\nemulated: {}\n", "x:1", "required key 'robots' is missing"),
+        ("emulated: {}\nroles: {}", "x:1", "required key 'robots' is missing"),
+        ("robots: {a: {profile: x}}", "x:1", "required key 'roles' is missing"),
         ("", "x:1", "keys with values are needed here, and there are none"),
         ("robots: {a: {profile: x, host: 10}}\nroles: {}", "x:1", "put it in quotes"),
         ("robots: {a: {profile: x, port: 1_0}}\nroles: {}", "x:1", "in digits only"),

@@ -58,7 +58,7 @@ def test_a_script_reads_a_line_only_after_its_request_was_reported() -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "message"), [("", "no answer left to: move a"), ("what", "'what' is not an answer")]
+    ("line", "message"), [("", "there is no further answer for: move a"), ("what", "'what' is not an answer")]
 )
 def test_an_error_of_a_script_names_its_line(line: str, message: str) -> None:
     script = Script(iter(["", line] if line else [""]), "answers.txt", lambda event: None)

@@ -171,7 +171,7 @@ def test_the_cost_of_a_bound_is_reported_with_the_fixed_windows_that_satisfy_it(
     )
     assert f"{factor:.3g} times as many; the longest windows of the single runs need" in report
     rejected_run = cosim(lab, "shootout", "pass.yaml", "--bound", "--set", "policy.bound_db=1")
-    assert (rejected_run.code, "bound_db limits the error of path loss" in rejected_run.err) == (2, True)
+    assert (rejected_run.code, "bound_db is a bound on the error of path loss" in rejected_run.err) == (2, True)
     rejected_run = cosim(lab, "shootout", "pass.yaml", "--bound", "--figure", "b.svg")
     assert (rejected_run.code, "has no figure" in rejected_run.err) == (2, True)
 
@@ -218,7 +218,7 @@ def test_a_policy_that_finds_no_window_is_reported_and_the_others_continue(lab: 
         (("--policy", "slidng_window"), "there is no sync policy 'slidng_window'", "did you mean 'sliding_window'?"),
         (("--window", "1"), "--window '1' has no unit", "1s or 1ms"),
         (("--window", "0ms"), "a window that is not above 0", "--window 1ms,10ms,100ms"),
-        (("--bias",), "--bias: one seed has no distribution", "add --seeds 20"),
+        (("--bias",), "--bias compares several seeds, but there is only one", "add --seeds 20"),
         (("--figure", "x.jpg"), "--figure: 'x.jpg' has no known format", ".svg, .pdf, .png"),
         (("--figure", "none/x.svg"), "none: there is no such folder", "mkdir -p none"),
     ],

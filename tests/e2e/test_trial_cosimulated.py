@@ -138,7 +138,6 @@ def test_a_robot_that_real_ros_drives_stops_at_the_wall(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("emulated", "reason"),
     [
-        ("{physics: gazebo, ros: builtin}", "fieldkit.yaml:7: an autopilot cannot fly the drone robot-2 in Gazebo"),
         (
             "{network: ns3, record_air: true}",
             "fieldkit.yaml:7: in emulated: the network ns3 does not support `record_air`",
@@ -154,11 +153,6 @@ def test_a_robot_that_real_ros_drives_stops_at_the_wall(tmp_path: Path) -> None:
 )
 def test_an_impossible_combination_is_rejected(emulated: str, reason: str, tmp_path: Path) -> None:
     make_site(tmp_path, emulated)
-    if "gazebo" in emulated:
-        site = (tmp_path / "fieldkit.yaml").read_text(encoding="utf-8")
-        (tmp_path / "fieldkit.yaml").write_text(
-            site.replace("robot-2: {profile: turtlebot3_burger}", "robot-2: {profile: iris}"), encoding="utf-8"
-        )
     run = run_here(tmp_path, "trial", "los", "30ft", "--topology", "masterless")
     assert run.code == 2
     assert reason in run.err

@@ -38,6 +38,7 @@ def children(since_s: float) -> set[int]:
 
 
 Alter = Callable[[bytes], bytes | None]
+"""Returns the frame that is sent in place of a frame, or None to send nothing."""
 
 HELLO = Hello(
     PHYSICS,

@@ -122,7 +122,7 @@ class Forwarder(Generic[Key]):
 
     Args:
         endpoints: For each key, a function that connects to the endpoint within a number of seconds, or raises
-        OSError.
+            OSError.
     """
 
     def __init__(self, endpoints: Mapping[Key, Connect]) -> None:

@@ -1,8 +1,8 @@
 /* A server with the services and topics of Gazebo Fortress, for tests: DART moves the models of an SDF file.
  *
- * It follows the loop of Fortress (ign-gazebo6, SimulationRunner): The control service answers before the request is
- * executed, as do the services that create and remove models; the clock of a step is published before the step is
- * made; poses are limited to a rate in wall time; a request without `pause` starts the world; and a reset sets the
+ * It follows the loop of Fortress (ign-gazebo6, SimulationRunner). The services that control the world and that create
+ * and remove models answer before the request is executed. The clock of a step is published before the step is made.
+ * Poses are published at a limited rate in wall time. A request without `pause` starts the world. A reset sets the
  * time to 0 without moving the models. DART clears commands to joints after each step. Unlike Fortress, a world that
  * has been paused for some time iterates less often until the next request, so that an idle server uses almost no
  * processor time.

@@ -9,7 +9,9 @@ from pymavlink.dialects.v20 import common as d
 
 from sim_backends.emulated.autopilot.autopilot import Autopilot
 from sim_backends.emulated.autopilot.firmware import Firmware
+from sim_backends.emulated.autopilot.flight import MakeAirframe
 from sim_backends.emulated.autopilot.mavlink_frames import Message
+from sim_backends.emulated.autopilot.mission_plan import degrees_e7
 from sim_backends.emulated.autopilot.parameters import FlightLimits, Parameters
 from sim_backends.emulated.autopilot.px4 import PX4
 from sim_backends.physics.ground import Ground
@@ -20,6 +22,7 @@ SYSTEM: Final = 7
 LIMITS: Final = FlightLimits(speed_m_s=3.0, height_m=30.0, fence_m=100.0)
 TICK_NS: Final = 20_000_000
 HOME_M: Final = (120.0, -40.0, 0.0)
+RELATIVE: Final = d.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT
 
 
 class GroundStation:
@@ -31,6 +34,7 @@ class GroundStation:
         world: World that it flies in; None for open flat ground.
         firmware: Family of the autopilot.
         boot_s: Its boot time.
+        make_airframe: Creates its airframe; None for an airframe that the autopilot itself moves.
     """
 
     def __init__(
@@ -39,7 +43,9 @@ class GroundStation:
         limits: FlightLimits = LIMITS,
         world: World | None = None,
         firmware: Firmware = PX4,
+        *,
         boot_s: float = 0.0,
+        make_airframe: MakeAirframe | None = None,
     ) -> None:
         obstacles = Ground(world, None).obstacles
         self.autopilot = Autopilot(
@@ -50,6 +56,7 @@ class GroundStation:
             obstacles=obstacles,
             now_ns=0,
             boot_s=boot_s,
+            make_airframe=make_airframe,
         )
         self.autopilot.vehicle.place(HOME_M, math.pi / 2, 0)
         self._ardupilot = firmware.is_ardupilot
@@ -70,13 +77,17 @@ class GroundStation:
             return []
         return self._receive(frame for _, frame in self.autopilot.receive(datagram, ("gcs", 1), self.now_ns))
 
-    def wait(self, seconds: float) -> list[Message]:
-        """Advance the time, with heartbeats; return the received messages."""
+    def advance_world(self) -> None:
+        """Advance the world to the current time; the default world has nothing that moves."""
+
+    def wait(self, seconds: float, *, heartbeats: bool = True) -> list[Message]:
+        """Advance the time; return the received messages."""
         received, until_ns = [], self.now_ns + round(seconds * 1e9)
         while self.now_ns < until_ns:
-            if self.now_ns % 1_000_000_000 == 0:
+            if heartbeats and self.now_ns % 1_000_000_000 == 0:
                 self.send_message(d.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
             self.now_ns += TICK_NS
+            self.advance_world()
             received += self._receive(frame for _, frame in self.autopilot.advance(self.now_ns))
         return received
 
@@ -117,3 +128,21 @@ class GroundStation:
         ]
         self.received += received
         return received
+
+
+def item(number: int, east_m: float, north_m: float, up_m: float, command: int = d.MAV_CMD_NAV_WAYPOINT) -> Message:
+    """Return an item of a mission, at a position relative to `HOME_M`."""
+    x, y = degrees_e7(HOME_M[0] + east_m, HOME_M[1] + north_m)
+    return d.MAVLink_mission_item_int_message(SYSTEM, 1, number, RELATIVE, command, 0, 1, 0, 0, 0, 0, x, y, up_m)
+
+
+def upload(gcs: GroundStation, items: list[Message]) -> int:
+    """Upload items, repeating messages without an answer; return the result."""
+    message = d.MAVLink_mission_count_message(SYSTEM, 1, len(items))
+    for _ in range(200):
+        for answer in gcs.send_message(message) + gcs.wait(0.3):
+            if answer.get_type() == "MISSION_ACK":
+                return int(answer.type)
+            if answer.get_type() == "MISSION_REQUEST_INT":
+                message = items[answer.seq]
+    raise AssertionError("the upload did not end")

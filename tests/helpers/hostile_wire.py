@@ -1,9 +1,9 @@
-"""A malicious host on the cable: `python -m tests.helpers.hostile_wire ATTACK ARGUMENT...`.
+"""A malicious host on the network of other hosts: `python -m tests.helpers.hostile_wire ATTACK ARGUMENT...`.
 
 `rtps COUNT` captures messages of other hosts and sends them again with changes. `heartbeat` sends one message in the
 name of the writer of a stream; it states that the oldest sample of the writer has a very high sequence number.
 `tcpros MASTER HOST:PORT...` connects to nodes and sends data that is not valid TCPROS, and registers publishers that
-do the same. The program prints `done` at its end.
+do the same. The program reports its progress on standard error, and `done` at its end.
 """
 
 import itertools
@@ -27,6 +27,7 @@ _ETH_P_ALL: Final = 0x0003
 """All protocols, including packets sent by this host."""
 _UDP: Final = 17
 _SEEDS: Final = 40
+"""Number of captured messages, which are changed and sent again."""
 _HEADER_BYTES: Final = 20
 """Size of an RTPS header: protocol, version, vendor and GUID prefix."""
 _DATA, _HEARTBEAT, _LITTLE_ENDIAN = 0x15, 0x07, 0x01
@@ -34,6 +35,7 @@ _SEQUENCE_AHEAD: Final = 1 << 40
 _MAX_BYTES: Final = 60_000
 _BAD_PUBLISHERS: Final = 8
 _CONNECTIONS: Final = 15
+"""Number of connections to each node."""
 
 Datagram = tuple[tuple[str, int], bytes]
 

@@ -58,7 +58,7 @@ class _ProcessWatch:
 
     def _end_processes(self) -> None:
         deadline_s = time.monotonic() + self._config.getoption("--end-within")
-        # The tracker process of multiprocessing lives as long as the process that started it.
+        # The tracker process of multiprocessing runs as long as the process that started it.
         resource_tracker._resource_tracker._stop()  # type: ignore[attr-defined]
         while remaining := self._running():
             if time.monotonic() >= deadline_s:

@@ -117,7 +117,18 @@ class Segment:
 
 @dataclass(frozen=True)
 class TcpTruth:
-    """A TCP transfer: both captures, and the correct results of their analysis."""
+    """A TCP transfer: both captures, and the correct results of their analysis.
+
+    Attributes:
+        sender: Frames of the sender's capture.
+        receiver: Frames of the receiver's capture.
+        sent_bytes: Payload of all sent segments, retransmissions included.
+        received_bytes: Payload of the sent segments that arrived, retransmissions included.
+        retransmitted: Number of sent frames whose first segment had been sent before.
+        spurious: Number of sent frames whose segments had all arrived in earlier copies.
+        reordered: Number of received frames whose first segment arrived after a segment that was sent later.
+        duplicated_bytes: Payload of arrivals beyond the first of each segment.
+    """
 
     sender: list[Frame]
     receiver: list[Frame]

@@ -43,11 +43,12 @@ def tables(outcomes: Sequence[MotionOutcome], observed_on: str) -> str:
     for craft, title in _TITLES.items():
         rows = list(_rows(craft, outcomes))
         if rows:
-            ground = " on the ground, bound | median | max |" if craft.flies else ""
+            ground = " on the ground: bound (s) | median (s) | max (s) |" if craft.flies else ""
             start_column = "descends" if craft.flies else "stationary"
             lines += ["", f"### {title}", ""]
             lines.append(
-                f"| party | fault | detected by | robot | {start_column}, bound | median | max |{ground} n | beyond |"
+                f"| party | fault | detected by | reaction "
+                f"| {start_column}: bound (s) | median (s) | max (s) |{ground} trials | beyond |"
             )
             lines.append("| --- " * (12 if craft.flies else 9) + "|")
             lines += rows

@@ -19,7 +19,9 @@ AHEAD_NS = 3600 * SECOND_NS
 SENDER, RECEIVER = (robot.address for robot in list(CAST.values())[:2])
 PACKETS = 40
 LOST = (3, 4, 17)
+"""Numbers of the packets that do not arrive."""
 REPEATED = 8
+"""Number of the packet that arrives twice."""
 RTT_MS = (4.5, 3.25, 12.0)
 
 PING_HEAD = f"PING {RECEIVER} ({RECEIVER}) 8192(8220) bytes of data."

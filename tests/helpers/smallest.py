@@ -91,7 +91,7 @@ def _few_losses(module: ModuleType, folder: Path) -> None:
     replace(module, "RANDOM_LOSSES", {"2 % of data": (0.02, 0.0, 1.0)})
 
 
-def _stand_in_iw(module: ModuleType, folder: Path) -> None:
+def _failing_iw(module: ModuleType, folder: Path) -> None:
     """Provide a program `iw` that fails, for `telemetry` on machines without `iw`."""
     del module
     script = folder / "iw"
@@ -305,7 +305,7 @@ CASES: Final[Mapping[str, MinimalRun]] = {
     "swarm": MinimalRun("--sizes 2 --seconds 1", {"PINGS": 5}, shrink=_small_swarm, emulated=True),
     "tcp_vs_kernel": MinimalRun("--runs 2 --seconds 1 --together 1 --loss 1% --delay 5ms", emulated=True),
     "tcp_vs_ns3": MinimalRun("", {"SECONDS": 1.0, "SEEDS": 2}, shrink=_few_losses),
-    "telemetry": MinimalRun("--seconds 0.5", {"SLOWER": (1,)}, shrink=_stand_in_iw),
+    "telemetry": MinimalRun("--seconds 0.5", {"SLOWER": (1,)}, shrink=_failing_iw),
     "topics": MinimalRun("--rounds 1", {"PLAIN": {"zenoh": ("plain", "attached")}, "STREAM_S": 1.0, "BURST_S": 0.1}),
     "trial_overhead": MinimalRun("--rounds 1 --record 1s --round-trips 0s", emulated=True),
     "sweep": MinimalRun("--rounds 1 --seeds 1 --tasks 8 --duration 100ms", {"COUNTS": (1,), "PROCESSES": 1}),

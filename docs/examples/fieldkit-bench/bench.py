@@ -80,6 +80,6 @@ class BenchTestbed:
                 link.sendall(f"ATT {loss_db:.1f}\n".encode())
         except OSError as error:
             raise LinkError(
-                f"the attenuator does not answer: {error}", where=self._attenuator, remedy="is it switched on?"
+                f"the attenuator does not answer: {error}", where=self._attenuator, remedy="check that it is on"
             ) from error
         return DONE

@@ -46,7 +46,7 @@ class FlightDialect(Protocol):
         estimate_message: Id of the message with the flags of the position estimate.
         limit_parameters: Names of the parameters with the limits of the autopilot; `|` separates alternative names of
             one parameter.
-        checks_current_mode: Whether the arming checks of the autopilot apply to its current mode.
+        checks_current_mode: Whether the result of the autopilot's arming checks depends on its current mode.
     """
 
     name: str

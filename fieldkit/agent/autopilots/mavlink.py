@@ -53,7 +53,7 @@ class FlightRecording:
     Attributes:
         connection: Name of the connection to the autopilot; see `mavlink_links.open_link`.
         intervals_us: Requested interval by message id, which is a string because keys of JSON objects are strings.
-        system: System id of the autopilot; 0 for the first one whose heartbeat arrives.
+        system: System id of the autopilot; 0 for the autopilot whose heartbeat arrives first.
     """
 
     connection: str

@@ -16,7 +16,7 @@ class FlightLink(Protocol):
         """The requested messages, by id."""
 
     def fileno(self) -> int:
-        """Return a file descriptor that is readable when frames have arrived. It never changes."""
+        """Return a file descriptor that is readable when frames have arrived. A reconnection does not change it."""
 
     def receive(self) -> Iterator[bytes]:
         """Yield the frames that have arrived; bytes outside frames are ignored."""

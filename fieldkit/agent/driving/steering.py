@@ -75,7 +75,7 @@ class Driver:
         phase: `waits` until the robot is stationary and ordered to start; `returns` while it first drives to its
             origin; then `out` on its path, `there` at its end, `back` on the path back, and `home` at its
             origin.
-        driven_m: Distance since the start of `out`.
+        driven_m: Distance driven since the start of `out`; before `out`, since the first pose.
         refused: Whether the robot did not start because it is not at the required place.
     """
 
@@ -117,7 +117,7 @@ class Driver:
 
     @property
     def ready(self) -> bool:
-        """Whether the robot is stationary at a place where it may start."""
+        """Whether the robot is stationary at a place where it may start; valid only before it starts."""
         return self._origin is not None and self._pose is not None and not self.is_finished and self._is_still
 
     @property
@@ -136,7 +136,7 @@ class Driver:
 
     @property
     def remaining_m(self) -> float:
-        """Distance to the end of the current path: the origin when the robot drives back, else the last corner."""
+        """Distance to the origin in the phases `back` and `home`, otherwise to the last corner of the path."""
         relative_pose, goal = self.relative_pose, self._corners[0 if self.phase in ("back", "home") else -1]
         return (
             math.inf

@@ -121,7 +121,10 @@ class ArmingCheck:
 
     @property
     def is_starting(self) -> bool:
-        """Whether the position estimate is not ready yet. It is ready about 30 s after power-on."""
+        """Whether the position estimate or the required home position is not ready yet.
+
+        Both are ready about 30 s after power-on.
+        """
         reports_no_estimate = any(_NO_ESTIMATE in text for text in self._drone.texts.warnings)
         return self._drone.dialect is not None and (reports_no_estimate or any(self._position_faults()))
 
@@ -221,7 +224,9 @@ class ArmingCheck:
 
 
 def check_arming(connection: str, needs: FlightNeeds, stop_event: threading.Event) -> int:
-    """Check an autopilot; print one JSON object per fault, and one with its family and charge; return the exit code.
+    """Check an autopilot, print the result as JSON, and return the exit code.
+
+    Each line is a JSON object: one per fault, then the summary with the family and the charge of the autopilot.
 
     Raises:
         OSError: The connection cannot be opened.

@@ -1,10 +1,11 @@
 """Fly a drone for a trial by set-points (target positions), and land it if the flight is aborted.
 
-The laptop writes orders to a file. Each order has a lease, the number of seconds for which it is valid. The drone
-lands or returns, as its plan requires, if an order is not renewed in time because the laptop or its link is lost, if
-a signal cancels the job, or if the guard, a second program on the drone (`flying.guard`), stops. The guard lands the
-drone if this program stops. If set-points are missing, the autopilot itself reacts: PX4 has a failsafe
-(COM_OF_LOSS_T, COM_OBL_RC_ACT); ArduCopter holds its position.
+The laptop writes orders to a file. Each order has a lease, the number of seconds for which it is valid. This program
+is the pilot. A second program on the drone, the guard (`flying.guard`), lands the drone if the pilot stops.
+
+The pilot lands the drone, or lets it return and land as its plan requires, in three cases: an order is not renewed in
+time because the laptop or its link is lost, a signal cancels the job, or the guard stops. If set-points are missing,
+the autopilot reacts: PX4 has a failsafe (COM_OF_LOSS_T, COM_OBL_RC_ACT); ArduCopter holds its position.
 """
 
 from __future__ import annotations
@@ -280,7 +281,7 @@ class OffboardPilot:
         )
 
     def _start_phase(self, phase: str) -> None:
-        """Start a phase of the flight: set it for the log file and write it to the log."""
+        """Start a phase of the flight: set it for the lines of the flight log, and report it by `log_line`."""
         self._log.phase = phase
         log_line(phase)
 

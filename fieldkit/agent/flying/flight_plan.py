@@ -68,7 +68,7 @@ class FlightPlan:
         origin: Values of the `FlightOrigin` of the trial; None at the first start, which becomes the origin.
         log: The log file of positions; empty to write none.
         liveness: The file that pilot and guard share (`LivenessFile`); empty if only one of them runs.
-        landing_marker: A file that exists while the program lands a drone, so that the program is not killed.
+        landing_marker: A file that exists while the program lands a drone. Meanwhile, fieldkit does not kill it.
     """
 
     connection: str

@@ -17,8 +17,9 @@ from fieldkit.agent.autopilots.px4 import Px4
 from fieldkit.agent.flying.session import AutopilotSession
 
 LEASE_EXPIRED, REFUSED, TAKEN_OVER, CANCELLED, PEER_STOPPED, FENCE_BREACHED = 4, 5, 6, 7, 8, 9
-"""Exit codes: the lease expired; the autopilot refused a command or did not answer; a person or another program flies
-the drone; the job was cancelled; the other program of the flight stopped; the drone was outside its fence."""
+"""Exit codes: the lease expired (4); the autopilot refused a command or did not answer (5); a person or another
+program flies the drone (6); the job was cancelled (7); the guard has stopped, or in the guard: the pilot has stopped
+(8); the drone was outside its fence (9)."""
 
 RETRY_S = 0.4
 """Retry interval of a command without an answer."""
@@ -26,7 +27,7 @@ COMMAND_TIMEOUT_S = 5.0
 """Time within which an autopilot must execute a command."""
 _POLL_S = 0.1
 _MODE_WAIT_S = 0.3
-"""Maximum wait for a heartbeat before the first command, because the last one may be older than a takeover by a
+"""Maximum wait for a heartbeat before the first command, because the last heartbeat may be older than a takeover by a
 person."""
 _LANDING_TIMEOUT_S = 600.0
 """Maximum time between the first command to come down and the stop of the motors."""
@@ -58,9 +59,9 @@ def bring_down(
     If the drone does not obey the command `return`, it is commanded to land.
 
     Commands are sent only while `may_command` returns True: in the modes in which fieldkit controls the drone. The
-    first command waits for a new heartbeat, because the mode may have changed since the last one. A drone that lands
-    or returns automatically is only monitored. An autopilot without heartbeats may still receive commands, and the
-    connection may be restored: for `NO_HEARTBEAT_S` its last reported mode is assumed, and commands are sent. A
+    first command waits for a new heartbeat, because the mode may have changed since the last heartbeat. A drone that
+    lands or returns automatically is only monitored. An autopilot without heartbeats may still receive commands, and
+    the connection may be restored: for `NO_HEARTBEAT_S` its last reported mode is assumed, and commands are sent. A
     missing heartbeat causes an alarm in the log.
 
     Args:

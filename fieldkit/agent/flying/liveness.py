@@ -62,6 +62,8 @@ def entries(content: bytes) -> tuple[LifeEntry, LifeEntry]:
 class LivenessFile:
     """The file that the pilot and the guard of a drone share.
 
+    The *other* program is the guard if this object is used by the pilot, and the pilot if it is used by the guard.
+
     Args:
         path: The file; it is created if it is missing.
         own_index: Index of the entry of this program: `PILOT` or `GUARD`.

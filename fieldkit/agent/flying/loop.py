@@ -148,7 +148,7 @@ class FlightLoop:
         Args:
             send_command: Sends the command.
             is_done: Returns True if the command is executed.
-            what: The command as the object of "the autopilot refuses", for the error message.
+            what: The command as the object of "the autopilot refuses", for the error message: `the take-off`.
             set_point: Returns the next set-point; None for no set-points.
 
         Raises:

@@ -114,7 +114,7 @@ class SharedLink:
             self._stop_event.wait(0.01)
 
     def fileno(self) -> int:
-        """Return a file descriptor that is readable when frames have arrived. It never changes."""
+        """Return a file descriptor that is readable when frames have arrived. A reconnection does not change it."""
         return self._frames_out.fileno()
 
     def receive(self) -> Iterator[bytes]:
@@ -264,7 +264,7 @@ class SharedLink:
         return server
 
     def _start(self) -> None:
-        """Start a server; return when it or another server is ready."""
+        """Start a server, unless the connection has a server; return when it is ready or has failed."""
         request = json.dumps({"connection": self._connection})
         path = os.pathsep.join(filter(None, (_ROOT, os.environ.get("PYTHONPATH", ""))))
         completed = subprocess.run(

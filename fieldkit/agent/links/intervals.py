@@ -63,7 +63,10 @@ class MessageInterval:
 
     @property
     def interval_us(self) -> int:
-        """The smallest positive interval that a client requests; without one `_OFF` if requested, else `DEFAULT`."""
+        """The interval for all clients: the smallest positive interval that a client requests.
+
+        If no client requests a positive interval, it is `_OFF` if a client requests this, otherwise `DEFAULT`.
+        """
         positive_us = [interval_us for interval_us in self.requested_us.values() if interval_us > 0]
         if positive_us:
             return min(positive_us)

@@ -310,7 +310,9 @@ class LinkServer:
 
 
 def serve(connection: str, stop_event: threading.Event) -> None:
-    """Start a server in a separate process; return when this or another server of the connection is ready.
+    """Start a server in a separate process, and return when it is ready or has failed.
+
+    If the connection already has a server, do nothing.
 
     Raises:
         OSError: The folder of sockets cannot be used.

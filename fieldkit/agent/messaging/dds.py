@@ -1,8 +1,8 @@
 """DDS with the Python binding of CycloneDDS, the package `cyclonedds`. Only this module imports it.
 
-Samples are passed through as bytes: the binding writes and takes serialized data (`_clayer`) in 2 us, whereas its
-serializer needs 30 us and more. The library still needs a type, which is built member by member; other
-participants receive only its name.
+Samples are passed through as bytes: the binding writes and takes serialized data (`_clayer`) in 2 us, but its
+serializer needs 30 us or more. The library also needs the type of a topic, which is built member by member; other
+participants receive only the name of the type.
 """
 
 from __future__ import annotations
@@ -176,10 +176,10 @@ def unpadded(data: bytes) -> bytes:
 def hide_type_description(topic: DdsTopic) -> Any:  # noqa: ANN401 (ctypes declares no type for it)
     """Let discovery announce only the name of a topic's type; must be called before endpoints are created.
 
-    CycloneDDS 11.0 cannot read the type descriptions of Fast DDS 3 (ROS 2 Kilted), and endpoints do not match if both
-    announce descriptions and these differ. The binding has no option for this, so the three functions that return the
-    description are removed from the type's table of functions (`struct ddsi_sertype_ops`), if it has the expected
-    layout.
+    CycloneDDS 11.0 cannot read the type descriptions of Fast DDS 3 (ROS 2 Kilted), and two endpoints that announce
+    different descriptions do not match. The binding has no option to omit descriptions. Therefore, the three
+    functions that return the description are removed from the type's table of functions (`struct ddsi_sertype_ops`),
+    if the table has the expected layout.
 
     Returns:
         The table, which must not be freed before the topic; None if nothing was changed.

@@ -81,7 +81,7 @@ class Ros2Middleware:
         # With a separate context rclpy installs no signal handlers.
         self._context = Context()
         try:
-            # Without this, each run leaves a file in the robot's ~/.ros/log.
+            # Without the second argument, each run leaves a file in the robot's ~/.ros/log.
             rclpy.init(args=["--ros-args", "--disable-external-lib-logs"], context=self._context)
             self._node = rclpy.create_node(
                 network.node,

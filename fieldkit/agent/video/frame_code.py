@@ -1,8 +1,9 @@
 """Frames of a synthetic camera, whose pixels contain the number of the frame and the time at which it was taken.
 
-The upper part of a frame has 16 x 8 cells, black or white, which survive lossy compression. They are bits, row by
-row, the most significant first: number (32 bits), time in nanoseconds since 1970 UTC (64), CRC-32 of both. The lower
-part is random, because it determines the size of the compressed frame.
+The upper part of a frame has 16 x 8 cells, black or white, which remain readable after lossy compression. Each cell
+is a bit. Row by row, with the most significant bit first, they contain the number (32 bits), the time in nanoseconds
+since 1970 UTC (64 bits), and the CRC-32 of both. The lower part is random, because it determines the size of the
+compressed frame.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ def add(parser: Parser) -> None:
     parser.description = (
         "List the clock of every robot of the site file: its offset from this machine's clock, the program that sets "
         "it with its time source, and a remedy for each problem. Report pairs of robots whose programs contradict "
-        "the measured offsets. Changes nothing. Exit code 3 if a robot was not reached, 1 if there is another "
+        "the measured offsets. It changes nothing. Exit code 3 if a robot was not reached, 1 if there is another "
         "problem."
     )
     shared.add_site(parser)

@@ -57,7 +57,7 @@ def write_completions(parser: Parser) -> None:
 
 
 def _declare_command(parser: Parser) -> None:
-    """Declare the arguments of the command in the shell's line, which argcomplete needs before it parses."""
+    """Declare the arguments of the command in the shell's line before argcomplete parses the line."""
     words = os.environ["COMP_LINE"].split()
     command = parser.command(words[1]) if len(words) > 1 else None
     if command is not None:

@@ -82,7 +82,7 @@ def _robot(name: str, path: Path) -> "tuple[SiteRobot, str]":
         raise ConfigurationError(
             f"there is no robot {name!r}",
             where=str(path),
-            remedy=did_you_mean(name, site.robots, f"the robots are: {', '.join(site.robots)}"),
+            remedy=did_you_mean(name, site.robots, f"the robots are: {', '.join(site.robots) or 'none'}"),
         )
     where = document.where(("robots", name))
     if site.robots[name].host is None:

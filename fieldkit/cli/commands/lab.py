@@ -34,8 +34,8 @@ def add(parser: Parser) -> None:
         help="start the robots of the site file, or N equal robots",
         description="Start every robot of the site file, with any roles and backend, or N equal robots with "
         "--robots, and return when all can be reached. They are placed in a square in the middle of the world, at "
-        "most 5 m apart, and communicate directly with each other; radio, world and ROS are those of the site file's "
-        "`emulated`. SSH does not use the radio: `control: radio` is ignored, with a note. No program listens on the "
+        "most 5 m apart, and communicate directly with each other; `emulated` in the site file sets radio, world and "
+        "ROS. SSH does not use the radio: `control: radio` is ignored, with a note. No program listens on the "
         "network of this machine; the files that other programs need to reach the robots are in a folder of this "
         "user, in memory if there is /run/user. The lab exists as long as its process.",
     )
@@ -57,8 +57,8 @@ def add(parser: Parser) -> None:
     action = actions.add_parser(
         "shell",
         help="log in on a robot, or run a command there as ssh does",
-        description="Log in on a robot, or run COMMAND there as ssh does: its words are joined for the robot's "
-        "shell, and its exit code is that of fieldkit.",
+        description="Log in on a robot, or run COMMAND there as ssh does: the words are joined for the robot's "
+        "shell, and fieldkit returns the exit code of COMMAND.",
     )
     action.add_argument("robot", metavar="ROBOT", help="name of the robot")
     action.add_argument("command", nargs=argparse.REMAINDER, metavar="COMMAND", help="command for its shell")

@@ -53,7 +53,7 @@ def _list_or_show(kind: locations.Kind, summary: Callable[[str], str], name: str
     """List all files of `kind`, or show the file called `name`."""
     if name is None:
         rows = [(item, str(path), summary(item)) for item, path in locations.names(kind).items()]
-        print_table(("name", "file", "summary"), rows)  # only the last column is folded, so paths are not
+        print_table(("name", "file", "summary"), rows)  # only the last column is folded, so paths stay on one line
     else:
         summary(name)  # raises if the file has an error
         print_text(locations.find(kind, name).read_text(encoding="utf-8"), end="")

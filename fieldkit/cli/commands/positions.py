@@ -35,7 +35,10 @@ def add(parser: Parser) -> None:
         help="time to add to the times of the files: 0.3s, -2s (default: 0s)",
     )
     parser.add_argument(
-        "--gap", metavar="TIME", default="3s", help="positions are unknown in longer gaps (default: 3s)"
+        "--gap",
+        metavar="TIME",
+        default="3s",
+        help="if two positions are farther apart in time, positions between them are unknown (default: 3s)",
     )
     parser.add_argument("--heights", action="store_true", help="also use heights above the ellipsoid")
     parser.add_argument("--clear", action="store_true", help="remove the stored files")

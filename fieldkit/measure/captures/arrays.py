@@ -226,7 +226,8 @@ class Chunk:
 
     Attributes:
         frames: The frames.
-        damage: Position and kind of the damage after the frames. This chunk is then the last one. None if undamaged.
+        damage: Position and kind of the damage after the frames; the chunk is then the last chunk of the file. None
+            without damage.
     """
 
     frames: Frames

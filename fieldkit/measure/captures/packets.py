@@ -57,7 +57,7 @@ NO_ECHO: Final = -1
 """Identifier of a packet that is not an ICMP echo, or was truncated before it."""
 
 ECHO_REPLY: Final = 1 << 16
-"""Added to the identifier of an ICMP echo reply."""
+"""Added to the identifier of an ICMP echo reply, to distinguish it from a request."""
 
 NOT_CAPTURED: Final = -1
 """Content hash of a packet that was truncated before `CONTENT_BYTES` of content."""
@@ -230,8 +230,10 @@ def _time_stamps(integers: Integers, tcp: Mask, transport: Ints, end: Ints) -> I
     # Keep only the packets whose options begin with the time stamp.
     is_aligned[is_aligned] = integers.u32(transport[is_aligned] + 20) == _ALIGNED_STAMP
     stamps[is_aligned] = integers.u32(transport[is_aligned] + 24)
-    others = np.flatnonzero(tcp & ~is_aligned & (transport + 30 <= end))
-    return np.where(is_aligned, stamps, _option(integers, others, transport, end, _STAMP_OPTION, missing=NO_STAMP))
+    unaligned_rows = np.flatnonzero(tcp & ~is_aligned & (transport + 30 <= end))
+    return np.where(
+        is_aligned, stamps, _option(integers, unaligned_rows, transport, end, _STAMP_OPTION, missing=NO_STAMP)
+    )
 
 
 def _option(integers: Integers, rows: Ints, transport: Ints, end: Ints, option: int, *, missing: int) -> Ints:

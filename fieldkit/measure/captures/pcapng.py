@@ -144,8 +144,8 @@ def _next_definition(section: _Section, data: Buffer, at: int) -> tuple[_Section
     """Read a section header or an interface description at `at`.
 
     Returns:
-        The new section, or the current one with the interface added, and the end of the block. None if the block at
-        `at` has another type, is incomplete or is invalid.
+        The new section, or the current section with the interface added; and the position after the block. None if
+        the block at `at` has another type, is incomplete or is invalid.
     """
     order = section.order
     kind = bytes(data[at : at + 4])

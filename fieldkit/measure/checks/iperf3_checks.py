@@ -175,8 +175,8 @@ def _datagram_bytes(test: IperfTest, payload_bytes: int) -> Iterator[str]:
     received_bytes = _sum(test.intervals, "payload_bytes")
     if datagrams is None or lost is None or received_bytes is None:
         return
-    extra = received_bytes - (datagrams - lost) * payload_bytes
-    if not 0 <= extra <= test.totals.out_of_order * payload_bytes:
+    duplicate_bytes = received_bytes - (datagrams - lost) * payload_bytes
+    if not 0 <= duplicate_bytes <= test.totals.out_of_order * payload_bytes:
         datagrams_text = f"{datagrams} datagrams of {payload_bytes} bytes with {lost} lost"
         yield f"it received {received_bytes} bytes, but counts {datagrams_text}"
 

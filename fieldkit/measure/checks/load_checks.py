@@ -25,7 +25,8 @@ from fieldkit.measure.transfers.tcp_streams import LONGEST_BYTES
 
 EARLY_NS: Final = 300_000_000
 LATE_NS: Final = 500_000_000
-"""Largest differences between times in the JSON and in the capture; iperf3 reads late on a busy robot."""
+"""Tolerances of times: a time in the JSON may be up to `EARLY_NS` earlier or `LATE_NS` later than in the capture,
+because iperf3 reads late on a busy robot."""
 
 _BUFFERED_BYTES: Final = 256 << 10
 _BUFFERED_WINDOWS: Final = 3

@@ -28,8 +28,8 @@ class PingCaptures:
     Attributes:
         file: Name of the file with the output of ping, for messages.
         sender: Role of the robot that sends the requests.
-        by_role: Capture of the sender and then of the receiver; None if a robot did not capture, or if its capture is
-            incomplete.
+        by_role: Captures by role, first the sender's and then the receiver's; None if a robot did not capture, or if
+            its capture is incomplete.
         source: Source address of the requests.
         destination: Their destination address.
     """
@@ -87,7 +87,7 @@ class PingCaptures:
                 return
 
     def _contradictions(self, result: Ping, interval_s: float) -> Iterator[str]:
-        """Yield the contradictions with each capture.
+        """Yield the contradictions between the output and each capture.
 
         If several pings ran, the ping with the fewest contradictions is assumed to be this one.
         """

@@ -1,8 +1,8 @@
 """Contradictions within the output of ping, and between the output and captures.
 
-On a busy machine with 2 cores, the round-trip times printed by iputils' ping minus the captured ones were -0.03 to
-0.9 ms, and their median was below 0.1 ms. iputils reads the arrival time of a reply from the kernel. busybox reads
-the clock when its process resumes.
+On a busy machine with 2 cores, a round-trip time printed by iputils' ping minus the captured time was between -0.03
+and 0.9 ms. The median of these differences was below 0.1 ms. iputils reads the arrival time of a reply from the
+kernel. busybox reads the clock when its process resumes.
 """
 
 from collections.abc import Iterator, Mapping
@@ -86,7 +86,7 @@ def _complete_ns(packets: Packets, first: Packets, size_bytes: int) -> Ints:
 
 
 def _earliest_by_number(numbers: Ints, times_ns: Ints) -> dict[int, int]:
-    """Return the earliest time of each number."""
+    """Return the earliest time of each sequence number."""
     # The latest times are first, because a dictionary keeps the last value of a key.
     order = np.argsort(-times_ns, kind="stable")
     return dict(zip(numbers[order].tolist(), times_ns[order].tolist(), strict=True))
@@ -95,17 +95,17 @@ def _earliest_by_number(numbers: Ints, times_ns: Ints) -> dict[int, int]:
 _ROUNDING: Final = 0.006
 """Relative rounding error of a round-trip time: ping prints three digits."""
 _MAX_EARLIER_S: Final = 0.000_2
-"""Maximum of a captured time minus the printed one."""
+"""Maximum of a captured time minus the printed time."""
 _MAX_LATER_S: Final = 0.020
-"""Maximum of a printed round-trip time minus the captured one: the process of ping may be delayed."""
+"""Maximum of a printed round-trip time minus the captured time: the process of ping may be delayed."""
 _MAX_MEDIAN_LATER_S: Final = 0.001
-"""Maximum of the median of printed round-trip times minus the captured ones."""
+"""Maximum median of the differences between printed and captured round-trip times."""
 _BUSYBOX_FACTOR: Final = 5
 """Factor by which the limits are larger for busybox's ping, which may print later."""
 _MAX_PRINT_DELAY_S: Final = 1.0
 """Maximum of the time stamp of a printed line minus the captured time of the reply."""
 _MAX_MEDIAN_PRINT_DELAY_S: Final = 0.05
-"""Maximum of the median of time stamps minus captured times."""
+"""Maximum median of the differences between time stamps of printed lines and captured times of the replies."""
 _MAX_SEQUENCE: Final = 0xFFFF
 """Largest ICMP sequence number; the numbers of a longer ping wrap."""
 _WAIT_SHARE: Final = 0.9

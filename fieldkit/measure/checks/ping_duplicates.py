@@ -99,7 +99,10 @@ def echoes_by_interface(
     if sender.are_fragmented or receiver.are_fragmented:
         return "the requests are fragmented"
     if any((echoes.interface == NO_INTERFACE).any() for echoes in (*sender, *receiver)):
-        return "a capture does not contain interfaces: ping over a link with the interface lo, and use tcpdump 4.99"
+        return (
+            "a capture does not contain the interface of each packet: ping over a link with the interface lo, and "
+            "use tcpdump 4.99 or later"
+        )
     return sender, receiver
 
 

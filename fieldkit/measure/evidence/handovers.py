@@ -114,7 +114,7 @@ def find_handovers(samples: Sequence[LinkSample]) -> list[Handover]:
 
 
 def count_ping_pongs(handovers: Sequence[Handover], within_s: float) -> int:
-    """Return the number of handovers back to an access point within `within_s` after the robot had left it."""
+    """Return the number of handovers back to an access point within `within_s` after the handover away from it."""
     return sum(
         later.new == earlier.old and later.joined_ns - earlier.joined_ns <= within_s * 1e9
         for earlier, later in pairwise(handovers)

@@ -108,8 +108,8 @@ class IperfInterval:
         datagrams: UDP datagrams; at the receiver, the datagrams that it expected.
         lost: Expected datagrams that the receiver did not receive.
         retransmits: Retransmitted segments.
-        start_s: Start in seconds; None if the JSON does not contain it.
-        end_s: End in seconds; None if the JSON does not contain it.
+        start_s: Start in seconds after the start of the test; None if the JSON does not contain it.
+        end_s: End in seconds after the start of the test; None if the JSON does not contain it.
         stream_bytes: Sum of the payloads of the streams; None without streams.
         rate_bit_s: Payload bits per second as printed by iperf3.
     """

@@ -77,13 +77,13 @@ def read(path: Path) -> Mapping[Role, Sequence[LinkSample]]:
 
 
 def _parse_row(match: re.Match[str]) -> tuple[Role, LinkSample]:
-    utc_ns, role, noise, active, busy, station, signal, *others = match.groups()
-    numbers = [None if count is None else int(count) for count in others[:6]]
-    # The rates and counts are in the order of the attributes of `StationSample`.
+    utc_ns, role, noise, active, busy, station, signal, *numbers_and_cell = match.groups()
+    # The numbers are rates and counts, in the order of the attributes of `StationSample`.
+    numbers = [None if number is None else int(number) for number in numbers_and_cell[:6]]
     peer = StationSample(station, _parse_dbm(signal), *numbers) if station else None
     radio = LinkSample(
         int(utc_ns),
-        cell=others[6] if len(others) > 6 else None,
+        cell=numbers_and_cell[6] if len(numbers_and_cell) > 6 else None,
         noise_dbm=_parse_dbm(noise),
         active_ns=None if active is None else int(active),
         busy_ns=None if busy is None else int(busy),

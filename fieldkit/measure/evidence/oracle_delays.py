@@ -76,7 +76,7 @@ _LATENESS_TEXT: Final = re.compile(
 
 
 def lateness_text(before: Lateness, after: Lateness) -> str:
-    """Return the file text for the packets that were counted between `before` and `after`."""
+    """Return the file text for the packets and windows that were counted between `before` and `after`."""
     lines = _histogram_lines("late", before.packets, after.packets)
     text = "".join((f"bound {after.bound_ns} lines {len(lines)}\n", *lines))
     if after.windows is None:
@@ -128,7 +128,7 @@ def late_packet_count(lateness: Lateness) -> int:
 
 
 def measure_lateness(lateness: Lateness | None) -> Measured:
-    """Return the columns; `lateness` is None for real radios, or if the testbed cannot measure it."""
+    """Return `LATENESS_COLUMNS`; `lateness` is None for real radios, or if the testbed cannot measure it."""
     if lateness is None:
         return Measured.all_missing(LATENESS_COLUMNS, "the radios are real")
     late_ns = {share: lateness_quantile_ns(lateness.packets, share) for share in (0.99, 1.0)}
@@ -141,7 +141,7 @@ def measure_lateness(lateness: Lateness | None) -> Measured:
 
 
 def measure_window_lateness(lateness: Lateness | None) -> Measured:
-    """Return the columns; they have no values unless the testbed is a co-simulation."""
+    """Return `WINDOW_COLUMNS`, which have no values unless the testbed is a co-simulation."""
     if lateness is None or lateness.windows is None:
         return Measured.all_missing(WINDOW_COLUMNS, "the robots do not run on a co-simulation")
     late_ns = {share: lateness_quantile_ns(lateness.windows, share) for share in (0.99, 1.0)}
@@ -245,7 +245,7 @@ def air_delay_text(before: DelayParts, after: DelayParts) -> str:
 
 
 def measure_air_delay(parts: DelayParts | None) -> Measured:
-    """Return the columns (means over the packets); `parts` is None if the testbed cannot measure the delay."""
+    """Return `AIR_DELAY_COLUMNS`, means over the packets; `parts` is None if the testbed cannot measure the delay."""
     if parts is None:
         return Measured.all_missing(AIR_DELAY_COLUMNS, "the testbed cannot measure the delay on the air")
     scale = 1e9 * parts.packets
@@ -263,7 +263,7 @@ def measure_air_delay(parts: DelayParts | None) -> Measured:
 
 
 def measure_policy_delay(parts: DelayParts | None) -> Measured:
-    """Return the column, a mean over the packets; it has no value unless the testbed is a co-simulation."""
+    """Return `POLICY_COLUMNS`, a mean over the packets, which has no value unless the testbed is a co-simulation."""
     if parts is None or parts.policy_ns is None:
         return Measured.all_missing(POLICY_COLUMNS, "the robots do not run on a co-simulation")
     value = parts.policy_ns / 1e9 / parts.packets if parts.packets else None

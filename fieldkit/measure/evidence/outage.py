@@ -3,7 +3,7 @@
 The observer is the robot at the other end of the link, which pings the robot with the fault. If a process is killed,
 the observer is the robot itself, which polls the process; a poll that finds the process running counts as an answer.
 
-All times are of the observer's clock, and the resolution is the interval of pings or polls: if two consecutive
+All times are by the observer's clock, and the resolution is the interval of pings or polls: if two consecutive
 answers are a time G apart, the outage lasted at most G, and at least G minus two intervals.
 
 The cause of a fault is the injected action, such as a link that is taken down; its duration is recorded in a note

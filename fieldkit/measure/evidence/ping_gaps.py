@@ -64,10 +64,10 @@ class AnswerGap:
 
 
 def longest_gap(output: Ping, interval_s: float) -> AnswerGap | None:
-    """Return the longest time between two answers with no answered request between them; None without time stamps.
+    """Return the longest time between two answers with no answered request between them.
 
     A gap in which ping started or ended is open. It is returned if it is at least as long as the longest gap between
-    two answers, or at least `MIN_OPEN_GAP_S` long.
+    two answers, or at least `MIN_OPEN_GAP_S` long. Return None if too few answers have a time stamp.
 
     Args:
         output: Output of ping.

@@ -41,7 +41,7 @@ MAX_CPU_S: Final = 3600
 # limit is larger than the CPU time, because other processes may use the CPU.
 _WALL_PER_CPU_S: Final = 6
 _EXIT_WAIT_S: Final = 5.0
-"""Time within which a process that has closed its output must exit; then it is killed."""
+"""Time within which a process that has closed its output must exit; otherwise it is killed."""
 ERROR_KEY: Final = "unanswered"
 """Key of the error message in the answer to a query that failed."""
 _TIMED_OUT: Final = -signal.SIGXCPU
@@ -114,7 +114,8 @@ class SandboxedReader:
         except TimeoutError:
             self._kill(process)
             return {}, _TIMED_OUT
-        except BaseException:  # after Ctrl-C, the next query would otherwise read this answer
+        except BaseException:  # for example KeyboardInterrupt
+            # Otherwise the next query would read the answer to this query.
             self._kill(process)
             raise
         if len(line) > max_bytes:

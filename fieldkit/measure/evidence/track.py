@@ -88,7 +88,7 @@ def _vector(values: Sequence[float | None]) -> Vector | None:
 
 
 def distances_m(track: Sequence[TrackPoint], source: Role, destination: Role) -> Iterator[tuple[int, float | None]]:
-    """Yield the time in ns and the distance between two robots for each entry of either robot."""
+    """Yield the time in ns and the distance between two robots (None if unknown) for each entry of either robot."""
     for utc_ns, sender, receiver in _joint_states(track, source, destination):
         yield utc_ns, _distance_m(sender, receiver)
 

@@ -27,7 +27,7 @@ _GPX_READER: Final = SandboxedReader("fieldkit.measure.positions.gpx_reader")
 
 
 def read_file(path: Path) -> Samples:
-    """Return the samples in a GPX or CSV file, with the times in the file. The file name's suffix gives the format.
+    """Return the samples in a GPX or CSV file, with the file's times unchanged. The name's suffix gives the format.
 
     Raises:
         EvidenceError: The file has another suffix or is invalid.

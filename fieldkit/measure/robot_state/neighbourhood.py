@@ -1,4 +1,4 @@
-"""Channel of a robot's radio before and after an attempt, and other networks and other users' airtime on this channel.
+"""Channel of a robot's radio before and after an attempt, with other networks and airtime of others on this channel.
 
 `iw dev INTERFACE scan freq MHZ passive` lists the networks that the radio receives on its channel (scan.c of iw),
 without sending packets. A network with the state `associated` or `joined`, or with the address of the radio, is the
@@ -91,7 +91,7 @@ class RadioState:
     Attributes:
         channel: Channel of the radio.
         country: Regulatory domain: two-letter country code, or `00` (world).
-        signals_dbm: Received power of each network of others on the channel; None for a power that is not reported.
+        signals_dbm: Received power of each other network on the channel; None for a power that is not reported.
         others_share: Share of the airtime in which the channel was busy, minus the radio's transmissions.
     """
 
@@ -134,12 +134,12 @@ def _channel(info: str) -> WifiChannel | None:
 
 
 def _signals(scan: str, channel: WifiChannel, own_address: str) -> tuple[float | None, ...]:
-    """Return the received power of each network of others that was received on a channel."""
+    """Return the received power of each other network that was received on a channel."""
     parts = _NETWORK.split(scan)
     signals: dict[str, float | None] = {}
     for address, state, body in zip(parts[1::3], parts[2::3], parts[3::3], strict=True):
-        frequency, signal, seen = (pattern.search(body) for pattern in (_FREQUENCY, _SIGNAL, _LAST_SEEN))
-        is_stale = seen is not None and int(seen[1]) >= _STALE_MS
+        frequency, signal, last_seen = (pattern.search(body) for pattern in (_FREQUENCY, _SIGNAL, _LAST_SEEN))
+        is_stale = last_seen is not None and int(last_seen[1]) >= _STALE_MS
         if state or address == own_address or is_stale or frequency is None:
             continue
         if channel.overlaps(float(frequency[1])):
@@ -168,7 +168,10 @@ def _times_ms(survey: str) -> Mapping[str, int] | None:
 
 
 def measure(role: Role, states: Sequence[RadioState]) -> Measured:
-    """Return the columns of one robot's channel and its other users. Each number is the largest of several states."""
+    """Return the columns of one robot's channel and of its other users.
+
+    Each number is the largest value in the states.
+    """
     channels = list(dict.fromkeys(str(state.channel) for state in states if state.channel))
     countries = list(dict.fromkeys(state.country for state in states if state.country))
     counts = [len(state.signals_dbm) for state in states if state.signals_dbm is not None]

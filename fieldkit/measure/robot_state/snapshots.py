@@ -21,7 +21,8 @@ _CODE: Final = re.compile(r" code ([0-9]{1,3})", re.ASCII)
 _FAILURES: Final = {None: "was interrupted", 137: "did not answer in time", 153: "printed too much"}
 """Failure by exit code. 137 and 153 are 128 plus SIGKILL and SIGXFSZ."""
 _NOT_EXECUTABLE: Final = (126, 127)
-"""Exit codes of a program that cannot be started. 126 occurs because BusyBox finds files that are not executable."""
+"""Exit codes of a program that cannot be started. 126 occurs because `command -v` of BusyBox also finds files that
+are not executable."""
 MAX_SOURCES: Final = 50
 """Maximum number of sources in a snapshot; further sources are ignored."""
 

@@ -30,7 +30,7 @@ _DUPLICATE_NS: Final = 1_000_000
 
 
 def header_problem(packets: Packets) -> str | None:
-    """Return the reason if a capture contains altered packets; None if all checksums of IPv4 headers are correct."""
+    """Return a description of the altered packets, or None if all checksums of IPv4 headers are correct."""
     if not (wrong := int(packets.wrong_checksum.sum())):
         return None
     return (
@@ -156,7 +156,7 @@ def _were_sent(sent: Packets, received: Packets) -> Mask:
     # Offload cuts and joins frames, but does not change their time stamps and the range of sequence numbers.
     sent_stamps, received_stamps = usable_stamps(sent, received)
     base = np.zeros(1 << 16, dtype=np.int64)
-    # If an index occurs several times, numpy stores the last value, which is the earliest one in reversed order.
+    # If an index occurs several times, numpy stores the last value: the first frame, because the order is reversed.
     base[sent.sport[::-1]] = sent.tcp_seq[::-1]
     has_syn = np.zeros(1 << 16, dtype=np.bool_)
     has_syn[sent.sport[sent.tcp_flags & SYN != 0]] = True

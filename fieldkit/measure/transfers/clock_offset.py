@@ -111,9 +111,10 @@ def estimate(forward: StampPairs, reverse: StampPairs) -> Clocks | None:
     """Return the offset between the clocks, or None if no line fits all packets because a clock was set.
 
     The estimated skew maximizes the shortest round-trip time, computed without the fastest packet of each direction.
-    If both directions have undelayed packets at the start and at the end, any other skew gives a shorter time. Of
-    equally good skews, the smallest one is used. If the range of possible skews is wider than `QUARTZ_SKEW`, the
-    smallest possible skew is used. The offset is the middle of the range that is possible with this skew.
+    If both directions have undelayed packets at the start and at the end, any other skew gives a shorter time. If
+    several skews are equally good, the one closest to 0 is used. If the range of possible skews is wider than
+    `QUARTZ_SKEW`, the possible skew closest to 0 is used. The offset is the middle of the range that is possible with
+    this skew.
 
     Args:
         forward: Packets from sender to receiver; at least one. Each frame may be in one pair only.
@@ -124,7 +125,7 @@ def estimate(forward: StampPairs, reverse: StampPairs) -> Clocks | None:
     base_ns = int(forward.receiver_ns[0] - forward.sender_ns[0])
     above, below = (_points(pairs, middle_ns, base_ns) for pairs in (forward, reverse))
     # A ceiling is the lower hull of the offset's upper bounds. A floor is the lower hull of the negated lower bounds.
-    # The first of each contains all packets; each of the others omits one packet.
+    # The first hull of each list contains all packets; each later hull omits one packet.
     ceilings, floors = _Hull.of_all_but_one(*above), _Hull.of_all_but_one(below[0], -below[1])
     ceiling, floor = ceilings[0], floors[0]
     if _polygon(ceiling, floor) is None:

@@ -126,7 +126,7 @@ def tcp_pair_indices(frames: tcp.TcpFrames) -> tuple[Ints, Ints]:
     """
     sent_pieces, received_pieces, matched = frames.payload.sent, frames.payload.received, frames.payload.match
     is_certain = matched.arrived & ~matched.ambiguous & _is_last_piece(sent_pieces)
-    # Of these pieces, keep those that match the last piece of a received frame.
+    # Keep only the pieces that match the last piece of a received frame.
     is_certain[is_certain] = _is_last_piece(received_pieces)[matched.received_index[is_certain]]
     return sent_pieces.frame[is_certain], received_pieces.frame[matched.received_index[is_certain]]
 
@@ -226,7 +226,7 @@ def clocks_between(sender: Packets, receiver: Packets, sender_address: str, rece
 
 
 def _delays_s(pairs: StampPairs, clocks: Clocks) -> tuple[Floats, float]:
-    """Return delays and their maximum error in seconds, as `packet_delays` does."""
+    """Return the one-way delay of each pair and the maximum error that the clocks cause, in seconds."""
     return clocks.delays_s(pairs.sender_ns, pairs.receiver_ns), clocks.error_s(pairs.receiver_ns) + STAMP_S
 
 

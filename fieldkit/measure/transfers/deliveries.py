@@ -83,13 +83,13 @@ class StreamDeliveries:
     min_stall_s: float
 
 
-def udp_stream_deliveries(packets: UdpPackets, in_stream: Mask, expected: FlowSchedule) -> StreamDeliveries:
+def udp_stream_deliveries(packets: UdpPackets, in_stream: Mask, schedule: FlowSchedule) -> StreamDeliveries:
     """Return the deliveries of datagrams.
 
     Args:
         packets: UDP packets of both captures.
         in_stream: Mask of the sent datagrams that belong to the stream. Shape (k,).
-        expected: Known properties of the stream.
+        schedule: Known properties of the stream.
 
     Raises:
         EvidenceError: The deliveries cannot be determined from the captures.
@@ -106,7 +106,7 @@ def udp_stream_deliveries(packets: UdpPackets, in_stream: Mask, expected: FlowSc
     at_ns = np.sort(complete_ns[complete_ns != NO_TIME])
     index = np.flatnonzero(stream_packets & matched.arrived)
     pairs = StampPairs(packets.sent.time_ns[index], packets.received.time_ns[matched.received_index[index]])
-    return stream_deliveries(at_ns, (int(sent_ns.min()), int(sent_ns.min()), int(sent_ns.max())), pairs, expected)
+    return stream_deliveries(at_ns, (int(sent_ns.min()), int(sent_ns.min()), int(sent_ns.max())), pairs, schedule)
 
 
 def arrivals_ns(packets: UdpPackets) -> Ints:
@@ -117,13 +117,13 @@ def arrivals_ns(packets: UdpPackets) -> Ints:
     return np.where(udp.complete(packets)[:-1], last_ns, NO_TIME)
 
 
-def tcp_stream_deliveries(frames: TcpFrames, answers: Packets, expected: FlowSchedule) -> StreamDeliveries:
+def tcp_stream_deliveries(frames: TcpFrames, answers: Packets, schedule: FlowSchedule) -> StreamDeliveries:
     """Return the deliveries of one TCP connection in one direction.
 
     Args:
         frames: Frames of the connection in both captures.
         answers: Packets of the other direction in the sender's capture.
-        expected: Known properties of the connection.
+        schedule: Known properties of the connection.
 
     Raises:
         EvidenceError: The deliveries cannot be determined from the captures.
@@ -132,30 +132,30 @@ def tcp_stream_deliveries(frames: TcpFrames, answers: Packets, expected: FlowSch
     _require_times(sent.time_ns, received.time_ns)
     advancing, received_contiguous = advancing_frames(received)
     _, sent_contiguous = advancing_frames(sent)
-    has_payload = received_contiguous > expected.head_bytes
+    has_payload = received_contiguous > schedule.head_bytes
     # Two processors may have captured two packets in the wrong order.
     at_ns = np.maximum.accumulate(received.time_ns[advancing])[has_payload]
     delivered_bytes, sent_bytes = (
         int(contiguous_bytes[-1]) if len(contiguous_bytes) else 0
         for contiguous_bytes in (received_contiguous, sent_contiguous)
     )
-    is_complete = delivered_bytes >= max(sent_bytes, expected.size_bytes or 0, expected.head_bytes + 1)
-    data = sent.tcp_payload_bytes > expected.head_bytes
+    is_complete = delivered_bytes >= max(sent_bytes, schedule.size_bytes or 0, schedule.head_bytes + 1)
+    data = sent.tcp_payload_bytes > schedule.head_bytes
     first_ns = int(sent.time_ns.min())
     data_ns = int(sent.time_ns[data].min()) if data.any() else first_ns
     last_ns = max(int(sent.time_ns[sent.tcp_payload_bytes > 0].max(initial=first_ns)), _last_syn_ns(sent, first_ns))
     sent_index, received_index = delay.tcp_pair_indices(frames)
     pairs = StampPairs(sent.time_ns[sent_index], received.time_ns[received_index])
-    stream = stream_deliveries(at_ns, (first_ns, data_ns, last_ns), pairs, expected, rtt_s=_rtt_s(sent, answers))
-    if expected.duration_s is not None or not len(at_ns):
+    stream = stream_deliveries(at_ns, (first_ns, data_ns, last_ns), pairs, schedule, rtt_s=_rtt_s(sent, answers))
+    if schedule.duration_s is not None or not len(at_ns):
         return stream
     if is_complete:
         return replace(stream, end_ns=None)
     # A receiver of a known number of bytes waits for the missing bytes until it is terminated.
     return (
         stream
-        if expected.size_bytes is None or expected.receiver_end_ns is None
-        else replace(stream, end_ns=expected.receiver_end_ns)
+        if schedule.size_bytes is None or schedule.receiver_end_ns is None
+        else replace(stream, end_ns=schedule.receiver_end_ns)
     )
 
 
@@ -188,7 +188,7 @@ def advancing_frames(frames: Packets) -> tuple[Ints, Ints]:
 
 
 def stream_deliveries(
-    at_ns: Ints, sent_ns: tuple[int, int, int], pairs: StampPairs, expected: FlowSchedule, *, rtt_s: float = 0.0
+    at_ns: Ints, sent_ns: tuple[int, int, int], pairs: StampPairs, schedule: FlowSchedule, *, rtt_s: float = 0.0
 ) -> StreamDeliveries:
     """Return the deliveries of a stream.
 
@@ -198,20 +198,20 @@ def stream_deliveries(
         at_ns: Times at which new payload of the stream arrived, ascending.
         sent_ns: Times at which the sender sent the first packet, the first payload and the last payload.
         pairs: Packets of the stream that are in both captures.
-        expected: Known properties of the stream.
+        schedule: Known properties of the stream.
         rtt_s: Round-trip time if the stream retransmits lost data, otherwise 0.
     """
-    min_stall_s = max(MIN_STALL_S, _MIN_RTTS * rtt_s, _MIN_INTERVALS * expected.interval_s)
+    min_stall_s = max(MIN_STALL_S, _MIN_RTTS * rtt_s, _MIN_INTERVALS * schedule.interval_s)
     first_ns, data_ns, last_ns = sent_ns
-    if expected.duration_s is not None:
-        last_ns = data_ns + round(1e9 * expected.duration_s)
+    if schedule.duration_s is not None:
+        last_ns = data_ns + round(1e9 * schedule.duration_s)
     if not len(at_ns):
-        return StreamDeliveries(at_ns, first_ns, last_ns, expected.interval_s, min_stall_s)
+        return StreamDeliveries(at_ns, first_ns, last_ns, schedule.interval_s, min_stall_s)
     start_offset_ns, end_offset_ns = _sender_to_receiver_ns(pairs)
     end_ns = last_ns + end_offset_ns
-    if expected.duration_s is not None and expected.receiver_end_ns is not None:
-        end_ns = min(end_ns, expected.receiver_end_ns)
-    return StreamDeliveries(at_ns, first_ns + start_offset_ns, end_ns, expected.interval_s, min_stall_s)
+    if schedule.duration_s is not None and schedule.receiver_end_ns is not None:
+        end_ns = min(end_ns, schedule.receiver_end_ns)
+    return StreamDeliveries(at_ns, first_ns + start_offset_ns, end_ns, schedule.interval_s, min_stall_s)
 
 
 def _sender_to_receiver_ns(pairs: StampPairs) -> tuple[int, int]:
@@ -244,6 +244,6 @@ def _rtt_s(sent: Packets, answers: Packets) -> float:
     """Return the round-trip time of the handshake at the sender, or 0 if the handshake was not captured."""
     acknowledged_ns = answers.time_ns[answers.tcp_flags & ACK != 0]
     syn_ns = sent.time_ns[sent.tcp_flags & SYN != 0]
-    if not len(acknowledged_ns) or not (before := syn_ns[syn_ns <= acknowledged_ns[0]]).size:
+    if not len(acknowledged_ns) or not (earlier_syn_ns := syn_ns[syn_ns <= acknowledged_ns[0]]).size:
         return 0.0
-    return float(acknowledged_ns[0] - before[-1]) / 1e9
+    return float(acknowledged_ns[0] - earlier_syn_ns[-1]) / 1e9

@@ -103,7 +103,7 @@ def _loss(flow: LoadFlow, sent: list[Packets], received: list[Packets]) -> float
 
 
 def _rate(flow: LoadFlow, received: list[Packets]) -> float | None:
-    """Return the rate of received payload, each byte once; None if it cannot be computed."""
+    """Return the rate of received payload, in which each byte is counted once; None if it cannot be computed."""
     is_udp = flow.protocol is Protocol.UDP
     data = [packets if is_udp else packets.where(packets.tcp_payload_bytes > COOKIE_BYTES) for packets in received]
     times_ns: Ints = np.concatenate([packets.time_ns for packets in data]) if data else np.array([], dtype=np.int64)
@@ -178,7 +178,7 @@ class LoadStreams:
         payload_bytes: Payload of a UDP datagram.
         ports: Sender's and receiver's port of each stream as reported by iperf3. If empty, they are determined from
             the packets.
-        expected: Known properties of each stream.
+        schedule: Known properties of each stream.
     """
 
     protocol: Protocol
@@ -189,7 +189,7 @@ class LoadStreams:
     count: int
     payload_bytes: int
     ports: tuple[tuple[int, int], ...]
-    expected: FlowSchedule
+    schedule: FlowSchedule
 
     def forward(self, packets: Packets) -> Packets:
         """Return the packets of the load's protocol from sender to receiver, with any ports."""
@@ -259,7 +259,7 @@ def read_deliveries(load: LoadStreams, sender: Packets | None, receiver: Packets
     if load.protocol is Protocol.UDP:
         packets = _udp_packets(load, sender, receiver)
         masks = load.datagram_masks(packets.sent.where(packets.first))
-        return [deliveries.udp_stream_deliveries(packets, mask, load.expected) for mask in masks]
+        return [deliveries.udp_stream_deliveries(packets, mask, load.schedule) for mask in masks]
     sent, received, reverse = load.forward(sender), load.forward(receiver), load.backward(sender)
     return [
         deliveries.tcp_stream_deliveries(
@@ -270,7 +270,7 @@ def read_deliveries(load: LoadStreams, sender: Packets | None, receiver: Packets
                 )
             ),
             reverse.where((reverse.sport == destination_port) & (reverse.dport == source_port)),
-            load.expected,
+            load.schedule,
         )
         for source_port, destination_port in load.stream_ports(sent)
     ]

@@ -42,9 +42,9 @@ class Match:
         sent_index: Index of the sent packet that each received packet is a copy of; `NONE` if the sender's capture
             has no such packet. Shape (m,).
         duplicates: Mask of received packets that are further copies of a packet that had arrived. Shape (m,).
-        ambiguous: Mask of sent packets that cannot be distinguished: others are equal and were sent at nearly the
-            same time, so the order of their arrival is unknown. They are matched in the order of sending; the number
-            that arrived is the number sent or the number received, whichever is smaller. Shape (n,).
+        ambiguous: Mask of sent packets that cannot be distinguished from other packets: these are equal and were sent
+            at nearly the same time, so the order of arrival is unknown. Such packets are matched in the order of
+            sending. The number of arrived packets is the number sent or received, whichever is smaller. Shape (n,).
         possible_copy: Mask of received packets that are counted as arrived, but may be copies of another packet,
             because packets with the same key arrived at shorter intervals than they were sent. Shape (m,).
     """
@@ -101,11 +101,11 @@ def match(sent: Packets, received: Packets) -> Match:
         (payload.sent, payload.received, frames.received_index, payload.match.received_index),
         (payload.received, payload.sent, frames.sent_index, payload.match.sent_index),
     ):
-        # A frame takes the match of its first piece; the index `NONE` (-1) selects the appended `NONE`.
+        # The match of a frame is that of its first piece; the index `NONE` (-1) selects the appended `NONE`.
         frame, first = np.unique(from_pieces.frame, return_index=True)
         index[frame] = np.append(to_pieces.frame, NONE)[piece_index[first]]
     frames.ambiguous[payload.sent.frame[payload.match.ambiguous]] = True
-    # A frame is a duplicate unless one of its pieces is not.
+    # A frame is a duplicate if all of its pieces are duplicates.
     frames.duplicates[payload.received.frame] = True
     frames.duplicates[payload.received.frame[~payload.match.duplicates]] = False
     return frames

@@ -166,15 +166,17 @@ def find_recovery(stream: StreamDeliveries, began_ns: int, ended_ns: int | None)
     last_ns = int(at_ns[-1]) if stream.end_ns is None else max(stream.end_ns, int(at_ns[-1]))
     if last_ns <= began_ns:
         raise EvidenceError("the flow ended before the fault")
-    before, after = (int(np.searchsorted(at_ns, time_ns, side="right")) for time_ns in (began_ns, cause_end_ns))
-    has_recovered = after < len(at_ns)
+    count_before, first_after = (
+        int(np.searchsorted(at_ns, time_ns, side="right")) for time_ns in (began_ns, cause_end_ns)
+    )
+    has_recovered = first_after < len(at_ns)
     if not has_recovered and stream.end_ns is None:
         raise EvidenceError("all payload of the flow arrived before the end of the cause")
     # From the last delivery before the fault to the first one after the end of the cause.
-    longest_gap_s = float(np.diff(at_ns[max(before - 1, 0) : after + 1]).max(initial=0)) / 1e9
-    before_first_s = 0.0 if before else (int(at_ns[0]) - stream.begin_ns) / 1e9
+    longest_gap_s = float(np.diff(at_ns[max(count_before - 1, 0) : first_after + 1]).max(initial=0)) / 1e9
+    before_first_s = 0.0 if count_before else (int(at_ns[0]) - stream.begin_ns) / 1e9
     after_last_s = 0.0 if has_recovered else (last_ns - int(at_ns[-1])) / 1e9
-    recovery_ns = int(at_ns[after]) - cause_end_ns if has_recovered else last_ns - cause_end_ns
+    recovery_ns = int(at_ns[first_after]) - cause_end_ns if has_recovered else last_ns - cause_end_ns
     is_observed = ended_ns is not None and (has_recovered or recovery_ns > 0)
     return FaultRecovery(
         outage_s=max(longest_gap_s, before_first_s, after_last_s),
@@ -217,7 +219,7 @@ def measure(
     recoveries_s = [stream.recovery_s for stream in streams if stream.recovery_s is not None]
     if recoveries_s and len(recoveries_s) == len(streams):
         values[_column_name(recovery, any(stream.recovery_open for stream in streams))] = max(recoveries_s)
-    reason = "the end of the cause is unknown, or the value is in the other column of the pair"
+    reason = "the end of the cause is unknown, or the value is in the other column of the pair *_s and *_at_least_s"
     return Measured(values, {column.name: reason for column in declared_columns if column.name not in values})
 
 

@@ -137,7 +137,7 @@ def measure(flow: str, deliveries: Callable[[], Sequence[StreamDeliveries]]) -> 
         flow: Prefix of the columns' names; see `declare_columns`.
         deliveries: Function that returns the deliveries of each stream; raises `EvidenceError` if they are unknown.
     """
-    declared_columns = declare_columns(flow, flow, 0)  # only the names are used, so any label and rank will do
+    declared_columns = declare_columns(flow, flow, 0)  # only the names are used, so label and rank have no effect
     try:
         streams = [find_stalls(stream) for stream in deliveries()]
     except EvidenceError as error:

@@ -42,7 +42,7 @@ class TcpCounts:
         frames_received: Frames in the receiver's capture. Offload may change the number of frames.
         sent_bytes: Sent payload bytes, including retransmissions.
         unique_bytes: Sent payload bytes; each sequence number is counted once.
-        received_bytes: Sent payload bytes that arrived; copies that were not sent are not counted.
+        received_bytes: Sent payload bytes that arrived; copies that the network created are not counted.
         lost_bytes: Unique bytes that never reached the receiver.
         duplicated_bytes: Received payload bytes without the first copy of each sequence number.
         retransmitted_frames: Frames with bytes that had been sent before.
@@ -131,14 +131,14 @@ def count(frames: TcpFrames) -> TcpCounts:
     )
 
 
-def _is_repeated(pieces: Pieces, others: Pieces) -> Mask:
-    """Return a mask of the pieces that are in a later frame than the first piece of `others` with the same bytes."""
+def _is_repeated(pieces: Pieces, originals: Pieces) -> Mask:
+    """Return a mask of the pieces whose bytes are in `originals` in an earlier frame."""
     earliest = np.full(
-        max(pieces.range_id.max(initial=-1), others.range_id.max(initial=-1)) + 1, np.iinfo(np.int64).max
+        max(pieces.range_id.max(initial=-1), originals.range_id.max(initial=-1)) + 1, np.iinfo(np.int64).max
     )
     # If an index occurs several times, numpy stores the last value: the earliest frame, because the order is
     # reversed.
-    earliest[others.range_id[::-1]] = others.frame[::-1]
+    earliest[originals.range_id[::-1]] = originals.frame[::-1]
     mask: Mask = pieces.frame > earliest[pieces.range_id]
     return mask
 

@@ -44,7 +44,7 @@ def paper_frames_to(packets: Packets, address: str, port: int) -> int:
 
 
 def paper_transfer_s(packets: int, delay_s: float) -> float:
-    """Return the paper's transfer time: number of packets times the mean RTT of pings with the window as payload."""
+    """Return the paper's transfer time: number of packets times the mean RTT of pings with `PAPER_WINDOW_BYTES`."""
     return packets * delay_s
 
 
@@ -182,7 +182,7 @@ def _layers(
             stall_columns = stalls.measure("transfer", lambda: stalls.tcp_deliveries(frames, reverse, schedule))
         ambiguous = bool(counts.get("ip_packets_doubtful") or counts.get("tcp_doubtful_segments"))
         delays = delay.measure(pairs, sender.packets, receiver.packets, transfer, sent=sent or 0, ambiguous=ambiguous)
-    except EvidenceError as error:  # the captures cannot be evaluated, as if they were damaged
+    except EvidenceError as error:  # captures that cannot be evaluated are treated like damaged captures
         return Measured.all_missing(all_columns, error.what)
     rate_values = transfer_rates.values(files.values.get("received_bytes"))
     if delays.values.get("one_way_withheld") == delay.UNSTEADY:

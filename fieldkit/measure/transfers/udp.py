@@ -11,14 +11,15 @@ from fieldkit.measure.transfers.match import Match, match, reordered
 from fieldkit.measure.transfers.transfer_spec import Transfer, span_s
 
 NO_DATAGRAM: Final = -1
-"""Datagram index of a fragment without a first fragment."""
+"""Datagram index of a fragment whose first fragment was not captured."""
 
 
 def datagrams(packets: Packets) -> tuple[Ints, Ints]:
     """Return the index of the first packet of each datagram, and the datagram index of each packet.
 
-    A later fragment belongs to the nearest earlier first fragment with the same addresses and id. If there is none,
-    it belongs to the nearest later one. If there is none either, its datagram is `NO_DATAGRAM`.
+    A later fragment belongs to the datagram of the nearest first fragment before it with the same addresses and id.
+    If all such first fragments are after it, it belongs to the nearest of them. If there are none, its datagram is
+    `NO_DATAGRAM`.
     """
     is_fragment = packets.more_fragments | (packets.fragment_offset > 0)
     # An unfragmented packet has no other fragments, even if another packet has the same id.

@@ -42,7 +42,8 @@ class DrivePlan:
     Attributes:
         legs: The path from the robot's position.
         speed_m_s: The speed.
-        window: The robot's clock before and after the attempt, nanoseconds since 1970 UTC; None if unknown.
+        window: Readings of the robot's clock before and after the attempt, nanoseconds since 1970 UTC; None if
+            unknown.
     """
 
     legs: tuple[Leg, ...]

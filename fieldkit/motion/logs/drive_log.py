@@ -1,7 +1,7 @@
 """Log of an autonomous drive of a ground robot, and its columns.
 
 fieldkit's agent on the robot writes a JSON object per line, ten times a second (`fieldkit.agent.driving.drive`):
-time, pose by its odometry in the frame of the start, and driven distance. The last line contains the reason for the
+time, pose from odometry in the frame of the start, and driven distance. The last line contains the reason for the
 end. All values are measurements of the robot.
 """
 
@@ -79,7 +79,7 @@ class DriveMoment:
     Attributes:
         at_s: Time since the start of the program.
         phase: Phase of the drive: `waits` before the start, `returns` if the robot first drives to its origin, `out`
-            on the path, `there` at its end, `back` on the way back, or `home`.
+            on the path, `there` at its end, `back` on the return path, or `home`.
         x_m: Position ahead of the start.
         y_m: Position to the left of the start.
         yaw_rad: Heading relative to the start, positive to the left.
@@ -159,7 +159,10 @@ def measure(log: Sequence[DriveMoment] | None) -> Measured:
 
 
 def speeds_m_s(log: Sequence[DriveMoment]) -> list[float]:
-    """Return the speeds over half a second in m/s, one per line if the robot was commanded to move at both ends."""
+    """Return the speeds over half a second in m/s, one for each line at which the half second starts.
+
+    A speed is omitted if the robot was not commanded to move at the start or at the end of the half second.
+    """
     times_s = [record.at_s for record in log]
     pairs = ((record, bisect_left(times_s, record.at_s + _SPEED_INTERVAL_S)) for record in log if record.forward_m_s)
     return [

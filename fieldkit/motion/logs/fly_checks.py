@@ -14,7 +14,8 @@ from fieldkit.motion.logs.fly_log import FlightMoment
 from fieldkit.motion.logs.motion_log import time_contradictions
 
 POSITION_ERROR_M: Final = 5.0
-"""Tolerance for errors and jumps of an autopilot's position estimate: satellite positioning under open sky, 95 %."""
+"""Tolerance for errors and jumps of an autopilot's position estimate: the 95 % error of satellite positioning under
+open sky."""
 
 _SPEED_SHARE: Final = 1.5
 _SPEED_M_S: Final = 2.0
@@ -29,7 +30,8 @@ class FlyPlan:
         highest_m: Largest height.
         farthest_m: Largest horizontal distance from the take-off position.
         fastest_m_s: Speed limit.
-        window: Its computer's clock before and after the attempt, nanoseconds since 1970 UTC; None if unknown.
+        window: Readings of the clock of the drone's computer before and after the attempt, nanoseconds since 1970
+            UTC; None if unknown.
     """
 
     highest_m: float

@@ -21,7 +21,7 @@ _STALL_S: Final = 2.0
 
 
 _END: Final = re.compile(r'(.*), "crc32": ([0-9]{1,10})\}', re.ASCII)
-"""Last line of a log: the first group is followed by the CRC-32 of everything before it."""
+"""Last line of a log, which contains the CRC-32 of the log without the key `crc32`."""
 
 
 class MotionMoment(Protocol):
@@ -120,8 +120,9 @@ def time_contradictions(log: Sequence[MotionMoment], window: tuple[int, int] | N
     """Yield the contradictions between the times of a log, one sentence each.
 
     Args:
-        log: Its lines; lines without a time by the robot's clock are not checked.
-        window: The robot's clock before and after the attempt, nanoseconds since 1970 UTC; None if unknown.
+        log: Lines of the log; lines without a time by the robot's clock are not checked.
+        window: Readings of the robot's clock before and after the attempt, nanoseconds since 1970 UTC; None if
+            unknown.
     """
     timed_moments = [moment for moment in log if moment.utc_ns]
     if not timed_moments:

@@ -24,9 +24,9 @@ _MIN_MESSAGES: Final = 10
 _MIN_INTERVALS: Final = 3
 """Minimum number of intervals without a missing sequence number that are needed to estimate a period."""
 _REQUEST_TOLERANCE: Final = 0.25
-"""Maximum relative difference between the observed and the requested period of a granted request. A station that
-changes the rate changes it by more than this. The observed mean is too short, because long intervals, which contain a
-missing number more often, are omitted."""
+"""Maximum relative difference between the observed and the requested period. A larger difference shows that another
+station changed the rate. Without such a change, the observed mean is still too short, because long intervals, which
+contain a missing sequence number more often, are omitted."""
 _RATE_TOLERANCE: Final = 0.08
 """Maximum relative difference between the observed rate and an integer rate, for a stream without a request."""
 _MAX_RATE_HZ: Final = 10
@@ -38,7 +38,7 @@ _SKIP_COST: Final = 1.0
 """Cost of a period that the autopilot skipped, in squared periods: more than the squared deviation of one late
 message, less than the sum for two."""
 _HYPOTHESES: Final = 4
-"""Maximum number of hypotheses that are kept. After late messages two or three are still possible."""
+"""Maximum number of hypotheses that are kept. After late messages, two or three hypotheses are still possible."""
 
 
 @dataclass(frozen=True)
@@ -144,8 +144,8 @@ def _next_hypotheses(before: _Hypothesis, boot_ms: int, missing_count: int, peri
 def _period_ms(messages: Sequence[StreamMessage], indices: Sequence[int], interval_us: int | None) -> float | None:
     """Return the period of a stream in milliseconds, or None if it is unknown.
 
-    That is the requested interval if the stream has about this period. Otherwise it is the period of the nearest
-    integer rate up to 10 Hz, because autopilots are configured in hertz.
+    The period is the requested interval if the stream has about this period. Otherwise it is the period of the
+    nearest integer rate up to 10 Hz, because autopilots are configured in hertz.
     """
     intervals_ms = sorted(
         after.boot_ms - before.boot_ms

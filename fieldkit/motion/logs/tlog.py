@@ -146,8 +146,8 @@ class RecorderSummary:
         ended_us: End of the recording, microseconds since 1970 UTC by its robot's clock.
         refusals: MAV_RESULT by message ID, for messages whose rate the autopilot did not set.
         crc32: CRC-32 of the log; None for a recorder of an older version.
-        slow_s: Longest time for which a requested message was too slow; None if no message was requested, or for a
-            recorder of an older version.
+        slow_s: Longest time for which the rate of a requested message was too low; None if no message was requested,
+            or for a recorder of an older version.
     """
 
     frames: int
@@ -200,7 +200,7 @@ class Tlog:
     Attributes:
         frames: Number of frames of all senders.
         kinds: Number of messages of the autopilot by message name.
-        values: Values of columns.
+        values: Values of the columns by name.
         first_us: Earliest time of a frame, microseconds since 1970 UTC by the recorder's clock.
         last_us: Latest time of a frame.
         back_us: Largest backward step between the times of consecutive frames.
@@ -260,7 +260,8 @@ def contradictions(
         log: The log.
         summary: Summary of the recorder.
         file_crc32: CRC-32 of the log's file.
-        window: The recorder's clock before and after the attempt, nanoseconds since 1970 UTC; None if unknown.
+        window: Readings of the recorder's clock before and after the attempt, nanoseconds since 1970 UTC; None if
+            unknown.
     """
     if summary.crc32 is not None and summary.crc32 != file_crc32:
         yield "was changed: its checksum differs from the one that its recorder wrote"

@@ -14,8 +14,8 @@ from fieldkit.motion.logs import tlog
 def read_tlog(path: Path, position_source: PositionSource) -> Samples:
     """Return the samples of a message type in a telemetry log. Times are by the recorder's clock.
 
-    With `stamps` set to `header`, the differences between times are those of the autopilot's time since boot. The
-    message with the lowest delay aligns them with the recorder's clock, because a radio may delay other messages.
+    If `stamps` is `header`, a time is the autopilot's time since boot plus a constant offset. The offset is computed
+    from the message with the lowest delay, because a radio may delay other messages.
 
     Raises:
         EvidenceError: The log cannot be read, has no such message, or the autopilot restarted during the recording.

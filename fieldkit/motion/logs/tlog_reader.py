@@ -31,12 +31,12 @@ _SIGNED_FLAG: Final = 1
 _SIGNATURE_BYTES: Final = 13
 _UNKNOWN_16: Final = 0xFFFF
 _UNKNOWN_8: Final = 0xFF
-"""Values of unsigned fields of 16 and 8 bits that the sender does not know."""
+"""Values of unsigned fields of 16 and 8 bits that mean *unknown*."""
 _RADIO: Final = "RADIO_STATUS"
 """Status of a telemetry radio's link; the radio has a separate system ID."""
 
 Source = tuple[int, int]
-"""IDs of a system and its component."""
+"""IDs of a system and of one of its components."""
 
 
 @dataclass(frozen=True)
@@ -53,13 +53,13 @@ class LoggedFrame:
 
     @property
     def source(self) -> Source:
-        """The sender. The positions of its IDs are those of MAVLink 1 or of MAVLink 2."""
-        system = 3 if self.data[0] == _MAGIC_1 else 5
-        return self.data[system], self.data[system + 1]
+        """System ID and component ID of the sender. Their positions differ between MAVLink 1 and MAVLink 2."""
+        system_index = 3 if self.data[0] == _MAGIC_1 else 5
+        return self.data[system_index], self.data[system_index + 1]
 
     @property
     def number(self) -> int:
-        """Sequence number of its sender, from 0 to 255."""
+        """Sequence number that the sender assigned, from 0 to 255."""
         return self.data[2 if self.data[0] == _MAGIC_1 else 4]
 
     @property
@@ -217,7 +217,8 @@ def _column_values(series: dict[str, list[float]]) -> Iterator[tuple[str, float]
     A column is named by quantity, statistic and unit: the largest value of `climb_m_s` is `climb_max_m_s`.
     """
     for name in ("height_m", "speed_m_s", "climb_m_s"):
-        # Either message can be missing if the link has many losses; both are relative to home.
+        # Either message can be missing if the link has many losses. Heights are over the autopilot's origin in the
+        # local message, and over home in the global one.
         series[name] = series[f"{name}/local"] or series[f"{name}/global"]
     for name in ("battery", "battery_v", "north_m", "east_m", "lat_deg", "lon_deg"):
         quantity, unit = name.split("_", 1) if "_" in name else (name, "")
@@ -248,8 +249,8 @@ def _positions(data: bytes, autopilot: Source, kind: str) -> Iterator[tuple[int,
     """Yield time of arrival in us, the autopilot's time in ms, three coordinates and the heading of each message.
 
     The coordinates of `LOCAL_POSITION_NED` are metres east, north and up; those of `GLOBAL_POSITION_INT` are latitude
-    and longitude in degrees, and metres up. The heading is from the last ATTITUDE (before the first one, from the
-    first one; 0 without one), in radians from east to north.
+    and longitude in degrees, and metres up. The heading is from the last ATTITUDE before the message, in radians from
+    east to north. Before the first ATTITUDE it is from the first one; without any it is 0.
     """
     decoder, heading_rad, rows = TlogDecoder(), math.nan, []
     for frame in frames(data):

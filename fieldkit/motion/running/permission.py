@@ -53,11 +53,11 @@ class MotionPermission:
 
     Args:
         plan: The trial.
-        testbed: Its robots. In a transient testbed they are back at their places after each motion.
-        folder: Its folder.
+        testbed: The trial's robots. In a transient testbed they are back at their places after each motion.
+        folder: The trial's folder.
 
     Attributes:
-        origins: Origins of its robots, for the steps.
+        origins: Origins of the trial's robots, for the steps.
 
     Raises:
         EvidenceError: The journal of motions is damaged.

@@ -39,7 +39,7 @@ class DriveLease(LeaseKeeper):
     Args:
         shell: Connection to the robot.
         job: The running program.
-        name_pattern: Names of the step's files, with `{}` in place of the name without the prefix.
+        name_pattern: Pattern of the names of the step's files, with `{}` in place of the name without the prefix.
         lease_s: Duration of the lease; the robot stops if it is not renewed in this time.
     """
 

@@ -80,7 +80,7 @@ def drive_job(scene: Scene, move: Move, inside_s: float, name_pattern: str) -> P
     Args:
         scene: The attempt.
         move: Path and speed.
-        inside_s: Maximum duration of the steps inside.
+        inside_s: Maximum duration of the inner steps, which run during the drive.
         name_pattern: Pattern of the names of the step's jobs and files, from `Step.prefixed_name`; `{}` is replaced.
     """
     robot = scene.robot(move.role)

@@ -1,4 +1,4 @@
-"""Rescue of a drone from the laptop: it is landed if its pilot and its guard have both exited or are suspended.
+"""Rescue of a drone: the laptop lands it if its pilot and its guard have both exited or are suspended.
 
 The pilot is the program that flies the drone, the guard is the program that lands it if the pilot fails. They run on
 the drone and monitor each other. The rescue monitors both by the counters in the file that they share. It polls

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
-from typing import Annotated, Final
+from typing import Annotated, ClassVar, Final
 
 from typing_extensions import override
 
@@ -52,7 +52,7 @@ _SLACK_S: Final = 30.0
 _SLOWEST_M_S: Final = 0.3
 """Lower bound of the landing speed. PX4 lands at 0.7 m/s (MPC_LAND_SPEED), slower near the ground (MPC_LAND_CRWL)."""
 _LIMIT_S: Final = 3600.0
-"""Time that the limit of the pilot's job exceeds the expected duration of the flight."""
+"""Time by which the limit of the pilot's job exceeds the expected duration of the flight."""
 _AT_REST_S: Final = 3.0
 """Approximate time that the log covers before the take-off and after the landing."""
 _LOG_BYTES_PER_S: Final = 2200.0
@@ -63,23 +63,18 @@ class FlyLeg(PathLeg):
     """A straight segment of a path in the air; several keys together are one diagonal segment.
 
     Attributes:
+        away: Distance forward, in the direction of the drone's nose before take-off.
+        towards: Distance backward.
+        left: Distance to the left of that direction.
+        right: Distance to the right of that direction.
         up: Distance up.
         down: Distance down, but not to the ground.
     """
 
+    opposites: ClassVar[tuple[tuple[str, str], ...]] = (*PathLeg.opposites, ("up", "down"))
+
     up: _Distance = None
     down: _Distance = None
-
-    @schema.model_validator(mode="after")
-    def _has_one_direction(self) -> "FlyLeg":
-        for key, opposite in (("away", "towards"), ("left", "right"), ("up", "down")):
-            if getattr(self, key) is not None and getattr(self, opposite) is not None:
-                raise schema.validation_error(
-                    f"a segment has {key} or {opposite}, not both; make two segments", opposite
-                )
-        if not any((self.away, self.towards, self.left, self.right, self.up, self.down)):
-            raise schema.validation_error("a segment needs a distance: away, towards, left, right, up or down")
-        return self
 
     @property
     def metres(self) -> tuple[float, float, float]:

@@ -143,7 +143,7 @@ class LeaseKeeper:
     def run_while_leased(self, end: Callable[[], None]) -> Iterator[None]:
         """Run the body; abort it if the program ends.
 
-        If orders are not renewed, the end of the program is noticed only after the body has finished.
+        If orders are not renewed, the end of the program is detected only after the body has finished.
 
         Args:
             end: Aborts the operations that the body waits for. After the program has ended, it is called at each
@@ -174,7 +174,7 @@ class LeaseKeeper:
             line = f"{next(self._numbers)} {self._order} {self._expires_s:g}"
         argv = ("sh", "-c", _ORDER, "sh", self._exit_file, self._orders_file, line, self._output_file)
         result = self._shell.run(argv, deadline=Deadline.after(within_s))
-        *_, code = (b"", *result.stderr.splitlines())  # a login shell may print messages before it
+        *_, code = (b"", *result.stderr.splitlines())  # a login shell may print messages before the exit code
         self.exit_code = code.decode() if code.isdigit() else ""
         if result.stdout != self.output:
             self.output, self._changed_s = result.stdout, time.monotonic()

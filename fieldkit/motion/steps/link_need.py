@@ -16,8 +16,8 @@ _KINDS = {
     "tcp": "TCP",
 }
 _LINK_SERVER_TEXTS = {True: "use it through the link server", False: "uses it through the link server"}
-"""Text by whether several programs use the connection, which the link server, a program on the robot, shares among
-them."""
+"""End of the sentence about the programs that use the connection; True for several programs. The link server is the
+program on the robot that shares the connection among them."""
 
 
 def link_need(robot: Robot, role: Role, connection: str, programs: Sequence[str]) -> Need:
@@ -50,7 +50,8 @@ def _judge(connection: str, programs: Sequence[str], result: CommandResult) -> t
     except JSON_ERRORS:
         last_line = sanitized((result.text.splitlines() or ["no answer"])[-1]).removeprefix("error: ")
         return Verdict.FAIL, f"{connection} ({kind}): {last_line}", "correct mavlink.connection of the profile"
-    available = f"this computer has {candidates}" if candidates else "this computer has no other common connection"
+    computer = "the robot's computer"
+    available = f"{computer} has {candidates}" if candidates else f"{computer} has no other common connection"
     remedy = f"{available}; write the connection of the autopilot as mavlink.connection in the profile"
     if error:
         return Verdict.FAIL, f"{connection} ({kind}) cannot be opened: {error}", remedy

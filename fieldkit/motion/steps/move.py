@@ -118,7 +118,7 @@ class MoveStep(
 
     @property
     def motion(self) -> model.Move:
-        """The move in the form for the testbed.
+        """The move as the data type that testbeds accept.
 
         Raises:
             ValueError: The step has no speed, because it is not resolved.

@@ -95,7 +95,7 @@ def guard_job(
         name: Name of the job.
         abort: Action if the attempt is aborted, a value of `OnAbort`.
         lease_s: Time in seconds until an order expires.
-        has_pilot: Whether a pilot program flies the drone, with which the guard shares the liveness file.
+        has_pilot: Whether a pilot program flies the drone. It then shares the liveness file with the guard.
     """
     plan = FlightPlan(
         connection=onboard_connection(scene.robot(role)),
@@ -186,7 +186,7 @@ class FlightLease(LeaseKeeper):
 
     @property
     def _reported_reason(self) -> str:
-        """The reason why the program ended the flight, from its log; empty if it did not end it."""
+        """The reason why the program ended the flight, from its log; empty if it did not end the flight."""
         match = next(filter(None, map(_END_LINE.match, self._lines)), None)
         return shorten(match["reason"]) if match else ""
 

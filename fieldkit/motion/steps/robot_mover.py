@@ -26,9 +26,9 @@ class RobotMover(NamedTuple):
     """A robot that a program of fieldkit moves; a `fieldkit.steps.motions.Mover`.
 
     Attributes:
-        robot: Its name.
-        shell: Its control connection.
-        folder: The folder of the attempt on it.
+        robot: Name of the robot.
+        shell: Control connection to the robot.
+        folder: Folder of the attempt on the robot.
         fallback: Behaviour of the robot if no order reaches it, for example "it stops automatically within 2 s".
     """
 

@@ -1,4 +1,4 @@
-"""Position samples of one robot from a bag: an entry point of `fieldkit.positions`."""
+"""Read the position samples of one robot from a bag. The entry point group `fieldkit.positions` lists `read_bag`."""
 
 from pathlib import Path
 

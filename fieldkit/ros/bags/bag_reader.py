@@ -38,8 +38,12 @@ def answer(request: Json) -> Json:
         share = battery_share(path, request["topic"])
         return {"share": None if math.isnan(share) else share}
     if "topic_stats" in request:
-        return {"topics": topic_stats(_open_ros2(path.parent) if path.suffix in bag.ROS2 else rosbag1.Reader(path))}
-    if path.suffix not in bag.ROS2:
+        return {
+            "topics": topic_stats(
+                _open_ros2(path.parent) if path.suffix in bag.ROS2_SUFFIXES else rosbag1.Reader(path)
+            )
+        }
+    if path.suffix not in bag.ROS2_SUFFIXES:
         return contents(rosbag1.Reader(path))
     if path.suffix == ".db3":
         _check_database(path)
@@ -77,7 +81,7 @@ def contents(reader: "rosbag1.Reader | rosbag2.Reader") -> Json:
 
 
 def topic_stats(reader: "rosbag1.Reader | rosbag2.Reader") -> Json:
-    """Return number and times of the messages by topic, keyed by the attributes of `TopicStats`."""
+    """Return the number and the times of the messages of each topic, keyed by the attributes of `TopicStats`."""
     by_topic: dict[str, dict[str, int]] = {}
     with reader:
         for connection, stamp_ns, _ in reader.messages():
@@ -145,7 +149,7 @@ def _open_decoder(path: Path) -> "AnyReader":
 
     # A bag in SQLite does not contain the definitions of its message types.
     types = get_typestore(Stores.ROS2_FOXY)
-    return AnyReader([path.parent if path.suffix in bag.ROS2 else path], default_typestore=types)
+    return AnyReader([path.parent if path.suffix in bag.ROS2_SUFFIXES else path], default_typestore=types)
 
 
 def _pose(msgtype: str, message: Any, child: str) -> tuple[float, float, float, float] | None:  # noqa: ANN401
@@ -174,7 +178,7 @@ def _pose(msgtype: str, message: Any, child: str) -> tuple[float, float, float, 
 
 
 def _check_database(path: Path) -> None:
-    """Check every page, because the message count can be correct even if messages are truncated."""
+    """Check every page of an SQLite database, because the message count can be correct even if pages are damaged."""
     import sqlite3  # noqa: PLC0415 (needed only for bags in SQLite)
 
     with closing(sqlite3.connect(f"{path.absolute().as_uri()}?immutable=1", uri=True)) as database:

@@ -95,7 +95,7 @@ class TopicStats:
 
 
 def topic_stats(path: Path) -> Mapping[str, TopicStats]:
-    """Return number and times of the messages by topic; topics without a message are omitted.
+    """Return the number and the times of the messages of each topic; topics without a message are omitted.
 
     Raises:
         EvidenceError: The bag is missing or cannot be read.
@@ -127,7 +127,8 @@ def read(folder: Path, log: str, file: str, topics: Sequence[str], duration_s: f
     try:
         by_topic = topic_stats(folder / file)
     except EvidenceError:
-        # A recorder that cannot reach its master never subscribes and writes no bag.
+        # Without a bag, reception is unknown, unless the recorder did not subscribe, for example because it could not
+        # connect to its master: then it received no message.
         return RecordingReception(None if is_subscribed_to_all else False, None, None, None)
     discovered = by_topic.keys() >= set(topics)
     messages = sum(by_topic[topic].messages for topic in topics if topic in by_topic)
@@ -140,7 +141,10 @@ def read(folder: Path, log: str, file: str, topics: Sequence[str], duration_s: f
 
 
 def subscription_ns(log: str, topics: Sequence[str]) -> dict[str, int]:
-    """Return the time of subscription or start of discovery by topic, from the log; nanoseconds since 1970 UTC."""
+    """Return the time of subscription by topic, from the recorder's log, in nanoseconds since 1970 UTC.
+
+    For ROS 2 it is the start of discovery, which is the same for all topics.
+    """
     by_topic = {match["topic"]: _stamp_ns(match) for match in _ROS1.finditer(log)}
     ros2_start = _ROS2.search(log)
     if ros2_start is not None:

@@ -136,7 +136,7 @@ def _any_reader(bag: BagFiles) -> AnyReader:
 
 
 def _count_recoverable(bag: BagFiles) -> Json:
-    """Return the number of messages that can be recovered, and the damage at which reading stops; empty if none."""
+    """Return the number of messages that can be recovered, and the damage at which reading stops, if any."""
     count, reason = 0, ""
     try:
         for file in bag.files:

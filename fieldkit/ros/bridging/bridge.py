@@ -28,11 +28,11 @@ from fieldkit.ros.interfaces.types import MessageTypes
 
 Convert = Callable[[bytes], bytes]
 
-_PACKAGES: Final = "python3 -m pip install 'fieldkit[ros2]', and give an address of this machine"
+_PACKAGES_REMEDY: Final = "python3 -m pip install 'fieldkit[ros2]', and give an address of this machine"
 _REMEDIES: Final = {
     "ros1": "start roscore, or give its address; if rospy is missing here: apt-get install python3-rospy",
-    "dds": _PACKAGES,
-    "zenoh": _PACKAGES,
+    "dds": _PACKAGES_REMEDY,
+    "zenoh": _PACKAGES_REMEDY,
 }
 
 
@@ -134,7 +134,7 @@ def bridge_topics(
     """Bridge topics between two sides while the body runs.
 
     Args:
-        near: The first side. It is the source of topics, except for those with `Crossing.back`, whose target it is.
+        near: The first side, which is the source of the topics without `Crossing.back`, and the target of the others.
         far: The second side.
         crossings: The topics.
         types: The message types.

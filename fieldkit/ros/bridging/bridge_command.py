@@ -80,7 +80,7 @@ def add(parser: Parser) -> None:
         "--node",
         metavar="NAME",
         default="fieldkit_bridge",
-        help="name of the bridge's node; a second bridge on a master needs another (default: fieldkit_bridge)",
+        help="name of the bridge's node, different for each bridge on the same master (default: fieldkit_bridge)",
     )
     parser.add_choice(
         "--distribution",
@@ -104,7 +104,7 @@ def add(parser: Parser) -> None:
 
 
 _POLL_S: Final = 1.0
-"""Interval at which the bridge looks for nodes that use a topic with another type."""
+"""Interval at which the bridge checks for nodes that use a topic with another type."""
 _ROUTER_PORT: Final = 7447
 _NODE: Final = re.compile(r"[A-Za-z]\w*", re.ASCII)
 

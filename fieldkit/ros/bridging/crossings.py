@@ -21,9 +21,9 @@ _NAME: Final = re.compile(r"(/[A-Za-z]\w*)+", re.ASCII)
 """A name that is valid in ROS 1 and ROS 2 (wiki.ros.org/Names; design.ros2.org, "Topic and Service name mapping to
 DDS")."""
 
-_BUCKET: Final = math.log(1.01)
-"""Logarithmic width of the buckets in the histogram of delays: 1 %. A histogram needs constant memory, even if a
-bridge runs for months."""
+_LOG_BUCKET_RATIO: Final = math.log(1.01)
+"""Natural logarithm of the ratio between adjacent buckets in the histogram of delays: each is 1 % above the previous
+one. A histogram needs constant memory, even if a bridge runs for months."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ class CrossingTally:
         self._bytes += size_bytes
         self._last_ns = forwarded_ns
         # If the clock was set back, the delay counts as 0.
-        self._histogram[round(math.log(max(1, forwarded_ns - arrived_ns)) / _BUCKET)] += 1
+        self._histogram[round(math.log(max(1, forwarded_ns - arrived_ns)) / _LOG_BUCKET_RATIO)] += 1
 
     def counts(self, crossing: Crossing, source: str, target: str) -> CrossingCounts:
         """Return the counters."""
@@ -157,5 +157,5 @@ class CrossingTally:
         for bucket in sorted(self._histogram):
             remaining -= self._histogram[bucket]
             if remaining <= 0:
-                return math.exp(bucket * _BUCKET) / 1e9
+                return math.exp(bucket * _LOG_BUCKET_RATIO) / 1e9
         return None

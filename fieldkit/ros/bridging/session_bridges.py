@@ -15,9 +15,9 @@ from fieldkit.steps.scene import BY_FIELDKIT, Planned
 LIMIT_S: Final = 12 * 3600.0
 """Maximum duration of a bridge that is not stopped."""
 
-_MASTER_S: Final = 5
+_MASTER_TIMEOUT_S: Final = 5
 """Time for which the bridge waits for the ROS master, in seconds."""
-_READY_S: Final = 40
+_READY_TIMEOUT_S: Final = 40
 """Timeout for the start: a small computer needs many seconds to load Python, rospy and a middleware."""
 _LOG: Final = "bridge.log"
 _REMEDY: Final = (
@@ -46,15 +46,15 @@ def planned(cast: Cast, session: str) -> Iterator[Planned]:
 
 
 def _bridge(role: Role, robot: Robot, ros: Ros, bridge: RobotBridge, session: str) -> Planned:
-    command = bridge.command(robot.address, robot.ros_master, _MASTER_S)
+    command = bridge.command(robot.address, robot.ros_master, _MASTER_TIMEOUT_S)
     job = Job(
-        folder=jobs.work_folder(folder_of(session), "1"),  # a bridge has one attempt
+        folder=jobs.work_folder(folder_of(session), "1"),  # a subfolder per attempt; a bridge is started only once
         name="bridge",
         argv=with_environment(command, setup=ros.command.setup, environment=ros.environment),
         limit_s=LIMIT_S,
         log=_LOG,
         ready=f"log:{BRIDGE_IS_UP}",
-        ready_s=_READY_S,
+        ready_s=_READY_TIMEOUT_S,
     )
     return Planned(
         role,

@@ -7,4 +7,4 @@ from typing import Final
 EXTRA_DEFINITIONS: Final[Mapping[str, str]] = MappingProxyType(
     {"tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n"}
 )
-"""Definition of each type by its name."""
+"""Definitions in the format of .msg files, by the name of the type."""

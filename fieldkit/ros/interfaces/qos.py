@@ -11,7 +11,7 @@ from typing import Final, TypeVar
 
 
 class Policy(Enum):
-    """A policy with the numbers of rmw/types.h."""
+    """Base class of the policies of a profile. The values are the numbers in rmw/types.h."""
 
 
 class Reliability(Policy):
@@ -134,7 +134,8 @@ def _resolve(policy: Kind, default: Kind) -> Kind:
 def _duration(time_ns: int | None) -> str:
     if time_ns is None:
         return ","
-    # Seconds and nanoseconds are each omitted if they are equal to the default.
+    # The default is an infinite duration. Seconds are omitted if they are equal to its seconds, and nanoseconds if
+    # they are equal to its nanoseconds.
     return ",".join(
         "" if part == default else str(part)
         for part, default in zip(divmod(time_ns, _SECOND_NS), divmod(_INFINITE_NS, _SECOND_NS), strict=True)

@@ -58,8 +58,8 @@ class MessageField:
     Attributes:
         name: Its name.
         type: A primitive type (`float32`, `string`), or the name of a message type (`std_msgs/msg/Header`).
-        count: None for a single value, 0 for an unbounded sequence, the length of an array, or the negative bound of
-            a sequence.
+        count: None for a single value, N for an array of N values, 0 for an unbounded sequence, or -N for a sequence
+            of at most N values.
     """
 
     name: str
@@ -127,7 +127,7 @@ class MessageTypes:
         return MessageType(type_name, definition, md5, self.ros2.hash_rihs01(type_name) if in_ros2 else "")
 
     def fields(self, name: str) -> Mapping[str, tuple[MessageField, ...]]:
-        """Return the members of a type in ROS 2, which is the first key, and of all nested types, by type name.
+        """Return the members of a type of ROS 2 and of all its nested types, by type name. The type is the first key.
 
         Raises:
             ConfigurationError: ROS 2 has no such type.

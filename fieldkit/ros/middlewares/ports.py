@@ -1,8 +1,10 @@
 """Ports and multicast groups of middlewares, which identify the packets of a middleware in captures.
 
-DDS: RTPS 2.5, section 9.6.2 (PB 7400, DG 250, PG 2, d0 0, d1 10, d2 1, d3 11). Zenoh and ROS 1 do not use their
-default ports, so that fieldkit's routers, masters and nodes can run on a robot together with the robot's. Each domain
-has separate ports, so that several domains can be used on one robot. Only Zenoh scouting uses its default port.
+DDS: RTPS 2.5, section 9.6.2. A port is 7400 + 250 * domain + 2 * participant + offset; the offset is 0 for multicast
+discovery and 1 for multicast data (both without the participant), 10 for unicast discovery and 11 for unicast data.
+fieldkit's routers, masters and nodes do not use the default ports of Zenoh and ROS 1, so that they can run on a robot
+together with routers, masters and nodes that were started by others. Each domain has separate ports, so that several
+domains can be used on one robot. Only Zenoh scouting uses its default port.
 """
 
 from dataclasses import dataclass

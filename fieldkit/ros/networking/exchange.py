@@ -23,13 +23,13 @@ COUNT: Final = 20
 """Number of datagrams of each kind that a robot sends."""
 INTERVAL_S: Final = 0.05
 
-_PARTICIPANT: Final = 119
+_PARTICIPANT_ID: Final = 119
 """Highest participant ID of a domain (RTPS 2.5, section 9.6.2.3). No ROS program on a robot has an ID that high, so
 its port is free."""
-_GROUP: Final = "239.255.0.1"
+_MULTICAST_GROUP: Final = "239.255.0.1"
 """Multicast group that DDS uses for discovery."""
-_SEND_S: Final = 30.0
-_READ_S: Final = 10.0
+_SEND_TIMEOUT_S: Final = 30.0
+_READ_TIMEOUT_S: Final = 10.0
 """Timeouts for sending the datagrams of one robot, and for reading its counts."""
 _COUNTS_FILE: Final = "counts.json"
 
@@ -56,7 +56,7 @@ def multicast_port(domain: int) -> int:
 def unicast_port(domain: int) -> int:
     """Return the port of unicast test datagrams."""
     # RTPS: the discovery port of a participant is d1 (10) and PG (2) times its ID above the multicast port.
-    return multicast_port(domain) + 10 + 2 * _PARTICIPANT
+    return multicast_port(domain) + 10 + 2 * _PARTICIPANT_ID
 
 
 def exchange(cast: Cast, shells: Shells, domain: int, trial: str) -> dict[tuple[Role, Role], Arrivals]:
@@ -87,7 +87,7 @@ def exchange(cast: Cast, shells: Shells, domain: int, trial: str) -> dict[tuple[
 
 
 class _Exchange:
-    """The steps of an exchange on each robot; the arguments are those of `exchange`."""
+    """An exchange in progress. The arguments are those of the function `exchange`."""
 
     def __init__(self, cast: Cast, shells: Shells, domain: int, trial: str) -> None:
         self._cast = cast
@@ -112,7 +112,7 @@ class _Exchange:
             self._cast[role], agent.path_from_home(), "datagrams", self._arguments(role, peers=peers)
         )
         with self._store_error(role):
-            self._shells[role].run(argv, deadline=Deadline.after(_SEND_S))
+            self._shells[role].run(argv, deadline=Deadline.after(_SEND_TIMEOUT_S))
 
     def end(self, role: Role) -> None:
         """Stop counting on a robot, read the counts, and delete the files of the exchange."""
@@ -120,7 +120,7 @@ class _Exchange:
         with self._store_error(role):
             try:
                 jobs.stop(shell, job)
-                counts = shell.run(("cat", f"{job.folder}/{_COUNTS_FILE}"), deadline=Deadline.after(_READ_S))
+                counts = shell.run(("cat", f"{job.folder}/{_COUNTS_FILE}"), deadline=Deadline.after(_READ_TIMEOUT_S))
                 self._counts[role] = parse_counts(counts.stdout)
             finally:
                 evidence.discard(shell, self._trial)
@@ -134,7 +134,7 @@ class _Exchange:
 
     def _counting_job(self, role: Role) -> Job:
         robot = self._cast[role]
-        limit_s = 2 * _SEND_S * len(self._cast)
+        limit_s = 2 * _SEND_TIMEOUT_S * len(self._cast)
         arguments = self._arguments(role, limit_s=limit_s)
         return Job(
             folder=jobs.work_folder(self._trial, "datagrams"),
@@ -149,7 +149,7 @@ class _Exchange:
     def _arguments(self, role: Role, *, peers: list[str] | None = None, limit_s: float = 0.0) -> str:
         ports = DatagramPorts(
             address=self._cast[role].address,
-            group=_GROUP,
+            group=_MULTICAST_GROUP,
             multicast_port=multicast_port(self._domain),
             unicast_port=unicast_port(self._domain),
             token=self._trial[:32],

@@ -16,14 +16,15 @@ from fieldkit.ros.networking.state import RosState
 from fieldkit.trial.check.report import Report
 
 MIN_ARRIVED: Final = 18
-"""Minimum number of arrived datagrams, out of `COUNT`, on a good link: 10 % loss."""
+"""Minimum number of arrived datagrams, out of `COUNT`, on a good link. It corresponds to a loss of 10 %."""
 
-_RESOLVE_S: Final = 15.0
+_RESOLVE_TIMEOUT_S: Final = 15.0
 """Timeout for the resolution of a name."""
-_LOOPBACK: Final = {None, "localhost", "127.0.0.1", "::1"}
+_LOOPBACK_HOSTS: Final = {None, "localhost", "127.0.0.1", "::1"}
 """Hosts in the URI of a master that runs on the robot itself; None if the URI has no host."""
-_FRAGMENTS: Final = -(-SIZES[FRAGMENTED] // 1480)
-"""Number of IP fragments, rounded up, if each has 1480 bytes of payload (MTU 1500 without the IPv4 header)."""
+_FRAGMENT_COUNT: Final = -(-SIZES[FRAGMENTED] // 1480)
+"""Number of IP fragments of a datagram of the kind `FRAGMENTED`. A fragment has at most 1480 bytes of payload: an MTU
+of 1500 bytes without the IPv4 header."""
 
 
 def judge_arrivals(
@@ -65,7 +66,7 @@ def judge_arrivals(
             report,
             none_reason=f"{SIZES[UNICAST]} B arrive, but {SIZES[FRAGMENTED]} B do not{firewall_note}",
             remedy="allow IP fragments in the firewall; or keep datagrams below the MTU: settings: tuned",
-            datagram_text=f"datagrams of {SIZES[FRAGMENTED]} B ({_FRAGMENTS} fragments)",
+            datagram_text=f"datagrams of {SIZES[FRAGMENTED]} B ({_FRAGMENT_COUNT} fragments)",
         )
 
 
@@ -106,7 +107,7 @@ def judge_names(
         LinkError: The robot did not answer.
     """
     master = states[role].variables.get("ROS_MASTER_URI", "")
-    if _host(master) in _LOOPBACK:
+    if _host(master) in _LOOPBACK_HOSTS:
         report.ok(
             "ROS network", f"its ROS master, {master}, runs on the robot itself: its topics do not reach other robots"
         )
@@ -116,7 +117,7 @@ def judge_names(
             continue
         robot, name = cast[other], advertised_name(state)
         argv = ("getent", "ahostsv4", name)
-        output = shell.run(argv, deadline=Deadline.after(_RESOLVE_S), check=False).stdout
+        output = shell.run(argv, deadline=Deadline.after(_RESOLVE_TIMEOUT_S), check=False).stdout
         addresses = list(
             dict.fromkeys(line.split()[0] for line in output.decode(errors="replace").splitlines() if line)
         )

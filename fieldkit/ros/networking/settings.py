@@ -20,7 +20,7 @@ DEFAULT_RMW: Final = "rmw_fastrtps_cpp"
 _ZENOH_PORT: Final = 7447
 _SERVER_PORT: Final = 11811
 """Default port of a discovery server of Fast DDS."""
-_RECOMMENDED: Final = {
+_RECOMMENDED_KERNEL: Final = {
     # "DDS tuning information": CycloneDDS recommends 10 MB, Fast DDS and Connext recommend more.
     "net/core/rmem_max": (10_485_760, "at least", "a burst of fragments of a large sample exceeds the buffer"),
     "net/ipv4/ipfrag_time": (3, "at most", "incomplete datagrams of a lossy link occupy the reassembly buffer"),
@@ -218,7 +218,7 @@ def _judge_multicast_route(robot: Robot, state: RosState, report: Report) -> Non
 
 def _judge_kernel(state: RosState, report: Report) -> None:
     problems, commands = [], []
-    for key, (value, relation, consequence) in _RECOMMENDED.items():
+    for key, (value, relation, consequence) in _RECOMMENDED_KERNEL.items():
         actual = state.kernel.get(key)
         if actual is not None and (actual < value if relation == "at least" else actual > value):
             name = key.replace("/", ".")

@@ -1,4 +1,4 @@
-"""State of a robot that determines whether its ROS programs reach those of other robots, read in one round trip."""
+"""Read the state of a robot that determines if its ROS programs reach other robots, in one round trip."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -17,6 +17,7 @@ from fieldkit.trial.check.probe import MISSING_SECTION, Sections
 STATE_S: Final = 30.0
 """Timeout of the script; setup files of a large workspace take seconds on a small computer."""
 MAX_PROGRAMS: Final = 500
+"""Maximum number of running ROS programs that are evaluated; further ones are ignored."""
 
 SCRIPT: Final = resources.files("fieldkit.ros.networking").joinpath("state.sh").read_text(encoding="ascii")
 _ROUTE: Final = re.compile(r"\bdev (?P<interface>\S{1,30})")

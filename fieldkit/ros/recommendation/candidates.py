@@ -123,7 +123,10 @@ def _attempts_by_step(attempts: Repeats) -> Iterator[tuple[Repeats, StreamOption
 
 
 def _rmw(folder: Path, step: StreamOptions) -> str:
-    """Return the RMW that the publishers of a trial reported; `unknown` unless exactly one was reported."""
+    """Return the RMW that the publishers of a trial reported, or `unknown` if they reported none or several.
+
+    It is empty if the step does not use the robot's ROS 2.
+    """
     if step.over is not MiddlewareName.ROS2 or not isinstance(step, Step):
         return ""
     logs = folder.glob(f"repeats/*/{step.prefixed_name(f'{step.sender}-topic.log')}")

@@ -1,4 +1,4 @@
-"""A criterion for a middleware on a link, and the repeats measured with one sample size at one place."""
+"""The criterion that a middleware must meet on a link, and the repeats measured with one sample size at one place."""
 
 import math
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from fieldkit.core.columns import Kind, step_prefixed
 MIN_REPEATS: Final = 5
 """Default number of valid repeats that a cell needs. Losses over TCP may be bimodal
 (docs/studies/middleware-link.md): a smaller number of repeats may all be in the same mode."""
-_DECIMALS: Final = 12
+_BOUND_DECIMALS: Final = 12
 """Decimals to which a bound is rounded. In binary floating point 2.9 % is slightly less than 0.029; without rounding,
 a loss of 29 of 1,000 samples would exceed it."""
 _INTENDED: Final = "topic_intended"
@@ -70,7 +70,7 @@ class LinkCriterion:
     def expectations(self) -> tuple[Expectation, ...]:
         """The criterion in the form that `fieldkit.analysis` judges."""
         bounds = [
-            (_LOSS, round(self.max_loss, _DECIMALS)),
+            (_LOSS, round(self.max_loss, _BOUND_DECIMALS)),
             *([] if self.max_delay_s is None else [(_DELAY, self.max_delay_s)]),
         ]
         return tuple(

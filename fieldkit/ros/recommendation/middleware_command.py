@@ -1,4 +1,4 @@
-"""`fieldkit middleware recommend`: the configuration that passed on the measured link."""
+"""`fieldkit middleware recommend`: write the middleware configuration that met a criterion on the measured link."""
 
 import argparse
 from pathlib import Path

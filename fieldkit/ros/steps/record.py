@@ -46,7 +46,7 @@ from fieldkit.steps.view import View
 
 DEFAULT_BAG: Final = "scan"
 
-# Measured: rosbag took 0.6 to 0.8 s longer than its duration, and 3.2 s longer on a lossy interface.
+# Time that a recorder may take in addition to its duration. rosbag took 0.6 to 0.8 s, and 3.2 s on a lossy interface.
 START_AND_CLOSE_S: Final = 20.0
 
 # A recorder needs up to a second to subscribe, and more on a small computer under load. A recording has failed if the
@@ -74,11 +74,12 @@ _RECORD_BYTES: Final = 60
 _BAG_BYTES: Final = 16_384
 
 SUBSCRIBED: Final = "log:Subscribed to topic"
-"""Line of `ros2 bag record` when it starts to record. Its start takes seconds, which are not part of the duration."""
+"""Condition for the start of the duration: `ros2 bag record` has logged its first subscription. The program needs
+seconds to start, which are not part of the duration."""
 
 
 class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpace, Records, Summarizes):
-    """Records a ROS bag, by the record command of the robot's profile.
+    """Records a ROS bag with the record command of the robot's profile.
 
     A robot may record several bags with different names, one after the other; the `file` of a `transfer` selects one.
 

@@ -8,7 +8,7 @@ from fieldkit.core.model import ROS_MASTER_PORT, Role, Verdict
 from fieldkit.steps.scene import CommandResult, Need, Scene
 
 _TIMEOUT_S: Final = 5
-_OK: Final = " 200 "
+_OK_STATUS: Final = " 200 "
 """Part of the first line of a successful HTTP answer."""
 
 # The simplest method of a master (wiki.ros.org/ROS/Master_API).
@@ -40,7 +40,7 @@ def needs(scene: Scene, role: Role, *, program: str) -> Iterator[Need]:
 def judge(master: Robot, answer: CommandResult) -> tuple[Verdict, str, str]:
     """Return verdict, detail and remedy from the first line of a master's HTTP answer."""
     where = f"{master.name}, {master.address}:{ROS_MASTER_PORT}"
-    if answer.ok and _OK in answer.text:
+    if answer.ok and _OK_STATUS in answer.text:
         return Verdict.OK, where, ""
     output = answer.text or "no output"
     start = f"on {master.name}: ROS_HOSTNAME={master.address} roscore"

@@ -202,7 +202,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
 
     @override
     def exclusive_resources(self) -> tuple[str, ...]:
-        return ("topics", read_checks.SEEN) if self.reads and self.image else ("topics",)
+        return ("a stream of topics", read_checks.SEEN) if self.reads and self.image else ("a stream of topics",)
 
     @override
     def files(self) -> tuple[str, ...]:

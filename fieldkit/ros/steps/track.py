@@ -35,7 +35,7 @@ from fieldkit.steps.scene import BY_FIELDKIT, Announce, Need, Planned, Refusal, 
 from fieldkit.steps.surroundings import EarlierStep, EnclosingStep
 from fieldkit.steps.view import View
 
-_PERIODS: Final = 1.5
+_EXTRA_PERIODS: Final = 1.5
 """Recording time after the last step, in periods of the topic."""
 ODOMETRY: Final = "nav_msgs/Odometry"
 
@@ -80,7 +80,7 @@ class FixedPosition(Strict):
 
     @property
     def position_source(self) -> PositionSource:
-        """The position as a source of positions."""
+        """This position as the source of a robot's positions."""
         if self.frame is not None:
             return PositionSource(
                 place=(float(self.x or 0), float(self.y or 0), float(self.z)), frame=f"frame {self.frame}"
@@ -207,7 +207,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
             if ros
             else []
         )
-        return math.ceil(_PERIODS / min(rates_hz, default=1.0))
+        return math.ceil(_EXTRA_PERIODS / min(rates_hz, default=1.0))
 
     def _position_sources(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> PositionSources:
         """Return the sources of the robots' positions in an attempt."""

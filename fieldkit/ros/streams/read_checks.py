@@ -11,10 +11,10 @@ from fieldkit.measure.captures.arrays import Ints
 from fieldkit.ros.streams.topic_checks import MAX_SLEW_NS
 from fieldkit.ros.streams.topic_samples import TopicLog
 
-SEEN: Final = "frames that are seen"
-"""Exclusive resource of the steps that have the columns `seen_*`."""
-_HANDOVER_NS: Final = 200_000_000
-"""Maximum time on a busy robot from the arrival of a sample until a read can return the sample."""
+SEEN: Final = "a display of frames"
+"""Exclusive resource of the steps that have the columns `seen_*`: a repeat has only one such step without a name."""
+_MAX_READ_DELAY_NS: Final = 200_000_000
+"""Maximum time from the arrival of a sample until a read returns it, on a busy robot."""
 
 
 def check_reads(received: TopicLog) -> Iterator[str]:
@@ -31,7 +31,7 @@ def check_reads(received: TopicLog) -> Iterator[str]:
 
     if early := int((reads.sequence > newest_at(reads.at_ns + MAX_SLEW_NS)).sum()):
         yield f"{format_count(early, 'read')} in the subscriber's log returned a sample before it arrived"
-    if stale := int((reads.sequence < newest_at(reads.at_ns - _HANDOVER_NS)).sum()):
+    if stale := int((reads.sequence < newest_at(reads.at_ns - _MAX_READ_DELAY_NS)).sum()):
         yield f"{format_count(stale, 'read')} in the subscriber's log did not return the newest sample"
     numbers, first = np.unique(samples.sequence, return_index=True)
     _, read_index, sample_index = np.intersect1d(reads.sequence, numbers, return_indices=True)

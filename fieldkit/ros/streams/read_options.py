@@ -5,7 +5,7 @@ from typing import Annotated, Final
 from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, Duration, Field, Hertz, Strict
 
-_MULTIPLE: Final = 16
+_SIZE_MULTIPLE: Final = 16
 _WIDTHS: Final = (128, 2032)
 _HEIGHTS: Final = (64, 2032)
 """Limits in pixels. At the lower limits, each of the 16 x 8 cells with the number and time of a frame has 8 x 8
@@ -28,10 +28,10 @@ class Reads(Strict):
 
 def _validate_size(text: str) -> str:
     for pixels, (least, most) in zip(dimensions(text), (_WIDTHS, _HEIGHTS), strict=True):
-        if not least <= pixels <= most or pixels % _MULTIPLE:
+        if not least <= pixels <= most or pixels % _SIZE_MULTIPLE:
             raise schema.validation_error(
                 f"an image is {_WIDTHS[0]} to {_WIDTHS[1]} pixels wide and {_HEIGHTS[0]} to {_HEIGHTS[1]} high, each "
-                f"a multiple of {_MULTIPLE}, not {text}"
+                f"a multiple of {_SIZE_MULTIPLE}, not {text}"
             )
     return text
 

@@ -30,7 +30,7 @@ RANK: Final = 130
 """Position of the columns in trial.csv: after the columns of earlier versions."""
 MIN_READS: Final = 0.9
 """If a program read less often than this share of the planned reads, columns that need each read are empty."""
-_TAIL: Final = 0.95
+_TAIL_QUANTILE: Final = 0.95
 """Quantile of the ages in the column `age_p95_s`."""
 
 
@@ -217,7 +217,7 @@ def _ages(reads: SampleReads, clocks: Clocks | None, unknown_clocks: str) -> dic
         return {"withheld": unknown_clocks}
     age_s = clocks.delays_s(sample_reads.sent_ns, sample_reads.at_ns)
     ages = {
-        "age_p95_s": quantile_of_sent(age_s, len(reads), _TAIL),
+        "age_p95_s": quantile_of_sent(age_s, len(reads), _TAIL_QUANTILE),
         "age_mean_s": float(age_s.mean()),
         "age_max_s": float(age_s.max()),
     }

@@ -118,9 +118,10 @@ class StreamOptions(Strict):
             `Discovery/SPDPInterval: 500 ms` of CycloneDDS, `Internal/SocketReceiveBufferSize@min: 10 MB` for an
             attribute, `transport/link/tx/batch_size: "1400"` of Zenoh, `tcp_nodelay: "1"` of ROS 1, and for `ros2`
             environment variables: `RMW_IMPLEMENTATION: rmw_cyclonedds_cpp`.
-        reads: A program of the receiver that reads the newest sample, with [the age at its reads](teleop.md).
-        image: Size in pixels of grey images, `320x240`, which are the samples instead of `bytes`: `sensor_msgs/Image`
-            of [a synthetic camera](teleop.md).
+        reads: Reads of the newest sample by a program of the receiver, which measure [the age of the
+            sample](teleop.md).
+        image: Size of grey images in pixels, such as `320x240`. The samples are then images of [a synthetic
+            camera](teleop.md) (`sensor_msgs/Image`) instead of `bytes`.
     """
 
     sender: Role = Field(alias="from")

@@ -98,6 +98,7 @@ def check_captures(
         subscriber_log: Complete log of the subscriber.
         captured: The topic in both captures.
     """
+    # A capture in which packets lack a time cannot be compared with a log.
     if any(
         flow is not None and (flow.packets.time_ns == NO_TIME).any()
         for flow in (captured.publisher, captured.subscriber)
@@ -182,7 +183,14 @@ def _quantile_of_sent(latency_s: Floats, values: Mapping[str, Value], share: flo
 def _content_contradictions(
     heads: SampleHeads, samples: TopicSamples, numbers: Ints | None, name: str
 ) -> Iterator[str]:
-    """Yield differences in the time of sending between capture and log, and captured samples without a record."""
+    """Yield contradictions between the heads in a capture and the log of the same robot.
+
+    Args:
+        heads: Heads of samples in the capture.
+        samples: Samples in the log. Their times of sending must be those in the heads.
+        numbers: Numbers of the samples in the log, if it must contain every captured sample; otherwise None.
+        name: `publisher` or `subscriber`.
+    """
     if numbers is not None and (unlogged_count := int((~np.isin(heads.sequence, numbers)).sum())):
         yield f"{format_count(unlogged_count, 'sample')} in the {name}'s capture are not in its log"
     first_heads = heads.first()
@@ -229,7 +237,7 @@ def _uncaptured_samples(plan: TopicPlan, arrivals: TopicSamples, subscriber: Sam
     headless_count = int((~np.isin(arrivals.sequence, subscriber.heads.sequence)).sum())
     payload_bytes = packets.tcp_payload_bytes + np.maximum(packets.udp_bytes - UDP_HEADER_BYTES, 0)
     # `capacity` is the number of samples without a captured head that fit into the captured bytes.
-    if subscriber.is_tcp or size_bytes > _DATAGRAM_BYTES:
+    if subscriber.is_tcp or size_bytes > _MAX_UNDIVIDED_BYTES:
         capacity = int(payload_bytes.sum()) // size_bytes - len(subscriber.heads.first())
     else:
         capacity = int((payload_bytes // size_bytes).sum()) - len(subscriber.heads)
@@ -240,7 +248,7 @@ def _uncaptured_samples(plan: TopicPlan, arrivals: TopicSamples, subscriber: Sam
         yield from _early_samples(arrivals, packets.time_ns, payload_bytes, size_bytes)
 
 
-_DATAGRAM_BYTES: Final = 1_200
+_MAX_UNDIVIDED_BYTES: Final = 1_200
 """A DDS sample larger than this may be divided into several messages, each smaller than the sample."""
 
 

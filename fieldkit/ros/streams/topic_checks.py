@@ -26,7 +26,7 @@ SETTLING_NS: Final = 500_000_000
 PADDING_BYTES: Final = 3
 """DDS pads a sample to a multiple of 4 bytes, and some implementations do not report this."""
 
-_NAMES: Final = {topic_samples.PUBLISHER: "publisher", topic_samples.SUBSCRIBER: "subscriber"}
+_END_NAMES: Final = {topic_samples.PUBLISHER: "publisher", topic_samples.SUBSCRIBER: "subscriber"}
 
 
 @dataclass(frozen=True)
@@ -99,9 +99,9 @@ def check_times(logs: Mapping[Role, TopicLog], windows: Mapping[Role, tuple[int,
 
 def _log_contradictions(plan: TopicPlan, log: TopicLog, role: int) -> Iterator[str]:
     """Yield the contradictions of a log with its role, its topic, and its start and end records."""
-    name = _NAMES[role]
+    name = _END_NAMES[role]
     if log.role is not None and log.role != role:
-        yield f"the {name}'s log was written by the {_NAMES.get(log.role, 'unknown end')} of the topic"
+        yield f"the {name}'s log was written by the {_END_NAMES.get(log.role, 'unknown end')} of the topic"
     if log.topic_sum is not None and log.topic_sum != zlib.crc32(plan.topic.encode()):
         yield f"the {name}'s log is of another topic than {plan.topic}"
     has_valid_counts = (

@@ -23,9 +23,9 @@ _ENVELOPE_BYTES: Final = MappingProxyType(
 )
 """Bytes that serialization adds to the data. The first element of a key is True for images, the second is True for
 the serialization of ROS 1 and False for CDR."""
-_ROS1_QUEUE: Final = 1000
+_ROS1_QUEUE_SIZE: Final = 1000
 """Queue size in samples that the agent sets in ROS 1 for the history `keep_all` (`fieldkit.agent.messaging.ros1`)."""
-_LATE_S: Final = 0.1
+_MAX_START_DELAY_S: Final = 0.1
 """If the first sample is sent more than this time after the end of the publisher's wait, which follows the discovery,
 the column of the discovery time is empty."""
 
@@ -34,7 +34,7 @@ def plan(step: StreamOptions) -> TopicPlan:
     """Return the plan of a step's topic, with which its logs are compared."""
     quality = step.qos.resolved()
     keeps_last = quality.history is not History.KEEP_ALL and quality.depth > 0
-    depth = quality.depth if keeps_last else _ROS1_QUEUE if step.over is MiddlewareName.ROS1 else None
+    depth = quality.depth if keeps_last else _ROS1_QUEUE_SIZE if step.over is MiddlewareName.ROS1 else None
     return TopicPlan(
         topic=step.topic,
         samples=round(step.duration * step.rate),
@@ -120,13 +120,16 @@ def without_contradicted_times(
     )
     if publisher_log.matched_ns is not None and len(publisher_log.samples):
         late_s = (int(publisher_log.samples.sent_ns[0]) - publisher_log.matched_ns - topic_checks.SETTLING_NS) / 1e9
-        if late_s > _LATE_S:
+        if late_s > _MAX_START_DELAY_S:
             reasons["topic_discovery_s"] = f"the first sample was sent {late_s:.3f} s too late after the discovery"
     return measured.without(reasons)
 
 
 def read(step: StreamOptions, view: View, files: Mapping[Role, str]) -> tuple[dict[Role, TopicLog], list[str]]:
-    """Return the complete logs by role, and an error message for each other log and for samples of other programs."""
+    """Return the complete logs by role, and error messages.
+
+    There is a message for each log that is incomplete or unreadable, and for each log with samples of other programs.
+    """
     logs, errors = read_logs(view, files)
     for name in files.values():
         log = view.evidence.read_or_none(topic_samples.read_log, name)
@@ -136,7 +139,7 @@ def read(step: StreamOptions, view: View, files: Mapping[Role, str]) -> tuple[di
 
 
 def read_logs(view: View, files: Mapping[Role, str]) -> tuple[dict[Role, TopicLog], list[str]]:
-    """Return the complete logs by role, and an error message for each other log."""
+    """Return the complete logs by role, and an error message for each log that is incomplete or unreadable."""
     logs, errors = dict[Role, TopicLog](), list[str]()
     for role, name in files.items():
         try:

@@ -20,7 +20,10 @@ _LOST: Final = Style("lost", "x", "none")
 
 
 def panels(step: Step, evidence: AttemptEvidence, times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
-    """Yield the delays of received samples, and lost samples, by the time of sending; see `DrawsPanels.panels`."""
+    """Yield a panel with the delays of received samples, and with lost samples, by the time of sending.
+
+    Each delay is shown relative to the delay of the fastest sample. See `DrawsPanels.panels`.
+    """
     logs = {
         role: evidence.read_or_none(topic_samples.read_log, step.prefixed_name(f"{role}-topic.bin"))
         for verb in ("publish", "subscribe")

@@ -44,7 +44,7 @@ SUBSCRIBER: Final = 2
 _HAS_CHECKSUM: Final = 1
 """Value of `sent_ns` in an end record whose size field is a checksum. Older logs, without writer records, have
 none."""
-_SIZE_AT: Final = 4
+_SIZE_OFFSET: Final = 4
 """Offset of the size field in a record."""
 
 
@@ -173,7 +173,7 @@ def _is_intact(content: bytes | mmap, end_record: np.void, *, required: bool) ->
         return not required
     record = end_record.tobytes()
     starts_at = content.rfind(record)
-    without_checksum = record[:_SIZE_AT] + bytes(4) + record[_SIZE_AT + 4 :]
+    without_checksum = record[:_SIZE_OFFSET] + bytes(4) + record[_SIZE_OFFSET + 4 :]
     return zlib.crc32(without_checksum, zlib.crc32(memoryview(content)[:starts_at])) == int(end_record["size"])
 
 
@@ -321,7 +321,10 @@ def find_heads(path: Path, size_bytes: int, width: int = 0) -> Occurrences:
 
 
 def _before_head(size_bytes: int, width: int) -> bytes:
-    """Return the last fields of a message before its data: an empty layout, or an image's bytes per row, and size."""
+    """Return the last fields of a message before its data.
+
+    For an array these are an empty layout and the size of the data, for an image the bytes per row and this size.
+    """
     return struct.pack("<II", width, size_bytes) if width else struct.pack("<III", 0, 0, size_bytes)
 
 

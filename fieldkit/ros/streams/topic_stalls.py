@@ -60,7 +60,7 @@ def topic_deliveries(
         raise EvidenceError("a sample is earlier than the one before it: a clock was set back")
     pairs = StampPairs(samples.sent_ns[sent_index], subscriber_log.samples.at_ns[received_index])
     first_ns, last_ns = int(samples.sent_ns.min()), int(samples.sent_ns.max())
-    sent_ns = first_ns, first_ns, last_ns  # the first packet of a topic's data has the first payload
+    sent_ns = first_ns, first_ns, last_ns  # the first packet already has payload
     return deliveries.stream_deliveries(np.sort(at_ns), sent_ns, pairs, schedule)
 
 

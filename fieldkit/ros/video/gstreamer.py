@@ -16,9 +16,9 @@ PACKET_BYTES: Final = 1400
 
 _FD: Final = "{fd}"
 """Placeholder of a file descriptor (`fieldkit.agent.messaging.rtp_stream.FD`)."""
-_FORMAT: Final = "application/x-rtp,media=video,clock-rate=90000,encoding-name=JPEG,payload=26"
-_SEND: Final = ("fdsrc", "rawvideoparse", "jpegenc", "rtpjpegpay", "udpsink")
-_RECEIVE: Final = ("udpsrc", "rtpjitterbuffer", "rtpjpegdepay", "jpegdec", "fdsink")
+_RTP_FORMAT: Final = "application/x-rtp,media=video,clock-rate=90000,encoding-name=JPEG,payload=26"
+_SEND_ELEMENTS: Final = ("fdsrc", "rawvideoparse", "jpegenc", "rtpjpegpay", "udpsink")
+_RECEIVE_ELEMENTS: Final = ("udpsrc", "rtpjitterbuffer", "rtpjpegdepay", "jpegdec", "fdsink")
 _LIST_MISSING: Final = 'for element; do gst-inspect-1.0 --exists "$element" || echo "$element"; done 2>&1'
 
 
@@ -60,7 +60,7 @@ def receiver(address: str, port: int, buffer_s: float) -> list[str]:
     """
     jitter_buffer = [("rtpjitterbuffer", f"latency={round(1e3 * buffer_s)}")] if buffer_s else []
     return _command(
-        ("udpsrc", f"address={address}", f"port={port}", f"caps={_FORMAT}"),
+        ("udpsrc", f"address={address}", f"port={port}", f"caps={_RTP_FORMAT}"),
         *jitter_buffer,
         ("rtpjpegdepay",),
         ("jpegdec",),
@@ -75,7 +75,9 @@ def _command(*elements: Sequence[str]) -> list[str]:
 
 def need(role: Role, *, sends: bool) -> Need:
     """Return the preflight check that a robot has the elements of its pipeline."""
-    return Need(role, "GStreamer", ("sh", "-c", _LIST_MISSING, "sh", *(_SEND if sends else _RECEIVE)), judge)
+    return Need(
+        role, "GStreamer", ("sh", "-c", _LIST_MISSING, "sh", *(_SEND_ELEMENTS if sends else _RECEIVE_ELEMENTS)), judge
+    )
 
 
 def judge(result: CommandResult) -> tuple[Verdict, str, str]:

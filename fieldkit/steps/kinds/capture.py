@@ -139,22 +139,13 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
 
     def _planned_job(self, scene: Scene, role: Role) -> Planned:
         profile = scene.robot(role).profile
+        interface = self.capture_interface(scene, role)
         immediate = ("--immediate-mode",) if scene.tools(role).immediate_mode else ()
         options = ("-n", "-U", *immediate, "-s", str(self._snap_bytes), "-B", str(self._buffer_kib))
         job = Job(
             folder=scene.folder,
             name=self.prefixed_name("capture"),
-            argv=(
-                *(
-                    profile.tools.capture,
-                    "-i",
-                    self.capture_interface(scene, role),
-                    *options,
-                    "-w",
-                    self._file(role),
-                ),
-                self._filter(scene),
-            ),
+            argv=(profile.tools.capture, "-i", interface, *options, "-w", self._file(role), self._filter(scene)),
             # The limit exceeds the captured jobs, because a capture that was stopped at its limit looks complete.
             limit_s=LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene)),
             log=self._log(role),
@@ -238,7 +229,8 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
         starts: list[Callable[[], None]] = [
             partial(jobs.start, testbed.shells[capture.role], capture.job) for capture in captures
         ]
-        # sudo may take seconds if its host name cannot be resolved, which is too long for a waiting UDP listener.
+        # With sudo the first step is prepared after the captures have started. sudo may take seconds if the robot's
+        # host name cannot be resolved, and a UDP listener that the first step has started would stop waiting.
         rounds = ([*starts], [prepare]) if any(capture.job.as_root for capture in captures) else ([*starts, prepare],)
         announce("start captures", None)
         try:

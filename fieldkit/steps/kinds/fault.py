@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 PATIENCE_S: Final = 600.0
 """Time allowed for the operator to cause a fault."""
 
-_CLOCK_S: Final = 5.0
+_CLOCK_TIMEOUT_S: Final = 5.0
 """Timeout of a time query."""
 
 _START_S: Final = 0.3
@@ -50,7 +50,7 @@ _KINDS_WITH_DURATION: Final = frozenset({FaultKind.LINK_DOWN, FaultKind.OUT_OF_R
 
 
 class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
-    """Causes a fault of a robot while the steps in `during` run. Their losses are a result, not an error.
+    """Causes a fault of a robot while the steps in `during` run. Losses in these steps are a result, not an error.
 
     The backend of simulated robots causes the fault. In the field the operator is asked to cause it; with `--yes` no
     operator is asked, and the attempts are void.
@@ -190,7 +190,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
 
         def query(role: Role) -> Offset | None:
             with suppress(LinkError):
-                if exchanges := clocks.exchanges(testbed.shells[role], _CLOCK_S):
+                if exchanges := clocks.exchanges(testbed.shells[role], _CLOCK_TIMEOUT_S):
                     return offset(exchanges)
             return None
 

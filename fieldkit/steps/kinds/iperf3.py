@@ -36,7 +36,7 @@ from fieldkit.steps.view import View
 _SERVER_EXIT_S: Final = 5
 """Maximum time between the exits of client and server."""
 
-_DEFAULT_S: Final = 10.0
+_DEFAULT_DURATION_S: Final = 10.0
 """Default duration of iperf3."""
 
 _START_S: Final = 0.5
@@ -57,17 +57,14 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
 
     Attributes:
         duration: Duration of the test in whole seconds; 10 s without `size`.
-        size: Amount of data to send, `10MB`, instead of `duration`.
+        size: Amount of data to send, such as `10MB`, instead of `duration`.
         reverse: Whether the server sends and the client receives.
-        limit: A test that takes longer is stopped, and the repeat is void. With `along` it is added to the duration.
+        limit: Maximum duration. A test that takes longer is stopped, and the repeat is void. With `along` the maximum
+            is the duration of the path plus this value.
     """
 
     flow_kind: ClassVar[str] = "iperf3"
-    cross_checks = (
-        *iperf3_checks.CROSS_CHECKS,
-        *iperf3_load.JITTER_CROSS_CHECKS,
-        *stalls.cross_checks("iperf3"),
-    )
+    cross_checks = (*iperf3_checks.CROSS_CHECKS, *iperf3_load.JITTER_CROSS_CHECKS, *stalls.cross_checks("iperf3"))
 
     duration: Annotated[Duration, Field(ge=1)] | None = None
     size: Bytes | None = None
@@ -90,7 +87,7 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
 
     @property
     def _duration_s(self) -> float:
-        return _DEFAULT_S if self.duration is None else self.duration
+        return _DEFAULT_DURATION_S if self.duration is None else self.duration
 
     @property
     def source(self) -> Role:
@@ -181,7 +178,10 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
 
     @override
     def listens(self) -> tuple[ListeningPort, ...]:
-        """Return the port of the server. Its source is given, because the reports contain the ports of both ends."""
+        """Return the port of the server, with the role that sends the data.
+
+        The reports contain the ports of both ends, so two tests in opposite directions can use the same port.
+        """
         return (ListeningPort(self.receiver, self.port, self.sender, self.source),)
 
     @override

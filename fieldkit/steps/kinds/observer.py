@@ -19,7 +19,7 @@ _INTERVAL_S: Final = 0.1
 
 # Every $2 seconds, prints the seconds since boot. While processes named $1 run, also prints `up` and their process
 # IDs. Zombies do not count.
-_WATCH: Final = (
+_WATCH_SCRIPT: Final = (
     'echo "watching $1"; while :; do pids=; for file in /proc/[0-9]*/comm; do '
     'read -r name <"$file" && [ "$name" = "$1" ] && read -r stat <"${file%comm}stat" || continue; '
     'case $stat in *") Z "*) ;; *) pids="$pids ${stat%% *}" ;; esac; done 2>/dev/null; '
@@ -28,7 +28,7 @@ _WATCH: Final = (
 
 # Prints the duration of the cause ($1: how long the fault itself lasted, without the recovery) and the interval of
 # pings or polls ($2). Then waits until file $3 has $5 more lines that contain $4.
-_WAIT_FOR_RECOVERY: Final = (
+_RECOVERY_SCRIPT: Final = (
     'echo "lasted_s $1"; echo "interval_s $2"; enough=$(($(grep -c "$4" "$3") + $5)); '
     'until [ "$(grep -c "$4" "$3")" -ge "$enough" ]; do sleep 0.1; done'
 )
@@ -64,7 +64,7 @@ class Observer:
         """Return the job that observes until it is stopped; it is ready when the robot has answered."""
         interval = f"{self._interval_s:g}"
         if self._is_kill:
-            argv: tuple[str, ...] = ("sh", "-c", _WATCH, "sh", self.fault.process, interval)
+            argv: tuple[str, ...] = ("sh", "-c", _WATCH_SCRIPT, "sh", self.fault.process, interval)
         else:
             link = self.fault.link
             # Without `-I`, the requests could use another link, because a robot answers on any link for all of its
@@ -105,7 +105,7 @@ class Observer:
         job = Job(
             folder=self.scene.folder,
             name=step_prefixed(self.name, f"fault-{self.fault.kind}-heals"),
-            argv=("sh", "-c", _WAIT_FOR_RECOVERY, "sh", *arguments),
+            argv=("sh", "-c", _RECOVERY_SCRIPT, "sh", *arguments),
             limit_s=limit_s,
             log=step_prefixed(self.name, outage.log_file(self.fault.kind)),
             stdout=step_prefixed(self.name, outage.note_file(self.fault.kind)),

@@ -37,8 +37,7 @@ if TYPE_CHECKING:
 REPLY_TIMEOUT_S: Final = 2
 """Time that ping waits for the reply to its last request (option `-W`)."""
 MAX_SEQUENCE_COUNT: Final = 0xFFFF
-"""Number of requests after which sequence numbers repeat."""
-"""Size of the ICMP header of an echo request."""
+"""Largest sequence number of an echo request, which has 16 bits (RFC 792). With more requests, numbers repeat."""
 OLD_IPUTILS_MIN_INTERVAL_S: Final = 0.2
 """Shortest interval that iputils before 20210722 allows without root."""
 MAX_COUNT: Final = 1_000_000
@@ -84,7 +83,7 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
         sender: Role that sends the requests.
         receiver: Role that answers.
         count: Number of echo requests.
-        interval: Time between requests; below `200ms` iputils before 20210722 needs root.
+        interval: Time between requests. For less than `200ms`, iputils before 20210722 needs root.
         payload_bytes: ICMP payload per protocol; one number sets both.
         gap: Whether columns report the longest time without an answer, `rtt_gap_s`, and the requests lost in it,
             `rtt_gap_lost`. If the ping started or ended in the gap, the columns have lower bounds

@@ -47,12 +47,12 @@ class PrintedColumn(Strict):
 
     Attributes:
         name: Name of the column.
-        unit: Any unit, `V`, `dBm`, `%`; `text`, `bool` or `count` for values without one.
+        unit: Any unit, such as `V`, `dBm` or `%`; `text`, `bool` or `count` for values without a unit.
         meaning: Meaning of the values, for `fieldkit columns`.
-        path: Location of the value in JSON output, `battery.cells[0].mV`: a [JMESPath](https://jmespath.org). If a
-            key occurs twice, the last one is used.
-        expression: In place of `json`, a regular expression ([RE2](https://github.com/google/re2/wiki/Syntax)) with
-            one group; its first match is the value. `^` and `$` match at ends of a line.
+        path: Location of the value in JSON output, such as `battery.cells[0].mV`: a [JMESPath](https://jmespath.org).
+            If a key occurs twice, the last one is used.
+        expression: Instead of `json`, a regular expression ([RE2](https://github.com/google/re2/wiki/Syntax)) with
+            one group, whose first match is the value. `^` and `$` match the start and the end of a line.
         optional: Whether the value may be missing in a valid repeat.
         label: Label in tables and figures, instead of its name.
     """
@@ -149,15 +149,15 @@ class RunStep(Step, UsesSpace, Summarizes):
 
     Attributes:
         robot: Role of the robot on which it runs.
-        command: The command, split into words as a shell does, without shell operators such as a pipe; with
-            variables.
+        command: The command, which is split into words as by a shell. It may contain variables, but no shell
+            operators such as a pipe.
         argv: The command as a list of words, instead of `command`.
         put: A program of the lab, at most 8.4 MB, which is copied to the robot before the first step: a path relative
             to the folder of the procedure or, if it does not exist there, of the lab; links must not point outside.
             `{put}` is its path on the robot. In `trial.yaml` it is a mapping with the keys below; in a procedure it
             is a path.
         takes: Approximate duration, for the estimate of the remaining time.
-        limit: A program that runs longer is stopped, and the repeat is void.
+        limit: Maximum duration. A program that runs longer is stopped, and the repeat is void.
         output: File for its standard output.
         prints: Approximate size of the output, for the estimate of disk space.
         figures: Columns of `trial.csv`, each read from the output.

@@ -26,7 +26,7 @@ from fieldkit.steps.view import View
 LIMIT_S: Final = 900.0
 """Time limit of the load in addition to the limits of the steps inside."""
 
-_FOREVER_S: Final = 86_400
+_MAX_DURATION_S: Final = 86_400
 """Maximum duration that iperf3 accepts."""
 
 _START_S: Final = 0.5
@@ -36,7 +36,7 @@ _STALLS: Final = stalls.declare_columns("soak", "the load", rank=69)
 
 # Executes the command in $2 and later arguments, and prints "flows" when interface $1 has sent 10 kB. iperf3 itself
 # reports its packets only after a second. If its output is a file, old versions report nothing until they exit.
-_FLOWS: Final = (
+_CLIENT_SCRIPT: Final = (
     'sent() { awk -v i="$1" \'{ sub(":", " ") } $1 == i { print $10 }\' /proc/net/dev; }; '
     '(from=$(sent "$1"); until [ "$(sent "$1")" -gt $((from + 10000)) ]; do sleep 0.1; done; echo flows >&2) & '
     'shift; exec "$@"'
@@ -69,10 +69,10 @@ class SoakStep(LoadOptions, Nest, Listens, SendsTraffic):
         """Return the jobs of server and client."""
         limit_s = LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene))
         interface = scene.link(self.sender, self.over).interface
-        client_command = self.client_command(scene, "-t", str(_FOREVER_S))
+        client_command = self.client_command(scene, "-t", str(_MAX_DURATION_S))
         ends = {
             self.receiver: (self.server_command(), jobs.ready_when_bound(Protocol.TCP, self.port)),
-            self.sender: (("sh", "-c", _FLOWS, "sh", interface, *client_command), "log:flows"),
+            self.sender: (("sh", "-c", _CLIENT_SCRIPT, "sh", interface, *client_command), "log:flows"),
         }
         server, client = (
             Planned(

@@ -108,7 +108,7 @@ class TransferStep(
         into: The file written by the receiver.
         port: Port that the receiver listens on.
         idle: A UDP listener exits after this time without a datagram; at least `1s`, rounded up to whole seconds.
-        limit: A transfer that takes longer is stopped, and the data received until then is measured.
+        limit: Maximum duration. A longer transfer is stopped, and the data received until then is measured.
     """
 
     columns = COLUMNS

@@ -38,10 +38,7 @@ def run_probe(shell: Shell, interface: str, commands: Mapping[str, Sequence[str]
         RobotError: The probe wrote too much output.
     """
     completed = shell.run(
-        ("sh", "-s", interface),
-        stdin=script(commands).encode(),
-        deadline=Deadline.after(PROBE_S),
-        check=False,
+        ("sh", "-s", interface), stdin=script(commands).encode(), deadline=Deadline.after(PROBE_S), check=False
     )
     return parse(completed.stdout.decode(errors="replace"))
 

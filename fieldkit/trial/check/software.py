@@ -27,6 +27,7 @@ from fieldkit.trial.check.report import Report
 from fieldkit.trial.plan import Plan
 
 BASE_PROGRAMS: Final = ("setsid", "mkfifo", "timeout", "awk", "tar", "sha256sum")
+"""Programs that fieldkit needs on every robot, for all procedures."""
 
 # Package names in Debian.
 _PACKAGES: Final = {
@@ -46,8 +47,8 @@ _PACKAGES: Final = {
     "iperf3": "iperf3",
     "python3": "python3",
 }
-_TOOLS: Final = "tools"
-_AGENT_S: Final = 30.0
+_TOOLS_SECTION: Final = "tools"
+_AGENT_TIMEOUT_S: Final = 30.0
 """Timeout of a check that the agent runs."""
 
 
@@ -84,7 +85,7 @@ def commands(plan: Plan, role: Role) -> dict[str, Sequence[str]]:
         )
     for need in needs_of(plan, role):
         commands_by_section[need.name] = need.argv
-    commands_by_section[_TOOLS] = tools.probe(profile, _tools(plan, role))
+    commands_by_section[_TOOLS_SECTION] = tools.probe(profile, _tools(plan, role))
     return commands_by_section
 
 
@@ -116,7 +117,7 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> Variant
             report.add(need.name, *need.judge(sections.get(need.name, MISSING_SECTION)))
     if len(present) < len(programs):
         return variants.expected(profile)
-    return _judge_tools(profile, sections.get(_TOOLS, MISSING_SECTION), report)
+    return _judge_tools(profile, sections.get(_TOOLS_SECTION, MISSING_SECTION), report)
 
 
 def check_agent(plan: Plan, role: Role, sections: Sections, shell: Shell, report: Report) -> None:
@@ -131,7 +132,7 @@ def check_agent(plan: Plan, role: Role, sections: Sections, shell: Shell, report
             from fieldkit.remote import agent  # noqa: PLC0415 (few steps need the agent)
 
             agent.install(shell)
-            completed = shell.run(need.argv, deadline=Deadline.after(_AGENT_S), check=False)
+            completed = shell.run(need.argv, deadline=Deadline.after(_AGENT_TIMEOUT_S), check=False)
             text = (completed.stdout + completed.stderr).decode("utf-8", "replace")
             report.add(need.name, *need.judge(CommandResult(text, completed.exit_code)))
 
@@ -148,14 +149,14 @@ def _judge_tools(profile: RobotProfile, result: CommandResult, report: Report) -
     try:
         detected = tools.parse(result.text.encode(), profile)
     except RobotError as error:
-        report.fail(_TOOLS, error.what, error.remedy)
+        report.fail(_TOOLS_SECTION, error.what, error.remedy)
         return variants.expected(profile)
     # For netcat, the variant is reported: some variants print no version, and the formats of the others differ.
     words = [
         f"{detected.netcat} netcat" if tool is Tool.NETCAT else version for tool, version in detected.versions.items()
     ]
     if words:
-        report.ok(_TOOLS, ", ".join(words))
+        report.ok(_TOOLS_SECTION, ", ".join(words))
     return detected
 
 

@@ -22,7 +22,9 @@ SNAPSHOT_S: Final = 15.0
 remaining time is for a slow connection."""
 
 _NO_PROGRAM: Final = "no program of the robot reports that it sets the clock"
-_INSTALL: Final = "sudo apt-get install chrony   # then add a line `server ADDRESS iburst` to /etc/chrony/chrony.conf"
+_INSTALL_REMEDY: Final = (
+    "sudo apt-get install chrony   # then add a line `server ADDRESS iburst` to /etc/chrony/chrony.conf"
+)
 _REMEDIES: Final[Mapping[str, str]] = {
     "chronyd does not run": "sudo systemctl enable --now chrony",
     "chrony": "chronyc -n sources   # add a line `server ADDRESS iburst` to /etc/chrony/chrony.conf, restart chrony",
@@ -30,8 +32,8 @@ _REMEDIES: Final[Mapping[str, str]] = {
     "ptp4l": "sudo pmc -u -b 0 'GET PORT_DATA_SET'   # its network needs a PTP master",
 }
 """Remedy by problem, or by program."""
-_STEP: Final[Mapping[str, str]] = {"chrony": "sudo chronyc makestep"}
-_STEP_ANY: Final = "wait until the program has corrected the clock, or restart the program"
+_STEP_REMEDIES: Final[Mapping[str, str]] = {"chrony": "sudo chronyc makestep"}
+_DEFAULT_STEP_REMEDY: Final = "wait until the program has corrected the clock, or restart the program"
 """Remedy for a clock that differs from its time source, by program."""
 
 
@@ -76,17 +78,17 @@ def judge(reports: Sequence[ClockReport], report: Report, *, is_required: bool =
     """
     for clock_report in reports:
         if clock_report.problem:
-            remedy = _REMEDIES.get(clock_report.problem) or _REMEDIES.get(clock_report.program, _INSTALL)
+            remedy = _REMEDIES.get(clock_report.problem) or _REMEDIES.get(clock_report.program, _INSTALL_REMEDY)
             report.warn(CHECK, clock_report.problem, remedy)
         else:
             error = "" if clock_report.error_s is None else f" \N{PLUS-MINUS SIGN} {clock_report.error_s:.6f} s"
             detail = f"{clock_report.program} follows {clock_report.reference}, {clock_report.offset_s:+.6f} s{error}"
             if exchanges.is_wrong(Offset(clock_report.offset_s or 0.0, clock_report.error_s or 0.0)):
-                report.warn(CHECK, detail, _STEP.get(clock_report.program, _STEP_ANY))
+                report.warn(CHECK, detail, _STEP_REMEDIES.get(clock_report.program, _DEFAULT_STEP_REMEDY))
             else:
                 report.ok(CHECK, detail)
     if not reports and is_required:
-        report.warn(CHECK, _NO_PROGRAM, _INSTALL)
+        report.warn(CHECK, _NO_PROGRAM, _INSTALL_REMEDY)
 
 
 def contradictions(times: Mapping[str, RobotTime]) -> Iterator[str]:

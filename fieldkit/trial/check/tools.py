@@ -32,8 +32,8 @@ _PROBE_FUNCTION: Final = r"""run_tool() {
 """
 _MARK: Final = re.compile(rb"^==> (?:(?P<name>[a-z]+)|exit (?P<code>[0-9]{1,3})) <==$", re.MULTILINE)
 # Exit codes of a POSIX shell: a program that cannot be executed or is not found, and a program killed by SIGKILL (9).
-_MISSING: Final = {126, 127}
-_KILLED: Final = 128 + 9
+_MISSING_CODES: Final = {126, 127}
+_KILLED_CODE: Final = 128 + 9
 _USER: Final = "user"
 _ECHO: Final = "echo"
 
@@ -78,11 +78,8 @@ def probe(profile: RobotProfile, tools: Iterable[Tool] = Tool) -> tuple[str, ...
         (_USER, ("id", "-u")),
         *(command for tool in probed_tools for command in commands_by_tool[tool]),
     ]
-    return (
-        "sh",
-        "-c",
-        _PROBE_FUNCTION + "".join(f"run_tool {name} {quote(argv)}\n" for name, argv in named_commands),
-    )
+    calls = "".join(f"run_tool {name} {quote(argv)}\n" for name, argv in named_commands)
+    return ("sh", "-c", _PROBE_FUNCTION + calls)
 
 
 def parse(output: bytes, profile: RobotProfile) -> Variants:
@@ -174,7 +171,7 @@ def _parse_recorder(text: str, code: int, profile: RobotProfile) -> Recorder:
         return Recorder.NONE
     is_ros1 = profile.ros.variant == "ros1"
     if ("rosbag record" if is_ros1 else "ros2 bag record") not in text:
-        if code == _KILLED:
+        if code == _KILLED_CODE:
             raise _timeout_error(" ".join((*_record_command(profile), "--help")))
         return Recorder.NONE
     if is_ros1:
@@ -204,8 +201,8 @@ def _timeout_error(command: str) -> RobotError:
 
 
 def _unknown_tool_error(text: str, code: int, program: str, remedy: str) -> RobotError:
-    if code == _KILLED:
+    if code == _KILLED_CODE:
         return _timeout_error(program)
-    problem = f"there is no {program}" if code in _MISSING else f"{program} is of an unknown kind"
+    problem = f"there is no {program}" if code in _MISSING_CODES else f"{program} is of an unknown kind"
     excerpt = printable(text.encode(), limit=100)
     return RobotError(f"{problem}: {excerpt}" if excerpt else problem, remedy=f"{remedy} in its profile")

@@ -9,14 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from fieldkit.core.columns import Measured
-from fieldkit.core.errors import (
-    EvidenceError,
-    FieldkitError,
-    LinkError,
-    LockLostError,
-    RobotError,
-    TestbedLostError,
-)
+from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, LockLostError, RobotError, TestbedLostError
 from fieldkit.core.events import Note, PhaseStarted, Sink
 from fieldkit.core.model import RepeatId, Role, Status
 from fieldkit.measure.attempt import AttemptEvidence

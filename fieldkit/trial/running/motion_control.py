@@ -36,7 +36,10 @@ class MotionClearance(Protocol):
         ...
 
     def reporting_holds(self, sink: Sink) -> AbstractContextManager[None]:
-        """Run the body. If the operator stops it, report each robot that must not move without a confirmation."""
+        """Return a context manager.
+
+        If the operator stops its body, it reports each robot that must not move until a person confirms the motion.
+        """
         ...
 
 

@@ -10,14 +10,7 @@ from typing import Final, TypeVar
 
 from fieldkit.backends.protocols import Testbed, Transient
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import (
-    EvidenceError,
-    FieldkitError,
-    LinkError,
-    LockLostError,
-    RobotError,
-    TestbedLostError,
-)
+from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, LockLostError, RobotError, TestbedLostError
 from fieldkit.core.events import PhaseStarted, Sink
 from fieldkit.core.model import RepeatId, Role
 from fieldkit.core.threads import run_parallel

@@ -25,7 +25,7 @@ MIN_NEW: Final = 20
 """Smallest number of new or changed tables for which an index is written again. Fewer are read from their files."""
 MAX_TABLE_BYTES: Final = 1 << 25
 """Maximum size of a table in the index."""
-_IN_PARALLEL: Final = 200
+_MIN_PARALLEL_PLANS: Final = 200
 """Smallest number of plans that are read in parallel. Reading a plan takes 20 ms; starting processes takes 1 s."""
 
 Note = Callable[[str], None]
@@ -123,7 +123,7 @@ def _facts(tables: Sequence[Path], workers: Workers, note: Note) -> dict[Path, T
         with suppress(FieldkitError):
             names[table] = table_files.names(table)
     with_plan = [table for table in names if other_names(names[table])]
-    if len(with_plan) < _IN_PARALLEL:
+    if len(with_plan) < _MIN_PARALLEL_PLANS:
         workers = Workers(jobs=1)
     declarations = dict.fromkeys(names, "")
     absolute = [table.absolute() for table in with_plan]  # workers of a cluster have another working directory

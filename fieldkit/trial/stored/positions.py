@@ -184,17 +184,19 @@ def attempt_positions(folder: Path) -> Iterator[AttemptPositions]:
             )
 
 
-_SMALLEST: Final = "_distance_min_m"
+_MIN_DISTANCE_SUFFIX: Final = "_distance_min_m"
 
 
 def _distances_m(measured: Measured) -> Iterator[tuple[str, tuple[float, float]]]:
     for name, minimum_m in measured.values.items():
-        if name.endswith(_SMALLEST):
-            measurement = name.removesuffix(_SMALLEST)
+        if name.endswith(_MIN_DISTANCE_SUFFIX):
+            measurement = name.removesuffix(_MIN_DISTANCE_SUFFIX)
             yield measurement, (float(minimum_m), float(measured.values[f"{measurement}_distance_max_m"]))
 
 
 def _missing(measured: Measured) -> Mapping[str, str]:
     return {
-        name.removesuffix(_SMALLEST): reason for name, reason in measured.missing.items() if name.endswith(_SMALLEST)
+        name.removesuffix(_MIN_DISTANCE_SUFFIX): reason
+        for name, reason in measured.missing.items()
+        if name.endswith(_MIN_DISTANCE_SUFFIX)
     }

@@ -26,7 +26,7 @@ from fieldkit.trial.stored.indexed_tables import NO_INDEX, IndexedTables
 
 ALL_PROCESSORS: Final = Workers()
 
-_IN_PARALLEL: Final = 8
+_MIN_PARALLEL_TRIALS: Final = 8
 """Smallest number of trials that are measured in parallel by default, because starting processes takes a second."""
 
 Note = Callable[[str], None]
@@ -354,7 +354,7 @@ def _identity(table: Path) -> object:
 
 def _remeasured_tables(tables: Sequence[Path], workers: Workers, note: Note) -> Callable[[Path], bytes]:
     """Return a function that returns the table of a trial, measured again from its raw evidence."""
-    if workers.is_default and len(tables) < _IN_PARALLEL:
+    if workers.is_default and len(tables) < _MIN_PARALLEL_TRIALS:
         return partial(_remeasured_table, note=note)
     from fieldkit.core.tasks import completed  # noqa: PLC0415 (needed only to measure again)
 
@@ -388,7 +388,10 @@ def _remeasured_table(table: Path, note: Note) -> bytes:
         )
     plan = plans.read_plan(folder)
     note_differences(folder, note)
-    return rows.to_csv(rebuild.measure_rows(folder, plan), plan.table).encode()
+    measured_rows, problems = rebuild.measure_rows(folder, plan)
+    if problems:
+        note(f"{folder}: {rebuild.problems_text(problems)}")
+    return rows.to_csv(measured_rows, plan.table).encode()
 
 
 def note_differences(folder: Path, note: Note) -> None:

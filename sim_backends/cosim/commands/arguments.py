@@ -270,7 +270,7 @@ def _add_sdf(commands: Commands) -> None:
         "--gazebo",
         ("fortress", "garden"),
         default="fortress",
-        help="names of the plugins: fortress (default), or garden for it and later versions",
+        help="version of Gazebo for which the plugins are named: fortress (default), or garden for Garden and later",
     )
     parser.set_defaults(run=f"{_PACKAGE}.sdf:run")
 
@@ -361,18 +361,18 @@ def _set_completer(action: Any, names: Callable[[], Iterable[str]]) -> None:  # 
 
 
 def _scenario_names() -> Iterable[str]:
-    from sim_backends.cosim.scenario.loading import scenario_files  # noqa: PLC0415 (pydantic)
+    from sim_backends.cosim.scenario.loading import scenario_files  # noqa: PLC0415 (importing pydantic is slow)
 
     return [*scenario_files(), *map(str, Path().glob("*.yaml"))]
 
 
 def _policy_names() -> Iterable[str]:
-    from sim_backends.cosim.policies.registry import policies  # noqa: PLC0415 (as above)
+    from sim_backends.cosim.policies.registry import policies  # noqa: PLC0415 (importing pydantic is slow)
 
     return policies()
 
 
 def _federate_names(role: str) -> Iterable[str]:
-    from sim_backends.cosim.scenario.external import simulators  # noqa: PLC0415 (as above)
+    from sim_backends.cosim.scenario.external import simulators  # noqa: PLC0415 (importing pydantic is slow)
 
     return [simulator.name for simulator in simulators() if simulator.role == role]

@@ -1,6 +1,6 @@
 """The command `fieldkit cosim shootout --bias`, which computes the bias of each sync policy.
 
-The bias is the mean difference from the exact reference over seeds.
+The bias of a measure, for example of the loss, is the mean over seeds of its difference from the exact reference.
 """
 
 import argparse
@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
     policies = settings.read_policies(arguments)
     seeds = settings.read_seeds(arguments, scenario)
     if len(seeds) < 2:
-        raise ConfigurationError("--bias: one seed has no distribution", remedy="add --seeds 20")
+        raise ConfigurationError("--bias compares several seeds, but there is only one", remedy="add --seeds 20")
     if arguments.windows:
         scenario = settings.with_window(scenario, settings.read_windows_s(arguments, scenario)[0])
     draw = None if arguments.figure is None else settings.open_figure(arguments.figure, "--figure")

@@ -1,4 +1,7 @@
-"""The command `fieldkit cosim shootout --bound`, which compares exchanges of fixed windows and `error_bounded`."""
+"""The command `fieldkit cosim shootout --bound`, which compares the policy `error_bounded` with fixed windows.
+
+It compares the numbers of exchanges that are needed to keep a bound on position errors.
+"""
 
 import argparse
 import math
@@ -52,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
     scenario = settings.read_scenario(arguments)
     if scenario.policy.bound_db is not None:
         raise ConfigurationError(
-            "--bound compares position errors, and policy.bound_db limits the error of path loss",
+            "--bound needs a bound on position errors, but policy.bound_db is a bound on the error of path loss",
             remedy="remove policy.bound_db; change the bound by --set policy.bound=1cm",
         )
     seeds = settings.read_seeds(arguments, scenario)

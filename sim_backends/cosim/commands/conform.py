@@ -104,7 +104,7 @@ def _is_federate_with_role(endpoint: str, role: int) -> bool:
     """Return True if there is a federate with this name and this role."""
     try:
         return named_federate(endpoint, role) is not None
-    except ConfigurationError:  # the federate has the other role, or its package cannot be loaded
+    except ConfigurationError:  # the federate has only the other role, or its package cannot be loaded
         return False
 
 

@@ -118,7 +118,8 @@ def simulate(
         try:
             folder.write_rows(result)
         except ConfigurationError:
-            if ended_by is None:  # otherwise report that error, which may have the same cause
+            # If the run failed, only its error is reported, because both errors may have the same cause.
+            if ended_by is None:
                 raise
     return result
 
@@ -168,7 +169,7 @@ def simulate_all(
     tasks = [Task(policy, seed) for seed in seeds]
     is_interrupted = False
     try:
-        # A federate with an address serves one run at a time, and parallel runs would delay each other.
+        # A federate with an address serves one run at a time, and parallel runs in real time would delay each other.
         workers = (
             Workers(1)
             if has_addresses(scenario) or pace is not None
@@ -178,7 +179,8 @@ def simulate_all(
         for number, result in as_completed_tasks(work, tasks, workers=workers):
             results[number] = result
             report(len(results))
-            if result.is_interrupted:  # with a single worker, the run catches Ctrl-C
+            # With a single worker, `simulate` catches the KeyboardInterrupt, and returns an interrupted result.
+            if result.is_interrupted:
                 is_interrupted = True
                 break
     except KeyboardInterrupt:

@@ -14,7 +14,7 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 BACKEND: Final = "cosim"
 
 _NOT_PROCEDURE: Final = frozenset({"name", "summary", "policy", "seeds", "duration", "trial"})
-"""Keys of a scenario that are not part of the procedure: if only their values differ, its hash is the same."""
+"""Keys of a scenario that are not part of the procedure: their values do not change the hash of the procedure."""
 
 
 def flow_rows(
@@ -108,7 +108,11 @@ def _measured_columns(flow: FlowResult) -> dict[str, Value]:
 
 
 def _ping_columns(flow: FlowResult) -> dict[str, Value]:
-    """Return the columns of a ping; payload sizes are comparable, because UDP and ICMP have headers of 8 bytes."""
+    """Return the columns of a ping.
+
+    A simulated ping is sent over a transport such as UDP. The headers of UDP and ICMP have 8 bytes, so payload sizes
+    are comparable with the sizes of a real ping.
+    """
     trips = flow.round_trips
     if trips is None:
         return {}

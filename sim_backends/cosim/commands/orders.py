@@ -116,7 +116,7 @@ def _measure(
 def _local_errors(scenario: CosimScenario, windows_s: Sequence[float], task: Task) -> LocalErrors | PolicyError:
     """Return the local errors of a policy with one seed, or the error with which the policy failed."""
 
-    def make(policy: SyncPolicy) -> Coordinator:
+    def make_coordinator(policy: SyncPolicy) -> Coordinator:
         return build(scenario, policy=policy, seed=task.seed, measures_all=True).coordinator
 
     def policy_for(window_s: float) -> SyncPolicy:
@@ -128,7 +128,7 @@ def _local_errors(scenario: CosimScenario, windows_s: Sequence[float], task: Tas
     step_ns = scenario.physics.step_ns
     starts_ns = low_discrepancy_times_ns(0, max(until_ns, step_ns), START_TIMES, step_ns)
     try:
-        return local_errors(make, {task.policy: policy_for}, windows_s, starts_ns)[task.policy]
+        return local_errors(make_coordinator, {task.policy: policy_for}, windows_s, starts_ns)[task.policy]
     except PolicyError as error:
         return error
 

@@ -40,7 +40,7 @@ class CostPoint:
     """The errors and the cost of a policy, with one window; an error is nan if there are no packets to measure it.
 
     Attributes:
-        policy: Its name.
+        policy: Name of the policy.
         exchanges_per_s: Exchanges per simulated second.
         delivery_error_mean_s: Mean error of delivery times.
         position_error_mean_m: Mean error of the positions that the network assumes.
@@ -147,7 +147,7 @@ def _positive_points(errors: LocalErrors, measure: str, factor: float) -> tuple[
 
 
 def _curves(points: Sequence[CostPoint], name: str) -> list[Curve]:
-    """Return a curve per policy, with the errors times 1000; errors that are nan are omitted."""
+    """Return a curve per policy, with the errors in ms or mm; errors that are nan are omitted."""
     curves: dict[str, list[tuple[float, float]]] = {}
     for point in points:
         if not math.isnan(error := getattr(point, name)):

@@ -47,7 +47,7 @@ def recording_at(folder: Path) -> Recording:
     """Return the recording in a folder.
 
     Raises:
-        EvidenceError: It does not exist, or is damaged.
+        EvidenceError: The recording does not exist or is damaged, or the folder contains several recordings.
     """
     seed_folders = sorted(path.parent for path in folder.glob("seed-*/run.json"))
     if seed_folders and not (folder / "run.json").exists():

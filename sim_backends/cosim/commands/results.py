@@ -126,7 +126,9 @@ class FlowRoundTrips:
 
 @dataclass(frozen=True)
 class FlowResult:
-    """The results of a flow. Packets that were under way at the end of the run count only in `packets_under_way`.
+    """The results of a flow.
+
+    Packets that were under way at the end of the run count only in `packets_under_way`, the distances and the speeds.
 
     Attributes:
         name: The flow.
@@ -304,7 +306,7 @@ class SeedResult:
     """The result of a run.
 
     Attributes:
-        seed: Its seed.
+        seed: The seed of the run.
         flows: The results of its flows.
         simulated_s: Simulated time.
         windows: Number of windows.
@@ -313,9 +315,9 @@ class SeedResult:
         starts_m: Position of each agent at its start, metres east, north, up.
         recoveries: Recoveries of flows after faults.
         formation: Errors of the positions of followers.
-        stop_reason: The reason why it ended early; empty if it is complete.
-        error: The error that ended it early; None if it is complete or was interrupted.
-        lateness: Lateness of its windows; None if it was not a run in real time.
+        stop_reason: The reason why the run ended early; empty if the run is complete.
+        error: The error that ended the run early; None if the run is complete or was interrupted.
+        lateness: Lateness of the run's windows; None if it was not a run in real time.
     """
 
     seed: int
@@ -333,7 +335,7 @@ class SeedResult:
 
     @property
     def is_interrupted(self) -> bool:
-        """True if Ctrl-C ended it."""
+        """True if Ctrl-C ended the run."""
         return bool(self.stop_reason) and self.error is None
 
 
@@ -351,12 +353,12 @@ def seed_result(
 
     Args:
         scenario: The scenario.
-        seed: Its seed.
-        run: The record.
+        seed: The seed of the run.
+        run: The record of the run.
         states: States of agents in the form of `Recording.states`, at least for time 0.
-        ended_by: The exception that ended it early, or None.
-        starts: States of all agents at their starts; None for the first states in `states`.
-        lateness: Lateness of its windows; None if it was not a run in real time.
+        ended_by: The exception that ended the run early, or None.
+        starts: States of all agents at their starts; if None, the first state of each agent in `states` is used.
+        lateness: Lateness of the run's windows; None if it was not a run in real time.
     """
     ended_s = run.windows_ns[-1] / 1e9 if run.windows_ns else 0.0
     error = ended_by if isinstance(ended_by, FieldkitError) else None

@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     threshold = parse_quantity(arguments.threshold, {"%": 0.01}, "threshold")
     if threshold > 1:
         raise ConfigurationError(
-            f"--threshold: {arguments.threshold} is more than all packets", remedy="write for example --threshold 10%"
+            f"--threshold: {arguments.threshold} is above 100 %", remedy="write for example --threshold 10%"
         )
     seed = scenario.seeds[0] if arguments.seed is None else arguments.seed
     build(without_federates(scenario))  # raises before any run if the scenario is invalid

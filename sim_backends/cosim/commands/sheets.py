@@ -121,9 +121,14 @@ def show_all(sheets: Mapping[str, Sheet], form: str) -> None:
 
 
 def number_text(value: float, digits: int = 3) -> str:
-    """Return a number with `digits` significant digits, without an exponent unless it would be long."""
+    """Return a number as text with at least `digits` significant digits: `0.0123`, `12.3`, `12,345`, `1.23e+08`.
+
+    Magnitudes from 1000 to 1e7 are rounded to whole numbers. Larger ones, and those below 1e-4, have an exponent.
+    """
     if value == 0 or 1e-4 <= abs(value) < 1e3:
-        return f"{value:.{digits}g}"
+        text = f"{value:.{digits}g}"
+        # The format `g` returns 1e+03 for 999.6, because the rounded number has more digits than requested.
+        return f"{value:,.0f}" if "e" in text else text
     return f"{value:,.0f}" if 1e3 <= abs(value) < 1e7 else f"{value:.2e}"
 
 

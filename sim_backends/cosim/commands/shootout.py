@@ -118,11 +118,11 @@ def _all_rows(
     report = progress_reporter(sink)
     for number, window_s in enumerate(windows_s):
         policies_to_run = [name for name in policies if number == 0 or settings.has_window(name)]
-        make = partial(_build, settings.with_window(scenario, window_s))
+        make_simulation = partial(_build, settings.with_window(scenario, window_s))
         runs = len({*policies_to_run, EventDriven.name}) * len(seeds)
         progress = partial(report, f"window {window_s * 1e3:g} ms", runs)
         progress(0)
-        window_outcomes = run_outcomes(make, policies_to_run, seeds, workers=workers, progress=progress)
+        window_outcomes = run_outcomes(make_simulation, policies_to_run, seeds, workers=workers, progress=progress)
         window_rows = rows(window_outcomes, partial(compute_formation, scenario))
         all_rows += [(window_s, row) for row in window_rows if row.policy in policies_to_run]
     return sorted(all_rows, key=lambda window_and_row: policies.index(window_and_row[1].policy))

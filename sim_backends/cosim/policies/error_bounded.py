@@ -27,7 +27,7 @@ that they have moved. If one physics step moves them farther than the bound, the
 The bound may be given in dB of path loss. By the log-distance law, the path loss at a distance d is a constant plus
 10 n log10(d). If two agents with the assumed distance d are nearer by x, their path loss is lower by
 10 n log10(d / (d - x)); if they are farther by x, the change is smaller. A bound of b dB therefore allows an error
-x = d (1 - 10^(-b / 10 n)), which decreases no faster than the assumed distance.
+x = d (1 - 10^(-b / (10 n))), which decreases no faster than the assumed distance.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""The interface of a sync policy, and the data on which it decides.
+"""The interface of a sync policy, and the data from which it determines the next window.
 
 A sync policy determines how long physics and network run without an exchange of data (a window).
 """
@@ -24,7 +24,8 @@ class Situation:
         now_ns: Time that physics and network have reached.
         states: States of the agents now.
         pairs: Sender and receiver of each possible transmission.
-        next_wake_ns: A function; returns the next time at which a timer of a program fires, or None.
+        next_wake_ns: A function; returns the next time at which a program wakes, or an agent appears or disappears;
+            None without such a time.
         next_event_ns: A function; returns the time of the next event in the network, or None.
         physics_step_ns: Time step of the physics simulator.
         limits_m_s2: Largest change of each agent's velocity per second.
@@ -115,9 +116,9 @@ class LookingAhead(SyncPolicy, Protocol):
         """Return the time to which the current window can be extended; the agents have reached `situation.now_ns`.
 
         Args:
-            situation: The current situation, except for the network, which is still at the beginning of the window:
-                its next event is the next one after that time. If a program has sent in the window, the network may
-                need positions immediately.
+            situation: The current situation of physics and programs. The network is still at the beginning of the
+                window, so `next_event_ns` returns its first event after the beginning. If a program has sent a packet
+                in the window, `next_use_ns` is `now_ns`, because the network may need positions immediately.
 
         Returns:
             The time up to which the agents may advance before the next call; `situation.now_ns` if the window must
@@ -128,7 +129,8 @@ class LookingAhead(SyncPolicy, Protocol):
 
 def looks_ahead(policy: SyncPolicy) -> TypeGuard[LookingAhead]:
     """Return True if a policy has the methods of `LookingAhead`."""
-    # `isinstance` with a runtime-checkable protocol takes 20 us, which is noticeable in each advance of a live run.
+    # `isinstance` with a runtime-checkable protocol takes 20 us, which is significant in a run in real time: it calls
+    # `Coordinator.advance` for each window.
     return hasattr(policy, "reckoning_step_ns") and hasattr(policy, "extended_end_ns")
 
 
@@ -146,7 +148,7 @@ class PolicyError(ConfigurationError):
 
 
 _MAX_EMPTY_WINDOWS: Final = 1000
-"""Number of successive windows of length 0 after which the policy has failed."""
+"""Largest number of successive windows of length 0; after more, the run fails."""
 
 
 class EmptyWindows:

@@ -7,7 +7,7 @@ from typing import Final
 from sim_backends.cosim.policies.sync_policy import PolicyError, Situation, window_ns
 
 _AS_PER_NS: Final = 10**9
-"""Attoseconds per nanosecond. Rounding each window to half an attosecond adds up to 0.5 ns after 10^9 windows."""
+"""Attoseconds per nanosecond. A length in whole attoseconds is wrong by at most 0.5 as, or 0.5 ns in 10^9 windows."""
 
 
 class Windows:
@@ -41,11 +41,11 @@ class FixedWindow:
     """Base class of the policies whose windows all have the same length.
 
     Args:
-        window_s: Their length in seconds. Windows end at whole nanoseconds; the remaining fractions are carried over
-            to later windows.
+        window_s: Length of the windows in seconds. Windows end at whole nanoseconds; the remaining fractions are
+            added to later windows.
 
     Raises:
-        PolicyError: It is not a positive time.
+        PolicyError: The length is not a positive time.
     """
 
     name: str

@@ -81,7 +81,7 @@ class FollowAtHeadway(NeverSends):
         gain_per_s: Rate at which an error of the distance decays.
         top_speed_m_s: Top speed.
         period_ns: Time between commands.
-        timeout_ns: Time without a state after which it stops.
+        timeout_ns: Time without a state after which the follower stops.
         begin_ns: Time of the first command.
 
     Raises:
@@ -102,8 +102,9 @@ class FollowAtHeadway(NeverSends):
     ) -> None:
         if min(headway_s, standstill_m, gain_per_s, top_speed_m_s, period_ns) <= 0:
             raise ConfigurationError(
-                f"cannot follow {leader} {headway_s:g} s and {standstill_m:g} m behind at up to "
-                f"{top_speed_m_s:g} m/s, with a gain of {gain_per_s:g}/s, steered every {period_ns} ns",
+                f"cannot follow {leader} with a headway of {headway_s:g} s, a distance at standstill of "
+                f"{standstill_m:g} m, a top speed of {top_speed_m_s:g} m/s, a gain of {gain_per_s:g}/s, and "
+                f"{period_ns} ns between commands",
                 remedy="set all of these to values above 0",
             )
         self._leader = LatestStates([leader], timeout_ns)
@@ -152,7 +153,8 @@ class HoldStation(NeverSends):
         top_speed_m_s: Largest correction of the velocity.
         gain_per_s: Speed per metre of distance from that point.
         period_ns: Time between commands.
-        timeout_ns: Time without a state after which a leader is ignored; without any leader it hovers.
+        timeout_ns: Time without a state after which a leader is ignored; if all leaders are ignored, the follower
+            hovers.
         begin_ns: Time of the first command.
 
     Raises:
@@ -172,8 +174,8 @@ class HoldStation(NeverSends):
     ) -> None:
         if min(above_m, top_speed_m_s, gain_per_s, period_ns) <= 0:
             raise ConfigurationError(
-                f"cannot fly {above_m:g} m above others at up to {top_speed_m_s:g} m/s with a gain of "
-                f"{gain_per_s:g}/s, steered every {period_ns} ns",
+                f"cannot fly {above_m:g} m above other agents with a top speed of {top_speed_m_s:g} m/s, a gain of "
+                f"{gain_per_s:g}/s, and {period_ns} ns between commands",
                 remedy="set all of these to values above 0",
             )
         self._leaders = LatestStates(leaders, timeout_ns)

@@ -156,8 +156,8 @@ class BagMessage:
     """A message of a bag.
 
     Attributes:
-        at_ns: Time of recording, from the beginning of the bag.
-        size_bytes: Its serialized size.
+        at_ns: Time from the beginning of the bag to the recording of the message.
+        size_bytes: Serialized size of the message.
     """
 
     at_ns: int
@@ -170,7 +170,9 @@ class BagMessage:
 def generated_bag(
     draws: RandomStream, *, length_ns: int, rate_hz: float, size_bytes: int, jitter_ns: int
 ) -> list[BagMessage]:
-    """Return a bag of messages of one size and rate. Each is recorded with a random delay; none overtakes another.
+    """Return a bag of messages that have the same size, at a constant rate.
+
+    Each message is recorded after a random delay, but not before the previous message.
 
     Args:
         draws: Random numbers, one for each message.

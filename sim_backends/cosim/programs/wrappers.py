@@ -183,7 +183,11 @@ class ProgramWithClock:
         return Action(stamped_datagrams, action.command)
 
     def _unstamped(self, received_datagram: ReceivedDatagram) -> ReceivedDatagram:
-        """Return a datagram with its original payload, the sender's time of sending, and the own time of arrival."""
+        """Return the datagram as the program receives it.
+
+        It has the original payload, the time of sending by the sender's clock, and the time of arrival by the clock
+        of this program.
+        """
         stamped_payload: _StampedPayload = received_datagram.payload
         arrived_ns = self._clock.reading_ns(received_datagram.arrived_ns)
         return ReceivedDatagram(

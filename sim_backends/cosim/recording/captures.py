@@ -30,7 +30,7 @@ _FIRST_HOST: Final = int(IPv4Address("10.0.0.1"))
 _MULTICAST: Final = IPv4Address("239.255.0.1").packed
 """Destination of packets for all hosts: the multicast group of DDS discovery (OMG DDSI-RTPS 2.5, 9.6.1.4)."""
 _TOPIC_PORT, _DISCOVERY_PORT = 7411, 7400
-"""Ports of DDS: of the first participant of a host, and of discovery (DDSI-RTPS 2.5, 9.6.1.1)."""
+"""Ports of DDS: for user data of the first participant of a host, and for discovery (DDSI-RTPS 2.5, 9.6.1.1)."""
 _FIRST_PORT: Final = 40_000
 """Destination port of the first flow; each further flow has the next port."""
 _FIRST_EPHEMERAL_PORT: Final = 50_000
@@ -114,7 +114,7 @@ class IpEncoder:
         begin = fragment.offset_bytes
         payload_part = transport_header[begin : begin + fragment.size_bytes - HEADER_BYTES]
         fragment_flag = _MORE_FRAGMENTS if fragment.index + 1 < fragment.count else 0
-        words = (
+        header_fields = (
             0x45,  # version 4, header of 5 words
             0,  # type of service
             fragment.size_bytes,
@@ -124,7 +124,7 @@ class IpEncoder:
             protocol,
         )
         ends = self._packed[packet.source], self._packed[packet.destination]
-        header = _IP.pack(*words, _checksum(_IP.pack(*words, 0, *ends)), *ends)
+        header = _IP.pack(*header_fields, _checksum(_IP.pack(*header_fields, 0, *ends)), *ends)
         data_bytes = min(fragment.size_bytes, max_bytes) - HEADER_BYTES - len(payload_part)
         return (header + payload_part + bytes(max(data_bytes, 0)))[:max_bytes]
 

@@ -1,4 +1,4 @@
-"""Writes and reads the tables of a recording. Each table is a folder of Parquet files, its parts.
+"""Writes and reads the tables of a recording. Each table is a folder of Parquet files, which are its parts.
 
 Each part is readable without the others. `RecordingState` is the state of a recording between two parts.
 """
@@ -206,7 +206,7 @@ class RecordingState:
     Attributes:
         parts: Number of parts of each table.
         windows: Number of recorded windows.
-        digest: Hash over all their events.
+        digest: Hash over all events of these windows.
         under_way: Packets whose fate is not decided yet, by packet id, each with the window in which it entered.
         checksums: Checksums of all files of tables, by path.
     """

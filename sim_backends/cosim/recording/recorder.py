@@ -204,7 +204,7 @@ class RunRecorder:
             self._finish(error)
 
     def _finish(self, error: BaseException | None) -> None:
-        """Write the remaining windows and the end of the run; `error` is what ended the run early, or None."""
+        """Write the remaining windows and the end of the run; `error` is the exception that stopped it, or None."""
         ending = RunEnding.COMPLETE
         if error is not None:
             ending = RunEnding.INTERRUPTED if isinstance(error, KeyboardInterrupt) else RunEnding.FAILED
@@ -223,7 +223,7 @@ class RunRecorder:
         try:
             write_manifest(self._folder, self._manifest)
         except OSError as manifest_error:
-            if not self._has_failed:  # otherwise an error was raised before
+            if not self._has_failed:  # if writing has failed before, that error was already raised
                 raise self._error(manifest_error) from manifest_error
 
     def _close(self) -> None:
@@ -308,7 +308,7 @@ class RunRecorder:
             (self._folder / _RESERVE).unlink(missing_ok=True)
 
     def _error(self, error: OSError) -> RecordingError:
-        """Return the error for a failed write, and remember that the recording is incomplete."""
+        """Mark the recording as incomplete, and return the error for the failed write."""
         self._has_failed = True
         return RecordingError(
             f"the recording cannot be written: {error.strerror}; the parts written before remain readable",

@@ -106,7 +106,8 @@ class FollowPlan(Strict):
     Attributes:
         kind: `follow`.
         leader: The agent that it follows or, if it flies, a list of several agents.
-        distance: Distance behind the leader at standstill, or height above it; from antenna to antenna.
+        distance: Distance behind the leader at standstill or, if the agent flies, height above the leaders; from
+            antenna to antenna.
         headway: Time headway behind the leader, in addition to the distance.
         timeout: Time without a state after which it stops.
     """
@@ -182,7 +183,7 @@ class _Traffic(Strict, ABC):
     start: Duration = 0.0
 
     @schema.model_validator(mode="after")
-    def _ends_are_different(self) -> "_Traffic":
+    def _qos_and_ends_are_valid(self) -> "_Traffic":
         if self.qos is not None and self.protocol != "topic":
             raise schema.validation_error(
                 f"only the protocol topic has a qos, but the protocol is {self.protocol}", "qos"

@@ -52,8 +52,8 @@ def list_robots() -> list[str]:
 def limits_of(robot: str) -> DriveLimits | QuadrotorLimits:
     """Return the limits of a robot's body.
 
-    For the name of a robot profile, these are the limits of the TurtleBot3 Burger, or of the Duckiedrone if the robot
-    flies, with the top speed of the profile.
+    A robot profile contains only the top speed. The other limits are those of the TurtleBot3 Burger or, if the robot
+    flies, of the Duckiedrone.
     """
     if robot in BODIES:
         return BODIES[robot]
@@ -115,8 +115,8 @@ def make_controllers(scenario: CosimScenario, bodies: Mapping[str, Body[Any]], s
     Args:
         scenario: The scenario.
         bodies: The body of each agent.
-        seed: Seed of the phases (times of first commands) that the scenario does not set; the controllers of
-            different robots do not run at the same times.
+        seed: Seed of the phases (times of first commands) that the scenario does not set. They are random, because
+            the controllers of different robots do not run at the same times.
     """
     programs = {
         name: _controller(plan, bodies[name], plan.lifetime.appears_ns, _phase_ns(name, plan, seed))
@@ -133,7 +133,7 @@ def _phase_ns(name: str, plan: AgentPlan, seed: int) -> int:
 
 
 def _controller(plan: AgentPlan, body: Body[Any], appears_ns: int, phase_ns: int) -> Program | None:
-    """Return the program that steers an agent; None if the agent only stands."""
+    """Return the program that steers an agent; None if the agent never moves."""
     motion = plan.motion
     first_ns = appears_ns + phase_ns
     match motion:

@@ -109,7 +109,10 @@ def captured_flows(traffic: Iterable[Traffic]) -> dict[str, CapturedFlow]:
 
 
 def _captures(scenario: CosimScenario, folder: Path) -> dict[str, Any] | None:
-    """Return the settings for captures with the same headers as in `Captures`; None if the network writes none."""
+    """Return the settings with which an external network writes captures like those of the class `Captures`.
+
+    The result is None if the network writes no captures.
+    """
     if not writes_captures(scenario):
         return None
     flows = captured_flows(scenario.traffic)
@@ -278,7 +281,8 @@ def build(
         captures_settings = None if network is not None or captures is None else _captures(scenario, captures)
         carrier = open_network(*federate_arguments, captures=captures_settings) if network is None else None
         federates.callback(getattr(carrier, "close", _nothing_to_close))
-        # With its own transports, the external network is the complete network; otherwise it only carries IP packets.
+        # `federate`: the external network has the transports, so it is the complete network. `builtin`: it only
+        # carries the IP packets of the built-in transports.
         if scenario.network.transports == "federate":
             network = network or carrier
         if physics is None:

@@ -110,7 +110,7 @@ def _leg_demands(leg: LegPlan, limits: Limits) -> Iterator[Demand]:
     turn_deg_s = abs(float(leg.turn_deg_s))
     if isinstance(limits, QuadrotorLimits):
         yield _climb_demand(("climb_m_s",), float(leg.climb_m_s), limits)
-        yield Demand(("turn_deg_s",), "a rate of turn", turn_deg_s, 0.0, "deg/s")  # it keeps its heading
+        yield Demand(("turn_deg_s",), "a rate of turn", turn_deg_s, 0.0, "deg/s")  # a quadrotor keeps its heading
     else:
         yield Demand(("turn_deg_s",), "a rate of turn", turn_deg_s, math.degrees(limits.turn_rad_s), "deg/s")
         yield Demand(("climb_m_s",), "a climb rate", abs(float(leg.climb_m_s)), 0.0, "m/s")

@@ -1,6 +1,7 @@
 """Publishes the positions of a run's agents, and the path losses between them, as events of EMANE.
 
-EMANE is an emulator of radio networks. Its events tell it where radios are, and how much signals are attenuated.
+EMANE is an emulator of radio networks. Its events contain the positions of radios, and the attenuation of the signals
+between them.
 """
 
 import time

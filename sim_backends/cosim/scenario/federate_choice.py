@@ -90,7 +90,7 @@ def drop_options_of_replaced_federates(data: Any, changes: Mapping[str, Any]) ->
 
 
 def add_options(definitions: dict[str, Any], sections: Mapping[str, str]) -> None:
-    """Add the options of each installed simulator to the JSON schema; they are valid if the scenario names it.
+    """Add the options of each installed simulator to the JSON schema; they apply if `federate` names the simulator.
 
     Args:
         definitions: The definitions of the JSON schema of scenarios.

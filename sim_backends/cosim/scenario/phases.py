@@ -90,10 +90,10 @@ def incommensurate_window_s(scenario: CosimScenario, window_s: float) -> float |
 
 
 def _few_phases(event: PeriodicEvent, window_s: float) -> int | None:
-    """Return the number of phases of a window at which an event occurs; None if there are enough.
+    """Return the number of phases of a window at which an event occurs, if there are at most `MAX_PHASES`; else None.
 
-    After b periods the phase has drifted by d windows, so in n periods it drifts by n d / b. The phases are 1 / b
-    apart, so their number stays b if n d < 1.
+    If the event occurs at b phases, they are 1 / b of a window apart. After b periods the phase has drifted by d
+    windows, so in n periods it drifts by n d / b. The number of phases therefore stays b if n d < 1.
     """
     if 2 * event.jitter_s >= window_s:  # the jitter distributes the phases over at least half of a window
         return None

@@ -1,4 +1,4 @@
-"""The section of a scenario file that names a trial of robots, which the scenario reproduces to compare both."""
+"""The section of a scenario file that names a trial of robots, which the scenario reproduces for a comparison."""
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
@@ -58,7 +58,7 @@ class ReproducedTrial(Strict):
         return {protocol: selected_flows for protocol, selected_flows in flows.items() if selected_flows is not None}
 
     def problems(self, traffic: Sequence[Traffic]) -> Iterator[tuple[str, Location]]:
-        """Yield each contradiction between this section and the traffic, with the keys of the wrong value."""
+        """Yield the first contradiction between this section and the traffic, if any, with the keys of its value."""
         by_name = {entry.title: entry for entry in traffic}
         ends: set[tuple[str, ...]] = set()
         for protocol, flows in self.flows.items():

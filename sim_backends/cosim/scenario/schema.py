@@ -47,10 +47,10 @@ class PolicyChoice(Strict):
 
     Attributes:
         name: The default policy of a run.
-        window: Length of a window, or the window w of two agents at rest of the velocity-aware policies.
+        window: Length of a window; for the velocity-aware policies, the window w of two agents at rest.
         longest: Longest window of policies with variable windows.
         bound: For `error_bounded`: largest error of the relative position of two agents, as the network assumes it.
-        bound_db: Instead of `bound`: largest error of the path loss between them in free line of sight, in dB.
+        bound_db: Instead of `bound`: largest error of the path loss between two agents in free line of sight, in dB.
         exponent: Exponent of the log-distance law for `bound_db`.
     """
 
@@ -226,8 +226,8 @@ class CosimScenario(Named):
             the ROS 1 master, if any.
         relay: The agent whose access point relays packets.
         policy: The [sync policy](method-cosim.md#sync-policies).
-        emane: If given, a run publishes its positions to the network emulator [EMANE](emane.md) or, with the physics
-            federate `emane`, takes them from its events.
+        emane: If given, a run publishes the positions of its agents to the network emulator [EMANE](emane.md). With
+            the physics federate `emane`, it reads them from EMANE's events instead.
         agents: The agents by name.
         traffic: The traffic between the agents.
         faults: Faults during a run.

@@ -22,8 +22,8 @@ class BoundCost:
 
     Attributes:
         largest_m: The largest position error of the run with `error_bounded`.
-        exchanges: Its number of exchanges.
-        added_s: Mean delay that it added; nan if nothing arrived.
+        exchanges: The number of exchanges of that run.
+        added_s: Mean delay that `error_bounded` added to a packet; nan if no packet arrived.
         window_s: The longest fixed window that keeps the bound in this run, with a tolerance of 2 %; nan if there is
             none.
         fixed_exchanges: Number of exchanges with that window; 0 if there is none.

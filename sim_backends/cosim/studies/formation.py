@@ -243,7 +243,7 @@ def compute_formation(scenario: CosimScenario, tracks: Tracks) -> Formation:
 
 
 def mean_formation(formations: Sequence[Formation]) -> Formation:
-    """Return the combined formation of several runs: means, or the largest of maxima.
+    """Return the combined formation of several runs: the means of their values, and the largest of their maxima.
 
     Args:
         formations: At least one.

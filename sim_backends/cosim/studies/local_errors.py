@@ -31,7 +31,7 @@ MEASURES: Final = ("delivery_s", "late_s", "position_m", "fates", "path_m")
 - `delivery_s`: error of the delivery time.
 - `late_s`: time by which an arrival was in the receiver's past.
 - `position_m`: error of the relative position that the network assumed for sender and receiver.
-- `fates`: share of packets that arrived in only one of the two runs.
+- `fates`: share of packets that arrived either in the fork or in the reference, but not in both.
 - `path_m`: position error of agents at the end of the window.
 """
 
@@ -87,7 +87,7 @@ def pool(errors_by_run: Iterable[LocalErrors]) -> LocalErrors:
 
 
 def local_errors(
-    make: Callable[[SyncPolicy], Coordinator],
+    make_coordinator: Callable[[SyncPolicy], Coordinator],
     policies: Mapping[str, Callable[[float], SyncPolicy]],
     parameters: Sequence[float],
     starts_ns: Sequence[int],
@@ -96,7 +96,7 @@ def local_errors(
     """Return the local errors of each policy.
 
     Args:
-        make: Builds the co-simulation of one scenario and seed.
+        make_coordinator: Builds the co-simulation of one scenario and seed.
         policies: Functions that return a policy for a parameter: the length of a window in seconds, or its
             equivalent.
         parameters: The parameters.
@@ -113,7 +113,7 @@ def local_errors(
         return {measure: np.zeros(shape) for measure in MEASURES}
 
     results = {name: LocalErrors(np.zeros(shape), zeros(), zeros()) for name in policies}
-    reference = make(EventDriven())
+    reference = make_coordinator(EventDriven())
     for column, start_ns in enumerate(starts_ns):
         _delete_decided(reference.advance(start_ns))
         exact_by_end: dict[int, _Outcome] = {}
@@ -133,7 +133,7 @@ def local_errors(
                 for measure, values in _differences(start_ns, end_ns, exact_by_end[end_ns], actual).items():
                     results[name].sums[measure][row, column] = sum(values)
                     results[name].counts[measure][row, column] = len(values)
-    _check_unchanged(make, starts_ns, reference)
+    _check_unchanged(make_coordinator, starts_ns, reference)
     return results
 
 
@@ -206,10 +206,10 @@ def _delete_decided(run: Run) -> None:
 
 
 def _check_unchanged(
-    make: Callable[[SyncPolicy], Coordinator], starts_ns: Sequence[int], reference: Coordinator
+    make_coordinator: Callable[[SyncPolicy], Coordinator], starts_ns: Sequence[int], reference: Coordinator
 ) -> None:
     """Check that no fork has changed the reference, by comparison with a run that was not forked."""
-    without_forks = make(EventDriven())
+    without_forks = make_coordinator(EventDriven())
     for start_ns in starts_ns:
         _delete_decided(without_forks.advance(start_ns))
     if without_forks.run.digest != reference.run.digest:

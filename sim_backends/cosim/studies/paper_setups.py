@@ -131,7 +131,7 @@ RADIOS: Final[Mapping[str, Changes]] = MappingProxyType(
 """Radios of the mesh: the radio of the scenario file, and fixed links as in EMANE's model RF Pipe."""
 
 _DURATION: Final = "20s"
-"""The run ends 9 s after the last packet of a bag; packets that are still under way then count as lost."""
+"""The run ends about 9.5 s after the last packet of a bag; packets that are still under way then count as lost."""
 
 
 def masterless(sight: Sight, distance_m: float, changes: Changes, *, flying: bool = False) -> Setup:

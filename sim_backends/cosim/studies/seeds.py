@@ -64,8 +64,8 @@ def run_many(
         progress: Called with the number of finished tasks.
 
     Raises:
-        FieldkitError: A task failed, or its worker died repeatedly; the error names the task. Errors of fieldkit keep
-            their class.
+        FieldkitError: A task failed, or its worker process terminated repeatedly; the error names the task. Errors of
+            fieldkit keep their class.
     """
     results: dict[int, Result] = {}
     for number, result in as_completed_tasks(work, tasks, workers=workers):

@@ -37,7 +37,7 @@ class RunnableScenario(Protocol):
         ...
 
 
-Make = Callable[[str, int], RunnableScenario]
+ScenarioFactory = Callable[[str, int], RunnableScenario]
 """Builds the scenario for the name of a policy and a seed."""
 
 
@@ -77,7 +77,7 @@ class Outcomes:
 
 
 def run_outcomes(
-    make: Make,
+    make_scenario: ScenarioFactory,
     policies: Sequence[str],
     seeds: Sequence[int],
     *,
@@ -87,7 +87,7 @@ def run_outcomes(
     """Run a scenario with each policy and each seed, including the exact reference.
 
     Args:
-        make: Builds the scenario; it must be picklable.
+        make_scenario: Builds the scenario; it must be picklable.
         policies: Names of policies.
         seeds: The seeds.
         workers: The workers that run the simulations.
@@ -98,7 +98,7 @@ def run_outcomes(
     """
     names = [EventDriven.name, *(name for name in policies if name != EventDriven.name)]
     tasks = [Task(name, seed) for name in names for seed in seeds]
-    results = run_many(partial(_outcome, make), tasks, workers=workers, progress=progress)
+    results = run_many(partial(_outcome, make_scenario), tasks, workers=workers, progress=progress)
     runs: dict[str, dict[int, RunOutcome]] = {name: {} for name in names}
     failures: dict[str, PolicyError] = {}
     for task, result in zip(tasks, results, strict=True):
@@ -109,9 +109,9 @@ def run_outcomes(
     return Outcomes(tuple(seeds), runs[EventDriven.name], runs, failures)
 
 
-def _outcome(make: Make, task: Task) -> RunOutcome | PolicyError:
+def _outcome(make_scenario: ScenarioFactory, task: Task) -> RunOutcome | PolicyError:
     """Return the outcome of a run, or the error with which its policy failed."""
-    scenario_run = make(task.policy, task.seed)
+    scenario_run = make_scenario(task.policy, task.seed)
     sampled_physics = SampledPhysics(scenario_run.agents.physics, SAMPLING_NS)
     scenario_run.agents.physics = sampled_physics
     try:
@@ -189,12 +189,12 @@ class Row:
     """The results of one policy.
 
     Attributes:
-        policy: Its name.
-        by_seed: Its errors relative to the reference for each seed; empty if it could not be run.
+        policy: Name of the policy.
+        by_seed: Its errors relative to the reference for each seed; empty if the policy could not be run.
         formations: Position errors of the followers, for each seed.
         growth_m: Two arrays of shape (times,): times in seconds, and the largest distance of an agent from its
             position in the reference at that time, as a mean over seeds.
-        failure: The reason why it could not be run with a seed; empty if it could be run with all seeds.
+        failure: The reason why the policy could not be run with a seed; empty if it could be run with all seeds.
     """
 
     policy: str

@@ -94,7 +94,7 @@ class SweepFolder:
             os.close(descriptor)
 
     def _require_same_sweep(self, plan: SweepPlan) -> None:
-        """Check that the folder is empty, or contains a sweep of the same scenario and factors."""
+        """Check that the folder is empty, or contains a sweep of the same scenario with the same names of factors."""
         path = self.path / SWEEP
         if not path.exists():
             if next(self.path.iterdir(), None) is not None:
@@ -102,8 +102,9 @@ class SweepFolder:
             return
         stored_plan, current_plan = self._read(path), _description(plan)
         for key in ("scenario", "factors"):
+            # Of factors, only the names are compared (the keys), because a sweep may be continued with other values.
             old_value, new_value = (
-                [*item] if isinstance(item, dict) else item for item in (stored_plan.get(key), current_plan[key])
+                [*value] if isinstance(value, dict) else value for value in (stored_plan.get(key), current_plan[key])
             )
             if old_value != new_value:
                 raise ConfigurationError(

@@ -69,7 +69,7 @@ class SweepPlan:
     """All runs of a sweep.
 
     Attributes:
-        scenario: The scenario without its factors.
+        scenario: The scenario without the values of the factors.
         factors: The factors.
         settings: All combinations of their values, in the order of the command line.
         seeds: Seeds of each combination.

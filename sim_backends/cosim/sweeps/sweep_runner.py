@@ -25,8 +25,8 @@ ATTEMPTS: Final = 3
 """Largest number of attempts at a run."""
 
 _TRANSIENT: Final = (LinkError, FederateError, WorkerDiedError, OSError, MemoryError)
-"""Errors after which a run is tried again: a worker or simulator died or did not answer, or a resource was exhausted.
-Other errors occur again, because a run depends only on its settings and seed."""
+"""Errors after which a run is tried again: a worker or simulator terminated or did not answer, or a resource was
+exhausted. Other errors would occur again, because a run depends only on its settings and seed."""
 
 _IN_OTHER_COLUMNS: Final = frozenset({"policy", DISTANCE, "line", "topology"})
 """Factors that the name of the procedure does not contain, because they are in other columns."""
@@ -37,8 +37,8 @@ class RunResult:
     """The result of a run, as a worker returns it.
 
     Attributes:
-        content: The content of its file.
-        error: The error that ended it early; None if it is complete.
+        content: The content of the file with the result.
+        error: The error that ended the run early; None if the run is complete.
     """
 
     content: Mapping[str, Any]

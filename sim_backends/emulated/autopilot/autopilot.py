@@ -1,4 +1,4 @@
-"""The emulated autopilot, which answers messages and sends periodic ones. It uses neither socket nor clock."""
+"""The emulated autopilot, which answers messages and sends periodic ones. The caller passes datagrams and times."""
 
 import math
 from collections.abc import Iterator, Sequence

@@ -3,7 +3,8 @@
 ArduCopter: https://ardupilot.org/copter/docs/failsafe-battery.html,
 https://ardupilot.org/copter/docs/gcs-failsafe.html,
 https://ardupilot.org/copter/docs/common-ac2_simple_geofence.html. The fence is a cylinder around home. PX4:
-https://docs.px4.io/main/en/config/safety.html; it refuses goals outside its fence.
+https://docs.px4.io/main/en/config/safety.html; it refuses goals outside its fence, and reacts before a vehicle that
+follows set-points crosses it.
 """
 
 import math
@@ -63,7 +64,7 @@ class Failsafes(Protocol):
 
     Attributes:
         active: True if a failsafe is triggered; HEARTBEAT then has MAV_STATE_CRITICAL.
-        arming_errors: Reasons why they prevent arming.
+        arming_errors: Reasons why the failsafes prevent arming; empty if they permit it.
     """
 
     @property
@@ -72,7 +73,7 @@ class Failsafes(Protocol):
 
     @property
     def arming_errors(self) -> list[str]:
-        """Reasons why they prevent arming."""
+        """Reasons why the failsafes prevent arming; empty if they permit it."""
 
     def on_heartbeat(self, system: int, kind: int, now_ns: int) -> None:
         """Process a heartbeat: system id and MAV_TYPE of its sender."""
@@ -302,13 +303,24 @@ _LOW_BATTERY_ACTIONS: Final = {
 
 _FENCE_ACTIONS: Final = {0: None, 1: Mode.RTL, 2: Mode.LAND, 3: Mode.RTL, 4: Mode.BRAKE, 5: Mode.LAND}
 """Mode after a breach, by FENCE_ACTION."""
+_GEOFENCE_ACTIONS: Final = {
+    1: ("warning", None),
+    2: ("hold", Mode.LOITER),
+    3: ("return", Mode.RTL),
+    4: ("hold", Mode.LOITER),
+    5: ("land", Mode.LAND),
+}
+"""Text and mode of the reaction, by GF_ACTION of PX4; 0 disables the reaction.
+
+Action 4 (terminate) is not emulated: the vehicle holds its position instead.
+"""
 
 
 class Fence:
     """Fence of one vehicle; positions are relative to home: metres east, north, up.
 
     Args:
-        parameters: The vehicle's parameters; the fence reads GF_MAX_* and FENCE_ACTION.
+        parameters: The vehicle's parameters; the fence reads GF_MAX_*, FENCE_ACTION and GF_ACTION.
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -355,6 +367,17 @@ class Fence:
         text = f"{' and '.join(fences)} fence{'s' * (len(fences) > 1)} breached"
         mode = None if state.mode in LANDING else _FENCE_ACTIONS[int(self._parameters["FENCE_ACTION"])]
         return Reaction(text, dialect.MAV_SEVERITY_NOTICE, mode)
+
+    def before_crossing(self, here_m: Vector, stop_m: Vector) -> Reaction | None:
+        """Return the reaction of PX4 if `is_crossed` is True for these arguments, or None.
+
+        A warning is repeated only after the vehicle could again have stopped inside the fence.
+        """
+        was_crossed, self._is_breached = self._is_breached, self.is_crossed(here_m, stop_m)
+        text, mode = _GEOFENCE_ACTIONS.get(int(self._parameters["GF_ACTION"]), ("", None))
+        if not text or not self._is_breached or (mode is None and was_crossed):
+            return None
+        return Reaction(f"Geofence: {text}", _CRITICAL, mode)
 
 
 def is_within(position_m: Vector, limits_m: tuple[float, float]) -> bool:

@@ -50,7 +50,7 @@ class ModeRefusal(NamedTuple):
 
     Attributes:
         text: Text of the refusal.
-        reason: Text that is sent before it; empty if there is none.
+        reason: Text with the reason, which is sent before `text`; empty if the firmware sends only `text`.
     """
 
     text: str
@@ -71,7 +71,7 @@ class Firmware:
         starting_flags: Flags of its position estimate before the estimate has an origin.
         boot_mode: Mode after power-on.
         modes_without_arming: Modes in which it cannot be armed.
-        refusal_result: MAV_RESULT of a command that it refuses now.
+        refusal_result: MAV_RESULT of a command that it refuses in its current state.
         unknown_mode: MAV_RESULT of a change to a mode that it does not have.
         unknown_rate: MAV_RESULT of MAV_CMD_SET_MESSAGE_INTERVAL for a message that it does not send.
         unknown_message: MAV_RESULT of MAV_CMD_REQUEST_MESSAGE for a message that it does not send.

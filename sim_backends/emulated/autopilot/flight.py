@@ -14,7 +14,7 @@ from sim_backends.emulated.autopilot.firmware import Firmware
 from sim_backends.emulated.autopilot.modes import LANDING, PILOTED, Mode
 from sim_backends.emulated.autopilot.parameters import Parameters
 from sim_backends.physics.body import Velocity
-from sim_backends.physics.collisions import Footprint, gap_m, move
+from sim_backends.physics.collisions import Footprint, gap_m, is_supported, move
 from sim_backends.physics.quadrotor import FlightPose, Quadrotor
 from sim_backends.physics.robot_limits import QuadrotorLimits
 
@@ -34,7 +34,7 @@ _SUPPORT_GAP_M: Final = 1e-3
 _MAX_REST_CLIMB_M_S: Final = 1e-3
 """A supported drone that climbs faster is not on the ground, because it is lifting off."""
 _SEARCH_M: Final = 2.0
-"""Distance within which obstacles are considered; the search is repeated after half of that distance."""
+"""Distance within which obstacles are considered; the search is repeated when the drone has moved half of it."""
 
 
 class Airframe:
@@ -48,7 +48,7 @@ class Airframe:
         place_m: Position of its lowest point in the world, which is also home.
         facing_rad: Initial heading.
         obstacles: Obstacles in the world, including the floor.
-        now_ns: Time of this state.
+        now_ns: Time of the initial state.
 
     Attributes:
         home_m: Position of home in the world; `position_m` is relative to it.
@@ -121,7 +121,9 @@ class Airframe:
             pose = body.after_contact(pose, stop, None)
         self.turn_rad_s = math.remainder(pose.heading_rad - self._pose.heading_rad, math.tau) / _STEP_S
         self._pose = pose
-        self.on_ground = pose.velocity_m_s[2] <= _MAX_REST_CLIMB_M_S and self._is_supported(obstacles)
+        self.on_ground = pose.velocity_m_s[2] <= _MAX_REST_CLIMB_M_S and is_supported(
+            self._quadrotor, pose.place_m, obstacles, _SUPPORT_GAP_M
+        )
         if self.on_ground and (not self.motors_on or target_m_s[2] <= 0):
             # At rest it neither slides nor tilts nor turns.
             self._pose, self.turn_rad_s = FlightPose(pose.place_m, heading_rad=pose.heading_rad), 0.0
@@ -129,11 +131,6 @@ class Airframe:
     def rest(self, now_ns: int) -> None:
         """Stay on the ground without power until this time, in whole steps."""
         self.now_ns += (now_ns - self.now_ns) // STEP_NS * STEP_NS
-
-    def _is_supported(self, obstacles: Sequence[Footprint]) -> bool:
-        east, north, up = self._pose.place_m
-        stop = move(self._quadrotor, self._pose.place_m, (east, north, up - _SUPPORT_GAP_M), obstacles)
-        return stop is not None and any(contact.normal[2] > 0 for contact in stop.contacts)
 
     def _nearby_obstacles(self, place_m: Vector) -> Sequence[Footprint]:
         """Return the obstacles that the drone may hit in this step."""
@@ -152,7 +149,7 @@ class Airframe:
 
 
 MakeAirframe = Callable[[Vector, float, int], Airframe]
-"""Creates a drone; arguments: position of its lowest point in the world, heading, time."""
+"""Creates the airframe of a drone; arguments: position of its lowest point in the world, heading, time."""
 
 
 def limits_within(limits: QuadrotorLimits, parameters: Parameters) -> QuadrotorLimits:
@@ -181,8 +178,8 @@ def velocity_to(goal_m: Vector, body: Airframe, limits: QuadrotorLimits) -> Vect
 def stop_m(body: Airframe, limits: QuadrotorLimits) -> Vector:
     """Return the position, relative to home, at which the drone stops if it brakes now.
 
-    A drone that is not below home is assumed not to sink below home.
-    The stopping distance is the distance during the lags of attitude and velocity control, plus v^2 / 2a.
+    The stopping distance is the distance during the lags of attitude and velocity control, plus v^2 / (2 a). The
+    returned height is at least 0 or, if the drone is below home, at least the current height of the drone.
     """
     (x, y, z), (east, north, up) = body.position_m, body.velocity_m_s
     brake_s = limits.lag_s + 1 / limits.gains_per_s[0] + math.hypot(east, north) / 2 / limits.acceleration_m_s2

@@ -72,13 +72,16 @@ class _RawMessage(dialect.MAVLink_message):  # type: ignore[misc]  # pymavlink h
 
 
 def protocol_version() -> Message:
-    """Return PROTOCOL_VERSION: MAVLink 2, at least 1 (https://mavlink.io/en/messages/common.html#PROTOCOL_VERSION)."""
+    """Return PROTOCOL_VERSION: the autopilot sends MAVLink 2, and accepts versions 1 and 2.
+
+    Source: https://mavlink.io/en/messages/common.html#PROTOCOL_VERSION.
+    """
     payload = struct.pack("<3H8s8s", 200, 100, 200, b"", b"")
     return _RawMessage(PROTOCOL_VERSION, "PROTOCOL_VERSION", payload, 217)
 
 
 def component_metadata(boot_ms: int, uri: str) -> Message:
-    """Return COMPONENT_METADATA with the URI of the general metadata file; 0 means that its checksum is unknown."""
+    """Return COMPONENT_METADATA with the URI of the general metadata file, and with the checksum 0 (unknown)."""
     payload = struct.pack("<II100s", boot_ms, 0, uri.encode("ascii"))
     return _RawMessage(COMPONENT_METADATA, "COMPONENT_METADATA", payload, 182)
 
@@ -99,7 +102,7 @@ def available_modes(count: int, index: int, standard: int, custom: int, name: st
 
 def ekf_status_report(flags: int) -> Message:
     """Return ArduPilot's EKF_STATUS_REPORT with these flags."""
-    from pymavlink.dialects.v20 import ardupilotmega  # noqa: PLC0415 (60 ms, and only ArduPilot sends it)
+    from pymavlink.dialects.v20 import ardupilotmega  # noqa: PLC0415 (takes 60 ms; only ArduPilot sends it)
 
     return ardupilotmega.MAVLink_ekf_status_report_message(flags, *(0.1,) * 5)
 

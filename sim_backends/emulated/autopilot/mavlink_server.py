@@ -27,11 +27,11 @@ _BURST: Final = 64
 
 
 class PhysicsFiles(NamedTuple):
-    """The files between an autopilot and the physics simulator that flies its drone.
+    """The files by which an autopilot and the physics simulator that moves its drone communicate.
 
     Attributes:
-        commands: File of `FlightCommandRecord`.
-        flight: File of `FlightRecord`.
+        commands: File of `FlightCommandRecord`, which the autopilot writes.
+        flight: File of `FlightRecord`, which the physics simulator writes.
     """
 
     commands: Path
@@ -53,7 +53,7 @@ class Drone:
         antenna_m: Height of the antenna, whose position the lab uses, above the lowest point of the drone.
         world: World that it flies in, as JSON.
         boot_s: Time from power-on until its position estimate has an origin.
-        physics: Its files for the physics simulator that flies it; None if the autopilot moves it itself.
+        physics: The files for the physics simulator that moves the drone; None if the autopilot moves it.
     """
 
     system: int
@@ -131,14 +131,14 @@ def _load(
 
 
 def simulated_airframe(profile: str, files: PhysicsFiles, reporter: MotionReporter) -> "MakeAirframe":
-    """Return the function that creates a drone at a position; a physics simulator moves this drone."""
-    from sim_backends.emulated.autopilot.simulated_airframe import SimulatedAirframe  # noqa: PLC0415 (as above)
+    """Return the function that creates the airframe of a drone that a physics simulator moves."""
+    from sim_backends.emulated.autopilot.simulated_airframe import SimulatedAirframe  # noqa: PLC0415 (see `_load`)
     from sim_backends.physics.robot_limits import quadrotor  # noqa: PLC0415
 
     limits = quadrotor(profile)
     commands, flight_record = FlightCommandRecord.open(files.commands), FlightRecord.open(files.flight)
 
-    def make(place_m: Vector, facing_rad: float, now_ns: int) -> SimulatedAirframe:
+    def make_airframe(place_m: Vector, facing_rad: float, now_ns: int) -> SimulatedAirframe:
         path_start_ns = reporter.path_start_ns
         return SimulatedAirframe(
             limits,
@@ -150,7 +150,7 @@ def simulated_airframe(profile: str, files: PhysicsFiles, reporter: MotionReport
             path_start_ns=path_start_ns,
         )
 
-    return make
+    return make_airframe
 
 
 class DroneMotionReporter:

@@ -225,7 +225,7 @@ class MissionTransfer:
 
     Args:
         items: Returns the vehicle's mission.
-        check: Returns the fault of an item, as MAV_MISSION_RESULT.
+        check: Returns the MAV_MISSION_RESULT for an item: accepted, or the reason why the item is invalid.
         load: Loads a new mission.
     """
 

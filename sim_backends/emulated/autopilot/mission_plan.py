@@ -125,7 +125,7 @@ _LANDING_HEIGHT_M: Final = -1.0
 """Height of the goal of a landing. It is below the ground, so that the drone descends until the ground stops it."""
 
 _CLIMB_TOLERANCE_M: Final = 0.2
-"""The climb to the first item ends this far below its height."""
+"""The vertical climb from the ground ends when the drone is at most this far below the height of the item."""
 
 
 class Mission:

@@ -21,7 +21,7 @@ class Parameter:
         minimum: Smallest value that is accepted.
         maximum: Largest value that is accepted.
         key: PX4's name, by which the vehicle reads it; empty if it equals `name`.
-        scale: Number of its units per SI unit.
+        scale: Number of its units per SI unit, for example 100 for centimetres.
         integer: True if it is an integer (MAV_PARAM_TYPE_INT32); otherwise a float (REAL32).
     """
 

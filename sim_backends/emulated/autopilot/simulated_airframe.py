@@ -18,14 +18,14 @@ _MAX_EXTRAPOLATION_NS: Final = 100_000_000
 class SimulatedAirframe(Airframe):
     """An `Airframe` that a physics simulator moves.
 
-    On the ground its rotors turn without thrust until it climbs. Until its first flight it stays at the position at
-    which the lab has placed it.
+    On the ground, the autopilot commands no thrust (`FlightCommand.powered` is False) until the drone climbs. Until
+    its first flight, the drone stays at the position at which the lab has placed it.
 
     Args:
         limits: Limits of the airframe.
         place_m: Position of its lowest point in the world, which is also home.
         facing_rad: Initial heading.
-        now_ns: Time of this state.
+        now_ns: Time of the initial state.
         commands: Record of the autopilot's commands.
         flight_record: Record in which the physics simulator stores the flight.
         path_start_ns: Start time of the path with which the lab last placed it.

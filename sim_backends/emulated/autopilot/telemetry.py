@@ -15,10 +15,10 @@ from sim_backends.emulated.autopilot.vehicle import Vehicle
 from sim_backends.world.motion import GRAVITY_M_S2
 
 _UNKNOWN_CELL: Final = 0xFFFF
-"""Voltage of a cell that the battery does not have."""
+"""Voltage value that means that the battery does not have this cell."""
 _NAN: Final = math.nan
 _METADATA: Final = "mftp:///etc/extras/component_general.json.xz"
-"""Location of PX4's metadata; the emulated file transfer refuses it."""
+"""Location of PX4's metadata; the emulated file transfer answers that this file does not exist."""
 _MAGNET_GAUSS: Final = 0.21, 0.0, 0.42
 """Magnetic field north, east, down in gauss; typical for middle latitudes."""
 _SEA_HPA: Final = 1013.25
@@ -165,7 +165,7 @@ class Telemetry:
             fix,
             *degrees_e7(east_m, north_m),
             round(up_m * 1e3),
-            # HDOP 0.8 and VDOP 1.2; the last number is that of the satellites.
+            # HDOP 0.8, VDOP 1.2, and 12 satellites.
             *(80, 120, round(math.hypot(east, north) * 1e2), self._course_cdeg(east, north), 12),
         )
 

@@ -164,7 +164,7 @@ class Vehicle(VehicleBase):
                 break
             self._check_flight_state()
             self.body.motors_on = self.is_armed
-            target_m_s = self._target_m_s()  # it may change the mode
+            target_m_s = self._target_m_s()  # this call may change the mode
             self.body.step(target_m_s, self.limits, self.guidance.yaw_rad(self.mode, self.body))
         self._update_boot_state()
         self._run_failsafes()
@@ -274,9 +274,8 @@ class Vehicle(VehicleBase):
             self.report(_CRITICAL, "Failsafe activated")
             self._switch_automatically(_OFFBOARD_LOST.get(int(self._parameters["COM_OBL_RC_ACT"]), Mode.LOITER))
             self.failsafes.on_lost_set_points()
-        elif self.fence.is_crossed(self.body.position_m, stop_m(self.body, self.limits)):
-            self.report(_CRITICAL, "Geofence: hold")
-            self._switch_automatically(Mode.LOITER)
+        elif breach := self.fence.before_crossing(self.body.position_m, stop_m(self.body, self.limits)):
+            self._react(breach)
 
     def _must_stay_on_ground(self) -> bool:
         """Return True if it is on the ground and cannot lift off now.

@@ -9,7 +9,8 @@
 | `real_agents` | the agents of the coordinator: packets read from devices, in windows that end in real time | cosim |
 | `lab_physics` | the physics simulator, with robots that the lab has placed | steering, federates |
 | `steering` | commanded velocities of one robot, and the record of its motion | records in the robot |
-| `simulators` | builds the physics and the network | cosim, network, radio, physics |
+| `velocity_flights` | drones in a physics simulator that accepts only velocities | physics |
+| `simulators` | builds the physics and the network | cosim, network, radio, physics, velocity flights |
 
 The coordinator advances physics and network together, in windows of simulated time. It is the same as in a
 co-simulation without real programs, with the same policies. Only its agents (the robots and their programs) differ:

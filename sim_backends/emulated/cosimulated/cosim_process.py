@@ -133,7 +133,7 @@ class CosimulatedMedium(MediumServer):
         return self._queue[0].at_ns if self._queue else None
 
     def pop_packets(self, last_ns: int) -> list[RealPacket]:
-        """Implement `Devices.pop_packets`: take the packets up to a time from the queue."""
+        """Implement `Devices.pop_packets`: remove the packets up to a time from the queue, and return them."""
         packets, queue = [], self._queue
         while queue and queue[0].at_ns <= last_ns:
             packets.append(queue.popleft())
@@ -192,9 +192,9 @@ class CosimulatedMedium(MediumServer):
             if destination == NO_ROBOT:
                 port.unroutable_packets += 1
                 continue
-            if self._flows.delays_by_flow and (inner := framing.ipv4(content)) is not None:
-                self._flows.note_first_fragment(inner)
-                self._added_delays.note_first_fragment(inner)
+            if self._flows.delays_by_flow and (ip_packet := framing.ipv4(content)) is not None:
+                self._flows.note_first_fragment(ip_packet)
+                self._added_delays.note_first_fragment(ip_packet)
             now_ns = time.monotonic_ns()
             size_bytes = len(content) - framing.header_bytes
             waited_ns = now_ns - port.backlog_since_ns
@@ -250,12 +250,12 @@ class CosimulatedMedium(MediumServer):
         delay, undivided_ns = session.network_delay(fate)
         delay += late_ns * PROCESSING_NS
         port.delays[packet.source] += delay + undivided_ns * PROCESSING_NS
-        if self._flows.delays_by_flow and (inner := self._framing.ipv4(packet.content)) is not None:
+        if self._flows.delays_by_flow and (ip_packet := self._framing.ipv4(packet.content)) is not None:
             # From sending until the packet entered the network, and from its arrival until the end of the window.
             added_ns = end_ns - fate.arrived_ns + fate.packet.enters_ns - fate.packet.sent_ns
-            self._flows.count(inner, delay, port.address.packed)
+            self._flows.count(ip_packet, delay, port.address.packed)
             added_delay = PACKET + added_ns * PROCESSING_NS + undivided_ns * TRANSMISSION_NS
-            self._added_delays.count(inner, added_delay, port.address.packed)
+            self._added_delays.count(ip_packet, added_delay, port.address.packed)
         self._packet_lateness_counts[round_up(late_ns)] += 1
 
     # Requests of the lab.
@@ -350,7 +350,7 @@ def main() -> None:
     try:
         medium.run()
     except FieldkitError as error:
-        # The lab shows the last line.
+        # The lab shows the last line of the standard error output.
         sys.exit(f"{error.what}; {error.remedy}" if error.remedy else error.what)
 
 

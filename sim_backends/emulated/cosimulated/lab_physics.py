@@ -52,7 +52,7 @@ class Flying(PhysicsFederate, Protocol):
     """A physics simulator that moves drones according to the commands of their autopilots."""
 
     def flight_status(self, name: str) -> FlightStatus:
-        """Return attitude and support of a drone in its current state."""
+        """Return the position and attitude of a drone, and True if it rests on the ground or on an obstacle."""
         ...
 
 
@@ -258,9 +258,9 @@ class LabPhysics:
             return
         for name in names:
             state = self._assigned_states[name]
-            if state.velocity_m_s == STILL and (other := self._physics.overlap(name)):
+            if state.velocity_m_s == STILL and (obstacle := self._physics.overlap(name)):
                 raise ConfigurationError(
-                    f"{name} would be within {other}, at {coordinates_text(state.position_m)} m",
+                    f"{name} would be within {obstacle}, at {coordinates_text(state.position_m)} m",
                     remedy="place it at a free position, or choose another world or distance",
                 )
 

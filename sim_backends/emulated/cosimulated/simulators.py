@@ -9,6 +9,7 @@ from typing import Any, Final, NamedTuple, Self
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Topology
 from sim_backends.cosim.scenario.schema import CosimScenario
+from sim_backends.emulated.cosimulated.velocity_flights import VelocityFlights
 from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.federates import remote
 from sim_backends.federates.frames import NETWORK, PHYSICS
@@ -137,7 +138,12 @@ def start_physics(settings: LabSettings, states: Mapping[str, State]) -> Physics
             f"{physics.session.name} has a step of {physics.step_ns} ns instead of {step_ns} ns",
             remedy=f"configure a step of {step_ns} ns in the simulator's world",
         )
-    return physics
+    drones = {
+        robot: body
+        for robot, state in states.items()
+        if isinstance(body := _body(settings.bodies[robot].limits, state), Quadrotor)
+    }
+    return VelocityFlights(physics, drones, settings.world) if drones else physics
 
 
 def _body(limits: DriveLimits | QuadrotorLimits, state: State) -> DifferentialDrive | Quadrotor:
@@ -176,7 +182,7 @@ def start_network(settings: LabSettings, states: Mapping[str, State]) -> remote.
     """Start the program of a network.
 
     Args:
-        settings: Settings of the lab.
+        settings: Settings of the session.
         states: State of the antenna of each station.
 
     Raises:

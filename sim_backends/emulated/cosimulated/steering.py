@@ -98,7 +98,8 @@ class Steering(ABC):
         """Yield the commands up to a time, each with its time.
 
         `idle` is yielded at the time at which the last command has not been repeated for `TIMEOUT_NS`. If the
-        simulation lags behind real time, it may read commands with later times, which are kept for later calls.
+        simulation lags behind real time, the programs may have sent commands with times after `until_ns`. These are
+        kept for later calls.
         """
         newest = self._read_command()
         if newest is not None and self._last_command_ns < newest.time_ns and self.is_placed:
@@ -185,8 +186,10 @@ class GroundSteering(Steering):
 
     @override
     def _read_command(self) -> TimedCommand | None:
-        last = self._command_record.read()
-        return None if last is None else TimedCommand(last.time_ns, Twist(last.forward_m_s, last.turn_rad_s))
+        command = self._command_record.read()
+        if command is None:
+            return None
+        return TimedCommand(command.time_ns, Twist(command.forward_m_s, command.turn_rad_s))
 
 
 class FlightSteering(Steering):
@@ -208,13 +211,13 @@ class FlightSteering(Steering):
 
     @override
     def _read_command(self) -> TimedCommand | None:
-        last = self._command_record.read()
-        if last is None or last.path_start_ns != self._reporter.path_start_ns:
+        command = self._command_record.read()
+        if command is None or command.path_start_ns != self._reporter.path_start_ns:
             return None
-        if not last.powered:
-            return TimedCommand(last.time_ns, ROTORS_OFF, is_idle=True)
-        velocity = Velocity(last.velocity_m_s, last.yaw_rad)
-        return TimedCommand(last.time_ns, FlightTarget(velocity, last.acceleration_m_s2, last.climb_m_s2))
+        if not command.powered:
+            return TimedCommand(command.time_ns, ROTORS_OFF, is_idle=True)
+        velocity = Velocity(command.velocity_m_s, command.yaw_rad)
+        return TimedCommand(command.time_ns, FlightTarget(velocity, command.acceleration_m_s2, command.climb_m_s2))
 
     @override
     def _write(

@@ -36,7 +36,10 @@ table netdev fieldkit {{
     }}
 }}
 """
-"""nftables rules for frames that the bridge forwards, which do not pass the hook `output` of the robots' rules."""
+"""nftables rules that assign the frames that the bridge forwards to access category VO.
+
+On robots, `wireless` has the same rule with the hook `output`, which forwarded frames do not pass.
+"""
 _BEACON_INTERVALS_TU: Final = (100, 101, 103, 107, 109, 113)
 """Intervals of the beacons in time units (1024 us). They differ because mac80211_hwsim derives the times of beacons
 from one clock: beacons of equal intervals would always collide."""
@@ -68,7 +71,8 @@ class AccessPoints:
         for number, radio in enumerate(radios.values()):
             files.append(f"{number}.conf")
             (folder / files[-1]).write_text(configuration(radio.interface, wifi, number), encoding="ascii")
-        (folder / "rules").write_text(_RULES.format(interfaces=", ".join(r.interface for r in radios.values())))
+        interfaces = ", ".join(radio.interface for radio in radios.values())
+        (folder / "rules").write_text(_RULES.format(interfaces=interfaces))
         self._log = folder / "hostapd.log"
         argv = ("setpriv", "--pdeathsig", "KILL", "--", "unshare", "--net", "--", "sh", "-c")
         with self._log.open("wb") as log:
@@ -93,7 +97,10 @@ class AccessPoints:
             raise TestbedLostError(f"hostapd of the access points has ended: {self._last_line()}", remedy="try again")
 
     def close(self) -> None:
-        """Stop hostapd and wait until it has exited; the kernel returns the radios. A second call does nothing."""
+        """Stop hostapd and wait until it has exited; a second call does nothing.
+
+        The kernel then moves the radios to the initial network namespace.
+        """
         if self._process.poll() is None:
             self._process.terminate()
             try:

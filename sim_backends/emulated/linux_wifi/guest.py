@@ -52,7 +52,7 @@ def run_command(argv: Sequence[str], results: Path, *, radios: int) -> int:
     kernel = require_machine()
     results.mkdir(parents=True, exist_ok=True)
     # Ctrl-C interrupts the command in the machine, which finishes its repeat. A second Ctrl-C ends the machine.
-    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    previous_handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         result = run_in_machine(
             kernel,
@@ -63,13 +63,14 @@ def run_command(argv: Sequence[str], results: Path, *, radios: int) -> int:
             on_output=_write,
         )
     finally:
-        signal.signal(signal.SIGINT, previous)
+        signal.signal(signal.SIGINT, previous_handler)
     return result.code
 
 
 def prologue(folder: Path) -> str:
     """Return the part of a shell script that prepares the machine for programs of fieldkit in a folder."""
-    # If packages were extracted to a folder, their programs are not on the PATH of the robots, so they get links.
+    # If packages were extracted to a folder, their programs are not in a folder of the robots' PATH. Links to them
+    # are created in /usr/local/sbin, which is in this PATH.
     links = [
         shlex.join(("ln", "-sf", path, f"/usr/local/sbin/{name}"))
         for name in PACKAGE_OF

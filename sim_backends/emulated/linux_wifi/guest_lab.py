@@ -140,7 +140,7 @@ def _require_connection(stream: socket.socket) -> None:
     """Read the answer to `connect`; raise ConnectionError if it is not `CONNECTED`."""
     answer = stream.recv(len(CONNECTED))
     if answer != CONNECTED:
-        raise ConnectionError((answer + stream.recv(4096)).decode(errors="replace") or "it does not answer")
+        raise ConnectionError((answer + stream.recv(4096)).decode(errors="replace") or "the robot does not answer")
 
 
 @contextmanager

@@ -216,7 +216,7 @@ def encode_sent(frame: SentFrame) -> bytes:
 def _sent_frame(attributes: dict[int, bytes]) -> SentFrame:
     frame = attributes.get(_FRAME, b"")
     if not MIN_FRAME_BYTES <= len(frame) <= MAX_FRAME_BYTES:
-        raise NetlinkFormatError(f"a frame of {len(frame)} bytes")
+        raise NetlinkFormatError(f"a frame has {len(frame)} bytes, not {MIN_FRAME_BYTES} to {MAX_FRAME_BYTES}")
     return SentFrame(
         radio=RadioAddress(_value(attributes, _TRANSMITTER, 6)),
         frame=frame,

@@ -98,7 +98,7 @@ def build_initrd(modules: Path, *, radios: int, job: str, output: str) -> bytes:
 def module_order(modules: Path, names: Iterable[str]) -> list[Path]:
     """Return the files of modules and of their dependencies; a module follows its dependencies.
 
-    A name that is built into the kernel (`modules.builtin`) is left out.
+    Modules that are built into the kernel (`modules.builtin`) are omitted.
 
     Raises:
         ConfigurationError: A module is missing.
@@ -153,7 +153,8 @@ def cpio_archive(files: Mapping[str, tuple[int, bytes]], folders: Iterable[str])
         files: Permissions and content of each file, by path without a slash at the start.
         folders: Additional folders; the folders of files are included.
     """
-    # With "x", a folder of `folders` is one of its own parents; so is each file, which is removed again.
+    # The parents of PATH/x include PATH, so this set contains the folders in `folders`, and the files, which the next
+    # line removes.
     parents = {str(parent) for path in (*files, *folders) for parent in (Path(path) / "x").parents}
     parents -= {".", *files}
     entries = [(path, stat.S_IFDIR | 0o755, b"") for path in sorted(parents)]

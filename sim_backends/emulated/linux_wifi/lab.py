@@ -26,7 +26,7 @@ def wifi_specs(
     """Return the Wi-Fi settings of each robot.
 
     In a mesh, all robots are mesh points. If there are access points that are not robots, all robots are stations of
-    these. Otherwise the relay of a trial runs the access point; without a relay, all robots are ad hoc.
+    these. Otherwise the relay of a trial runs the access point; without a relay, all robots join an ad hoc cell.
     """
     if settings.mesh:
         return dict.fromkeys(robots, WifiSpec("mesh point", has_monitor=settings.monitor))

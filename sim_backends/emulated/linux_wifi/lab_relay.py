@@ -1,4 +1,7 @@
-"""Program in the virtual machine that connects the host to the lab of a folder: `python -m ... PATTERN FOLDER`.
+"""Program in the virtual machine that connects the host to the lab of a folder.
+
+The command is `python -m sim_backends.emulated.linux_wifi.lab_relay PATTERN FOLDER`. PATTERN is a glob pattern of the
+channel's device, and FOLDER is the folder in which the lab was started.
 
 Each stream of the channel is one connection to the lab's socket: a request and its answer. The request `login` is
 answered from the lab's files. After `connect ROBOT` the stream is a connection to the SSH server of the robot.
@@ -56,7 +59,7 @@ def relay(descriptor: int, lab: LabFolder) -> None:
 
 
 def serve(stream: socket.socket, lab: LabFolder) -> None:
-    """Answer the request on a stream; errors of the connection end it."""
+    """Answer the request on a stream; an error of the stream or of the lab's connection ends the stream."""
     with stream, contextlib.suppress(OSError, ValueError):
         stream.settimeout(_REQUEST_S)
         request = _read_line(stream)

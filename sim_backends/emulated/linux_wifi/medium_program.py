@@ -11,7 +11,8 @@ Requests and replies are JSON objects, one per line. The first request is `Mediu
 
 It exits when the requests end. When the last descriptor of the registered socket is closed, hwsim again delivers all
 frames without loss. A supervisor therefore opens the socket with `hwsim_socket.open_registered`, keeps it open, and
-passes its descriptor with `--fd`. If the medium is then killed, no frame is delivered until a new medium takes over.
+passes its descriptor with `--fd`. If the medium is then killed, no frame is delivered until a new medium is started
+with this descriptor.
 """
 
 import argparse

@@ -170,7 +170,7 @@ class FamilySocket:
 
     Attributes:
         overruns: Number of times that the kernel dropped messages because the socket was full.
-        foreign: Number of datagrams that other processes than the kernel sent; they are ignored.
+        foreign: Number of received datagrams that were not sent by the kernel; they are ignored.
 
     Raises:
         ConfigurationError: The kernel does not have the family.

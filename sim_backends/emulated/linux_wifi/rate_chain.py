@@ -52,9 +52,9 @@ class RateChain:
         Skipped stages before the last attempt count as tried and failed. If no stage is in the radio model, all
         stages count as tried and failed.
         """
-        last = self.stages[attempts - 1] if attempts else len(self.is_skipped) - 1
+        last_stage = self.stages[attempts - 1] if attempts else len(self.is_skipped) - 1
         on_air = Counter(self.stages[:attempts])
-        return [self.max_tries[stage] if self.is_skipped[stage] else on_air[stage] for stage in range(last + 1)]
+        return [self.max_tries[stage] if self.is_skipped[stage] else on_air[stage] for stage in range(last_stage + 1)]
 
 
 def rate_chain(stages: Sequence[RateStage], frequency_mhz: int, *, max_tries: int = SHORT_RETRY_LIMIT) -> RateChain:

@@ -1,4 +1,4 @@
-"""Multiplexing: the connections of a lab to a virtual machine, as many byte streams over the machine's only channel.
+"""Multiplexing: each connection of a lab to a virtual machine is a stream of bytes on the machine's only channel.
 
 A frame has the number of its stream, its kind and its length, then data. The host opens streams; a stream ends when
 both sides have sent END. A frame with an invalid header ends the channel, because the other side is not trusted.

@@ -95,7 +95,7 @@ class WifiClient(MediumClient):
         velocities_m_s: Mapping[str, Vector] = MappingProxyType({}),
         attitudes: Mapping[str, Attitude] = MappingProxyType({}),
     ) -> None:
-        """Implement `MediumClient.place`; other access points are at their positions in the site file."""
+        """Implement `MediumClient.place`; access points that are not robots keep their positions in the site file."""
         self._robots |= self._access_points_m.keys()
         positions_m = {**self._access_points_m, **positions_m}
         super().place(positions_m, relay=relay, velocities_m_s=velocities_m_s, attitudes=attitudes)

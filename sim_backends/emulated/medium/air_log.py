@@ -88,9 +88,9 @@ class AirLog:
     def _record(self, attempt: TransmissionAttempt) -> bytes:
         receiver = _BROADCAST if attempt.receiver is None else self._addresses[attempt.receiver]
         frame = self._control_frame(attempt, receiver) if attempt.control else self._data_frame(attempt, receiver)
-        seconds, rest_ns = divmod(attempt.start_ns + self._utc_offset_ns, 1_000_000_000)
+        seconds, nanoseconds = divmod(attempt.start_ns + self._utc_offset_ns, 1_000_000_000)
         snapshot = frame[:_SNAP_BYTES]
-        return _RECORD_HEADER.pack(seconds, rest_ns, len(snapshot), len(frame)) + snapshot
+        return _RECORD_HEADER.pack(seconds, nanoseconds, len(snapshot), len(frame)) + snapshot
 
     def _control_frame(self, attempt: TransmissionAttempt, receiver: bytes) -> bytes:
         transmitter = self._addresses[attempt.transmitter] if attempt.control == "RTS" else b""

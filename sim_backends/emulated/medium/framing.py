@@ -10,7 +10,7 @@ from ipaddress import IPv4Address, IPv4Interface
 from typing import Final
 
 NO_ROBOT: Final = ""
-"""Receiver of a packet whose destination address no robot has."""
+"""Value of the receiver of a packet if no robot has the destination address."""
 
 Routes = Mapping[bytes, str | None]
 """Robot per destination address, None for broadcast; empty for a robot that is not placed."""

@@ -1,4 +1,4 @@
-"""The media of a lab: that of the radio under test, and one per further link of the robots, for example LTE."""
+"""The media of a lab: one for the radio under test, and one per further link of the robots, for example LTE."""
 
 from collections import Counter
 from collections.abc import Mapping

@@ -168,7 +168,7 @@ def unpack_links(message: Message) -> dict[str, list[LinkSample]]:
 
 
 def round_up(late_ns: int) -> int:
-    """Return the smallest number above `late_ns` with at most 4 significant bits; it is at most 1/8 larger."""
+    """Return the smallest number above `late_ns` with at most 4 significant bits; above 8 ns at most 1/8 larger."""
     shift = late_ns.bit_length() - _KEPT_BITS
     return late_ns + 1 if shift <= 0 else ((late_ns >> shift) + 1) << shift
 

@@ -112,12 +112,12 @@ class Medium(MediumServer):
             if destination == NO_ROBOT:
                 port.unroutable_packets += 1
                 continue
-            if requested_flows and (inner := framing.ipv4(packet)) is not None:
-                flows.note_first_fragment(inner)
+            if requested_flows and (ip_packet := framing.ipv4(packet)) is not None:
+                flows.note_first_fragment(ip_packet)
             now_ns = clock_ns()
             delay = delay_offset + now_ns
-            if has_priorities and (inner := framing.ipv4(packet)) is not None:
-                dscp = inner[1] >> 2
+            if has_priorities and (ip_packet := framing.ipv4(packet)) is not None:
+                dscp = ip_packet[1] >> 2
                 send(now_ns, name, packet, len(packet) - header_bytes, destination, before=delay, dscp=dscp)
                 continue
             send(now_ns, name, packet, len(packet) - header_bytes, destination, before=delay)
@@ -128,7 +128,8 @@ class Medium(MediumServer):
         now_ns = time.monotonic_ns()
         deliveries = self._model.deliveries(now_ns)
         if deliveries:
-            ports, write, clock_ns, late = self._ports, os.write, time.monotonic_ns, self._packet_lateness_counts
+            ports, write, clock_ns = self._ports, os.write, time.monotonic_ns
+            lateness_counts = self._packet_lateness_counts
             flows, requested_flows = self._flows, self._flows.delays_by_flow
             for at_ns, name, packet, source, delay in deliveries:
                 port = ports[name]
@@ -140,9 +141,9 @@ class Medium(MediumServer):
                     continue
                 late_ns = clock_ns() - at_ns
                 port.delays[source] += delay + late_ns
-                if requested_flows and (inner := self._framing.ipv4(packet)) is not None:
-                    flows.count(inner, delay + late_ns, port.address.packed)
-                late[round_up(late_ns + processing_ns(delay))] += 1
+                if requested_flows and (ip_packet := self._framing.ipv4(packet)) is not None:
+                    flows.count(ip_packet, delay + late_ns, port.address.packed)
+                lateness_counts[round_up(late_ns + processing_ns(delay))] += 1
         next_ns = self._model.next_event_ns()
         if next_ns is not None and next_ns != self._timer_ns:
             self._timer.set(next_ns)

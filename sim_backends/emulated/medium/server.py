@@ -31,7 +31,7 @@ from sim_backends.world.motion import Attitude
 from sim_backends.world.world import World
 
 BURST: Final = 64
-"""Maximum number of packets read from one robot before other robots and the timer are served, in about 0.5 ms."""
+"""Maximum number of packets read from one robot before other robots and the timer are served: about 0.5 ms."""
 READ_BYTES: Final = 2048
 """Size of a read, which is longer than any packet of an interface with the MTU 1500 of Wi-Fi."""
 DEVICE_PACKETS: Final = 500
@@ -44,7 +44,7 @@ _OWNER_TIMEOUT_S: Final = 5.0
 # The link sampler of a robot has the same sampling interval.
 _SAMPLE_NS: Final = 200_000_000
 _MAX_SAMPLES: Final = 10_000
-"""Maximum number of samples that are kept per robot: half an hour."""
+"""Maximum number of samples that are kept per robot: the last 33 minutes."""
 
 AttemptLog = Callable[[TransmissionAttempt], None]
 
@@ -180,7 +180,10 @@ class MediumServer(ABC):
         self._writable.register(fd, select.EPOLLOUT)
 
     def _robots_with_interface_up(self) -> set[str]:
-        """Return the robots whose interface is up; a change (`ip link`, an empty battery) sends no event."""
+        """Return the robots whose interface is up.
+
+        The medium polls this set, because a change (`ip link`, an empty battery) causes no event.
+        """
         self._polled_ns = time.monotonic_ns()
         return {self._by_fd[fd].name for fd, events in self._writable.poll(0) if events & select.EPOLLOUT}
 

@@ -119,7 +119,7 @@ class Worker:
         self.name = name
         self._lock = threading.Lock()
         self._channel, worker_end = socket.socketpair()
-        self._log = tempfile.TemporaryFile()  # noqa: SIM115 (lives as long as the process; `close` closes it)
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115 (open while the process runs; `close` closes it)
         python = command(module)
         argv = ["setpriv", "--pdeathsig", "KILL", "--", *command_prefix, *python, str(worker_end.fileno()), *words]
         try:
@@ -164,7 +164,7 @@ class Worker:
         """
         if not self._lock.acquire(timeout=timeout_s):
             raise LinkError("is busy with another request", where=self.name, remedy="try again")
-        # The wait is never shorter than REPLY_S, because a late reply would look like the reply to the next request.
+        # The wait is never shorter than REPLY_S, because a late reply would be read as the reply to the next request.
         deadline = Deadline.after(max(timeout_s, REPLY_S))
         try:
             send(self._channel, message, deadline, descriptors)

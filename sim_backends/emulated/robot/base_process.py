@@ -95,7 +95,7 @@ CHANNEL: Final = Path(STATE, "velocities")
 
 _TWIST: Final = struct.Struct("<6d")
 BYTES: Final = _TWIST.size
-"""Length of a datagram. A receiver reads one byte more, so that it notices a longer datagram."""
+"""Length of a datagram. A receiver reads one byte more, so that it can detect and reject a longer datagram."""
 
 STAMPED: Final = "geometry_msgs/TwistStamped"
 """Type of velocity messages with a time stamp."""

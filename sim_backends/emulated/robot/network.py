@@ -31,7 +31,7 @@ def babeld_command(interface: str, address: str, hello_s: float, links: Mapping[
     Args:
         interface: The radio interface. It is declared wireless, because a TAP device has no wireless extensions.
         address: The robot's address with the prefix length; each robot announces its own address as a host route.
-        hello_s: Interval of the hello messages with which babeld measures its neighbours.
+        hello_s: Interval of the hello messages with which babeld measures the links to its neighbours.
         links: Address with the prefix length of each further link, by its interface. If `LOOPBACK_INTERFACE` is one
             of them, the daemon also uses the other links, each with the cost `LINK_COST`, and announces the address
             of `LOOPBACK_INTERFACE` over all links. It announces the address on the radio only over the radio.
@@ -132,8 +132,8 @@ def open_device() -> int:
 
 def _set_queue(index: int) -> None:
     """Set the queue of the interface with this index to `QUEUE_PACKETS`."""
-    # Netlink is used, because the ioctl (also in busybox's ip) needs a capability that no user namespace grants.
-    # The structs ifinfomsg, rtattr and nlmsghdr.
+    # Netlink is used, because the ioctl (also in busybox's ip) needs a capability that no user namespace grants. The
+    # message consists of the structs nlmsghdr, ifinfomsg and rtattr.
     link = struct.pack("=BxHiII", socket.AF_UNSPEC, 0, index, 0, 0)
     length = struct.pack("=HHI", 8, _IFLA_TXQLEN, QUEUE_PACKETS)
     size_bytes = _HEADER_BYTES + len(link) + len(length)

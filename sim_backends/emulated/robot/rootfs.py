@@ -33,7 +33,8 @@ sshd:x:100:65534::/run/sshd:/usr/sbin/nologin
 tcpdump:x:101:101::/nonexistent:/usr/sbin/nologin
 """
 _GROUPS: Final = "root:x:0:\ntty:x:5:\nnogroup:x:65534:\ntcpdump:x:101:\n"
-# `*` matches no password; keys still log in. `!` would lock the account, which sshd without PAM refuses.
+# `*` matches no password; a login with a key is still possible. `!` would lock the account, and sshd without PAM
+# refuses any login to a locked account.
 _PASSWORDS: Final = "root:*:20000:0:99999:7:::\n"
 
 ROBOT_FILES: Final = tuple(f"/etc/{name}" for name in ("passwd", "group", "shadow", "hostname", "hosts"))
@@ -186,7 +187,7 @@ def _ros_packages(setup: Path) -> Path:
 
 
 def _etc_files(spec: RobotSpec) -> dict[str, str]:
-    """Return the content of the robot's own files in `/etc`, by name."""
+    """Return the content of the files in `/etc` that each robot has separately, by name."""
     names = "".join(f"{address}\t{name}\n" for name, address in spec.hosts.items())
     return {
         "passwd": _ACCOUNTS.format(shell="/bin/sh" if spec.userland == "busybox" else "/bin/bash"),

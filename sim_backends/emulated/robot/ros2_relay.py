@@ -1,8 +1,8 @@
 """Publishes an emulated robot's sensors over DDS or Zenoh, as nodes of ROS 2 do; or runs a Zenoh router.
 
 The command line is `route ADDRESS` for the router, or `relay ADDRESS NODE VELOCITY_TOPIC VELOCITY_TYPE ROS2 TYPES`.
-ADDRESS is the robot's. ROS2 (the fields of `Ros2Spec`) and TYPES (the type of each topic) are JSON. The two words
-about velocities are empty for a robot without a base.
+ADDRESS is the robot's address on the radio. ROS2 (the fields of `Ros2Spec`) and TYPES (the type of each topic) are
+JSON. The two words about velocities are empty for a robot without a base.
 
 The sensors process creates each message. The relay converts it to CDR, the serialization of ROS 2, as the robot's
 distribution defines the type, and publishes it while a node on the radio subscribes to the topic. It publishes

@@ -197,7 +197,7 @@ def main() -> None:
         _relay_velocities(velocities, velocity_type)
     services.ready_file("ros_relay").touch()
     rospy.spin()
-    del relays  # rospy has finished; until now this list kept the relays alive
+    del relays  # rospy has finished; until now, this list prevented the garbage collection of the relays
 
 
 if __name__ == "__main__":

@@ -30,10 +30,10 @@ MOTION_RECORD: Final = Path(STATE, "steered")
 """The file in which a robot that steers itself records its motion."""
 
 FLIGHT_COMMAND: Final = Path(STATE, "flight_command")
-"""The file in which an autopilot records its command for a physics simulator that flies the drone."""
+"""The file in which an autopilot records its command for the physics simulator that moves the drone."""
 
 FLIGHT: Final = Path(STATE, "flown")
-"""The file in which this physics simulator records the flight."""
+"""The file in which the physics simulator records the motion of the drone for its autopilot."""
 
 READY_FOLDER: Final = f"{STATE}/ready"
 
@@ -64,7 +64,7 @@ def spawn(argv: tuple[str, ...], environment: Mapping[str, str], log: Path) -> i
         ],
         setsid=True,
         setsigmask=[],
-        setsigdef=[signal.SIGPIPE, signal.SIGXFSZ],  # Python ignores these signals
+        setsigdef=[signal.SIGPIPE, signal.SIGXFSZ],  # Python ignores these signals, and a program would inherit that
     )
 
 

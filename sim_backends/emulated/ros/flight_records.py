@@ -77,7 +77,7 @@ class FlightCommandRecord(Record):
 
 
 class FlightMotion(NamedTuple):
-    """Motion of a drone that a physics simulator flies, for its autopilot.
+    """Motion of a drone that a physics simulator moves; the autopilot of the drone reads it.
 
     Attributes:
         time_ns: Its time, from the monotonic clock.

@@ -79,7 +79,11 @@ class _Scan:
                 self._record_hit(beam, cross_product / divisor)
 
     def add_circle(self, centre: tuple[float, float], radius_m: float) -> None:
-        """Add an upright cylinder: t = m - sqrt(r^2 - d^2); its centre is m along the beam and d beside it."""
+        """Add an upright cylinder.
+
+        A beam hits it at the distance m - sqrt(r^2 - d^2), with the radius r. The point of the beam that is nearest
+        to the axis of the cylinder is at the distance m from the scanner, and d from the axis.
+        """
         x, y = centre[0] - self._east_m, centre[1] - self._north_m
         distance_m = math.hypot(x, y)
         if distance_m <= radius_m or distance_m - radius_m > self._reach_m:

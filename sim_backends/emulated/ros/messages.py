@@ -105,7 +105,9 @@ def _template_generator(template: Template) -> Generator:
         nonlocal pool
         if not template.floats:
             return head + noise.randbytes(size_bytes) + tail
-        if not pool:  # drawn once and read from varying offsets, because a large cloud takes longer than its period
+        # The floats are drawn only once, because drawing those of a large cloud takes longer than the period of the
+        # topic. Each message contains them from another offset.
+        if not pool:
             # Twice the list, so that a whole list follows each offset.
             pool = 2 * struct.pack(f"<{size_bytes // 4}f", *_gaussian(noise, 1.0, *[0.0] * (size_bytes // 4)))
         start = _POINT_BYTES * noise.randrange(max(1, size_bytes // _POINT_BYTES))

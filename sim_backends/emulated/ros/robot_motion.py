@@ -1,8 +1,8 @@
-"""Motion of an emulated robot as its sensors need it: wheel odometry and position.
+"""Motion of an emulated robot, which its sensors measure: wheel odometry and position.
 
-The lab sends a path only once, when the motion starts, and the robot computes its position on the path itself, so no
-position message can be late. The wheels do not turn when the lab puts a robot back, so the odometry continues from
-its last value.
+The lab sends a path only once, when the motion starts. The robot then computes its position on the path, so no
+position message can be late. The wheels do not turn when the lab moves a robot back to its place, so the odometry
+continues from its last value.
 
 Some robots steer themselves. The process that steers such a robot (a base controller or an autopilot) uses a
 `MotionReporter`: it reads the position at which the lab has last placed the robot, computes the motion from there,
@@ -25,14 +25,14 @@ from sim_backends.world.motion import LEVEL, STILL, WayPoints
 
 @dataclass(frozen=True)
 class AssignedPath:
-    """Path on which the lab moves a robot, which stops at its end.
+    """Path on which the lab moves a robot. The robot stops at the end of the path.
 
     On a path of one point, the robot stays at this point.
 
     Attributes:
         start_ns: Start of the motion, as a time of the monotonic clock, which is common to all robots on one machine.
         points_m: Points of the path, metres east, north, up.
-        speed_m_s: Speed along the path.
+        speed_m_s: Horizontal speed.
         facing_rad: Heading of the robot before the start, from east towards north.
     """
 
@@ -53,7 +53,7 @@ class RobotMotionState:
         speed_m_s: Forward speed.
         position_m: Position, metres east, north, up.
         heading_rad: Heading, from east towards north.
-        turn_rad_s: Turn rate to the left; a robot on an assigned path turns in zero time, with a rate of 0.
+        turn_rad_s: Turn rate to the left; 0 on an assigned path, where the robot turns in zero time.
     """
 
     x_m: float = 0.0
@@ -101,7 +101,7 @@ class Odometer:
             self._base = RobotMotionState(-x_m, -y_m, yaw_rad)
 
     def at(self, now_ns: int) -> RobotMotionState:
-        """Return the robot's motion at a time, which must not be earlier than that of the last call."""
+        """Return the robot's motion at a time, which must not be earlier than the time of the last call."""
         self._read_paths(now_ns)
         return self._recorded_motion(now_ns) or self._assigned_motion(now_ns)
 
@@ -184,7 +184,7 @@ def _rotate(x: float, y: float, angle_rad: float) -> tuple[float, float]:
 
 
 class MotionReporter:
-    """Reads the placements of a robot by the lab, and records the motion of the robot.
+    """Reads the positions at which the lab places a robot, and records the motion of the robot.
 
     Only the process that steers the robot may create one.
 

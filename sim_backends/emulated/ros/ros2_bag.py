@@ -173,7 +173,7 @@ def _parser(distribution: str) -> argparse.ArgumentParser:
     record.add_argument("positional", nargs="*", metavar="Topic", help="topics to record")
     record.add_argument("--topics", nargs="+", default=[], metavar="Topic", help="topics to record")
     record.add_argument("-a", "--all", action="store_true", help="record every topic")
-    record.add_argument("-o", "--output", help="folder of the bag; else one with the date")
+    record.add_argument("-o", "--output", help="folder of the bag; by default its name has the date")
     record.add_argument(
         "-s",
         "--storage",
@@ -189,7 +189,7 @@ def main(argv: Sequence[str], distribution: str) -> int | str:
     """Run a command line; return its exit code, or the original's error message, for exit code 1."""
     options = _parser(distribution).parse_args(argv)
     topics = [f"/{topic.lstrip('/')}" for topic in (*options.positional, *options.topics)]
-    if bool(topics) is options.all:  # both, or neither
+    if bool(topics) is options.all:  # both were given, or neither
         return "[ERROR] [ros2bag]: Need to specify either topics or --all"
     folder = Path(options.output or datetime.now().astimezone().strftime("rosbag2_%Y_%m_%d-%H_%M_%S"))
     if folder.exists():

@@ -74,7 +74,7 @@ class Rosbag1Recorder:
         self._complete_topics: set[str] = set()
 
     def run(self) -> None:
-        """Record.
+        """Record until the recording is complete or stopped.
 
         Raises:
             RecorderError: The bag cannot be written.

@@ -36,7 +36,7 @@ class Template:
         head: Content between the header and the list that is filled, serialized, in hexadecimal digits.
         tail: Content after the list, in the same form.
         size_bytes: Size of the list.
-        floats: True if the list holds 4-byte floats; otherwise any bytes.
+        floats: True if the list holds 4-byte floats; False if any bytes are valid values.
     """
 
     has_header: bool
@@ -134,11 +134,15 @@ def check(sensor: Sensor) -> None:
         )
     if sensor.rate_hz <= 0:
         raise ConfigurationError(
-            "a topic with rate 0Hz publishes nothing", where=f"topic {sensor.topic}", remedy="write 5Hz"
+            "a topic with rate 0Hz publishes nothing",
+            where=f"topic {sensor.topic}",
+            remedy="write a rate above 0Hz, for example 5Hz",
         )
     if sensor.type == LASER_SCAN and sensor.points is None:
         raise ConfigurationError(
-            "a laser scan needs `points`, beams per turn", where=f"topic {sensor.topic}", remedy="write points: 360"
+            "a laser scan needs `points`, the number of beams per turn",
+            where=f"topic {sensor.topic}",
+            remedy="write for example points: 360",
         )
 
 

@@ -63,7 +63,7 @@ class Subscriber:
             self._read()
 
     def _flush(self) -> None:
-        """Send as much as the socket accepts; the rest is sent when it is writable again."""
+        """Send as much as the socket accepts; the remaining data are sent when the socket is writable again."""
         try:
             with contextlib.suppress(BlockingIOError):
                 del self._unsent[: self._stream.send(self._unsent)]
@@ -89,7 +89,7 @@ class Subscriber:
             self._disconnect()
 
     def _send_greeting(self) -> None:
-        """Answer the connection header once it is complete; anything after it is ignored."""
+        """Send the greeting once the subscriber's connection header is complete; later data are ignored."""
         for packet in self._packets:
             framing.unpack_header(packet)
             self.is_subscribed = True

@@ -1,7 +1,7 @@
 """A record in a file, with one writer and any number of readers.
 
-Two slots are written alternately, each with a number and a CRC. A reader therefore finds a complete record at any
-time: while another record is being written, and after the writer was killed.
+Two slots are written alternately, each with a number and a CRC. One of them therefore always has a complete record,
+even while the other one is being written, or after the writer was killed during a write.
 """
 
 import os
@@ -61,7 +61,7 @@ class Slots:
         os.close(self._fd)
 
     def _accept(self, slot: bytes, crc: bytes) -> None:
-        """Store a newer slot unless it is being written."""
+        """Store the values of a newer slot, unless its CRC shows that it is being written."""
         if _CRC.unpack(crc)[0] == zlib.crc32(slot):
             self._number, *values = self._slot.unpack(slot)
             self._values = tuple(values)

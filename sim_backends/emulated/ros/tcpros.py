@@ -154,10 +154,10 @@ def _header(payload: bytes, topic: str) -> Header:
     header = unpack_header(payload)
     missing = {"topic", "type", "md5sum", "message_definition"} - header.keys()
     if missing or header["topic"] != topic or not _TYPE.fullmatch(header["type"]):
-        raise ValueError(f"not the header of a publisher of {topic}")
+        raise ValueError(f"the connection header is not the header of a publisher of {topic}")
     latching = header.get("latching", "0")
     if latching not in {"0", "1"}:
-        raise ValueError(f"latching is {latching!r}")
+        raise ValueError(f"latching is {latching!r}, not 0 or 1")
     return {"callerid": "", **header, "latching": latching}
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _HEADER: Final = "std_msgs/msg/Header"
 _QUATERNION: Final = "geometry_msgs/msg/Quaternion"
-# Format characters of `struct`; times have two fields, and rosbags treats them as types with fields.
+# Format characters of `struct`. Times are missing, because rosbags treats a time as a type with two fields.
 _STRUCT_FORMATS: Final = {
     "bool": "?",
     "byte": "B",
@@ -111,7 +111,7 @@ def _types(kind: str, definition: str) -> "Typestore":
 def _unknown_type_error(topic: PublishedTopic) -> ConfigurationError:
     remedy = f"write what `rosmsg show -r {topic.type}` prints under definition: of the topic"
     return ConfigurationError(
-        f"an emulated robot cannot publish {topic.type}: ROS 1 itself has no definition of it, or of a type in it",
+        f"an emulated robot cannot publish {topic.type}: ROS 1 has no definition of this type, or of a type in it",
         where=f"topic {topic.name}",
         remedy=f"{did_you_mean(topic.type, GENERATED_TYPES, remedy)}",
     )

@@ -29,28 +29,28 @@ def check_ping(target: Target) -> None:
 
 def check_malformed(target: Target) -> None:
     """A frame that ends too early is refused with an error."""
-    kind, answer = (
+    kind, answer_kind = (
         (MessageKind.ADVANCE_PHYSICS, MessageKind.STATES)
         if target.is_physics
         else (MessageKind.ADVANCE_NETWORK, MessageKind.OUTCOMES)
     )
-    target.open().expect_error(kind, bytes(9), answer, "a frame that ends too early")
+    target.open().expect_error(kind, bytes(9), answer_kind, "a frame that ends too early")
 
 
 def check_counts(target: Target) -> None:
     """A count that is larger than the frame is refused with an error."""
-    bytes_before_count, kind, answer = (
+    bytes_before_count, kind, answer_kind = (
         (16, MessageKind.ADVANCE_PHYSICS, MessageKind.STATES)
         if target.is_physics
         else (24, MessageKind.ADVANCE_NETWORK, MessageKind.OUTCOMES)
     )
     target.open().expect_error(
-        kind, bytes(bytes_before_count) + b"\xff" * 4, answer, "a count that is larger than the frame"
+        kind, bytes(bytes_before_count) + b"\xff" * 4, answer_kind, "a count that is larger than the frame"
     )
 
 
 def check_fork_absence(target: Target) -> None:
-    """A federate that does not declare fork refuses it."""
+    """A federate that does not declare fork refuses a request to fork."""
     probe = target.open()
     if probe.has(FederateCapability.FORK):
         raise NotDeclaredError("it declares FORK")

@@ -112,11 +112,17 @@ class FederateProbe:
             raise NotDeclaredError(f"it does not declare {capability.name}")
 
     def request(
-        self, kind: MessageKind, body: bytes, answer: MessageKind, decode: Callable[[bytes], Any], *, copy: int = 0
+        self,
+        kind: MessageKind,
+        body: bytes,
+        answer_kind: MessageKind,
+        decode: Callable[[bytes], Any],
+        *,
+        copy: int = 0,
     ) -> Any:  # noqa: ANN401 (the result of `decode`)
         """Send a request, and return the decoded answer. Raises the errors of `FederateSession.request`."""
         request_name = kind.name.lower().replace("_", " ")
-        return self._session.request(kind, copy, body, answer, decode=decode, describe=lambda: request_name)
+        return self._session.request(kind, copy, body, answer_kind, decode=decode, describe=lambda: request_name)
 
     def advance_physics(
         self, to_ns: int, commands: Mapping[str, Any] | None = None, *, from_ns: int | None = None, copy: int = 0
@@ -166,15 +172,15 @@ class FederateProbe:
         number: int = self.request(MessageKind.PING, encode_number(value), MessageKind.PONG, decode_number)
         return number
 
-    def expect_error(self, kind: MessageKind, body: bytes, answer: MessageKind, request_text: str) -> None:
+    def expect_error(self, kind: MessageKind, body: bytes, answer_kind: MessageKind, request_text: str) -> None:
         """Send a request that the federate must refuse.
 
         Raises:
-            CheckError: It sends another answer, or no answer within the deadline.
+            CheckError: The federate sends another answer, or no answer within the deadline.
         """
         start_s = time.monotonic()
         try:
-            self.request(kind, body, answer, bytes)
+            self.request(kind, body, answer_kind, bytes)
         except FederateError as error:
             # The federate answered with an error, or closed the connection. A missing answer has another exit code,
             # and a malformed or wrong answer has another message.
@@ -189,7 +195,7 @@ class FederateProbe:
         """End the session by `bye`, and wait until the federate closes the connection.
 
         Raises:
-            CheckError: It does not close the connection.
+            CheckError: The federate does not close the connection.
         """
         try:
             self._session.send_bye(_CLOSE_S)

@@ -89,7 +89,7 @@ def read_token(address: TransportAddress) -> str:
     value = os.environ.get(TOKEN_VARIABLE, "")
     if not value and not address.is_loopback:
         raise ConfigurationError(
-            f"{address} is not on this machine, but there is no token",
+            f"other machines can use {address}, but there is no token",
             remedy=f"set {TOKEN_VARIABLE} to the same secret text on both sides",
         )
     return value

@@ -1,19 +1,22 @@
 """The datagrams of the UDP transport: a byte stream in numbered datagrams that are acknowledged and resent.
 
-A datagram has at most 1,200 bytes: a header of 40 bytes, `FKUD`, `version` u8 (1), `kind` u8, `reserved` u16,
-`connection` u64, `cookie` u64, `number` u64, `expected` u64, then, in data (kind 3), a part of the stream.
+A datagram has at most 1,200 bytes. Its header has 40 bytes: `FKUD`, `version` u8 (1), `kind` u8, `reserved` u16,
+`connection` u64, `cookie` u64, `number` u64, `expected` u64. The kinds are open (1), cookie (2), data (3),
+acknowledgement (4) and close (5). A data datagram contains a part of the stream after its header.
 
-- The side that connects draws a random `connection`, and sends open (1) with `cookie` 0. It sends open again after
-  50 ms and then at intervals that double up to 1 s, until it receives cookie (2). That datagram has the `cookie` that
-  the other side has computed for this number and address. All later datagrams have both numbers. A datagram with
-  other numbers or from another address is ignored. The side that connects sends the first data.
-- Data are numbered from 0 in each direction. In a datagram of another kind, `number` is the number of the next data.
-  `expected` acknowledges all data before this number. At most 64 are unacknowledged.
-- Before a side waits, it sends an acknowledgement (4) of new data. While it waits, it sends one every 2 s.
-  Unacknowledged data are sent again after the time-out of RFC 6298, between 20 ms and 2 s.
-- A side that ends sends one close datagram (5), when all its data are acknowledged or after 0.5 s. The receiver ends
-  the connection if `number` is the expected one. If the datagram is lost, the connection ends with an ICMP message
-  that the port is unreachable, or after 3,600 s of silence.
+- The side that connects draws a random `connection`, and sends open with `cookie` 0. It sends open again after 50 ms
+  and then at intervals that double up to 1 s, until it receives a cookie datagram. The other side has computed the
+  `cookie` in it from `connection` and the sender's address. All later datagrams have this `connection` and this
+  `cookie`; a datagram with other values or from another address is ignored. The side that connects sends the first
+  data.
+- Data datagrams are numbered from 0 in each direction. In a datagram of another kind, `number` is the number of the
+  next data datagram. `expected` acknowledges all data datagrams before this number. At most 64 of them are
+  unacknowledged.
+- Before a side waits, it acknowledges new data. While it waits, it sends an acknowledgement every 2 s. Unacknowledged
+  data are sent again after the time-out of RFC 6298, which is limited to the range from 20 ms to 2 s.
+- A side that ends the connection sends close once: when all its data are acknowledged, but after 0.5 s at the latest.
+  The receiver ends the connection if `number` is the number that it expects. If close is lost, the receiver ends the
+  connection after an ICMP message that the port is unreachable, or after 3,600 s without a datagram.
 """
 
 import select
@@ -37,7 +40,7 @@ DATAGRAM_VERSION: Final = 1
 _WINDOW: Final = 64
 """Largest number of unacknowledged datagrams; they fit into a receive buffer of Linux's default size."""
 _LINGER_S: Final = 0.5
-"""Longest wait for acknowledgements when a side ends."""
+"""Longest wait for acknowledgements when a side ends the connection."""
 _PROBE_S: Final = 2.0
 """Interval at which a side that waits sends an acknowledgement."""
 _SILENCE_S: Final = 3600.0
@@ -77,7 +80,7 @@ _KINDS: Final = {int(kind): kind for kind in DatagramKind}
 
 
 def pack_datagram(header: DatagramHeader, data: bytes | memoryview = b"") -> bytes:
-    """Return a datagram."""
+    """Return the bytes of a datagram."""
     kind, connection, cookie, number, expected = header
     return _HEADER.pack(_MAGIC, DATAGRAM_VERSION, kind, 0, connection, cookie, number, expected) + data
 

@@ -188,7 +188,7 @@ def parse(text: str) -> DdsAddress:
     """Return the address of `dds:NAME`, `dds:NAME:DOMAIN` or `dds:NAME:DOMAIN:INTERFACE`.
 
     Raises:
-        ValueError: It is invalid.
+        ValueError: The address is invalid.
     """
     _, name, *fields = text.split(":")
     domain = fields[0] if fields else "0"

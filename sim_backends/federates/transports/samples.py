@@ -4,13 +4,13 @@ The coordinator writes `requests` and reads `answers`; the federate does the rev
 a random u64 that the coordinator draws, and one frame. The first frame is `hello`; a sample without a frame ends the
 run.
 
-DDS: topics `fieldkit/NAME/requests` and `fieldkit/NAME/answers`, final type
-`fieldkit::Frame { sequence<octet> data; }` in plain CDR, reliable, keep all, transient local; the durability service
-of a writer keeps the last two samples. A volatile writer does not match. A volatile reader matches, but misses
-`hello` if it discovers the writer too late.
+DDS: the topics are `fieldkit/NAME/requests` and `fieldkit/NAME/answers`. Their type is the final type
+`fieldkit::Frame { sequence<octet> data; }` in plain CDR. Their quality of service is reliable, keep all and transient
+local; the durability service of a writer keeps the last two samples. A volatile writer does not match. A volatile
+reader matches, but misses `hello` if it discovers the writer too late.
 
-ROS 1: topics `/fieldkit/NAME/requests` and `/fieldkit/NAME/answers`, type `std_msgs/UInt8MultiArray` without
-dimensions.
+ROS 1: the topics are `/fieldkit/NAME/requests` and `/fieldkit/NAME/answers`. Their type is `std_msgs/UInt8MultiArray`
+without dimensions.
 """
 
 import secrets
@@ -39,7 +39,7 @@ _KIND_OFFSET: Final = _RUN.size + KIND_POSITION
 _CHECK_S: Final = 0.5
 """Interval at which a channel that waits checks that the other side exists."""
 _PEER_S: Final = 10.0
-"""Longest time for which the accepting side waits until its peer is discovered. An earlier answer may be lost."""
+"""Longest wait of the accepting side until its peer is discovered. An answer that is sent before may be lost."""
 _MAX_WAITING: Final = 16
 """Largest number of runs that wait for the end of the current run."""
 _POLL_S: Final = 0.01
@@ -110,7 +110,8 @@ class SampleChannel:
             raise MalformedFrameError(len(sample) - _RUN.size, "the sample ends within a header")
         header = read_header(sample[_RUN.size : body_offset], max_bytes)
         if len(sample) != body_offset + header.size:
-            raise MalformedFrameError(0, f"a sample with {len(sample) - body_offset} bytes, not {header.size}")
+            received_bytes = len(sample) - body_offset
+            raise MalformedFrameError(0, f"the body has {received_bytes} bytes, but its header states {header.size}")
         return ProtocolFrame(header, sample[body_offset:])
 
     def _next_sample(self, deadline_s: float | None) -> bytes:

@@ -23,10 +23,11 @@ class Ros1:
     connection is opened, and existing connections continue.
 
     An agent keeps its connection to the master, as rospy does, while each request to a publisher has a separate
-    connection. Between hosts with the delay d, and an open connection to the master, the time from registration to
-    first message is 12 d: 2 for the response of the master, 4 for the response of the publisher, 2 for the keep-alive
-    query, 4 for connection and headers. This is the time of rospy 1.15.15 for messages that fill a segment or
-    subscribers that request `tcp_nodelay`; smaller messages wait for an ACK (Nagle), which takes 2 d more.
+    connection. Let d be the delay between hosts. If the connection to the master is open, the time from registration
+    to first message is 12 d: 2 d for the response of the master, 4 d for the response of the publisher, 2 d for the
+    keep-alive query, and 4 d for the connection and its headers. This is the time of rospy 1.15.15 for messages that
+    fill a segment, or for subscribers that request `tcp_nodelay`. Smaller messages wait for an ACK (Nagle), which
+    takes 2 d more.
 
     Every flow is registered separately, as a topic with one publisher and one subscriber. Other traffic of nodes
     (other parameters, services, `/rosout`) is not modelled.

@@ -101,7 +101,7 @@ class Heartbeat:
 
     @property
     def size_bytes(self) -> int:
-        """Its size."""
+        """Its size, without the headers of the message."""
         return _HEARTBEAT_BYTES
 
 

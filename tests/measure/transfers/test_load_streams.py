@@ -20,7 +20,7 @@ from tests.helpers.streams import ISN, MS, SECOND, START, Stream, captured
 
 SCHEDULE = FlowSchedule(interval_s=0.01)
 UDP = LoadStreams(Protocol.UDP, SENDER, RECEIVER, PORT, False, 1, 1000, (), SCHEDULE)
-TCP = replace(UDP, protocol=Protocol.TCP, expected=FlowSchedule(head_bytes=COOKIE_BYTES))
+TCP = replace(UDP, protocol=Protocol.TCP, schedule=FlowSchedule(head_bytes=COOKIE_BYTES))
 LOST = (100, 150)
 
 
@@ -67,7 +67,7 @@ def test_streams_that_cannot_be_distinguished_have_no_stall() -> None:
 
 
 def test_a_test_longer_than_its_arrivals_has_a_lower_bound() -> None:
-    with_duration = replace(UDP, expected=replace(SCHEDULE, duration_s=10.0))
+    with_duration = replace(UDP, schedule=replace(SCHEDULE, duration_s=10.0))
     assert measure_values(with_duration, [control(), data()]) == {"stall_at_least_s": pytest.approx(6.0), "stalls": 2}
 
 
@@ -108,7 +108,7 @@ def test_a_reverse_test_sends_from_the_port_of_the_server() -> None:
         )
     control_stream = Stream(sport=PORT, port=39000)
     control_stream.handshake(0)
-    load = replace(TCP, source_listens=True, expected=FlowSchedule())
+    load = replace(TCP, source_listens=True, schedule=FlowSchedule())
     assert measure_values(load, [control_stream, data_stream])["stall_s"] == pytest.approx(2.01, abs=1e-3)
 
 

@@ -109,7 +109,7 @@ def test_columns_of_seen_frames_belong_to_one_step_without_a_name() -> None:
 """,
         protocols="udp",
     )
-    with pytest.raises(ConfigurationError, match="frames that are seen"):
+    with pytest.raises(ConfigurationError, match="a display of frames is defined twice"):
         schema.validate(schema.parse(text.replace("NAME", ""), source="x.yaml"), Procedure)
     schema.validate(schema.parse(text.replace("NAME", ", name: images"), source="x.yaml"), Procedure)
 

@@ -405,7 +405,7 @@ def test_commands_and_invalid_options_of_the_physics_emane_are_refused(network: 
     world = load_world(scenario.world)
     hello = make_hello(scenario, world, make_bodies(scenario, world), 1, PHYSICS)
     physics = EmaneLocations(hello)
-    with pytest.raises(FederateError, match="does not move robots, and leader has a command"):
+    with pytest.raises(FederateError, match="does not move robots, but there is a command for leader"):
         physics.advance(0, {"leader": Twist()})
     physics.close()
     for options, message in (

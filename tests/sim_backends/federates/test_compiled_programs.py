@@ -32,7 +32,9 @@ def test_a_program_is_compiled_once_and_again_if_its_source_changes(
     assert len(paths) == 1
     path = paths.pop()
     assert subprocess.run([path], check=False).returncode == 7
-    assert capfd.readouterr().err == "note: compiling seven; this takes about 30 s, once for these libraries\n"
+    assert (
+        capfd.readouterr().err == "note: compiling seven; this takes about 30 s, once per version of its libraries\n"
+    )
     assert path.parent == cache_folder() == tmp_path / "cache" / "fieldkit" / "programs"
     assert program(tmp_path, "int main() { return 8; }\n").path() != path
     assert capfd.readouterr().err.startswith("note: compiling")

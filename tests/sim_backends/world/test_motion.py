@@ -90,5 +90,5 @@ def test_on_the_ground_the_height_is_that_of_the_ground() -> None:
 
 @pytest.mark.parametrize(("points", "speed_m_s"), [([], 1.0), ([STILL], 0.0), ([STILL], -1.0), ([STILL], math.nan)])
 def test_an_invalid_path_is_rejected(points: list[Vector], speed_m_s: float) -> None:
-    with pytest.raises(ValueError, match="not a path"):
+    with pytest.raises(ValueError, match="use a point and a speed above 0"):
         WayPoints("a", points, speed_m_s)

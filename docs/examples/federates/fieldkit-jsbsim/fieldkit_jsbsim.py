@@ -13,7 +13,8 @@ from sim_backends.federates.simulator_options import SimulatorOptions
 from sim_backends.physics.body import Velocity
 from sim_backends.world.motion import GRAVITY_M_S2, State
 
-FOOT_M, EAST_M, NORTH_M = 0.3048, 6_378_137.0, 6_335_439.0  # with radii of WGS 84 at the equator, along both axes
+FOOT_M = 0.3048
+EAST_M, NORTH_M = 6_378_137.0, 6_335_439.0  # metres per radian of longitude and of latitude, WGS 84 at the equator
 HOVER_S = 3.0  # hovering before time 0, in which the motors reach their speed
 RATE_RAD_S = 0.75  # maximum turning rate that the model accepts as a command
 os.environ.setdefault("JSBSIM_DEBUG", "0")  # otherwise JSBSim writes to standard output
@@ -68,7 +69,7 @@ def limited(value, limit):
 
 
 class Drones:
-    """A physics: `advance` moves the drones, one step at a time."""
+    """A physics simulator: `advance` moves the drones, one step at a time."""
 
     def __init__(self, hello):
         for agent in hello.agents:
@@ -79,7 +80,7 @@ class Drones:
         self.drones = {agent.name: Drone(agent.start, hello.step_ns / 1e9) for agent in hello.agents}
 
     def advance(self, to_ns, commands):
-        """Return the states at the last step that is not after `to_ns`; commands apply from the previous call on."""
+        """Return the states at the last step until `to_ns`; commands apply from the previous `to_ns` on."""
         if commands:
             self.commands, self.from_ns = self.commands | commands, self.last_ns
         self.last_ns = to_ns

@@ -49,6 +49,21 @@ def test_a_table_without_rows_is_not_an_error(capsys: pytest.CaptureFixture[str]
     assert "policy,delay_s,packets" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0"),
+        (0.012345, "0.0123"),
+        (12.345, "12.3"),
+        (999.6, "1,000"),
+        (12345.6, "12,346"),
+        (1.234e8, "1.23e+08"),
+    ],
+)
+def test_a_number_has_an_exponent_only_if_it_is_very_small_or_large(value: float, text: str) -> None:
+    assert number_text(value) == text
+
+
 @given(st.floats(allow_nan=False, allow_infinity=False, width=32))
 def test_a_number_is_rounded_to_three_digits(value: float) -> None:
     assert float(number_text(value).replace(",", "")) == pytest.approx(value, rel=0.005)

@@ -13,12 +13,11 @@ from pymavlink.dialects.v20 import common as d
 from sim_backends.emulated.autopilot.mavlink_frames import Message
 from sim_backends.emulated.autopilot.mission_plan import REPEATS, degrees_e7
 from sim_backends.emulated.autopilot.parameters import FlightLimits
-from tests.helpers.ground_station import HOME_M, SYSTEM, GroundStation
+from tests.helpers.ground_station import HOME_M, RELATIVE, SYSTEM, GroundStation, item, upload
 
 OK = d.MAV_RESULT_ACCEPTED
 REJECTED = d.MAV_RESULT_TEMPORARILY_REJECTED
 CUSTOM = d.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-RELATIVE = d.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT
 POSITION_ONLY, VELOCITY_ONLY = 0b110111111000, 0b111111000111
 """Type masks of set-points, which name the fields that are ignored (POSITION_TARGET_TYPEMASK)."""
 
@@ -39,23 +38,6 @@ def take_off(gcs: GroundStation, height_m: float = 3.0) -> None:
 
 def status_texts(gcs: GroundStation) -> list[str]:
     return [message.text for message in gcs.received if message.get_type() == "STATUSTEXT"]
-
-
-def item(number: int, east_m: float, north_m: float, up_m: float, command: int = d.MAV_CMD_NAV_WAYPOINT) -> Message:
-    x, y = degrees_e7(HOME_M[0] + east_m, HOME_M[1] + north_m)
-    return d.MAVLink_mission_item_int_message(SYSTEM, 1, number, RELATIVE, command, 0, 1, 0, 0, 0, 0, x, y, up_m)
-
-
-def upload(gcs: GroundStation, items: list[Message]) -> int:
-    """Upload items, repeating messages without an answer; return the result."""
-    message = d.MAVLink_mission_count_message(SYSTEM, 1, len(items))
-    for _ in range(200):
-        for answer in gcs.send_message(message) + gcs.wait(0.3):
-            if answer.get_type() == "MISSION_ACK":
-                return int(answer.type)
-            if answer.get_type() == "MISSION_REQUEST_INT":
-                message = items[answer.seq]
-    raise AssertionError("the upload did not end")
 
 
 class TestTelemetry:

@@ -11,8 +11,9 @@ from pymavlink.dialects.v20 import ardupilotmega as d
 from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
 from sim_backends.emulated.autopilot.autopilot import Autopilot
 from sim_backends.emulated.autopilot.firmware import Firmware
+from sim_backends.emulated.autopilot.flight import SetPoint
 from sim_backends.emulated.autopilot.mission_plan import Item
-from sim_backends.emulated.autopilot.modes import RETURNING
+from sim_backends.emulated.autopilot.modes import RETURNING, Mode
 from sim_backends.emulated.autopilot.px4 import PX4
 from tests.helpers.ground_station import HOME_M, SYSTEM, GroundStation
 
@@ -345,6 +346,27 @@ def test_px4_lands_with_a_low_battery_as_its_parameter_requires(px4: Station, ac
     assert (CRITICAL, "Critical battery") in px4.texts()
     px4.wait(15)
     assert px4.autopilot.vehicle.is_armed != lands
+
+
+@pytest.mark.parametrize(
+    ("action", "texts", "mode"),
+    [(0, [], Mode.OFFBOARD), (1, ["Geofence: warning"], Mode.OFFBOARD), (5, ["Geofence: land"], Mode.LAND)],
+)
+def test_px4_at_its_fence_acts_as_its_parameter_requires(
+    px4: Station, action: int, texts: list[str], mode: Mode
+) -> None:
+    px4.set("GF_MAX_HOR_DIST", 5.0)
+    px4.set("GF_ACTION", action)
+    px4.fly()
+    vehicle = px4.autopilot.vehicle
+    vehicle.accept_set_point(SetPoint((2.0, 0.0, 0.0), is_position=False))
+    vehicle.change_mode(Mode.OFFBOARD)
+    for _ in px4.poll("beyond the fence", 20):
+        vehicle.accept_set_point(SetPoint((2.0, 0.0, 0.0), is_position=False))
+        if vehicle.mode is Mode.LAND or vehicle.body.position_m[0] > 6.0:
+            break
+    assert [text for _, text in px4.texts() if text.startswith("Geofence")] == texts
+    assert vehicle.mode is mode
 
 
 @pytest.mark.parametrize(("action", "sub_mode"), [(0, 3), (3, 5), (4, 6)])

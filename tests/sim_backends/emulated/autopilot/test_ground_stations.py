@@ -26,10 +26,11 @@ LOSS = "0.05"
 
 
 @pytest.fixture
-def emulation() -> Iterator[EmulatedTestbed]:
+def emulation(request: pytest.FixtureRequest) -> Iterator[EmulatedTestbed]:
+    """The robots of the paper; the parameter is the physics simulator, by default that of the autopilot."""
     with testbed.bring_up(
         EmulatedBackend(None, None).cast(Topology.MASTER),
-        options=EmulatedOptions(radio=RadioOptions(fading=False)),
+        options=EmulatedOptions(radio=RadioOptions(fading=False), physics=getattr(request, "param", None)),
         world=load_world("lawn"),
         ros=RosChoice.BUILTIN,
         seed=1,
@@ -69,6 +70,7 @@ def test_mavsdk_flies_a_mission_of_three_points_although_every_twentieth_datagra
     assert math.dist(last_m, (east_m, north_m + 2.0, up_m)) < 0.6
 
 
+@pytest.mark.parametrize("emulation", ["kinematic"], indirect=True)
 def test_mavproxy_flies_a_mission_although_every_twentieth_datagram_is_lost(emulation: EmulatedTestbed) -> None:
     report = fly(emulation, "mavproxy_flight")
     assert report["height_m"] < 0.2

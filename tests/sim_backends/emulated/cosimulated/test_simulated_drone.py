@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -18,15 +19,20 @@ from sim_backends.emulated.autopilot.modes import Mode
 from sim_backends.emulated.autopilot.px4 import PX4
 from sim_backends.emulated.autopilot.vehicle import Vehicle
 from sim_backends.emulated.cosimulated.simulators import RobotBody
+from sim_backends.emulated.emulated_options import SyncOptions
 from sim_backends.emulated.robot.base_controller import TIMEOUT_NS
 from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.emulated.ros.flight_records import FlightMotion, FlightRecord
 from sim_backends.emulated.ros.robot_motion import MotionReporter
+from sim_backends.federates.frames import PHYSICS
+from sim_backends.federates.named import command_line, default_options
+from sim_backends.gazebo.sdf import SdfRobot, world_sdf
 from sim_backends.physics.ground import Ground
 from sim_backends.physics.robot_limits import DUCKIEDRONE
 from sim_backends.world.motion import GRAVITY_M_S2
 from sim_backends.world.world import load_world
-from tests.helpers.cosim_benches import PLACES, ControlFiles, CosimBench, cosim_bench
+from tests.helpers.cosim_benches import BODY, PLACES, ControlFiles, CosimBench, cosim_bench
+from tests.helpers.gazebo_server import gazebo_server, missing_libraries
 from tests.helpers.ground_station import LIMITS
 
 pytestmark = pytest.mark.emulated
@@ -96,13 +102,35 @@ class Drone:
 
 
 @contextmanager
+def physics_of(folder: Path, simulator: str) -> Iterator[dict[str, Any]]:
+    """Start Gazebo if it is the simulator; yield the arguments of `cosim_bench` that choose the simulator."""
+    if simulator != "gazebo":
+        yield {"physics": simulator}
+        return
+    robots = {
+        "a": SdfRobot(DUCKIEDRONE, START_M, 0.0),
+        "b": SdfRobot(BODY.limits, (*PLACES["b"][:2], 0.0), 0.0),
+    }
+    (folder / "gazebo").mkdir()
+    with gazebo_server(folder / "gazebo", world_sdf(load_world("lawn"), robots)) as server:
+        yield {
+            "physics": command_line("gazebo", PHYSICS),
+            "physics_options": default_options("gazebo", PHYSICS) | server.options | {"velocity": "window"},
+            "sync": SyncOptions.model_validate({"name": "sliding_window", "window": "10ms"}),
+        }
+
+
+@contextmanager
 def drone(folder: Path, physics: str) -> Iterator[Drone]:
     place_m = (*START_M[:2], ANTENNA_M)
     places_m: dict[str, Vector] = {**PLACES, "a": place_m}
     control_files = ControlFiles.make(folder / "a", "flight_command", "flown")
-    with cosim_bench(
-        folder, physics=physics, world=load_world("lawn"), places_m=places_m, control_files=control_files, body=DRONE
-    ) as bench:
+    with (
+        physics_of(folder, physics) as choice,
+        cosim_bench(
+            folder, world=load_world("lawn"), places_m=places_m, control_files=control_files, body=DRONE, **choice
+        ) as bench,
+    ):
         now_ns = time.monotonic_ns()
         motion = MotionReporter(control_files.folder / "motion", control_files.folder / "steered", now_ns)
         files = PhysicsFiles(control_files.folder / "flight_command", control_files.folder / "flown")
@@ -118,7 +146,10 @@ def drone(folder: Path, physics: str) -> Iterator[Drone]:
         yield Drone(bench, autopilot, DroneMotionReporter(autopilot, motion, ANTENNA_M))
 
 
-@pytest.mark.parametrize("physics", ["kinematic", "mujoco"])
+GAZEBO = pytest.param("gazebo", marks=pytest.mark.skipif(bool(missing_libraries()), reason=missing_libraries()))
+
+
+@pytest.mark.parametrize("physics", ["kinematic", "mujoco", GAZEBO])
 def test_a_wall_stops_the_drone_and_without_its_autopilot_the_drone_falls(physics: str, tmp_path: Path) -> None:
     """Its rotors stop `TIMEOUT_NS` after the last command, and it falls for sqrt(2 h / g)."""
     with drone(tmp_path, physics) as simulated_drone:
