@@ -23,7 +23,8 @@ class AntennaOptions(Strict):
     Directions are relative to the robot's body: forward, left, up.
 
     Attributes:
-        pattern: `isotropic`: 0 dBi in all directions. `dipole`: a half-wave dipole. `table`: measured gains.
+        pattern: `isotropic`: 0 dBi in all directions. `dipole`: a half-wave dipole, whose gain is at least -30 dBi
+            (an assumption: reflections at the robot fill the nulls). `table`: measured gains.
         axis: Pattern `dipole`: direction of its wire, forward, left, up.
         elevations_deg: Pattern `table`: elevations of the rows, ascending, -90 (down) to 90 (up).
         azimuths_deg: Pattern `table`: azimuths of the columns, ascending within one turn, from forward to the left.

@@ -160,6 +160,12 @@ def test_goodput_equals_the_closed_form(mode: WifiMode, maximum: int, payload_by
     assert goodput["a"] == pytest.approx(expected, rel=0.05)
 
 
+def test_goodput_is_within_one_percent_of_ns3() -> None:
+    """ns-3 3.37: `benchmarks.high_throughput_vs_ns3`, A-MSDU in A-MPDU, one station."""
+    goodput = saturate(AmsduPowers("ar", HT20_7, 3839), "a", "r", seconds=1.0, queued=150)
+    assert goodput["a"] / 1e6 == pytest.approx(58.97, rel=0.01)
+
+
 def test_all_packets_of_a_frame_are_received_or_none() -> None:
     channel = AmsduPowers("ar", VHT80_9, 3839)
     ratio_db = next(step / 100 for step in range(4000) if packet_error(VHT80_9, step / 100, 3160) < 0.3)
