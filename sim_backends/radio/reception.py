@@ -140,7 +140,7 @@ class Reception(Generic[Payload]):
         for index in undecoded:
             self._defer(now_ns, index)
         if reserved_ns or self._eifs_ends_ns > now_ns:
-            self._use_decoded(now_ns, receivers.difference(undecoded), reserved_ns)
+            self._use_decoded(now_ns, receivers - set(undecoded), reserved_ns)
         transmission.interferers.clear()
         self._results.clear()
 

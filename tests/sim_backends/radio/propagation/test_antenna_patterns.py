@@ -61,7 +61,7 @@ def test_a_dipole_without_losses_radiates_the_power_that_it_receives() -> None:
     """The mean gain over the sphere is 1."""
 
     def ring(elevation_rad: float) -> float:
-        return math.cos(elevation_rad) * 10.0 ** (gain_dbi(UPRIGHT, math.degrees(elevation_rad)) / 10)
+        return math.cos(elevation_rad) * math.pow(10, gain_dbi(UPRIGHT, math.degrees(elevation_rad)) / 10)
 
     mean = scipy.integrate.quad(ring, -math.pi / 2, math.pi / 2)[0] / 2
     assert mean == pytest.approx(1.0, abs=1e-3)
@@ -154,7 +154,7 @@ def test_the_network_of_the_cosimulation_passes_the_attitude_of_each_state() -> 
         at_ns = number * 10**9
         packet = Packet(number, "drone", "base", 100, ("flow", number), at_ns, at_ns)
         network.advance(at_ns + 10**8, [packet], states)
-        signals_dbm.append(radio.sample(at_ns + 10**8, 0)["base"].stations[0].signal_dbm)
+        signals_dbm.append(radio.sample(at_ns + 10**8, 0)["base"].stations[0].signal_dbm or 0.0)
     assert np.diff(signals_dbm) == pytest.approx([-20.0, 0.0], abs=1.0), "without a heading the robot keeps its yaw"
 
 
