@@ -1,4 +1,4 @@
-"""Shared fixtures, and settings of all tests: examples have no time limit, and long test files run first."""
+"""Shared fixtures, and settings of all tests: examples have no time limit, and the order of test files."""
 
 import gc
 import signal
@@ -14,7 +14,7 @@ from tests.helpers.sshd import server
 
 __all__ = ["server"]
 
-pytest_plugins = ("pytester", "tests.helpers.leaks", "tests.helpers.reruns")
+pytest_plugins = ("pytester", "tests.helpers.leaks", "tests.helpers.priority", "tests.helpers.reruns")
 
 # Tests that a shell starts in the background ignore SIGINT, and the programs that they start would also ignore it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -144,7 +144,7 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Move long files to the front, without a change of the order of the others."""
+    """Move long files to the front. Afterwards, `tests.helpers.priority` distributes those with real programs."""
     items.sort(key=lambda item: _LONG.index(item.path.stem) if item.path.stem in _LONG else len(_LONG))
 
 

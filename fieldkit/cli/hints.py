@@ -18,7 +18,7 @@ _REPEATED_OPTIONS: Final = ("site", "backend", "topology", "protocol", "repeats"
 """Options that select robots and measurements, by their names in the namespace of argparse."""
 
 # Words in lower case: a command of fieldkit, and perhaps its subcommand, such as `lab up`.
-_COMMAND: Final = re.compile(r"\bfieldkit(?P<words>(?: [a-z][a-z-]*)+)(?P<rest>[^;\n`]*)")
+_COMMAND: Final = re.compile(r"\bfieldkit(?P<words>(?: [a-z][a-z-]*)+)[^;\n`]*")
 
 
 class CliOptions:

@@ -1,4 +1,4 @@
-"""Judgements of the expectations of trials, for reports.
+"""Texts that show in a report if the measured values meet the expectations of the trials.
 
 A cell contains the repeats under one condition, and their estimates.
 """

@@ -29,7 +29,7 @@ class Capability(ABC):  # noqa: B024 (its subclasses have the abstract methods)
     @classmethod
     @override
     def __subclasshook__(cls, candidate: type) -> bool:
-        # A step that derives from a capability inherits this method.
+        # Classes of steps inherit this method, but it applies to the capabilities only.
         if Capability in cls.__bases__ and not _undefined_methods(cls, candidate):
             return True
         return NotImplemented  # type: ignore[no-any-return]

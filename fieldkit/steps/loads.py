@@ -16,7 +16,7 @@ from fieldkit.steps.scene import GOOD_BIT_S, Flow, Scene, frames
 PROGRAM: Final = "iperf3"
 
 DEFAULT_UDP_BIT_S: Final = 1e6
-"""Default rate of iperf3."""
+"""Default rate of iperf3 for UDP."""
 
 _BLOCK_BYTES: Final = 8192
 """Block size of TCP with a rate. With iperf3's default of 128 KiB, 2 Mbit/s would be two bursts per second."""

@@ -47,7 +47,7 @@ IDENTITY: Final = columns.columns(
 """Columns that identify an attempt. The columns of measured values follow them."""
 
 OTHERS: Final = Column("others", "text", "Robots in further roles of the procedure: ROLE=ROBOT, separated by spaces.")
-"""Column that is in a table only if the procedure has such roles."""
+"""Column that is in a table only if the procedure has further roles."""
 
 ALWAYS: Final = (*oracle_delays.LATENESS_COLUMNS, *link.COLUMNS, *oracle_delays.WINDOW_COLUMNS)
 """Columns that are measured in every trial, independent of its steps."""

@@ -11,6 +11,7 @@ from sim_backends.cosim.federates import (
     FederateError,
     PhysicsFederate,
     Program,
+    advance_text,
     federate_error,
     next_send_ns,
     seconds_text,
@@ -150,7 +151,7 @@ class Agents:
         try:
             states = self.physics.advance(now_ns, commands)
         except Exception as error:
-            request = f"advance from {seconds_text(self._states_ns)} to {seconds_text(now_ns)}"
+            request = advance_text(self._states_ns, now_ns)
             raise federate_error(error, "physics", request) from error
         self._states_ns = now_ns
         try:

@@ -14,6 +14,7 @@ from sim_backends.cosim.agents import Agents, SentDatagram
 from sim_backends.cosim.federates import (
     FederateError,
     NetworkFederate,
+    advance_text,
     check_physics,
     check_states,
     federate_error,
@@ -202,7 +203,7 @@ class Coordinator:
             try:
                 arrivals, drops = network.advance(last_ns, packets, assumed_states)
             except Exception as error:
-                request = f"advance from {seconds_text(begin_ns)} to {seconds_text(last_ns)}"
+                request = advance_text(begin_ns, last_ns)
                 raise federate_error(error, "network", request) from error
             lap("network")
             self.is_committing = is_observed

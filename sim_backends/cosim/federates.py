@@ -14,6 +14,7 @@ from sim_backends.federates.protocols import (
     NetworkFederate,
     PhysicsFederate,
     UnansweredError,
+    advance_text,
     federate_error,
     seconds_text,
 )
@@ -29,6 +30,7 @@ __all__ = [
     "PhysicsFederate",
     "Program",
     "UnansweredError",
+    "advance_text",
     "check_physics",
     "check_states",
     "federate_error",

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from fieldkit.core.model import Vector
 from sim_backends.cosim.agents import AgentAbsence, SentDatagram
-from sim_backends.cosim.federates import FederateError, seconds_text
+from sim_backends.cosim.federates import FederateError, advance_text, seconds_text
 from sim_backends.cosim.run_record import Fate
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.radio.random_streams import PacketIdentity
@@ -223,7 +223,7 @@ class PacketLedger:
             )
         if not max(begin_ns, packet.enters_ns) <= arrival.at_ns <= last_ns:
             raise FederateError(
-                f"the network, requested to advance from {seconds_text(begin_ns)} to {seconds_text(last_ns)}, "
+                f"the network, requested to {advance_text(begin_ns, last_ns)}, "
                 f"delivered packet {packet.packet_id}, which entered at {seconds_text(packet.enters_ns)}, at "
                 f"{seconds_text(arrival.at_ns)}",
                 remedy=_CORRECT_NETWORK,

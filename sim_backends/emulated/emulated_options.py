@@ -165,7 +165,7 @@ class EmulatedOptions(Strict):
         boot: Time for which a robot that reboots is off before its programs start.
         mesh: Robots forward packets for each other, and a routing daemon on each finds the routes: [a mesh](mesh.md).
         physics: Physics simulator of [the co-simulation](lab-cosim.md) that moves the robots: `kinematic`, `mujoco`
-            or `gazebo`. The default is `kinematic` if `network` is given. `gazebo` refuses drones with an autopilot.
+            or `gazebo`. The default is `kinematic` if `network` is given.
         network: The network of the co-simulation: `builtin` or `ns3`. The default is `builtin` if `physics`
             is given.
         sync: The sync policy between physics and network: its name, or name and parameters. The default is

@@ -57,6 +57,12 @@ def seconds_text(time_ns: int) -> str:
     return f"{seconds}.{nanoseconds:09d}".rstrip("0").rstrip(".") + " s"
 
 
+def advance_text(from_ns: int, to_ns: int) -> str:
+    """Return the text of a request to advance. A window of 1 ns, or the first request, only has an end."""
+    start = f" from {seconds_text(from_ns)}" if from_ns < to_ns else ""
+    return f"advance{start} to {seconds_text(to_ns)}"
+
+
 class PhysicsFederate(Protocol):
     """A physics simulator: it moves the agents.
 

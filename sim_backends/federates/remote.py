@@ -19,7 +19,7 @@ from sim_backends.federates.exchanges import (
 from sim_backends.federates.frames import NETWORK, PHYSICS, MessageKind
 from sim_backends.federates.handshake import NO_EVENT, FederateCapability, Hello, Welcome
 from sim_backends.federates.link_records import decode_links
-from sim_backends.federates.protocols import FederateError, seconds_text
+from sim_backends.federates.protocols import FederateError, advance_text, seconds_text
 from sim_backends.federates.records import ArrivalDelay, command_type
 from sim_backends.federates.session import FederateSession, open_session
 from sim_backends.network.packets import Arrival, Drop, Packet
@@ -118,7 +118,7 @@ class RemotePhysics(_RemoteFederate):
             encode_advance_physics(to_ns, from_ns, commands, self._agents),
             MessageKind.STATES,
             decode=partial(decode_states, agents=self._agents),
-            describe=lambda: f"advance from {seconds_text(from_ns)} to {seconds_text(to_ns)}",
+            describe=lambda: advance_text(from_ns, to_ns),
         )
         if states_ns != at_ns:
             self.session.fail(
@@ -211,7 +211,7 @@ class RemoteNetwork(_RemoteFederate):
             AdvanceNetwork(to_ns, states, packets, since_ns, reckoning_ns).encode(self._agents),
             MessageKind.OUTCOMES,
             decode=partial(NetworkOutcomes.decode, agents=self._agents),
-            describe=lambda: f"advance from {seconds_text(from_ns)} to {seconds_text(to_ns)}",
+            describe=lambda: advance_text(from_ns, to_ns),
         )
         if outcomes.at_ns != to_ns:
             self.session.fail(

@@ -233,7 +233,7 @@ class Connection
         WorldLock world_lock(m_options.world);
         // Other runs may take much longer than the timeout for a lack of progress.
         auto limit = Clock::now() + std::chrono::duration<double>(50 * m_options.timeout_s);
-        while (!world_lock.Take())
+        while (!world_lock.TryLock())
         {
             if (Clock::now() >= limit)
             {

@@ -58,6 +58,7 @@ class Station(Generic[Payload]):
     def __init__(self, index: int, draws: PacketDraws, ifs_ns: int, rts_threshold_bytes: int) -> None:
         self.index = index
         self._draws = draws
+        # The attempt for which a backoff was drawn last, and the number of further backoffs drawn for it.
         self._redraws_of: tuple[PacketIdentity, int] | None = None
         self._redraws = 0
         self.queue: deque[Frame[Payload]] = deque()

@@ -218,7 +218,7 @@ def test_a_value_that_is_not_a_number_is_named(old: str, new: str, message: str)
 def test_part_of_a_document_keeps_lines_and_path() -> None:
     document = schema.parse("a:\n  b:\n    robots: 1\n", source="x.yaml").part("a", "b")
     assert document.where(("robots",)) == "x.yaml:3"
-    with pytest.raises(ConfigurationError, match=r"in a\.b: "):
+    with pytest.raises(ConfigurationError, match=r"in a\.b\.robots: "):
         schema.validate(document, Site)
 
 

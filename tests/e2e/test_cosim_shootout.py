@@ -171,7 +171,7 @@ def test_the_cost_of_a_bound_is_reported_with_the_fixed_windows_that_satisfy_it(
     )
     assert f"{factor:.3g} times as many; the longest windows of the single runs need" in report
     rejected_run = cosim(lab, "shootout", "pass.yaml", "--bound", "--set", "policy.bound_db=1")
-    assert (rejected_run.code, "bound_db limits the error of path loss" in rejected_run.err) == (2, True)
+    assert (rejected_run.code, "bound_db is a bound on the error of path loss" in rejected_run.err) == (2, True)
     rejected_run = cosim(lab, "shootout", "pass.yaml", "--bound", "--figure", "b.svg")
     assert (rejected_run.code, "has no figure" in rejected_run.err) == (2, True)
 

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as d
@@ -149,7 +150,11 @@ def autopilot_at_udp(
 
 @contextmanager
 def at_terminal(damage: Damage = lambda frame: [frame]) -> Iterator[str]:
-    """Run a drone at a serial line; its output starts in the middle of a frame."""
+    """Run a drone at a serial line; its output starts in the middle of a frame.
+
+    The path is a symbolic link, removed at the end. A link server that still runs would otherwise open the
+    pseudo-terminal of a later test, which has the same number.
+    """
     master, terminal = os.openpty()
 
     def send(frame: bytes) -> None:
@@ -158,8 +163,10 @@ def at_terminal(damage: Damage = lambda frame: [frame]) -> Iterator[str]:
     try:
         os.set_blocking(master, True)
         os.write(master, Sender().frame(beat())[3:])
-        with flying(master, send, lambda size: os.read(master, size)):
-            yield os.ttyname(terminal)
+        with TemporaryDirectory() as folder, flying(master, send, lambda size: os.read(master, size)):
+            device = Path(folder) / "ttyACM0"
+            device.symlink_to(os.ttyname(terminal))
+            yield str(device)
     finally:
         os.close(master)
         os.close(terminal)

@@ -26,6 +26,7 @@ class Follower(Node):
         super().__init__("follow")
         self.ahead_m = ahead_m
         self.latest: dict[str, Odometry] = {}
+        self.steered_s = self.now_s()
         self.velocities = self.create_publisher(Twist, "/follower/cmd_vel", 1)
         for robot in ("leader", "follower"):
             self.create_subscription(
@@ -36,12 +37,15 @@ class Follower(Node):
             )
         self.create_timer(PERIOD_S, self.steer)
 
+    def now_s(self) -> float:
+        return self.get_clock().now().nanoseconds / 1e9
+
     def now(self, robot: str) -> tuple[float, float, float, float] | None:
         """Return position, heading and speed of a robot at the present time, or None without a valid state."""
         if (odometry := self.latest.get(robot)) is None:
             return None
         stamp = odometry.header.stamp
-        age_s = self.get_clock().now().nanoseconds / 1e9 - stamp.sec - stamp.nanosec / 1e9
+        age_s = self.now_s() - stamp.sec - stamp.nanosec / 1e9
         if age_s > TIMEOUT_S:
             return None
         pose, speed_m_s = odometry.pose.pose, odometry.twist.twist.linear.x
@@ -53,6 +57,8 @@ class Follower(Node):
     def steer(self) -> None:
         """Publish the velocity that reduces the error of the distance; 0 without a valid state."""
         velocity = Twist()
+        now_s = self.now_s()
+        since_s, self.steered_s = min(now_s - self.steered_s, TIMEOUT_S), now_s  # a busy machine delays the timer
         leader, follower = self.now("leader"), self.now("follower")
         if leader is not None and follower is not None:
             x_m, y_m, heading_rad, speed_m_s = follower
@@ -61,7 +67,7 @@ class Follower(Node):
             closing_m_s = leader[3] * math.cos(leader[2] - bearing_rad)
             error_m = gap_m - STANDSTILL_M - HEADWAY_S * speed_m_s
             acceleration_m_s2 = (closing_m_s - speed_m_s + GAIN_PER_S * error_m) / HEADWAY_S
-            target_m_s = min(max(speed_m_s + acceleration_m_s2 * PERIOD_S, 0.0), TOP_SPEED_M_S)
+            target_m_s = min(max(speed_m_s + acceleration_m_s2 * since_s, 0.0), TOP_SPEED_M_S)
             off_rad = math.remainder(bearing_rad - heading_rad, math.tau)
             velocity.linear.x = target_m_s * max(math.cos(off_rad), 0.0)
             velocity.angular.z = TURNING_PER_S * off_rad

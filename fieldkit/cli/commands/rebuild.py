@@ -83,11 +83,12 @@ def _rebuild_many(folders: Sequence[Path], arguments: argparse.Namespace) -> int
 
 
 def _show_notes(folder: Path, rebuilt: "RebuildResult") -> None:
+    from fieldkit.trial.stored.rebuild import problems_text
+
     if not rebuilt.has_manifest:
         show_note(f"{folder}: there is no manifest to verify its evidence with")
     if rebuilt.problems:
-        others = f" (and {len(rebuilt.problems) - 1} more)" if len(rebuilt.problems) > 1 else ""
-        show_note(f"{folder}: valid repeats may lack values now: {rebuilt.problems[0]}{others}")
+        show_note(f"{folder}: {problems_text(rebuilt.problems)}")
 
 
 def _changes(rebuilt: "RebuildResult") -> str:

@@ -11,7 +11,7 @@ from fieldkit.measure.evidence.sandbox import Json, ReaderError, SandboxedReader
 METADATA: Final = "metadata.yaml"
 """File that a ROS 2 recorder writes next to its data file when it closes the bag."""
 
-ROS2: Final = {".db3", ".mcap"}
+ROS2_SUFFIXES: Final = {".db3", ".mcap"}
 """Suffixes of the data files of ROS 2 bags."""
 
 # A larger value is a percentage. Fractions above 1 occur, because the TurtleBot3 publishes the ratio of the voltage
@@ -40,7 +40,7 @@ def read(path: Path) -> RecordingContents:
         raise EvidenceError("there is no bag", where=where, remedy="read the recorder's log: did it start?")
     if path.stat().st_size == 0:
         raise EvidenceError("the bag is empty", where=where, remedy="read the recorder's log: was the disk full?")
-    is_ros2 = path.suffix in ROS2
+    is_ros2 = path.suffix in ROS2_SUFFIXES
     if is_ros2 and not (path.parent / METADATA).is_file():
         raise EvidenceError(
             f"the bag has no {METADATA}: its recorder was killed before it could close the bag",

@@ -38,8 +38,12 @@ def answer(request: Json) -> Json:
         share = battery_share(path, request["topic"])
         return {"share": None if math.isnan(share) else share}
     if "topic_stats" in request:
-        return {"topics": topic_stats(_open_ros2(path.parent) if path.suffix in bag.ROS2 else rosbag1.Reader(path))}
-    if path.suffix not in bag.ROS2:
+        return {
+            "topics": topic_stats(
+                _open_ros2(path.parent) if path.suffix in bag.ROS2_SUFFIXES else rosbag1.Reader(path)
+            )
+        }
+    if path.suffix not in bag.ROS2_SUFFIXES:
         return contents(rosbag1.Reader(path))
     if path.suffix == ".db3":
         _check_database(path)
@@ -145,7 +149,7 @@ def _open_decoder(path: Path) -> "AnyReader":
 
     # A bag in SQLite does not contain the definitions of its message types.
     types = get_typestore(Stores.ROS2_FOXY)
-    return AnyReader([path.parent if path.suffix in bag.ROS2 else path], default_typestore=types)
+    return AnyReader([path.parent if path.suffix in bag.ROS2_SUFFIXES else path], default_typestore=types)
 
 
 def _pose(msgtype: str, message: Any, child: str) -> tuple[float, float, float, float] | None:  # noqa: ANN401

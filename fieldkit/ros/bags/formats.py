@@ -30,7 +30,8 @@ _MAGIC: Final = {
     b"SQLite format 3\0": BagFormat.SQLITE,
     _MCAP_MAGIC: BagFormat.MCAP,
 }
-"""wiki.ros.org/Bags/Format/2.0; sqlite.org/fileformat.html, 1.3; mcap.dev/spec, "Magic"."""
+"""Format of a file by its magic number (wiki.ros.org/Bags/Format/2.0; sqlite.org/fileformat.html, 1.3; mcap.dev/spec,
+"Magic")."""
 
 _WHAT_TO_NAME: Final = "name a .bag, .db3 or .mcap file, or its folder"
 

@@ -48,7 +48,7 @@ def planned(cast: Cast, session: str) -> Iterator[Planned]:
 def _bridge(role: Role, robot: Robot, ros: Ros, bridge: RobotBridge, session: str) -> Planned:
     command = bridge.command(robot.address, robot.ros_master, _MASTER_TIMEOUT_S)
     job = Job(
-        folder=jobs.work_folder(folder_of(session), "1"),  # a bridge has one attempt
+        folder=jobs.work_folder(folder_of(session), "1"),  # a subfolder per attempt; a bridge is started only once
         name="bridge",
         argv=with_environment(command, setup=ros.command.setup, environment=ros.environment),
         limit_s=LIMIT_S,

@@ -11,7 +11,7 @@ from typing import Final, TypeVar
 
 
 class Policy(Enum):
-    """A policy with the numbers of rmw/types.h."""
+    """Base class of the policies of a profile. The values are the numbers in rmw/types.h."""
 
 
 class Reliability(Policy):

@@ -23,7 +23,8 @@ _RESOLVE_TIMEOUT_S: Final = 15.0
 _LOOPBACK_HOSTS: Final = {None, "localhost", "127.0.0.1", "::1"}
 """Hosts in the URI of a master that runs on the robot itself; None if the URI has no host."""
 _FRAGMENT_COUNT: Final = -(-SIZES[FRAGMENTED] // 1480)
-"""Number of IP fragments, rounded up, if each has 1480 bytes of payload (MTU 1500 without the IPv4 header)."""
+"""Number of IP fragments of a datagram of the kind `FRAGMENTED`. A fragment has at most 1480 bytes of payload: an MTU
+of 1500 bytes without the IPv4 header."""
 
 
 def judge_arrivals(

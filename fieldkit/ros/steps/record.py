@@ -74,7 +74,8 @@ _RECORD_BYTES: Final = 60
 _BAG_BYTES: Final = 16_384
 
 SUBSCRIBED: Final = "log:Subscribed to topic"
-"""Line of `ros2 bag record` when it starts to record. Its start takes seconds, which are not part of the duration."""
+"""Condition for the start of the duration: `ros2 bag record` has logged its first subscription. The program needs
+seconds to start, which are not part of the duration."""
 
 
 class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpace, Records, Summarizes):

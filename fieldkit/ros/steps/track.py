@@ -80,7 +80,7 @@ class FixedPosition(Strict):
 
     @property
     def position_source(self) -> PositionSource:
-        """The position as a source of positions."""
+        """This position as the source of a robot's positions."""
         if self.frame is not None:
             return PositionSource(
                 place=(float(self.x or 0), float(self.y or 0), float(self.z)), frame=f"frame {self.frame}"

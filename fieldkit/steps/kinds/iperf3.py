@@ -178,7 +178,10 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
 
     @override
     def listens(self) -> tuple[ListeningPort, ...]:
-        """Return the port of the server. Its source is given, because the reports contain the ports of both ends."""
+        """Return the port of the server, with the role that sends the data.
+
+        The reports contain the ports of both ends, so two tests in opposite directions can use the same port.
+        """
         return (ListeningPort(self.receiver, self.port, self.sender, self.source),)
 
     @override

@@ -149,8 +149,8 @@ class RunStep(Step, UsesSpace, Summarizes):
 
     Attributes:
         robot: Role of the robot on which it runs.
-        command: The command, split into words as a shell does, without shell operators such as a pipe; with
-            variables.
+        command: The command, which is split into words as by a shell. It may contain variables, but no shell
+            operators such as a pipe.
         argv: The command as a list of words, instead of `command`.
         put: A program of the lab, at most 8.4 MB, which is copied to the robot before the first step: a path relative
             to the folder of the procedure or, if it does not exist there, of the lab; links must not point outside.

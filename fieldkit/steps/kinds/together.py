@@ -23,7 +23,8 @@ from fieldkit.steps.scene import Announce, Planned, Scene
 T = TypeVar("T")
 
 MAX_PARALLEL: Final = 8
-"""OpenSSH permits 10 simultaneous commands per connection (MaxSessions); two are reserved."""
+"""Maximum number of simultaneous steps. OpenSSH permits 10 simultaneous commands per connection (MaxSessions), of
+which two are reserved."""
 
 
 class TogetherStep(Nest, Prepares, DescribesActions):

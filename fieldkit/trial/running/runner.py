@@ -75,7 +75,7 @@ class PlacementResult:
 
     Attributes:
         answer: The operator's answer: a note, or a request to skip the trial.
-        duration_s: Duration in seconds.
+        duration_s: Time that placing the robots took, in seconds.
     """
 
     answer: Answer

@@ -3,6 +3,7 @@
 The same version of fieldkit writes the same bytes.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,14 +73,22 @@ def rebuild(folder: Path) -> RebuildResult:
     )
 
 
-def measure_rows(folder: Path, plan: Plan) -> list[Row]:
-    """Return the rows of a trial's attempts, measured again from the evidence. Nothing is written.
+def problems_text(problems: Sequence[str]) -> str:
+    """Return the text of a note on the problems of attempts that were valid when they ended."""
+    others = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    return f"valid repeats may lack values now: {problems[0]}{others}"
+
+
+def measure_rows(folder: Path, plan: Plan) -> tuple[list[Row], list[str]]:
+    """Measure the rows of a trial's attempts again from the evidence. Nothing is written.
+
+    Returns:
+        The rows, and the problems as in `RebuildResult`.
 
     Raises:
         EvidenceError: For the same reasons as `journal.history`.
     """
-    measured_rows, _ = _measure(folder, plan, journal.history(folder, plan))
-    return measured_rows
+    return _measure(folder, plan, journal.history(folder, plan))
 
 
 def _measure(folder: Path, plan: Plan, entries: list[JournalEntry]) -> tuple[list[Row], list[str]]:

@@ -388,7 +388,10 @@ def _remeasured_table(table: Path, note: Note) -> bytes:
         )
     plan = plans.read_plan(folder)
     note_differences(folder, note)
-    return rows.to_csv(rebuild.measure_rows(folder, plan), plan.table).encode()
+    measured_rows, problems = rebuild.measure_rows(folder, plan)
+    if problems:
+        note(f"{folder}: {rebuild.problems_text(problems)}")
+    return rows.to_csv(measured_rows, plan.table).encode()
 
 
 def note_differences(folder: Path, note: Note) -> None:

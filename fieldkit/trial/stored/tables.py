@@ -104,7 +104,7 @@ def other_names(names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def frozen_columns(table: Path) -> tuple[Column, ...]:
-    """Return the columns in the plan next to a table. For a dataset (a folder), return those that it declares.
+    """Return the columns in the plan next to a table. For a dataset (a folder), return the columns that it declares.
 
     Raises:
         ConfigurationError: The plan cannot be read.

@@ -126,7 +126,9 @@ class FlowRoundTrips:
 
 @dataclass(frozen=True)
 class FlowResult:
-    """The results of a flow. Packets that were under way at the end of the run count only in `packets_under_way`.
+    """The results of a flow.
+
+    Packets that were under way at the end of the run count only in `packets_under_way`, the distances and the speeds.
 
     Attributes:
         name: The flow.

@@ -310,7 +310,10 @@ _GEOFENCE_ACTIONS: Final = {
     4: ("hold", Mode.LOITER),
     5: ("land", Mode.LAND),
 }
-"""Text and mode by PX4's GF_ACTION; 0 disables it. 4 (terminate) is not emulated, the vehicle holds its position."""
+"""Text and mode of the reaction, by GF_ACTION of PX4; 0 disables the reaction.
+
+Action 4 (terminate) is not emulated: the vehicle holds its position instead.
+"""
 
 
 class Fence:
@@ -366,9 +369,9 @@ class Fence:
         return Reaction(text, dialect.MAV_SEVERITY_NOTICE, mode)
 
     def before_crossing(self, here_m: Vector, stop_m: Vector) -> Reaction | None:
-        """Return PX4's reaction if a vehicle that brakes now stops outside the fence, or None.
+        """Return the reaction of PX4 if `is_crossed` is True for these arguments, or None.
 
-        The arguments are those of `is_crossed`. A warning is given once, until the vehicle can stop inside again.
+        A warning is repeated only after the vehicle could again have stopped inside the fence.
         """
         was_crossed, self._is_breached = self._is_breached, self.is_crossed(here_m, stop_m)
         text, mode = _GEOFENCE_ACTIONS.get(int(self._parameters["GF_ACTION"]), ("", None))

@@ -7,8 +7,9 @@ from typing import Final
 class Mode(Enum):
     """A flight mode; each firmware has its own names: ArduCopter's GUIDED is PX4's OFFBOARD.
 
-    The last four are modes for a pilot with a remote control, which is not emulated. In the air the drone holds its
-    position, as if the sticks were centred. On the ground it stays, as if the throttle were closed.
+    STABILIZE, ALT_HOLD and POSHOLD are modes for a pilot with a remote control, which is not emulated. In the air the
+    drone holds its position, as if the sticks were centred. On the ground it stays, as if the throttle were closed.
+    BRAKE, which stops the drone in the air, is emulated in the same way.
     """
 
     TAKEOFF = auto()
@@ -30,7 +31,7 @@ LANDING: Final = frozenset({Mode.LAND, Mode.HOMECOMING})
 RETURNING: Final = LANDING | {Mode.RTL}
 """Modes in which the drone returns home or descends to the ground."""
 PILOTED: Final = frozenset({Mode.STABILIZE, Mode.ALT_HOLD, Mode.POSHOLD, Mode.BRAKE})
-"""Modes for a pilot with a remote control."""
+"""Modes in which the drone holds its position in the air and does not take off: the modes for a pilot, and BRAKE."""
 
 
 def reported_mode(mode: Mode) -> Mode:

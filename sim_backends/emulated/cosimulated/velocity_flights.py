@@ -20,10 +20,11 @@ from sim_backends.world.world import World
 CONTROL_NS: Final = 10_000_000
 """Maximum time between two velocities; the autopilot has the same step."""
 _TOLERANCE_M_S: Final = 0.05
-"""A velocity that differs by more from the last two commanded ones is the result of a contact. There are two, because
-Gazebo applies a command one step after it has received it."""
+"""If a measured velocity differs by more than this from the last two commanded velocities, the drone has touched
+something. Two commands are compared, because Gazebo applies a command one step after it has received it."""
 _MIN_SINK_M_S: Final = 0.05
-"""Support is only detected while the drone is commanded to sink faster. The lowest speed of a landing is 0.1 m/s."""
+"""Support is detected only while the commanded sink rate is higher than this. The lowest sink rate of a landing is
+0.1 m/s."""
 _MIN_RISE_M_S: Final = 0.01
 """A supported drone that rises faster has lifted off."""
 _START_GAP_M: Final = 0.02
@@ -79,7 +80,7 @@ class VelocityFlights:
                 return states
 
     def flight_status(self, name: str) -> FlightStatus:
-        """Return attitude and support of a drone; the attitude is the attitude of the model."""
+        """Return the measured position of a drone, the attitude of its model, and True if it rests on something."""
         drone = self._drones[name]
         return FlightStatus(drone.pose.place_m, drone.pose.roll_rad, drone.pose.pitch_rad, drone.is_supported)
 
@@ -127,12 +128,12 @@ class _Drone:
             self.pose = self._body.course(self.pose, self.command, elapsed_s).at(1)
             turns = self.command.velocity.yaw_rad is not None
             self._velocity = Velocity(self.pose.velocity_m_s, self.pose.heading_rad if turns else None)
-        else:  # It rests, level.
+        else:  # the drone is at rest and level
             self.pose = FlightPose(self.pose.place_m, heading_rad=self.pose.heading_rad)
         return None if self._velocity == self._last_velocity else self._velocity
 
     def observe(self, state: State, elapsed_s: float) -> None:
-        """Continue with the state of its antenna that was measured at the end of an interval of this length."""
+        """Update the pose with the measured state of the antenna at the end of an interval of this length."""
         east_m, north_m, up_m = state.position_m
         before_m, self._place_m = self._place_m, (east_m, north_m, up_m - self._body.antenna_m)
         east, north, up = (
@@ -152,8 +153,8 @@ class _Drone:
     def _update_support(self, up_m_s: float) -> None:
         """Detect support if it sinks at less than half of the commanded speed, and lift-off if it rises."""
         last_m_s, current_m_s = (velocity.velocity_m_s[2] for velocity in (self._last_velocity, self._velocity))
-        slower_m_s = max(last_m_s, current_m_s)
-        if slower_m_s < -_MIN_SINK_M_S and up_m_s > slower_m_s / 2:
+        slower_sink_m_s = max(last_m_s, current_m_s)
+        if slower_sink_m_s < -_MIN_SINK_M_S and up_m_s > slower_sink_m_s / 2:
             self.is_supported = True
         elif current_m_s > 0 and up_m_s > _MIN_RISE_M_S:
             self.is_supported = False

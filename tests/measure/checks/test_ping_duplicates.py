@@ -88,7 +88,7 @@ def test_captures_without_interfaces_or_with_fragments_give_no_number() -> None:
         (
             echoes_of(pcap.parse(file_bytes(frames_without_interfaces), where="x")),
             complete_capture,
-            "does not contain interfaces",
+            "does not contain the interface of each packet",
         ),
         (complete_capture, capture_echoes(Echo(REQUEST, 1, WIFI), more=True), "fragmented"),
     ):
