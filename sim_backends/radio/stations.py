@@ -128,7 +128,7 @@ class Peer(Generic[Payload]):
         self.last_frame: Frame[Payload] | None = None
 
     def has_received(self, frame: Frame[Payload]) -> bool:
-        """Return True if the peer has decoded a frame that may not have been acknowledged."""
+        """Return True if the peer has decoded a frame, even if its acknowledgement was lost."""
         return frame.is_received or self.last_frame is frame
 
     def count_frames(self, *, delivered: int, lost: int) -> None:

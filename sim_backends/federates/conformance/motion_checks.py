@@ -33,9 +33,9 @@ _TURN_RAD_S: Final = 0.3
 _FLIGHT_M_S: Final = (0.4, 0.0, 0.2)
 """Commanded velocity of robots that fly: east, north, up."""
 _HEADING_RAD: Final = 0.25
-"""Largest error of a heading that an agent keeps or has reached."""
+"""Largest accepted error of a heading that an agent must keep or must have reached."""
 _DIRECTION_RAD: Final = 0.6
-"""Largest angle between heading and direction of motion; it is above 0 because wheels slip."""
+"""Largest accepted angle between heading and direction of motion; it is above 0 because wheels slip."""
 
 
 def _hello_with_heading(hello: Hello, heading_rad: float) -> Hello:
