@@ -10,7 +10,6 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from fieldkit.measure.positions import position_files
-from tests.helpers.priority import interleaved
 from tests.helpers.sshd import server
 
 __all__ = ["server"]
@@ -145,9 +144,8 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Move long files to the front, and distribute those with real programs evenly."""
+    """Move long files to the front. Afterwards, `tests.helpers.priority` distributes those with real programs."""
     items.sort(key=lambda item: _LONG.index(item.path.stem) if item.path.stem in _LONG else len(_LONG))
-    items[:] = interleaved(items)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -118,7 +118,7 @@ def read_announcements(reader: FrameReader, agents: AgentTable) -> None:
     """Add announced agents to the table.
 
     Raises:
-        MalformedFrameError: An index is not the next one, or a name is already in use.
+        MalformedFrameError: An index is not the next free index, or a name is empty or already in use.
     """
     count = reader.count(_NEW_AGENT_BYTES)
     if not count:

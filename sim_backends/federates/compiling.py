@@ -78,7 +78,7 @@ class CompiledProgram:
         """Return the versions of the compiler and of the libraries.
 
         Raises:
-            ConfigurationError: One of them is not installed.
+            ConfigurationError: The compiler or a library is not installed.
         """
         for tool in ("g++", "pkg-config"):
             if shutil.which(tool) is None:

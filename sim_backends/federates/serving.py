@@ -12,7 +12,7 @@ from sim_backends.federates.transports.joining import join
 from sim_backends.federates.transports.transport_table import FORMS, parse_address
 
 _CONNECT_S: Final = 60.0
-"""Longest wait for a coordinator that listens."""
+"""Longest wait until the coordinator listens."""
 _HELLO_S: Final = 10.0
 """Maximum wait for the first message after a program connects; other programs are queued meanwhile."""
 

@@ -43,7 +43,7 @@ _BYE_S: Final = 0.2
 _MAX_SHOWN: Final = 400
 """Largest number of characters of a federate's text in a message."""
 _REQUEST_NUMBERS: Final = 1 << 32
-"""Number of request numbers, which have 32 bits; then they begin again at 0."""
+"""Number of different request numbers, which have 32 bits; the number after the last one is 0."""
 _ADDRESS_PATTERN: Final = re.compile(r"[a-z][a-z0-9+.-]*:\S*")
 
 Answer = TypeVar("Answer")

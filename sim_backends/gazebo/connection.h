@@ -231,9 +231,9 @@ class Connection
     void WaitForOtherRuns()
     {
         WorldLock world_lock(m_options.world);
-        // Other runs may take much longer than the timeout for a lack of progress.
+        // The limit is longer than the timeout for a lack of progress, because other runs may take long.
         auto limit = Clock::now() + std::chrono::duration<double>(50 * m_options.timeout_s);
-        while (!world_lock.Take())
+        while (!world_lock.TryLock())
         {
             if (Clock::now() >= limit)
             {
@@ -291,7 +291,7 @@ class Connection
         std::string worlds;
         for (const std::string& service : services)
         {
-            // The service of a world is called /world/NAME/control; 7 and 8 characters are before and after the name.
+            // The service of a world is called /world/NAME/control: 7 characters are before the name, and 8 after it.
             if (service.rfind("/world/", 0) == 0 && service.size() > 15 &&
                 service.compare(service.size() - 8, 8, "/control") == 0)
             {
@@ -323,7 +323,7 @@ class Connection
     const Options& m_options;
     std::vector<Agent>& m_agents;
     WorldMonitor& m_monitor;
-    std::vector<CommandReceiver> m_receivers; // by agent
+    std::vector<CommandReceiver> m_receivers; // by index of the agent
     bool m_usesFence = false; // see `Acknowledge`
     uint64_t m_passed = 0;    // number of answers to the fence
     transport::Node::Publisher m_fence;

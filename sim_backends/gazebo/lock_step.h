@@ -368,7 +368,7 @@ class LockStep
             lock, [&] { return m_monitor.pose_ns == 0; },
             [] { return std::string("no poses have arrived after a reset"); });
         m_nowNs = 0;
-        // Newer versions create the models and plugins again, so the plugins subscribe again.
+        // Newer versions of Gazebo create the models and plugins again at a reset, so the plugins subscribe again.
         m_connection.SetPresence();
         m_connection.WaitForSubscribers(lock);
     }

@@ -29,8 +29,8 @@ class WorldLock
         name.copy(m_address.sun_path + 1, sizeof m_address.sun_path - 1); // abstract: the first byte is 0
     }
 
-    // Take the lock until the process exits; returns false if another process has it.
-    bool Take()
+    // Acquire the lock until the process exits; returns false if another process has it.
+    bool TryLock()
     {
         if (m_socket < 0)
         {
@@ -43,7 +43,7 @@ class WorldLock
         if (m_socket < 0 || errno != EADDRINUSE)
         {
             throw protocol::Refusal("the lock of Gazebo world '" + m_world +
-                                    "' cannot be taken: " + std::strerror(errno));
+                                    "' cannot be acquired: " + std::strerror(errno));
         }
         return false;
     }

@@ -17,7 +17,7 @@ def agent_limits(agent: AgentStart, body: Mapping[str, Any] | None) -> DriveLimi
     """Return the limits of an agent: the limits in the configuration, otherwise the limits of its profile.
 
     Raises:
-        ConfigurationError: The limits in the configuration are not those of its kind of robot.
+        ConfigurationError: The configuration has limits of another kind of robot.
     """
     if body is not None:
         values: dict[str, Any] = {

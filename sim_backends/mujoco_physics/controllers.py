@@ -1,6 +1,6 @@
 """The controllers of robots in MuJoCo: wheel speeds of a robot on wheels, attitude and thrust of a quadrotor.
 
-They run at `TICK_NS`, as on real robots; motors and attitude control run in MuJoCo at every step.
+They run with the period `TICK_NS`, as on real robots; motors and attitude control run in MuJoCo at every step.
 """
 
 import math
@@ -17,7 +17,7 @@ from sim_backends.physics.robot_limits import DriveLimits, QuadrotorLimits
 TICK_NS: Final = 10_000_000
 """Period of the controllers: PX4's velocity controller runs at 100 Hz."""
 _UPRIGHT: Final = 0.1
-"""If the cosine of a quadrotor's tilt is below this value, thrust cannot keep its height, and the minimum is used."""
+"""Below this cosine of a quadrotor's tilt, thrust cannot keep its height, and the minimum thrust is used."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The physics federate `mujoco`, found by its entry point; MuJoCo is imported when it is used."""
+"""The physics federate `mujoco`, which is declared as an entry point; MuJoCo is imported when it is used."""
 
 import sys
 

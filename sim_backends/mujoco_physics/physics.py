@@ -43,7 +43,7 @@ _PARKED_M: Final = 10_000.0
 _PARKED_APART_M: Final = 10.0
 """Distance between parked agents."""
 _PARKED_UP_M: Final = 0.0
-"""Height of parked agents: they stand on the ground."""
+"""Height of parked agents, which are on the ground."""
 
 
 class SensedStates(Mapping[str, State]):

@@ -171,7 +171,7 @@ class Channel
         return Friis(direct_m) - 20 * std::log10(std::max(std::abs(ratio), 0.01));
     }
 
-    // Draw the plane waves whose sum is the shadowing field; see `Shadowing` in sim_backends/radio/propagation.py.
+    // Draw the plane waves whose sum is the shadowing field; see `Shadowing` in sim_backends/radio/propagation/fading.py.
     void DrawWaves(double decorrelation_m)
     {
         auto draws = RandomStream(m_seed, {"shadowing"}).First(3 * kWaves);

@@ -228,7 +228,7 @@ class Bodies:
             yield -(-lifetime.disappears_ns // self.step_ns)  # rounded up
 
     def _is_present(self, name: str) -> bool:
-        """Return True if a body exists at the current step: its lifetime includes the step, rounded outwards."""
+        """Return True if the lifetime of a body, extended to whole steps, includes the current step."""
         lifetime = self._lifetimes.get(name)
         if lifetime is None:
             return True

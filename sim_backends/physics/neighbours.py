@@ -141,7 +141,7 @@ def _ground_times_s(mover: _Kinematics, ground: Ground) -> list[float]:
 
 
 def _pair_time_s(mover: _Kinematics, other: _Kinematics) -> float:
-    """Return the minimum time to a contact of two bodies; bitwise independent of their order."""
+    """Return the minimum time to a contact of two bodies; the result is exactly the same for both orders of them."""
     first, second = mover.body, other.body
     (e, n, u), (other_e, other_n, other_u) = mover.place_m, other.place_m
     horizontal_m = math.hypot(e - other_e, n - other_n) - (first.radius_m + second.radius_m)

@@ -273,7 +273,7 @@ class Quadrotor:
     def after_contact(self, pose: FlightPose, stop: ContactStop, command: object) -> FlightPose:
         """Implement `Body.after_contact`: it keeps the component of its velocity along the obstacle.
 
-        Without power it comes to rest in a level attitude on whatever supports it.
+        Without power it comes to rest in a level attitude on the ground or obstacle that supports it.
         """
         is_off = isinstance(command, FlightTarget) and not command.powered
         if is_off and any(contact.normal[2] > 0 for contact in stop.contacts):

@@ -52,7 +52,8 @@ AMPDU_LIMITS: Final[dict[PhyFormat, AmpduLimits]] = {
     "VHT": AmpduLimits(64, 1_048_575),
     "HE": AmpduLimits(256, 4_194_303),
 }
-"""Largest exponents of the maximum A-MPDU length: 9.4.2.55.3, 9.4.2.157.2 and 9.4.2.248 (without its extension)."""
+"""Limits for the largest exponents of the A-MPDU length: 9.4.2.55.3, 9.4.2.157.2 and 9.4.2.248 (without its
+extension)."""
 
 
 @dataclass(eq=False, slots=True)

@@ -59,7 +59,7 @@ class RadioChannel(Protocol):
         return None
 
     def packet_time_ns(self, station: int) -> int:  # noqa: ARG002 (a default)
-        """Return the time that a station needs per packet before the queue of its radio."""
+        """Return the time that the bus and driver of a station need per packet, before the queue of its radio."""
         return 0
 
     def ampdu_limits(self, transmitter: int, receiver: int) -> AmpduLimits | None:  # noqa: ARG002 (a default)

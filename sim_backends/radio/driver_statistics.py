@@ -55,7 +55,7 @@ class RadioMeter:
             link.rate_bit_s = transmission.mode.rate_bit_s
 
     def on_busy(self, start_ns: int, end_ns: int, stations: Iterable[int]) -> None:
-        """Record that the channel of stations is busy between two times."""
+        """Record that the channel is busy between two times at these stations."""
         busy_ns, busy_until_ns = self._busy_ns, self._busy_until_ns
         for index in stations:
             until_ns = busy_until_ns[index]
@@ -83,7 +83,7 @@ class RadioMeter:
         self.link(transmitter, receiver).failures += packets
 
     def link(self, transmitter: int, receiver: int) -> LinkMeter:
-        """Return the counters of a link, which continue to change."""
+        """Return the counters of a link; later frames change the returned object."""
         return self._links.setdefault((transmitter, receiver), LinkMeter())
 
     def busy_ns(self, now_ns: int) -> Sequence[int]:

@@ -55,7 +55,7 @@ _LAST_WEIGHT: Final = 2 * _DECAY * math.cos(math.sqrt(2) * 2 * math.pi / 16)
 _SECOND_WEIGHT: Final = -(_DECAY**2)
 _NEW_WEIGHT: Final = 1 - _LAST_WEIGHT - _SECOND_WEIGHT
 _SMALLEST_SHARE: Final = 1 / 4096
-"""Smallest share after a measurement; a share of 0 means that there was none."""
+"""Smallest share after a measurement; a share of 0 means that the mode was never measured."""
 
 # Kinds of sampled modes (see `_refill_samples`), and the order in which they are sampled.
 _FASTER, _JUMP, _SLOWER = range(3)

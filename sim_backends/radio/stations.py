@@ -58,6 +58,7 @@ class Station(Generic[Payload]):
     def __init__(self, index: int, draws: PacketDraws, ifs_ns: int, rts_threshold_bytes: int) -> None:
         self.index = index
         self._draws = draws
+        # The attempt for which a backoff was drawn last, and the number of further backoffs drawn for it.
         self._redraws_of: tuple[PacketIdentity, int] | None = None
         self._redraws = 0
         self.queue: deque[Frame[Payload]] = deque()
@@ -127,7 +128,7 @@ class Peer(Generic[Payload]):
         self.last_frame: Frame[Payload] | None = None
 
     def has_received(self, frame: Frame[Payload]) -> bool:
-        """Return True if the peer has decoded a frame that may not have been acknowledged."""
+        """Return True if the peer has decoded a frame, even if its acknowledgement was lost."""
         return frame.is_received or self.last_frame is frame
 
     def count_frames(self, *, delivered: int, lost: int) -> None:

@@ -18,7 +18,7 @@ from sim_backends.world.shapes import Box, Cylinder, Shape
 Real = Number | Int
 """A number as in a YAML file, `2` or `2.5`: metres or degrees, depending on the key."""
 Coordinate = Annotated[Real, Field(ge=-1e6, le=1e6)]
-"""Metres from the origin. The limits keep squares of distances finite, and a larger ground is not flat."""
+"""Metres from the origin. The limits keep squares of distances finite; a larger area of ground would not be flat."""
 Place = tuple[Coordinate, Coordinate]
 """Metres east and north."""
 Size = tuple[Annotated[Real, Field(gt=0)], Annotated[Real, Field(gt=0)], Annotated[Real, Field(gt=0)]]

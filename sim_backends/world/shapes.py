@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fieldkit.core.model import Vector
 
 Floats = NDArray[np.float64]
-"""Positions are in metres east, north, up."""
+"""An array of numbers; positions are in metres east, north, up."""
 
 _CIRCLE_CORNERS: Final = 32
 """Number of corners of the polygon that is drawn for a circle."""

@@ -5,7 +5,8 @@ become slower if they wait for a processor.
 """
 
 import os
-from collections.abc import Generator, Sequence
+from collections import Counter
+from collections.abc import Generator
 from itertools import groupby
 from typing import Final
 
@@ -28,22 +29,22 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
             os.setpriority(os.PRIO_PROCESS, 0, 0)
 
 
-def interleaved(items: Sequence[pytest.Item]) -> list[pytest.Item]:
-    """Return tests so that files with real programs are evenly distributed among the other files.
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Distribute the files with real programs evenly among the other files; keep the order of both groups.
 
     Workers take the files in order. If all files with real programs were first, each of their programs would have to
     wait for the programs of all other workers.
     """
     files = [list(file_items) for _, file_items in groupby(items, key=lambda item: item.path)]
     is_real = [any(map(_has_real_programs, file_items)) for file_items in files]
-    # A file's position in its group, from 0 to 1.
-    seen = {True: 0, False: 0}
-    positions = []
+    totals, counts = Counter(is_real), Counter[bool]()
+    positions: list[float] = []
     for real in is_real:
-        positions.append(seen[real] / is_real.count(real))
-        seen[real] += 1
+        positions.append(counts[real] / totals[real])  # in the group of this file, from 0 to 1
+        counts[real] += 1
     order = sorted(range(len(files)), key=lambda index: (positions[index], not is_real[index]))
-    return [item for index in order for item in files[index]]
+    items[:] = [item for index in order for item in files[index]]
 
 
 def _has_real_programs(item: pytest.Item) -> bool:

@@ -36,7 +36,7 @@ class Template:
         head: Content between the header and the list that is filled, serialized, in hexadecimal digits.
         tail: Content after the list, in the same form.
         size_bytes: Size of the list.
-        floats: True if the list holds 4-byte floats; otherwise any bytes.
+        floats: True if the list holds 4-byte floats; False if any bytes are valid values.
     """
 
     has_header: bool

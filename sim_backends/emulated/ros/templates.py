@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _HEADER: Final = "std_msgs/msg/Header"
 _QUATERNION: Final = "geometry_msgs/msg/Quaternion"
-# Format characters of `struct`; times have two fields, and rosbags treats them as types with fields.
+# Format characters of `struct`. Times are missing, because rosbags treats a time as a type with two fields.
 _STRUCT_FORMATS: Final = {
     "bool": "?",
     "byte": "B",

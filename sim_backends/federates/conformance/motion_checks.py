@@ -33,9 +33,9 @@ _TURN_RAD_S: Final = 0.3
 _FLIGHT_M_S: Final = (0.4, 0.0, 0.2)
 """Commanded velocity of robots that fly: east, north, up."""
 _HEADING_RAD: Final = 0.25
-"""Largest error of a heading that an agent keeps or has reached."""
+"""Largest accepted error of a heading that an agent must keep or must have reached."""
 _DIRECTION_RAD: Final = 0.6
-"""Largest angle between heading and direction of motion; it is above 0 because wheels slip."""
+"""Largest accepted angle between heading and direction of motion; it is above 0 because wheels slip."""
 
 
 def _hello_with_heading(hello: Hello, heading_rad: float) -> Hello:
@@ -77,7 +77,7 @@ def _displacement_m(before: State, after: State) -> tuple[float, float, float]:
     return east_m, north_m, up_m
 
 
-def _angle(heading_rad: float, other_rad: float) -> float:
+def _angle_difference_rad(heading_rad: float, other_rad: float) -> float:
     return math.remainder(heading_rad - other_rad, math.tau)
 
 
@@ -86,7 +86,7 @@ def _vector_text(vector: tuple[float, ...]) -> str:
 
 
 def _check_heading(name: str, state: State, expected_rad: float, when: str) -> None:
-    if state.heading_rad is not None and abs(_angle(state.heading_rad, expected_rad)) > _HEADING_RAD:
+    if state.heading_rad is not None and abs(_angle_difference_rad(state.heading_rad, expected_rad)) > _HEADING_RAD:
         raise CheckError(f"the heading of {name} is {state.heading_rad:.3g} rad {when}, not {expected_rad:.3g} rad")
 
 
@@ -117,7 +117,7 @@ def check_turn(target: Target) -> None:
     turned_rad = dict.fromkeys(commands, 0.0)
     for states in later:
         for name in commands:
-            turned_rad[name] += _angle(_heading_rad(states, name), _heading_rad(before, name))
+            turned_rad[name] += _angle_difference_rad(_heading_rad(states, name), _heading_rad(before, name))
         before = states
     nominal_rad = _TURN_RAD_S * _DRIVE_S
     for name in commands:
@@ -129,7 +129,7 @@ def check_turn(target: Target) -> None:
         # The direction of motion in the last three windows is compared with the heading near their middle.
         moved_m = _displacement_m(later[-4][name], later[-1][name])
         heading_rad = _heading_rad(later[-2], name)
-        if abs(_angle(math.atan2(moved_m[1], moved_m[0]), heading_rad)) > _DIRECTION_RAD:
+        if abs(_angle_difference_rad(math.atan2(moved_m[1], moved_m[0]), heading_rad)) > _DIRECTION_RAD:
             raise CheckError(
                 f"{name} drives forward at a heading of {heading_rad:.3g} rad, and moved by {_vector_text(moved_m)} m"
             )
@@ -195,7 +195,9 @@ def check_yaw(target: Target) -> None:
     yaw_rad = 1.5
     names = _suitable_agents(probe, VELOCITY)
     for states in _states_under_commands(probe, dict.fromkeys(names, Velocity(yaw_rad=yaw_rad)), _YAW_S):
-        if all(abs(_angle(_heading_rad(states, name), yaw_rad)) < 0.5 * _HEADING_RAD for name in names):
+        if all(
+            abs(_angle_difference_rad(_heading_rad(states, name), yaw_rad)) < 0.5 * _HEADING_RAD for name in names
+        ):
             break
     for name in names:
         _check_heading(name, states[name], yaw_rad, f"{_YAW_S:g} s after a command with this yaw")

@@ -176,7 +176,7 @@ class FederateProbe:
         """Send a request that the federate must refuse.
 
         Raises:
-            CheckError: It sends another answer, or no answer within the deadline.
+            CheckError: The federate sends another answer, or no answer within the deadline.
         """
         start_s = time.monotonic()
         try:
@@ -195,7 +195,7 @@ class FederateProbe:
         """End the session by `bye`, and wait until the federate closes the connection.
 
         Raises:
-            CheckError: It does not close the connection.
+            CheckError: The federate does not close the connection.
         """
         try:
             self._session.send_bye(_CLOSE_S)

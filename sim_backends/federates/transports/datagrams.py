@@ -40,7 +40,7 @@ DATAGRAM_VERSION: Final = 1
 _WINDOW: Final = 64
 """Largest number of unacknowledged datagrams; they fit into a receive buffer of Linux's default size."""
 _LINGER_S: Final = 0.5
-"""Longest wait for acknowledgements when a side ends."""
+"""Longest wait for acknowledgements when a side ends the connection."""
 _PROBE_S: Final = 2.0
 """Interval at which a side that waits sends an acknowledgement."""
 _SILENCE_S: Final = 3600.0

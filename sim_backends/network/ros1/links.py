@@ -84,7 +84,7 @@ class TcprosLink:
         self._silence_timer = WireTimer(wire, flow.subscriber, self._probe)
 
     def accept(self) -> None:
-        """Do nothing; the publisher has sent its address to the subscriber."""
+        """Do nothing: the subscriber opens the connection, to the address in the publisher's response."""
 
     def connect(self) -> None:
         """Open a connection from the subscriber, which has received the publisher's address."""
@@ -221,7 +221,7 @@ class UdprosLink:
         self.is_connected = False
 
     def connect(self) -> None:
-        """Do nothing; the subscriber has sent its address to the publisher."""
+        """Do nothing: the publisher sends to the address in the subscriber's request."""
 
     def accept(self) -> None:
         """Add the subscriber at the publisher."""

@@ -54,7 +54,7 @@ class TopicFlow:
         subscriber: Agent with the reader.
         qos: Quality of service of writer and reader.
         topic: Name of the topic in ROS; its length affects the size of discovery messages.
-        type_name: DDS name of its type; its length also affects their size.
+        type_name: DDS name of its type; its length also affects the size of discovery messages.
     """
 
     publisher: str

@@ -152,7 +152,7 @@ class TopicReader:
         fragments, _ = self._fragments.setdefault(number, (set(), data.fragment_count))
         fragments.update(range(data.first, data.first + data.count))
         if len(fragments) < data.fragment_count:
-            # More fragments of the sample itself may be in flight.
+            # More fragments of this sample may be in flight, so only earlier samples may be missing.
             self._last_number = max(self._last_number, number - 1)
             return
         del self._fragments[number]

@@ -21,8 +21,8 @@ begins with the kind of message."""
 
 EVICTED: Final = "evicted from the writer's history before it was acknowledged"
 OVERTAKEN: Final = "overtaken by a later sample"
-"""Why a best-effort sample that arrived was not delivered: a later one had been delivered before. A lost sample is
-reported with the reason of its loss."""
+"""Reason for a best-effort sample that arrived but was not delivered, because a later one had been delivered before.
+A lost sample is reported with the reason of its loss."""
 BLOCKED: Final = "the writer was blocked for longer than max_blocking_time"
 _NEVER_NS: Final = -(10**18)
 """A time before the start of every run."""

@@ -11,7 +11,7 @@ SIGNAL_HYSTERESIS_DB: Final = 4.0
 
 _AVERAGE_WEIGHT: Final = 0.25
 _MIN_BEACONS: Final = 4
-"""Weight of the last beacon in the average, and number of beacons before the first event: ieee80211_i.h."""
+"""Weight of the last beacon in the average signal, and number of beacons before the first event: ieee80211_i.h."""
 
 _DIFFERENCES_DB: Final = ((-85.0, 1.0), (-80.0, 2.0), (-75.0, 3.0), (-70.0, 4.0))
 """Upper limits of the current signal in dBm, each with the margin in dB."""

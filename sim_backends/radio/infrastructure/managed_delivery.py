@@ -70,7 +70,7 @@ class ManagedDelivery(PacketDelivery[Payload]):
         # Packets from and to a robot that is not on the channel; during a handover only packets from the robot.
         self._held_packets: dict[int, list[tuple[Station[Payload], Frame[Payload]]]] = {}
         self._in_handover: set[int] = set()
-        # Robots to which an access point sends a broadcast.
+        # The robots for which each broadcast of an access point is intended.
         self._broadcast_receivers: dict[Frame[Payload], frozenset[int]] = {}
         self._management_counts: defaultdict[int, int] = defaultdict(int)
 

@@ -38,7 +38,8 @@ _HANDSHAKE: Final = (
 )
 _STEP_TIMEOUT_NS: Final = 200_000_000
 _MAX_TRIES: Final = 3
-"""IEEE80211_AUTH_TIMEOUT, IEEE80211_ASSOC_TIMEOUT and their MAX_TRIES: mlme.c."""
+"""Time after which a frame of an association is sent again, and number of attempts: IEEE80211_AUTH_TIMEOUT,
+IEEE80211_ASSOC_TIMEOUT and their MAX_TRIES in mlme.c."""
 
 LINK_LOSS_NS: Final = 7 * BEACON_INTERVAL_NS + 2 * 500_000_000
 """Time without beacons after which a link is lost: 7 beacon intervals, and 2 null frames with a timeout of 500 ms

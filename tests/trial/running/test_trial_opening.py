@@ -8,14 +8,15 @@ from typing import Any
 import pytest
 
 from fieldkit.backends.protocols import Cast, Testbed
-from fieldkit.core import runtime
+from fieldkit.core import runtime, seeds
 from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError, RobotError
 from fieldkit.core.events import Event, Note, Sink
-from fieldkit.core.model import Topology
+from fieldkit.core.model import Protocol, Status, Topology
 from fieldkit.core.prompts import Operator, Question
 from fieldkit.remote.shell import Shell
 from fieldkit.steps.scene import Shells
-from fieldkit.trial import store
+from fieldkit.trial import journal, store
+from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.running import locks, opening, preflight, resumption, runner
 from fieldkit.trial.running.locks import Holder
@@ -53,6 +54,7 @@ class Recorder:
         self.done: list[str] = []
         self.events: list[Event] = []
         self.holder: Holder | None = None
+        self.seeds: list[int] = []
 
     def note(self, event: str) -> None:
         self.done.append(event)
@@ -73,7 +75,8 @@ class Recorder:
 
     @contextmanager
     def open(self, cast: Cast, *, seed: int, sink: Sink, operator: Operator) -> Iterator[Testbed]:
-        assert (cast, seed) == (CAST, 7)
+        assert cast == CAST
+        self.seeds.append(seed)
         with self.record_both_ends("open"):
             yield TESTBED
 
@@ -137,6 +140,7 @@ def test_trials_run_one_after_the_other_on_robots_opened_once(
     assert recording.holder == Holder(plans()[0].session, runtime.user_at_host(), plans()[0].trial)
     assert out.is_dir()
     assert notes(recording) == []
+    assert recording.seeds == [7]
 
 
 @pytest.mark.parametrize(
@@ -194,6 +198,20 @@ def test_a_trial_is_resumed_through_the_same_steps(recorder: Callable[..., Recor
     assert resume(recording, folder) == Outcome(folder, (), 2, 0)
     assert recording.done == ["open", "meet", "hold", "resume", "hold ends", "open ends"]
     assert recording.holder == Holder(plan.session, runtime.user_at_host(), plan.trial)
+
+
+def test_a_resumed_trial_draws_other_random_numbers_for_each_attempt(
+    recorder: Callable[..., Recorder], tmp_path: Path
+) -> None:
+    recording = recorder()
+    folder = store.create(tmp_path, plain_plan())
+    for attempt in (1, 2, 3):
+        resume(recording, folder)
+        for status in (Status.RUNNING, Status.VOID):
+            journal.append(folder, JournalEntry(attempt, Protocol.TCP, 1, attempt, status))
+    assert recording.seeds[0] == 7, "before the first attempt, the seed of the trial"
+    assert len(set(recording.seeds)) == 3
+    assert {seeds.place_seed(seed) for seed in recording.seeds} == {7}, "the shadowing of the place stays the same"
 
 
 def test_a_trial_of_another_backend_is_rejected_before_robots_are_opened(

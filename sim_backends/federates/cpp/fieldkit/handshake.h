@@ -44,7 +44,7 @@ struct Hello
     int64_t step_ns = 0; // physics step that the scenario requests
     int64_t end_ns = 0; // end of the run
     std::string configuration_hash; // SHA-256 of `configuration`
-    std::string token; // of a connection between machines
+    std::string token; // secret text that both sides of a connection between machines must have
     std::string name; // of the scenario
     std::vector<Agent> agents;
     std::string configuration; // JSON
