@@ -183,7 +183,7 @@ class Mission:
             yield from islice(self._repeated_reports, 1)
             self._next_repeat_ns = now_ns + REPEAT_NS
 
-    def next_goal_or_mode(self, body: Airframe, home_m: Vector, near_m: float) -> Vector | str:
+    def next_goal_or_mode(self, body: Airframe, home_m: Vector, near_m: float, *, has_landed: bool) -> Vector | str:
         """Return the point to fly to, or the name of the mode to change to.
 
         The point is relative to home. A point below home means landing.
@@ -192,6 +192,8 @@ class Mission:
             body: State of motion of the vehicle.
             home_m: Home in the world.
             near_m: Radius within which a point is reached, unless the item defines a radius.
+            has_landed: True if the vehicle has detected that it is on the ground. A first contact does not complete a
+                landing, because the vehicle may bounce.
         """
         while not self._is_finished:
             item = self.items[self.current]
@@ -204,7 +206,8 @@ class Mission:
                 if self._start_m is None:
                     self._start_m, self._is_climbing = body.position_m, body.on_ground
                 goal = self._goal_m(item, self._start_m, body, home_m, near_m)
-                if not self._is_complete(item, body, goal, near_m):
+                is_landing = item.command == dialect.MAV_CMD_NAV_LAND
+                if not (has_landed if is_landing else self._is_complete(item, body, goal, near_m)):
                     return goal
             self._next()
         return "LOITER"
@@ -227,8 +230,6 @@ class Mission:
 
     def _is_complete(self, item: Item, body: Airframe, goal: Vector, near_m: float) -> bool:
         """Return True if the vehicle has been at the goal for as long as the item requires."""
-        if item.command == dialect.MAV_CMD_NAV_LAND:
-            return body.on_ground
         wait_s, radius_m, _, _ = item.parameters
         if item.command == dialect.MAV_CMD_NAV_WAYPOINT and radius_m > 0:
             near_m = radius_m

@@ -22,6 +22,8 @@ _CRITICAL: Final = dialect.MAV_SEVERITY_CRITICAL
 
 _PREARM_NS: Final = 30_000_000_000
 """ArduPilot repeats the reasons why it cannot be armed at this interval (AP_Arming)."""
+_MIN_LIFT_OFF_M_S: Final = 0.02
+"""A landed vehicle lifts off at a higher target velocity. Lower ones are caused by small errors of its position."""
 _OFFBOARD_LOST: Final = {3: Mode.RTL, 4: Mode.LAND}
 """Mode when set-points are missing, by COM_OBL_RC_ACT. For values that name a mode of a remote control, PX4 holds the
 position instead, because such a mode needs the sticks."""
@@ -295,12 +297,19 @@ class Vehicle(VehicleBase):
         limits = self.limits
         if self.mode is Mode.MISSION:
             limits = replace(limits, speed_m_s=min(limits.speed_m_s, self.mission.speed_m_s or limits.speed_m_s))
-        return self.guidance.velocity_m_s(self.mode, self.body, limits, self.fence.limits_m[1])
+        target_m_s = self.guidance.velocity_m_s(self.mode, self.body, limits, self.fence.limits_m[1])
+        stays_landed = self.land_detector.has_landed and target_m_s[2] < _MIN_LIFT_OFF_M_S
+        return (0.0, 0.0, 0.0) if stays_landed else target_m_s
 
     def _advance_mode(self) -> None:
         """Proceed to the next item of a mission, and to the mode after a take-off, a mission or a return."""
         if self.mode is Mode.MISSION:
-            action = self.mission.next_goal_or_mode(self.body, self.home_m, self._parameters["NAV_ACC_RAD"])
+            action = self.mission.next_goal_or_mode(
+                self.body,
+                self.home_m,
+                self._parameters["NAV_ACC_RAD"],
+                has_landed=self.land_detector.has_landed,
+            )
             if isinstance(action, str):
                 self._switch_automatically(Mode[action])
             else:

@@ -7,7 +7,7 @@
 | `cosim_session` | one run of the coordinator, with its physics and network | cosim, all below |
 | `clock` | conversion between simulated time and the monotonic clock | nothing |
 | `real_agents` | the agents of the coordinator: packets read from devices, in windows that end in real time | cosim |
-| `lab_physics` | the physics simulator, with robots that the lab has placed | steering, federates |
+| `lab_physics` | the physics simulator, with robots that the lab has placed | steering, velocity flights, federates |
 | `steering` | commanded velocities of one robot, and the record of its motion | records in the robot |
 | `velocity_flights` | drones in a physics simulator that accepts only velocities | physics |
 | `simulators` | builds the physics and the network | cosim, network, radio, physics, velocity flights |

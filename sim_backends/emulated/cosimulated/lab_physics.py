@@ -14,10 +14,11 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.emulated.cosimulated.clock import RealTime
 from sim_backends.emulated.cosimulated.steering import Command, FlightSteering, Steering
+from sim_backends.emulated.cosimulated.velocity_flights import VelocityFlights
 from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.federates.protocols import PhysicsFederate
 from sim_backends.physics.bodies import Bodies, coordinates_text
-from sim_backends.physics.quadrotor import FlightStatus
+from sim_backends.physics.quadrotor import FlightStatus, FlightTarget
 from sim_backends.world.motion import STILL, State
 
 OFF_AIR_M: Final[Vector] = (0.0, 0.0, 1e7)
@@ -174,11 +175,16 @@ class LabPhysics:
                 yield self._clock.simulated_ns(at_ns), name, command
 
     def _drive(self, name: str, at_ns: int, command: Command) -> None:
-        """Apply a command to a robot from a time on. If the robot already follows this command, nothing is done."""
+        """Apply a command to a robot from a time on. If the robot already follows this command, nothing is done.
+
+        A drone in `VelocityFlights` follows it from the start of the window on, because each additional exchange with
+        such a physics simulator takes long.
+        """
         if self._active_commands.get(name) == command:
             return
         self._active_commands[name] = command
-        self._advance(at_ns)
+        if not (isinstance(self._physics, VelocityFlights) and isinstance(command, FlightTarget)):
+            self._advance(at_ns)
         self._pending_commands[name] = command
 
     def _advance(self, to_ns: int) -> None:

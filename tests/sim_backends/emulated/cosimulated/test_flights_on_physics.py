@@ -1,7 +1,7 @@
 """Missions, fences and failsafes of drones that a physics simulator moves; the clock is simulated."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -9,7 +9,6 @@ from pymavlink.dialects.v20 import common as d
 
 from fieldkit.core.model import Vector
 from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
-from sim_backends.emulated.autopilot.firmware import Firmware
 from sim_backends.emulated.autopilot.flight import SetPoint
 from sim_backends.emulated.autopilot.modes import LANDING, RETURNING, Mode
 from sim_backends.emulated.autopilot.px4 import PX4
@@ -19,10 +18,27 @@ from sim_backends.physics.quadrotor import ROTORS_OFF, FlightTarget, Quadrotor
 from sim_backends.physics.robot_limits import DUCKIEDRONE
 from sim_backends.world.motion import GRAVITY_M_S2, State
 from tests.helpers.ground_station import HOME_M, GroundStation, item, upload
+from tests.helpers.nightly import mark_nightly
 from tests.helpers.simulated_drones import NAME, START_M, VelocityPhysics, physics_station
 
 SIMULATORS = ("none", "kinematic", "mujoco", "velocities")
-FIRMWARES = pytest.mark.parametrize("firmware", [PX4, ARDUCOPTER], ids=["px4", "arducopter"])
+FIRMWARES = {"px4": PX4, "arducopter": ARDUCOPTER}
+
+
+def cases(*in_ci: str) -> pytest.MarkDecorator:
+    """Parametrize a test with all simulators and the firmwares of `in_ci`; all other cases are marked `nightly`."""
+    firmwares = dict.fromkeys(case.split()[1] for case in in_ci)
+    names = [f"{simulator} {firmware}" for simulator in SIMULATORS for firmware in firmwares]
+    return pytest.mark.parametrize("case", mark_nightly(names, in_ci=in_ci))
+
+
+@pytest.fixture
+def station(case: str, tmp_path: Path) -> Iterator[GroundStation]:
+    simulator, firmware = case.split()
+    with physics_station(tmp_path, simulator, FIRMWARES[firmware]) as started_station:
+        yield started_station
+
+
 OK = d.MAV_RESULT_ACCEPTED
 HEIGHT_M = 2.0
 
@@ -60,116 +76,103 @@ def has_landed(station: GroundStation, distance_m: float = 0.7) -> bool:
     return is_down
 
 
-@pytest.mark.parametrize("simulator", SIMULATORS)
-@FIRMWARES
-def test_a_mission_is_uploaded_and_flown(simulator: str, firmware: Firmware, tmp_path: Path) -> None:
+@cases("mujoco px4", "velocities arducopter")
+def test_a_mission_is_uploaded_and_flown(station: GroundStation) -> None:
     corners_m = ((4.0, 0.0, HEIGHT_M), (4.0, 3.0, HEIGHT_M + 1.0))
-    with physics_station(tmp_path, simulator, firmware) as station:
-        items = [item(0, 0, 0, HEIGHT_M, d.MAV_CMD_NAV_TAKEOFF)] * (1 + firmware.first_item)
-        items += [item(0, *corner_m) for corner_m in corners_m]
-        items.append(item(0, 4.0, 3.0, 0.0, d.MAV_CMD_NAV_LAND))
-        for number, uploaded_item in enumerate(items):
-            uploaded_item.seq = number
-        assert upload(station, items) == d.MAV_MISSION_ACCEPTED
-        vehicle = station.autopilot.vehicle
-        if firmware.is_ardupilot:
-            vehicle.change_mode(Mode.OFFBOARD)  # it cannot be armed in AUTO
-        assert station.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 1) == OK
-        assert station.command(d.MAV_CMD_MISSION_START) == OK
-        nearest_m = dict.fromkeys(corners_m, math.inf)
+    vehicle = station.autopilot.vehicle
+    firmware = vehicle.firmware
+    plan = [(0.0, 0.0, HEIGHT_M, d.MAV_CMD_NAV_TAKEOFF)] * (1 + firmware.first_item)
+    plan += [*((*corner_m, d.MAV_CMD_NAV_WAYPOINT) for corner_m in corners_m), (4.0, 3.0, 0.0, d.MAV_CMD_NAV_LAND)]
+    items = [item(number, *place_and_command) for number, place_and_command in enumerate(plan)]
+    assert upload(station, items) == d.MAV_MISSION_ACCEPTED
+    if firmware.is_ardupilot:
+        vehicle.change_mode(Mode.OFFBOARD)  # it cannot be armed in AUTO
+    assert station.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 1) == OK
+    assert station.command(d.MAV_CMD_MISSION_START) == OK
+    nearest_m = dict.fromkeys(corners_m, math.inf)
 
-        def is_done() -> bool:
-            for corner_m, distance_m in nearest_m.items():
-                nearest_m[corner_m] = min(distance_m, math.dist(corner_m, place_m(station)))
-            return not vehicle.is_armed
+    def is_done() -> bool:
+        for corner_m, distance_m in nearest_m.items():
+            nearest_m[corner_m] = min(distance_m, math.dist(corner_m, place_m(station)))
+        return not vehicle.is_armed
 
-        wait_until(station, is_done)
-        assert max(nearest_m.values()) < vehicle._parameters["NAV_ACC_RAD"] + 0.3
-        assert place_m(station) == pytest.approx((4.0, 3.0, 0.0), abs=0.7)
-        reached_items = [message.seq for message in station.received if message.get_type() == "MISSION_ITEM_REACHED"]
-        assert list(dict.fromkeys(reached_items))[-1] == len(items) - 1
+    wait_until(station, is_done)
+    assert max(nearest_m.values()) < (2.3 if firmware.is_ardupilot else 0.8), "the acceptance radius and a margin"
+    assert place_m(station) == pytest.approx((4.0, 3.0, 0.0), abs=0.7)
+    reached_items = [message.seq for message in station.received if message.get_type() == "MISSION_ITEM_REACHED"]
+    assert list(dict.fromkeys(reached_items)) == list(range(firmware.first_item, len(items)))
 
 
-@pytest.mark.parametrize("simulator", SIMULATORS)
-@pytest.mark.parametrize(("action", "text"), [(2, "hold"), (3, "return")])
-def test_px4_does_not_cross_its_fence_and_acts_as_its_parameter_requires(
-    simulator: str, action: int, text: str, tmp_path: Path
-) -> None:
-    with physics_station(tmp_path, simulator, PX4) as station:
-        station.set("GF_MAX_HOR_DIST", 6.0)
-        station.set("GF_ACTION", action)
-        take_off(station)
-        vehicle, farthest_m = station.autopilot.vehicle, 0.0
+def push_out(station: GroundStation) -> float:
+    """Fly east until the mode changes; return the greatest distance from home."""
+    vehicle, farthest_m = station.autopilot.vehicle, 0.0
 
-        def push() -> bool:
-            nonlocal farthest_m
-            farthest_m = max(farthest_m, math.hypot(*place_m(station)[:2]))
-            vehicle.accept_set_point(SetPoint((2.5, 0.0, 0.0), is_position=False))
-            return vehicle.mode is not Mode.OFFBOARD
+    def push() -> bool:
+        nonlocal farthest_m
+        farthest_m = max(farthest_m, math.hypot(*place_m(station)[:2]))
+        vehicle.accept_set_point(SetPoint((2.5, 0.0, 0.0), is_position=False))
+        return vehicle.mode is not Mode.OFFBOARD
 
-        push()
-        vehicle.change_mode(Mode.OFFBOARD)
-        wait_until(station, push)
-        assert (d.MAV_SEVERITY_CRITICAL, f"Geofence: {text}") in station.texts()
-        if action == 2:
-            station.wait(4)
-            assert 5.0 < place_m(station)[0] < 6.1
-            assert vehicle.mode is Mode.LOITER
-        else:
-            assert vehicle.mode in RETURNING
-            wait_until(station, lambda: has_landed(station))
-        assert farthest_m < 6.5
+    push()
+    vehicle.change_mode(Mode.OFFBOARD)
+    wait_until(station, push)
+    return farthest_m
 
 
-@pytest.mark.parametrize("simulator", SIMULATORS)
-def test_a_breach_of_arducopters_fence_returns_home(simulator: str, tmp_path: Path) -> None:
-    with physics_station(tmp_path, simulator, ARDUCOPTER) as station:
-        station.set("FENCE_RADIUS", 6.0)
-        station.set("FENCE_ACTION", 1)
-        take_off(station)
-        vehicle = station.autopilot.vehicle
-
-        def push() -> bool:
-            vehicle.accept_set_point(SetPoint((2.5, 0.0, 0.0), is_position=False))
-            return vehicle.mode is not Mode.OFFBOARD
-
-        wait_until(station, push)
-        assert vehicle.mode is Mode.RTL
-        assert "Circle fence breached" in [text for _, text in station.texts()]
-        wait_until(station, lambda: has_landed(station, 2.5))
-
-
-@pytest.mark.parametrize("simulator", SIMULATORS)
-@FIRMWARES
-def test_without_its_ground_station_the_drone_returns_and_lands(
-    simulator: str, firmware: Firmware, tmp_path: Path
-) -> None:
-    with physics_station(tmp_path, simulator, firmware) as station:
-        station.set("FS_GCS_ENABLE" if firmware.is_ardupilot else "NAV_DLL_ACT", 1 if firmware.is_ardupilot else 2)
-        take_off(station)
-        vehicle = station.autopilot.vehicle
-        vehicle.go_to((4.0, 0.0, HEIGHT_M))
-        wait_until(station, lambda: place_m(station)[0] > 3.5)
-        wait_until(station, lambda: vehicle.mode in RETURNING, 20, heartbeats=False)
-        wait_until(station, lambda: has_landed(station, 2.5), heartbeats=False)
-
-
-@pytest.mark.parametrize("simulator", SIMULATORS)
-@FIRMWARES
-def test_a_low_battery_lands_the_drone(simulator: str, firmware: Firmware, tmp_path: Path) -> None:
-    with physics_station(tmp_path, simulator, firmware) as station:
-        limits = (
-            {"BATT_LOW_VOLT": 11.0, "BATT_FS_LOW_ACT": 1, "BATT_LOW_TIMER": 2}
-            if firmware.is_ardupilot
-            else {"COM_LOW_BAT_ACT": 2, "SIM_BAT_MIN_PCT": 6.0}
-        )
-        for name, value in limits.items():
-            station.set(name, value)
-        take_off(station)
-        drain = ("SIM_BATT_VOLTAGE", 10.8) if firmware.is_ardupilot else ("SIM_BAT_DRAIN", 5.0)
-        station.set(*drain)
-        wait_until(station, lambda: station.autopilot.vehicle.mode in LANDING, 20)
+@pytest.mark.parametrize("action", [2, 3])
+@cases("velocities px4", "mujoco px4")
+def test_px4_does_not_cross_its_fence_and_acts_as_its_parameter_requires(station: GroundStation, action: int) -> None:
+    station.set("GF_MAX_HOR_DIST", 6.0)
+    station.set("GF_ACTION", action)
+    take_off(station)
+    farthest_m = push_out(station)
+    text = "hold" if action == 2 else "return"
+    assert (d.MAV_SEVERITY_CRITICAL, f"Geofence: {text}") in station.texts()
+    vehicle = station.autopilot.vehicle
+    if action == 2:
+        station.wait(6)
+        assert 5.0 < place_m(station)[0] < 6.1
+        assert vehicle.mode is Mode.LOITER
+    else:
+        assert vehicle.mode in RETURNING
         wait_until(station, lambda: has_landed(station))
+    assert farthest_m < 6.0
+
+
+@cases("kinematic arducopter")
+def test_a_breach_of_arducopters_fence_returns_home(station: GroundStation) -> None:
+    station.set("FENCE_RADIUS", 6.0)
+    station.set("FENCE_ACTION", 1)
+    take_off(station)
+    push_out(station)
+    assert station.autopilot.vehicle.mode is Mode.RTL
+    assert "Circle fence breached" in [text for _, text in station.texts()]
+    wait_until(station, lambda: has_landed(station, 2.5))
+
+
+@cases("kinematic px4", "mujoco arducopter")
+def test_without_its_ground_station_the_drone_returns_and_lands(station: GroundStation) -> None:
+    vehicle = station.autopilot.vehicle
+    station.set(*(("FS_GCS_ENABLE", 1) if vehicle.firmware.is_ardupilot else ("NAV_DLL_ACT", 2)))
+    take_off(station)
+    vehicle.go_to((4.0, 0.0, HEIGHT_M))
+    wait_until(station, lambda: place_m(station)[0] > 3.5)
+    wait_until(station, lambda: vehicle.mode in RETURNING, 20, heartbeats=False)
+    wait_until(station, lambda: has_landed(station, 2.5), heartbeats=False)
+
+
+@cases("velocities px4", "kinematic arducopter")
+def test_a_low_battery_lands_the_drone(station: GroundStation) -> None:
+    is_ardupilot = station.autopilot.vehicle.firmware.is_ardupilot
+    actions: dict[str, float] = {"COM_LOW_BAT_ACT": 2, "SIM_BAT_MIN_PCT": 6.0}
+    if is_ardupilot:
+        actions = {"BATT_LOW_VOLT": 11.0, "BATT_FS_LOW_ACT": 1, "BATT_LOW_TIMER": 2}
+    for name, value in actions.items():
+        station.set(name, value)
+    take_off(station)
+    station.set(*(("SIM_BATT_VOLTAGE", 10.8) if is_ardupilot else ("SIM_BAT_DRAIN", 5.0)))
+    wait_until(station, lambda: station.autopilot.vehicle.mode in LANDING, 20)
+    wait_until(station, lambda: has_landed(station))
 
 
 class TestVelocityFlights:
