@@ -34,6 +34,8 @@ HT20_7: Final = format_modes("HT", "2.4 GHz", 20, 1, 800)[7]
 RATIOS_DB: Final = (40.0, 26.0, 24.5, 24.0, 23.5, 23.0)
 """Signal-to-noise ratios of a single station."""
 STATIONS: Final = (2, 5, 10, 20)
+AMSDU_BYTES: Final = 3_839
+AMSDU_STATIONS: Final = (1, 2, 5)
 DSCPS: Final = {"background": 8, "video": 40, "voice": 48}
 QUEUED: Final = 300
 """Packets in the queue of each station; a packet that arrived is replaced by a new one."""
@@ -108,7 +110,13 @@ def error_curves(ns3: Ns3) -> dict[str, list[tuple[float, float, float]]]:
 
 
 def goodput_mbit_s(
-    mode: WifiMode, ratio_db: float, stations: int, *, rts: bool = False, dscp: int | None = None
+    mode: WifiMode,
+    ratio_db: float,
+    stations: int,
+    *,
+    rts: bool = False,
+    dscp: int | None = None,
+    amsdu_max_bytes: int | None = None,
 ) -> float:
     """Return the goodput of saturated stations with A-MPDU in the radio model, all at one signal-to-noise ratio.
 
@@ -118,6 +126,7 @@ def goodput_mbit_s(
         stations: Number of stations.
         rts: True if they send RTS before each aggregate.
         dscp: DSCP of all packets, for stations with access categories; None for stations without.
+        amsdu_max_bytes: Maximum size of A-MSDUs; None for none.
     """
     phy = PhyCapability(
         "n" if mode.phy_format == "HT" else "ac" if mode.phy_format == "VHT" else "ax",
@@ -127,6 +136,7 @@ def goodput_mbit_s(
         mode.guard_interval_ns,
         rts_threshold_bytes=0 if rts else None,
         access_categories=None if dscp is None else "linux",
+        amsdu_max_bytes=amsdu_max_bytes,
     )
     names = [*(f"s{number}" for number in range(stations)), "receiver"]
     antennas = {name: Antenna("802.11n", TX_POWER_DBM, SENSITIVITY_DBM, phy) for name in names}
@@ -168,6 +178,11 @@ def goodputs(ns3: Ns3) -> list[Row]:
             ns3_value = float(ns3(seconds=SECONDS, payload=PAYLOAD_BYTES, **options))
             name = f"bare, {'RTS, ' * rts}{stations} stations"
             rows.append((name, ns3_value, goodput_mbit_s(HT20_7, 50.0, stations, rts=rts)))
+    for stations in AMSDU_STATIONS:
+        options = common | {"stations": stations, "amsdu": AMSDU_BYTES}
+        ns3_value = float(ns3(seconds=SECONDS, payload=PAYLOAD_BYTES, **options))
+        fieldkit_value = goodput_mbit_s(HT20_7, 50.0, stations, amsdu_max_bytes=AMSDU_BYTES)
+        rows.append((f"A-MSDU, bare, {stations} stations", ns3_value, fieldkit_value))
     for category, dscp in DSCPS.items():
         for stations in (1, 2):
             options = common | {"stations": stations, "classes": dscp << 2}

@@ -4,6 +4,7 @@
 // - `durations`: airtime in ns by frame size in bytes;
 // - `link`: goodput in Mbit/s, by traffic class, of saturated stations that send UDP to one receiver, all with the same
 //   distance from each other;
+// - `pairs`: goodput in Mbit/s of two pairs of stations, each with a saturated sender and a receiver;
 // - `udp`: goodput and loss of a stream at a fixed rate;
 // - `tcp`: goodput of a stream at full rate, and the events of its sender.
 
@@ -90,6 +91,8 @@ struct Options
     uint16_t streams = 1;
     uint16_t guard_ns = 800;
     uint32_t ampdu = 0;
+    uint32_t amsdu = 0;
+    double between_db = 60;
     uint32_t rts = 4692480; // size of the largest frame without RTS; this one is above any frame
     bool bare = false;      // without ns-3's retry limits for aggregates, and without its BlockAckReqs
     std::string classes = "0";
@@ -122,16 +125,20 @@ WifiStandard StandardOf(const std::string& mode)
     }
 }
 
-NetDeviceContainer Install(const Options& options, NodeContainer nodes)
+NetDeviceContainer Install(const Options& options, NodeContainer nodes,
+                           Ptr<MatrixPropagationLossModel> loss = CreateObject<MatrixPropagationLossModel>())
 {
     auto channel = CreateObject<YansWifiChannel>();
-    auto loss = CreateObject<MatrixPropagationLossModel>();
     loss->SetDefaultLoss(options.loss_db);
     channel->SetPropagationLossModel(loss);
     channel->SetPropagationDelayModel(CreateObject<ConstantSpeedPropagationDelayModel>());
     YansWifiPhyHelper phy;
     phy.SetChannel(channel);
     phy.SetErrorRateModel("ns3::NistErrorRateModel");
+    if (options.what == "pairs")
+    {
+        phy.SetPreambleDetectionModel("ns3::ThresholdPreambleDetectionModel", "MinimumRssi", DoubleValue(-101));
+    }
     phy.Set("TxPowerStart", DoubleValue(kTxPowerDbm));
     phy.Set("TxPowerEnd", DoubleValue(kTxPowerDbm));
     phy.Set("RxNoiseFigure", DoubleValue(kNoiseFigureDb));
@@ -166,7 +173,7 @@ NetDeviceContainer Install(const Options& options, NodeContainer nodes)
     auto ampdu = UintegerValue(options.ampdu);
     if (!options.relay)
     {
-        mac.SetType("ns3::AdhocWifiMac", "BE_MaxAmpduSize", ampdu,
+        mac.SetType("ns3::AdhocWifiMac", "BE_MaxAmsduSize", UintegerValue(options.amsdu), "BE_MaxAmpduSize", ampdu,
                     "BK_MaxAmpduSize", ampdu, "VI_MaxAmpduSize", ampdu, "VO_MaxAmpduSize", ampdu);
         return wifi.Install(phy, mac, nodes);
     }
@@ -248,6 +255,60 @@ std::vector<double> Goodputs(const Options& options)
         OnOffHelper source("ns3::UdpSocketFactory", targets[n % targets.size()]);
         source.SetConstantRate(DataRate(offered_bit_s), options.payload);
         source.Install(nodes.Get(n)).Start(Seconds(kWarmUpS + 0.001 * n));
+    }
+    std::vector<double> bits(sinks.size());
+    auto count = [&](double sign) {
+        for (std::size_t number = 0; number < sinks.size(); number++)
+        {
+            bits[number] += sign * 8.0 * sinks[number]->GetTotalRx();
+        }
+    };
+    Simulator::Schedule(Seconds(2 * kWarmUpS), [&] { count(-1); });
+    Simulator::Stop(Seconds(2 * kWarmUpS + options.seconds));
+    Simulator::Run();
+    count(1);
+    Simulator::Destroy();
+    for (auto& value : bits)
+    {
+        value /= options.seconds * 1e6;
+    }
+    return bits;
+}
+
+// Goodputs of two pairs of stations: station 0 sends to 1, and 2 to 3. The losses are equal, except those from the first
+// pair to the second one.
+std::vector<double> PairGoodputs(const Options& options)
+{
+    NodeContainer nodes;
+    nodes.Create(4);
+    auto loss = CreateObject<MatrixPropagationLossModel>();
+    auto devices = Install(options, nodes, loss);
+    Config::Set("/NodeList/*/DeviceList/*/$ns3::WifiNetDevice/Phy/Slot", TimeValue(MicroSeconds(9)));
+    MobilityHelper mobility;
+    mobility.Install(nodes);
+    for (uint32_t from : {0, 1})
+    {
+        for (uint32_t to : {2, 3})
+        {
+            auto source = nodes.Get(from)->GetObject<MobilityModel>(), target = nodes.Get(to)->GetObject<MobilityModel>();
+            loss->SetLoss(source, target, options.between_db, false);
+            loss->SetLoss(target, source, options.loss_db, false);
+        }
+    }
+    InternetStackHelper internet;
+    internet.Install(nodes);
+    Ipv4AddressHelper addresses("10.0.0.0", "255.255.255.0");
+    auto interfaces = addresses.Assign(devices);
+    NeighborCacheHelper().PopulateNeighborCache(interfaces);
+    std::vector<Ptr<PacketSink>> sinks;
+    for (uint32_t sender : {0, 2})
+    {
+        InetSocketAddress to(interfaces.GetAddress(sender + 1), 9);
+        PacketSinkHelper sink("ns3::UdpSocketFactory", to);
+        sinks.push_back(DynamicCast<PacketSink>(sink.Install(nodes.Get(sender + 1)).Get(0)));
+        OnOffHelper source("ns3::UdpSocketFactory", to);
+        source.SetConstantRate(DataRate(70000000), options.payload);
+        source.Install(nodes.Get(sender)).Start(Seconds(kWarmUpS + 0.001 * sender));
     }
     std::vector<double> bits(sinks.size());
     auto count = [&](double sign) {
@@ -457,7 +518,7 @@ int main(int argc, char** argv)
 {
     Options options;
     CommandLine command;
-    command.AddValue("what", "errors, durations, link, udp or tcp", options.what);
+    command.AddValue("what", "errors, durations, link, pairs, udp or tcp", options.what);
     command.AddValue("mode", "ns-3's name of the mode", options.mode);
     command.AddValue("stations", "number of stations that send", options.stations);
     command.AddValue("payload", "UDP payload of a packet, bytes", options.payload);
@@ -467,6 +528,8 @@ int main(int argc, char** argv)
     command.AddValue("streams", "number of spatial streams", options.streams);
     command.AddValue("guard", "guard interval, ns", options.guard_ns);
     command.AddValue("ampdu", "maximum size of an A-MPDU, bytes; 0 for none", options.ampdu);
+    command.AddValue("amsdu", "maximum size of an A-MSDU, bytes; 0 for none", options.amsdu);
+    command.AddValue("between", "path loss from the first pair to the second one, dB", options.between_db);
     command.AddValue("rts", "size of the largest frame without RTS, bytes", options.rts);
     command.AddValue("bare", "without BlockAckReq and without a retry limit", options.bare);
     command.AddValue("classes", "traffic classes (TOS) of the stations, by turns, comma-separated", options.classes);
@@ -505,7 +568,7 @@ int main(int argc, char** argv)
     }
     else
     {
-        for (double value : Goodputs(options))
+        for (double value : options.what == "pairs" ? PairGoodputs(options) : Goodputs(options))
         {
             std::cout << value << " ";
         }

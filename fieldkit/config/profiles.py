@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Annotated, ClassVar, Final
 
 from fieldkit.config import catalog, schema
+from fieldkit.config.antennas import AntennaOptions
 from fieldkit.config.schema import AfterValidator, Bytes, Field, Hertz, Int, Number, Strict, pattern_field
 from fieldkit.config.sections import Sectioned
 from fieldkit.config.wifi_phy import WifiPhy, check_standard
@@ -252,6 +253,7 @@ class Radio(Strict):
         sensitivity_dbm: Weakest signal that it can receive, in dBm; used by the emulated radio, and by `check` to
             report a weak signal.
         phy: Physical layer of 802.11n, ac or ax, for the emulated radio.
+        antenna: Pattern and orientation of its antenna, for the emulated radio.
     """
 
     interface: InterfaceName
@@ -260,6 +262,7 @@ class Radio(Strict):
     tx_power_dbm: Number | Int
     sensitivity_dbm: Number | Int
     phy: WifiPhy | None = Field(default=None, exclude_if=schema.is_empty)
+    antenna: AntennaOptions | None = Field(default=None, exclude_if=schema.is_empty)
 
     @schema.model_validator(mode="after")
     def _check_standard(self) -> "Radio":

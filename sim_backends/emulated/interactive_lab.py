@@ -27,7 +27,7 @@ from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.ros.robot_motion import AssignedPath
 from sim_backends.radio.antennas import antenna_of
 from sim_backends.radio.world_channel import WorldChannel
-from sim_backends.world.motion import State
+from sim_backends.world.motion import Attitude, State, attitude_of
 from sim_backends.world.world import World
 
 
@@ -123,7 +123,8 @@ class EmulatedLab:
                 self._states = states
                 self._positions_m = self._positions_m | {name: state.position_m for name, state in states.items()}
                 velocities_m_s = {name: state.velocity_m_s for name, state in states.items()}
-                self._running.media.place(self._positions_m, velocities_m_s=velocities_m_s)
+                attitudes = {name: attitude_of(state, before=Attitude()) for name, state in states.items()}
+                self._running.media.place(self._positions_m, velocities_m_s=velocities_m_s, attitudes=attitudes)
                 self._running.positions_writer.write(self._positions_m)
         return WATCH_S
 

@@ -20,7 +20,7 @@ from sim_backends.emulated.motion_sections import mavlink_of
 from sim_backends.emulated.nodes import EmulatedRobot, Laptop
 from sim_backends.emulated.provisioning import RobotKey
 from sim_backends.emulated.ros.motion_record import RecordedMotion
-from sim_backends.world.motion import STILL, Motion, State
+from sim_backends.world.motion import STILL, Attitude, Motion, State, attitude_of
 from sim_backends.world.world import World
 
 STEP_M: Final = 0.1
@@ -110,6 +110,7 @@ class PlacesRobots(Protocol):
         *,
         relay: str | None = None,
         velocities_m_s: Mapping[str, Vector] = ...,
+        attitudes: Mapping[str, Attitude] = ...,
     ) -> None:
         """Place the robots. The arguments are those of `MediumClient.place`."""
 
@@ -150,6 +151,7 @@ class Mobility:
         self._path_starts_ns: dict[Role, int] = {}
         self._last_motions: dict[Role, RecordedMotion] = {}
         self._track: list[TrackPoint] = []
+        self._attitudes: dict[str, Attitude] = {}
         # Each motion runs in a separate thread.
         self._lock = threading.RLock()
 
@@ -260,6 +262,10 @@ class Mobility:
             now_ns, utc_ns = time.monotonic_ns(), time.time_ns()
             positions_m = positions.positions_m(self._cast, placement, self._world)
             states = {name: State(position_m) for name, position_m in positions_m.items()}
+            for role, robot in self._cast.items():
+                if (state := states.get(robot.name)) is not None:
+                    heading_rad = positions.facing_rad(placement, role, self._world)
+                    states[robot.name] = state._replace(heading_rad=heading_rad)
             for start_ns, motion in self._motions:
                 states |= motion.at(now_ns - start_ns)
             states |= {
@@ -274,10 +280,15 @@ class Mobility:
             self._write_positions({name: state.position_m for name, state in visible_states.items()})
             if hidden_robot is not None:
                 states = {} if hidden_robot == relay else visible_states
+            self._attitudes = {
+                name: attitude_of(state, before=self._attitudes.get(name, Attitude()))
+                for name, state in states.items()
+            }
             self._media.place(
                 {name: state.position_m for name, state in states.items()},
                 relay=relay if relay in states else None,
                 velocities_m_s={name: state.velocity_m_s for name, state in states.items()},
+                attitudes=self._attitudes,
             )
             self._extend_track(utc_ns, states)
             return self._next_update_s(now_ns, states)

@@ -58,13 +58,17 @@ def assigned_path(placement: Placement, move: Move, world: World, start_ns: int)
         world: The world around the robots.
         start_ns: Start of the move, as a time of the monotonic clock.
     """
-    line, (along_m, left_m) = _line(placement, world), _along_line_m(placement)[move.role]
-    # 1 m ahead of the robot, which faces along the line (1) or against it (-1).
-    ahead_m = math.cos(geometry.heading_rad(move.role, "away"))
-    start, goal = line.at(along_m, left_m), line.at(along_m + ahead_m, left_m)
-    facing_rad = math.atan2(goal[1] - start[1], goal[0] - start[0])
     points_m = [antenna_m(world, corner) for corner in _corners_m(placement, move, world)]
-    return AssignedPath(start_ns, points_m, move.speed_m_s, facing_rad)
+    return AssignedPath(start_ns, points_m, move.speed_m_s, facing_rad(placement, move.role, world))
+
+
+def facing_rad(placement: Placement, role: Role, world: World) -> float:
+    """Return the heading of a robot at its place: away from the other end of its link."""
+    line, (along_m, left_m) = _line(placement, world), _along_line_m(placement)[role]
+    # 1 m ahead of the robot, which faces along the line (1) or against it (-1).
+    ahead_m = math.cos(geometry.heading_rad(role, "away"))
+    start, goal = line.at(along_m, left_m), line.at(along_m + ahead_m, left_m)
+    return math.atan2(goal[1] - start[1], goal[0] - start[0])
 
 
 def _corners_m(placement: Placement, move: Move, world: World) -> list[tuple[float, float]]:

@@ -18,7 +18,7 @@ from sim_backends.world.obstacles import Raised, Ramp
 from sim_backends.world.shapes import Box, Shape
 from sim_backends.world.world import World
 
-SENSED_NUMBERS: Final = 9
+SENSED_NUMBERS: Final = 12
 """Number of values of the sensors of an agent."""
 WHEEL_CONTROL_PER_S: Final = 40.0
 """Natural frequency of the speed control of a wheel. The control is critically damped, and lags its set-point by 0.05
@@ -145,7 +145,7 @@ class _Document:
             self._add_vehicle(body, name, robot.body, robot.friction)
         else:
             self._add_quadrotor(body, name, robot.body)
-        for kind in ("framepos", "framelinvel", "framexaxis"):
+        for kind in ("framepos", "framelinvel", "framexaxis", "frameyaxis"):
             _add(self._sensors, kind, objtype="site", objname=name)
 
     def _new_ground(self) -> str:

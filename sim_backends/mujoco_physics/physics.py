@@ -63,8 +63,11 @@ class SensedStates(Mapping[str, State]):
         state = self._cache.get(name)
         if state is None:
             first = self._rows[name] * SENSED_NUMBERS
-            e, n, u, v_e, v_n, v_u, x_e, x_n, _ = self._numbers[first : first + SENSED_NUMBERS]
-            state = self._cache[name] = State((e, n, u), (v_e, v_n, v_u), math.atan2(x_n, x_e))
+            e, n, u, v_e, v_n, v_u, x_e, x_n, x_u, _, _, y_u = self._numbers[first : first + SENSED_NUMBERS]
+            level = math.hypot(x_e, x_n)
+            # Rounding may give a sine above 1.
+            tilt_rad = math.asin(max(-1.0, min(y_u / (level or 1.0), 1.0))), math.atan2(-x_u, level)
+            state = self._cache[name] = State((e, n, u), (v_e, v_n, v_u), math.atan2(x_n, x_e), tilt_rad)
         return state
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "SensedStates":

@@ -17,7 +17,7 @@ from sim_backends.network.wire import CountsMisses, IpPacket, Transport, Wire
 from sim_backends.radio.channel import Emitter
 from sim_backends.radio.links import RADIO_OFF, Delay
 from sim_backends.radio.model import RadioModel
-from sim_backends.world.motion import STILL, DeadReckoned, State
+from sim_backends.world.motion import STILL, Attitude, DeadReckoned, State, attitude_of
 
 TransportFactory = Callable[[Wire], Transport]
 
@@ -38,9 +38,10 @@ class RadioNetwork:
     The immediate consequences of an event are processed before the next event.
 
     The radio receives the positions of stations when an event is processed, not at every window, so the result does
-    not depend on earlier updates. It receives no velocities: for the radio, stations stay at the coordinator's
-    positions, or move in steps if the coordinator passes dead-reckoned states. The position error therefore depends
-    only on the coordinator's sync policy. A station without a state is absent: its radio is off.
+    not depend on earlier updates. It receives attitudes if it needs them, but no velocities: for the radio, stations
+    stay at the coordinator's positions, or move in steps if the coordinator passes dead-reckoned states. The position
+    error therefore depends only on the coordinator's sync policy. A station without a state is absent: its radio is
+    off.
 
     `Transport.record_loss` is called only for packets with a single destination. For broadcasts, `CountsMisses`
     records the hosts that miss them.
@@ -86,6 +87,7 @@ class RadioNetwork:
         self._stations_off: set[str] = set()
         self._absent_stations: frozenset[str] = frozenset()
         self._positions_m: dict[str, Vector] = {}
+        self._attitudes: dict[str, Attitude] = {}
         self._jammers: dict[str, Jammer] = {}
         self._states: Mapping[str, State] = {}
         self._placed_states: Mapping[str, State] | None = None
@@ -233,7 +235,8 @@ class RadioNetwork:
             present_m = {name: states[name].position_m for name in self._names if name not in absent_stations}
             # The radio of an absent station is off; the station keeps its last position.
             self._positions_m = dict.fromkeys(self._names, STILL) | self._positions_m | present_m
-        self._radio.place(self.now_ns, self._positions_m, self._relay)
+        attitudes = self._update_attitudes(states) if self._radio.uses_attitudes else None
+        self._radio.place(self.now_ns, self._positions_m, self._relay, attitudes=attitudes)
         if absent_stations != self._absent_stations:
             self._absent_stations = absent_stations
             if self._current_stations_off() != self._stations_off:
@@ -241,6 +244,12 @@ class RadioNetwork:
         if self._jammers:
             self._jam()
         return True
+
+    def _update_attitudes(self, states: Mapping[str, State]) -> Mapping[str, Attitude]:
+        for name in self._names:
+            if (state := states.get(name)) is not None:
+                self._attitudes[name] = attitude_of(state, before=self._attitudes.get(name, Attitude()))
+        return self._attitudes
 
     def _collect(self) -> None:
         """Pass the packets that the radio delivers now to their hosts, until it delivers no further packet now."""

@@ -492,6 +492,10 @@ class Network
             {
                 continue;
             }
+            if (radio.contains("pattern") && !radio.at("pattern").is_null())
+            {
+                throw Refusal("the antenna of " + agent.name + " has a pattern, which this network does not model");
+            }
             Station station;
             station.name = agent.name;
             station.agent = static_cast<uint32_t>(m_agents.size() - 1);

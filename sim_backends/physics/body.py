@@ -59,6 +59,11 @@ class Pose(Protocol):
         """Its heading, from east towards north."""
         ...
 
+    @property
+    def tilt_rad(self) -> tuple[float, float]:
+        """Its roll (left side up) and pitch (nose down) relative to the ground."""
+        ...
+
 
 PoseT = TypeVar("PoseT", bound=Pose)
 PoseT_co = TypeVar("PoseT_co", bound=Pose, covariant=True)
@@ -168,7 +173,7 @@ class Track(NamedTuple):
         """Return the state of the antenna at a step."""
         pose = self.pose(step)
         east_m, north_m, up_m = pose.place_m
-        return State((east_m, north_m, up_m + self.antenna_m), pose.velocity_m_s, pose.heading_rad)
+        return State((east_m, north_m, up_m + self.antenna_m), pose.velocity_m_s, pose.heading_rad, pose.tilt_rad)
 
 
 class Snapshot(Mapping[str, State]):

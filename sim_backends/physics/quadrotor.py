@@ -91,6 +91,11 @@ class FlightPose(NamedTuple):
     pitch_rad: float = 0.0
     heading_rad: float = 0.0
 
+    @property
+    def tilt_rad(self) -> tuple[float, float]:
+        """Implement `Pose.tilt_rad`."""
+        return self.roll_rad, self.pitch_rad
+
 
 @dataclass(frozen=True, slots=True)
 class Glide:

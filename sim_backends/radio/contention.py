@@ -40,6 +40,9 @@ class ChannelAccess(Protocol):
     def defer_until(self, until_ns: int) -> None:
         """Count no backoff slots before `until_ns`: the end of EIFS after a frame that the station did not decode."""
 
+    def end_eifs(self) -> None:
+        """End EIFS, because a frame was decoded: only the inter-frame space after the end of the frame remains."""
+
     def set_busy_until(self, until_ns: int) -> None:
         """Record that the channel is busy until `until_ns`."""
 
@@ -113,6 +116,10 @@ class Contention:
     def defer_until(self, until_ns: int) -> None:
         """Count no backoff slots before `until_ns`: the end of EIFS after a frame that the station did not decode."""
         self.count_from_ns = max(self.count_from_ns, until_ns)
+
+    def end_eifs(self) -> None:
+        """End EIFS, because a frame was decoded: only the inter-frame space after the end of the frame remains."""
+        self.count_from_ns = min(self.count_from_ns, self.busy_until_ns + self.ifs_ns)
 
     def set_busy_until(self, until_ns: int) -> None:
         """Record that the channel is busy until `until_ns`."""

@@ -210,6 +210,11 @@ class AccessCategories(ChannelAccess, Generic[Payload]):
         for queue in self._queues:
             queue.contention.defer_until(until_ns + queue.contention.ifs_ns)
 
+    @override
+    def end_eifs(self) -> None:
+        for queue in self._queues:
+            queue.contention.end_eifs()
+
     def wait_until(self, now_ns: int) -> None:
         """Restart the countdown at the end of the wait for a response, during which the channel was idle."""
         for queue in self._queues:

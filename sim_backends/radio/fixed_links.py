@@ -34,6 +34,7 @@ from sim_backends.radio.links import (
 )
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
+from sim_backends.world.motion import Attitude
 
 
 class FixedLink:
@@ -363,6 +364,8 @@ class UniformLinks(FixedLinks[Payload]):
         options: Parameters of every link.
     """
 
+    uses_attitudes = False
+
     def __init__(self, seed: int, options: RadioOptions) -> None:
         super().__init__(seed)
         self._options = options
@@ -374,6 +377,7 @@ class UniformLinks(FixedLinks[Payload]):
         positions_m: Mapping[str, Vector],
         relay: str | None,
         velocities_m_s: Mapping[str, Vector] | None = None,  # noqa: ARG002
+        attitudes: Mapping[str, Attitude] | None = None,  # noqa: ARG002
     ) -> None:
         """Implement `RadioModel.place`; only the set of stations matters."""
         stations = frozenset(positions_m), relay

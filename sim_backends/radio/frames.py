@@ -62,6 +62,8 @@ class Transmission:
         interferers: Frames and jammer noise that overlap it in time.
         receivers: Indices of the stations that are synchronized to it, and so receive it.
         response_bytes: Size of the ACK or Block Ack to it.
+        frame_count: Number of frames, if it is an aggregate.
+        weakest_ratio: Smallest ratio of signal to noise in 20 MHz at the stations that detect it.
     """
 
     transmitter: int
@@ -76,6 +78,8 @@ class Transmission:
     interferers: list["Transmission | Emission"] = field(default_factory=list)
     receivers: set[int] = field(default_factory=set)
     response_bytes: int = ACK_BYTES
+    frame_count: int = 1
+    weakest_ratio: float = math.inf
 
 
 def success_probability(frame: Transmission, receiver: int, noise_mw: float) -> float:

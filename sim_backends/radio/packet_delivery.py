@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from typing import Generic
 
 from sim_backends.radio.aggregation import BlockAckSession
+from sim_backends.radio.amsdu import AmsduSession
 from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.contention import EventQueue
 from sim_backends.radio.edca import category_of
@@ -171,4 +172,6 @@ class PacketDelivery(Generic[Payload]):
 
     def _session(self, transmitter: int, receiver: int) -> BlockAckSession[Payload] | None:
         limits = self._channel.ampdu_limits(transmitter, receiver)
-        return None if limits is None else BlockAckSession(limits)
+        if limits is None:
+            return None
+        return AmsduSession(limits) if limits.amsdu_bytes else BlockAckSession(limits)

@@ -18,6 +18,10 @@ GRAVITY_M_S2: Final = 9.80665
 """Standard acceleration of gravity (CGPM 1901)."""
 
 
+LEVEL: Final = (0.0, 0.0)
+"""Roll and pitch of a robot on level ground."""
+
+
 class State(NamedTuple):
     """Position and velocity of a robot; a tuple, which is faster to create than a frozen dataclass.
 
@@ -25,11 +29,40 @@ class State(NamedTuple):
         position_m: Metres east, north, up.
         velocity_m_s: Metres per second east, north, up.
         heading_rad: Heading, from east towards north; None if its motion does not define one.
+        tilt_rad: Roll (left side up) and pitch (nose down).
     """
 
     position_m: Vector
     velocity_m_s: Vector = STILL
     heading_rad: float | None = None
+    tilt_rad: tuple[float, float] = LEVEL
+
+
+class Attitude(NamedTuple):
+    """Orientation of a body: the rotation by roll about forward, then pitch about left, then yaw about up.
+
+    Attributes:
+        yaw_rad: Heading, from east towards north.
+        pitch_rad: Positive with the nose down.
+        roll_rad: Positive with the left side up.
+    """
+
+    yaw_rad: float = 0.0
+    pitch_rad: float = 0.0
+    roll_rad: float = 0.0
+
+
+def attitude_of(state: State, *, before: Attitude) -> Attitude:
+    """Return the attitude of a robot.
+
+    A robot without a heading faces the direction in which it moves; at rest it keeps the yaw of `before`.
+    """
+    yaw_rad = state.heading_rad
+    if yaw_rad is None:
+        east_m_s, north_m_s, _ = state.velocity_m_s
+        yaw_rad = math.atan2(north_m_s, east_m_s) if east_m_s or north_m_s else before.yaw_rad
+    roll_rad, pitch_rad = state.tilt_rad
+    return Attitude(yaw_rad, pitch_rad, roll_rad)
 
 
 class Lifetime(NamedTuple):
@@ -164,9 +197,9 @@ class OnGround:
 
 def extrapolate(state: State, seconds: float) -> State:
     """Return the state after this time, at constant velocity."""
-    (e, n, u), velocity_m_s, heading_rad = state
+    (e, n, u), velocity_m_s, heading_rad, tilt_rad = state
     v_e, v_n, v_u = velocity_m_s
-    return State((e + seconds * v_e, n + seconds * v_n, u + seconds * v_u), velocity_m_s, heading_rad)
+    return State((e + seconds * v_e, n + seconds * v_n, u + seconds * v_u), velocity_m_s, heading_rad, tilt_rad)
 
 
 class _ExtrapolatedStates(Mapping[str, State]):

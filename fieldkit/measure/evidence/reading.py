@@ -9,11 +9,9 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import BinaryIO, Final, TypeVar
+from typing import BinaryIO, Final
 
 from fieldkit.core.errors import EvidenceError
-
-T = TypeVar("T")
 
 MAX_TEXT_BYTES: Final = 64 << 20
 """Maximum size of a tool's output; ping with 10 requests per second for an hour prints 3 MB."""

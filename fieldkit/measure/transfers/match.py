@@ -158,7 +158,7 @@ def match_keys(
     received_order, received_group = received_order[has_match], received_group[has_match]
     received_count = np.bincount(received_group, minlength=len(keys))
 
-    position, is_clear, has_no_copies = assign(
+    position, is_clear, may_have_copies = assign(
         group, time_ns[sent_order], received_group, received_time_ns[received_order]
     )
     sent_index = np.full(len(received_key), NONE)
@@ -172,7 +172,7 @@ def match_keys(
     ambiguous[sent_order] = (~is_clear & (received_count > 0))[group]
     possible_copy = np.zeros(len(received_key), dtype=np.bool_)
     # If only one packet of a group arrived, it cannot be a copy of another one.
-    possible_copy[received_order] = (~is_clear & ~has_no_copies & (received_count > 1))[received_group]
+    possible_copy[received_order] = (~is_clear & may_have_copies & (received_count > 1))[received_group]
     possible_copy &= ~duplicates
     return Match(received_index, sent_index, duplicates, ambiguous, possible_copy)
 
@@ -305,8 +305,8 @@ def assign(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns: I
     In any other group, each received item is assigned to the nearest sent item that fulfils two conditions: the order
     of the items does not change, and as many items as possible are assigned to different sent items.
 
-    A group has no copies if each received item is clearly nearest to a different sent item, even if the time between
-    the sent items is short.
+    If each received item is clearly nearest to a different sent item, the group contains no copies, even if the time
+    between the sent items is short. Any other group may contain copies.
 
     Args:
         group: Group of each sent item, ascending.
@@ -316,16 +316,16 @@ def assign(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns: I
 
     Returns:
         Position of the sent item in its group for each received item, from 0 in the order of sending; mask of the
-        groups that are clear; mask of the groups without copies.
+        groups that are clear; mask of the groups that may contain copies.
     """
     group_count = int(group.max(initial=-1)) + 1
     sent_count, received_count = (np.bincount(numbers, minlength=group_count) for numbers in (group, received_group))
     position = np.zeros(len(received_group), dtype=np.int64)
     has_several = sent_count > 1
-    is_clear_group = np.ones(group_count, dtype=np.bool_)
+    is_clear_group, may_have_copies = np.ones(group_count, dtype=np.bool_), np.zeros(group_count, dtype=np.bool_)
     is_undecided, in_several = has_several[received_group], has_several[group]
     if not is_undecided.any():
-        return position, is_clear_group, is_clear_group
+        return position, is_clear_group, may_have_copies
     offset_ns, is_offset_known = _clock_offset_ns(group, time_ns, received_group, received_time_ns)
     group, time_ns = group[in_several], time_ns[in_several]
     received_group, received_time_ns = received_group[is_undecided], received_time_ns[is_undecided] - offset_ns
@@ -335,8 +335,7 @@ def assign(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns: I
     spacing_ns = _spacing_ns(group, time_ns)[index]
     is_nearest = _CLEAR_FACTOR * np.abs(received_time_ns - time_ns[index]) <= spacing_ns
     is_clear_group[received_group[~(is_offset_known & is_nearest & (spacing_ns >= MIN_SPACING_NS))]] = False
-    has_no_copies = np.ones(group_count, dtype=np.bool_)
-    has_no_copies[received_group[~is_nearest | (np.diff(index, prepend=-1) == 0)]] = False
+    may_have_copies[received_group[~is_nearest | (np.diff(index, prepend=-1) == 0)]] = True
 
     order = np.arange(len(received_group)) - (np.cumsum(received_count) - received_count)[received_group]
     surplus = (sent_count - received_count)[received_group]
@@ -347,7 +346,7 @@ def assign(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns: I
     group_base = received_group * (len(group) + len(received_group))
     in_order = order + sign * (np.maximum.accumulate(skipped + group_base) - group_base)
     position[is_undecided] = np.where(is_clear_group[received_group], nearest, in_order)
-    return position, is_clear_group, has_no_copies
+    return position, is_clear_group, may_have_copies
 
 
 def _spacing_ns(group: Ints, time_ns: Ints) -> Ints:

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
 from fieldkit.config import schema
+from fieldkit.config.antennas import AntennaOptions
 from fieldkit.config.catalog import Named
 from fieldkit.config.schema import AfterValidator, Duration, Field, Int, Length, Location, Strict
 from fieldkit.config.wifi_phy import WifiPhy, check_standard
@@ -117,12 +118,14 @@ class AgentRadio(Strict):
         tx_power_dbm: Its transmit power.
         sensitivity_dbm: Power of the weakest frame that it detects.
         phy: Physical layer of 802.11n, ac or ax, as `radio.phy` of a [robot profile](reference/robot-profile.md).
+        antenna: Pattern and orientation of its antenna, as `radio.antenna` of a robot profile.
     """
 
     standard: str = "802.11n"
     tx_power_dbm: Annotated[Real, Field(ge=-50, le=50)] = 17
     sensitivity_dbm: Annotated[Real, Field(ge=-120, le=0)] = -82
     phy: WifiPhy | None = None
+    antenna: AntennaOptions | None = None
 
     @schema.model_validator(mode="after")
     def _check_standard(self) -> "AgentRadio":

@@ -184,8 +184,14 @@ class DroneMotionReporter:
         self._was_flying = not body.on_ground
         east_m, north_m, up_m = body.place_m
         antenna_m = (east_m, north_m, up_m + self._antenna_m)
+        roll_rad, nose_up_rad = body.tilt_rad
         self._reporter.write(
-            body.now_ns, antenna_m, body.velocity_m_s, heading_rad=body.yaw_rad, turn_rad_s=body.turn_rad_s
+            body.now_ns,
+            antenna_m,
+            body.velocity_m_s,
+            heading_rad=body.yaw_rad,
+            turn_rad_s=body.turn_rad_s,
+            tilt_rad=(roll_rad, -nose_up_rad),
         )
 
 

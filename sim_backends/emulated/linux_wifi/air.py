@@ -24,6 +24,7 @@ from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.radio.rate_control import RateControl
 from sim_backends.radio.wifi import Wifi
 from sim_backends.radio.world_channel import WorldChannel
+from sim_backends.world.motion import Attitude
 from sim_backends.world.world import World
 
 _FCS_BYTES: Final = 4
@@ -163,9 +164,15 @@ class _Channel:
         self.frames: dict[PacketIdentity, FrameOnAir] = {}
         self.events = AirEvents()
 
-    def place(self, now_ns: int, positions_m: Mapping[str, Vector], velocities_m_s: Mapping[str, Vector]) -> None:
+    def place(
+        self,
+        now_ns: int,
+        positions_m: Mapping[str, Vector],
+        velocities_m_s: Mapping[str, Vector],
+        attitudes: Mapping[str, Attitude],
+    ) -> None:
         self._wifi.advance(now_ns)
-        self._gains.move(now_ns, positions_m, velocities_m_s)
+        self._gains.move(now_ns, positions_m, velocities_m_s, attitudes)
 
     def transmit(self, now_ns: int, frame: FrameOnAir) -> None:
         """Send a frame. If none of its tries is possible, its status is reported immediately."""
@@ -241,12 +248,18 @@ class Air:
         self._tuned_mhz: dict[str, int] = {}
         self._positions_m: Mapping[str, Vector] = {}
         self._velocities_m_s: Mapping[str, Vector] = {}
+        self._attitudes: Mapping[str, Attitude] = {}
 
     def place(
-        self, now_ns: int, positions_m: Mapping[str, Vector], velocities_m_s: Mapping[str, Vector] | None = None
+        self,
+        now_ns: int,
+        positions_m: Mapping[str, Vector],
+        velocities_m_s: Mapping[str, Vector] | None = None,
+        attitudes: Mapping[str, Attitude] | None = None,
     ) -> None:
         """Set the positions of the radios, metres east, north, up; radios without a position are out of range."""
         self._positions_m, self._velocities_m_s = dict(positions_m), dict(velocities_m_s or {})
+        self._attitudes = {**self._attitudes, **(attitudes or {})}
         for frequency_mhz in self._channels:
             self._place(now_ns, frequency_mhz)
 
@@ -301,4 +314,4 @@ class Air:
             if self._tuned_mhz.get(name, frequency_mhz) == frequency_mhz
         }
         velocities_m_s = {name: velocity for name, velocity in self._velocities_m_s.items() if name in positions_m}
-        self._channels[frequency_mhz].place(now_ns, positions_m, velocities_m_s)
+        self._channels[frequency_mhz].place(now_ns, positions_m, velocities_m_s, self._attitudes)

@@ -35,7 +35,9 @@ from sim_backends.emulated.linux_wifi.netlink import NetlinkFormatError, Netlink
 from sim_backends.emulated.medium.timerfd import Timer
 from sim_backends.radio.antennas import Antenna
 from sim_backends.radio.modes import Standard
+from sim_backends.radio.propagation.antenna_patterns import decode_pattern
 from sim_backends.radio.radio_options import RadioOptions
+from sim_backends.world.motion import Attitude
 from sim_backends.world.world import World
 
 _BURST: Final = 64
@@ -62,12 +64,14 @@ class RadioSetup(Strict):
         standard: Standard of its radio.
         tx_power_dbm: Transmit power.
         sensitivity_dbm: Received power of the weakest frame that it detects.
+        pattern: Pattern of its antenna, as `dataclasses.asdict` returns it; None if it is isotropic.
     """
 
     address: Annotated[str, AfterValidator(_radio_address)]
     standard: Standard = "802.11n"
     tx_power_dbm: Number | Int = 15
     sensitivity_dbm: Number | Int = -92
+    pattern: dict[str, Any] | None = None
 
 
 class MediumSetup(Strict):
@@ -88,7 +92,12 @@ class MediumSetup(Strict):
     def medium(self) -> HwsimMedium:
         """Return the medium of this setup."""
         antennas = {
-            name: Antenna(radio.standard, float(radio.tx_power_dbm), float(radio.sensitivity_dbm))
+            name: Antenna(
+                radio.standard,
+                float(radio.tx_power_dbm),
+                float(radio.sensitivity_dbm),
+                pattern=None if radio.pattern is None else decode_pattern(radio.pattern),
+            )
             for name, radio in self.radios.items()
         }
         addresses = {
@@ -201,7 +210,8 @@ def _answer(
             case "place":
                 positions_m = {str(name): _vector(position_m) for name, position_m in request["positions"].items()}
                 velocities_m_s = {str(name): _vector(value) for name, value in request["velocities"].items()}
-                medium.air.place(time.monotonic_ns(), positions_m, velocities_m_s)
+                attitudes = {name: Attitude(*_vector(rad)) for name, rad in request.get("attitudes", {}).items()}
+                medium.air.place(time.monotonic_ns(), positions_m, velocities_m_s, attitudes)
                 return medium, {}
             case "totals":
                 links = [

@@ -160,7 +160,8 @@ class Medium(MediumServer):
             )
             self._model.use_meter()
             self._model.log_attempts(None if self._air_log is None else self._air_log.write)
-        self._model.place(time.monotonic_ns(), positions_m, relay, self._layout.velocities_m_s)
+        layout = self._layout
+        self._model.place(time.monotonic_ns(), positions_m, relay, layout.velocities_m_s, layout.attitudes)
 
     def _new_model(self) -> RadioModel[bytes]:
         if self._options.is_fixed:

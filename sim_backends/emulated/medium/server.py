@@ -27,6 +27,7 @@ from sim_backends.radio.antennas import Antenna, decode_antenna
 from sim_backends.radio.frames import TransmissionAttempt
 from sim_backends.radio.links import LinkCounters, Pair
 from sim_backends.radio.radio_options import RadioOptions
+from sim_backends.world.motion import Attitude
 from sim_backends.world.world import World
 
 BURST: Final = 64
@@ -55,11 +56,13 @@ class Layout:
     Attributes:
         positions_m: Position of each robot, metres east, north, up; empty before the first request.
         velocities_m_s: Velocity of each robot.
+        attitudes: Attitude of each robot; empty if no antenna has a pattern.
         relay: The robot whose access point relays between the others; None if they communicate directly.
     """
 
     positions_m: dict[str, Vector] = field(default_factory=dict)
     velocities_m_s: dict[str, Vector] = field(default_factory=dict)
+    attitudes: dict[str, Attitude] = field(default_factory=dict)
     relay: str | None = None
 
     @classmethod
@@ -67,7 +70,8 @@ class Layout:
         """Return the layout from a request to place the robots."""
         positions_m = {name: tuple(position_m) for name, position_m in message["positions"].items()}
         velocities_m_s = {name: tuple(velocity) for name, velocity in message["velocities"].items()}
-        return cls(positions_m, velocities_m_s, message["relay"])
+        attitudes = {name: Attitude(*angles_rad) for name, angles_rad in message.get("attitudes", {}).items()}
+        return cls(positions_m, velocities_m_s, attitudes, message["relay"])
 
 
 class MediumServer(ABC):

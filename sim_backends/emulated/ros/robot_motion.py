@@ -20,7 +20,7 @@ from typing import Final
 
 from fieldkit.core.model import Vector
 from sim_backends.emulated.ros.motion_record import MotionRecord, RecordedMotion
-from sim_backends.world.motion import STILL, WayPoints
+from sim_backends.world.motion import LEVEL, STILL, WayPoints
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def _motion_on(path: AssignedPath, base: RobotMotionState, now_ns: int) -> Robot
     """Return a robot's motion on a path at a time; `base` is its motion when the path started."""
     elapsed_ns = now_ns - path.start_ns
     points_m = [(point_m[0], point_m[1], 0.0) for point_m in path.points_m]  # `speed_m_s` is the horizontal speed
-    (east_m, north_m, _), velocity_m_s, _ = WayPoints("", points_m, path.speed_m_s).at(elapsed_ns)[""]
+    (east_m, north_m, _), velocity_m_s, *_ = WayPoints("", points_m, path.speed_m_s).at(elapsed_ns)[""]
     heading_rad = path.facing_rad
     if velocity_m_s != STILL:
         heading_rad = math.atan2(velocity_m_s[1], velocity_m_s[0])
@@ -230,6 +230,7 @@ class MotionReporter:
         heading_rad: float = 0.0,
         turn_rad_s: float = 0.0,
         odometry: Vector = (0.0, 0.0, 0.0),
+        tilt_rad: tuple[float, float] = LEVEL,
     ) -> None:
         """Record the robot's position and motion. The arguments are the attributes of `RecordedMotion`.
 
@@ -240,5 +241,7 @@ class MotionReporter:
             OSError: There is no space for the record.
         """
         self._record.write(
-            RecordedMotion(now_ns, self.path_start_ns, position_m, velocity_m_s, heading_rad, turn_rad_s, odometry)
+            RecordedMotion(
+                now_ns, self.path_start_ns, position_m, velocity_m_s, heading_rad, turn_rad_s, odometry, tilt_rad
+            )
         )
