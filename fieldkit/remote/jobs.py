@@ -26,6 +26,7 @@ from fieldkit.remote.script import (
 from fieldkit.remote.shell import Completed, Session, Shell
 
 __all__ = [
+    "AGENT_READY_S",
     "HOME",
     "KILLED",
     "READY_S",
@@ -79,6 +80,9 @@ _LIMITED: Final = (
 
 READY_S: Final = 8
 """Time in which a started job must be ready; shorter than `REPLY_S`, so that the robot can report a failure."""
+
+AGENT_READY_S: Final = 30
+"""The same for a Python program, whose imports take several seconds on a busy robot or from a slow SD card."""
 
 
 @dataclass(frozen=True)

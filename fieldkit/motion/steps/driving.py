@@ -99,6 +99,7 @@ def drive_job(scene: Scene, move: Move, inside_s: float, name_pattern: str) -> P
         limit_s=START_S + 2 * limit_s(move) + inside_s,
         log=name_pattern.format(_LOG),
         ready="log:up,",
+        ready_s=jobs.AGENT_READY_S,
     )
     program = robot.profile.tools.python
     return Planned(move.role, job, program=program, setup=setup, permitted_causes=BY_EXIT | BY_FIELDKIT)

@@ -80,7 +80,15 @@ def flight_job(scene: Scene, role: Role, name: str, plan: FlightPlan, limit_s: f
     robot, complete_plan = scene.robot(role), replace(plan, landing_marker=jobs.landing_marker_file(name))
     argv = agent_commands.agent_command(robot, "fly", agent_commands.compact(asdict(complete_plan)))
     log = f"{name}.log"
-    job = Job(folder=scene.folder, name=name, argv=argv, limit_s=limit_s, log=log, ready=f"log:{READY}")
+    job = Job(
+        folder=scene.folder,
+        name=name,
+        argv=argv,
+        limit_s=limit_s,
+        log=log,
+        ready=f"log:{READY}",
+        ready_s=jobs.AGENT_READY_S,
+    )
     return Planned(role, job, program=robot.profile.tools.python, permitted_causes=BY_EXIT)
 
 

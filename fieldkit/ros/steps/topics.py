@@ -111,6 +111,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
             limit_s=duration_s if publishes else 2 * duration_s,
             log=self._log(role),
             ready=None if publishes else "log:up,",
+            ready_s=jobs.AGENT_READY_S,
         )
         setup, program = agent_commands.setup(robot), robot.profile.tools.python
         return Planned(
@@ -137,6 +138,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
             limit_s=3 * (self.patience + self.duration + _OVERHEAD_S),
             log=self.prefixed_name(f"{role}-serve.log"),
             ready="log:up," if is_router else jobs.ready_when_bound(Protocol.TCP, self.listening_port),
+            ready_s=jobs.AGENT_READY_S,
         )
         remedy = "" if is_router else f"sudo apt-get install python3-{MASTER}"
         return Planned(role, job, program=program, setup=setup, permitted_causes=BY_FIELDKIT, remedy=remedy)

@@ -147,33 +147,6 @@ class PolicyError(ConfigurationError):
     """A policy cannot determine a window; the message states the time, the pair and the reason."""
 
 
-_MAX_EMPTY_WINDOWS: Final = 1000
-"""Largest number of successive windows of length 0; after more, the run fails."""
-
-
-class EmptyWindows:
-    """Counts the successive windows in which time does not advance; a limited number is allowed."""
-
-    def __init__(self) -> None:
-        self._at_ns = self._count = 0
-
-    def add(self, policy: str, begin_ns: int, end_ns: int) -> None:
-        """Count a window.
-
-        Raises:
-            PolicyError: There are too many such windows, or time would run backwards.
-        """
-        if begin_ns != self._at_ns:
-            self._at_ns, self._count = begin_ns, 0
-        self._count += 1
-        if end_ns < begin_ns or self._count > _MAX_EMPTY_WINDOWS:
-            raise PolicyError(
-                f"time does not advance beyond {begin_ns} ns",
-                where=policy,
-                remedy="use another policy, or correct it",
-            )
-
-
 def window_ns(policy: str, window_s: float) -> float:
     """Return the length of a window in nanoseconds, which need not be a whole number.
 
