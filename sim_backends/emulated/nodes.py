@@ -35,7 +35,7 @@ from sim_backends.world.world import World
 if TYPE_CHECKING:
     from sim_backends.emulated.linux_wifi.radios import HwsimRadio
 
-# The same radio as on robots, so that a link has the same quality in both directions.
+# The radio of the shipped robot profiles, so that a link has the same quality in both directions.
 LAPTOP_RADIO: Final = Radio(interface="wlan0", standard="802.11n 2.4 GHz", tx_power_dbm=17, sensitivity_dbm=-82)
 
 
@@ -93,7 +93,7 @@ class Node:
 
     @property
     def has_device(self) -> bool:
-        """True if its radio is a TUN or TAP device."""
+        """True if its radio is a TUN or TAP device, which `open_radio` has opened."""
         return self._radio_fd is not None
 
     @property
@@ -191,7 +191,10 @@ class EmulatedRobot(Node):
         self._worker.request({"do": "open wifi", "wifi": asdict(self.spec.wifi), **link})
 
     def recorded_motion(self) -> RecordedMotion | None:
-        """Return the last motion that the robot recorded, or None if it never steered itself. Sends no request."""
+        """Return the last motion that the robot recorded, or None if it never steered itself or does not run.
+
+        The motion is read from shared memory; the robot gets no request.
+        """
         return None if self._record is None else self._record.read()
 
     def start(self) -> None:
@@ -295,7 +298,7 @@ _MAX_PARALLEL_STARTS: Final = 16
 
 @dataclass(frozen=True)
 class RunningRobots(Generic[RobotKey]):
-    """Running robots, attached to their media but not placed yet.
+    """Running robots, attached to their media but not placed yet, or placed 1 m apart (`running_robots`).
 
     Attributes:
         robots: The robots.
@@ -325,8 +328,8 @@ def running_robots(
 ) -> Iterator[RunningRobots[RobotKey]]:
     """Yield robots whose programs are ready; leaving the context stops all their processes.
 
-    The arguments are those of `testbed.bring_up`. Robots that share a ROS master or a Zenoh router start 1 m apart,
-    and connect to it over the radio.
+    The arguments are those of `testbed.bring_up`. If robots share a ROS master or a Zenoh router, all robots are
+    placed 1 m apart when they start, because they connect to it over the radio.
 
     Raises:
         ConfigurationError: The site file fixes a radio mode that one of the robots does not have.
