@@ -209,7 +209,7 @@ def states_bytes(states: Mapping[str, State], agents: AgentTable, limits_m_s2: M
         pack(
             indices[name], 0, e, n, u, v_e, v_n, v_u, nan if heading is None else heading, limits.get(name, infinity)
         )
-        for name, ((e, n, u), (v_e, v_n, v_u), heading, _) in states.items()
+        for name, ((e, n, u), (v_e, v_n, v_u), heading) in states.items()
     ]
     return count_bytes(count) + b"".join(parts)
 

@@ -29,7 +29,7 @@ from sim_backends.mujoco_physics.mjcf import SENSED_NUMBERS, RobotModel, model_x
 from sim_backends.physics.body import Twist, Velocity
 from sim_backends.physics.quadrotor import FlightStatus
 from sim_backends.physics.robot_limits import DriveLimits, QuadrotorLimits
-from sim_backends.world.motion import Lifetime, State
+from sim_backends.world.motion import Lifetime, State, TiltedState
 from sim_backends.world.world import World
 
 _LONGEST_STEP_NS: Final = 1_000_000
@@ -67,7 +67,8 @@ class SensedStates(Mapping[str, State]):
             level = math.hypot(x_e, x_n)
             # Rounding may give a sine above 1.
             tilt_rad = math.asin(max(-1.0, min(y_u / (level or 1.0), 1.0))), math.atan2(-x_u, level)
-            state = self._cache[name] = State((e, n, u), (v_e, v_n, v_u), math.atan2(x_n, x_e), tilt_rad)
+            heading_rad = math.atan2(x_n, x_e)
+            state = self._cache[name] = TiltedState.of((e, n, u), (v_e, v_n, v_u), heading_rad, tilt_rad)
         return state
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "SensedStates":

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple, Protocol, TypeVar
 
 from fieldkit.core.model import Vector
 from sim_backends.physics.collisions import ContactStop, Surface
-from sim_backends.world.motion import State
+from sim_backends.world.motion import State, TiltedState
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +173,8 @@ class Track(NamedTuple):
         """Return the state of the antenna at a step."""
         pose = self.pose(step)
         east_m, north_m, up_m = pose.place_m
-        return State((east_m, north_m, up_m + self.antenna_m), pose.velocity_m_s, pose.heading_rad, pose.tilt_rad)
+        antenna_m = east_m, north_m, up_m + self.antenna_m
+        return TiltedState.of(antenna_m, pose.velocity_m_s, pose.heading_rad, pose.tilt_rad)
 
 
 class Snapshot(Mapping[str, State]):

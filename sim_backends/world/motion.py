@@ -29,13 +29,37 @@ class State(NamedTuple):
         position_m: Metres east, north, up.
         velocity_m_s: Metres per second east, north, up.
         heading_rad: Heading, from east towards north; None if its motion does not define one.
-        tilt_rad: Roll (left side up) and pitch (nose down).
     """
 
     position_m: Vector
     velocity_m_s: Vector = STILL
     heading_rad: float | None = None
-    tilt_rad: tuple[float, float] = LEVEL
+
+    @property
+    def tilt_rad(self) -> tuple[float, float]:
+        """Roll (left side up) and pitch (nose down)."""
+        return self._tilt_rad if isinstance(self, TiltedState) else LEVEL
+
+
+class TiltedState(State):
+    """The state of a robot that is not level.
+
+    The tilt is not an item of the tuple: it is not recorded and not sent to external federates, and it does not
+    affect whether two states are equal.
+    """
+
+    _tilt_rad: tuple[float, float] = LEVEL
+
+    @classmethod
+    def of(
+        cls, position_m: Vector, velocity_m_s: Vector, heading_rad: float | None, tilt_rad: tuple[float, float]
+    ) -> State:
+        """Return a state with this tilt."""
+        if tilt_rad == LEVEL:
+            return State(position_m, velocity_m_s, heading_rad)
+        state = cls(position_m, velocity_m_s, heading_rad)
+        state._tilt_rad = tilt_rad
+        return state
 
 
 class Attitude(NamedTuple):
@@ -197,9 +221,12 @@ class OnGround:
 
 def extrapolate(state: State, seconds: float) -> State:
     """Return the state after this time, at constant velocity."""
-    (e, n, u), velocity_m_s, heading_rad, tilt_rad = state
+    (e, n, u), velocity_m_s, heading_rad = state
     v_e, v_n, v_u = velocity_m_s
-    return State((e + seconds * v_e, n + seconds * v_n, u + seconds * v_u), velocity_m_s, heading_rad, tilt_rad)
+    position_m = e + seconds * v_e, n + seconds * v_n, u + seconds * v_u
+    if isinstance(state, TiltedState):
+        return TiltedState.of(position_m, velocity_m_s, heading_rad, state.tilt_rad)
+    return State(position_m, velocity_m_s, heading_rad)
 
 
 class _ExtrapolatedStates(Mapping[str, State]):

@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 
 from fieldkit.core.model import Vector
 from sim_backends.emulated.ros.slots import Record
-from sim_backends.world.motion import LEVEL, STILL, State
+from sim_backends.world.motion import LEVEL, STILL, State, TiltedState
 
 SILENT_NS: Final = 500_000_000
 """A robot that has not written a record for this long counts as stopped. A moving robot writes much more often."""
@@ -51,7 +51,7 @@ class RecordedMotion(NamedTuple):
     @property
     def state(self) -> State:
         """Position, velocity and attitude as the lab uses them."""
-        return State(self.position_m, self.velocity_m_s, self.heading_rad, self.tilt_rad)
+        return TiltedState.of(self.position_m, self.velocity_m_s, self.heading_rad, self.tilt_rad)
 
     @property
     def is_moving(self) -> bool:

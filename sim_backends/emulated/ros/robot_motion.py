@@ -149,7 +149,7 @@ def _motion_on(path: AssignedPath, base: RobotMotionState, now_ns: int) -> Robot
     """Return a robot's motion on a path at a time; `base` is its motion when the path started."""
     elapsed_ns = now_ns - path.start_ns
     points_m = [(point_m[0], point_m[1], 0.0) for point_m in path.points_m]  # `speed_m_s` is the horizontal speed
-    (east_m, north_m, _), velocity_m_s, *_ = WayPoints("", points_m, path.speed_m_s).at(elapsed_ns)[""]
+    (east_m, north_m, _), velocity_m_s, _ = WayPoints("", points_m, path.speed_m_s).at(elapsed_ns)[""]
     heading_rad = path.facing_rad
     if velocity_m_s != STILL:
         heading_rad = math.atan2(velocity_m_s[1], velocity_m_s[0])

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from fieldkit.config.antennas import AntennaOptions
 from fieldkit.config.profiles import Radio
 from fieldkit.core.model import Vector
+from sim_backends.cosim.scenario.schema import AgentRadio
 from sim_backends.network.packets import Packet
 from sim_backends.network.radio import RadioNetwork
 from sim_backends.radio.antennas import Antenna, antenna_of, decode_antenna
@@ -173,6 +174,7 @@ def test_the_antenna_of_a_profile_survives_its_encodings(antenna: Mapping[str, o
     assert Radio.model_validate(radio.model_dump(mode="json")) == radio
     stations = antenna_of(radio)
     assert decode_antenna(json.loads(json.dumps(asdict(stations)))) == stations
+    assert antenna_of(AgentRadio.model_validate({"antenna": antenna})).pattern == stations.pattern
     assert hash(stations) == hash(antenna_of(radio))
     assert (stations.pattern is None) == (antenna["pattern"] == "isotropic")
 
