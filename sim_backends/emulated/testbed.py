@@ -31,9 +31,10 @@ from sim_backends.emulated import placement as positions
 from sim_backends.emulated.emulated_options import EmulatedOptions, MeshOptions, RosChoice
 from sim_backends.emulated.medium.media import Media
 from sim_backends.emulated.mobility import Mobility
-from sim_backends.emulated.nodes import LAPTOP_RADIO, Laptop, Node, RunningRobots, running_robots
+from sim_backends.emulated.nodes import LAPTOP_RADIO, Laptop, Node
 from sim_backends.emulated.provisioning import LAPTOP_ADDRESS, NETWORK, RobotKey
 from sim_backends.emulated.robot.spec import USER
+from sim_backends.emulated.running_robots import RunningRobots, running_robots
 from sim_backends.world.world import World
 
 _IP_PROTOCOL: Final = {Protocol.TCP: socket.IPPROTO_TCP, Protocol.UDP: socket.IPPROTO_UDP}
