@@ -1,7 +1,7 @@
 """Contacts of upright cylinders with their surroundings: a cylinder stops at an obstacle, and slides along it.
 
-A moving body slides around an obstacle as far as possible; no body is pushed. A move is divided into pieces of at most
-half a radius, so that a body cannot pass through even a thin obstacle. A body that would still overlap stays
+A moving body slides around an obstacle as far as possible; no body is pushed. A move is divided into pieces of at
+most half a radius, so that a body cannot pass through even a thin obstacle. A body that would still overlap stays
 at its previous position, which was free, so no body ever overlaps another body or an obstacle.
 """
 
@@ -111,7 +111,7 @@ class Edge(Protocol):
     """Edges of raised ground, over which no body drives."""
 
     def edge_stop(self, from_m: Vector, to_m: Vector) -> tuple[str, Vector] | None:
-        """Return the name of the area over whose edge a body would drive, and where it stops; None without an edge."""
+        """Return the name of the area over whose edge a body would drive, and where it stops; None if there is none."""
         ...
 
 
@@ -242,7 +242,7 @@ def _move_in_pieces(
 def _push_out(
     extent: Extent, from_m: Vector, to_m: Vector, footprints: Sequence[Footprint], edge: Edge | None
 ) -> tuple[Vector, list[Contact]]:
-    """Return the position of a cylinder after a short path, and its contacts; `from_m` if each pass finds contacts."""
+    """Return the position of a cylinder after a short path, `from_m` if every pass finds contacts; and its contacts."""
     place_m = to_m
     contacts: list[Contact] = []
     for _ in range(_PASSES):
@@ -266,9 +266,9 @@ def _push_out(
 def _exit_direction(footprint: Footprint, extent: Extent, from_m: Vector, place_m: Vector) -> tuple[Vector, float]:
     """Return the direction and distance out of an obstacle that a cylinder overlaps.
 
-    The direction is vertical if a flying body came from above or below, otherwise horizontal and away from the closest
-    point. A driving body that came from above or below, for example on a ramp below a roof, is moved back to its
-    previous position, and so is a body whose axis is within the obstacle.
+    The direction is vertical if a flying body came from above or below, otherwise horizontal and away from the
+    closest point. A driving body that came from above or below, for example on a ramp below a roof, is moved back to
+    its previous position, and so is a body whose axis is within the obstacle.
     """
     closest_e_m, closest_n_m = footprint.closest_m(place_m[0], place_m[1])
     east_m, north_m = place_m[0] - closest_e_m, place_m[1] - closest_n_m

@@ -92,7 +92,7 @@ class Ground:
         return min((area.edge_m(place_m[0], place_m[1]) for area in self._areas), default=math.inf)
 
     def edge_stop(self, from_m: Vector, to_m: Vector) -> tuple[str, Vector] | None:
-        """Return the name of the area over whose edge a body would drive, and where it stops; None without an edge."""
+        """Return the name of the area over whose edge a body would drive, and where it stops; None if there is none."""
         east_m, north_m, up_m = to_m
         drop_m = from_m[2] - self.surface(east_m, north_m).height_m
         if drop_m <= _LEVEL_M + self._max_grade * math.dist(from_m, to_m):
@@ -113,7 +113,7 @@ class Ground:
         return Footprint(area.obstacle.name, area.nearest_m, 0.0, 0.0, top_m, partial(self._wall_m, area))
 
     def _wall_m(self, area: _Area, east_m: float, north_m: float) -> float:
-        """Return the height up to which the side of an area is a wall at a point; 0 if other ground leads up to it."""
+        """Return the height up to which an area's side is a wall at a point; 0 if other ground leads up to it."""
         height_m = area.obstacle.height_m((east_m, north_m))
         other_areas = (
             other for other in self._areas if other is not area and other.distance_m(east_m, north_m) <= _LEVEL_M

@@ -71,8 +71,8 @@ class Minstrel(RateControl):
     Each mode has an exponentially weighted mean of the share of acknowledged attempts: weight 75 % for the old value,
     updated every 100 ms. A frame is sent first in the mode with the highest throughput, then in the second best mode,
     then in the most robust mode, and finally in the slowest mode. The most robust mode has the highest throughput
-    among the modes with at least 95 % success, or without such modes the highest share. Each mode is tried as often as
-    fits into 6 ms, but only half as often and at most twice if its success share is above 95 % or below 10 %. All
+    among the modes with at least 95 % success, or without such modes the highest share. Each mode is tried as often
+    as fits into 6 ms, but only half as often and at most twice if its success share is above 95 % or below 10 %. All
     attempts together do not exceed the retry limit of the standard.
 
     A tenth of the frames are samples. A sample is tried in another mode before the best mode. This mode is faster

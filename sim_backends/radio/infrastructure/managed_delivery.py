@@ -1,8 +1,8 @@
 """Delivers packets of robots that are stations of access points, and management frames of all stations.
 
 The access points share an ideal wired network: it takes no time and has no losses. A packet goes from a robot to its
-access point, over the wired network to the access point of its destination, and to the destination. Packets to a robot
-without an access point, and to a robot that changes its access point, are lost.
+access point, over the wired network to the access point of its destination, and to the destination. Packets to a
+robot without an access point, and to a robot that changes its access point, are lost.
 """
 
 from collections import defaultdict, deque
