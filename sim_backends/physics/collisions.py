@@ -111,7 +111,7 @@ class Edge(Protocol):
     """Edges of raised ground, over which no body drives."""
 
     def edge_stop(self, from_m: Vector, to_m: Vector) -> tuple[str, Vector] | None:
-        """Return the name of the area over whose edge a body would drive, and where it stops; None if there is none."""
+        """Return the name of the area over whose edge a body would drive, and where it stops; None for no edge."""
         ...
 
 
@@ -242,7 +242,10 @@ def _move_in_pieces(
 def _push_out(
     extent: Extent, from_m: Vector, to_m: Vector, footprints: Sequence[Footprint], edge: Edge | None
 ) -> tuple[Vector, list[Contact]]:
-    """Return the position of a cylinder after a short path, `from_m` if every pass finds contacts; and its contacts."""
+    """Return the position of a cylinder after a short path, and its contacts.
+
+    The position is `from_m` if every pass finds contacts.
+    """
     place_m = to_m
     contacts: list[Contact] = []
     for _ in range(_PASSES):

@@ -92,7 +92,7 @@ class Ground:
         return min((area.edge_m(place_m[0], place_m[1]) for area in self._areas), default=math.inf)
 
     def edge_stop(self, from_m: Vector, to_m: Vector) -> tuple[str, Vector] | None:
-        """Return the name of the area over whose edge a body would drive, and where it stops; None if there is none."""
+        """Return the name of the area over whose edge a body would drive, and where it stops; None for no edge."""
         east_m, north_m, up_m = to_m
         drop_m = from_m[2] - self.surface(east_m, north_m).height_m
         if drop_m <= _LEVEL_M + self._max_grade * math.dist(from_m, to_m):
