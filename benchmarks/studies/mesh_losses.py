@@ -28,8 +28,9 @@ from fieldkit.lab.robots import LabRobot
 from fieldkit.remote.shell import Shell
 from fieldkit.remote.ssh import SshShell
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
-from sim_backends.emulated.nodes import EmulatedRobot, running_robots
+from sim_backends.emulated.nodes import EmulatedRobot
 from sim_backends.emulated.robot.spec import USER
+from sim_backends.emulated.running_robots import running_robots
 from sim_backends.world.world import load_world
 
 HELLO_S: Final = 0.5

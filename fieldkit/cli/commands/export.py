@@ -77,7 +77,7 @@ def _load(arguments: argparse.Namespace) -> "Repeats":
 
 def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:
     from fieldkit.export import mcap, timeline
-    from fieldkit.trial.stored import plans, sources
+    from fieldkit.trial.stored import plans, remeasured
 
     folder: Path = arguments.paths[0]
     if len(arguments.paths) > 1:
@@ -87,7 +87,7 @@ def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:
             + shell_command("fieldkit", "export", folder, "--format", "mcap", "-o", f"{folder.name}.mcap"),
         )
     plan = plans.read_plan(folder)
-    sources.note_differences(folder, show_note)
+    remeasured.note_differences(folder, show_note)
     mcap.write(file, timeline.about(plan), timeline.messages(folder, plan))
 
 

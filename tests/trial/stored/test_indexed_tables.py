@@ -242,7 +242,7 @@ EDITS: Final[dict[str, Callable[[Path, int], object]]] = {
     "removed": lambda trial, _: shutil.rmtree(trial),
     "table removed": lambda trial, _: (trial / "trial.csv").unlink(),
     "plan removed": lambda trial, _: (trial / "trial.yaml").unlink(missing_ok=True),
-    "renamed": lambda trial, draw: trial.rename(trial.with_name(f"renamed-{draw}")),
+    "renamed": lambda trial, draw: trial.rename(trial.with_name(f"{trial.name}-{draw}")),
     "hidden": lambda trial, draw: trial.rename(trial.with_name(f".hidden-{draw}")),
     "added": lambda trial, draw: add_trial(trial.parent, 1000 + draw),
     "copied": lambda trial, draw: shutil.copytree(trial, trial.with_name(f"copy-{draw}")),
