@@ -221,8 +221,8 @@ class TopicWriter:
     def _interval_ns(self) -> int:
         """Return the time to the next heartbeat.
 
-        It is doubled after the seventh heartbeat since the last write, and again after every second one, while it stays
-        below its upper limit. It is divided while much data is unacknowledged or samples wait.
+        It is doubled after the seventh heartbeat since the last write, and again after every second one, but
+        stays below its limit. It is divided while much data is unacknowledged or samples wait.
         """
         interval_ns = self._timing.heartbeat_ns
         for _ in range((self._heartbeats_since_write - _HEARTBEATS_AT_FULL_RATE) // 2):
