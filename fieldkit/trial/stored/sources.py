@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -19,15 +19,12 @@ from fieldkit.core.columns import Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError, did_you_mean, shell_command
 from fieldkit.core.executors import Workers
 from fieldkit.core.units import format_count
-from fieldkit.trial import rows, store
+from fieldkit.trial import store
 from fieldkit.trial.plan import PLAN_FILE
-from fieldkit.trial.stored import indexed_tables, plans, tables
+from fieldkit.trial.stored import indexed_tables, tables
 from fieldkit.trial.stored.indexed_tables import NO_INDEX, IndexedTables
 
 ALL_PROCESSORS: Final = Workers()
-
-_MIN_PARALLEL_TRIALS: Final = 8
-"""Smallest number of trials that are measured in parallel by default, because starting processes takes a second."""
 
 Note = Callable[[str], None]
 """Function that shows a sentence about data that is omitted or treated in an unexpected way."""
@@ -177,7 +174,11 @@ class Sources:
             columns = {column.name for column in self.columns} - omitted
         if self.row_filter is not None:
             columns = {*columns, *self.row_filter.names}
-        content = _remeasured_tables(self.tables, self.workers, self.note) if self.rebuild else Path.read_bytes
+        content: Callable[[Path], bytes] = Path.read_bytes
+        if self.rebuild:
+            from fieldkit.trial.stored import remeasured  # noqa: PLC0415 (loads all measuring code)
+
+            content = remeasured.table_reader(self.tables, self.workers, self.note)
         attempts, notes = deduplicated(self._rows(columns, content))
         for note in notes:
             self.note(note)
@@ -354,53 +355,3 @@ def _identity(table: Path) -> object:
     is_folder = table.name == store.TRIAL_CSV or table.is_dir()
     status = (table.parent if is_folder else table).stat()
     return status.st_dev, status.st_ino
-
-
-def _remeasured_tables(tables: Sequence[Path], workers: Workers, note: Note) -> Callable[[Path], bytes]:
-    """Return a function that returns the table of a trial, measured again from its raw evidence."""
-    if workers.is_default and len(tables) < _MIN_PARALLEL_TRIALS:
-        return partial(_remeasured_table, note=note)
-    from fieldkit.core.tasks import completed  # noqa: PLC0415 (needed only to measure again)
-
-    contents: dict[Path, bytes] = {}
-    absolute = [table.absolute() for table in tables]  # workers of a cluster have another working directory
-    for end in completed(_remeasure, absolute, workers, note):
-        if end.result is None:
-            raise end.error or EvidenceError("no table was measured", where=str(tables[end.number]))
-        contents[tables[end.number]], notes = end.result
-        for text in notes:
-            note(text)
-    return contents.__getitem__
-
-
-def _remeasure(table: Path) -> tuple[bytes, list[str]]:
-    """Return a trial's table, measured again, and the notes on it."""
-    notes: list[str] = []
-    return _remeasured_table(table, notes.append), notes
-
-
-def _remeasured_table(table: Path, note: Note) -> bytes:
-    """Return a trial's table, measured again from its raw evidence."""
-    from fieldkit.trial.stored import rebuild  # noqa: PLC0415 (loads all measuring code, which existing tables do not need)
-
-    folder = table.parent
-    if table.name != store.TRIAL_CSV or not (folder / PLAN_FILE).is_file():
-        raise ConfigurationError(
-            "a table alone has no raw evidence to rebuild from",
-            where=str(table),
-            remedy="name the folder of the trial, or leave out --rebuild",
-        )
-    plan = plans.read_plan(folder)
-    note_differences(folder, note)
-    measured_rows, problems = rebuild.measure_rows(folder, plan)
-    if problems:
-        note(f"{folder}: {rebuild.problems_text(problems)}")
-    return rows.to_csv(measured_rows, plan.table).encode()
-
-
-def note_differences(folder: Path, note: Note) -> None:
-    """Show a note if the evidence that is measured again has changed since it was first measured."""
-    from fieldkit.trial.stored import verification  # noqa: PLC0415 (needed only to measure again)
-
-    if differences := verification.differences(folder):
-        note(f"{folder}: measured from changed evidence: {verification.summarize(differences)}")
