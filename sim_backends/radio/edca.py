@@ -258,7 +258,7 @@ class AccessCategories(ChannelAccess, Generic[Payload]):
         return winner.frames
 
     def remaining_ns(self, now_ns: int) -> int:
-        """Return the remaining time of the transmission opportunity; a long time if it has no limit."""
+        """Return the remaining time of the transmission opportunity; a very long time if it has one exchange."""
         return self._txop_end_ns - now_ns if self._txop_end_ns else _UNLIMITED_NS
 
     def continue_ns(self, now_ns: int, exchange_ns: int) -> int | None:

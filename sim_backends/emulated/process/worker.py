@@ -55,7 +55,7 @@ def send(channel: socket.socket, message: Message, deadline: Deadline, descripto
 
 
 def receive(channel: socket.socket, deadline: Deadline) -> tuple[Message, list[int]] | None:
-    """Return the next message and its file descriptors, or None if the peer has closed the socket.
+    """Return the next message and its file descriptors, or None if the peer closed the socket before its end.
 
     Raises:
         OSError: The message was not complete by the deadline, or the connection broke.
@@ -208,7 +208,10 @@ class Worker:
         self._log.close()
 
     def _exit_error(self, cause: str) -> TestbedLostError:
-        """Return the error for a process that does not answer, with the signal that killed it and its last output."""
+        """Return the error for a process that does not answer.
+
+        It has the signal that killed the process, if any, and the last line in the first 64 KiB of its output.
+        """
         if self._log.closed:
             cause, last_line = "it was stopped", ""
         else:
