@@ -19,7 +19,7 @@ from sim_backends.emulated.robot.ssh_server import SSH_PORT
 from sim_backends.emulated.ros.motion_record import MotionRecord, RecordedMotion
 from sim_backends.emulated.ros.robot_motion import AssignedPath
 
-# The same radio as on robots, so that a link has the same quality in both directions.
+# The radio of the shipped robot profiles, so that a link has the same quality in both directions.
 LAPTOP_RADIO: Final = Radio(interface="wlan0", standard="802.11n 2.4 GHz", tx_power_dbm=17, sensitivity_dbm=-82)
 
 
@@ -77,7 +77,7 @@ class Node:
 
     @property
     def has_device(self) -> bool:
-        """True if its radio is a TUN or TAP device."""
+        """True if its radio is a TUN or TAP device, which `open_radio` has opened."""
         return self._radio_fd is not None
 
     @property
@@ -175,7 +175,10 @@ class EmulatedRobot(Node):
         self._worker.request({"do": "open wifi", "wifi": asdict(self.spec.wifi), **link})
 
     def recorded_motion(self) -> RecordedMotion | None:
-        """Return the last motion that the robot recorded, or None if it never steered itself. Sends no request."""
+        """Return the last motion that the robot recorded, or None if it never steered itself or does not run.
+
+        The motion is read from shared memory; the robot gets no request.
+        """
         return None if self._record is None else self._record.read()
 
     def start(self) -> None:

@@ -30,7 +30,7 @@ _MAX_PARALLEL_STARTS: Final = 16
 
 @dataclass(frozen=True)
 class RunningRobots(Generic[RobotKey]):
-    """Running robots, attached to their media but not placed yet.
+    """Running robots, attached to their media but not placed yet, or placed 1 m apart (`running_robots`).
 
     Attributes:
         robots: The robots.
@@ -60,8 +60,8 @@ def running_robots(
 ) -> Iterator[RunningRobots[RobotKey]]:
     """Yield robots whose programs are ready; leaving the context stops all their processes.
 
-    The arguments are those of `testbed.bring_up`. Robots that share a ROS master or a Zenoh router start 1 m apart,
-    and connect to it over the radio.
+    The arguments are those of `testbed.bring_up`. If robots share a ROS master or a Zenoh router, all robots are
+    placed 1 m apart when they start, because they connect to it over the radio.
 
     Raises:
         ConfigurationError: The site file fixes a radio mode that one of the robots does not have.

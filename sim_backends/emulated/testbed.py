@@ -148,7 +148,7 @@ class EmulatedTestbed:
         return DONE
 
     def inject(self, fault: Fault) -> float | None:
-        """Implement `Testbed.inject`; the fault is also reverted if the call is interrupted."""
+        """Implement `Testbed.inject`; if the call is interrupted, a link or a robot is switched on again at once."""
         robot = self.robots[fault.role]
         match fault.kind:
             case FaultKind.LINK_DOWN:
@@ -189,7 +189,10 @@ class LinuxWifiTestbed(EmulatedTestbed):
 
 
 def _apply_for(duration_s: float, apply: Callable[[], None], revert: Callable[[], None]) -> float:
-    """Call `apply`, and `revert` after `duration_s` or on an interrupt; return the seconds between both calls."""
+    """Call `apply`, and `revert` after `duration_s` or on an interrupt.
+
+    Return the seconds from the end of `apply` to the end of `revert`.
+    """
     apply()
     start_s = time.monotonic()
     try:

@@ -61,7 +61,7 @@ class Pose(Protocol):
 
     @property
     def tilt_rad(self) -> tuple[float, float]:
-        """Its roll (left side up) and pitch (nose down) relative to the ground."""
+        """Its roll (positive with the left side up) and pitch (positive with the nose down) from level."""
         ...
 
 

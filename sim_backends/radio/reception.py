@@ -41,7 +41,7 @@ class _Reach:
     Attributes:
         powers_mw: The list returned by `RadioChannel.powers_mw`.
         detected_by: Indices of the stations that detect its frames and therefore do not send.
-        weakest_ratio: Smallest ratio of its power to the noise at these stations.
+        weakest_ratio: Smallest ratio of its power to the noise at these stations; infinite if there are none.
     """
 
     powers_mw: list[float]
@@ -244,7 +244,7 @@ class Reception(Generic[Payload]):
         station.sending_until_ns = min(station.sending_until_ns, now_ns)
 
     def set_emissions(self, now_ns: int, emissions: Mapping[str, Emission]) -> None:
-        """Set the noise on the air until the next call, by jammer name. Received powers of a jammer may change."""
+        """Set the noise on the air until the next call, by name of its source, whose received powers may change."""
         for name, emission in self._emissions.items():
             if name not in emissions:
                 emission.end_ns = now_ns
@@ -257,7 +257,7 @@ class Reception(Generic[Payload]):
         self._emissions = current
 
     def is_jammed(self, index: int) -> bool:
-        """Return True if the jammer noise at a station is so strong that the station does not send."""
+        """Return True if the noise of jammers and ovens at a station is so strong that the station does not send."""
         emissions = self._emissions.values()
         return bool(emissions) and sum(emission.powers_mw[index] for emission in emissions) >= _ENERGY_DETECTION_MW
 

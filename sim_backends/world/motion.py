@@ -166,8 +166,8 @@ class WayPoints:
         """Return an acceleration a for which an extrapolation by the time t has an error of at most a t^2 / 2.
 
         The extrapolation uses the current velocity, so it has no error until the robot is at the next corner, after
-        the time c. From then on, the true and the extrapolated velocity have the same speed v and differ by at most
-        2 v. The error is therefore at most 2 v (t - c), which is at most (v / c) t^2 / 2.
+        the time c. From then on, neither the true nor the extrapolated velocity exceeds the speed v, so they differ
+        by at most 2 v. The error is therefore at most 2 v (t - c), which is at most (v / c) t^2 / 2.
         """
         corner = bisect_right(self._times_ns, time_ns)
         if corner == len(self._times_ns):

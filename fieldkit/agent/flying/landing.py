@@ -30,7 +30,7 @@ _MODE_WAIT_S = 0.3
 """Maximum wait for a heartbeat before the first command, because the last heartbeat may be older than a takeover by a
 person."""
 _LANDING_TIMEOUT_S = 600.0
-"""Maximum time between the first command to come down and the stop of the motors."""
+"""Maximum time between a call of `bring_down` and the stop of the motors."""
 NO_HEARTBEAT_S = 60.0
 """Time for which commands are sent although no heartbeat arrives, because a lost connection may be restored."""
 
@@ -60,9 +60,10 @@ def bring_down(
 
     Commands are sent only while `may_command` returns True: in the modes in which fieldkit controls the drone. Before
     the first command, it waits up to `_MODE_WAIT_S` for a new heartbeat, because the mode may have changed since the
-    last one. A drone that lands or returns automatically is only monitored. An autopilot without heartbeats may still
-    receive commands, and the connection may be restored: for `NO_HEARTBEAT_S` its last reported mode is assumed, and
-    commands are sent. A missing heartbeat causes an alarm in the log.
+    last one. A drone that lands or returns automatically, or whose unknown autopilot has accepted the command, is
+    only monitored. An autopilot without heartbeats may still receive commands, and the connection may be restored:
+    for `NO_HEARTBEAT_S` its last reported mode is assumed, and commands are sent. A missing heartbeat causes an alarm
+    in the log.
 
     Args:
         session: The session with its autopilot.
@@ -124,7 +125,7 @@ def alarm(drone: AutopilotState) -> str:
     if drone.last_position_m is not None:
         north_m, east_m, down_m = drone.last_position_m
         position_text = (
-            f"LAST KNOWN {drone.position_age_s:.0f} S AGO {north_m:.1f} M NORTH, {east_m:.1f} M EAST, "
+            f"LAST POSITION {drone.position_age_s:.0f} S AGO: {north_m:.1f} M NORTH, {east_m:.1f} M EAST, "
             f"{-down_m:.1f} M UP IN ITS LOCAL FRAME"
         )
     heartbeat = "NO HEARTBEAT"

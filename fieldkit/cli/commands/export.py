@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 
 def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit export`."""
-    parser.description = "Write the rows of trials as one table, or the events of one trial as a time line."
+    parser.description = (
+        "Write the rows of trials as one table, the events of one trial as a time line, or the results of repeats "
+        "and expectations for CI servers."
+    )
     shared.add_paths(parser)
     parser.add_choice(
         "--format",

@@ -115,6 +115,11 @@ def test_a_replaced_table_of_the_same_size_and_time_is_read_again(tmp_path: Path
     assert outcome(tmp_path / "trials", use_index=True) == outcome(tmp_path / "trials", use_index=False)
 
 
+def test_a_pipe_without_a_plan_is_not_indexed(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "table.csv")
+    assert table_index.stamp(tmp_path / "table.csv", tmp_path / "trial.yaml") is None
+
+
 def test_a_table_that_has_just_changed_is_not_indexed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(table_index, "SETTLED_S", 3600.0)
     write_archive(tmp_path / "trials")
