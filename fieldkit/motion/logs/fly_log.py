@@ -41,7 +41,10 @@ COLUMNS: Final = columns(
     (
         "fly_farthest_m",
         "m",
-        "Largest horizontal distance from the position of the drone's first take-off at its place.",
+        (
+            "Largest horizontal distance from the position of the drone's first take-off in the trial (in a campaign: "
+            "at this place)."
+        ),
         Figure("farthest distance flown", Kind.MEDIAN),
     ),
     (
