@@ -6,7 +6,7 @@ grows linearly. In the same round a peer program (`pandas_peer`) reads the small
 concatenates and groups them, and scipy computes a bootstrap interval per condition and quantity. The benchmark stops
 if the counts, means, medians or 95th percentiles of the two programs differ.
 
-`--rows N` adds one table of N repeats, like the CSV that `fieldkit export` writes for a campaign.
+`--rows N` adds one table of N repeats (a multiple of 40), like the CSV that `fieldkit export` writes for a campaign.
 """
 
 import argparse
@@ -67,7 +67,7 @@ def write_tables(folder: Path, count: int) -> None:
 
 
 def write_table(path: Path, rows: int) -> None:
-    """Write one table of `rows` repeats."""
+    """Write one table of `rows` repeats, rounded down to a multiple of `REPEATS`."""
     generator = np.random.default_rng(1)
     with path.open("w", encoding="utf-8") as file:
         file.write(_header())

@@ -85,7 +85,7 @@ PATHS: Final = (
 
 
 def dds_plain(name: str, deliver: Deliver | None) -> Write:
-    """Start a publisher, or a subscriber if `deliver` is given, with the binding of CycloneDDS and its own type."""
+    """Start a publisher, or a subscriber if `deliver` is given, with the binding of CycloneDDS and a plain type."""
     from cyclonedds.domain import Domain, DomainParticipant  # noqa: PLC0415
     from cyclonedds.idl import make_idl_struct, types  # noqa: PLC0415
     from cyclonedds.pub import DataWriter  # noqa: PLC0415
@@ -366,7 +366,7 @@ def main() -> int:
 
 
 def spread(values: Sequence[float]) -> str:
-    """Return the median, followed by the smallest and the largest value."""
+    """Return the median, followed by the smallest and the largest value; empty without values."""
     return f"{_figure(median(values))} ({_figure(min(values))} to {_figure(max(values))})" if values else ""
 
 

@@ -25,7 +25,7 @@ class Memory:
 
     @classmethod
     def of(cls, pid: int) -> Self:
-        """Return the memory of a process and all its descendants.
+        """Return the memory of the processes of `tree`.
 
         Forks share anonymous pages, which belong only to this tree. A file page, of a program or a library, counts as
         own if only one process has it.
@@ -36,7 +36,7 @@ class Memory:
 
 
 def cpu_s(pid: int) -> float:
-    """Return the processor time of a process and all its descendants, with terminated and awaited ones."""
+    """Return the processor time of the processes of `tree` and of their terminated and awaited children."""
     total_s = 0.0
     for process in tree(pid):
         total_s += sum(_scheduled_ns(thread) for thread in Path(f"/proc/{process}/task").iterdir()) / 1e9
@@ -48,7 +48,7 @@ def cpu_s(pid: int) -> float:
 
 
 def tree(pid: int) -> Iterator[int]:
-    """Yield a process and all its descendants."""
+    """Yield a process and its descendants, without children that a thread other than the main thread started."""
     yield pid
     for child in Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split():
         yield from tree(int(child))

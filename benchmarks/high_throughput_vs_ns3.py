@@ -1,13 +1,13 @@
 """802.11n, ac and ax compared with ns-3: `python -m benchmarks.high_throughput_vs_ns3 [--json]`.
 
-Needs ns-3 3.37 and a C++ compiler: `apt-get install libns3-dev g++`. For all modes, airtimes and packet errors of
-1000 bytes are compared. Known differences of airtimes are due to ns-3: it does not end the data of short guard
-intervals at multiples of 4 us (IEEE 802.11-2020, 19.4.3, 21.4.3), omits VHT-SIG-B (4 us) of frames to one station,
-and uses 8 us for each HE-LTF at all guard intervals. Then goodput with A-MPDU is compared in one mode: for one
-station at signal-to-noise ratios down to the limit of its range; for several stations; with RTS; and with access
-categories. In rows `bare` and in rows with an access category, ns-3 has no retry limit and sends no BlockAckReq: ns-3
-3.37 does not reset its count of failed aggregates to a receiver when an aggregate succeeds, so it drops a whole
-aggregate at the seventh failure.
+Needs ns-3 3.37 and a C++ compiler: `apt-get install libns3-dev g++`. Airtimes are compared for all modes at 5 GHz,
+and packet errors of 1000 bytes for the modes with one stream in 40 MHz and a guard interval of 800 ns. Known
+differences of airtimes are due to ns-3: it does not end the data of short guard intervals at multiples of 4 us (IEEE
+802.11-2020, 19.4.3, 21.4.3), omits VHT-SIG-B (4 us) of frames to one station, and uses 8 us for each HE-LTF at all
+guard intervals. Then goodput with A-MPDU is compared in one mode: for one station at signal-to-noise ratios down to
+the limit of its range; for several stations; with RTS; with A-MSDUs; and with access categories. In rows `bare` and
+in rows with an access category, ns-3 has no retry limit and sends no BlockAckReq: ns-3 3.37 does not reset its count
+of failed aggregates to a receiver when an aggregate succeeds, so it drops a whole aggregate at the seventh failure.
 """
 
 import argparse
@@ -75,7 +75,7 @@ def all_modes() -> Iterator[WifiMode]:
 
 
 def unexplained_ns(mode: WifiMode, size_bytes: int, ns3_ns: int) -> int:
-    """Return the difference of an airtime from that of ns-3, without the differences that the standard explains."""
+    """Return the difference of an airtime from that of ns-3, without the known differences (see this module)."""
     airtime_ns = mode.airtime_ns(size_bytes)
     if mode.phy_format == "VHT":
         airtime_ns -= 4_000

@@ -1,6 +1,6 @@
 // Prints results of ns-3 for 802.11 links, for radio_vs_ns3.py and cosim_vs_ns3.py:
 //
-// - `errors`: frame error by mode and SNR;
+// - `errors`: frame error of a mode by SNR;
 // - `durations`: airtime in ns by frame size in bytes;
 // - `link`: goodput in Mbit/s, by traffic class, of saturated stations that send UDP to one receiver, all with the same
 //   distance from each other;
@@ -192,7 +192,7 @@ NetDeviceContainer Install(const Options& options, NodeContainer nodes,
     return devices;
 }
 
-// Goodput of the stations of each traffic class.
+// Goodput in Mbit/s of the stations of each traffic class.
 std::vector<double> Goodputs(const Options& options)
 {
     if (options.bare)
@@ -275,7 +275,7 @@ std::vector<double> Goodputs(const Options& options)
     return bits;
 }
 
-// Goodputs of two pairs of stations: station 0 sends to 1, and 2 to 3. The losses are equal, except those from the first
+// Goodputs in Mbit/s of two pairs of stations: 0 sends to 1, and 2 to 3. The losses are equal, except those from the first
 // pair to the second one.
 std::vector<double> PairGoodputs(const Options& options)
 {
@@ -361,7 +361,7 @@ Ipv4InterfaceContainer Cable(const Options& options, NodeContainer& nodes)
     return interfaces;
 }
 
-// Two nodes, on a cable or over Wi-Fi. Over Wi-Fi packets wait only in the queue of the MAC, without a time limit.
+// Two nodes, on a cable or over Wi-Fi. Over Wi-Fi packets wait only in the queue of the MAC, for up to 1000 s.
 Ipv4InterfaceContainer Pair(const Options& options, NodeContainer& nodes)
 {
     if (options.cable)
@@ -539,7 +539,7 @@ int main(int argc, char** argv)
     command.AddValue("adapt", "choose the mode by Minstrel", options.adapt);
     command.AddValue("control", "congestion control of TCP", options.control);
     command.AddValue("recovery", "loss recovery of TCP", options.recovery);
-    command.AddValue("rate", "rate of the UDP stream, Mbit/s", options.rate_mbit_s);
+    command.AddValue("rate", "rate of the UDP stream, and of the cable, Mbit/s", options.rate_mbit_s);
     command.AddValue("queue", "queue limit, packets", options.queue);
     command.AddValue("cable", "use a cable instead of a radio, and print all TCP events", options.cable);
     command.AddValue("delay", "delay of the cable, ms", options.delay_ms);

@@ -57,7 +57,7 @@ def peak_kb():
 before = peak_kb()
 print(json.dumps([sum(len(part.packets) for part in pcap.stream(pathlib.Path(sys.argv[1]))), before, peak_kb()]))
 """
-"""Prints the number of packets of a file, and the peak memory of this process before and after reading them."""
+"""Prints the number of packets of a file, and the peak memory of its process in KiB before and after reading them."""
 
 READ: Final = STREAM.replace("sum(len(part.packets) for part in pcap.stream(", "len(pcap.read(").replace(
     "sys.argv[1])))", "sys.argv[1])).packets)"
@@ -108,7 +108,7 @@ def losses_by_fieldkit(sender: Path, receiver: Path) -> int:
 
 
 def lost_count(sent: Iterable[Key], received: Iterable[Key]) -> int:
-    """Return the number of keys that arrived less often than they were sent."""
+    """Return the number of sent packets that did not arrive; packets with the same key are counted individually."""
     return (Counter(sent) - Counter(received)).total()
 
 

@@ -219,9 +219,9 @@ def rows(ns3: Ns3) -> list[Row]:
 
 
 def main() -> None:
-    """Run both, print the table, and draw the figure if `--figure` is given."""
+    """Run both, print the table, and draw the figure if `--figure` is given; or only print JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", action="store_true", help="print single values as JSON")
+    parser.add_argument("--json", action="store_true", help="print single values as JSON, and draw no figure")
     parser.add_argument("--figure", type=Path, help="write the curves of both to this SVG file")
     arguments = parser.parse_args()
     ns3 = build()

@@ -3,7 +3,8 @@
 Each command of fieldkit runs alternately with its references: Python that does nothing, `git --version`, and Python
 that only imports the libraries of the command. The benchmark measures wall time, processor time and the peak memory
 of the process, which is at least the 16 MB of the benchmark. The main figure is the command's processor time minus
-the time to import its libraries. `--peer PYTHON` runs fieldkit of another checkout with that Python.
+the time to import its libraries. `--peer PYTHON` also runs fieldkit of another checkout with that Python, except for
+the completion.
 """
 
 import argparse

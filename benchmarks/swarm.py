@@ -114,7 +114,7 @@ def round_trips(client: Namespace) -> Figures:
 
 
 def lateness(medium: MediumClient, before: Counter[int]) -> Figures:
-    """Return the lateness of the medium's packets since the counts `before`."""
+    """Return the lateness of the medium's packets since the counts `before`, in ms."""
     late = Lateness(bound_ns=1, packets=Counter(medium.stats().packet_lateness_counts) - before)
     shares = {"median": 0.5, "p99": 0.99, "max": 1.0}
     return {
@@ -123,7 +123,7 @@ def lateness(medium: MediumClient, before: Counter[int]) -> Figures:
 
 
 def throughput(client: Namespace, server: Namespace, seconds: float) -> Figures:
-    """Return the rate of small packets that `server` receives."""
+    """Return the rate of small packets that `server` receives, in packets per second."""
     with listening_iperf(server):
         arrived = packets_in(server)
         udp = iperf(client, seconds, "-u", "-b", "0", "-l", str(PAYLOAD_BYTES))
@@ -131,7 +131,7 @@ def throughput(client: Namespace, server: Namespace, seconds: float) -> Figures:
 
 
 def tcp(client: Namespace, server: Namespace, seconds: float) -> Figures:
-    """Return the throughput of TCP."""
+    """Return the throughput of TCP, in Mbit/s."""
     with listening_iperf(server):
         return {"tcp_mbit_s": iperf(client, seconds)["sum_received"]["bits_per_second"] / 1e6}
 

@@ -132,7 +132,7 @@ def stream_together(plain: Sequence[RunningPath], agent_pair: AgentPair, rates_h
 
 
 def measure_round(over: str, number: int, agent_pair: AgentPair, environment: dict[str, str]) -> dict[str, Any]:
-    """Return the results of a middleware in a round: median delay and rate of a burst, by pair."""
+    """Return the results of a middleware in a round, by pair: median delay, and rate of a burst if it had one."""
     pairs = (*PLAIN[over], "agent")
     rates_hz = [RATES_HZ[(place + number) % len(pairs)] for place in range(len(pairs))]
     with ExitStack() as stack:

@@ -1,6 +1,6 @@
 """Judgements of expectations by measured figures. If repeats are missing or censored, the ruling is never `holds`.
 
-A cell contains the repeats under one condition, and their estimates.
+A cell has the estimates and counts of the repeats under one condition.
 """
 
 import math
@@ -36,8 +36,8 @@ class Judgement:
         cell: The repeats; None if there are none.
         ruling: The outcome.
         estimate: The estimate; None if no valid repeat has a value.
-        why: Reason for the ruling that the numbers do not show: repeats without a value, or the number of repeats
-            that are needed.
+        why: Reason for the ruling that the numbers do not show, for example repeats without a value, or the number of
+            repeats that are needed; empty if there is none.
         met: Number of repeats that meet the expectation; None if it does not refer to single repeats.
         limit: One-sided 95 % bound that determines the ruling, of the share of repeats that meet the expectation or
             of the loss; None if the ruling depends on no such bound.
@@ -68,7 +68,7 @@ class _Decision:
 
 
 def judge(expectations: Sequence[Expectation], cells: Sequence[Cell]) -> tuple[Judgement, ...]:
-    """Return the judgements of expectations, in their order. If there are no cells, all of them are undecided."""
+    """Return the judgements of expectations, in their order. An expectation that no cell fits is undecided."""
     return tuple(judgement for expectation in expectations for judgement in _judge_cells(expectation, cells))
 
 

@@ -36,8 +36,8 @@ class CellFigure:
         unit: Its unit.
         n: Number of valid repeats that have it.
         value: The figure.
-        low: Lower end of the interval; minus infinity for a single repeat, which has no interval.
-        high: Upper end; infinity for a single repeat.
+        low: Lower end of the interval; minus infinity without an interval, for example for a single repeat.
+        high: Upper end; infinity without an interval, or if censored repeats leave it open.
     """
 
     name: str

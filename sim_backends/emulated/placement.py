@@ -20,7 +20,8 @@ _SPACING_M: Final = 5.0
 """Maximum distance of neighbouring robots in an interactive lab."""
 
 _CEILING_M: Final = 100_000.0
-"""Maximum height of a flying robot: the boundary of space by the definition of the FAI."""
+"""Maximum height of a flying robot above the ground. The FAI defines this height above sea level as the boundary of
+space."""
 
 
 def positions_m(cast: Cast, placement: Placement, world: World) -> dict[str, Vector]:
@@ -136,7 +137,7 @@ def destination_m(start_m: Vector, to: Destination, world: World) -> Vector:
         world: The world around the robot.
 
     Raises:
-        ConfigurationError: The destination is outside the world, below its ground, or above 100 km.
+        ConfigurationError: The destination is outside the world, below its ground, or more than 100 km above it.
     """
     origin_m = start_m[:2] if to.relative else (0.0, 0.0)
     end_m = origin_m[0] + to.east_m, origin_m[1] + to.north_m
@@ -156,8 +157,8 @@ def destination_m(start_m: Vector, to: Destination, world: World) -> Vector:
     up_m = ground_m + above_ground_m
     if not 0 <= above_ground_m <= _CEILING_M:
         raise ConfigurationError(
-            f"{up_m:g} m up is not a valid height: the ground is at {ground_m:g} m there, and nothing flies above "
-            f"{_CEILING_M / 1000:g} km",
+            f"{up_m:g} m up is not a valid height: the ground is at {ground_m:g} m there, and nothing flies more "
+            f"than {_CEILING_M / 1000:g} km above it",
             remedy=f"omit UP for a robot on the ground, whose antenna is {ANTENNA_M:g} m above it",
         )
     return *end_m, up_m

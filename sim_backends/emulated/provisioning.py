@@ -138,7 +138,7 @@ def _neighbours(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) ->
 
 
 def neighbour(number: int, profile: RobotProfile) -> Neighbour:
-    """Return the body of a robot as a cylinder, from the ground up to its antenna, or to its top if that is higher.
+    """Return the body of a robot as a cylinder: from `ANTENNA_M` below its antenna up to its antenna or higher top.
 
     A robot whose body is unknown has the body of the paper's ground robot or of the paper's drone.
     """
@@ -192,7 +192,8 @@ def drives_by_topic(profile: RobotProfile, options: EmulatedOptions) -> bool:
 def ros2_middleware(profile: RobotProfile, options: EmulatedOptions) -> str:
     """Return the middleware of a profile's ROS 2 over the radio: `dds`, `zenoh`, or "" if it has none.
 
-    The result is also "" if the middleware is not installed on this machine.
+    The result is also "" if the site file selects the built-in ROS, or if the middleware is not installed on this
+    machine.
     """
     ros = profile.ros
     if ros is None or ros.variant != "ros2" or options.ros is RosChoice.BUILTIN:
@@ -282,7 +283,10 @@ def _ros2_spec(
 
 
 def _bridge(robot: "Robot | LabRobot") -> tuple[str, ...]:
-    """Return the command of the bridge that starts with the robot in an interactive lab; empty in a trial."""
+    """Return the command of the bridge that starts with the robot in an interactive lab.
+
+    It is empty in a trial, and for a profile without a bridge.
+    """
     ros = robot.profile.ros
     if ros is None or ros.bridge is None or isinstance(robot, Robot):
         return ()

@@ -102,7 +102,7 @@ class AgentStart:
         start: State of its antenna at time 0.
         flies: True if it flies.
         antenna_m: Height of the antenna above the body's position.
-        limit_m_s2: Largest change of its velocity per second.
+        limit_m_s2: Largest change of its velocity per second; infinity if it is unknown.
     """
 
     name: str
@@ -127,7 +127,7 @@ class Hello:
         step_ns: Physics step that the scenario requests.
         end_ns: End of the run.
         name: Name of the scenario.
-        configuration: JSON with scenario, world and robots.
+        configuration: JSON with scenario, world, robots and options.
         heartbeat_ms: Interval at which a federate sends `busy` while it computes.
         token: Token of a connection between machines.
     """

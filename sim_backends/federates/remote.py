@@ -168,7 +168,9 @@ class RemoteNetwork(_RemoteFederate):
         self._log_delay = log
 
     def sample_links(self) -> dict[str, LinkSample]:
-        """Return a sample of the links of each radio, at the network's current time; empty if there are no radios.
+        """Return a sample of the links of each radio, at the network's current time.
+
+        The result is empty if there are no radios, or if the network does not declare this capability.
 
         Raises:
             FederateError: The network failed, or sent a malformed answer.

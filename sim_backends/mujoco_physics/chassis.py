@@ -132,7 +132,7 @@ CASTER_RADIUS_M: Final = 0.01
 
 
 def chassis(profile: str, limits: DriveLimits) -> Chassis:
-    """Return the chassis of a profile; for an unknown profile, a TurtleBot3 Burger scaled to the robot's size."""
+    """Return the Husky's chassis for the profile `husky`, otherwise a TurtleBot3 Burger of the robot's radius."""
     if profile == "husky":
         return HUSKY
     factor = limits.radius_m / TURTLEBOT3_BURGER.radius_m

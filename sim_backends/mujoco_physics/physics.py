@@ -47,11 +47,11 @@ _PARKED_UP_M: Final = 0.0
 
 
 class SensedStates(Mapping[str, State]):
-    """The states of all agents at a step, each created on request.
+    """The states of the present agents at a step, each created on request.
 
     Args:
-        rows: Position of each agent in the order of the sensors.
-        numbers: The values of all sensors, `SENSED_NUMBERS` for each agent.
+        rows: Position of each present agent in the order of the sensors.
+        numbers: The values of all sensors, `SENSED_NUMBERS` for each agent, also for absent agents.
     """
 
     def __init__(self, rows: Mapping[str, int], numbers: Sequence[float]) -> None:

@@ -56,11 +56,11 @@ class RadioNetwork:
     Attributes:
         now_ns: Current simulated time.
         extrapolates: True, because dead-reckoned states are evaluated at the time of each event.
-        transmitters: Stations that send independently of the traffic: the relay, and agents that carry a jammer.
+        transmitters: Stations whose positions matter for packets of others: the relay, and carriers of a jammer.
         fixed_emitters_m: Positions of the jammers that no agent carries.
 
     Raises:
-        ConfigurationError: A disturbance or the relay names an unknown station.
+        ConfigurationError: A node loss, a link cut or the relay names an unknown station.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class RadioNetwork:
         radio.log_losses(self._on_fragment_lost)
 
     def log_ip(self, log: IpLog | None) -> None:
-        """Pass every IP packet that a host sends or receives from now on to `log`; None stops logging."""
+        """Pass every packet or fragment that a host sends or receives from now on to `log`; None stops logging."""
         self._log_ip = log
 
     def log_delays(self, log: DelayLog | None) -> None:
@@ -218,10 +218,11 @@ class RadioNetwork:
             call()
 
     def _place(self, at_ns: int) -> bool:
-        """Pass the positions of the stations at `at_ns`, the time of the next event, to the radio if they changed.
+        """Pass the positions of the stations at `at_ns`, the time of the next event, to the radio.
 
         Returns:
-            True if the positions changed. The next event of the radio may then be a different one.
+            False if the states are the same object as in the last call, which then changes nothing. If True, the next
+            event of the radio may be a different one.
         """
         states = self._states.at(at_ns) if isinstance(self._states, DeadReckoned) else self._states
         if states is self._placed_states:

@@ -155,7 +155,7 @@ class DifferentialDrive:
         limits: Its limits and size.
         place_m: Position at time 0, metres east and north.
         heading_rad: Its heading, from east towards north.
-        antenna_m: Height of its antenna above the ground.
+        antenna_m: Height of its antenna above the ground; None for the height of the robot.
     """
 
     def __init__(

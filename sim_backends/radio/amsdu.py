@@ -123,7 +123,10 @@ class AmsduSession(BlockAckSession[Payload]):
     def _next_frame(
         self, packets: Sequence[Frame[Payload]], first: int, room_bytes: int, *, is_single: bool
     ) -> list[Frame[Payload]]:
-        """Return the packets of the frame that starts with a packet: those of its last attempt, or as many as fit."""
+        """Return the packets of the frame that starts with a packet: those of its last attempt, or as many as fit.
+
+        A probe that was not sent before has only the first packet.
+        """
         sequence = packets[first].sequence
         frame = [packets[first]]
         if is_single and sequence < 0:

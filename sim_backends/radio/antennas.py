@@ -17,7 +17,7 @@ class RadioSettings(Protocol):
 
     @property
     def standard(self) -> str:
-        """Its standard, `802.11n 2.4 GHz`."""
+        """Its standard, for example `802.11n 2.4 GHz`."""
         ...
 
     @property
@@ -32,12 +32,12 @@ class RadioSettings(Protocol):
 
     @property
     def phy(self) -> WifiPhy | None:
-        """Its physical layer."""
+        """Its physical layer; None if it is not described."""
         ...
 
     @property
     def antenna(self) -> AntennaOptions | None:
-        """Its antenna."""
+        """Its antenna; None if it is isotropic."""
         ...
 
 
@@ -118,14 +118,16 @@ def band_of(antennas: Mapping[str, Antenna]) -> Band:
 
 
 def fixed_mode(name: str | None, antennas: Mapping[str, Antenna]) -> WifiMode | None:
-    """Return the mode in which all stations must send. Stations of 802.11n and later also support modes of 802.11g.
+    """Return the mode in which all stations must send; None if each station chooses its mode.
+
+    Stations of 802.11n and later also support modes of 802.11g, or at 5 GHz of 802.11a.
 
     Args:
         name: Name of the mode; None if each station chooses its mode.
         antennas: The stations, by name.
 
     Raises:
-        ConfigurationError: A station does not support the mode.
+        ConfigurationError: A station does not support the mode, or the stations have different bands.
     """
     if name is None:
         return None

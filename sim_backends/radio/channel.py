@@ -15,7 +15,7 @@ class RadioChannel(Protocol):
     """The received power of each station at each other station.
 
     Attributes:
-        names: Names of the stations; all other methods identify stations by their index in this list.
+        names: Names of the stations; the methods identify stations by their index in this list.
         noise_mw: Noise power at each station, in mW.
         sensitivity_mw: Received power of the weakest frame that each station detects, in mW. A station does not send
             while it detects a frame.

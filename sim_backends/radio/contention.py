@@ -25,7 +25,10 @@ class ChannelAccess(Protocol):
         """Inter-frame space before the backoff; 0 if each queue adds an inter-frame space."""
 
     def earliest_start_ns(self, now_ns: int) -> int:
-        """Return the earliest start time of a station with a frame to send at `now_ns`, if the channel stays idle."""
+        """Return the earliest start time of a station with a frame to send at `now_ns`, if the channel stays idle.
+
+        Slots that were idle until `now_ns` are counted down.
+        """
 
     def on_busy(self, now_ns: int, until_ns: int) -> None:
         """Record that the channel is busy from `now_ns` to `until_ns`, for a station that has nothing to send."""
@@ -83,7 +86,10 @@ class Contention:
         self.slots = 0
 
     def earliest_start_ns(self, now_ns: int) -> int:
-        """Return the earliest start time of a station with a frame to send at `now_ns`, if the channel stays idle."""
+        """Count down the slots that were idle until `now_ns`, and return the earliest start time from then on.
+
+        A backoff is drawn if the channel is busy and no slots remain.
+        """
         self._count_down(now_ns)
         if now_ns < self.busy_until_ns and not self.slots:
             self._draw_backoff()

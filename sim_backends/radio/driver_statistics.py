@@ -117,7 +117,7 @@ def link_samples(
     busy_ns = meter.busy_ns(now_ns)
 
     def peers_of(index: int) -> Sequence[int]:
-        """Return the stations to which a station sends frames: all others, or its access point."""
+        """Return the stations to which a robot sends frames: all other robots, or its access point if it has one."""
         if cells is not None:
             access_point = cells[index]
             return [] if access_point is None else [access_point]

@@ -72,7 +72,7 @@ def category_of(dscp: int, mapping: DscpMapping) -> int:
 
     Args:
         dscp: Differentiated services code point, 0 to 63.
-        mapping: `linux`: the three upper bits of the DSCP are the user priority (cfg80211 up to Linux 6.10).
+        mapping: `linux`: the three upper bits of the DSCP are the user priority (cfg80211 up to Linux 6.7).
             `rfc8325`: the mapping of RFC 8325, in which the classes for network control (CS6, CS7) are best effort.
     """
     return _OF_USER_PRIORITY[dscp >> 3 if mapping == "linux" else _RFC_8325.get(dscp, 0)]
@@ -258,7 +258,7 @@ class AccessCategories(ChannelAccess, Generic[Payload]):
         return winner.frames
 
     def remaining_ns(self, now_ns: int) -> int:
-        """Return the remaining time of the transmission opportunity; a long time if it has no limit."""
+        """Return the remaining time of the transmission opportunity; a very long time if it has one exchange."""
         return self._txop_end_ns - now_ns if self._txop_end_ns else _UNLIMITED_NS
 
     def continue_ns(self, now_ns: int, exchange_ns: int) -> int | None:

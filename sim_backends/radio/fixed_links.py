@@ -107,7 +107,7 @@ class FixedLink:
         return arrival_ns, delay_sum
 
     def count_cut(self) -> None:
-        """Count a packet as lost because the link is cut."""
+        """Count a packet as lost because the link is cut or a radio is off."""
         self.sent += 1
         self.count_lost()
 
@@ -274,7 +274,7 @@ class FixedLinks(Generic[Payload]):
                 self._in_flight.append(entry)
 
     def counters(self) -> dict[Pair, LinkCounters]:
-        """Return the current counters of each link."""
+        """Return the current counters of each link, including removed links."""
         return {pair: link.counters for pair, link in self._all_links.items()}
 
     def use_meter(self) -> None:

@@ -63,7 +63,8 @@ class Transmission:
         receivers: Indices of the stations that are synchronized to it, and so receive it.
         response_bytes: Size of the ACK or Block Ack to it.
         frame_count: Number of frames, if it is an aggregate.
-        weakest_ratio: Smallest ratio of signal to noise in 20 MHz at the stations that detect it.
+        weakest_ratio: Smallest ratio of signal to noise in 20 MHz at the stations that detect it; infinite if none
+            detects it.
     """
 
     transmitter: int
@@ -140,12 +141,13 @@ class Frame(Generic[Payload]):
         size_bytes: Size of the packet, without MAC header.
         source: Name of the original sender.
         receiver: Index of the station at the end of this hop; None for a broadcast.
-        forward_to: Indices of the stations to which the relay forwards it; None for a broadcast.
+        forward_to: Receivers to which the relay forwards it, each an index or None for a broadcast; empty if it is
+            not forwarded.
         is_for_receiver: True if the packet is delivered to the receiver of this hop.
         packet: Identity of the packet, from which its random numbers are derived.
         queued_ns: Time at which it entered the transmitter's queue.
         before: Sum of the delays before this hop, in the packed form of `links.Delay`; 0 for none.
-        first_attempt_ns: Start of its first attempt.
+        first_attempt_ns: Start of its first attempt; 0 before it.
         attempts: Number of attempts that have started.
         sequence: Its number in a Block Ack session; -1 before its first attempt, or without a session.
         is_received: True if the receiver of a Block Ack session has decoded it.

@@ -46,9 +46,9 @@ class LinkCounters:
     A packet is sent on the link or dropped by its queue; a sent packet is lost, delivered or still in flight.
 
     Attributes:
-        sent: Packets that were transmitted.
+        sent: Packets that were transmitted, or could not be because the receiver was out of range or a radio was off.
         queue_dropped: Packets dropped because the queue was full.
-        lost: Packets that were transmitted and did not arrive.
+        lost: Packets in `sent` that did not arrive.
         delivered: Packets that arrived.
     """
 

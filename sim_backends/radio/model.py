@@ -85,7 +85,7 @@ class RadioModel(Protocol[Payload]):
         ...
 
     def next_event_ns(self) -> int | None:
-        """Return the time of the next event for `deliveries`, or None if no packet is in flight."""
+        """Return the time of the next event that `deliveries` processes, or None if there is none."""
         ...
 
     def deliveries(self, now_ns: int) -> list[Delivery[Payload]]:
@@ -196,7 +196,7 @@ class WifiInWorld(Wifi[Payload]):
 
     @override
     def log_attempts(self, log: Callable[[TransmissionAttempt], None] | None) -> None:
-        """Implement `RadioModel.log_attempts`; management frames are omitted."""
+        """Implement `RadioModel.log_attempts`; management frames and frames of neighbours are omitted."""
         infrastructure = self._infrastructure
         super().log_attempts(
             log if log is None or infrastructure is None else partial(infrastructure.log_packet, log)

@@ -94,7 +94,7 @@ class WifiMode:
     """A combination of modulation and coding. Each mode is one object, so comparing and hashing use its identity.
 
     Attributes:
-        name: `g54`, `n7` or `vht80-mcs9-2ss-400ns`.
+        name: Its name, for example `g54`, `n7` or `vht80-mcs9-2ss-400ns`.
         modulation: Modulation of each subcarrier.
         code_rate: Rate of the convolutional code.
         bits_per_symbol: Data bits of all streams in an OFDM symbol, N_DBPS.

@@ -9,11 +9,14 @@ from functools import cache
 from typing import Final
 
 from sim_backends.radio.error_rates import log_success
-from sim_backends.radio.frames import Transmission, part_success_probability
+from sim_backends.radio.frames import Transmission, part_success_probability, success_probability
 from sim_backends.radio.modes import WifiMode
 
 _CERTAIN: Final = 1e-6
 """Error probability, or success probability, that counts as 0."""
+
+LARGEST_MAGNITUDE: Final = (11_454).bit_length()
+"""Number of binary digits of the size of the largest frame in bytes."""
 
 # Search range of the thresholds in dB, and the number of bisections (0.0001 dB).
 _RANGE_DB: Final = (-20.0, 60.0)
@@ -71,7 +74,9 @@ def decoding_probability(transmission: Transmission, station: int, noise_mw: flo
     if signal_mw * factor >= always * (noise_mw * factor + interference_mw):
         return 1.0
     parts = transmission.frame_count
-    start_ns = transmission.start_ns + (transmission.mode.preamble_ns if parts > 1 else 0)
+    if parts == 1:
+        return success_probability(transmission, station, noise_mw)
+    start_ns = transmission.start_ns + transmission.mode.preamble_ns
     length_ns, bits = (transmission.end_ns - start_ns) / parts, 8.0 * transmission.size_bytes / parts
     failure = 1.0
     # The last frames are first, because interference often overlaps only the first ones.

@@ -30,7 +30,7 @@ class PacketDelivery(Generic[Payload]):
         channel: Received powers between the stations.
         stations: Stations by index.
         events: Scheduled events.
-        queue_packets: Maximum number of queued packets per station.
+        queue_packets: Maximum number of packets in each queue of a station, without the first.
 
     Attributes:
         peers: State of each link that was used, by indices of transmitter and receiver.
@@ -57,12 +57,12 @@ class PacketDelivery(Generic[Payload]):
         self.power_save: PowerSave[Payload] | None = None
 
     def enqueue(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> None:
-        """Queue a frame for its next hop, or drop it if the queue is full or the receiver is out of range."""
+        """Buffer a frame for a dozing receiver, or pass it to `enqueue_now`."""
         if self.power_save is None or not self.power_save.buffer(now_ns, station, frame):
             self.enqueue_now(now_ns, station, frame)
 
     def enqueue_now(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> None:
-        """Queue a frame whose receiver is awake."""
+        """Queue a frame for its next hop, or drop it if the queue is full or the receiver is out of range."""
         queue = station.queue
         if station.categories is not None:
             frame.category = category_of(frame.dscp, station.categories.mapping)
@@ -86,7 +86,7 @@ class PacketDelivery(Generic[Payload]):
                 self._events.schedule_start(station.contention.earliest_start_ns(now_ns), station.index)
 
     def discard_queue(self, now_ns: int, station: Station[Payload]) -> None:
-        """Empty the queue of a station whose radio was switched off; frames that were not received are lost."""
+        """Empty the queues of a station whose radio was switched off; frames that were not received are lost."""
         if self.power_save is not None:
             for frame in self.power_save.discard(station):
                 self._discard(now_ns, station, frame)

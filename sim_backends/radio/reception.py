@@ -19,8 +19,13 @@ from sim_backends.radio.frames import (
     success_probability,
 )
 from sim_backends.radio.links import Payload
-from sim_backends.radio.modes import ENERGY_DETECTION_DBM, ack_ns, basic_mode
-from sim_backends.radio.overhearing import always_decoded_ratio, decoding_probability
+from sim_backends.radio.modes import ENERGY_DETECTION_DBM, WifiMode, ack_ns, basic_mode
+from sim_backends.radio.overhearing import (
+    LARGEST_MAGNITUDE,
+    always_decoded_ratio,
+    certain_ratios,
+    decoding_probability,
+)
 from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.stations import Station
 
@@ -36,7 +41,7 @@ class _Reach:
     Attributes:
         powers_mw: The list returned by `RadioChannel.powers_mw`.
         detected_by: Indices of the stations that detect its frames and therefore do not send.
-        weakest_ratio: Smallest ratio of its power to the noise at these stations.
+        weakest_ratio: Smallest ratio of its power to the noise at these stations; infinite if there are none.
     """
 
     powers_mw: list[float]
@@ -77,6 +82,8 @@ class Reception(Generic[Payload]):
         self._deferring: dict[int, int] = {}
         # Stations that have decoded, or not, the frame that ends now.
         self._results: dict[int, bool] = {}
+        self._has_failed = False
+        self._always_ratios: dict[WifiMode, float] = {}
 
     def start(self, transmission: Transmission, reserved_ns: int) -> None:
         """Start a transmission; stations that detect it do not send until `reserved_ns`."""
@@ -130,8 +137,19 @@ class Reception(Generic[Payload]):
         """
         self._on_air.remove(transmission)
         receivers: Set[int] = transmission.receivers
+        stations = self._stations
         for index in receivers:
-            self._stations[index].receiving = None
+            stations[index].receiving = None
+        # Most frames: all stations have decoded it, and no station waits for EIFS.
+        if (
+            not transmission.interferers
+            and transmission.weakest_ratio >= self._always_decoded_ratio(transmission.mode)
+            and self._eifs_ends_ns <= now_ns
+            and not reserved_ns
+            and not self._has_failed
+        ):
+            self._results.clear()
+            return
         if transmission.interferers:
             undetermined = self._defer_unsynchronized(now_ns, transmission)
             if not reserved_ns:
@@ -143,6 +161,14 @@ class Reception(Generic[Payload]):
             self._use_decoded(now_ns, receivers - set(undecoded), reserved_ns)
         transmission.interferers.clear()
         self._results.clear()
+        self._has_failed = False
+
+    def _always_decoded_ratio(self, mode: WifiMode) -> float:
+        """Return the ratio of signal to noise in 20 MHz at which a station certainly decodes any frame in a mode."""
+        ratio = self._always_ratios.get(mode)
+        if ratio is None:
+            ratio = self._always_ratios[mode] = certain_ratios(mode, LARGEST_MAGNITUDE)[1]
+        return ratio
 
     def _defer_unsynchronized(self, now_ns: int, transmission: Transmission) -> Set[int]:
         """Start EIFS of the stations that detected a transmission with interference and were not synchronized to it.
@@ -218,7 +244,7 @@ class Reception(Generic[Payload]):
         station.sending_until_ns = min(station.sending_until_ns, now_ns)
 
     def set_emissions(self, now_ns: int, emissions: Mapping[str, Emission]) -> None:
-        """Set the noise on the air until the next call, by jammer name. Received powers of a jammer may change."""
+        """Set the noise on the air until the next call, by name of its source, whose received powers may change."""
         for name, emission in self._emissions.items():
             if name not in emissions:
                 emission.end_ns = now_ns
@@ -231,7 +257,7 @@ class Reception(Generic[Payload]):
         self._emissions = current
 
     def is_jammed(self, index: int) -> bool:
-        """Return True if the jammer noise at a station is so strong that the station does not send."""
+        """Return True if the noise of jammers and ovens at a station is so strong that the station does not send."""
         emissions = self._emissions.values()
         return bool(emissions) and sum(emission.powers_mw[index] for emission in emissions) >= _ENERGY_DETECTION_MW
 
@@ -250,6 +276,8 @@ class Reception(Generic[Payload]):
         )
         is_decoded = draw < success_probability(transmission, index, self._channel.noise_mw[index])
         self._results[index] = is_decoded
+        if not is_decoded:
+            self._has_failed = True
         return is_decoded
 
     def decode_frames(
@@ -279,6 +307,8 @@ class Reception(Generic[Payload]):
             if draws.draw(frame.packet, frame.attempts) < probability:
                 decoded_frames.extend(amsdus[number] if has_amsdus else (frame,))
         self._results[index] = bool(decoded_frames)
+        if not decoded_frames:
+            self._has_failed = True
         return decoded_frames
 
     def _reach(self, transmitter: int, now_ns: int) -> _Reach:

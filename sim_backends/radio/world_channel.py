@@ -121,7 +121,7 @@ class WorldChannel(RadioChannel):
         velocities_m_s: Mapping[str, Vector] | None = None,
         attitudes: Mapping[str, Attitude] | None = None,
     ) -> None:
-        """Set the current positions, velocities and attitudes of the stations; without attitude a station keeps its.
+        """Set the current positions, velocities and attitudes; a station without a new attitude keeps its last one.
 
         Stations without a position are out of range of all others. Until the next call, mean powers do not change;
         only fading, which changes within a wavelength, extrapolates with the velocities.
@@ -164,7 +164,9 @@ class WorldChannel(RadioChannel):
         self._cut = cut
 
     def use_path_losses(self, losses_db: Mapping[tuple[str, str], float]) -> None:
-        """Set the mean losses of some paths, from transmitter to receiver, which replace path loss and obstacles.
+        """Set the mean losses of some paths, from transmitter to receiver, which replace the computed losses.
+
+        They also replace shadowing, obstacles and antenna gains.
 
         Args:
             losses_db: The losses in dB; losses of other paths are computed from the positions.
@@ -388,7 +390,7 @@ class WorldChannel(RadioChannel):
 
 
 def milliwatt(dbm: float) -> float:
-    """Return a power in mW; 0 below the range of a float."""
+    """Return a power in mW; powers below -3000 dBm are returned as 1e-300 mW."""
     return float(10 ** (max(dbm, -3000.0) / 10))
 
 

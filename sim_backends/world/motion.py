@@ -9,8 +9,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import accumulate, pairwise
 from typing import Final, NamedTuple, Protocol
 
-from typing_extensions import override
-
 from fieldkit.core.model import Vector
 
 STILL: Final[Vector] = (0.0, 0.0, 0.0)
@@ -40,7 +38,7 @@ class State(NamedTuple):
     @property
     def tilt_rad(self) -> tuple[float, float]:
         """Roll (left side up) and pitch (nose down)."""
-        return LEVEL
+        return self._tilt_rad if isinstance(self, TiltedState) else LEVEL
 
 
 class TiltedState(State):
@@ -50,7 +48,7 @@ class TiltedState(State):
     affect whether two states are equal.
     """
 
-    _tilt_rad = LEVEL
+    _tilt_rad: tuple[float, float] = LEVEL
 
     @classmethod
     def of(
@@ -62,11 +60,6 @@ class TiltedState(State):
         state = cls(position_m, velocity_m_s, heading_rad)
         state._tilt_rad = tilt_rad
         return state
-
-    @property
-    @override
-    def tilt_rad(self) -> tuple[float, float]:
-        return self._tilt_rad
 
 
 class Attitude(NamedTuple):
@@ -173,8 +166,8 @@ class WayPoints:
         """Return an acceleration a for which an extrapolation by the time t has an error of at most a t^2 / 2.
 
         The extrapolation uses the current velocity, so it has no error until the robot is at the next corner, after
-        the time c. From then on, the true and the extrapolated velocity have the same speed v and differ by at most
-        2 v. The error is therefore at most 2 v (t - c), which is at most (v / c) t^2 / 2.
+        the time c. From then on, neither the true nor the extrapolated velocity exceeds the speed v, so they differ
+        by at most 2 v. The error is therefore at most 2 v (t - c), which is at most (v / c) t^2 / 2.
         """
         corner = bisect_right(self._times_ns, time_ns)
         if corner == len(self._times_ns):

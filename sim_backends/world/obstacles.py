@@ -25,7 +25,7 @@ Size = tuple[Annotated[Real, Field(gt=0)], Annotated[Real, Field(gt=0)], Annotat
 Dimension = Annotated[Length, Field(gt=0)]
 
 _STEPS: Final = 8
-"""Number of steps of a ramp, for radio waves and for flying robots."""
+"""Number of steps of a ramp, for radio waves and for robots that do not drive on it."""
 
 
 def _require_material(name: str) -> str:
@@ -248,7 +248,7 @@ class Raised(_HigherGround):
 class Ramp(_HigherGround):
     """Ground that rises evenly along its first edge, from 0 to its height, with upright sides.
 
-    For radio waves and flying robots, the slope has eight steps.
+    For radio waves, and for robots that fly or for which it is too steep, the slope has eight steps.
 
     Attributes:
         kind: `ramp`.

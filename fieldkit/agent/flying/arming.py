@@ -50,7 +50,7 @@ _SENSORS = {
     0x1000000: "logging",
     0x2000000: "battery",
 }
-"""Bits of MAV_SYS_STATUS_SENSOR for sensors that an operator can repair."""
+"""Bits of MAV_SYS_STATUS_SENSOR for sensors and functions whose fault an operator can remove."""
 _PREFIXES = ("PreArm: ", "Preflight Fail: ")
 """Prefixes of the texts in which ArduPilot and PX4 report why they cannot be armed."""
 
@@ -224,9 +224,10 @@ class ArmingCheck:
 
 
 def check_arming(connection: str, needs: FlightNeeds, stop_event: threading.Event) -> int:
-    """Check an autopilot, print the result as JSON, and return the exit code.
+    """Check an autopilot, print the result as JSON, and return the exit code: 1 without a heartbeat, else 0.
 
-    Each line is a JSON object: one per fault, then the summary with the family and the charge of the autopilot.
+    Each line is a JSON object: one per fault, then the summary with the family of the autopilot and the charge of its
+    battery.
 
     Raises:
         OSError: The connection cannot be opened.

@@ -140,16 +140,16 @@ def up(arguments: argparse.Namespace) -> int:
 
     lab_folder, backend = folder.of_directory(Path.cwd()), _backend(arguments)
 
-    def announce(robots: "Lab") -> None:
-        print_text(f"{format_count(len(robots.members), 'robot')} up, until Ctrl-C", flush=True)
+    def announce(lab: "Lab") -> None:
+        print_text(f"{format_count(len(lab.members), 'robot')} up, until Ctrl-C", flush=True)
 
     if arguments.foreground:
         daemon.run(lab_folder, backend, seed=arguments.seed, sink=_show_note, on_ready=announce)
         return 0
 
     def serve(detach: daemon.OnReady) -> int:
-        def ready(robots: "Lab") -> None:
-            print_text(f"{format_count(len(robots.members), 'robot')} up; next: {_NEXT}")
+        def ready(lab: "Lab") -> None:
+            print_text(f"{format_count(len(lab.members), 'robot')} up; next: {_NEXT}")
             detach(lab_folder.log)
 
         try:
@@ -195,7 +195,7 @@ def _show_lateness(lateness: "LabLateness") -> None:
     print_text(f"late: {', '.join(texts) or 'nothing'}; {format_count(lateness.windows, 'window')}")
     if lateness.late:
         show_note(
-            f"the co-simulation could not keep up: {format_count(lateness.late, 'packet or window')} later than "
+            f"the co-simulation could not keep up: {lateness.late} of its packets and windows later than "
             f"{lateness.bound_s * 1e3:g} ms, so a trial would be void; reduce the load of this machine, or set a "
             "longer window in emulated.sync"
         )

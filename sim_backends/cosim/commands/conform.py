@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
         1 if a check failed, otherwise 0.
 
     Raises:
-        FieldkitError: The federate cannot be started or connected.
+        FieldkitError: The federate cannot be started or connected, or the scenario is invalid.
     """
     endpoint = arguments.federate[0] if len(arguments.federate) == 1 else shlex.join(arguments.federate)
     deadline_s = settings.parse_deadline_s(arguments.deadline)
@@ -66,7 +66,7 @@ def _role(endpoint: str, scenario: CosimScenario, requested_role: str | None, de
     """Return the role of a federate (the requested role, or the first that it accepts) and its name for messages.
 
     Raises:
-        FieldkitError: The federate accepts no role.
+        FieldkitError: The federate cannot be started or connected, or it accepts none of these roles.
     """
     roles = [role for role in (PHYSICS, NETWORK) if requested_role in {None, ROLES[role]}]
     if requested_role is None:

@@ -256,8 +256,8 @@ def build(
         scenario: The scenario.
         policy: A sync policy or its name; None for the policy of the scenario.
         seed: Seed of all random draws; None for the first seed of the scenario.
-        recorder: Receives every window, and every IP packet if it has `log_ip`; or None. With another network it
-            receives the programs' packets as IP packets.
+        recorder: Receives every window, and every IP packet if it has `log_ip`; or None. If a network other than the
+            built-in one has the transports, the recorder receives the programs' packets as IP packets.
         deadline_s: Longest wait for an answer of a federate, in seconds of wall time; None for no deadline.
         physics: Replaces the scenario's physics, and receives the commands to bodies.
         network: Replaces the scenario's network; it must then also apply the faults of the radio.

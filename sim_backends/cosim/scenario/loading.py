@@ -62,7 +62,7 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
             "agents.husky-2.along": "40m"}`.
 
     Raises:
-        ConfigurationError: It does not exist, or is invalid; the message states the line in the file.
+        ConfigurationError: The scenario does not exist, or it is invalid; the message states the line in the file.
     """
     path = _path(str(name_or_path))
     document = schema.read(path)

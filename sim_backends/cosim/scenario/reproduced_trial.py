@@ -92,7 +92,7 @@ class ReproducedTrial(Strict):
 
         Args:
             traffic: The traffic of the scenario.
-            duration_ns: Its duration.
+            duration_ns: Duration of the scenario.
         """
         by_name = {entry.title: entry for entry in traffic}
         selected_flows = [

@@ -222,9 +222,8 @@ class CosimScenario(Named):
         network: The network simulator.
         radio: The radio model.
         tcp: The TCP of all agents, also for ROS 1 topics.
-        topology: `masterless`, or `master`: all packets go through the relay, which also runs
-            the ROS 1 master, if any.
-        relay: The agent whose access point relays packets.
+        topology: `masterless`, or `master`: all packets go through the relay.
+        relay: The agent that runs the ROS 1 master, if any; with `master`, its access point also relays all packets.
         policy: The [sync policy](method-cosim.md#sync-policies).
         emane: If given, a run publishes the positions of its agents to the network emulator [EMANE](emane.md). With
             the physics federate `emane`, it reads them from EMANE's events instead.

@@ -46,7 +46,8 @@ class FlowSample:
         arrived_packets: Number of packets that arrived or, for a ping, got a reply before the run ended.
         delay_sum_s: Sum of their delays, from sending to the arrival that counts for the receiver, or of round trips;
             nan if none arrived, because 0 would mean an immediate transmission.
-        reasons: Number of the other packets by the reason why they did not arrive.
+        reasons: Number of the packets that did not arrive, by reason. Requests of a ping whose reply did not arrive
+            are not included.
     """
 
     sent_packets: int

@@ -77,7 +77,7 @@ class Airframe:
 
     @property
     def position_m(self) -> Vector:
-        """Position relative to home."""
+        """Position of its lowest point relative to home."""
         (east, north, up), home = self._pose.place_m, self.home_m
         return east - home[0], north - home[1], up - home[2]
 

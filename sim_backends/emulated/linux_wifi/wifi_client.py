@@ -26,7 +26,8 @@ class WifiClient(MediumClient):
     """Starts the medium of the simulated radios (hwsim), and access points that are not robots.
 
     Arguments that are not described are those of `MediumClient`. This object keeps the registered socket open. If the
-    medium is killed or suspended, no frame is delivered.
+    medium is killed or suspended, no frame is delivered. After `place`, `robot_names` also has the names of the
+    access points.
 
     Args:
         radios: Radio of each robot and access point, by its name.

@@ -34,7 +34,9 @@ class Media:
         velocities_m_s: Mapping[str, Vector] = MappingProxyType({}),
         attitudes: Mapping[str, Attitude] = MappingProxyType({}),
     ) -> None:
-        """Place the robots in all media. Only the radio under test has a relay.
+        """Place the robots in the medium of the radio, and in the medium of each link to which they are attached.
+
+        Only the radio under test has a relay.
 
         Arguments and errors are those of `MediumClient.place`.
         """
@@ -48,7 +50,10 @@ class Media:
             )
 
     def lateness_counts(self) -> Mapping[int, int]:
-        """Return the number of packets of all media by lateness in ns. Raises the errors of `MediumClient.stats`."""
+        """Return the number of packets of all media by lateness in ns, rounded as in `MediumStats`.
+
+        Raises the errors of `MediumClient.stats`.
+        """
         counts: Counter[int] = Counter()
         for medium in (self.radio, *self.links.values()):
             counts.update(medium.stats().packet_lateness_counts)

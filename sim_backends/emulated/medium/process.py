@@ -30,7 +30,7 @@ from sim_backends.radio.fixed_links import UniformLinks
 from sim_backends.radio.links import PACKET, LinkCounters, Pair, processing_ns
 from sim_backends.radio.model import RadioModel, WifiInWorld
 
-# Maximum sleep of the medium. If it sleeps longer, packets may have waited for the additional time.
+# Timeout of a poll. If the process sleeps longer, packets may have waited for the additional time.
 _MAX_SLEEP_NS: Final = 10_000_000
 
 
@@ -124,7 +124,7 @@ class Medium(MediumServer):
         port.backlog -= BURST
 
     def _deliver(self) -> None:
-        """Write arrived packets to the robots, and set the timer to the next arrival."""
+        """Write arrived packets to the robots, and set the timer to the next event of the model."""
         now_ns = time.monotonic_ns()
         deliveries = self._model.deliveries(now_ns)
         if deliveries:

@@ -77,6 +77,8 @@ def append_path(file_path: Path, path: AssignedPath) -> None:
 class Odometer:
     """Odometry of a robot, which starts at 0 when the object is created.
 
+    While a robot steers itself, its odometry is read from its motion record, and may have started earlier.
+
     Args:
         paths_file: The file of assigned paths, which may be missing.
         now_ns: Time of the start, from the monotonic clock.

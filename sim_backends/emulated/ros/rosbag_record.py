@@ -26,8 +26,8 @@ class Options:
         topics: Names of the topics.
         all_topics: Record every published topic.
         prefix: Prefix of the bag's name, before the date.
-        name: Name of the bag; if it is None, the name consists of the prefix and the date.
-        duration_s: Stop after this time.
+        name: Name of the bag; if it is None, the name consists of the prefix (if there is one) and the date.
+        duration_s: Stop after this time; None for no limit.
         limit: Stop each topic after this number of messages; 0 for no limit.
         chunk_bytes: Size of a chunk of the bag.
     """
@@ -119,7 +119,7 @@ class Rosbag1Recorder:
         _print(f"Subscribing to {topic}")
 
     def _write(self, writer: Writer, start_ns: int) -> None:
-        """Write the messages that arrive within one tick."""
+        """Wait for messages, at most one tick, and write those that have arrived; later than the duration, none."""
         for header, message in self._listener.events(_TICK_S):
             connection = _connection(writer, header)
             if message is None:

@@ -55,9 +55,10 @@ class Sensor:
         type: ROS message type, `package/Name`.
         rate_hz: Messages per second.
         frame: `frame_id` of the header.
-        points: For a laser scan, beams per turn.
-        template: Parts of the messages of a type without a generator.
-        child_frame: Frame of the robot, for odometry and transforms; REP 105 calls it `base_link`.
+        points: For a laser scan, beams per turn; for a point cloud, its points; None if the profile has no number.
+        template: Parts of the messages of a type without a generator; None for a type with one.
+        child_frame: Frame of the robot, for odometry and transforms; REP 105 calls it `base_link`. Empty if the
+            profile names none.
     """
 
     topic: str
@@ -123,7 +124,8 @@ def check(sensor: Sensor) -> None:
     """Check that an emulated robot can publish `sensor`.
 
     Raises:
-        ConfigurationError: There is no generator for its type, or a property that its type needs is missing.
+        ConfigurationError: Its type has neither a generator nor a template, its rate is 0, or a laser scan has no
+            `points`.
     """
     if sensor.type not in GENERATED_TYPES and sensor.template is None:
         hint = did_you_mean(sensor.type, GENERATED_TYPES, f"known types: {', '.join(GENERATED_TYPES)}")

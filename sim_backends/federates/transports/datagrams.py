@@ -184,7 +184,7 @@ class DatagramChannel:
         return ProtocolFrame(header, body)
 
     def close(self) -> None:
-        """Implement `FrameChannel.close`; the last frames are resent for half a second."""
+        """Implement `FrameChannel.close`; unacknowledged data are resent for at most half a second."""
         if self._is_closed:
             return
         limit_s = time.monotonic() + _LINGER_S

@@ -40,7 +40,7 @@ class TcpAddress(HostAndPort):
     """A TCP address."""
 
     def connect(self, deadline_s: float) -> StreamChannel:
-        """Implement `TransportAddress.connect`; refused attempts are repeated."""
+        """Implement `TransportAddress.connect`; failed attempts are repeated until the deadline."""
         while True:
             remaining_s = deadline_s - time.monotonic()
             try:

@@ -128,7 +128,7 @@ class Infrastructure:
 
     @staticmethod
     def log_packet(log: Callable[[TransmissionAttempt], None], attempt: TransmissionAttempt) -> None:
-        """Pass an attempt to `log` if its frame is a packet of a robot; frames without a packet are omitted."""
+        """Pass an attempt to `log`, unless its frame is a management frame or a frame of a neighbour."""
         if not isinstance(attempt.payload, ManagementFrame):
             log(attempt)
 

@@ -156,7 +156,7 @@ class StationGains:
             self._echo_gains[index] = self._mean_horizontal_gain(index)
 
     def orient(self, attitudes: Mapping[str, Attitude]) -> list[int]:
-        """Set the attitudes of stations, and return the stations whose gains have changed.
+        """Set the attitudes of stations, and return the indices of stations with a pattern whose attitude changed.
 
         Stations that are not named keep their attitude, which is initially level with the nose to the east.
         """

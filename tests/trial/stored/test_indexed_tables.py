@@ -115,6 +115,11 @@ def test_a_replaced_table_of_the_same_size_and_time_is_read_again(tmp_path: Path
     assert outcome(tmp_path / "trials", use_index=True) == outcome(tmp_path / "trials", use_index=False)
 
 
+def test_a_pipe_without_a_plan_is_not_indexed(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "table.csv")
+    assert table_index.stamp(tmp_path / "table.csv", tmp_path / "trial.yaml") is None
+
+
 def test_a_table_that_has_just_changed_is_not_indexed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(table_index, "SETTLED_S", 3600.0)
     write_archive(tmp_path / "trials")
@@ -242,7 +247,7 @@ EDITS: Final[dict[str, Callable[[Path, int], object]]] = {
     "removed": lambda trial, _: shutil.rmtree(trial),
     "table removed": lambda trial, _: (trial / "trial.csv").unlink(),
     "plan removed": lambda trial, _: (trial / "trial.yaml").unlink(missing_ok=True),
-    "renamed": lambda trial, draw: trial.rename(trial.with_name(f"renamed-{draw}")),
+    "renamed": lambda trial, draw: trial.rename(trial.with_name(f"{trial.name}-{draw}")),
     "hidden": lambda trial, draw: trial.rename(trial.with_name(f".hidden-{draw}")),
     "added": lambda trial, draw: add_trial(trial.parent, 1000 + draw),
     "copied": lambda trial, draw: shutil.copytree(trial, trial.with_name(f"copy-{draw}")),
