@@ -42,8 +42,8 @@ COLUMNS: Final = columns(
         "fly_farthest_m",
         "m",
         (
-            "Largest horizontal distance from the position of the drone's first take-off in the trial (in a campaign: "
-            "at this place)."
+            "Largest horizontal distance from the position of the drone's first take-off in the trial (in a "
+            "campaign: at this place)."
         ),
         Figure("farthest distance flown", Kind.MEDIAN),
     ),
