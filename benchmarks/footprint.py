@@ -16,7 +16,7 @@ class Memory:
     """Memory of a process tree.
 
     Attributes:
-        own_bytes: Unique set size (USS): anonymous pages, each counted once, and file pages that only one process has.
+        own_bytes: Unique set size (USS): anonymous pages, each counted once, and file pages that one process has.
         pss_bytes: Proportional set size: own pages, and one n-th of each page that n processes of this machine share.
     """
 
