@@ -172,7 +172,7 @@ class EmulatedOptions(Strict):
             `event_driven`, which adds no delay; with `ns3` it is `{name: sliding_window, window: 2ms}`, because an
             exchange at every event of ns-3 takes too long for real time.
         wifi: `model`: the Wi-Fi of fieldkit's radio. `linux`: [Linux Wi-Fi](linux-wifi.md), over the same radio,
-            in a virtual machine if this kernel has no mac80211_hwsim.
+            in a virtual machine if this kernel has no mac80211_hwsim, or the user is not root.
         linux_wifi: Settings of Linux Wi-Fi.
     """
 

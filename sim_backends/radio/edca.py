@@ -72,7 +72,7 @@ def category_of(dscp: int, mapping: DscpMapping) -> int:
 
     Args:
         dscp: Differentiated services code point, 0 to 63.
-        mapping: `linux`: the three upper bits of the DSCP are the user priority (cfg80211 up to Linux 6.10).
+        mapping: `linux`: the three upper bits of the DSCP are the user priority (cfg80211 up to Linux 6.7).
             `rfc8325`: the mapping of RFC 8325, in which the classes for network control (CS6, CS7) are best effort.
     """
     return _OF_USER_PRIORITY[dscp >> 3 if mapping == "linux" else _RFC_8325.get(dscp, 0)]

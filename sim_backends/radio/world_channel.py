@@ -121,7 +121,7 @@ class WorldChannel(RadioChannel):
         velocities_m_s: Mapping[str, Vector] | None = None,
         attitudes: Mapping[str, Attitude] | None = None,
     ) -> None:
-        """Set the current positions, velocities and attitudes of the stations; others keep their attitudes.
+        """Set the current positions, velocities and attitudes; a station without a new attitude keeps its last one.
 
         Stations without a position are out of range of all others. Until the next call, mean powers do not change;
         only fading, which changes within a wavelength, extrapolates with the velocities.

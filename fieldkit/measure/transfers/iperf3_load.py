@@ -210,7 +210,7 @@ class LoadStreams:
             sent: Packets of the sender's capture, from `forward`. Unknown ports are determined from them.
 
         Raises:
-            EvidenceError: The streams cannot be distinguished from other connections.
+            EvidenceError: More connections use the port than the load has streams.
         """
         if self.ports:
             return self.ports
@@ -309,10 +309,11 @@ def _udp_packets(load: LoadStreams, sender: Packets, receiver: Packets) -> UdpPa
 
 
 def _steady_clocks(load: LoadStreams, sender: Packets, receiver: Packets) -> Clocks | None:
-    """Return the offset between the clocks, or None if a direction without packets makes an estimate impossible.
+    """Return the offset between the clocks, or None if a capture has no packet of one of the robots.
 
     Raises:
-        EvidenceError: A clock was set during the load.
+        EvidenceError: The offset cannot be estimated although both captures have packets of both robots. A clock
+            that was set during the load is assumed to be the cause.
     """
     ends = load.source_address, load.destination_address
     clocks = delay.clocks_between(sender, receiver, *ends)

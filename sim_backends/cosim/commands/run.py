@@ -169,7 +169,7 @@ def _recovery_sheet(scenario: CosimScenario, results: Sequence[SeedResult]) -> S
 def _lateness_sheet(results: Sequence[SeedResult]) -> Sheet:
     columns = (
         SheetColumn("seed", "seed", ""),
-        SheetColumn("late_up_to_s", "late up to (ms)", "lateness of a window against real time; 0: in time", 1e3),
+        SheetColumn("late_up_to_s", "late up to (ms)", "upper limit of the lateness of windows; 0: in time", 1e3),
         SheetColumn(
             "windows", "windows", "number of windows with at most this lateness, but more than in the row above"
         ),

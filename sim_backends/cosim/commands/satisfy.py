@@ -27,8 +27,8 @@ NOT_SATISFIED: Final = 1
 
 _COLUMNS: Final = (
     SheetColumn("round", "round", ""),
-    SheetColumn("window_s", "w (ms)", "initial window", 1e3),
-    SheetColumn("median_window_s", "median (ms)", "median of the windows that the rule computed", 1e3),
+    SheetColumn("window_s", "w (ms)", "parameter w of the rule", 1e3),
+    SheetColumn("median_window_s", "median (ms)", "median of the windows of the round", 1e3),
     SheetColumn("loss", "lost (%)", "lost packets as a share of those whose fate is decided", 100),
     SheetColumn("fate_disagreement", "fate (%)", "lost in this run or in the reference, but not in both", 100),
     SheetColumn(

@@ -121,7 +121,7 @@ def _outcome(make_scenario: ScenarioFactory, task: Task) -> RunOutcome | PolicyE
         return error
 
 
-def delay_s(outcome: RunOutcome) -> float:
+def mean_delay_s(outcome: RunOutcome) -> float:
     """Return the mean time, over packets, from sending to the arrival that counts; nan if no packet arrived."""
     delays_ns = [
         fate.counted_ns - fate.packet.sent_ns for fate in outcome.run.fates.values() if fate.counted_ns is not None
@@ -140,7 +140,7 @@ def mean_separation_m(outcome: RunOutcome) -> float:
 
 MEASURES: Final[Mapping[str, Callable[[RunOutcome], float]]] = {
     "loss": lambda outcome: lost_share(outcome.run),
-    "delay_s": delay_s,
+    "delay_s": mean_delay_s,
     "apart_m": mean_separation_m,
 }
 """The compared measures, by name."""

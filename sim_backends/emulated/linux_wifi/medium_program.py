@@ -9,6 +9,8 @@ Requests and replies are JSON objects, one per line. The first request is `Mediu
     {"do": "place", "positions": {"r1": [0, 0, 1]}, "velocities": {}}
     {"do": "totals"}
 
+The request `place` may also have `attitudes`: the yaw, pitch and roll of radios in radians, by name (`Attitude`).
+
 It exits when the requests end. When the last descriptor of the registered socket is closed, hwsim again delivers all
 frames without loss. A supervisor therefore opens the socket with `hwsim_socket.open_registered`, keeps it open, and
 passes its descriptor with `--fd`. If the medium is then killed, no frame is delivered until a new medium is started
@@ -131,7 +133,7 @@ class RequestLines:
         fd: The descriptor.
 
     Attributes:
-        is_at_end: True if there are no more lines.
+        is_at_end: True if there is no more data.
     """
 
     def __init__(self, fd: int) -> None:
@@ -140,7 +142,7 @@ class RequestLines:
         self._buffer = b""
 
     def read(self) -> Iterator[bytes]:
-        """Wait for data, read once, and yield the complete lines.
+        """Wait for data, read once, and yield the complete lines; an incomplete line at the end is not yielded.
 
         Raises:
             ValueError: A line is too long.

@@ -186,7 +186,7 @@ class Tcp:
 
     Args:
         wire: The network below.
-        options: Options of all its connections.
+        options: Options of all its connections; None for the defaults.
         log: Called with the state of a sender after every event; None for no log.
     """
 
