@@ -148,7 +148,7 @@ class EmulatedTestbed:
         return DONE
 
     def inject(self, fault: Fault) -> float | None:
-        """Implement `Testbed.inject`; if the call is interrupted, a link or a robot is switched on again at once."""
+        """Implement `Testbed.inject`; after an interrupt, the link, the position or the power is restored at once."""
         robot = self.robots[fault.role]
         match fault.kind:
             case FaultKind.LINK_DOWN:

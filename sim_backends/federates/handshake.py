@@ -162,7 +162,7 @@ class Hello:
         """Return the body of the message.
 
         Raises:
-            ValueError: A number, a text or the configuration is too large.
+            ValueError: A number, a text or the whole message is too large, or there are too many agents.
         """
         table = AgentTable(agent.name for agent in self.agents)
         try:
@@ -181,7 +181,10 @@ class Hello:
             ]
         body = b"".join([*parts, count_bytes(len(self.configuration)), self.configuration])
         if len(body) > MAX_HELLO_BYTES or len(self.agents) > MAX_AGENTS:
-            raise ValueError(f"the configuration of {len(body)} bytes is too large for an external federate")
+            raise ValueError(
+                f"a hello of {len(body)} bytes with {len(self.agents)} agents is too large for an external federate "
+                f"(limits: {MAX_HELLO_BYTES} bytes, {MAX_AGENTS} agents)"
+            )
         return body
 
     @staticmethod

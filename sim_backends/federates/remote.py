@@ -87,7 +87,7 @@ class RemotePhysics(_RemoteFederate):
 
     Attributes:
         step_ns: Time step, as reported in the federate's answer.
-        limits_m_s2: Acceleration limit of each agent, as last reported by the federate.
+        limits_m_s2: Acceleration limit of each agent, as last reported by the federate; at first the limit in hello.
         agents_disappear: True if agents may disappear during a run.
     """
 

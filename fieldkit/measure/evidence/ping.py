@@ -139,7 +139,7 @@ class Ping:
         replies: All replies in the order of arrival, including duplicates.
         problems: All ICMP errors.
         transmitted: Number of sent requests according to the summary; None if ping was killed before the summary.
-        received: Number of answered requests according to the summary.
+        received: Number of answered requests according to the summary; None without a summary.
         unknown_lines: Unknown lines, unchanged.
         first_seq: Sequence number of the first request: 1, or 0 for busybox.
         summary_s: Shortest, mean and longest round-trip time according to the summary; None without these.
@@ -166,7 +166,10 @@ class Ping:
 
     @property
     def unanswered_seqs(self) -> tuple[int, ...]:
-        """Sequence numbers of the requests without an answer, up to the last request in the output."""
+        """Sequence numbers of the requests without an answer, up to the last request, but at most 65,535.
+
+        Without a summary, the last request is the last one that a line of the output names.
+        """
         answered_seqs = {reply.seq for reply in self.answers}
         printed_seqs = answered_seqs | {problem.seq for problem in self.problems}
         end = max(printed_seqs, default=-1) + 1 if self.transmitted is None else self.first_seq + self.transmitted

@@ -192,7 +192,8 @@ def stream_deliveries(
 ) -> StreamDeliveries:
     """Return the deliveries of a stream.
 
-    Payload was due for the known duration of the stream or, without one, until the last payload was sent.
+    Payload was due for the known duration of the stream, but at most until the receiving program exited. Without a
+    known duration, it was due until the last payload was sent.
 
     Args:
         at_ns: Times at which new payload of the stream arrived, ascending.

@@ -38,7 +38,11 @@ class RobotMover(NamedTuple):
     fallback: str
 
     def stop(self, report: Report, cancel_event: threading.Event) -> None:
-        """Stop the robot, and wait until it is stationary or on the ground."""
+        """Stop the robot, and report its state; if a drone lands, wait for the landing and report the state again.
+
+        The wait ends early after `_LANDING_S`, if `cancel_event` is set, or if the robot does not answer, which is
+        reported with `fallback`.
+        """
         start_s = time.monotonic()
         try:
             result = halting.halt_attempt(self.shell, self.folder, STOPPED_BY, Deadline.after(_REPLY_S))

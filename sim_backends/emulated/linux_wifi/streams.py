@@ -88,7 +88,10 @@ class ChannelStreams:
                     stream.frames.put_nowait(b"")
 
     def _receive(self, number: int, kind: int, data: bytes) -> None:
-        """Handle a frame of the other side: it opens a stream, has data for one, or ends one."""
+        """Handle a frame of the other side: it opens a stream, has data for one, or ends one.
+
+        Frames of unknown streams, and streams beyond the limit, are ignored.
+        """
         with self._lock:
             stream = self._streams.get(number)
             if kind == _OPEN and stream is None and self._accept is not None and len(self._streams) < _MAX_STREAMS:
