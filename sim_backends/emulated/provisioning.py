@@ -319,7 +319,7 @@ def robot_spec(
         hosts={other.name: other.address for other in robots.values()},
         host_key=host_key.private,
         authorized_key=login.public,
-        # Debian has no ROS 2, and a robot without ROS runs no master.
+        # `debian` is Debian's ROS 1; robots with ROS 2 or without ROS do not use it.
         ros=(RosChoice.BUILTIN if is_ros2 or profile_ros is None else ros).value,
         ros_version=2 if is_ros2 else 1,
         distribution=profile_ros.command.distribution if profile_ros else "",

@@ -106,7 +106,7 @@ class WorldChannel(RadioChannel):
         self._positions_m, self._velocities_m_s = np.zeros((2, count, 3))
         # Time of the positions, and time for which a fading gain is used.
         self._moved_ns, self._gain_valid_ns = 0, self._compute_gain_valid_ns()
-        self._revision = 0  # increases with each change of positions, velocities or losses
+        self._revision = 0  # increases with each change of positions, velocities, cuts or losses
         self.use_losses(np.full((count, count), np.inf))
 
     @property

@@ -48,7 +48,7 @@ JOBS: Final = "jobs"
 _SNMP: Final = "/proc/net/snmp"
 _CONGESTION: Final = "/proc/sys/net/ipv4/tcp_congestion_control"
 _MAX_NAME_BYTES: Final = 16
-"""Maximum length of the name of a congestion control in Linux (TCP_CA_NAME_MAX)."""
+"""Limit of the length of the name of a congestion control in Linux (TCP_CA_NAME_MAX, which includes a NUL byte)."""
 _DEV: Final = "/proc/net/dev"
 _REQUIRED_SECTIONS: Final = (BOOT, CLOCK, "date", _SNMP, _DEV, "iw station dump", "end")
 """Sections that must be in both files of an attempt or in neither. The same script writes both files, and each file

@@ -50,9 +50,9 @@ class MotionEntry:
             person confirmed that it is at its place. `allowed`: an option allowed it to move from its current
             position.
         robot: Name of the robot.
-        place: Name of the place of the origin, from `place_of`.
-        origin: The origin; for `ended`, the robot's position at the end, if it reported one.
-        reason: Reason why it is held, or how it was confirmed.
+        place: Name of the place of the origin, from `place_of`; empty for other events.
+        origin: The origin; for `ended` and `held`, the robot's position at the end, if it reported one.
+        reason: Reason why it is held, or how it was confirmed or allowed; empty for other events.
     """
 
     utc_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
