@@ -75,7 +75,7 @@ def all_modes() -> Iterator[WifiMode]:
 
 
 def unexplained_ns(mode: WifiMode, size_bytes: int, ns3_ns: int) -> int:
-    """Return the difference of an airtime from that of ns-3, without the known differences (see this module)."""
+    """Return the difference of an airtime from that of ns-3, without the differences listed above in this module."""
     airtime_ns = mode.airtime_ns(size_bytes)
     if mode.phy_format == "VHT":
         airtime_ns -= 4_000

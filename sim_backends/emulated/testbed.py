@@ -99,6 +99,10 @@ class EmulatedTestbed:
         world: The world around the robots.
         laptop: The node from which SSH reaches the robots over the medium; None if SSH bypasses the medium.
         operator: The person who answers the questions of steps.
+
+    Attributes:
+        robots: The handle of each robot.
+        medium: The medium of the radio under test.
     """
 
     def __init__(

@@ -75,7 +75,7 @@ def _read_prefix(reader: FrameReader) -> None:
 
 
 def encode_join(token: str) -> bytes:
-    """Return the body of `join`."""
+    """Return the body of `join`. Raises ValueError if the token is too long."""
     return _PREFIX.pack(MAGIC, VERSION) + text_bytes(token)
 
 
@@ -257,7 +257,7 @@ class Welcome:
     emitters_m: Sequence[Vector] = ()
 
     def encode(self) -> bytes:
-        """Return the body of the message."""
+        """Return the body of the message. Raises ValueError if a text is too long."""
         numbers = (VERSION, self.role, 0, self.capabilities, self.step_ns, self.next_event_ns)
         parts = [_WELCOME.pack(*numbers, self.configuration_hash), text_bytes(self.name), text_bytes(self.software)]
         parts += [short_count_bytes(len(self.commands)), *map(_U16.pack, self.commands)]

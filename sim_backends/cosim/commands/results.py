@@ -284,7 +284,7 @@ FORMATION: Final = (
     SheetColumn(
         "amplification",
         "amplified",
-        "ratio of a follower's acceleration to its leader's; at most 1 if disturbances do not grow along the row",
+        "largest ratio of a follower's acceleration to its leader's; up to 1 if disturbances do not grow in the row",
     ),
 )
 """Columns of a `Formation`, in the order of `formation_values`."""

@@ -122,7 +122,7 @@ class Rosbag1Recorder:
         _print(f"Subscribing to {topic}")
 
     def _write(self, writer: Writer, start_ns: int) -> None:
-        """Wait for messages, at most one tick, and write those that have arrived; later than the duration, none."""
+        """Wait at most one tick, and write the messages that have arrived, but none after the end of the duration."""
         for header, message in self._listener.events(_TICK_S):
             connection = _connection(writer, header)
             if message is None:

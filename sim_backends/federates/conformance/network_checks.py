@@ -61,7 +61,12 @@ def _times_ns() -> list[int]:
 
 
 class _FateAccount:
-    """Records the fates of packets, and checks the reports of the network."""
+    """Records the fates of packets, and checks the reports of the network.
+
+    Attributes:
+        arrivals: All arrivals so far, in the order of the reports.
+        reasons: Reason of each drop, by the number of the packet.
+    """
 
     def __init__(self, probe: FederateProbe) -> None:
         self._probe = probe
