@@ -31,7 +31,7 @@ class Session(Protocol):
 
     @property
     def is_ready(self) -> bool:
-        """Whether the command wrote the output for which `Shell.begin` waited; False if it ended earlier."""
+        """Whether the command wrote as many bytes as `Shell.begin` waited for; False if it ended earlier."""
         ...
 
     def end(self, *, deadline: Deadline, check: bool = True) -> Completed:

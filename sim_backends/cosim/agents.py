@@ -357,8 +357,8 @@ class Agents:
             repeats = repeats + 1 if wake_ns <= previous_wake_ns else 0
             if repeats > _MAX_WAKES_AT_ONE_TIME:
                 raise FederateError(
-                    f"the program of {' and '.join(names)} woke {repeats} times at {seconds_text(wake_ns)}: its "
-                    "next wake time does not advance",
+                    f"a program woke again {repeats} times at {seconds_text(wake_ns)}, most recently the program of "
+                    f"{' and '.join(names)}: its next wake time does not advance",
                     remedy="correct the program: after a wake, next_wake_ns must return a later time",
                 )
             previous_wake_ns = wake_ns

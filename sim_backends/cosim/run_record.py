@@ -62,7 +62,8 @@ class Run:
         windows_ns: The ends of all windows.
         wall_s: Wall time by part: `agents` (physics and programs), `network`, `exchange` (policy and coordinator),
             `wait` (time in which federates only waited).
-        digest: Hash over every packet, arrival, drop and window, in order (`EventDigest`).
+        digest: Hash over every packet, arrival, drop and window, in order (`EventDigest`); empty before the first
+            call of `Coordinator.advance` has returned.
     """
 
     fates: dict[PacketIdentity, Fate] = field(default_factory=dict)

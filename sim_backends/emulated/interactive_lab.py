@@ -173,7 +173,7 @@ def members_of(site: Site, document: Document | None, addresses: Mapping[str, st
 
     Args:
         site: The site file.
-        document: The document of the site file, for error messages with line numbers.
+        document: The document of the site file, for error messages with line numbers; or None.
         addresses: Radio address of each robot.
 
     Raises:

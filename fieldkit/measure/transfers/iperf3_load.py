@@ -317,14 +317,15 @@ def _steady_clocks(load: LoadStreams, sender: Packets, receiver: Packets) -> Clo
     """Return the offset between the clocks, or None if a capture has no packet of one of the robots.
 
     Raises:
-        EvidenceError: The offset cannot be estimated although both captures have packets of both robots. A clock
-            that was set during the load is assumed to be the cause.
+        EvidenceError: The offset cannot be estimated although both captures have packets of both robots: packets have
+            no times or, otherwise, a clock was probably set during the load.
     """
     ends = load.source_address, load.destination_address
     clocks = delay.clocks_between(sender, receiver, *ends)
     has_packets = (packets.are_from(end).any() for packets in (sender, receiver) for end in ends)
     if clocks is None and all(has_packets):
-        raise EvidenceError(delay.UNSTEADY)
+        lacks_times = any((packets.time_ns == NO_TIME).any() for packets in (sender, receiver))
+        raise EvidenceError("a capture lacks times" if lacks_times else delay.UNSTEADY)
     return clocks
 
 

@@ -59,7 +59,7 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
     Args:
         name_or_path: Its name, or the path of a file that ends in `.yaml`.
         changes: Values that replace values of the file, by their keys: `{"policy.window": "2ms",
-            "agents.husky-2.along": "40m"}`.
+            "agents.husky-2.along": "40m"}`; None for no changes.
 
     Raises:
         ConfigurationError: The scenario does not exist, or it is invalid; the message states the line in the file.

@@ -117,8 +117,9 @@ class AgentRadio(Strict):
         standard: Its IEEE standard; with `phy` also its band, `802.11ac 5 GHz`.
         tx_power_dbm: Its transmit power.
         sensitivity_dbm: Power of the weakest frame that it detects.
-        phy: Physical layer of 802.11n, ac or ax, as `radio.phy` of a [robot profile](reference/robot-profile.md).
-        antenna: Pattern and orientation of its antenna, as `radio.antenna` of a robot profile.
+        phy: Physical layer of 802.11n, ac or ax, as `radio.phy` of a [robot profile](reference/robot-profile.md); if
+            omitted, that of `standard` with one stream in 20 MHz.
+        antenna: Pattern and orientation of its antenna, as `radio.antenna` of a robot profile; isotropic if omitted.
     """
 
     standard: str = "802.11n"

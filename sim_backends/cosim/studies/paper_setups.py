@@ -79,7 +79,7 @@ def flow_samples(
         setups: The setups by name.
         seeds: Seeds of the random draws.
         workers: The workers that run the simulations.
-        progress: Called with the number of finished runs.
+        progress: Called with the number of finished runs, or None.
 
     Raises:
         FieldkitError: A run failed.

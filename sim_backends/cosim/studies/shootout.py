@@ -91,7 +91,7 @@ def run_outcomes(
         policies: Names of policies.
         seeds: The seeds.
         workers: The workers that run the simulations.
-        progress: Called with the number of finished runs.
+        progress: Called with the number of finished runs, or None.
 
     Raises:
         FieldkitError: A run failed with an error other than `PolicyError`.

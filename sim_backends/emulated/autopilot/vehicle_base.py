@@ -35,6 +35,7 @@ class VehicleBase:
         make_airframe: Creates the airframe at a position; None for an airframe that the autopilot itself moves.
 
     Attributes:
+        firmware: Family of its autopilot.
         body: Position and motion, relative to home.
         is_armed: True if its motors turn.
         land_detector: Its detection of take-off and landing.

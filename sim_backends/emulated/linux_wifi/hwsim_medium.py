@@ -72,6 +72,7 @@ class HwsimMedium:
         radios: Name of each radio in the air, by its address.
 
     Attributes:
+        air: The air.
         counts: Counts of messages.
         totals: Totals of each directed link.
     """

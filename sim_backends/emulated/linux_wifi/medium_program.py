@@ -133,6 +133,7 @@ class RequestLines:
         fd: The descriptor.
 
     Attributes:
+        fd: The descriptor.
         is_at_end: True if there is no more data.
     """
 
@@ -203,7 +204,10 @@ def _receive(kernel: KernelSocket, medium: HwsimMedium | None, now_ns: int) -> N
 def _answer(
     medium: HwsimMedium | None, kernel: KernelSocket, line: bytes
 ) -> tuple[HwsimMedium | None, dict[str, Any]]:
-    """Return the medium after a request, and the reply; an invalid request changes nothing."""
+    """Return the medium after a request (None before a valid first request), and the reply.
+
+    An invalid request changes nothing.
+    """
     try:
         request = json.loads(line)
         if medium is None:
