@@ -221,8 +221,8 @@ def main() -> None:
     """Make the tables, run the rounds, print a table or JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--tables", type=int, nargs="+", default=[1_000, 3_000, 10_000])
-    parser.add_argument("--rows", type=int, default=0, metavar="N")
+    parser.add_argument("--tables", type=int, nargs="+", default=[1_000, 3_000, 10_000], help="numbers of tables")
+    parser.add_argument("--rows", type=int, default=0, metavar="N", help="rows of one more table")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     os.chdir(ROOT)

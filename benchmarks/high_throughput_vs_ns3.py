@@ -75,7 +75,7 @@ def all_modes() -> Iterator[WifiMode]:
 
 
 def unexplained_ns(mode: WifiMode, size_bytes: int, ns3_ns: int) -> int:
-    """Return the difference of an airtime from that of ns-3, without the known differences (see this module)."""
+    """Return the difference of an airtime from that of ns-3, without the differences listed above in this module."""
     airtime_ns = mode.airtime_ns(size_bytes)
     if mode.phy_format == "VHT":
         airtime_ns -= 4_000
@@ -163,31 +163,35 @@ def _loss_db(ratio_db: float) -> float:
     return TX_POWER_DBM - NOISE_DBM - ratio_db
 
 
+def _stations_text(stations: int) -> str:
+    return f"{stations} station{'s' * (stations != 1)}"
+
+
 def goodputs(ns3: Ns3) -> list[Row]:
     """Return goodputs in Mbit/s over the signal-to-noise ratio, and for contending stations."""
     rows: list[Row] = []
     for ratio_db, stations in (*((ratio_db, 1) for ratio_db in RATIOS_DB), *((50.0, count) for count in STATIONS)):
         options = ns3_options(HT20_7) | {"loss": _loss_db(ratio_db), "stations": stations, "ampdu": 65_535}
         ns3_value = float(ns3(seconds=SECONDS, payload=PAYLOAD_BYTES, **options))
-        name = f"{HT20_7.name}, {ratio_db} dB, {stations} stations"
+        name = f"{HT20_7.name}, {ratio_db} dB, {_stations_text(stations)}"
         rows.append((name, ns3_value, goodput_mbit_s(HT20_7, ratio_db, stations)))
     common = ns3_options(HT20_7) | {"loss": _loss_db(50.0), "ampdu": 65_535, "bare": 1}
     for stations in STATIONS:
         for rts in (False, True):
             options = common | {"stations": stations} | ({"rts": 0} if rts else {})
             ns3_value = float(ns3(seconds=SECONDS, payload=PAYLOAD_BYTES, **options))
-            name = f"bare, {'RTS, ' * rts}{stations} stations"
+            name = f"bare, {'RTS, ' * rts}{_stations_text(stations)}"
             rows.append((name, ns3_value, goodput_mbit_s(HT20_7, 50.0, stations, rts=rts)))
     for stations in AMSDU_STATIONS:
         options = common | {"stations": stations, "amsdu": AMSDU_BYTES}
         ns3_value = float(ns3(seconds=SECONDS, payload=PAYLOAD_BYTES, **options))
         fieldkit_value = goodput_mbit_s(HT20_7, 50.0, stations, amsdu_max_bytes=AMSDU_BYTES)
-        rows.append((f"A-MSDU, bare, {stations} stations", ns3_value, fieldkit_value))
+        rows.append((f"A-MSDU, bare, {_stations_text(stations)}", ns3_value, fieldkit_value))
     for category, dscp in DSCPS.items():
         for stations in (1, 2):
             options = common | {"stations": stations, "classes": dscp << 2}
             ns3_value = float(ns3(seconds=SECONDS, payload=PAYLOAD_BYTES, **options))
-            name = f"{category}, {stations} stations"
+            name = f"{category}, {_stations_text(stations)}"
             rows.append((name, ns3_value, goodput_mbit_s(HT20_7, 50.0, stations, dscp=dscp)))
     return rows
 

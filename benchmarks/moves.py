@@ -66,7 +66,7 @@ def _processor_s(pid: int) -> float:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="numbers of robots")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     print(f"load before: {os.getloadavg()[0]:.2f}")

@@ -180,8 +180,8 @@ def measure_startup(size: int) -> Figures:
     return {
         "start_s": lasted_s,
         "cpu_s": processors_s,
-        "own_mb": statistics.mean(robot_memory.own for robot_memory in memory) / 1e6,
-        "pss_mb": statistics.mean(robot_memory.pss for robot_memory in memory) / 1e6,
+        "own_mb": statistics.mean(robot_memory.own_bytes for robot_memory in memory) / 1e6,
+        "pss_mb": statistics.mean(robot_memory.pss_bytes for robot_memory in memory) / 1e6,
     }
 
 
@@ -210,7 +210,7 @@ def show(table: dict[str, dict[int, Figures]], veth: Figures, sizes: Sequence[in
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="numbers of robots")
     parser.add_argument("--seconds", type=float, default=3.0, help="length of each throughput run")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()

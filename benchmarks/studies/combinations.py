@@ -25,7 +25,7 @@ from sim_backends.cosim.policies.registry import BUILTIN
 from sim_backends.cosim.scenario.build import Simulation
 from sim_backends.cosim.scenario.federate_choice import BUILT_IN
 from sim_backends.cosim.studies.intervals import mean
-from sim_backends.cosim.studies.shootout import Outcomes, RunOutcome, delay_s, mean_separation_m, run_outcomes
+from sim_backends.cosim.studies.shootout import Outcomes, RunOutcome, mean_delay_s, mean_separation_m, run_outcomes
 
 REFERENCE: Final = "event_driven"
 NETWORK_OPTIONS: Final = {"ns3": {"topics": "udp"}}
@@ -97,7 +97,7 @@ def _row(run: StudyRow, reference: RunOutcome, outcome: RunOutcome) -> StudyRow:
     differences = compare_runs(reference.run, outcome.run, outcome.tracks.distances_m(reference.tracks))
     return run._replace(
         loss=lost_share(outcome.run),
-        delay_s=delay_s(outcome),
+        delay_s=mean_delay_s(outcome),
         separation_m=mean_separation_m(outcome),
         time_error_s=differences.delivery_error_s.mean,
         path_error_m=differences.path_error_m.mean,

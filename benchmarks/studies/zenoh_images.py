@@ -50,7 +50,7 @@ class ImageSetting:
     """A pair of programs and its settings.
 
     Attributes:
-        label: Row of the table.
+        label: Label of its row in the table.
         profile: Quality of service of the agent; empty for the plain pair.
         settings: Settings of Zenoh by their path, as in the step `topics`.
     """

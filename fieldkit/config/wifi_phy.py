@@ -49,7 +49,7 @@ class WifiPhy(Strict):
         rts_threshold_bytes: Size of the largest frame or aggregate that it sends without RTS and CTS; without this
             key it sends no RTS, as with `iw phy PHY set rts off`.
         access_categories: Mapping of the DSCP of a packet to one of the four access categories of EDCA: `linux` (by
-            the upper three bits, as Linux up to 6.10 does) or `rfc8325`. Without this key all packets are best
+            the upper three bits, as Linux up to 6.7 does) or `rfc8325`. Without this key all packets are best
             effort.
         amsdu_max_bytes: Maximum size of an A-MSDU (several packets in one frame of an aggregate): 3839, 7935 or 11454
             (not 802.11n, not at 2.4 GHz). A-MSDUs are used between robots that both have this key, up to the smaller

@@ -30,8 +30,8 @@ class LabOptions:
     Attributes:
         backend: Name of the backend; None for the backend of the site file, or `emulated` without a site file.
         site: The site file; None for `fieldkit.yaml` in the current folder, if there is one.
-        topology: `master` or `masterless`; None for the first topology of the site file, and in a trial for the
-            topology of its procedure.
+        topology: `master` or `masterless`; None for the first topology of the site file, or `master` without one, and
+            in a trial for the topology of its procedure.
         distance: Initial distance of emulated robots, in line of sight.
         seed: Seed of all random numbers in the lab.
         yes: Whether no person is asked: real robots are already at the required places.

@@ -150,8 +150,9 @@ class RobotHandle:
             ros: Whether it runs in the ROS environment of the robot's profile.
 
         Raises:
-            ProgramError: It did not exit in time, or its exit code is not 0.
+            ProgramError: It did not exit in time, or its exit code is not 0 and `check` is set.
             LinkError: The robot could not be reached.
+            RobotError: A signal terminated it, or its output is too long.
         """
         __tracebackhide__ = True
         content = stdin.encode() if isinstance(stdin, str) else stdin
@@ -173,6 +174,7 @@ class RobotHandle:
             ros: Whether it runs in the ROS environment of the robot's profile.
 
         Raises:
+            ProgramError: It did not exit, not even after SIGKILL.
             LinkError: The robot could not be reached.
         """
         command = until_closed(self._command(argv, ros=ros))
@@ -322,7 +324,7 @@ class RobotHandles:
         )
 
     def __getattr__(self, name: str) -> RobotHandle:
-        """Return a robot by its role."""
+        """Return a robot by its role, or by a name that is a Python identifier."""
         if name.startswith("_"):
             raise AttributeError(name)
         return self[name]

@@ -74,7 +74,11 @@ class Connection:
         return self._close_event
 
     def link(self, deadline: Deadline) -> Link:
-        """Return the link, which is opened again if it is not alive. Raises the same errors as `log_in`."""
+        """Return the link, which is opened again if it is not alive.
+
+        Raises the same errors as `log_in`, and `LinkLostError` if another thread logs in for too long, or if the link
+        is lost while no packets may be sent.
+        """
         close_event, limit = self._close_event, deadline.earlier_of(self._timing.connect_s)
         if not self._connecting.acquire(timeout=limit.remaining_s):
             raise LinkLostError("another command is still connecting", where=self.address.robot)
@@ -111,7 +115,8 @@ class Connection:
 
         Only a link that was open before is reopened, so that a wrong address is reported immediately. A repeated
         attempt has at least `Timing.reply_s`. The total time is at most the time until `deadline`, plus
-        `reconnect_timeout_s`, the time of one login, and `Timing.reply_s`.
+        `reconnect_timeout_s`, the time of one login, `Timing.reply_s`, and the silences (`silence`) during which the
+        link is not reopened.
 
         Raises:
             LinkError: The deadline passed with an open link, the link was not restored, or `close` was called.

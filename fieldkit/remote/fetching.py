@@ -122,7 +122,7 @@ def fetch(
     progress: FetchProgress | None = None,
     forbidden_reason: Callable[[str], str | None] = lambda _: None,
 ) -> None:
-    """Let the robot record its state again, fetch the files of a repeat, and check the hash of each file.
+    """Let the robot record its state again, fetch the files of an attempt, and check the hash of each file.
 
     Small files are sent in one archive, large files piece by piece. Each transfer has a timeout, the total time
     increases with the size, and an interrupted fetch continues from the last piece, also in a later call.

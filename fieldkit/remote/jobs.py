@@ -178,7 +178,7 @@ def start(shell: Shell, job: Job) -> None:
 class PendingJob:
     """A started job, or a wait for the end of a job that was started before.
 
-    The control connection is silent until `end` is called.
+    The control connection is silent until `end` is called or, for a job from `serve`, until the job ends.
 
     Attributes:
         shell: The robot.
@@ -219,8 +219,8 @@ def run(shell: Shell, job: Job) -> int:
         The job's exit code.
 
     Raises:
-        LinkError: The robot did not answer by the end of the job's limit, plus `READY_S` if it has `ready`.
-        RobotError: The job could not be started.
+        LinkError: The robot did not answer within the job's limit plus `REPLY_S`, and `READY_S` if it has `ready`.
+        RobotError: The job could not be started, or the robot rebooted while it ran.
     """
     session = shell.begin(command("run", job), deadline=Deadline.after(REPLY_S), until=b"")
     return PendingJob(shell, job, session).end((READY_S if job.ready else 0) + job.limit_s + REPLY_S)
@@ -294,7 +294,10 @@ def stop(
 
 
 def list_running(shell: Shell, deadline: Deadline) -> tuple[str, ...]:
-    """Return one line per running job of fieldkit on the robot, from any trial and version."""
+    """Return one line per running job of fieldkit on the robot, from any trial and version.
+
+    There is also a line for each process in a deleted folder of a job.
+    """
     return _lines(call(shell, "left", deadline=deadline))
 
 
@@ -304,7 +307,7 @@ class AbortResult:
 
     Attributes:
         locked: Whether the robot was locked.
-        jobs: A line per stopped or signalled job, in the format of `list_running`.
+        jobs: A line per stopped or signalled job or process, in the format of `list_running`.
         landing: Programs that still land a drone, `TRIAL/ATTEMPT/.jobs/NAME` below the robot's home, each with its
             `motion_states.MotionState`.
         error: The error if a part failed; None otherwise.

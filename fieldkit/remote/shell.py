@@ -16,8 +16,8 @@ class Completed:
     Attributes:
         argv: The command.
         exit_code: Its exit code.
-        stdout: Its complete standard output.
-        stderr: Its complete standard error.
+        stdout: Its complete standard output; empty after `Shell.fetch`.
+        stderr: The end of its standard error, at most 64 KiB.
     """
 
     argv: tuple[str, ...]
@@ -31,7 +31,7 @@ class Session(Protocol):
 
     @property
     def is_ready(self) -> bool:
-        """Whether the command wrote the output for which `Shell.begin` waited; False if it ended earlier."""
+        """Whether the command wrote as many bytes as `Shell.begin` waited for; False if it ended earlier."""
         ...
 
     def end(self, *, deadline: Deadline, check: bool = True) -> Completed:
@@ -91,7 +91,8 @@ class Shell(Protocol):
 
         Raises:
             LinkError: The robot could not be reached, the connection broke, or the deadline passed.
-            RobotError: The exit code is not 0 and `check` is set; the message has the end of stderr.
+            RobotError: The exit code is not 0 and `check` is set; the message has the end of stderr. Or a signal
+                terminated the command, or it wrote too much output.
         """
         ...
 

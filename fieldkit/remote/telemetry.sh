@@ -65,9 +65,9 @@ poll_source() { # start the job of the source in the quoted line $1, unless it w
 MAX_OUTPUT=65536 # limit of an output, in bytes
 MAX_TOTAL=4194304 # limit of all outputs of a source
 
-# Run ARGV at intervals and print its outputs, until file $1 no longer exists or the lock of token $2 (-: none) is lost. The
-# other arguments: ADDRESS that is queried, or -; INTERFACE by which packets to ADDRESS must not leave, or -; INTERVAL in s
-# (0: run once); LIMIT of a run in s; ARGV...
+# Run ARGV at intervals and print its outputs, until file $1 no longer exists, the lock of token $2 (-: none) is lost, the
+# outputs exceed MAX_TOTAL, or packets to ADDRESS would leave by INTERFACE. The other arguments: ADDRESS that is queried, or
+# -; INTERFACE by which packets to ADDRESS must not leave, or -; INTERVAL in s (0: run once); LIMIT of a run in s; ARGV...
 poll() {
     required_file=$1 token=$2 address=$3 tested_interface=$4 interval=$5 limit=$6 total=0 child=
     shift 6

@@ -145,7 +145,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Chart:
-    """A figure: panels side by side, under one legend.
+    """A figure: panels side by side or, if `is_stacked`, below each other, under one legend.
 
     Attributes:
         name: Name in file names and links.

@@ -275,11 +275,13 @@ def repeat_to_draw(cells: Sequence[Cell], evidence: Evidence, requested: str) ->
     Args:
         cells: Conditions.
         evidence: The table and the available evidence.
-        requested: Folder of an attempt, `udp-07`, preceded by `TRIAL/` if several trials have it. If empty,
-            it is chosen from the condition with the highest loss: the valid repeat with the median of its losses.
+        requested: Folder of an attempt, `udp-07`, preceded by `TRIAL/` if several trials have it. If empty, a valid
+            repeat with available evidence is chosen from the condition with the highest loss: among its repeats with
+            a loss above 0, the one with the median loss. If there is none, the longest transfer time or, without
+            transfers, the longest round-trip time is used in place of the loss.
 
     Returns:
-        The row, or None if `requested` is empty and no evidence is available.
+        The row, or None if `requested` is empty and no repeat can be chosen.
 
     Raises:
         ConfigurationError: There is no such attempt, or several, or its evidence is not available.

@@ -49,7 +49,7 @@ class _Lane:
         label: Its name, and the payload size of a ping.
         quantity: The quantity.
         cells: The conditions that have it.
-        with_missing: These conditions, and the conditions without a value.
+        with_missing: These conditions, and those of the same protocol and topology that lack the quantity.
     """
 
     label: str

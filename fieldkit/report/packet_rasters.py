@@ -1,4 +1,4 @@
-"""Packet rasters: the packets of each repeat in the order of sending, with losses and retransmissions marked.
+"""Packet rasters: the packets of each repeat in the order of sending; lost or retransmitted packets are marked.
 
 A cell contains the repeats under one condition, and their estimates.
 """
@@ -20,9 +20,10 @@ from fieldkit.report.trial_folders import Evidence
 from fieldkit.trial import planned_evidence
 
 MAX_REPEATS: Final = 400
-"""Maximum number of repeats whose captures are read, over all cells. Each cell shows at least its first repeat."""
+"""Maximum number of repeats whose captures are read, divided equally among the cells. Each cell shows at least its
+first valid repeat with captures."""
 MAX_LINES: Final = 20
-"""Maximum number of lines of a cell."""
+"""Maximum number of lines of a raster."""
 MAX_COLUMNS: Final = 300
 """Maximum number of columns of a line. If a line has more packets, each column represents several packets and is
 marked if any of them is marked."""
@@ -53,10 +54,10 @@ class Raster:
 
 @dataclass(frozen=True)
 class RasterGroup:
-    """Rasters of one protocol and topology.
+    """Rasters of one transfer with one protocol and topology.
 
     Attributes:
-        title: Transfer, protocol and topology.
+        title: Name of the transfer, if it has one, protocol and topology.
         what: The meaning of a mark, and the number of packets per column.
         rasters: One per condition whose captures are available.
     """

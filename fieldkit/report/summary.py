@@ -42,7 +42,7 @@ class Caution:
 
 
 def paragraph(cells: Sequence[Cell], evidence: Evidence, sweep: Mapping[str, str]) -> str:
-    """Return a paragraph about the trials: procedures, times, distances and numbers of attempts.
+    """Return a paragraph about the trials or the sweep: procedures or factors, times, distances, protocols, attempts.
 
     Args:
         cells: Conditions.
@@ -170,14 +170,14 @@ class Provenance:
     Attributes:
         name: Its name.
         source: Its folder, or the table with its rows.
-        has_evidence: True if its raw evidence is available.
-        start_text: Start of its first attempt, as text.
-        robots: Sender, receiver and relay.
+        has_evidence: True if its folder is available and the plan in it can be read.
+        start_text: Start of its first attempt, to the minute in UTC; empty if unknown.
+        robots: Sender and receiver, and the relay if there is one.
         attempts: Numbers of attempts by status.
-        seed: Its seed.
-        hashes: Hashes of code, procedure and profiles; empty if missing.
-        versions: Versions of its programs; empty if its folder is not available.
-        notes: The operator's notes.
+        seed: Its seed; empty if unknown.
+        hashes: Hashes of code, procedure and profiles; a missing hash is an empty text.
+        versions: Versions of its programs; empty if its plan is not available.
+        notes: The operator's notes; empty if its plan is not available.
     """
 
     name: str

@@ -34,7 +34,10 @@ def evidence_bytes(plan: Plan, role: Role) -> int:
 
 
 def attempt_bytes(plan: Plan) -> int:
-    """Return the estimated number of bytes that one attempt leaves on the laptop, times `SPARE`."""
+    """Return the estimated number of bytes that one attempt leaves on the laptop.
+
+    It is the evidence of all robots, times `SPARE`, and the maximum that the testbed adds (`Plan.lab_bytes`).
+    """
     return sum(evidence_bytes(plan, role) for role in plan.cast) + plan.lab_bytes
 
 
@@ -51,5 +54,5 @@ def reserve_bytes(plan: Plan, role: Role) -> int:
 
 
 def trial_bytes(plan: Plan) -> int:
-    """Return the estimated number of bytes that the whole trial leaves on the laptop, times `SPARE`."""
+    """Return `attempt_bytes` times the number of repeats. `SPARE` includes the attempts that are repeated."""
     return attempt_bytes(plan) * plan.repeats * len(plan.protocols)

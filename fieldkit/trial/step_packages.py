@@ -1,4 +1,4 @@
-"""Packages of step kinds that do not ship with fieldkit. A plan contains their versions and code hashes."""
+"""Packages of the kinds of step that do not ship with fieldkit; a plan contains their versions and code hashes."""
 
 import hashlib
 from collections.abc import Iterable
@@ -19,7 +19,8 @@ class StepPackage(Strict):
     Attributes:
         package: Name of the package.
         version: Version of the package.
-        code_sha256: Hash of the Python files of its top-level module; empty if there are no such files.
+        code_sha256: First 16 hex digits of the SHA-256 hash of the names and contents of the Python files of its
+            top-level module; empty if there are no such files.
     """
 
     package: str
@@ -28,7 +29,10 @@ class StepPackage(Strict):
 
 
 def packages_of_kinds(names: Iterable[str]) -> dict[str, StepPackage]:
-    """Return the package of each kind of step that does not ship with fieldkit."""
+    """Return the packages of the kinds of step with these names, by name.
+
+    Kinds that ship with fieldkit, and kinds that no installed package declares, are omitted.
+    """
     others = set(names) - kinds.shipped_names()
     return {
         point.name: StepPackage(
@@ -40,7 +44,7 @@ def packages_of_kinds(names: Iterable[str]) -> dict[str, StepPackage]:
 
 
 def _code_hash(module: str) -> str:
-    """Return the hash of the names and contents of the Python files of a module's top-level package."""
+    """Return `StepPackage.code_sha256` for a module (the top-level module that contains it is hashed)."""
     spec = find_spec(module.partition(".")[0])
     if spec is None:
         return ""

@@ -1,6 +1,6 @@
 """The coordinator: advances agents and network window by window, and exchanges data between them.
 
-It stores the payloads; the network gets only identities, sizes and times. It records the fate of every packet.
+It stores the payloads, and passes packets without payloads to the network. It records the fate of every packet.
 """
 
 import copy
@@ -60,8 +60,8 @@ class Coordinator:
         is_interrupted: True if `KeyboardInterrupt` must be raised as soon as `is_committing` is False.
 
     Raises:
-        ConfigurationError: The physics federate or the policy lacks a required member, or the physics federate has no
-            state of an agent that may send, receive or interfere.
+        ConfigurationError: The physics federate or the policy lacks a required member, or the physics federate
+            returns an invalid state or no state of an agent that may send, receive or interfere.
         FederateError: The physics federate failed, or has no state of an agent that runs a program.
     """
 
@@ -333,7 +333,8 @@ class Coordinator:
     ) -> list[Fate]:
         """Record the arrivals and drops of a window, and deliver the datagrams that arrived.
 
-        Packets from or to agents that are absent at the end of the window are dropped.
+        An arrival is dropped if its sender or receiver had disappeared before it. Packets that are still under way
+        from or to agents that are absent at the end of the window are dropped.
         """
         decided_fates, agents, ledger = [], self._agents, self._ledger
         for arrival in arrivals:

@@ -106,7 +106,7 @@ class Program(Protocol):
 
 
 def next_send_ns(program: Program) -> int | None:
-    """Return a time before which a program sends only in reply to a received datagram, or None if it never sends.
+    """Return a time before which a program sends only in reply to a received datagram, or None if it always does.
 
     A program may have a method `next_send_ns`; otherwise it is assumed to send whenever it wakes.
     """

@@ -40,6 +40,10 @@ class EmulatedLab:
         options: The lab's options.
         world: The world around the robots.
 
+    Attributes:
+        members: The robots by name.
+        login: The login at the robots.
+
     Raises:
         LinkError: The medium process exited or did not answer.
     """
@@ -129,7 +133,7 @@ class EmulatedLab:
         return WATCH_S
 
     def lateness(self) -> LabLateness | None:
-        """Implement `Lab.lateness`: the lateness of packets and windows since the lab was ready."""
+        """Implement `Lab.lateness`: lateness since the start; None without a co-simulation."""
         first_stats = self._first_stats
         if first_stats is None:
             return None
@@ -169,7 +173,7 @@ def members_of(site: Site, document: Document | None, addresses: Mapping[str, st
 
     Args:
         site: The site file.
-        document: The document of the site file, for error messages with line numbers.
+        document: The document of the site file, for error messages with line numbers; or None.
         addresses: Radio address of each robot.
 
     Raises:
@@ -186,7 +190,7 @@ def members_of(site: Site, document: Document | None, addresses: Mapping[str, st
 def overview(
     members: Mapping[str, LabRobot], positions_m: Mapping[str, Vector], options: EmulatedOptions, world: World
 ) -> Overview:
-    """Return the map of the lab, computed without shadowing, which depends on the seed."""
+    """Return the map of the lab, computed without fading, and without shadowing, which depends on the seed."""
     antennas = {name: antenna_of(member.profile.radio) for name, member in members.items()}
     channel = WorldChannel(
         0, antennas, options.radio.model_copy(update={"shadowing_db": 0.0, "fading": False}), world

@@ -138,7 +138,9 @@ def _neighbours(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) ->
 
 
 def neighbour(number: int, profile: RobotProfile) -> Neighbour:
-    """Return the body of a robot as a cylinder: from `ANTENNA_M` below its antenna up to its antenna or higher top.
+    """Return the body of a robot as a cylinder: from `ANTENNA_M` below its antenna up to the antenna.
+
+    If the robot is higher than its antenna, the cylinder ends at the top of the robot.
 
     A robot whose body is unknown has the body of the paper's ground robot or of the paper's drone.
     """
@@ -319,7 +321,7 @@ def robot_spec(
         hosts={other.name: other.address for other in robots.values()},
         host_key=host_key.private,
         authorized_key=login.public,
-        # Debian has no ROS 2, and a robot without ROS runs no master.
+        # `debian` is Debian's ROS 1; robots with ROS 2 or without ROS do not use it.
         ros=(RosChoice.BUILTIN if is_ros2 or profile_ros is None else ros).value,
         ros_version=2 if is_ros2 else 1,
         distribution=profile_ros.command.distribution if profile_ros else "",

@@ -99,6 +99,10 @@ class EmulatedTestbed:
         world: The world around the robots.
         laptop: The node from which SSH reaches the robots over the medium; None if SSH bypasses the medium.
         operator: The person who answers the questions of steps.
+
+    Attributes:
+        robots: The handle of each robot.
+        medium: The medium of the radio under test.
     """
 
     def __init__(
@@ -148,7 +152,7 @@ class EmulatedTestbed:
         return DONE
 
     def inject(self, fault: Fault) -> float | None:
-        """Implement `Testbed.inject`; if the call is interrupted, a link or a robot is switched on again at once."""
+        """Implement `Testbed.inject`; after an interrupt, the link, the position or the power is restored at once."""
         robot = self.robots[fault.role]
         match fault.kind:
             case FaultKind.LINK_DOWN:

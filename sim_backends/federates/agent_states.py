@@ -100,7 +100,7 @@ def announcements_bytes(states: Mapping[str, State], agents: AgentTable) -> byte
     """Return the announcement of the agents that are not in the table yet, and add them to the table.
 
     Raises:
-        ValueError: There are too many agents.
+        ValueError: There are too many agents, or a name is too long.
     """
     if states.keys() <= agents.indices.keys():
         return _NO_NEW_AGENTS

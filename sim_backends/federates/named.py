@@ -130,7 +130,8 @@ def command_line(endpoint: str, role: int) -> str:
     """Return the command that starts the federate with a name, or `endpoint` itself if it is a command or an address.
 
     Raises:
-        ConfigurationError: The federate cannot be used; the remedy states how to install the missing software.
+        ConfigurationError: The federate cannot be used, then the remedy states how to install the missing software;
+            or there is neither a federate nor a program with this name.
     """
     federate = named_federate(endpoint, role)
     if isinstance(federate, ProgramFederate):

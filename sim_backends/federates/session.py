@@ -63,7 +63,7 @@ class FederateSession:
         endpoint: The federate's command or address, for messages.
         channel: The channel.
         deadline_s: Longest wait for a frame, in seconds of wall time; None for no deadline.
-        child: The process of the federate, if this process has started it.
+        child: The process of the federate; None if this process has not started it.
 
     Attributes:
         name: The federate's role, its name if it has sent one, and its command or address.

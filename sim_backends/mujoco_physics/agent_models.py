@@ -17,7 +17,7 @@ from sim_backends.world.world import World
 def agent_limits(agent: AgentStart, body: Mapping[str, Any] | None) -> DriveLimits | QuadrotorLimits:
     """Return the limits of an agent: the limits in the configuration, otherwise the built-in limits of its profile.
 
-    A ground robot with neither has the limits of a TurtleBot3 Burger.
+    A ground robot with neither has the limits of a TurtleBot3 Burger, a drone those of the Duckiedrone.
 
     Raises:
         ConfigurationError: The configuration has limits of another kind of robot.

@@ -41,8 +41,8 @@ class Chassis:
 
     Attributes:
         mass_kg: Mass without wheels.
-        centre_m: Its centre of mass.
-        inertia_kg_m2: Moments of inertia about its axes.
+        centre_m: Centre of mass without wheels.
+        inertia_kg_m2: Moments of inertia without wheels, about the axes through this centre: forward, left, up.
         boxes: Its shape.
         wheels: Its wheels.
         caster_m: Lowest point of a caster without friction; None for a robot without a caster.

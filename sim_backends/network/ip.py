@@ -82,7 +82,14 @@ def fragments(packet: IpPacket, ip_id: int, mtu_bytes: int = MTU_BYTES) -> Itera
 
 @dataclass(slots=True)
 class _PartialPacket:
-    """State of a packet at a host: fragments that arrived or were lost, time of the first arrival, and failure."""
+    """State of a packet at a host.
+
+    Attributes:
+        packet: The packet.
+        fragment_count: Number of its fragments that arrived or were lost.
+        since_ns: Time at which the first fragment arrived; None before.
+        has_failed: True if the packet was reported as lost.
+    """
 
     packet: IpPacket
     fragment_count: int = 0

@@ -206,7 +206,7 @@ class FrameTracker
         return busy.total_ns - std::max<int64_t>(busy.until_ns - Simulator::Now().GetNanoSeconds(), 0);
     }
 
-    // Report the packet of a frame or IP packet as lost.
+    // Report the packet of a frame or IP packet as lost, if it has an IdTag.
     void Lost(Ptr<const Packet> packet, const std::string& reason)
     {
         IdTag tag;

@@ -223,7 +223,7 @@ class Bodies:
             self._step = end_step
 
     def _change_steps_of(self, lifetime: Lifetime) -> Iterator[int]:
-        """Yield the step in which a body appears, unless this is step 0, and the first step without it."""
+        """Yield the step in which a body appears, unless this is step 0, and the first step after it disappears."""
         if lifetime.appears_ns >= self.step_ns:
             yield lifetime.appears_ns // self.step_ns
         if lifetime.disappears_ns is not None:

@@ -17,7 +17,7 @@ from sim_backends.radio.links import Payload
 from sim_backends.radio.modes import ACK_BYTES, PhyFormat, WifiMode
 
 QOS_HEADER_BYTES: Final = HEADER_BYTES + 2
-"""Headers of a QoS data frame: 9.2.4.5."""
+"""MAC header, LLC, SNAP and FCS of a QoS data frame: 9.2.4.5."""
 
 TYPICAL_FRAMES: Final = 16
 """Number of frames per aggregate for which rate control compares modes. An assumption, between 1 and the window."""

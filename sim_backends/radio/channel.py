@@ -35,7 +35,7 @@ class RadioChannel(Protocol):
         ...
 
     def are_linked(self, transmitter: int, receiver: int) -> bool:
-        """Return True if the stations can be associated; frames are sent only to associated stations."""
+        """Return True if both stations can receive each other; a frame to one station is sent only in this case."""
         ...
 
     def delay_ns(self, transmitter: int, receiver: int) -> int:

@@ -42,7 +42,7 @@ class RadioMeter:
         self._busy_until_ns = [0] * stations
 
     def on_start(self, transmission: Transmission, receiver: int | None) -> None:
-        """Record a frame that starts now; `receiver` is None for broadcasts, ACKs and aggregates."""
+        """Record a frame that starts now; `receiver` is None for broadcasts, control frames and aggregates."""
         self.on_busy(
             transmission.start_ns, transmission.end_ns, (transmission.transmitter, *transmission.detected_by)
         )

@@ -171,8 +171,8 @@ class FixedLinks(Generic[Payload]):
 
     With a relay (the master topology) a packet between two other stations is sent to the relay first and forwarded
     from there; each hop has its own queue, rate, delay and loss. A broadcast of a station reaches the relay, which
-    repeats it to all other stations. Without a relay, and to and from the relay itself, packets go directly. A
-    broadcast is one packet per receiver, each with its own random draws.
+    repeats it to all other stations. Without a relay, and to and from the relay itself, packets go directly. Except
+    on the way to the relay, a broadcast is one packet per receiver, each with its own random draws.
 
     Args:
         seed: Seed of all random draws: equal seeds, links and packets give equal results.

@@ -32,7 +32,7 @@ ControlFrame = Literal["", "ACK", "RTS", "CTS"]
 
 @dataclass(eq=False, slots=True)
 class Emission:
-    """Noise that a jammer sends in the whole channel.
+    """Noise that a jammer or an oven sends in the whole channel.
 
     Attributes:
         start_ns: Start time.
@@ -47,7 +47,7 @@ class Emission:
 
 @dataclass(eq=False, slots=True)
 class Transmission:
-    """A frame on the air.
+    """A frame or an aggregate on the air.
 
     Attributes:
         transmitter: Index of the sending station.
@@ -55,7 +55,7 @@ class Transmission:
         end_ns: End of its last symbol.
         mode: Modulation and coding.
         size_bytes: Size with MAC header and FCS.
-        packet: The packet that it carries or acknowledges.
+        packet: The packet that it carries, acknowledges or announces (RTS, CTS); the first one of several.
         attempt: Number of the transmission attempt on this hop, from 1.
         powers_mw: Received power at each station, by index; 0 at the transmitter.
         detected_by: Indices of the stations that detect it, whether or not they can receive it.

@@ -43,7 +43,9 @@ class LinkParameters:
 class LinkCounters:
     """Counters of one directed link.
 
-    A packet is sent on the link or dropped by its queue; a sent packet is lost, delivered or still in flight.
+    A packet is sent on the link or dropped by its queue; a sent packet is lost, delivered or still in flight. Packets
+    that a Wi-Fi station loses before it sends them for another reason, for example because it is switched off, are
+    not counted.
 
     Attributes:
         sent: Packets that were transmitted, or could not be because the receiver was out of range or a radio was off.

@@ -86,7 +86,10 @@ class Reception(Generic[Payload]):
         self._always_ratios: dict[WifiMode, float] = {}
 
     def start(self, transmission: Transmission, reserved_ns: int) -> None:
-        """Start a transmission; stations that detect it do not send until `reserved_ns`."""
+        """Start a transmission; stations that detect it do not send until `reserved_ns`.
+
+        A station that starts within `CCA_TIME_NS` has not sensed the transmission yet, and sends too.
+        """
         station, now_ns, end_ns = self._stations[transmission.transmitter], transmission.start_ns, transmission.end_ns
         reach = self._reach(transmission.transmitter, now_ns)
         transmission.powers_mw, transmission.detected_by = reach.powers_mw, reach.detected_by

@@ -106,7 +106,7 @@ class WorldChannel(RadioChannel):
         self._positions_m, self._velocities_m_s = np.zeros((2, count, 3))
         # Time of the positions, and time for which a fading gain is used.
         self._moved_ns, self._gain_valid_ns = 0, self._compute_gain_valid_ns()
-        self._revision = 0  # increases with each change of positions, velocities or losses
+        self._revision = 0  # increases with each change of positions, velocities, cuts or losses
         self.use_losses(np.full((count, count), np.inf))
 
     @property
@@ -121,7 +121,7 @@ class WorldChannel(RadioChannel):
         velocities_m_s: Mapping[str, Vector] | None = None,
         attitudes: Mapping[str, Attitude] | None = None,
     ) -> None:
-        """Set the current positions, velocities and attitudes of the stations; others keep their attitudes.
+        """Set the current positions, velocities and attitudes; a station without a new attitude keeps its last one.
 
         Stations without a position are out of range of all others. Until the next call, mean powers do not change;
         only fading, which changes within a wavelength, extrapolates with the velocities.

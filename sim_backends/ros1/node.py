@@ -83,9 +83,10 @@ class RosPublisher:
         self._disconnect(stream)
 
     def publish(self, message: bytes, deadline_s: float | None) -> int:
-        """Send a message to all subscribers, and return their number.
+        """Send a message to all subscribers; return the number of subscribers to which it was sent.
 
-        A subscriber that does not read in time is disconnected.
+        A subscriber that does not read until `deadline_s` (on the clock of `time.monotonic`; None for no limit) is
+        disconnected.
 
         Raises:
             TimeoutError: No subscriber has received the message, because they did not read in time.
@@ -154,7 +155,7 @@ class RosSubscriber:
         """Return the next message.
 
         Raises:
-            TimeoutError: No message arrived in time.
+            TimeoutError: No message arrived until `deadline_s`, on the clock of `time.monotonic`. None has no limit.
         """
         try:
             return self._messages.get(timeout=None if deadline_s is None else max(deadline_s - time.monotonic(), 0))

@@ -37,7 +37,7 @@ class State(NamedTuple):
 
     @property
     def tilt_rad(self) -> tuple[float, float]:
-        """Roll (left side up) and pitch (nose down)."""
+        """Roll (positive with the left side up) and pitch (positive with the nose down)."""
         return self._tilt_rad if isinstance(self, TiltedState) else LEVEL
 
 

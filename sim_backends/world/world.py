@@ -58,9 +58,10 @@ class World(Named):
     """The surroundings of emulated and simulated robots: `worlds/NAME.yaml` of the lab, or a shipped one.
 
     Coordinates are metres east and north of a corner. The ground is flat at height 0, except for raised ground and
-    ramps. An antenna is 0.2 m above the ground. The robots of a trial are placed along the line of its scenario, in
-    the compass direction `bearing_deg`: the sender at `from_m`, then the relay at the distance and the receiver at
-    twice the distance (`master`), or the receiver at the distance (`masterless`).
+    ramps. The antenna of an emulated robot is 0.2 m above the ground, or above its lowest point in flight. The robots
+    of a trial are placed along the line of its scenario, in the compass direction `bearing_deg`: the sender at
+    `from_m`, then the relay at the distance and the receiver at twice the distance (`master`), or the receiver at the
+    distance (`masterless`).
 
     Attributes:
         name: The name of its file without `.yaml`.

@@ -113,13 +113,18 @@ _COUNT: Final = re.compile(r"# lines ([0-9]{1,9})\n", re.ASCII)
 
 
 def counted_csv_text(header: str, lines: Iterable[str]) -> str:
-    """Return the text of a CSV file that starts with its number of lines, which shows whether it is complete."""
+    """Return the text of a CSV file.
+
+    It starts with a comment that contains the number of data lines, which shows whether the file is complete.
+    """
     data_lines = list(lines)
     return "".join(f"{line}\n" for line in (f"# lines {len(data_lines)}", header, *data_lines))
 
 
 def read_counted_csv(path: Path, header: str, pattern: re.Pattern[str], error: str) -> list[re.Match[str]]:
-    """Return the lines of a file that `counted_csv_text` created, as matches of a pattern.
+    """Return the data lines of a file that `counted_csv_text` created, as matches of a pattern.
+
+    A file without the number of lines is accepted, too; whole lines that are missing at its end are not detected.
 
     Args:
         path: The file.

@@ -80,6 +80,8 @@ def parse_cell(text: str) -> StationSample | None:
 def parse_channel(text: str) -> tuple[float | None, int | None, int | None]:
     """Return noise in dBm, active time in ns and busy time in ns of the channel in use; None for missing values.
 
+    Both times are None if one of them is missing.
+
     Args:
         text: Output of `iw dev INTERFACE survey dump`.
     """

@@ -27,7 +27,8 @@ COLUMNS: Final = columns(
         "bit/s",
         (
             "Payload rate of the test in the receiver's capture during the same seconds as iperf3_throughput_bit_s, "
-            "counted from the first packet; each byte counts once. Compare it with iperf3_throughput_bit_s."
+            "counted from the first packet; each byte of a TCP stream counts once, each copy of a datagram counts. "
+            "Compare it with iperf3_throughput_bit_s."
         ),
         Figure("iperf3 throughput, captured", Kind.MEDIAN, rank=65),
     ),
@@ -68,7 +69,7 @@ class LoadFlow:
     window_s: tuple[float, float]
 
     def streams(self, packets: Packets) -> list[Packets]:
-        """Return the data packets of each stream in a capture; for UDP, only the first fragments of datagrams."""
+        """Return the packets of each stream in a capture; for UDP, only the first fragments of data."""
         number = UDP if self.protocol is Protocol.UDP else TCP
         ends = packets.are_from(self.source_address) & packets.are_to(self.destination_address)
         packets_between = packets.where(ends & (packets.protocol == number))
@@ -103,7 +104,11 @@ def _loss(flow: LoadFlow, sent: list[Packets], received: list[Packets]) -> float
 
 
 def _rate(flow: LoadFlow, received: list[Packets]) -> float | None:
-    """Return the rate of received payload, in which each byte is counted once; None if it cannot be computed."""
+    """Return the rate of received payload, in which each byte of a TCP stream is counted once.
+
+    Copies of UDP datagrams are counted. Return None if no data has arrived, a packet has no time, the time span is
+    empty, or the SYN of a TCP stream was not captured.
+    """
     is_udp = flow.protocol is Protocol.UDP
     data = [packets if is_udp else packets.where(packets.tcp_payload_bytes > COOKIE_BYTES) for packets in received]
     times_ns: Ints = np.concatenate([packets.time_ns for packets in data]) if data else np.array([], dtype=np.int64)
@@ -210,7 +215,7 @@ class LoadStreams:
             sent: Packets of the sender's capture, from `forward`. Unknown ports are determined from them.
 
         Raises:
-            EvidenceError: The streams cannot be distinguished from other connections.
+            EvidenceError: More connections use the port than the load has streams.
         """
         if self.ports:
             return self.ports
@@ -309,16 +314,18 @@ def _udp_packets(load: LoadStreams, sender: Packets, receiver: Packets) -> UdpPa
 
 
 def _steady_clocks(load: LoadStreams, sender: Packets, receiver: Packets) -> Clocks | None:
-    """Return the offset between the clocks, or None if a direction without packets makes an estimate impossible.
+    """Return the offset between the clocks, or None if a capture has no packet of one of the robots.
 
     Raises:
-        EvidenceError: A clock was set during the load.
+        EvidenceError: The offset cannot be estimated although both captures have packets of both robots: packets have
+            no times or, otherwise, a clock was probably set during the load.
     """
     ends = load.source_address, load.destination_address
     clocks = delay.clocks_between(sender, receiver, *ends)
     has_packets = (packets.are_from(end).any() for packets in (sender, receiver) for end in ends)
     if clocks is None and all(has_packets):
-        raise EvidenceError(delay.UNSTEADY)
+        lacks_times = any((packets.time_ns == NO_TIME).any() for packets in (sender, receiver))
+        raise EvidenceError("a capture lacks times" if lacks_times else delay.UNSTEADY)
     return clocks
 
 

@@ -267,7 +267,7 @@ def _equal_frames(sent: Packets, received: Packets, frames: Match) -> tuple[Ints
 def _key(packets: Packets, stamp: Ints) -> Keys:
     """Return a key of each packet, which is equal for packets with equal fields.
 
-    Two different packets have equal keys with a probability of 2**-48.
+    Two different packets have equal keys with a probability of at most about 2**-48.
     """
     ip = (packets.ip_id << 16 | packets.fragment_offset, packets.ip_payload_bytes << 8 | packets.protocol)
     tcp = (packets.tcp_seq << 32 | packets.tcp_ack, packets.tcp_flags << 33 | stamp + 1)

@@ -60,10 +60,13 @@ class Rates:
     """Rates of a transfer.
 
     Attributes:
-        throughput_bit_s: IP-layer bits per second; None with fewer than two packets with payload, or without times.
-        completion_s: Time until the program had received the file; None if it did not receive the whole file, or if
+        throughput_bit_s: IP-layer bits per second; None with fewer than two packets with payload, without times, or
+            if the first and the last of these packets have the same time.
+        completion_s: Time until the program had received the file: over TCP until it closed the connection after it
+            had received every byte, over UDP until the last complete datagram. None if this did not happen, or if
             the time is unknown.
-        head_bytes: Payload in the first packet, with which the measured time starts.
+        head_bytes: Payload in the first packet of a UDP transfer, with which the measured time starts; 0 if its
+            datagram is incomplete, and for TCP.
     """
 
     throughput_bit_s: float | None

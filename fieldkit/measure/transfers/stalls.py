@@ -102,7 +102,8 @@ def find_stalls(stream: StreamDeliveries) -> Stalls:
     """Return the stalls of a stream.
 
     Raises:
-        EvidenceError: Only a single packet arrived, so no time can be computed.
+        EvidenceError: No time can be computed, because a single packet arrived without a stall before or after it, or
+            because no packet arrived and only one was sent.
     """
     at_ns, min_stall_s = stream.at_ns, stream.min_stall_s
     if not len(at_ns):

@@ -144,8 +144,9 @@ def _next_hypotheses(before: _Hypothesis, boot_ms: int, missing_count: int, peri
 def _period_ms(messages: Sequence[StreamMessage], indices: Sequence[int], interval_us: int | None) -> float | None:
     """Return the period of a stream in milliseconds, or None if it is unknown.
 
-    The period is the requested interval if the stream has about this period. Otherwise it is the period of the
-    nearest integer rate up to 10 Hz, because autopilots are configured in hertz.
+    The period is the requested interval if the stream has about this period, or if it has too few intervals to
+    estimate the period. Otherwise it is the period of the nearest integer rate up to 10 Hz, because autopilots are
+    configured in hertz.
     """
     intervals_ms = sorted(
         after.boot_ms - before.boot_ms

@@ -50,9 +50,9 @@ class MotionEntry:
             person confirmed that it is at its place. `allowed`: an option allowed it to move from its current
             position.
         robot: Name of the robot.
-        place: Name of the place of the origin, from `place_of`.
-        origin: The origin; for `ended`, the robot's position at the end, if it reported one.
-        reason: Reason why it is held, or how it was confirmed.
+        place: Name of the place of the origin, from `place_of`; empty for other events.
+        origin: The origin; for `ended` and `held`, the robot's position at the end, if it reported one.
+        reason: Reason why it is held, or how it was confirmed or allowed; empty for other events.
     """
 
     utc_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
@@ -70,7 +70,7 @@ class MotionHold:
     Attributes:
         robot: Name of the robot.
         reason: Cause of the stop.
-        utc_ns: Time of the stop, in nanoseconds since 1970 UTC.
+        utc_ns: Time of the stop, or of the start of a motion without an end, in nanoseconds since 1970 UTC.
     """
 
     robot: str
@@ -107,7 +107,10 @@ def origins(entries: Sequence[MotionEntry]) -> Mapping[str, MotionEntry]:
 
 
 def last_places(entries: Sequence[MotionEntry]) -> Mapping[str, MotionOrigin]:
-    """Return the position of each robot at the end of its last motion, by name; unknown positions are omitted."""
+    """Return the position of each robot at the end of its last motion, by name.
+
+    Positions are omitted if the robot did not report them, and after a new start or a confirmation by a person.
+    """
     by_robot: dict[str, MotionOrigin] = {}
     for entry in entries:
         if entry.event in {MotionEvent.ENDED, MotionEvent.HELD} and entry.origin is not None:
@@ -118,7 +121,7 @@ def last_places(entries: Sequence[MotionEntry]) -> Mapping[str, MotionOrigin]:
 
 
 def holds(entries: Sequence[MotionEntry]) -> Sequence[MotionHold]:
-    """Return the robots that may not move; a motion without an end means that fieldkit was killed."""
+    """Return the robots that may not move; a motion without an end is in progress, or fieldkit was killed in it."""
     by_robot: dict[str, MotionHold] = {}
     for entry in entries:
         if entry.event is MotionEvent.STARTED:
@@ -239,7 +242,7 @@ class JournaledOrigins:
         self._journal.add(MotionEvent.HELD, self._robots[role], reason=f"it did not start: {reason}")
 
     def require(self) -> None:
-        """Check that robots may move; robots in motion are exempt.
+        """Check that no robot is held, except robots in motion, whose motion has no end yet.
 
         Raises:
             MotionHeldError: A robot is held.

@@ -79,11 +79,14 @@ class MotionPermission:
         )
 
     def require(self) -> None:
-        """Check that robots may move in the next attempt. After a fault, a person must type `confirm`.
+        """Check that robots may move in the next attempt.
+
+        After a fault, a person must type `confirm`, or the operator must have set `--allow-motion-after-fault`.
 
         Raises:
             ConfigurationError: For the same reasons as `Operator.enter`.
-            MotionHeldError: No person has confirmed.
+            MotionHeldError: No person has confirmed, or a robot must be at a new place and no person was asked to
+                move it there.
             OSError: The disk is full or was removed.
         """
         if self._journaled_origins is None or not self._moving:

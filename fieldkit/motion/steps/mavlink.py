@@ -83,7 +83,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
     Attributes:
         robot: Role of the robot with the autopilot.
         at: Role of the robot that records over the radio; by default the computer of `robot` records.
-        system: The autopilot's system id; 0 for the first one received, which is then the only one in the log.
+        system: The autopilot's system id; 0 for the first one received, which must then be the only one in the log.
         rates: Requested messages per second, of `SYS_STATUS`, `GPS_RAW_INT`, `ATTITUDE`, `LOCAL_POSITION_NED`,
             `GLOBAL_POSITION_INT`, `VFR_HUD`, `RADIO_STATUS`, `BATTERY_STATUS`, `ESTIMATOR_STATUS`, `HOME_POSITION`
             and `EXTENDED_SYS_STATE`: `{ATTITUDE: 20Hz}`. Every message received is recorded.

@@ -146,9 +146,9 @@ def liveness_file(guard_name: str) -> str:
 def guarding(
     scene: Scene, shell: Shell, program: Planned, *, lease_s: float = LEASE_S, body_s: float
 ) -> Iterator["FlightLease"]:
-    """Start the guard of a drone, yield its lease, and stop it after the body.
+    """Start the guard of a drone, yield its lease, and stop it after a successful body.
 
-    Raises the same errors as `leased_program`.
+    After an error in the body, the guard continues; see `leased_program`. Raises the same errors.
     """
     with leased_program(scene, shell, program, lease_s=lease_s, body_s=body_s, exit_s=_GUARD_EXIT_S) as flight:
         yield flight

@@ -33,7 +33,8 @@ def read(path: Path) -> RecordingContents:
         path: A ROS 1 bag, or the data file of a ROS 2 bag (`.db3`, `.mcap`) in its folder.
 
     Raises:
-        EvidenceError: The file is missing, empty, unindexed, truncated, without messages, or not a bag.
+        EvidenceError: The file is missing, empty, unindexed, truncated, without messages, or not a bag; or it is a
+            ROS 2 bag without metadata, or one that is split into several files.
     """
     where = str(path)
     if not path.is_file():
@@ -78,7 +79,7 @@ def battery_share(path: Path, topic: str) -> float | None:
     TurtleBot3 writes the ratio of voltage to nominal voltage, slightly above 1.
 
     Raises:
-        EvidenceError: A message of the bag cannot be read.
+        EvidenceError: The bag or a message in it cannot be read.
     """
     try:
         share: float | None = query(path, topic=topic)["share"]
@@ -108,6 +109,9 @@ def query(path: Path, **parameters: str) -> Json:
 
 
 def allocated_bytes(path: Path) -> int:
-    """Return the size of a file for the reader's limits, without the holes of a sparse file."""
+    """Return the size of a file for the reader's limits.
+
+    For a sparse file above 64 MiB it is the allocated size, at least 64 MiB.
+    """
     status = path.stat()
     return min(status.st_size, max(_BLOCK_BYTES * status.st_blocks, _MIN_ALLOCATED_BYTES))

@@ -25,8 +25,8 @@ _MAX_TOPICS: Final = 10_000
 def answer(request: Json) -> Json:
     """Return the answer to a request about the bag at `path`.
 
-    The keys of the request select the answer: the message times by topic (`topic_stats`), the last battery state
-    (`topic`), the positions in one topic (`positions`), or else the contents of the bag.
+    The keys of the request select the answer: number and times of the messages by topic (`topic_stats`), the charge
+    in the last battery state (`topic`), the positions in one topic (`positions`), or else the contents of the bag.
 
     Raises:
         Exception: The bag cannot be read; rosbags and its dependencies raise any exception for invalid bytes.
@@ -97,7 +97,7 @@ def topic_stats(reader: "rosbag1.Reader | rosbag2.Reader") -> Json:
 
 
 def battery_share(path: Path, topic: str) -> float:
-    """Return the charge in the last `sensor_msgs/BatteryState` of a topic; NaN if there is no such message."""
+    """Return the charge in the last `sensor_msgs/BatteryState` of a topic; NaN if it is unknown or there is none."""
     share = math.nan
     with _open_decoder(path) as reader:
         connections = [
@@ -117,11 +117,12 @@ def positions(path: Path, topic: str, child: str) -> Json:
     Args:
         path: The bag.
         topic: The topic.
-        child: Child frame whose position is returned, for a topic of transforms (tf2).
+        child: Child frame whose position is returned, for a topic of transforms; empty for all transforms.
 
     Returns:
         `types` and `frames` of the messages, and `rows`: time in the header and time of recording in ns, three
-        coordinates, and the yaw in radians. Fixes without a position are omitted.
+        coordinates, and the yaw in radians. For fixes, the coordinates are latitude and longitude in degrees and
+        altitude in metres. Fixes without a position and poses with NaN or infinite values are omitted.
     """
     rows: list[tuple[int, int, float, float, float, float]] = []
     types, frames = set[str](), set[str]()

@@ -103,6 +103,8 @@ def judge_names(
 ) -> None:
     """Check that a robot with ROS 1 resolves the names of the other robots on its master to their radio addresses.
 
+    Robots use the same master if their ROS_MASTER_URI are equal. Nothing is resolved for a loopback address.
+
     Raises:
         LinkError: The robot did not answer.
     """

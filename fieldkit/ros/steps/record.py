@@ -274,8 +274,10 @@ class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpa
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
         discovery_s = values.get("bag_discovery_s")
-        if "bag_discovered" in values:
-            yield f"received after {discovery_s:.2f} s" if isinstance(discovery_s, float) else "received nothing"
+        if isinstance(discovery_s, float):
+            yield f"received after {discovery_s:.2f} s"
+        elif values.get("bag_discovered") is False:
+            yield "a topic without messages"
 
     @override
     def expected_s(self, protocol: Protocol) -> float:

@@ -17,6 +17,7 @@ from fieldkit.core.crosschecks import CrossCheck
 from fieldkit.core.errors import EvidenceError, FieldkitError
 from fieldkit.core.model import Protocol, Role, Verdict, sort_roles
 from fieldkit.core.threads import run_parallel
+from fieldkit.core.units import format_count
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.arrays import NO_TIME
 from fieldkit.measure.captures.pcap import Capture
@@ -48,14 +49,15 @@ _RECORD_BYTES: Final = 16
 """Size of the header of each captured frame in the file."""
 
 RING_S: Final = 2
-"""Time before tcpdump is stopped if it does not support immediate mode. The kernel then passes packets to tcpdump
-with a delay of up to a second: of 215 packets, tcpdump had none after 0.5 s and all after 1.0 s."""
+"""Waiting time after the steps inside, before tcpdump is stopped, if it does not support immediate mode. The kernel
+then passes packets to tcpdump with a delay of up to a second: of 215 packets, tcpdump had none after 0.5 s and all
+after 1.0 s."""
 
 LAST_LINE: Final = "dropped by kernel"
 """Text of tcpdump's last line. After this line the kernel needs 15 to 31 ms to close the socket."""
 
 BACK_S: Final = 0.1
-"""Maximum step backwards between time stamps: packets received by two processors may be recorded out of order."""
+"""Permitted step backwards between time stamps: packets received by two processors may be recorded out of order."""
 
 STAMP_NS: Final = 1_000
 """Resolution of time stamps: tcpdump truncates them to microseconds."""
@@ -270,7 +272,7 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
         return tuple(name for role in self.robots for name in (self._file(role), self._log(role)))
 
     def check(self, view: View) -> Iterator[str]:
-        """Yield a reason for each incomplete capture file, and for dropped packets; see `Step.check`.
+        """Yield a reason for each incomplete or contradictory capture, and for dropped packets; see `Step.check`.
 
         Dropped packets are permitted if each step inside leaves the columns that depend on them empty.
         """
@@ -316,7 +318,8 @@ def _problems(role: Role, file: str, log_file: str, view: View, *, needs_all: bo
         yield "tcpdump ended without its counters"
         return
     if needs_all and (log.dropped_by_kernel or log.dropped_by_interface):
-        yield f"its kernel dropped {log.dropped_by_kernel} packets, its interface {log.dropped_by_interface}"
+        dropped_text = format_count(log.dropped_by_kernel or 0, "packet")
+        yield f"its kernel dropped {dropped_text}, its interface {log.dropped_by_interface or 0}"
     # The filter may have matched more packets than were written: see `CaptureLog.received_by_filter`.
     if log.received_by_filter is not None and log.received_by_filter < log.captured:
         yield f"{log.received_by_filter} packets matched, but {log.captured} were written"

@@ -50,8 +50,11 @@ Payload = Annotated[Int, Field(ge=0, le=65507)]
 
 
 def command_line(scene: Scene, role: Role, options: Iterable[str], address: str) -> tuple[str, ...]:
-    """Return the ping command of a robot. Its output is English, with numeric addresses and with time stamps."""
-    # busybox has no time stamps and never resolves names.
+    """Return the ping command of a robot. Its output is in English and has numeric addresses.
+
+    It has time stamps unless the ping is busybox's.
+    """
+    # busybox has no option for time stamps, and never resolves names.
     stamp_options = () if scene.tools(role).ping is PingTool.BUSYBOX else ("-n", "-D")
     return ("env", "LC_ALL=C", scene.robot(role).profile.tools.ping, *stamp_options, *options, address)
 

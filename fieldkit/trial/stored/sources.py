@@ -153,17 +153,17 @@ class Sources:
     def read(
         self, columns: Collection[str] | None = None, *, also: Collection[str] = (), undeclared: bool = False
     ) -> Repeats:
-        """Return the attempts in the tables without duplicates; see `table_files.read`.
+        """Return the attempts in the tables that the row filter selects, without duplicates; see `table_files.read`.
 
         Args:
-            columns: Columns to read; None for all declared columns.
-            also: Further columns to read, even if they are not declared.
-            undeclared: True to read all undeclared columns; a note lists them.
+            columns: Columns to read, besides the columns of the row filter; None for all declared columns.
+            also: With `columns` None, further columns to read, even if they are not declared.
+            undeclared: With `columns` None, True to read all undeclared columns; a note lists them.
 
         Raises:
             ConfigurationError: A file is not a table of repeats, two tables contradict each other, or there is no
                 evidence to rebuild from.
-            EvidenceError: A line or a journal is damaged, or no repeat has ended.
+            EvidenceError: A line or a journal is damaged, no repeat has ended, or the row filter selects no attempt.
         """
         undeclared_names = [column.name for column in self.columns if table_files.is_undeclared(column)]
         if undeclared_names and undeclared:
@@ -230,18 +230,19 @@ def find(
     workers: Workers = ALL_PROCESSORS,
     use_index: bool = True,
 ) -> Sources:
-    """Return the tables of the trials and CSV files at or below `paths`, with their columns.
+    """Return the tables at `paths`: CSV files, and the tables of trials and sweeps at or below folders.
 
     Args:
-        paths: Folders of trials, folders with trials at any depth, or CSV files with the columns of trial.csv.
+        paths: Folders of trials or sweeps, folders with them at any depth, or CSV files with the columns of
+            trial.csv.
         note: Receives notes.
         rebuild: True to measure raw evidence again.
         workers: Processes that measure evidence and read plans.
         use_index: True to read many tables from an index, which does not change the result.
 
     Raises:
-        ConfigurationError: A path does not exist or contains no trial, or the columns cannot be determined; see
-            `tables.declared_columns`.
+        ConfigurationError: A path does not exist or contains no trial, `rebuild` is True and there is a sweep, or the
+            columns cannot be determined; see `tables.declared_columns`.
         EvidenceError: No trial has a table.
     """
     return find_each([paths], note, rebuild=rebuild, workers=workers, use_index=use_index)[0]
@@ -283,7 +284,10 @@ def _paths_text(paths: Sequence[Path]) -> str:
 
 
 def _tables(path: Path, note: Note, *, rebuild: bool) -> Iterator[Path]:
-    """Yield the CSV file of each trial at or below a path."""
+    """Yield the path itself if it is a file, otherwise the table of each trial and sweep at or below the folder.
+
+    The table of a sweep is a folder.
+    """
     if path.is_file():
         yield path
         return
@@ -319,7 +323,7 @@ def _tables(path: Path, note: Note, *, rebuild: bool) -> Iterator[Path]:
 
 
 def trial_folders(path: Path) -> list[Path]:
-    """Return the folders of trials at or below a path; none if the path is not a folder."""
+    """Return the folders of trials and sweeps at or below a path; none if the path is not a folder."""
     return [Path(folder) for folder in _trials(str(path), set())] if path.is_dir() else []
 
 
@@ -330,7 +334,7 @@ _IDENTIFYING_FILES: Final = frozenset({PLAN_FILE, store.TRIAL_CSV, laptop_files.
 def _trials(folder: str, visited: set[tuple[int, int]]) -> Iterator[str]:
     """Yield the folders of trials and sweeps at or below a folder, sorted.
 
-    Links are followed. Each folder is visited once.
+    Links are followed. Each folder is visited once. Names that start with `.` or end with `.partial` are omitted.
     """
     status = os.stat(folder)  # noqa: PTH116 (a path object per folder takes longer than the call)
     if (status.st_dev, status.st_ino) in visited:

@@ -116,7 +116,7 @@ def _values(cell: PaperCell) -> tuple[Value, ...]:
 
 
 def summary(rows: Sequence[PaperRow]) -> str:
-    """Return a sentence with the number of cells of a table that agree."""
+    """Return the number of cells of a table that agree, as text."""
     cells = [cell for row in rows for cell in (row.delay, row.loss)]
     agreeing_cells = [cell for cell in cells if cell.agreement is Agreement.AGREES]
     by_mean = sum(cell.agrees_by_mean for cell in agreeing_cells)

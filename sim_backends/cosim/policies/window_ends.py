@@ -12,7 +12,7 @@ _MAX_EMPTY_WINDOWS: Final = 1000
 
 
 class WindowEnds:
-    """Gets the ends of windows from policies, and limits the number of successive windows in which time stays."""
+    """Gets the ends of windows from policies, and limits the number of successive windows of length 0."""
 
     def __init__(self) -> None:
         self._empty_at_ns = self._empty_count = 0

@@ -131,7 +131,7 @@ def write_part(folder: Path, table: str, number: int, rows: Sequence[Row]) -> st
     """Write a part of a table; it becomes visible when it is complete.
 
     Returns:
-        BLAKE2b of the file, in hexadecimal.
+        BLAKE2b of the file (128 bits), in hexadecimal.
 
     Raises:
         OSError: The part cannot be written; no incomplete file remains.
@@ -150,7 +150,7 @@ def file_checksum(path: Path) -> str:
     """Return the BLAKE2b of a file, computed as by `write_part`.
 
     Raises:
-        OSError: It cannot be read.
+        OSError: The file cannot be read.
     """
     return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
 

@@ -117,8 +117,9 @@ class AgentRadio(Strict):
         standard: Its IEEE standard; with `phy` also its band, `802.11ac 5 GHz`.
         tx_power_dbm: Its transmit power.
         sensitivity_dbm: Power of the weakest frame that it detects.
-        phy: Physical layer of 802.11n, ac or ax, as `radio.phy` of a [robot profile](reference/robot-profile.md).
-        antenna: Pattern and orientation of its antenna, as `radio.antenna` of a robot profile.
+        phy: Physical layer of 802.11n, ac or ax, as `radio.phy` of a [robot profile](reference/robot-profile.md); if
+            omitted, that of `standard` with one stream in 20 MHz.
+        antenna: Pattern and orientation of its antenna, as `radio.antenna` of a robot profile; isotropic if omitted.
     """
 
     standard: str = "802.11n"
@@ -222,9 +223,8 @@ class CosimScenario(Named):
         network: The network simulator.
         radio: The radio model.
         tcp: The TCP of all agents, also for ROS 1 topics.
-        topology: `masterless`, or `master`: all packets go through the relay, which also runs
-            the ROS 1 master, if any.
-        relay: The agent whose access point relays packets.
+        topology: `masterless`, or `master`: all packets go through the relay.
+        relay: The agent that runs the ROS 1 master, if any; with `master`, its access point also relays all packets.
         policy: The [sync policy](method-cosim.md#sync-policies).
         emane: If given, a run publishes the positions of its agents to the network emulator [EMANE](emane.md). With
             the physics federate `emane`, it reads them from EMANE's events instead.

@@ -42,7 +42,7 @@ def write_dataset(plan: SweepPlan, folder: SweepFolder) -> int:
     """Replace the dataset of a sweep by a dataset of the results so far, and return the number of its rows.
 
     Raises:
-        ConfigurationError: It cannot be written; an existing dataset is unchanged.
+        ConfigurationError: The new dataset cannot be written; an existing dataset is unchanged.
         EvidenceError: The file of a run is damaged.
     """
     rows = {setting.digest: _rows_of(setting, plan, folder) for setting in plan.settings}

@@ -74,6 +74,7 @@ class SweepFolder:
         Raises:
             ConfigurationError: The folder contains other files or another sweep, another process runs the sweep, or
                 the folder cannot be written.
+            EvidenceError: The file with the plan is damaged.
         """
         with self.error_conversion():
             self.path.mkdir(parents=True, exist_ok=True)
@@ -138,7 +139,11 @@ class SweepFolder:
         (self.path / _FAILED / f"{run.name}.json").unlink(missing_ok=True)
 
     def failure(self, run: SweepRun) -> RunFailure | None:
-        """Return the last failure of a run; None if it did not fail."""
+        """Return the last failure of a run; None if it did not fail, or has finished since.
+
+        Raises:
+            EvidenceError: The file of the failure is damaged.
+        """
         path = self.path / _FAILED / f"{run.name}.json"
         if not path.exists():
             return None

@@ -41,12 +41,12 @@ class FrameOnAir:
     Attributes:
         sent_frame: The frame.
         source: Name of its transmitter.
-        receiver: Name of its receiver; None for a broadcast or multicast, `""` if no radio has the address.
+        receiver: Name of its receiver; None for a broadcast or multicast, `""` if no other radio has the address.
         chain: Its tries; a broadcast or multicast has one, in the basic mode.
         attempts: Number of tries that were made.
         is_acknowledged: True if an ACK was received.
-        signal_dbm: Signal of that ACK, at the start of the try.
-        mode: Mode of the last try that a receiver decoded.
+        signal_dbm: Signal of that ACK, at the start of the try; -120 without an ACK.
+        mode: Mode of the last try that a receiver decoded; the lowest mode of 802.11g if there is none.
         is_final: True if its status is known.
     """
 

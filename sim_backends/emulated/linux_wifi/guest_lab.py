@@ -48,6 +48,10 @@ class GuestLab:
         draw: Returns the plan view for the positions of the robots.
         deadline: Time by which the lab must answer for the first time.
 
+    Attributes:
+        members: The robots by name.
+        login: The login at the robots.
+
     Raises:
         LinkError: The lab does not answer.
         TestbedLostError: The machine has ended.
@@ -96,7 +100,7 @@ class GuestLab:
         return self._draw({name: self.place_m(name) for name in self.members})
 
     def lateness(self) -> None:
-        """Implement `Lab.lateness`: the lab has no co-simulation."""
+        """Implement `Lab.lateness`: None, because the lab has no co-simulation."""
         return
 
     def _state(self, name: str) -> RobotState:
@@ -137,7 +141,7 @@ def _read_login(answer: bytes) -> GuestLogin:
 
 
 def _require_connection(stream: socket.socket) -> None:
-    """Read the answer to `connect`; raise ConnectionError if it is not `CONNECTED`."""
+    """Read the answer to `connect`; raise ConnectionError, with the text of the answer, if it is not `CONNECTED`."""
     answer = stream.recv(len(CONNECTED))
     if answer != CONNECTED:
         raise ConnectionError((answer + stream.recv(4096)).decode(errors="replace") or "the robot does not answer")

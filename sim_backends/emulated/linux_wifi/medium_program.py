@@ -9,6 +9,8 @@ Requests and replies are JSON objects, one per line. The first request is `Mediu
     {"do": "place", "positions": {"r1": [0, 0, 1]}, "velocities": {}}
     {"do": "totals"}
 
+The request `place` may also have `attitudes`: the yaw, pitch and roll of radios in radians, by name (`Attitude`).
+
 It exits when the requests end. When the last descriptor of the registered socket is closed, hwsim again delivers all
 frames without loss. A supervisor therefore opens the socket with `hwsim_socket.open_registered`, keeps it open, and
 passes its descriptor with `--fd`. If the medium is then killed, no frame is delivered until a new medium is started
@@ -131,7 +133,8 @@ class RequestLines:
         fd: The descriptor.
 
     Attributes:
-        is_at_end: True if there are no more lines.
+        fd: The descriptor.
+        is_at_end: True if there is no more data.
     """
 
     def __init__(self, fd: int) -> None:
@@ -140,7 +143,7 @@ class RequestLines:
         self._buffer = b""
 
     def read(self) -> Iterator[bytes]:
-        """Wait for data, read once, and yield the complete lines.
+        """Wait for data, read once, and yield the complete lines; an incomplete line at the end is not yielded.
 
         Raises:
             ValueError: A line is too long.
@@ -201,7 +204,10 @@ def _receive(kernel: KernelSocket, medium: HwsimMedium | None, now_ns: int) -> N
 def _answer(
     medium: HwsimMedium | None, kernel: KernelSocket, line: bytes
 ) -> tuple[HwsimMedium | None, dict[str, Any]]:
-    """Return the medium after a request, and the reply; an invalid request changes nothing."""
+    """Return the medium after a request (None before a valid first request), and the reply.
+
+    An invalid request changes nothing.
+    """
     try:
         request = json.loads(line)
         if medium is None:

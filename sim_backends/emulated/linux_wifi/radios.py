@@ -20,7 +20,7 @@ _RADIO_BIT: Final = 0x40
 _ARPHRD_IEEE80211_RADIOTAP: Final = "803"
 """Type of a monitor interface: linux/if_arp.h."""
 _RETURN_S: Final = 5.0
-"""Maximum time until the kernel moves the radios of a network namespace back, after its last process has exited."""
+"""Default wait until the kernel has moved the radios of a lab back, after the last process of the lab has exited."""
 _POLL_S: Final = 0.05
 _TIMEOUT_S: Final = 60.0
 """Timeout of `iw`."""
@@ -85,7 +85,7 @@ def find_radios(folder: Path = _FOLDER) -> list[HwsimRadio]:
 
 
 def can_use_radios() -> bool:
-    """Return True if this process can use radios of hwsim: it is root, and the kernel has the module."""
+    """Return True if this process can use radios of hwsim: it is root, and the module is loaded."""
     return os.geteuid() == 0 and _MODULE.exists()
 
 

@@ -182,7 +182,7 @@ class Machine:
 
         Args:
             deadline: Time by which the machine must have switched off.
-            on_output: Called with new output of the script.
+            on_output: Called several times per second with the new output of the script, which may be empty.
 
         Raises:
             TestbedLostError: The machine ended before its script, or did not switch off before the deadline.
@@ -226,7 +226,7 @@ class Machine:
         return TestbedLostError(
             f"{cause}; its last output: {last_line}" if last_line else cause,
             where="the virtual machine with Linux's Wi-Fi",
-            remedy="run it on a machine that is less busy, or that has KVM",
+            remedy="use a host that is less busy, or that has KVM",
         )
 
     def _has_ended(self, timeout_s: float, *, is_interrupted: bool) -> bool:

@@ -35,7 +35,8 @@ class Framing:
         carries: Returns True if the radio carries this packet; raises IndexError if it is empty.
         destination: Returns the receiver of this hop; None for broadcast and multicast; `NO_ROBOT` if no robot has
             the address, or if there are no routes.
-        routes: Returns the routes of a robot from its own address, and the addresses of the others by name.
+        routes: Returns the routes of a robot; its arguments are the robot's address, and the addresses of the robots
+            that it can reach, by name.
     """
 
     name: str

@@ -67,7 +67,7 @@ class MediumClient:
 
     @property
     def robot_names(self) -> Set[str]:
-        """Names of the attached robots."""
+        """Names of the attached robots; with Linux Wi-Fi also those of the access points, after `place`."""
         return self._robots
 
     def attach(
@@ -152,8 +152,8 @@ class MediumClient:
             OSError: The files cannot be created.
         """
         with ExitStack() as stack:
-            names = () if folder is None else (folder / air_log.PCAP, folder / air_log.CSV)
-            files = [stack.enter_context(name.open("wb")) for name in names]
+            paths = () if folder is None else (folder / air_log.PCAP, folder / air_log.CSV)
+            files = [stack.enter_context(path.open("wb")) for path in paths]
             self._worker.request({"do": "record"}, descriptors=[file.fileno() for file in files])
 
     def stats(self) -> MediumStats:

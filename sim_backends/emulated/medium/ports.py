@@ -22,7 +22,8 @@ FlowKey = bytes
 class FlowDelays:
     """Sums of the delays of each requested flow since the first request for it.
 
-    `delays_by_flow` is empty until the first request; until then the medium does not call the methods for packets.
+    `delays_by_flow` is empty until the first request. Until then the medium saves the calls of `note_first_fragment`
+    and `count`.
 
     Attributes:
         delays_by_flow: Sum of the delays of each requested flow.
@@ -182,6 +183,14 @@ class Port:
         name: Name of the robot.
         address: Its address.
         fd: Descriptor of the device.
+
+    Attributes:
+        backlog: Number of packets in the device that may have waited since `backlog_since_ns`.
+        backlog_since_ns: Earliest time at which these packets can have arrived.
+        delays: Sum of the delays of the packets that were written to the device, by the robot that sent them.
+        routes: Routes to the other robots (`framing.Routes`).
+
+    The other attributes are those of `PortCounters`.
     """
 
     def __init__(self, name: str, address: IPv4Interface, fd: int) -> None:
@@ -192,11 +201,8 @@ class Port:
         self.refused_packets = 0
         self.unroutable_packets = 0
         self.other_packets = 0
-        # Number of packets in the device that may have waited since `backlog_since_ns`.
         self.backlog = 0
         self.backlog_since_ns = 0
-        # Delays of the written packets, by the robot that sent them. `refused_packets` counts packets that were not
-        # written.
         self.delays: defaultdict[str, Delay] = defaultdict(int)
         self.routes: Routes = {}
 

@@ -55,7 +55,7 @@ class Layout:
 
     Attributes:
         positions_m: Position of each robot, metres east, north, up; empty before the first request.
-        velocities_m_s: Velocity of each moving robot, metres per second east, north, up.
+        velocities_m_s: Velocity of each robot, metres per second east, north, up; at rest without an entry.
         attitudes: Attitude of each robot; empty if no antenna has a pattern.
         relay: The robot whose access point relays between the others; None if they communicate directly.
     """

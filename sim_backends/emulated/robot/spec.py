@@ -123,8 +123,8 @@ class RobotSpec:
         host_key: Private host key of its SSH server, OpenSSH PEM.
         authorized_key: Public key that may log in.
         ros: Source of its ROS programs: `builtin` for those of this package, `debian` for Debian's.
-        ros_version: 1 or 2.
-        distribution: ROS distribution that its profile names.
+        ros_version: 1 or 2; 1 for a robot without ROS.
+        distribution: ROS distribution that its profile names; empty for a robot without ROS.
         setup: Setup files that its profile names.
         ros_master: Address of its ROS master: `LOOPBACK`, or the radio address of this or of another robot.
         sensors: Its sensors, one per published topic.

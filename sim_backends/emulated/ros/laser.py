@@ -130,6 +130,9 @@ class PositionsWriter:
     Args:
         names: Names of all robots, in the order of `Neighbour.number`.
 
+    Attributes:
+        fd: Descriptor of the memory.
+
     Raises:
         OSError: The memory cannot be allocated.
     """

@@ -216,6 +216,7 @@ def publish(
         ready: File that is created when every topic can be subscribed to.
 
     Raises:
+        ConfigurationError: The error of `messages.Source`.
         OSError: A socket cannot be created.
     """
     start_s = time.monotonic()

@@ -46,7 +46,7 @@ Header = Mapping[str, str]
 
 @dataclass
 class _Subscription:
-    """Connection to the publisher of one topic."""
+    """Connection to the publisher of one topic; `header` is None until the publisher's connection header arrives."""
 
     topic: str
     stream: socket.socket

@@ -127,6 +127,10 @@ class _SerializedFields:
         store: Type definitions.
         size_bytes: Size of the list; 0 for an empty one.
         values: Values of fields of the outermost message.
+
+    Attributes:
+        parts: The fields before and after the gap; all fields are before it if there is no gap.
+        list_type: Type of the numbers in the gap; None if there is no gap yet.
     """
 
     def __init__(self, store: "Typestore", size_bytes: int, values: Values) -> None:

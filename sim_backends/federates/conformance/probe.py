@@ -35,7 +35,7 @@ class CheckError(Exception):
 
 
 class NotDeclaredError(Exception):
-    """A check does not apply, because the federate does not declare the capability; the message names it."""
+    """A check does not apply, for example because the federate does not declare a capability; the message is why."""
 
 
 class Opener(Protocol):
@@ -246,7 +246,7 @@ class Target:
         """Stop the last federate, and return a new one; a listening federate may serve only one run at a time.
 
         Args:
-            hello: The hello that it receives, if it is not the hello of the target.
+            hello: The hello that it receives; None for the hello of the target.
         """
         self.close()
         self.exchange |= {"request": "hello", "answer": "none"}

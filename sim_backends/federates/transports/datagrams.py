@@ -31,7 +31,7 @@ from sim_backends.federates.channels import ClosedError, DeadlineError
 from sim_backends.federates.frames import HEADER_BYTES, MAX_FRAME_BYTES, ProtocolFrame, read_header
 
 MAX_DATAGRAM_BYTES: Final = 1200
-"""A size that passes every path without fragmentation (RFC 9000, section 14.1)."""
+"""A size that should pass every path without fragmentation: QUIC requires this of paths (RFC 9000, section 14.1)."""
 _MAGIC: Final = b"FKUD"
 _HEADER: Final = struct.Struct("<4sBBHQQQQ")
 DATAGRAM_HEADER_BYTES: Final = _HEADER.size

@@ -60,7 +60,9 @@ class TcpAddress(HostAndPort):
                 (self.host, self.port), family=socket.AF_INET6 if ":" in self.host else socket.AF_INET
             )
         except OSError as error:
-            raise ConfigurationError(f"cannot listen at {self}: {error}", remedy="use another port") from error
+            raise ConfigurationError(
+                f"cannot listen at {self}: {error}", remedy="use another port or host"
+            ) from error
         with server:
             yield TcpListener(server)
 

@@ -28,7 +28,7 @@ class MeanLoss:
         )
 
     def open_db(self, start_m: Floats, end_m: Floats) -> Floats:
-        """Return the loss of paths between points of shape (n, 3) without obstacles, in dB."""
+        """Return the loss of paths between points of shape (n, 3) with shadowing and without obstacles, in dB."""
         match self._options.propagation:
             case "free-space":
                 loss_db = path_loss.free_space_db(start_m, end_m, self._carrier_hz)

@@ -4,9 +4,10 @@ import math
 from collections.abc import Sequence
 
 import pytest
+from typing_extensions import override
 
 from sim_backends.radio.error_rates import packet_error
-from sim_backends.radio.frames import Transmission, TransmissionAttempt
+from sim_backends.radio.frames import HEADER_BYTES, Transmission, TransmissionAttempt
 from sim_backends.radio.high_throughput import format_modes
 from sim_backends.radio.links import Delivery
 from sim_backends.radio.modes import BANDS, CW_MIN, DIFS_NS, G_MODES, OFDM_MODES, SIFS_NS, SLOT_NS, WifiMode, ack_ns
@@ -76,6 +77,33 @@ def test_a_station_waits_for_eifs_after_a_frame_that_it_did_not_decode(
         slots.add(slot)
     assert slots <= set(range(CW_MIN + 1))
     assert len(slots) > 10, "only the backoff is random"
+
+
+class ProtectedPowers(Powers):
+    """Stations that send RTS."""
+
+    @override
+    def rts_threshold_bytes(self, station: int) -> int:
+        return 0 if station == 0 else 10_000
+
+
+@pytest.mark.parametrize("ratio_db", [STRONG_DB, ONLY_PREAMBLE_DB])
+def test_only_a_cts_that_is_decoded_reserves_the_channel(ratio_db: float) -> None:
+    """Station c detects only b, to which a sends data after RTS and CTS."""
+    ratios_db = {"ab": STRONG_DB, "ba": STRONG_DB, "cb": STRONG_DB, "bc": ratio_db}
+    wifi: Wifi[str] = Wifi(ProtectedPowers("abc", ratios_db), 1)
+    log: list[TransmissionAttempt] = []
+    wifi.log_attempts(log.append)
+    wifi.send(0, "a", "data", 1500, "b")
+    wifi.send(50_000, "c", "waiting", 100, "b")
+    wifi.deliveries(10**7)
+    cts = next(attempt for attempt in log if attempt.control == "CTS")
+    start_ns = next(attempt.start_ns for attempt in log if attempt.transmitter == "c")
+    reserved_ns = 2 * SIFS_NS + G54.airtime_ns(1500 + HEADER_BYTES) + ack_ns(G54)
+    waits_from_ns = cts.end_ns + (reserved_ns + DIFS_NS if ratio_db == STRONG_DB else EIFS_NS)
+    slots, rest_ns = divmod(start_ns - waits_from_ns, SLOT_NS)
+    assert rest_ns == 0
+    assert 0 <= slots <= CW_MIN
 
 
 def test_a_sender_waits_for_eifs_after_an_ack_that_it_did_not_decode() -> None:
