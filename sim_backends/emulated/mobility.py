@@ -297,7 +297,7 @@ class Mobility:
             return self._next_update_s(now_ns, states)
 
     def _extend_track(self, utc_ns: int, states: Mapping[str, State]) -> None:
-        """Append a point for each robot whose position or velocity differs from its last point, if it has one.
+        """Append a point for each robot that has none, or whose position or velocity has changed since its last one.
 
         A robot that is not in `states` is off the air: its point has no position. `utc_ns` is the time of `states`.
         """

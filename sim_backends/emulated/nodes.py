@@ -144,8 +144,8 @@ class EmulatedRobot(Node):
         physics_fds: Descriptors for a physics simulator that moves the robot, set by `build`: its motion record, its
             file of assigned paths, and either its record of commanded velocities or, for a robot with an autopilot,
             its records of commands and of flight. Empty if no simulator moves the robot.
-        link_fds: Descriptor of the TUN device of each further link (a link beside the radio under test), by its name,
-            after `open_links`.
+        link_fds: Descriptor of the TUN or TAP device of each further link (a link beside the radio under test), by
+            its name, after `open_links`. A link on the loopback interface has no device.
 
     Raises:
         ConfigurationError: A program of util-linux is missing.

@@ -138,7 +138,9 @@ def _neighbours(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) ->
 
 
 def neighbour(number: int, profile: RobotProfile) -> Neighbour:
-    """Return the body of a robot as a cylinder: from `ANTENNA_M` below its antenna up to its antenna or higher top.
+    """Return the body of a robot as a cylinder: from `ANTENNA_M` below its antenna up to the antenna.
+
+    If the robot is higher than its antenna, the cylinder ends at the top of the robot.
 
     A robot whose body is unknown has the body of the paper's ground robot or of the paper's drone.
     """

@@ -105,7 +105,7 @@ def encode_advance_physics(to_ns: int, from_ns: int, commands: Mapping[str, Any]
 
 
 def decode_advance_physics(body: bytes, agents: AgentTable) -> tuple[int, int, dict[str, Twist | Velocity]]:
-    """Return the two times and the commands of a request to a physics federate.
+    """Return `to_ns`, `from_ns` and the commands of a request to a physics federate.
 
     Raises:
         MalformedFrameError: The body is malformed.

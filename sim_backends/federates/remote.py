@@ -170,7 +170,7 @@ class RemoteNetwork(_RemoteFederate):
     def sample_links(self) -> dict[str, LinkSample]:
         """Return a sample of the links of each radio, at the network's current time.
 
-        The result is empty if there are no radios, or if the network does not declare this capability.
+        The result is empty if there are no radios, or if the network does not declare `SAMPLES_LINKS`.
 
         Raises:
             FederateError: The network failed, or sent a malformed answer.

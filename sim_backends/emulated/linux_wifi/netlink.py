@@ -64,7 +64,7 @@ class NetlinkMessage:
     payload: bytes
 
     def encode(self) -> bytes:
-        """Return the message with header and padding. Its port number is 0: the kernel takes that of the socket."""
+        """Return the message with header and padding. Its port number is 0, because the kernel uses the socket's."""
         size = _MESSAGE.size + len(self.payload)
         return _pad(_MESSAGE.pack(size, self.type, self.flags, self.sequence, 0) + self.payload)
 
@@ -118,7 +118,7 @@ def encode_generic(command: int, version: int, attributes: Mapping[int, bytes]) 
 
 
 def decode_generic(payload: bytes) -> tuple[int, dict[int, bytes]]:
-    """Return the command and the attributes of a generic netlink message, by type without flags.
+    """Return the command of a generic netlink message, and the value of each attribute by its type without flags.
 
     If a type is repeated, its last value is returned.
 

@@ -22,7 +22,8 @@ FlowKey = bytes
 class FlowDelays:
     """Sums of the delays of each requested flow since the first request for it.
 
-    `delays_by_flow` is empty until the first request; until then the medium does not call the methods for packets.
+    `delays_by_flow` is empty until the first request. Until then the medium saves the calls of `note_first_fragment`
+    and `count`.
 
     Attributes:
         delays_by_flow: Sum of the delays of each requested flow.
@@ -185,6 +186,7 @@ class Port:
 
     Attributes:
         backlog: Number of packets in the device that may have waited since `backlog_since_ns`.
+        backlog_since_ns: Earliest time at which these packets can have arrived.
         delays: Sum of the delays of the packets that were written to the device, by the robot that sent them.
         routes: Routes to the other robots (`framing.Routes`).
 

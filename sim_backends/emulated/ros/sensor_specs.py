@@ -33,9 +33,10 @@ class Template:
 
     Attributes:
         has_header: True if the message starts with a header.
-        head: Content between the header and the list that is filled, serialized, in hexadecimal digits.
+        head: Content before the list that is filled, without the header, serialized, in hexadecimal digits. It is the
+            whole content if no list is filled.
         tail: Content after the list, in the same form.
-        size_bytes: Size of the list.
+        size_bytes: Size of the list without its length field; 0 if no list is filled.
         floats: True if the list holds 4-byte floats; False if any bytes are valid values.
     """
 

@@ -35,7 +35,7 @@ class CheckError(Exception):
 
 
 class NotDeclaredError(Exception):
-    """A check does not apply, because the federate does not declare the capability; the message names it."""
+    """A check does not apply, for example because the federate does not declare a capability; the message is why."""
 
 
 class Opener(Protocol):
