@@ -127,7 +127,7 @@ def iperf(namespace: Namespace, seconds: float, *options: str) -> dict[str, dict
 
 
 def measure_delay(client: Namespace, server: Namespace, probes: int) -> list[float]:
-    """Return one-way delays in ms of datagrams sent every 2 ms."""
+    """Return the one-way delays in ms of the datagrams that arrived; one is sent every 2 ms."""
     module = ("-m", "benchmarks.medium", "--probes", str(probes))
     receiver = server.start(sys.executable, *module, "--probe", "receive")
     assert receiver.stdout is not None

@@ -89,7 +89,11 @@ class Cost:
 
 
 def measure(argv: Sequence[str], environment: Mapping[str, str]) -> Cost:
-    """Run a command in an empty folder until it exits, and return its cost."""
+    """Run a command in an empty folder until it exits, and return its cost.
+
+    Raises:
+        RuntimeError: The command failed.
+    """
     with tempfile.TemporaryDirectory() as folder:
         started_s = time.perf_counter()
         process = subprocess.Popen(

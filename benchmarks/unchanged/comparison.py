@@ -43,7 +43,7 @@ class Differences:
     """Differences between two outputs.
 
     Attributes:
-        labels: Pairs of words, before and after the change, with their counts.
+        labels: Pairs of passages, before and after the change, with their counts.
         real: Differences that are not labels, each with the lines that differ.
     """
 

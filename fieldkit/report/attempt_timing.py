@@ -64,7 +64,8 @@ class AttemptTimes:
         bags: Contents of the bags that were sent, by file.
         transfers: Transfers with known fates of their packets.
         pings: Step name, role and output of each ping with an output.
-        clock_offset_ns: Clock offset of each role relative to the first sending robot; 0 if unknown.
+        clock_offset_ns: Clock offset of each role relative to the first sending robot; 0 if it is unknown and no
+            packet gives an estimate, see `clock_note`.
         clock_note: A sentence about the source of the clock offset.
         links: Samples of the radio link at each end.
         telemetry: Values from telemetry sources at each end by quantity (`telemetry_samples.series`).

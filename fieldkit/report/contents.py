@@ -178,6 +178,9 @@ def build_contents(
         sweep: If the repeats are runs of sweeps, the result of `datasets.condition`: columns of the flow and of the
             factors, each with the column that contains its values as the user typed them. None or empty for other
             repeats.
+
+    Raises:
+        ConfigurationError: For the same reasons as `repeat_to_draw`.
     """
     evidence = load_evidence(repeats, repeat)
     has_all_plans = evidence.plans.keys() == set(repeats.texts["source"].tolist())

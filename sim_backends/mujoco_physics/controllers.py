@@ -59,7 +59,7 @@ class Controller(Protocol):
 
         Args:
             registers: The simulation.
-            elapsed_s: Time since the last tick.
+            elapsed_s: Time since the last tick, at most about `TICK_NS`.
         """
         ...
 

@@ -27,7 +27,7 @@ class Ns3Options(SimulatorOptions):
         delay_parts: File for the [parts of each delay](ns3.md#parts-of-the-delay); `{seed}` is replaced by the seed
             of the run.
         pcap: Prefix of the names of captures of 802.11 frames with radiotap, one per radio, for example
-            `air-{seed}-`; with an access point, their time stamps are 1 s later.
+            `air-{seed}-`. Their time stamps are 1 ms later than simulated time, with an access point 1 s.
     """
 
     standard: Literal["802.11a", "802.11g", "802.11n"] | None = None

@@ -56,7 +56,7 @@ _OF_USER_PRIORITY: Final = (
     *(BEST_EFFORT, BACKGROUND, BACKGROUND, BEST_EFFORT),
     *(VIDEO, VIDEO, VOICE, VOICE),
 )
-# User priorities of DSCPs by RFC 8325, 4.3 (figure 1); all others are 0.
+# User priorities of DSCPs by RFC 8325, 4.3 (figure 1), and of 1 (LE) by RFC 8622, 11; all others are 0.
 _RFC_8325: Final = {
     **dict.fromkeys((46, 44), 6),
     40: 5,
@@ -73,7 +73,8 @@ def category_of(dscp: int, mapping: DscpMapping) -> int:
     Args:
         dscp: Differentiated services code point, 0 to 63.
         mapping: `linux`: the three upper bits of the DSCP are the user priority (cfg80211 up to Linux 6.7).
-            `rfc8325`: the mapping of RFC 8325, in which the classes for network control (CS6, CS7) are best effort.
+            `rfc8325`: the mapping of RFC 8325. It permits two user priorities for network control (CS6, CS7), 7 and
+            0; here they are best effort (0).
     """
     return _OF_USER_PRIORITY[dscp >> 3 if mapping == "linux" else _RFC_8325.get(dscp, 0)]
 

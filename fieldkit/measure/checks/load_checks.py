@@ -307,8 +307,9 @@ def _check_datagrams(
         # Each copy reduces the number of losses that iperf3 reports by one.
         copies = sum(map(len, received_streams)) - arrived
         if not missed - tail - copies - race_tolerance <= lost <= max_lost + race_tolerance:
-            missing_text = f"the receiver's capture lacks {missed} datagrams of the sender's capture"
-            yield f"iperf3 lost {lost} datagrams, but {missing_text}, and the receiver's kernel dropped {undelivered}"
+            missing_text = f"the receiver's capture lacks {format_count(missed, 'datagram')} of the sender's capture"
+            lost_text = f"iperf3 lost {format_count(lost, 'datagram')}"
+            yield f"{lost_text}, but {missing_text}, and the receiver's kernel dropped {undelivered}"
 
 
 def _distinct_datagrams(stream: Packets) -> int:

@@ -48,7 +48,7 @@ SENT_COLUMNS: Final = columns(
         "s",
         (
             "Median round-trip time over all echo requests, in which the time of an unanswered request "
-            "is infinite; empty if half of the requests or more were unanswered."
+            "is infinite; empty if half of the requests or more were unanswered, and if ping was killed."
         ),
     ),
 )
@@ -249,9 +249,13 @@ def measure(output: Ping | None) -> Measured:
         "rtt_max_s": max(rtt_s, default=None),
         "rtt_jitter_s": float(np.abs(np.diff(rtt_s)).mean()) if len(rtt_s) > 1 else None,
     }
-    of_sent = {"rtt_median_sent_s": quantile_of_sent(rtt_s, output.transmitted or 0, 0.5)}
+    # Without the summary, the number of requests is unknown.
+    sent = output.transmitted
+    of_sent = {"rtt_median_sent_s": None if sent is None else quantile_of_sent(rtt_s, sent, 0.5)}
     return (
         Measured.from_optional(counts, "ping was killed before its summary")
         | Measured.from_optional(times, "too few replies have a time")
-        | Measured.from_optional(of_sent, "half of the requests or more were unanswered")
+        | Measured.from_optional(
+            of_sent, "half of the requests or more were unanswered, or ping was killed before its summary"
+        )
     )

@@ -71,7 +71,8 @@ class StreamDeliveries:
     Attributes:
         at_ns: Times of arrival of new payload, ascending. Shape (n,).
         begin_ns: Time of the first packet of the stream, which is the SYN for TCP.
-        end_ns: Time until which payload was due; None if all payload arrived.
+        end_ns: Time until which payload was due; None if all payload of a TCP stream without a fixed duration
+            arrived.
         interval_s: Sending interval; see `FlowSchedule.interval_s`.
         min_stall_s: Minimum length of a stall: payload is overdue for longer than this.
     """

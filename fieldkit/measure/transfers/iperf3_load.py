@@ -10,6 +10,7 @@ from fieldkit.core.columns import NEGATIVE_LOSS_BOUNDS, Figure, Kind, Measured, 
 from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol
+from fieldkit.core.units import format_count
 from fieldkit.measure.captures.arrays import NO_TIME, Ints, Mask
 from fieldkit.measure.captures.headers import TCP, UDP
 from fieldkit.measure.captures.packets import UDP_HEADER_BYTES, Packets
@@ -226,7 +227,8 @@ class LoadStreams:
         if self.protocol is Protocol.TCP:  # the first connection is iperf3's control connection
             first = first[1:]
         if len(first) > self.count:
-            raise EvidenceError(f"{len(first)} connections use the port of the load, but it has {self.count} streams")
+            streams_text = format_count(self.count, "stream")
+            raise EvidenceError(f"{len(first)} connections use the port of the load, but it has {streams_text}")
         return tuple((int(packets.sport[index]), int(packets.dport[index])) for index in first)
 
     def _is_data(self, packets: Packets) -> Mask:
@@ -317,14 +319,15 @@ def _steady_clocks(load: LoadStreams, sender: Packets, receiver: Packets) -> Clo
     """Return the offset between the clocks, or None if a capture has no packet of one of the robots.
 
     Raises:
-        EvidenceError: The offset cannot be estimated although both captures have packets of both robots. A clock
-            that was set during the load is assumed to be the cause.
+        EvidenceError: The offset cannot be estimated although both captures have packets of both robots: packets have
+            no times or, otherwise, a clock was probably set during the load.
     """
     ends = load.source_address, load.destination_address
     clocks = delay.clocks_between(sender, receiver, *ends)
     has_packets = (packets.are_from(end).any() for packets in (sender, receiver) for end in ends)
     if clocks is None and all(has_packets):
-        raise EvidenceError(delay.UNSTEADY)
+        lacks_times = any((packets.time_ns == NO_TIME).any() for packets in (sender, receiver))
+        raise EvidenceError("a capture lacks times" if lacks_times else delay.UNSTEADY)
     return clocks
 
 

@@ -16,7 +16,7 @@ STOPPED_BY: Final = "the-operator"
 """Recorded on a robot as the originator of the stop."""
 
 _REPLY_S: Final = 3.0
-"""A robot that does not answer for this time is reported as out of reach. The usual response time is 0.1 s."""
+"""A robot that does not answer for this time is reported as not answering. The usual response time is 0.1 s."""
 _POLL_S: Final = 0.5
 _LANDING_S: Final = 600.0
 """Maximum wait for a landing; the pilot waits for the same time (`fieldkit.agent.flying.landing`)."""

@@ -65,7 +65,8 @@ class NewReno:
 
         Args:
             flight_bytes: Bytes in flight.
-            is_repeated: True if there was no progress since the last timeout.
+            is_repeated: True if the threshold must stay, because there was no progress since the last timeout, or
+                because a recovery is in progress (see `reduces_in_recovery`).
         """
         if not is_repeated:
             self.threshold_bytes = self._reduced_threshold(flight_bytes)

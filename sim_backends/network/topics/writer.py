@@ -84,7 +84,7 @@ class TopicWriter:
 
     @property
     def last(self) -> int:
-        """The sequence number of its last sample."""
+        """The sequence number of its last sample; 0 if there is none."""
         return self._last_number
 
     @property

@@ -1,5 +1,6 @@
 """The index of tables: results with it equal results without it, even after changes of the trials or the index."""
 
+import errno
 import io
 import os
 import shutil
@@ -269,7 +270,9 @@ def _check_edits(folder: Path, edits: list[tuple[str, int, int]]) -> None:
             return
         try:
             EDITS[name](trials[trial_index % len(trials)], draw)
-        except FileExistsError:  # the same edit with the same number
+        except OSError as error:
+            if error.errno not in {errno.EEXIST, errno.ENOTEMPTY}:  # the same edit with the same number
+                raise
             continue
         assert outcome(folder, use_index=True) == outcome(folder, use_index=False), name
 
