@@ -63,7 +63,12 @@ class EvidenceFolder:
         return self._created_path is not None
 
     def add(self, text: str) -> None:
-        """Add lines to the log; the first has the time of day in UTC."""
+        """Add lines to the log; the first has the time of day in UTC.
+
+        Raises:
+            ConfigurationError: The folder cannot be created.
+            OSError: The log cannot be written.
+        """
         lines = "\n".join(map(sanitized, text.splitlines()))  # output of robots may contain control characters
         with (self.path / LOG).open("a", encoding="utf-8") as file:
             file.write(f"{datetime.now(UTC):%H:%M:%S.%f} {lines}\n")

@@ -142,7 +142,8 @@ def fetch(
         forbidden_reason: Returns the reason why this robot must not send a file of this name, or None if it may.
 
     Raises:
-        LinkError: The robot did not answer.
+        LinkError: The robot did not answer, or the fetch was cancelled.
+        OSError: A file cannot be written on this computer.
         LateJobError: All files were fetched, but a job failed after `jobs.stop` had returned.
         RobotError: It has no such folder, or could not pack its files; files that arrived are kept.
         EvidenceError: The files are incomplete, unsafe or too large, or do not match their hash.

@@ -54,6 +54,9 @@ class Shell(Protocol):
     Every command must be idempotent. After a loss of the link the progress of a command is unknown, so a Shell may
     reconnect and send the same command again, also during `Session.end`. A command that only takes too long is not
     sent again.
+
+    Each method that opens the connection raises a `RobotError` if the robot refuses the login or its host key has
+    changed, and a `ConfigurationError` if there is no key for the login.
     """
 
     @property
@@ -101,6 +104,7 @@ class Shell(Protocol):
 
         Raises:
             LinkError: For the same reasons as `run`.
+            OSError: The file cannot be written, for example because the disk of this computer is full.
             RobotError: The exit code is not 0, or there is more output than `limit_bytes`.
         """
         ...

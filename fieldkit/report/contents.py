@@ -62,7 +62,7 @@ _CROWDED: Final = (
     "Choose fewer with --where."
 )
 _MAX_IN_TABLE: Final = 8
-"""Maximum number of visible columns of quantities that are not defined by fieldkit."""
+"""Maximum number of visible columns in a table without quantities that are always visible."""
 
 
 @dataclass(frozen=True)
@@ -178,6 +178,9 @@ def build_contents(
         sweep: If the repeats are runs of sweeps, the result of `datasets.condition`: columns of the flow and of the
             factors, each with the column that contains its values as the user typed them. None or empty for other
             repeats.
+
+    Raises:
+        ConfigurationError: For the same reasons as `repeat_to_draw`.
     """
     evidence = load_evidence(repeats, repeat)
     has_all_plans = evidence.plans.keys() == set(repeats.texts["source"].tolist())

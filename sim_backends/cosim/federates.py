@@ -43,7 +43,7 @@ def check_physics(physics: object) -> None:
     """Check that an object is a physics federate, before it is used.
 
     Raises:
-        ConfigurationError: It lacks an attribute or method; the message names it.
+        ConfigurationError: The object lacks an attribute or method, which the message names.
     """
     step_ns = getattr(physics, "step_ns", None)
     problem = ""

@@ -46,7 +46,7 @@ class EmulatedBackend:
 
     Args:
         site: The site file; None for the paper's lab. A site file without robots has the robots of the paper's lab.
-        document: The document of the site file, for error messages with line numbers.
+        document: The document of the site file, for error messages with line numbers; None without a site file.
 
     Raises:
         ConfigurationError: The `emulated:` section is wrong or names a robot that the lab does not have, the lab has

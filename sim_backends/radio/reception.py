@@ -82,8 +82,8 @@ class Reception(Generic[Payload]):
         self._deferring: dict[int, int] = {}
         # Stations that have decoded, or not, the frame that ends now.
         self._results: dict[int, bool] = {}
-        self._has_failed = False
-        self._always_ratios: dict[WifiMode, float] = {}
+        self._has_failed = False  # True if one of these stations has not decoded it
+        self._always_ratios: dict[WifiMode, float] = {}  # results of `_always_decoded_ratio`
 
     def start(self, transmission: Transmission, reserved_ns: int) -> None:
         """Start a transmission; stations that detect it do not send until `reserved_ns`.

@@ -39,7 +39,7 @@ def check_link_type(*link_types: int, where: str) -> None:
 
     if not LINKS.keys() & set(link_types):
         raise EvidenceError(
-            f"has the link type {', '.join(map(str, link_types))}, which fieldkit cannot read",
+            f"has no link type that fieldkit can read: {', '.join(map(str, link_types))}",
             where=where,
             remedy=f"capture on an interface of link type {', '.join(map(str, sorted(RAW_LINKS | LINKS.keys())))}",
         )

@@ -1,10 +1,10 @@
 """Contradictions between the results of an iperf3 test and the captures of both ends.
 
 iperf3 counts the bytes that its sockets read and write; a capture contains the packets that passed the interface. At
-any time, iperf3 has therefore received at most the bytes that the capture contains until this time. It has received
-at least the bytes that the kernel has acknowledged (TCP), or the bytes that have arrived minus the bytes that were
-dropped at its socket buffer (UDP). Times in the JSON are relative to the start of the test. The test starts between
-the client's last message on the control connection and the first data packet.
+any time, iperf3 has therefore received at most the bytes that the capture contains until this time. When it has read
+its socket buffers, it has received at least the bytes that the kernel has acknowledged (TCP), or the bytes that have
+arrived minus the bytes that were dropped at its socket buffer (UDP). Times in the JSON are relative to the start of
+the test. The test starts between the client's last message on the control connection and the first data packet.
 """
 
 from collections.abc import Iterator
@@ -307,8 +307,9 @@ def _check_datagrams(
         # Each copy reduces the number of losses that iperf3 reports by one.
         copies = sum(map(len, received_streams)) - arrived
         if not missed - tail - copies - race_tolerance <= lost <= max_lost + race_tolerance:
-            missing_text = f"the receiver's capture lacks {missed} datagrams of the sender's capture"
-            yield f"iperf3 lost {lost} datagrams, but {missing_text}, and the receiver's kernel dropped {undelivered}"
+            missing_text = f"the receiver's capture lacks {format_count(missed, 'datagram')} of the sender's capture"
+            lost_text = f"iperf3 lost {format_count(lost, 'datagram')}"
+            yield f"{lost_text}, but {missing_text}, and the receiver's kernel dropped {undelivered}"
 
 
 def _distinct_datagrams(stream: Packets) -> int:

@@ -112,7 +112,10 @@ def _read_sources(evidence: AttemptEvidence) -> PositionSources:
 
 
 def sources_text(evidence: AttemptEvidence) -> str | None:
-    """Return a text such as `sender as placed, receiver /odom`, or None if there are no sources."""
+    """Return a text such as `sender as placed, receiver /odom`, or None if there are no sources.
+
+    Raises the same errors as `read_position_sources`.
+    """
     robots = read_position_sources(evidence).robots
     return ", ".join(f"{role} {robots[role].description}" for role in sort_roles(robots)) or None
 
@@ -212,7 +215,10 @@ def clock_offset_ns(evidence: AttemptEvidence, role: Role) -> int:
 
 
 def clock_error_s(evidence: AttemptEvidence) -> float | None:
-    """Return the maximum error of a time difference between two robots; None if no clock offset was measured."""
+    """Return the maximum error of a time difference between two robots; None if no clock offset was measured.
+
+    It is the sum of the two largest errors of clock offsets. Raises the same errors as `read_position_sources`.
+    """
     errors_s = sorted(offset.error_s for offset in read_position_sources(evidence).clocks.values())
     return sum(errors_s[-2:]) if errors_s else None
 

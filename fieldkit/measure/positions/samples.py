@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.units import METRES_PER_UNIT
+from fieldkit.core.units import METRES_PER_UNIT, format_count
 from fieldkit.measure.captures.arrays import Floats, Ints
 from fieldkit.measure.evidence import reading
 
@@ -96,7 +96,7 @@ def read_csv(path: Path) -> Samples:
     for number, row in lines:
         where = f"{path}:{number}"
         if len(row) != len(names):
-            raise EvidenceError(f"has {len(row)} cells, but the header has {len(names)}", where=where)
+            raise EvidenceError(f"has {format_count(len(row), 'cell')}, but the header has {len(names)}", where=where)
         if len(values) == MAX_SAMPLES:
             remedy = "remove the lines outside of the trial"
             raise EvidenceError(f"has more than {MAX_SAMPLES} lines", where=str(path), remedy=remedy)

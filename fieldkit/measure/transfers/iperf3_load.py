@@ -10,6 +10,7 @@ from fieldkit.core.columns import NEGATIVE_LOSS_BOUNDS, Figure, Kind, Measured, 
 from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol
+from fieldkit.core.units import format_count
 from fieldkit.measure.captures.arrays import NO_TIME, Ints, Mask
 from fieldkit.measure.captures.headers import TCP, UDP
 from fieldkit.measure.captures.packets import UDP_HEADER_BYTES, Packets
@@ -226,7 +227,8 @@ class LoadStreams:
         if self.protocol is Protocol.TCP:  # the first connection is iperf3's control connection
             first = first[1:]
         if len(first) > self.count:
-            raise EvidenceError(f"{len(first)} connections use the port of the load, but it has {self.count} streams")
+            streams_text = format_count(self.count, "stream")
+            raise EvidenceError(f"{len(first)} connections use the port of the load, but it has {streams_text}")
         return tuple((int(packets.sport[index]), int(packets.dport[index])) for index in first)
 
     def _is_data(self, packets: Packets) -> Mask:

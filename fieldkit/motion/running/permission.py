@@ -128,8 +128,8 @@ class MotionPermission:
             reasons = "; ".join(f"{hold.robot}: {hold.reason}" for hold in self._journal.holds)
             names = " and ".join(hold.robot for hold in self._journal.holds)
             text = (
-                f"a fault stopped a robot ({reasons}); put {names} at its place with the initial heading, and clear "
-                f"its path; type {CONFIRM} to let robots move again"
+                f"a fault stopped a robot ({reasons}); put {names} at the start with the initial heading, and clear "
+                f"the path; type {CONFIRM} to let robots move again"
             )
             if testbed.operator.enter(Question(text, choices=(CONFIRM, _STOP), usual=_STOP)) == CONFIRM:
                 self._journal.confirm("a person confirmed", at_place=True)

@@ -15,6 +15,7 @@ from fieldkit.core import geometry
 from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.model import Protocol, Role
+from fieldkit.core.units import format_count
 from fieldkit.measure.captures.arrays import Floats
 from fieldkit.measure.positions import position_checks, position_sources
 from fieldkit.measure.positions.position_sources import GAP_S, PositionSource, PositionSources
@@ -267,7 +268,8 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
             yield f"{self._file}: {error.what}"
             return
         if counters.dropped_frames:
-            yield f"{self._file} lacks {counters.dropped_frames} received frames, because it reached its maximum size"
+            frames_text = format_count(counters.dropped_frames, "received frame")
+            yield f"{self._file} lacks {frames_text}, because it reached its maximum size"
         if log.frames != counters.frames:
             yield f"{self._file} has {log.frames} frames, but its recorder wrote {counters.frames}"
         window = view.attempt_window(self.recorder)

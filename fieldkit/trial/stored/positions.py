@@ -31,7 +31,8 @@ class AttemptPositions:
 
     Attributes:
         attempt: Name of the attempt's folder.
-        source: Sources of the positions as text, such as `sender as placed, receiver /odom`; None without sources.
+        source: Sources of the positions as text, such as `sender as placed, receiver /odom`; None if the only source,
+            if any, is the testbed.
         distances_m: Smallest and largest distance by measurement, such as `transfer`, `rtt` or `up.rtt`.
         missing: Reasons for missing distances, by measurement.
     """
@@ -52,7 +53,8 @@ def set_positions(
         sources: GPX or CSV file, or a fixed place, by role; empty to remove positions that were added before.
         offset_s: Offset that is added to the times of the files to convert them to the laptop's clock, in seconds.
         gap_s: Longest time between two points over which positions are interpolated linearly, in seconds.
-        heights: True to use the heights of the positions as well; False for horizontal distances.
+        heights: True to use the heights of positions in degrees as well; False for horizontal distances of such
+            positions. The heights of positions in metres are always used.
 
     Raises:
         ConfigurationError: `folder` is not a trial, another process runs the trial, the trial has no such role, or a

@@ -143,7 +143,7 @@ def simulate_all(
 ) -> tuple[list[SeedResult], bool]:
     """Run a scenario with each seed; return the results, and True if Ctrl-C interrupted the runs.
 
-    If the runs are not parallel, the last result after an interrupt is that of the interrupted run. If they are
+    If the runs are not parallel, the last result after an interrupt may be that of the interrupted run. If they are
     parallel, there are no results for seeds whose runs had not finished. The runs are parallel unless a federate
     serves one run at a time, they run in real time, or they have few packets.
 

@@ -78,7 +78,7 @@ class ReproducedRows:
         """Check that the line of sight and the traffic of the scenario agree with the procedure.
 
         Raises:
-            ConfigurationError: They differ.
+            ConfigurationError: The scenario and the procedure differ.
         """
         procedure = trial.procedure
         remedy = "change the scenario, or remove `trial` from it"

@@ -106,7 +106,7 @@ def read_policies(arguments: argparse.Namespace) -> list[str]:
     """Return the names of the sync policies without repetitions, in the order of `registry.policies`.
 
     Raises:
-        ConfigurationError: One of these names is not a policy.
+        ConfigurationError: There is no policy with one of the names.
     """
     for name in arguments.policy:
         make_policy(name)
@@ -117,7 +117,7 @@ def read_windows_s(arguments: argparse.Namespace, scenario: CosimScenario) -> li
     """Return the different windows of a comparison in seconds, in ascending order.
 
     Raises:
-        ConfigurationError: One of them is not a duration above 0.
+        ConfigurationError: A window is not a duration above 0.
     """
     if not arguments.windows:
         return [scenario.policy.window]

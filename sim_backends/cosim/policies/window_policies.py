@@ -205,7 +205,7 @@ class VelocityAware:
         longest_s: Longest window, in seconds, if that is at least a physics step; it also applies without pairs.
 
     Raises:
-        PolicyError: One of them is not a positive time.
+        PolicyError: One of these values is not a positive time.
     """
 
     name = "velocity_aware"

@@ -234,7 +234,7 @@ def _make_federate(federate: PythonFederate, name: str, hello: Hello) -> Any:  #
     """Return a federate in this process.
 
     Raises:
-        ConfigurationError: It does not support the scenario, or required software is not installed.
+        ConfigurationError: The federate does not support the scenario, or required software is not installed.
     """
     service = federate.load()
     try:

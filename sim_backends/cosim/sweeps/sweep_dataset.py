@@ -76,7 +76,7 @@ def write_dataset(plan: SweepPlan, folder: SweepFolder) -> int:
 
 
 def _rows_of(setting: SweepSetting, plan: SweepPlan, folder: SweepFolder) -> list[dict[str, Value]]:
-    """Return the rows of all runs of a setting, with the values of the factors as numbers."""
+    """Return the rows of all runs of a setting, with the values of factors that are numbers (`Factor.numbers`)."""
     numbers: dict[str, Value] = {}
     for factor in plan.factors:
         if (number_column := factor.numbers) is not None:

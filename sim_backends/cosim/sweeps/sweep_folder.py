@@ -120,7 +120,7 @@ class SweepFolder:
         """Return a row of columns for each flow of a run; empty if the run has neither finished nor failed.
 
         Raises:
-            EvidenceError: Its file is damaged.
+            EvidenceError: The file of the run is damaged.
         """
         path = self.path / _RUNS / f"{run.name}.json"
         if path.exists():
@@ -133,7 +133,7 @@ class SweepFolder:
         """Write the result of a run.
 
         Raises:
-            ConfigurationError: It cannot be written.
+            ConfigurationError: The result cannot be written.
         """
         self._write(self.path / _RUNS / f"{run.name}.json", _identity(run) | dict(result))
         (self.path / _FAILED / f"{run.name}.json").unlink(missing_ok=True)

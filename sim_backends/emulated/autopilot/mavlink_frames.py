@@ -193,7 +193,7 @@ class MavlinkPort:
         return bool(self._clients)
 
     def register(self, sender: Address, message: Message, now_ns: int) -> bool:
-        """Register the sender of a message as a client; return False if there are `MAX_CLIENTS` other clients."""
+        """Register the sender of a message as a client; return True unless there are `MAX_CLIENTS` other clients."""
         client = self._clients.get(sender)
         if client is None:
             if len(self._clients) == MAX_CLIENTS:

@@ -43,7 +43,7 @@ class Vehicle(VehicleBase):
         """Report the reasons why it cannot be armed.
 
         Raises:
-            Refused: It is armed.
+            Refused: The vehicle is armed.
         """
         if self.is_armed:
             raise self._refusal("Prearm checks denied: armed")
@@ -81,7 +81,7 @@ class Vehicle(VehicleBase):
             force: True to stop them even in the air, which makes the vehicle fall.
 
         Raises:
-            Refused: It is flying.
+            Refused: The vehicle is in the air, and `force` is False.
         """
         if self.is_armed and not self.body.on_ground and not force:
             raise self._refusal("Disarming denied: not landed")
@@ -117,8 +117,8 @@ class Vehicle(VehicleBase):
         """Fly to a point relative to home, and stay there.
 
         Raises:
-            Refused: It is not flying, or the point is outside PX4's fence. ArduCopter ignores a point outside its
-                fence, and holds its position.
+            Refused: The vehicle is not flying, or the point is outside PX4's fence. ArduCopter ignores a point
+                outside its fence.
         """
         if self.body.on_ground:
             raise self._refusal("Reposition denied: not in the air")

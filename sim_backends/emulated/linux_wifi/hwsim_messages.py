@@ -62,7 +62,8 @@ class RateStage:
     """One stage of a rate chain.
 
     Attributes:
-        index: Index of the rate in the list of the band, or the MCS.
+        index: Index of the rate in the list of the band; with `RATE_MCS` the MCS; with `RATE_VHT` the MCS plus 16 for
+            each stream after the first.
         tries: Number of tries.
         flags: `RATE_*`.
     """
