@@ -1,8 +1,8 @@
 """Compare two recorded outputs: they can be equal, differ only in words, or differ in other parts.
 
 Machine-readable output (commands of dry runs, tables, exports, hashes, exit codes) must be equal, except for parts
-that vary between runs, such as time stamps, and for sentences in printed JSON. Other text (help, messages, tables on a
-terminal, reports) may differ in words, which are listed as labels; its numbers and options must be equal and in the
+that vary between runs, such as time stamps, and for sentences in printed JSON. Other text (help, messages, tables on
+a terminal, reports) may differ in words, which are listed as labels; its numbers and options must be equal and in the
 same order.
 """
 

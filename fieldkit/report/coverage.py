@@ -44,8 +44,8 @@ class RepeatCounts:
     """Numbers of repeats under one condition by outcome.
 
     Attributes:
-        planned: Repeats of the trials that started one: of a trial with a plan the planned ones, at least the started
-            ones; of a trial without a plan the started ones.
+        planned: Planned repeats, at least the started ones, of the trials that have rows under the condition. For a
+            trial without a plan, only the started repeats are counted.
         valid: Repeats with a valid attempt.
         void: Repeats without a valid attempt whose last attempt is void.
         failed: Repeats without a valid attempt whose last attempt failed.

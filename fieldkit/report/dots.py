@@ -183,7 +183,7 @@ def _series(identity: Identity, placed_points: Sequence[tuple[float, Point]], as
 def _caption(drawn_panels: Sequence[Panel]) -> str:
     parts = [
         _EXPLANATION,
-        "The axis is logarithmic if values differ by a factor of more than 30."
+        "The axis is logarithmic if values differ by a factor of more than about 30."
         if any(panel.x_log for panel in drawn_panels)
         else "",
         "Hollow, with an arrow: a lower bound, because the timed event had not ended."

@@ -16,6 +16,7 @@ from fieldkit.core.units import format_count
 from fieldkit.report import coverage, wording
 from fieldkit.report.coverage import Absence
 from fieldkit.report.trial_folders import Evidence
+from fieldkit.trial.columns import columns_of_step
 from fieldkit.trial.plan import Plan
 
 _USER_DEFINED_KINDS: Final = frozenset(("ask", "run"))
@@ -68,7 +69,7 @@ class Ranking:
 def _user_defined_columns(plan: Plan) -> Iterator[str]:
     for placed in plan.procedure.walk():
         if placed.kind in _USER_DEFINED_KINDS:
-            yield from (column.name for column in placed.step.output_columns())
+            yield from (column.name for column in columns_of_step(placed.step))
 
 
 _PROTOCOL_QUANTITIES: Final = {"udp": ("datagram_loss", "rtt_median_s"), "tcp": ("tcp_byte_loss", "rtt_median_s")}

@@ -80,7 +80,11 @@ def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Caution]:
     for caution in cautions(cells):
         yield Caution(f"{caution}.".replace(" %", "\N{NO-BREAK SPACE}%"))
     if single_count := sum(cell.n_valid == 1 for cell in cells):
-        yield Caution(f"{single_count} of {len(cells)} conditions have a single valid repeat, and no intervals.")
+        total = format_count(len(cells), "condition")
+        yield Caution(
+            f"A single valid repeat in {single_count} of {total}, so only figures that are true or false have an "
+            "interval there."
+        )
     valid = repeats.where(repeats.texts["status"] == Status.VALID)
     columns = [texts for name, texts in valid.texts.items() if plain_name(name) == "one_way_withheld"]
     withheld_reasons = [reasons for reasons in zip(*columns, strict=True) if any(reasons)]

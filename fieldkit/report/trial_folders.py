@@ -23,6 +23,7 @@ from fieldkit.core.model import Status
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import ping
 from fieldkit.trial import planned_evidence, store
+from fieldkit.trial.columns import columns_of_step
 from fieldkit.trial.plan import PLAN_FILE, Plan
 from fieldkit.trial.stored import plans as stored_plans
 from fieldkit.trial.stored import verification
@@ -80,7 +81,7 @@ class Evidence:
             sources = dict.fromkeys(self.repeats.texts["source"][self.rows(cell)].tolist())
             plans = [self.plans[source] for source in sources if source in self.plans]
             steps = (placed.step for plan in plans for placed in plan.procedure.walk())
-            names = frozenset(column.name for step in steps for column in step.output_columns())
+            names = frozenset(column.name for step in steps for column in columns_of_step(step))
             self._measured_columns[key] = names if plans else None
         return self._measured_columns[key]
 

@@ -137,7 +137,7 @@ def placement_error(kind: str, within: Sequence[EnclosingStep]) -> str | None:
     if any(nest.has_path for nest in within):
         return f"a {kind} must start before robots move: put the move into the {kind}"
     if any(nest.disturbs or nest.parallel for nest in within):
-        return f"a {kind} must not be inside a fault or a together: put the fault or the together into the {kind}"
+        return f"a {kind} must not be inside a step fault or together: put that step into the {kind}"
     return None
 
 

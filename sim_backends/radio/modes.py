@@ -1,7 +1,7 @@
 """Bands, and modulation and coding of 802.11a/g and of 802.11n with one stream in 20 MHz: airtime of frames.
 
-Clauses refer to IEEE 802.11-2020: 17 (OFDM), 18 (ERP-OFDM, 802.11g: clause 17 at 2.4 GHz), 19 (HT, 802.11n); clause 27
-(HE) is in IEEE 802.11ax-2021. Modes with more streams or wider channels are in `high_throughput`.
+Clauses refer to IEEE 802.11-2020: 17 (OFDM), 18 (ERP-OFDM, 802.11g: clause 17 at 2.4 GHz), 19 (HT, 802.11n); clause
+27 (HE) is in IEEE 802.11ax-2021. Modes with more streams or wider channels are in `high_throughput`.
 """
 
 from dataclasses import dataclass

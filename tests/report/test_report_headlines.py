@@ -8,8 +8,11 @@ import pytest
 from fieldkit.analysis.cells import aggregate
 from fieldkit.config import schema
 from fieldkit.report.coverage import everything_lost
-from fieldkit.report.headlines import Headline, headlines
+from fieldkit.report.headlines import Headline, Ranking, headlines
 from fieldkit.report.trial_folders import Evidence, load_evidence
+from fieldkit.steps.base import StepEntry
+from fieldkit.steps.kinds.ping import PingStep
+from fieldkit.steps.kinds.run import RunStep
 from fieldkit.trial.plan import PLAN_FILE
 from fieldkit.trial.stored import plans, sources
 from tests.helpers import lawns, recorded
@@ -124,6 +127,27 @@ def test_expected_quantities_are_first(tmp_path: Path) -> None:
     subjects = [headline.subject for headline in headlines(aggregate(evidence.repeats), evidence)]
     assert subjects[:2] == ["Repeats", "IP packet loss"]
     assert subjects.count("IP packet loss") == 1
+
+
+def test_columns_of_named_steps_have_the_names_of_the_table(tmp_path: Path) -> None:
+    evidence = evidence_with(tmp_path)
+    plan = next(iter(evidence.plans.values()))
+    figures = [{"name": "volts", "unit": "V", "json": "volts"}]
+    steps = (
+        StepEntry("ping", PingStep.model_validate({"name": "up", "from": "sender", "to": "receiver"})),
+        StepEntry(
+            "run",
+            RunStep.model_validate({"name": "up", "robot": "sender", "command": "meter", "columns": figures}),
+        ),
+    )
+    named_plan = plan.model_copy(update={"procedure": plan.procedure.model_copy(update={"steps": steps})})
+    plans_by_source = dict.fromkeys(evidence.plans, named_plan)
+    named_evidence = Evidence(evidence.repeats, plans_by_source, (), frozenset(), evidence.verified_sources)
+    names = named_evidence.measured_columns(aggregate(evidence.repeats)[0])
+    assert names is not None
+    assert {"up.rtt_loss", "up.volts"} <= names
+    assert "rtt_loss" not in names
+    assert Ranking(named_evidence).is_user_defined("up.volts")
 
 
 def test_planned_repeats_without_an_attempt_are_not_run(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ def read(path: Path) -> RecordingContents:
     is_ros2 = path.suffix in ROS2_SUFFIXES
     if is_ros2 and not (path.parent / METADATA).is_file():
         raise EvidenceError(
-            f"the bag has no {METADATA}: its recorder was killed before it could close the bag",
+            f"the bag has no {METADATA}: its recorder was killed before it closed the bag, or the file was lost",
             where=where,
             remedy="stop the recorder with SIGINT and wait for it, or repair the bag with `fieldkit bag repair`",
         )

@@ -110,9 +110,8 @@ def judge_names(
     """
     master = states[role].variables.get("ROS_MASTER_URI", "")
     if _host(master) in _LOOPBACK_HOSTS:
-        report.ok(
-            "ROS network", f"its ROS master, {master}, runs on the robot itself: its topics do not reach other robots"
-        )
+        reason = f"its ROS master, {master}, runs on the robot itself" if master else "ROS_MASTER_URI is not set"
+        report.ok("ROS network", f"{reason}: its topics do not reach other robots")
         return
     for other, state in states.items():
         if other is role or settings.is_ros2(cast[other]) or state.variables.get("ROS_MASTER_URI") != master:

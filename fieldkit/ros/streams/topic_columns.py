@@ -215,7 +215,7 @@ def measure(
 
 
 def withheld_reasons(measured: Measured, reason: str) -> dict[str, str]:
-    """Return the reason for each column of a topic that is missing because packets were dropped before tcpdump.
+    """Return the reason for each missing column of a topic that depends on the captures, if packets were dropped.
 
     Args:
         measured: Columns measured without the captures.

@@ -317,7 +317,7 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
         if isinstance(gap_s := values.get("rtt_gap_s"), float):
             yield f"longest gap {gap_s:.1f} s with {values['rtt_gap_lost']} lost"
         if duplicates := values.get("rtt_duplicates"):
-            yield f"{format_count(int(duplicates), 'packet')} received over both links"
+            yield f"{format_count(int(duplicates), 'packet')} received again over another link"
         if isinstance(open_s := values.get("rtt_gap_at_least_s"), float):
             yield f"longest gap >= {open_s:.1f} s with {values['rtt_gap_lost_at_least']} lost"
         if isinstance(median_s := values.get("rtt_median_s"), float):

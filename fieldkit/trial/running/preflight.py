@@ -147,7 +147,7 @@ def require_passed(findings: Sequence[Finding]) -> None:
 def _check_robot(
     plan: Plan, role: Role, shell: Shell, variants_by_role: dict[Role, Variants], report: Report, *, all_checks: bool
 ) -> bool:
-    """Add the findings about a robot. Return False if another user has locked it."""
+    """Add the findings about a robot. Return False if locks are checked and it is locked."""
     stage, robot = _CONNECTION, plan.cast[role]  # if an error is raised, it is reported as the check `stage`
     try:
         offset = contact.judge(shell, report)

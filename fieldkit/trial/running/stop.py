@@ -12,8 +12,8 @@ class Stop:
 
     The first SIGINT takes effect after the running repeat. A second SIGINT, and SIGTERM and SIGHUP, stop during the
     repeat. While a robot moves automatically or may start to move (`motions`), or no repeat is running, every signal
-    takes effect immediately. Every stop waits until `saving` is False. `fieldkit.cli.interrupts` implements these
-    rules for signals.
+    takes effect immediately: robots are ordered to stop at once. In all cases KeyboardInterrupt is raised only when
+    `saving` is False. `fieldkit.cli.interrupts` implements these rules for signals.
 
     Attributes:
         after_repeat: True if the trial must stop after the running repeat.
