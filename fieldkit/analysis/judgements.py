@@ -39,8 +39,8 @@ class Judgement:
         why: Reason for the ruling that the numbers do not show, for example repeats without a value, or the number of
             repeats that are needed; empty if there is none.
         met: Number of repeats that meet the expectation; None if it does not refer to single repeats.
-        limit: One-sided 95 % bound that determines the ruling, of the share of repeats that meet the expectation or
-            of the loss; None if the ruling depends on no such bound.
+        limit: One-sided 95 % bound that the ruling `holds` requires: the lower bound of the share of repeats that
+            meet the expectation, or the upper bound of the loss; None if `holds` depends on no such bound.
     """
 
     expectation: Expectation

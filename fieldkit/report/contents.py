@@ -62,7 +62,7 @@ _CROWDED: Final = (
     "Choose fewer with --where."
 )
 _MAX_IN_TABLE: Final = 8
-"""Maximum number of visible columns of quantities that are not defined by fieldkit."""
+"""Maximum number of visible columns in a table without quantities that are always visible."""
 
 
 @dataclass(frozen=True)

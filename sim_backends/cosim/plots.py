@@ -34,7 +34,7 @@ from sim_backends.cosim.plot_layout import (
 )
 
 _FONT_POINTS: Final = 8.0
-"""Font size that IEEE requires."""
+"""Font size of labels of figures in IEEE's template for papers."""
 _BOTH_COLUMNS_INCHES: Final = 7.16
 """Width of a figure: both columns of an IEEE paper."""
 _PANEL_HEIGHT_INCHES: Final = 2.9

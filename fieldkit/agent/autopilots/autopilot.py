@@ -58,7 +58,8 @@ _LOCAL_NED = 1
 _POSITION_AND_YAW = 0b100111111000
 """POSITION_TARGET_TYPEMASK: position and yaw are used; velocity, acceleration and yaw rate are ignored."""
 _OWN_SYSTEM = 245
-"""System id of fieldkit's programs, in the range of ground stations."""
+"""System id of fieldkit's programs, near the end of the range, as is usual for ground stations and tools
+(https://mavlink.io/en/guide/routing.html)."""
 _TYPE_ONBOARD = 18
 """MAV_TYPE_ONBOARD_CONTROLLER."""
 _MAX_PAYLOAD_BYTES = 255

@@ -75,8 +75,9 @@ class Px4:
     def is_failsafe_hold(self, mode: int) -> bool:
         """Return True in AUTO.LOITER.
 
-        PX4 changes to it if set-points are missing and COM_OBL_RC_ACT selects a mode that needs a remote control, but
-        none is connected.
+        PX4 uses this mode if set-points are missing and COM_OBL_RC_ACT selects Hold or, depending on the version, a
+        mode that needs a remote control although none is connected. It also precedes other failsafe actions for the
+        time COM_FAIL_ACT_T.
         """
         return _mode_parts(mode) == (_AUTO, _LOITER)
 

@@ -123,7 +123,7 @@ class ArmingCheck:
     def is_starting(self) -> bool:
         """Whether the position estimate or the required home position is not ready yet.
 
-        Both are ready about 30 s after power-on.
+        With good reception of satellites, both are ready about 30 s after power-on.
         """
         reports_no_estimate = any(_NO_ESTIMATE in text for text in self._drone.texts.warnings)
         return self._drone.dialect is not None and (reports_no_estimate or any(self._position_faults()))

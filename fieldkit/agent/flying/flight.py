@@ -107,7 +107,7 @@ class OffboardPilot:
     def _abort_flight(self, error: Exception) -> None:
         """Land the drone, or let it return and land, after an error, unless a person or another program flies it.
 
-        An alarm is logged if the drone does not land, or if somebody else flies it.
+        An alarm is logged if the drone does not land, or if a person or another program flies it.
 
         Raises the same errors as `bring_down`.
         """

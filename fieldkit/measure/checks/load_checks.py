@@ -1,10 +1,10 @@
 """Contradictions between the results of an iperf3 test and the captures of both ends.
 
 iperf3 counts the bytes that its sockets read and write; a capture contains the packets that passed the interface. At
-any time, iperf3 has therefore received at most the bytes that the capture contains until this time. It has received
-at least the bytes that the kernel has acknowledged (TCP), or the bytes that have arrived minus the bytes that were
-dropped at its socket buffer (UDP). Times in the JSON are relative to the start of the test. The test starts between
-the client's last message on the control connection and the first data packet.
+any time, iperf3 has therefore received at most the bytes that the capture contains until this time. When it has read
+its socket buffers, it has received at least the bytes that the kernel has acknowledged (TCP), or the bytes that have
+arrived minus the bytes that were dropped at its socket buffer (UDP). Times in the JSON are relative to the start of
+the test. The test starts between the client's last message on the control connection and the first data packet.
 """
 
 from collections.abc import Iterator

@@ -1,10 +1,11 @@
 """Handovers of a station between access points, and the time without answers to ping that each handover causes.
 
-Handovers are detected in samples of the station's link. Only samples taken while ping runs are used, because a robot
-may roam again while it is moved back to its start. A handover happens between the last sample with the old access
-point and the first sample with the new one. The gap of a handover is the longest time between two consecutive answers
-that overlaps this interval. Its resolution is therefore the interval of the ping, not of the samples. The times of
-samples and answers must be from the clock of the robot that roams.
+Handovers are detected in samples of the station's link. If the answers of ping have time stamps, only samples taken
+while ping runs (plus or minus one interval) are used, because a robot may roam again while it is moved back to its
+start. A handover happens between the last sample with the old access point and the first sample with the new one. The
+gap of a handover is the longest time between two consecutive answers that overlaps this interval. Its resolution is
+therefore the interval of the ping, not of the samples. The times of samples and answers must be from the clock of the
+robot that roams.
 """
 
 import math

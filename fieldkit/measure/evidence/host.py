@@ -58,7 +58,7 @@ contains the sections that the host supports.
 
 @dataclass(frozen=True)
 class Counters:
-    """Counters of /proc/net/snmp (names of RFC 1213; Linux adds RcvbufErrors); a missing counter is None.
+    """Counters of /proc/net/snmp (names of RFC 1213; Linux adds RcvbufErrors, SndbufErrors); None if missing.
 
     Attributes:
         udp_buffer_errors: Datagrams dropped because of a full receive buffer, `Udp: RcvbufErrors`.

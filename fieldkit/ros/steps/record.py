@@ -99,8 +99,8 @@ class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpa
             source="the bag",
             against=("the procedure: topics and duration", "duration of the recorder's job"),
             tolerance=(
-                "a bag may be shorter than planned by half of its duration, because a recorder needs time to "
-                "subscribe"
+                "a bag may be shorter than planned by half of the planned duration plus 1 s, because a recorder "
+                "needs time to subscribe"
             ),
         ),
     )

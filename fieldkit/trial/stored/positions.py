@@ -129,8 +129,8 @@ def _remove_others(folder: Path, names: set[str]) -> None:
 def parse_source(text: str) -> tuple[Role, Path | PositionSource]:
     """Return a role and the position source of its robot.
 
-    Examples are `receiver=walk.gpx`, `sender=48.1,11.5` (degrees) and `sender=0m,5m` (metres east and north). A third
-    number is the height in metres; after degrees, it is the height above the ellipsoid.
+    Examples are `receiver=walk.gpx`, `sender=48.1,11.5` (latitude and longitude) and `sender=0m,5m` (along two axes).
+    A third number is the height in metres; after degrees, it is the height above the ellipsoid.
 
     Raises:
         ConfigurationError: The text does not have this form.

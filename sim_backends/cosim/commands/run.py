@@ -29,7 +29,9 @@ _COLUMNS: Final = (
     SheetColumn("protocol", "transport", "transport of the packets"),
     SheetColumn("sent", "sent", "packets whose fate is decided"),
     SheetColumn(
-        "under_way", "under way", "packets whose fate was not decided when the run ended; the other columns omit them"
+        "under_way",
+        "under way",
+        "packets whose fate was not decided when the run ended; the other columns, except the distance, omit them",
     ),
     SheetColumn("loss", "lost (%)", "share of the sent packets that never arrived", 100),
     SheetColumn("delay_mean_s", "delay (ms)", "mean time of a packet in the network", 1e3),

@@ -68,7 +68,7 @@ class DriveThrough(NeverSends):
 
     Args:
         points_m: The waypoints, metres east and north.
-        speed_m_s: Speed.
+        speed_m_s: Speed when it heads towards the next point, before it brakes.
         begin_ns: Time of the first command.
         period_ns: Time between commands.
         reached_m: Distance within which a point counts as reached.
@@ -126,7 +126,7 @@ class FlyThrough(NeverSends):
 
     Args:
         points_m: The waypoints, metres east, north, up.
-        speed_m_s: Speed.
+        speed_m_s: Speed, before it slows down at the last point.
         begin_ns: Time of the first command.
         period_ns: Time between commands.
         reached_m: Distance within which a point counts as reached.

@@ -99,7 +99,7 @@ class NetworkOptions(Strict):
 
     Attributes:
         federate: An [external federate](federates.md) that replaces the built-in network, as for the physics. It is
-            then responsible for the radio, `tcp` and the faults of radios.
+            then responsible for the radio, the faults of radios and, unless `transports` is `builtin`, `tcp`.
         options: Options of the federate, as for the physics.
         transports: `federate`: the transports of the federate. `builtin`: the built-in UDP, TCP, topics and ROS 1,
             whose IP packets the federate carries with its transport `ip`.

@@ -315,7 +315,7 @@ _LOW_BATTERY_ACTIONS: Final = {
 
 
 _FENCE_ACTIONS: Final = {0: None, 1: Mode.RTL, 2: Mode.LAND, 3: Mode.RTL, 4: Mode.BRAKE, 5: Mode.LAND}
-"""Mode after a breach, by FENCE_ACTION."""
+"""Mode after a breach, by FENCE_ACTION, with the same replacements; None if the breach is only reported."""
 _GEOFENCE_ACTIONS: Final = {
     1: ("warning", None),
     2: ("hold", Mode.LOITER),

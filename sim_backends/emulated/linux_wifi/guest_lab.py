@@ -34,8 +34,8 @@ _POLL_S: Final = 0.5
 _MAX_ANSWER_BYTES: Final = 8 << 20
 _LOGIN: Final = Codec(GuestLogin)
 _SUBJECT: Final = "the lab in the virtual machine"
-_LAB: Final = "/run/lab"
-"""Folder in the machine in which the lab is started."""
+_SITE: Final = "/run/lab.yaml"
+"""Path of the lab's site file in the machine."""
 
 
 class GuestLab:
@@ -192,9 +192,9 @@ def _check(machine: Machine) -> None:
 
 def _script(site: Mapping[str, object], folder: Path, seed: int) -> str:
     relay = shlex.join((*worker.command("sim_backends.emulated.linux_wifi.lab_relay"), CHANNEL, str(folder)))
-    lab = ("lab", "up", "--foreground", "--seed", str(seed), "--site", f"{_LAB}.yaml")
+    lab = ("lab", "up", "--foreground", "--seed", str(seed), "--site", _SITE)
     return (
-        f"printf %s {shlex.quote(json.dumps(site))} > {_LAB}.yaml\n"
+        f"printf %s {shlex.quote(json.dumps(site))} > {_SITE}\n"
         + guest.prologue(folder)
         + f"{relay} &\nexec {shlex.join((*worker.command('fieldkit'), *lab))}\n"
     )
