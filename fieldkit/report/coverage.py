@@ -71,7 +71,7 @@ class Absence:
 
     Attributes:
         cell: The condition.
-        reason: `nothing arrived`, `no value` or `no valid repeat`. `total_absences` joins the first two if both apply.
+        reason: `nothing arrived`, `no value` or `no valid repeat`. `total_absences` can join the first two.
         count: Number of repeats without a value for this reason; number of attempts if no repeat is valid.
         total: Number of all repeats or attempts.
     """
