@@ -20,7 +20,9 @@ start_sampler() {
     detach "$meta" 86400 - 0 /dev/null "$1-link.txt" "$meta/log" "$shell" "$self" sample "$2" "$token"
 }
 
-stop_samplers() { # stop the jobs of the link, of the clock and of the telemetry sources of role $1
+# Stop the jobs of the link, of the clock and of the telemetry sources of role $1; compress the files of the link and of the
+# sources.
+stop_samplers() {
     for meta in .jobs/link .jobs/clock .jobs/telemetry-*; do
         [ -d "$meta" ] || continue
         end_sampler
@@ -117,7 +119,8 @@ uses_tested_interface() { # true if packets to $address leave by the interface u
     case "$route " in *" dev $tested_interface "*) ;; *) return 1 ;; esac
 }
 
-# Print samples of interface $1 until this job is stopped, its folder is deleted, or the lock of token $2 (-: none) is lost.
+# Print samples of interface $1 until this job is stopped, its folder is deleted, or the lock of token $2 (-: none) is lost;
+# return earlier if the interface is not Wi-Fi.
 sample() {
     interface=$1 token=$2 next_check=0 next_query=0 wifi=
     ulimit -f "$BLOCKS"

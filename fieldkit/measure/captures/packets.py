@@ -113,7 +113,8 @@ class Packets(Table):
         content: Hash of the first `CONTENT_BYTES` after the TCP or UDP header or, without one, after the IP header;
             fewer if the packet is shorter. The checksum of TCP and UDP is excluded, because with offload it is
             computed after the capture. `NOT_CAPTURED` if one of these bytes was not captured.
-        interface: Index of the interface in captures on all interfaces; `headers.NO_INTERFACE` in other captures.
+        interface: Index of the interface in captures of the link type `headers.COOKED_V2`, which are on all
+            interfaces; `headers.NO_INTERFACE` in other captures.
     """
 
     time_ns: Ints

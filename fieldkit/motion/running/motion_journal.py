@@ -137,10 +137,10 @@ class MotionJournal:
     """The journal of motions in a file; empty if the file does not exist.
 
     Args:
-        path: The file.
+        path: The file. An incomplete last line that a crash left is removed.
 
     Raises:
-        EvidenceError: It is damaged.
+        EvidenceError: Another line of the file is damaged.
     """
 
     def __init__(self, path: Path) -> None:
