@@ -188,7 +188,7 @@ def ratio(rows: Sequence[dict[str, Any]], pair: str, reference: str) -> str:
 
 
 def main() -> int:
-    """Print a line per pair."""
+    """Measure; print a line per pair, or the results as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true", help="print single values as JSON")
     parser.add_argument("--rounds", type=int, default=8, help="measurements of each pair")

@@ -1,8 +1,8 @@
 """Compare two recorded outputs: they can be equal, differ only in words, or differ in other parts.
 
 Machine-readable output (commands of dry runs, tables, exports, hashes, exit codes) must be equal, except for parts
-that vary between runs, such as time stamps, and for sentences in JSON. Other text (help, messages, tables on a
-terminal, reports) may differ in words, which are listed as labels; its numbers and options must be equal and in the
+that vary between runs, such as time stamps, and for sentences in printed JSON. Other text (help, messages, tables on
+a terminal, reports) may differ in words, which are listed as labels; its numbers and options must be equal and in the
 same order.
 """
 
@@ -44,7 +44,7 @@ class Differences:
 
     Attributes:
         labels: Pairs of passages, before and after the change, with their counts.
-        real: Differences that are not labels, each with the lines that differ.
+        real: Descriptions of differences that are not labels, with the lines or files that differ.
     """
 
     labels: Counter[tuple[str, str]] = field(default_factory=Counter)

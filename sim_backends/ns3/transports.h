@@ -158,7 +158,8 @@ class TcpTransport
     {
         bool is_newreno = congestion == "newreno";
         auto type = TypeId::LookupByName(is_newreno ? "ns3::TcpLinuxReno" : "ns3::TcpCubic");
-        // The values of fieldkit's own TCP, which are Linux's values (sim_backends/network/tcp/tcp_options.py).
+        // The values of fieldkit's own TCP (sim_backends/network/tcp/tcp_options.py), which has no HyStart and no limit
+        // of the send buffer. Here the buffer is larger than the receiver's.
         Config::SetDefault("ns3::TcpL4Protocol::SocketType", TypeIdValue(type));
         Config::SetDefault("ns3::TcpCubic::HyStart", BooleanValue(false));
         Config::SetDefault("ns3::TcpSocket::SegmentSize", UintegerValue(1448));

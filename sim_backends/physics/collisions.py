@@ -171,7 +171,10 @@ def rectangle(
 
 
 def gap_m(footprint: Footprint, extent: Extent, place_m: Vector) -> float:
-    """Return the minimum distance between a cylinder and a footprint; 0 if they touch or overlap."""
+    """Return the minimum distance between a cylinder and a footprint; 0 if they touch or overlap.
+
+    The footprint counts up to `high_m` everywhere, even where `wall_m` is lower.
+    """
     horizontal_m = _horizontal_gap_m(footprint, extent, place_m)
     vertical_m = max(place_m[2] - footprint.high_m, footprint.low_m - place_m[2] - extent.height_m)
     return math.hypot(max(horizontal_m, 0.0), max(vertical_m, 0.0))

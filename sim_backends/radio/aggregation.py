@@ -4,6 +4,7 @@ The originator (the sending station) sends frames again, alone or with new ones,
 up. The recipient passes them to the layer above in the order of their sequence numbers, so a frame waits for the ones
 before it. Two steps of the standard are instantaneous here: the agreement exists from the first frame, and the
 recipient immediately skips a frame that the originator has given up (a BlockAckReq reports this in the standard).
+Limits of HE are those of IEEE 802.11ax-2021.
 """
 
 from collections import deque

@@ -33,11 +33,11 @@ def add(parser: Parser) -> None:
         "up",
         help="start the robots of the site file, or N equal robots",
         description="Start every robot of the site file, with any roles and backend, or N equal robots with "
-        "--robots, and return when all can be reached. They are placed in a square in the middle of the world, at "
-        "most 5 m apart, and communicate directly with each other; `emulated` in the site file sets radio, world and "
-        "ROS. SSH does not use the radio: `control: radio` is ignored, with a note. No program listens on the "
-        "network of this machine; the files that other programs need to reach the robots are in a folder of this "
-        "user, in memory if there is /run/user. The lab exists as long as its process.",
+        "--robots, and return when all can be reached. They are placed on a square grid in the middle of the world, "
+        "with at most 5 m between neighbours, and communicate directly with each other; `emulated` in the site file "
+        "sets radio, world and ROS. SSH does not use the radio: `control: radio` is ignored, with a note. No program "
+        "listens on the network of this machine; the files that other programs need to reach the robots are in a "
+        "folder of this user, in memory if there is /run/user. The lab exists as long as its process.",
     )
     shared.add_robots(action)
     action.add_argument("--seed", type=int, default=1, metavar="N", help="seed of all random draws (default 1)")
