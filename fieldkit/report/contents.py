@@ -32,7 +32,7 @@ from fieldkit.report import (
     wording,
 )
 from fieldkit.report.charts import Chart
-from fieldkit.report.coverage import absences
+from fieldkit.report.coverage import total_absences
 from fieldkit.report.headlines import Headline, Ranking, headlines
 from fieldkit.report.series import Identities
 from fieldkit.report.theme import CYCLE
@@ -344,8 +344,7 @@ def _missing_reasons(table: CellTable, evidence: Evidence) -> dict[tuple[int, st
     return {
         (numbers[id(absence.cell)], quantity.name): absence.text
         for quantity in (*table.quantities, *table.collapsed_quantities)
-        for absence in absences(cells, quantity, evidence)
-        if absence.is_total
+        for absence in total_absences(cells, quantity, evidence)
     }
 
 

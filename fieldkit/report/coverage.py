@@ -4,7 +4,8 @@ A cell contains the repeats under one condition, and their estimates.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import Final
 
 import numpy as np
@@ -70,7 +71,7 @@ class Absence:
 
     Attributes:
         cell: The condition.
-        reason: `nothing arrived`, `no value`, or `no valid repeat`.
+        reason: `nothing arrived`, `no value` or `no valid repeat`. `total_absences` can join the first two.
         count: Number of repeats without a value for this reason; number of attempts if no repeat is valid.
         total: Number of all repeats or attempts.
     """
@@ -79,11 +80,6 @@ class Absence:
     reason: str
     count: int
     total: int
-
-    @property
-    def is_total(self) -> bool:
-        """True if no repeat of the condition has a value, all for this reason."""
-        return self.count == self.total
 
     @property
     def share(self) -> str:
@@ -165,6 +161,15 @@ def absences(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> I
     for cell in cells:
         if wording.group(cell) in measured_groups and _is_measured(cell, quantity, cells, evidence):
             yield from _absences_of(cell, quantity, evidence)
+
+
+def total_absences(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> Iterator[Absence]:
+    """Yield one item for each condition in which a quantity has no value at all; see `absences` for the arguments."""
+    for _, parts in groupby(absences(cells, quantity, evidence), key=lambda absence: id(absence.cell)):
+        first, *others = parts
+        if first.count + sum(other.count for other in others) == first.total:
+            reason = " or ".join((first.reason, *(other.reason for other in others)))
+            yield replace(first, reason=reason, count=first.total)
 
 
 def _is_measured(cell: Cell, quantity: Quantity, cells: Iterable[Cell], evidence: Evidence) -> bool:

@@ -13,7 +13,7 @@ from fieldkit.analysis.wording import scale_of
 from fieldkit.core.columns import Kind, plain_name
 from fieldkit.report import wording
 from fieldkit.report.charts import Chart, EdgeMark, Panel, Series
-from fieldkit.report.coverage import Absence, absences
+from fieldkit.report.coverage import Absence, total_absences
 from fieldkit.report.headlines import Ranking
 from fieldkit.report.series import Identities, Identity, Point, axis_limits, panels, point
 from fieldkit.report.trial_folders import Evidence
@@ -78,7 +78,7 @@ def charts(
 
 def is_curve(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> bool:
     """Return True if any panel has a quantity, or should have it, at more than one distance."""
-    cells_without = (absence.cell for absence in absences(cells, quantity, evidence) if absence.is_total)
+    cells_without = (absence.cell for absence in total_absences(cells, quantity, evidence))
     distances_m: dict[tuple[str, str], set[float]] = {}
     for cell in (*_cells_with_distance(cells, quantity), *cells_without):
         distances_m.setdefault(wording.group(cell), set()).add(wording.metres(cell))
@@ -189,8 +189,8 @@ class _CurveDrawing:
         places = [_CurvePlace(cell, point(cell, quantity, factor, self.evidence)) for cell in group]
         places += [
             _CurvePlace(absence.cell, absence, is_high=is_high)
-            for absence in absences(with_missing(self.cells, quantity, group), quantity, self.evidence)
-            if absence.is_total and absence.cell.key["distance_m"] is not None
+            for absence in total_absences(with_missing(self.cells, quantity, group), quantity, self.evidence)
+            if absence.cell.key["distance_m"] is not None
         ]
         return sorted(places, key=lambda place: place.metres)
 

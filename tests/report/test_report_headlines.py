@@ -7,7 +7,7 @@ import pytest
 
 from fieldkit.analysis.cells import aggregate
 from fieldkit.config import schema
-from fieldkit.report.coverage import everything_lost
+from fieldkit.report.coverage import absences, everything_lost, total_absences
 from fieldkit.report.headlines import Headline, Ranking, headlines
 from fieldkit.report.trial_folders import Evidence, load_evidence
 from fieldkit.steps.base import StepEntry
@@ -109,6 +109,24 @@ def test_quantity_without_its_own_loss_uses_the_other_losses() -> None:
     rows = [lawns.row(1), lawns.row(2, **(LOST | {"rtt_loss": None})), lawns.row(3, rtt_median_s=None)]
     values = lines(rows)["RTT with UDP"]
     assert values[:2] == ["nothing arrived 10ft (1 of 3)", "no value 10ft (1 of 3)"]
+
+
+def test_condition_without_a_value_for_two_reasons_has_one_total_absence() -> None:
+    rows = [lawns.row(1, **FAR, **LOST), lawns.row(2, **(FAR | {"rtt_median_s": None})), lawns.row(1)]
+    evidence = load_evidence(parsed(rows))
+    quantity = evidence.quantities["rtt_median_s"]
+    cells = aggregate(evidence.repeats)
+    assert [absence.text for absence in absences(cells, quantity, evidence)] == [
+        "nothing arrived: 1 of 2",
+        "no value: 1 of 2",
+    ]
+    (total,) = total_absences(cells, quantity, evidence)
+    assert total.text == "nothing arrived or no value: 2 of 2"
+
+
+def test_condition_with_some_values_has_no_total_absence() -> None:
+    evidence = load_evidence(parsed([lawns.row(1), lawns.row(2, rtt_median_s=None)]))
+    assert not list(total_absences(aggregate(evidence.repeats), evidence.quantities["rtt_median_s"], evidence))
 
 
 def evidence_with(folder: Path, *expected: str) -> Evidence:
