@@ -369,7 +369,8 @@ def wait_until_created(path: Path) -> None:
         ("tcp:127.0.0.1:1", "Connection refused"),
         ("/dev/null:115200", "Inappropriate ioctl"),
         ("/dev/none:115200", "No such file"),
-        ("/dev/null:7", "does not support 7 baud"),
+        ("/dev/null:7", "/dev/null:7 has no valid baud rate; write for example /dev/null:57600"),
+        ("/dev/null", "/dev/null has no valid baud rate"),
         ("usb:1:2", "is not a connection: it must start with udpout:"),
     ],
 )
