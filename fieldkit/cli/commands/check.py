@@ -23,7 +23,7 @@ def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit check`."""
     parser.description = (
         "Check everything that a trial of the procedure needs from the robots and from this machine. The robots need "
-        "not be placed, and only the job script of fieldkit is installed on them. `fieldkit trial` makes the same "
+        "not be placed, and only the scripts of fieldkit are installed on them. `fieldkit trial` makes the same "
         "checks, except for time sources, telemetry sources and a test recording. For the estimate of disk space, "
         "give --repeats and --record of the planned trial."
     )

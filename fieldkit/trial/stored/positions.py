@@ -141,7 +141,8 @@ def parse_source(text: str) -> tuple[Role, Path | PositionSource]:
     except ValueError:
         separator = ""
     if not separator or not source:
-        raise ConfigurationError(f"{text[:80]!r} is not ROLE=FILE", remedy="write for example receiver=walk.gpx")
+        problem = f"{text[:80]!r} is not ROLE=FILE or ROLE=PLACE"
+        raise ConfigurationError(problem, remedy="write for example receiver=walk.gpx or sender=0m,5m")
     return role, _place(source) or Path(source)
 
 

@@ -173,7 +173,7 @@ class FlowResult:
 
     @property
     def loss(self) -> float:
-        """Share of the packets that never arrived; nan without packets."""
+        """Share of `sent_packets` that never arrived; nan without such packets."""
         return 1 - self.arrived_packets / self.sent_packets if self.sent_packets else np.nan
 
 

@@ -83,8 +83,8 @@ class AirEvents:
     """Events on the air since the last call of `Air.pop_events`.
 
     Attributes:
-        receptions: Frames that arrived, in order.
-        statuses: Frames whose status is known, in order.
+        receptions: Frames that arrived, in order on each channel.
+        statuses: Frames whose status became known, in order on each channel.
     """
 
     receptions: list[FrameReception] = field(default_factory=list)
