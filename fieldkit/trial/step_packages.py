@@ -33,13 +33,13 @@ def packages_of_kinds(names: Iterable[str]) -> dict[str, StepPackage]:
 
     Kinds that ship with fieldkit, and kinds that no installed package declares, are omitted.
     """
-    others = set(names) - kinds.shipped_names()
+    kinds_of_packages = set(names) - kinds.shipped_names()
     return {
         point.name: StepPackage(
             package=point.dist.name, version=point.dist.version, code_sha256=_code_hash(point.module)
         )
         for point in plugins.entry_points(plugins.STEPS)
-        if point.name in others and point.dist is not None
+        if point.name in kinds_of_packages and point.dist is not None
     }
 
 

@@ -3,7 +3,7 @@
 During an attempt, a script on each robot, the sampler, reads the state of the link several times per second. Its file
 `ROLE-link.txt`, which is usually compressed, has sections. Each section has a line `==> SECONDS NAME <==` and the
 output at this time: `link`, `survey` and `station` of iw, or `wireless` of /proc/net/wireless. The seconds are
-counted from boot; the time of boot is computed from the host state before the attempt.
+counted from boot; the time of boot is computed from the host state before the attempt or, without it, after it.
 
 The format of iw's lines is defined in its source files station.c, link.c and survey.c. Versions 3 to 6 differ only in
 added lines.

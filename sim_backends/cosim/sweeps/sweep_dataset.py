@@ -83,7 +83,7 @@ def _rows_of(setting: SweepSetting, plan: SweepPlan, folder: SweepFolder) -> lis
             name, _, values = number_column
             numbers[name] = values[factor.values.index(setting.values[factor.name])]
     runs = (run for run in plan.runs if run.setting is setting)
-    hashes = scenario_hashes(plan.scenario)  # equal for all settings: factors do not change the procedure
+    hashes = scenario_hashes(plan.scenario)  # one for all settings: factors do not count as part of the procedure
     return [numbers | dict(row) | hashes for run in runs for row in folder.rows(run)]
 
 

@@ -49,7 +49,7 @@ class Commands:
     def run(self, message: Message) -> int:
         """Execute the command in a COMMAND_LONG or COMMAND_INT; return its MAV_RESULT.
 
-        The reason for a refusal is added to the vehicle's status texts.
+        The reason for a refusal is added to the vehicle's status texts, if the firmware sends one.
         """
         handler = self._handlers.get(message.command)
         if handler is None:

@@ -102,7 +102,7 @@ class ArduCopterFailsafes:
 
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
-        # Number of the last stage in `_STAGES` that was triggered, from 1; 0 if none was.
+        # Number of the highest stage in `_STAGES` that was triggered, from 1; 0 if none was.
         self._stage = 0
         # Time since which the voltage has been below the limit of a stage, by its name.
         self._below_ns: dict[str, int] = {}
@@ -177,8 +177,8 @@ class ArduCopterFailsafes:
     ) -> Iterator[Reaction]:
         """Yield the reaction of a failsafe whose parameter has the value `action`.
 
-        `modes` has the mode to change to for each value that changes the mode. On the ground, the vehicle is disarmed
-        instead. While it lands, it continues to land.
+        `modes` has the mode to change to for each value that changes the mode. A disarmed vehicle only reports the
+        failsafe. On the ground, an armed vehicle is disarmed instead. While it lands, it continues to land.
         """
         mode = modes.get(action)
         if not state.is_armed or mode is None:

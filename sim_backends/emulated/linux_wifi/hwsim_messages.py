@@ -231,7 +231,7 @@ def _sent_frame(attributes: dict[int, bytes]) -> SentFrame:
 def _stages(rates: bytes, flags: bytes) -> tuple[RateStage, ...]:
     """Return the stages of a rate chain from the attributes TX_INFO and TX_INFO_FLAGS."""
     stages = []
-    # The flags have the same order; a kernel before 4.20 does not send them.
+    # The flags have the same order; old kernels do not send them.
     all_flags = (
         [bits for _, bits in _RATE_FLAGS.iter_unpack(flags)] if len(flags) == STAGES * _RATE_FLAGS.size else []
     )
