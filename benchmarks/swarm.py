@@ -137,7 +137,7 @@ def tcp(client: Namespace, server: Namespace, seconds: float) -> Figures:
 
 
 def measure_pairs(size: int, options: RadioOptions, seconds: float, packets_s: int, pairs: int) -> Figures:
-    """Return the received packets between pairs of `size` robots, and the cost per packet in the medium."""
+    """Return the rate of received packets in pairs of `size` robots, and the cost per packet in the medium."""
     with swarm(size, options) as (medium, spaces):
         senders, receivers = spaces[: 2 * pairs : 2], spaces[1 : 2 * pairs : 2]
         packets_s_each = str(packets_s / len(senders))
@@ -214,7 +214,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=3.0, help="length of each throughput run")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    print(f"load before: {os.getloadavg()[0]:.2f}")
+    print(f"load before: {os.getloadavg()[0]:.2f}", file=sys.stderr)
     table = {
         name: {size: measure_medium(size, radio_options, options.seconds) for size in options.sizes}
         for name, radio_options in RADIOS.items()
@@ -231,7 +231,7 @@ def main() -> None:
         print(json.dumps({"veth": veth, **table}, indent=2))
     else:
         show(table, veth, options.sizes)
-    print(f"load after: {os.getloadavg()[0]:.2f}")
+    print(f"load after: {os.getloadavg()[0]:.2f}", file=sys.stderr)
 
 
 if __name__ == "__main__":

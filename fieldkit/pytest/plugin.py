@@ -30,7 +30,7 @@ OPTIONS: Final[dict[str, tuple[str, str, tuple[str, ...] | None]]] = {
     "site": ("FILE", "the lab's site file; default: fieldkit.yaml in the current folder, if there is one", None),
     "topology": (
         "NAME",
-        "topology of the robots; default: the first topology of the site file, or of a trial's procedure",
+        "topology of the robots; default: the first of the site file, otherwise master; in a trial, its procedure's",
         ("master", "masterless"),
     ),
     "output": ("DIR", "folder for the evidence of all runs; default: fieldkit-results in pytest's root folder", None),

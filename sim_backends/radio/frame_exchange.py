@@ -115,7 +115,7 @@ class FrameExchange(Generic[Payload]):
         self.events.schedule_start(station.contention.earliest_start_ns(now_ns), station.index)
 
     def _start(self, now_ns: int, index: int) -> None:
-        """Start an exchange of a station whose backoff has ended."""
+        """Start an exchange of a station after its backoff, or in its transmission opportunity."""
         station = self.stations[index]
         station.contention.earliest_start_ns(now_ns)  # counts down the backoff slots that were idle until now
         if self.reception.is_jammed(index):
@@ -314,7 +314,7 @@ class FrameExchange(Generic[Payload]):
         transmission: Transmission,
         exchange_id: int,
     ) -> None:
-        """Start the ACK or Block Ack to a transmission of `station`."""
+        """Start the ACK or Block Ack to a transmission of `station`, unless the receiver is transmitting itself."""
         receiver = self.stations[peer.receiver]
         if receiver.sending_until_ns > now_ns:
             return

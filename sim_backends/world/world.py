@@ -150,7 +150,7 @@ def _material_losses(names: tuple[str, ...], frequency_hz: float) -> tuple[Float
 
 
 def world_files() -> dict[str, Path]:
-    """Return the files of all worlds by name: worlds in the lab's folder `worlds/`, and shipped ones."""
+    """Return the files of worlds by name: those in the lab's folder `worlds/`, and shipped ones of other names."""
     return {path.stem: path for folder in (SHIPPED, Path("worlds")) for path in sorted(folder.glob("*.yaml"))}
 
 
