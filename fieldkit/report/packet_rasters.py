@@ -12,6 +12,7 @@ import numpy as np
 
 from fieldkit.analysis.cells import Cell
 from fieldkit.core.model import Protocol, Status
+from fieldkit.core.units import format_count
 from fieldkit.measure.captures.arrays import Mask
 from fieldkit.measure.transfers import fates
 from fieldkit.report import wording
@@ -116,7 +117,8 @@ def _raster(place: str, lines: Sequence[Mask], width: int, what: str) -> Raster:
         columns=max(map(len, columns)),
         lengths=[len(line) for line in columns],
         runs=[(number, *run) for number, line in enumerate(columns) for run in _runs(line)],
-        description=f"{place}: {len(lines)} repeats, {marked_count} of {total} {what}, at most {longest} in a row",
+        description=f"{place}: {format_count(len(lines), 'repeat')}, {marked_count} of {total} {what}, at most "
+        f"{longest} in a row",
     )
 
 

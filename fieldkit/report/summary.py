@@ -106,7 +106,8 @@ def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Caution]:
     yield from map(Caution, evidence.limitations[:_MAX_LIMITATIONS])
     if (more_count := len(evidence.limitations) - _MAX_LIMITATIONS) > 0:
         yield Caution(
-            f"{more_count} further notes of this kind are not shown; fieldkit verify lists them for a trial."
+            f"Not shown: {format_count(more_count, 'further note')} of this kind; fieldkit verify lists them for a "
+            "trial."
         )
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fieldkit.core.columns import step_prefixed
 from fieldkit.core.model import Protocol, Role
+from fieldkit.core.units import format_count
 from fieldkit.measure.evidence import ping
 from fieldkit.measure.transfers.fates import Fates
 from fieldkit.measure.transfers.transfer_spec import Transfer
@@ -162,8 +163,8 @@ def _packets(transfer: Transfer, fates: Fates, zero_ns: int) -> Panel:
         x_label=f"time [ms] after {(first_sent_ns - zero_ns) / 1e9:.3f} s",
         y_label="offset in the payload [kB]",
         series=series,
-        description=f"{len(fates.sent_ns)} packets sent, {fates.lost_or_repeated.sum()} of them {marked_text}, "
-        f"{len(fates.received_ns)} received",
+        description=f"{format_count(len(fates.sent_ns), 'packet')} sent, {fates.lost_or_repeated.sum()} of them "
+        f"{marked_text}, {len(fates.received_ns)} received",
     )
 
 
@@ -199,7 +200,8 @@ def _round_trips(name: str, role: Role, output: ping.Ping, times: AttemptTimes, 
         x_label=_TIME_LABEL,
         y_label="RTT [ms]",
         series=series,
-        description=f"{len(answered_requests)} round trips{median_text}; {len(lost_numbers)} without a reply",
+        description=f"{format_count(len(answered_requests), 'round trip')}{median_text}; {len(lost_numbers)} without "
+        "a reply",
         top=None if answered_requests else 1.0,
     )
 

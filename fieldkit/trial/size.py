@@ -13,7 +13,7 @@ RESERVE_BYTES: Final = 100 << 20
 """Bytes that a trial leaves free on every disk for other data."""
 
 FETCHED_BYTES_PER_S: Final = 2.5e6
-"""Assumed transfer rate of evidence. TCP over a good 802.11n link with one stream in 20 MHz has about 20 Mbit/s."""
+"""Assumed transfer rate of evidence: 20 Mbit/s, somewhat less than on a good link (`steps.scene.GOOD_BIT_S`)."""
 
 # The states of the host before and after the attempt, logs, and the output of ping take about 20 kB on a robot with
 # Wi-Fi; the rest is a margin.

@@ -5,6 +5,7 @@ from types import MappingProxyType
 from typing import Final
 
 from fieldkit.core.errors import EvidenceError
+from fieldkit.core.units import format_count
 from fieldkit.measure.evidence.recordings import RecordingContents
 from fieldkit.measure.evidence.sandbox import Json, ReaderError, SandboxedReader
 
@@ -59,7 +60,7 @@ def read(path: Path) -> RecordingContents:
     messages, metadata_messages = contents["messages"], contents.get("metadata_messages", contents["messages"])
     if messages != metadata_messages:
         raise EvidenceError(
-            f"the file contains {messages} messages, but {METADATA} states {metadata_messages}",
+            f"the file contains {format_count(messages, 'message')}, but {METADATA} states {metadata_messages}",
             where=where,
             remedy="is the bag split into several files? omit --max-bag-size and --max-bag-duration in `record`",
         )

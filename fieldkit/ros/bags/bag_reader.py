@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rosbags import rosbag1
 
+from fieldkit.core.units import format_count
 from fieldkit.measure.evidence import sandbox_process
 from fieldkit.measure.evidence.sandbox import Json
 from fieldkit.ros.bags import bag
@@ -68,7 +69,8 @@ def contents(reader: "rosbag1.Reader | rosbag2.Reader") -> Json:
         messages, started_ns = _checked_count(reader.message_count), _checked_count(reader.start_time)
         if len(by_topic) > _MAX_TOPICS or sum(by_topic.values()) != messages:
             raise ValueError(
-                f"its index counts {messages} messages, but the counts of its {len(by_topic)} topics differ"
+                f"its index counts {format_count(messages, 'message')}, but the sum of its topics differs, or it has "
+                f"more than {_MAX_TOPICS} topics"
             )
         # The duration of rosbags ends one nanosecond after the last message.
         duration_s = (_checked_count(reader.duration) - 1) / 1e9 if messages else 0.0

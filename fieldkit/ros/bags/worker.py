@@ -128,7 +128,8 @@ def _problems(bag: BagFiles) -> Iterator[str]:
                     f"{message_name} is not a valid {connection.msgtype}: {_error_text(error)}"
                 )
         if reader.message_count != sum(read_counts.values()):
-            yield f"its index counts {reader.message_count} messages, but it contains {sum(read_counts.values())}"
+            index_text = f"its index counts {format_count(reader.message_count, 'message')}"
+            yield f"{index_text}, but it contains {sum(read_counts.values())}"
         if outside_count:
             yield f"{format_count(outside_count, 'message')} outside the time range of its index"
     yield from errors_by_type.values()

@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 
+from fieldkit.core.units import format_count
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.report.attempt_timing import TIME_LABEL, AttemptTimes
 from fieldkit.report.charts import Panel, Series
@@ -58,7 +59,7 @@ def panels(step: Step, evidence: AttemptEvidence, times: AttemptTimes, zero_ns: 
         y_label="[ms]",
         series=series,
         description=(
-            f"{len(sent_samples.sequence)} samples sent, {int(is_lost.sum())} lost, "
+            f"{format_count(len(sent_samples.sequence), 'sample')} sent, {int(is_lost.sum())} lost, "
             f"{len(received_samples.sequence)} received"
         ),
         top=None if len(excess_ms) else 1.0,  # without delays the y axis has no automatic end

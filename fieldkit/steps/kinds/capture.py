@@ -322,11 +322,11 @@ def _problems(role: Role, file: str, log_file: str, view: View, *, needs_all: bo
         yield f"its kernel dropped {dropped_text}, its interface {log.dropped_by_interface or 0}"
     # The filter may have matched more packets than were written: see `CaptureLog.received_by_filter`.
     if log.received_by_filter is not None and log.received_by_filter < log.captured:
-        yield f"{log.received_by_filter} packets matched, but {log.captured} were written"
+        yield f"{format_count(log.received_by_filter, 'packet')} matched the filter, but tcpdump wrote {log.captured}"
     if capture.damage is not None:
         yield capture.damage
     elif capture.frames != log.captured:
-        yield f"the file has {capture.frames} packets, but tcpdump counted {log.captured}"
+        yield f"the file has {format_count(capture.frames, 'packet')}, but tcpdump counted {log.captured}"
     else:
         if problem := altered_packets.header_problem(capture.packets):
             yield problem

@@ -236,7 +236,8 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
             reasons = ping_duplicates.contradictions(result, self.interval, *self._captured_echoes(view))
             yield from (f"{self._file}: {reason}" for reason in reasons)
         if result.received is not None and result.received != len(result.answers):
-            yield f"{self._file}: ping counted {result.received} answers and printed {len(result.answers)}"
+            answers_text = format_count(result.received, "answer")
+            yield f"{self._file}: ping counted {answers_text} and printed {len(result.answers)}"
         # iputils reports 0 for a negative time, and "time of day goes back" in its log.
         if 0.0 in result.rtt_s:
             yield f"{self._file} has a round-trip time of 0: the clock was set back while ping waited"
