@@ -111,8 +111,8 @@ def concerns(
 ) -> tuple[Concern, ...]:
     """Return the concerns about comparing two runs, refusals first.
 
-    A column in `varied`, or in `VARIED` but not in `by`, causes no refusal if it has a single value in each run,
-    because it is then the variable of the comparison.
+    A column in `varied`, or in `VARIED` but not in `by`, causes no refusal if it has a single value in A and a single
+    value in B under the condition, because it is then the variable of the comparison.
 
     Args:
         pairs: Name of each condition, and its valid repeats in A and in B; at least one in each run.

@@ -112,10 +112,10 @@ def _judge_cells(expectation: Expectation, cells: Sequence[Cell]) -> Iterator[Ju
 def _limitations(expectation: Expectation, estimate: Estimate, n_valid: int) -> Iterator[str]:
     """Yield the reasons why the ruling cannot be `holds`, even if the repeats with a value meet the expectation."""
     if missing := max(n_valid - estimate.n, estimate.missing):
-        yield f"{missing} of {estimate.n + missing} repeats have no value"
+        yield f"no value in {missing} of {estimate.n + missing} repeats"
     if estimate.n_censored:
         share = f"{estimate.n_censored} of {estimate.n}"
-        yield f"in {share} repeats the timed event had not ended, so their values are only lower bounds"
+        yield f"in {share} repeats the timed event had not ended, so only a lower bound is known"
     if expectation.is_below and estimate.quantity.of_sent and estimate.sample is not None:
         infinite = int(np.isinf(estimate.sample.high).sum()) - estimate.n_censored
         if infinite:

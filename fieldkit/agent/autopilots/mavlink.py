@@ -113,7 +113,7 @@ class FlightRecorder:
         if not self.ready and self._autopilot is not None and time.monotonic() - self._first_heartbeat_s > _TIMEOUT_S:
             missing_ids = ", ".join(str(kind) for kind in sorted(self._missing_kinds - set(self._refusals)))
             raise MissingMessageError(
-                f"the autopilot has not sent the requested message {missing_ids} in {_TIMEOUT_S:g} s "
+                f"the autopilot has not sent all requested messages in {_TIMEOUT_S:g} s; missing: {missing_ids} "
                 "(ids of https://mavlink.io/en/messages/common.html)"
             )
 
