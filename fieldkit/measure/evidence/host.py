@@ -208,7 +208,7 @@ def parse_counters(text: str) -> Counters:
 
 
 def received_bytes(path: Path, interface: str) -> int | None:
-    """Return the number of bytes that an interface has received (/proc/net/dev), or None if the file does not list it.
+    """Return the number of bytes that an interface has received (/proc/net/dev), or None if it is not listed.
 
     Raises:
         EvidenceError: The file is missing or cannot be read.
