@@ -120,7 +120,7 @@ def run(folder: LabFolder, backend: LabBackend, *, seed: int, sink: Sink, on_rea
 
 @contextmanager
 def _lab_lock(folder: LabFolder) -> Iterator[None]:
-    """Hold the lock that allows only one lab per directory."""
+    """Hold the lock that allows only one lab per directory; raises `ConfigurationError` if a process holds it."""
     with ExitStack() as stack:
         try:
             stack.enter_context(runtime.hold_lock(folder.lock_name))

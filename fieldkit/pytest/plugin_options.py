@@ -93,7 +93,10 @@ def _text(config: pytest.Config, name: str) -> str | None:
 
 
 def _path(config: pytest.Config, name: str) -> Path | None:
-    """Return a path. On the command line it is relative to the current folder, in the configuration to the root."""
+    """Return the path in an option, or None if the option is not set.
+
+    On the command line it is relative to the current folder, in the configuration to pytest's root folder.
+    """
     option, configured = config.getoption(f"fieldkit_{name}"), config.getini(f"fieldkit_{name}")
     if option:
         return Path(config.invocation_params.dir, option)

@@ -276,7 +276,12 @@ class RobotHandle:
         return with_environment(argv, setup=ros_profile.command.setup, environment=ros_profile.environment)
 
     def _result(self, argv: Sequence[str], wait: Callable[[], Completed], *, check: bool = False) -> ProgramOutput:
-        """Return the result of a program; a timeout is a test failure, not a robot error."""
+        """Return the result of a program; a timeout is a test failure, not a robot error.
+
+        Raises:
+            ProgramError: The program did not exit in time, or its exit code is not 0 and `check` is set.
+            LinkLostError: The connection broke.
+        """
         __tracebackhide__ = True
         command_text = f"{self.name} $ {quote(argv)}"
         try:

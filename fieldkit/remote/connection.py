@@ -189,7 +189,10 @@ class Connection:
         """Wait until packets may be sent again.
 
         Returns:
-            The expected duration of the silence when the wait started, in seconds.
+            The expected duration of the silence when the wait started, in seconds; 0 without a silence.
+
+        Raises:
+            LinkError: `close` was called.
         """
         initial_s = self._silence_s()
         if initial_s and notify:
@@ -224,7 +227,7 @@ class Connection:
 
     @contextmanager
     def silence(self, seconds: float) -> Iterator[None]:
-        """Send no packets on the link during the body; see `Shell.silence`.
+        """Send no packets on the link during the body, if it crosses the radio under test; see `Shell.silence`.
 
         Keepalive probes are not sent either, so the link is not closed for lack of answers during this time. The
         body starts when no channel is being opened any more.

@@ -268,9 +268,10 @@ def stop(
         job: A started job, which may have ended.
         signal: Name without `SIG`.
         grace_s: Time until SIGKILL, in whole seconds.
-        settle: File in the job's folder that must stop growing before the signal.
+        settle: File in the job's folder that must stop growing before the signal, but is waited for at most 2 s; None
+            to send the signal immediately.
         end_text: Text in the log that shows that the job has finished its work. `stop` then does not wait for its
-            end; `fetching.fetch` waits for it, and fails if its exit code is not 0.
+            end; `fetching.fetch` waits for it, and fails if its exit code is not 0. None to wait for the end.
 
     Returns:
         The job's exit code, or `KILLED`; 0 if `end_text` is in its log.

@@ -103,7 +103,7 @@ class _Packetizer(paramiko.packet.Packetizer):
         return super().read_all(n, check_rekey)
 
     def _read_timeout(self, timeout: float) -> bytes:
-        """Return a part of the banner."""
+        """Return a part of the banner; raises `FloodError` if the banner is too long."""
         piece: bytes = super()._read_timeout(timeout)  # type: ignore[misc]
         self._received_banner_bytes += len(piece)
         if self._received_banner_bytes > _BANNER_BYTES:

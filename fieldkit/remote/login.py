@@ -54,7 +54,10 @@ def read_host_key(address: Address, connect: Connect, *, deadline: Deadline, kin
 
 @contextlib.contextmanager
 def _converting_errors(link: Link, address: Address, close_event: threading.Event) -> Iterator[None]:
-    """Close a link that could not be opened, and convert its exception to an error with a remedy."""
+    """Close a link that could not be opened, and convert its exception to an error with a remedy.
+
+    Raises the errors that `log_in` describes; exceptions that are not of a broken connection are not converted.
+    """
     try:
         yield
     except BaseException as error:

@@ -20,7 +20,7 @@ class LinkMeter:
         frames: Packets whose first attempt has started.
         retries: Attempts after the first.
         failures: Packets given up after the last attempt.
-        rate_bit_s: Rate of the last attempt; None before the first.
+        rate_bit_s: Rate of the last attempt in which the data was sent (not only an RTS); None before the first.
     """
 
     frames: int = 0

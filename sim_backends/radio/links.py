@@ -35,7 +35,7 @@ class LinkParameters:
     queue_packets: int = 1000
 
     def serialization_ns(self, size_bytes: int) -> int:
-        """Return the time for which a packet of `size_bytes` occupies the link, in ns, rounded up."""
+        """Return the time for which a packet of `size_bytes` occupies the link, in ns, rounded up; 0 if unlimited."""
         return 0 if self.rate_bit_s is None else -(-8 * size_bytes * 1_000_000_000 // self.rate_bit_s)
 
 

@@ -69,6 +69,7 @@ class RosPublisher:
         """Answer the connection header of a subscriber, and send it all later messages until it disconnects.
 
         Raises:
+            OSError: The connection failed.
             ValueError: The subscriber expects another type.
         """
         if header.get("md5sum") not in {"*", self._kind.md5}:
@@ -175,9 +176,11 @@ class RosSubscriber:
     def _read(self, stream: socket.socket) -> None:
         """Exchange headers, then store each message.
 
+        A publisher of another type is disconnected, and none of its messages is stored.
+
         Raises:
             OSError: The connection failed.
-            ValueError: The publisher violates TCPROS, or has another type.
+            ValueError: The publisher violates TCPROS.
         """
         stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         fields = {

@@ -108,7 +108,7 @@ def stream(path: Path, *, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Capture]:
 
 
 def _captures(data: Buffer, where: str, chunk_bytes: int) -> Iterator[Capture]:
-    """Yield the decoded packets of each chunk of a file."""
+    """Yield the decoded packets of each chunk of a file. Raises the same errors as `parse`."""
     reader = frame_reader(data)
     if reader is None:
         raise EvidenceError(

@@ -148,7 +148,11 @@ def _read_note(path: Path) -> _Note:
 
 
 def _ping_answers(path: Path, note: _Note) -> _Answers:
-    """Return the answers in the output of the observer's ping."""
+    """Return the answers in the output of the observer's ping.
+
+    Raises:
+        EvidenceError: The output is missing or has no summary.
+    """
     output = ping.read(path)
     if output.transmitted is None:
         raise EvidenceError("ping was stopped before its summary", where=path.name)

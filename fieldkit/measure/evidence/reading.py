@@ -92,7 +92,11 @@ def compressed(path: Path) -> bytes:
 
 @contextmanager
 def _open_regular(path: Path) -> Iterator[BinaryIO]:
-    """Open a regular file; other types, such as a pipe without a writer or an endless device, are refused."""
+    """Open a regular file; other types, such as a pipe without a writer or an endless device, are refused.
+
+    Raises:
+        EvidenceError: The file is missing, cannot be read, or is not a regular file.
+    """
     try:
         # The type is checked after opening, because the path can be replaced between a check and the opening.
         with open(path, "rb", opener=_open_nonblocking) as file:

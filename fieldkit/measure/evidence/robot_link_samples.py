@@ -98,7 +98,10 @@ def parse_channel(text: str) -> tuple[float | None, int | None, int | None]:
 
 
 def parse_wireless(line: str) -> tuple[float | None, float | None]:
-    """Return signal and noise in dBm from a line of /proc/net/wireless without the interface's name."""
+    """Return signal and noise in dBm from a line of /proc/net/wireless without the interface's name.
+
+    The noise is None if the driver does not report it; both values are None if the line has no negative signal.
+    """
     match = _WIRELESS_LINE.match(line)
     if match is None:
         return None, None

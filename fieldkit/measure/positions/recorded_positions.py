@@ -188,7 +188,10 @@ def _shifted(samples: Samples, by_ns: int) -> Samples:
 
 
 def _samples_in_trial(path: Path) -> Samples:
-    """Return the samples in a file of a trial. They are cached, because all attempts of the trial use this file."""
+    """Return the samples in a file of a trial. They are cached, because all attempts of the trial use this file.
+
+    Raises the same errors as `position_files.read_file`.
+    """
     try:
         status = path.stat()
     except OSError as error:

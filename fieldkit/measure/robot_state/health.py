@@ -147,7 +147,7 @@ def marks(names: Mapping[Role, str], flags_by_role: Mapping[Role, frozenset[str]
 
     Args:
         names: Name of the robot in each role.
-        flags_by_role: Results of `flags_during`.
+        flags_by_role: Results of `flags_during`; None for a robot whose flags are unknown.
     """
     for role, flags in flags_by_role.items():
         if UNDER_VOLTAGE in (flags or ()):

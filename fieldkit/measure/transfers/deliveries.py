@@ -217,7 +217,11 @@ def stream_deliveries(
 
 
 def _sender_to_receiver_ns(pairs: StampPairs) -> tuple[int, int]:
-    """Return the offsets in ns that convert the sender's times at the start and at the end of a flow."""
+    """Return the offsets in ns that convert the sender's times at the start and at the end of a flow.
+
+    Raises:
+        EvidenceError: There are no pairs.
+    """
     if not len(pairs):
         raise EvidenceError("no packet of the flow is known to be in both captures")
     order = np.argsort(pairs.receiver_ns, kind="stable")

@@ -332,7 +332,11 @@ def _steady_clocks(load: LoadStreams, sender: Packets, receiver: Packets) -> Clo
 
 
 def _transits_ns(load: LoadStreams, sender: Packets, receiver: Packets) -> Iterator[Ints]:
-    """Yield an array for each stream: the delays of its datagrams in ns, in the order of arrival."""
+    """Yield an array for each stream with complete datagrams: their delays in ns, in the order of arrival.
+
+    Raises:
+        EvidenceError: The delays cannot be determined from the captures.
+    """
     clocks = _steady_clocks(load, sender, receiver)
     if clocks is None:
         raise EvidenceError("no packet from receiver to sender is in both captures")

@@ -143,7 +143,8 @@ def match_keys(
         time_ns: Time of sending of each item. Shape (n,).
         received_key: Key of each received item. Shape (m,).
         received_time_ns: Time of reception of each item, by any clock. Shape (m,).
-        contents: Values that distinguish sent and received items with equal keys; `NOT_CAPTURED` if unknown.
+        contents: Values that distinguish sent and received items with equal keys, `NOT_CAPTURED` for an unknown
+            value; None if there are no such values.
     """
     sent_order, received_order = np.lexsort((time_ns, key)), np.lexsort((received_time_ns, received_key))
     keys, group = np.unique(key[sent_order], return_inverse=True)

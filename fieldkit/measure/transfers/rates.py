@@ -74,7 +74,11 @@ class Rates:
     head_bytes: int = 0
 
     def values(self, received_bytes: Value | None) -> dict[str, Value | None]:
-        """Return the columns, given the size of the file that the program wrote."""
+        """Return the columns; None for an unknown value.
+
+        Args:
+            received_bytes: Size of the file that the program wrote; None if unknown.
+        """
         goodput = None
         if isinstance(received_bytes, int) and self.completion_s:
             goodput = 8 * max(received_bytes - self.head_bytes, 0) / self.completion_s

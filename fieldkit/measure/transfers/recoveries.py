@@ -229,7 +229,11 @@ def _column_name(column: str, is_open: bool) -> str:
 
 
 def _fault_times_at(times: FaultTimes | None, role: Role) -> tuple[int, int | None]:
-    """Return start and end of a fault by the clock of a robot."""
+    """Return start and end of a fault by the clock of a robot; the end is None if unknown.
+
+    Raises:
+        EvidenceError: The start is unknown, or the offset of the robot's clock is unknown or not accurate enough.
+    """
     if times is None:
         raise EvidenceError("the start of the fault is unknown")
     clock_offset = times.clock_offsets.get(role)

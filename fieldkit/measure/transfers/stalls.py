@@ -124,7 +124,11 @@ def find_stalls(stream: StreamDeliveries) -> Stalls:
 
 
 def _stall_without_arrivals(stream: StreamDeliveries) -> Stalls:
-    """Return the stall of a stream without arrivals; it has the stream's whole duration."""
+    """Return the stall of a stream without arrivals; it has the stream's whole duration.
+
+    Raises:
+        EvidenceError: The stream has no duration, because a single packet was sent.
+    """
     duration_s = ((stream.end_ns or stream.begin_ns) - stream.begin_ns) / 1e9
     if duration_s <= 0:
         raise EvidenceError("no packet of the flow arrived, and only one was sent")

@@ -86,8 +86,8 @@ def count_messages(
         numbers: Time of arrival (microseconds) and sequence number of each message of the autopilot, in this order.
         streams: Messages with a time by message name, in order of arrival.
         ended_us: End of the recording; 0 if unknown.
-        intervals_us: Requested intervals by message name. Other messages are counted if their rate is an integer
-            number of hertz up to 10.
+        intervals_us: Requested intervals by message name; None if there are no requests. Other messages are counted
+            if their rate is an integer number of hertz up to 10.
     """
     indices = _unwrap([number for _, number in numbers])
     received_count = lost_count = 0

@@ -284,7 +284,7 @@ def measure(log: Tlog | None, slow_s: float | None = None) -> Measured:
 
     Args:
         log: Contents of the log; None if it is incomplete.
-        slow_s: `RecorderSummary.slow_s`.
+        slow_s: `RecorderSummary.slow_s`; None if it is unknown.
     """
     if log is None:
         return Measured.all_missing(COLUMNS, "the telemetry log is incomplete")

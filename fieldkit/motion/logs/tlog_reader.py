@@ -252,6 +252,9 @@ def _positions(data: bytes, autopilot: Source, kind: str) -> Iterator[tuple[int,
     and longitude in degrees, and metres above the sea. The heading is from the last ATTITUDE before the message, in
     radians from east to north. Before the first ATTITUDE it is the heading of the next position that has one; without
     any it is 0.
+
+    Raises:
+        ValueError: A message has an impossible position.
     """
     decoder, heading_rad, rows = TlogDecoder(), math.nan, []
     for frame in frames(data):

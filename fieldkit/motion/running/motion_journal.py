@@ -51,7 +51,8 @@ class MotionEntry:
             position.
         robot: Name of the robot.
         place: Name of the place of the origin, from `place_of`; empty for other events.
-        origin: The origin; for `ended` and `held`, the robot's position at the end, if it reported one.
+        origin: The origin; for `ended` and `held`, the robot's position at the end, if it reported one; None for
+            other events.
         reason: Reason why it is held, or how it was confirmed or allowed; empty for other events.
     """
 

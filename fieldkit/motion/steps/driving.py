@@ -254,7 +254,10 @@ def drive_robot(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name_
 
 
 def _wait_until_ready(scene: Scene, drive_lease: DriveLease, move: Move) -> None:
-    """Wait until a robot is stationary at its place, and record its origin before its first start there."""
+    """Wait until a robot is stationary at its place, and record its origin before its first start there.
+
+    Raises the same errors as `drive_robot`.
+    """
     drive_lease.wait(lambda: drive_lease.is_ready or drive_lease.final_state, Deadline.after(START_S))
     if drive_lease.is_refused:
         origins_of(scene).refuse(move.role, drive_lease.final_state)

@@ -244,7 +244,7 @@ class Px4Failsafes:
         self._active, self._pending_change = False, None
 
     def on_lost_set_points(self) -> None:
-        """Implement `Failsafes.on_lost_set_points`: the failsafe lasts until a client changes the mode."""
+        """Implement `Failsafes.on_lost_set_points`: the failsafe lasts until the next call of `on_mode_change`."""
         self._active = True
 
     def advance(self, state: VehicleState) -> Iterator[Reaction]:

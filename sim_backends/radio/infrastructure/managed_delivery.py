@@ -1,8 +1,8 @@
 """Delivers packets of robots that are stations of access points, and management frames of all stations.
 
 The access points share an ideal wired network: it takes no time and has no losses. A packet goes from a robot to its
-access point, over the wired network to the access point of its destination, and to the destination. Packets to a
-robot without an access point, and to a robot that changes its access point, are lost.
+access point, over the wired network to the access point of its destination, and to the destination. Packets from or
+to a robot without an access point, and packets to a robot that changes its access point, are lost.
 """
 
 from collections import defaultdict, deque
@@ -310,7 +310,7 @@ class ManagedDelivery(PacketDelivery[Payload]):
         return receiver is not None and self.peer(station.index, receiver, frame.category).has_received(frame)
 
     def _end_session(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> None:
-        """Remove a frame from the Block Ack session with its receiver."""
+        """Remove a frame from the Block Ack session with its receiver, and set its number of attempts to 0."""
         receiver = frame.receiver
         if receiver is not None and frame.sequence >= 0:
             peer = self.peer(station.index, receiver, frame.category)
