@@ -254,7 +254,7 @@ def load(*paths: str | PathLike[str], rebuild: bool = False, where: str = "", us
     Raises:
         ConfigurationError: A path does not exist or has no trial, or a file is not a table of repeats. It is a
             `fieldkit.core.errors.FieldkitError`, with a message, a location and a remedy.
-        EvidenceError: A table is damaged, or no repeat has ended.
+        EvidenceError: A table is damaged, no repeat has ended, or `where` selects no attempt.
     """
     if not paths:
         raise ConfigurationError("no path is given", remedy='write for example fieldkit.load("trials")')

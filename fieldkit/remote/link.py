@@ -272,7 +272,9 @@ class Link:
         wait(spares, timeout=deadline.remaining_s)
 
     def open_additional(self) -> Channel | None:
-        """Open a channel in addition to the spare ones; return None if the server does not allow it.
+        """Open a channel in addition to the spare ones.
+
+        Return None without opening a channel if the server closes channels that are opened in advance.
 
         Raises:
             OSError, SSHException, EOFError: The connection broke, or the server refuses more.

@@ -31,7 +31,10 @@ class Session(Protocol):
 
     @property
     def is_ready(self) -> bool:
-        """Whether the command wrote as many bytes as `Shell.begin` waited for; False if it ended earlier."""
+        """Whether the command wrote as many bytes as `Shell.begin` waited for; False if it ended earlier.
+
+        True if `Shell.begin` waited for no output.
+        """
         ...
 
     def end(self, *, deadline: Deadline, check: bool = True) -> Completed:

@@ -113,7 +113,7 @@ class ArmingCheck:
             drone.commands.request_parameter(name)
 
     def _missing_parameters(self) -> list[str]:
-        """Return the names of the requested parameters that the autopilot has not reported."""
+        """Return the names of the needed parameters, with all alternative names of each that was not reported."""
         dialect = self._drone.dialect
         alternatives = [names.split("|") for names in dialect.limit_parameters] if dialect else []
         reported_names = self._drone.parameters.keys()

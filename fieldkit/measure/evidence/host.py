@@ -177,7 +177,7 @@ def station_dump(path: Path) -> str:
 
 
 def congestion_control(path: Path) -> str | None:
-    """Return the name of the host's TCP congestion control, or None if the file does not report it.
+    """Return the name of the host's TCP congestion control, or None if the file does not contain a valid name.
 
     Raises:
         EvidenceError: The file is missing or cannot be read.
@@ -208,7 +208,7 @@ def parse_counters(text: str) -> Counters:
 
 
 def received_bytes(path: Path, interface: str) -> int | None:
-    """Return the number of bytes that an interface has received (/proc/net/dev), or None if there is no interface.
+    """Return the number of bytes that an interface has received (/proc/net/dev), or None if it is not listed.
 
     Raises:
         EvidenceError: The file is missing or cannot be read.

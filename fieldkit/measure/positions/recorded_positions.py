@@ -260,7 +260,9 @@ _MARGIN_S: Final = 1.0
 def travel_contradiction(
     evidence: AttemptEvidence, role: Role, farthest_m: float, speed_m_s: float, log_span_ns: tuple[int, int] | None
 ) -> str | None:
-    """Return the reason why a robot cannot have travelled `farthest_m` away from its start, or None if it can.
+    """Return the reason why a robot cannot have travelled `farthest_m` away from its start.
+
+    None if no other source of its position contradicts the distance.
 
     Args:
         evidence: The attempt's evidence.

@@ -151,7 +151,9 @@ def contradictions(clocks: Mapping[Role, RobotClock], measured: Measured) -> Ite
 def contradiction(
     names: tuple[str, str], reports_of_pair: tuple[ClockReport | None, ClockReport | None], measured: Offset
 ) -> str | None:
-    """Return a sentence if the reports of two robots contradict the measured offset between their clocks, or None.
+    """Return a sentence if the reports of two robots contradict the measured offset between their clocks.
+
+    None if they do not, or if a clock is not synchronized or has no report.
 
     Args:
         names: Names of the two robots.

@@ -41,7 +41,9 @@ def header_problem(packets: Packets) -> str | None:
 
 
 def incomparability_reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:
-    """Return the reason why two complete captures cannot be compared, or None if they can.
+    """Return the reason why two complete captures cannot be compared.
+
+    None if they can be compared, or if the sender's capture has no packet of the transfer.
 
     The reason continues a sentence about the transfer, to which the word `its` in the reason refers.
 

@@ -158,7 +158,7 @@ def _closed_ns(sent: Packets, receiver: Packets, transfer: Transfer, counts: tcp
 def _throughput(received: Packets, carries_payload: Mask, ip_bytes: Ints) -> float | None:
     """Return the bit/s from the first packet with payload to the last, without the bits of the first packet.
 
-    Return None if the two packets have the same time.
+    Return None if there is only one such packet, or if the two packets have the same time.
     """
     order = np.argsort(received.time_ns, kind="stable")
     with_payload = np.flatnonzero(carries_payload[order])

@@ -128,7 +128,7 @@ def _incomparability_reason(evidence: AttemptEvidence, transfer: Transfer) -> st
 
 
 def loss(arrived: int | None, sent: int | None) -> float | None:
-    """Return the loss 1 - arrived/sent (eq. 1 of the paper), or None if nothing was sent."""
+    """Return the loss 1 - arrived/sent (eq. 1 of the paper), or None if nothing was sent or a number is unknown."""
     return None if arrived is None or not sent else 1 - arrived / sent
 
 

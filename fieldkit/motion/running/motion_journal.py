@@ -217,12 +217,15 @@ class JournaledOrigins:
         self._places = {role: place_of(role, placement) for role in robots}
 
     def get(self, role: Role) -> MotionOrigin | None:
-        """Return the recorded origin of a robot at its current place, or None."""
+        """Return the recorded origin of a robot at its current place, or None if no origin is valid there."""
         entry = origins(self._journal.entries).get(self._robots[role])
         return entry.origin if entry is not None and entry.place == self._places[role] else None
 
     def is_new_place(self, role: Role) -> bool:
-        """Return True if the last recorded origin is at another place than the robot's place in this trial."""
+        """Return True if the last recorded origin is at another place than the robot's place in this trial.
+
+        False if no origin of the robot is recorded.
+        """
         places = [
             entry.place
             for entry in self._journal.entries

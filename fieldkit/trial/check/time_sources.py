@@ -69,7 +69,7 @@ def read(shell: Shell) -> RobotTime:
 
 
 def judge(reports: Sequence[ClockReport], report: Report, *, is_required: bool = False) -> None:
-    """Add a finding for each report of a program that sets a robot's clock, or fails to do so.
+    """Add a finding for each report on the program that sets a robot's clock.
 
     Args:
         reports: Reports of the robot's programs.

@@ -84,7 +84,8 @@ def check(
         shells: The robots.
         out: Folder of the trial.
         all_checks: True to check locks as well, and to run the checks that packages add (`plugins.CHECKS`).
-        fleet_checks: Checks of all robots together. They run last, and only if no robot is locked.
+        fleet_checks: Checks of all robots together. They run after the other checks of robots, and only if no robot
+            is locked.
     """
     reports = {role: Report(robot.name) for role, robot in plan.cast.items()}
     variants_by_role: dict[Role, Variants] = {}
