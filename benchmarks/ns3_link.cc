@@ -1,4 +1,4 @@
-// Prints results of ns-3 for 802.11 links, for radio_vs_ns3.py and cosim_vs_ns3.py:
+// Prints results of ns-3 for 802.11 links and cables, for the benchmarks *_vs_ns3.py:
 //
 // - `errors`: frame error of a mode by SNR;
 // - `durations`: airtime in ns by frame size in bytes;
@@ -6,7 +6,7 @@
 //   distance from each other;
 // - `pairs`: goodput in Mbit/s of two pairs of stations, each with a saturated sender and a receiver;
 // - `udp`: goodput and loss of a stream at a fixed rate;
-// - `tcp`: goodput of a stream at full rate, and the events of its sender.
+// - `tcp`: goodput of a stream at full rate, and the events of its sender (over 802.11 only its congestion window).
 
 #include "ns3/applications-module.h"
 #include "ns3/core-module.h"

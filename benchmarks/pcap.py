@@ -1,8 +1,8 @@
 """Compute losses and times of a transfer from two captures, compared with other readers: `python -m benchmarks.pcap`.
 
 The captures are of a UDP transfer of 200,000 IP packets with a loss of 10 %: fragments of 8,192-byte datagrams, with
-128 bytes captured of each, as in a trial. Each peer reads both captures into columns and matches the packets by
-identification and offset. In every round all peers run one after the other, and all must compute the same losses.
+128 bytes captured of each, as in a trial. Each peer reads both captures, and matches the packets by identification
+and offset. In every round all peers run one after the other, and all must compute the same losses.
 fieldkit computes all values that `fieldkit.measure.transfers.transfer_measures` computes from captures: losses of
 packets, datagrams and bytes, the transfer's time, and the counts of the paper (docs/index.md). The other readers,
 dpkt, tshark and scapy, only count lost packets. scapy would take minutes, so it reads only the first packets; tshark

@@ -2,8 +2,8 @@
 
 Functions are compared by their shape: the syntax tree without names, docstrings, annotations and imports. Only the
 digits of a string are compared. A function is matched with one of the same shape anywhere in the other tests, so it
-may move; the remaining functions are matched by name. Inside an assertion equal names must remain equal, so that
-`assert a == b` differs from `assert a == a`. Outside assertions, a replaced name is not detected.
+may move; the remaining functions are matched by name. Inside an `assert` statement equal names must remain equal, so
+that `assert a == b` differs from `assert a == a`. Elsewhere, as in `pytest.raises`, a replaced name is not detected.
 """
 
 import ast
