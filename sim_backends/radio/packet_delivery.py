@@ -120,7 +120,7 @@ class PacketDelivery(Generic[Payload]):
             self.deliveries.append((now_ns, name, payload, source, delay))
 
     def count_broadcast(self, now_ns: int, transmitter: int, frame: Frame[Payload], received: list[int]) -> None:
-        """Count a broadcast on the link to each station, and log its loss for each station that did not decode it."""
+        """Count a broadcast on the link to each station in range, and log its loss for stations that missed it."""
         self.count_receptions(now_ns, transmitter, frame, received, range(len(self._channel.names)))
 
     def count_receptions(
@@ -131,7 +131,7 @@ class PacketDelivery(Generic[Payload]):
         received: Sequence[int],
         addressed_stations: Iterable[int],
     ) -> None:
-        """Count a broadcast on the link to each addressed station, and log its loss for stations that missed it."""
+        """Count a broadcast on the links to addressed stations in range; log its loss for all that missed it."""
         for index in addressed_stations:
             name = self._channel.names[index]
             is_linked, is_missed = self._channel.are_linked(transmitter, index), index not in received

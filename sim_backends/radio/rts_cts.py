@@ -34,7 +34,7 @@ class ProtectedFrame(Generic[Payload]):
         packet: Its first packet.
         attempt: Number of the attempt for that packet.
         send: Called at its start.
-        fail: Called if there was no CTS.
+        fail: Called if the sender has not decoded a CTS.
     """
 
     station: Station[Payload]

@@ -1,10 +1,9 @@
 """802.11 stations on one channel: contention (DCF), hidden stations, ACKs, retries, relaying by an access point.
 
 The model is event-driven, computes with integer nanoseconds, and uses no clock and no socket. It implements
-`model.RadioModel`. Frames between stations whose radios have the section `phy` (802.11n and later) are
-aggregated, and may use RTS/CTS and access categories.
-Power save delays frames to stations of an access point. Beacons have airtime only if the option
-`access_points` is used; fragmentation is not modelled.
+`model.RadioModel`, in part in the subclass `WifiInWorld`. Frames between stations whose radios have the section `phy`
+(802.11n and later) are aggregated, and may use RTS/CTS and access categories. Power save delays frames to stations of
+an access point. Beacons have airtime only if the option `access_points` is used; fragmentation is not modelled.
 """
 
 from collections.abc import Callable, Mapping, Sequence, Set

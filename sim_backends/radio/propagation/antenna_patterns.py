@@ -59,8 +59,8 @@ class GainTable(AntennaPattern):
     """Measured gains, with bilinear interpolation in dB. The gains are constant beyond the first and last elevation.
 
     Attributes:
-        elevations_deg: Elevations of the rows, ascending.
-        azimuths_deg: Azimuths of the columns, ascending within one turn.
+        elevations_deg: Elevations of the rows, ascending; 90 is up.
+        azimuths_deg: Azimuths of the columns, from forward towards left, ascending within one turn.
         table_dbi: The gains.
         orientation_deg: Roll, pitch and yaw of the antenna relative to the body.
     """
