@@ -314,7 +314,7 @@ def line(row: Row) -> str:
 
 
 def draw(path: Path, results: Sequence[Row], windows: dict[Control, tuple[Trace, Trace]]) -> None:
-    """Draw goodputs over distance, and windows over time: ns-3 as lines, the co-simulation as marks or dashes."""
+    """Draw goodputs over distance (ns-3: lines, co-simulation: marks) and congestion windows over time."""
     import matplotlib as mpl  # noqa: PLC0415 (needed only for the figure)
     from matplotlib.figure import Figure  # noqa: PLC0415
 

@@ -1,6 +1,6 @@
 """Numbered lines of JSON with a checksum at the end, so that missing lines of a log are detected.
 
-`fieldkit.measure.evidence.reading` checks them.
+`fieldkit.motion.logs.motion_log.numbered_lines_problem` checks them.
 """
 
 from __future__ import annotations

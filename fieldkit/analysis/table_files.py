@@ -377,7 +377,7 @@ def _header(path: Path, header: bytes) -> tuple[str, ...]:
 
 
 def _concatenated(parts: Sequence[Repeats]) -> Repeats:
-    """Return the rows of all parts. To save memory, the columns of the parts are freed after they were joined."""
+    """Return the rows of all parts."""
     numbers, texts = ([dict(getattr(part, kind)) for part in parts] for kind in ("numbers", "texts"))
     names, words, columns = list(numbers[0]), list(texts[0]), parts[0].columns
     return Repeats(

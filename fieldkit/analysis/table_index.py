@@ -68,9 +68,9 @@ TableStamp = tuple[FileStamp, FileStamp | None]
 
 
 def stamp(table: Path, plan: Path) -> TableStamp | None:
-    """Return the stamps of a table and its plan; None, so that the table is not indexed, if that is not possible.
+    """Return the stamps of a table and its plan, or None if the table cannot be indexed.
 
-    The table must be a readable regular file, and the plan must be one, too, or missing.
+    The table must be a regular file or a link to one, and the plan a regular file or missing.
     """
     try:
         table_status = table.stat()
@@ -203,8 +203,8 @@ def load(path: Path) -> TableIndex:
     except FileNotFoundError:
         return TableIndex()
     with os.fdopen(descriptor, "rb") as file:
-        for status in (path.parent.stat(), os.fstat(descriptor)):
-            _require_private(status, path)
+        _require_private(path.parent.stat(), path.parent)
+        _require_private(os.fstat(descriptor), path)
         content = file.read() if stat.S_ISREG(os.fstat(descriptor).st_mode) else b""
     tail = len(MAGIC) + _DIGEST_BYTES
     if not content.endswith(MAGIC) or len(content) < tail + _LENGTH_BYTES:

@@ -21,7 +21,7 @@ class EstimateRow:
     quantity: str | None = _column(
         "text", "Column of trial.csv that was summarized; for a text column one row per word: `grass=wet`."
     )
-    unit: str | None = _column("text", "Unit of all numbers except counts, for example s, bit/s or share.")
+    unit: str | None = _column("text", "Unit of the estimates and intervals, for example s, bit/s or share.")
     n_valid: int | None = _column("count", "Valid repeats.")
     n_void: int | None = _column("count", "Attempts with incomplete evidence.")
     n_failed: int | None = _column("count", "Attempts that failed.")
@@ -49,8 +49,8 @@ class EstimateRow:
     p_order: float | None = _column(
         "share",
         "p-value of a test for a trend or autocorrelation of the repeats in time, corrected for the number of all "
-        "rows. Below 0.05 the repeats are not independent and the interval is too narrow. Empty below 10 repeats or "
-        "5 distinct values.",
+        "tested rows. Below 0.05 the repeats are not independent and the interval is too narrow. Empty below 10 "
+        "repeats or 5 distinct values, for flags and words, and without start times.",
     )
     estimate: str | None = _column(
         "text",
@@ -96,7 +96,7 @@ class DifferenceRow:
     quantity: str | None = _column(
         "text", "Column of trial.csv that was compared; for a text column one row per word: `grass=wet`."
     )
-    unit: str | None = _column("text", "Unit of all numbers except counts, for example s, bit/s or share.")
+    unit: str | None = _column("text", "Unit of the estimates and intervals, for example s, bit/s or share.")
     estimate: str | None = _column(
         "text", "How a and b were estimated: `counted`, `mean`, `median`, `flag` or `words`, as in summary.csv."
     )

@@ -272,7 +272,9 @@ class TelemetrySource(Strict):
             raise schema.validation_error("wired applies only to snmp and http, which have an address", "wired")
         credentials = self.credentials
         if credentials is not None and credentials.environment and self.at == "robot":
-            raise schema.validation_error("only the laptop has environment variables; use file", self.kind)
+            raise schema.validation_error(
+                "credentials from the environment are possible only with at: laptop; use file", self.kind
+            )
         is_snmp_conf = credentials is None or credentials.file is None or credentials.file.endswith("/snmp.conf")
         if self.snmp is not None and not is_snmp_conf:
             raise schema.validation_error("the file with credentials of snmp must have the name snmp.conf", "snmp")

@@ -28,8 +28,8 @@ class Fate:
         late_ns: Time from `counted_ns` to the simulated time of the receiver at delivery, if that is later; otherwise
             0.
         reason: The reason why the packet was dropped; empty if it arrived or is under way.
-        position_error_m: Largest error, over all pairs of agents that affect the packet, of the relative position
-            that the network assumed. None if only source and destination affect the packet: then
+        position_error_m: Largest error, over all pairs of the agents and fixed emitters that the ledger includes, of
+            the relative position that the network assumed. None if the ledger includes only source and destination: then
             `packet_ledger.position_error_m` computes the error.
     """
 
@@ -75,12 +75,13 @@ class Run:
 _EVENT: Final = struct.Struct("<cQQ")
 """A hashed event: its kind (`a` arrival, `d` drop, `w` window), the number of the packet or window, and a time.
 
-The time is the time of the arrival, or the end of the window in which the packet was dropped, or of the window.
+The time of an arrival is when it happened, that of a drop is the end of its window, and that of a window is its end.
 """
 _PACKET: Final = struct.Struct("<QqqQQ")
 """A hashed packet: its id, number in the flow, size, and the times when it was sent and entered the network."""
 _HASHED_BYTES: Final = 1 << 15
-"""Events are hashed in blocks of this size, because hashing each window separately would take longer."""
+"""Events are collected until they exceed this size and then hashed, because hashing each window separately would take
+longer."""
 
 
 class EventDigest:
@@ -127,7 +128,7 @@ class EventDigest:
             self._hash_events()
 
     def _add_quiet_windows(self) -> None:
-        """Append the ends of the windows without packets to the events."""
+        """Append the ends in `quiet_ends_ns` to the events."""
         ends_ns = self.quiet_ends_ns
         numbers = range(self._windows, self._windows + len(ends_ns))
         self._events += b"".join(map(_EVENT.pack, repeat(b"w"), numbers, ends_ns))

@@ -33,7 +33,8 @@ class EmaneLocations:
 
     A NEM (network emulation module) is a radio interface in EMANE; the option `nems` assigns one to each agent.
 
-    From the first request on, simulated time passes as fast as wall time. The motion of the scenario's agents is not
+    The first request waits until each agent has a location. From then on, simulated time passes as fast as wall
+    time. The motion of the scenario's agents is not
     simulated.
 
     Args:

@@ -145,10 +145,10 @@ class EmulatedOptions(Strict):
     """Options of the emulated backend.
 
     Attributes:
-        ros: `debian`: ROS's master and rosbag from Debian. `builtin`: fieldkit's, which [need less processor
-            time](add-a-robot.md#built-in-or-debians-ros). `auto`: Debian's if they are installed. Robots with ROS 2
-            always use fieldkit's, and [communicate over the radio](add-a-robot.md#ros-2-over-the-radio) unless this
-            is `builtin`.
+        ros: `debian`: ROS's master and rosbag from Debian. `builtin`: fieldkit's rosbag, without a master, which
+            [needs less processor time](add-a-robot.md#built-in-or-debians-ros). `auto`: Debian's if they are
+            installed. Robots with ROS 2 always use fieldkit's, are refused with `debian`, and [communicate over the
+            radio](add-a-robot.md#ros-2-over-the-radio) unless this is `builtin` or their middleware is not installed.
         ros2: Discovery between robots with ROS 2.
         robots: Variants of tools, by robot; the default is the tools of this machine. See [add a
             robot](add-a-robot.md#variants-of-tools).
@@ -169,8 +169,8 @@ class EmulatedOptions(Strict):
         network: The network of the co-simulation: `builtin` or `ns3`. The default is `builtin` if `physics`
             is given.
         sync: The sync policy between physics and network: its name, or name and parameters. The default is
-            `event_driven`, which adds no delay; with `ns3` it is `{name: sliding_window, window: 2ms}`, because an
-            exchange at every event of ns-3 takes too long for real time.
+            `event_driven`, which adds no delay; with `ns3` it is `{name: sliding_window, window: 2ms}`, and with
+            `gazebo` the same with 10 ms, because an exchange at every event takes too long for real time.
         wifi: `model`: the Wi-Fi of fieldkit's radio. `linux`: [Linux Wi-Fi](linux-wifi.md), over the same radio,
             in a virtual machine if this kernel has no mac80211_hwsim, or the user is not root.
         linux_wifi: Settings of Linux Wi-Fi.

@@ -167,7 +167,7 @@ class Mobility:
         with self._lock:
             self._placement = placement
             # The robots are updated before the medium: the new path invalidates motion that refers to the old one.
-            # A move without legs keeps a robot where it is; its speed has no effect.
+            # A move without legs puts a robot at its place in the placement; its speed has no effect.
             for role in self._robots:
                 self._send_path(Move(role, (), speed_m_s=1.0), time.monotonic_ns())
             self._update_medium()

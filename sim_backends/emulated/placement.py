@@ -55,7 +55,7 @@ def assigned_path(placement: Placement, move: Move, world: World, start_ns: int)
 
     Args:
         placement: The scenario, the topology and the distance of the robots.
-        move: The move; without legs the robot stays where it is.
+        move: The move; without legs the robot is at its place in the placement.
         world: The world around the robots.
         start_ns: Start of the move, as a time of the monotonic clock.
     """

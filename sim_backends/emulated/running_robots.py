@@ -60,8 +60,9 @@ def running_robots(
 ) -> Iterator[RunningRobots[RobotKey]]:
     """Yield robots whose programs are ready; leaving the context stops all their processes.
 
-    The arguments are those of `testbed.bring_up`. If robots share a ROS master or a Zenoh router, all robots are
-    placed 1 m apart when they start, because they connect to it over the radio.
+    The arguments are those of `testbed.bring_up`; `robots` is its `cast`. If robots share a ROS master or a Zenoh
+    router, or are stations of an access point, all robots and access points are placed 1 m apart when they start,
+    because the robots connect over the radio.
 
     Raises:
         ConfigurationError: The site file fixes a radio mode that one of the robots does not have.

@@ -47,12 +47,15 @@ _JAMMED_RETRY_NS: Final = 1_000_000
 
 
 class FrameExchange(Generic[Payload]):
-    """The frame exchanges of stations that share one channel, each from the end of a backoff to the next.
+    """The frame exchanges of stations that share one channel.
+
+    An exchange starts after a backoff or in a transmission opportunity. It ends with the response or its timeout, or,
+    for a broadcast, with the frame. Then the next exchange of the station is scheduled.
 
     Args:
         channel: Received powers between the stations.
         seed: Seed of all random draws.
-        queue_packets: Maximum number of queued packets per station.
+        queue_packets: Maximum number of packets in each queue of a station, without the first packet.
         make_delivery: Class of `delivery`.
 
     Attributes:
@@ -61,7 +64,7 @@ class FrameExchange(Generic[Payload]):
         delivery: Queues of the stations, and delivered packets.
         reception: The frames on the air.
         rts_cts: RTS and CTS before the frames of stations with a threshold.
-        log: Called with every transmission attempt that ends; None without a log.
+        log: Called at the end of every attempt to send a data frame and of every ACK or Block Ack; None without a log.
         meter: Counters of the radio drivers; None without counters.
     """
 

@@ -13,7 +13,8 @@ class RateControl(Protocol):
     """Selects the mode of each attempt on one directed link.
 
     Attributes:
-        is_probing: True if the most recent new frame is a sample of another mode, which must not be aggregated.
+        is_probing: True if the most recent new frame must not be aggregated, because it is a sample of another mode.
+            Always False for a rate control that aggregates samples.
     """
 
     is_probing: bool = False

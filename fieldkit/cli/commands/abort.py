@@ -1,4 +1,4 @@
-"""`fieldkit abort`: terminate all programs of fieldkit on the robots, from any laptop."""
+"""`fieldkit abort`: stop all programs of fieldkit on the robots, from any laptop."""
 
 import argparse
 from typing import Final
@@ -17,9 +17,10 @@ from fieldkit.core.units import format_count
 def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit abort`."""
     parser.description = (
-        "Terminate every job of fieldkit on every robot of the site file, of any trial and from any laptop, and "
-        "remove the robots' locks. For each robot, print the terminated jobs, and terminated processes whose folder "
-        "was deleted; `not locked` means that no program held the lock. A trial on these robots stops, and "
+        "Stop every job of fieldkit on every robot of the site file, of any trial and from any laptop, and remove "
+        "the robots' locks. A program that lands a drone continues until the drone has landed; its state is printed. "
+        "For each robot, print the stopped jobs, and stopped processes whose folder was deleted; `not locked` means "
+        "that no program held the lock. A trial on these robots stops, and "
         "reports the user who aborted it. Exit code 3 if a robot was not reached, a job was not terminated or, on a "
         "full disk, a lock was not removed; 1 if you answer no. The other robots are processed nevertheless. "
         "Emulated robots stop with their lab, so nothing is done for them."
@@ -32,7 +33,8 @@ def add(parser: Parser) -> None:
 _NO_ROBOTS: Final = "the robots of this backend run only while their lab runs, so there is nothing to abort"
 
 _LANDING_END: Final = (
-    "It terminates when the drone has landed, 60 s after the last heartbeat of its autopilot, or after 10 min"
+    "It terminates when the drone has landed or another person or program flies it, 60 s after the last heartbeat of "
+    "its autopilot, or after 10 min"
 )
 
 

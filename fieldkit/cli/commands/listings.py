@@ -64,7 +64,7 @@ def add_columns(parser: Parser) -> None:
     """Declare the arguments of `fieldkit columns`."""
     parser.usage = "%(prog)s [-h] [PROCEDURE | show NAME]"
     parser.description = (
-        "Explain the columns of the CSV files: all, those that the steps of a procedure fill, or one."
+        "Explain the columns of the CSV files: all, those that a trial with a procedure fills, or one."
     )
     parser.add_argument(
         "procedure_or_show",
@@ -94,7 +94,7 @@ def run_columns(arguments: argparse.Namespace) -> int:
 
 
 def _columns_of(procedure: str) -> int:
-    """List the columns that the steps of a procedure fill. The procedure is given by its name or its file."""
+    """List the columns that a trial with a procedure fills. The procedure is given by its name or its file."""
     from fieldkit.trial.columns import filled_columns, installed_columns
     from fieldkit.trial.procedure import load_procedure, read_procedure
 

@@ -31,8 +31,8 @@ MAX_SKEW: Final = 500e-6
 """
 
 QUARTZ_SKEW: Final = 100e-6
-"""Usual upper limit of the skew between two quartz clocks. If the range of possible skews is wider than this, the
-packets are not sufficient to estimate the skew.
+"""Usual upper limit of the skew between two quartz clocks. If the error of an estimated skew can be larger than this,
+the packets are not sufficient to estimate it.
 """
 
 STAMP_S: Final = 1e-6
@@ -65,7 +65,7 @@ class Clocks:
 
     Attributes:
         middle_ns: Middle of the packets' times by the receiver's clock.
-        base_ns: Integer part of the offset.
+        base_ns: Reference for offsets: offset plus delay of the first packet from sender to receiver.
         offset_s: Estimate of the remaining offset at `middle_ns`.
         skew: Estimate of the skew: relative rate of the receiver's clock minus 1, in seconds per second.
         skews: Skews at the corners of the polygons of possible lines, ascending. Shape (k,).
@@ -96,7 +96,7 @@ class Clocks:
 
     def error_s(self, receiver_ns: Ints) -> float:
         """Return the maximum error of the offset at these times of the receiver's clock."""
-        # The possible range widens with the distance from the middle, so the error is largest at the ends.
+        # The error is a maximum of linear functions of time, so it is largest at one of the ends.
         ends = np.array((receiver_ns.min(), receiver_ns.max()))
         best, drift = self.offset_at_s(ends), np.outer(self.skews, self._elapsed_s(ends))
         above, below = self.highest_s[:, None] + drift - best, best - self.lowest_s[:, None] - drift
@@ -110,13 +110,14 @@ class Clocks:
 def estimate(forward: StampPairs, reverse: StampPairs) -> Clocks | None:
     """Return the offset between the clocks.
 
-    Return None if no line fits all packets, because a clock was set or the skew is larger than `MAX_SKEW`.
+    Return None if no line fits all packets, for example because a clock was set, the skew is larger than `MAX_SKEW`,
+    or a time stamp is wrong by more than the delays.
 
     The estimated skew maximizes the shortest round-trip time, computed without the fastest packet of each direction.
     If both directions have undelayed packets at the start and at the end, any other skew gives a shorter time. If
-    several skews are equally good, the one closest to 0 is used. If the range of possible skews is wider than
-    `QUARTZ_SKEW`, the possible skew closest to 0 is used. The offset is the middle of the range that is possible with
-    this skew.
+    several skews are equally good, the one closest to 0 is used. If a possible skew differs from this estimate by
+    more than `QUARTZ_SKEW`, the possible skew closest to 0 is used. The offset is the middle of the range that is
+    possible with this skew.
 
     Args:
         forward: Packets from sender to receiver; at least one. Each frame may be in one pair only.

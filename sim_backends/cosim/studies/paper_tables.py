@@ -84,7 +84,7 @@ def _or_value(bound: float, value: float) -> float:
 
 
 DISTANCES_M: Final = (20, 40, 60, 80, 100)
-"""The distances of every table."""
+"""The distances of tables 1 to 3."""
 
 
 class PrintedColumns(NamedTuple):

@@ -189,9 +189,8 @@ class ArduCopterFailsafes:
 _BATTERY_ACTIONS: Final = {1: Mode.LAND, 2: Mode.RTL, 3: Mode.RTL, 4: Mode.LAND, 6: Mode.RTL, 7: Mode.LAND}
 """Mode by BATT_FS_LOW_ACT or BATT_FS_CRT_ACT.
 
-Modes that are not emulated are replaced by the mode that ArduCopter uses if they are not possible: SmartRTL by RTL
-(3) or LAND (4), the landing sequence of a mission by RTL (6), BRAKE by LAND (7). 5 (terminate) only reports the
-failsafe.
+SmartRTL and the landing sequence of a mission are not emulated: SmartRTL is replaced by RTL (3) or LAND (4), the
+landing sequence by RTL (6). BRAKE or LAND (7) is LAND here. 5 (terminate) only reports the failsafe.
 """
 _GCS_ACTIONS: Final = {1: Mode.RTL, 2: Mode.RTL, 3: Mode.RTL, 4: Mode.LAND, 5: Mode.LAND, 6: Mode.RTL, 7: Mode.LAND}
 """Mode by FS_GCS_ENABLE, with the same replacements; 2 was removed in ArduCopter 4.0, and is RTL here."""

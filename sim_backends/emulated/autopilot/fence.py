@@ -15,8 +15,8 @@ from sim_backends.emulated.autopilot.modes import LANDING, Mode
 from sim_backends.emulated.autopilot.parameters import Parameters
 
 _FENCE_ACTIONS: Final = {0: None, 1: Mode.RTL, 2: Mode.LAND, 3: Mode.RTL, 4: Mode.BRAKE, 5: Mode.LAND}
-"""Mode after a breach, by FENCE_ACTION of ArduCopter; None if the breach is only reported. Modes that are not
-emulated are replaced as in `failsafes`."""
+"""Mode after a breach, by FENCE_ACTION of ArduCopter; None if the breach is only reported. SmartRTL is not
+emulated: it is replaced by RTL (3) or LAND (5)."""
 _GEOFENCE_ACTIONS: Final = {
     1: ("warning", None),
     2: ("hold", Mode.LOITER),

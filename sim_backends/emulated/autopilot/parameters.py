@@ -1,6 +1,6 @@
 """Parameters of the emulated autopilots.
 
-Clients use the names and units of the firmware. The vehicle reads the values in SI units, by PX4's names.
+Clients use the names and units of the firmware. The vehicle reads the values in SI units, by `key`.
 """
 
 import math
@@ -20,7 +20,8 @@ class Parameter:
         value: Value at power-on.
         minimum: Smallest value that is accepted.
         maximum: Largest value that is accepted.
-        key: PX4's name, by which the vehicle reads it; empty if it equals `name`.
+        key: Name by which the vehicle reads it: PX4's, or ArduPilot's if PX4 has no such parameter;
+            empty if it equals `name`.
         scale: Number of its units per SI unit, for example 100 for centimetres.
         integer: True if it is an integer (MAV_PARAM_TYPE_INT32); otherwise a float (REAL32).
     """
@@ -54,7 +55,7 @@ class FlightLimits:
 
 
 def profile_limit(name: str, maximum: float, *, minimum: float, key: str = "", scale: float = 1.0) -> Parameter:
-    """Return a parameter whose value and maximum are a limit of the profile, in SI units."""
+    """Return a parameter whose value and maximum are a limit of the profile; the arguments are in SI units."""
     return Parameter(name, maximum * scale, min(minimum, maximum) * scale, maximum * scale, key, scale)
 
 
@@ -98,7 +99,7 @@ class Parameters:
         self.names: Final = tuple(self._key_of)
 
     def __getitem__(self, key: str) -> float:
-        """Return a value in SI units, by PX4's name."""
+        """Return a value in SI units, by its key."""
         return self._values[key] / self._by_key[key].scale
 
     def __contains__(self, key: str) -> bool:
@@ -118,7 +119,7 @@ class Parameters:
         return name in self._key_of and self._store(self._key_of[name], value)
 
     def change(self, key: str, value: float) -> bool:
-        """Set a parameter in SI units, by PX4's name; return True if it accepts the value."""
+        """Set a parameter in SI units, by its key; return True if it accepts the value."""
         return self._store(key, value * self._by_key[key].scale)
 
     def _store(self, key: str, value: float) -> bool:

@@ -140,7 +140,7 @@ def decode_event(payload: bytes) -> SentFrame | InterfaceAddress | None:
 
 
 def encode_register() -> bytes:
-    """Return the message that makes its sender the medium of all radios in the network namespace."""
+    """Return the message that makes its sender the medium of all radios created in its network namespace."""
     return encode_generic(CMD_REGISTER, _VERSION, {})
 
 

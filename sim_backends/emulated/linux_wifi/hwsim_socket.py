@@ -8,7 +8,9 @@ from sim_backends.emulated.linux_wifi.netlink import FamilySocket
 
 
 def open_registered(fd: int | None = None) -> FamilySocket:
-    """Return a socket that is registered as the medium of all radios in the network namespace.
+    """Return a socket that is registered as the medium of all radios that were created in this network namespace.
+
+    It remains their medium if they are moved to other namespaces.
 
     Args:
         fd: Descriptor of a socket that is already registered; None to open and register one.

@@ -85,7 +85,7 @@ def serve(stream: socket.socket, lab: LabFolder) -> None:
 
 
 def _wait_for_login(lab: LabFolder) -> None:
-    """Wait until the lab has written its last file, which the host needs to log in."""
+    """Wait until the lab has written its last file; the files that the host needs to log in are then complete."""
     end_s = time.monotonic() + _START_S
     while not lab.ssh_config.exists():
         if time.monotonic() > end_s:

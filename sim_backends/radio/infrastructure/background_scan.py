@@ -102,7 +102,8 @@ class BackgroundScan:
     def on_scan(self, now_ns: int) -> None:
         """Record that a scan starts.
 
-        After many consecutive scans at the short interval, the schedule switches to the long interval.
+        Scans at the short interval are counted, and each scan at the long interval reduces the count by 1. When the
+        count reaches its limit, the schedule switches to the long interval.
         """
         if self._interval_ns == self.short_ns:
             self._short_scans += 1
