@@ -29,8 +29,8 @@ class Fate:
             0.
         reason: The reason why the packet was dropped; empty if it arrived or is under way.
         position_error_m: Largest error, over all pairs of the agents and fixed emitters that the ledger includes, of
-            the relative position that the network assumed. None if the ledger includes only source and destination: then
-            `packet_ledger.position_error_m` computes the error.
+            the relative position that the network assumed. None if the ledger includes only source and destination:
+            then `packet_ledger.position_error_m` computes the error.
     """
 
     packet: Packet

@@ -64,7 +64,7 @@ class FrameExchange(Generic[Payload]):
         delivery: Queues of the stations, and delivered packets.
         reception: The frames on the air.
         rts_cts: RTS and CTS before the frames of stations with a threshold.
-        log: Called at the end of every attempt to send a data frame and of every ACK or Block Ack; None without a log.
+        log: Called at the end of each attempt to send a data frame, and of each ACK or Block Ack; None without a log.
         meter: Counters of the radio drivers; None without counters.
     """
 

@@ -50,16 +50,14 @@ COLUMNS: Final = columns(
     (
         "fly_speed_median_m_s",
         "m/s",
-        "Median speed of the drone from the order to fly its path to the end of the path; without a path, while it "
-        "hovers.",
+        "Median speed of the drone while it flies its path, or, without a path, while it hovers.",
         Figure("flight speed", Kind.MEDIAN),
     ),
     ("fly_speed_max_m_s", "m/s", "Largest speed during the whole flight."),
     (
         "fly_back_off_m",
         "m",
-        "Horizontal distance from the position of the drone's first take-off, as in fly_farthest_m, when the motors "
-        "had stopped.",
+        "Horizontal distance from the drone's first take-off (as in fly_farthest_m) when the motors had stopped.",
     ),
 )
 """Columns of trials with a step `fly`."""
