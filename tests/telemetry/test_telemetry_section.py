@@ -55,7 +55,7 @@ def test_a_source_has_the_command_of_its_program() -> None:
         ),
         (
             f"snmp: {{address: 10.0.0.1, credentials: {{environment: A}}}}\nvalues: {{signal_dbm: {{oid: {OID}}}}}",
-            "only the laptop has environment variables",
+            "credentials from the environment are possible only with at: laptop",
         ),
         (
             f"snmp: {{address: 10.0.0.1, credentials: {{}}}}\nvalues: {{signal_dbm: {{oid: {OID}}}}}",
