@@ -7,7 +7,7 @@ from typing import Final
 
 from fieldkit.backends.protocols import CLOCK, INSTRUCTIONS
 from fieldkit.config.profiles import TELEMETRY
-from fieldkit.core.columns import Column, Measured, cell_text, step_prefixed
+from fieldkit.core.columns import PHY_RATE, Column, Measured, cell_text, step_prefixed
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Lateness, RepeatId, Role, sort_roles
 from fieldkit.measure.attempt import AttemptEvidence
@@ -95,7 +95,7 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
                 }
                 result = result.without(dependent)
             if has_no_times:
-                result = result.without({column.name: _NO_TIMES for column in columns if column.unit in _TIME_UNITS})
+                result = result.without({column.name: _NO_TIMES for column in columns if _depends_on_clock(column)})
         except MemoryError:
             raise
         except Exception as error:  # noqa: BLE001 (see the docstring)
@@ -114,6 +114,11 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
         step_errors.add(f"{name} cannot be read", error) for name, error in tuple(evidence.unexpected_errors)
     )
     return EvidenceVerdict(tuple(problems), measured, tuple(step_errors.tracebacks), tuple(notes))
+
+
+def _depends_on_clock(column: Column) -> bool:
+    """Return True if a clock that measures no real durations makes a column of a step invalid."""
+    return column.unit in _TIME_UNITS and not column.name.endswith(PHY_RATE)
 
 
 def roaming_roles(procedure: Procedure) -> frozenset[Role]:
