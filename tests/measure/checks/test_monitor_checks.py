@@ -1,7 +1,8 @@
 """Columns of frames on monitor interfaces, and contradictions between them and the other sources."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -45,7 +46,9 @@ def exchange(*, retries: int = 0) -> RadioFrames:
     )
 
 
-def samples(frames: RadioFrames, *, at: Sequence[int] = (10, 30, 50), **changes: float) -> list[LinkSample]:
+def samples(
+    frames: RadioFrames, changes: Mapping[str, float] = MappingProxyType({}), *, at: Sequence[int] = (10, 30, 50)
+) -> list[LinkSample]:
     """Return samples of the counters at the times of some frames; `changes` replace values of the last one."""
     result = []
     for row in at:
@@ -89,19 +92,19 @@ def test_counters_signals_and_rates_of_the_same_frames_do_not_contradict_them(re
 )
 def test_a_sample_that_contradicts_the_frames_is_reported(changes: dict[str, float], text: str) -> None:
     frames = exchange()
-    (contradiction,) = monitor_checks.link_contradictions(frames, samples(frames, **changes))
+    (contradiction,) = monitor_checks.link_contradictions(frames, samples(frames, changes))
     assert text in contradiction
 
 
 def test_rates_during_retransmissions_are_not_compared() -> None:
     frames = exchange(retries=1)
-    recorded = samples(frames, at=(9, 29, 50), tx_rate_bit_s=6e6)
+    recorded = samples(frames, {"tx_rate_bit_s": 6e6}, at=(9, 29, 50))
     assert list(monitor_checks.link_contradictions(frames, recorded)) == []
 
 
 def test_samples_outside_of_the_capture_are_not_compared() -> None:
     frames = exchange()
-    recorded = samples(frames, signal_dbm=-60.0, tx_packets=99)
+    recorded = samples(frames, {"signal_dbm": -60.0, "tx_packets": 99})
     assert list(monitor_checks.link_contradictions(frames.where(slice(0, 50)), recorded)) == []
     assert list(monitor_checks.link_contradictions(frames.where(slice(0, 0)), recorded)) == []
 
