@@ -105,7 +105,7 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
 
     robots: Annotated[tuple[Role, ...], Field(min_length=1)] = (Role.SENDER, Role.RECEIVER)
     port: Annotated[Int, Field(gt=0, lt=65536)] | None = None
-    monitor: InterfaceName | None = None
+    monitor: InterfaceName | None = Field(default=None, exclude_if=schema.is_empty)
     during: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
 
     @schema.model_validator(mode="after")
