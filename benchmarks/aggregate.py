@@ -6,7 +6,7 @@ grows linearly. In the same round a peer program (`pandas_peer`) reads the small
 concatenates and groups them, and scipy computes a bootstrap interval per condition and quantity. The benchmark stops
 if the counts, means, medians or 95th percentiles of the two programs differ.
 
-`--rows N` adds one table of N repeats, like the CSV that `fieldkit export` writes for a campaign.
+`--rows N` adds one table of N repeats (a multiple of 40), like the CSV that `fieldkit export` writes for a campaign.
 """
 
 import argparse
@@ -67,7 +67,7 @@ def write_tables(folder: Path, count: int) -> None:
 
 
 def write_table(path: Path, rows: int) -> None:
-    """Write one table of `rows` repeats."""
+    """Write one table of `rows` repeats, rounded down to a multiple of `REPEATS`."""
     generator = np.random.default_rng(1)
     with path.open("w", encoding="utf-8") as file:
         file.write(_header())
@@ -221,8 +221,8 @@ def main() -> None:
     """Make the tables, run the rounds, print a table or JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--tables", type=int, nargs="+", default=[1_000, 3_000, 10_000])
-    parser.add_argument("--rows", type=int, default=0, metavar="N")
+    parser.add_argument("--tables", type=int, nargs="+", default=[1_000, 3_000, 10_000], help="numbers of tables")
+    parser.add_argument("--rows", type=int, default=0, metavar="N", help="rows of one more table")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     os.chdir(ROOT)

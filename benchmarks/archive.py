@@ -54,7 +54,7 @@ def check(fieldkit_output: Path, peer_output: Path) -> None:
     """Compare the figures of two outputs.
 
     Raises:
-        RuntimeError: The figures differ.
+        RuntimeError: The figures differ, or there are none.
     """
     our_figures, peer_figures = figures(fieldkit_output), figures(peer_output)
     is_equal = our_figures.keys() == peer_figures.keys() and all(

@@ -35,7 +35,12 @@ def _query(folder: Path, text: str) -> Any:  # noqa: ANN401 (a relation of DuckD
 
 
 def by_duckdb(folder: Path, source: str) -> list[list[Any]]:
-    """Return the same rows as `by_pandas`, computed by DuckDB from a table that it reads."""
+    """Return the rows of `by_pandas`, with distances as text, in any order; DuckDB reads them from a table.
+
+    Args:
+        folder: The archive.
+        source: The table, as in the FROM clause of a query.
+    """
     keys = ", ".join(BY)
     query = (
         f"SELECT {keys}, count({QUANTITY}), avg({QUANTITY}), median({QUANTITY}) FROM {source} "

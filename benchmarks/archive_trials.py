@@ -47,7 +47,7 @@ class StoredTrial:
 
 
 def stored_trials() -> list[StoredTrial]:
-    """Return the trials in `tests/data`."""
+    """Return the trials in the folders `4` and `evidence` of `tests/data/fieldkit`."""
     trials = []
     for folder in (*sorted((STORED / "4" / "trials").iterdir()), *(STORED / "evidence").iterdir()):
         table = csv.DictReader(io.StringIO((folder / "trial.csv").read_text(encoding="utf-8")))

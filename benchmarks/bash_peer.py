@@ -75,7 +75,8 @@ class BashPeer:
         """Run a repeat; yield the name of each phase at its start.
 
         Raises:
-            RuntimeError: It failed or took longer than `limit_s`; the message contains its standard error.
+            RuntimeError: It failed or took longer than `limit_s`; the message has the first 4 KiB of its standard
+                error.
         """
         deadline = Deadline.after(limit_s)
         self._orders.write(f"{protocol} {number}\n".encode())

@@ -50,7 +50,7 @@ Write = Callable[[bytes], Any]
 """Function of a publisher that sends data. The function of a subscriber sends nothing, and only keeps the objects of
 the middleware alive."""
 Deliver = Callable[[bytes], None]
-"""Function of a subscriber that is called with the data of each message."""
+"""Function of a subscriber that is called with the data of each message, or with its first `HEAD.size` bytes."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ PATHS: Final = (
 
 
 def dds_plain(name: str, deliver: Deliver | None) -> Write:
-    """Start a publisher, or a subscriber if `deliver` is given, with the binding of CycloneDDS and its own type."""
+    """Start a publisher, or a subscriber if `deliver` is given, with the binding of CycloneDDS and a plain type."""
     from cyclonedds.domain import Domain, DomainParticipant  # noqa: PLC0415
     from cyclonedds.idl import make_idl_struct, types  # noqa: PLC0415
     from cyclonedds.pub import DataWriter  # noqa: PLC0415
@@ -184,7 +184,8 @@ def agent(middleware_name: str, name: str, deliver: Deliver | None, endpoint_spe
 def run_end(kind: str, name: str, endpoint_spec: str, *, is_subscriber: bool) -> int:
     """Run a publisher or subscriber, controlled by the lines of standard input.
 
-    After a line `SECONDS RATE` a publisher sends; after any line a subscriber prints the messages that it received.
+    After a line `SECONDS RATE` a publisher sends, and prints the number of messages. After any line a subscriber
+    prints arrival time and delay, in ns, of each message since the last line.
     """
     arrivals: list[tuple[int, int]] = []
 
@@ -335,7 +336,7 @@ def measure(rounds: int) -> list[dict[str, Any]]:
 
 
 def main() -> int:
-    """Print a line per path."""
+    """Measure; print a line per path, or the results as JSON. With `--end`, run a publisher or subscriber."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true", help="print single values as JSON")
     parser.add_argument("--rounds", type=int, default=5, help="measurements of each path")
@@ -366,7 +367,7 @@ def main() -> int:
 
 
 def spread(values: Sequence[float]) -> str:
-    """Return the median, followed by the smallest and the largest value."""
+    """Return the median, followed by the smallest and the largest value; empty without values."""
     return f"{_figure(median(values))} ({_figure(min(values))} to {_figure(max(values))})" if values else ""
 
 

@@ -2,8 +2,8 @@
 
 Twenty participants are on a circle of 10 m radius. Each publishes to the next one, and starts at a random time within
 an interval. The benchmark prints, over several seeds, the IP packets that they send in the first second (mean), and
-the time until all writers and readers have discovered each other (median and range). The results do not depend on the
-machine or its load.
+the time until all writers and readers have discovered each other, at least 1 s (median and range). The results do not
+depend on the machine or its load.
 """
 
 import math
@@ -39,7 +39,7 @@ ROWS: Final = ((0.0, None), (0.1, None), (5.0, None), (0.0, "g6"), (0.1, "g6"), 
 def discover(within_s: float, mode: str | None, seed: int) -> tuple[int, float]:
     """Return the number of packets in the first second, and the time until discovery was complete in seconds.
 
-    The time is infinite if discovery was not complete after `TIMEOUT_NS`.
+    The time is at least 1 s, and infinite if discovery was not complete after `TIMEOUT_NS`.
     """
     names = [f"r{number}" for number in range(COUNT)]
     places_m = {name: _place_m(number) for number, name in enumerate(names)}

@@ -118,7 +118,7 @@ class ExchangePeer:
 
     Attributes:
         exchange: Makes an exchange.
-        pids: The process, whose processor time is measured too.
+        pids: Processes of the other side, whose processor time is measured too; empty if there are none.
     """
 
     exchange: Exchange
@@ -237,9 +237,9 @@ class Times:
     """Times of an exchange in microseconds.
 
     Attributes:
-        wall: Median of the rounds.
-        wall_min: Minimum of the rounds.
-        cpu: Median of the processor time.
+        wall: Median of the wall times of the rounds.
+        wall_min: Minimum of the wall times.
+        cpu: Median of the processor times of both processes.
     """
 
     wall: float

@@ -37,7 +37,7 @@ def measure(peer: str, count: int, steps: int) -> tuple[float, float]:
     """Return the microseconds of wall time and of processor time per step, measured in a separate process.
 
     Raises:
-        RuntimeError: The peer failed; the message is its output.
+        RuntimeError: The peer failed; the message has the end of its standard error.
     """
     command = (sys.executable, "-m", "benchmarks.cosim_peers", peer, str(count), str(steps))
     completed = subprocess.run(command, capture_output=True, text=True, timeout=_LIMIT_S, check=False)
@@ -76,7 +76,7 @@ class HelicsFederate:
         """Exchange data for some steps; return the seconds of wall time, and of processor time of this process.
 
         Raises:
-            RuntimeError: The other federate's data did not arrive.
+            RuntimeError: In the last step the other federate's data did not arrive.
         """
         helics = self._helics
         helics.helicsFederateEnterExecutingMode(self._federate)

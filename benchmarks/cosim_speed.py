@@ -191,7 +191,7 @@ def measure_fleet(count: int, seconds: float) -> Figures:
     """Return the figures for a number of robots.
 
     Raises:
-        RuntimeError: Coordinator and plain loop deliver different packets.
+        RuntimeError: Coordinator and plain loop deliver different packets, or deliver them at different times.
     """
     fleet = Fleet(count)
     # The plain loop runs before and after the coordinator, so that a drift of the machine's speed affects both

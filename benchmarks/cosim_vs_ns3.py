@@ -211,7 +211,7 @@ def run_once(ns3: Ns3, cell: Cell, run: int) -> list[list[float]]:
 
 
 def measure_link(ns3: Ns3, cell: Cell, pool: ProcessPoolExecutor) -> Row:
-    """Return the results of a link, from as many runs as needed."""
+    """Return the results of a link, from as many runs as needed but at most `MAX_RUNS`."""
     runs: list[list[list[float]]] = []
     while True:
         runs += pool.map(partial(run_once, ns3, cell), range(len(runs) + 1, len(runs) + 1 + BATCH))
@@ -222,7 +222,10 @@ def measure_link(ns3: Ns3, cell: Cell, pool: ProcessPoolExecutor) -> Row:
 
 
 def ratio_of(fieldkit: np.ndarray, ns3: np.ndarray) -> tuple[float, float, float]:
-    """Return the ratio of two means and its 95 % interval, from the logarithm's variance; NaN without goodput."""
+    """Return the ratio of two means and its 95 % interval, from the logarithm's variance.
+
+    All are NaN if one of the means, which are goodputs, is below 0.01 Mbit/s.
+    """
     if min(fieldkit.mean(), ns3.mean()) < 0.01:
         return math.nan, math.nan, math.nan
     spread = math.sqrt(sum(runs.var(ddof=1) / len(runs) / runs.mean() ** 2 for runs in (fieldkit, ns3)))
@@ -290,7 +293,11 @@ def main() -> None:
 
 
 def line(row: Row) -> str:
-    """Return the results of a link as a table row: means of the `PEERS`, and ratios of the co-simulation to each."""
+    """Return the results of a link as a table row.
+
+    For each congestion control it has the mean goodputs of the `PEERS`, and the ratios of the co-simulation to each
+    variant of ns-3; for UDP the mean losses in percent, and differences in percentage points.
+    """
     parts = [f"{row.cell!s:32}{len(row.newreno):3} runs"]
     for name, values in (("newreno", row.newreno), ("cubic", row.cubic)):
         means = " ".join(f"{mean:6.2f}" for mean in values.mean(axis=0))

@@ -80,7 +80,7 @@ def lab(radio: str) -> Iterator[Path]:
 
 
 def measure_pings(lab_folder: Path) -> Figures:
-    """Return the results of 100 pings; None for times without a reply, and for the SNR of fixed links."""
+    """Return the results of 100 pings; the times are None if none was answered, and the SNR on fixed links."""
     words = ("ping", "-c", str(PINGS), "-i", "0.1", "-W", "1", "-s", "56", f"robot-{ROBOTS}")
     ping_output = parse(fieldkit(lab_folder, "shell", "robot-1", *words))
     rtt_ms = [1e3 * value for value in ping_output.rtt_s]

@@ -63,7 +63,7 @@ class Bench:
         self._orders = 0
 
     def check(self) -> str:
-        """Query the agent until the drone can be armed."""
+        """Query the agent until the drone can be armed, for at most `_BOOT_S`."""
         needs = {
             "highest_m": HEIGHT_M,
             "farthest_m": AHEAD_M,
@@ -89,10 +89,10 @@ class Bench:
         with self._running("mavlink", request, str(log)) as process:
             time.sleep(_RECORD_S)
             process.terminate()
-            _, errors = process.communicate(timeout=30)
+            process.communicate(timeout=30)
         counts = _messages(log)
         if process.returncode or not counts.get("LOCAL_POSITION_NED") or not counts.get("ATTITUDE"):
-            raise CaseFailed(f"code {process.returncode}, {counts}, {errors.strip()}")
+            raise CaseFailed(f"code {process.returncode}, {counts}, {self._last_log_line()}")
         return ", ".join(f"{name} {number}" for name, number in sorted(counts.items()))
 
     def out_and_back(self) -> str:

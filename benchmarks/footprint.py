@@ -13,22 +13,22 @@ _TICKS_PER_S: Final = os.sysconf("SC_CLK_TCK")
 
 @dataclass(frozen=True)
 class Memory:
-    """Memory of a process tree, in bytes.
+    """Memory of a process tree.
 
     Attributes:
-        own: Unique set size (USS): pages that no process outside of the tree has, each counted once.
-        pss: Proportional set size: own pages, and one n-th of each page that n processes of this machine share.
+        own_bytes: Unique set size (USS): anonymous pages, each counted once, and file pages that one process has.
+        pss_bytes: Proportional set size: own pages, and one n-th of each page that n processes of this machine share.
     """
 
-    own: int
-    pss: int
+    own_bytes: int
+    pss_bytes: int
 
     @classmethod
     def of(cls, pid: int) -> Self:
-        """Return the memory of a process and all its descendants.
+        """Return the memory of the processes of `tree`.
 
-        Forks share anonymous pages, which belong only to this tree. A file page, of a program or a library, counts as
-        own if only one process has it.
+        Forks share anonymous pages, which are assumed to belong only to this tree. A file page, of a program or a
+        library, counts as own if only one process has it.
         """
         rollups = [_smaps(process) for process in tree(pid)]
         own_kb = sum(rollup["Pss_Anon"] + rollup["Private_Clean"] for rollup in rollups)
@@ -36,7 +36,7 @@ class Memory:
 
 
 def cpu_s(pid: int) -> float:
-    """Return the processor time of a process and all its descendants, with terminated and awaited ones."""
+    """Return the processor time of the processes of `tree` and of their terminated and awaited children."""
     total_s = 0.0
     for process in tree(pid):
         total_s += sum(_scheduled_ns(thread) for thread in Path(f"/proc/{process}/task").iterdir()) / 1e9
@@ -48,7 +48,7 @@ def cpu_s(pid: int) -> float:
 
 
 def tree(pid: int) -> Iterator[int]:
-    """Yield a process and all its descendants."""
+    """Yield a process and its descendants, without children that a thread other than the main thread started."""
     yield pid
     for child in Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split():
         yield from tree(int(child))

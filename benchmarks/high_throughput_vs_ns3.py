@@ -1,13 +1,13 @@
 """802.11n, ac and ax compared with ns-3: `python -m benchmarks.high_throughput_vs_ns3 [--json]`.
 
-Needs ns-3 3.37 and a C++ compiler: `apt-get install libns3-dev g++`. For all modes, airtimes and packet errors of
-1000 bytes are compared. Known differences of airtimes are due to ns-3: it does not end the data of short guard
-intervals at multiples of 4 us (IEEE 802.11-2020, 19.4.3, 21.4.3), omits VHT-SIG-B (4 us) of frames to one station,
-and uses 8 us for each HE-LTF at all guard intervals. Then goodput with A-MPDU is compared in one mode: for one
-station at signal-to-noise ratios down to the limit of its range; for several stations; with RTS; and with access
-categories. In rows `bare` and in rows with an access category, ns-3 has no retry limit and sends no BlockAckReq: ns-3
-3.37 does not reset its count of failed aggregates to a receiver when an aggregate succeeds, so it drops a whole
-aggregate at the seventh failure.
+Needs ns-3 3.37 and a C++ compiler: `apt-get install libns3-dev g++`. Airtimes are compared for all modes at 5 GHz,
+and packet errors of 1000 bytes for the modes with one stream in 40 MHz and a guard interval of 800 ns. Known
+differences of airtimes are due to ns-3: it does not end the data of short guard intervals at multiples of 4 us (IEEE
+802.11-2020, 19.4.3, 21.4.3), omits VHT-SIG-B (4 us) of frames to one station, and uses 8 us for each HE-LTF at all
+guard intervals. Then goodput with A-MPDU is compared in one mode: for one station at signal-to-noise ratios down to
+the limit of its range; for several stations; with RTS; with A-MSDUs; and with access categories. In rows `bare` and
+in rows with an access category, ns-3 has no retry limit and sends no BlockAckReq: ns-3 3.37 does not reset its count
+of failed aggregates to a receiver when an aggregate succeeds, so it drops a whole aggregate at the seventh failure.
 """
 
 import argparse
@@ -34,6 +34,8 @@ HT20_7: Final = format_modes("HT", "2.4 GHz", 20, 1, 800)[7]
 RATIOS_DB: Final = (40.0, 26.0, 24.5, 24.0, 23.5, 23.0)
 """Signal-to-noise ratios of a single station."""
 STATIONS: Final = (2, 5, 10, 20)
+AMSDU_BYTES: Final = 3_839
+AMSDU_STATIONS: Final = (1, 2, 5)
 DSCPS: Final = {"background": 8, "video": 40, "voice": 48}
 QUEUED: Final = 300
 """Packets in the queue of each station; a packet that arrived is replaced by a new one."""
@@ -73,7 +75,7 @@ def all_modes() -> Iterator[WifiMode]:
 
 
 def unexplained_ns(mode: WifiMode, size_bytes: int, ns3_ns: int) -> int:
-    """Return the difference of an airtime from that of ns-3, without the differences that the standard explains."""
+    """Return the difference of an airtime from that of ns-3, without the differences listed above in this module."""
     airtime_ns = mode.airtime_ns(size_bytes)
     if mode.phy_format == "VHT":
         airtime_ns -= 4_000
@@ -108,7 +110,13 @@ def error_curves(ns3: Ns3) -> dict[str, list[tuple[float, float, float]]]:
 
 
 def goodput_mbit_s(
-    mode: WifiMode, ratio_db: float, stations: int, *, rts: bool = False, dscp: int | None = None
+    mode: WifiMode,
+    ratio_db: float,
+    stations: int,
+    *,
+    rts: bool = False,
+    dscp: int | None = None,
+    amsdu_max_bytes: int | None = None,
 ) -> float:
     """Return the goodput of saturated stations with A-MPDU in the radio model, all at one signal-to-noise ratio.
 
@@ -118,6 +126,7 @@ def goodput_mbit_s(
         stations: Number of stations.
         rts: True if they send RTS before each aggregate.
         dscp: DSCP of all packets, for stations with access categories; None for stations without.
+        amsdu_max_bytes: Maximum size of A-MSDUs; None for none.
     """
     phy = PhyCapability(
         "n" if mode.phy_format == "HT" else "ac" if mode.phy_format == "VHT" else "ax",
@@ -127,6 +136,7 @@ def goodput_mbit_s(
         mode.guard_interval_ns,
         rts_threshold_bytes=0 if rts else None,
         access_categories=None if dscp is None else "linux",
+        amsdu_max_bytes=amsdu_max_bytes,
     )
     names = [*(f"s{number}" for number in range(stations)), "receiver"]
     antennas = {name: Antenna("802.11n", TX_POWER_DBM, SENSITIVITY_DBM, phy) for name in names}
@@ -153,26 +163,35 @@ def _loss_db(ratio_db: float) -> float:
     return TX_POWER_DBM - NOISE_DBM - ratio_db
 
 
+def _stations_text(stations: int) -> str:
+    return f"{stations} station{'s' * (stations != 1)}"
+
+
 def goodputs(ns3: Ns3) -> list[Row]:
     """Return goodputs in Mbit/s over the signal-to-noise ratio, and for contending stations."""
     rows: list[Row] = []
     for ratio_db, stations in (*((ratio_db, 1) for ratio_db in RATIOS_DB), *((50.0, count) for count in STATIONS)):
         options = ns3_options(HT20_7) | {"loss": _loss_db(ratio_db), "stations": stations, "ampdu": 65_535}
         ns3_value = float(ns3(seconds=SECONDS, payload=PAYLOAD_BYTES, **options))
-        name = f"{HT20_7.name}, {ratio_db} dB, {stations} stations"
+        name = f"{HT20_7.name}, {ratio_db} dB, {_stations_text(stations)}"
         rows.append((name, ns3_value, goodput_mbit_s(HT20_7, ratio_db, stations)))
     common = ns3_options(HT20_7) | {"loss": _loss_db(50.0), "ampdu": 65_535, "bare": 1}
     for stations in STATIONS:
         for rts in (False, True):
             options = common | {"stations": stations} | ({"rts": 0} if rts else {})
             ns3_value = float(ns3(seconds=SECONDS, payload=PAYLOAD_BYTES, **options))
-            name = f"bare, {'RTS, ' * rts}{stations} stations"
+            name = f"bare, {'RTS, ' * rts}{_stations_text(stations)}"
             rows.append((name, ns3_value, goodput_mbit_s(HT20_7, 50.0, stations, rts=rts)))
+    for stations in AMSDU_STATIONS:
+        options = common | {"stations": stations, "amsdu": AMSDU_BYTES}
+        ns3_value = float(ns3(seconds=SECONDS, payload=PAYLOAD_BYTES, **options))
+        fieldkit_value = goodput_mbit_s(HT20_7, 50.0, stations, amsdu_max_bytes=AMSDU_BYTES)
+        rows.append((f"A-MSDU, bare, {_stations_text(stations)}", ns3_value, fieldkit_value))
     for category, dscp in DSCPS.items():
         for stations in (1, 2):
             options = common | {"stations": stations, "classes": dscp << 2}
             ns3_value = float(ns3(seconds=SECONDS, payload=PAYLOAD_BYTES, **options))
-            name = f"{category}, {stations} stations"
+            name = f"{category}, {_stations_text(stations)}"
             rows.append((name, ns3_value, goodput_mbit_s(HT20_7, 50.0, stations, dscp=dscp)))
     return rows
 

@@ -82,7 +82,11 @@ class Cell:
         self._sent: SentFrame | None = None
 
     def poll(self) -> SentFrame | None:
-        """Forward all frames except data frames of the first radio; return such a frame, or None if there is none."""
+        """Forward all frames except unicast data frames of the first radio.
+
+        Returns:
+            A unicast data frame of the first radio, or None if there is none.
+        """
         for message in self._kernel.receive():
             event = None if message.type == NLMSG_ERROR else decode_event(message.payload)
             if not isinstance(event, SentFrame):

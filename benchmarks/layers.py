@@ -1,11 +1,11 @@
 """Cost of each layer of the radio model: `python -m benchmarks.layers [--json]`, as root.
 
-First the radio model alone (the engine) is measured in virtual time, while layers are added: processor time per
-packet of 64 bytes of UDP payload between two stations, one of which always has packets to send, and its share of the
-packets' air time (above 100 % a saturated channel does not run in real time). Then all layers are measured with more
-stations, which are in range of each other and send to the first one. Then the medium (the process that carries
-packets between robots) is measured: round trips of ping between two namespaces, and their mean without the delays
-from the model.
+Layers are added one after the other. With each of them, the radio model alone (the engine) is measured in virtual
+time: processor time per packet of 64 bytes of UDP payload between two stations, one of which always has packets to
+send, and its share of the packets' air time (above 100 % a saturated channel does not run in real time). The medium
+(the process that carries packets between robots) is measured too: round trips of ping between two namespaces, and
+their mean without the delays from the model. Finally the engine with all layers is measured with several numbers of
+stations, which are in range of each other and send to the first one.
 """
 
 import argparse
@@ -57,7 +57,7 @@ class Layer:
         return RadioOptions.model_validate(self.options)
 
     def load(self) -> World | None:
-        """Return the world."""
+        """Return the world, None for open ground."""
         return None if self.world is None else load_world(self.world)
 
     def model(self, stations: int) -> RadioModel[int]:
@@ -88,7 +88,7 @@ def _places(stations: int) -> dict[str, tuple[float, float, float]]:
 
 
 def measure_engine(layer: Layer, stations: int, packets: int) -> Figures:
-    """Return the processor time per packet to the first station from all others."""
+    """Return the processor time per packet to the first station from all others, and its share of the air time."""
     model = layer.model(stations)
     receiver, *senders = _places(stations)
     model.place(0, _places(stations), None)

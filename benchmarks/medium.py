@@ -2,11 +2,11 @@
 
 The medium is the process that carries packets between emulated robots. Two namespaces without robots are used. Each
 round measures for each path, in this order: round-trip time at zero delay (ping), TCP throughput (iperf3), 64-byte
-UDP payloads at full rate (iperf3), and the error of a 5 ms delay. For UDP it counts the packets at the receiver's
-interface, and the packets that the receiving program reads; on two cores the processor time of that program is the
-bottleneck. For the delay, a sender writes its send time into a datagram every 2 ms, and the receiver's kernel records
-the arrival time by the same clock. The column `bare timer` has the part of the error that is due to the machine: the
-lateness of a 5 ms sleep at the same priority.
+UDP payloads at full rate (iperf3), and the error of a delay: 5 ms on the medium, 0 on the veth pair. For UDP it
+counts the packets at the receiver's interface, and the packets that the receiving program reads; on two cores the
+processor time of that program is the bottleneck. For the delay, a sender writes its send time into a datagram every
+2 ms, and the receiver's kernel records the arrival time by the same clock. The column `bare timer` has the part of
+the error that is due to the machine: the lateness of a 5 ms sleep at the same priority.
 """
 
 import argparse
@@ -78,7 +78,7 @@ def veth_path() -> Iterator[tuple[Namespace, Namespace]]:
 
 
 def measure_throughput(client: Namespace, server: Namespace, seconds: float) -> Figures:
-    """Return round-trip times in ms, TCP bit/s and packets per second."""
+    """Return round-trip times in ms, TCP throughput in Mbit/s, and UDP packets per second."""
     client.run("ping", "-c", "3", "10.9.0.2")
     pings = client.run("ping", "-c", "1000", "-i", "0.002", "10.9.0.2", timeout_s=60.0).stdout
     rtt_ms = [float(value) for value in re.findall(r"time=([\d.]+)", pings)]
@@ -127,7 +127,7 @@ def iperf(namespace: Namespace, seconds: float, *options: str) -> dict[str, dict
 
 
 def measure_delay(client: Namespace, server: Namespace, probes: int) -> list[float]:
-    """Return one-way delays in ms of datagrams sent every 2 ms."""
+    """Return the one-way delays in ms of the datagrams that arrived; one is sent every 2 ms."""
     module = ("-m", "benchmarks.medium", "--probes", str(probes))
     receiver = server.start(sys.executable, *module, "--probe", "receive")
     assert receiver.stdout is not None

@@ -175,7 +175,7 @@ def fieldkit_frames(content: dict[str, Any], times_ns: Sequence[int], seed: int)
 def goodput_bit_s(frames: Sequence[SelectedFrame]) -> float:
     """Return the received payload per time on the air, in bit/s.
 
-    The time includes ACKs and interframe spaces, but no backoffs.
+    The time includes ACKs and interframe spaces, but no MAC headers, no backoffs, and no tries in 802.11b.
     """
     air_ns = 0
     for frame in frames:
@@ -191,7 +191,7 @@ def frames_per_mcs(frames: Sequence[SelectedFrame]) -> Counter[str]:
 
 
 def rates_bit_s(frames: Sequence[SelectedFrame], window_ns: int = 1_000_000_000) -> list[float]:
-    """Return the mean rate of first tries in each window of time, without samples."""
+    """Return the mean rate of first tries in each window of time, without samples; other windows are omitted."""
     windows: dict[int, list[int]] = {}
     for frame in frames:
         if not frame.is_sample and (mode := frame.modes[0]) is not None:

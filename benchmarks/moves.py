@@ -1,15 +1,16 @@
 """Cost of a move in the medium, by the number of robots: `python -m benchmarks.moves [--json]`, as root.
 
 The medium is the process that carries packets between emulated robots. For each world and number of robots, the
-benchmark moves one robot repeatedly by 0.1 m, and measures the medium's processor time per move, and the time until
-the medium answers, during which it forwards no packets. The reference moves all robots in each step, so that all
-links are computed.
+benchmark moves one robot by 0.1 m in each step (after 9.9 m it returns to its start), and measures the medium's
+processor time per move, and the time until the medium answers, during which it forwards no packets. The reference
+moves all robots in each step, so that all links are computed.
 """
 
 import argparse
 import json
 import os
 import statistics
+import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -31,7 +32,7 @@ Figures = dict[str, float]
 
 
 def measure_moves(world: str, size: int, radio: RadioOptions, *, move_all: bool) -> Figures:
-    """Return the cost of a step with `size` robots, 5 m apart, of which one or all move."""
+    """Return the cost of a step with `size` robots, which start 5 m apart, and of which one or all move."""
     with ExitStack() as stack:
         medium = stack.enter_context(MediumClient(radio, load_world(world), seed=1))
         places: dict[str, Vector] = {}
@@ -42,12 +43,14 @@ def measure_moves(world: str, size: int, radio: RadioOptions, *, move_all: bool)
             os.close(fd)
             places[f"r{number}"] = 5.0 * (number % 7), 5.0 * (number // 7), 0.2
         medium.place(places)
+        starts = dict(places)
         waited_s: list[float] = []
         before_s = _processor_s(medium.pid)
         for step in range(1, STEPS + 1):
             offset_m = 0.1 * (step % 100)
             for name in places if move_all else ("r0",):
-                places[name] = offset_m, *places[name][1:]
+                east_m, north_m, up_m = starts[name]
+                places[name] = east_m + offset_m, north_m, up_m
             started_s = time.monotonic()
             medium.place(places, velocities_m_s={"r0": (1.0, 0.0, 0.0)})
             waited_s.append(time.monotonic() - started_s)
@@ -66,10 +69,10 @@ def _processor_s(pid: int) -> float:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="numbers of robots")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    print(f"load before: {os.getloadavg()[0]:.2f}")
+    print(f"load before: {os.getloadavg()[0]:.2f}", file=sys.stderr)
     radios = {"steady": RadioOptions(fading=False), "fading": RadioOptions(fading=True, shadowing_db=4.0)}
     table: dict[str, Figures] = {}
     for world in WORLDS:
@@ -83,7 +86,7 @@ def main() -> None:
                         print(f"{key:44}" + "".join(figures))
     if options.json:
         print(json.dumps(table, indent=2))
-    print(f"load after: {os.getloadavg()[0]:.2f}")
+    print(f"load after: {os.getloadavg()[0]:.2f}", file=sys.stderr)
 
 
 if __name__ == "__main__":

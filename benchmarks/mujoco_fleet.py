@@ -1,8 +1,9 @@
 """Part of `cosim_speed`: the cost of the co-simulation in addition to the steps of MuJoCo.
 
-One robot in fifteen, and at least one, is a drone; the others are alternately Huskies and TurtleBots. All move. The
-coordinator advances them in windows of 10 ms, with a network without packets. The peer is a loop over the same model
-and the same controllers, ten steps per call, without states, commands and coordinator.
+One robot in fifteen is a drone, beginning with the third (number 2). Of the others, those with even numbers are
+Huskies, and those with odd numbers are TurtleBots. All move. The coordinator advances them in windows of 10 ms, with
+a network without packets. The peer is a loop over the same model and the same controllers, ten steps per call,
+without states, commands and coordinator.
 """
 
 import gc

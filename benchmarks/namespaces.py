@@ -1,4 +1,4 @@
-"""Network namespaces without robots for benchmarks and tests; they are removed with the process that created them."""
+"""Network namespaces without robots for benchmarks and tests; they end with the thread that created them."""
 
 import ctypes
 import os

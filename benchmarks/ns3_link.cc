@@ -1,11 +1,12 @@
-// Prints results of ns-3 for 802.11 links, for radio_vs_ns3.py and cosim_vs_ns3.py:
+// Prints results of ns-3 for 802.11 links and cables, for the benchmarks *_vs_ns3.py:
 //
-// - `errors`: frame error by mode and SNR;
+// - `errors`: frame error of a mode by SNR;
 // - `durations`: airtime in ns by frame size in bytes;
 // - `link`: goodput in Mbit/s, by traffic class, of saturated stations that send UDP to one receiver, all with the same
 //   distance from each other;
+// - `pairs`: goodput in Mbit/s of two pairs of stations, each with a saturated sender and a receiver;
 // - `udp`: goodput and loss of a stream at a fixed rate;
-// - `tcp`: goodput of a stream at full rate, and the events of its sender.
+// - `tcp`: goodput of a stream at full rate, and the events of its sender (over 802.11 only its congestion window).
 
 #include "ns3/applications-module.h"
 #include "ns3/core-module.h"
@@ -90,6 +91,8 @@ struct Options
     uint16_t streams = 1;
     uint16_t guard_ns = 800;
     uint32_t ampdu = 0;
+    uint32_t amsdu = 0;
+    double between_db = 60;
     uint32_t rts = 4692480; // size of the largest frame without RTS; this one is above any frame
     bool bare = false;      // without ns-3's retry limits for aggregates, and without its BlockAckReqs
     std::string classes = "0";
@@ -122,16 +125,20 @@ WifiStandard StandardOf(const std::string& mode)
     }
 }
 
-NetDeviceContainer Install(const Options& options, NodeContainer nodes)
+NetDeviceContainer Install(const Options& options, NodeContainer nodes,
+                           Ptr<MatrixPropagationLossModel> loss = CreateObject<MatrixPropagationLossModel>())
 {
     auto channel = CreateObject<YansWifiChannel>();
-    auto loss = CreateObject<MatrixPropagationLossModel>();
     loss->SetDefaultLoss(options.loss_db);
     channel->SetPropagationLossModel(loss);
     channel->SetPropagationDelayModel(CreateObject<ConstantSpeedPropagationDelayModel>());
     YansWifiPhyHelper phy;
     phy.SetChannel(channel);
     phy.SetErrorRateModel("ns3::NistErrorRateModel");
+    if (options.what == "pairs")
+    {
+        phy.SetPreambleDetectionModel("ns3::ThresholdPreambleDetectionModel", "MinimumRssi", DoubleValue(-101));
+    }
     phy.Set("TxPowerStart", DoubleValue(kTxPowerDbm));
     phy.Set("TxPowerEnd", DoubleValue(kTxPowerDbm));
     phy.Set("RxNoiseFigure", DoubleValue(kNoiseFigureDb));
@@ -166,7 +173,7 @@ NetDeviceContainer Install(const Options& options, NodeContainer nodes)
     auto ampdu = UintegerValue(options.ampdu);
     if (!options.relay)
     {
-        mac.SetType("ns3::AdhocWifiMac", "BE_MaxAmpduSize", ampdu,
+        mac.SetType("ns3::AdhocWifiMac", "BE_MaxAmsduSize", UintegerValue(options.amsdu), "BE_MaxAmpduSize", ampdu,
                     "BK_MaxAmpduSize", ampdu, "VI_MaxAmpduSize", ampdu, "VO_MaxAmpduSize", ampdu);
         return wifi.Install(phy, mac, nodes);
     }
@@ -185,7 +192,7 @@ NetDeviceContainer Install(const Options& options, NodeContainer nodes)
     return devices;
 }
 
-// Goodput of the stations of each traffic class.
+// Goodput in Mbit/s of the stations of each traffic class.
 std::vector<double> Goodputs(const Options& options)
 {
     if (options.bare)
@@ -268,6 +275,60 @@ std::vector<double> Goodputs(const Options& options)
     return bits;
 }
 
+// Goodputs in Mbit/s of two pairs of stations: 0 sends to 1, and 2 to 3. The losses are equal, except those from the first
+// pair to the second one.
+std::vector<double> PairGoodputs(const Options& options)
+{
+    NodeContainer nodes;
+    nodes.Create(4);
+    auto loss = CreateObject<MatrixPropagationLossModel>();
+    auto devices = Install(options, nodes, loss);
+    Config::Set("/NodeList/*/DeviceList/*/$ns3::WifiNetDevice/Phy/Slot", TimeValue(MicroSeconds(9)));
+    MobilityHelper mobility;
+    mobility.Install(nodes);
+    for (uint32_t from : {0, 1})
+    {
+        for (uint32_t to : {2, 3})
+        {
+            auto source = nodes.Get(from)->GetObject<MobilityModel>(), target = nodes.Get(to)->GetObject<MobilityModel>();
+            loss->SetLoss(source, target, options.between_db, false);
+            loss->SetLoss(target, source, options.loss_db, false);
+        }
+    }
+    InternetStackHelper internet;
+    internet.Install(nodes);
+    Ipv4AddressHelper addresses("10.0.0.0", "255.255.255.0");
+    auto interfaces = addresses.Assign(devices);
+    NeighborCacheHelper().PopulateNeighborCache(interfaces);
+    std::vector<Ptr<PacketSink>> sinks;
+    for (uint32_t sender : {0, 2})
+    {
+        InetSocketAddress to(interfaces.GetAddress(sender + 1), 9);
+        PacketSinkHelper sink("ns3::UdpSocketFactory", to);
+        sinks.push_back(DynamicCast<PacketSink>(sink.Install(nodes.Get(sender + 1)).Get(0)));
+        OnOffHelper source("ns3::UdpSocketFactory", to);
+        source.SetConstantRate(DataRate(70000000), options.payload);
+        source.Install(nodes.Get(sender)).Start(Seconds(kWarmUpS + 0.001 * sender));
+    }
+    std::vector<double> bits(sinks.size());
+    auto count = [&](double sign) {
+        for (std::size_t number = 0; number < sinks.size(); number++)
+        {
+            bits[number] += sign * 8.0 * sinks[number]->GetTotalRx();
+        }
+    };
+    Simulator::Schedule(Seconds(2 * kWarmUpS), [&] { count(-1); });
+    Simulator::Stop(Seconds(2 * kWarmUpS + options.seconds));
+    Simulator::Run();
+    count(1);
+    Simulator::Destroy();
+    for (auto& value : bits)
+    {
+        value /= options.seconds * 1e6;
+    }
+    return bits;
+}
+
 // An error model that loses the packets with the given numbers: comma-separated, from 0, in the order of arrival.
 Ptr<ErrorModel> Losing(const std::string& numbers)
 {
@@ -300,7 +361,7 @@ Ipv4InterfaceContainer Cable(const Options& options, NodeContainer& nodes)
     return interfaces;
 }
 
-// Two nodes, on a cable or over Wi-Fi. Over Wi-Fi packets wait only in the queue of the MAC, without a time limit.
+// Two nodes, on a cable or over Wi-Fi. Over Wi-Fi packets wait only in the queue of the MAC, for up to 1000 s.
 Ipv4InterfaceContainer Pair(const Options& options, NodeContainer& nodes)
 {
     if (options.cable)
@@ -457,7 +518,7 @@ int main(int argc, char** argv)
 {
     Options options;
     CommandLine command;
-    command.AddValue("what", "errors, durations, link, udp or tcp", options.what);
+    command.AddValue("what", "errors, durations, link, pairs, udp or tcp", options.what);
     command.AddValue("mode", "ns-3's name of the mode", options.mode);
     command.AddValue("stations", "number of stations that send", options.stations);
     command.AddValue("payload", "UDP payload of a packet, bytes", options.payload);
@@ -467,6 +528,8 @@ int main(int argc, char** argv)
     command.AddValue("streams", "number of spatial streams", options.streams);
     command.AddValue("guard", "guard interval, ns", options.guard_ns);
     command.AddValue("ampdu", "maximum size of an A-MPDU, bytes; 0 for none", options.ampdu);
+    command.AddValue("amsdu", "maximum size of an A-MSDU, bytes; 0 for none", options.amsdu);
+    command.AddValue("between", "path loss from the first pair to the second one, dB", options.between_db);
     command.AddValue("rts", "size of the largest frame without RTS, bytes", options.rts);
     command.AddValue("bare", "without BlockAckReq and without a retry limit", options.bare);
     command.AddValue("classes", "traffic classes (TOS) of the stations, by turns, comma-separated", options.classes);
@@ -476,7 +539,7 @@ int main(int argc, char** argv)
     command.AddValue("adapt", "choose the mode by Minstrel", options.adapt);
     command.AddValue("control", "congestion control of TCP", options.control);
     command.AddValue("recovery", "loss recovery of TCP", options.recovery);
-    command.AddValue("rate", "rate of the UDP stream, Mbit/s", options.rate_mbit_s);
+    command.AddValue("rate", "rate of the UDP stream, and of the cable, Mbit/s", options.rate_mbit_s);
     command.AddValue("queue", "queue limit, packets", options.queue);
     command.AddValue("cable", "use a cable instead of a radio, and print all TCP events", options.cable);
     command.AddValue("delay", "delay of the cable, ms", options.delay_ms);
@@ -505,7 +568,7 @@ int main(int argc, char** argv)
     }
     else
     {
-        for (double value : Goodputs(options))
+        for (double value : options.what == "pairs" ? PairGoodputs(options) : Goodputs(options))
         {
             std::cout << value << " ";
         }

@@ -5,8 +5,8 @@ that release with all libraries that it needs, from the Debian mirror in apt's s
 and libraries in the PyPI package `ns3`. They are extracted into a folder (about 1 GB per release), and nothing is
 installed. This machine's g++ compiles fieldkit's C++ program for ns-3 against them, and the program runs with their
 libraries. Then the conformance suite and the tests in `tests/sim_backends/ns3` run.
-Each line of the output states the version that the program reports, and the results. The exit code is 1 if something
-failed.
+Each line of the output states the version of ns-3 according to pkg-config, and the results. The exit code is 1 if
+something failed.
 """
 
 import argparse
@@ -119,7 +119,7 @@ def environment(folder: Path, *, is_wheel: bool) -> dict[str, str]:
 
 
 def check(name: str, folder: Path) -> bool:
-    """Extract a version, test it, and print the results; return True if all passed."""
+    """Extract a version if necessary, test it, and print the results; return True if all passed."""
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / "root/usr/include").is_dir() and not (folder / "root/ns3").is_dir():
         if name == "wheel":
@@ -152,7 +152,7 @@ def _last_line(folder: Path, variables: Mapping[str, str], *words: str) -> tuple
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Test the versions."""
+    """Test the versions; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", default=NAMES, metavar="NAME", help="trixie, sid, wheel; by default all")
     parser.add_argument("--folder", type=Path, default=cache_folder().parent / "ns3-versions")

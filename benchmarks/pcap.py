@@ -1,8 +1,8 @@
 """Compute losses and times of a transfer from two captures, compared with other readers: `python -m benchmarks.pcap`.
 
 The captures are of a UDP transfer of 200,000 IP packets with a loss of 10 %: fragments of 8,192-byte datagrams, with
-128 bytes captured of each, as in a trial. Each peer reads both captures into columns and matches the packets by
-identification and offset. In every round all peers run one after the other, and all must compute the same losses.
+128 bytes captured of each, as in a trial. Each peer reads both captures, and matches the packets by identification
+and offset. In every round all peers run one after the other, and all must compute the same losses.
 fieldkit computes all values that `fieldkit.measure.transfers.transfer_measures` computes from captures: losses of
 packets, datagrams and bytes, the transfer's time, and the counts of the paper (docs/index.md). The other readers,
 dpkt, tshark and scapy, only count lost packets. scapy would take minutes, so it reads only the first packets; tshark
@@ -57,7 +57,7 @@ def peak_kb():
 before = peak_kb()
 print(json.dumps([sum(len(part.packets) for part in pcap.stream(pathlib.Path(sys.argv[1]))), before, peak_kb()]))
 """
-"""Prints the number of packets of a file, and the peak memory of this process before and after reading them."""
+"""Prints the number of packets of a file, and the peak memory of its process in KiB before and after reading them."""
 
 READ: Final = STREAM.replace("sum(len(part.packets) for part in pcap.stream(", "len(pcap.read(").replace(
     "sys.argv[1])))", "sys.argv[1])).packets)"
@@ -108,7 +108,7 @@ def losses_by_fieldkit(sender: Path, receiver: Path) -> int:
 
 
 def lost_count(sent: Iterable[Key], received: Iterable[Key]) -> int:
-    """Return the number of keys that arrived less often than they were sent."""
+    """Return the number of sent packets that did not arrive; packets with the same key are counted individually."""
     return (Counter(sent) - Counter(received)).total()
 
 

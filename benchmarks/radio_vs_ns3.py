@@ -16,11 +16,13 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from typing_extensions import override
 
 from sim_backends.federates.compiling import CompiledProgram
 from sim_backends.ns3.federate import standard_flag, version
 from sim_backends.radio.antennas import Antenna
 from sim_backends.radio.error_rates import packet_error
+from sim_backends.radio.high_throughput import PhyCapability
 from sim_backends.radio.modes import CHANNEL_6_HZ, G_MODES, N_MODES, WifiMode
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.wifi import Wifi
@@ -39,6 +41,10 @@ NOISE_DBM: Final = 10 * math.log10(1.3803e-23 * 290 * 20e6 * 1e3) + 6
 noise figure of 6 dB. With -95 dBm up to 7 % fewer datagrams are lost at the edge of a link."""
 DISTANCES_M: Final = (5, 10, 20, 30, 40, 50, 60, 70, 80, 90)
 STATIONS: Final = (1, 2, 5, 10)
+STRONG_DB: Final = 52.0
+PAIR_RATIOS_DB: Final = (52.0, 15.0, 8.0)
+"""Ratios of signal to noise of the first pair at the second pair, which at 15 dB decodes only the ACKs of the first
+pair, and at 8 dB none of its frames (EIFS). In ns-3, EIFS of 802.11g has an ACK of 802.11b, so 802.11a is used."""
 FIXED: Final = tuple(mode for mode in G_MODES if mode.name in {"g6", "g24", "g54"})
 
 Row = tuple[str, float, float]
@@ -122,6 +128,43 @@ def goodput_mbit_s(
     return arrived * PAYLOAD_BYTES * 8 / SECONDS / 1e6
 
 
+def pair_goodputs_mbit_s(between_db: float) -> list[float]:
+    """Return the goodputs of two pairs of 802.11a in the radio model, each with a saturated sender.
+
+    The ratio of signal to noise is `STRONG_DB`, except for frames of the first pair at the second pair: `between_db`.
+    """
+    phy = PhyCapability("n", "5 GHz", 20, 1, 800)
+    antennas = {name: Antenna("802.11n", TX_POWER_DBM, NOISE_DBM, phy) for name in "abcd"}
+    options = RadioOptions(fading=False, noise_floor_dbm=NOISE_DBM, mode="a54")
+    channel = _WithDifs(1, antennas, options)
+    losses_db = np.where(np.eye(4, dtype=bool), np.inf, _loss_db(STRONG_DB))
+    losses_db[:2, 2:] = _loss_db(between_db)
+    channel.use_losses(losses_db)
+    wifi: Wifi[str] = Wifi(channel, 1)
+    receivers, arrived = {"a": "b", "c": "d"}, dict.fromkeys("ac", 0)
+    for name, receiver in receivers.items():
+        for _ in range(50):
+            wifi.send(0, name, name, PAYLOAD_BYTES + 28, receiver)
+    while (now_ns := wifi.next_event_ns()) is not None and now_ns < SECONDS * 1e9:
+        for at_ns, _, name, _, _ in wifi.deliveries(now_ns):
+            arrived[name] += 1
+            wifi.send(at_ns, name, name, PAYLOAD_BYTES + 28, receivers[name])
+    return [count * PAYLOAD_BYTES * 8 / SECONDS / 1e6 for count in arrived.values()]
+
+
+def _loss_db(ratio_db: float) -> float:
+    """Return the path loss that gives a signal-to-noise ratio."""
+    return TX_POWER_DBM - NOISE_DBM - ratio_db
+
+
+class _WithDifs(WorldChannel):
+    """A channel on which stations at 5 GHz have no QoS."""
+
+    @override
+    def ifs_ns(self, station: int) -> int:
+        return self.band.difs_ns
+
+
 class _Equidistant(WorldChannel):
     """A channel in which all pairs of stations have the same distance, as in the ns-3 program.
 
@@ -159,13 +202,26 @@ def rows(ns3: Ns3) -> list[Row]:
             results.append((f"{mode.name}, {stations} contending", ns3_value, fieldkit_mbit_s))
         ns3_value = ns3_mbit_s(loss=path_loss_db(5), mode=ns3_name(mode), relay=1)
         results.append((f"{mode.name}, through an access point", ns3_value, goodput_mbit_s(5, mode=mode, relay=True)))
+    for between_db in PAIR_RATIOS_DB:
+        ns3_values = ns3(
+            what="pairs",
+            loss=_loss_db(STRONG_DB),
+            between=_loss_db(between_db),
+            mode=f"Ofdm{ns3_name(FIXED[-1]).removeprefix('ErpOfdm')}",
+            seconds=SECONDS,
+            payload=PAYLOAD_BYTES,
+        ).split()
+        for pair, (ns3_word, fieldkit_mbit_s) in enumerate(
+            zip(ns3_values, pair_goodputs_mbit_s(between_db), strict=True), 1
+        ):
+            results.append((f"a54, pair {pair}, {between_db:g} dB between", float(ns3_word), fieldkit_mbit_s))
     return results
 
 
 def main() -> None:
-    """Run both, print the table, and draw the figure if `--figure` is given."""
+    """Run both, print the table, and draw the figure if `--figure` is given; or only print JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", action="store_true", help="print single values as JSON")
+    parser.add_argument("--json", action="store_true", help="print single values as JSON, and draw no figure")
     parser.add_argument("--figure", type=Path, help="write the curves of both to this SVG file")
     arguments = parser.parse_args()
     ns3 = build()

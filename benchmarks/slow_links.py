@@ -33,7 +33,7 @@ class _Direction:
         source: Socket from which bytes are read.
         sink: Socket to which they are written.
         in_flight: Delayed chunks: due time, trip number, and the bytes, which are empty at the end of the stream.
-        ended: Whether the source has reached its end.
+        ended: True if the source has reached its end.
     """
 
     source: socket.socket

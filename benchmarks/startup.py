@@ -3,7 +3,8 @@
 Each command of fieldkit runs alternately with its references: Python that does nothing, `git --version`, and Python
 that only imports the libraries of the command. The benchmark measures wall time, processor time and the peak memory
 of the process, which is at least the 16 MB of the benchmark. The main figure is the command's processor time minus
-the time to import its libraries. `--peer PYTHON` runs fieldkit of another checkout with that Python.
+the time to import its libraries. `--peer PYTHON` also runs fieldkit of another checkout with that Python, except for
+the completion.
 """
 
 import argparse
@@ -88,7 +89,11 @@ class Cost:
 
 
 def measure(argv: Sequence[str], environment: Mapping[str, str]) -> Cost:
-    """Run a command in an empty folder until it exits, and return its cost."""
+    """Run a command in an empty folder until it exits, and return its cost.
+
+    Raises:
+        RuntimeError: The command failed.
+    """
     with tempfile.TemporaryDirectory() as folder:
         started_s = time.perf_counter()
         process = subprocess.Popen(

@@ -114,7 +114,7 @@ def round_trips(client: Namespace) -> Figures:
 
 
 def lateness(medium: MediumClient, before: Counter[int]) -> Figures:
-    """Return the lateness of the medium's packets since the counts `before`."""
+    """Return the lateness of the medium's packets since the counts `before`, in ms."""
     late = Lateness(bound_ns=1, packets=Counter(medium.stats().packet_lateness_counts) - before)
     shares = {"median": 0.5, "p99": 0.99, "max": 1.0}
     return {
@@ -123,7 +123,7 @@ def lateness(medium: MediumClient, before: Counter[int]) -> Figures:
 
 
 def throughput(client: Namespace, server: Namespace, seconds: float) -> Figures:
-    """Return the rate of small packets that `server` receives."""
+    """Return the rate of small packets that `server` receives, in packets per second."""
     with listening_iperf(server):
         arrived = packets_in(server)
         udp = iperf(client, seconds, "-u", "-b", "0", "-l", str(PAYLOAD_BYTES))
@@ -131,13 +131,13 @@ def throughput(client: Namespace, server: Namespace, seconds: float) -> Figures:
 
 
 def tcp(client: Namespace, server: Namespace, seconds: float) -> Figures:
-    """Return the throughput of TCP."""
+    """Return the throughput of TCP, in Mbit/s."""
     with listening_iperf(server):
         return {"tcp_mbit_s": iperf(client, seconds)["sum_received"]["bits_per_second"] / 1e6}
 
 
 def measure_pairs(size: int, options: RadioOptions, seconds: float, packets_s: int, pairs: int) -> Figures:
-    """Return the received packets between pairs of `size` robots, and the cost per packet in the medium."""
+    """Return the rate of received packets in pairs of `size` robots, and the cost per packet in the medium."""
     with swarm(size, options) as (medium, spaces):
         senders, receivers = spaces[: 2 * pairs : 2], spaces[1 : 2 * pairs : 2]
         packets_s_each = str(packets_s / len(senders))
@@ -180,8 +180,8 @@ def measure_startup(size: int) -> Figures:
     return {
         "start_s": lasted_s,
         "cpu_s": processors_s,
-        "own_mb": statistics.mean(robot_memory.own for robot_memory in memory) / 1e6,
-        "pss_mb": statistics.mean(robot_memory.pss for robot_memory in memory) / 1e6,
+        "own_mb": statistics.mean(robot_memory.own_bytes for robot_memory in memory) / 1e6,
+        "pss_mb": statistics.mean(robot_memory.pss_bytes for robot_memory in memory) / 1e6,
     }
 
 
@@ -210,11 +210,11 @@ def show(table: dict[str, dict[int, Figures]], veth: Figures, sizes: Sequence[in
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="numbers of robots")
     parser.add_argument("--seconds", type=float, default=3.0, help="length of each throughput run")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    print(f"load before: {os.getloadavg()[0]:.2f}")
+    print(f"load before: {os.getloadavg()[0]:.2f}", file=sys.stderr)
     table = {
         name: {size: measure_medium(size, radio_options, options.seconds) for size in options.sizes}
         for name, radio_options in RADIOS.items()
@@ -231,7 +231,7 @@ def main() -> None:
         print(json.dumps({"veth": veth, **table}, indent=2))
     else:
         show(table, veth, options.sizes)
-    print(f"load after: {os.getloadavg()[0]:.2f}")
+    print(f"load after: {os.getloadavg()[0]:.2f}", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -130,7 +130,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--seeds", type=int, default=50, help="seeds of each of 4 windows")
-    parser.add_argument("--tasks", type=int, default=10_000)
+    parser.add_argument("--tasks", type=int, default=10_000, help="number of empty tasks")
     parser.add_argument("--duration", default="2s", help="duration of a run")
     arguments = parser.parse_args()
     factors = parse_factors([WINDOWS])

@@ -89,8 +89,8 @@ class Run:
     """A run of a sender.
 
     Attributes:
-        events: Time in ns, kind and value of each event: `window` and `threshold` in segments, `timeout` in ms, and
-            `sent` with the number of the segment, from 0.
+        events: Time in ns, kind and value of each event: `window` and `threshold` in segments, `timeout` in ms,
+            `sent` with the number of the segment, from 0, and in ns-3 also `state` with the number of the state.
         mbit_s: Its goodput.
     """
 
@@ -103,7 +103,7 @@ class Run:
         return [(at_ns, value) for at_ns, kind, value in self.events if kind == "sent"]
 
     def window_at(self, at_s: float) -> float:
-        """Return the congestion window at a time, in segments."""
+        """Return the congestion window at a time, in segments; NaN before the first event with a window."""
         before = (value for at_ns, kind, value in reversed(self.events) if kind == "window" and at_ns <= at_s * 1e9)
         return next(before, math.nan)
 
@@ -180,7 +180,7 @@ def paired_ratio(ours_mbit_s: np.ndarray, peers_mbit_s: np.ndarray) -> tuple[flo
 
 
 def pattern_lines(ns3: Ns3) -> Iterator[str]:
-    """Yield windows after fixed loss patterns."""
+    """Yield windows and goodputs after fixed loss patterns."""
     yield f"{'segments after (s)':32}" + " ".join(f"{at_s:6}" for at_s in AT_S)
     for control in CONTROLS:
         for name, losses in PATTERNS.items():

@@ -148,7 +148,7 @@ def measure_sources(seconds: float) -> Iterator[Row]:
 
 
 def main() -> int:
-    """Print a line per shell and factor of slowness."""
+    """Print a line per kind of source, and for each shell the reference, a source, and the sampler by slowness."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true", help="print single values as JSON")
     parser.add_argument("--seconds", type=float, default=20.0, help="length of each run")

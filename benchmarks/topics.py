@@ -132,7 +132,7 @@ def stream_together(plain: Sequence[RunningPath], agent_pair: AgentPair, rates_h
 
 
 def measure_round(over: str, number: int, agent_pair: AgentPair, environment: dict[str, str]) -> dict[str, Any]:
-    """Return the results of a middleware in a round: median delay and rate of a burst, by pair."""
+    """Return the results of a middleware in a round, by pair: median delay, and rate of a burst if it had one."""
     pairs = (*PLAIN[over], "agent")
     rates_hz = [RATES_HZ[(place + number) % len(pairs)] for place in range(len(pairs))]
     with ExitStack() as stack:
@@ -188,7 +188,7 @@ def ratio(rows: Sequence[dict[str, Any]], pair: str, reference: str) -> str:
 
 
 def main() -> int:
-    """Print a line per pair."""
+    """Measure; print a line per pair, or the results as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true", help="print single values as JSON")
     parser.add_argument("--rounds", type=int, default=8, help="measurements of each pair")

@@ -139,7 +139,7 @@ class AlternatingPeers:
         return 0 if self.slow is None else self.slow.trips
 
     def _store(self, peer: str, protocol: str, number: int, end_ns: int) -> tuple[Lifetime, ...]:
-        """Store the result of a repeat, and return the tools that ran; none if a tool was not identified."""
+        """Store the result of a repeat unless it is a warm-up; return its tools, none if one was not identified."""
         trips = self._trips() - self._start_trips
         try:
             tools = self.watch.read(sum(TOOLS.values()), self._start_ns)

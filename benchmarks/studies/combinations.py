@@ -1,7 +1,7 @@
 """Every sync policy on every pair of simulators: `python -m benchmarks.studies.combinations run FILE.csv`.
 
 The program runs one scenario with each physics simulator, network simulator, sync policy and seed, and appends a row
-per run to a CSV file. Combinations that are already in the file are not run again. `table FILE.csv --page
+per run to a CSV file. A pair of simulators that is already in the file is not run again. `table FILE.csv --page
 docs/studies/simulators.md` writes the tables of the documentation. For `gazebo`, a Gazebo must be running.
 """
 
@@ -25,7 +25,7 @@ from sim_backends.cosim.policies.registry import BUILTIN
 from sim_backends.cosim.scenario.build import Simulation
 from sim_backends.cosim.scenario.federate_choice import BUILT_IN
 from sim_backends.cosim.studies.intervals import mean
-from sim_backends.cosim.studies.shootout import Outcomes, RunOutcome, delay_s, mean_separation_m, run_outcomes
+from sim_backends.cosim.studies.shootout import Outcomes, RunOutcome, mean_delay_s, mean_separation_m, run_outcomes
 
 REFERENCE: Final = "event_driven"
 NETWORK_OPTIONS: Final = {"ns3": {"topics": "udp"}}
@@ -83,7 +83,7 @@ def make(scenario: str, changes: Mapping[str, object], policy: str, seed: int) -
 
 
 def study_rows(physics: str, network: str, results: Outcomes) -> Iterator[StudyRow]:
-    """Yield a row per run of a pair of simulators."""
+    """Yield a row for each policy and seed of a pair of simulators."""
     for policy, runs in results.runs.items():
         for seed in results.seeds:
             row = StudyRow(physics, network, policy, seed)
@@ -97,7 +97,7 @@ def _row(run: StudyRow, reference: RunOutcome, outcome: RunOutcome) -> StudyRow:
     differences = compare_runs(reference.run, outcome.run, outcome.tracks.distances_m(reference.tracks))
     return run._replace(
         loss=lost_share(outcome.run),
-        delay_s=delay_s(outcome),
+        delay_s=mean_delay_s(outcome),
         separation_m=mean_separation_m(outcome),
         time_error_s=differences.delivery_error_s.mean,
         path_error_m=differences.path_error_m.mean,
@@ -130,7 +130,7 @@ def append_rows(path: Path, rows: Sequence[StudyRow]) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Run the missing combinations, append their rows to the file, and print its tables."""
+    """Run the pairs of simulators that the file lacks, append their rows to the file, and print its tables."""
     done = {row.pair for row in read_rows(arguments.file)}
     for pair in itertools.product(arguments.physics, arguments.network):
         if pair in done:
@@ -156,7 +156,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def estimate_text(values: Sequence[float], scale: float, digits: int) -> str:
-    """Return the mean of seeds with its 95 % interval."""
+    """Return the mean of the finite values with its 95 % interval if there is one; empty without finite values."""
     finite = np.array([value for value in values if math.isfinite(value)]) * scale
     estimate = mean(finite)
     if math.isnan(estimate.low):
@@ -230,7 +230,7 @@ def path_text(runs: Sequence[StudyRow], _: Sequence[StudyRow]) -> str:
 
 
 def cost_text(runs: Sequence[StudyRow], _: Sequence[StudyRow]) -> str:
-    """Return the number of exchanges and the wall time, both per simulated second."""
+    """Return the mean number of exchanges and the median wall time, both per simulated second."""
     exchanges = np.mean([run.exchanges_per_s for run in runs])
     return f"{exchanges:.0f}; {np.median([run.wall_s for run in runs]):.2f}"
 

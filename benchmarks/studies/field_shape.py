@@ -137,9 +137,9 @@ def _panel(cells: Sequence[Cell], title: str, protocol: str, quantity: str) -> P
 
 
 def _end(source: Estimate, end: float | None, factor: float) -> float | None:
-    """Return an end of an interval to draw.
+    """Return an end of an interval to draw; None if there is no interval.
 
-    The result is None if the value is 0, because the interval would then depend only on the number of repeats.
+    The result is also None if the value is 0, because the interval would then depend only on the number of repeats.
     """
     return None if end is None or source.value == 0 else factor * end
 

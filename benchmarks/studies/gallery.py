@@ -71,7 +71,7 @@ def save_shot(browser: Browser, report: Path, shot: Shot, folder: Path) -> Path:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Make the report and its pictures; print their sizes."""
+    """Make the report and its pictures, and print their sizes; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("docs/gallery"), help="folder of the pictures")
     options = parser.parse_args(arguments)

@@ -80,7 +80,7 @@ LAYOUTS: Final = {
 
 
 def gaps_s(out: Path, name: str, hello_s: int, repeats: int) -> list[float]:
-    """Return the gap of each valid repeat of a layout; run its trial first if it does not exist."""
+    """Return the gap of each valid repeat of a layout, minus `Layout.away_s`; run its trial if it does not exist."""
     layout, lab = LAYOUTS[name], out / f"{name}-{hello_s}s"
     if not (lab / "trials").exists():
         _make_lab(lab, layout, hello_s)

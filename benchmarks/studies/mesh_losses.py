@@ -28,8 +28,9 @@ from fieldkit.lab.robots import LabRobot
 from fieldkit.remote.shell import Shell
 from fieldkit.remote.ssh import SshShell
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
-from sim_backends.emulated.nodes import EmulatedRobot, running_robots
+from sim_backends.emulated.nodes import EmulatedRobot
 from sim_backends.emulated.robot.spec import USER
+from sim_backends.emulated.running_robots import running_robots
 from sim_backends.world.world import load_world
 
 HELLO_S: Final = 0.5
@@ -57,7 +58,7 @@ class Detour:
     Attributes:
         label: Description of the paths.
         places: Positions of robots, metres east and north.
-        lost: Robots to switch off if they are on the sender's path.
+        lost: Robots to switch off if they are the next hop of the sender.
         fading: True if the radio fades.
     """
 
@@ -93,7 +94,7 @@ class DetourLab:
         return self.shell.run(argv, deadline=Deadline.after(within_s + 60), check=False).exit_code == 0
 
     def next_hop(self) -> str:
-        """Return the next hop on the sender's path, or an empty string without a path."""
+        """Return the name of the robot that is the sender's next hop; empty if the receiver has no route or is it."""
         argv = ("ip", "-4", "route", "show", self._address("receiver"), "proto", "babel")
         words = self.shell.run(argv, deadline=Deadline.after(60)).stdout.decode().split()
         via = words[words.index("via") + 1] if "via" in words else ""
@@ -158,7 +159,7 @@ def healing_times_s(detour_lab: DetourLab, detour: Detour, losses: int) -> list[
 
 
 def row(detour: Detour, times_s: Sequence[float | None]) -> str:
-    """Return a line of the table."""
+    """Return a line of the table. A time longer than `PATIENCE_S` counts as `PATIENCE_S` in the median."""
     bound_s = BOUND_HELLOS * HELLO_S
     in_order = sorted(PATIENCE_S if time_s is None else time_s for time_s in times_s)
     most = f"not in {PATIENCE_S:g} s" if None in times_s else f"{in_order[-1]:.1f} s"

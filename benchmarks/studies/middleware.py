@@ -54,7 +54,9 @@ ROBOTS_DODGE: Final = 0.06
 
 
 def copy_lab(folder: Path, repeats: int | None = None) -> None:
-    """Copy missing files of the lab into a folder; the files of a started campaign do not change.
+    """Copy missing files of the lab into a folder, so that the files of a started campaign do not change.
+
+    The profile of the robots with a real ROS 2 is written each time.
 
     Args:
         folder: The folder.
@@ -178,7 +180,11 @@ def _series(label: str, points: Sequence[tuple[float, MiddlewareCell]], quantity
 
 
 def _sample_count_text(cells: Sequence[MiddlewareCell], size: int) -> str:
-    """Return the number of samples and repeats of each point of a size: `, n = 80 (2 repeats)`."""
+    """Return the number of samples and repeats of each point of a size: `, n = 80 (2 repeats)`.
+
+    If the numbers of samples differ, the text has their range, and the repeats of the point with the most samples. It
+    is empty without samples.
+    """
     counts = sorted({(cell.samples, cell.repeats) for cell in cells if cell.size_bytes == size})
     if not counts or not counts[-1][0]:
         return ""

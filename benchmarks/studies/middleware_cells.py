@@ -36,11 +36,12 @@ class MiddlewareCell:
         robots: Number of robots, including the subscriber.
         loss: Share of the samples of all valid repeats that did not arrive, or were not sent because the previous one
             blocked the publisher; None if the subscriber was not discovered.
-        delay_p95_s: Median over repeats of the 95th percentile of the delay; None if the clocks are not comparable.
+        delay_p95_s: Median over repeats of the 95th percentile of the delay (of one publisher, if there are several);
+            None if no repeat has one, for example because the clocks are not comparable.
         loss_low: Lower end of the 95 % interval of the loss over repeats; None if there are fewer than two repeats.
-        loss_high: Upper end of this interval.
-        samples: Number of samples.
-        repeats: Number of repeats.
+        loss_high: Upper end of this interval, or None.
+        samples: Number of samples that arrived or did not arrive.
+        repeats: Number of valid repeats with samples.
     """
 
     middleware: str
@@ -63,7 +64,7 @@ class MiddlewareFindings:
     Attributes:
         cells: Cells of valid repeats.
         status_text: Number of repeats of each status, as text.
-        ended_s: End of the last repeat, in seconds since 1970 UTC.
+        ended_s: Time at which the last table was written, in seconds since 1970 UTC; 0 without tables.
         late_s: Largest lateness of a packet in valid repeats.
     """
 

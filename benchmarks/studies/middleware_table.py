@@ -49,9 +49,9 @@ def interval(loss: float, size_bytes: int, samples: int) -> tuple[float, float]:
 
 
 def is_bimodal(cell: MiddlewareCell) -> bool:
-    """Return True if each repeat of the cell loses either few samples or nearly all of them.
+    """Return True for large reliable samples over Zenoh with default settings.
 
-    This was observed for large reliable samples over Zenoh.
+    In the campaigns each of their repeats lost either few samples or nearly all of them.
     """
     return (cell.middleware, cell.kind) == ("Zenoh", "reliable") and cell.size_bytes >= IMAGE_BYTES
 
@@ -80,7 +80,7 @@ def text(cells: Sequence[MiddlewareCell], middlewares: Sequence[str]) -> str:
 
 
 def cells(path: Path) -> list[MiddlewareCell]:
-    """Return the cells of a table that has a loss, with their intervals."""
+    """Return the cells of a table that have a loss, with their intervals."""
     with path.open(encoding="utf-8", newline="") as file:
         return [_cell(row) for row in csv.DictReader(file) if row["lost_percent"]]
 

@@ -50,7 +50,7 @@ class ImageSetting:
     """A pair of programs and its settings.
 
     Attributes:
-        label: Row of the table.
+        label: Label of its row in the table.
         profile: Quality of service of the agent; empty for the plain pair.
         settings: Settings of Zenoh by their path, as in the step `topics`.
     """
@@ -94,7 +94,9 @@ class ImageLab:
         """Return the numbers of the images that did not arrive in one repeat.
 
         Raises:
-            RuntimeError: A program failed, or the publisher discovered no subscription.
+            subprocess.CalledProcessError: A program on a robot failed.
+            RuntimeError: The subscriber exited early, a log of the agent is incomplete, or no image was sent because
+                the publisher discovered no subscription.
         """
         sent, arrived = self._agent(setting) if setting.profile else self._plain(setting)
         if not sent:

@@ -1,8 +1,9 @@
 """Compare two recorded outputs: they can be equal, differ only in words, or differ in other parts.
 
-Machine-readable output (commands of dry runs, tables, exports, hashes, exit codes) must be equal byte by byte. Other
-text (help, messages, tables on a terminal, reports) may differ in words, which are listed as labels; its numbers and
-options must be equal and in the same order.
+Machine-readable output (commands of dry runs, tables, exports, hashes, exit codes) must be equal, except for parts
+that vary between runs, such as time stamps, and for sentences in printed JSON. Other text (help, messages, tables on
+a terminal, reports) may differ in words, which are listed as labels; its numbers and options must be equal and in the
+same order.
 """
 
 import difflib
@@ -42,8 +43,8 @@ class Differences:
     """Differences between two outputs.
 
     Attributes:
-        labels: Pairs of words, before and after the change, with their counts.
-        real: Differences that are not labels, each with the lines that differ.
+        labels: Pairs of passages, before and after the change, with their counts.
+        real: Descriptions of differences that are not labels, with the lines or files that differ.
     """
 
     labels: Counter[tuple[str, str]] = field(default_factory=Counter)
@@ -124,7 +125,10 @@ def _compare_texts(name: str, before: str, after: str, *, exact: bool) -> Differ
 
 
 def _json_lines(before: str, after: str) -> list[tuple[Any, Any]] | None:
-    """Return pairs of the JSON values of two texts, per line or of the whole text, or None if one is not JSON."""
+    """Return pairs of the JSON values of two texts, per line or of the whole text.
+
+    The result is None if a text is not JSON, or if the numbers of values differ.
+    """
     values = [_json_values(text) for text in (before, after)]
     if values[0] is None or values[1] is None or len(values[0]) != len(values[1]):
         return None
@@ -182,7 +186,7 @@ def _exit_codes(result: Path) -> Iterator[str]:
 
 
 def _event_shapes(result: Path) -> Iterator[str]:
-    """Yield each event with its fields: the types of sentences and numbers, and the other values."""
+    """Yield each event with its fields: the types of sentences and numbers, and the other values without digits."""
     for line in (result / "stdout").read_text(encoding="utf-8").splitlines():
         event = json.loads(line)
         shown = {
@@ -198,7 +202,7 @@ def _event_shapes(result: Path) -> Iterator[str]:
 
 
 def _file_shapes(result: Path) -> Iterator[str]:
-    """Yield each file of the trial, numbers masked, with the header of its tables."""
+    """Yield each file of the trial, numbers masked, with the header if it is `trial.csv` or `summary.csv`."""
     folder = result / "trials"
     for path in folder.rglob("*"):
         if path.is_file():

@@ -50,7 +50,7 @@ class Item:
         kind: Its kind.
         arguments: The words after `fieldkit` on the command line.
         working_folder: Relative to the laboratory folder.
-        outputs: Files and folders that it creates there; they are moved to the results and compared.
+        outputs: Files and folders that it creates or changes there; they are moved or copied to the results.
         simulation: The simulation; then there are no arguments.
         succeeds: True if it must succeed with the base, because the outputs of a failed command prove nothing.
         counts_lines: True to count the lines of imported modules after the item, which must then run first.

@@ -42,7 +42,7 @@ AVOIDED_WORDS: Final = {
 
 
 def table(base: Tree, head: Tree) -> str:
-    """Return the numbers of two trees, a line each."""
+    """Return a line per number, with its values of both trees, then the files and classes counted in `head`."""
     olds, news = ({**imported(tree), **dict(numbers(tree.code))} for tree in (base, head))
     lines = [f"{'structure':40} {'base':>9} {'head':>9}  target"]
     for name, new in news.items():
@@ -70,7 +70,7 @@ def imported(tree: Tree) -> dict[str, str]:
 
 
 def numbers(tree: Path) -> Iterator[tuple[str, str]]:
-    """Yield the name of each number, and the number with its target after a semicolon."""
+    """Yield the name of each number, and the number, followed by a semicolon and its target if it has one."""
     paths = modules(tree)
     texts = [path.read_text(encoding="utf-8") for path in paths]
     count = sum(text.count("\n") for text in texts)

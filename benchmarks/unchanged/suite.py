@@ -2,8 +2,8 @@
 
 Functions are compared by their shape: the syntax tree without names, docstrings, annotations and imports. Only the
 digits of a string are compared. A function is matched with one of the same shape anywhere in the other tests, so it
-may move; the remaining functions are matched by name. Inside an assertion equal names must remain equal, so that
-`assert a == b` differs from `assert a == a`. Outside assertions, a replaced name is not detected.
+may move; the remaining functions are matched by name. Inside an `assert` statement equal names must remain equal, so
+that `assert a == b` differs from `assert a == a`. Elsewhere, as in `pytest.raises`, a replaced name is not detected.
 """
 
 import ast
@@ -52,11 +52,11 @@ class Changes:
     """Differences between the tests of two commits, except for names.
 
     Attributes:
-        same: Tests that are the same.
-        added: Tests that the second commit adds.
+        same: Number of tests that are the same.
+        added: Number of tests that the second commit adds.
         removed: Tests, and helpers with assertions, that the second commit does not have.
-        assertions: Assertions that are missing in a function of the second commit.
-        bodies: Functions with the same assertions, but other statements or numbers around them.
+        assertions: Assertions that are missing in a function of the second commit, and the new ones of this function.
+        bodies: Functions without a missing assertion, but with other statements, numbers or additional assertions.
     """
 
     same: int = 0

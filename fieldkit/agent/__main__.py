@@ -1,7 +1,8 @@
 """The program on a robot: `agent.pyz VERB JSON [LOG]`.
 
 The verb selects the task (`_USAGE` lists the verbs), the JSON object contains its parameters, and some verbs write a
-log file. The program writes `up` to standard error when it is ready, and stops cleanly on SIGINT and SIGTERM.
+log file. The programs that publish, subscribe, receive, record, drive or route write `up` to standard error when they
+are ready. SIGINT and SIGTERM set an event, and each task then ends in an orderly way.
 """
 
 from __future__ import annotations
@@ -117,7 +118,7 @@ def _fly(arguments: Arguments, stop_event: threading.Event) -> int:
 
 
 def _check_arming(arguments: Arguments, stop_event: threading.Event) -> int:
-    """Print the faults that prevent a flight; return the exit code."""
+    """Print the faults that an arming check finds; return the exit code."""
     from fieldkit.agent.flying import arming, flight_plan  # noqa: PLC0415 (each subcommand loads only its modules)
 
     with _add_connection_to_errors(arguments["connection"]):

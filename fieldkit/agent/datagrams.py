@@ -1,7 +1,7 @@
-"""Test datagrams between robots: multicast, unicast, and unicast in fragments. Each robot counts received datagrams.
+"""Test datagrams between robots: multicast, unicast, and unicast in fragments. Receivers count them.
 
-They are sent to the multicast group and the ports of a DDS domain (RTPS 2.5, section 9.6.2). Participants of the
-domain ignore them, because they do not start with `RTPS`.
+The test datagrams are sent to the multicast group and the ports of a DDS domain (RTPS 2.5, section 9.6.2).
+Participants of the domain ignore them, because the datagrams do not start with `RTPS`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class DatagramPorts:
         group: Multicast group.
         multicast_port: UDP port of multicast datagrams.
         unicast_port: UDP port of unicast datagrams.
-        token: Text that identifies the datagrams of this test, at most 32 ASCII characters.
+        token: Text that identifies the datagrams of this test, at most 32 ASCII characters without spaces.
     """
 
     address: str
@@ -80,7 +80,8 @@ def receive(ports: DatagramPorts, stop_event: threading.Event, limit_s: float) -
         Number of distinct datagrams by address of the sender, then by kind.
 
     Raises:
-        OSError: Another program uses a port and does not share it, or this robot does not have the address.
+        OSError: Another program uses the unicast port, or uses the multicast port and does not share it, or this
+            robot does not have the address.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as multicast, socket.socket(
         socket.AF_INET, socket.SOCK_DGRAM
@@ -124,7 +125,11 @@ def _count(
 
 
 def run(arguments: Mapping[str, Any], stop_event: threading.Event) -> int:
-    """Send test datagrams if there are peers, otherwise receive them and print their counts; return the exit code."""
+    """Send test datagrams if there are peers, otherwise receive them and print their counts.
+
+    Returns:
+        The exit code: 0, or 3 after an error of the network.
+    """
     ports = DatagramPorts(**arguments["ports"])
     try:
         if arguments["peers"]:

@@ -26,7 +26,9 @@ class NumberedLines:
         return self._append(self._numbered_line(values))
 
     def end(self, values: Mapping[str, Any]) -> str:
-        """Write the last line and return it; its last member `crc32` is the CRC-32 of everything before that member.
+        """Write the last line and return it.
+
+        Its last member `crc32` is the CRC-32 of all earlier lines, and of the last line without that member.
 
         Raises:
             OSError: The line cannot be written.

@@ -33,8 +33,9 @@ class RepeatValues:
 
     Attributes:
         low: Value of each repeat; the lower bound of the value if it is censored.
-        high: Upper bound of the value of each repeat; infinity if the value is censored, or if the statistic over all
-            sent items (see `columns.Figure.of_sent`) is infinite.
+        high: Upper bound of the value of each repeat; infinity if the value is censored. For a quantity with
+            `columns.Figure.of_sent`, it is the statistic over all sent items; infinity if that is infinite or
+            unknown.
         lost: Number of lost items; for a flag, 1 if it is true, else 0. None unless the quantity is counted or a
             flag.
         sent: Number of sent items; for a flag, 1. None unless the quantity is counted or a flag.
@@ -53,19 +54,21 @@ class Estimate:
     Attributes:
         quantity: The quantity.
         n: Number of valid repeats that have a value.
-        value: The point estimate: share of all counted items, mean or median, depending on the quantity's kind.
-        low: Lower end of the 95 % interval, with repeats as sampling units; None for a single repeat.
-        high: Upper end of the interval; None for a single repeat, and if it is open because of censored repeats.
+        value: The point estimate, which depends on the quantity's kind: share of all counted items, share of the
+            repeats in which a flag is true, mean or median.
+        low: Lower end of the 95 % interval, with repeats as sampling units. None without an interval: for a single
+            repeat, unless the quantity is a flag, and for a share of counted items that is outside of 0 to 1.
+        high: Upper end of the interval; None without an interval, and if it is open because of censored repeats.
         assured: Coverage of the interval for any distribution of the repeats; None unless the estimate is a median of
             at least two repeats.
         p_order: p-value of the hypothesis that the repeats are independent in time (`independence.p_values`),
             corrected for the number of all estimates; None if it was not tested.
-        wilson_low: Lower end of the 95 % Wilson interval, which assumes that all counted items are independent; None
-            unless counted.
-        wilson_high: Upper end of the Wilson interval.
+        wilson_low: Lower end of the 95 % Wilson interval, which assumes that all counted items, or repeats of a flag,
+            are independent; None unless the quantity is counted or a flag, and if the share is outside of 0 to 1.
+        wilson_high: Upper end of the Wilson interval; None as `wilson_low`.
         events: Number of lost items, or of repeats in which a flag is true; None unless the quantity is counted or a
             flag.
-        trials: Number of sent items, or of repeats.
+        trials: Number of sent items, or of repeats of a flag; None for other quantities.
         mean: Mean over repeats.
         median: Median over repeats.
         p95: 95th percentile over repeats.
@@ -258,7 +261,7 @@ def _estimates(repeats: Repeats, quantity: Quantity, rows: Indices, cells: Indic
         cells: Cell of each row of `repeats`.
     """
     rows = rows[np.isfinite(repeats.observed(quantity)[0][rows])]
-    for name in quantity.columns[1:]:  # omit repeats with a share but no counts, which cannot be summed over repeats
+    for name in quantity.columns[1:]:  # omit repeats without both counts: a share alone cannot be added to others
         rows = rows[np.isfinite(repeats.numbers[name][rows])]
     cell_of_row = cells[rows]
     starts = np.flatnonzero(np.diff(cell_of_row, prepend=-1))
@@ -322,7 +325,10 @@ def _same_size_estimates(repeats: Repeats, quantity: Quantity, cell_rows: Indice
 def _upper_of_sent(
     repeats: Repeats, quantity: Quantity, cell_rows: Indices, upper: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return upper bounds of the values, with infinite values for lost items; infinity if unknown."""
+    """Return upper bounds of the values if each lost item counts as infinite; infinity if this statistic is unknown.
+
+    For a quantity without `of_sent`, return `upper`.
+    """
     if quantity.of_sent is None:
         return upper
     column = repeats.numbers.get(quantity.of_sent)  # tables of earlier versions do not have the column

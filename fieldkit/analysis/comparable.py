@@ -24,7 +24,7 @@ SAME: Final = (
     "paper_window_bytes",
     "tcp_congestion_control",
 )
-"""Columns that must have the same values in both runs."""
+"""Columns that must have the same values in both runs, except as `concerns` and `_KERNEL_COLUMNS` describe."""
 
 VARIED: Final = frozenset({"distance_m"})
 """Columns of `SAME` that may be the variable of a comparison. Protocol and topology are excluded, because they change
@@ -86,8 +86,8 @@ class Concern:
 
     Attributes:
         what: The column, or a description of a value that is computed from columns.
-        a: Value of A as text; `unknown` if its rows do not contain it.
-        b: Value of B as text; `unknown` if its rows do not contain it.
+        a: Value or values of A as text; `unknown` if its rows do not contain one.
+        b: Value or values of B as text; `unknown` if its rows do not contain one.
         cells: Names of the affected conditions; empty if all conditions are affected.
         refuses: True if the difference makes the runs incomparable; otherwise it is only a note.
     """
@@ -111,8 +111,8 @@ def concerns(
 ) -> tuple[Concern, ...]:
     """Return the concerns about comparing two runs, refusals first.
 
-    A column in `varied`, or in `VARIED` but not in `by`, causes no refusal if it has a single value in each run,
-    because it is then the variable of the comparison.
+    A column in `varied`, or in `VARIED` but not in `by`, causes no refusal if it has a single value in A and a single
+    value in B under the condition, because it is then the variable of the comparison.
 
     Args:
         pairs: Name of each condition, and its valid repeats in A and in B; at least one in each run.
@@ -174,7 +174,7 @@ def _pair_concerns(a: Repeats, b: Repeats, varied: Collection[str]) -> Iterator[
 
 
 def _compare_column(name: str, a: Repeats, b: Repeats, *, refuses: bool) -> Iterator[Concern]:
-    """Yield a concern if the values of a column in A and B differ."""
+    """Yield a concern if the values of a column in A and B differ, or if robots or procedure are unknown."""
     text_a, text_b = _values(name, a), _values(name, b)
     is_unknown = UNKNOWN in {text_a, text_b}
     # If a column is missing in both runs, this is a concern only for columns that identify robots or procedure.
@@ -232,7 +232,7 @@ def _offload_state(a: Repeats, b: Repeats) -> Iterator[Concern]:
 
 
 def _offload_text(rows: Repeats) -> str:
-    """Return `on` if a capture contains frames that only offload creates, otherwise `off`."""
+    """Return `on` if a capture contains frames that only offload creates, otherwise `off`; `unknown` without data."""
     frames = rows.numbers["tcp_superframes"]
     finite = frames[np.isfinite(frames)]
     if not len(finite):

@@ -1,6 +1,6 @@
 """Comparison of two runs A and B: differences per condition and quantity.
 
-A cell contains the repeats under one condition, and their estimates.
+A cell has the estimates and counts of the repeats under one condition.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence

@@ -19,7 +19,7 @@ NOT_JUDGED: Final = "words are counted, not judged"
 
 
 def difference_rows(comparison: Comparison) -> Iterator[tuple[Pair, DifferenceRow]]:
-    """Yield conditions and their rows. A condition has a row per quantity, or one row if it has no quantity."""
+    """Yield conditions and their rows. A condition has a row per quantity and per word, or one row without both."""
     for pair in comparison.pairs:
         missing_in = pair.missing_in or None
         rows = [_difference_row(difference, missing_in, comparison.n_compared) for difference in pair.differences]

@@ -10,10 +10,13 @@ from fieldkit.core.units import format_count
 
 
 def deduplicated(repeats: Repeats) -> tuple[Repeats, tuple[str, ...]]:
-    """Return the first row of each attempt, and a note on each source from which rows were removed.
+    """Return the first row of each attempt, and notes on the removed rows.
+
+    Rows without the name of a trial are all kept. There is a note for each pair of a source whose rows were removed,
+    and the source with the first rows of these attempts.
 
     Raises:
-        ConfigurationError: Two sources have different values for an attempt.
+        ConfigurationError: Two rows have different values for an attempt.
     """
     attempts = repeats.codes(("trial", "protocol", "repeat", "attempt"))
     # Attempts without the name of a trial cannot be identified, so all of them are kept.

@@ -79,7 +79,7 @@ def parse(text: str, quantities: Iterable[Quantity]) -> Expectation:
         quantities: The possible figures.
 
     Raises:
-        ConfigurationError: The text is not an expectation, or its figure is unknown.
+        ConfigurationError: The text is not an expectation, its figure is unknown, or no result could show it.
     """
     quantities_by_name = {quantity.name: quantity for quantity in quantities}
     match = _TEXT.fullmatch(text.strip())
@@ -112,7 +112,11 @@ def parse(text: str, quantities: Iterable[Quantity]) -> Expectation:
 
 
 def _scope(match: re.Match[str], quantity: Quantity, *, is_below: bool) -> tuple[Scope, float | None]:
-    """Return the scope of an expectation and its share of repeats."""
+    """Return the scope of an expectation, and its share of repeats if the scope is `share`.
+
+    Raises:
+        ConfigurationError: The scope does not fit the bound, or the share is not possible.
+    """
     if match["packets"]:
         if match["repeats"] or match["share"] or not is_below or quantity.kind is not Kind.COUNTED:
             raise ConfigurationError(

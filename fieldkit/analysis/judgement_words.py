@@ -19,7 +19,7 @@ def judgement_texts(judgement: Judgement) -> tuple[str, str, str, str, str]:
 
 
 def _measured(judgement: Judgement, estimate: Estimate) -> tuple[str, str]:
-    """Return the measured value of a judgement, and the interval or bound that determines the ruling."""
+    """Return the measured value of a judgement, and its interval or one-sided bound; empty if the scope has none."""
     expectation = judgement.expectation
     value_scale = wording.scale_of(estimate.quantity, [estimate.value])
     if expectation.scope is Scope.EVERY:

@@ -1,6 +1,6 @@
 """Judgements of expectations by measured figures. If repeats are missing or censored, the ruling is never `holds`.
 
-A cell contains the repeats under one condition, and their estimates.
+A cell has the estimates and counts of the repeats under one condition.
 """
 
 import math
@@ -36,11 +36,11 @@ class Judgement:
         cell: The repeats; None if there are none.
         ruling: The outcome.
         estimate: The estimate; None if no valid repeat has a value.
-        why: Reason for the ruling that the numbers do not show: repeats without a value, or the number of repeats
-            that are needed.
+        why: Reason for the ruling that the numbers do not show, for example repeats without a value, or the number of
+            repeats that are needed; empty if there is none.
         met: Number of repeats that meet the expectation; None if it does not refer to single repeats.
-        limit: One-sided 95 % bound that determines the ruling, of the share of repeats that meet the expectation or
-            of the loss; None if the ruling depends on no such bound.
+        limit: One-sided 95 % bound that the ruling `holds` requires: the lower bound of the share of repeats that
+            meet the expectation, or the upper bound of the loss; None if `holds` depends on no such bound.
     """
 
     expectation: Expectation
@@ -68,7 +68,7 @@ class _Decision:
 
 
 def judge(expectations: Sequence[Expectation], cells: Sequence[Cell]) -> tuple[Judgement, ...]:
-    """Return the judgements of expectations, in their order. If there are no cells, all of them are undecided."""
+    """Return the judgements of expectations, in their order. An expectation that no cell fits is undecided."""
     return tuple(judgement for expectation in expectations for judgement in _judge_cells(expectation, cells))
 
 
@@ -112,10 +112,10 @@ def _judge_cells(expectation: Expectation, cells: Sequence[Cell]) -> Iterator[Ju
 def _limitations(expectation: Expectation, estimate: Estimate, n_valid: int) -> Iterator[str]:
     """Yield the reasons why the ruling cannot be `holds`, even if the repeats with a value meet the expectation."""
     if missing := max(n_valid - estimate.n, estimate.missing):
-        yield f"{missing} of {estimate.n + missing} repeats have no value"
+        yield f"no value in {missing} of {estimate.n + missing} repeats"
     if estimate.n_censored:
         share = f"{estimate.n_censored} of {estimate.n}"
-        yield f"in {share} repeats the timed event had not ended, so their values are only lower bounds"
+        yield f"in {share} repeats the timed event had not ended, so only a lower bound is known"
     if expectation.is_below and estimate.quantity.of_sent and estimate.sample is not None:
         infinite = int(np.isinf(estimate.sample.high).sum()) - estimate.n_censored
         if infinite:

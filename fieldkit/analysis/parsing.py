@@ -39,6 +39,8 @@ def csv_columns(
 ) -> tuple[Mapping[str, pa.ChunkedArray], int]:
     """Return the declared columns of a table, with the types of `arrow_type`, and the number of rows.
 
+    If the table has none of the declared columns, there are no columns and 0 rows.
+
     Takes the same arguments and raises the same errors as `columns`.
     """
     present = [name for name in declared if name in names]

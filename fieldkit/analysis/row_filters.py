@@ -1,8 +1,8 @@
 """Conditions on rows of a table, written as expressions of Python: `distance_m < 20 and topology == "master"`.
 
-Comparisons of columns and constants are allowed, and their combinations with `and`, `or` and `not`; no code is
-executed. A comparison with a missing value is neither true nor false (three-valued logic, Kleene 1938). A row is
-therefore selected only if its values are sufficient to decide the condition.
+Columns of the type bool, comparisons of columns and constants, and their combinations with `and`, `or` and `not` are
+allowed; no code is executed. A comparison with a missing value is neither true nor false (three-valued logic, Kleene
+1938). A row is therefore selected only if its values are sufficient to decide the condition.
 """
 
 import ast

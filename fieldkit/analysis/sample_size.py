@@ -2,7 +2,7 @@
 
 Expectations are checked before the trial runs. Additional repeats narrow the interval of a cell to a requested width.
 
-A cell contains the repeats under one condition, and their estimates.
+A cell has the estimates and counts of the repeats under one condition.
 """
 
 import math

@@ -43,7 +43,8 @@ def read(
     parser takes longer than parsing the 40 rows of a trial.
 
     Args:
-        paths: CSV files with the columns of trial.csv. Their schema version is at most `SCHEMA_VERSION`.
+        paths: CSV files with the columns of trial.csv, whose schema version is at most `SCHEMA_VERSION`; or folders
+            of datasets.
         declared: The columns of trial.csv.
         columns: Names of the columns to read; None for all columns. The columns of `IDENTITY` are always read.
         content: Function that reads the bytes of a table.
@@ -314,7 +315,7 @@ def _is_valid(rows: Repeats, declared: Mapping[str, Column]) -> bool:
 
 
 def _source(path: Path) -> str:
-    """Return the trial's folder for a `trial.csv`, otherwise the path itself."""
+    """Return the folder of a `trial.csv` or of a dataset; for other tables, the path itself."""
     return str(path.parent if path.name == "trial.csv" or path.is_dir() else path)
 
 

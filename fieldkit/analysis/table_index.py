@@ -68,10 +68,15 @@ TableStamp = tuple[FileStamp, FileStamp | None]
 
 
 def stamp(table: Path, plan: Path) -> TableStamp | None:
-    """Return the stamps of a table and its plan; None, so that it is not indexed, if one is not a regular file."""
+    """Return the stamps of a table and its plan; None, so that the table is not indexed, if that is not possible.
+
+    The table must be a readable regular file, and the plan must be one, too, or missing.
+    """
     try:
         table_status = table.stat()
     except OSError:
+        return None
+    if not stat.S_ISREG(table_status.st_mode):
         return None
     try:
         plan_status = plan.lstat()
@@ -79,9 +84,7 @@ def stamp(table: Path, plan: Path) -> TableStamp | None:
         return FileStamp.of(table_status), None
     except OSError:
         return None
-    if not (stat.S_ISREG(table_status.st_mode) and stat.S_ISREG(plan_status.st_mode)):
-        return None
-    return FileStamp.of(table_status), FileStamp.of(plan_status)
+    return (FileStamp.of(table_status), FileStamp.of(plan_status)) if stat.S_ISREG(plan_status.st_mode) else None
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
-"""Lines of tables: their quantities and labels, and the texts of the figures of cells.
+"""Lines of tables: the rows or columns that each show one quantity of several cells, as texts.
 
-A cell contains the repeats under one condition, and their estimates.
+A cell has the estimates and counts of the repeats under one condition.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -37,7 +37,7 @@ _OPERATOR: Final = (
 """Quantities for an operator during a trial, in this order."""
 
 _FAULT_ENDINGS: Final = ("_recovered", "_recovery_s")
-"""Ends of the names of columns about faults that are also shown to an operator."""
+"""Endings of the names of columns about the recovery from a fault, which are also shown to an operator."""
 
 _SENT: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {
@@ -47,8 +47,8 @@ _SENT: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
         "iperf3 datagrams sent": ("iperf3_loss",),
     }
 )
-"""Labels of numbers of sent items, each with the losses of these items. The number is `trials` of the first of these
-losses that a cell has."""
+"""Labels of numbers of sent items, each with the losses of these items. The number is `Estimate.trials` of the first
+of these losses for which a cell has it."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def partial_count(n: int, cell: Cell) -> str:
 def lines(cells: Sequence[Cell], quantities: Iterable[Quantity] | None = None) -> list[TableLine]:
     """Return a line for each quantity that was measured in a cell, even if it has no value, in order.
 
-    An RTT has a line for each payload size.
+    A round-trip time has one line for the cells with equal payload sizes, because other sizes are not comparable.
 
     Args:
         cells: The cells of the table.
@@ -134,23 +134,23 @@ def lines(cells: Sequence[Cell], quantities: Iterable[Quantity] | None = None) -
 
 
 def _quantity_lines(quantity: Quantity, cells: Sequence[Cell]) -> Iterator[TableLine]:
-    """Yield the line of a quantity; for a round-trip time, a line for each payload size."""
+    """Yield the line of a quantity; for a round-trip time, one line for the cells with equal payload sizes."""
     label = wording.label(quantity)
     cells_with_quantity = [
         cell for cell in cells if quantity.name in cell.estimates or quantity in cell.quantities_without_value
     ]
-    sizes = sorted({cell.payload_bytes.get(quantity.name, ()) for cell in cells_with_quantity})
-    if not any(sizes):
+    sizes_of_cells = sorted({cell.payload_bytes.get(quantity.name, ()) for cell in cells_with_quantity})
+    if not any(sizes_of_cells):
         yield TableLine(label, (quantity,))
         return
-    for size in sizes:
-        yield TableLine(_payload_label(quantity, size), (quantity,), size)
+    for sizes in sizes_of_cells:
+        yield TableLine(_payload_label(quantity, sizes), (quantity,), sizes)
 
 
 def _payload_label(quantity: Quantity, sizes: Sequence[int]) -> str:
     """Return the label of round-trip times for these payload sizes, such as `RTT, 8192-byte ping, median`."""
-    size = f"{sizes[0]}" if len(sizes) == 1 else f"{sizes[0]}- to {sizes[-1]}" if sizes else "unknown"
-    return wording.label(replace(quantity, label=f"{quantity.label}, {size}-byte ping"))
+    size_text = f"{sizes[0]}" if len(sizes) == 1 else f"{sizes[0]}- to {sizes[-1]}" if sizes else "unknown"
+    return wording.label(replace(quantity, label=f"{quantity.label}, {size_text}-byte ping"))
 
 
 def operator_lines(cells: Sequence[Cell], expected: Collection[str] = ()) -> list[TableLine]:
@@ -205,14 +205,14 @@ def sent_counts(cells: Sequence[Cell]) -> dict[str, list[str]]:
     counts_by_label: dict[str, list[str]] = {}
     for step in steps:
         for label, names in _SENT.items():
-            counts = [_trial_count(cell, [step_prefixed(step, name) for name in names]) for cell in cells]
+            counts = [_sent_count(cell, [step_prefixed(step, name) for name in names]) for cell in cells]
             if any(counts):
                 counts_by_label[_with_step(step, label)] = counts
     return counts_by_label
 
 
-def _trial_count(cell: Cell, names: Sequence[str]) -> str:
-    """Return `trials` of the first of these counted quantities in a cell; empty without one."""
+def _sent_count(cell: Cell, names: Sequence[str]) -> str:
+    """Return the number of sent items of the first of these losses that a cell has, as text; empty without one."""
     trials = (cell.estimates[name].trials for name in names if name in cell.estimates)
     return next((f"{count}" for count in trials if count is not None), "")
 

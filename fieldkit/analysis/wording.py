@@ -1,6 +1,6 @@
 """Texts about estimates: numbers with units, intervals, verdicts, cautions.
 
-A cell contains the repeats under one condition, and their estimates.
+A cell has the estimates and counts of the repeats under one condition.
 """
 
 import math
@@ -26,7 +26,8 @@ _MAX_LISTED: Final = 3
 """Maximum number of estimates that a caution names."""
 _MAX_WORDS: Final = 5
 _MAX_WORD_LENGTH: Final = 30
-"""Maximum number of words that are listed with their counts, and maximum number of characters of each."""
+"""Number of words that are listed with their counts if there are more than one further word, and maximum number of
+characters of each."""
 _PLAIN_WORD: Final = re.compile(r"[A-Za-z](?:[\w -]*[A-Za-z])?")
 
 
@@ -125,7 +126,7 @@ def assumes_normal(estimate: Estimate) -> bool:
 
 
 def is_dependent(estimate: Estimate) -> bool:
-    """Return True if the repeats are not independent in time (p-value below 5 %)."""
+    """Return True if a test shows that the repeats are not independent in time (p-value below 5 %)."""
     return estimate.p_order is not None and estimate.p_order < 1 - CONFIDENCE
 
 
@@ -232,7 +233,10 @@ def word_labels(cells: Sequence[Cell]) -> dict[str, str]:
 
 
 def tally(cell: Cell, name: str, between: str = ", ") -> str:
-    """Return the number of valid repeats for each word of a column, such as `wet 12, dry 7, 1 without`."""
+    """Return the number of valid repeats for each word of a column, such as `wet 12, dry 7, 1 without`.
+
+    Empty if no valid repeat has a word.
+    """
     words = cell.tallies.get(name)
     if words is None:
         return ""
@@ -257,5 +261,5 @@ def _word_counts(words: Tally) -> Iterator[str]:
 
 
 def status_counts(numbers: Mapping[str, int]) -> str:
-    """Return the numbers of attempts by final status, such as `20 valid, 1 void`."""
+    """Return the numbers of attempts by final status, such as `20 valid, 1 void`; `none` without attempts."""
     return ", ".join(f"{numbers[status]} {status}" for status in FINAL_STATUSES if numbers.get(status)) or "none"

@@ -36,8 +36,8 @@ class CellFigure:
         unit: Its unit.
         n: Number of valid repeats that have it.
         value: The figure.
-        low: Lower end of the interval; minus infinity for a single repeat, which has no interval.
-        high: Upper end; infinity for a single repeat.
+        low: Lower end of the interval; minus infinity without an interval, for example for a single repeat.
+        high: Upper end; infinity without an interval, or if censored repeats leave it open.
     """
 
     name: str
@@ -254,7 +254,7 @@ def load(*paths: str | PathLike[str], rebuild: bool = False, where: str = "", us
     Raises:
         ConfigurationError: A path does not exist or has no trial, or a file is not a table of repeats. It is a
             `fieldkit.core.errors.FieldkitError`, with a message, a location and a remedy.
-        EvidenceError: A table is damaged, or no repeat has ended.
+        EvidenceError: A table is damaged, no repeat has ended, or `where` selects no attempt.
     """
     if not paths:
         raise ConfigurationError("no path is given", remedy='write for example fieldkit.load("trials")')

@@ -117,8 +117,8 @@ class Oracle(Protocol):
         `since_utc_ns` must not decrease from call to call, because older positions may be deleted.
 
         Returns:
-            Positions in the order of time. The first position of each robot is its position at `since_utc_ns`; the
-            time of this entry is the robot's arrival there.
+            Positions in the order of time. The first entry of each robot is the last one until `since_utc_ns`, so it
+            may be older; the robot had this position, or moved from it with this velocity.
         """
         ...
 

@@ -40,7 +40,7 @@ class CampaignEntry:
         progress: Progress of the trial.
         trial: Name of its folder, if it has one.
         note: Note of the operator.
-        took_s: Duration of placing the robots, in seconds.
+        took_s: Duration of placing the robots, in seconds; 0 in entries of other progress.
         valid: Number of valid repeats.
         failed: Number of failed repeats.
         unmet: Number of expectations that are not met or undecided.
@@ -77,7 +77,7 @@ class CampaignJournal:
 
     @contextmanager
     def locked(self, plan: CampaignPlan) -> Iterator[None]:
-        """Lock the campaign against other processes while the body runs, and store its plan on disk.
+        """Lock the campaign against other processes while the body runs, and store its plan on disk if it is missing.
 
         Raises:
             ConfigurationError: Another process runs the campaign, or the folder cannot be written.

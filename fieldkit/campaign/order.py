@@ -78,8 +78,8 @@ def shuffle(trials: Sequence[PlannedTrial], *, seed: int, limit_m: float) -> Ord
     """Return a random order whose path is at most `limit_m`.
 
     This is a random walk over the orders within the limit: two blocks or trials are swapped at random, and the swap
-    is undone if the path becomes too long. A swap and its inverse are equally likely, so all reachable orders are
-    equally likely.
+    is undone if the path becomes too long. A swap and its inverse are equally likely, so all reachable orders become
+    equally likely after many swaps.
 
     Args:
         trials: The trials in any order.

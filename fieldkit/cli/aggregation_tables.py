@@ -149,7 +149,7 @@ def _note_omitted(cells: Sequence[Cell], shown_lines: Sequence[TableLine]) -> No
     """Print the number of quantities that are not shown."""
     names = {quantity.name for line in shown_lines for quantity in line.quantities}
     if omitted_count := len({quantity.name for quantity in wording.measured(cells)} - names):
-        print_folded(f"{results.more_rows_note(omitted_count)}: add --all")
+        print_folded(f"{results.more_quantities_text(omitted_count)}: add --all")
 
 
 def _print_tables(

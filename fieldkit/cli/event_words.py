@@ -94,7 +94,7 @@ def _fold_after(text: str, start_column: int, width: int) -> str:
 
 
 def _wrap(text: str, width: int, initial_indent: str = "", subsequent_indent: str = "") -> list[str]:
-    """Return the lines of a text. A line never ends between a number and its unit."""
+    """Return the lines of a text. A line never ends between a number and `%`, `s`, `ms` or `us`."""
     # textwrap breaks lines only at ASCII white space.
     joined = _BEFORE_UNIT.sub("\N{NO-BREAK SPACE}", text)
     lines = textwrap.wrap(joined, width, initial_indent=initial_indent, subsequent_indent=subsequent_indent)

@@ -1,4 +1,4 @@
-"""Print the results of trials: a table per condition, next commands, failures. Return the exit code."""
+"""Print the results of trials: a table per condition, failures, and next commands."""
 
 import argparse
 import re
@@ -67,7 +67,10 @@ def show_summary(cells: Sequence[Cell], *, show_all: bool = False, expected: Col
 
 
 def _summary(group: Sequence[Cell], shown_lines: Sequence[TableLine], separator: str = " ") -> _SummaryTable:
-    """Return the head and the rows of a table of one condition, with `separator` between the parts of a cell."""
+    """Return the head and the rows of a table with a column per cell in `group`, whose cells differ in the protocol.
+
+    `separator` is between the value, the interval and the note of a figure.
+    """
     figures = [
         (line.label, *(line.amount(cell, line.scale(group), separator) for cell in group)) for line in shown_lines
     ]
@@ -80,8 +83,8 @@ def _summary(group: Sequence[Cell], shown_lines: Sequence[TableLine], separator:
     return ("[95 % interval]", *(str(cell.key["protocol"]).upper() for cell in group)), rows
 
 
-def more_rows_note(count: int) -> str:
-    """Return the number of omitted quantities in words."""
+def more_quantities_text(count: int) -> str:
+    """Return the number of omitted quantities as text, such as `3 more quantities`."""
     return f"{count} more {'quantity' if count == 1 else 'quantities'}"
 
 
@@ -107,14 +110,15 @@ def report(outcomes: Sequence[Outcome | None], arguments: argparse.Namespace) ->
             reasons = outcome.folder / store.TRIAL_CSV
             failed = format_count(outcome.failed, "repeat")
             command = shell_command("fieldkit", "resume", outcome.folder, "--failed")
-            remedy = f"remove the causes, then repeat them: {command}"
+            remedy = f"remove the causes, then run: {command}"
             show_error(f"{failed} failed; reasons in {reasons}\n  remedy: {remedy}")
     if not is_json:
         _show_next(outcomes_run, omitted_count)
     skipped = len(outcomes) - len(outcomes_run)
     if skipped:
         show_error(
-            f"{skipped} of {len(outcomes)} skipped\n  remedy: to run the skipped trials, run the command again"
+            f"{skipped} of {format_count(len(outcomes), 'trial')} skipped\n"
+            "  remedy: to run the skipped trials, run the command again"
         )
     write_junit(arguments, [outcome.folder for outcome in outcomes_run])
     if any(outcome.failed for outcome in outcomes_run):
@@ -164,7 +168,7 @@ def _next_commands(outcomes_run: Sequence[Outcome], omitted_count: int) -> Itera
     folders = [outcome.folder for outcome in outcomes_run]
     yield shell_command("fieldkit", "report", *folders)
     if omitted_count:
-        yield f"{shell_command('fieldkit', 'aggregate', *folders, '--all')}  # {more_rows_note(omitted_count)}"
+        yield f"{shell_command('fieldkit', 'aggregate', *folders, '--all')}  # {more_quantities_text(omitted_count)}"
     cells = [cell for outcome in outcomes_run for cell in outcome.cells[:1]]
     next_distance = _next_distance([str(cell.key["distance"]) for cell in cells])
     if next_distance and not any(_lost_all(cell) for outcome in outcomes_run for cell in outcome.cells):
@@ -172,12 +176,16 @@ def _next_commands(outcomes_run: Sequence[Outcome], omitted_count: int) -> Itera
 
 
 def _lost_all(cell: Cell) -> bool:
-    """Return True if no ping of a cell was answered. In this case a longer distance is not suggested."""
+    """Return True if at least one step of a cell received no answer to a ping. Then no next distance is suggested."""
     return any(plain_name(name) == "rtt_loss" and estimate.value >= 1 for name, estimate in cell.estimates.items())
 
 
 def _next_distance(distances: Sequence[str]) -> str:
-    """Return the last distance increased by its difference to the previous one; empty if distances are words."""
+    """Return the last distance increased by its difference to the previous one.
+
+    A single distance is doubled, as is the last one if the previous one has another unit. Empty if the last two
+    distances are words or equal.
+    """
     matches = [match for distance in distances[-2:] if (match := _LENGTH.fullmatch(distance))]
     if not matches:
         return ""

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Annotated, ClassVar, Final
 
 from fieldkit.config import catalog, schema
+from fieldkit.config.antennas import AntennaOptions
 from fieldkit.config.schema import AfterValidator, Bytes, Field, Hertz, Int, Number, Strict, pattern_field
 from fieldkit.config.sections import Sectioned
 from fieldkit.config.wifi_phy import WifiPhy, check_standard
@@ -53,7 +54,10 @@ class PublishedTopic(Strict):
 
     @property
     def payload_bytes(self) -> int:
-        """Size of the data array in each message in bytes, or 0 if the profile does not give it."""
+        """Size of the data array in each message of a point cloud, an image or a type with `size`, in bytes.
+
+        It is 0 for other types, for example for a laser scan.
+        """
         if self.type == "sensor_msgs/PointCloud2":
             return 16 * (self.points or 0)
         return round(self.size or 3 * (self.width or 0) * (self.height or 0))
@@ -221,7 +225,8 @@ class Tools(Strict):
             treats `nc` as traditional.
         capture: Its tcpdump.
         ping: Its ping: iputils (old or new) or busybox.
-        python: Its Python, 3.8 or later, for the step `topics`; searched after the setup files of ROS are sourced.
+        python: Its Python, 3.8 or later, for the programs that fieldkit copies to it, for example in the step
+            `topics`; searched after the setup files of ROS are sourced.
         capture_right: `direct`: the user has the right to capture. `sudo`: captures are started by `sudo -n` (never a
             prompt), see [the right to capture](field.md#the-right-to-capture).
     """
@@ -252,6 +257,7 @@ class Radio(Strict):
         sensitivity_dbm: Weakest signal that it can receive, in dBm; used by the emulated radio, and by `check` to
             report a weak signal.
         phy: Physical layer of 802.11n, ac or ax, for the emulated radio.
+        antenna: Pattern and orientation of its antenna, for the emulated radio.
     """
 
     interface: InterfaceName
@@ -260,6 +266,7 @@ class Radio(Strict):
     tx_power_dbm: Number | Int
     sensitivity_dbm: Number | Int
     phy: WifiPhy | None = Field(default=None, exclude_if=schema.is_empty)
+    antenna: AntennaOptions | None = Field(default=None, exclude_if=schema.is_empty)
 
     @schema.model_validator(mode="after")
     def _check_standard(self) -> "Radio":

@@ -83,13 +83,14 @@ class Site(Strict):
     The emulated backend ignores `host`, `port`, `user`, `key`, `host_key` and `address`: its robots have addresses
     from 10.42.0.1 on, in the order of the file, and generated keys. With `control: radio` the operator's laptop is
     also a station, `laptop` at 10.42.0.254: it is 2 m from the relay in `master` and from the receiver in
-    `masterless`, and never behind the wall of `nlos`. It has the same radio as the robots, and every packet of SSH is
-    subject to the radio model. In `master`, packets from sender to receiver cross two links, so `loss` and `delay`
-    apply twice. [Method](method-radio.md#the-emulated-radio) describes the radio model.
+    `masterless`, and never behind the wall of `nlos`. Its radio is 802.11n at 2.4 GHz with 17 dBm and a sensitivity
+    of -82 dBm, and every packet of SSH is subject to the radio model. In `master`, packets from sender to receiver
+    cross two links, so `loss` and `delay` apply twice. [Method](method-radio.md#the-emulated-radio) describes the
+    radio model.
 
     Attributes:
         backend: Backend used if the command line gives none. The default is `emulated` if the file has the section
-            `emulated`, but neither `robots` nor `roles`.
+            `emulated`, but neither `robots` nor `roles`; otherwise `field`.
         control: `separate`: SSH has a separate network. `radio`: SSH uses the radio under test, see [two ways of
             control](field.md#two-ways-of-control).
         ros_master: Role of the robot that runs the ROS master of all robots with ROS 1, in topologies that have this
@@ -161,9 +162,9 @@ class Site(Strict):
 
     @schema.model_validator(mode="after")
     def _ros_master_has_a_robot(self) -> "Site":
-        if self.has_default_robots:  # they have all fixed roles
+        if self.has_default_robots:  # the default robots have all fixed roles
             return self
-        # A role of a procedure exists only in trials of that procedure, so it cannot be the master.
+        # Only a fixed role can be the master: other roles exist only in trials of the procedures that define them.
         assigned = [
             role for role in FIXED_ROLES if any(role in robot_by_role for robot_by_role in self.roles.values())
         ]

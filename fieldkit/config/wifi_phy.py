@@ -27,6 +27,9 @@ _GUARD_INTERVALS_NS: Final[dict[WifiAmendment, tuple[int, ...]]] = {
 }
 _MODELLED_WIDTHS_MHZ: Final = (20, 40, 80)
 
+_AMSDU_BYTES: Final = (3839, 7935, 11454)
+"""Maximum sizes: IEEE 802.11-2020, table 9-34. The last one is the size of the frame with the A-MSDU."""
+
 
 class WifiPhy(Strict):
     """The physical layer of 802.11n, ac or ax, as the emulated radio models it.
@@ -46,8 +49,11 @@ class WifiPhy(Strict):
         rts_threshold_bytes: Size of the largest frame or aggregate that it sends without RTS and CTS; without this
             key it sends no RTS, as with `iw phy PHY set rts off`.
         access_categories: Mapping of the DSCP of a packet to one of the four access categories of EDCA: `linux` (by
-            the upper three bits, as Linux up to 6.10 does) or `rfc8325`. Without this key all packets are best
+            the upper three bits, as Linux up to 6.7 does) or `rfc8325`. Without this key all packets are best
             effort.
+        amsdu_max_bytes: Maximum size of an A-MSDU (several packets in one frame of an aggregate): 3839, 7935 or 11454
+            (not 802.11n, not at 2.4 GHz). A-MSDUs are used between robots that both have this key, up to the smaller
+            of their sizes. Without this key each frame contains one packet.
         power_save: True if it uses power save as a station of an access point (topology `master`), as Linux does by
             default, also on a Raspberry Pi (`iw dev wlan0 get power_save`).
         packet_time: Time that its bus (SDIO) and driver need for each packet that it sends, one after another, before
@@ -64,6 +70,7 @@ class WifiPhy(Strict):
     rts_threshold_bytes: Annotated[Int, Field(ge=0, le=10_000_000)] | None = None
     access_categories: DscpMapping | None = None
     packet_time: Annotated[Duration, Field(ge=0, le=0.1)] = 0.0
+    amsdu_max_bytes: Int | None = None
     power_save: Bool = False
     power_save_timeout: Annotated[Duration, Field(ge=0.001, le=10)] = 0.1
 
@@ -75,6 +82,11 @@ class WifiPhy(Strict):
             )
         if self.streams not in {1, 2}:
             raise schema.validation_error(f"{self.streams} streams are not modelled; write 1 or 2", "streams")
+        if self.amsdu_max_bytes not in {None, *_AMSDU_BYTES}:
+            raise schema.validation_error(
+                f"there is no A-MSDU size of {self.amsdu_max_bytes} bytes; write {_join_words(_AMSDU_BYTES)}",
+                "amsdu_max_bytes",
+            )
         valid = sorted({interval for intervals in _GUARD_INTERVALS_NS.values() for interval in intervals})
         if self.guard_interval_ns not in valid:
             raise schema.validation_error(
@@ -94,6 +106,11 @@ class WifiPhy(Strict):
         widths_mhz = _widths_mhz(amendment, band)
         if self.width_mhz not in widths_mhz:
             return f"{standard} has no width of {self.width_mhz} MHz; write phy.width_mhz: {_join_words(widths_mhz)}"
+        if self.amsdu_max_bytes == _AMSDU_BYTES[-1] and (amendment == "n" or band == "2.4 GHz"):
+            return (
+                f"{standard} has no A-MSDU of {_AMSDU_BYTES[-1]} bytes; write phy.amsdu_max_bytes: "
+                f"{_join_words(_AMSDU_BYTES[:-1])}"
+            )
         intervals_ns = _GUARD_INTERVALS_NS[amendment]
         if self.guard_interval_ns not in intervals_ns:
             return (

@@ -171,7 +171,7 @@ def _message(problem: Mapping[str, Any], descriptions: Mapping[str, str]) -> str
             message = _pattern_message(str(value), context["pattern"], descriptions)
         case "too_short":
             min_length, actual_length = context["min_length"], context["actual_length"]
-            message = f"at least {format_count(min_length, 'item')} are needed here, not {actual_length}"
+            message = f"{actual_length} here, but at least {format_count(min_length, 'item')} must be given"
         case "literal_error" | "enum" if isinstance(value, str) and "'" in context["expected"]:
             message = _choice_message(value, re.findall(r"'([^']*)'", context["expected"]))
         case kind:

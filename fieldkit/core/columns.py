@@ -315,7 +315,7 @@ def cell_text(value: object) -> str:
 
 
 def csv_text(names: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
-    """Return a header line and lines of values as CSV (RFC 4180, lines end in LF)."""
+    """Return a header line and lines of values as CSV (RFC 4180, but lines end in LF)."""
     return "".join(map(csv_line, (names, *rows)))
 
 

@@ -60,7 +60,7 @@ class Deadline:
 
 
 class ExpiredError(TimeoutError):
-    """A fieldkit deadline has passed.
+    """A fieldkit deadline has passed, or a wait was cancelled.
 
     The operating system raises a plain `TimeoutError` if a connection times out.
 

@@ -151,8 +151,8 @@ class CommandPlanned(Event):
         robot: Name of the robot.
         role: Its role.
         folder: Working directory, relative to the robot's home directory.
-        number: Index in the order of starting, from 0.
-        name: Name of the job, for example `record`.
+        number: 0 for a command that prepares the repeat; then the order of starting, from 1.
+        name: Name of the job, for example `record`, or `begin`, `put` or `pack`.
         command: The command line for a shell.
     """
 

@@ -61,7 +61,7 @@ def append(path: Path, *records: Mapping[str, Any]) -> None:
     """Append one line per record and wait until the lines are on disk.
 
     Raises:
-        OSError: The disk is full or unavailable; the file is unchanged.
+        OSError: The disk is full or unavailable; the file is unchanged, unless only the sync failed.
     """
     lines = "".join(json.dumps(record) + "\n" for record in records).encode()
     descriptor = files.open_plain(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
@@ -99,10 +99,10 @@ def read(path: Path, parse: Parse[Entry], *, remedy: str) -> list[Entry]:
     Args:
         path: The file.
         parse: Converts the JSON value of a line to an entry.
-        remedy: What to do if the file does not exist.
+        remedy: What to do if the file cannot be read.
 
     Raises:
-        EvidenceError: The file does not exist, or a complete line cannot be read.
+        EvidenceError: The file does not exist or cannot be read, or a complete line is not an entry.
     """
     try:
         content = files.read(path, _LIMIT_BYTES)

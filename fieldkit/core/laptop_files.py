@@ -1,7 +1,8 @@
 """Names of files that only the laptop writes, most of them into the folder of an attempt.
 
-The modules that write these files import the names. An archive from a robot that contains one of them is refused,
-because a robot must not provide the data of the operator or of a modelled radio (`backends.protocols.Oracle`).
+The modules that write these files import the names. An archive from a robot that contains a reserved name
+(`is_reserved`) is refused, because a robot must not provide the data of the operator or of a modelled radio
+(`backends.protocols.Oracle`).
 """
 
 import re
@@ -68,5 +69,8 @@ def fault_times_file(kind: str) -> str:
 
 
 def is_reserved(name: str) -> bool:
-    """Return True if any part of a path is a name that only the laptop writes; the case of letters is ignored."""
+    """Return True if any part of a path is the name of a file that only the laptop writes into folders of trials.
+
+    The case of letters is ignored.
+    """
     return any(_RESERVED.match(part.strip()) for part in re.split(r"[/\\]", name))

@@ -287,7 +287,8 @@ class LinkSample:
     """Statistics that a radio reported at one time; None if not reported.
 
     Attributes:
-        utc_ns: Time of the sample, nanoseconds since 1970 UTC by the robot's clock.
+        utc_ns: Time of the sample, nanoseconds since 1970 UTC by the robot's clock; by the laptop's clock for a
+            sample of a modelled radio.
         stations: Statistics of its peer stations.
         cell: BSSID of the access point with which it is associated.
         noise_dbm: Noise level in its channel.

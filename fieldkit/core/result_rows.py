@@ -29,12 +29,18 @@ class EstimateRow:
         "count", "Valid repeats that have a value of the quantity; all numbers are computed from these."
     )
     value: float | None = _column(
-        "unit", "Point estimate: share of all counted items, mean over repeats, or median over repeats."
+        "unit",
+        "Point estimate: share of all counted items, of the repeats in which a flag is true, or of the repeats with "
+        "the word; mean or median over repeats.",
     )
     low: float | None = _column(
-        "unit", "Lower end of the 95 % interval, with repeats as sampling units; empty for a single repeat."
+        "unit",
+        "Lower end of the 95 % interval, with repeats as sampling units; empty for a single repeat, unless the "
+        "quantity is a flag, and for words.",
     )
-    high: float | None = _column("unit", "Upper end of the 95 % interval.")
+    high: float | None = _column(
+        "unit", "Upper end of the 95 % interval; also empty if censored repeats leave it open."
+    )
     assured: float | None = _column(
         "share",
         "Coverage of the interval for any distribution of the repeats. Below 0.95, its 95 % coverage assumes a "
@@ -54,8 +60,8 @@ class EstimateRow:
     wilson_low: float | None = _column(
         "unit",
         "Lower end of the 95 % Wilson interval, which assumes that all counted items are independent. Only for "
-        "counted quantities; empty if more items arrived than were sent. This is possible in the `paper_*` columns "
-        "if a network card splits or merges frames (offload).",
+        "counted quantities and flags (whose items are repeats); empty if more items arrived than were sent. This is "
+        "possible in the `paper_*` columns if a network card splits or merges frames (offload).",
     )
     wilson_high: float | None = _column("unit", "Upper end of the 95 % Wilson interval.")
     events: int | None = _column(
@@ -63,7 +69,9 @@ class EstimateRow:
         "Number of lost items, or of repeats in which the flag is true or the word occurs; empty for means and "
         "medians.",
     )
-    trials: int | None = _column("count", "Number of items or repeats among which `events` are counted.")
+    trials: int | None = _column(
+        "count", "Number of items or repeats among which `events` are counted; empty for means and medians."
+    )
     mean: float | None = _column("unit", "Mean over repeats.")
     median: float | None = _column("unit", "Median over repeats.")
     p95: float | None = _column("unit", "95th percentile over repeats.")
@@ -85,9 +93,13 @@ class DifferenceRow:
     """
 
     missing_in: str | None = _column("text", "A or B if that run has no such condition; empty if both have it.")
-    quantity: str | None = _column("text", "Column of trial.csv that was compared.")
+    quantity: str | None = _column(
+        "text", "Column of trial.csv that was compared; for a text column one row per word: `grass=wet`."
+    )
     unit: str | None = _column("text", "Unit of all numbers except counts, for example s, bit/s or share.")
-    estimate: str | None = _column("text", "How a and b were estimated: `counted`, `mean`, `median`, or `flag`.")
+    estimate: str | None = _column(
+        "text", "How a and b were estimated: `counted`, `mean`, `median`, `flag` or `words`, as in summary.csv."
+    )
     n_a: int | None = _column("count", "Valid repeats of A that have a value of the quantity.")
     n_b: int | None = _column("count", "Valid repeats of B that have a value of the quantity.")
     a: float | None = _column("unit", "Estimate of A, as `value` of summary.csv; empty if A did not measure it.")

@@ -34,7 +34,7 @@ class SweepPlanned(Event):
     def words(self) -> Words:
         done = f"; {self.done:,} are done" if self.done else ""
         factors = f"{format_count(self.settings, 'setting')} with {format_count(self.seeds, 'seed')}"
-        return ((f"{self.total:,} runs: {factors}{done}", ""),)
+        return ((f"{self.total:,} {'run' if self.total == 1 else 'runs'}: {factors}{done}", ""),)
 
 
 @dataclass(frozen=True)

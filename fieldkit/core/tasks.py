@@ -61,7 +61,8 @@ def completed(
 
     Args:
         work: The function that runs a task. It is called in another process, unless `workers` is a single process on
-            this machine. The function, the tasks and the results must be picklable.
+            this machine, or there is only one task for processes on this machine. The function, the tasks and the
+            results must be picklable.
         tasks: The tasks.
         workers: The workers on which they run.
         note: Receives a sentence when a worker died or when no worker is connected.

@@ -82,7 +82,7 @@ def parse_offset_m(text: str) -> float:
 
 
 def format_distance(distance: Distance) -> str:
-    """Return a distance in the operator's unit, and in metres: `40 ft (12.19 m)`."""
+    """Return a distance in the operator's unit, and also in metres if that is another unit: `40 ft (12.19 m)`."""
     label = re.sub(r"(?<=[\d.])(?=[a-z])", " ", distance.label)
     metres = f"{distance.metres:.2f} m"
     return label if label.endswith(" m") else f"{label} ({metres})"

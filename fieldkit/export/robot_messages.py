@@ -105,7 +105,8 @@ _LARGEST_PAYLOAD_BYTES: Final = 1480
 def packet_fates(captures: Mapping[str, Capture], transfers: Iterable[Transfer]) -> Mapping[str, MarkedPackets]:
     """Return the packets of each capture, with their fates.
 
-    A fate is known only if the packet belongs to a transfer that both its sender and its receiver captured.
+    A fate is known only if the packet belongs to a transfer that both its sender and its receiver captured, and if
+    these captures can be matched without ambiguity.
 
     Args:
         captures: The captures by file.

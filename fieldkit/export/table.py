@@ -30,7 +30,7 @@ _TYPES: Final[Mapping[type, pa.DataType]] = {
 
 
 def write_csv(file: BinaryIO, repeats: Repeats) -> None:
-    """Write all columns. The columns that every trial has are first.
+    """Write all columns except `source`. The columns that every trial has are first.
 
     Raises:
         OSError: The file cannot be written.
@@ -41,7 +41,7 @@ def write_csv(file: BinaryIO, repeats: Repeats) -> None:
 
 
 def write_parquet(file: BinaryIO, repeats: Repeats) -> None:
-    """Write all columns with their types. Units and meanings are metadata of the columns.
+    """Write all columns except `source` with their types. Units and meanings are metadata of the columns.
 
     Raises:
         OSError: The file cannot be written.

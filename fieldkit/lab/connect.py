@@ -10,7 +10,10 @@ TIMEOUT_S = 20.0
 
 
 def main(path: str, robot: str) -> int:
-    """Pass the robot's socket to ssh over standard output (`ProxyUseFdpass` in ssh_config(5))."""
+    """Pass the robot's socket to ssh over standard output (`ProxyUseFdpass` in ssh_config(5)).
+
+    Return the exit code: 1 if the lab passed no socket; its message is then printed to standard error.
+    """
     try:
         with socket.socket(socket.AF_UNIX) as lab:
             lab.settimeout(TIMEOUT_S)

@@ -28,19 +28,21 @@ _READY: Final = b"+"
 
 
 def run_detached(work: Callable[[OnReady], int]) -> int:
-    """Run `work` in a child process; return when its start-up is complete or it has exited.
+    """Run `work` in a child process; return when its start-up is complete or the child has exited.
 
-    During start-up the child keeps this terminal: its output is shown here, and it receives Ctrl-C.
+    During start-up the child keeps this terminal: its output is shown here, and it receives Ctrl-C. If an exception,
+    such as KeyboardInterrupt, ends the wait of this process, the child is terminated first.
 
     Args:
         work: Receives a function that it calls with its log file when start-up is complete; after that call it has no
             terminal. Returns its exit code.
 
     Returns:
-        0 if start-up is complete, the exit code of `work` if it exited earlier.
+        0 if start-up is complete. If the child exited earlier, its exit code: the result of `work`, 1 if `work`
+        raised an exception, or the negative number of the signal that killed the child.
     """
     ready_reader, ready_writer = os.pipe()
-    sys.stdout.flush()  # otherwise the child would write the buffered text again
+    sys.stdout.flush()  # otherwise the child would write a copy of the buffered text
     pid = os.fork()
     if pid == 0:
         os.close(ready_reader)
@@ -79,7 +81,7 @@ def _detach(ready_writer: int, log: Path) -> None:
 
 
 REQUEST_S: Final = 5.0
-"""Timeout for a client to send its request, and for a robot to accept a connection."""
+"""Timeout of each read from a client and each write to it, and of the connection to a robot."""
 
 _REQUEST_BYTES: Final = 4096
 
@@ -87,36 +89,38 @@ _REQUEST_BYTES: Final = 4096
 def run(folder: LabFolder, backend: LabBackend, *, seed: int, sink: Sink, on_ready: Callable[[Lab], None]) -> None:
     """Run the robots of a backend until SIGINT, SIGTERM or SIGHUP, then remove them completely.
 
-    Call it in the main thread: the robots are terminated when the thread that started them exits.
+    It must be called in the main thread: only this thread can set signal handlers, and the kernel terminates the
+    robots when the thread that started them exits.
 
     Args:
         folder: The folder of the lab.
         backend: Starts the robots.
         seed: Seed of all random numbers of the lab.
         sink: Receives the names of phases.
-        on_ready: Called when the robots can be reached.
+        on_ready: Called with the lab when its robots have started and its files are written. The requests of clients
+            are answered after this call.
 
     Raises:
-        ConfigurationError: A lab of this directory is already up.
+        ConfigurationError: A lab of this directory is already up, or other users have access to its folder.
         FieldkitError: For the same reasons as `LabBackend.open_lab`.
     """
     with (
         _until_signal(),
         _lab_lock(folder),
         _listen(folder) as listener,
-        backend.open_lab(seed=seed, sink=sink) as robots,
+        backend.open_lab(seed=seed, sink=sink) as lab,
     ):
         start_s = time.monotonic()
-        write_ssh_config(folder, robots.login)
-        on_ready(robots)
+        write_ssh_config(folder, lab.login)
+        on_ready(lab)
         while True:
             client, _ = listener.accept()
-            _serve(client, robots, start_s)
+            _serve(client, lab, start_s)
 
 
 @contextmanager
 def _lab_lock(folder: LabFolder) -> Iterator[None]:
-    """Hold the lock that allows only one lab per directory."""
+    """Hold the lock that allows only one lab per directory; raises `ConfigurationError` if a process holds it."""
     with ExitStack() as stack:
         try:
             stack.enter_context(runtime.hold_lock(folder.lock_name))
@@ -142,7 +146,10 @@ def _listen(folder: LabFolder) -> Iterator[socket.socket]:
 
 @contextmanager
 def _until_signal() -> Iterator[None]:
-    """Leave the body at the first signal. Later signals are ignored, so that the clean-up is not interrupted."""
+    """Leave the body at the first signal, without an exception for the caller.
+
+    Later signals are ignored until the body has been left, so that its clean-up is not interrupted.
+    """
     is_stopping = False
 
     def stop(_number: int, _frame: FrameType | None) -> None:
@@ -164,29 +171,29 @@ def _until_signal() -> Iterator[None]:
             signal.signal(signal_number, handler)
 
 
-def _serve(client: socket.socket, robots: Lab, start_s: float) -> None:
-    """Answer one request; errors of the connection and invalid requests are ignored."""
+def _serve(client: socket.socket, lab: Lab, start_s: float) -> None:
+    """Answer one request. After an error of the connection or an invalid request, the connection is only closed."""
     with closing(client):
         client.settimeout(REQUEST_S)
         try:
             command, _, arguments = client.recv(_REQUEST_BYTES).decode().strip().partition(" ")
             match command:
                 case "connect":
-                    _pass_socket(client, robots, arguments)
+                    _pass_socket(client, lab, arguments)
                 case "state":
-                    client.sendall(_state(robots, time.monotonic() - start_s))
+                    client.sendall(_state(lab, time.monotonic() - start_s))
                 case "overview":
-                    client.sendall(_overview(robots))
+                    client.sendall(_overview(lab))
                 case "move":
-                    client.sendall(_move(robots, *arguments.split(" ", 1)))
+                    client.sendall(_move(lab, *arguments.split(" ", 1)))
         except (OSError, TypeError, ValueError):
             return
 
 
-def _pass_socket(client: socket.socket, robots: Lab, name: str) -> None:
+def _pass_socket(client: socket.socket, lab: Lab, name: str) -> None:
     """Pass a client the socket to a robot, or send it the error message."""
     try:
-        stream = robots.connect(name, REQUEST_S)
+        stream = lab.connect(name, REQUEST_S)
     except KeyError:
         client.sendall(f"there is no robot {name!r} in this lab".encode())
     except (OSError, FieldkitError) as error:
@@ -197,43 +204,43 @@ def _pass_socket(client: socket.socket, robots: Lab, name: str) -> None:
             socket.send_fds(client, [b"+"], [stream.fileno()])
 
 
-def _move(robots: Lab, name: str, destination: str) -> bytes:
-    """Move a robot; return the answer, which is its new position or an error."""
+def _move(lab: Lab, name: str, destination: str) -> bytes:
+    """Move a robot; return the answer: its new position, or the error that prevented the move."""
     try:
-        if name not in robots.members:
-            raise unknown_robot_error(name, robots.members)
-        return requests.pack_place(robots.move(name, requests.unpack_destination(destination)))
+        if name not in lab.members:
+            raise unknown_robot_error(name, lab.members)
+        return requests.pack_place(lab.move(name, requests.unpack_destination(destination)))
     except FieldkitError as error:
         return requests.pack_error(error)
 
 
-def _overview(robots: Lab) -> bytes:
-    """Return the plan view of the lab, or the error of a lab that has lost a process."""
+def _overview(lab: Lab) -> bytes:
+    """Return the answer to `overview`: the plan view of the lab, or the error that prevents it."""
     try:
-        return requests.pack_overview(robots.overview())
+        return requests.pack_overview(lab.overview())
     except FieldkitError as error:
         return requests.pack_error(error)
 
 
-def _state(robots: Lab, up_s: float) -> bytes:
-    """Return the state of the lab, or the error of a lab that has lost a process."""
+def _state(lab: Lab, up_s: float) -> bytes:
+    """Return the answer to `state`: the state of the lab, or the error that prevents it."""
     try:
-        return requests.pack_state(LabState(os.getpid(), up_s, tuple(_robot_states(robots)), robots.lateness()))
+        return requests.pack_state(LabState(os.getpid(), up_s, tuple(_robot_states(lab)), lab.lateness()))
     except FieldkitError as error:
         return requests.pack_error(error)
 
 
-def _robot_states(robots: Lab) -> Iterator[RobotState]:
+def _robot_states(lab: Lab) -> Iterator[RobotState]:
     return (
         RobotState(
             name=name,
             profile=member.profile.name,
             roles=member.roles,
             address=member.address,
-            place_m=robots.place_m(name),
-            programs=robots.programs(name),
+            place_m=lab.place_m(name),
+            programs=lab.programs(name),
         )
-        for name, member in robots.members.items()
+        for name, member in lab.members.items()
     )
 
 
@@ -241,7 +248,10 @@ _CONNECT: Final = Path(__file__).with_name("connect.py")
 
 
 def write_ssh_config(folder: LabFolder, login: Login) -> None:
-    """Write key, host keys and configuration into the lab's folder, readable for this user only."""
+    """Write three files into the lab's folder: private key, host keys and ssh configuration.
+
+    New files are readable for this user only.
+    """
     hosts = "".join(f"{name} {key}\n" for name, key in login.host_keys.items())
     for path, text in (
         (folder.key, login.private_key),
@@ -254,7 +264,7 @@ def write_ssh_config(folder: LabFolder, login: Login) -> None:
 
 
 def ssh_config(folder: LabFolder, user: str, robots: Iterable[str]) -> str:
-    """Return a configuration for `ssh -F`: robots by name, with pinned host keys, over Unix sockets."""
+    """Return a configuration for `ssh -F`: robots by name, with pinned host keys, connected by `connect.py`."""
     # -I ignores modules in the current directory and Python's environment variables.
     words = (sys.executable, "-I", str(_CONNECT), str(folder.socket))
     command = shlex.join(words).replace("%", "%%")

@@ -1,4 +1,7 @@
-"""The runtime folder of a directory's lab: socket, key, ssh configuration and log; in memory, for one user only."""
+"""The runtime folder of a directory's lab: socket, key, ssh configuration and log; only its user has access.
+
+Its parent is the base folder of runtime files (`runtime.base_folder`), which is in memory on most systems.
+"""
 
 import hashlib
 import os
@@ -54,7 +57,7 @@ def of_directory(directory: Path) -> LabFolder:
     """Return the folder of the lab of a directory, without creating it.
 
     Raises:
-        ConfigurationError: Another user owns the path.
+        ConfigurationError: The path exists, but is not a folder to which only this user has access.
     """
     digest = hashlib.sha256(os.fsencode(directory.resolve())).hexdigest()[:16]
     path = runtime.base_folder() / f"fieldkit-{os.geteuid()}-{digest}"
@@ -67,7 +70,7 @@ def make(folder: LabFolder) -> None:
     """Create the folder for this user only, and delete files that a killed lab left there.
 
     Raises:
-        ConfigurationError: Another user owns the path.
+        ConfigurationError: The path exists and cannot be removed, for example because another user owns it.
     """
     remove(folder)
     try:
@@ -77,7 +80,7 @@ def make(folder: LabFolder) -> None:
 
 
 def remove(folder: LabFolder) -> None:
-    """Remove the folder if it exists."""
+    """Remove the folder if it exists; errors are ignored."""
     shutil.rmtree(folder.path, ignore_errors=True)
 
 

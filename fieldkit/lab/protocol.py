@@ -51,7 +51,7 @@ class LabLink:
     Attributes:
         ends: Names of the two robots.
         snr_db: Signal-to-noise ratio of the worse direction.
-        linked: Whether any frames arrive.
+        linked: Whether frames can arrive.
         through: Names of the obstacles between them.
     """
 
@@ -116,7 +116,9 @@ class Lab(Protocol):
         """Return a connected socket to the SSH server of a robot.
 
         Raises:
+            KeyError: There is no such robot.
             OSError: The connection failed or timed out.
+            FieldkitError: A process of the lab has failed.
         """
         ...
 
@@ -138,6 +140,7 @@ class Lab(Protocol):
         Raises:
             ConfigurationError: The destination is not in the world.
             LinkError: The process of the modelled radio does not answer.
+            RobotError: The robot or a physics simulator refuses the position.
         """
         ...
 
@@ -193,7 +196,7 @@ class ChoosesWifi(Protocol):
 
 
 def unknown_robot_error(name: str, names: Iterable[str]) -> ConfigurationError:
-    """Return the error for a robot that is not in the lab, with the most similar name as a hint."""
+    """Return the error for a robot that is not in the lab, with a similar name as a hint if there is one."""
     return ConfigurationError(
         f"there is no robot {name!r} in this lab", remedy=did_you_mean(name, names, "fieldkit lab ps lists them")
     )

@@ -1,6 +1,7 @@
 """Messages between the process of a lab and its client, and the client.
 
-A request is a line of text, and its answer is one JSON document.
+A request is a line of text, and its answer is one JSON document. The answer to the request `connect` of `connect.py`
+is a socket instead, or the text of an error.
 """
 
 import json
@@ -34,7 +35,7 @@ class RobotState:
         roles: Its roles in trials.
         address: Its address on the radio.
         place_m: Position of its antenna, metres east, north, up.
-        programs: Names of the programs that run on it; empty if its process has exited.
+        programs: Names of the programs that run on it; empty if the robot has terminated.
     """
 
     name: str
@@ -160,9 +161,9 @@ def state(folder: LabFolder) -> LabState:
     """Return the state of the lab.
 
     Raises:
-        NoLabError: No lab is running in this directory.
-        LinkError: The lab does not answer, or its answer is invalid.
-        FieldkitError: The answer of the lab is an error.
+        NoLabError: The socket of a lab of this directory does not exist, or does not accept connections.
+        LinkError: The lab does not answer, its answer is invalid, or is another error than a `ConfigurationError`.
+        ConfigurationError: The answer of the lab is this error.
     """
     return _request(folder, "state", unpack_state)
 
@@ -184,6 +185,8 @@ def move(folder: LabFolder, robot: str, destination: Destination) -> Vector:
 
 def end(folder: LabFolder) -> None:
     """Terminate the lab's process with its robots; return when it has exited.
+
+    If the process does not exit after SIGTERM, it is killed.
 
     Raises:
         NoLabError: No lab is running in this directory.

@@ -94,10 +94,10 @@ class AttemptEvidence:
         return (self.folder / name).is_file()
 
     def links(self, role: Role) -> Sequence[LinkSample]:
-        """Return the link samples of a robot in the order of time.
+        """Return the link samples of a robot in the order of time; empty if there are none.
 
-        They are read from the testbed's file, which a testbed with modelled radios writes. If there are none, they
-        are read from the files that the robot's sampler wrote.
+        They are read from the testbed's file, which a testbed with modelled radios writes. If it has no samples of
+        this robot, they are read from the files that the robot wrote.
         """
         testbed_samples = self.read_or_none(link_samples.read, link_samples.FILE) or {}
         if samples := testbed_samples.get(role):
@@ -114,13 +114,16 @@ class AttemptEvidence:
         return host.increments(before or Counters(None, None), after or Counters(None, None))
 
     def interface_bytes(self, role: Role, interface: str) -> int | None:
-        """Return the number of bytes that an interface received during the attempt, or None if unknown."""
+        """Return the number of bytes that an interface received during the attempt.
+
+        None if a counter is missing, or has decreased because of a restart.
+        """
         files = (file(role) for file in (host.before_file, host.after_file))
         before, after = (self.read_or_none(host.received_bytes, file, interface) for file in files)
         return None if before is None or after is None or after < before else after - before
 
     def undamaged_capture(self, name: str | None) -> Capture | None:
-        """Return a capture, or None if `name` is None, or the file is missing or damaged.
+        """Return a capture, or None if `name` is None, or the file is missing, invalid or damaged.
 
         A damaged capture would give wrong counts.
         """

@@ -73,9 +73,10 @@ def parse_date(text: str) -> tuple[int, int] | None:
 
 
 def job_end_ns(evidence: AttemptEvidence, role: Role, job: str) -> int | None:
-    """Return the end time of a job by the robot's clock, in nanoseconds since 1970 UTC, accurate to about 20 ms.
+    """Return the end time of a job by the robot's clock, in nanoseconds since 1970 UTC.
 
-    Return None if the robot did not record it, if the robot rebooted, or if its clock was set during the attempt.
+    It is accurate to about 20 ms, or to 0.5 s if the robot recorded its clock in whole seconds. Return None if the
+    robot did not record it, if the robot rebooted, or if its clock was set during the attempt.
 
     Args:
         evidence: The attempt.

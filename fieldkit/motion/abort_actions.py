@@ -46,7 +46,7 @@ class AbortActions(ProcedureSection, RootModel[dict[Role, OnAbort]]):
     @override
     def dry_run_notes(self, plan: TrialOutline) -> Iterator[str]:
         for role, action in self.root.items():
-            yield f"if it is aborted: {plan.cast[role].name} is commanded to {action}"
+            yield f"if a repeat is aborted: {plan.cast[role].name} is commanded to {action}"
 
     @override
     def abort_notes(self, plan: TrialOutline) -> Iterator[str]:

@@ -29,7 +29,7 @@ class HaltResult:
 
     @property
     def state(self) -> MotionState:
-        """State of the robot: the worst state of its programs."""
+        """State of the robot: the worst state of its programs; `NOTHING` without programs."""
         states = (state for _, state in self.programs)
         return max(states, key=BY_SEVERITY.index, default=MotionState.NOTHING)
 

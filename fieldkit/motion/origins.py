@@ -11,7 +11,7 @@ from fieldkit.steps.scene import Scene
 
 @dataclass(frozen=True)
 class MotionOrigin:
-    """Position and heading of a robot at its first start in a trial: centre of its fence, reference of directions.
+    """Position and heading of a robot. At its first start at a place: centre of its fence, reference of directions.
 
     Attributes:
         frame: Frame of the coordinates: `odometry`, or `local` for MAVLink's LOCAL_POSITION_NED.
@@ -88,7 +88,7 @@ class Origins(Protocol):
     def refuse(self, role: Role, reason: str) -> None:
         """Record that a robot refused to start because it is not at its start position.
 
-        Then no robot moves until a person confirms.
+        Then no robot moves until a person confirms, or the operator permits it by an option.
 
         Raises:
             OSError: For the same reasons as `record`.
@@ -98,8 +98,8 @@ class Origins(Protocol):
     def moving(self, role: Role) -> AbstractContextManager[RobotMotion]:
         """Record that a robot moves while the body runs. The record is on disk before the body begins.
 
-        Unless the body calls `RobotMotion.mark_ended`, no robot moves again before a person has confirmed. The body
-        does not call it after a fault, or if this process is killed.
+        Unless the body calls `RobotMotion.mark_ended`, no robot moves again before a person has confirmed, or the
+        operator has permitted it by an option. The body does not call it after a fault, or if this process is killed.
 
         Raises:
             MotionHeldError: A fault stopped a robot earlier, and no person has confirmed since.
@@ -139,5 +139,5 @@ class MemoryOrigins:
 
 
 def origins_of(scene: Scene) -> Origins:
-    """Return the origins of the robots of an attempt; without an attempt, as in a dry run, there are no origins."""
+    """Return the origins of the robots of an attempt; without an attempt, as in a dry run, they are empty."""
     return MemoryOrigins() if scene.origins is None else cast("Origins", scene.origins)

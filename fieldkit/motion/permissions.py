@@ -8,7 +8,8 @@ MOVE: Final = "motion"
 MOVE_AFTER_FAULT: Final = "motion-after-fault"
 
 MOTION: Final = Permission(
-    "allow fieldkit to drive real robots in steps that move them (safety: `fieldkit docs motion`)", is_repeated=True
+    "allow fieldkit to drive and fly real robots in steps that move them (safety: `fieldkit docs motion`)",
+    is_repeated=True,
 )
 AFTER_FAULT: Final = Permission(
     "after a fault stopped a robot, let robots move again from their positions without a confirmation"

@@ -56,7 +56,11 @@ Robots = Mapping[str, Shell | FieldkitError]
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Stop the robots, print the state of each, and return 3 if one was not reached or has not confirmed."""
+    """Stop the robots, print the state of each, and return 3 if one was not reached or has not confirmed.
+
+    Raises:
+        ConfigurationError: There are no robots that can be stopped, or one of the named robots does not exist.
+    """
     print_lock = threading.Lock()
 
     def report(name: str, result: HaltResult) -> None:

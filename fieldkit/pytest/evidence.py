@@ -63,13 +63,18 @@ class EvidenceFolder:
         return self._created_path is not None
 
     def add(self, text: str) -> None:
-        """Add lines to the log; the first has the time of day."""
+        """Add lines to the log; the first has the time of day in UTC.
+
+        Raises:
+            ConfigurationError: The folder cannot be created.
+            OSError: The log cannot be written.
+        """
         lines = "\n".join(map(sanitized, text.splitlines()))  # output of robots may contain control characters
         with (self.path / LOG).open("a", encoding="utf-8") as file:
             file.write(f"{datetime.now(UTC):%H:%M:%S.%f} {lines}\n")
 
     def remove_unless_kept(self, keep: Keep) -> None:
-        """Remove the folder unless it must be kept; later content gets a new folder."""
+        """Remove the folder unless it must be kept; content that is added after its removal gets a new folder."""
         if self._created_path is not None and (keep is Keep.NONE or (keep is Keep.FAILED and not self.has_failed)):
             shutil.rmtree(self._created_path, ignore_errors=True)
             with suppress(OSError):  # not empty if other tests have folders in it

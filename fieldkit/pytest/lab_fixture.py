@@ -95,7 +95,7 @@ class OpenedLab:
         options: Options of the lab.
         keeper: Receives events and log lines as evidence.
         session: Identifies the lab in the robots' locks.
-        topology: Topology of the open robots; None before any are open.
+        topology: Topology of the open robots; None if no robots are open.
         robots: The robots.
     """
 
@@ -212,7 +212,7 @@ class OpenedLab:
     def moving(
         self, robot: str, *, away: str = "0m", left: str = "0m", speed: str = "0.2m/s"
     ) -> AbstractContextManager[None]:
-        """Return a context in which a robot moves away from its place; afterwards it is back at its place.
+        """Return a context in which a robot moves along a straight path; afterwards it is back at its place.
 
         Args:
             robot: Its role or its name.

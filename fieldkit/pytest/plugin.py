@@ -30,7 +30,7 @@ OPTIONS: Final[dict[str, tuple[str, str, tuple[str, ...] | None]]] = {
     "site": ("FILE", "the lab's site file; default: fieldkit.yaml in the current folder, if there is one", None),
     "topology": (
         "NAME",
-        "topology of the robots; default: the first topology of the site file, or of a trial's procedure",
+        "topology of the robots; default: the first of the site file, otherwise master; in a trial, its procedure's",
         ("master", "masterless"),
     ),
     "output": ("DIR", "folder for the evidence of all runs; default: fieldkit-results in pytest's root folder", None),
@@ -41,7 +41,7 @@ YES: Final = "show no questions: real robots are already at their places"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the options; each is also a key of pytest's configuration: `fieldkit_backend`."""
+    """Add the options; each except `--fieldkit-yes` is also a key of pytest's configuration: `fieldkit_backend`."""
     group = parser.getgroup("fieldkit", "fieldkit: tests on emulated or real robots")
     for name, (metavar, text, choices) in OPTIONS.items():
         group.addoption(f"--fieldkit-{name}", metavar=metavar, choices=choices, help=text)
@@ -81,7 +81,7 @@ def pytest_runtest_call(item: pytest.Item) -> None:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Report the evidence of a failed test, and remove the evidence of a passed test."""
+    """Report the evidence of a failed test, and remove the evidence of a test unless the option `keep` selects it."""
     report = yield
     if keeper := item.config.stash.get(_KEEPER, None):
         keeper.process_report(item, call, report)

@@ -30,8 +30,8 @@ class LabOptions:
     Attributes:
         backend: Name of the backend; None for the backend of the site file, or `emulated` without a site file.
         site: The site file; None for `fieldkit.yaml` in the current folder, if there is one.
-        topology: `master` or `masterless`; None for the first topology of the site file, and in a trial for the
-            topology of its procedure.
+        topology: `master` or `masterless`; None for the first topology of the site file, or `master` without one, and
+            in a trial for the topology of its procedure.
         distance: Initial distance of emulated robots, in line of sight.
         seed: Seed of all random numbers in the lab.
         yes: Whether no person is asked: real robots are already at the required places.
@@ -93,7 +93,10 @@ def _text(config: pytest.Config, name: str) -> str | None:
 
 
 def _path(config: pytest.Config, name: str) -> Path | None:
-    """Return a path. On the command line it is relative to the current folder, in the configuration to the root."""
+    """Return the path in an option, or None if the option is not set.
+
+    On the command line it is relative to the current folder, in the configuration to pytest's root folder.
+    """
     option, configured = config.getoption(f"fieldkit_{name}"), config.getini(f"fieldkit_{name}")
     if option:
         return Path(config.invocation_params.dir, option)

@@ -150,8 +150,9 @@ class RobotHandle:
             ros: Whether it runs in the ROS environment of the robot's profile.
 
         Raises:
-            ProgramError: It did not exit in time, or its exit code is not 0.
+            ProgramError: It did not exit in time, or its exit code is not 0 and `check` is set.
             LinkError: The robot could not be reached.
+            RobotError: A signal terminated it, or its output is too long.
         """
         __tracebackhide__ = True
         content = stdin.encode() if isinstance(stdin, str) else stdin
@@ -173,6 +174,7 @@ class RobotHandle:
             ros: Whether it runs in the ROS environment of the robot's profile.
 
         Raises:
+            ProgramError: It did not exit, not even after SIGKILL.
             LinkError: The robot could not be reached.
         """
         command = until_closed(self._command(argv, ros=ros))
@@ -274,7 +276,12 @@ class RobotHandle:
         return with_environment(argv, setup=ros_profile.command.setup, environment=ros_profile.environment)
 
     def _result(self, argv: Sequence[str], wait: Callable[[], Completed], *, check: bool = False) -> ProgramOutput:
-        """Return the result of a program; a timeout is a test failure, not a robot error."""
+        """Return the result of a program; a timeout is a test failure, not a robot error.
+
+        Raises:
+            ProgramError: The program did not exit in time, or its exit code is not 0 and `check` is set.
+            LinkLostError: The connection broke.
+        """
         __tracebackhide__ = True
         command_text = f"{self.name} $ {quote(argv)}"
         try:
@@ -322,7 +329,7 @@ class RobotHandles:
         )
 
     def __getattr__(self, name: str) -> RobotHandle:
-        """Return a robot by its role."""
+        """Return a robot by its role, or by a name that is a Python identifier."""
         if name.startswith("_"):
             raise AttributeError(name)
         return self[name]

@@ -11,7 +11,7 @@ from fieldkit.remote.script import HOME, require_success
 from fieldkit.remote.shell import Shell
 
 _INSTALL_S: Final = 30.0
-"""Timeout of the copy: about 140 kB over a radio that may be slow."""
+"""Timeout of the copy: about 310 kB over a radio that may be slow."""
 
 _ROOT: Final = Path(__file__).parents[1]
 _FILE_TIME: Final = (1980, 1, 1, 0, 0, 0)

@@ -27,7 +27,7 @@ class TarMember:
     """A file in the archive.
 
     Attributes:
-        name: Its name, printable ASCII; callers must check it further.
+        name: Its name, at most 100 bytes of printable text; callers must check it further.
         chunks: Its content, which must be read before the next member.
     """
 

@@ -20,7 +20,7 @@ def quote(argv: Sequence[str]) -> str:
 def with_environment(
     argv: Sequence[str], *, setup: Sequence[str] = (), environment: Mapping[str, str] | None = None
 ) -> tuple[str, ...]:
-    """Return `argv` run by bash after sourcing `setup`, with `environment` set.
+    """Return `argv` with `environment` set and, if there is a `setup`, run by bash after sourcing these files.
 
     A non-interactive SSH session skips `.bashrc`, where robots usually source their ROS setup files.
     """
@@ -33,7 +33,10 @@ def with_environment(
 
 
 def printable(data: bytes, limit: int = 300) -> str:
-    """Return output of a robot as one line that is safe in a terminal, a log and a CSV; long output is shortened."""
+    """Return output of a robot as one line that is safe in a terminal, a log and a CSV.
+
+    Of a long output, only the end is returned: at most `limit` characters, from the start of a word.
+    """
     words = sanitized(" ".join(_STYLE.sub("", data.decode("utf-8", "replace")).split()))
     if len(words) <= limit:
         return words

@@ -36,7 +36,8 @@
 #   job.sh left                          list running jobs of all trials: DIR/NAME PID COMMAND, DIR below the home; and
 #                                        processes whose working folder was deleted
 #   job.sh lock TOKEN SECONDS WHO WHAT   lock this robot; idempotent
-#   job.sh renew TOKEN SECONDS           extend the lock to at least SECONDS from now; fail if it is not the lock of TOKEN
+#   job.sh renew TOKEN SECONDS           extend the lock to at least SECONDS from now; fail if it is not the lock of TOKEN;
+#                                        create it if the robot has no record of a lock
 #   job.sh unlock TOKEN                  release the lock
 #   job.sh holder                        print the record of the lock, if any: TOKEN SECONDS WHO WHAT; it expires in SECONDS
 #   job.sh abort WHO                     break the lock, print `held WHO WHAT` or `free`, stop all jobs of all trials and list

@@ -74,7 +74,11 @@ class Connection:
         return self._close_event
 
     def link(self, deadline: Deadline) -> Link:
-        """Return the link, which is opened again if it is not alive. Raises the same errors as `log_in`."""
+        """Return the link, which is opened again if it is not alive.
+
+        Raises the same errors as `log_in`, and `LinkLostError` if another thread logs in for too long, or if the link
+        is lost while no packets may be sent.
+        """
         close_event, limit = self._close_event, deadline.earlier_of(self._timing.connect_s)
         if not self._connecting.acquire(timeout=limit.remaining_s):
             raise LinkLostError("another command is still connecting", where=self.address.robot)
@@ -111,7 +115,8 @@ class Connection:
 
         Only a link that was open before is reopened, so that a wrong address is reported immediately. A repeated
         attempt has at least `Timing.reply_s`. The total time is at most the time until `deadline`, plus
-        `reconnect_timeout_s`, the time of one login, and `Timing.reply_s`.
+        `reconnect_timeout_s`, the time of one login, `Timing.reply_s`, and the silences (`silence`) during which the
+        link is not reopened.
 
         Raises:
             LinkError: The deadline passed with an open link, the link was not restored, or `close` was called.
@@ -184,7 +189,10 @@ class Connection:
         """Wait until packets may be sent again.
 
         Returns:
-            The expected duration of the silence when the wait started, in seconds.
+            The expected duration of the silence when the wait started, in seconds; 0 without a silence.
+
+        Raises:
+            LinkError: `close` was called.
         """
         initial_s = self._silence_s()
         if initial_s and notify:
@@ -219,7 +227,7 @@ class Connection:
 
     @contextmanager
     def silence(self, seconds: float) -> Iterator[None]:
-        """Send no packets on the link during the body; see `Shell.silence`.
+        """Send no packets on the link during the body, if it crosses the radio under test; see `Shell.silence`.
 
         Keepalive probes are not sent either, so the link is not closed for lack of answers during this time. The
         body starts when no channel is being opened any more.

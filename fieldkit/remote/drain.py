@@ -86,7 +86,10 @@ def _is_at_end(channel: Execution) -> bool:
 
 
 def _feed(channel: Channel, pending: memoryview | None) -> memoryview | None:
-    """Send as much of `pending` as the channel accepts, return the rest; close standard input after all is sent."""
+    """Send as much of `pending` as the channel accepts, and return the rest.
+
+    When all is sent, standard input is closed, and the rest is None. If `pending` is None, nothing is done.
+    """
     while pending and channel.send_ready():
         pending = pending[channel.send(pending[:_CHUNK].tobytes()) :]
     if pending is not None and not pending:

@@ -48,7 +48,7 @@ def begin(
         role: Role of the robot, the prefix of the files with the state.
         interface: Network interface of the radio.
         old_folder: Folder of an earlier attempt, which is deleted; None to delete nothing.
-        token: Token of the trial's lock, which is renewed.
+        token: Token of the trial's lock, which is renewed; None to renew no lock.
         required_kib: Required free disk space in KiB.
         sources: Telemetry sources that the robot queries until its evidence is fetched. Each is a sequence: the name
             of the source, then the arguments of the shell function `poll` (telemetry.sh), starting with ADDRESS.

@@ -122,7 +122,7 @@ def fetch(
     progress: FetchProgress | None = None,
     forbidden_reason: Callable[[str], str | None] = lambda _: None,
 ) -> None:
-    """Let the robot record its state again, fetch the files of a repeat, and check the hash of each file.
+    """Let the robot record its state again, fetch the files of an attempt, and check the hash of each file.
 
     Small files are sent in one archive, large files piece by piece. Each transfer has a timeout, the total time
     increases with the size, and an interrupted fetch continues from the last piece, also in a later call.
@@ -138,11 +138,12 @@ def fetch(
         interface: Network interface of the radio.
         destination: The destination folder.
         expected_bytes: Expected total size; see `EXPECTED_TIMES`.
-        progress: Receives the progress of large files.
+        progress: Receives the progress of large files; None to report no progress.
         forbidden_reason: Returns the reason why this robot must not send a file of this name, or None if it may.
 
     Raises:
-        LinkError: The robot did not answer.
+        LinkError: The robot did not answer, or the fetch was cancelled.
+        OSError: A file cannot be written on this computer.
         LateJobError: All files were fetched, but a job failed after `jobs.stop` had returned.
         RobotError: It has no such folder, or could not pack its files; files that arrived are kept.
         EvidenceError: The files are incomplete, unsafe or too large, or do not match their hash.
@@ -174,7 +175,10 @@ def _fetch_small(
     """Fetch and unpack the archive of all small files.
 
     Returns:
-        The sizes of the large files by name, and the error of the robot if all files arrived nevertheless.
+        The sizes of the large files by name, and the error of the robot if all files arrived nevertheless; None if
+        there was no error.
+
+    Raises the same errors as `fetch`.
     """
     job_error: RobotError | None = None
     try:
@@ -229,7 +233,10 @@ class _LargeFile:
     size_bytes: int
 
     def fetch(self, destination: Path, role: str, progress: FetchProgress) -> None:
-        """Fetch the file piece by piece, after the pieces of an earlier call, and check its hash."""
+        """Fetch the file piece by piece, after the pieces of an earlier call, and check its hash.
+
+        Raises the same errors as the function `fetch`.
+        """
         part, piece = destination / f".{role}.{self.name.replace('/', '+')}.part", destination / f".{role}.piece"
         digest = hashlib.sha256()
         with part.open("ab+") as file:
@@ -276,7 +283,11 @@ class _LargeFile:
 def _unpack(
     archive_path: Path, destination: Path, robot: str, forbidden_reason: Callable[[str], str | None]
 ) -> Mapping[str, int]:
-    """Unpack an archive of small files, check them, and return the sizes of the large files by name."""
+    """Unpack an archive of small files, check them, and return the sizes of the large files by name.
+
+    Raises:
+        EvidenceError: A file is not allowed, is missing or does not match its hash, or the archive is damaged.
+    """
     hashes: dict[str, str] = {}
     large_sizes: dict[str, int] = {}
     received_hashes: dict[str, str] = {}
@@ -317,7 +328,7 @@ def _require_allowed_name(name: str, robot: str, forbidden_reason: Callable[[str
 
 
 def _write(member: archive.TarMember, destination: Path, robot: str) -> str:
-    """Write a member to a new file; return its hash."""
+    """Write a member to a new file; return its hash. Raises `EvidenceError` if the file exists."""
     try:
         file = _target_path(destination, member.name, robot).open("xb")
     except FileExistsError as error:
@@ -331,7 +342,11 @@ def _write(member: archive.TarMember, destination: Path, robot: str) -> str:
 
 
 def _target_path(destination: Path, name: str, robot: str) -> Path:
-    """Return the path for a file of this name; its folder is created."""
+    """Return the path for a file of this name; its folder is created.
+
+    Raises:
+        EvidenceError: A file that was sent before has the name of this folder.
+    """
     path = destination / name
     try:
         path.parent.mkdir(exist_ok=True)

@@ -26,6 +26,7 @@ from fieldkit.remote.script import (
 from fieldkit.remote.shell import Completed, Session, Shell
 
 __all__ = [
+    "AGENT_READY_S",
     "HOME",
     "KILLED",
     "READY_S",
@@ -79,6 +80,9 @@ _LIMITED: Final = (
 
 READY_S: Final = 8
 """Time in which a started job must be ready; shorter than `REPLY_S`, so that the robot can report a failure."""
+
+AGENT_READY_S: Final = 30
+"""The same for a Python program, whose imports take several seconds on a busy robot or from a slow SD card."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +178,7 @@ def start(shell: Shell, job: Job) -> None:
 class PendingJob:
     """A started job, or a wait for the end of a job that was started before.
 
-    The control connection is silent until `end` is called.
+    The control connection is silent until `end` is called or, for a job from `serve`, until the job ends.
 
     Attributes:
         shell: The robot.
@@ -215,8 +219,8 @@ def run(shell: Shell, job: Job) -> int:
         The job's exit code.
 
     Raises:
-        LinkError: The robot did not answer by the end of the job's limit, plus `READY_S` if it has `ready`.
-        RobotError: The job could not be started.
+        LinkError: The robot did not answer within the job's limit plus `REPLY_S`, and `READY_S` if it has `ready`.
+        RobotError: The job could not be started, or the robot rebooted while it ran.
     """
     session = shell.begin(command("run", job), deadline=Deadline.after(REPLY_S), until=b"")
     return PendingJob(shell, job, session).end((READY_S if job.ready else 0) + job.limit_s + REPLY_S)
@@ -264,9 +268,10 @@ def stop(
         job: A started job, which may have ended.
         signal: Name without `SIG`.
         grace_s: Time until SIGKILL, in whole seconds.
-        settle: File in the job's folder that must stop growing before the signal.
+        settle: File in the job's folder that must stop growing before the signal, but is waited for at most 2 s; None
+            to send the signal immediately.
         end_text: Text in the log that shows that the job has finished its work. `stop` then does not wait for its
-            end; `fetching.fetch` waits for it, and fails if its exit code is not 0.
+            end; `fetching.fetch` waits for it, and fails if its exit code is not 0. None to wait for the end.
 
     Returns:
         The job's exit code, or `KILLED`; 0 if `end_text` is in its log.
@@ -290,7 +295,10 @@ def stop(
 
 
 def list_running(shell: Shell, deadline: Deadline) -> tuple[str, ...]:
-    """Return one line per running job of fieldkit on the robot, from any trial and version."""
+    """Return one line per running job of fieldkit on the robot, from any trial and version.
+
+    There is also a line for each process in a deleted folder of a job.
+    """
     return _lines(call(shell, "left", deadline=deadline))
 
 
@@ -300,7 +308,7 @@ class AbortResult:
 
     Attributes:
         locked: Whether the robot was locked.
-        jobs: A line per stopped or signalled job, in the format of `list_running`.
+        jobs: A line per stopped or signalled job or process, in the format of `list_running`.
         landing: Programs that still land a drone, `TRIAL/ATTEMPT/.jobs/NAME` below the robot's home, each with its
             `motion_states.MotionState`.
         error: The error if a part failed; None otherwise.

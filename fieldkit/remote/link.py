@@ -103,7 +103,7 @@ class _Packetizer(paramiko.packet.Packetizer):
         return super().read_all(n, check_rekey)
 
     def _read_timeout(self, timeout: float) -> bytes:
-        """Return a part of the banner."""
+        """Return a part of the banner; raises `FloodError` if the banner is too long."""
         piece: bytes = super()._read_timeout(timeout)  # type: ignore[misc]
         self._received_banner_bytes += len(piece)
         if self._received_banner_bytes > _BANNER_BYTES:
@@ -272,7 +272,9 @@ class Link:
         wait(spares, timeout=deadline.remaining_s)
 
     def open_additional(self) -> Channel | None:
-        """Open a channel in addition to the spare ones; return None if the server does not allow it.
+        """Open a channel in addition to the spare ones.
+
+        Return None without opening a channel if the server closes channels that are opened in advance.
 
         Raises:
             OSError, SSHException, EOFError: The connection broke, or the server refuses more.

@@ -30,7 +30,7 @@ def log_in(
     Raises:
         LinkLostError: The robot was not reached, or did not answer before the deadline.
         LinkError: `close_event` was set.
-        RobotError: Its host key is not the pinned one.
+        RobotError: Its host key is not the pinned one, or its SSH server is not secure enough.
         LoginRefusedError: It refused the login.
         ConfigurationError: There is no key for the login.
     """
@@ -45,6 +45,7 @@ def read_host_key(address: Address, connect: Connect, *, deadline: Deadline, kin
 
     Raises:
         LinkLostError: The robot was not reached, or did not answer before the deadline.
+        RobotError: Its SSH server supports only insecure algorithms, or violates the protocol.
     """
     link, no_event = Link(connect, Timing()), threading.Event()
     with _converting_errors(link, address, no_event), contextlib.closing(link):
@@ -53,7 +54,10 @@ def read_host_key(address: Address, connect: Connect, *, deadline: Deadline, kin
 
 @contextlib.contextmanager
 def _converting_errors(link: Link, address: Address, close_event: threading.Event) -> Iterator[None]:
-    """Close a link that could not be opened, and convert its exception to an error with a remedy."""
+    """Close a link that could not be opened, and convert its exception to an error with a remedy.
+
+    Raises the errors that `log_in` describes; exceptions that are not of a broken connection are not converted.
+    """
     try:
         yield
     except BaseException as error:

@@ -6,7 +6,9 @@ from typing import Final
 
 
 class MotionState(StrEnum):
-    """States of a robot after the order to stop, from best to worst; `job.sh` uses the same names for each program.
+    """States of a robot after the order to stop, from best to worst.
+
+    Except for `NOTHING`, they are also the states of its programs, with the names that the job script prints.
 
     Attributes:
         NOTHING: No program of fieldkit moves it; nothing is sent to it.

@@ -16,8 +16,8 @@ class Completed:
     Attributes:
         argv: The command.
         exit_code: Its exit code.
-        stdout: Its complete standard output.
-        stderr: Its complete standard error.
+        stdout: Its complete standard output; empty after `Shell.fetch`.
+        stderr: The end of its standard error, at most 64 KiB.
     """
 
     argv: tuple[str, ...]
@@ -31,7 +31,10 @@ class Session(Protocol):
 
     @property
     def is_ready(self) -> bool:
-        """Whether the command wrote the output for which `Shell.begin` waited; False if it ended earlier."""
+        """Whether the command wrote as many bytes as `Shell.begin` waited for; False if it ended earlier.
+
+        True if `Shell.begin` waited for no output.
+        """
         ...
 
     def end(self, *, deadline: Deadline, check: bool = True) -> Completed:
@@ -54,6 +57,9 @@ class Shell(Protocol):
     Every command must be idempotent. After a loss of the link the progress of a command is unknown, so a Shell may
     reconnect and send the same command again, also during `Session.end`. A command that only takes too long is not
     sent again.
+
+    Each method that opens the connection raises a `RobotError` if the robot refuses the login or its host key has
+    changed, and a `ConfigurationError` if there is no key for the login.
     """
 
     @property
@@ -91,7 +97,8 @@ class Shell(Protocol):
 
         Raises:
             LinkError: The robot could not be reached, the connection broke, or the deadline passed.
-            RobotError: The exit code is not 0 and `check` is set; the message has the end of stderr.
+            RobotError: The exit code is not 0 and `check` is set; the message has the end of stderr. Or a signal
+                terminated the command, or it wrote too much output.
         """
         ...
 
@@ -100,6 +107,7 @@ class Shell(Protocol):
 
         Raises:
             LinkError: For the same reasons as `run`.
+            OSError: The file cannot be written, for example because the disk of this computer is full.
             RobotError: The exit code is not 0, or there is more output than `limit_bytes`.
         """
         ...

@@ -35,7 +35,10 @@ def over_tcp(host: str, port: int) -> Connect:
 
 
 def enable_keepalive(stream: socket.socket, timing: Timing) -> None:
-    """Make the kernel close the connection if the peer does not answer, also while no data is sent."""
+    """Make the kernel close the connection if the peer does not answer, also while no data is sent.
+
+    Small packets are then also sent without a delay (TCP_NODELAY).
+    """
     stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     set_timeout(stream, timing.dead_s)
     stream.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)

@@ -265,7 +265,14 @@ def _is_call(argv: Sequence[str]) -> bool:
 
 @contextlib.contextmanager
 def _converting_errors(address: Address, link: Link, argv: Sequence[str]) -> Iterator[None]:
-    """Convert exceptions of paramiko, the socket and the deadline to errors with robot, command and remedy."""
+    """Convert exceptions of paramiko, the socket and the deadline to errors with robot, command and remedy.
+
+    Raises:
+        LinkError: The deadline passed.
+        LinkLostError: The connection broke, or the server opens no session; the link is then closed.
+        RobotError: The server violated the SSH protocol.
+        OSError: The disk of this computer is full.
+    """
     command, robot = quote(argv), address.robot
     try:
         yield

@@ -20,7 +20,9 @@ start_sampler() {
     detach "$meta" 86400 - 0 /dev/null "$1-link.txt" "$meta/log" "$shell" "$self" sample "$2" "$token"
 }
 
-stop_samplers() { # stop the jobs of the link, of the clock and of the telemetry sources of role $1
+# Stop the jobs of the link, of the clock and of the telemetry sources of role $1; compress the files of the link and of the
+# sources.
+stop_samplers() {
     for meta in .jobs/link .jobs/clock .jobs/telemetry-*; do
         [ -d "$meta" ] || continue
         end_sampler
@@ -65,9 +67,9 @@ poll_source() { # start the job of the source in the quoted line $1, unless it w
 MAX_OUTPUT=65536 # limit of an output, in bytes
 MAX_TOTAL=4194304 # limit of all outputs of a source
 
-# Run ARGV at intervals and print its outputs, until file $1 no longer exists or the lock of token $2 (-: none) is lost. The
-# other arguments: ADDRESS that is queried, or -; INTERFACE by which packets to ADDRESS must not leave, or -; INTERVAL in s
-# (0: run once); LIMIT of a run in s; ARGV...
+# Run ARGV at intervals and print its outputs, until file $1 no longer exists, the lock of token $2 (-: none) is lost, the
+# outputs exceed MAX_TOTAL, or packets to ADDRESS would leave by INTERFACE. The other arguments: ADDRESS that is queried, or
+# -; INTERFACE by which packets to ADDRESS must not leave, or -; INTERVAL in s (0: run once); LIMIT of a run in s; ARGV...
 poll() {
     required_file=$1 token=$2 address=$3 tested_interface=$4 interval=$5 limit=$6 total=0 child=
     shift 6
@@ -117,7 +119,8 @@ uses_tested_interface() { # true if packets to $address leave by the interface u
     case "$route " in *" dev $tested_interface "*) ;; *) return 1 ;; esac
 }
 
-# Print samples of interface $1 until this job is stopped, its folder is deleted, or the lock of token $2 (-: none) is lost.
+# Print samples of interface $1 until this job is stopped, its folder is deleted, or the lock of token $2 (-: none) is lost;
+# return earlier if the interface is not Wi-Fi.
 sample() {
     interface=$1 token=$2 next_check=0 next_query=0 wifi=
     ulimit -f "$BLOCKS"

@@ -64,14 +64,16 @@ class AttemptTimes:
         bags: Contents of the bags that were sent, by file.
         transfers: Transfers with known fates of their packets.
         pings: Step name, role and output of each ping with an output.
-        clock_offset_ns: Clock offset of each role relative to the first sending robot; 0 if unknown.
+        clock_offset_ns: Clock offset of each role relative to the first sending robot; 0 if it is unknown and no
+            packet gives an estimate, see `clock_note`.
         clock_note: A sentence about the source of the clock offset.
         links: Samples of the radio link at each end.
         telemetry: Values from telemetry sources at each end by quantity (`telemetry_samples.series`).
-        distances_m: Distances between the ends, with the start time of each; empty if unknown.
-        ends: Roles of the first transfer's sender and receiver.
+        distances_m: Distances between the ends, with the start time of each; None in a gap of the positions; empty if
+            unknown.
+        ends: Roles of the first transfer's sender and receiver; `sender` and `receiver` without a transfer.
         jobs: Start and end of each job on a robot, by role and name.
-        activities: Activities in order of time.
+        activities: Activities in the order of their starts.
     """
 
     bags: Mapping[str, RecordingContents]

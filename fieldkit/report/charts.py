@@ -23,7 +23,7 @@ class Series:
         x: Positions.
         y: Values.
         low: Lower ends of their intervals, None for a point without interval; empty if no point has one.
-        high: Upper ends.
+        high: Upper ends, in the same form as `low`.
         join: Type of line between the points.
         behind: Single values, as (x, y), which are drawn faintly behind the points.
         breaks: Indices of points after which the line is interrupted.
@@ -145,7 +145,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Chart:
-    """A figure: panels side by side, under one legend.
+    """A figure: panels side by side or, if `is_stacked`, below each other, under one legend.
 
     Attributes:
         name: Name in file names and links.

@@ -32,7 +32,7 @@ from fieldkit.report import (
     wording,
 )
 from fieldkit.report.charts import Chart
-from fieldkit.report.coverage import absences
+from fieldkit.report.coverage import total_absences
 from fieldkit.report.headlines import Headline, Ranking, headlines
 from fieldkit.report.series import Identities
 from fieldkit.report.theme import CYCLE
@@ -62,7 +62,7 @@ _CROWDED: Final = (
     "Choose fewer with --where."
 )
 _MAX_IN_TABLE: Final = 8
-"""Maximum number of visible columns of quantities that are not defined by fieldkit."""
+"""Maximum number of visible columns in a table without quantities that are always visible."""
 
 
 @dataclass(frozen=True)
@@ -178,6 +178,9 @@ def build_contents(
         sweep: If the repeats are runs of sweeps, the result of `datasets.condition`: columns of the flow and of the
             factors, each with the column that contains its values as the user typed them. None or empty for other
             repeats.
+
+    Raises:
+        ConfigurationError: For the same reasons as `repeat_to_draw`.
     """
     evidence = load_evidence(repeats, repeat)
     has_all_plans = evidence.plans.keys() == set(repeats.texts["source"].tolist())
@@ -275,11 +278,13 @@ def repeat_to_draw(cells: Sequence[Cell], evidence: Evidence, requested: str) ->
     Args:
         cells: Conditions.
         evidence: The table and the available evidence.
-        requested: Folder of an attempt, `udp-07`, preceded by `TRIAL/` if several trials have it. If empty,
-            it is chosen from the condition with the highest loss: the valid repeat with the median of its losses.
+        requested: Folder of an attempt, `udp-07`, preceded by `TRIAL/` if several trials have it. If empty, a valid
+            repeat with available evidence is chosen from the condition with the highest loss: among its repeats with
+            a loss above 0, the one with the median loss. If there is none, the longest transfer time or, without
+            transfers, the longest round-trip time is used in place of the loss.
 
     Returns:
-        The row, or None if `requested` is empty and no evidence is available.
+        The row, or None if `requested` is empty and no repeat can be chosen.
 
     Raises:
         ConfigurationError: There is no such attempt, or several, or its evidence is not available.
@@ -339,8 +344,7 @@ def _missing_reasons(table: CellTable, evidence: Evidence) -> dict[tuple[int, st
     return {
         (numbers[id(absence.cell)], quantity.name): absence.text
         for quantity in (*table.quantities, *table.collapsed_quantities)
-        for absence in absences(cells, quantity, evidence)
-        if absence.is_total
+        for absence in total_absences(cells, quantity, evidence)
     }
 
 

@@ -1,10 +1,11 @@
-"""Number of repeats with a value of a quantity under each condition, and reasons for missing values.
+"""Numbers of repeats by outcome under each condition, and of repeats without a value of a quantity, with the reason.
 
 A cell contains the repeats under one condition, and their estimates.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import Final
 
 import numpy as np
@@ -44,10 +45,11 @@ class RepeatCounts:
     """Numbers of repeats under one condition by outcome.
 
     Attributes:
-        planned: Planned repeats according to the available plans; without a plan, the started repeats.
+        planned: Planned repeats, at least the started ones, of the trials that have rows under the condition. For a
+            trial without a plan, only the started repeats are counted.
         valid: Repeats with a valid attempt.
-        void: Repeats whose last attempt is void.
-        failed: Repeats whose last attempt failed.
+        void: Repeats without a valid attempt whose last attempt is void.
+        failed: Repeats without a valid attempt whose last attempt failed.
         all_lost: Valid repeats in which nothing arrived.
     """
 
@@ -69,7 +71,7 @@ class Absence:
 
     Attributes:
         cell: The condition.
-        reason: `nothing arrived`, `no value`, or `no valid repeat`.
+        reason: `nothing arrived`, `no value` or `no valid repeat`. `total_absences` can join the first two.
         count: Number of repeats without a value for this reason; number of attempts if no repeat is valid.
         total: Number of all repeats or attempts.
     """
@@ -78,11 +80,6 @@ class Absence:
     reason: str
     count: int
     total: int
-
-    @property
-    def is_total(self) -> bool:
-        """True if the condition has no value at all."""
-        return self.count == self.total
 
     @property
     def share(self) -> str:
@@ -118,7 +115,7 @@ def repeat_counts(cell: Cell, evidence: Evidence, all_lost: Rows) -> RepeatCount
 
 
 def everything_lost(repeats: Repeats) -> Rows:
-    """Return a mask of the rows in which every known loss is total; shape (n,)."""
+    """Return a mask of the rows with at least one known loss in which every known loss is total; shape (n,)."""
     names = [name for name in repeats.numbers if plain_name(name) in _ALL_LOSSES]
     return _all_lost([repeats.numbers[name] for name in names], len(repeats))
 
@@ -126,7 +123,8 @@ def everything_lost(repeats: Repeats) -> Rows:
 def nothing_arrived(repeats: Repeats, quantity: Quantity, rows: NDArray[np.int64]) -> Rows:
     """Return a mask of the given rows in which nothing arrived; shape of `rows`.
 
-    For a row without a loss that belongs to the quantity, all losses of the row are used.
+    This is the case if any loss that belongs to the quantity is total. If none of these is known in a row, every
+    known loss of the row must be total.
     """
     kind = plain_name(quantity.name).partition("_")[0]
     related = {step_prefixed(quantity.step, loss) for loss in _LOSSES.get(kind, _TRANSFER_LOSSES)}
@@ -165,8 +163,21 @@ def absences(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> I
             yield from _absences_of(cell, quantity, evidence)
 
 
+def total_absences(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> Iterator[Absence]:
+    """Yield one item for each condition in which a quantity has no value at all; see `absences` for the arguments."""
+    for _, parts in groupby(absences(cells, quantity, evidence), key=lambda absence: id(absence.cell)):
+        first, *others = parts
+        if first.count + sum(other.count for other in others) == first.total:
+            reason = " or ".join((first.reason, *(other.reason for other in others)))
+            yield replace(first, reason=reason, count=first.total)
+
+
 def _is_measured(cell: Cell, quantity: Quantity, cells: Iterable[Cell], evidence: Evidence) -> bool:
-    """Return True if the repeats of a cell measure a quantity, according to their plan, or else to similar cells."""
+    """Return True if the repeats of a cell should have a value of a quantity.
+
+    The plan decides this. Without a plan, the result is True if the cell has no valid repeat, if a similar cell has
+    the quantity, or if nothing arrived in one of the cell's attempts.
+    """
     if quantity.name in cell.estimates:
         return True
     if (measured_columns := evidence.measured_columns(cell)) is not None:

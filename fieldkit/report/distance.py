@@ -13,7 +13,7 @@ from fieldkit.analysis.wording import scale_of
 from fieldkit.core.columns import Kind, plain_name
 from fieldkit.report import wording
 from fieldkit.report.charts import Chart, EdgeMark, Panel, Series
-from fieldkit.report.coverage import Absence, absences
+from fieldkit.report.coverage import Absence, total_absences
 from fieldkit.report.headlines import Ranking
 from fieldkit.report.series import Identities, Identity, Point, axis_limits, panels, point
 from fieldkit.report.trial_folders import Evidence
@@ -40,26 +40,26 @@ RATE: Final = ("goodput_bit_s", "throughput_bit_s", "iperf3_throughput_bit_s")
 """Quantities with charts against distance by default, by section of the page."""
 
 _DODGE: Final = 0.026
-"""Offset between series at the same distance, as a share of the axis, so that intervals do not overlap."""
+"""Offset between series at the same distance, as a share of the range of distances. It separates their intervals."""
 _ASIDE: Final = 0.009
-"""Offset of single repeats from the interval of their estimate, as a share of the axis."""
+"""Offset of single repeats from the interval of their estimate, as a share of the range of distances."""
 _MIN_JOINED: Final = 4
 """Smallest number of distances whose points are joined. A line through fewer points suggests an unmeasured curve."""
 _MAX_WIDE: Final = 2
-"""Maximum number of panels of a chart of several steps that are drawn large."""
+"""Maximum number of large panels of a chart of several steps. If the chart has more panels, all are drawn small."""
 _MARGIN: Final = 0.06
-"""Margin at each end of the axis, as a share of the axis."""
+"""Margin at each end of the axis beyond the outermost series, as a share of the range of distances."""
 _TICKS_APART: Final = 0.16
-"""Minimum distance between labels, as a share of the axis."""
+"""Minimum distance between labels, as a share of the range of distances."""
 
 
 def charts(
     cells: Sequence[Cell], identities: Identities, evidence: Evidence, names: Sequence[str]
 ) -> Iterator[Chart]:
-    """Yield a chart for each of the quantities `names` that was measured at several distances.
+    """Yield a chart for each of the quantities `names` that was measured, or should have been, at several distances.
 
-    Named steps share a chart with a panel for each step. Round-trip times of different payload sizes have separate
-    charts unless they belong to named steps, because they must not be compared.
+    Named steps share a chart in which each step has its own panels. Round-trip times of different payload sizes must
+    not be compared. If their step has no name, each size therefore has its own chart.
     """
     drawing = _CurveDrawing(cells, identities, evidence, Ranking(evidence))
     for name in names:
@@ -78,7 +78,7 @@ def charts(
 
 def is_curve(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> bool:
     """Return True if any panel has a quantity, or should have it, at more than one distance."""
-    cells_without = (absence.cell for absence in absences(cells, quantity, evidence) if absence.is_total)
+    cells_without = (absence.cell for absence in total_absences(cells, quantity, evidence))
     distances_m: dict[tuple[str, str], set[float]] = {}
     for cell in (*_cells_with_distance(cells, quantity), *cells_without):
         distances_m.setdefault(wording.group(cell), set()).add(wording.metres(cell))
@@ -189,8 +189,8 @@ class _CurveDrawing:
         places = [_CurvePlace(cell, point(cell, quantity, factor, self.evidence)) for cell in group]
         places += [
             _CurvePlace(absence.cell, absence, is_high=is_high)
-            for absence in absences(with_missing(self.cells, quantity, group), quantity, self.evidence)
-            if absence.is_total and absence.cell.key["distance_m"] is not None
+            for absence in total_absences(with_missing(self.cells, quantity, group), quantity, self.evidence)
+            if absence.cell.key["distance_m"] is not None
         ]
         return sorted(places, key=lambda place: place.metres)
 
@@ -298,7 +298,10 @@ def _series(
 
 
 def _breaks(places: Sequence[_CurvePlace], limits: tuple[float, float]) -> frozenset[int]:
-    """Return the points after which no line is drawn, because their interval is wide or values are missing."""
+    """Return the indexes of the points after which no line is drawn; -1 stands for the start, before the first point.
+
+    A line does not start or end at a point with a vague interval, and does not cross a distance without a value.
+    """
     breaks, index = set(), -1
     for place in places:
         if isinstance(place.content, Absence):
@@ -311,7 +314,7 @@ def _breaks(places: Sequence[_CurvePlace], limits: tuple[float, float]) -> froze
 
 
 def _ticks(places: Sequence[_CurvePlace], span: float) -> list[tuple[float, str]]:
-    """Return the distances that get a label, as the operator wrote them."""
+    """Return the distances that get a label, in metres, and the labels, as the operator wrote them."""
     labels: list[tuple[float, str]] = []
     for metres, label in sorted({(place.metres, wording.distance(place.cell)) for place in places}):
         if not labels or metres - labels[-1][0] >= _TICKS_APART * span:
@@ -320,7 +323,7 @@ def _ticks(places: Sequence[_CurvePlace], span: float) -> list[tuple[float, str]
 
 
 def _describe(title: str, y_label: str, series: Iterable[tuple[Identity, list[_CurvePlace]]]) -> str:
-    """Return the description of a panel, one sentence per series."""
+    """Return the description of a panel, with a list of values for each series."""
     sentences = [
         f"{identity.label or 'all'}: "
         + ", ".join(

@@ -1,4 +1,6 @@
-"""Distribution functions of all round-trip times if outputs of ping are available, otherwise of values of repeats.
+"""Distribution functions of round-trip times and transfer times.
+
+Round-trip times are those of all replies if all outputs of ping are available, otherwise the medians of the repeats.
 
 A cell contains the repeats under one condition, and their estimates.
 """
@@ -25,7 +27,7 @@ _LOG_MARGIN: Final = 1.1
 """Factor between the ends of an axis and the extreme times."""
 _LOG: Final = ", on a logarithmic axis"
 MAX_STEPS: Final = 120
-"""Maximum number of steps of a line. A longer line is drawn through this number of its quantiles."""
+"""Maximum number of steps of a line. A line of more times is drawn through their quantiles at multiples of 1/120."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +90,7 @@ def _repeat_samples(name: str, cells: Sequence[Cell], evidence: Evidence) -> lis
 def _chart(
     name: str, title: str, unit_name: str, samples: Sequence[_Sample], identities: Identities
 ) -> Iterator[Chart]:
-    """Yield a chart with a panel per condition and distance; nothing if there are no times."""
+    """Yield a chart with a panel per protocol, topology and shown distance; nothing if there are no times."""
     nonempty = [sample for sample in samples if len(sample.times_s)]
     if not nonempty:
         return

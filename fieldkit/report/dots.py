@@ -14,7 +14,7 @@ from fieldkit.analysis.wording import Scale, measured, scale_of
 from fieldkit.core.columns import Kind
 from fieldkit.report import distance, wording
 from fieldkit.report.charts import Chart, EdgeMark, Panel, Series
-from fieldkit.report.coverage import absences
+from fieldkit.report.coverage import total_absences
 from fieldkit.report.headlines import Ranking
 from fieldkit.report.series import Identities, Identity, Point, axis_limits, needs_log, panels, point
 from fieldkit.report.trial_folders import Evidence
@@ -49,7 +49,7 @@ class _Lane:
         label: Its name, and the payload size of a ping.
         quantity: The quantity.
         cells: The conditions that have it.
-        with_missing: These conditions, and the conditions without a value.
+        with_missing: These conditions, and those of the same protocol and topology that lack the quantity.
     """
 
     label: str
@@ -127,8 +127,7 @@ class _DotDrawing:
                     self.identities.of(absence.cell).style.colour,
                     is_high,
                 )
-                for absence in absences(lane.with_missing, lane.quantity, self.evidence)
-                if absence.is_total
+                for absence in total_absences(lane.with_missing, lane.quantity, self.evidence)
             ]
         points = [estimate for _, placed_points in points_by_label.values() for _, estimate in placed_points]
         ranked_series = sorted(points_by_label.values(), key=lambda pair: pair[0].rank)
@@ -183,7 +182,7 @@ def _series(identity: Identity, placed_points: Sequence[tuple[float, Point]], as
 def _caption(drawn_panels: Sequence[Panel]) -> str:
     parts = [
         _EXPLANATION,
-        "The axis is logarithmic if values differ by a factor of more than 30."
+        "The axis is logarithmic if values differ by a factor of more than about 30."
         if any(panel.x_log for panel in drawn_panels)
         else "",
         "Hollow, with an arrow: a lower bound, because the timed event had not ended."

@@ -28,7 +28,7 @@ _TICK_STEPS: Final = (1, 2, 5, 10)
 _MAX_TITLE_LENGTH: Final = 48
 _MAX_TICK_LENGTH: Final = 20
 _MAX_LANE_LENGTH: Final = 26
-"""Maximum numbers of characters of titles, tick labels and names of lanes."""
+"""Maximum numbers of characters of titles and axis labels, of tick labels, and of each line of a lane's name."""
 _BOUND_MARKER_SIZE: Final = 4.0
 """Size of the triangles of single repeats whose values are only lower bounds."""
 _ARROW_POINTS: Final = 14.0

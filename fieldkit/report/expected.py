@@ -1,4 +1,4 @@
-"""Texts that show in a report if the measured values meet the expectations of the trials.
+"""Texts that show in a report whether the measured values meet the expectations of the trials.
 
 A cell contains the repeats under one condition, and their estimates.
 """
@@ -19,11 +19,11 @@ class JudgementRow:
     """The judgement of an expectation under one condition, as texts.
 
     Attributes:
-        condition: The condition; empty if no repeat has ended.
-        value: The measured value.
-        interval: Its 95 % interval; empty if it has none.
+        condition: The condition; empty if no repeat of the expectation's protocol has ended.
+        value: The measured value; `nothing` if no valid repeat has one.
+        interval: The 95 % interval or the one-sided bound that determines the ruling; empty if there is none.
         ruling: The ruling on the expectation.
-        why: Reason for the ruling that the numbers do not show, or empty.
+        why: Reason for the ruling that the numbers do not show; empty if there is none.
     """
 
     condition: str

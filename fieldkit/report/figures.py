@@ -1,4 +1,4 @@
-"""Figures of matplotlib for the page and for papers. Equal inputs give equal bytes on every machine."""
+"""Figures of matplotlib for the page and for papers. Equal inputs give equal bytes with the same matplotlib."""
 
 import io
 import math
@@ -34,7 +34,7 @@ _LANE_INCHES: Final = 0.3
 _HEAT_ROW_INCHES: Final = 0.16
 _LANE_MARGINS_INCHES: Final = 1.05
 """Heights of a lane, of a row of a heat map, and of both margins of a panel with lanes or rows."""
-# IEEE requires a width of one column, 3.5 in, or of both, 7.16 in, and a font of 8 pt in figures.
+# Figures of IEEE papers are one column, 3.5 in, or both columns, 7.16 in, wide.
 _COLUMN_INCHES: Final = 3.5
 _BOTH_COLUMNS_INCHES: Final = 7.16
 _PAPER_PANEL_INCHES: Final = 2.3
@@ -105,7 +105,7 @@ def _inches(panel: Panel) -> tuple[float, float]:
 
 
 def paper(chart: Chart, file_format: Format) -> bytes:
-    """Return a chart with its legend, one column of a paper wide, or two columns wide if it has several panels."""
+    """Return the file of a chart with its legend: one column of a paper wide, or both if it has several panels."""
     columns = 1 if chart.is_stacked else min(2, len(chart.panels))
     rows = math.ceil(len(chart.panels) / columns)
     width = _COLUMN_INCHES if len(chart.panels) == 1 else _BOTH_COLUMNS_INCHES
@@ -138,7 +138,7 @@ def save(charts: Iterable[Chart], folder: Path) -> Iterator[Path]:
 
 
 def overview(lab: Overview, file_format: Format) -> bytes:
-    """Return a plan view of a lab: obstacles, robots, and links coloured by SNR (dotted: no reception)."""
+    """Return the file of a plan view of a lab: obstacles, robots, links coloured by SNR (dotted: no reception)."""
     with _settings(8.0):
         figure = _Figure(figsize=(_BOTH_COLUMNS_INCHES, _BOTH_COLUMNS_INCHES * 0.75), layout="constrained")
         axes = figure.add_subplot()

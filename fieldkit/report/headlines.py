@@ -1,4 +1,4 @@
-"""Headlines of a report: first the missing results, then each quantity, its worst condition first.
+"""Headlines of a report: first the outcomes of the repeats, then the quantities, each with its worst value first.
 
 A cell contains the repeats under one condition, and their estimates.
 """
@@ -16,6 +16,7 @@ from fieldkit.core.units import format_count
 from fieldkit.report import coverage, wording
 from fieldkit.report.coverage import Absence
 from fieldkit.report.trial_folders import Evidence
+from fieldkit.trial.columns import columns_of_step
 from fieldkit.trial.plan import Plan
 
 _USER_DEFINED_KINDS: Final = frozenset(("ask", "run"))
@@ -51,9 +52,10 @@ class Ranking:
         return name in self._user_defined_columns
 
     def more_is_worse(self, quantity: Quantity) -> bool | None:
-        """Return True if larger values are worse, or None if that is unknown.
+        """Return True if larger values are worse, False if they are better, or None if that is unknown.
 
-        The expectation on the quantity determines the result. Without an expectation, the unit or the name does.
+        The expectation on the quantity determines the result. Without an expectation, the unit or the name does,
+        except for flags and user-defined quantities, for which the result is None.
         """
         if (expectation := self._expected.get(quantity.name)) is not None:
             return expectation.is_below
@@ -67,7 +69,7 @@ class Ranking:
 def _user_defined_columns(plan: Plan) -> Iterator[str]:
     for placed in plan.procedure.walk():
         if placed.kind in _USER_DEFINED_KINDS:
-            yield from (column.name for column in placed.step.output_columns())
+            yield from (column.name for column in columns_of_step(placed.step))
 
 
 _PROTOCOL_QUANTITIES: Final = {"udp": ("datagram_loss", "rtt_median_s"), "tcp": ("tcp_byte_loss", "rtt_median_s")}
@@ -77,7 +79,7 @@ _TOPIC_QUANTITIES: Final = ("topic_loss", "topic_delay_median_s", "video_loss", 
 In these trials pings serve only to measure the clock offset, and transfers only to generate load.
 """
 _MAX_FIRST_HEADLINES: Final = 6
-"""Maximum number of headlines of expected and user-defined quantities."""
+"""Maximum number of expected and user-defined quantities with headlines. An RTT has one per payload size."""
 _MAX_PLACES: Final = 3
 """Maximum number of conditions that a line names."""
 _COUNT_TEXTS: Final = {
@@ -94,11 +96,13 @@ class HeadlineLine:
     """One line of a headline.
 
     Attributes:
-        extreme: `least` or `most`; empty if there is nothing to compare.
-        value: The value with its unit, or the missing result.
-        interval: The 95 % interval, and the number of repeats with a value if not all have one; may be empty.
-        place: The condition.
-        is_missing: True if it reports something missing or lost.
+        extreme: `least` or `most`; if all values are equal, `in all conditions` or `in all others`; empty if there is
+            nothing to compare.
+        value: The value with its unit, the number of repeats with an outcome, or the reason for missing values.
+        interval: The 95 % interval, and the number of repeats with a value if not all have one; empty if several
+            conditions have the value.
+        place: The conditions, at most three and the number of others; may be empty.
+        is_missing: True if the line reports something missing or lost.
     """
 
     extreme: str
@@ -114,7 +118,7 @@ class Headline:
 
     Attributes:
         subject: Its title.
-        lines: Its lines, the worst first.
+        lines: Its lines: missing values, then the worst value, then the best.
     """
 
     subject: str
@@ -124,8 +128,9 @@ class Headline:
 def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[str] = ()) -> Iterator[Headline]:
     """Yield the headline of the outcomes of repeats, then headlines of quantities.
 
-    Quantities with an expectation and user-defined quantities come first, then the quantities of each protocol. Steps
-    that differ only in their names share a headline, in which the step is part of the condition.
+    At most six quantities with an expectation or user-defined quantities come first, then the quantities of each
+    protocol. The latter share a headline if several named steps measure the same one: the condition then names the
+    step.
 
     Args:
         cells: Conditions.
@@ -172,7 +177,11 @@ class _HeadlineWriter:
     differing: Collection[str]
 
     def repeats_headline(self, cells: Sequence[Cell], unmeasured: Sequence[str]) -> Headline:
-        """Return the number of valid repeats, and the conditions of the other repeats, the worst first."""
+        """Return the headline of the numbers of repeats by outcome.
+
+        Its first line is the number of valid repeats. The others name the conditions of repeats in which nothing
+        arrived, that failed, are void or were not run, the largest share first.
+        """
         all_lost = coverage.everything_lost(self.evidence.repeats)
         cell_counts = [(cell, coverage.repeat_counts(cell, self.evidence, all_lost)) for cell in cells]
         planned, valid = (sum(getattr(counts, name) for _, counts in cell_counts) for name in ("planned", "valid"))
@@ -266,7 +275,7 @@ def _missing(
 def _worst_and_best(
     values: Sequence[tuple[Cell, Estimate]], place: Callable[[Cell, Quantity], str], *, has_all_values: bool
 ) -> list[HeadlineLine]:
-    """Return the worst and the best of values that are sorted from worst to best, or only one if all are equal."""
+    """Return the worst and the best of values that are sorted from worst to best; one line if both have one text."""
     worst, best = (wording.value(values[index][1]) for index in (0, -1))
     if worst == best and len(values) > 1:
         return [HeadlineLine("in all conditions" if has_all_values else "in all others", worst, "", "")]
@@ -309,7 +318,8 @@ def _subject(variants: Sequence[Quantity], protocol: str, has_topics: bool) -> s
 def _existing_quantities(quantities: Sequence[Quantity], names: Sequence[str]) -> list[list[Quantity]]:
     """Return the quantity of each name, with its variants in other steps.
 
-    Names that no quantity has are omitted. If none exists, the first quantities are returned, as many as `names`.
+    Names that no quantity has are omitted. If no name exists, the first quantities are returned instead, at most as
+    many as there are `names`.
     """
     existing = [matching for name in names if (matching := _quantities_named(quantities, name))]
     first_names = dict.fromkeys(plain_name(quantity.name) for quantity in quantities)

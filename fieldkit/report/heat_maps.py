@@ -27,7 +27,7 @@ _DEFAULT_NAMES: Final = (
     "rtt_median_s",
     "added_delay_mean_s",
 )
-"""Quantities that are drawn by default."""
+"""Quantities that are drawn without a request, if their values differ."""
 _MAX_PANELS: Final = 12
 """Maximum number of maps of a quantity."""
 
@@ -50,7 +50,10 @@ class _Axis:
 def charts(
     repeats: Repeats, sweep: Mapping[str, str], requested: Sequence[str] = (), *, one_factor: bool = False
 ) -> Iterator[Chart]:
-    """Yield a chart per quantity; none if too few factors have several values.
+    """Yield a chart for each measured quantity that is drawn by default or requested.
+
+    Quantities whose values are all equal are drawn only if they are requested. The axes are the first two factors
+    with several values. Nothing is yielded if there are too few such factors.
 
     Args:
         repeats: The runs of sweeps.
@@ -106,7 +109,7 @@ def _chart(quantity: Quantity, cells: Sequence[Cell], axes: Sequence[_Axis], oth
     omitted_count = len(groups) - len(panels)
     caption = "Each value is an estimate over the valid runs, one per seed; the table has its interval."
     if omitted_count:
-        caption += f" {omitted_count} more maps are left out."
+        caption += f" {omitted_count} more {'map is' if omitted_count == 1 else 'maps are'} left out."
     title = f"{scale.head(quantity.label)} over {axes[0].name} and {axes[1].name}"
     return Chart(f"map-{quantity.name}".replace(".", "-"), title, caption, panels)
 

@@ -1,4 +1,4 @@
-"""Packet rasters: the packets of each repeat in the order of sending, with losses and retransmissions marked.
+"""Packet rasters: the packets of each repeat in the order of sending; lost or retransmitted packets are marked.
 
 A cell contains the repeats under one condition, and their estimates.
 """
@@ -12,6 +12,7 @@ import numpy as np
 
 from fieldkit.analysis.cells import Cell
 from fieldkit.core.model import Protocol, Status
+from fieldkit.core.units import format_count
 from fieldkit.measure.captures.arrays import Mask
 from fieldkit.measure.transfers import fates
 from fieldkit.report import wording
@@ -20,9 +21,10 @@ from fieldkit.report.trial_folders import Evidence
 from fieldkit.trial import planned_evidence
 
 MAX_REPEATS: Final = 400
-"""Maximum number of repeats whose captures are read, over all cells. Each cell shows at least its first repeat."""
+"""Maximum number of repeats whose captures are read, divided equally among the cells. Each cell shows at least its
+first valid repeat with captures."""
 MAX_LINES: Final = 20
-"""Maximum number of lines of a cell."""
+"""Maximum number of lines of a raster."""
 MAX_COLUMNS: Final = 300
 """Maximum number of columns of a line. If a line has more packets, each column represents several packets and is
 marked if any of them is marked."""
@@ -53,10 +55,10 @@ class Raster:
 
 @dataclass(frozen=True)
 class RasterGroup:
-    """Rasters of one protocol and topology.
+    """Rasters of one transfer with one protocol and topology.
 
     Attributes:
-        title: Transfer, protocol and topology.
+        title: Name of the transfer, if it has one, protocol and topology.
         what: The meaning of a mark, and the number of packets per column.
         rasters: One per condition whose captures are available.
     """
@@ -115,7 +117,8 @@ def _raster(place: str, lines: Sequence[Mask], width: int, what: str) -> Raster:
         columns=max(map(len, columns)),
         lengths=[len(line) for line in columns],
         runs=[(number, *run) for number, line in enumerate(columns) for run in _runs(line)],
-        description=f"{place}: {len(lines)} repeats, {marked_count} of {total} {what}, at most {longest} in a row",
+        description=f"{place}: {format_count(len(lines), 'repeat')}, {marked_count} of {total} {what}, at most "
+        f"{longest} in a row",
     )
 
 

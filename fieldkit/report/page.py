@@ -26,7 +26,7 @@ from fieldkit.report.contents import Contents
 
 DEFAULT_NAME: Final = "report.html"
 _FIRST_BYTES: Final = b"<!DOCTYPE html>"
-"""First bytes of a report; other files are not overwritten."""
+"""First bytes of a report. A file that begins with other bytes is not overwritten."""
 _TEMPLATE: Final = "report.html"
 _SVG_NAMESPACE: Final = "http://www.w3.org/2000/svg"
 _XLINK_NAMESPACE: Final = "http://www.w3.org/1999/xlink"
@@ -51,10 +51,12 @@ def write(contents: Contents, out: Path) -> None:
 
 
 def require_writable(out: Path) -> None:
-    """Check, before a report is computed, that its page can be written to `out`. Only a report may be overwritten.
+    """Check, before a report is computed, that its page may be written to `out`.
+
+    Only a report or an empty file may be overwritten. Permissions are not checked.
 
     Raises:
-        ConfigurationError: The page cannot be written there.
+        ConfigurationError: The page cannot be written there, or the suffix is that of another format.
     """
     if not out.parent.is_dir():
         raise ConfigurationError(
@@ -79,7 +81,7 @@ def require_writable(out: Path) -> None:
 
 
 def _is_page(out: Path) -> bool:
-    """Return True if a file is a report or empty. A pipe is not read, because that would block."""
+    """Return True if a regular file is a report or empty. Others, such as a pipe, are not read: that could block."""
     if not out.is_file():
         return False
     with explaining_write_errors(out, "-o"), out.open("rb") as file:

@@ -30,7 +30,7 @@ class Identity:
     Attributes:
         label: `LOS`, with the procedure if several procedures share a scenario, and the backend if there are several.
         style: Its style.
-        rank: Sort key: by scenario; within a scenario, the field backend is first.
+        rank: Sort key: by scenario and procedure, then by backend, the field backend first.
     """
 
     label: str
@@ -98,15 +98,16 @@ def _by_scenario(kind: tuple[str, str]) -> tuple[bool, int, str, str]:
 MAX_BEHIND: Final = 100
 """Maximum number of single repeats that are drawn behind one estimate. If there are more, every k-th is drawn."""
 _MIN_BEHIND: Final = 10
-"""Number of single repeats that are drawn behind one estimate even if there are many conditions."""
+"""Smallest value of `max_behind`, which applies if there are many conditions."""
 _MAX_BEHIND_IN_CHART: Final = 2000
-"""Maximum number of single repeats in the chart of a quantity, divided equally among its conditions."""
+"""Maximum number of single repeats in the chart of a quantity, divided equally among the conditions of the table."""
 _MIN_TOP_PERCENT: Final = 1.0
 """Smallest upper end of an axis of percentages."""
 _TOP_FACTOR: Final = 1.08
 """Ratio between the upper end of an axis that starts at 0 and the largest value."""
 _MAX_AXIS_FACTOR: Final = 2.0
-"""Maximum length of the axis, as a multiple of the largest value. Wider intervals are cut there."""
+"""Maximum end of an axis that starts at 0, as a multiple of the largest estimate, before `_TOP_FACTOR` is applied.
+Intervals are cut at the end of the axis, and repeats beyond it are not drawn."""
 _MARGIN_SHARE: Final = 0.25
 """Margins of an axis that does not start at 0, as a share of the range of values."""
 _LOG_FROM_DECADES: Final = 1.5
@@ -123,7 +124,7 @@ class Point:
         cell: The condition.
         value: The estimate.
         low: Lower end of its 95 % interval; None if it has none.
-        high: Upper end; None if it has no interval.
+        high: Upper end; None if there is no interval, or if it is open because of lower bounds.
         repeats: Values of single repeats; if there are many, only some of them.
         bounds: True for each value in `repeats` that is only a lower bound.
         is_bound: True if the estimate is only a lower bound because of such values.
@@ -164,7 +165,10 @@ class Point:
         return [value for value, is_bound in zip(self.repeats, self.bounds, strict=True) if is_bound is are_bounds]
 
     def is_vague(self, ends: tuple[float, float]) -> bool:
-        """Return True if the point has no interval, or its interval is open or wider than half of the axis."""
+        """Return True if the point is a lower bound, or its interval is missing, open or wider than half of the axis.
+
+        `ends` are the ends of the axis.
+        """
         if self.low is None or self.high is None or self.is_bound:
             return True
         return self.high - self.low > _MAX_INTERVAL_SHARE * (ends[1] - ends[0])
@@ -178,7 +182,7 @@ def max_behind(evidence: Evidence) -> int:
 def point(cell: Cell, quantity: Quantity, factor: float, evidence: Evidence) -> Point:
     """Return the estimate of a quantity under one condition, with values multiplied by `factor`.
 
-    A flag has no single repeats, since each is either 0 or 1.
+    The point of a flag contains no single repeats, because their values could only be 0 or 1.
     """
     estimate = cell.estimates[quantity.name]
     low, high = (None if end is None else factor * end for end in (estimate.low, estimate.high))

@@ -1,4 +1,4 @@
-"""Strip charts: one mark per attempt, in order of time, with the loss as its height.
+"""Strip charts: marks of attempts in order of time, with the loss as the height of a mark.
 
 A cell contains the repeats under one condition, and their estimates.
 """
@@ -34,8 +34,8 @@ class Mark:
     Attributes:
         row: Its row in the table.
         status: Its status.
-        height: Its loss divided by the highest loss in strips of the same protocol. None if the attempt is not valid
-            or its loss is unknown.
+        height: Its loss divided by the highest loss in strips of the same protocol; 0 if this highest loss is 0. None
+            if the attempt is not valid or its loss is unknown.
         title: Description for a tooltip or a screen reader.
     """
 
@@ -72,7 +72,7 @@ class StripGroup:
 
     Attributes:
         title: Protocol and topology.
-        scale: The meaning of a mark of full height.
+        scale: The meaning of a mark of full height; empty if no loss was measured.
         strips: A strip per cell.
     """
 
@@ -113,7 +113,7 @@ class _Heights:
 
     Attributes:
         loss: The first quantity of `LOSSES` that is measured; None if none is.
-        full_height_loss: The loss at which a mark has its full height, 0 to 1.
+        full_height_loss: The loss at which a mark has its full height, 0 to 1; 0 if nothing was lost or measured.
     """
 
     loss: Quantity | None

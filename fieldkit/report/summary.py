@@ -42,7 +42,7 @@ class Caution:
 
 
 def paragraph(cells: Sequence[Cell], evidence: Evidence, sweep: Mapping[str, str]) -> str:
-    """Return a paragraph about the trials: procedures, times, distances and numbers of attempts.
+    """Return a paragraph about the trials or the sweep: procedures or factors, times, distances, protocols, attempts.
 
     Args:
         cells: Conditions.
@@ -80,7 +80,11 @@ def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Caution]:
     for caution in cautions(cells):
         yield Caution(f"{caution}.".replace(" %", "\N{NO-BREAK SPACE}%"))
     if single_count := sum(cell.n_valid == 1 for cell in cells):
-        yield Caution(f"{single_count} of {len(cells)} conditions have a single valid repeat, and no intervals.")
+        total = format_count(len(cells), "condition")
+        yield Caution(
+            f"A single valid repeat in {single_count} of {total}, so only figures that are true or false have an "
+            "interval there."
+        )
     valid = repeats.where(repeats.texts["status"] == Status.VALID)
     columns = [texts for name, texts in valid.texts.items() if plain_name(name) == "one_way_withheld"]
     withheld_reasons = [reasons for reasons in zip(*columns, strict=True) if any(reasons)]
@@ -102,7 +106,8 @@ def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Caution]:
     yield from map(Caution, evidence.limitations[:_MAX_LIMITATIONS])
     if (more_count := len(evidence.limitations) - _MAX_LIMITATIONS) > 0:
         yield Caution(
-            f"{more_count} further notes of this kind are not shown; fieldkit verify lists them for a trial."
+            f"Not shown: {format_count(more_count, 'further note')} of this kind; fieldkit verify lists them for a "
+            "trial."
         )
 
 
@@ -170,14 +175,14 @@ class Provenance:
     Attributes:
         name: Its name.
         source: Its folder, or the table with its rows.
-        has_evidence: True if its raw evidence is available.
-        start_text: Start of its first attempt, as text.
-        robots: Sender, receiver and relay.
+        has_evidence: True if its folder is available and the plan in it can be read.
+        start_text: Start of its first attempt, to the minute in UTC; empty if unknown.
+        robots: Sender and receiver, and the relay if there is one.
         attempts: Numbers of attempts by status.
-        seed: Its seed.
-        hashes: Hashes of code, procedure and profiles; empty if missing.
-        versions: Versions of its programs; empty if its folder is not available.
-        notes: The operator's notes.
+        seed: Its seed; empty if unknown.
+        hashes: Hashes of code, procedure and profiles; a missing hash is an empty text.
+        versions: Versions of its programs; empty if its plan is not available.
+        notes: The operator's notes; empty if its plan is not available.
     """
 
     name: str

@@ -142,7 +142,7 @@ CYCLE: Final[tuple[tuple[Colour, Marker], ...]] = (
 without line of sight; the others are assigned to further procedures."""
 
 LINES: Final[tuple[Line, ...]] = ("solid", "dashed", "dotted", "dashdot")
-"""Lines of backends, in order: the field backend is the first."""
+"""Lines of backends, in order: the field backend, if there is one, has the first."""
 
 _NAME_BY_HEX: Final = {value: name for name, value in LIGHT.items()}
 _HEX: Final = re.compile("|".join(_NAME_BY_HEX))

@@ -1,4 +1,4 @@
-"""The time line of one repeat: bars of steps, faults and moves, then flows, pings, radios and distance."""
+"""The time line of one attempt: bars of steps, faults and moves, then flows, pings, radios and distance."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fieldkit.core.columns import step_prefixed
 from fieldkit.core.model import Protocol, Role
+from fieldkit.core.units import format_count
 from fieldkit.measure.evidence import ping
 from fieldkit.measure.transfers.fates import Fates
 from fieldkit.measure.transfers.transfer_spec import Transfer
@@ -85,7 +86,7 @@ def charts(row: int, data: Evidence) -> Iterator[Chart]:
 def _stack(panels: Sequence[Panel], end_s: float) -> list[Panel]:
     """Return panels with a shared time axis, which has a label in the lowest panel.
 
-    Points outside of the axis are removed.
+    Points outside of the axis are removed; those of step functions are moved to its nearest end.
     """
     last_index, right_s = len(panels) - 1, (1 + _MARGIN_SHARE) * end_s or 1.0
     return [
@@ -102,7 +103,7 @@ def _stack(panels: Sequence[Panel], end_s: float) -> list[Panel]:
 
 
 def _clip_series(series: Series, right_s: float) -> Series:
-    """Return the points of a series from 0 to the end of the time axis."""
+    """Return a series without the points outside of the time axis; those of a step function are moved to its end."""
     x, y = (np.asarray(values, dtype=np.float64) for values in (series.x, series.y))
     if series.join == "steps":  # a value holds until the next one, so an early value applies from the start
         x = np.clip(x, 0.0, right_s)
@@ -162,13 +163,17 @@ def _packets(transfer: Transfer, fates: Fates, zero_ns: int) -> Panel:
         x_label=f"time [ms] after {(first_sent_ns - zero_ns) / 1e9:.3f} s",
         y_label="offset in the payload [kB]",
         series=series,
-        description=f"{len(fates.sent_ns)} packets sent, {fates.lost_or_repeated.sum()} of them {marked_text}, "
-        f"{len(fates.received_ns)} received",
+        description=f"{format_count(len(fates.sent_ns), 'packet')} sent, {fates.lost_or_repeated.sum()} of them "
+        f"{marked_text}, {len(fates.received_ns)} received",
     )
 
 
 def _round_trips(name: str, role: Role, output: ping.Ping, times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
-    """Yield a panel of round-trip times and of requests without a reply, by the time of sending, if there are any."""
+    """Yield a panel of round-trip times and of requests without a reply.
+
+    Round-trip times are placed at the times of the replies. Requests without a reply are placed at estimated times;
+    nothing is yielded if these times are unknown, or if there is neither a reply nor a request without one.
+    """
     clock_offset_ns = times.clock_offset_ns[role]
     answered_requests = [
         (reply.seq, reply.at_utc_ns - clock_offset_ns - zero_ns, reply.rtt_s)
@@ -195,7 +200,8 @@ def _round_trips(name: str, role: Role, output: ping.Ping, times: AttemptTimes, 
         x_label=_TIME_LABEL,
         y_label="RTT [ms]",
         series=series,
-        description=f"{len(answered_requests)} round trips{median_text}; {len(lost_numbers)} without a reply",
+        description=f"{format_count(len(answered_requests), 'round trip')}{median_text}; {len(lost_numbers)} without "
+        "a reply",
         top=None if answered_requests else 1.0,
     )
 
@@ -203,7 +209,7 @@ def _round_trips(name: str, role: Role, output: ping.Ping, times: AttemptTimes, 
 def _spread_over_job(
     lost_numbers: NDArray[np.int64], name: str, role: Role, times: AttemptTimes, zero_ns: int
 ) -> NDArray[np.float64] | None:
-    """Return approximate send times of requests without any reply, spread evenly over the job; None if unknown."""
+    """Return approximate send times of requests if none was answered, evenly over the job; None without its times."""
     if (span := times.jobs.get((role, step_prefixed(name, "ping")))) is None:
         return None
     start_s, stop_s = ((at_ns - zero_ns) / 1e9 for at_ns in span)
@@ -216,7 +222,8 @@ def estimate_send_times(
 ) -> NDArray[np.float64]:
     """Return approximate send times of requests without a reply, interpolated by sequence number.
 
-    Before the first and after the last answered request, the mean interval is used.
+    Before the first and after the last answered request, the mean interval is used, or 1 s if only one was answered.
+    The times are those of replies, so they are later than the true ones by about a round-trip time.
 
     Args:
         lost_numbers: Sequence numbers of the requests without a reply.

@@ -23,6 +23,7 @@ from fieldkit.core.model import Status
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import ping
 from fieldkit.trial import planned_evidence, store
+from fieldkit.trial.columns import columns_of_step
 from fieldkit.trial.plan import PLAN_FILE, Plan
 from fieldkit.trial.stored import plans as stored_plans
 from fieldkit.trial.stored import verification
@@ -38,12 +39,13 @@ class Evidence:
     Attributes:
         repeats: The table.
         plans: Plans by the `source` of rows; only sources that are folders of trials have one.
-        limitations: A sentence per plan that could not be read, and per trial whose evidence differs from its
-            manifest.
+        limitations: Sentences about plans that cannot be read, about trials whose evidence differs from the manifest
+            or cannot be compared with it, and about trials that were left out because there are too many.
         changed_folders: Folders of attempts whose evidence differs from the manifest and therefore counts as not
             available.
-        verified_sources: The `source` of the trials whose evidence was compared with the manifest. The evidence of
-            other trials counts as not available.
+        verified_sources: The `source` of the trials whose evidence was compared with the manifest, or could not be
+            compared because of an error that `limitations` reports. The evidence of other trials counts as not
+            available.
     """
 
     repeats: Repeats
@@ -79,7 +81,7 @@ class Evidence:
             sources = dict.fromkeys(self.repeats.texts["source"][self.rows(cell)].tolist())
             plans = [self.plans[source] for source in sources if source in self.plans]
             steps = (placed.step for plan in plans for placed in plan.procedure.walk())
-            names = frozenset(column.name for step in steps for column in step.output_columns())
+            names = frozenset(column.name for step in steps for column in columns_of_step(step))
             self._measured_columns[key] = names if plans else None
         return self._measured_columns[key]
 
@@ -103,18 +105,24 @@ class Evidence:
         return values[is_known], is_bound[is_known]
 
     def by_payload(self, cells: Sequence[Cell], step: str = "") -> Mapping[str, list[Cell]]:
-        """Return cells by the payload size of their pings in words, since different sizes must not be compared."""
+        """Return cells by the payload size of their pings as returned by `payload`, empty if it is unknown.
+
+        Cells with different sizes must not be compared.
+        """
         cells_by_size: dict[str, list[Cell]] = {}
         for cell in cells:
             cells_by_size.setdefault(self.payload(cell, step), []).append(cell)
         return cells_by_size
 
     def payloads(self, cells: Iterable[Cell], step: str = "") -> list[str]:
-        """Return the payload sizes of the pings of cells, `502 bytes`, optionally of a named step."""
+        """Return the different known payload sizes of the pings of cells, `502 bytes`; `step` is the step's name."""
         return [size for size in dict.fromkeys(self.payload(cell, step) for cell in cells) if size]
 
     def payload(self, cell: Cell, step: str = "") -> str:
-        """Return the payload size of a cell's pings, `502 bytes`, or an empty string if it is unknown."""
+        """Return the payload size of a cell's pings, or an empty string if it is unknown.
+
+        Examples: `502 bytes`; `56 or 502 bytes` if it differs between repeats.
+        """
         name = f"{step}.rtt_payload_bytes".removeprefix(".")
         if name not in self.repeats.numbers:
             return ""
@@ -156,7 +164,7 @@ def load_evidence(repeats: Repeats, attempt: str = "") -> Evidence:
 
     Args:
         repeats: The table.
-        attempt: An attempt whose evidence must be available, in the form of `Repeats.row`; empty for none.
+        attempt: An attempt whose trial is among these in any case, in the form of `Repeats.row`; empty for none.
 
     Raises:
         ConfigurationError: There is no such attempt, or there are several.
@@ -193,7 +201,8 @@ def load_evidence(repeats: Repeats, attempt: str = "") -> Evidence:
 def _choose_sources(repeats: Repeats, plans: Mapping[str, Plan], required_sources: Iterable[str]) -> list[str]:
     """Return at most `MAX_TRIALS` sources with plans.
 
-    `required_sources` come first, then one source per condition, then a second one per condition, and so on.
+    If there are more, `required_sources` are chosen first, then one source per condition, then a second one per
+    condition, and so on. The result has the order of `plans`.
     """
     if len(plans) <= MAX_TRIALS:
         return list(plans)

@@ -18,7 +18,7 @@ def value(result: Estimate) -> str:
 
 
 def interval(result: Estimate) -> str:
-    """Return the interval of an estimate, such as `[1.10, 6.70] (7 of 10)` if 7 of 10 repeats have a value."""
+    """Return the interval of an estimate, `[1.10, 6.70] (7 of 10)` if only 7 of 10 repeats have a value, or empty."""
     part = incomplete(result)
     return without_breaks(" ".join(filter(None, (interval_of(_scale(result), result), f"({part})" if part else ""))))
 
@@ -29,7 +29,7 @@ def estimate(result: Estimate) -> str:
 
 
 def without_breaks(words: str) -> str:
-    """Return a text with non-breaking spaces."""
+    """Return a text with each space replaced by a non-breaking space."""
     return words.replace(" ", "\N{NO-BREAK SPACE}")
 
 
@@ -61,12 +61,12 @@ def distance(cell: Cell) -> str:
 
 
 def scenario(cell: Cell) -> str:
-    """Return a cell's scenario, `LOS` or `NLOS`, or its procedure if it has no scenario."""
+    """Return a cell's scenario, `LOS` or `NLOS`; without one its procedure, and without both `no scenario`."""
     return text(cell, "scenario").upper() or text(cell, "procedure") or "no scenario"
 
 
 def procedure(cell: Cell) -> str:
-    """Return the name of a cell's procedure, or an empty string if it equals the scenario."""
+    """Return the name of a cell's procedure, or an empty string if there is no scenario or it has the same name."""
     name, scenario_name = text(cell, "procedure"), text(cell, "scenario")
     return name if scenario_name and name != scenario_name else ""
 
@@ -76,7 +76,7 @@ def place(cell: Cell, *, differing: Collection[str]) -> str:
 
     Args:
         cell: The cell.
-        differing: Columns of its key that differ between the cells; the others are omitted, except for the distance.
+        differing: Columns of its key that differ between the cells; other parts are omitted, except for the distance.
     """
     parts = {
         "scenario": scenario(cell),
@@ -94,7 +94,7 @@ def condition(cell: Cell, *, differing: Collection[str]) -> str:
 
 
 def differing(cells: Sequence[Cell]) -> frozenset[str]:
-    """Return the columns that distinguish cells; the procedure is omitted if the scenario determines it."""
+    """Return the columns whose values differ between cells; `procedure` is omitted if the scenario determines it."""
     names = {name for name in cells[0].key if len({cell.key[name] for cell in cells}) > 1} if cells else set()
     kinds = {(cell.key["scenario"], cell.key["procedure"]) for cell in cells}
     if len(kinds) == len({scenario for scenario, _ in kinds}):

@@ -32,7 +32,8 @@ StepName = Annotated[
 FileName = Annotated[
     str,
     schema.pattern_field(
-        r"^[a-z][a-z0-9_.-]{0,40}$", "a file name of at most 41 lower-case letters, digits, _ . and -"
+        r"^[a-z][a-z0-9_.-]{0,40}$",
+        "a file name of at most 41 lower-case letters, digits, _ . and -, with a letter first",
     ),
 ]
 """Name of a file in the folder of an attempt."""
@@ -51,7 +52,7 @@ class Step(Strict, ABC):
     group `fieldkit.steps`.
 
     Attributes:
-        columns: Columns that steps of its kind measure.
+        columns: Columns that steps of its kind measure, unless the kind overrides `output_columns`.
         cross_checks: Sources of these columns, and the checks between them.
         kept_bytes: Bytes of each frame that a capture must keep for the step; 0 if the default number is enough.
         capture_buffer_kib: Kernel buffer that a capture needs for the step's packets; 0 if the default is enough.

@@ -7,6 +7,7 @@ import numpy as np
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Role
+from fieldkit.core.units import format_count
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.arrays import NO_TIME
 from fieldkit.measure.captures.pcap import Capture
@@ -15,7 +16,7 @@ from fieldkit.measure.transfers import altered_packets
 from fieldkit.steps.view import View
 
 BACK_S: Final = 0.1
-"""Maximum step backwards between time stamps: packets received by two processors may be recorded out of order."""
+"""Permitted step backwards between time stamps: packets received by two processors may be recorded out of order."""
 
 STAMP_NS: Final = 1_000
 """Resolution of time stamps: tcpdump truncates them to microseconds."""
@@ -35,14 +36,15 @@ def find(role: Role, file: str, view: View, *, needs_all: bool) -> Iterator[str]
         yield "tcpdump ended without its counters"
         return
     if needs_all and (log.dropped_by_kernel or log.dropped_by_interface):
-        yield f"its kernel dropped {log.dropped_by_kernel} packets, its interface {log.dropped_by_interface}"
+        dropped_text = format_count(log.dropped_by_kernel or 0, "packet")
+        yield f"its kernel dropped {dropped_text}, its interface {log.dropped_by_interface or 0}"
     # The filter may have matched more packets than were written: see `CaptureLog.received_by_filter`.
     if log.received_by_filter is not None and log.received_by_filter < log.captured:
-        yield f"{log.received_by_filter} packets matched, but {log.captured} were written"
+        yield f"{format_count(log.received_by_filter, 'packet')} matched the filter, but tcpdump wrote {log.captured}"
     if capture.damage is not None:
         yield capture.damage
     elif capture.frames != log.captured:
-        yield f"the file has {capture.frames} packets, but tcpdump counted {log.captured}"
+        yield f"the file has {format_count(capture.frames, 'packet')}, but tcpdump counted {log.captured}"
     else:
         if problem := altered_packets.header_problem(capture.packets):
             yield problem

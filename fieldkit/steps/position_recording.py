@@ -34,7 +34,11 @@ _ROUNDING_M: Final = 1e-3
 
 COLUMNS: Final = columns(
     100,
-    ("positions_from", "text", "Source of the robots' positions: a topic, a message, a file, or a place."),
+    (
+        "positions_from",
+        "text",
+        "Source of each robot's positions: a topic, a message type of a telemetry log, a file, or a fixed place.",
+    ),
     ("positions_clock_error_s", "s", "Maximum error of the time between two robots' clocks."),
 )
 """Columns of trials with a step that records positions."""
@@ -113,7 +117,10 @@ def _stop(testbed: Testbed, recordings: Sequence[Planned]) -> Sequence[int]:
 
 
 def stationary_robots(nest: Nest, scene: Scene) -> Mapping[Role, PositionSource]:
-    """Return the fixed positions of the robots that do not move while the steps inside run."""
+    """Return the fixed positions of the robots of a step that do not move while the steps inside run.
+
+    Robots that were not placed are omitted.
+    """
     movers = (step for step in steps_inside(nest) if isinstance(step, Nest) and step.has_path)
     moving = frozenset[Role]().union(*(step.moves() for step in movers if isinstance(step, Moves)))
     places_m = {role: place_m for role, place_m in scene.places_m.items() if role not in moving}
@@ -130,7 +137,7 @@ def placement_error(kind: str, within: Sequence[EnclosingStep]) -> str | None:
     if any(nest.has_path for nest in within):
         return f"a {kind} must start before robots move: put the move into the {kind}"
     if any(nest.disturbs or nest.parallel for nest in within):
-        return f"a {kind} must not be inside a fault or a together: put them into the {kind}"
+        return f"a {kind} must not be inside a step fault or together: put that step into the {kind}"
     return None
 
 
@@ -151,7 +158,7 @@ def problems(view: View, roles: Sequence[Role]) -> Iterator[str]:
 def _place_problems(view: View, sources: PositionSources) -> Iterator[str]:
     """Yield a reason for each robot whose fixed position or start differs from its placement.
 
-    Positions in another frame, with times from another clock, or from a GPX or CSV file are not compared.
+    Positions in another frame than the placement, and positions from a GPX or CSV file, are not compared.
     """
     for role, position_source in sources.robots.items():
         planned_m = view.scene.places_m.get(role)

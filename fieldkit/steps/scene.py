@@ -264,7 +264,7 @@ class Flow:
         source: Role of the sender.
         destination: Role of the receiver.
         port: Listening port of one of them; None if the packets have no ports.
-        frames: Approximate number of Ethernet frames including answers, from `frames`.
+        frames: Approximate number of Ethernet frames including answers.
         protocol: Transport protocol; None for the protocol under test.
         group: A multicast group to which either of them also sends; None without multicast.
         has_other_listener: Whether a program that the step does not start listens on the source.

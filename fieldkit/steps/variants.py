@@ -66,7 +66,10 @@ class Variants:
 
 
 def expected(profile: RobotProfile) -> Variants:
-    """Return the variants expected from the program names of a profile; `nc` counts as the traditional netcat."""
+    """Return the variants expected from the program names of a profile.
+
+    A netcat with any other name, such as `nc`, counts as the traditional one. The versions are assumed to be new.
+    """
     names = {"nc.openbsd": Netcat.OPENBSD, "ncat": Netcat.NCAT, "busybox": Netcat.BUSYBOX}
     return Variants(
         netcat=names.get(PurePosixPath(profile.tools.netcat).name, Netcat.TRADITIONAL),

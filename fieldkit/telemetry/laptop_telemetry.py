@@ -74,7 +74,7 @@ def _argv(source: TelemetrySource, credentials: str | None, interval: str | None
 
 
 def query_once(source: TelemetrySource, environment: Mapping[str, str]) -> bytes:
-    """Return the output of one query on this computer, in the format of `source_readings`."""
+    """Return the output of one query on this computer, in the format of `source_readings`; empty after a timeout."""
     with credentials_file(source, environment) as credentials, _temporary_folder() as folder:
         process = subprocess.Popen(
             _argv(source, credentials, ONCE),

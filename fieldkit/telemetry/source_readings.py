@@ -58,7 +58,7 @@ class SourceReadings:
 
     @property
     def reason(self) -> str:
-        """Most frequent reason why runs have no value; empty if all have one."""
+        """Most frequent reason why runs have no value; empty if all have one, or there are no runs."""
         return self.reasons.most_common(1)[0][0] if self.reasons else ""
 
 

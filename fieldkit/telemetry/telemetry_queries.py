@@ -33,6 +33,8 @@ def queries_by_role(cast: Cast) -> Mapping[Role, Sequence[Sequence[str]]]:
 def refusals(cast: Cast, all_robots: Cast) -> Iterator[Refusal]:
     """Yield the sources whose address is a robot's address on the radio: queries would load the link under test.
 
+    Sources with `wired` are permitted.
+
     An address that is only reached over the radio is detected on the robot before each query.
     """
     by_address = {ipaddress.ip_address(robot.address): robot.name for robot in all_robots.values()}

@@ -48,10 +48,10 @@ def read(evidence: AttemptEvidence, role: Role, profile: RobotProfile) -> Sequen
 
 
 def series(evidence: AttemptEvidence, role: Role, profile: RobotProfile) -> Mapping[str, Sequence[tuple[int, float]]]:
-    """Return the times and values of each numeric quantity that a source of the profile reports.
+    """Return the times and numbers of each quantity that a source of the profile reports.
 
-    The source of a quantity is the first one in the profile, as in the columns. A quantity without a known time or
-    value is empty.
+    The source of a quantity is the first one in the profile, as in the columns. The sequence is empty for a text, and
+    for a quantity without a known time or value.
     """
     telemetry = telemetry_of(profile)
     if telemetry is None:

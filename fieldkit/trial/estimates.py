@@ -37,7 +37,7 @@ class FinishedRepeat:
 
 
 def dead_link_s(procedure: Procedure, protocol: Protocol) -> float:
-    """Return the longest duration of an attempt in which no packet arrives and all steps reach their timeouts."""
+    """Return the duration of an attempt in which no packet arrives, with all timeouts added: an upper bound."""
     # `limit` and `patience` are the timeouts of steps. A step without such a key adds nothing.
     waits_s = (getattr(placed.step, name, 0.0) for placed in procedure.walk() for name in ("limit", "patience"))
     return procedure.expected_s(protocol) + sum(waits_s)

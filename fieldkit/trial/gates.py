@@ -171,7 +171,7 @@ def _unexplained_columns(placed: PlacedStep, columns: Iterable[Column], measured
 def _impossible_values(
     placed: PlacedStep, columns: Iterable[Column], measured: Measured
 ) -> Iterator[tuple[str, str]]:
-    """Yield the name of each column whose measured value is outside its declared range, and the reason.
+    """Yield the name of each column whose measured value is NaN or outside its declared range, and the reason.
 
     Such values are removed, because a table that contains them could not be read again.
     """

@@ -1,4 +1,4 @@
-"""Hashes that show if two trials were measured in the same way. They are shortened to fit into a CSV column."""
+"""Hashes that show whether two trials were measured in the same way: the first 16 hexadecimal digits of SHA-256."""
 
 import hashlib
 import json
@@ -12,7 +12,7 @@ _HASH_DIGITS: Final = 16
 
 @cache
 def code_hash() -> str:
-    """Return the hash of the names and contents of fieldkit's source files; the result is cached."""
+    """Return the first 16 digits of the hash of the names and contents of fieldkit's source files (.py and .sh)."""
     digest = hashlib.sha256()
     package = Path(__file__).resolve().parent.parent
     file_paths = (f"{folder}/{name}" for folder, _, names in os.walk(package) for name in names)
@@ -23,5 +23,5 @@ def code_hash() -> str:
 
 
 def data_hash(data: object) -> str:
-    """Return the hash of plain data (as JSON)."""
+    """Return the first 16 digits of the hash of plain data (as JSON with sorted keys)."""
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:_HASH_DIGITS]

@@ -78,7 +78,7 @@ class Attempt:
 
     @property
     def folder(self) -> str:
-        """Name of the attempt's folder in `repeats/`: `udp-07`, or `udp-07.void1` if the attempt was repeated."""
+        """Name of the attempt's folder in `repeats/`: `udp-07` if it is valid, otherwise such as `udp-07.void1`."""
         return self.repeat.folder(self.status, self.number)
 
     def remote_folder(self, trial: str) -> str:
@@ -212,7 +212,10 @@ def ended_attempts(entries: list[JournalEntry]) -> list[Attempt]:
 
 
 def interrupted_attempts(entries: list[JournalEntry]) -> list[Attempt]:
-    """Return the attempts that did not end because fieldkit was killed; their status is `running` or `measured`."""
+    """Return the attempts that have not ended, because fieldkit was killed or is still running.
+
+    Their status is `running` or `measured`.
+    """
     ended_keys = {(attempt.repeat, attempt.number) for attempt in ended_attempts(entries)}
     start_ns_by_attempt = {
         (entry.repeat, entry.attempt): entry.utc_ns

@@ -50,8 +50,8 @@ class Manifest:
     def unchanged_lines(self, name: str) -> int | None:
         """Return the number of lines of a top-level file that have not changed since its checksum was computed.
 
-        Lines that were appended later are not counted. The result is None if the other lines have changed, and 0 if
-        the file has no checksum.
+        Lines that were appended later are not counted. The result is None if the other lines have changed or the file
+        cannot be read, and 0 if the file has no checksum.
         """
         return count_unchanged_lines(self._folder / name, self._top_level[name]) if name in self._top_level else 0
 
@@ -84,7 +84,10 @@ class Manifest:
         self._save()
 
     def renew_positions(self) -> None:
-        """Compute the checksums of the position files that were added after the trial. Others are not changed."""
+        """Compute the checksums of the position files, which can be added, changed and removed after the trial.
+
+        Other checksums are not changed.
+        """
         top_level = {name: digest for name, digest in self._top_level.items() if not is_positions(name)}
         position_names = (
             path.name for path in self._folder.iterdir() if is_positions(path.name) and _is_top_level(path)
@@ -125,7 +128,10 @@ def is_positions(name: str) -> bool:
 
 
 def count_unchanged_lines(path: Path, digest: str) -> int | None:
-    """Return the number of lines at the start of a file that have this checksum, or None if no lines have it."""
+    """Return the number of lines at the start of a file that have this checksum.
+
+    None if no lines have it, or the file cannot be read.
+    """
     hasher, count = hashlib.sha256(), 0
     try:
         lines = files.read(path, _LIMIT_BYTES).splitlines(keepends=True)
@@ -154,7 +160,10 @@ def _sums(folder: Path, attempt: Path) -> Sums:
 
 
 def plain_files(folder: Path) -> Iterator[Path]:
-    """Yield the plain files at any depth below a folder, except hidden files (incomplete, or from a desktop)."""
+    """Yield the plain files at any depth below a folder, except hidden ones and those in hidden folders.
+
+    Hidden files are incomplete, or were created by a desktop.
+    """
     for where, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith(".")]
         paths = (Path(where, name) for name in names if not name.startswith("."))

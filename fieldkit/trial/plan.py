@@ -39,9 +39,9 @@ class Plan(Strict):
             used for its measurement.
         trial: Name of the trial and of its folder.
         versions: Versions of fieldkit, Python, packages for measurements, and packages that add steps or backends.
-        code_sha256: Hash of fieldkit's source.
-        profiles_sha256: Hash of the profiles of the cast.
-        procedure_sha256: Hash of the procedure.
+        code_sha256: First 16 digits of the hash of fieldkit's source.
+        profiles_sha256: First 16 digits of the hash of the profiles and roles of the cast.
+        procedure_sha256: First 16 digits of the hash of the procedure, without its expectations.
         backend: Name of the backend.
         session: ID of the run of fieldkit that started the trial. The locks on the robots contain it, and a resumed
             trial uses it again.
@@ -160,7 +160,7 @@ class Plan(Strict):
         return (*section_notes, *(line for step in steps for line in step.dry_run_notes(scene)))
 
     def abort_notes(self, scene: Scene) -> tuple[str, ...]:
-        """Return a sentence about the reaction of each robot that moves without a person if a repeat is aborted."""
+        """Return a sentence about the reaction of each robot that moves automatically if a repeat is aborted."""
         section_notes = (line for section in self._sections() for line in section.abort_notes(self))
         steps = (placed.step for placed in self.procedure.walk() if isinstance(placed.step, Moves))
         return (*section_notes, *(line for step in steps for line in step.abort_notes(scene)))

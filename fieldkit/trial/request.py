@@ -74,8 +74,8 @@ def make_plan(
         simulators: Simulators of the backend (`simulators_of`).
 
     Raises:
-        ConfigurationError: No robot has a role that the procedure or the topology needs, or the procedure needs a
-            common ROS master and each robot has its own.
+        ConfigurationError: No robot has a role that the procedure or the topology needs; or the procedure needs a
+            common ROS master, but its robots do not share one; or the commands of a step cannot be derived.
     """
     procedure, topology = request.procedure, request.effective_topology
     _require_roles(procedure, topology, cast)
@@ -153,7 +153,7 @@ def _robot_data(cast: Cast) -> dict[str, object]:
 def _require_ros_master(procedure: Procedure, topology: Topology, cast: Cast) -> None:
     if procedure.needs_ros_master and not any(robot.ros_master for robot in cast.values()):
         raise ConfigurationError(
-            f"procedure {procedure.name} needs one ROS master for all robots; in {topology} each robot has its own",
+            f"procedure {procedure.name} needs one ROS master for all robots; in {topology} they do not share one",
             remedy="set the robot that runs it in the site file: ros_master: relay",
         )
 

@@ -1,4 +1,4 @@
-"""Rows of trial.csv and summary.csv. Measuring an attempt again after the trial gives the same row."""
+"""Rows of trial.csv and summary.csv. Measuring an attempt again with the same code gives the same row."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import filterfalse

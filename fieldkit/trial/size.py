@@ -13,7 +13,7 @@ RESERVE_BYTES: Final = 100 << 20
 """Bytes that a trial leaves free on every disk for other data."""
 
 FETCHED_BYTES_PER_S: Final = 2.5e6
-"""Assumed transfer rate of evidence. TCP over a good 802.11n link with one stream in 20 MHz has about 20 Mbit/s."""
+"""Assumed transfer rate of evidence: 20 Mbit/s, somewhat less than on a good link (`steps.scene.GOOD_BIT_S`)."""
 
 # The states of the host before and after the attempt, logs, and the output of ping take about 20 kB on a robot with
 # Wi-Fi; the rest is a margin.
@@ -34,7 +34,10 @@ def evidence_bytes(plan: Plan, role: Role) -> int:
 
 
 def attempt_bytes(plan: Plan) -> int:
-    """Return the estimated number of bytes that one attempt leaves on the laptop, times `SPARE`."""
+    """Return the estimated number of bytes that one attempt leaves on the laptop.
+
+    It is the evidence of all robots, times `SPARE`, and the maximum that the testbed adds (`Plan.lab_bytes`).
+    """
     return sum(evidence_bytes(plan, role) for role in plan.cast) + plan.lab_bytes
 
 
@@ -51,5 +54,5 @@ def reserve_bytes(plan: Plan, role: Role) -> int:
 
 
 def trial_bytes(plan: Plan) -> int:
-    """Return the estimated number of bytes that the whole trial leaves on the laptop, times `SPARE`."""
+    """Return `attempt_bytes` times the number of repeats. `SPARE` includes the attempts that are repeated."""
     return attempt_bytes(plan) * plan.repeats * len(plan.protocols)

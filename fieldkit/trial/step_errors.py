@@ -75,13 +75,14 @@ def during_attempt(kind: str) -> Iterator[None]:
 def before_trial(what: str) -> Iterator[None]:
     """Run the body, which calls a step before the folder of an attempt exists, and convert exceptions of the step.
 
-    Errors of fieldkit are not converted.
+    Errors of fieldkit and of this machine's memory are not converted.
 
     Args:
         what: The failed action, for example `the commands of the step route cannot be derived`.
 
     Raises:
-        ConfigurationError: The body raised another exception. The message names a file with the traceback.
+        ConfigurationError: The body raised another exception. The remedy names a file with the traceback, unless it
+            could not be written.
     """
     try:
         yield

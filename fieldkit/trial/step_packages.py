@@ -1,4 +1,4 @@
-"""Packages of step kinds that do not ship with fieldkit. A plan contains their versions and code hashes."""
+"""Packages of the kinds of step that do not ship with fieldkit; a plan contains their versions and code hashes."""
 
 import hashlib
 from collections.abc import Iterable
@@ -19,7 +19,8 @@ class StepPackage(Strict):
     Attributes:
         package: Name of the package.
         version: Version of the package.
-        code_sha256: Hash of the Python files of its top-level module; empty if there are no such files.
+        code_sha256: First 16 hex digits of the SHA-256 hash of the names and contents of the Python files of its
+            top-level module; empty if there are no such files.
     """
 
     package: str
@@ -28,19 +29,22 @@ class StepPackage(Strict):
 
 
 def packages_of_kinds(names: Iterable[str]) -> dict[str, StepPackage]:
-    """Return the package of each kind of step that does not ship with fieldkit."""
-    others = set(names) - kinds.shipped_names()
+    """Return the packages of the kinds of step with these names, by name.
+
+    Kinds that ship with fieldkit, and kinds that no installed package declares, are omitted.
+    """
+    kinds_of_packages = set(names) - kinds.shipped_names()
     return {
         point.name: StepPackage(
             package=point.dist.name, version=point.dist.version, code_sha256=_code_hash(point.module)
         )
         for point in plugins.entry_points(plugins.STEPS)
-        if point.name in others and point.dist is not None
+        if point.name in kinds_of_packages and point.dist is not None
     }
 
 
 def _code_hash(module: str) -> str:
-    """Return the hash of the names and contents of the Python files of a module's top-level package."""
+    """Return `StepPackage.code_sha256` for a module (the top-level module that contains it is hashed)."""
     spec = find_spec(module.partition(".")[0])
     if spec is None:
         return ""

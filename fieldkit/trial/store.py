@@ -25,10 +25,12 @@ POSITIONS: Final = "positions-"
 
 
 def prepare(out: Path) -> None:
-    """Create the folder for trials. This is done before robots are used.
+    """Create the folder for trials if it does not exist, and check that files can be created in it.
+
+    This is done before robots are used.
 
     Raises:
-        ConfigurationError: The folder cannot be created or written.
+        ConfigurationError: The folder cannot be created, or no file can be created in it.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -64,7 +66,10 @@ def attempt_folder(folder: Path, name: str) -> Path:
 
 
 def open_attempt(folder: Path, repeat: RepeatId) -> Path:
-    """Create and return an empty folder for an attempt's evidence. Files of an interrupted attempt are removed."""
+    """Create and return an empty folder for an attempt's evidence.
+
+    Files of an interrupted attempt of the same repeat are removed.
+    """
     partial_folder = _partial_folder(folder, repeat)
     shutil.rmtree(partial_folder, ignore_errors=True)
     partial_folder.mkdir()
@@ -72,7 +77,10 @@ def open_attempt(folder: Path, repeat: RepeatId) -> Path:
 
 
 def reopen_attempt(folder: Path, repeat: RepeatId) -> Path:
-    """Return the folder of an attempt whose evidence is fetched again. Partially fetched files are kept in it."""
+    """Return the folder of an attempt whose evidence is fetched again.
+
+    Partially fetched files are kept in it; completely fetched files and subfolders are removed.
+    """
     partial_folder = _partial_folder(folder, repeat)
     partial_folder.mkdir(exist_ok=True)
     for path in partial_folder.iterdir():
@@ -104,9 +112,10 @@ def commit_attempt(partial_folder: Path, name: str) -> Path:
 
 
 def find_committed_attempt(folder: Path, names: Iterable[str]) -> Path | None:
-    """Return the final folder of an attempt if fieldkit was killed after it had renamed the folder; otherwise None.
+    """Return the final folder of an attempt, or None if there is none.
 
-    The journal then lacks the entry about the end of the attempt.
+    The folder exists if fieldkit was killed after it had renamed the folder, and before it wrote the end of the
+    attempt to the journal.
 
     Args:
         folder: The trial's folder.

@@ -27,7 +27,7 @@ class SentDatagram(NamedTuple):
         at_ns: Time of sending.
         source: Name of the sending agent.
         datagram: The datagram.
-        states: States of all agents at the last physics step at or before `at_ns`.
+        states: States of the agents that are present, at the last physics step at or before `at_ns`.
     """
 
     at_ns: int
@@ -41,8 +41,8 @@ class AgentAbsence(NamedTuple):
 
     Attributes:
         since_ns: Beginning of the absence.
-        state: The state that is used for the agent while physics has none. Before the agent appears, it is its start
-            state. After the agent has disappeared, it is its last position with a velocity of 0.
+        state: The state that is used for the agent while it is absent. Before the agent first appears, this is its
+            start state. After the agent has disappeared, this is its last position with a velocity of 0.
     """
 
     since_ns: int
@@ -73,7 +73,7 @@ class _PresentStates(Mapping[str, State]):
 
 
 _MAX_WAKES_AT_ONE_TIME: Final = 1000
-"""Largest number of times that a program may wake again at the same simulated time; after more, the run fails."""
+"""Largest number of repeated wakes, of any programs, at the same simulated time; with more, the run fails."""
 _NO_LIFETIMES: Final[Mapping[str, Lifetime]] = MappingProxyType({})
 _CHANGE: Final = ""
 """Name of the queue entry for the next beginning or end of a lifetime; it sorts before all names of agents."""
@@ -99,7 +99,7 @@ class Agents:
         physics: The physics federate.
         programs: The programs by agent name, sorted.
         absent: The absence of each agent that is absent now, by name.
-        has_changed: True if an agent has ever been absent, or was added by the physics federate.
+        has_changed: True if an agent has a lifetime, or if an agent has appeared or disappeared during the run.
     """
 
     def __init__(
@@ -199,7 +199,8 @@ class Agents:
         """Update the names of the agents that are present.
 
         Raises:
-            FederateError: An agent has disappeared within its lifetime, but this physics may not remove agents.
+            FederateError: The physics federate returned no state for an agent within its lifetime, and it may not
+                remove agents, or the agent is missing in its first states.
         """
         lost_names = self._names - states.keys()
         missing_names = lost_names - self._names_outside_lifetime
@@ -228,29 +229,29 @@ class Agents:
         self._names = frozenset(states)
         self._schedule((name for name in sorted(new_names) if name in self.programs), now_ns)
 
-    def with_changes(self, begin: Mapping[str, State], *, end: Mapping[str, State]) -> Mapping[str, State]:
+    def with_changes(self, selected: Mapping[str, State], *, end: Mapping[str, State]) -> Mapping[str, State]:
         """Return the states that the network uses in a window, for all agents that were present in the window.
 
         An agent that appeared in the window has its state at the end of the window. An agent that disappeared has its
         last state. Each call includes only the changes since the previous call.
 
         Args:
-            begin: The states that the sync policy selects for the window: those at its beginning or at its end.
+            selected: The states that the sync policy selects for the window: those at its beginning or at its end.
             end: The states at the end of the window.
         """
         if not (self._new_agents or self._last_states):
-            return begin
+            return selected
         new_agents, self._new_agents = self._new_agents, frozenset()
         last_states, self._last_states = self._last_states, {}
         added_states = {
             name: end.get(name) or last_states[name]
             for name in sorted(new_agents | last_states.keys())
-            if name not in begin
+            if name not in selected
         }
-        return {**added_states, **begin} if added_states else begin
+        return {**added_states, **selected} if added_states else selected
 
     def next_wake_ns(self) -> int | None:
-        """Return the next time at which a timer wakes a program, or a lifetime begins or ends; None without one."""
+        """Return the next time at which a timer wakes a program or a lifetime begins or ends, or None."""
         return self._next_ns
 
     def next_send_ns(self) -> int | None:
@@ -310,7 +311,10 @@ class Agents:
         self._next_ns = queue[0][0] if queue else None
 
     def deliver(self, receiver: str, received_datagram: ReceivedDatagram) -> None:
-        """Store a datagram for the program of an agent; the next call of `advance` delivers it."""
+        """Store a datagram for the program of an agent; the next call of `advance` delivers it.
+
+        The datagram is dropped if the agent has no program or is absent.
+        """
         if receiver in self.programs and receiver not in self.absent:
             self._received.setdefault(receiver, []).append(received_datagram)
 
@@ -353,8 +357,8 @@ class Agents:
             repeats = repeats + 1 if wake_ns <= previous_wake_ns else 0
             if repeats > _MAX_WAKES_AT_ONE_TIME:
                 raise FederateError(
-                    f"the program of {' and '.join(names)} woke {repeats} times at {seconds_text(wake_ns)}: its "
-                    "next wake time does not advance",
+                    f"a program woke again {repeats} times at {seconds_text(wake_ns)}, most recently the program of "
+                    f"{' and '.join(names)}: its next wake time does not advance",
                     remedy="correct the program: after a wake, next_wake_ns must return a later time",
                 )
             previous_wake_ns = wake_ns

@@ -38,7 +38,7 @@ class Errors:
     """The errors and the cost of a run. A value for which there are no packets is nan.
 
     Attributes:
-        packets: Number of packets that arrived or were dropped in each of the two runs.
+        packets: Number of packets whose fate (arrived or dropped) is decided in both runs.
         delivery_error_s: Absolute difference of delivery times, over packets that arrived in both runs.
         position_error_m: Error of the positions that the network assumed when a packet was sent: the largest
             error, over all pairs of agents that transmit, forward or interfere in this run, of the relative position.
@@ -46,7 +46,7 @@ class Errors:
             state for a step of length h, its mean error at speed v is therefore v h / 2.
         path_error_m: Distance of agents from their positions in the reference, over time; above 0 only if programs
             steer by received data.
-        fate_disagreement: Share of packets that arrived in one run only.
+        fate_disagreement: Share of these `packets` that arrived in one run only.
         first_disagreement: The first of these packets by time of sending, or None.
         first_disagreement_s: Time when that packet was sent, or nan.
         causality_violations: Number of arrivals at a time that was already in the past of the receiver.
@@ -118,8 +118,8 @@ def compare_runs(reference: Run, run: Run, path_errors_m: Floats | None = None) 
 def mean_errors(all_errors: Sequence[Errors]) -> Errors:
     """Return the combined errors of several runs, for example of all seeds.
 
-    Numbers are means over the runs that have them. A maximum is the largest of all runs, and the first disagreement
-    is the earliest of all runs.
+    Numbers are means over the runs that have them, with three exceptions: `packets` is a sum, a maximum is the
+    largest of all runs, and the first disagreement is the earliest of all runs.
 
     Args:
         all_errors: The errors of each run, at least one.

@@ -1,18 +1,16 @@
 """The coordinator: advances agents and network window by window, and exchanges data between them.
 
-It stores the payloads; the network gets only identities, sizes and times. It records the fate of every packet.
+It stores the payloads, and passes packets without payloads to the network. It records the fate of every packet.
 """
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from itertools import islice, repeat
-from operator import index
 from typing import Final
 
-from fieldkit.core.errors import ConfigurationError, FieldkitError, describe_exception
+from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.agents import Agents, SentDatagram
 from sim_backends.cosim.federates import (
-    FederateError,
     NetworkFederate,
     advance_text,
     check_physics,
@@ -22,15 +20,14 @@ from sim_backends.cosim.federates import (
 )
 from sim_backends.cosim.packet_ledger import ABSENT, PacketLedger, fixed_emitters_m, transmitters
 from sim_backends.cosim.policies.sync_policy import (
-    EmptyWindows,
     LookingAhead,
     Pair,
-    PolicyError,
     Situation,
     SyncPolicy,
     looks_ahead,
     missing_members,
 )
+from sim_backends.cosim.policies.window_ends import WindowEnds
 from sim_backends.cosim.run_record import EventDigest, Fate, Run, Window, WindowObserver
 from sim_backends.cosim.wall_time import Progress, WallTime, rate_limited
 from sim_backends.network.packets import Arrival, Drop, Packet, ReceivedDatagram
@@ -63,8 +60,8 @@ class Coordinator:
         is_interrupted: True if `KeyboardInterrupt` must be raised as soon as `is_committing` is False.
 
     Raises:
-        ConfigurationError: The physics federate or the policy lacks a required member, or the physics federate has no
-            state of an agent that may send, receive or interfere.
+        ConfigurationError: The physics federate or the policy lacks a required member, or the physics federate
+            returns an invalid state or no state of an agent that may send, receive or interfere.
         FederateError: The physics federate failed, or has no state of an agent that runs a program.
     """
 
@@ -101,7 +98,7 @@ class Coordinator:
         self._active = paired_agents | {*other_agents}
         self._pairs, self._other_agents = tuple(pairs), other_agents
         self._deferred: Sequence[SentDatagram] = ()
-        self._empty_windows = EmptyWindows()
+        self._window_ends = WindowEnds()
         self._digest = EventDigest()
         self._extrapolates = getattr(network, "extrapolates", False)
         self._wall_time = WallTime(
@@ -189,7 +186,7 @@ class Coordinator:
                 end_ns, sent_datagrams, states, assumed_states = self._look_ahead(looking_ahead, begin_ns, to_ns)
                 last_ns = end_ns - 1
             else:
-                end_ns = self._next_window(begin_ns, to_ns)
+                end_ns = self._window_ends.next_ns(self.policy, situation, begin_ns, to_ns)
                 lap("exchange")
                 # If the network uses the states at the end of the window, events at that time belong to the window.
                 last_ns = end_ns if uses_end_states else end_ns - 1
@@ -220,38 +217,6 @@ class Coordinator:
                 self._notify(begin_ns, entered_fates, decided_fates, assumed_states, report=report)
                 self._wall_time.start()
 
-    def _next_window(self, begin_ns: int, to_ns: int) -> int:
-        """Return the end of the next window, as determined by the policy, but at most `to_ns`.
-
-        Raises:
-            PolicyError: The policy cannot determine a window, or time does not advance.
-            FederateError: The policy failed, or did not return a whole number.
-        """
-        try:
-            end_ns = self.policy.next_window(self.situation)
-        except PolicyError:
-            raise
-        except Exception as error:
-            raise FederateError(
-                f"policy {self.policy.name} failed to return the end of {_window_text(begin_ns)}: "
-                f"{describe_exception(error)}",
-                remedy=error.remedy if isinstance(error, FieldkitError) else "",
-            ) from error
-        if end_ns is None:
-            return to_ns
-        try:
-            end_ns = index(end_ns)
-        except TypeError as error:  # the policy may come from another package
-            raise FederateError(
-                f"policy {self.policy.name} returned {end_ns!r} as the end of {_window_text(begin_ns)}",
-                remedy="return a whole number of nanoseconds, or None",
-            ) from error
-        if end_ns > to_ns:
-            return to_ns
-        if end_ns <= begin_ns:
-            self._empty_windows.add(self.policy.name, begin_ns, end_ns)
-        return end_ns
-
     def _look_ahead(
         self, policy: LookingAhead, begin_ns: int, to_ns: int
     ) -> tuple[int, list[SentDatagram], Mapping[str, State], Mapping[str, State]]:
@@ -275,7 +240,7 @@ class Coordinator:
         self._update_situation(begin_ns, begin_states, moving_states, sent_datagrams=())
         reckoning_step_ns = policy.reckoning_step_ns(situation)
         assumed_states = DeadReckoned(moving_states, since_ns, reckoning_step_ns)
-        end_ns = self._next_window(begin_ns, to_ns)
+        end_ns = self._window_ends.next_ns(self.policy, situation, begin_ns, to_ns)
         lap = self._wall_time.lap
         lap("exchange")
         sent_datagrams, states = agents.advance(begin_ns, end_ns - 1, end_ns)
@@ -368,7 +333,8 @@ class Coordinator:
     ) -> list[Fate]:
         """Record the arrivals and drops of a window, and deliver the datagrams that arrived.
 
-        Packets from or to agents that are absent at the end of the window are dropped.
+        An arrival is dropped if its sender or receiver had disappeared before it. Packets that are still under way
+        from or to agents that are absent at the end of the window are dropped.
         """
         decided_fates, agents, ledger = [], self._agents, self._ledger
         for arrival in arrivals:
@@ -418,7 +384,3 @@ class Coordinator:
         self.is_committing = False
         if self.is_interrupted:
             raise KeyboardInterrupt
-
-
-def _window_text(begin_ns: int) -> str:
-    return f"the window that begins at {seconds_text(begin_ns)}"

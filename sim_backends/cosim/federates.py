@@ -43,7 +43,7 @@ def check_physics(physics: object) -> None:
     """Check that an object is a physics federate, before it is used.
 
     Raises:
-        ConfigurationError: It lacks an attribute or method; the message names it.
+        ConfigurationError: The object lacks an attribute or method, which the message names.
     """
     step_ns = getattr(physics, "step_ns", None)
     problem = ""
@@ -106,7 +106,7 @@ class Program(Protocol):
 
 
 def next_send_ns(program: Program) -> int | None:
-    """Return a time before which a program sends only in reply to a received datagram, or None if it never sends.
+    """Return a time before which a program sends only in reply to a received datagram, or None if it always does.
 
     A program may have a method `next_send_ns`; otherwise it is assumed to send whenever it wakes.
     """

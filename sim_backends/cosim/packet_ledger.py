@@ -121,7 +121,7 @@ class PacketLedger:
             absences: The agents that are absent at the end of the window; None if all have always been present.
 
         Raises:
-            FederateError: Its destination is not an agent, or its flow already has a packet with this number.
+            FederateError: The destination is not an agent, or the flow already has a packet with this number.
         """
         at_ns, source, datagram, true_states = sent_datagram
         destination = datagram.destination

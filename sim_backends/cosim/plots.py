@@ -34,7 +34,7 @@ from sim_backends.cosim.plot_layout import (
 )
 
 _FONT_POINTS: Final = 8.0
-"""Font size that IEEE requires."""
+"""Font size of labels of figures in IEEE's template for papers."""
 _BOTH_COLUMNS_INCHES: Final = 7.16
 """Width of a figure: both columns of an IEEE paper."""
 _PANEL_HEIGHT_INCHES: Final = 2.9
@@ -196,7 +196,7 @@ def interval_figure(panels: Mapping[str, Mapping[str, tuple[float, float, float]
 def _draw_paths(axes: Axes, paths_m: Mapping[str, Sequence[tuple[float, float]]]) -> None:
     """Draw the path of each agent from above, with a marker at its start and an arrow at its end."""
     axes.set(aspect="equal", xlabel="east (m)", ylabel="north (m)")
-    # Paths are black, because colours distinguish flows.
+    # Paths are grey and their ends black, because colours distinguish flows.
     for path_m in paths_m.values():
         axes.plot(*zip(*path_m, strict=True), color=LIGHT["muted"], zorder=3)
     for number, path_m in enumerate(paths_m.values()):
@@ -346,7 +346,7 @@ def _colour(number: int) -> str:
 
 
 def _plain(value: float, _: object = None) -> str:
-    """Return the label of a tick: the number without an exponent."""
+    """Return the label of a tick: the number, with an exponent only below 0.0001 or from 10,000,000."""
     return f"{value:,.7g}"
 
 

@@ -28,8 +28,8 @@ class WindowLateness:
 
     Attributes:
         windows: Number of windows by the upper limit of their lateness in nanoseconds: 0 for windows in time,
-            otherwise 1, 2 or 5 times a power of ten.
-        largest_ns: Largest lateness, in nanoseconds.
+            otherwise 1, 2 or 5 times a power of ten, at least 100,000.
+        largest_ns: Largest lateness, in nanoseconds; 0 if no window was late.
     """
 
     windows: Counter[int] = field(default_factory=Counter)

@@ -24,7 +24,7 @@ class Fate:
             step, extrapolated at their velocity. At an acceleration a and a step h the error is at most a h^2 / 2.
         arrived_ns: Time when the network delivered the packet, or None.
         counted_ns: Time from which the arrival counts for its receiver: `arrived_ns` or the end of the window,
-            depending on the policy.
+            depending on the policy; None if the packet has not arrived.
         late_ns: Time from `counted_ns` to the simulated time of the receiver at delivery, if that is later; otherwise
             0.
         reason: The reason why the packet was dropped; empty if it arrived or is under way.
@@ -62,7 +62,8 @@ class Run:
         windows_ns: The ends of all windows.
         wall_s: Wall time by part: `agents` (physics and programs), `network`, `exchange` (policy and coordinator),
             `wait` (time in which federates only waited).
-        digest: Hash over every packet, arrival, drop and window, in order (`EventDigest`).
+        digest: Hash over every packet, arrival, drop and window, in order (`EventDigest`); empty before the first
+            call of `Coordinator.advance` has returned.
     """
 
     fates: dict[PacketIdentity, Fate] = field(default_factory=dict)
@@ -72,7 +73,10 @@ class Run:
 
 
 _EVENT: Final = struct.Struct("<cQQ")
-"""A hashed event: its kind (`a` arrival, `d` drop, `w` window), the number of the packet or window, and the time."""
+"""A hashed event: its kind (`a` arrival, `d` drop, `w` window), the number of the packet or window, and a time.
+
+The time is the time of the arrival, or the end of the window in which the packet was dropped, or of the window.
+"""
 _PACKET: Final = struct.Struct("<QqqQQ")
 """A hashed packet: its id, number in the flow, size, and the times when it was sent and entered the network."""
 _HASHED_BYTES: Final = 1 << 15
@@ -87,8 +91,8 @@ class EventDigest:
     the same with every library.
 
     Attributes:
-        quiet_ends_ns: Ends of the windows since the last window with packets. They are hashed together. For a window
-            without packets, a caller may append the end of the window here.
+        quiet_ends_ns: Ends of windows that are not hashed yet; they are hashed together. For a window without
+            packets, a caller may append the end of the window here instead of calling `add_window`.
     """
 
     def __init__(self) -> None:
@@ -155,7 +159,7 @@ class Window(NamedTuple):
         end_ns: Its end.
         decided_by: Reason for its length, for example a pair of agents; empty if the policy does not report it.
         entered_fates: Fates of the packets that entered the network in it, in order. Most are not decided yet; they
-            are updated, and are in `decided_fates` of a later window.
+            are updated, and are in `decided_fates` of the window in which they are decided.
         decided_fates: Fates that were decided in it, in order.
         states: States of the agents at its end.
         assumed_states: States that the network assumed during the whole window; if the network extrapolates, the

@@ -67,7 +67,7 @@ class EventPublisher:
         """Send events, several in a datagram if they fit.
 
         Raises:
-            ConfigurationError: They cannot be sent.
+            ConfigurationError: The events cannot be sent.
         """
         group: list[SerializedEvent] = []
         size_bytes = 0

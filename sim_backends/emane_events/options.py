@@ -42,7 +42,7 @@ class EmaneOptions(SimulatorOptions):
         device: Network interface; if omitted, the interface of the route to the group.
         nems: EMANE's identifiers (NEM, one per radio) of agents; if empty, 1, 2, ... in the order of the agents.
         reference: Latitude and longitude in degrees, and height above the ellipsoid in metres, of the world's origin.
-        interval: Smallest time between two events of a run, in simulated time.
+        interval: Smallest time between two publications of a run's positions and path losses, in simulated time.
         pathloss: Publish the mean path loss between all agents, with obstacles, for `precomputed` propagation; or, if
             the run reads positions from events, use the path losses in them.
         real_time: True if a run is at most as fast as the wall clock, because EMANE uses the wall clock.

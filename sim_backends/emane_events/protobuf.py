@@ -97,7 +97,7 @@ def as_integer(value: Value, below: int = 1 << 64) -> int:
     """Return the value of an integer field.
 
     Raises:
-        MalformedEventError: It is not an integer, or too large.
+        MalformedEventError: The field is not an integer, or its value is too large.
     """
     if not isinstance(value, int) or value >= below:
         raise MalformedEventError("a field is not an integer of the expected size")
@@ -108,7 +108,7 @@ def as_bytes(value: Value) -> bytes:
     """Return the value of a field of bytes.
 
     Raises:
-        MalformedEventError: It is an integer.
+        MalformedEventError: The field is an integer.
     """
     if isinstance(value, int):
         raise MalformedEventError("a field is an integer instead of bytes")
@@ -119,7 +119,7 @@ def as_real(value: Value) -> float:
     """Return the value of a field of type double or float.
 
     Raises:
-        MalformedEventError: It has another size.
+        MalformedEventError: The field is an integer, or has another size than a double or a float.
     """
     content = as_bytes(value)
     if len(content) not in {_DOUBLE.size, _FLOAT.size}:

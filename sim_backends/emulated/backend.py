@@ -46,11 +46,12 @@ class EmulatedBackend:
 
     Args:
         site: The site file; None for the paper's lab. A site file without robots has the robots of the paper's lab.
-        document: The document of the site file, for error messages with line numbers.
+        document: The document of the site file, for error messages with line numbers; None without a site file.
 
     Raises:
         ConfigurationError: The `emulated:` section is wrong or names a robot that the lab does not have, the lab has
-            more robots than addresses, or a robot has the name of the laptop.
+            more robots than addresses, or, with `control: radio`, a robot has the name of the laptop or the lab has
+            `wifi: linux`.
     """
 
     by_hand: Final = False
@@ -242,7 +243,7 @@ class EmulatedBackend:
         if self.must_relocate:
             from sim_backends.emulated.linux_wifi import guest_lab  # noqa: PLC0415 (only some labs use it)
 
-            sink(Note("starting a virtual machine, because this kernel has no mac80211_hwsim"))
+            sink(Note("starting a virtual machine, because mac80211_hwsim cannot be used here"))
             draw = partial(interactive_lab.overview, members, options=self._options, world=self._world)
             with guest_lab.bring_up(
                 members, self._site_of_guest(), seed=seed, radios=self._radio_count, draw=draw

@@ -49,8 +49,8 @@ class RobotOptions(Strict):
         userland: `gnu` or `busybox`. With `busybox`, `sh`, `tar`, `ip` and similar programs are busybox's, and
             programs that busybox lacks are missing.
         netcat: `traditional`, `openbsd`, `ncat` or `busybox`: its only netcat, installed as `nc` and under its own
-            name.
-        ping: `iputils` or `busybox`.
+            name. If omitted, it has the netcats of this machine, or with `userland: busybox` that of busybox.
+        ping: `iputils` or `busybox`; if omitted, that of this machine, or with `userland: busybox` that of busybox.
         scripts: Programs that only this robot has, as shell scripts by name, which replace those of this machine:
             `{vcgencmd: echo throttled=0x50005}`. See [state of the robots](robot-state.md#emulated-robots).
     """
@@ -92,7 +92,7 @@ class Ros2Options(Strict):
     Attributes:
         discovery: `multicast`: by multicast (DDS) or scouting (Zenoh). `peers`: each robot has a list of the
             addresses of all others. `router`: by a router, which only Zenoh has.
-        router: The robot that runs the router.
+        router: The robot that runs the router; required for `discovery: router`, otherwise not allowed.
     """
 
     discovery: Literal["multicast", "peers", "router"] = "multicast"
@@ -172,7 +172,7 @@ class EmulatedOptions(Strict):
             `event_driven`, which adds no delay; with `ns3` it is `{name: sliding_window, window: 2ms}`, because an
             exchange at every event of ns-3 takes too long for real time.
         wifi: `model`: the Wi-Fi of fieldkit's radio. `linux`: [Linux Wi-Fi](linux-wifi.md), over the same radio,
-            in a virtual machine if this kernel has no mac80211_hwsim.
+            in a virtual machine if this kernel has no mac80211_hwsim, or the user is not root.
         linux_wifi: Settings of Linux Wi-Fi.
     """
 

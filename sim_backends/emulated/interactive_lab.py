@@ -22,12 +22,12 @@ from sim_backends.emulated import placement
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.mobility import WATCH_S, MotionThread, self_steered_motions
 from sim_backends.emulated.motion_sections import mavlink_of
-from sim_backends.emulated.nodes import RunningRobots, running_robots
 from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.ros.robot_motion import AssignedPath
+from sim_backends.emulated.running_robots import RunningRobots, running_robots
 from sim_backends.radio.antennas import antenna_of
 from sim_backends.radio.world_channel import WorldChannel
-from sim_backends.world.motion import State
+from sim_backends.world.motion import Attitude, State, attitude_of
 from sim_backends.world.world import World
 
 
@@ -39,6 +39,10 @@ class EmulatedLab:
         running: The running robots and their medium.
         options: The lab's options.
         world: The world around the robots.
+
+    Attributes:
+        members: The robots by name.
+        login: The login at the robots.
 
     Raises:
         LinkError: The medium process exited or did not answer.
@@ -123,12 +127,13 @@ class EmulatedLab:
                 self._states = states
                 self._positions_m = self._positions_m | {name: state.position_m for name, state in states.items()}
                 velocities_m_s = {name: state.velocity_m_s for name, state in states.items()}
-                self._running.media.place(self._positions_m, velocities_m_s=velocities_m_s)
+                attitudes = {name: attitude_of(state, before=Attitude()) for name, state in states.items()}
+                self._running.media.place(self._positions_m, velocities_m_s=velocities_m_s, attitudes=attitudes)
                 self._running.positions_writer.write(self._positions_m)
         return WATCH_S
 
     def lateness(self) -> LabLateness | None:
-        """Implement `Lab.lateness`: the lateness of packets and windows since the lab was ready."""
+        """Implement `Lab.lateness`: lateness since the start; None without a co-simulation."""
         first_stats = self._first_stats
         if first_stats is None:
             return None
@@ -168,7 +173,7 @@ def members_of(site: Site, document: Document | None, addresses: Mapping[str, st
 
     Args:
         site: The site file.
-        document: The document of the site file, for error messages with line numbers.
+        document: The document of the site file, for error messages with line numbers; or None.
         addresses: Radio address of each robot.
 
     Raises:
@@ -185,7 +190,7 @@ def members_of(site: Site, document: Document | None, addresses: Mapping[str, st
 def overview(
     members: Mapping[str, LabRobot], positions_m: Mapping[str, Vector], options: EmulatedOptions, world: World
 ) -> Overview:
-    """Return the map of the lab, computed without shadowing, which depends on the seed."""
+    """Return the map of the lab, computed without fading, and without shadowing, which depends on the seed."""
     antennas = {name: antenna_of(member.profile.radio) for name, member in members.items()}
     channel = WorldChannel(
         0, antennas, options.radio.model_copy(update={"shadowing_db": 0.0, "fading": False}), world

@@ -20,11 +20,13 @@ from sim_backends.emulated.motion_sections import mavlink_of
 from sim_backends.emulated.nodes import EmulatedRobot, Laptop
 from sim_backends.emulated.provisioning import RobotKey
 from sim_backends.emulated.ros.motion_record import RecordedMotion
-from sim_backends.world.motion import STILL, Motion, State
+from sim_backends.world.motion import STILL, Attitude, Motion, State, attitude_of
 from sim_backends.world.world import World
 
 STEP_M: Final = 0.1
-"""Distance that a robot may move between two updates of the medium.
+"""Distance that a robot may move between two updates of the medium, at a speed of 1 to 5 m/s.
+
+At lower and higher speeds, `_MAX_PERIOD_S` and `_MIN_PERIOD_S` determine the distance.
 
 At the distance d, the path loss increases by 10 n / (d ln 10) dB per metre, with the path-loss exponent n. At 10 m
 and n = 3 this is 1.3 dB/m, so a step changes it by 0.13 dB. Fading, which changes within a wavelength (0.12 m),
@@ -36,8 +38,8 @@ _MAX_PERIOD_S: Final = 0.1
 """Limits of the time between two updates of the medium while the lab moves a robot."""
 
 WATCH_S: Final = 0.05
-"""Polling interval for robots that steer themselves, while they are at rest; a robot that starts to drive at 0.2 m/s
-moves 1 cm within it."""
+"""Polling interval for robots that steer themselves, while they are at rest or slow; a robot that starts to drive at
+0.2 m/s moves 1 cm within it."""
 
 
 class MotionThread:
@@ -49,7 +51,7 @@ class MotionThread:
         name: Name of the thread.
 
     Raises:
-        FieldkitError: The error of `step`. It is raised when the context is left, unless its body raised an error.
+        BaseException: The error of `step`. It is raised when the context is left, unless its body raised an error.
     """
 
     def __init__(self, step: Callable[[], float | None], name: str = "motion") -> None:
@@ -110,6 +112,7 @@ class PlacesRobots(Protocol):
         *,
         relay: str | None = None,
         velocities_m_s: Mapping[str, Vector] = ...,
+        attitudes: Mapping[str, Attitude] = ...,
     ) -> None:
         """Place the robots. The arguments are those of `MediumClient.place`."""
 
@@ -123,7 +126,8 @@ class Mobility:
         world: The world around the robots.
         laptop: The operator's laptop, placed beside the robots; None if it is not on the air.
         robots: Handles of the robots, which receive their paths and report their motion if they steer themselves.
-        write_positions: Called with the robots' positions, metres east, north, up, for the lasers of other robots.
+        write_positions: Called with the positions of the laptop and of the robots that are not out of range, metres
+            east, north, up, for the lasers of other robots.
     """
 
     def __init__(
@@ -150,6 +154,7 @@ class Mobility:
         self._path_starts_ns: dict[Role, int] = {}
         self._last_motions: dict[Role, RecordedMotion] = {}
         self._track: list[TrackPoint] = []
+        self._attitudes: dict[str, Attitude] = {}
         # Each motion runs in a separate thread.
         self._lock = threading.RLock()
 
@@ -230,7 +235,7 @@ class Mobility:
         return self_steered_motions(self._robots, self._path_starts_ns)
 
     def track(self, since_utc_ns: int) -> tuple[TrackPoint, ...]:
-        """Return the track points after a time, and the last point of each robot before it; discard older points."""
+        """Return the track points after a time, and the last point of each robot until then; discard older points."""
         with self._lock:
             first_kept = {
                 point.role: number for number, point in enumerate(self._track) if point.utc_ns <= since_utc_ns
@@ -260,6 +265,10 @@ class Mobility:
             now_ns, utc_ns = time.monotonic_ns(), time.time_ns()
             positions_m = positions.positions_m(self._cast, placement, self._world)
             states = {name: State(position_m) for name, position_m in positions_m.items()}
+            for role, robot in self._cast.items():
+                if (state := states.get(robot.name)) is not None:
+                    heading_rad = positions.facing_rad(placement, role, self._world)
+                    states[robot.name] = state._replace(heading_rad=heading_rad)
             for start_ns, motion in self._motions:
                 states |= motion.at(now_ns - start_ns)
             states |= {
@@ -274,16 +283,24 @@ class Mobility:
             self._write_positions({name: state.position_m for name, state in visible_states.items()})
             if hidden_robot is not None:
                 states = {} if hidden_robot == relay else visible_states
+            self._attitudes = {
+                name: attitude_of(state, before=self._attitudes.get(name, Attitude()))
+                for name, state in states.items()
+            }
             self._media.place(
                 {name: state.position_m for name, state in states.items()},
                 relay=relay if relay in states else None,
                 velocities_m_s={name: state.velocity_m_s for name, state in states.items()},
+                attitudes=self._attitudes,
             )
             self._extend_track(utc_ns, states)
             return self._next_update_s(now_ns, states)
 
     def _extend_track(self, utc_ns: int, states: Mapping[str, State]) -> None:
-        """Append a point for each robot whose position or velocity has changed; `utc_ns` is the time of `states`."""
+        """Append a point for each robot that has none, or whose position or velocity has changed since its last one.
+
+        A robot that is not in `states` is off the air: its point has no position. `utc_ns` is the time of `states`.
+        """
         last_points = {point.role: point for point in self._track}
         for role, robot in self._cast.items():
             state = states.get(robot.name)

@@ -20,7 +20,8 @@ _SPACING_M: Final = 5.0
 """Maximum distance of neighbouring robots in an interactive lab."""
 
 _CEILING_M: Final = 100_000.0
-"""Maximum height of a flying robot: the boundary of space by the definition of the FAI."""
+"""Maximum height of a flying robot above the ground. The FAI defines this height above sea level as the boundary of
+space."""
 
 
 def positions_m(cast: Cast, placement: Placement, world: World) -> dict[str, Vector]:
@@ -58,13 +59,17 @@ def assigned_path(placement: Placement, move: Move, world: World, start_ns: int)
         world: The world around the robots.
         start_ns: Start of the move, as a time of the monotonic clock.
     """
-    line, (along_m, left_m) = _line(placement, world), _along_line_m(placement)[move.role]
-    # 1 m ahead of the robot, which faces along the line (1) or against it (-1).
-    ahead_m = math.cos(geometry.heading_rad(move.role, "away"))
-    start, goal = line.at(along_m, left_m), line.at(along_m + ahead_m, left_m)
-    facing_rad = math.atan2(goal[1] - start[1], goal[0] - start[0])
     points_m = [antenna_m(world, corner) for corner in _corners_m(placement, move, world)]
-    return AssignedPath(start_ns, points_m, move.speed_m_s, facing_rad)
+    return AssignedPath(start_ns, points_m, move.speed_m_s, facing_rad(placement, move.role, world))
+
+
+def facing_rad(placement: Placement, role: Role, world: World) -> float:
+    """Return the heading of a robot at its place: away from the other end of its link."""
+    line, (along_m, left_m) = _line(placement, world), _along_line_m(placement)[role]
+    # 1 m ahead of the robot, which faces along the line (1) or against it (-1).
+    ahead_m = math.cos(geometry.heading_rad(role, "away"))
+    start, goal = line.at(along_m, left_m), line.at(along_m + ahead_m, left_m)
+    return math.atan2(goal[1] - start[1], goal[0] - start[0])
 
 
 def _corners_m(placement: Placement, move: Move, world: World) -> list[tuple[float, float]]:
@@ -132,7 +137,7 @@ def destination_m(start_m: Vector, to: Destination, world: World) -> Vector:
         world: The world around the robot.
 
     Raises:
-        ConfigurationError: The destination is outside the world, below its ground, or above 100 km.
+        ConfigurationError: The destination is outside the world, below its ground, or more than 100 km above it.
     """
     origin_m = start_m[:2] if to.relative else (0.0, 0.0)
     end_m = origin_m[0] + to.east_m, origin_m[1] + to.north_m
@@ -152,8 +157,8 @@ def destination_m(start_m: Vector, to: Destination, world: World) -> Vector:
     up_m = ground_m + above_ground_m
     if not 0 <= above_ground_m <= _CEILING_M:
         raise ConfigurationError(
-            f"{up_m:g} m up is not a valid height: the ground is at {ground_m:g} m there, and nothing flies above "
-            f"{_CEILING_M / 1000:g} km",
+            f"{up_m:g} m up is not a valid height: the ground is at {ground_m:g} m there, and nothing flies more "
+            f"than {_CEILING_M / 1000:g} km above it",
             remedy=f"omit UP for a robot on the ground, whose antenna is {ANTENNA_M:g} m above it",
         )
     return *end_m, up_m

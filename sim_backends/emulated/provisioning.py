@@ -138,7 +138,9 @@ def _neighbours(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) ->
 
 
 def neighbour(number: int, profile: RobotProfile) -> Neighbour:
-    """Return the body of a robot as a cylinder, from the ground up to its antenna, or to its top if that is higher.
+    """Return the body of a robot as a cylinder: from `ANTENNA_M` below its antenna up to the antenna.
+
+    If the robot is higher than its antenna, the cylinder ends at the top of the robot.
 
     A robot whose body is unknown has the body of the paper's ground robot or of the paper's drone.
     """
@@ -192,7 +194,8 @@ def drives_by_topic(profile: RobotProfile, options: EmulatedOptions) -> bool:
 def ros2_middleware(profile: RobotProfile, options: EmulatedOptions) -> str:
     """Return the middleware of a profile's ROS 2 over the radio: `dds`, `zenoh`, or "" if it has none.
 
-    The result is also "" if the middleware is not installed on this machine.
+    The result is also "" if the site file selects the built-in ROS, or if the middleware is not installed on this
+    machine.
     """
     ros = profile.ros
     if ros is None or ros.variant != "ros2" or options.ros is RosChoice.BUILTIN:
@@ -282,7 +285,10 @@ def _ros2_spec(
 
 
 def _bridge(robot: "Robot | LabRobot") -> tuple[str, ...]:
-    """Return the command of the bridge that starts with the robot in an interactive lab; empty in a trial."""
+    """Return the command of the bridge that starts with the robot in an interactive lab.
+
+    It is empty in a trial, and for a profile without a bridge.
+    """
     ros = robot.profile.ros
     if ros is None or ros.bridge is None or isinstance(robot, Robot):
         return ()
@@ -315,7 +321,7 @@ def robot_spec(
         hosts={other.name: other.address for other in robots.values()},
         host_key=host_key.private,
         authorized_key=login.public,
-        # Debian has no ROS 2, and a robot without ROS runs no master.
+        # `debian` is Debian's ROS 1; robots with ROS 2 or without ROS do not use it.
         ros=(RosChoice.BUILTIN if is_ros2 or profile_ros is None else ros).value,
         ros_version=2 if is_ros2 else 1,
         distribution=profile_ros.command.distribution if profile_ros else "",

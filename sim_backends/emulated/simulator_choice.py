@@ -111,8 +111,9 @@ def bodies_of(robots: Iterable[Robot | LabRobot]) -> dict[str, RobotBody]:
 def _body(profile: RobotProfile) -> RobotBody:
     """Return the body of a robot with this profile, and its limits of motion.
 
-    A ground robot whose body is unknown has the body of a TurtleBot3; its limits are those in the profile. A drone
-    has the limits of its airframe, because its autopilot enforces the limits in the profile.
+    A ground robot whose body is unknown has the body of a TurtleBot3. The maximum speed of a ground robot is that of
+    its profile; so are its acceleration and turn rate, if the profile has the section `drive`. A drone has the limits
+    of its airframe, because its autopilot enforces the limits in the profile.
     """
     if mavlink_of(profile) is not None:
         return RobotBody(profile.name, quadrotor(profile.name))

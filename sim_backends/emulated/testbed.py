@@ -31,9 +31,10 @@ from sim_backends.emulated import placement as positions
 from sim_backends.emulated.emulated_options import EmulatedOptions, MeshOptions, RosChoice
 from sim_backends.emulated.medium.media import Media
 from sim_backends.emulated.mobility import Mobility
-from sim_backends.emulated.nodes import LAPTOP_RADIO, Laptop, Node, RunningRobots, running_robots
+from sim_backends.emulated.nodes import LAPTOP_RADIO, Laptop, Node
 from sim_backends.emulated.provisioning import LAPTOP_ADDRESS, NETWORK, RobotKey
 from sim_backends.emulated.robot.spec import USER
+from sim_backends.emulated.running_robots import RunningRobots, running_robots
 from sim_backends.world.world import World
 
 _IP_PROTOCOL: Final = {Protocol.TCP: socket.IPPROTO_TCP, Protocol.UDP: socket.IPPROTO_UDP}
@@ -98,6 +99,10 @@ class EmulatedTestbed:
         world: The world around the robots.
         laptop: The node from which SSH reaches the robots over the medium; None if SSH bypasses the medium.
         operator: The person who answers the questions of steps.
+
+    Attributes:
+        robots: The handle of each robot.
+        medium: The medium of the radio under test.
     """
 
     def __init__(
@@ -147,7 +152,7 @@ class EmulatedTestbed:
         return DONE
 
     def inject(self, fault: Fault) -> float | None:
-        """Implement `Testbed.inject`; the fault is also reverted if the call is interrupted."""
+        """Implement `Testbed.inject`; after an interrupt, the link, the position or the power is restored at once."""
         robot = self.robots[fault.role]
         match fault.kind:
             case FaultKind.LINK_DOWN:
@@ -188,7 +193,10 @@ class LinuxWifiTestbed(EmulatedTestbed):
 
 
 def _apply_for(duration_s: float, apply: Callable[[], None], revert: Callable[[], None]) -> float:
-    """Call `apply`, and `revert` after `duration_s` or on an interrupt; return the seconds between both calls."""
+    """Call `apply`, and `revert` after `duration_s` or on an interrupt.
+
+    Return the seconds from the end of `apply` to the end of `revert`.
+    """
     apply()
     start_s = time.monotonic()
     try:

@@ -100,7 +100,7 @@ def announcements_bytes(states: Mapping[str, State], agents: AgentTable) -> byte
     """Return the announcement of the agents that are not in the table yet, and add them to the table.
 
     Raises:
-        ValueError: There are too many agents.
+        ValueError: There are too many agents, or a name is too long.
     """
     if states.keys() <= agents.indices.keys():
         return _NO_NEW_AGENTS
@@ -118,7 +118,8 @@ def read_announcements(reader: FrameReader, agents: AgentTable) -> None:
     """Add announced agents to the table.
 
     Raises:
-        MalformedFrameError: An index is not the next free index, or a name is empty or already in use.
+        MalformedFrameError: An index is not the next free index, there are too many agents, or a name is empty or
+            already in use.
     """
     count = reader.count(_NEW_AGENT_BYTES)
     if not count:
@@ -127,8 +128,10 @@ def read_announcements(reader: FrameReader, agents: AgentTable) -> None:
     for _ in range(count):
         position, expected = reader.position, len(agents.names) + len(new_names)
         (index,) = reader.unpack(_INDEX)
-        if index != expected or index >= MAX_AGENTS:
+        if index != expected:
             raise MalformedFrameError(position, f"the new agent has index {index}, not {expected}")
+        if index >= MAX_AGENTS:
+            raise MalformedFrameError(position, f"there are more than {MAX_AGENTS} agents")
         position = reader.position
         name = reader.text()
         if not name or name in agents.indices or name in new_names:
@@ -218,7 +221,7 @@ def read_states(reader: FrameReader, agents: AgentTable) -> ReceivedStates:
     """Return the next list of states in a frame, by name of the agent.
 
     Raises:
-        MalformedFrameError: A state is invalid, or an agent has two states.
+        MalformedFrameError: A state is invalid, an agent has two states, or an agent was not announced.
     """
     count = reader.count(STATE.size)
     begin = reader.position
@@ -234,7 +237,7 @@ def unpack_states(data: bytes, begin: int, agents: AgentTable) -> ReceivedStates
         agents: The agents.
 
     Raises:
-        MalformedFrameError: A state is invalid, or an agent has two states.
+        MalformedFrameError: A state is invalid, an agent has two states, or an agent was not announced.
     """
     layouts = _layouts(len(data) // STATE.size)
     indices, limits = layouts.indices.unpack(data), layouts.acceleration_limits.unpack(data)

@@ -178,7 +178,7 @@ class _Run:
         token: Token that the coordinator must send.
         hello_s: Timeout of the first message of the coordinator, in seconds; None for no limit.
         copies: The federate (number 0) and its copies, by number.
-        heartbeat: Sends `busy`; None before the first message.
+        heartbeat: Sends `busy`; None until a hello with the right token has arrived.
     """
 
     service: FederateService

@@ -13,7 +13,7 @@ _CHUNK_BYTES: Final = 1 << 16
 
 
 class ClosedError(ConnectionError):
-    """The other side closed the channel."""
+    """The channel is closed, by the other side or by this one."""
 
 
 class DeadlineError(TimeoutError):

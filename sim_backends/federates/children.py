@@ -73,7 +73,7 @@ class Child:
 
     @property
     def last_output(self) -> list[str]:
-        """The last lines that it wrote to its standard error, at most ten."""
+        """The last lines that it wrote to its standard error, at most ten, without empty ones; none after `close`."""
         if self._stderr.closed:
             return []
         size = os.fstat(self._stderr.fileno()).st_size
@@ -81,7 +81,10 @@ class Child:
         return [line.rstrip() for line in tail.splitlines() if line.strip()][-_SHOWN_LINES:]
 
     def first_notes(self) -> list[str]:
-        """Return the lines `note: TEXT` at the start of its standard error, without `note: `; at most ten."""
+        """Return the texts of the first lines `note: TEXT` of its standard error, at most ten.
+
+        Only the first 4096 bytes are searched.
+        """
         head = os.pread(self._stderr.fileno(), _SHOWN_BYTES, 0).decode(errors="replace")
         notes = [line.removeprefix(_NOTE) for line in head.splitlines() if line.startswith(_NOTE)]
         return notes[:_SHOWN_LINES]

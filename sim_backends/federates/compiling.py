@@ -54,10 +54,12 @@ class CompiledProgram:
     def path(self) -> Path:
         """Return the path of the program, and compile it if necessary.
 
-        It is compiled unless the cache contains a program for this source, compiler, and versions of the libraries.
+        It is compiled unless the cache contains a program for this source, these options, this compiler, and these
+        versions of the libraries.
 
         Raises:
-            ConfigurationError: The compiler or a library is not installed, or the compilation failed.
+            ConfigurationError: The compiler or a library is not installed, or the compilation failed or took too
+                long, here or in another process.
         """
         compiler, libraries = self._versions()
         digest = hashlib.sha256()
@@ -109,7 +111,7 @@ class CompiledProgram:
             except subprocess.TimeoutExpired as error:
                 raise ConfigurationError(
                     f"{self.name} was not compiled within {_LIMIT_S:g} s",
-                    remedy="repeat it when the machine is less busy",
+                    remedy="run the command again when the machine is less busy",
                 ) from error
             if compilation.returncode:
                 lines = compilation.stderr.splitlines()[:_SHOWN_LINES]

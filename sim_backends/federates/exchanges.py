@@ -105,7 +105,7 @@ def encode_advance_physics(to_ns: int, from_ns: int, commands: Mapping[str, Any]
 
 
 def decode_advance_physics(body: bytes, agents: AgentTable) -> tuple[int, int, dict[str, Twist | Velocity]]:
-    """Return the two times and the commands of a request to a physics federate.
+    """Return `to_ns`, `from_ns` and the commands of a request to a physics federate.
 
     Raises:
         MalformedFrameError: The body is malformed.
@@ -124,7 +124,7 @@ def decode_advance_physics(body: bytes, agents: AgentTable) -> tuple[int, int, d
 def encode_states(
     at_ns: int, states: Mapping[str, State], agents: AgentTable, limits_m_s2: Mapping[str, float]
 ) -> bytes:
-    """Return the body of a physics federate's answer."""
+    """Return the body of a physics federate's answer. Raises the errors of `announcements_bytes`."""
     return _TIME.pack(at_ns) + announcements_bytes(states, agents) + states_bytes(states, agents, limits_m_s2)
 
 
@@ -167,7 +167,7 @@ class AdvanceNetwork(NamedTuple):
         """Return the body of the message.
 
         Raises:
-            ValueError: There are too many agents.
+            ValueError: There are too many agents, or a text is too long.
         """
         return b"".join(
             (
@@ -214,7 +214,7 @@ class NetworkOutcomes(NamedTuple):
     delays: Sequence[ArrivalDelay] = ()
 
     def encode(self, agents: AgentTable) -> bytes:
-        """Return the body of the message."""
+        """Return the body of the message. Raises ValueError if a reason of a drop is too long."""
         return (
             _TWO_TIMES.pack(self.at_ns, self.next_event_ns)
             + arrivals_bytes(self.arrivals, agents)

@@ -75,7 +75,7 @@ def _read_prefix(reader: FrameReader) -> None:
 
 
 def encode_join(token: str) -> bytes:
-    """Return the body of `join`."""
+    """Return the body of `join`. Raises ValueError if the token is too long."""
     return _PREFIX.pack(MAGIC, VERSION) + text_bytes(token)
 
 
@@ -102,7 +102,7 @@ class AgentStart:
         start: State of its antenna at time 0.
         flies: True if it flies.
         antenna_m: Height of the antenna above the body's position.
-        limit_m_s2: Largest change of its velocity per second.
+        limit_m_s2: Largest change of its velocity per second; infinity if it is unknown.
     """
 
     name: str
@@ -127,7 +127,7 @@ class Hello:
         step_ns: Physics step that the scenario requests.
         end_ns: End of the run.
         name: Name of the scenario.
-        configuration: JSON with scenario, world and robots.
+        configuration: JSON with scenario, world, robots and options.
         heartbeat_ms: Interval at which a federate sends `busy` while it computes.
         token: Token of a connection between machines.
     """
@@ -162,7 +162,7 @@ class Hello:
         """Return the body of the message.
 
         Raises:
-            ValueError: A number, a text or the configuration is too large.
+            ValueError: A number, a text or the whole message is too large, or there are too many agents.
         """
         table = AgentTable(agent.name for agent in self.agents)
         try:
@@ -181,7 +181,10 @@ class Hello:
             ]
         body = b"".join([*parts, count_bytes(len(self.configuration)), self.configuration])
         if len(body) > MAX_HELLO_BYTES or len(self.agents) > MAX_AGENTS:
-            raise ValueError(f"the configuration of {len(body)} bytes is too large for an external federate")
+            raise ValueError(
+                f"a hello of {len(body)} bytes with {len(self.agents)} agents is too large for an external federate "
+                f"(limits: {MAX_HELLO_BYTES} bytes, {MAX_AGENTS} agents)"
+            )
         return body
 
     @staticmethod
@@ -254,7 +257,7 @@ class Welcome:
     emitters_m: Sequence[Vector] = ()
 
     def encode(self) -> bytes:
-        """Return the body of the message."""
+        """Return the body of the message. Raises ValueError if a text is too long."""
         numbers = (VERSION, self.role, 0, self.capabilities, self.step_ns, self.next_event_ns)
         parts = [_WELCOME.pack(*numbers, self.configuration_hash), text_bytes(self.name), text_bytes(self.software)]
         parts += [short_count_bytes(len(self.commands)), *map(_U16.pack, self.commands)]

@@ -22,7 +22,7 @@ from sim_backends.radio.links import (
     Pair,
 )
 from sim_backends.radio.random_streams import PacketIdentity
-from sim_backends.world.motion import State
+from sim_backends.world.motion import Attitude, State
 
 
 class IpRadio:
@@ -35,6 +35,8 @@ class IpRadio:
         federate: A network with the transports `ip` and `ip-broadcast`, which announces its next event.
         names: The stations.
     """
+
+    uses_attitudes = False
 
     def __init__(self, federate: NetworkFederate, names: Sequence[str]) -> None:
         self._federate = federate
@@ -57,6 +59,7 @@ class IpRadio:
         positions_m: Mapping[str, Vector],
         relay: str | None,  # noqa: ARG002
         velocities_m_s: Mapping[str, Vector] | None = None,  # noqa: ARG002
+        attitudes: Mapping[str, Attitude] | None = None,  # noqa: ARG002
     ) -> None:
         """Implement `RadioModel.place`."""
         self._states = {name: State(position_m) for name, position_m in positions_m.items()}

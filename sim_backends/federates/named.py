@@ -96,7 +96,9 @@ def named_federate(endpoint: str, role: int) -> NamedFederate | None:
 
 
 def default_options(endpoint: str, role: int) -> dict[str, Any]:
-    """Return the default options of the federate with a name; empty if `endpoint` is a command or an address.
+    """Return the default options of the federate with a name.
+
+    The result is empty if the federate declares no options, or if `endpoint` is a command or an address.
 
     Raises:
         ConfigurationError: The package of the federate cannot be loaded, or the federate has another role.
@@ -115,7 +117,7 @@ def _load(entry_point: EntryPoint) -> NamedFederate:
 
 
 def is_single_threaded(endpoint: str, role: int) -> bool:
-    """Return True if `endpoint` is the name of a program that declares one thread; False for a command or an address.
+    """Return True if `endpoint` is the name of a program that declares one thread, otherwise False.
 
     Raises:
         ConfigurationError: The package of the federate cannot be loaded, or the federate has another role.
@@ -128,7 +130,8 @@ def command_line(endpoint: str, role: int) -> str:
     """Return the command that starts the federate with a name, or `endpoint` itself if it is a command or an address.
 
     Raises:
-        ConfigurationError: The federate cannot be used; the remedy states how to install the missing software.
+        ConfigurationError: The federate cannot be used, then the remedy states how to install the missing software;
+            or there is neither a federate nor a program with this name.
     """
     federate = named_federate(endpoint, role)
     if isinstance(federate, ProgramFederate):

@@ -58,7 +58,7 @@ def seconds_text(time_ns: int) -> str:
 
 
 def advance_text(from_ns: int, to_ns: int) -> str:
-    """Return the text of a request to advance. A window of 1 ns, or the first request, only has an end."""
+    """Return the text of a request to advance; the start is omitted unless it is before the end."""
     start = f" from {seconds_text(from_ns)}" if from_ns < to_ns else ""
     return f"advance{start} to {seconds_text(to_ns)}"
 

@@ -87,7 +87,7 @@ class RemotePhysics(_RemoteFederate):
 
     Attributes:
         step_ns: Time step, as reported in the federate's answer.
-        limits_m_s2: Acceleration limit of each agent, as last reported by the federate.
+        limits_m_s2: Acceleration limit of each agent, as last reported by the federate; at first the limit in hello.
         agents_disappear: True if agents may disappear during a run.
     """
 
@@ -168,7 +168,9 @@ class RemoteNetwork(_RemoteFederate):
         self._log_delay = log
 
     def sample_links(self) -> dict[str, LinkSample]:
-        """Return a sample of the links of each radio, at the network's current time; empty if there are no radios.
+        """Return a sample of the links of each radio, at the network's current time.
+
+        The result is empty if there are no radios, or if the network does not declare `SAMPLES_LINKS`.
 
         Raises:
             FederateError: The network failed, or sent a malformed answer.

@@ -19,7 +19,7 @@ def main(role_name: str, name: str, address: str | None = None) -> None:
         address: Address of a transport; None for standard input and output.
 
     Raises:
-        SystemExit: The federate with this name is not a Python class.
+        SystemExit: There is no federate with this name that is a Python class, or `serve_service` raised it.
     """
     (role,) = (number for number, text in ROLES.items() if text == role_name)
     federate = named_federate(name, role)

@@ -26,12 +26,14 @@ def serve(make: MakeFederate, *, address: str | None = None, runs: int | None = 
         address: None for standard input and output, which then carry only frames; everything that the federate prints
             goes to standard error. Otherwise an address of a transport (`transports.transport_table`).
         runs: Number of runs after which to return; None means one run if this side does not listen, otherwise no
-            limit.
+            limit. Over standard input and output there is always one run.
         **properties: Other attributes of `FederateService`.
 
     Raises:
         ConfigurationError: The address is invalid or cannot be used, or the token is missing.
-        SystemExit: The last run failed.
+        SystemExit: The last run failed, no coordinator or ROS master answered in time, or standard input is a
+            terminal.
+        ValueError: The address does not begin with the scheme of a transport.
     """
     serve_service(FederateService(make, **properties), address=address, runs=runs)
 

@@ -56,14 +56,14 @@ def printable(text: str) -> str:
 
 
 class FederateSession:
-    """A connection to an external federate. After an error it is closed, and the child process has exited.
+    """A connection to an external federate. After a FederateError it is closed, and the child process has exited.
 
     Args:
         role: `PHYSICS` or `NETWORK`.
         endpoint: The federate's command or address, for messages.
         channel: The channel.
         deadline_s: Longest wait for a frame, in seconds of wall time; None for no deadline.
-        child: The process of the federate, if this process has started it.
+        child: The process of the federate; None if this process has not started it.
 
     Attributes:
         name: The federate's role, its name if it has sent one, and its command or address.
@@ -110,6 +110,7 @@ class FederateSession:
 
         Raises:
             FederateError: The federate failed, did not answer, or is not compatible; the message names it.
+            ValueError: The hello is too large.
         """
         request_text = f"begin a run as {ROLES[self._role]}"
         welcome = self.request(
@@ -309,12 +310,12 @@ def open_session(
     Args:
         role: `PHYSICS` or `NETWORK`.
         endpoint: A name, a command, or an address of a transport (`transports.transport_table`).
-        hello: The hello that the federate receives; the token is added, and the interval of heartbeats is limited to
-            a quarter of the deadline.
+        hello: The hello that the federate receives; the token is added if `endpoint` is an address, and the interval
+            of heartbeats is limited to a quarter of the deadline.
         deadline_s: Longest wait for the connection and for each frame; None for no deadline.
 
     Raises:
-        ConfigurationError: The name, the command or the address cannot be used.
+        ConfigurationError: The name, the command or the address cannot be used, or the hello is too large.
         FederateError: The federate failed, or has not connected or answered in time.
     """
     address = parse_address(endpoint)

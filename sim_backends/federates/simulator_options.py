@@ -52,7 +52,7 @@ class SimulatorOptions(Strict):
 
 
 Options = SimulatorOptions | dict[str, JsonValue] | None
-"""Options of a federate: a model, or any mapping if the federate declares no options."""
+"""Options of a federate: a model, any mapping if the federate declares no options, or None for no options."""
 
 
 def options_json(options: Options) -> dict[str, Any]:

@@ -79,7 +79,8 @@ class Connection
         }
     }
 
-    // Wait until the plugins of all models subscribe to commands.
+    // Wait until the plugins of all present models subscribe to commands, and find out whether the world has the fence
+    // (see `Acknowledge`). If the option `acknowledge` is `required`, wait for the fence too.
     void WaitForSubscribers(WorldMonitor::Lock& lock)
     {
         const CommandReceiver* missing = nullptr;

@@ -234,7 +234,7 @@ def _add_robot(world: Element, name: str, robot: SdfRobot, version: Version, ste
 
 
 def _chassis_of(limits: DriveLimits) -> _Chassis:
-    """Return the geometry of the Husky, or the geometry of the TurtleBot scaled to the size of the body."""
+    """Return the geometry of the Husky for a body of its radius, otherwise a TurtleBot scaled to that radius."""
     if limits.radius_m == HUSKY_A200.radius_m:
         return _HUSKY
     scale = limits.radius_m / TURTLEBOT3_BURGER.radius_m

@@ -8,13 +8,16 @@ from fieldkit.core.errors import ConfigurationError
 from sim_backends.federates.handshake import AgentStart
 from sim_backends.mujoco_physics.chassis import chassis
 from sim_backends.mujoco_physics.mjcf import RobotModel, quaternion
+from sim_backends.physics.differential_drive import slope_tilt_rad
 from sim_backends.physics.ground import Ground
 from sim_backends.physics.robot_limits import BODIES, TURTLEBOT3_BURGER, DriveLimits, QuadrotorLimits, quadrotor
 from sim_backends.world.world import World
 
 
 def agent_limits(agent: AgentStart, body: Mapping[str, Any] | None) -> DriveLimits | QuadrotorLimits:
-    """Return the limits of an agent: the limits in the configuration, otherwise the limits of its profile.
+    """Return the limits of an agent: the limits in the configuration, otherwise the built-in limits of its profile.
+
+    A ground robot with neither has the limits of a TurtleBot3 Burger, a drone those of the Duckiedrone.
 
     Raises:
         ConfigurationError: The configuration has limits of another kind of robot.
@@ -41,10 +44,6 @@ def agent_model(agent: AgentStart, limits: DriveLimits | QuadrotorLimits, world:
     place_m, heading_rad = (e, n, u - agent.antenna_m), agent.start.heading_rad or 0.0
     if isinstance(limits, QuadrotorLimits):
         return RobotModel(place_m, quaternion(heading_rad), agent.antenna_m, 0.0, limits)
-    cos, sin = math.cos(heading_rad), math.sin(heading_rad)
-    east, north = Ground(world, math.inf).surface(e, n).grade
-    # Slopes of the ground in the robot's forward and left directions.
-    forward, left = east * cos + north * sin, north * cos - east * sin
-    roll_rad = math.asin(left / math.hypot(1.0, forward, left))
-    orientation = quaternion(heading_rad, -math.atan(forward), roll_rad)
+    roll_rad, pitch_rad = slope_tilt_rad(Ground(world, math.inf).surface(e, n).grade, heading_rad)
+    orientation = quaternion(heading_rad, pitch_rad, roll_rad)
     return RobotModel(place_m, orientation, agent.antenna_m, limits.friction, chassis(agent.profile, limits))

@@ -41,8 +41,8 @@ class Chassis:
 
     Attributes:
         mass_kg: Mass without wheels.
-        centre_m: Its centre of mass.
-        inertia_kg_m2: Moments of inertia about its axes.
+        centre_m: Centre of mass without wheels.
+        inertia_kg_m2: Moments of inertia without wheels, about the axes through this centre: forward, left, up.
         boxes: Its shape.
         wheels: Its wheels.
         caster_m: Lowest point of a caster without friction; None for a robot without a caster.
@@ -132,7 +132,7 @@ CASTER_RADIUS_M: Final = 0.01
 
 
 def chassis(profile: str, limits: DriveLimits) -> Chassis:
-    """Return the chassis of a profile; for an unknown profile, a TurtleBot3 Burger scaled to the robot's size."""
+    """Return the Husky's chassis for the profile `husky`, otherwise a TurtleBot3 Burger of the robot's radius."""
     if profile == "husky":
         return HUSKY
     factor = limits.radius_m / TURTLEBOT3_BURGER.radius_m

@@ -59,7 +59,7 @@ class Controller(Protocol):
 
         Args:
             registers: The simulation.
-            elapsed_s: Time since the last tick.
+            elapsed_s: Time since the last tick, at most about `TICK_NS`.
         """
         ...
 
@@ -137,7 +137,7 @@ class FlightController:
     def tick(self, registers: Registers, elapsed_s: float) -> bool:  # noqa: ARG002 (see Controller)
         """Implement `Controller.tick`."""
         limits, (body, mocap, dof, motor) = self._limits, self._indices
-        # Components east, north, up (e, n, u): x and z are axes of the body, v is its velocity, f is the thrust.
+        # Components east, north, up (e, n, u): x and z are axes of the body, v is its velocity, f is thrust per mass.
         x_e, _, z_e, x_n, _, z_n, _, _, z_u = registers.xmat[9 * body : 9 * body + 9]
         v_e, v_n, v_u = registers.qvel[dof : dof + 3]
         drag_n_s_m = limits.drag_n_s_m + limits.drag_n_s2_m2 * math.hypot(v_e, v_n, v_u)

@@ -1,7 +1,7 @@
 """The model of a run in MJCF, MuJoCo's XML: world, robots, motors and sensors.
 
 Elements are named by the numbers of agents, because names of agents may have any characters. The sensors of an agent
-are, in this order, the position and velocity of its antenna and its forward direction: 9 numbers.
+are, in this order, the position and velocity of its antenna and its forward and left directions: 12 numbers.
 """
 
 import math
@@ -18,7 +18,7 @@ from sim_backends.world.obstacles import Raised, Ramp
 from sim_backends.world.shapes import Box, Shape
 from sim_backends.world.world import World
 
-SENSED_NUMBERS: Final = 9
+SENSED_NUMBERS: Final = 12
 """Number of values of the sensors of an agent."""
 WHEEL_CONTROL_PER_S: Final = 40.0
 """Natural frequency of the speed control of a wheel. The control is critically damped, and lags its set-point by 0.05
@@ -48,7 +48,7 @@ class RobotModel:
         place_m: Position of its lowest point at time 0, metres east, north, up.
         quaternion: Its orientation at time 0.
         antenna_m: Height of its antenna above its position.
-        friction: Coefficient of friction of its tires.
+        friction: Coefficient of friction of its tires; 0 for a quadrotor.
         body: Its masses and sizes.
     """
 
@@ -145,7 +145,7 @@ class _Document:
             self._add_vehicle(body, name, robot.body, robot.friction)
         else:
             self._add_quadrotor(body, name, robot.body)
-        for kind in ("framepos", "framelinvel", "framexaxis"):
+        for kind in ("framepos", "framelinvel", "framexaxis", "frameyaxis"):
             _add(self._sensors, kind, objtype="site", objname=name)
 
     def _new_ground(self) -> str:
@@ -205,7 +205,10 @@ class _Document:
         )
 
     def _add_grip(self, name: str, friction: float) -> None:
-        """Add contacts with friction between a shape and the ground; contacts with obstacles have no friction."""
+        """Add contacts with friction between a shape and the ground, ramps and raised floors.
+
+        Contacts with other obstacles have no friction.
+        """
         for ground in self._grounds:
             # `condim="3"` uses only the first two coefficients, for sliding; the others are MuJoCo's defaults.
             _add(

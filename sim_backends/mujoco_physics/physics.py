@@ -29,7 +29,7 @@ from sim_backends.mujoco_physics.mjcf import SENSED_NUMBERS, RobotModel, model_x
 from sim_backends.physics.body import Twist, Velocity
 from sim_backends.physics.quadrotor import FlightStatus
 from sim_backends.physics.robot_limits import DriveLimits, QuadrotorLimits
-from sim_backends.world.motion import Lifetime, State
+from sim_backends.world.motion import Lifetime, State, TiltedState
 from sim_backends.world.world import World
 
 _LONGEST_STEP_NS: Final = 1_000_000
@@ -47,11 +47,11 @@ _PARKED_UP_M: Final = 0.0
 
 
 class SensedStates(Mapping[str, State]):
-    """The states of all agents at a step, each created on request.
+    """The states of the present agents at a step, each created on request.
 
     Args:
-        rows: Position of each agent in the order of the sensors.
-        numbers: The values of all sensors, `SENSED_NUMBERS` for each agent.
+        rows: Position of each present agent in the order of the sensors.
+        numbers: The values of all sensors, `SENSED_NUMBERS` for each agent, also for absent agents.
     """
 
     def __init__(self, rows: Mapping[str, int], numbers: Sequence[float]) -> None:
@@ -63,8 +63,12 @@ class SensedStates(Mapping[str, State]):
         state = self._cache.get(name)
         if state is None:
             first = self._rows[name] * SENSED_NUMBERS
-            e, n, u, v_e, v_n, v_u, x_e, x_n, _ = self._numbers[first : first + SENSED_NUMBERS]
-            state = self._cache[name] = State((e, n, u), (v_e, v_n, v_u), math.atan2(x_n, x_e))
+            e, n, u, v_e, v_n, v_u, x_e, x_n, x_u, _, _, y_u = self._numbers[first : first + SENSED_NUMBERS]
+            level = math.hypot(x_e, x_n)
+            # Rounding may give a sine above 1.
+            tilt_rad = math.asin(max(-1.0, min(y_u / (level or 1.0), 1.0))), math.atan2(-x_u, level)
+            heading_rad = math.atan2(x_n, x_e)
+            state = self._cache[name] = TiltedState.of((e, n, u), (v_e, v_n, v_u), heading_rad, tilt_rad)
         return state
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "SensedStates":

@@ -55,7 +55,9 @@ class Fragment:
 
 
 def fragments(packet: IpPacket, ip_id: int, mtu_bytes: int = MTU_BYTES) -> Iterator[Fragment]:
-    """Yield the fragments of a packet; all but the last have the maximum size, a multiple of 8 bytes (RFC 791, 3.2).
+    """Yield the fragments of a packet, or the whole packet if it is not longer than the MTU.
+
+    The payloads of all fragments but the last have the maximum size, a multiple of 8 bytes (RFC 791, 3.2).
 
     Raises:
         ConfigurationError: The packet is longer than the maximum of an IP packet.
@@ -80,7 +82,14 @@ def fragments(packet: IpPacket, ip_id: int, mtu_bytes: int = MTU_BYTES) -> Itera
 
 @dataclass(slots=True)
 class _PartialPacket:
-    """State of a packet at a host: fragments that arrived or were lost, time of the first arrival, and failure."""
+    """State of a packet at a host.
+
+    Attributes:
+        packet: The packet.
+        fragment_count: Number of its fragments that arrived or were lost.
+        since_ns: Time at which the first fragment arrived; None before.
+        has_failed: True if the packet was reported as lost.
+    """
 
     packet: IpPacket
     fragment_count: int = 0
@@ -102,7 +111,7 @@ class Reassembly:
     def on_arrival(self, now_ns: int, host: str, fragment: Fragment) -> bool:
         """Record a fragment that arrived at a host; return True if its packet is now complete there.
 
-        If the last fragments arrive later than `REASSEMBLY_NS` after the first, the packet is lost.
+        If a fragment arrives `REASSEMBLY_NS` or longer after the first one, the packet is lost.
         """
         if fragment.count == 1:
             return True

@@ -15,7 +15,7 @@ class Datagram:
 
     Attributes:
         destination: Name of the receiving agent.
-        size_bytes: Size of the packet.
+        size_bytes: Size of the message, without the headers that its transport adds.
         flow: Stream of packets to which it belongs; names are unique in a scenario.
         number: Number of the packet in its flow; flow and number identify the packet when runs are compared.
         payload: Content for the receiver's program; the network does not inspect it.
@@ -37,7 +37,7 @@ class Packet(NamedTuple):
         packet_id: Number of the packet in the run.
         source: Name of the sender.
         destination: Name of the receiver.
-        size_bytes: Its size.
+        size_bytes: Its size, without the headers that its transport adds.
         identity: Flow and number, from which random numbers are derived.
         sent_ns: Time at which its program sent it.
         enters_ns: Time at which the network receives it; later than `sent_ns` if the sync policy delays it.

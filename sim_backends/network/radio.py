@@ -17,7 +17,7 @@ from sim_backends.network.wire import CountsMisses, IpPacket, Transport, Wire
 from sim_backends.radio.channel import Emitter
 from sim_backends.radio.links import RADIO_OFF, Delay
 from sim_backends.radio.model import RadioModel
-from sim_backends.world.motion import STILL, DeadReckoned, State
+from sim_backends.world.motion import STILL, Attitude, DeadReckoned, State, attitude_of
 
 TransportFactory = Callable[[Wire], Transport]
 
@@ -38,9 +38,10 @@ class RadioNetwork:
     The immediate consequences of an event are processed before the next event.
 
     The radio receives the positions of stations when an event is processed, not at every window, so the result does
-    not depend on earlier updates. It receives no velocities: for the radio, stations stay at the coordinator's
-    positions, or move in steps if the coordinator passes dead-reckoned states. The position error therefore depends
-    only on the coordinator's sync policy. A station without a state is absent: its radio is off.
+    not depend on earlier updates. It receives attitudes if it needs them, but no velocities: for the radio, stations
+    stay at the coordinator's positions, or move in steps if the coordinator passes dead-reckoned states. The position
+    error therefore depends only on the coordinator's sync policy. A station without a state is absent: its radio is
+    off.
 
     `Transport.record_loss` is called only for packets with a single destination. For broadcasts, `CountsMisses`
     records the hosts that miss them.
@@ -55,11 +56,11 @@ class RadioNetwork:
     Attributes:
         now_ns: Current simulated time.
         extrapolates: True, because dead-reckoned states are evaluated at the time of each event.
-        transmitters: Stations that send independently of the traffic: the relay, and agents that carry a jammer.
+        transmitters: Stations whose positions matter for packets of others: the relay, and carriers of a jammer.
         fixed_emitters_m: Positions of the jammers that no agent carries.
 
     Raises:
-        ConfigurationError: A disturbance or the relay names an unknown station.
+        ConfigurationError: A node loss, a link cut or the relay names an unknown station.
     """
 
     def __init__(
@@ -86,6 +87,7 @@ class RadioNetwork:
         self._stations_off: set[str] = set()
         self._absent_stations: frozenset[str] = frozenset()
         self._positions_m: dict[str, Vector] = {}
+        self._attitudes: dict[str, Attitude] = {}
         self._jammers: dict[str, Jammer] = {}
         self._states: Mapping[str, State] = {}
         self._placed_states: Mapping[str, State] | None = None
@@ -107,7 +109,7 @@ class RadioNetwork:
         radio.log_losses(self._on_fragment_lost)
 
     def log_ip(self, log: IpLog | None) -> None:
-        """Pass every IP packet that a host sends or receives from now on to `log`; None stops logging."""
+        """Pass every packet or fragment that a host sends or receives from now on to `log`; None stops logging."""
         self._log_ip = log
 
     def log_delays(self, log: DelayLog | None) -> None:
@@ -216,10 +218,11 @@ class RadioNetwork:
             call()
 
     def _place(self, at_ns: int) -> bool:
-        """Pass the positions of the stations at `at_ns`, the time of the next event, to the radio if they changed.
+        """Pass the positions of the stations at `at_ns`, the time of the next event, to the radio.
 
         Returns:
-            True if the positions changed. The next event of the radio may then be a different one.
+            False if the states are the same object as in the last call, which then changes nothing. If True, the next
+            event of the radio may be a different one.
         """
         states = self._states.at(at_ns) if isinstance(self._states, DeadReckoned) else self._states
         if states is self._placed_states:
@@ -233,7 +236,8 @@ class RadioNetwork:
             present_m = {name: states[name].position_m for name in self._names if name not in absent_stations}
             # The radio of an absent station is off; the station keeps its last position.
             self._positions_m = dict.fromkeys(self._names, STILL) | self._positions_m | present_m
-        self._radio.place(self.now_ns, self._positions_m, self._relay)
+        attitudes = self._update_attitudes(states) if self._radio.uses_attitudes else None
+        self._radio.place(self.now_ns, self._positions_m, self._relay, attitudes=attitudes)
         if absent_stations != self._absent_stations:
             self._absent_stations = absent_stations
             if self._current_stations_off() != self._stations_off:
@@ -241,6 +245,12 @@ class RadioNetwork:
         if self._jammers:
             self._jam()
         return True
+
+    def _update_attitudes(self, states: Mapping[str, State]) -> Mapping[str, Attitude]:
+        for name in self._names:
+            if (state := states.get(name)) is not None:
+                self._attitudes[name] = attitude_of(state, before=self._attitudes.get(name, Attitude()))
+        return self._attitudes
 
     def _collect(self) -> None:
         """Pass the packets that the radio delivers now to their hosts, until it delivers no further packet now."""

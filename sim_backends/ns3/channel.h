@@ -33,7 +33,8 @@ class Channel
           m_stir(Number(radio.at("stir_m_s"))),
           m_links(m_names.size() * m_names.size())
     {
-        // A fading gain is used for 2 % of an echo's period, as in WorldChannel.
+        // A fading gain is used for 2 % of an echo's period, as in WorldChannel for stations at rest; a move of an end
+        // also gives a new gain.
         m_slotNs = std::llround(0.02 * kSpeedOfLight / kFrequencyHz / std::max(m_stir, 1e-6) * 1e9);
         if (m_shadowingDb > 0)
         {

@@ -1,5 +1,5 @@
 // Links with a given rate, delay, jitter and loss instead of Wi-Fi: the model of sim_backends/radio/fixed_links.py
-// below ns-3's IP layer, with the same random draws for the same packets.
+// below ns-3's IP layer, with the same random draws for packets with an IdTag.
 
 #ifndef FIELDKIT_FIXED_LINKS_H
 #define FIELDKIT_FIXED_LINKS_H
@@ -36,7 +36,7 @@ struct LinkParameters
 // Name and number of a packet, which key its random draws.
 using PacketIdentity = std::pair<std::string, int64_t>;
 
-// All links of the stations, in both directions. With a relay, a packet between two others crosses two links.
+// All links of the stations, in both directions. With a relay, a packet between two other stations crosses two links.
 class FixedLinks : public SimpleChannel
 {
   public:
@@ -141,7 +141,8 @@ class FixedLinks : public SimpleChannel
         return m_links[from * m_stations->size() + to];
     }
 
-    // The identity of a packet of the coordinator, as in sim_backends/network/ip.py; packets of ns-3 are numbered.
+    // The identity of a packet with an IdTag, as in sim_backends/network/ip.py; other packets, such as TCP segments and
+    // broadcasts, are numbered.
     PacketIdentity IdentityOf(Ptr<const Packet> packet, size_t station)
     {
         IdTag tag;
@@ -265,7 +266,7 @@ class FixedLinks : public SimpleChannel
     std::map<Mac48Address, size_t> m_numbers;
     std::vector<Link> m_links; // by transmitter and receiver
     std::map<std::tuple<size_t, size_t, std::string, std::string>, RandomStream> m_streams;
-    int64_t m_sent = 0; // packets without an identity
+    int64_t m_sent = 0; // number of packets without an IdTag
 };
 
 // Give the stations IP addresses and links; callbacks of ns-3 keep references to `stations`.

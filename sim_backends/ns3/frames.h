@@ -69,7 +69,7 @@ class IdTag : public NumberTag
     }
 };
 
-// The number of a broadcast, which is one IP packet.
+// The number of a broadcast, which is one IP packet for all its receivers.
 class BroadcastTag : public NumberTag
 {
   public:
@@ -107,11 +107,11 @@ using protocol::DelayParts;
 // Counters of the frames from one station to another, like the counters of a radio's driver.
 struct LinkCounters
 {
-    uint64_t frames = 0; // frames whose first attempt has started
+    uint64_t frames = 0; // frames whose first attempt has started; on fixed links also frames that are out of range
     uint64_t retries = 0;
     uint64_t failures = 0; // frames given up after the last retry
     uint64_t delivered = 0;
-    double rate_bit_s = NAN; // rate of the last attempt
+    double rate_bit_s = NAN; // rate of the last attempt; NAN before the first attempt, and on links without a rate
 };
 
 // Tracks the frames of all stations with ns-3's traces.
@@ -124,10 +124,10 @@ class FrameTracker
     // if frames are not aggregated.
     size_t relay = kNoStation;
 
-    // Called when a frame is lost, with the id of its packet and the reason.
+    // Called when a frame with an IdTag is lost, with the id of its packet and the reason.
     std::function<void(uint64_t, const std::string&)> on_lost;
 
-    // Add the next station, which has no Wi-Fi.
+    // Add the next station without tracking Wi-Fi frames.
     size_t AddStation(Ptr<MobilityModel> mobility)
     {
         m_mobilities.push_back(mobility);
@@ -180,7 +180,7 @@ class FrameTracker
                                         }));
     }
 
-    // The parts of the delay of the frame that a station receives now.
+    // The parts of the delay of the frame that a station receives now; all are 0 if it receives none now.
     DelayParts PartsNow(size_t station) const
     {
         const auto& [at_ns, parts] = m_last[station];
@@ -193,7 +193,7 @@ class FrameTracker
         m_last[station] = {NowNs(), parts};
     }
 
-    // Counters of the frames between two stations.
+    // Counters of the frames from one station to another.
     LinkCounters& Counters(size_t from, size_t to)
     {
         return m_links[{from, to}];
@@ -206,7 +206,7 @@ class FrameTracker
         return busy.total_ns - std::max<int64_t>(busy.until_ns - Simulator::Now().GetNanoSeconds(), 0);
     }
 
-    // Report the packet of a frame or IP packet as lost.
+    // Report the packet of a frame or IP packet as lost, if it has an IdTag.
     void Lost(Ptr<const Packet> packet, const std::string& reason)
     {
         IdTag tag;
@@ -328,7 +328,7 @@ class FrameTracker
         }
     }
 
-    // Add the parts of a hop that ends now.
+    // Add the parts of a hop that ends now, unless the frame was received before.
     void Complete(HopFrame& frame)
     {
         if (!frame.is_received)

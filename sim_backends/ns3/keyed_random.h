@@ -156,7 +156,7 @@ class RandomStream
         return static_cast<double>(word >> 11) * 0x1p-53;
     }
 
-    // A step of Philox-4x64.
+    // The words with the numbers 4 `number` to 4 `number` + 3: Philox-4x64 with 10 rounds.
     std::array<uint64_t, kBlockWords> Block(uint64_t number) const
     {
         // numpy increments the counter before it generates the first words.

@@ -410,7 +410,7 @@ class Network
         }
     }
 
-    // The time in ns-3 of a time in the scenario, in seconds.
+    // ns-3's time at a time of the scenario, which is given in seconds.
     static Time At(const Json& seconds)
     {
         return NanoSeconds(g_start_ns + std::llround(Number(seconds) * 1e9));
@@ -458,7 +458,7 @@ class Network
         }
     }
 
-    // A path in which {seed} is replaced by the seed.
+    // A path in which the first {seed} is replaced by the seed.
     static std::string OutputPath(std::string path, uint64_t seed)
     {
         const std::string placeholder = "{seed}";
@@ -491,6 +491,10 @@ class Network
             if (radio.is_null())
             {
                 continue;
+            }
+            if (radio.contains("pattern") && !radio.at("pattern").is_null())
+            {
+                throw Refusal("the antenna of " + agent.name + " has a pattern, which this network does not model");
             }
             Station station;
             station.name = agent.name;

@@ -20,13 +20,14 @@ class Ns3Options(SimulatorOptions):
     Attributes:
         standard: Standard of all radios. If omitted, it is 802.11n if all profiles have this standard, otherwise
             802.11g.
-        ampdu_bytes: Largest aggregate of frames in 802.11n; 0 sends frames singly, as the built-in network does.
+        ampdu_bytes: Largest aggregate of frames in 802.11n; 0 sends frames singly, as the built-in network does
+            between robots without `radio.phy`.
         topics: With `udp`, topics with `reliability: best_effort` are sent as UDP datagrams with the headers of RTPS,
             without discovery.
         delay_parts: File for the [parts of each delay](ns3.md#parts-of-the-delay); `{seed}` is replaced by the seed
             of the run.
         pcap: Prefix of the names of captures of 802.11 frames with radiotap, one per radio, for example
-            `air-{seed}-`; with an access point, their time stamps are 1 s later.
+            `air-{seed}-`. Their time stamps are 1 ms later than simulated time, with an access point 1 s.
     """
 
     standard: Literal["802.11a", "802.11g", "802.11n"] | None = None

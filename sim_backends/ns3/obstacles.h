@@ -23,7 +23,7 @@ using Point = std::array<double, 3>; // metres east, north, up
 constexpr double kSpeedOfLight = 299792458.0;
 constexpr double kFrequencyHz = 2.437e9; // channel 6
 
-// A number, or a text with a number and an SI unit: "0.2m", "0.5s".
+// A number, or a text with a number in m or s, such as "0.2m" or "0.5s". The unit itself is not evaluated.
 inline double
 Number(const Json& value)
 {

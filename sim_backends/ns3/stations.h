@@ -209,7 +209,7 @@ Install(std::vector<Station>& stations, const WifiSetup& setup, Channel& channel
 {
     bool is_ht = setup.standard == "802.11n";
     bool is_high_band = setup.standard == "802.11a";
-    // Packets wait only in the queue of the MAC, without a time limit. The frame on the air is in the queue too.
+    // Packets wait only in the queue of the MAC, for up to 1000 s. The frame on the air is in the queue too.
     Config::SetDefault("ns3::WifiMacQueue::MaxSize",
                        QueueSizeValue(QueueSize(QueueSizeUnit::PACKETS, setup.queue_packets + 1)));
     Config::SetDefault("ns3::WifiMacQueue::MaxDelay", TimeValue(Seconds(1000)));

@@ -38,13 +38,13 @@ struct Fates
 // Size of the headers that ns-3 adds to a datagram; a bare IP packet already contains them.
 constexpr int64_t kIpAndUdpBytes = 28;
 
-// Time after which no station can receive a broadcast any more: frames wait for at most 0.5 s in a queue of ns-3's MAC.
+// Time after which a broadcast is lost for each station that has not received it, even if its frame is still queued.
 constexpr int64_t kBroadcastNs = 1'000'000'000;
 
 constexpr uint16_t kUdpPort = 7411;
 constexpr uint16_t kTcpPort = 7412;
 
-// Sends each packet as one datagram. The IP layer fragments a large datagram.
+// Sends each packet as one datagram, and all packets of a broadcast as one. The IP layer fragments a large datagram.
 class UdpTransport
 {
   public:
@@ -158,7 +158,8 @@ class TcpTransport
     {
         bool is_newreno = congestion == "newreno";
         auto type = TypeId::LookupByName(is_newreno ? "ns3::TcpLinuxReno" : "ns3::TcpCubic");
-        // The values of fieldkit's own TCP, which are Linux's values (sim_backends/network/tcp/tcp_options.py).
+        // The values of fieldkit's own TCP (sim_backends/network/tcp/tcp_options.py), which has no HyStart and no limit
+        // of the send buffer. Here the buffer is larger than the receiver's.
         Config::SetDefault("ns3::TcpL4Protocol::SocketType", TypeIdValue(type));
         Config::SetDefault("ns3::TcpCubic::HyStart", BooleanValue(false));
         Config::SetDefault("ns3::TcpSocket::SegmentSize", UintegerValue(1448));

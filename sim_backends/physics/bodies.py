@@ -37,7 +37,7 @@ class Bodies:
         world: Ground and obstacles; None for open flat ground.
         step_ns: Time step; there are states only at whole steps.
         lifetimes: Lifetimes of the bodies that exist only during a part of the run. A body exists from the last step
-            before its lifetime begins to the first step after its lifetime ends.
+            at or before the start of its lifetime, and is absent from the first step at or after the end.
 
     Attributes:
         step_ns: Time step.
@@ -47,7 +47,8 @@ class Bodies:
         collisions: The starts of all contacts so far, in order of time.
 
     Raises:
-        ConfigurationError: A body overlaps something at its start, or the step is not positive.
+        ConfigurationError: A body overlaps something at its start, its start is not finite, or the step is not
+            positive.
     """
 
     def __init__(
@@ -112,7 +113,8 @@ class Bodies:
         """Implement `PhysicsFederate.advance`.
 
         Raises:
-            ConfigurationError: A command is for an unknown body, or for another kind of body.
+            ConfigurationError: A command is for an unknown body or does not suit the body, or a body that appears
+                overlaps another one.
         """
         if commands:
             self._pending_commands |= commands
@@ -186,7 +188,7 @@ class Bodies:
         )
 
     def _apply_commands(self) -> None:
-        """Let the pending commands take effect at the current step."""
+        """Let the pending commands take effect at the current step; commands for absent bodies are discarded."""
         commands_by_name, self._pending_commands = self._pending_commands, {}
         tracks = {}
         for name, command in commands_by_name.items():
@@ -221,7 +223,7 @@ class Bodies:
             self._step = end_step
 
     def _change_steps_of(self, lifetime: Lifetime) -> Iterator[int]:
-        """Yield the step in which a body appears, and the first step in which it has disappeared."""
+        """Yield the step in which a body appears, unless this is step 0, and the first step after it disappears."""
         if lifetime.appears_ns >= self.step_ns:
             yield lifetime.appears_ns // self.step_ns
         if lifetime.disappears_ns is not None:
@@ -332,7 +334,7 @@ class Bodies:
         return {name: track.pose(self._step) for name, track in self._tracks.items()}
 
     def _check_starts(self, names: Iterable[str]) -> None:
-        """Check that no body starts within an obstacle."""
+        """Check that each body starts at finite coordinates, and not within an obstacle."""
         for name in names:
             place_m = self._initial_pose(name).place_m
             if not all(map(math.isfinite, place_m)):

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple, Protocol, TypeVar
 
 from fieldkit.core.model import Vector
 from sim_backends.physics.collisions import ContactStop, Surface
-from sim_backends.world.motion import State
+from sim_backends.world.motion import LEVEL, State, TiltedState
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +57,11 @@ class Pose(Protocol):
     @property
     def heading_rad(self) -> float:
         """Its heading, from east towards north."""
+        ...
+
+    @property
+    def tilt_rad(self) -> tuple[float, float]:
+        """Its roll (positive with the left side up) and pitch (positive with the nose down) from level."""
         ...
 
 
@@ -168,7 +173,10 @@ class Track(NamedTuple):
         """Return the state of the antenna at a step."""
         pose = self.pose(step)
         east_m, north_m, up_m = pose.place_m
-        return State((east_m, north_m, up_m + self.antenna_m), pose.velocity_m_s, pose.heading_rad)
+        antenna_m, tilt_rad = (east_m, north_m, up_m + self.antenna_m), pose.tilt_rad
+        if tilt_rad is LEVEL:  # true for most robots; a call of TiltedState.of would take longer
+            return State(antenna_m, pose.velocity_m_s, pose.heading_rad)
+        return TiltedState.of(antenna_m, pose.velocity_m_s, pose.heading_rad, tilt_rad)
 
 
 class Snapshot(Mapping[str, State]):

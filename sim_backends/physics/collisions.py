@@ -1,7 +1,7 @@
 """Contacts of upright cylinders with their surroundings: a cylinder stops at an obstacle, and slides along it.
 
-A moving body slides around an obstacle as far as possible; no body is pushed. A move is divided into pieces shorter
-than half a radius, so that a body cannot pass through even a thin obstacle. A body that would still overlap stays
+A moving body slides around an obstacle as far as possible; no body is pushed. A move is divided into pieces of at
+most half a radius, so that a body cannot pass through even a thin obstacle. A body that would still overlap stays
 at its previous position, which was free, so no body ever overlaps another body or an obstacle.
 """
 
@@ -83,7 +83,7 @@ class ContactStop:
     contacts: Sequence[Contact]
 
     def sliding_velocity(self, velocity: Vector) -> Vector:
-        """Return a velocity without its components into the touched obstacles."""
+        """Return a velocity without its components into the touched obstacles; 0 in a corner."""
         for contact in self.contacts:
             inward = sum(v * n for v, n in zip(velocity, contact.normal, strict=True))
             velocity = _add(velocity, contact.normal, -min(inward, 0.0))
@@ -111,7 +111,7 @@ class Edge(Protocol):
     """Edges of raised ground, over which no body drives."""
 
     def edge_stop(self, from_m: Vector, to_m: Vector) -> tuple[str, Vector] | None:
-        """Return the edge over which a body would drive, and the point where it stops; None if there is no edge."""
+        """Return the name of the area over whose edge a body would drive, and where it stops; None for no edge."""
         ...
 
 
@@ -171,7 +171,10 @@ def rectangle(
 
 
 def gap_m(footprint: Footprint, extent: Extent, place_m: Vector) -> float:
-    """Return the minimum distance between a cylinder and a footprint; 0 if they touch."""
+    """Return the minimum distance between a cylinder and a footprint; 0 if they touch or overlap.
+
+    The footprint counts up to `high_m` everywhere, even where `wall_m` is lower.
+    """
     horizontal_m = _horizontal_gap_m(footprint, extent, place_m)
     vertical_m = max(place_m[2] - footprint.high_m, footprint.low_m - place_m[2] - extent.height_m)
     return math.hypot(max(horizontal_m, 0.0), max(vertical_m, 0.0))
@@ -205,8 +208,8 @@ def move(
         return None
     moved_m = math.dist(from_m, place_m)
     if moved_m > path_m:
-        # The cylinder slid around a corner on a path that is longer than the planned one. The move is repeated with a
-        # nearer target. If the path is then still too long, the cylinder does not move.
+        # The cylinder slid to a point that is further from its start than the target. The move is repeated with a
+        # nearer target. If the end point is then still too far away, the cylinder does not move.
         place_m, retry_contacts = _move_in_pieces(
             extent, from_m, _interpolate(from_m, to_m, path_m / moved_m), footprints, edge
         )
@@ -242,7 +245,10 @@ def _move_in_pieces(
 def _push_out(
     extent: Extent, from_m: Vector, to_m: Vector, footprints: Sequence[Footprint], edge: Edge | None
 ) -> tuple[Vector, list[Contact]]:
-    """Return the position of a cylinder after a short path, and its contacts."""
+    """Return the position of a cylinder after a short path, and its contacts.
+
+    The position is `from_m` if every pass finds contacts.
+    """
     place_m = to_m
     contacts: list[Contact] = []
     for _ in range(_PASSES):
@@ -266,8 +272,9 @@ def _push_out(
 def _exit_direction(footprint: Footprint, extent: Extent, from_m: Vector, place_m: Vector) -> tuple[Vector, float]:
     """Return the direction and distance out of an obstacle that a cylinder overlaps.
 
-    The direction is vertical if the cylinder came from above or below, otherwise horizontal. A driving body is never
-    moved vertically. If it comes from above or below, for example on a ramp below a roof, it is moved back.
+    The direction is vertical if a flying body came from above or below, otherwise horizontal and away from the
+    closest point. A driving body that came from above or below, for example on a ramp below a roof, is moved back to
+    its previous position, and so is a body whose axis is within the obstacle.
     """
     closest_e_m, closest_n_m = footprint.closest_m(place_m[0], place_m[1])
     east_m, north_m = place_m[0] - closest_e_m, place_m[1] - closest_n_m

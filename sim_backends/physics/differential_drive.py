@@ -22,7 +22,7 @@ from fieldkit.core.model import Vector
 from sim_backends.physics.body import Twist
 from sim_backends.physics.collisions import TOUCH_M, ContactStop, Surface
 from sim_backends.physics.robot_limits import DriveLimits
-from sim_backends.world.motion import GRAVITY_M_S2
+from sim_backends.world.motion import GRAVITY_M_S2, LEVEL
 
 _LEVEL: Final = (0.0, 0.0)
 """Grade of level ground."""
@@ -53,6 +53,11 @@ class DrivePose(NamedTuple):
     grade: tuple[float, float] = (0.0, 0.0)
 
     @property
+    def tilt_rad(self) -> tuple[float, float]:
+        """Implement `Pose.tilt_rad`: the tilt of the ground below it."""
+        return LEVEL if self.grade == LEVEL else slope_tilt_rad(self.grade, self.heading_rad)
+
+    @property
     def velocity_m_s(self) -> Vector:
         """Implement `Pose.velocity_m_s`."""
         if self.sliding_m_s is not None:
@@ -63,6 +68,14 @@ class DrivePose(NamedTuple):
             self.speed_m_s * level * math.sin(self.heading_rad),
             self.speed_m_s * up,
         )
+
+
+def slope_tilt_rad(grade: tuple[float, float], heading_rad: float) -> tuple[float, float]:
+    """Return roll and pitch of a robot on wheels on a slope, from the rise per metre east and north."""
+    (east, north), cos, sin = grade, math.cos(heading_rad), math.sin(heading_rad)
+    # Slopes of the ground in the robot's forward and left directions.
+    forward, left = east * cos + north * sin, north * cos - east * sin
+    return math.asin(left / math.hypot(1.0, forward, left)), -math.atan(forward)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +155,7 @@ class DifferentialDrive:
         limits: Its limits and size.
         place_m: Position at time 0, metres east and north.
         heading_rad: Its heading, from east towards north.
-        antenna_m: Height of its antenna above the ground.
+        antenna_m: Height of its antenna above the ground; None for the height of the robot.
     """
 
     def __init__(

@@ -80,7 +80,7 @@ class Ground:
         self._max_grade = max((math.hypot(*area.obstacle.grade) for area in self._areas), default=0.0)
 
     def surface(self, east_m: float, north_m: float) -> Surface:
-        """Return the ground at a point: the highest area there."""
+        """Return the ground at a point: the highest area there, or flat ground at height 0."""
         areas = [area.obstacle for area in self._areas if area.distance_m(east_m, north_m) <= _ON_AREA_M]
         highest = max(areas, key=lambda area: area.height_m((east_m, north_m)), default=None)
         if highest is None:
@@ -88,11 +88,11 @@ class Ground:
         return Surface(highest.height_m((east_m, north_m)), highest.grade)
 
     def edge_m(self, place_m: Vector) -> float:
-        """Return the minimum distance to the edge of an area of ground."""
+        """Return the minimum distance to the edge of an area of ground; infinite if there is no area."""
         return min((area.edge_m(place_m[0], place_m[1]) for area in self._areas), default=math.inf)
 
     def edge_stop(self, from_m: Vector, to_m: Vector) -> tuple[str, Vector] | None:
-        """Return the edge over which a body would drive, and the point where it stops; None if there is no edge."""
+        """Return the name of the area over whose edge a body would drive, and where it stops; None for no edge."""
         east_m, north_m, up_m = to_m
         drop_m = from_m[2] - self.surface(east_m, north_m).height_m
         if drop_m <= _LEVEL_M + self._max_grade * math.dist(from_m, to_m):
@@ -113,7 +113,7 @@ class Ground:
         return Footprint(area.obstacle.name, area.nearest_m, 0.0, 0.0, top_m, partial(self._wall_m, area))
 
     def _wall_m(self, area: _Area, east_m: float, north_m: float) -> float:
-        """Return the height of the side of an area at one of its points; 0 if other ground leads up to it."""
+        """Return the height up to which an area's side is a wall at a point; 0 if other ground leads up to it."""
         height_m = area.obstacle.height_m((east_m, north_m))
         other_areas = (
             other for other in self._areas if other is not area and other.distance_m(east_m, north_m) <= _LEVEL_M

@@ -25,7 +25,7 @@ from sim_backends.world.motion import GRAVITY_M_S2
 _REACHED: Final = 1e-9
 """Tolerance for reaching a target, in m/s or rad: a first-order lag alone never reaches it."""
 _MAX_STEPS: Final = 64
-"""Maximum number of steps of a course, and therefore of its stored poses."""
+"""Number of steps for which a `Flight` is valid; it limits the number of stored poses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +90,11 @@ class FlightPose(NamedTuple):
     roll_rad: float = 0.0
     pitch_rad: float = 0.0
     heading_rad: float = 0.0
+
+    @property
+    def tilt_rad(self) -> tuple[float, float]:
+        """Implement `Pose.tilt_rad`."""
+        return self.roll_rad, self.pitch_rad
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,6 +4,7 @@ The originator (the sending station) sends frames again, alone or with new ones,
 up. The recipient passes them to the layer above in the order of their sequence numbers, so a frame waits for the ones
 before it. Two steps of the standard are instantaneous here: the agreement exists from the first frame, and the
 recipient immediately skips a frame that the originator has given up (a BlockAckReq reports this in the standard).
+Limits of HE are those of IEEE 802.11ax-2021.
 """
 
 from collections import deque
@@ -17,12 +18,12 @@ from sim_backends.radio.links import Payload
 from sim_backends.radio.modes import ACK_BYTES, PhyFormat, WifiMode
 
 QOS_HEADER_BYTES: Final = HEADER_BYTES + 2
-"""Headers of a QoS data frame: 9.2.4.5."""
+"""MAC header, LLC, SNAP and FCS of a QoS data frame: 9.2.4.5."""
 
 TYPICAL_FRAMES: Final = 16
 """Number of frames per aggregate for which rate control compares modes. An assumption, between 1 and the window."""
 
-_DELIMITER_BYTES: Final = 4
+DELIMITER_BYTES: Final = 4
 """Size of the delimiter before each frame of an aggregate."""
 MAX_PPDU_NS: Final = 5_484_000
 """Longest airtime of an aggregate (aPPDUMaxTime): tables 19-25, 21-28 and 27-54."""
@@ -36,10 +37,12 @@ class AmpduLimits:
         window: Maximum number of frames from the oldest unacknowledged one to the newest. It is the number of bits in
             the bitmap of a Block Ack.
         max_bytes: Maximum size of an A-MPDU.
+        amsdu_bytes: Maximum size of the A-MSDUs in it; 0 if each frame contains one packet.
     """
 
     window: int
     max_bytes: int
+    amsdu_bytes: int = 0
 
     @property
     def block_ack_bytes(self) -> int:
@@ -61,15 +64,17 @@ class Aggregate(Generic[Payload]):
     """Frames that are sent together.
 
     Attributes:
-        frames: The frames, in the order of their sequence numbers.
+        frames: The packets, in the order of the sequence numbers of their frames.
         size_bytes: Size of the PSDU.
         response_bytes: Size of the Block Ack, or of the ACK to a single frame.
+        frame_count: Number of frames, each with one packet or an A-MSDU.
         decoded_frames: The frames that the receiver decoded; empty until the aggregate ends.
     """
 
     frames: Sequence[Frame[Payload]]
     size_bytes: int
     response_bytes: int
+    frame_count: int
     decoded_frames: Sequence[Frame[Payload]] = ()
 
 
@@ -110,7 +115,7 @@ class BlockAckSession(Generic[Payload]):
             is_single: True if the aggregate must contain only the first frame.
             limit_ns: Maximum airtime of the aggregate, unless it contains only the first frame.
         """
-        limit_bytes = min(self._limits.max_bytes, _bytes_in(mode, limit_ns))
+        limit_bytes = min(self._limits.max_bytes, bytes_in(mode, limit_ns))
         frames: list[Frame[Payload]] = []
         first, size_bytes, end_sequence = queue[0], 0, 0
         for frame in queue:
@@ -118,7 +123,7 @@ class BlockAckSession(Generic[Payload]):
                 continue
             sequence = self._next_sequence if frame.sequence < 0 else frame.sequence
             # Each subframe but the last is padded to a multiple of 4 bytes.
-            new_bytes = -(-size_bytes // 4) * 4 + _DELIMITER_BYTES + frame.size_bytes + QOS_HEADER_BYTES
+            new_bytes = -(-size_bytes // 4) * 4 + DELIMITER_BYTES + frame.size_bytes + QOS_HEADER_BYTES
             if not frames:
                 end_sequence = sequence + self._limits.window
             elif new_bytes > limit_bytes or sequence >= end_sequence:
@@ -131,9 +136,13 @@ class BlockAckSession(Generic[Payload]):
             if is_single:
                 break
         if len(frames) > 1:
-            return Aggregate(frames, size_bytes, self._limits.block_ack_bytes)
+            return Aggregate(frames, size_bytes, self._limits.block_ack_bytes, len(frames))
         # Frames of VHT and HE always have a delimiter: 9.7.1.
-        return Aggregate(frames, size_bytes - (_DELIMITER_BYTES if mode.phy_format == "HT" else 0), ACK_BYTES)
+        return Aggregate(frames, size_bytes - (DELIMITER_BYTES if mode.phy_format == "HT" else 0), ACK_BYTES, 1)
+
+    def first_frame_bytes(self, queue: deque[Frame[Payload]]) -> int:
+        """Return the smallest size of the next frame to the receiver of a queue's first packet."""
+        return queue[0].size_bytes + QOS_HEADER_BYTES
 
     def receive(self, frames: Iterable[Frame[Payload]]) -> list[Frame[Payload]]:
         """Store decoded frames at the recipient; return the frames that it passes up now, without duplicates."""
@@ -171,7 +180,7 @@ def remove_frames(queue: deque[Frame[Payload]], finished_frames: Set[Frame[Paylo
 
 
 @lru_cache(maxsize=4096)
-def _bytes_in(mode: WifiMode, time_ns: int) -> int:
+def bytes_in(mode: WifiMode, time_ns: int) -> int:
     """Return the size of the largest PSDU with at most this airtime."""
     symbols = max(time_ns - mode.preamble_ns - mode.band.signal_extension_ns, 0) // mode.symbol_ns
     size_bytes = symbols * mode.bits_per_symbol // 8

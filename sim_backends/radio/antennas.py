@@ -4,10 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
+from fieldkit.config.antennas import AntennaOptions
 from fieldkit.config.wifi_phy import WifiPhy
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.radio.high_throughput import PhyCapability, capability_of, common_modes, mode_named
 from sim_backends.radio.modes import BAND_2_4, G_MODES, MODES, OFDM_MODES, Band, Standard, WifiMode
+from sim_backends.radio.propagation.antenna_patterns import Dipole, GainTable, decode_pattern, pattern_of
 
 
 class RadioSettings(Protocol):
@@ -15,7 +17,7 @@ class RadioSettings(Protocol):
 
     @property
     def standard(self) -> str:
-        """Its standard, `802.11n 2.4 GHz`."""
+        """Its standard, for example `802.11n 2.4 GHz`."""
         ...
 
     @property
@@ -30,7 +32,12 @@ class RadioSettings(Protocol):
 
     @property
     def phy(self) -> WifiPhy | None:
-        """Its physical layer."""
+        """Its physical layer; None if it is not described."""
+        ...
+
+    @property
+    def antenna(self) -> AntennaOptions | None:
+        """Its antenna; None if it is isotropic."""
         ...
 
 
@@ -44,12 +51,14 @@ class Antenna:
         sensitivity_dbm: Received power of the weakest frame that it detects.
         phy: Its capability, for 802.11n and later; None for 802.11g, or 802.11n with one stream in 20 MHz, at 2.4
             GHz.
+        pattern: Pattern of its antenna; None if it is isotropic.
     """
 
     standard: Standard
     tx_power_dbm: float
     sensitivity_dbm: float
     phy: PhyCapability | None = None
+    pattern: Dipole | GainTable | None = None
 
     @property
     def band(self) -> Band:
@@ -69,13 +78,18 @@ def antenna_of(radio: RadioSettings) -> Antenna:
     """Return the antenna of a robot's radio; without `phy` any standard other than 802.11n is treated as 802.11g."""
     standard: Standard = "802.11n" if radio.standard.startswith("802.11n") else "802.11g"
     phy = capability_of(radio.standard, radio.phy)
-    return Antenna(standard, float(radio.tx_power_dbm), float(radio.sensitivity_dbm), phy)
+    power_dbm, sensitivity_dbm = float(radio.tx_power_dbm), float(radio.sensitivity_dbm)
+    return Antenna(standard, power_dbm, sensitivity_dbm, phy, pattern_of(radio.antenna))
 
 
 def decode_antenna(fields: Mapping[str, object]) -> Antenna:
     """Return the antenna whose `dataclasses.asdict` is `fields`."""
-    phy = fields["phy"]
-    return Antenna(**{**fields, "phy": None if phy is None else PhyCapability(**phy)})  # type: ignore[arg-type]
+    phy, pattern = fields["phy"], fields.get("pattern")
+    decoded_fields = {
+        "phy": None if phy is None else PhyCapability(**phy),  # type: ignore[arg-type]
+        "pattern": None if pattern is None else decode_pattern(pattern),  # type: ignore[arg-type]
+    }
+    return Antenna(**{**fields, **decoded_fields})  # type: ignore[arg-type]
 
 
 def modes_between(first: Antenna, second: Antenna) -> tuple[WifiMode, ...]:
@@ -104,14 +118,16 @@ def band_of(antennas: Mapping[str, Antenna]) -> Band:
 
 
 def fixed_mode(name: str | None, antennas: Mapping[str, Antenna]) -> WifiMode | None:
-    """Return the mode in which all stations must send. Stations of 802.11n and later also support modes of 802.11g.
+    """Return the mode in which all stations must send; None if each station chooses its mode.
+
+    Stations of 802.11n and later also support modes of 802.11g, or at 5 GHz of 802.11a.
 
     Args:
         name: Name of the mode; None if each station chooses its mode.
         antennas: The stations, by name.
 
     Raises:
-        ConfigurationError: A station does not support the mode.
+        ConfigurationError: A station does not support the mode, or the stations have different bands.
     """
     if name is None:
         return None

@@ -15,7 +15,7 @@ class RadioChannel(Protocol):
     """The received power of each station at each other station.
 
     Attributes:
-        names: Names of the stations; all other methods identify stations by their index in this list.
+        names: Names of the stations; the methods identify stations by their index in this list.
         noise_mw: Noise power at each station, in mW.
         sensitivity_mw: Received power of the weakest frame that each station detects, in mW. A station does not send
             while it detects a frame.
@@ -35,7 +35,7 @@ class RadioChannel(Protocol):
         ...
 
     def are_linked(self, transmitter: int, receiver: int) -> bool:
-        """Return True if the stations can be associated; frames are sent only to associated stations."""
+        """Return True if both stations can receive each other; a frame to one station is sent only in this case."""
         ...
 
     def delay_ns(self, transmitter: int, receiver: int) -> int:

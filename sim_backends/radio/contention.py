@@ -25,7 +25,10 @@ class ChannelAccess(Protocol):
         """Inter-frame space before the backoff; 0 if each queue adds an inter-frame space."""
 
     def earliest_start_ns(self, now_ns: int) -> int:
-        """Return the earliest start time of a station with a frame to send at `now_ns`, if the channel stays idle."""
+        """Return the earliest start time of a station with a frame to send at `now_ns`, if the channel stays idle.
+
+        Slots that were idle until `now_ns` are counted down.
+        """
 
     def on_busy(self, now_ns: int, until_ns: int) -> None:
         """Record that the channel is busy from `now_ns` to `until_ns`, for a station that has nothing to send."""
@@ -39,6 +42,9 @@ class ChannelAccess(Protocol):
 
     def defer_until(self, until_ns: int) -> None:
         """Count no backoff slots before `until_ns`: the end of EIFS after a frame that the station did not decode."""
+
+    def end_eifs(self) -> None:
+        """End EIFS, because a frame was decoded: only the inter-frame space after the end of the frame remains."""
 
     def set_busy_until(self, until_ns: int) -> None:
         """Record that the channel is busy until `until_ns`."""
@@ -80,7 +86,10 @@ class Contention:
         self.slots = 0
 
     def earliest_start_ns(self, now_ns: int) -> int:
-        """Return the earliest start time of a station with a frame to send at `now_ns`, if the channel stays idle."""
+        """Count down the slots that were idle until `now_ns`, and return the earliest start time from then on.
+
+        A backoff is drawn if the channel is busy and no slots remain.
+        """
         self._count_down(now_ns)
         if now_ns < self.busy_until_ns and not self.slots:
             self._draw_backoff()
@@ -113,6 +122,10 @@ class Contention:
     def defer_until(self, until_ns: int) -> None:
         """Count no backoff slots before `until_ns`: the end of EIFS after a frame that the station did not decode."""
         self.count_from_ns = max(self.count_from_ns, until_ns)
+
+    def end_eifs(self) -> None:
+        """End EIFS, because a frame was decoded: only the inter-frame space after the end of the frame remains."""
+        self.count_from_ns = min(self.count_from_ns, self.busy_until_ns + self.ifs_ns)
 
     def set_busy_until(self, until_ns: int) -> None:
         """Record that the channel is busy until `until_ns`."""

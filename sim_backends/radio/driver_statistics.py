@@ -20,7 +20,7 @@ class LinkMeter:
         frames: Packets whose first attempt has started.
         retries: Attempts after the first.
         failures: Packets given up after the last attempt.
-        rate_bit_s: Rate of the last attempt; None before the first.
+        rate_bit_s: Rate of the last attempt in which the data was sent (not only an RTS); None before the first.
     """
 
     frames: int = 0
@@ -42,7 +42,7 @@ class RadioMeter:
         self._busy_until_ns = [0] * stations
 
     def on_start(self, transmission: Transmission, receiver: int | None) -> None:
-        """Record a frame that starts now; `receiver` is None for broadcasts, ACKs and aggregates."""
+        """Record a frame that starts now; `receiver` is None for broadcasts, control frames and aggregates."""
         self.on_busy(
             transmission.start_ns, transmission.end_ns, (transmission.transmitter, *transmission.detected_by)
         )
@@ -117,7 +117,7 @@ def link_samples(
     busy_ns = meter.busy_ns(now_ns)
 
     def peers_of(index: int) -> Sequence[int]:
-        """Return the stations to which a station sends frames: all others, or its access point."""
+        """Return the stations to which a robot sends frames: all other robots, or its access point if it has one."""
         if cells is not None:
             access_point = cells[index]
             return [] if access_point is None else [access_point]

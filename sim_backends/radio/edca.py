@@ -56,7 +56,7 @@ _OF_USER_PRIORITY: Final = (
     *(BEST_EFFORT, BACKGROUND, BACKGROUND, BEST_EFFORT),
     *(VIDEO, VIDEO, VOICE, VOICE),
 )
-# User priorities of DSCPs by RFC 8325, 4.3 (figure 1); all others are 0.
+# User priorities of DSCPs by RFC 8325, 4.3 (figure 1), and of 1 (LE) by RFC 8622, 11; all others are 0.
 _RFC_8325: Final = {
     **dict.fromkeys((46, 44), 6),
     40: 5,
@@ -72,8 +72,9 @@ def category_of(dscp: int, mapping: DscpMapping) -> int:
 
     Args:
         dscp: Differentiated services code point, 0 to 63.
-        mapping: `linux`: the three upper bits of the DSCP are the user priority (cfg80211 up to Linux 6.10).
-            `rfc8325`: the mapping of RFC 8325, in which the classes for network control (CS6, CS7) are best effort.
+        mapping: `linux`: the three upper bits of the DSCP are the user priority (cfg80211 up to Linux 6.7).
+            `rfc8325`: the mapping of RFC 8325. It permits two user priorities for network control (CS6, CS7), 7 and
+            0; here they are best effort (0).
     """
     return _OF_USER_PRIORITY[dscp >> 3 if mapping == "linux" else _RFC_8325.get(dscp, 0)]
 
@@ -210,6 +211,11 @@ class AccessCategories(ChannelAccess, Generic[Payload]):
         for queue in self._queues:
             queue.contention.defer_until(until_ns + queue.contention.ifs_ns)
 
+    @override
+    def end_eifs(self) -> None:
+        for queue in self._queues:
+            queue.contention.end_eifs()
+
     def wait_until(self, now_ns: int) -> None:
         """Restart the countdown at the end of the wait for a response, during which the channel was idle."""
         for queue in self._queues:
@@ -253,7 +259,7 @@ class AccessCategories(ChannelAccess, Generic[Payload]):
         return winner.frames
 
     def remaining_ns(self, now_ns: int) -> int:
-        """Return the remaining time of the transmission opportunity; a long time if it has no limit."""
+        """Return the remaining time of the transmission opportunity; a very long time if it has one exchange."""
         return self._txop_end_ns - now_ns if self._txop_end_ns else _UNLIMITED_NS
 
     def continue_ns(self, now_ns: int, exchange_ns: int) -> int | None:

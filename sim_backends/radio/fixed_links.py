@@ -34,6 +34,7 @@ from sim_backends.radio.links import (
 )
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
+from sim_backends.world.motion import Attitude
 
 
 class FixedLink:
@@ -106,7 +107,7 @@ class FixedLink:
         return arrival_ns, delay_sum
 
     def count_cut(self) -> None:
-        """Count a packet as lost because the link is cut."""
+        """Count a packet as lost because the link is cut or a radio is off."""
         self.sent += 1
         self.count_lost()
 
@@ -170,8 +171,8 @@ class FixedLinks(Generic[Payload]):
 
     With a relay (the master topology) a packet between two other stations is sent to the relay first and forwarded
     from there; each hop has its own queue, rate, delay and loss. A broadcast of a station reaches the relay, which
-    repeats it to all other stations. Without a relay, and to and from the relay itself, packets go directly. A
-    broadcast is one packet per receiver, each with its own random draws.
+    repeats it to all other stations. Without a relay, and to and from the relay itself, packets go directly. Except
+    on the way to the relay, a broadcast is one packet per receiver, each with its own random draws.
 
     Args:
         seed: Seed of all random draws: equal seeds, links and packets give equal results.
@@ -273,7 +274,7 @@ class FixedLinks(Generic[Payload]):
                 self._in_flight.append(entry)
 
     def counters(self) -> dict[Pair, LinkCounters]:
-        """Return the current counters of each link."""
+        """Return the current counters of each link, including removed links."""
         return {pair: link.counters for pair, link in self._all_links.items()}
 
     def use_meter(self) -> None:
@@ -363,6 +364,8 @@ class UniformLinks(FixedLinks[Payload]):
         options: Parameters of every link.
     """
 
+    uses_attitudes = False
+
     def __init__(self, seed: int, options: RadioOptions) -> None:
         super().__init__(seed)
         self._options = options
@@ -374,6 +377,7 @@ class UniformLinks(FixedLinks[Payload]):
         positions_m: Mapping[str, Vector],
         relay: str | None,
         velocities_m_s: Mapping[str, Vector] | None = None,  # noqa: ARG002
+        attitudes: Mapping[str, Attitude] | None = None,  # noqa: ARG002
     ) -> None:
         """Implement `RadioModel.place`; only the set of stations matters."""
         stations = frozenset(positions_m), relay

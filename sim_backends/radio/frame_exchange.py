@@ -115,7 +115,7 @@ class FrameExchange(Generic[Payload]):
         self.events.schedule_start(station.contention.earliest_start_ns(now_ns), station.index)
 
     def _start(self, now_ns: int, index: int) -> None:
-        """Start an exchange of a station whose backoff has ended."""
+        """Start an exchange of a station after its backoff, or in its transmission opportunity."""
         station = self.stations[index]
         station.contention.earliest_start_ns(now_ns)  # counts down the backoff slots that were idle until now
         if self.reception.is_jammed(index):
@@ -261,7 +261,7 @@ class FrameExchange(Generic[Payload]):
         size_bytes, response_bytes = aggregate.size_bytes, aggregate.response_bytes
         end_ns = now_ns + mode.airtime_ns(size_bytes)
         transmission = Transmission(station.index, now_ns, end_ns, mode, size_bytes, first.packet, first.attempts)
-        transmission.response_bytes = response_bytes
+        transmission.response_bytes, transmission.frame_count = response_bytes, aggregate.frame_count
         self.reception.start(transmission, end_ns + self._sifs_ns + response_ns(mode, response_bytes))
         if self.meter is not None:
             self.meter.on_start(transmission, None)
@@ -314,7 +314,7 @@ class FrameExchange(Generic[Payload]):
         transmission: Transmission,
         exchange_id: int,
     ) -> None:
-        """Start the ACK or Block Ack to a transmission of `station`."""
+        """Start the ACK or Block Ack to a transmission of `station`, unless the receiver is transmitting itself."""
         receiver = self.stations[peer.receiver]
         if receiver.sending_until_ns > now_ns:
             return
@@ -413,7 +413,11 @@ class FrameExchange(Generic[Payload]):
         station.aggregate = None
         frames, acknowledged_frames = aggregate.frames, set(aggregate.decoded_frames if acknowledged else ())
         if is_sent:
-            peer.rate.report(peer.mode, acknowledged=len(acknowledged_frames), attempts=len(frames))
+            count = aggregate.frame_count
+            acknowledged_count = len(acknowledged_frames)
+            if count < len(frames):
+                acknowledged_count = len({packet.sequence for packet in acknowledged_frames})
+            peer.rate.report(peer.mode, acknowledged=acknowledged_count, attempts=count)
         if acknowledged:
             station.contention.on_success()
             peer.failed_exchanges = 0
@@ -448,7 +452,11 @@ class FrameExchange(Generic[Payload]):
     ) -> None:
         """Schedule the next exchange of a station: in its transmission opportunity, or after contention."""
         if peer is not None and station.queue and (frame := station.queue[0]).receiver == peer.receiver:
-            data_ns = peer.mode.airtime_ns(frame.size_bytes + QOS_HEADER_BYTES)
+            session = peer.session
+            size_bytes = frame.size_bytes + QOS_HEADER_BYTES
+            if session is not None:
+                size_bytes = session.first_frame_bytes(station.queue)
+            data_ns = peer.mode.airtime_ns(size_bytes)
             start_ns = categories.continue_ns(now_ns, data_ns + self._sifs_ns + ack_ns(peer.mode))
             if start_ns is not None:
                 self.events.schedule_start(start_ns, station.index)

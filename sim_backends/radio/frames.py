@@ -32,7 +32,7 @@ ControlFrame = Literal["", "ACK", "RTS", "CTS"]
 
 @dataclass(eq=False, slots=True)
 class Emission:
-    """Noise that a jammer sends in the whole channel.
+    """Noise that a jammer or an oven sends in the whole channel.
 
     Attributes:
         start_ns: Start time.
@@ -47,7 +47,7 @@ class Emission:
 
 @dataclass(eq=False, slots=True)
 class Transmission:
-    """A frame on the air.
+    """A frame or an aggregate on the air.
 
     Attributes:
         transmitter: Index of the sending station.
@@ -55,13 +55,16 @@ class Transmission:
         end_ns: End of its last symbol.
         mode: Modulation and coding.
         size_bytes: Size with MAC header and FCS.
-        packet: The packet that it carries or acknowledges.
+        packet: The packet that it carries, acknowledges or announces (RTS, CTS); the first one of several.
         attempt: Number of the transmission attempt on this hop, from 1.
         powers_mw: Received power at each station, by index; 0 at the transmitter.
         detected_by: Indices of the stations that detect it, whether or not they can receive it.
         interferers: Frames and jammer noise that overlap it in time.
         receivers: Indices of the stations that are synchronized to it, and so receive it.
         response_bytes: Size of the ACK or Block Ack to it.
+        frame_count: Number of frames, if it is an aggregate.
+        weakest_ratio: Smallest ratio of signal to noise in 20 MHz at the stations that detect it; infinite if none
+            detects it.
     """
 
     transmitter: int
@@ -76,6 +79,8 @@ class Transmission:
     interferers: list["Transmission | Emission"] = field(default_factory=list)
     receivers: set[int] = field(default_factory=set)
     response_bytes: int = ACK_BYTES
+    frame_count: int = 1
+    weakest_ratio: float = math.inf
 
 
 def success_probability(frame: Transmission, receiver: int, noise_mw: float) -> float:
@@ -136,12 +141,13 @@ class Frame(Generic[Payload]):
         size_bytes: Size of the packet, without MAC header.
         source: Name of the original sender.
         receiver: Index of the station at the end of this hop; None for a broadcast.
-        forward_to: Indices of the stations to which the relay forwards it; None for a broadcast.
+        forward_to: Receivers to which the relay forwards it, each an index or None for a broadcast; empty if it is
+            not forwarded.
         is_for_receiver: True if the packet is delivered to the receiver of this hop.
         packet: Identity of the packet, from which its random numbers are derived.
         queued_ns: Time at which it entered the transmitter's queue.
         before: Sum of the delays before this hop, in the packed form of `links.Delay`; 0 for none.
-        first_attempt_ns: Start of its first attempt.
+        first_attempt_ns: Start of its first attempt; 0 before it.
         attempts: Number of attempts that have started.
         sequence: Its number in a Block Ack session; -1 before its first attempt, or without a session.
         is_received: True if the receiver of a Block Ack session has decoded it.

@@ -83,6 +83,7 @@ class PhyCapability:
         access_categories: Mapping of packets to its access categories; None if it sends all packets as best effort.
         power_save_timeout_ns: Time from its last frame until it dozes; None if it never dozes.
         packet_time_ns: Time that its bus and driver need per packet before the queue of the radio.
+        amsdu_max_bytes: Maximum size of the A-MSDUs that it sends and receives; None if it supports none.
     """
 
     amendment: WifiAmendment
@@ -97,6 +98,7 @@ class PhyCapability:
     access_categories: DscpMapping | None = None
     power_save_timeout_ns: int | None = None
     packet_time_ns: int = 0
+    amsdu_max_bytes: int | None = None
 
     @property
     def band(self) -> Band:
@@ -134,6 +136,7 @@ def capability_of(standard: str, phy: WifiPhy | None) -> PhyCapability | None:
         phy.access_categories,
         round(phy.power_save_timeout * 1e9) if phy.power_save else None,
         round(phy.packet_time * 1e9),
+        phy.amsdu_max_bytes,
     )
 
 

@@ -35,7 +35,7 @@ class LinkParameters:
     queue_packets: int = 1000
 
     def serialization_ns(self, size_bytes: int) -> int:
-        """Return the time for which a packet of `size_bytes` occupies the link, in ns, rounded up."""
+        """Return the time for which a packet of `size_bytes` occupies the link, in ns, rounded up; 0 if unlimited."""
         return 0 if self.rate_bit_s is None else -(-8 * size_bytes * 1_000_000_000 // self.rate_bit_s)
 
 
@@ -43,12 +43,14 @@ class LinkParameters:
 class LinkCounters:
     """Counters of one directed link.
 
-    A packet is sent on the link or dropped by its queue; a sent packet is lost, delivered or still in flight.
+    A packet is sent on the link or dropped by its queue; a sent packet is lost, delivered or still in flight. Packets
+    that a Wi-Fi station loses before it sends them for another reason, for example because it is switched off, are
+    not counted.
 
     Attributes:
-        sent: Packets that were transmitted.
+        sent: Packets that were transmitted, or could not be because the receiver was out of range or a radio was off.
         queue_dropped: Packets dropped because the queue was full.
-        lost: Packets that were transmitted and did not arrive.
+        lost: Packets in `sent` that did not arrive.
         delivered: Packets that arrived.
     """
 

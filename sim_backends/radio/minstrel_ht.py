@@ -231,8 +231,9 @@ class MinstrelHt(RateControl):
         """Return the third mode of the chain.
 
         It is the mode with the highest throughput among the modes with more than 75 % success. If no mode has more
-        than 75 %, it is the mode with the highest share. If groups with fewer streams than the best mode have usable
-        modes, it is selected from these groups.
+        than 75 %, it is the mode with the highest share. Modes that are faster and less reliable than the best mode
+        are not considered. If groups with fewer streams than the best mode have usable modes, it is selected from
+        these groups.
         """
         best = self._statistics[self._best]
         robust, group_robust = self._groups[0][0], []
@@ -263,7 +264,10 @@ class MinstrelHt(RateControl):
         self._default_chain = _fill_chain([self._best] * self._count_tries(self._best) + self._fallback)
 
     def _count_tries(self, mode: WifiMode) -> int:
-        """Return the number of tries of a mode in the chain: as many as fit into 6 ms, with mean backoffs."""
+        """Return the number of tries of a mode in the chain: as many as fit into 6 ms with mean backoffs, 2 to 7.
+
+        A mode with a share below 20 % has 2.
+        """
         statistics = self._statistics[mode]
         if statistics.share < _UNRELIABLE_SHARE:
             return 2

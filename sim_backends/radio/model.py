@@ -17,6 +17,7 @@ from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.radio.wifi import Wifi
 from sim_backends.radio.world_channel import WorldChannel
+from sim_backends.world.motion import Attitude
 from sim_backends.world.world import World
 
 if TYPE_CHECKING:
@@ -29,12 +30,18 @@ PathLosses = Callable[[], Mapping[Pair, float]]
 class RadioModel(Protocol[Payload]):
     """A radio model, which delivers packets at computed times, in ns. Times passed to it must not decrease."""
 
+    @property
+    def uses_attitudes(self) -> bool:
+        """True if `place` needs the attitudes of the stations."""
+        ...
+
     def place(
         self,
         now_ns: int,
         positions_m: Mapping[str, Vector],
         relay: str | None,
         velocities_m_s: Mapping[str, Vector] | None = None,
+        attitudes: Mapping[str, Attitude] | None = None,
     ) -> None:
         """Set the current positions of the stations; stations without a position are out of range.
 
@@ -43,6 +50,7 @@ class RadioModel(Protocol[Payload]):
             positions_m: Positions in metres east, north, up.
             relay: Station whose access point relays between the others; None for direct links.
             velocities_m_s: Velocities; None if all stations are at rest.
+            attitudes: Attitudes of stations; the others keep theirs, which is initially level and to the east.
         """
         ...
 
@@ -77,7 +85,7 @@ class RadioModel(Protocol[Payload]):
         ...
 
     def next_event_ns(self) -> int | None:
-        """Return the time of the next event for `deliveries`, or None if no packet is in flight."""
+        """Return the time of the next event that `deliveries` processes, or None if there is none."""
         ...
 
     def deliveries(self, now_ns: int) -> list[Delivery[Payload]]:
@@ -161,12 +169,18 @@ class WifiInWorld(Wifi[Payload]):
             self._infrastructure.start(self._world_channel, self._exchange)
             self._robots, self._linked_names = self._infrastructure.robots, self._infrastructure.linked_names
 
+    @property
+    def uses_attitudes(self) -> bool:
+        """Implement `RadioModel.uses_attitudes`."""
+        return self._world_channel.uses_attitudes
+
     def place(
         self,
         now_ns: int,
         positions_m: Mapping[str, Vector],
         relay: str | None,
         velocities_m_s: Mapping[str, Vector] | None = None,
+        attitudes: Mapping[str, Attitude] | None = None,
     ) -> None:
         """Implement `RadioModel.place`."""
         self.advance(now_ns)
@@ -175,14 +189,14 @@ class WifiInWorld(Wifi[Payload]):
         infrastructure = self._infrastructure
         if infrastructure is not None and infrastructure.positions_m:
             positions_m = {**positions_m, **infrastructure.positions_m}
-        self._world_channel.move(now_ns, positions_m, velocities_m_s)
+        self._world_channel.move(now_ns, positions_m, velocities_m_s, attitudes)
         self.set_relay(relay)
         if infrastructure is not None and infrastructure.roaming is not None:
             infrastructure.roaming.start(now_ns)
 
     @override
     def log_attempts(self, log: Callable[[TransmissionAttempt], None] | None) -> None:
-        """Implement `RadioModel.log_attempts`; management frames are omitted."""
+        """Implement `RadioModel.log_attempts`; management frames and frames of neighbours are omitted."""
         infrastructure = self._infrastructure
         super().log_attempts(
             log if log is None or infrastructure is None else partial(infrastructure.log_packet, log)

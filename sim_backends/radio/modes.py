@@ -1,7 +1,7 @@
 """Bands, and modulation and coding of 802.11a/g and of 802.11n with one stream in 20 MHz: airtime of frames.
 
-Clauses refer to IEEE 802.11-2020: 17 (OFDM), 18 (ERP-OFDM, 802.11g: clause 17 at 2.4 GHz), 19 (HT, 802.11n). Modes
-with more streams or wider channels are in `high_throughput`.
+Clauses refer to IEEE 802.11-2020: 17 (OFDM), 18 (ERP-OFDM, 802.11g: clause 17 at 2.4 GHz), 19 (HT, 802.11n); clause
+27 (HE) is in IEEE 802.11ax-2021. Modes with more streams or wider channels are in `high_throughput`.
 """
 
 from dataclasses import dataclass
@@ -94,7 +94,7 @@ class WifiMode:
     """A combination of modulation and coding. Each mode is one object, so comparing and hashing use its identity.
 
     Attributes:
-        name: `g54`, `n7` or `vht80-mcs9-2ss-400ns`.
+        name: Its name, for example `g54`, `n7` or `vht80-mcs9-2ss-400ns`.
         modulation: Modulation of each subcarrier.
         code_rate: Rate of the convolutional code.
         bits_per_symbol: Data bits of all streams in an OFDM symbol, N_DBPS.
@@ -224,7 +224,7 @@ def control_mode(mode: WifiMode) -> WifiMode:
     """Return the mode of the ACK to a frame in `mode`: the fastest mandatory rate up to the frame's rate (10.6.6.5).
 
     The rate of an HT, VHT or HE frame is its non-HT reference rate: the rate of the clause 17 mode with the same
-    modulation and code rate (10.6.11).
+    modulation and code rate, or 54 Mbit/s if there is no such mode (10.6.11).
     """
     reference, modes = mode, OFDM_MODES[mode.band.name]
     if mode.is_high_throughput:

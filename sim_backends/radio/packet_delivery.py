@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from typing import Generic
 
 from sim_backends.radio.aggregation import BlockAckSession
+from sim_backends.radio.amsdu import AmsduSession
 from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.contention import EventQueue
 from sim_backends.radio.edca import category_of
@@ -29,7 +30,7 @@ class PacketDelivery(Generic[Payload]):
         channel: Received powers between the stations.
         stations: Stations by index.
         events: Scheduled events.
-        queue_packets: Maximum number of queued packets per station.
+        queue_packets: Maximum number of packets in each queue of a station, without the first.
 
     Attributes:
         peers: State of each link that was used, by indices of transmitter and receiver.
@@ -56,12 +57,12 @@ class PacketDelivery(Generic[Payload]):
         self.power_save: PowerSave[Payload] | None = None
 
     def enqueue(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> None:
-        """Queue a frame for its next hop, or drop it if the queue is full or the receiver is out of range."""
+        """Buffer a frame for a dozing receiver, or pass it to `enqueue_now`."""
         if self.power_save is None or not self.power_save.buffer(now_ns, station, frame):
             self.enqueue_now(now_ns, station, frame)
 
     def enqueue_now(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> None:
-        """Queue a frame whose receiver is awake."""
+        """Queue a frame for its next hop, or drop it if the queue is full or the receiver is out of range."""
         queue = station.queue
         if station.categories is not None:
             frame.category = category_of(frame.dscp, station.categories.mapping)
@@ -85,7 +86,7 @@ class PacketDelivery(Generic[Payload]):
                 self._events.schedule_start(station.contention.earliest_start_ns(now_ns), station.index)
 
     def discard_queue(self, now_ns: int, station: Station[Payload]) -> None:
-        """Empty the queue of a station whose radio was switched off; frames that were not received are lost."""
+        """Empty the queues of a station whose radio was switched off; frames that were not received are lost."""
         if self.power_save is not None:
             for frame in self.power_save.discard(station):
                 self._discard(now_ns, station, frame)
@@ -119,7 +120,7 @@ class PacketDelivery(Generic[Payload]):
             self.deliveries.append((now_ns, name, payload, source, delay))
 
     def count_broadcast(self, now_ns: int, transmitter: int, frame: Frame[Payload], received: list[int]) -> None:
-        """Count a broadcast on the link to each station, and log its loss for each station that did not decode it."""
+        """Count a broadcast on the link to each station in range, and log its loss for stations that missed it."""
         self.count_receptions(now_ns, transmitter, frame, received, range(len(self._channel.names)))
 
     def count_receptions(
@@ -130,7 +131,7 @@ class PacketDelivery(Generic[Payload]):
         received: Sequence[int],
         addressed_stations: Iterable[int],
     ) -> None:
-        """Count a broadcast on the link to each addressed station, and log its loss for stations that missed it."""
+        """Count a broadcast on the links to addressed stations in range; log its loss for all that missed it."""
         for index in addressed_stations:
             name = self._channel.names[index]
             is_linked, is_missed = self._channel.are_linked(transmitter, index), index not in received
@@ -171,4 +172,6 @@ class PacketDelivery(Generic[Payload]):
 
     def _session(self, transmitter: int, receiver: int) -> BlockAckSession[Payload] | None:
         limits = self._channel.ampdu_limits(transmitter, receiver)
-        return None if limits is None else BlockAckSession(limits)
+        if limits is None:
+            return None
+        return AmsduSession(limits) if limits.amsdu_bytes else BlockAckSession(limits)

@@ -30,7 +30,7 @@ class PowerSave(Generic[Payload]):
 
     Args:
         timeouts_ns: Time from the last frame until a station dozes, by index of the station; others never doze.
-        beacon_phase_ns: Time of the first beacon, which has a DTIM.
+        beacon_phase_ns: Time of the first beacon with a DTIM.
         events: Scheduled events.
         release: Queues a frame at its transmitter.
 

@@ -71,9 +71,9 @@ class Minstrel(RateControl):
     Each mode has an exponentially weighted mean of the share of acknowledged attempts: weight 75 % for the old value,
     updated every 100 ms. A frame is sent first in the mode with the highest throughput, then in the second best mode,
     then in the most robust mode, and finally in the slowest mode. The most robust mode has the highest throughput
-    among the modes with at least 95 % success. Each mode is tried as often as fits into 6 ms, but at most twice if
-    its success share is above 95 % or below 10 %. All attempts together do not exceed the retry limit of the
-    standard.
+    among the modes with at least 95 % success, or without such modes the highest share. Each mode is tried as often
+    as fits into 6 ms, but only half as often and at most twice if its success share is above 95 % or below 10 %. All
+    attempts together do not exceed the retry limit of the standard.
 
     A tenth of the frames are samples. A sample is tried in another mode before the best mode. This mode is faster
     than the best mode, or was not used for 20 updates. If its share is above 95 % or below 10 %, it is sampled at
@@ -193,7 +193,7 @@ class Minstrel(RateControl):
 
 
 def _count_fitting_attempts(time_ns: int) -> int:
-    """Return the number of failed attempts, with mean backoffs in between, that take at most 6 ms."""
+    """Return the number of failed attempts, at least 1, that with mean backoffs in between take at most 6 ms."""
     attempts, window, elapsed_ns = 1, CW_MIN, 2 * time_ns + CW_MIN * SLOT_NS // 2
     while elapsed_ns <= _SEGMENT_NS:
         attempts, window = attempts + 1, 2 * window + 1

@@ -34,7 +34,7 @@ class ProtectedFrame(Generic[Payload]):
         packet: Its first packet.
         attempt: Number of the attempt for that packet.
         send: Called at its start.
-        fail: Called if there was no CTS.
+        fail: Called if the sender has not decoded a CTS.
     """
 
     station: Station[Payload]
@@ -81,8 +81,8 @@ class RtsCts(Generic[Payload]):
     def start(self, now_ns: int, frame: ProtectedFrame[Payload]) -> None:
         """Send RTS, at the start of the station's exchange.
 
-        Stations that receive the RTS wait for the CTS. They stop waiting if no data frame follows (10.3.2.4). The CTS
-        reserves the channel until the end of the response to the data.
+        Stations that decode the RTS wait for the CTS. They stop waiting if no data frame follows (10.3.2.4). The CTS
+        reserves the channel until the end of the response to the data, at stations that decode it.
         """
         mode = control_mode(frame.mode)
         end_ns = now_ns + mode.airtime_ns(RTS_BYTES)
@@ -100,8 +100,8 @@ class RtsCts(Generic[Payload]):
         is_decoded = self._reception.decodes(frame.receiver, rts, "rts")
         cts_ns = rts.mode.airtime_ns(CTS_BYTES)
         # NAVTimeout of 10.3.2.4.
-        self._reception.reserve(now_ns, rts, now_ns + 2 * (self._sifs_ns + SLOT_NS) + cts_ns + _PHY_START_DELAY_NS)
-        self._reception.end(now_ns, rts)
+        timeout_ns = 2 * (self._sifs_ns + SLOT_NS) + cts_ns + _PHY_START_DELAY_NS
+        self._reception.end(now_ns, rts, reserved_ns=now_ns + timeout_ns)
         self._log(rts, frame.receiver, "RTS", is_decoded=is_decoded)
         if exchange_id != frame.station.exchange_id:
             return  # aborted: its radio was switched off
@@ -117,7 +117,7 @@ class RtsCts(Generic[Payload]):
         mode = control_mode(frame.mode)
         end_ns = now_ns + mode.airtime_ns(CTS_BYTES)
         cts = Transmission(receiver.index, now_ns, end_ns, mode, CTS_BYTES, frame.packet, frame.attempt)
-        self._reception.start(cts, end_ns + self._sifs_ns + frame.exchange_ns)
+        self._reception.start(cts, end_ns)
         if self.meter is not None:
             self.meter.on_start(cts, None)
         cts_exchange_id = 0
@@ -128,7 +128,7 @@ class RtsCts(Generic[Payload]):
     def _end_cts(self, now_ns: int, frame: ProtectedFrame[Payload], cts: Transmission, exchange_id: int) -> None:
         station = frame.station
         is_decoded = station.receiving is cts and self._reception.decodes(station.index, cts, "cts")
-        self._reception.end(now_ns, cts)
+        self._reception.end(now_ns, cts, reserved_ns=now_ns + self._sifs_ns + frame.exchange_ns)
         self._log(cts, station.index, "CTS", is_decoded=is_decoded)
         self._events.schedule(now_ns + self._sifs_ns, self._finish, frame, exchange_id, is_decoded)
 

@@ -29,12 +29,12 @@ class Station(Generic[Payload]):
     Attributes:
         contention: Its carrier sense and backoff.
         queue: Frames to send; the first is being sent, or waits for the channel.
-        receiving: The frame that it is receiving.
+        receiving: The frame that it is receiving; None if it receives none.
         sending_until_ns: End of its last or current frame.
         exchange_id: Number that increases at the start and the end of each exchange of a frame and its ACK; odd
             during an exchange.
         packet_count: Number of packets that were passed to it for sending.
-        aggregate: The aggregate of its current exchange; None if it sends a single frame without a session.
+        aggregate: The aggregate of its current exchange; None between exchanges, and for a frame without a session.
         rts_threshold_bytes: Size of the largest frame or aggregate that it sends without RTS.
         categories: Its access categories (`queue` belongs to the active one); None if it has only one queue.
     """
@@ -102,7 +102,7 @@ class Peer(Generic[Payload]):
     Attributes:
         failed_exchanges: Number of aggregates without a Block Ack since the last Block Ack.
         last_frame: The last frame that the peer received; a retry after a lost ACK is a duplicate of it.
-        mode: Mode of the last attempt.
+        mode: Mode of the last attempt; not set before the first.
     """
 
     __slots__ = (

@@ -1,10 +1,9 @@
 """802.11 stations on one channel: contention (DCF), hidden stations, ACKs, retries, relaying by an access point.
 
 The model is event-driven, computes with integer nanoseconds, and uses no clock and no socket. It implements
-`model.RadioModel`. Frames between stations whose radios have the section `phy` (802.11n and later) are
-aggregated, and may use RTS/CTS and access categories.
-Power save delays frames to stations of an access point. Beacons have airtime only if the option
-`access_points` is used; fragmentation is not modelled.
+`model.RadioModel`, in part in the subclass `WifiInWorld`. Frames between stations whose radios have the section `phy`
+(802.11n and later) are aggregated, and may use RTS/CTS and access categories. Power save delays frames to stations of
+an access point. Beacons have airtime only if the option `access_points` is used; fragmentation is not modelled.
 """
 
 from collections.abc import Callable, Mapping, Sequence, Set
@@ -40,7 +39,7 @@ class Wifi(Generic[Payload]):
     Args:
         channel: Received powers between the stations.
         seed: Seed of all random draws.
-        queue_packets: Maximum number of queued packets per station.
+        queue_packets: Maximum number of packets in each queue of a station, without the first.
         make_delivery: Class that queues and delivers the packets.
     """
 
@@ -115,7 +114,7 @@ class Wifi(Generic[Payload]):
         self._off = frozenset(names)
 
     def set_emissions(self, now_ns: int, emissions: Mapping[str, Emission]) -> None:
-        """Set the jammer noise on the air until the next call, by jammer name."""
+        """Set the noise of jammers on the air until the next call, by name of the jammer."""
         self.advance(now_ns)
         self._exchange.reception.set_emissions(now_ns, emissions)
         if not emissions:
@@ -172,7 +171,10 @@ class Wifi(Generic[Payload]):
         self._delivery.enqueue(now_ns, station, frame)
 
     def _cross_bus(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> None:
-        """Queue a packet after the bus and driver of its sender have processed it and the packets before it."""
+        """Queue a packet after the bus and driver of its sender have processed it and the packets before it.
+
+        The packet is lost if more packets than the queue can contain wait for the bus.
+        """
         time_ns = self._packet_times_ns[station.index]
         ready_ns = max(now_ns, self._bus_free_ns.get(station.index, 0)) + time_ns
         if ready_ns - now_ns > (self._queue_packets + 1) * time_ns:
@@ -183,7 +185,7 @@ class Wifi(Generic[Payload]):
         self._events.schedule(ready_ns, self._delivery.enqueue, station, frame)
 
     def next_event_ns(self) -> int | None:
-        """Return the time of the next event for `deliveries`, or None if no packet is in flight."""
+        """Return the time of the next event that `deliveries` processes, or None if there is none."""
         return self._events.next_ns()
 
     def deliveries(self, now_ns: int) -> list[Delivery[Payload]]:

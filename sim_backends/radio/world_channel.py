@@ -6,12 +6,14 @@ from operator import ne
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from typing_extensions import override
 
 from fieldkit.config.wifi_phy import DscpMapping
 from fieldkit.core.model import Vector
 from fieldkit.core.seeds import place_seed
 from sim_backends.radio.aggregation import AMPDU_LIMITS, TYPICAL_FRAMES, AmpduLimits
+from sim_backends.radio.amsdu import limits_with_amsdu
 from sim_backends.radio.antennas import Antenna, band_of, fixed_mode, modes_between
 from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.error_rates import packet_error
@@ -20,14 +22,15 @@ from sim_backends.radio.frames import decibel
 from sim_backends.radio.high_throughput import common_modes, mode_groups
 from sim_backends.radio.minstrel_ht import MinstrelHt
 from sim_backends.radio.modes import OFDM_MODES
-from sim_backends.radio.propagation import path_loss
-from sim_backends.radio.propagation.fading import Fading, Shadowing
+from sim_backends.radio.propagation.antenna_patterns import StationGains
+from sim_backends.radio.propagation.fading import Fading
 from sim_backends.radio.propagation.link_caches import GainCache, LinkRow
+from sim_backends.radio.propagation.mean_loss import MeanLoss
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.rate_control import FixedRate, Minstrel, RateControl
 from sim_backends.world.materials import SPEED_OF_LIGHT_M_S
-from sim_backends.world.motion import STILL
+from sim_backends.world.motion import STILL, Attitude
 from sim_backends.world.shapes import Floats
 from sim_backends.world.world import World
 
@@ -72,10 +75,9 @@ class WorldChannel(RadioChannel):
         self._tx_powers_dbm = np.array([antenna.tx_power_dbm for antenna in self._antennas])
         self._options = options
         self._fixed_mode = fixed_mode(options.mode, antennas)
-        self._world = world
-        self._shadowing = (
-            Shadowing(place_seed(seed), options.shadowing_db, options.decorrelation) if options.shadowing_db else None
-        )
+        self._mean_loss = MeanLoss(options, self.band.carrier_hz, world, place_seed(seed))
+        patterns = [antenna.pattern for antenna in self._antennas]
+        self._station_gains = StationGains(self.names, patterns) if any(patterns) else None
         count = len(self.names)
         # The first end of a link is the one whose name sorts first, for any order of the stations.
         by_name = np.array(sorted(range(count), key=self.names.__getitem__), dtype=np.int64)
@@ -104,13 +106,22 @@ class WorldChannel(RadioChannel):
         self._positions_m, self._velocities_m_s = np.zeros((2, count, 3))
         # Time of the positions, and time for which a fading gain is used.
         self._moved_ns, self._gain_valid_ns = 0, self._compute_gain_valid_ns()
-        self._revision = 0  # increases with each change of positions, velocities or losses
+        self._revision = 0  # increases with each change of positions, velocities, cuts or losses
         self.use_losses(np.full((count, count), np.inf))
 
+    @property
+    def uses_attitudes(self) -> bool:
+        """True if the gain of a station depends on its attitude."""
+        return self._station_gains is not None
+
     def move(
-        self, now_ns: int, positions_m: Mapping[str, Vector], velocities_m_s: Mapping[str, Vector] | None = None
+        self,
+        now_ns: int,
+        positions_m: Mapping[str, Vector],
+        velocities_m_s: Mapping[str, Vector] | None = None,
+        attitudes: Mapping[str, Attitude] | None = None,
     ) -> None:
-        """Set the current positions and velocities of the stations.
+        """Set the current positions, velocities and attitudes; a station without a new attitude keeps its last one.
 
         Stations without a position are out of range of all others. Until the next call, mean powers do not change;
         only fading, which changes within a wavelength, extrapolates with the velocities.
@@ -122,6 +133,8 @@ class WorldChannel(RadioChannel):
         if velocities_by_name or self._in_motion:
             velocities = [velocities_by_name.get(name, STILL) for name in self.names]
             has_moved |= list(map(ne, velocities, self._velocities))
+        if self._station_gains is not None and attitudes:
+            has_moved[self._station_gains.orient(attitudes)] = True
         if not has_moved.any() and not self._in_motion:
             return
         if velocities is not self._velocities:
@@ -151,7 +164,9 @@ class WorldChannel(RadioChannel):
         self._cut = cut
 
     def use_path_losses(self, losses_db: Mapping[tuple[str, str], float]) -> None:
-        """Set the mean losses of some paths, from transmitter to receiver, which replace path loss and obstacles.
+        """Set the mean losses of some paths, from transmitter to receiver, which replace the computed losses.
+
+        They also replace shadowing, obstacles and antenna gains.
 
         Args:
             losses_db: The losses in dB; losses of other paths are computed from the positions.
@@ -175,6 +190,8 @@ class WorldChannel(RadioChannel):
         """Return the mean power, by index, that each station receives from another transmitter at a position."""
         to_m = self._positions_m
         loss_db = self.loss_db(np.broadcast_to(position_m, to_m.shape), to_m)
+        if self._station_gains is not None:
+            loss_db -= self._station_gains.direct_dbi(np.arange(len(to_m)), np.array(position_m) - to_m)
         loss_db[~self._present] = np.inf
         received_mw: list[float] = _milliwatts(power_dbm - loss_db).tolist()
         return received_mw
@@ -245,37 +262,37 @@ class WorldChannel(RadioChannel):
             stale = np.flatnonzero(self._stale)
         first, second = self._ends[:, stale]
         start, end = self._positions_m[first], self._positions_m[second]
-        obstacles_db = self._obstacles_db(start, end)
-        loss_db = reverse_db = self._open_db(start, end) + obstacles_db
+        obstacles_db = self._mean_loss.obstacles_db(start, end)
+        # Any obstacle on the path adds loss and removes the constant component.
+        k = np.where(obstacles_db == 0, 10 ** (self._options.k_db / 10), 0.0)
+        loss_db = reverse_db = self._mean_loss.open_db(start, end) + obstacles_db
+        if self._station_gains is not None:
+            k = self._add_antennas(stale, loss_db, k)
         if self._specified_db is not None:
             specified_db = self._specified_db[first, second], self._specified_db[second, first]
             loss_db, reverse_db = (np.where(np.isnan(values), loss_db, values) for values in specified_db)
         out_of_range = ~(self._present[first] & self._present[second]) | self._cut[first, second]
         loss_db[out_of_range] = reverse_db[out_of_range] = np.inf
-        # Any obstacle on the path adds loss and removes the constant component.
-        k = np.where(obstacles_db == 0, 10 ** (self._options.k_db / 10), 0.0)
         self._loss_db[first, second], self._loss_db[second, first] = loss_db, reverse_db
         self._rician_k[first, second] = self._rician_k[second, first] = k
         self._stale[stale] = False
 
+    def _add_antennas(self, links: NDArray[np.int64], loss_db: Floats, k: Floats) -> Floats:
+        """Subtract the antenna gains of links from their losses; return the K factors with these gains.
+
+        The direct path, K / (K + 1) of the power, has the gains in its direction; the echoes have their mean gain.
+        """
+        assert self._station_gains is not None
+        first, second = self._ends[:, links]
+        path_m = self._positions_m[second] - self._positions_m[first]
+        direct, echoes = self._station_gains.link_gains(first, second, path_m)
+        gains = (k * direct + echoes) / (k + 1) if self._options.fading else direct
+        loss_db -= 10 * np.log10(gains)
+        return k * direct / echoes
+
     def loss_db(self, start_m: Floats, end_m: Floats) -> Floats:
         """Return the mean loss of paths between points of shape (n, 3), with shadowing and obstacles, in dB."""
-        return self._open_db(start_m, end_m) + self._obstacles_db(start_m, end_m)
-
-    def _open_db(self, start_m: Floats, end_m: Floats) -> Floats:
-        match self._options.propagation:
-            case "free-space":
-                loss_db = path_loss.free_space_db(start_m, end_m, self.band.carrier_hz)
-            case "two-ray":
-                loss_db = path_loss.two_ray_db(start_m, end_m, self.band.carrier_hz)
-            case _:
-                loss_db = path_loss.log_distance_db(start_m, end_m, self.band.carrier_hz, self._options.exponent)
-        return loss_db if self._shadowing is None else loss_db + self._shadowing.loss_db(start_m, end_m)
-
-    def _obstacles_db(self, start_m: Floats, end_m: Floats) -> Floats:
-        if self._world is None:
-            return np.zeros(len(start_m))
-        return self._world.penetration_loss_db(start_m, end_m, self.band.carrier_hz)
+        return self._mean_loss.loss_db(start_m, end_m)
 
     def snr_db(self, transmitter: int, receiver: int) -> float:
         """Return the mean signal-to-noise ratio of a link."""
@@ -341,7 +358,9 @@ class WorldChannel(RadioChannel):
         ):
             return None
         mode = self._fixed_mode or common_modes(first.phy, second.phy)[0]
-        return AMPDU_LIMITS[mode.phy_format]
+        if first.phy.amsdu_max_bytes is None or second.phy.amsdu_max_bytes is None:
+            return AMPDU_LIMITS[mode.phy_format]
+        return limits_with_amsdu(mode.phy_format, min(first.phy.amsdu_max_bytes, second.phy.amsdu_max_bytes))
 
     @override
     def rate_control(self, transmitter: int, receiver: int) -> RateControl:
@@ -371,7 +390,7 @@ class WorldChannel(RadioChannel):
 
 
 def milliwatt(dbm: float) -> float:
-    """Return a power in mW; 0 below the range of a float."""
+    """Return a power in mW; powers below -3000 dBm are returned as 1e-300 mW."""
     return float(10 ** (max(dbm, -3000.0) / 10))
 
 

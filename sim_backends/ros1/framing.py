@@ -23,7 +23,7 @@ def pack(payload: bytes) -> bytes:
 
 
 def unpack_length(data: bytes) -> int:
-    """Return the length at the start of a packet.
+    """Return the length of a packet's payload from the first 4 bytes of the packet.
 
     Raises:
         ValueError: The length exceeds `MAX_BYTES`.

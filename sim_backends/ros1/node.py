@@ -69,6 +69,7 @@ class RosPublisher:
         """Answer the connection header of a subscriber, and send it all later messages until it disconnects.
 
         Raises:
+            OSError: The connection failed.
             ValueError: The subscriber expects another type.
         """
         if header.get("md5sum") not in {"*", self._kind.md5}:
@@ -83,9 +84,10 @@ class RosPublisher:
         self._disconnect(stream)
 
     def publish(self, message: bytes, deadline_s: float | None) -> int:
-        """Send a message to all subscribers, and return their number.
+        """Send a message to all subscribers; return the number of subscribers to which it was sent.
 
-        A subscriber that does not read in time is disconnected.
+        A subscriber that does not read until `deadline_s` (on the clock of `time.monotonic`; None for no limit) is
+        disconnected.
 
         Raises:
             TimeoutError: No subscriber has received the message, because they did not read in time.
@@ -154,7 +156,7 @@ class RosSubscriber:
         """Return the next message.
 
         Raises:
-            TimeoutError: No message arrived in time.
+            TimeoutError: No message arrived until `deadline_s`, on the clock of `time.monotonic`. None has no limit.
         """
         try:
             return self._messages.get(timeout=None if deadline_s is None else max(deadline_s - time.monotonic(), 0))
@@ -174,9 +176,11 @@ class RosSubscriber:
     def _read(self, stream: socket.socket) -> None:
         """Exchange headers, then store each message.
 
+        A publisher of another type is disconnected, and none of its messages is stored.
+
         Raises:
             OSError: The connection failed.
-            ValueError: The publisher violates TCPROS, or has another type.
+            ValueError: The publisher violates TCPROS.
         """
         stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         fields = {

@@ -18,6 +18,10 @@ GRAVITY_M_S2: Final = 9.80665
 """Standard acceleration of gravity (CGPM 1901)."""
 
 
+LEVEL: Final = (0.0, 0.0)
+"""Roll and pitch of a robot on level ground."""
+
+
 class State(NamedTuple):
     """Position and velocity of a robot; a tuple, which is faster to create than a frozen dataclass.
 
@@ -30,6 +34,59 @@ class State(NamedTuple):
     position_m: Vector
     velocity_m_s: Vector = STILL
     heading_rad: float | None = None
+
+    @property
+    def tilt_rad(self) -> tuple[float, float]:
+        """Roll (positive with the left side up) and pitch (positive with the nose down)."""
+        return self._tilt_rad if isinstance(self, TiltedState) else LEVEL
+
+
+class TiltedState(State):
+    """The state of a robot that is not level.
+
+    The tilt is not an item of the tuple: it is not recorded and not sent to external federates, and it does not
+    affect whether two states are equal.
+    """
+
+    _tilt_rad: tuple[float, float] = LEVEL
+
+    @classmethod
+    def of(
+        cls, position_m: Vector, velocity_m_s: Vector, heading_rad: float | None, tilt_rad: tuple[float, float]
+    ) -> State:
+        """Return a state with this tilt."""
+        if tilt_rad == LEVEL:
+            return State(position_m, velocity_m_s, heading_rad)
+        state = cls(position_m, velocity_m_s, heading_rad)
+        state._tilt_rad = tilt_rad
+        return state
+
+
+class Attitude(NamedTuple):
+    """Orientation of a body: the rotation by roll about forward, then pitch about left, then yaw about up.
+
+    Attributes:
+        yaw_rad: Heading, from east towards north.
+        pitch_rad: Positive with the nose down.
+        roll_rad: Positive with the left side up.
+    """
+
+    yaw_rad: float = 0.0
+    pitch_rad: float = 0.0
+    roll_rad: float = 0.0
+
+
+def attitude_of(state: State, *, before: Attitude) -> Attitude:
+    """Return the attitude of a robot.
+
+    A robot without a heading faces the direction in which it moves; at rest it keeps the yaw of `before`.
+    """
+    yaw_rad = state.heading_rad
+    if yaw_rad is None:
+        east_m_s, north_m_s, _ = state.velocity_m_s
+        yaw_rad = math.atan2(north_m_s, east_m_s) if east_m_s or north_m_s else before.yaw_rad
+    roll_rad, pitch_rad = state.tilt_rad
+    return Attitude(yaw_rad, pitch_rad, roll_rad)
 
 
 class Lifetime(NamedTuple):
@@ -109,8 +166,8 @@ class WayPoints:
         """Return an acceleration a for which an extrapolation by the time t has an error of at most a t^2 / 2.
 
         The extrapolation uses the current velocity, so it has no error until the robot is at the next corner, after
-        the time c. From then on, the true and the extrapolated velocity have the same speed v and differ by at most
-        2 v. The error is therefore at most 2 v (t - c), which is at most (v / c) t^2 / 2.
+        the time c. From then on, neither the true nor the extrapolated velocity exceeds the speed v, so they differ
+        by at most 2 v. The error is therefore at most 2 v (t - c), which is at most (v / c) t^2 / 2.
         """
         corner = bisect_right(self._times_ns, time_ns)
         if corner == len(self._times_ns):
@@ -166,7 +223,10 @@ def extrapolate(state: State, seconds: float) -> State:
     """Return the state after this time, at constant velocity."""
     (e, n, u), velocity_m_s, heading_rad = state
     v_e, v_n, v_u = velocity_m_s
-    return State((e + seconds * v_e, n + seconds * v_n, u + seconds * v_u), velocity_m_s, heading_rad)
+    position_m = e + seconds * v_e, n + seconds * v_n, u + seconds * v_u
+    if isinstance(state, TiltedState):
+        return TiltedState.of(position_m, velocity_m_s, heading_rad, state.tilt_rad)
+    return State(position_m, velocity_m_s, heading_rad)
 
 
 class _ExtrapolatedStates(Mapping[str, State]):

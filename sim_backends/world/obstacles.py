@@ -25,7 +25,7 @@ Size = tuple[Annotated[Real, Field(gt=0)], Annotated[Real, Field(gt=0)], Annotat
 Dimension = Annotated[Length, Field(gt=0)]
 
 _STEPS: Final = 8
-"""Number of steps of a ramp, for radio waves and for flying robots."""
+"""Number of steps of a ramp, for radio waves and for robots that do not drive on it."""
 
 
 def _require_material(name: str) -> str:
@@ -149,6 +149,12 @@ class Building(_Rectangular):
     thickness: Dimension
     material: MaterialName
 
+    @schema.model_validator(mode="after")
+    def _check_thickness(self) -> "Building":
+        if 2 * self.thickness >= min(self.size_m[:2]) or self.thickness >= self.size_m[2]:
+            raise schema.validation_error("the walls or the roof fill the whole building", "thickness")
+        return self
+
     @override
     def parts(self) -> Iterator[Part]:
         long_m, wide_m, high_m = self.size_m
@@ -175,7 +181,7 @@ class Tree(_Obstacle):
         kind: `tree`.
         at_m: Its position, metres east and north.
         height: Height of the top of its crown.
-        crown_base: Height of the lower end of its crown.
+        crown_base: Height of the lower end of its crown, below `height`.
         crown_radius: Radius of the crown.
         trunk_radius: Radius of the trunk.
     """
@@ -186,6 +192,12 @@ class Tree(_Obstacle):
     crown_base: Dimension
     crown_radius: Dimension
     trunk_radius: Dimension
+
+    @schema.model_validator(mode="after")
+    def _check_crown(self) -> "Tree":
+        if self.crown_base >= self.height:
+            raise schema.validation_error("the lower end of the crown must be below its top", "crown_base")
+        return self
 
     @override
     def parts(self) -> Iterator[Part]:
@@ -248,7 +260,7 @@ class Raised(_HigherGround):
 class Ramp(_HigherGround):
     """Ground that rises evenly along its first edge, from 0 to its height, with upright sides.
 
-    For radio waves and flying robots, the slope has eight steps.
+    For radio waves, and for robots that fly or for which it is too steep, the slope has eight steps.
 
     Attributes:
         kind: `ramp`.

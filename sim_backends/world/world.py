@@ -58,9 +58,10 @@ class World(Named):
     """The surroundings of emulated and simulated robots: `worlds/NAME.yaml` of the lab, or a shipped one.
 
     Coordinates are metres east and north of a corner. The ground is flat at height 0, except for raised ground and
-    ramps. An antenna is 0.2 m above the ground. The robots of a trial are placed along the line of its scenario, in
-    the compass direction `bearing_deg`: the sender at `from_m`, then the relay at the distance and the receiver at
-    twice the distance (`master`), or the receiver at the distance (`masterless`).
+    ramps. The antenna of an emulated robot is 0.2 m above the ground, or above its lowest point in flight. The robots
+    of a trial are placed along the line of its scenario, in the compass direction `bearing_deg`: the sender at
+    `from_m`, then the relay at the distance and the receiver at twice the distance (`master`), or the receiver at the
+    distance (`masterless`).
 
     Attributes:
         name: The name of its file without `.yaml`.
@@ -149,7 +150,7 @@ def _material_losses(names: tuple[str, ...], frequency_hz: float) -> tuple[Float
 
 
 def world_files() -> dict[str, Path]:
-    """Return the files of all worlds by name: worlds in the lab's folder `worlds/`, and shipped ones."""
+    """Return the files of worlds by name: those in the lab's folder `worlds/`, and shipped ones of other names."""
     return {path.stem: path for folder in (SHIPPED, Path("worlds")) for path in sorted(folder.glob("*.yaml"))}
 
 

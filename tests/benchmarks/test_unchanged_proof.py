@@ -55,7 +55,7 @@ def edit(clone: Path, name: str, old: str, new: str) -> None:
 
 def test_a_number_is_a_difference_and_a_word_is_a_label(clone: Path) -> None:
     edit(clone, "fieldkit/cli/commands/abort.py", "do not ask; required", "no question; required")
-    edit(clone, "fieldkit/cli/__init__.py", "130 interrupted", "131 interrupted")
+    edit(clone, "fieldkit/cli/__init__.py", "4 evidence not valid", "5 evidence not valid")
     completed = prove(clone, "HEAD", "--only", "help")
     assert completed.returncode == 1
     assert "DIFFERENT help texts: .: fieldkit --help" in completed.stdout
@@ -72,7 +72,7 @@ def test_a_label_passes_and_a_number_does_not(clone: Path) -> None:
     assert completed.returncode == 0, completed.stdout + completed.stderr
     assert "Field  ->  Outdoor" in completed.stdout
     assert " 0 different" in completed.stdout
-    edit(clone, "fieldkit/cli/__init__.py", "130 interrupted", "131 interrupted")
+    edit(clone, "fieldkit/cli/__init__.py", "4 evidence not valid", "5 evidence not valid")
     completed = prove(clone, "HEAD", *only_help)
     assert completed.returncode == 1
     assert "DIFFERENT help texts: .: fieldkit --help" in completed.stdout

@@ -54,7 +54,7 @@ def test_a_changed_log_of_a_real_stream_is_detected(tmp_path: Path) -> None:
         content = log.read_bytes()
         for changed, reason in (
             (shift_arrivals(content, 50_000_000), "later than its capture for every sample"),
-            (shift_arrivals(content, -5_000_000), "earlier than their packets in its capture"),
+            (shift_arrivals(content, -5_000_000), "earlier than the packets in its capture"),
             (content[:-40] + struct.pack("<d", 1.5) + content[-32:], "its checksum is wrong"),
         ):
             log.write_bytes(changed)

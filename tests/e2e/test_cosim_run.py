@@ -216,7 +216,7 @@ def test_ctrl_c_stops_a_run_of_many_seeds_and_keeps_finished_ones(lab: Path) -> 
     assert printed_seeds
     # One more seed may have finished after the last report.
     assert set(printed_seeds) <= set(finished_seeds)
-    assert f"interrupted: {len(printed_seeds)} of 10000 seeds had finished" in run.err
+    assert f"interrupted: the runs of {len(printed_seeds)} of 10000 seeds had finished" in run.err
     aggregate_run = run_here(lab, "aggregate", "sim", "--format", "csv")
     assert aggregate_run.code == 0, aggregate_run.err
 

@@ -63,9 +63,13 @@ def trial_row(folder: Path, emulated: str) -> dict[str, str]:
     return row
 
 
-def test_a_campaign_on_the_built_in_network(tmp_path: Path, untouched: NamespaceComparison) -> None:
+def test_a_campaign_of_the_default_robots_on_the_built_in_network(
+    tmp_path: Path, untouched: NamespaceComparison
+) -> None:
+    """The site file has no robots, so the receiver is the default drone."""
     sync = "{name: sliding_window, window: 4ms}"
-    make_site(tmp_path, f"{{physics: kinematic, ros: builtin, sync: {sync}}}")
+    site = f"emulated: {{physics: kinematic, ros: builtin, sync: {sync}}}\n"
+    (tmp_path / "fieldkit.yaml").write_text(site, encoding="utf-8")
     (tmp_path / "short.yaml").write_text(CAMPAIGN, encoding="utf-8")
     run = run_here(tmp_path, "campaign", "short.yaml")
     assert run.code == 0, run.err

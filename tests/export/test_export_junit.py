@@ -103,7 +103,7 @@ def test_an_expectation_on_repeats_without_a_value_is_a_failure_that_counts_them
     set_column(trial, "rtt_median_s", lambda number: "" if number % 4 == 1 else "0.01")
     (failure,) = suite(trial).iter("failure")
     assert failure.get("message") == (
-        "undecided: 1 of 2 repeats have no value; a single repeat has no interval: 10.00 ms (1 of 2)"
+        "undecided: no value in 1 of 2 repeats; a single repeat has no interval: 10.00 ms (1 of 2)"
     )
 
 

@@ -91,7 +91,7 @@ def test_lost_packets_are_marked_at_their_positions(trial: Path) -> None:
     assert raster.lines == 1
     assert raster.columns == recorded.PACKETS
     assert raster.runs == [(0, 3, 2), (0, 17, 1)]
-    assert raster.description.endswith("1 repeats, 3 of 40 IP packets lost, at most 2 in a row")
+    assert raster.description.endswith("1 repeat, 3 of 40 IP packets lost, at most 2 in a row")
 
 
 def test_each_reply_is_in_the_distribution(trial: Path) -> None:

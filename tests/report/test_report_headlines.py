@@ -7,9 +7,12 @@ import pytest
 
 from fieldkit.analysis.cells import aggregate
 from fieldkit.config import schema
-from fieldkit.report.coverage import everything_lost
-from fieldkit.report.headlines import Headline, headlines
+from fieldkit.report.coverage import absences, everything_lost, total_absences
+from fieldkit.report.headlines import Headline, Ranking, headlines
 from fieldkit.report.trial_folders import Evidence, load_evidence
+from fieldkit.steps.base import StepEntry
+from fieldkit.steps.kinds.ping import PingStep
+from fieldkit.steps.kinds.run import RunStep
 from fieldkit.trial.plan import PLAN_FILE
 from fieldkit.trial.stored import plans, sources
 from tests.helpers import lawns, recorded
@@ -108,6 +111,24 @@ def test_quantity_without_its_own_loss_uses_the_other_losses() -> None:
     assert values[:2] == ["nothing arrived 10ft (1 of 3)", "no value 10ft (1 of 3)"]
 
 
+def test_condition_without_a_value_for_two_reasons_has_one_total_absence() -> None:
+    rows = [lawns.row(1, **FAR, **LOST), lawns.row(2, **(FAR | {"rtt_median_s": None})), lawns.row(1)]
+    evidence = load_evidence(parsed(rows))
+    quantity = evidence.quantities["rtt_median_s"]
+    cells = aggregate(evidence.repeats)
+    assert [absence.text for absence in absences(cells, quantity, evidence)] == [
+        "nothing arrived: 1 of 2",
+        "no value: 1 of 2",
+    ]
+    (total,) = total_absences(cells, quantity, evidence)
+    assert total.text == "nothing arrived or no value: 2 of 2"
+
+
+def test_condition_with_some_values_has_no_total_absence() -> None:
+    evidence = load_evidence(parsed([lawns.row(1), lawns.row(2, rtt_median_s=None)]))
+    assert not list(total_absences(aggregate(evidence.repeats), evidence.quantities["rtt_median_s"], evidence))
+
+
 def evidence_with(folder: Path, *expected: str) -> Evidence:
     """Return the evidence of a synthetic trial with expectations."""
     trial = recorded.make_plain(folder)
@@ -124,6 +145,27 @@ def test_expected_quantities_are_first(tmp_path: Path) -> None:
     subjects = [headline.subject for headline in headlines(aggregate(evidence.repeats), evidence)]
     assert subjects[:2] == ["Repeats", "IP packet loss"]
     assert subjects.count("IP packet loss") == 1
+
+
+def test_columns_of_named_steps_have_the_names_of_the_table(tmp_path: Path) -> None:
+    evidence = evidence_with(tmp_path)
+    plan = next(iter(evidence.plans.values()))
+    figures = [{"name": "volts", "unit": "V", "json": "volts"}]
+    steps = (
+        StepEntry("ping", PingStep.model_validate({"name": "up", "from": "sender", "to": "receiver"})),
+        StepEntry(
+            "run",
+            RunStep.model_validate({"name": "up", "robot": "sender", "command": "meter", "columns": figures}),
+        ),
+    )
+    named_plan = plan.model_copy(update={"procedure": plan.procedure.model_copy(update={"steps": steps})})
+    plans_by_source = dict.fromkeys(evidence.plans, named_plan)
+    named_evidence = Evidence(evidence.repeats, plans_by_source, (), frozenset(), evidence.verified_sources)
+    names = named_evidence.measured_columns(aggregate(evidence.repeats)[0])
+    assert names is not None
+    assert {"up.rtt_loss", "up.volts"} <= names
+    assert "rtt_loss" not in names
+    assert Ranking(named_evidence).is_user_defined("up.volts")
 
 
 def test_planned_repeats_without_an_attempt_are_not_run(tmp_path: Path) -> None:

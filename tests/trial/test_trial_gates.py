@@ -121,10 +121,13 @@ def fewer_frames(folder: Path) -> None:
             text("sender-capture.log", f"{log()}2 packets dropped by interface\n"),
             "sender capture: its kernel dropped 0 packets, its interface 2",
         ),
-        (text("sender-capture.log", log(matched=23)), "sender capture: 23 packets matched, but 24 were written"),
+        (
+            text("sender-capture.log", log(matched=23)),
+            "sender capture: 23 packets matched the filter, but tcpdump wrote 24",
+        ),
         (
             text("lateness.txt", "bound 5000000\nlate 5000000 7\nlate 5242880 2\nlate 41943040 1\n"),
-            "lateness.txt: 3 packets were delivered too late, by up to 41.9 ms; the bound is 5 ms",
+            "lateness.txt: 3 packets arrived too late, by up to 41.9 ms; the bound is 5 ms",
         ),
         (text("track.csv", "utc_ns"), "track.csv: is not a track of robots"),
         (

@@ -51,8 +51,8 @@ class ArduCopter:
     """Dialect of ArduCopter.
 
     On the ground, ArduCopter ignores set-points (target positions). It takes off by command, and then follows
-    set-points. If set-points are missing in GUIDED, it holds the last position without a time limit (GUID_TIMEOUT
-    applies to velocities only).
+    set-points. If set-points are missing in GUIDED, it flies to the last one and holds it without a time limit
+    (GUID_TIMEOUT does not apply to positions).
     """
 
     name = "ArduCopter"

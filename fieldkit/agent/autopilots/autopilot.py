@@ -58,12 +58,13 @@ _LOCAL_NED = 1
 _POSITION_AND_YAW = 0b100111111000
 """POSITION_TARGET_TYPEMASK: position and yaw are used; velocity, acceleration and yaw rate are ignored."""
 _OWN_SYSTEM = 245
-"""System id of fieldkit's programs, in the range of ground stations."""
+"""System id of fieldkit's programs, near the end of the range, as is usual for ground stations and tools
+(https://mavlink.io/en/guide/routing.html)."""
 _TYPE_ONBOARD = 18
 """MAV_TYPE_ONBOARD_CONTROLLER."""
 _MAX_PAYLOAD_BYTES = 255
 _NAME_BYTES = 16
-"""Length of the name of a parameter."""
+"""Length of the field with the name of a parameter."""
 
 
 @dataclass(frozen=True)
@@ -145,18 +146,19 @@ class AutopilotState:
     Attributes:
         link: The connection.
         commands: Sends commands to the autopilot.
-        armed: Whether its motors may turn.
-        failsafe: Whether one of its failsafes is active.
-        mode: Its custom mode, from its heartbeat.
+        armed: Whether its motors may turn; False before its first heartbeat.
+        failsafe: Whether one of its failsafes is active; False before its first heartbeat.
+        mode: Its custom mode, from its last heartbeat; 0 before the first.
         dialect: The dialect of its family; None for an unknown family, or before its first heartbeat.
-        family: Its MAV_AUTOPILOT and MAV_TYPE.
-        speed_m_s: Its speed.
-        boot_time_s: Its boot time by CLOCK_BOOTTIME of this computer, from its last position report.
+        family: Its MAV_AUTOPILOT and MAV_TYPE; `NO_AUTOPILOT` and 0 before its first heartbeat.
+        speed_m_s: Its speed in three dimensions, from its last position report; 0 before the first.
+        boot_time_s: Its boot time by CLOCK_BOOTTIME of this computer, from its last position report; 0 before the
+            first.
         status: Its health and battery; None before its first report.
         estimate: Flags of its position estimate (ESTIMATOR_STATUS_FLAGS); None before its first report.
         has_home: Whether it has reported its home position.
         parameters: The values of the requested parameters that it has reported.
-        texts: Its text messages (STATUSTEXT).
+        texts: Its last text messages (STATUSTEXT).
         command_results: The final MAV_RESULT of each command, from its last acknowledgement.
     """
 
@@ -193,7 +195,7 @@ class AutopilotState:
 
     @property
     def alive(self) -> bool:
-        """Whether its last heartbeat is recent."""
+        """Whether its last heartbeat is less than `2 * FRESH_S` old."""
         return self.heartbeat_age_s < 2 * FRESH_S
 
     @property
@@ -213,7 +215,7 @@ class AutopilotState:
 
     @property
     def lands_or_returns(self) -> bool:
-        """Whether it lands or returns automatically in its mode."""
+        """Whether it lands, or returns and lands, automatically in its mode."""
         return self.dialect is not None and self.dialect.lands_or_returns(self.mode)
 
     @property
@@ -238,7 +240,7 @@ class AutopilotState:
 
     @property
     def latitude_longitude(self) -> tuple[float, float] | None:
-        """Latitude and longitude in degrees; None without a fresh report, or if they are unknown."""
+        """Latitude and longitude in degrees; None without a fresh report that contains them."""
         return self._latitude_longitude if time.monotonic() - self._latitude_longitude_s < FRESH_S else None
 
     @property
@@ -247,7 +249,7 @@ class AutopilotState:
         return self._yaw_rad if time.monotonic() - self._attitude_s < FRESH_S else None
 
     def receive(self) -> None:
-        """Process the frames that have arrived. Damaged frames and frames of other systems are ignored."""
+        """Process frames that have arrived. Damaged frames and frames of other senders are ignored."""
         for frame in self.link.receive():
             if not is_intact(frame):
                 continue
@@ -274,7 +276,7 @@ class AutopilotState:
             self.speed_m_s = math.hypot(*values[3:])
 
     def _on_global_position(self, payload: bytes) -> None:
-        """Process GLOBAL_POSITION_INT, in 1e-7 degrees. ArduPilot sends zeros if its position is unknown."""
+        """Process GLOBAL_POSITION_INT, in 1e-7 degrees. ArduPilot sends two zeros if its position is unknown."""
         latitude, longitude = struct.unpack_from("<ii", payload, 4)
         if (latitude or longitude) and abs(latitude) <= 90e7 and abs(longitude) <= 180e7:
             self._latitude_longitude, self._latitude_longitude_s = (latitude / 1e7, longitude / 1e7), time.monotonic()
@@ -309,5 +311,5 @@ class AutopilotState:
 
 
 def status_text(drone: AutopilotState) -> str:
-    """Return a text with the mode of an autopilot and its last text message."""
+    """Return a text with the mode of an autopilot, and with its last text message if it has sent one."""
     return f"mode {drone.mode_name}" + (f", its last text: {drone.texts.last_text}" if drone.texts.last_text else "")

@@ -45,7 +45,7 @@ class FlightDialect(Protocol):
         guided_mode: Name of the mode in which the autopilot follows set-points.
         estimate_message: Id of the message with the flags of the position estimate.
         limit_parameters: Names of the parameters with the limits of the autopilot; `|` separates alternative names of
-            one parameter.
+            one parameter. The last one contains the height of a return.
         checks_current_mode: Whether the result of the autopilot's arming checks depends on its current mode.
     """
 
@@ -74,7 +74,7 @@ class FlightDialect(Protocol):
         """Return the name of a mode, or its number if the mode is unknown."""
 
     def guided_command(self) -> Command:
-        """Return the command that selects the mode in which the autopilot follows set-points."""
+        """Return the command that selects `guided_mode`."""
 
     def take_off_commands(self, height_m: float, climb_m_s: float) -> Sequence[Command]:
         """Return the commands for the take-off of an armed drone; empty if set-points are enough."""

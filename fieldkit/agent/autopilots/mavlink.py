@@ -53,6 +53,7 @@ class FlightRecording:
     Attributes:
         connection: Name of the connection to the autopilot; see `mavlink_links.open_link`.
         intervals_us: Requested interval by message id, which is a string because keys of JSON objects are strings.
+            The recorder waits only for messages whose interval is positive.
         system: System id of the autopilot; 0 for the autopilot whose heartbeat arrives first.
     """
 
@@ -72,6 +73,9 @@ class FlightRecorder:
         recording: Parameters of the recording.
         link: The connection to the autopilot.
         path: The log file.
+
+    Raises:
+        OSError: The log file cannot be created.
     """
 
     def __init__(self, recording: FlightRecording, link: SharedLink, path: str) -> None:
@@ -93,20 +97,23 @@ class FlightRecorder:
 
     @property
     def ready(self) -> bool:
-        """Whether each requested message was received, or refused by the autopilot. Once True, it stays True."""
+        """Whether each message with a positive interval was received, or refused by the autopilot.
+
+        Once True, it stays True.
+        """
         self._was_ready |= self._autopilot is not None and self._missing_kinds <= set(self._refusals)
         return self._was_ready
 
     def check(self) -> None:
-        """Check that the requested messages arrive within `_TIMEOUT_S` after the first heartbeat of the autopilot.
+        """Check that the recorder is `ready` within `_TIMEOUT_S` after the first heartbeat of the autopilot.
 
         Raises:
-            MissingMessageError: A message has not arrived in this time.
+            MissingMessageError: A message was neither received nor refused in this time.
         """
         if not self.ready and self._autopilot is not None and time.monotonic() - self._first_heartbeat_s > _TIMEOUT_S:
             missing_ids = ", ".join(str(kind) for kind in sorted(self._missing_kinds - set(self._refusals)))
             raise MissingMessageError(
-                f"the autopilot has not sent the requested message {missing_ids} in {_TIMEOUT_S:g} s "
+                f"the autopilot has not sent all requested messages in {_TIMEOUT_S:g} s; missing: {missing_ids} "
                 "(ids of https://mavlink.io/en/messages/common.html)"
             )
 
@@ -141,7 +148,10 @@ class FlightRecorder:
             self._missing_kinds.discard(message.kind)
 
     def send(self) -> None:
-        """Send heartbeats, and repeat each request for a message until the link server has registered it."""
+        """Send heartbeats, repeat each request for a message until the link server has registered it, update rates.
+
+        Must be called periodically.
+        """
         now_s = time.monotonic()
         if now_s >= self._next_heartbeat_s:
             self._next_heartbeat_s = now_s + _HEARTBEAT_INTERVAL_S
@@ -184,7 +194,8 @@ def record(recording: FlightRecording, path: str, stop_event: threading.Event) -
     Writes `up` to standard error when a heartbeat arrived and each requested message was received or refused.
 
     Raises:
-        OSError: The connection cannot be opened.
+        OSError: The connection cannot be opened, or the log cannot be written.
+        ValueError: The name of the connection is invalid.
         MissingMessageError: A requested message did not arrive.
     """
     link = open_link(recording.connection)

@@ -19,7 +19,7 @@ NO_AUTOPILOT = 8
 """MAV_AUTOPILOT_INVALID: in heartbeats of ground stations, cameras and loggers."""
 
 OWN_SYSTEM, OWN_COMPONENT = 254, 155
-"""System and component id of the recorder: a system id that no vehicle has, and MAV_COMP_ID_LOG."""
+"""System and component id of the recorder: a system id that vehicles do not usually have, and MAV_COMP_ID_LOG."""
 TYPE_LOG = 38
 """MAV_TYPE_LOG."""
 
@@ -51,9 +51,10 @@ CRC_EXTRA = {
 
 
 def frame_bytes(buffer: bytes | bytearray) -> int | None:
-    """Return the length of the frame at the start of a buffer, or None if its header is incomplete.
+    """Return the length of the frame at the start of a buffer; None if the buffer has less than 3 bytes.
 
-    The first byte must be a start marker of MAVLink 1 or 2 (mavlink.io, serialization).
+    The length depends on the first 3 bytes. The first byte must be a start marker of MAVLink 1 or 2 (mavlink.io,
+    serialization). The frame itself may be incomplete.
     """
     if len(buffer) < 3:
         return None
@@ -66,7 +67,7 @@ def frame_bytes(buffer: bytes | bytearray) -> int | None:
 def frames(buffer: bytearray) -> Iterator[bytes]:
     """Yield the complete frames of a buffer. The frames, and bytes outside of frames, are deleted from the buffer.
 
-    A frame is accepted only if another frame or the end of the buffer follows, because a stream may start in the
+    A frame is accepted only if a start marker or the end of the buffer follows, because a stream may start in the
     middle of a frame. An incomplete frame at the end stays in the buffer.
     """
     while buffer:
@@ -114,7 +115,10 @@ class FrameWriter:
         self._sequence = 0
 
     def frame(self, kind: int, payload: bytes) -> bytes:
-        """Return the next frame of MAVLink 2 with this message; trailing zeros of the payload are omitted."""
+        """Return the next frame of MAVLink 2 with this message.
+
+        Trailing zeros of the payload are omitted, except its first byte.
+        """
         payload = payload.rstrip(b"\0") or payload[:1]
         header = (len(payload), 0, 0, self._sequence, *self._address)
         self._sequence = (self._sequence + 1) % 256
@@ -122,7 +126,12 @@ class FrameWriter:
         return bytes((_MAGIC_2,)) + body + checksum(body + bytes((CRC_EXTRA[kind],))).to_bytes(2, "little")
 
     def heartbeat(self, vehicle: int = TYPE_LOG) -> bytes:
-        """Return a heartbeat, by default of a logger: no autopilot starts a failsafe when a logger stops."""
+        """Return a heartbeat of a component that is not an autopilot.
+
+        Args:
+            vehicle: MAV_TYPE of the sender. The default is a logger, so that an autopilot does not take the sender
+                for a ground station, whose loss may start a failsafe.
+        """
         return self.frame(HEARTBEAT, struct.pack("<IBBBBB", 0, vehicle, NO_AUTOPILOT, 0, _ACTIVE, _VERSION))
 
     def command(self, target: tuple[int, int], command: int, *parameters: float) -> bytes:

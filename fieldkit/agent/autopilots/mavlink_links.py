@@ -13,13 +13,13 @@ class FlightLink(Protocol):
 
     @property
     def messages(self) -> Mapping[int, MessageRate]:
-        """The requested messages, by id."""
+        """State of this program's requests for messages, by message id."""
 
     def fileno(self) -> int:
         """Return a file descriptor that is readable when frames have arrived. A reconnection does not change it."""
 
     def receive(self) -> Iterator[bytes]:
-        """Yield the frames that have arrived; bytes outside frames are ignored."""
+        """Yield frames that have arrived; bytes outside of frames are ignored."""
 
     def send(self, frame: bytes) -> None:
         """Send a frame; it is dropped if the connection is closed or busy.

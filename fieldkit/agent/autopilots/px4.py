@@ -34,13 +34,15 @@ _SUB = {
     _PRECLAND: "PRECLAND",
     10: "VTOL_TAKEOFF",
 }
-"""Main modes, and sub-modes of AUTO: bytes 2 and 3 of a custom mode (PX4, px4_custom_mode.h)."""
+"""Main modes (`_MAIN`, bits 16 to 23 of a custom mode), and sub-modes of AUTO (`_SUB`, bits 24 to 31); see
+px4_custom_mode.h of PX4."""
 
 
 class Px4:
     """Dialect of PX4.
 
-    PX4 takes off by set-points (target positions). If set-points are missing, it holds its position (COM_OF_LOSS_T).
+    In OFFBOARD, an armed PX4 takes off if its set-point (target position) is above the ground. If set-points are
+    missing for COM_OF_LOSS_T, it changes to the mode that COM_OBL_RC_ACT selects.
     """
 
     name = "PX4"
@@ -60,7 +62,7 @@ class Px4:
     def is_program_controlled(self, mode: int) -> bool:
         """Return True in OFFBOARD, AUTO.TAKEOFF, AUTO.MISSION and AUTO.LOITER.
 
-        PX4 selects AUTO.LOITER after each take-off and each move.
+        PX4 selects AUTO.LOITER after a commanded take-off, and to fly to a commanded position.
         """
         main, sub = _mode_parts(mode)
         return main == _OFFBOARD or (main == _AUTO and sub in (_TAKEOFF, _LOITER, _MISSION))
@@ -71,11 +73,19 @@ class Px4:
         return main == _AUTO and sub in (_RTL, _LAND, _PRECLAND)
 
     def is_failsafe_hold(self, mode: int) -> bool:
-        """Return True in AUTO.LOITER, the failsafe mode of PX4 without a remote control (COM_OBL_RC_ACT)."""
+        """Return True in AUTO.LOITER.
+
+        PX4 uses this mode if set-points are missing and COM_OBL_RC_ACT selects Hold or, depending on the version, a
+        mode that needs a remote control although none is connected. It also precedes other failsafe actions for the
+        time COM_FAIL_ACT_T.
+        """
         return _mode_parts(mode) == (_AUTO, _LOITER)
 
     def mode_name(self, mode: int) -> str:
-        """Return the name of a mode, for example `AUTO.LAND`, or its number if the mode is unknown."""
+        """Return the name of a mode, for example `AUTO.LAND`, or its number if the main mode is unknown.
+
+        An unknown sub-mode of AUTO has its number in the name: `AUTO.13`.
+        """
         main, sub = _mode_parts(mode)
         if main not in _MAIN:
             return str(mode)
@@ -86,7 +96,7 @@ class Px4:
         return (SET_MODE, CUSTOM_MODE, _OFFBOARD)
 
     def take_off_commands(self, height_m: float, climb_m_s: float) -> Sequence[Command]:  # noqa: ARG002
-        """Return no commands, because PX4 takes off by set-points."""
+        """Return no commands: PX4 takes off when a set-point is above the ground."""
         return ()
 
     def bring_down_command(self, action: str) -> Command:

@@ -28,14 +28,14 @@ RATE_HZ = 20.0
 _MIN_STOP_S = 0.5
 """Minimum time for which zero velocities are published at the end, because a single message may be lost."""
 _MAX_STOP_S = 1.5
-"""Maximum time for which zero velocities are published while odometry shows that the robot still moves."""
+"""Maximum time for which zero velocities are published if odometry does not show that the robot is stationary."""
 _TIMEOUT_S = 15.0
 """Timeout for a subscription to the velocity topic, and for the first odometry."""
 _LOG_INTERVAL_S = 0.1
 
 
 def drive(middleware: Middleware, arguments: Mapping[str, Any], log: Path, stop_event: threading.Event) -> str:
-    """Drive until the robot is back at its origin, a limit stops it, or `stop_event` is set.
+    """Drive until the robot is back at its origin, a limit or the order `end` stops it, or `stop_event` is set.
 
     Args:
         middleware: The started middleware.
@@ -43,7 +43,7 @@ def drive(middleware: Middleware, arguments: Mapping[str, Any], log: Path, stop_
             a header); `task`, the `DriveTask`; `orders`, the file that the laptop writes; `status`, the file with the
             progress, which the laptop reads; `stationary`, a file that is created when the robot is stationary at the
             end (optional); `cdr`, True if messages are encoded in CDR as in ROS 2, False for ROS 1.
-        log: The log file: a line of JSON ten times per second.
+        log: The log file: a line of JSON ten times per second while the robot is on its path, and a last line.
         stop_event: Set when the drive must end.
 
     Returns:
@@ -51,7 +51,7 @@ def drive(middleware: Middleware, arguments: Mapping[str, Any], log: Path, stop_
 
     Raises:
         MiddlewareError: The velocity topic has no subscription, or no odometry arrives.
-        OSError: The log cannot be written; the robot was stopped.
+        OSError: The log or the status file cannot be written; the robot was stopped if it was driving.
     """
     cdr = bool(arguments["cdr"])
     command = Topic.from_json(arguments["command"])
@@ -120,7 +120,8 @@ def _wait_for_subscription(
     """Wait until the base of the robot has subscribed to the velocity topic.
 
     Raises:
-        MiddlewareError: The base has not subscribed; the message lists the types of the topic's other endpoints.
+        MiddlewareError: The base has not subscribed in time, or `stop_event` is set. If the topic has endpoints of
+            other types, the message lists these types.
     """
     if _wait_until(lambda: publisher.matched() > 0, stop_event):
         return
@@ -132,7 +133,7 @@ def _wait_for_subscription(
 
 
 def _wait_until(condition: Callable[[], bool], stop_event: threading.Event) -> bool:
-    """Return True when the condition is true, False after `_TIMEOUT_S` or a signal."""
+    """Return True when the condition is true, False after `_TIMEOUT_S` or when `stop_event` is set."""
     deadline_s = time.monotonic() + _TIMEOUT_S
     while not condition():
         if stop_event.wait(0.02) or time.monotonic() > deadline_s:
@@ -170,9 +171,10 @@ def _report(
 ) -> None:
     """Write the state of the drive to the status file for the laptop, and to the log while the robot is on its path.
 
-    The status also contains `pose`, the pose in the frame of the odometry; `frame_id`, the boot ID, which identifies
-    this frame because odometry restarts at each boot; `ready`, True if the robot is stationary and may start; and
-    `refused`, True if it did not start because it is not at the required place.
+    The last state, which has an `end_reason`, is written to the log in any phase. Nothing is written before the
+    origin is known. The status also contains `pose`, the pose in the frame of the odometry; `frame_id`, the boot ID,
+    which identifies this frame because odometry restarts at each boot; `ready`, True if the robot is stationary and
+    may start; and `refused`, True if it did not start because it is not at the required place.
     """
     relative_pose, pose = driver.relative_pose, driver.pose
     if relative_pose is None or pose is None:

@@ -60,7 +60,7 @@ class VelocityEncoder:
 
 
 def read_odometry(data: bytes, *, cdr: bool) -> OdometryPose | None:
-    """Return the pose in a serialized `nav_msgs/Odometry`, or None if the data are invalid.
+    """Return the pose in a serialized `nav_msgs/Odometry`; None if the data are invalid or a value is not finite.
 
     The pose follows a header (in ROS 1 with a sequence number before the time), the frame id of the header and the
     child frame id. Strings follow their length.

@@ -41,7 +41,7 @@ class DriveTask:
 
     Attributes:
         legs: Distances ahead and to the left per leg, relative to the heading at the origin, in metres.
-        speed_m_s: Its speed.
+        speed_m_s: Maximum speed.
         turn_rad_s: Maximum turn rate.
         acceleration_m_s2: Maximum acceleration.
         fence_m: Maximum distance from its origin.
@@ -74,7 +74,7 @@ class DriveTask:
 
 
 def path_duration_s(task: DriveTask) -> float:
-    """Return the duration of the path in seconds, for a base that follows commands without delay."""
+    """Return the duration of the path out in seconds, for a base that follows commands without delay."""
     heading_rad, duration_s = 0.0, 0.0
     for ahead_m, left_m in task.legs:
         leg_heading_rad = math.atan2(left_m, ahead_m)

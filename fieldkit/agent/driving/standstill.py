@@ -15,7 +15,7 @@ _MOVED_M, _TURNED_RAD = 0.005, 0.02
 
 
 class Standstill:
-    """Compares the newest pose with the poses of the last `WINDOW_S`."""
+    """Compares the newest pose with the poses of the last `WINDOW_S`, and with the last pose before this window."""
 
     def __init__(self) -> None:
         self._poses: deque[tuple[float, OdometryPose]] = deque()

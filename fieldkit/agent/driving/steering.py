@@ -107,7 +107,7 @@ class Driver:
 
     @property
     def relative_pose(self) -> OdometryPose | None:
-        """The robot's pose relative to its origin; None before the first odometry."""
+        """The robot's pose relative to its origin; None before the first odometry, or before the origin is known."""
         return None if self._origin is None or self._pose is None else _relative_pose(self._origin, self._pose)
 
     @property
@@ -136,7 +136,10 @@ class Driver:
 
     @property
     def remaining_m(self) -> float:
-        """Distance to the origin in the phases `back` and `home`, otherwise to the last corner of the path."""
+        """Distance to the origin in the phases `back` and `home`, otherwise to the last corner of the path.
+
+        It is infinite while `relative_pose` is None.
+        """
         relative_pose, goal = self.relative_pose, self._corners[0 if self.phase in ("back", "home") else -1]
         return (
             math.inf
@@ -145,7 +148,7 @@ class Driver:
         )
 
     def on_odometry(self, now_s: float, pose: OdometryPose) -> None:
-        """Process a pose; a pose with a value that is not finite is ignored."""
+        """Process a pose; a pose with a value that is not finite is ignored. A jump of the pose stops the robot."""
         if not all(map(math.isfinite, pose)):
             return
         if self._pose is not None:
@@ -313,7 +316,10 @@ class Driver:
         self.phase, self._phase_s, self._turning = BACK, now_s, True
 
     def _desired_velocity(self, relative_pose: OdometryPose) -> DriveVelocity:
-        """Return the desired velocity before limits are applied; at the end of a leg, select the next one."""
+        """Return the desired velocity before limits are applied.
+
+        At the end of a leg, select the next one; at the end of the last leg, start the next phase.
+        """
         if self.phase in (_WAITS, "there", "home"):
             return ZERO_VELOCITY
         while self._legs:

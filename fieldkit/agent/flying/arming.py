@@ -50,7 +50,7 @@ _SENSORS = {
     0x1000000: "logging",
     0x2000000: "battery",
 }
-"""Bits of MAV_SYS_STATUS_SENSOR for sensors that an operator can repair."""
+"""Bits of MAV_SYS_STATUS_SENSOR for sensors and functions whose fault an operator can remove."""
 _PREFIXES = ("PreArm: ", "Preflight Fail: ")
 """Prefixes of the texts in which ArduPilot and PX4 report why they cannot be armed."""
 
@@ -113,7 +113,7 @@ class ArmingCheck:
             drone.commands.request_parameter(name)
 
     def _missing_parameters(self) -> list[str]:
-        """Return the names of the requested parameters that the autopilot has not reported."""
+        """Return the names of the needed parameters, with all alternative names of each that was not reported."""
         dialect = self._drone.dialect
         alternatives = [names.split("|") for names in dialect.limit_parameters] if dialect else []
         reported_names = self._drone.parameters.keys()
@@ -123,7 +123,7 @@ class ArmingCheck:
     def is_starting(self) -> bool:
         """Whether the position estimate or the required home position is not ready yet.
 
-        Both are ready about 30 s after power-on.
+        With good reception of satellites, both are ready about 30 s after power-on.
         """
         reports_no_estimate = any(_NO_ESTIMATE in text for text in self._drone.texts.warnings)
         return self._drone.dialect is not None and (reports_no_estimate or any(self._position_faults()))
@@ -224,9 +224,10 @@ class ArmingCheck:
 
 
 def check_arming(connection: str, needs: FlightNeeds, stop_event: threading.Event) -> int:
-    """Check an autopilot, print the result as JSON, and return the exit code.
+    """Check an autopilot, print the result as JSON, and return the exit code: 1 without a heartbeat, else 0.
 
-    Each line is a JSON object: one per fault, then the summary with the family and the charge of the autopilot.
+    Each line is a JSON object: one per fault, then the summary with the family of the autopilot and the charge of its
+    battery.
 
     Raises:
         OSError: The connection cannot be opened.

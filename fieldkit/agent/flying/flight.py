@@ -3,9 +3,10 @@
 The laptop writes orders to a file. Each order has a lease, the number of seconds for which it is valid. This program
 is the pilot. A second program on the drone, the guard (`flying.guard`), lands the drone if the pilot stops.
 
-The pilot lands the drone, or lets it return and land as its plan requires, in three cases: an order is not renewed in
-time because the laptop or its link is lost, a signal cancels the job, or the guard stops. If set-points are missing,
-the autopilot reacts: PX4 has a failsafe (COM_OF_LOSS_T, COM_OBL_RC_ACT); ArduCopter holds its position.
+The pilot lands the drone, or lets it return and land as its plan requires, if the flight cannot continue. Examples:
+an order is not renewed in time because the laptop or its link is lost, a signal cancels the job, the guard stops, or
+the drone is outside its fence. It sends nothing to a drone that a person or another program flies. If set-points are
+missing, the autopilot reacts: PX4 has a failsafe (COM_OF_LOSS_T, COM_OBL_RC_ACT); ArduCopter holds its position.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ class OffboardPilot:
         """Fly according to the orders.
 
         Raises:
-            FlightError: The flight was aborted; the drone has landed if the pilot may control it.
+            FlightError: The flight was aborted. If the drone was flying, it has landed, or an alarm is in the log.
         """
         try:
             self._fly()
@@ -104,9 +105,9 @@ class OffboardPilot:
             self._loop.session.close()
 
     def _abort_flight(self, error: Exception) -> None:
-        """Land the drone after an error, unless a person or another program flies it.
+        """Land the drone, or let it return and land, after an error, unless a person or another program flies it.
 
-        An alarm is logged if the drone does not land.
+        An alarm is logged if the drone does not land, or if a person or another program flies it.
 
         Raises the same errors as `bring_down`.
         """
@@ -166,7 +167,8 @@ class OffboardPilot:
         """Return the origin in the coordinate frame that the autopilot has used since it was started.
 
         Raises:
-            FlightError: The drone is not at the origin of its trial, or it cannot be determined whether it is there.
+            FlightError: The drone is not at the origin of its trial, it cannot be determined whether it is there, or
+                its heading is unknown.
         """
         drone, start_s = self._drone, time.monotonic()
         self._loop.run_until(
@@ -184,7 +186,10 @@ class OffboardPilot:
             raise FlightError(REFUSED, str(error)) from error
 
     def _take_off(self, dialect: FlightDialect, start_m: Position, top_m: Position) -> None:
-        """Arm the drone if its checks pass, rise vertically, then fly to the first point of the path."""
+        """Arm the drone if its checks pass, rise vertically, fly to the first point of the path, and wait there.
+
+        Return after the order `go`, or early after the order `home`.
+        """
         loop, drone, start_s = self._loop, self._drone, time.monotonic()
         commands = dialect.take_off_commands(self._plan.height_m, self._plan.climb_m_s)
         start_set_point = None if commands else lambda: start_m
@@ -226,7 +231,7 @@ class OffboardPilot:
             raise FlightError(REFUSED, reasons)
 
     def _climb_by_commands(self, commands: Sequence[Command], start_m: Position) -> None:
-        """Command the take-off, and wait until the drone is near the target height.
+        """Command the take-off, and wait until the drone is near the target height or the order `home` arrives.
 
         Only the last command must be accepted.
         """
@@ -256,7 +261,7 @@ class OffboardPilot:
         return int(command) in self._drone.command_results
 
     def _fly_path(self, corners_m: Sequence[Position]) -> None:
-        """Fly the path, and wait at its end for the order `home`."""
+        """Fly the path, and wait at its end for the order `home`, which also ends the flight on the path."""
         loop, start_s, has_arrived = self._loop, time.monotonic(), False
         if loop.orders.order == GO:
             self._start_phase(ON_PATH)

@@ -44,7 +44,8 @@ class FlightLog:
     def note(self, drone: AutopilotState) -> None:
         """Write position, speed and mode of the drone, and the rate at which it reports positions.
 
-        Do nothing before `begin`, and if the autopilot has not reported its position recently.
+        Do nothing before `begin`, before the first phase, and if the autopilot has not reported its position
+        recently.
         """
         if self._lines is None or self._origin is None or drone.position_m is None or not self.phase:
             return

@@ -9,7 +9,8 @@ from typing import Any, Mapping, Sequence
 from fieldkit.agent.flying.origin import FlightOrigin, Position
 
 STAY, CLIMB, GO, HOME, LEAVE = "stay", "climb", "go", "home", "leave"
-"""Orders: wait, climb to the height, fly the path, land, and stop the program without a command to the drone."""
+"""Orders: wait (`stay`), climb to the height, fly the path (`go`), end the flight as the plan requires and land
+(`home`), and stop the program without a command to the drone (`leave`)."""
 
 ON_GROUND, CLIMBING, AT_PATH_START, ON_PATH = "standing", "climbing", "up", "flying"
 AT_PATH_END, RETURNING, DESCENDING = "there", "coming back", "coming down"
@@ -31,7 +32,7 @@ class FlightNeeds:
     Attributes:
         highest_m: Maximum height of the flight above the ground at its start.
         farthest_m: Maximum horizontal distance of the flight from its origin.
-        ceiling_m: Maximum allowed height.
+        ceiling_m: Maximum allowed height above the ground at the start of the flight.
         least_charge: Minimum charge of the battery, from 0 to 1.
         returns: Whether the drone must return automatically if the flight is aborted.
     """

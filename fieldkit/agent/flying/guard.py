@@ -2,7 +2,7 @@
 
 The guard of a step `fly` acts only during a flight of its pilot, and only in the mode that the pilot has set. The
 guard of a drone that other programs fly acts in all modes in which programs control a drone. If the drone is already
-flying when the guard starts, the guard also acts in the current mode, until the mode changes for the first time. In
+armed when the guard starts, the guard also acts in the current mode, until the mode changes for the first time. In
 all other modes a person or a failsafe of the autopilot controls the drone, and the guard sends nothing.
 """
 
@@ -51,7 +51,7 @@ class FlightGuard:
         self._drone = self._session.drone
         self._orders = Orders(plan.orders, (STAY, LEAVE), plan.lease_s)
         self._iteration_s: float | None = None
-        # The mode of a drone that was already flying at the start of the guard; None after the first change of mode.
+        # The mode of a drone that was already armed at the start of the guard; None after the first change of mode.
         self._first_mode: int | None = None
         self._mode_name = ""
 
@@ -59,7 +59,8 @@ class FlightGuard:
         """Guard the drone until the order `leave`.
 
         Raises:
-            FlightError: The flight was aborted; the drone has landed if the guard may control it.
+            FlightError: The flight was aborted. If the guard may control the drone, it has landed, or an alarm is in
+                the log.
         """
         try:
             log_line(f"waiting for the heartbeat of an autopilot at {self._plan.connection}")
@@ -100,7 +101,7 @@ class FlightGuard:
             self._exchange()
 
     def _require_pilot(self) -> None:
-        """Raise `FlightError` if the pilot has stopped during its flight."""
+        """If the pilot has stopped during its flight, kill it, so that it stays stopped, and raise `FlightError`."""
         if self._liveness is None:
             return
         problem = self._liveness.poll()

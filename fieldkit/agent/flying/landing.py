@@ -24,13 +24,13 @@ program flies the drone (6); the job was cancelled (7); the guard has stopped, o
 RETRY_S = 0.4
 """Retry interval of a command without an answer."""
 COMMAND_TIMEOUT_S = 5.0
-"""Time within which an autopilot must execute a command."""
+"""Maximum time until an autopilot executes a command, which is sent repeatedly."""
 _POLL_S = 0.1
 _MODE_WAIT_S = 0.3
 """Maximum wait for a heartbeat before the first command, because the last heartbeat may be older than a takeover by a
 person."""
 _LANDING_TIMEOUT_S = 600.0
-"""Maximum time between the first command to come down and the stop of the motors."""
+"""Maximum time between a call of `bring_down` and the stop of the motors."""
 NO_HEARTBEAT_S = 60.0
 """Time for which commands are sent although no heartbeat arrives, because a lost connection may be restored."""
 
@@ -56,13 +56,14 @@ def bring_down(
 ) -> None:
     """Command a drone to `land` or `return`, and wait until its motors have stopped.
 
-    If the drone does not obey the command `return`, it is commanded to land.
+    If the drone does not obey the command `return` within `COMMAND_TIMEOUT_S`, it is commanded to land.
 
-    Commands are sent only while `may_command` returns True: in the modes in which fieldkit controls the drone. The
-    first command waits for a new heartbeat, because the mode may have changed since the last heartbeat. A drone that
-    lands or returns automatically is only monitored. An autopilot without heartbeats may still receive commands, and
-    the connection may be restored: for `NO_HEARTBEAT_S` its last reported mode is assumed, and commands are sent. A
-    missing heartbeat causes an alarm in the log.
+    Commands are sent only while `may_command` returns True: in the modes in which fieldkit controls the drone. Before
+    the first command, it waits up to `_MODE_WAIT_S` for a new heartbeat, because the mode may have changed since the
+    last one. A drone that lands or returns automatically, or whose unknown autopilot has accepted the command, is
+    only monitored. An autopilot without heartbeats may still receive commands, and the connection may be restored:
+    for `NO_HEARTBEAT_S` its last reported mode is assumed, and commands are sent. A missing heartbeat causes an alarm
+    in the log.
 
     Args:
         session: The session with its autopilot.
@@ -119,12 +120,12 @@ def _wait_for_mode(session: AutopilotSession, each_iteration: Callable[[], None]
 
 
 def alarm(drone: AutopilotState) -> str:
-    """Return the alarm text for a flight that ended without a landing, with the last known state and what to do."""
+    """Return the alarm text for a drone that may be in the air, with its last known state and what to do."""
     position_text = "ITS POSITION IS UNKNOWN"
     if drone.last_position_m is not None:
         north_m, east_m, down_m = drone.last_position_m
         position_text = (
-            f"LAST KNOWN {drone.position_age_s:.0f} S AGO {north_m:.1f} M NORTH, {east_m:.1f} M EAST, "
+            f"LAST POSITION {drone.position_age_s:.0f} S AGO: {north_m:.1f} M NORTH, {east_m:.1f} M EAST, "
             f"{-down_m:.1f} M UP IN ITS LOCAL FRAME"
         )
     heartbeat = "NO HEARTBEAT"

@@ -98,7 +98,8 @@ class LivenessFile:
         """Check the other program; must be called in each iteration.
 
         Returns:
-            The reason why it does not run, for example `has ended`; empty while it runs.
+            The reason why it does not run, for example `has ended` (also before its first `update`); empty while it
+            runs.
         """
         pid, start_ticks, count, _ = self._other_entry()
         now_s = time.monotonic()

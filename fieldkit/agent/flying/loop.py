@@ -27,9 +27,9 @@ from fieldkit.agent.flying.session import AutopilotSession
 from fieldkit.agent.orders import Orders
 
 RATE_HZ = 10.0
-"""Rate of iterations, of set-points, and of the requested reports."""
+"""Rate of iterations, of set-points, and of the reports in `_STREAMS`."""
 GAP_S = 1.0
-"""Maximum time between two iterations. After a longer gap, for example after SIGSTOP, the flight is aborted."""
+"""Maximum time between two iterations in flight. After a longer gap, for example after SIGSTOP, it is aborted."""
 HEARTBEAT_S = 6.0
 """Timeout for the first heartbeat of the autopilot."""
 
@@ -53,12 +53,12 @@ class FlightLoop:
         drone: The state of the autopilot.
         orders: The orders of the laptop; their lease begins with the first heartbeat of the autopilot.
         state: The state of this program, for its guard.
-        yaw_rad: The heading of all set-points.
+        yaw_rad: The heading of all set-points; 0 before the origin is known.
         fence: The fence; None before the origin is known.
         has_armed: Whether the motors were armed for this flight.
 
     Raises:
-        OSError: The connection cannot be opened.
+        OSError: The connection or the liveness file cannot be opened.
     """
 
     def __init__(self, plan: FlightPlan, stop_event: threading.Event, note: Callable[[AutopilotState], None]) -> None:
@@ -152,7 +152,8 @@ class FlightLoop:
             set_point: Returns the next set-point; None for no set-points.
 
         Raises:
-            FlightError: The command was not executed in time; the message contains the autopilot's last text.
+            FlightError: The command was not executed in time, and the message contains the autopilot's last text; or
+                for the same reasons as in `iterate`.
         """
         start_s, retry_s = time.monotonic(), 0.0
         for _ in self.iterate(set_point):
@@ -165,7 +166,7 @@ class FlightLoop:
                 send_command()
 
     def _require_no_gap(self) -> None:
-        """Raise `FlightError` if this program was suspended or delayed for longer than `GAP_S`."""
+        """Raise `FlightError` if this program was suspended or delayed for longer than `GAP_S` in flight."""
         previous_s, self._iteration_s = self._iteration_s, time.monotonic()
         if self.state == FLYING and previous_s is not None and (gap_s := self._iteration_s - previous_s) > GAP_S:
             raise FlightError(LEASE_EXPIRED, f"the pilot did not run for {gap_s:.1f} s")
@@ -176,7 +177,10 @@ class FlightLoop:
             raise FlightError(PEER_STOPPED, f"the guard {problem}")
 
     def _require_control(self) -> None:
-        """Raise `FlightError` unless the autopilot follows set-points and the drone is inside the fence."""
+        """Raise `FlightError` in flight, unless the drone follows set-points, reports its state, and is in the fence.
+
+        Motors, position and fence are checked only after the motors were armed.
+        """
         drone = self.drone
         if self.state != FLYING:
             return

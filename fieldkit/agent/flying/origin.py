@@ -109,7 +109,7 @@ def resolve_origin(recorded_origin: FlightOrigin | None, start: FlightOrigin) ->
         start: Current position and heading of the drone.
 
     Raises:
-        OriginError: The drone is more than `START_M` from the origin, or the distance is unknown.
+        OriginError: The drone is more than `START_M` from the origin, or its distance from the origin is unknown.
     """
     if recorded_origin is None:
         return start

@@ -12,14 +12,17 @@ _CHUNK = struct.Struct("<HB")
 
 
 class AutopilotTexts:
-    """The last texts of STATUSTEXT messages that are at least as severe as `NOTICE`."""
+    """The last `_MAX_TEXTS` texts of STATUSTEXT messages that are at least as severe as `NOTICE`."""
 
     def __init__(self) -> None:
         self._texts: list[tuple[int, str]] = []
         self._last_id = self._count = self._read_count = 0
 
     def add_message(self, payload: bytes) -> None:
-        """Add a message. A long text arrives in chunks with the same id (STATUSTEXT, id and chunk_seq)."""
+        """Add a message, unless it is less severe than `NOTICE`.
+
+        A long text arrives in chunks with the same id (STATUSTEXT, id and chunk_seq).
+        """
         # The payload has the severity (1 byte), a text of 50 bytes, the id and chunk_seq.
         text = printable(payload[1:51].split(b"\0")[0].decode("utf-8", "replace"))
         message_id, chunk_index = _CHUNK.unpack_from(payload, 51)
@@ -35,7 +38,7 @@ class AutopilotTexts:
         self._last_id = message_id
 
     def unread(self) -> list[str]:
-        """Return the texts that have arrived since the last call."""
+        """Return the stored texts that have arrived since the last call."""
         count, self._read_count = min(self._count - self._read_count, len(self._texts)), self._count
         return [text for _, text in self._texts[len(self._texts) - count :]]
 

@@ -27,7 +27,7 @@ _ALARM_DELAY_S = 4.0
 
 
 def rescue(plan: FlightPlan) -> None:
-    """Kill the pilot and the guard, and land the drone if it is still in the mode that they have set.
+    """Kill the pilot and the guard, and land the drone if it is still under their control (`is_under_control`).
 
     The file with the laptop's orders to the pilot is not read.
 
@@ -35,8 +35,8 @@ def rescue(plan: FlightPlan) -> None:
         plan: A plan with the liveness file that the pilot and the guard share.
 
     Raises:
-        FlightError: No heartbeat arrived for `NO_HEARTBEAT_S`, a person or another program flies the drone, or it did
-            not land.
+        FlightError: The connection could not be opened, or no heartbeat arrived, in `NO_HEARTBEAT_S`; a person or
+            another program flies the drone; or it did not land.
         OSError: The liveness file cannot be opened.
         ValueError: The name of the connection is invalid.
     """

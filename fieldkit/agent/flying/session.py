@@ -40,7 +40,10 @@ class AutopilotSession:
         self._next_heartbeat_s = 0.0
 
     def exchange(self, duration_s: float) -> None:
-        """Receive and send messages for this time in seconds; 0 s receives the messages that have arrived."""
+        """Send a heartbeat if it is due, and receive messages for this time in seconds.
+
+        With 0 s, it receives at most one packet of the link server, if one has arrived.
+        """
         end_s = time.monotonic() + duration_s
         if time.monotonic() > self._next_heartbeat_s:
             self._next_heartbeat_s = time.monotonic() + _HEARTBEAT_INTERVAL_S

@@ -20,7 +20,7 @@ from fieldkit.agent.links import devices, link_files
 from fieldkit.agent.links.server import ALIVE, FRAMES, STATE
 
 OPEN_TIMEOUT_S = 3.0
-"""Timeout for opening a connection when a client starts; a router restarts in 2 s."""
+"""Timeout for opening a connection when a client starts, after the start of its server; a router restarts in 2 s."""
 
 _ROOT = os.path.abspath(os.path.join(os.path.dirname(__file__), "..", "..", ".."))  # noqa: PTH100, PTH118, PTH120
 """The archive of the agent, or the parent folder of `fieldkit`; absolute, because the working folder may change."""
@@ -62,9 +62,9 @@ class SharedLink:
 
     Attributes:
         lost_since_s: Monotonic time since which the connection is closed; None while it is open.
-        error: Number and text of the last error.
+        error: Number and text of the last error; 0 and an empty text if there was none.
         dropped_frames: Number of frames from the autopilot that were dropped because this program was too slow.
-        restarts: Number of replaced servers.
+        restarts: Number of servers whose connection to this program has ended.
         messages: State of this program's requests for messages, by message id.
     """
 
@@ -102,7 +102,7 @@ class SharedLink:
         """Connect to the link server, and wait until the connection to the autopilot is open.
 
         Raises:
-            OSError: It cannot be opened within `OPEN_TIMEOUT_S`.
+            OSError: The server cannot be started, or the connection is not open after `OPEN_TIMEOUT_S`.
         """
         self._connect()
         self._thread.start()
@@ -118,7 +118,7 @@ class SharedLink:
         return self._frames_out.fileno()
 
     def receive(self) -> Iterator[bytes]:
-        """Yield the frames that have arrived."""
+        """Yield the frames of the next packet that has arrived, if any."""
         data = b""
         with suppress(BlockingIOError):
             data = self._frames_out.recv(devices.MAX_BYTES + 1)
@@ -197,7 +197,7 @@ class SharedLink:
             self.lost_since_s = state["lost_since_s"]
 
     def _is_dead(self) -> bool:
-        """Return True if the server does not answer, or is suspended."""
+        """Return True if the server has not answered for `_TIMEOUT_S`, or is suspended and does not answer."""
         silent_s = time.monotonic() - self._last_answer_s
         return silent_s > _TIMEOUT_S or (silent_s > _SUSPENDED_TIMEOUT_S and self._is_suspended())
 
@@ -264,7 +264,11 @@ class SharedLink:
         return server
 
     def _start(self) -> None:
-        """Start a server, unless the connection has a server; return when it is ready or has failed."""
+        """Start a server, unless the connection has a server; return when it is ready or has failed.
+
+        Raises:
+            OSError: The program that starts the server has failed.
+        """
         request = json.dumps({"connection": self._connection})
         path = os.pathsep.join(filter(None, (_ROOT, os.environ.get("PYTHONPATH", ""))))
         completed = subprocess.run(

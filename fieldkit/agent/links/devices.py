@@ -61,7 +61,7 @@ def check(connection: str) -> None:
     kind, _, suffix = connection.partition(":")
     if kind.startswith("/"):
         if not suffix.isdigit() or not hasattr(termios, f"B{int(suffix)}"):
-            raise ValueError(f"{kind} does not support {suffix} baud")
+            raise ValueError(f"{connection} has no valid baud rate; write for example {kind}:57600")
         return
     host, _, port = suffix.rpartition(":")
     if kind not in ("tcp", "udpout", "udpin"):

@@ -21,12 +21,12 @@ RETRY_RESULTS = (1, 5)
 """MAV_RESULT_TEMPORARILY_REJECTED and MAV_RESULT_IN_PROGRESS: the request may be accepted later."""
 _ANSWER_TIMEOUT_S = 0.4
 _MIN_PAUSE_S, _MAX_PAUSE_S = 0.5, 8.0
-"""Bounds of the time between two requests for the same message."""
+"""Bounds of the time between two requests for the same interval of a message that the autopilot has answered."""
 _MIN_FRACTION = 0.7
 """A message with less than this fraction of the requested rate is requested again: 4 Hz instead of 5 Hz may be jitter
 or loss, but 4 Hz instead of 10 Hz is not."""
 _SILENT_INTERVALS = 3
-"""A message that does not arrive for this number of its intervals is requested again."""
+"""A message that does not arrive for this number of its intervals, and for `_MIN_PAUSE_S`, is requested again."""
 _WINDOW_INTERVALS = 10
 _WINDOW_S = 1.0
 """The rate of a message is measured in a window of `_WINDOW_INTERVALS` intervals, but at least `_WINDOW_S`."""
@@ -45,7 +45,8 @@ class MessageInterval:
     Attributes:
         requested_us: Requested interval of each client in microseconds.
         result: MAV_RESULT of the last answer; None before the first one.
-        set_us: Interval of the last answered request; None before the first one.
+        set_us: Interval of the last answered request; None if the request must be sent again in any case: before the
+            first answer, after the connection was reopened, and after a new request for a refused message.
         tries: Number of requests since the last answer.
         due_s: Time of the next request.
         pause_s: Time until a request for the same interval is repeated.
@@ -137,7 +138,7 @@ class MessageIntervals:
 
     @property
     def settled(self) -> bool:
-        """Whether each request was answered."""
+        """Whether the autopilot has answered a request for the current interval of each message."""
         return all(message.interval_us == message.set_us for message in self._messages.values())
 
     def request(self, client: Hashable, target: Target, kind: int, interval_us: int) -> None:

@@ -1,7 +1,7 @@
-"""Files of a link server: a Unix-domain socket and a lock file in a private folder.
+"""Files of a link server: a Unix-domain socket, a lock file and a log of errors in a private folder.
 
-The names of both are a hash of the connection, the network namespace and the boot ID, so that connections of
-different robots with a shared home folder, or of containers, are not confused.
+Their names contain a hash of the connection, the network namespace and the boot ID, so that connections of different
+robots with a shared home folder, or of containers, are not confused.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def folder() -> str:
 
 
 def name(connection: str) -> str:
-    """Return the file name of a connection, without suffix."""
+    """Return the file name of a connection, without suffix: the first 16 hexadecimal digits of the hash."""
     with open("/proc/sys/kernel/random/boot_id", encoding="ascii") as file:  # noqa: PTH123
         boot_id = file.read().strip()
     network_namespace = os.stat("/proc/self/ns/net").st_ino  # noqa: PTH116

@@ -42,7 +42,7 @@ _COMMAND = struct.Struct("<7fHBB")
 _COMMAND_ACK = struct.Struct("<HB5xBB")
 _POLL_S = 0.02
 _LINGER_S = 1.0
-"""Maximum time for which the server runs after its last client has disconnected."""
+"""Maximum time for which the server runs without clients, at its start or after the last one has disconnected."""
 _FIRST_PAUSE_S, _MAX_PAUSE_S = 0.1, 0.5
 """Bounds of the time between two attempts to open the connection."""
 _SILENT_S = 5.0
@@ -61,7 +61,7 @@ class SharedDevice:
         connection: Name of the connection.
 
     Attributes:
-        error: Number and text of the last error.
+        error: Number and text of the last error; 0 and an empty text if there was none.
         lost_since_s: Monotonic time since which the connection is closed; None while it is open.
     """
 
@@ -108,7 +108,7 @@ class SharedDevice:
             self._open_results.append(error)
 
     def receive(self) -> list[bytes]:
-        """Return the frames that have arrived."""
+        """Return the frames of the next read; empty if the connection is closed."""
         if self._device is None:
             return []
         try:
@@ -159,6 +159,7 @@ class LinkClient:
         stream: The socket that is connected to the client.
 
     Attributes:
+        stream: The socket.
         dropped_frames: Number of frames that were dropped because the client was too slow.
     """
 

@@ -31,7 +31,7 @@ from fieldkit.agent.messaging.middleware import Deliver, MiddlewareError, Networ
 
 MAX_BLOCKING_NS = 1_000_000_000
 """`max_blocking_time` of reliable writers: a write may block for this time if a reader is too slow and all samples
-are kept. ROS 2 has no limit."""
+are kept. rmw_cyclonedds_cpp has no limit."""
 
 _ANY_STATE = SampleState.Any | ViewState.Any | InstanceState.Any
 _BATCH = 256

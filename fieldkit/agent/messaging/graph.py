@@ -24,7 +24,11 @@ _GUID_BYTES = 16
 
 
 def topic(gid_bytes: int = GID_BYTES) -> Topic:
-    """Return the topic with its DDS names, which have no prefix because no node publishes it."""
+    """Return the topic. Its DDS name has no prefix `rt/`, because it belongs to no node.
+
+    Args:
+        gid_bytes: Length of a GID.
+    """
     members: dict[str, list[tuple[str, str, int | None]]] = {
         "ParticipantEntitiesInfo": [("gid", "Gid", None), ("node_entities_info_seq", "NodeEntitiesInfo", 0)],
         "Gid": [("data", "uint8", gid_bytes)],

@@ -17,7 +17,7 @@ ADAPTERS = ("dds", "zenoh", "ros1", "ros2")
 
 
 class MiddlewareError(Exception):
-    """The middleware is missing, or refused a request."""
+    """A middleware, a video pipeline or a connection to an autopilot cannot be used; the text is for the operator."""
 
 
 @dataclass(frozen=True)

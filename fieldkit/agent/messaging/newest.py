@@ -1,4 +1,4 @@
-"""The newest sample. A program such as the control loop of a robot, or a display, reads it periodically."""
+"""Log periodic reads of the newest received sample, as a control loop of a robot or a display reads it."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ class NewestSample:
 def logged_reads(newest: NewestSample, rate_hz: float, log: Log, stop_event: threading.Event) -> Iterator[None]:
     """Read the newest sample at a rate, and log each read, while the body runs; do nothing if the rate is 0.
 
-    A read whose scheduled time has passed is skipped.
+    If a read takes longer than a period, the reads whose scheduled times have passed meanwhile are skipped.
 
     Args:
         newest: The newest sample.
         rate_hz: Reads per second.
         log: The log.
-        stop_event: Set if the log cannot be written.
+        stop_event: Set by this function if the log cannot be written.
 
     Raises:
-        LogError: For the same reasons as `Log.note`.
+        LogError: After the body, for the same reasons as `Log.note`.
     """
     if rate_hz <= 0:
         yield

@@ -28,13 +28,13 @@ SAMPLE = 1
 """A sample; the send time is the time in the sample. The local time is the time after the middleware accepted the
 sample (publisher), or its time of arrival (subscriber)."""
 DISCOVERY_STARTED = 2
-"""The middleware is imported, and its discovery starts."""
+"""The middleware is imported, and its discovery starts; for a video, its pipeline is about to start."""
 MATCHED = 3
-"""The other endpoint was discovered."""
+"""The other endpoint was discovered; for a video, its pipeline is playing."""
 REFUSED = 4
 """A sample that the middleware did not accept."""
 SKIPPED = 5
-"""Samples that were not sent, because writing the previous one took too long. `sequence` is their number."""
+"""Samples that were not sent, because writing the previous one took too long. `sequence` is how many."""
 FOREIGN = 6
 """A received sample that does not belong to this stream."""
 END = 7
@@ -88,7 +88,7 @@ class Log:
         """Write a record.
 
         Raises:
-            LogError: The disk is full. The log contains all earlier records.
+            LogError: The log cannot be written, for example because the disk is full. It has all earlier records.
         """
         record = RECORD.pack(kind, 0, size, sequence, sent_ns, at_ns)
         with self._lock:

@@ -151,7 +151,7 @@ class Ros1Publisher:
         self._message_class = message_class
 
     def write(self, data: bytes) -> bool:
-        """Publish a sample."""
+        """Publish a sample; return True, because rospy does not report whether it was accepted."""
         message = self._message_class()
         message._buff = data
         self._publisher.publish(message)

@@ -29,7 +29,10 @@ def start(network: Network) -> Ros2Middleware:
 
 
 def environment(network: Network) -> dict[str, str]:
-    """Return the environment variables for these network settings. Other variables are unchanged on the robot.
+    """Return the environment variables for these network settings.
+
+    `Ros2Middleware` also removes `ROS_LOCALHOST_ONLY`, unless the discovery is `environment`. All other variables are
+    as on the robot.
 
     With `LOCALHOST`, nodes do not use multicast on the network, but contact static peers (docs.ros.org, "Improved
     Dynamic Discovery"). This is available since ROS 2 Iron; earlier versions support multicast only.
@@ -69,7 +72,7 @@ def message_type(name: str) -> Any:  # noqa: ANN401 (a generated class)
 
 
 class Ros2Middleware:
-    """A node with only the requested topics: it has no parameter services and no log on `/rosout`."""
+    """A node without parameter services and without a log on `/rosout`."""
 
     def __init__(self, network: Network) -> None:
         # Iron introduced static peers and type hashes; `rclpy.type_hash` shows that this is Iron or later.
@@ -165,6 +168,6 @@ class Ros2Publisher:
         return int(self._publisher.get_subscription_count())
 
     def drain(self, limit_s: float) -> None:
-        """Wait until all samples are acknowledged. rclpy supports this since Humble."""
+        """Wait until all samples are acknowledged, at most for this time. rclpy supports this since Humble."""
         if hasattr(self._publisher, "wait_for_all_acked"):
             self._publisher.wait_for_all_acked(Duration(nanoseconds=int(limit_s * 1e9)))

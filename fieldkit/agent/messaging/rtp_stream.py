@@ -45,7 +45,7 @@ class Video:
         rate_hz: Frames per second.
         duration_s: Duration.
         patience_s: Time within which the pipeline must be playing.
-        reads_hz: Refresh rate of the receiver's display.
+        reads_hz: Refresh rate of the receiver's display; 0 if it has none.
     """
 
     pipeline: Sequence[str]
@@ -203,7 +203,7 @@ def _stop_on_event(process: subprocess.Popen[str], stop_event: threading.Event) 
 
 
 def _stop(process: subprocess.Popen[str]) -> None:
-    """Stop a process, if it is running, by SIGINT, or by SIGKILL if that has no effect."""
+    """Stop a process, if it is running, by SIGINT, or by SIGKILL if it still runs after `_EXIT_TIMEOUT_S`."""
     if process.poll() is None:
         process.send_signal(signal.SIGINT)
     try:

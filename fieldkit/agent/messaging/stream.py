@@ -102,6 +102,8 @@ class SampleCodec:
 def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, stop_event: threading.Event) -> None:
     """Wait for a subscription, publish samples at their scheduled times, and log each of them.
 
+    Without a subscription in `stream.patience_s`, publish nothing.
+
     Args:
         middleware: The started middleware.
         topic: The topic.

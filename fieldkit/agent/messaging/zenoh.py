@@ -33,12 +33,12 @@ def start(network: Network) -> ZenohMiddleware:
 
 
 def route(network: Network) -> ZenohMiddleware:
-    """Open a session that is the router of other sessions."""
+    """Open a session that is the router of other sessions; raises `MiddlewareError` if Zenoh does not start."""
     return ZenohMiddleware(network, "router")
 
 
 def configuration(network: Network, mode: str) -> dict[str, Any]:
-    """Return the configuration of Zenoh by path: the address of this robot, and discovery."""
+    """Return the configuration of Zenoh by path: the addresses, discovery, and the settings of the network."""
     port = network.port or PORT
     addresses = {"peers": network.peers, "router": (network.server,)}.get(network.discovery, ())
     config: dict[str, Any] = {
@@ -135,7 +135,7 @@ class ZenohMiddleware:
     def other_types(self, topic: Topic) -> set[str]:
         """Return the types of the topic in liveliness tokens, except its type in `topic`.
 
-        A token ends with topic, type, hash and QoS.
+        A token ends with topic, type, hash and QoS. A type with the same name but another hash is included.
         """
         domain, own_name, own_hash = topic.key.split("/")[0], *topic.key.split("/")[-2:]
         tokens = f"@ros2_lv/{domain}/**/{topic.name.replace('/', '%')}/*/*/*"
@@ -145,7 +145,10 @@ class ZenohMiddleware:
         return {name for name, type_hash in types if (name, type_hash) != (own_name, own_hash)}
 
     def _declare_tokens(self, topic: Topic, role: str) -> str:
-        """Declare the liveliness tokens of an endpoint; return the last one, which identifies the endpoint."""
+        """Declare the liveliness tokens of an endpoint; return the last one, which identifies the endpoint.
+
+        Without tokens, return the key expression of the topic.
+        """
         token = topic.key
         for template in topic.tokens.get(role, ()):
             token = template.replace("{zid}", str(self._session.zid()))
@@ -168,7 +171,7 @@ class ZenohPublisher:
         self._sequence = 0
 
     def write(self, data: bytes) -> bool:
-        """Publish a sample."""
+        """Publish a sample; return True, because Zenoh does not report whether it was accepted."""
         self._sequence += 1
         attachment = ATTACHMENT.pack(self._sequence, time.time_ns(), GID_BYTES, self._gid)
         self._publisher.put(data, attachment=attachment)

@@ -2,8 +2,8 @@
 
 The upper part of a frame has 16 x 8 cells, black or white, which remain readable after lossy compression. Each cell
 is a bit. Row by row, with the most significant bit first, they contain the number (32 bits), the time in nanoseconds
-since 1970 UTC (64 bits), and the CRC-32 of both. The lower part is random, because it determines the size of the
-compressed frame.
+since 1970 UTC (64 bits), and the CRC-32 of both. The lower part, if any, is random, because it determines the size of
+the compressed frame.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ class FrameCode:
     Args:
         width: Pixels per row; a multiple of 16, at least 128.
         height: Rows; `height - noise_rows` must be at least 64.
-        noise_rows: Number of random rows at the bottom.
+        noise_rows: Number of random rows at the bottom. If the number of the other rows is not a multiple of 8, up to
+            7 of them are random, too.
     """
 
     def __init__(self, width: int, height: int, noise_rows: int = 0) -> None:
@@ -65,7 +66,7 @@ class FrameCode:
         return b"".join(parts) + self._noise[start : start + self._noise_bytes]
 
     def read(self, luma: bytes) -> tuple[int, int] | None:
-        """Return the number and the time of a frame, or None if it is truncated or a cell is not readable.
+        """Return the number and the time of a frame; None if it is truncated, or a cell or the CRC-32 is wrong.
 
         Args:
             luma: The luma of the frame, optionally followed by its other components.

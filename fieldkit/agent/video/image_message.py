@@ -40,7 +40,7 @@ class ImageCodec:
         return self._envelope(sequence, at_ns) + head + luma[len(head) :]
 
     def decode(self, data: bytes) -> tuple[int, int] | None:
-        """Return the number and the time in the pixels, or None if it is not a message of this camera."""
+        """Return the number and the time in the pixels; None if the size is wrong or the pixels are not readable."""
         padding_bytes = len(data) - self._envelope_bytes - self._width * self._height
         # Some implementations pad CDR to a multiple of 4 bytes and do not indicate this in the header.
         return self._code.read(data[self._envelope_bytes :]) if 0 <= padding_bytes < 4 else None

@@ -22,9 +22,10 @@ if TYPE_CHECKING:
 def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit check`."""
     parser.description = (
-        "Check everything that a trial of the procedure needs from the robots and from this machine; change nothing, "
-        "and do not ask for robots to be placed. `fieldkit trial` makes the same checks, except for the test "
-        "recording. For the estimate of disk space, give --repeats and --record of the planned trial."
+        "Check everything that a trial of the procedure needs from the robots and from this machine. The robots need "
+        "not be placed, and only the scripts of fieldkit are installed on them. `fieldkit trial` makes the same "
+        "checks, except for time sources, telemetry sources and a test recording. For the estimate of disk space, "
+        "give --repeats and --record of the planned trial."
     )
     parser.takes_lengths = True
     parser.epilog = "example: fieldkit check los --topology masterless"

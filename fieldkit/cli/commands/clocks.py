@@ -19,8 +19,8 @@ def add(parser: Parser) -> None:
     parser.description = (
         "List the clock of every robot of the site file: its offset from this machine's clock, the program that sets "
         "it with its time source, and a remedy for each problem. Report pairs of robots whose programs contradict "
-        "the measured offsets. It changes nothing. Exit code 3 if a robot was not reached, 1 if there is another "
-        "problem."
+        "the measured offsets. No clock is changed; only the job script of fieldkit is installed. Exit code 3 if the "
+        "clock of a robot could not be read, 1 if there is another problem."
     )
     shared.add_site(parser)
     shared.add_json(parser)

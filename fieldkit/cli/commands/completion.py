@@ -74,7 +74,7 @@ class _Values(BaseCompleter):
     def __call__(
         self, *, prefix: str, action: argparse.Action, parser: argparse.ArgumentParser, **_: object
     ) -> list[str]:
-        """Return the values that may follow `prefix`."""
+        """Return possible values; argcomplete drops those that do not start with `prefix`."""
         if action.dest == "robot" and parser.prog.startswith("fieldkit lab "):
             return _robots_of_lab()
         values = _VALUES.get(action.dest)

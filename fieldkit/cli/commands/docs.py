@@ -39,6 +39,6 @@ def run(arguments: argparse.Namespace) -> int:
         print_text(str(page.path))
     elif not webbrowser.open(page.uri):
         raise ConfigurationError(
-            "this machine has no browser", remedy=f"open the page on another machine: {page.path}"
+            "this machine has no browser", remedy=f"copy its folder to a machine with a browser: {page.path}"
         )
     return 0

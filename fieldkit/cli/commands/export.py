@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 
 def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit export`."""
-    parser.description = "Write the rows of trials as one table, or the events of one trial as a time line."
+    parser.description = (
+        "Write the rows of trials as one table, the events of one trial as a time line, or the results of repeats "
+        "and expectations for CI servers."
+    )
     shared.add_paths(parser)
     parser.add_choice(
         "--format",
@@ -77,7 +80,7 @@ def _load(arguments: argparse.Namespace) -> "Repeats":
 
 def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:
     from fieldkit.export import mcap, timeline
-    from fieldkit.trial.stored import plans, sources
+    from fieldkit.trial.stored import plans, remeasured
 
     folder: Path = arguments.paths[0]
     if len(arguments.paths) > 1:
@@ -87,7 +90,7 @@ def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:
             + shell_command("fieldkit", "export", folder, "--format", "mcap", "-o", f"{folder.name}.mcap"),
         )
     plan = plans.read_plan(folder)
-    sources.note_differences(folder, show_note)
+    remeasured.note_differences(folder, show_note)
     mcap.write(file, timeline.about(plan), timeline.messages(folder, plan))
 
 

@@ -33,11 +33,11 @@ def add(parser: Parser) -> None:
         "up",
         help="start the robots of the site file, or N equal robots",
         description="Start every robot of the site file, with any roles and backend, or N equal robots with "
-        "--robots, and return when all can be reached. They are placed in a square in the middle of the world, at "
-        "most 5 m apart, and communicate directly with each other; `emulated` in the site file sets radio, world and "
-        "ROS. SSH does not use the radio: `control: radio` is ignored, with a note. No program listens on the "
-        "network of this machine; the files that other programs need to reach the robots are in a folder of this "
-        "user, in memory if there is /run/user. The lab exists as long as its process.",
+        "--robots, and return when all can be reached. They are placed on a square grid in the middle of the world, "
+        "with at most 5 m between neighbours, and communicate directly with each other; `emulated` in the site file "
+        "sets radio, world and ROS. SSH does not use the radio: `control: radio` is ignored, with a note. No program "
+        "listens on the network of this machine; the files that other programs need to reach the robots are in a "
+        "folder of this user, in memory if there is /run/user. The lab exists as long as its process.",
     )
     shared.add_robots(action)
     action.add_argument("--seed", type=int, default=1, metavar="N", help="seed of all random draws (default 1)")
@@ -140,16 +140,16 @@ def up(arguments: argparse.Namespace) -> int:
 
     lab_folder, backend = folder.of_directory(Path.cwd()), _backend(arguments)
 
-    def announce(robots: "Lab") -> None:
-        print_text(f"{format_count(len(robots.members), 'robot')} up, until Ctrl-C", flush=True)
+    def announce(lab: "Lab") -> None:
+        print_text(f"{format_count(len(lab.members), 'robot')} up, until Ctrl-C", flush=True)
 
     if arguments.foreground:
         daemon.run(lab_folder, backend, seed=arguments.seed, sink=_show_note, on_ready=announce)
         return 0
 
     def serve(detach: daemon.OnReady) -> int:
-        def ready(robots: "Lab") -> None:
-            print_text(f"{format_count(len(robots.members), 'robot')} up; next: {_NEXT}")
+        def ready(lab: "Lab") -> None:
+            print_text(f"{format_count(len(lab.members), 'robot')} up; next: {_NEXT}")
             detach(lab_folder.log)
 
         try:
@@ -195,7 +195,7 @@ def _show_lateness(lateness: "LabLateness") -> None:
     print_text(f"late: {', '.join(texts) or 'nothing'}; {format_count(lateness.windows, 'window')}")
     if lateness.late:
         show_note(
-            f"the co-simulation could not keep up: {format_count(lateness.late, 'packet or window')} later than "
+            f"the co-simulation could not keep up: {lateness.late} of its packets and windows later than "
             f"{lateness.bound_s * 1e3:g} ms, so a trial would be void; reduce the load of this machine, or set a "
             "longer window in emulated.sync"
         )

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit rebuild`."""
     parser.description = (
-        "Regenerate trial.csv and summary.csv from plan, journal and raw evidence. The result is byte-identical."
+        "Regenerate trial.csv and summary.csv from plan, journal and raw evidence. The result is byte-identical if "
+        "the evidence and the version of fieldkit are the same."
     )
     parser.add_argument(
         "trial",
@@ -51,7 +52,7 @@ def _show_summary(rebuilt: "RebuildResult", *, show_all: bool) -> None:
     from fieldkit.cli import results
 
     if omitted_count := results.show_summary(rebuilt.cells, show_all=show_all, expected=rebuilt.expected):
-        print_folded(f"{results.more_rows_note(omitted_count)}: add --all")
+        print_folded(f"{results.more_quantities_text(omitted_count)}: add --all")
 
 
 def _rebuild_many(folders: Sequence[Path], arguments: argparse.Namespace) -> int:

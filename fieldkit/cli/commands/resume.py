@@ -13,8 +13,8 @@ def add(parser: Parser) -> None:
     parser.description = (
         "Continue a trial that was stopped by Ctrl-C or a signal, or because a robot or the emulator was lost or the "
         "disk was full. Finished repeats are not repeated. Files that differ from their checksums are reported; if "
-        "rows of trial.csv must be rebuilt from them, the trial does not continue (exit code 4). The backend and "
-        "the robots in their roles must be the same as at the start of the trial."
+        "rows of trial.csv must be rebuilt from them, the trial does not continue (exit code 4). The version of "
+        "fieldkit, the backend and the robots in their roles must be the same as at the start of the trial."
     )
     shared.add_trial(parser, "folder of the trial")
     parser.add_argument(

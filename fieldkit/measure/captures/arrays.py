@@ -177,7 +177,8 @@ class Integers:
 def row_hashes(*columns: Ints | Keys) -> Keys:
     """Return a hash for each row.
 
-    Equal rows have equal hashes. Two different rows have equal hashes with a probability of 2**-64.
+    Equal rows have equal hashes. Rows that differ in one column only have different hashes. Other different rows have
+    equal hashes with a probability of about 2**-64.
     """
     hashes = np.zeros(len(columns[0]), dtype=np.uint64)
     for column in columns:

@@ -25,7 +25,7 @@ _FILE_HEADER_BYTES: Final = 24
 _RECORD_HEADER_BYTES: Final = 16
 # After this many records of equal length, the next record probably has this length too.
 _MIN_RUN: Final = 16
-# libpcap's MAXIMUM_SNAPLEN: no record of a valid file is longer.
+# libpcap's MAXIMUM_SNAPLEN: no record of a valid file with a supported link type is longer.
 _MAX_CAPTURED_BYTES: Final = 262_144
 
 

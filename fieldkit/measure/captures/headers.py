@@ -39,14 +39,17 @@ def check_link_type(*link_types: int, where: str) -> None:
 
     if not LINKS.keys() & set(link_types):
         raise EvidenceError(
-            f"has the link type {', '.join(map(str, link_types))}, which fieldkit cannot read",
+            f"has no link type that fieldkit can read: {', '.join(map(str, link_types))}",
             where=where,
             remedy=f"capture on an interface of link type {', '.join(map(str, sorted(RAW_LINKS | LINKS.keys())))}",
         )
 
 
 def ip_header_positions(integers: Integers, frames: Frames) -> Ints:
-    """Return the position of each frame's IP header in the file; `NO_HEADER` if none is found."""
+    """Return the position of each frame's IP header in the file; `NO_HEADER` if the link layer contains none.
+
+    The header at this position may be truncated or invalid; `ip_headers` checks it.
+    """
     header_at = np.full(len(frames), NO_HEADER)
     for link_type in np.flatnonzero(np.bincount(frames.link_type)).tolist():
         rows = np.flatnonzero(frames.link_type == link_type)
@@ -111,8 +114,9 @@ class Headers(Table):
         more_fragments: True if more fragments follow.
         header_bytes: Length of the header and its extension headers.
         payload_at: Index of the first byte after the header and its extension headers in the file.
-        payload_bytes: Length of the payload according to the header, even if fewer bytes were captured.
-        wrong_checksum: True if the header checksum of IPv4 is wrong.
+        payload_bytes: Length of the payload according to the header, even if fewer bytes were captured. If the
+            header has no length because of segmentation offload, it is computed from the length on the link.
+        wrong_checksum: True if the header checksum of IPv4 is wrong and not 0; always False for IPv6.
     """
 
     frame: Ints
@@ -196,7 +200,8 @@ def _has_wrong_checksum(integers: Integers, head: Fields, at: Ints, header: Ints
 
     The one's complement sum of the words of a valid header is 0xFFFF (-0).
 
-    A checksum of 0 is accepted, because on some systems the network adapter computes the checksum after the capture.
+    A checksum field of 0 is accepted, because on some systems the network adapter computes the checksum after the
+    capture.
     Linux computes it before the capture, even with offload, and drops received packets with a wrong checksum.
 
     Args:

@@ -73,8 +73,8 @@ def ipv6_headers(integers: Integers, frame: Ints, at: Ints, captured: Ints, wire
 def _ipv6_payload_bytes(integers: Integers, at: Ints, captured: Ints, protocol: Ints, wire: Ints) -> Ints:
     """Return the payload length after the fixed header.
 
-    If the length in the header is 0, it is read from the jumbo option or, for frames from segmentation offload,
-    computed from the wire length.
+    If the length in the header is 0, it is read from the jumbo option. Without this option it is computed from the
+    wire length if the next header is TCP or UDP (frames from segmentation offload), and otherwise it is 0.
     """
     payload_length = integers.u16(at + 4)
     jumbo = (protocol == _HOP_BY_HOP) & (captured >= 48) & (integers.u16(at + 42) == _JUMBO_OPTION)

@@ -72,7 +72,10 @@ def _null(integers: Integers, frames: Frames) -> Ints:
 
 
 def _radiotap(integers: Integers, frames: Frames) -> Ints:
-    """Return the positions of the IP headers after radiotap headers; `NO_HEADER` if the FCS is wrong."""
+    """Return the positions of the IP headers after radiotap headers.
+
+    `NO_HEADER` if the FCS is wrong, or if `_after_mac_header` finds no IP header.
+    """
     little = integers.with_order(LITTLE)
     length = little.u16(frames.start + 2)
     end = frames.start + np.minimum(length, frames.captured_bytes)
@@ -98,7 +101,7 @@ def _80211(integers: Integers, frames: Frames) -> Ints:
 
 
 def _after_mac_header(integers: Integers, frames: Frames, mac: Ints, *, padded: Mask) -> Ints:
-    """Return the positions of the IP headers in data frames of IEEE 802.11.
+    """Return the positions of the IP headers in data frames of IEEE 802.11; `NO_HEADER` for other frames.
 
     Args:
         integers: Reader of integers in the file.

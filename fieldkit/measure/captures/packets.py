@@ -60,11 +60,12 @@ ECHO_REPLY: Final = 1 << 16
 """Added to the identifier of an ICMP echo reply, to distinguish it from a request."""
 
 NOT_CAPTURED: Final = -1
-"""Content hash of a packet that was truncated before `CONTENT_BYTES` of content."""
+"""Content hash of a packet that was truncated before the end of its first `CONTENT_BYTES` of content."""
 
 CONTENT_BYTES: Final = 32
-"""Number of content bytes that are compared. fieldkit captures 128 bytes of each packet, so its captures contain at
-least this many bytes after the headers."""
+"""Number of content bytes that are compared. fieldkit captures 128 bytes of each packet, so its captures contain
+them if all headers together have at most 96 bytes, such as 20 (link layer), 40 (IPv6) and 32 (TCP with time stamps).
+"""
 
 _CONTENT: Final = layout(LITTLE, CONTENT_BYTES, **{str(at): (at, 8) for at in range(0, CONTENT_BYTES, 8)})
 # Masks of the first 0 to 8 bytes of a little-endian word, by the number of bytes.
@@ -101,18 +102,19 @@ class Packets(Table):
         tcp_seq: TCP sequence number; 0 without a TCP header.
         tcp_ack: TCP acknowledgment number; 0 without a TCP header.
         tcp_flags: TCP flags; 0 without a TCP header.
-        tcp_stamp: TSval of the TCP time stamp option, which is larger in a retransmission; `NO_STAMP` without the
-            option.
-        tcp_mss: Maximum segment size option of a SYN; 0 without the option.
+        tcp_stamp: TSval of the TCP time stamp option, which is larger in a retransmission unless this is sent within
+            one tick of the sender's time stamp clock; `NO_STAMP` if the option is missing or was truncated.
+        tcp_mss: Maximum segment size option of a SYN; 0 if the option is missing or was truncated.
         tcp_payload_bytes: Length after the TCP header; 0 without a TCP header.
         udp_bytes: Length field of the UDP header, which includes the header; 0 without a UDP header.
         echo: Identifier of an ICMP echo request, which differs between ping processes; `ECHO_REPLY` is added in a
             reply. `NO_ECHO` for other packets.
         echo_seq: Sequence number of an ICMP echo request or reply; `NO_ECHO` for other packets.
-        content: Hash of the first `CONTENT_BYTES` after the TCP or UDP header or, without one, after the IP header.
-            The transport checksum is excluded, because with offload it is computed after the capture. `NOT_CAPTURED`
-            if one of these bytes is missing.
-        interface: Index of the interface in captures on all interfaces; `headers.NO_INTERFACE` in other captures.
+        content: Hash of the first `CONTENT_BYTES` after the TCP or UDP header or, without one, after the IP header;
+            fewer if the packet is shorter. The checksum of TCP and UDP is excluded, because with offload it is
+            computed after the capture. `NOT_CAPTURED` if one of these bytes was not captured.
+        interface: Index of the interface in captures of the link type `headers.COOKED_V2`, which are on all
+            interfaces; `headers.NO_INTERFACE` in other captures.
     """
 
     time_ns: Ints
@@ -173,7 +175,7 @@ for _name, _storage_type in _STORAGE_TYPES.items():
 
 
 def decode(integers: Integers, frames: Frames) -> Packets:
-    """Return the IP packets of `frames`; frames of other protocols or with a truncated IP header are omitted."""
+    """Return the IP packets of `frames`; frames without a complete and valid IP header are omitted."""
     ip = ip_headers(integers, frames, ip_header_positions(integers, frames))
     if len(ip) < len(frames):
         frames = frames.where(ip.frame)

@@ -21,7 +21,7 @@ CHUNK_BYTES: Final = 1 << 22
 addition to the columns."""
 
 _SPARE_DIVISOR: Final = 8
-"""The table has additional rows: the estimated number of rows divided by this value."""
+"""The table has spare rows: the number of rows that is estimated for later chunks, divided by this value."""
 
 FORMATS: Final = MappingProxyType(
     {
@@ -57,8 +57,8 @@ class Capture:
 
     Attributes:
         packets: IP packets.
-        frames: Number of frames, including frames without a decodable IP packet: too short, encrypted, or of an
-            unknown link type.
+        frames: Number of frames, including frames without a decodable IP packet: of another protocol, too short,
+            encrypted, or of an unknown link type.
         damage: Position and kind of the damage after `packets`, or None if the file is undamaged.
     """
 
@@ -71,7 +71,8 @@ def read(path: Path) -> Capture:
     """Return the packets of a capture file.
 
     Raises:
-        EvidenceError: The file is missing, not pcap or pcapng, or has an unknown link type.
+        EvidenceError: The file is missing, not pcap or pcapng, ends inside its header, or has an unknown link type;
+            or a pcapng file has too many sections and interfaces.
     """
     return _concatenate(stream(path), reading.size(path))
 
@@ -80,7 +81,7 @@ def parse(data: bytes, *, where: str) -> Capture:
     """Return the packets in the bytes of a capture file; `where` is its name in messages.
 
     Raises:
-        EvidenceError: The bytes are not pcap or pcapng, or have an unknown link type.
+        EvidenceError: For the same reasons as `read`.
     """
     return _concatenate(_captures(data, where, CHUNK_BYTES), len(data))
 
@@ -107,7 +108,7 @@ def stream(path: Path, *, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Capture]:
 
 
 def _captures(data: Buffer, where: str, chunk_bytes: int) -> Iterator[Capture]:
-    """Yield the decoded packets of each chunk of a file."""
+    """Yield the decoded packets of each chunk of a file. Raises the same errors as `parse`."""
     reader = frame_reader(data)
     if reader is None:
         raise EvidenceError(
@@ -123,8 +124,8 @@ def _captures(data: Buffer, where: str, chunk_bytes: int) -> Iterator[Capture]:
 def _concatenate(captures: Iterable[Capture], size_bytes: int) -> Capture:
     """Return all packets of a file. Each chunk is freed after it was copied, so little additional memory is needed.
 
-    The number of rows is estimated from the earlier chunks, with a margin. Rows that are never written occupy no
-    physical memory.
+    When the table is full, a larger one is allocated, with rows for as many packets as the remaining chunks probably
+    have, and a margin. Rows that are never written occupy no physical memory.
     """
     chunks = -(-size_bytes // CHUNK_BYTES)
     all_packets: Packets | None = None

@@ -136,7 +136,10 @@ def _frames(data: Buffer, section: _Section, start: Ints) -> tuple[Frames, Mask]
 
 
 def _snap_bytes(section: _Section) -> int:
-    """Return the snap length of simple packet blocks, which is the snap length of the first interface."""
+    """Return the snap length of simple packet blocks: the snap length of the first interface of the section.
+
+    `_NO_LIMIT` if this is 0; 0 if the section has no interface.
+    """
     return section.interfaces[0].snap_bytes or _NO_LIMIT if section.interfaces else 0
 
 
@@ -226,7 +229,10 @@ class Interface:
 
 
 def parse_interface(body: bytes, order: Order) -> Interface | None:
-    """Return the interface described by the body of an interface description block, or None if it is invalid."""
+    """Return the interface described by the body of an interface description block.
+
+    None if an option extends beyond the end of the block.
+    """
     link_type, _, snap_bytes = struct.unpack_from(f"{order}HHI", body)
     ticks_per_s, offset_s = 1_000_000, 0
     at = 8

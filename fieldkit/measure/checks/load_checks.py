@@ -1,10 +1,10 @@
 """Contradictions between the results of an iperf3 test and the captures of both ends.
 
 iperf3 counts the bytes that its sockets read and write; a capture contains the packets that passed the interface. At
-any time, iperf3 has therefore received at most the bytes that the capture contains until this time. It has received
-at least the bytes that the kernel has acknowledged (TCP), or the bytes that have arrived minus the bytes that were
-dropped at its socket buffer (UDP). Times in the JSON are relative to the start of the test. The test starts between
-the client's last message on the control connection and the first data packet.
+any time, iperf3 has therefore received at most the bytes that the capture contains until this time. When it has read
+its socket buffers, it has received at least the bytes that the kernel has acknowledged (TCP), or the bytes that have
+arrived minus the bytes that were dropped at its socket buffer (UDP). Times in the JSON are relative to the start of
+the test. The test starts between the client's last message on the control connection and the first data packet.
 """
 
 from collections.abc import Iterator
@@ -91,7 +91,7 @@ class _Progress:
 def find_contradictions(
     flow: LoadFlow, sent: IperfTest, received: IperfTest, evidence: LoadEvidence
 ) -> Iterator[str]:
-    """Yield the contradictions between the JSON of both ends and both captures; none if a capture has no times.
+    """Yield the contradictions between the JSON of both ends and both captures; none if a packet has no time.
 
     Args:
         flow: Addresses and ports of the test, which identify its packets.
@@ -176,7 +176,10 @@ def _udp_progress(flow: LoadFlow, streams: list[Packets]) -> _Progress:
 
 
 def _tcp_progress(flow: LoadFlow, streams: list[Packets], evidence: LoadEvidence) -> _Progress | None:
-    """Return the progress of all streams, or None if the sequence numbers of a long stream are ambiguous."""
+    """Return the progress of all streams.
+
+    None if the SYN of a stream was not captured, or if a stream is so long that its sequence numbers are ambiguous.
+    """
     cookie_bytes = 0 if evidence.reverse else COOKIE_BYTES
     parts_ns: list[Ints] = []
     lower: list[Ints] = []
@@ -228,7 +231,11 @@ def _acknowledgments(flow: LoadFlow, packets: Packets, sport: int, dport: int) -
 
 
 def _check_sent_bytes(sent: IperfTest, streams: list[Packets], evidence: LoadEvidence) -> Iterator[str]:
-    """Yield a contradiction if iperf3 wrote fewer TCP bytes than were captured, or more than a socket can buffer."""
+    """Yield a contradiction for each count of a TCP sender that disagrees with its capture: bytes, retransmissions.
+
+    iperf3 must have written at least the captured bytes, and at most as many more as its sockets can buffer. Nothing
+    is checked if the SYN of a stream was not captured, or if a stream is too long for 32-bit sequence numbers.
+    """
     written_bytes = sum(interval.payload_bytes for interval in sent.intervals)
     cookie_bytes = 0 if evidence.reverse else COOKIE_BYTES
     unique_bytes, carried_bytes, segment_bytes = 0, 0, 1
@@ -267,7 +274,10 @@ def _check_datagrams(
     received_streams: list[Packets],
     evidence: LoadEvidence,
 ) -> Iterator[str]:
-    """Yield the contradictions between the datagrams that iperf3 counted at both ends and those in the captures."""
+    """Yield the contradictions between the datagrams that iperf3 counted at both ends and those in the captures.
+
+    There are none if a count is missing in the JSON.
+    """
     counts = [
         [getattr(interval, name) for interval in test.intervals]
         for test, name in ((sent, "datagrams"), (received, "datagrams"), (received, "lost"))
@@ -297,8 +307,9 @@ def _check_datagrams(
         # Each copy reduces the number of losses that iperf3 reports by one.
         copies = sum(map(len, received_streams)) - arrived
         if not missed - tail - copies - race_tolerance <= lost <= max_lost + race_tolerance:
-            missing_text = f"the receiver's capture lacks {missed} datagrams of the sender's capture"
-            yield f"iperf3 lost {lost} datagrams, but {missing_text}, and the receiver's kernel dropped {undelivered}"
+            missing_text = f"the receiver's capture lacks {format_count(missed, 'datagram')} of the sender's capture"
+            lost_text = f"iperf3 lost {format_count(lost, 'datagram')}"
+            yield f"{lost_text}, but {missing_text}, and the receiver's kernel dropped {undelivered}"
 
 
 def _distinct_datagrams(stream: Packets) -> int:

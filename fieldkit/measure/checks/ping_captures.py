@@ -66,7 +66,9 @@ class PingCaptures:
             )
 
     def _missing_packets(self, result: Ping, role: Role) -> Iterator[str]:
-        """Yield a reason if ping printed more answers, or more answered requests, than a capture contains.
+        """Yield a reason if ping printed more replies, or more answered requests, than a capture contains.
+
+        Replies include duplicates and damaged replies.
 
         The capture may contain other pings, with other identifiers or sizes. The printed number is compared with
         the packet count of the most frequent identifier, so the identifier of this ping need not be known.
@@ -140,6 +142,6 @@ def _has_payload(packets: Packets, payload_bytes: int | None) -> Mask:
 
 
 def _max_count(echoes: Packets) -> int:
-    """Return the number of packets of the identifier with the most packets."""
+    """Return the number of packets of the identifier with the most packets; 0 without packets."""
     _, counts = np.unique(echoes.echo, return_counts=True)
     return int(counts.max(initial=0))

@@ -232,7 +232,8 @@ def compare_with_capture(
     if output.transmitted is None or output.transmitted > _MAX_SEQUENCE:
         return
     if len(captured.requested_ns) > output.transmitted:
-        yield f"ping sent {output.transmitted} requests, but the {role}'s capture has {len(captured.requested_ns)}"
+        sent_text = format_count(output.transmitted, "request")
+        yield f"ping sent {sent_text}, but the {role}'s capture has {len(captured.requested_ns)}"
     answers_by_seq = {reply.seq: reply for reply in output.answers}
     not_captured = sorted(answers_by_seq.keys() - (captured.requested_ns.keys() & captured.replied_ns.keys()))
     if not_captured:

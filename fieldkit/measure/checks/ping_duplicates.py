@@ -58,7 +58,7 @@ def captured_echoes(capture: Capture | None, source: str, destination: str, size
     """Return the echoes between two addresses in a capture; None without a capture.
 
     Args:
-        capture: The capture.
+        capture: The capture; None if it is missing.
         source: Source address of the requests.
         destination: Their destination address.
         size_bytes: Length of an echo with its ICMP header; echoes of another length belong to another ping.

@@ -226,7 +226,8 @@ CROSS_CHECKS: Final = (
         source="`scan.bag`",
         against=("sender's capture: bytes that left", "the procedure: topics and duration"),
         tolerance=(
-            "a bag may be shorter than planned by half of its duration, because a recorder needs time to subscribe"
+            "a bag may be shorter than planned by half of the planned duration plus 1 s, because a recorder needs "
+            "time to subscribe"
         ),
     ),
     CrossCheck(

@@ -45,7 +45,7 @@ def find_contradictions(
 ) -> Iterator[str]:
     """Yield contradictions between the received file and the datagrams that arrived.
 
-    There are none if the datagrams cannot be identified in the captures.
+    There are none if a file is missing, or if the datagrams cannot be identified in the captures.
 
     Args:
         evidence: The attempt's evidence.
@@ -110,7 +110,8 @@ def _is_block_at(
 def _blocks(sent: Packets, received: Packets, port: int, size_bytes: int) -> tuple[Sequence[_Block], bool] | None:
     """Return the datagrams that arrived completely, in the order of arrival, and True if a fragment arrived twice.
 
-    Return None if the datagrams cannot be identified.
+    Return None if the datagrams cannot be identified: the sent ids are not unique, another flow uses one of them, or
+    the sender's capture does not contain all bytes of the file.
     """
     first = sent.where(sent.dport == port)
     sizes = first.udp_bytes - UDP_HEADER_BYTES

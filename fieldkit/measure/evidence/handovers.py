@@ -1,10 +1,11 @@
 """Handovers of a station between access points, and the time without answers to ping that each handover causes.
 
-Handovers are detected in samples of the station's link. Only samples taken while ping runs are used, because a robot
-may roam again while it is moved back to its start. A handover happens between the last sample with the old access
-point and the first sample with the new one. The gap of a handover is the longest time between two consecutive answers
-that overlaps this interval. Its resolution is therefore the interval of the ping, not of the samples. The times of
-samples and answers must be from the clock of the robot that roams.
+Handovers are detected in samples of the station's link. If the answers of ping have time stamps, only samples taken
+while ping runs (plus or minus one interval) are used, because a robot may roam again while it is moved back to its
+start. A handover happens between the last sample with the old access point and the first sample with the new one. The
+gap of a handover is the longest time between two consecutive answers that overlaps this interval. Its resolution is
+therefore the interval of the ping, not of the samples. The times of samples and answers must be from the clock of the
+robot that roams.
 """
 
 import math
@@ -43,8 +44,8 @@ COLUMNS: Final = columns(
         "roam_gap_s",
         "s",
         (
-            "Longest time between consecutive answers around a handover; empty without a handover, and if ping "
-            "started or ended in this gap."
+            "Longest time between consecutive answers around a handover; empty without a handover, if ping started "
+            "or ended in this gap, and if the answers have no time stamps."
         ),
         Figure("longest gap of a handover", Kind.MEDIAN, at_least="roam_gap_at_least_s"),
     ),
@@ -63,7 +64,7 @@ COLUMNS: Final = columns(
 
 _NO_ACCESS_POINT: Final = "the robot's radio reported no access point: it is not a station, or was not sampled"
 _NO_HANDOVER: Final = "there was no handover"
-_NO_STAMPS: Final = "no two answers of ping have a time stamp"
+_NO_GAP: Final = "ping has no summary, or no answers with time stamps around a handover"
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ class HandoverGap:
     Attributes:
         duration_s: Time in seconds between the answers before and after the gap. For an open gap, the number of
             requests without an answer times the interval.
-        first_lost: Sequence number of the first request without an answer.
+        first_lost: Sequence number of the first request in the gap; it was answered if `lost` is 0.
         lost: Number of requests without an answer.
         is_open: True if ping started or ended in the gap.
     """
@@ -122,7 +123,9 @@ def count_ping_pongs(handovers: Sequence[Handover], within_s: float) -> int:
 
 
 def gap_around(handover: Handover, output: Ping, interval_s: float) -> HandoverGap | None:
-    """Return the gap of a handover, or None if ping was not running, or its answers have no time stamps.
+    """Return the gap of a handover.
+
+    None if ping was not running at that time, if its answers have no time stamps, or if it has no summary.
 
     Args:
         handover: The handover.
@@ -173,7 +176,10 @@ def measure(samples: Sequence[LinkSample], output: Ping | None, interval_s: floa
 
 
 def _window_ns(output: Ping | None, interval_s: float) -> tuple[float, float]:
-    """Return start and end of a run of ping in ns; minus and plus infinity if its answers have no time stamps."""
+    """Return start and end of a run of ping in ns.
+
+    Minus and plus infinity if there is no output, or it has no answer with a time stamp or no summary.
+    """
     answers = [] if output is None else sorted(stamped_answers(output))
     if output is None or not answers or output.transmitted is None:
         return -math.inf, math.inf
@@ -188,7 +194,7 @@ def _measure_gaps(handovers: Sequence[Handover], output: Ping | None, interval_s
     candidates = [] if output is None else [gap_around(handover, output, interval_s) for handover in handovers]
     gaps = [gap for gap in candidates if gap is not None]
     if not gaps:
-        reason = _NO_STAMPS if handovers else _NO_HANDOVER
+        reason = _NO_GAP if handovers else _NO_HANDOVER
         return Measured({}, dict.fromkeys(("roam_gap_s", "roam_gap_at_least_s", "roam_lost"), reason))
     longest = max(gaps, key=lambda gap: gap.duration_s)
     if longest.is_open:

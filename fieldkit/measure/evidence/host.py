@@ -48,7 +48,7 @@ JOBS: Final = "jobs"
 _SNMP: Final = "/proc/net/snmp"
 _CONGESTION: Final = "/proc/sys/net/ipv4/tcp_congestion_control"
 _MAX_NAME_BYTES: Final = 16
-"""Maximum length of the name of a congestion control in Linux (TCP_CA_NAME_MAX)."""
+"""Limit of the length of the name of a congestion control in Linux (TCP_CA_NAME_MAX, which includes a NUL byte)."""
 _DEV: Final = "/proc/net/dev"
 _REQUIRED_SECTIONS: Final = (BOOT, CLOCK, "date", _SNMP, _DEV, "iw station dump", "end")
 """Sections that must be in both files of an attempt or in neither. The same script writes both files, and each file
@@ -58,13 +58,14 @@ contains the sections that the host supports.
 
 @dataclass(frozen=True)
 class Counters:
-    """Counters of /proc/net/snmp (names of RFC 1213; Linux adds RcvbufErrors); a missing counter is None.
+    """Counters of /proc/net/snmp (names of RFC 1213; Linux adds RcvbufErrors, SndbufErrors); None if missing.
 
     Attributes:
         udp_buffer_errors: Datagrams dropped because of a full receive buffer, `Udp: RcvbufErrors`.
         reassembly_failures: Failed IP reassemblies, `Ip: ReasmFails`.
-        udp_in_errors: Datagrams that could not be delivered to their socket for any reason, `Udp: InErrors`.
-        udp_send_errors: Datagrams that were not sent because of a full queue, `Udp: SndbufErrors`.
+        udp_in_errors: Datagrams that could not be delivered for any reason except a port without a listener,
+            `Udp: InErrors`. They include `udp_buffer_errors`.
+        udp_send_errors: Datagrams that were not sent because of a full buffer, `Udp: SndbufErrors`.
         udp_no_ports: Datagrams to a port without a listener, `Udp: NoPorts`.
     """
 
@@ -76,7 +77,10 @@ class Counters:
 
     @property
     def udp_undelivered(self) -> int | None:
-        """Datagrams that arrived, but were not delivered to their socket; None if the kernel does not count them."""
+        """Datagrams that arrived for a listener, but were not delivered to it; None if no counter is known.
+
+        It is the larger of `udp_in_errors` and `udp_buffer_errors`.
+        """
         counts = [count for count in (self.udp_buffer_errors, self.udp_in_errors) if count is not None]
         return max(counts, default=None)
 
@@ -126,10 +130,11 @@ def read_state(path: Path) -> HostState:
 
 
 def incomplete_sections(before: HostState, after: HostState) -> Iterator[str]:
-    """Yield the names of sections that only one of the two states of an attempt contains.
+    """Yield the names of incomplete sections.
 
-    A section that the host does not support is in neither state. Files of fieldkit versions that did not record the
-    boot ID have no section of jobs.
+    A section is incomplete if only one of the two states contains it, or contains a valid boot ID or clock in it. A
+    section that the host does not support is in neither state. The section of jobs must be in the state after the
+    attempt, except in files of fieldkit versions that did not record the boot ID.
     """
     for name in _REQUIRED_SECTIONS:
         if name in before.sections ^ after.sections:
@@ -142,9 +147,10 @@ def incomplete_sections(before: HostState, after: HostState) -> Iterator[str]:
 
 
 def job_times_ns(path: Path) -> Mapping[str, tuple[int, int]]:
-    """Return start and end of each job on a host, in nanoseconds since 1970 UTC by its clock, accurate to 10 ms.
+    """Return start and end of each job on a host, in nanoseconds since 1970 UTC by its clock.
 
-    Jobs whose end is unknown are omitted; the result is empty if the file does not contain the clock.
+    They are accurate to about 10 ms, or to 0.5 s if the file has the clock in whole seconds. Jobs whose end is
+    unknown are omitted; the result is empty if the file does not contain the clock.
 
     Raises:
         EvidenceError: The file is missing or cannot be read.
@@ -171,7 +177,7 @@ def station_dump(path: Path) -> str:
 
 
 def congestion_control(path: Path) -> str | None:
-    """Return the name of the host's TCP congestion control, or None if the file does not report it.
+    """Return the name of the host's TCP congestion control, or None if the file does not contain a valid name.
 
     Raises:
         EvidenceError: The file is missing or cannot be read.
@@ -202,7 +208,7 @@ def parse_counters(text: str) -> Counters:
 
 
 def received_bytes(path: Path, interface: str) -> int | None:
-    """Return the number of bytes that an interface has received (/proc/net/dev), or None if there is no interface.
+    """Return the number of bytes that an interface has received (/proc/net/dev), or None if it is not listed.
 
     Raises:
         EvidenceError: The file is missing or cannot be read.
@@ -213,7 +219,7 @@ def received_bytes(path: Path, interface: str) -> int | None:
 
 
 def increments(before: Counters, after: Counters) -> Counters:
-    """Return the increments of the counters; None for a counter that is missing, or decreased because of a reboot."""
+    """Return the increments of the counters; None for a counter that is missing or decreased, as after a reboot."""
     return Counters(
         udp_buffer_errors=_increment(before.udp_buffer_errors, after.udp_buffer_errors),
         reassembly_failures=_increment(before.reassembly_failures, after.reassembly_failures),

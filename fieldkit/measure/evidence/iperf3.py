@@ -166,7 +166,7 @@ class IperfTest:
 
     @property
     def window_s(self) -> tuple[float, float]:
-        """Start and end of the steady intervals, in seconds after the first packet."""
+        """Start and end of the steady intervals, in seconds after the start of the first full interval."""
         start_s = sum(
             interval.duration_s
             for interval in self._full_intervals[: len(self._full_intervals) - len(self.steady_intervals)]

@@ -22,14 +22,14 @@ def items(document: Mapping[str, Any], key: str) -> list[Mapping[str, Any]]:
 
 
 def number(document: Mapping[str, Any], key: str) -> float | None:
-    """Return the number under a key; None if it is missing, not finite, negative, or not below 2**53."""
+    """Return the number under a key; None if it is missing, not a number, not finite, negative, or 2**53 or more."""
     value = document.get(key)
     is_in_range = isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < _MAX_COUNT
     return float(value) if is_in_range and value is not None and math.isfinite(value) else None
 
 
 def count(document: Mapping[str, Any], key: str) -> int | None:
-    """Return the number under a key as an integer; None if `number` returns None."""
+    """Return the number under a key, rounded down to an integer; None if `number` returns None."""
     value = number(document, key)
     return None if value is None else int(value)
 
@@ -58,6 +58,9 @@ class IperfStart:
 @dataclass(frozen=True)
 class IperfTotals:
     """Totals in `end`; None if unknown.
+
+    A total of 0 bytes or datagrams, or a jitter of 0, counts as unknown, because some versions print 0 for unknown
+    values.
 
     Attributes:
         sent_bytes: Payload sent.

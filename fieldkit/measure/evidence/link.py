@@ -192,7 +192,10 @@ def _total_increment(counter: str, links: Sequence[Sequence[StationSample]]) -> 
 
 
 def _busiest_peer(samples: Sequence[LinkSample]) -> str:
-    """Return the name of the peer with which the most packets were exchanged, or the first of several such peers."""
+    """Return the name of the peer with which the most packets were exchanged, or the first of several such peers.
+
+    Empty if no sample has a peer.
+    """
     names = dict.fromkeys(station.station for sample in samples for station in sample.stations)
 
     def packets(name: str) -> int:
@@ -209,7 +212,10 @@ def _busiest_peer(samples: Sequence[LinkSample]) -> str:
 
 
 def busy_share(samples: Sequence[LinkSample]) -> float | None:
-    """Return the share of the time in which the channel was busy, or None without two reports of its counters."""
+    """Return the share of the time in which the channel was busy.
+
+    None without two reports of the channel's counters, or if its active time did not increase.
+    """
     counters = [
         (sample.active_ns, sample.busy_ns)
         for sample in samples
@@ -229,7 +235,10 @@ def _increment(counts: Iterable[int | None]) -> int | None:
 
 
 def access_points(samples: Sequence[LinkSample]) -> list[tuple[int, str]]:
-    """Return the times in ns at which a robot was associated as a station, each with its access point."""
+    """Return the times in ns at which a robot was associated as a station, each with its access point.
+
+    Empty if the robot was never associated as a station.
+    """
     if not any(sample.cell for sample in samples):
         return []
     # A station dump also contains the access point, and may be the only sample of an association.

@@ -1,8 +1,9 @@
 """Samples of the radios' links during an attempt: names of their files, and the file that a testbed writes.
 
 The samples come from the sampler, which is a script on the robot (`robot_link_samples`), or from a testbed that
-models the radios (`Oracle.links`). A testbed's `link.csv` has a line per time and peer station. If the testbed has
-access points, the last column, `cell`, is the access point with which the robot is associated.
+models the radios (`Oracle.links`). A testbed's `link.csv` has a line per time, robot and peer station, and one line
+for a robot without peers. If the testbed has access points, the last column, `cell`, is the access point with which
+the robot is associated; empty if it is not associated.
 """
 
 import re

@@ -7,7 +7,8 @@ physics and network run in windows of time, which can also be late, and the sync
 exchange data, adds to the delay of packets.
 
 The air delay has four components (`Oracle.delays`). Its file has a line with the number of packets, `packets 215`,
-and a line for each component, which is summed over all packets, in integer nanoseconds.
+and a line for each component, which is summed over all packets, in integer nanoseconds. The file of a co-simulation
+has two more lines: the delay that is not divided into components, and the delay by the sync policy.
 """
 
 import re
@@ -21,6 +22,7 @@ from fieldkit.core import laptop_files
 from fieldkit.core.columns import Figure, Kind, Measured, columns
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import DelayParts, Lateness
+from fieldkit.core.units import format_count
 from fieldkit.measure.evidence import reading
 
 LATENESS_FILE: Final = laptop_files.LATENESS
@@ -94,7 +96,7 @@ def read_lateness(path: Path) -> Lateness:
     """Return the lateness in a file.
 
     Raises:
-        EvidenceError: The file is missing, truncated, or not a file of packet lateness.
+        EvidenceError: The file is missing, truncated, not a file of packet lateness, or has an impossible count.
     """
     match = _LATENESS_TEXT.match(reading.text(path))
     if match is None:
@@ -130,7 +132,7 @@ def late_packet_count(lateness: Lateness) -> int:
 def measure_lateness(lateness: Lateness | None) -> Measured:
     """Return `LATENESS_COLUMNS`; `lateness` is None for real radios, or if the testbed cannot measure it."""
     if lateness is None:
-        return Measured.all_missing(LATENESS_COLUMNS, "the radios are real")
+        return Measured.all_missing(LATENESS_COLUMNS, "the radios are real, or their lateness is not measured")
     late_ns = {share: lateness_quantile_ns(lateness.packets, share) for share in (0.99, 1.0)}
     values = {
         "emulator_late_p99_s": None if late_ns[0.99] is None else late_ns[0.99] / 1e9,
@@ -158,10 +160,12 @@ def lateness_problem(lateness: Lateness) -> str | None:
     packet_ns = lateness_quantile_ns(lateness.packets, 1.0)
     window_ns = lateness_quantile_ns(lateness.windows or {}, 1.0)
     if packet_ns is not None and packet_ns > bound_ns:
-        problem = f"{late_packet_count(lateness)} packets were delivered too late, by up to {packet_ns / 1e6:.3g} ms"
+        late_text = format_count(late_packet_count(lateness), "packet")
+        problem = f"{late_text} arrived too late, by up to {packet_ns / 1e6:.3g} ms"
     elif window_ns is not None and window_ns > bound_ns:
         windows = sum(count for late_ns, count in (lateness.windows or {}).items() if late_ns > bound_ns)
-        problem = f"{windows} windows of the co-simulation ended too late, by up to {window_ns / 1e6:.3g} ms"
+        windows_text = f"{format_count(windows, 'window')} of the co-simulation"
+        problem = f"{windows_text} ended too late, by up to {window_ns / 1e6:.3g} ms"
     return f"{problem}; the bound is {bound_ns / 1e6:g} ms" if problem else None
 
 
@@ -231,8 +235,8 @@ def read_air_delay(path: Path) -> DelayParts:
 def air_delay_ns(parts: DelayParts) -> int:
     """Return the delay in ns, summed over all packets.
 
-    It is the sum of the four components (the paper's eq. 2) and, if the network does not report these, the undivided
-    delay.
+    It is the sum of the four components (the paper's eq. 2) and of the delay that the network did not divide into
+    components.
     """
     components_ns = parts.processing_ns + parts.transmission_ns + parts.propagation_ns + parts.queuing_ns
     return components_ns + parts.undivided_ns

@@ -58,11 +58,13 @@ class Recovery:
     """Effect of one fault.
 
     Attributes:
-        outage_s: Longest time between two answers, in seconds; None if the robot did not recover.
+        outage_s: Longest time between two answers, in seconds, 0 for a single answer; None if the robot did not
+            recover.
         recovery_s: Part of the outage after the end of the cause, never negative; None if `outage_s` is None or the
             duration of the cause is unknown.
-        recovered: True if the robot answered at the end of the observation.
-        recovery_at_least_s: Lower bound of `recovery_s` if the robot did not recover.
+        recovered: True if the last answer is less than `MIN_SILENCE_S` before the end of the observation.
+        recovery_at_least_s: Lower bound of `recovery_s` if the robot did not recover; None if it recovered, or if
+            the duration of the cause is unknown.
     """
 
     outage_s: float | None
@@ -83,7 +85,8 @@ class _Note:
 class _Answers:
     """Times of the answers and end of the observation by the observer's clock; process IDs that did not change.
 
-    For a killed process, the answers are the observations in which it was running.
+    For a killed process, the answers are the observations in which it was running, and the unchanged process IDs are
+    those in both the first and the last answer; there are none for other faults.
     """
 
     at_s: Sequence[float]
@@ -145,7 +148,11 @@ def _read_note(path: Path) -> _Note:
 
 
 def _ping_answers(path: Path, note: _Note) -> _Answers:
-    """Return the answers in the output of the observer's ping."""
+    """Return the answers in the output of the observer's ping.
+
+    Raises:
+        EvidenceError: The output is missing or has no summary.
+    """
     output = ping.read(path)
     if output.transmitted is None:
         raise EvidenceError("ping was stopped before its summary", where=path.name)

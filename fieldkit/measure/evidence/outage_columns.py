@@ -23,9 +23,12 @@ def fault_columns(kind: FaultKind) -> tuple[Column, ...]:
     """Return the columns of a kind of fault."""
     outage_column = fault_column_name(kind, "outage_s")
     outage_meaning = f"Longest time without a reply around the fault {kind}; empty if the robot did not recover."
-    recovery_meaning = f"Part of {outage_column} after the end of the cause of {kind}; empty if that end is unknown."
+    recovery_meaning = f"Part of {outage_column} after the end of the cause of {kind}; empty if either is unknown."
     recovered_meaning = f"True if the robot recovered from the fault {kind} within the time limit."
-    bound_meaning = f"Lower bound of the recovery time if the robot did not recover from {kind}; otherwise empty."
+    bound_meaning = (
+        f"Lower bound of the recovery time if the robot did not recover from {kind} and the end of its cause is "
+        "known; otherwise empty."
+    )
     index, bound = list(FaultKind).index(kind), fault_column_name(kind, "recovery_at_least_s")
     recovered = Figure(f"{_recovered_state(kind)} after {kind}", Kind.FLAG, rank=70 + index)
     recovery = Figure(f"{_observer(kind)} recovery after {kind}", Kind.MEDIAN, rank=80 + index, at_least=bound)

@@ -48,7 +48,7 @@ SENT_COLUMNS: Final = columns(
         "s",
         (
             "Median round-trip time over all echo requests, in which the time of an unanswered request "
-            "is infinite; empty if half of the requests or more were unanswered."
+            "is infinite; empty if half of the requests or more were unanswered, and if ping was killed."
         ),
     ),
 )
@@ -139,7 +139,7 @@ class Ping:
         replies: All replies in the order of arrival, including duplicates.
         problems: All ICMP errors.
         transmitted: Number of sent requests according to the summary; None if ping was killed before the summary.
-        received: Number of answered requests according to the summary.
+        received: Number of answered requests according to the summary; None without a summary.
         unknown_lines: Unknown lines, unchanged.
         first_seq: Sequence number of the first request: 1, or 0 for busybox.
         summary_s: Shortest, mean and longest round-trip time according to the summary; None without these.
@@ -166,7 +166,10 @@ class Ping:
 
     @property
     def unanswered_seqs(self) -> tuple[int, ...]:
-        """Sequence numbers of the requests without an answer, up to the last request in the output."""
+        """Sequence numbers of the requests without an answer, up to the last request, but at most 65,535.
+
+        Without a summary, the last request is the last one that a line of the output names.
+        """
         answered_seqs = {reply.seq for reply in self.answers}
         printed_seqs = answered_seqs | {problem.seq for problem in self.problems}
         end = max(printed_seqs, default=-1) + 1 if self.transmitted is None else self.first_seq + self.transmitted
@@ -246,9 +249,13 @@ def measure(output: Ping | None) -> Measured:
         "rtt_max_s": max(rtt_s, default=None),
         "rtt_jitter_s": float(np.abs(np.diff(rtt_s)).mean()) if len(rtt_s) > 1 else None,
     }
-    of_sent = {"rtt_median_sent_s": quantile_of_sent(rtt_s, output.transmitted or 0, 0.5)}
+    # Without the summary, the number of requests is unknown.
+    sent = output.transmitted
+    of_sent = {"rtt_median_sent_s": None if sent is None else quantile_of_sent(rtt_s, sent, 0.5)}
     return (
         Measured.from_optional(counts, "ping was killed before its summary")
         | Measured.from_optional(times, "too few replies have a time")
-        | Measured.from_optional(of_sent, "half of the requests or more were unanswered")
+        | Measured.from_optional(
+            of_sent, "half of the requests or more were unanswered, or ping was killed before its summary"
+        )
     )

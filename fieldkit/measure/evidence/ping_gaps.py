@@ -52,9 +52,9 @@ class AnswerGap:
     """The longest time without an answer in a run of ping.
 
     Attributes:
-        duration_s: Time in seconds between the answers before and after the gap; the observed part of it if the gap
-            is open.
-        lost: Number of unanswered requests in the gap.
+        duration_s: Time in seconds between the answers before and after the gap. If the gap is open: the observed
+            part of this time or, if it is longer, the longest time between two answers.
+        lost: Number of unanswered requests in the gap; for an open gap, the larger of the two numbers.
         is_open: True if ping started or ended in the gap, so that both numbers are lower bounds.
     """
 
@@ -71,7 +71,7 @@ def longest_gap(output: Ping, interval_s: float) -> AnswerGap | None:
 
     Args:
         output: Output of ping.
-        interval_s: Time between two requests. The length of an open gap is this interval times the number of
+        interval_s: Time between two requests. The observed part of an open gap is this interval times the number of
             unanswered requests.
     """
     stamped = sorted(stamped_answers(output))

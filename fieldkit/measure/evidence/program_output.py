@@ -2,7 +2,7 @@
 
 Output of a robot is not trusted, and expressions can be inefficient. Paths are JMESPath (jmespath.org/specification),
 which has no loops except over the data. Expressions are RE2 (github.com/google/re2/wiki/Syntax): matching takes a
-time that is linear in the length of the text. Python's `re` needs years to match `(a+)+$` with some texts of forty
+time that is linear in the length of the text. Python's `re` needs years to match `(a+)+$` with some texts of fifty
 letters.
 """
 

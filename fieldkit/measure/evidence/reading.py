@@ -92,7 +92,11 @@ def compressed(path: Path) -> bytes:
 
 @contextmanager
 def _open_regular(path: Path) -> Iterator[BinaryIO]:
-    """Open a regular file; other types, such as a pipe without a writer or an endless device, are refused."""
+    """Open a regular file; other types, such as a pipe without a writer or an endless device, are refused.
+
+    Raises:
+        EvidenceError: The file is missing, cannot be read, or is not a regular file.
+    """
     try:
         # The type is checked after opening, because the path can be replaced between a check and the opening.
         with open(path, "rb", opener=_open_nonblocking) as file:
@@ -113,13 +117,18 @@ _COUNT: Final = re.compile(r"# lines ([0-9]{1,9})\n", re.ASCII)
 
 
 def counted_csv_text(header: str, lines: Iterable[str]) -> str:
-    """Return the text of a CSV file that starts with its number of lines, which shows whether it is complete."""
+    """Return the text of a CSV file.
+
+    It starts with a comment that contains the number of data lines, which shows whether the file is complete.
+    """
     data_lines = list(lines)
     return "".join(f"{line}\n" for line in (f"# lines {len(data_lines)}", header, *data_lines))
 
 
 def read_counted_csv(path: Path, header: str, pattern: re.Pattern[str], error: str) -> list[re.Match[str]]:
-    """Return the lines of a file that `counted_csv_text` created, as matches of a pattern.
+    """Return the data lines of a file that `counted_csv_text` created, as matches of a pattern.
+
+    A file without the number of lines is accepted, too; whole lines that are missing at its end are not detected.
 
     Args:
         path: The file.

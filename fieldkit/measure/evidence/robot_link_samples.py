@@ -3,7 +3,7 @@
 During an attempt, a script on each robot, the sampler, reads the state of the link several times per second. Its file
 `ROLE-link.txt`, which is usually compressed, has sections. Each section has a line `==> SECONDS NAME <==` and the
 output at this time: `link`, `survey` and `station` of iw, or `wireless` of /proc/net/wireless. The seconds are
-counted from boot; the time of boot is computed from the host state before the attempt.
+counted from boot; the time of boot is computed from the host state before the attempt or, without it, after it.
 
 The format of iw's lines is defined in its source files station.c, link.c and survey.c. Versions 3 to 6 differ only in
 added lines.
@@ -80,6 +80,8 @@ def parse_cell(text: str) -> StationSample | None:
 def parse_channel(text: str) -> tuple[float | None, int | None, int | None]:
     """Return noise in dBm, active time in ns and busy time in ns of the channel in use; None for missing values.
 
+    Both times are None if one of them is missing.
+
     Args:
         text: Output of `iw dev INTERFACE survey dump`.
     """
@@ -96,7 +98,10 @@ def parse_channel(text: str) -> tuple[float | None, int | None, int | None]:
 
 
 def parse_wireless(line: str) -> tuple[float | None, float | None]:
-    """Return signal and noise in dBm from a line of /proc/net/wireless without the interface's name."""
+    """Return signal and noise in dBm from a line of /proc/net/wireless without the interface's name.
+
+    The noise is None if the driver does not report it; both values are None if the line has no negative signal.
+    """
     match = _WIRELESS_LINE.match(line)
     if match is None:
         return None, None

@@ -3,7 +3,7 @@
 An untrusted file can make a library decompress any amount of data, run queries that the file's database schema
 defines, or follow references without end. A check of the file in advance cannot detect all of this. The reader is a
 process, because a process can be killed, unlike a thread. The first query starts it, which takes 0.1 s; the process
-also answers later queries. It exits if it is idle for some time, and if it runs out of memory.
+also answers later queries. It exits if it is idle for some time, if this process exits, and if it runs out of memory.
 """
 
 import json
@@ -24,7 +24,7 @@ from typing import Any, Final
 MEMORY_BYTES: Final = 256 << 20
 DISK_BYTES: Final = 16 << 20
 CPU_S: Final = 10
-"""Base limits for reading a file of any size."""
+"""Base limits for reading a file of any size. The limit of the disk applies to each file that the reader writes."""
 MEMORY_PER_BYTE: Final = 16
 DISK_PER_BYTE: Final = 1
 BYTES_PER_CPU_S: Final = 1 << 20
@@ -35,7 +35,7 @@ ANSWER_PER_BYTE: Final = 4
 """Limit of an answer's length: a base, and an addition per byte of the file."""
 MEMORY_SHARE: Final = 0.5
 MAX_CPU_S: Final = 3600
-"""Upper limits for a file of any size: share of this machine's memory, and CPU time."""
+"""Upper limits for a file of any size: share of this machine's memory (but at least `MEMORY_BYTES`), and CPU time."""
 
 # A reader that waits without using CPU time, for example for a named pipe, needs a limit of wall-clock time. This
 # limit is larger than the CPU time, because other processes may use the CPU.
@@ -100,7 +100,10 @@ class SandboxedReader:
                 self._kill(self._process)
 
     def _exchange(self, question: Sequence[object], size_bytes: int) -> tuple[Json, int]:
-        """Return the answer and 0, or an empty answer and the exit code if the process exited or was killed."""
+        """Return the answer and 0, or an empty answer and the exit code if the process exited or was killed.
+
+        If the answer is too long, the process is killed, and an answer with `ERROR_KEY` is returned.
+        """
         if self._owner_pid != os.getpid():  # after a fork, two processes could receive each other's answers
             self._process, self._owner_pid = None, os.getpid()
         process = self._process = self._process or _start(self._module)
@@ -158,7 +161,7 @@ def remove_folder(folder: str | None) -> None:
 
 
 def _limits(size_bytes: int) -> tuple[int, int, int]:
-    """Return the limits of memory and disk in bytes, and of CPU time in seconds, for a file of this size."""
+    """Return the limits of memory and of written files in bytes, and of CPU time in s, for a file of this size."""
     machine_bytes = os.sysconf("SC_PHYS_PAGES") * resource.getpagesize()
     max_bytes = max(MEMORY_BYTES, int(MEMORY_SHARE * machine_bytes))
     memory_bytes = min(MEMORY_BYTES + MEMORY_PER_BYTE * size_bytes, max_bytes)

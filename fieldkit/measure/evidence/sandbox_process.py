@@ -14,8 +14,8 @@ from typing import Final
 from fieldkit.measure.evidence.sandbox import ERROR_KEY, Json, remove_folder
 
 _IDLE_MS: Final = 60_000
-"""Idle time in ms after which the process exits. It is longer than a repeat, so that one process serves a whole
-trial. The process also exits with its parent process, because its input is then closed."""
+"""Idle time in ms after which the process exits. It is longer than most repeats, so that one process usually serves a
+whole trial. The process also exits with its parent process, because its input is then closed."""
 
 
 def serve(answer: Callable[[Json], Json]) -> None:
@@ -44,7 +44,10 @@ def serve(answer: Callable[[Json], Json]) -> None:
 
 
 def _apply_limits(memory_bytes: int, disk_bytes: int, cpu_s: int) -> None:
-    """Limit the resources that this process may use in addition to its current use."""
+    """Limit the memory and CPU time that this process may use in addition to its current use, and its files.
+
+    `disk_bytes` is the maximum size of each file that it writes.
+    """
     used_bytes = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
     used = resource.getrusage(resource.RUSAGE_SELF)
     limits = {

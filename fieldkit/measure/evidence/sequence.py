@@ -20,8 +20,8 @@ class MessageCounts:
         messages: Received messages without duplicates.
         lost: Lost messages.
         repeated: Duplicates.
-        silence_s: Longest time without a message.
-        rate_hz: Rate at which messages were sent in the time without silences.
+        silence_s: Longest time without a message, after the first message.
+        rate_hz: Rate at which messages were sent in the time without silences; 0 if it cannot be computed.
     """
 
     messages: int
@@ -37,7 +37,7 @@ def count_messages(arrivals: Sequence[tuple[int, int]], end_us: int) -> MessageC
     Between two consecutive messages, `(number - previous number - 1) % 256` messages are missing; a message that
     arrives late is not lost. In a silence of more than 1 s, a multiple of 256 further messages may be lost. The
     multiple that agrees best with the message rate outside of silences is used. After the last message, the loss is
-    computed from this rate.
+    computed from this rate. Without arrivals, all values are 0.
 
     Args:
         arrivals: Time of arrival in us and sequence number of each message, in the order of arrival.

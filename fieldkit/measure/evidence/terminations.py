@@ -14,7 +14,7 @@ _TERMINATION: Final = re.compile(
 )
 
 _TICKS_PER_S: Final = 100
-"""Unit of field 22 of /proc/PID/stat (USER_HZ), on every processor except Alpha and Itanium."""
+"""Clock ticks per second of field 22 of /proc/PID/stat (USER_HZ), on every processor except Alpha and Itanium."""
 
 _KILLED: Final = 128
 """A shell's exit code for a command that was killed by a signal is this number plus the signal number."""

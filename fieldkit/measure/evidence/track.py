@@ -49,7 +49,7 @@ class Separation:
 
 
 def text(track: Iterable[TrackPoint]) -> str:
-    """Return the file text of a track, with a resolution of 0.1 mm."""
+    """Return the file text of a track, with a resolution of 0.1 mm and 0.1 mm/s."""
     return reading.counted_csv_text(_HEADER, map(_format_line, track))
 
 
@@ -96,9 +96,10 @@ def distances_m(track: Sequence[TrackPoint], source: Role, destination: Role) ->
 def separation_between(
     track: Sequence[TrackPoint], source: Role, destination: Role, start_ns: int, end_ns: int
 ) -> Separation | None:
-    """Return distance and speeds of two robots between two times, or None if they never both have a position.
+    """Return distance and speeds of two robots between two times.
 
-    Times at which a robot has no position are ignored.
+    Times at which a robot has no position are ignored. Return None if the two robots never both have a position, or
+    if the track starts after `start_ns`.
 
     Args:
         track: Positions of the robots.

@@ -50,7 +50,7 @@ def distances_m(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> Sequence[
     """Return the distance of two robots over time, as (time, distance) pairs.
 
     Times are in nanoseconds since 1970 UTC by the first robot's clock. A gap in the positions is a pair without a
-    distance (None). The list is empty if no distance is known.
+    distance (None). There are no pairs if no positions are recorded, or if they cannot be compared.
     """
     if not are_recorded(evidence):
         return list(track.distances_m(evidence.read_or_none(track.read, track.FILE) or (), *ends))

@@ -30,7 +30,7 @@ def read_file(path: Path) -> Samples:
     """Return the samples in a GPX or CSV file, with the file's times unchanged. The name's suffix gives the format.
 
     Raises:
-        EvidenceError: The file has another suffix or is invalid.
+        EvidenceError: The file has another suffix, is missing or is invalid.
     """
     match path.suffix.lower():
         case ".csv":
@@ -93,7 +93,7 @@ def to_placement_frame(samples: Samples, position_source: PositionSource) -> Sam
         position_source: Source with the place and heading of the robot at the start of the step, and the start time.
 
     Raises:
-        EvidenceError: The heading is unknown, or the odometry has no sample at the start.
+        EvidenceError: The heading is unknown, or the odometry has no sample at or before the start.
     """
     assert samples.yaws_rad is not None
     if position_source.heading_rad is None:

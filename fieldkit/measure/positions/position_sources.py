@@ -155,7 +155,7 @@ def _record_from_json(record: type[Any], values: Mapping[str, Any]) -> Any:  # n
 
 
 def _typed_value(kind: Any, value: Any) -> Any:  # noqa: ANN401 (any JSON value)
-    """Return a JSON value converted to the type `kind`; raises `ValueError` if it is not of this type."""
+    """Return a JSON value converted to the type `kind`; raises `ValueError` if it has another type or is too big."""
     if kind is str and isinstance(value, str):
         return value
     if kind is int and type(value) is int and 0 <= value < 2**62:

@@ -1,6 +1,6 @@
 """Positions of robots from the sources in `positions.json`, and a check of travelled distances.
 
-If no robot has such a source, the positions of the testbed are used (`position_columns`).
+If neither robot of a pair has such a source, the positions of the testbed are used.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -64,7 +64,8 @@ def distances_m(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> Sequence[
     """Return the distance of two robots over time, as (time, distance) pairs.
 
     Times are in nanoseconds since 1970 UTC by the first robot's clock. A gap in the positions is a pair without a
-    distance (None). If neither robot has a source in `positions.json`, the positions of the testbed are used.
+    distance (None). If neither robot has a source in `positions.json`, the positions of the testbed are used. There
+    are no pairs if a source is missing or cannot be read, or if the frames of the robots differ.
     """
     try:
         sources = read_position_sources(evidence)
@@ -111,7 +112,10 @@ def _read_sources(evidence: AttemptEvidence) -> PositionSources:
 
 
 def sources_text(evidence: AttemptEvidence) -> str | None:
-    """Return a text such as `sender as placed, receiver /odom`, or None if there are no sources."""
+    """Return a text such as `sender as placed, receiver /odom`, or None if there are no sources.
+
+    Raises the same errors as `read_position_sources`.
+    """
     robots = read_position_sources(evidence).robots
     return ", ".join(f"{role} {robots[role].description}" for role in sort_roles(robots)) or None
 
@@ -147,7 +151,7 @@ def _trajectory(samples: Samples, places_m: Floats, position_source: PositionSou
 
 
 def samples_of(evidence: AttemptEvidence, role: Role) -> Samples:
-    """Return the samples of one robot, with times by the laptop's clock.
+    """Return the samples of one robot, with times by the laptop's clock. A fixed place is one sample at time 0.
 
     Raises:
         EvidenceError: The robot has no source, or the source cannot be read.
@@ -184,7 +188,10 @@ def _shifted(samples: Samples, by_ns: int) -> Samples:
 
 
 def _samples_in_trial(path: Path) -> Samples:
-    """Return the samples in a file of a trial. They are cached, because all attempts of the trial use this file."""
+    """Return the samples in a file of a trial. They are cached, because all attempts of the trial use this file.
+
+    Raises the same errors as `position_files.read_file`.
+    """
     try:
         status = path.stat()
     except OSError as error:
@@ -211,7 +218,10 @@ def clock_offset_ns(evidence: AttemptEvidence, role: Role) -> int:
 
 
 def clock_error_s(evidence: AttemptEvidence) -> float | None:
-    """Return the maximum error of a time difference between two robots; None if no clock offset was measured."""
+    """Return the maximum error of a time difference between two robots; None if no clock offset was measured.
+
+    It is the sum of the two largest errors of clock offsets. Raises the same errors as `read_position_sources`.
+    """
     errors_s = sorted(offset.error_s for offset in read_position_sources(evidence).clocks.values())
     return sum(errors_s[-2:]) if errors_s else None
 
@@ -219,7 +229,7 @@ def clock_error_s(evidence: AttemptEvidence) -> float | None:
 def _ecef_m(source: Samples, destination: Samples, *, heights: bool) -> tuple[Floats, Floats]:
     """Return ECEF positions of two robots in metres.
 
-    If `heights` is False, the median height is used for all positions.
+    If `heights` is False, the median of the known heights is used for all positions, or 0 if no height is known.
 
     Raises:
         EvidenceError: `heights` is True, and some heights are unknown.
@@ -250,13 +260,15 @@ _MARGIN_S: Final = 1.0
 def travel_contradiction(
     evidence: AttemptEvidence, role: Role, farthest_m: float, speed_m_s: float, log_span_ns: tuple[int, int] | None
 ) -> str | None:
-    """Return the reason why a robot cannot have travelled `farthest_m` away from its start, or None if it can.
+    """Return the reason why a robot cannot have travelled `farthest_m` away from its start.
+
+    None if no other source of its position contradicts the distance.
 
     Args:
         evidence: The attempt's evidence.
         role: The robot.
         farthest_m: Largest distance from the start according to the robot's log.
-        speed_m_s: Speed of the robot.
+        speed_m_s: Commanded speed of the robot.
         log_span_ns: First and last time of the log by the robot's clock; None if the log has no times.
     """
     track_samples = evidence.read_or_none(track.read, track.FILE) if evidence.has(track.FILE) else None

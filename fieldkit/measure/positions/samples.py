@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.units import METRES_PER_UNIT
+from fieldkit.core.units import METRES_PER_UNIT, format_count
 from fieldkit.measure.captures.arrays import Floats, Ints
 from fieldkit.measure.evidence import reading
 
@@ -96,7 +96,7 @@ def read_csv(path: Path) -> Samples:
     for number, row in lines:
         where = f"{path}:{number}"
         if len(row) != len(names):
-            raise EvidenceError(f"has {len(row)} cells, but the header has {len(names)}", where=where)
+            raise EvidenceError(f"has {format_count(len(row), 'cell')}, but the header has {len(names)}", where=where)
         if len(values) == MAX_SAMPLES:
             remedy = "remove the lines outside of the trial"
             raise EvidenceError(f"has more than {MAX_SAMPLES} lines", where=str(path), remedy=remedy)
@@ -111,7 +111,7 @@ def read_csv(path: Path) -> Samples:
 
 
 def _lines(rows: Iterator[list[str]], path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield the number and cells of each line that is not empty."""
+    """Yield the number and cells of each line that is not empty; raises `EvidenceError` if it is not CSV."""
     try:
         yield from ((number, row) for number, row in enumerate(rows, start=1) if row)
     except csv.Error as error:
@@ -154,7 +154,11 @@ class _Columns:
 
 
 def _columns(names: Sequence[str], where: str) -> _Columns:
-    """Return the indices of the time and position columns."""
+    """Return the indices of the time and position columns.
+
+    Raises:
+        EvidenceError: There is not exactly one time column, or no complete set of position columns.
+    """
     times = [index for index, name in enumerate(names) if name == "t" or name in _NS_PER]
     lengths = {
         f"{axis}_{unit}": (axis, factor) for axis in (*_AXES, "alt") for unit, factor in METRES_PER_UNIT.items()
@@ -180,7 +184,13 @@ def _columns(names: Sequence[str], where: str) -> _Columns:
 
 
 def _time_ns(name: str, text: str, where: str) -> int:
-    """Return a time in nanoseconds since 1970 UTC."""
+    """Return a time in nanoseconds since 1970 UTC; raises `EvidenceError` if the text is not a valid time.
+
+    Args:
+        name: Name of the column, which determines the format.
+        text: The text in the cell.
+        where: Place of the line, for the error message.
+    """
     invalid = EvidenceError(f"{text[:40]!r} is not a time", where=where, remedy="write it as 2026-11-22T10:00:00.5Z")
     if name != "t":
         if not _UNIX_TIME.fullmatch(text):  # also rejects times with an exponent, which have too few digits: 1.7e9

@@ -10,7 +10,8 @@ from fieldkit.measure.captures.arrays import Floats, Ints
 from fieldkit.measure.evidence.track import Separation
 
 SPEED_SPAN_NS: Final = 200_000_000
-"""Shortest time over which a speed is computed. Over a shorter time, noise of the positions would appear as speed."""
+"""Shortest time over which a speed is computed, unless the positions cover less. Over a shorter time, noise of the
+positions would appear as speed."""
 
 _ALWAYS: Final = np.array([0, 2**62])
 """Times of a trajectory that covers every time span, in ns since 1970."""
@@ -132,7 +133,8 @@ def _mean_m(begin: Floats, end: Floats) -> float:
 def _speed_m_s(robot: Trajectory, reference: Trajectory | None, start_ns: int, end_ns: int) -> float:
     """Return the mean speed of a robot relative to `reference` or, if it is None, to the ground.
 
-    A time span shorter than `SPEED_SPAN_NS` is extended to this length if the trajectories cover it.
+    A time span shorter than `SPEED_SPAN_NS` is extended to this length, as far as the trajectories cover it. The
+    speed is 0 if the time span then still has no length.
     """
     missing_ns = max(SPEED_SPAN_NS - (end_ns - start_ns), 0) // 2
     trajectories = [trajectory for trajectory in (robot, reference) if trajectory is not None]

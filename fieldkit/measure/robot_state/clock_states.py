@@ -38,7 +38,10 @@ class RobotClock:
 
     @property
     def report(self) -> ClockReport | None:
-        """The first report with a problem or, without one, the report with the largest possible offset."""
+        """The first report with a problem or, without one, the report with the largest possible offset.
+
+        None without reports.
+        """
         problems = [report for report in self.reports if not report.is_synchronized]
         return problems[0] if problems else max(self.reports, key=_largest_offset_s, default=None)
 
@@ -48,7 +51,10 @@ def _largest_offset_s(report: ClockReport) -> float:
 
 
 def reports(snapshot: Snapshot) -> tuple[ClockReport, ...]:
-    """Return the reports of all programs in a snapshot."""
+    """Return the reports of all programs in a snapshot.
+
+    If there are none, but the kernel's clock is known to be unsynchronized, the only report states this problem.
+    """
     parsed_reports: list[ClockReport | None] = []
     if (output := snapshot.get(chrony.NAME)) is not None:
         parsed_reports.append(chrony.parse(output))
@@ -145,7 +151,9 @@ def contradictions(clocks: Mapping[Role, RobotClock], measured: Measured) -> Ite
 def contradiction(
     names: tuple[str, str], reports_of_pair: tuple[ClockReport | None, ClockReport | None], measured: Offset
 ) -> str | None:
-    """Return a sentence if the reports of two robots contradict the measured offset between their clocks, or None.
+    """Return a sentence if the reports of two robots contradict the measured offset between their clocks.
+
+    None if they do not, or if a clock is not synchronized or has no report.
 
     Args:
         names: Names of the two robots.

@@ -108,7 +108,11 @@ def _flags(snapshot: Snapshot) -> tuple[frozenset[str] | None, frozenset[str] | 
 
 
 def flags_during(before: Health, after: Health) -> frozenset[str] | None:
-    """Return the flags that were set before, during or after the attempt; None if they are unknown."""
+    """Return the flags that were set before, during or after the attempt; None if they are unknown.
+
+    A flag that was set only between the two states is detected if the robot reports the flags since boot, and if this
+    flag had not been set since boot before the attempt.
+    """
     if before.flags is None or after.flags is None:
         return None
     new = (after.earlier_flags or frozenset()) - (before.earlier_flags or frozenset())
@@ -143,7 +147,7 @@ def marks(names: Mapping[Role, str], flags_by_role: Mapping[Role, frozenset[str]
 
     Args:
         names: Name of the robot in each role.
-        flags_by_role: Results of `flags_during`.
+        flags_by_role: Results of `flags_during`; None for a robot whose flags are unknown.
     """
     for role, flags in flags_by_role.items():
         if UNDER_VOLTAGE in (flags or ()):

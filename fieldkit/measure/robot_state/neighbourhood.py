@@ -134,7 +134,7 @@ def _channel(info: str) -> WifiChannel | None:
 
 
 def _signals(scan: str, channel: WifiChannel, own_address: str) -> tuple[float | None, ...]:
-    """Return the received power of each other network that was received on a channel."""
+    """Return the received power of each other network that was received on a channel; None if it is not reported."""
     parts = _NETWORK.split(scan)
     signals: dict[str, float | None] = {}
     for address, state, body in zip(parts[1::3], parts[2::3], parts[3::3], strict=True):

@@ -37,15 +37,16 @@ def declare_columns(role: str) -> tuple[Column, ...]:
             "text",
             (
                 f"Program that sets the clock of the {role}, and its time source, such as `chrony 10.0.0.1`. Empty "
-                "without a time source."
+                "if there was no time source before, during or after the repeat."
             ),
         ),
         (
             f"{role}_time_offset_s",
             "s",
             (
-                f"Clock of the {role} minus its time source, as reported by this program: the larger of the values "
-                "before and after the repeat. Empty without a time source."
+                f"Clock of the {role} minus its time source, as reported by this program: the value before, during "
+                "or after the repeat with the largest sum of its magnitude and its maximum error. Empty without a "
+                "time source."
             ),
             CLOCK_DIFFERENCE_BOUNDS_S,
         ),

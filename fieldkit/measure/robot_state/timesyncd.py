@@ -41,7 +41,7 @@ _NTP: Final = re.compile(r"^NTP=(yes|no)$", re.MULTILINE)
 
 
 def parse(status: SourceOutput, state: SourceOutput | None) -> ClockReport | None:
-    """Return the report of systemd-timesyncd, or None if timesyncd is not in use.
+    """Return the report of systemd-timesyncd, or None if it has no status and `timedatectl` reports it as disabled.
 
     Args:
         status: Output of `timedatectl timesync-status`.

@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from fieldkit.core.units import format_count
 from fieldkit.measure.captures.arrays import Keys, Mask, row_hashes
 from fieldkit.measure.captures.headers import TCP, address_text
 from fieldkit.measure.captures.packets import NO_PORT, SYN, Packets
@@ -40,9 +41,11 @@ def header_problem(packets: Packets) -> str | None:
 
 
 def incomparability_reason(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:
-    """Return the reason why two complete captures cannot be compared, or None if they can.
+    """Return the reason why two complete captures cannot be compared.
 
-    The reason continues a sentence about the transfer, to which `its` refers.
+    None if they can be compared, or if the sender's capture has no packet of the transfer.
+
+    The reason continues a sentence about the transfer, to which the word `its` in the reason refers.
 
     Args:
         sender: Packets of the sender's capture.
@@ -94,7 +97,8 @@ def _capture_problem(sent_forward: Packets, received_forward: Packets, sent: Pac
     """Return the reason why one of the captures cannot be used for any comparison, or None."""
     for end, packets in (("sender", sent_forward), ("receiver", received_forward)):
         if truncated := _truncated_count(packets):
-            return f"{truncated} packets in the {end}'s capture were truncated in their TCP or UDP header"
+            packets_text = format_count(truncated, "packet")
+            return f"the {end}'s capture has {packets_text} truncated in the TCP or UDP header"
     if (duplicates := _duplicate_count(sent)) > MAX_ALTERED_SHARE * len(sent):
         duplicates_text = f"{duplicates} of its {len(sent)} packets in the sender's capture occur twice"
         return f"{duplicates_text}, as if they were captured on two interfaces"

@@ -108,7 +108,9 @@ class Clocks:
 
 
 def estimate(forward: StampPairs, reverse: StampPairs) -> Clocks | None:
-    """Return the offset between the clocks, or None if no line fits all packets because a clock was set.
+    """Return the offset between the clocks.
+
+    Return None if no line fits all packets, because a clock was set or the skew is larger than `MAX_SKEW`.
 
     The estimated skew maximizes the shortest round-trip time, computed without the fastest packet of each direction.
     If both directions have undelayed packets at the start and at the end, any other skew gives a shorter time. If

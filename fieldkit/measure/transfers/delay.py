@@ -207,7 +207,8 @@ def packet_delays(
 def clocks_between(sender: Packets, receiver: Packets, sender_address: str, receiver_address: str) -> Clocks | None:
     """Return the offset between two robots' clocks, estimated from all packets between them, of any protocol.
 
-    Return None if a capture lacks times, if there are no packets in one direction, or if a clock was set.
+    Return None if a packet lacks a time, if no packet of one direction is in both captures, or if `estimate` returns
+    None.
 
     Args:
         sender: Packets of the sender's capture.
@@ -236,7 +237,9 @@ def _withheld(reason: str) -> Measured:
 
 
 def jitter_s(transit_ns: Ints) -> float | None:
-    """Return the interarrival jitter of RFC 3550, section 6.4.1, after the last packet; None for a single packet.
+    """Return the interarrival jitter of RFC 3550, section 6.4.1, after the last packet.
+
+    None for fewer than two packets.
 
     Args:
         transit_ns: Time of reception minus time of sending of each packet, in the order of arrival, by any two
@@ -252,7 +255,7 @@ def jitter_s(transit_ns: Ints) -> float | None:
 def mean_jitter_s(transit_ns: Ints) -> float | None:
     """Return the mean of the values that `jitter_s` has after each packet from the second on.
 
-    The argument is the same as for `jitter_s`.
+    None for fewer than two packets. The argument is the same as for `jitter_s`.
     """
     if len(transit_ns) < 2:
         return None
@@ -315,7 +318,11 @@ def _one_way(delay_s: Floats, error_s: float, sent: int) -> Measured:
 
 
 def _other_pairs(sender: Packets, receiver: Packets, transfer: Transfer) -> StampPairs:
-    """Return the times of other packets from sender to receiver: packets without payload, and packets of ping."""
+    """Return the times of the packets from sender to receiver that certainly do not belong to the transfer.
+
+    These are packets of other protocols such as ping and, for a TCP transfer, packets to other ports or without
+    payload.
+    """
     ends = transfer.sender_address, transfer.receiver_address
     return _matched_pairs(
         *(
@@ -361,7 +368,7 @@ def _matched_pairs(sent: Packets, received: Packets) -> StampPairs:
 
 
 def _pair_indices(matched: Match, selection: Mask | None = None) -> tuple[Ints, Ints]:
-    """Return the indices of matched packets among the sent and among the received packets, without ambiguous ones.
+    """Return the indices of matched packets among the sent and the received packets; ambiguous packets are omitted.
 
     Args:
         matched: The match.

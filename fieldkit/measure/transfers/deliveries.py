@@ -71,7 +71,8 @@ class StreamDeliveries:
     Attributes:
         at_ns: Times of arrival of new payload, ascending. Shape (n,).
         begin_ns: Time of the first packet of the stream, which is the SYN for TCP.
-        end_ns: Time until which payload was due; None if all payload arrived.
+        end_ns: Time until which payload was due; None if all payload of a TCP stream without a fixed duration
+            arrived.
         interval_s: Sending interval; see `FlowSchedule.interval_s`.
         min_stall_s: Minimum length of a stall: payload is overdue for longer than this.
     """
@@ -192,7 +193,8 @@ def stream_deliveries(
 ) -> StreamDeliveries:
     """Return the deliveries of a stream.
 
-    Payload was due for the known duration of the stream or, without one, until the last payload was sent.
+    Payload was due for the known duration of the stream, but at most until the receiving program exited. Without a
+    known duration, it was due until the last payload was sent.
 
     Args:
         at_ns: Times at which new payload of the stream arrived, ascending.
@@ -215,7 +217,11 @@ def stream_deliveries(
 
 
 def _sender_to_receiver_ns(pairs: StampPairs) -> tuple[int, int]:
-    """Return the offsets in ns that convert the sender's times at the start and at the end of a flow."""
+    """Return the offsets in ns that convert the sender's times at the start and at the end of a flow.
+
+    Raises:
+        EvidenceError: There are no pairs.
+    """
     if not len(pairs):
         raise EvidenceError("no packet of the flow is known to be in both captures")
     order = np.argsort(pairs.receiver_ns, kind="stable")

@@ -134,7 +134,10 @@ PACKET_COLUMNS: Final = columns(
     (
         "lost",
         "bool",
-        "True if the packet, or any byte of a TCP frame, did not arrive; empty if ambiguous.",
+        (
+            "True if the packet, or any byte of a TCP frame, did not arrive. Empty if ambiguous, and for all packets "
+            "if a received packet may be a copy that hides a loss."
+        ),
     ),
     ("sent_again", "bool", "True if any byte of the frame had been sent before. Empty for UDP."),
     ("wire_bytes", "B", "Length of the frame at the sender."),

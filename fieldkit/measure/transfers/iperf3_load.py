@@ -10,6 +10,7 @@ from fieldkit.core.columns import NEGATIVE_LOSS_BOUNDS, Figure, Kind, Measured, 
 from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol
+from fieldkit.core.units import format_count
 from fieldkit.measure.captures.arrays import NO_TIME, Ints, Mask
 from fieldkit.measure.captures.headers import TCP, UDP
 from fieldkit.measure.captures.packets import UDP_HEADER_BYTES, Packets
@@ -27,7 +28,8 @@ COLUMNS: Final = columns(
         "bit/s",
         (
             "Payload rate of the test in the receiver's capture during the same seconds as iperf3_throughput_bit_s, "
-            "counted from the first packet; each byte counts once. Compare it with iperf3_throughput_bit_s."
+            "counted from the first packet; each byte of a TCP stream counts once, each copy of a datagram counts. "
+            "Compare it with iperf3_throughput_bit_s."
         ),
         Figure("iperf3 throughput, captured", Kind.MEDIAN, rank=65),
     ),
@@ -68,7 +70,7 @@ class LoadFlow:
     window_s: tuple[float, float]
 
     def streams(self, packets: Packets) -> list[Packets]:
-        """Return the data packets of each stream in a capture; for UDP, only the first fragments of datagrams."""
+        """Return the packets of each stream in a capture; for UDP, only the first fragments of data."""
         number = UDP if self.protocol is Protocol.UDP else TCP
         ends = packets.are_from(self.source_address) & packets.are_to(self.destination_address)
         packets_between = packets.where(ends & (packets.protocol == number))
@@ -103,7 +105,11 @@ def _loss(flow: LoadFlow, sent: list[Packets], received: list[Packets]) -> float
 
 
 def _rate(flow: LoadFlow, received: list[Packets]) -> float | None:
-    """Return the rate of received payload, in which each byte is counted once; None if it cannot be computed."""
+    """Return the rate of received payload, in which each byte of a TCP stream is counted once.
+
+    Copies of UDP datagrams are counted. Return None if no data has arrived, a packet has no time, the time span is
+    empty, or the SYN of a TCP stream was not captured.
+    """
     is_udp = flow.protocol is Protocol.UDP
     data = [packets if is_udp else packets.where(packets.tcp_payload_bytes > COOKIE_BYTES) for packets in received]
     times_ns: Ints = np.concatenate([packets.time_ns for packets in data]) if data else np.array([], dtype=np.int64)
@@ -210,7 +216,7 @@ class LoadStreams:
             sent: Packets of the sender's capture, from `forward`. Unknown ports are determined from them.
 
         Raises:
-            EvidenceError: The streams cannot be distinguished from other connections.
+            EvidenceError: More connections use the port than the load has streams.
         """
         if self.ports:
             return self.ports
@@ -221,7 +227,8 @@ class LoadStreams:
         if self.protocol is Protocol.TCP:  # the first connection is iperf3's control connection
             first = first[1:]
         if len(first) > self.count:
-            raise EvidenceError(f"{len(first)} connections use the port of the load, but it has {self.count} streams")
+            streams_text = format_count(self.count, "stream")
+            raise EvidenceError(f"{len(first)} connections use the port of the load, but it has {streams_text}")
         return tuple((int(packets.sport[index]), int(packets.dport[index])) for index in first)
 
     def _is_data(self, packets: Packets) -> Mask:
@@ -309,21 +316,27 @@ def _udp_packets(load: LoadStreams, sender: Packets, receiver: Packets) -> UdpPa
 
 
 def _steady_clocks(load: LoadStreams, sender: Packets, receiver: Packets) -> Clocks | None:
-    """Return the offset between the clocks, or None if a direction without packets makes an estimate impossible.
+    """Return the offset between the clocks, or None if a capture has no packet of one of the robots.
 
     Raises:
-        EvidenceError: A clock was set during the load.
+        EvidenceError: The offset cannot be estimated although both captures have packets of both robots: packets have
+            no times or, otherwise, a clock was probably set during the load.
     """
     ends = load.source_address, load.destination_address
     clocks = delay.clocks_between(sender, receiver, *ends)
     has_packets = (packets.are_from(end).any() for packets in (sender, receiver) for end in ends)
     if clocks is None and all(has_packets):
-        raise EvidenceError(delay.UNSTEADY)
+        lacks_times = any((packets.time_ns == NO_TIME).any() for packets in (sender, receiver))
+        raise EvidenceError("a capture lacks times" if lacks_times else delay.UNSTEADY)
     return clocks
 
 
 def _transits_ns(load: LoadStreams, sender: Packets, receiver: Packets) -> Iterator[Ints]:
-    """Yield an array for each stream: the delays of its datagrams in ns, in the order of arrival."""
+    """Yield an array for each stream with complete datagrams: their delays in ns, in the order of arrival.
+
+    Raises:
+        EvidenceError: The delays cannot be determined from the captures.
+    """
     clocks = _steady_clocks(load, sender, receiver)
     if clocks is None:
         raise EvidenceError("no packet from receiver to sender is in both captures")

@@ -143,7 +143,8 @@ def match_keys(
         time_ns: Time of sending of each item. Shape (n,).
         received_key: Key of each received item. Shape (m,).
         received_time_ns: Time of reception of each item, by any clock. Shape (m,).
-        contents: Values that distinguish sent and received items with equal keys; `NOT_CAPTURED` if unknown.
+        contents: Values that distinguish sent and received items with equal keys, `NOT_CAPTURED` for an unknown
+            value; None if there are no such values.
     """
     sent_order, received_order = np.lexsort((time_ns, key)), np.lexsort((received_time_ns, received_key))
     keys, group = np.unique(key[sent_order], return_inverse=True)
@@ -267,7 +268,7 @@ def _equal_frames(sent: Packets, received: Packets, frames: Match) -> tuple[Ints
 def _key(packets: Packets, stamp: Ints) -> Keys:
     """Return a key of each packet, which is equal for packets with equal fields.
 
-    Two different packets have equal keys with a probability of 2**-48.
+    Two different packets have equal keys with a probability of at most about 2**-48.
     """
     ip = (packets.ip_id << 16 | packets.fragment_offset, packets.ip_payload_bytes << 8 | packets.protocol)
     tcp = (packets.tcp_seq << 32 | packets.tcp_ack, packets.tcp_flags << 33 | stamp + 1)

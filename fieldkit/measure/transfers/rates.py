@@ -60,10 +60,13 @@ class Rates:
     """Rates of a transfer.
 
     Attributes:
-        throughput_bit_s: IP-layer bits per second; None with fewer than two packets with payload, or without times.
-        completion_s: Time until the program had received the file; None if it did not receive the whole file, or if
+        throughput_bit_s: IP-layer bits per second; None with fewer than two packets with payload, without times, or
+            if the first and the last of these packets have the same time.
+        completion_s: Time until the program had received the file: over TCP until it closed the connection after it
+            had received every byte, over UDP until the last complete datagram. None if this did not happen, or if
             the time is unknown.
-        head_bytes: Payload in the first packet, with which the measured time starts.
+        head_bytes: Payload in the first packet of a UDP transfer, with which the measured time starts; 0 if its
+            datagram is incomplete, and for TCP.
     """
 
     throughput_bit_s: float | None
@@ -71,7 +74,11 @@ class Rates:
     head_bytes: int = 0
 
     def values(self, received_bytes: Value | None) -> dict[str, Value | None]:
-        """Return the columns, given the size of the file that the program wrote."""
+        """Return the columns; None for an unknown value.
+
+        Args:
+            received_bytes: Size of the file that the program wrote; None if unknown.
+        """
         goodput = None
         if isinstance(received_bytes, int) and self.completion_s:
             goodput = 8 * max(received_bytes - self.head_bytes, 0) / self.completion_s
@@ -151,7 +158,7 @@ def _closed_ns(sent: Packets, receiver: Packets, transfer: Transfer, counts: tcp
 def _throughput(received: Packets, carries_payload: Mask, ip_bytes: Ints) -> float | None:
     """Return the bit/s from the first packet with payload to the last, without the bits of the first packet.
 
-    Return None if the two packets have the same time.
+    Return None if there is only one such packet, or if the two packets have the same time.
     """
     order = np.argsort(received.time_ns, kind="stable")
     with_payload = np.flatnonzero(carries_payload[order])

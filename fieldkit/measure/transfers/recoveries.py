@@ -112,8 +112,9 @@ class FaultRecovery:
     Attributes:
         outage_s: Longest time without new payload that overlaps the fault.
         outage_open: True if the outage had not ended when the stream did, so that `outage_s` is a lower bound.
-        recovery_s: Time from the end of the cause to the first new payload; None if it was not observed.
-        recovery_open: True if no new payload arrived, so that `recovery_s` is a lower bound.
+        recovery_s: Time from the end of the cause to the first new payload; None if the end of the cause is unknown,
+            or if the stream ended before it without new payload.
+        recovery_open: True if no new payload arrived after the cause, so that `recovery_s` is a lower bound.
     """
 
     outage_s: float
@@ -228,7 +229,11 @@ def _column_name(column: str, is_open: bool) -> str:
 
 
 def _fault_times_at(times: FaultTimes | None, role: Role) -> tuple[int, int | None]:
-    """Return start and end of a fault by the clock of a robot."""
+    """Return start and end of a fault by the clock of a robot; the end is None if unknown.
+
+    Raises:
+        EvidenceError: The start is unknown, or the offset of the robot's clock is unknown or not accurate enough.
+    """
     if times is None:
         raise EvidenceError("the start of the fault is unknown")
     clock_offset = times.clock_offsets.get(role)

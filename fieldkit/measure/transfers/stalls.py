@@ -102,7 +102,8 @@ def find_stalls(stream: StreamDeliveries) -> Stalls:
     """Return the stalls of a stream.
 
     Raises:
-        EvidenceError: Only a single packet arrived, so no time can be computed.
+        EvidenceError: No time can be computed, because a single packet arrived without a stall before or after it, or
+            because no packet arrived and only one was sent.
     """
     at_ns, min_stall_s = stream.at_ns, stream.min_stall_s
     if not len(at_ns):
@@ -123,7 +124,11 @@ def find_stalls(stream: StreamDeliveries) -> Stalls:
 
 
 def _stall_without_arrivals(stream: StreamDeliveries) -> Stalls:
-    """Return the stall of a stream without arrivals; it has the stream's whole duration."""
+    """Return the stall of a stream without arrivals; it has the stream's whole duration.
+
+    Raises:
+        EvidenceError: The stream has no duration, because a single packet was sent.
+    """
     duration_s = ((stream.end_ns or stream.begin_ns) - stream.begin_ns) / 1e9
     if duration_s <= 0:
         raise EvidenceError("no packet of the flow arrived, and only one was sent")

@@ -24,7 +24,7 @@ class TcpFrames:
         sent: Frames in the sender's capture.
         received: Frames in the receiver's capture.
         payload: Match between the pieces of payload of both captures.
-        mss_bytes: Largest MSS in a SYN of either end; 0 if no SYN has an MSS.
+        mss_bytes: Largest MSS in a SYN of either end; 0 if no SYN has an MSS, and from `match_frames`.
     """
 
     sent: Packets
@@ -51,12 +51,12 @@ class TcpCounts:
         reordered_frames: Received frames whose first byte was sent before a byte that had already arrived; only the
             first of several copies is counted. None if frames are ambiguous.
         superframes: Frames of either capture with more payload than the largest MSS in a SYN, because offload joined
-            several segments. None if no SYN has an MSS.
+            several segments. None if no MSS is known.
         ambiguous_frames: Frames with bytes that were sent several times and arrived, if neither time stamps nor IP
             ids nor the time between the frames show which copy arrived.
         possible_copies: Received frames that may be copies and hide a loss (see `Match.possible_copy`).
         transfer_s: Time from the first frame to the last frame with payload at the receiver, in seconds; None without
-            payload.
+            payload, or if a frame has no time.
     """
 
     frames_sent: int

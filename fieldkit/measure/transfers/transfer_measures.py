@@ -104,7 +104,7 @@ def incomparability_reason(evidence: AttemptEvidence, transfer: Transfer) -> str
     """Return the reason why no loss can be computed from two undamaged captures, or None if it can be computed.
 
     The reason is a contradiction between the two captures, or between a capture and the received file. The result is
-    None if an end has no capture.
+    None if an end has no capture; a damaged capture is not compared.
     """
     return evidence.cached(_incomparability_reason, transfer) if transfer.captured else None
 
@@ -128,7 +128,7 @@ def _incomparability_reason(evidence: AttemptEvidence, transfer: Transfer) -> st
 
 
 def loss(arrived: int | None, sent: int | None) -> float | None:
-    """Return the loss 1 - arrived/sent (eq. 1 of the paper), or None if nothing was sent."""
+    """Return the loss 1 - arrived/sent (eq. 1 of the paper), or None if nothing was sent or a number is unknown."""
     return None if arrived is None or not sent else 1 - arrived / sent
 
 

@@ -41,7 +41,7 @@ class Transfer:
 
     @property
     def captured(self) -> bool:
-        """True if there are captures of both ends."""
+        """True if both ends are captured; the files can be missing nevertheless."""
         return None not in self.captures
 
     def forward(self, packets: Packets) -> Packets:

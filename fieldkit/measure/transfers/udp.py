@@ -96,7 +96,8 @@ class UdpCounts:
         datagrams_received: Datagrams of which all fragments arrived.
         bytes_sent: Sent payload bytes, without UDP headers.
         bytes_received: Payload bytes that arrived, including bytes of incomplete datagrams.
-        transfer_s: Time from the first to the last packet at the receiver, in seconds; None if nothing arrived.
+        transfer_s: Time from the first to the last packet at the receiver, in seconds; None if nothing arrived, or if
+            a packet has no time.
     """
 
     packets_sent: int

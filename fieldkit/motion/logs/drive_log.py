@@ -1,8 +1,8 @@
 """Log of an autonomous drive of a ground robot, and its columns.
 
 fieldkit's agent on the robot writes a JSON object per line, ten times a second (`fieldkit.agent.driving.drive`):
-time, pose from odometry in the frame of the start, and driven distance. The last line contains the reason for the
-end. All values are measurements of the robot.
+time, pose from odometry in the frame of the start, and driven distance. If the program was not killed, the last line
+contains the reason for the end. All values are measurements of the robot.
 """
 
 import math
@@ -66,7 +66,7 @@ _OUT: Final = frozenset({"out", "there"})
 """Phases from the start of the path until the robot turns back."""
 _PHASES: Final = frozenset({"waits", "returns", "back", HOME}) | _OUT
 _SPEED_INTERVAL_S: Final = 0.5
-"""Interval over which a speed is computed. One odometry message more or less changes it by 3 % at 50 Hz and by 7 %
+"""Interval over which a speed is computed. One odometry message more or less changes it by 4 % at 50 Hz and by 7 %
 at 30 Hz."""
 _ROUNDING: Final = 1e-4
 """Largest error of a rounded heading in the log, in radians."""

@@ -62,7 +62,9 @@ def contradictions(log: Sequence[FlightMoment], plan: FlyPlan) -> Iterator[str]:
 
 
 def telemetry_contradiction(log: Sequence[FlightMoment], places_m: Floats) -> str | None:
-    """Return the reason why telemetry and the log cannot be from the same flight; None if they can.
+    """Return the reason why telemetry and the log cannot be from the same flight.
+
+    None if they can, or if the telemetry has no positions.
 
     Args:
         log: The log.

@@ -1,9 +1,9 @@
 """Log of a drone's flight, and its columns.
 
 fieldkit's agent on the drone writes a JSON object per line, ten times a second (`fieldkit.agent.flying.flight_log`):
-time, phase of the flight, and the autopilot's position estimate relative to the origin of the trial's flights, which
-is the position and heading of the first start. All values are measurements of the drone. The first line contains the
-origin.
+time, phase of the flight, and the autopilot's position estimate. Horizontal positions are relative to the origin of
+the trial's flights, which is the position and heading of the first start. Heights are relative to the ground before
+this take-off. All values are measurements of the drone. The first line contains the origin.
 """
 
 import math
@@ -41,7 +41,10 @@ COLUMNS: Final = columns(
     (
         "fly_farthest_m",
         "m",
-        "Largest horizontal distance from the take-off position.",
+        (
+            "Largest horizontal distance from the position of the drone's first take-off in the trial (in a "
+            "campaign: at this place)."
+        ),
         Figure("farthest distance flown", Kind.MEDIAN),
     ),
     (
@@ -51,7 +54,11 @@ COLUMNS: Final = columns(
         Figure("flight speed", Kind.MEDIAN),
     ),
     ("fly_speed_max_m_s", "m/s", "Largest speed during the whole flight."),
-    ("fly_back_off_m", "m", "Horizontal distance from the take-off position when the motors had stopped."),
+    (
+        "fly_back_off_m",
+        "m",
+        "Horizontal distance from the position of fly_farthest_m when the motors had stopped.",
+    ),
 )
 """Columns of trials with a step `fly`."""
 
@@ -64,11 +71,11 @@ class FlightMoment:
     """A line of the log.
 
     Attributes:
-        at_s: Time since the start of the program.
+        at_s: Time since the origin was set, shortly before the take-off.
         phase: Phase of the flight, for example `flying`.
         ahead_m: Position ahead of the origin.
         left_m: Position to the left of the origin.
-        up_m: Height over the origin.
+        up_m: Height over the ground on which the drone was before this take-off.
         speed_m_s: Speed of the drone.
         utc_ns: Time by the clock of the drone's computer, nanoseconds since 1970 UTC; 0 if the line does not have it.
     """
@@ -91,7 +98,7 @@ def read(path: Path) -> tuple[FlightMoment, ...]:
     """Return the lines of a log in chronological order; an incomplete last line is omitted.
 
     Raises:
-        EvidenceError: The log is missing, empty, or has an invalid line.
+        EvidenceError: The log is missing, empty, has an invalid line, or its lines are not in order.
     """
     return motion_log.read(path, _parse_moment, "flight")
 

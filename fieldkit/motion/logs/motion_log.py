@@ -28,17 +28,17 @@ class MotionMoment(Protocol):
     """A line of a log.
 
     Attributes:
-        at_s: Time since the start of the program.
+        at_s: Time since the start of the log, by a clock that is never set.
         utc_ns: Time by the robot's clock, nanoseconds since 1970 UTC; 0 if the line does not have it.
     """
 
     @property
     def at_s(self) -> float:
-        """Time since the start of the program."""
+        """Time since the start of the log, by a clock that is never set."""
 
     @property
     def utc_ns(self) -> int:
-        """Time by the robot's clock."""
+        """Time by the robot's clock, nanoseconds since 1970 UTC; 0 if the line does not have it."""
 
 
 _Moment = TypeVar("_Moment", bound=MotionMoment)
@@ -54,7 +54,7 @@ def read(path: Path, parse: Callable[[Mapping[str, Any]], _Moment | None], motio
         motion: Kind of motion, for messages: `drive`.
 
     Raises:
-        EvidenceError: The log is missing, empty, or has an invalid line.
+        EvidenceError: The log is missing, empty, has an invalid line, or its lines are not in order.
     """
     lines = _json_lines(path, parse, f"is not a line of a {motion} log")
     moments = tuple(moment for moment in lines if moment is not None)

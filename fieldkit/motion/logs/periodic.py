@@ -86,8 +86,8 @@ def count_messages(
         numbers: Time of arrival (microseconds) and sequence number of each message of the autopilot, in this order.
         streams: Messages with a time by message name, in order of arrival.
         ended_us: End of the recording; 0 if unknown.
-        intervals_us: Requested intervals by message name. Other messages are counted if their rate is an integer
-            number of hertz up to 10.
+        intervals_us: Requested intervals by message name; None if there are no requests. Other messages are counted
+            if their rate is an integer number of hertz up to 10.
     """
     indices = _unwrap([number for _, number in numbers])
     received_count = lost_count = 0
@@ -144,8 +144,9 @@ def _next_hypotheses(before: _Hypothesis, boot_ms: int, missing_count: int, peri
 def _period_ms(messages: Sequence[StreamMessage], indices: Sequence[int], interval_us: int | None) -> float | None:
     """Return the period of a stream in milliseconds, or None if it is unknown.
 
-    The period is the requested interval if the stream has about this period. Otherwise it is the period of the
-    nearest integer rate up to 10 Hz, because autopilots are configured in hertz.
+    The period is the requested interval if the stream has about this period, or if it has too few intervals to
+    estimate the period. Otherwise it is the period of the nearest integer rate up to 10 Hz, because autopilots are
+    configured in hertz.
     """
     intervals_ms = sorted(
         after.boot_ms - before.boot_ms

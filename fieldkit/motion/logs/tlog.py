@@ -199,7 +199,7 @@ class Tlog:
 
     Attributes:
         frames: Number of frames of all senders.
-        kinds: Number of messages of the autopilot by message name.
+        kinds: Number of messages by message name: of the autopilot, and RADIO_STATUS of all senders.
         values: Values of the columns by name.
         first_us: Earliest time of a frame, microseconds since 1970 UTC by the recorder's clock.
         last_us: Latest time of a frame.
@@ -284,7 +284,7 @@ def measure(log: Tlog | None, slow_s: float | None = None) -> Measured:
 
     Args:
         log: Contents of the log; None if it is incomplete.
-        slow_s: `RecorderSummary.slow_s`.
+        slow_s: `RecorderSummary.slow_s`; None if it is unknown.
     """
     if log is None:
         return Measured.all_missing(COLUMNS, "the telemetry log is incomplete")

@@ -30,7 +30,9 @@ def read_tlog(path: Path, position_source: PositionSource) -> Samples:
     if position_source.stamps == "header":
         boot_ns = np.array([row[1] for row in rows], dtype=np.int64) * 1_000_000
         if (np.diff(boot_ns) < -MAX_STALE_S * 1e9).any():
-            raise EvidenceError("the autopilot restarted", where=str(path), remedy="write times: received")
+            raise EvidenceError(
+                "the autopilot restarted", where=str(path), remedy="write times: received, in the step mavlink"
+            )
         times_ns = boot_ns + (received_ns - boot_ns).min()
     times_ns, first = np.unique(times_ns, return_index=True)
     # The times are sorted and unique, so only the range of the first and the last one must be checked.

@@ -96,7 +96,7 @@ class TlogDecoder:
     """Decoder of frames of the common dialect.
 
     Attributes:
-        damaged_frames: Number of frames with a wrong checksum.
+        damaged_frames: Number of frames that cannot be decoded, usually because their checksum is wrong.
     """
 
     def __init__(self) -> None:
@@ -186,7 +186,7 @@ def _summary(data: bytes, autopilot: Source, ended_us: int, intervals_us: Mappin
 
 
 def _message_values(message: Any) -> Iterator[tuple[str, float]]:  # noqa: ANN401 (as `TlogDecoder.message`)
-    """Yield names and values of a message's fields, in SI units and degrees."""
+    """Yield names and values of a message's fields, in SI units, degrees and shares; `rssi` in units of the radio."""
     match message.get_type():
         case "HEARTBEAT":
             yield "armed", float(bool(message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED))
@@ -249,8 +249,12 @@ def _positions(data: bytes, autopilot: Source, kind: str) -> Iterator[tuple[int,
     """Yield time of arrival in us, the autopilot's time in ms, three coordinates and the heading of each message.
 
     The coordinates of `LOCAL_POSITION_NED` are metres east, north and up; those of `GLOBAL_POSITION_INT` are latitude
-    and longitude in degrees, and metres up. The heading is from the last ATTITUDE before the message, in radians from
-    east to north. Before the first ATTITUDE it is from the first one; without any it is 0.
+    and longitude in degrees, and metres above the sea. The heading is from the last ATTITUDE before the message, in
+    radians from east to north. Before the first ATTITUDE it is the heading of the next position that has one; without
+    any it is 0.
+
+    Raises:
+        ValueError: A message has an impossible position.
     """
     decoder, heading_rad, rows = TlogDecoder(), math.nan, []
     for frame in frames(data):

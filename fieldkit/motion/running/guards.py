@@ -2,8 +2,8 @@
 
 A guard runs on the drone's computer while the steps run, and exits without an action when they are done. It lands the
 drone or lets it return if the attempt's jobs are stopped (Ctrl-C, an error, `fieldkit abort`), or if no order arrives
-from the laptop for `piloting.LEASE_S`. It does nothing while a person or a failsafe controls the drone
-(`fieldkit.agent.flying.guard`). The step `fly` starts a separate guard for its drone.
+from the laptop for its lease (`piloting.leased_program`). It does nothing while a person or a failsafe controls the
+drone (`fieldkit.agent.flying.guard`). The step `fly` starts a separate guard for its drone.
 """
 
 from collections.abc import Iterator, Mapping
@@ -27,7 +27,7 @@ def guard_drones(actions: Mapping[Role, str], plan: TrialOutline, scene: Scene, 
 
     Raises:
         LinkError: A robot did not answer.
-        RobotError: A guard did not start, for example because the autopilot does not answer.
+        RobotError: A guard did not start, for example because the autopilot does not answer, or it failed.
     """
     with ExitStack() as stack:
         for role in sort_roles(actions):

@@ -50,9 +50,10 @@ class MotionEntry:
             person confirmed that it is at its place. `allowed`: an option allowed it to move from its current
             position.
         robot: Name of the robot.
-        place: Name of the place of the origin, from `place_of`.
-        origin: The origin; for `ended`, the robot's position at the end, if it reported one.
-        reason: Reason why it is held, or how it was confirmed.
+        place: Name of the place of the origin, from `place_of`; empty for other events.
+        origin: The origin; for `ended` and `held`, the robot's position at the end, if it reported one; None for
+            other events.
+        reason: Reason why it is held, or how it was confirmed or allowed; empty for other events.
     """
 
     utc_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
@@ -70,7 +71,7 @@ class MotionHold:
     Attributes:
         robot: Name of the robot.
         reason: Cause of the stop.
-        utc_ns: Time of the stop, in nanoseconds since 1970 UTC.
+        utc_ns: Time of the stop, or of the start of a motion without an end, in nanoseconds since 1970 UTC.
     """
 
     robot: str
@@ -107,7 +108,10 @@ def origins(entries: Sequence[MotionEntry]) -> Mapping[str, MotionEntry]:
 
 
 def last_places(entries: Sequence[MotionEntry]) -> Mapping[str, MotionOrigin]:
-    """Return the position of each robot at the end of its last motion, by name; unknown positions are omitted."""
+    """Return the position of each robot at the end of its last motion, by name.
+
+    Positions are omitted if the robot did not report them, and after a new start or a confirmation by a person.
+    """
     by_robot: dict[str, MotionOrigin] = {}
     for entry in entries:
         if entry.event in {MotionEvent.ENDED, MotionEvent.HELD} and entry.origin is not None:
@@ -118,7 +122,7 @@ def last_places(entries: Sequence[MotionEntry]) -> Mapping[str, MotionOrigin]:
 
 
 def holds(entries: Sequence[MotionEntry]) -> Sequence[MotionHold]:
-    """Return the robots that may not move; a motion without an end means that fieldkit was killed."""
+    """Return the robots that may not move; a motion without an end is in progress, or fieldkit was killed in it."""
     by_robot: dict[str, MotionHold] = {}
     for entry in entries:
         if entry.event is MotionEvent.STARTED:
@@ -134,10 +138,10 @@ class MotionJournal:
     """The journal of motions in a file; empty if the file does not exist.
 
     Args:
-        path: The file.
+        path: The file. An incomplete last line that a crash left is removed.
 
     Raises:
-        EvidenceError: It is damaged.
+        EvidenceError: Another line of the file is damaged.
     """
 
     def __init__(self, path: Path) -> None:
@@ -213,12 +217,15 @@ class JournaledOrigins:
         self._places = {role: place_of(role, placement) for role in robots}
 
     def get(self, role: Role) -> MotionOrigin | None:
-        """Return the recorded origin of a robot at its current place, or None."""
+        """Return the recorded origin of a robot at its current place, or None if no origin is valid there."""
         entry = origins(self._journal.entries).get(self._robots[role])
         return entry.origin if entry is not None and entry.place == self._places[role] else None
 
     def is_new_place(self, role: Role) -> bool:
-        """Return True if the last recorded origin is at another place than the robot's place in this trial."""
+        """Return True if the last recorded origin is at another place than the robot's place in this trial.
+
+        False if no origin of the robot is recorded.
+        """
         places = [
             entry.place
             for entry in self._journal.entries
@@ -239,7 +246,7 @@ class JournaledOrigins:
         self._journal.add(MotionEvent.HELD, self._robots[role], reason=f"it did not start: {reason}")
 
     def require(self) -> None:
-        """Check that robots may move; robots in motion are exempt.
+        """Check that no robot is held, except robots in motion, whose motion has no end yet.
 
         Raises:
             MotionHeldError: A robot is held.

@@ -79,11 +79,14 @@ class MotionPermission:
         )
 
     def require(self) -> None:
-        """Check that robots may move in the next attempt. After a fault, a person must type `confirm`.
+        """Check that robots may move in the next attempt.
+
+        After a fault, a person must type `confirm`, or the operator must have set `--allow-motion-after-fault`.
 
         Raises:
             ConfigurationError: For the same reasons as `Operator.enter`.
-            MotionHeldError: No person has confirmed.
+            MotionHeldError: No person has confirmed, or a robot must be at a new place and no person was asked to
+                move it there.
             OSError: The disk is full or was removed.
         """
         if self._journaled_origins is None or not self._moving:
@@ -125,8 +128,8 @@ class MotionPermission:
             reasons = "; ".join(f"{hold.robot}: {hold.reason}" for hold in self._journal.holds)
             names = " and ".join(hold.robot for hold in self._journal.holds)
             text = (
-                f"a fault stopped a robot ({reasons}); put {names} at its place with the initial heading, and clear "
-                f"its path; type {CONFIRM} to let robots move again"
+                f"a fault stopped a robot ({reasons}); put {names} at the start with the initial heading, and clear "
+                f"the path; type {CONFIRM} to let robots move again"
             )
             if testbed.operator.enter(Question(text, choices=(CONFIRM, _STOP), usual=_STOP)) == CONFIRM:
                 self._journal.confirm("a person confirmed", at_place=True)

@@ -99,6 +99,7 @@ def drive_job(scene: Scene, move: Move, inside_s: float, name_pattern: str) -> P
         limit_s=START_S + 2 * limit_s(move) + inside_s,
         log=name_pattern.format(_LOG),
         ready="log:up,",
+        ready_s=jobs.AGENT_READY_S,
     )
     program = robot.profile.tools.python
     return Planned(move.role, job, program=program, setup=setup, permitted_causes=BY_EXIT | BY_FIELDKIT)
@@ -253,7 +254,10 @@ def drive_robot(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name_
 
 
 def _wait_until_ready(scene: Scene, drive_lease: DriveLease, move: Move) -> None:
-    """Wait until a robot is stationary at its place, and record its origin before its first start there."""
+    """Wait until a robot is stationary at its place, and record its origin before its first start there.
+
+    Raises the same errors as `drive_robot`.
+    """
     drive_lease.wait(lambda: drive_lease.is_ready or drive_lease.final_state, Deadline.after(START_S))
     if drive_lease.is_refused:
         origins_of(scene).refuse(move.role, drive_lease.final_state)

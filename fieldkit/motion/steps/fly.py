@@ -56,7 +56,7 @@ _LIMIT_S: Final = 3600.0
 _AT_REST_S: Final = 3.0
 """Approximate time that the log covers before the take-off and after the landing."""
 _LOG_BYTES_PER_S: Final = 2200.0
-"""Growth of the log: ten lines a second (`agent/flying/flight_log.py`), each of about 200 bytes."""
+"""Growth of the log: ten lines a second (`agent/flying/flight_log.py`), each of about 220 bytes."""
 
 
 class FlyLeg(PathLeg):

@@ -15,6 +15,7 @@ from fieldkit.core import geometry
 from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.model import Protocol, Role
+from fieldkit.core.units import format_count
 from fieldkit.measure.captures.arrays import Floats
 from fieldkit.measure.positions import position_checks, position_sources
 from fieldkit.measure.positions.position_sources import GAP_S, PositionSource, PositionSources
@@ -83,7 +84,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
     Attributes:
         robot: Role of the robot with the autopilot.
         at: Role of the robot that records over the radio; by default the computer of `robot` records.
-        system: The autopilot's system id; 0 for the first one received, which is then the only one in the log.
+        system: The autopilot's system id; 0 for the first one received, which must then be the only one in the log.
         rates: Requested messages per second, of `SYS_STATUS`, `GPS_RAW_INT`, `ATTITUDE`, `LOCAL_POSITION_NED`,
             `GLOBAL_POSITION_INT`, `VFR_HUD`, `RADIO_STATUS`, `BATTERY_STATUS`, `ESTIMATOR_STATUS`, `HOME_POSITION`
             and `EXTENDED_SYS_STATE`: `{ATTITUDE: 20Hz}`. Every message received is recorded.
@@ -267,7 +268,8 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
             yield f"{self._file}: {error.what}"
             return
         if counters.dropped_frames:
-            yield f"{self._file} lacks {counters.dropped_frames} received frames, because it reached its maximum size"
+            frames_text = format_count(counters.dropped_frames, "received frame")
+            yield f"{self._file} lacks {frames_text}, because it reached its maximum size"
         if log.frames != counters.frames:
             yield f"{self._file} has {log.frames} frames, but its recorder wrote {counters.frames}"
         window = view.attempt_window(self.recorder)

@@ -231,7 +231,7 @@ class MoveStep(
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
-        """Return the columns of the drive, if the robot drives automatically."""
+        """Return the columns of the drive if `driven` is set, as for every robot that drives automatically."""
         return drive_log.COLUMNS if self.driven else ()
 
     @override

@@ -80,7 +80,15 @@ def flight_job(scene: Scene, role: Role, name: str, plan: FlightPlan, limit_s: f
     robot, complete_plan = scene.robot(role), replace(plan, landing_marker=jobs.landing_marker_file(name))
     argv = agent_commands.agent_command(robot, "fly", agent_commands.compact(asdict(complete_plan)))
     log = f"{name}.log"
-    job = Job(folder=scene.folder, name=name, argv=argv, limit_s=limit_s, log=log, ready=f"log:{READY}")
+    job = Job(
+        folder=scene.folder,
+        name=name,
+        argv=argv,
+        limit_s=limit_s,
+        log=log,
+        ready=f"log:{READY}",
+        ready_s=jobs.AGENT_READY_S,
+    )
     return Planned(role, job, program=robot.profile.tools.python, permitted_causes=BY_EXIT)
 
 
@@ -138,9 +146,9 @@ def liveness_file(guard_name: str) -> str:
 def guarding(
     scene: Scene, shell: Shell, program: Planned, *, lease_s: float = LEASE_S, body_s: float
 ) -> Iterator["FlightLease"]:
-    """Start the guard of a drone, yield its lease, and stop it after the body.
+    """Start the guard of a drone, yield its lease, and stop it after a successful body.
 
-    Raises the same errors as `leased_program`.
+    After an error in the body, the guard continues; see `leased_program`. Raises the same errors.
     """
     with leased_program(scene, shell, program, lease_s=lease_s, body_s=body_s, exit_s=_GUARD_EXIT_S) as flight:
         yield flight

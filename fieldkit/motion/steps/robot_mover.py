@@ -16,7 +16,7 @@ STOPPED_BY: Final = "the-operator"
 """Recorded on a robot as the originator of the stop."""
 
 _REPLY_S: Final = 3.0
-"""A robot that does not answer for this time is reported as out of reach. The usual response time is 0.1 s."""
+"""A robot that does not answer for this time is reported as not answering. The usual response time is 0.1 s."""
 _POLL_S: Final = 0.5
 _LANDING_S: Final = 600.0
 """Maximum wait for a landing; the pilot waits for the same time (`fieldkit.agent.flying.landing`)."""
@@ -38,7 +38,11 @@ class RobotMover(NamedTuple):
     fallback: str
 
     def stop(self, report: Report, cancel_event: threading.Event) -> None:
-        """Stop the robot, and wait until it is stationary or on the ground."""
+        """Stop the robot, and report its state; if a drone lands, wait for the landing and report the state again.
+
+        The wait ends early after `_LANDING_S`, if `cancel_event` is set, or if the robot does not answer, which is
+        reported with `fallback`.
+        """
         start_s = time.monotonic()
         try:
             result = halting.halt_attempt(self.shell, self.folder, STOPPED_BY, Deadline.after(_REPLY_S))

@@ -5,6 +5,7 @@ from types import MappingProxyType
 from typing import Final
 
 from fieldkit.core.errors import EvidenceError
+from fieldkit.core.units import format_count
 from fieldkit.measure.evidence.recordings import RecordingContents
 from fieldkit.measure.evidence.sandbox import Json, ReaderError, SandboxedReader
 
@@ -33,7 +34,8 @@ def read(path: Path) -> RecordingContents:
         path: A ROS 1 bag, or the data file of a ROS 2 bag (`.db3`, `.mcap`) in its folder.
 
     Raises:
-        EvidenceError: The file is missing, empty, unindexed, truncated, without messages, or not a bag.
+        EvidenceError: The file is missing, empty, unindexed, truncated, without messages, or not a bag; or it is a
+            ROS 2 bag without metadata, or one that is split into several files.
     """
     where = str(path)
     if not path.is_file():
@@ -43,7 +45,7 @@ def read(path: Path) -> RecordingContents:
     is_ros2 = path.suffix in ROS2_SUFFIXES
     if is_ros2 and not (path.parent / METADATA).is_file():
         raise EvidenceError(
-            f"the bag has no {METADATA}: its recorder was killed before it could close the bag",
+            f"the bag has no {METADATA}: its recorder was killed before it closed the bag, or the file was lost",
             where=where,
             remedy="stop the recorder with SIGINT and wait for it, or repair the bag with `fieldkit bag repair`",
         )
@@ -58,7 +60,7 @@ def read(path: Path) -> RecordingContents:
     messages, metadata_messages = contents["messages"], contents.get("metadata_messages", contents["messages"])
     if messages != metadata_messages:
         raise EvidenceError(
-            f"the file contains {messages} messages, but {METADATA} states {metadata_messages}",
+            f"the file contains {format_count(messages, 'message')}, but {METADATA} states {metadata_messages}",
             where=where,
             remedy="is the bag split into several files? omit --max-bag-size and --max-bag-duration in `record`",
         )
@@ -78,7 +80,7 @@ def battery_share(path: Path, topic: str) -> float | None:
     TurtleBot3 writes the ratio of voltage to nominal voltage, slightly above 1.
 
     Raises:
-        EvidenceError: A message of the bag cannot be read.
+        EvidenceError: The bag or a message in it cannot be read.
     """
     try:
         share: float | None = query(path, topic=topic)["share"]
@@ -108,6 +110,9 @@ def query(path: Path, **parameters: str) -> Json:
 
 
 def allocated_bytes(path: Path) -> int:
-    """Return the size of a file for the reader's limits, without the holes of a sparse file."""
+    """Return the size of a file for the reader's limits.
+
+    For a sparse file above 64 MiB it is the allocated size, at least 64 MiB.
+    """
     status = path.stat()
     return min(status.st_size, max(_BLOCK_BYTES * status.st_blocks, _MIN_ALLOCATED_BYTES))

@@ -17,8 +17,8 @@ def read_bag(path: Path, position_source: PositionSource) -> Samples:
     If several messages have the same time, the first is used.
 
     Raises:
-        EvidenceError: The bag cannot be read; the topic has no positions, or several frames or types; or the stamps
-            in its headers are from another clock than the times of reception.
+        EvidenceError: The bag cannot be read; the topic has no positions, or several frames or types; or stamps are
+            used and differ at the median by more than `MAX_STALE_S` from the times of reception.
     """
     topic = position_source.topic
     topic_data = bag.positions(path, topic, position_source.child)
@@ -27,7 +27,13 @@ def read_bag(path: Path, position_source: PositionSource) -> Samples:
             f"no position in {topic}", where=str(path), remedy="check that a node publishes the topic"
         )
     ((kind, *other_kinds), (frame, *other_frames)) = topic_data["types"], topic_data["frames"]
-    if other_kinds or other_frames:
+    if other_kinds:
+        raise EvidenceError(
+            f"{topic} has messages of several types: {', '.join(topic_data['types'])}",
+            where=str(path),
+            remedy="check that only one node publishes the topic",
+        )
+    if other_frames:
         raise EvidenceError(
             f"{topic} has positions in several frames: {', '.join(topic_data['frames'])}",
             where=str(path),

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rosbags import rosbag1
 
+from fieldkit.core.units import format_count
 from fieldkit.measure.evidence import sandbox_process
 from fieldkit.measure.evidence.sandbox import Json
 from fieldkit.ros.bags import bag
@@ -25,8 +26,8 @@ _MAX_TOPICS: Final = 10_000
 def answer(request: Json) -> Json:
     """Return the answer to a request about the bag at `path`.
 
-    The keys of the request select the answer: the message times by topic (`topic_stats`), the last battery state
-    (`topic`), the positions in one topic (`positions`), or else the contents of the bag.
+    The keys of the request select the answer: number and times of the messages by topic (`topic_stats`), the charge
+    in the last battery state (`topic`), the positions in one topic (`positions`), or else the contents of the bag.
 
     Raises:
         Exception: The bag cannot be read; rosbags and its dependencies raise any exception for invalid bytes.
@@ -68,7 +69,8 @@ def contents(reader: "rosbag1.Reader | rosbag2.Reader") -> Json:
         messages, started_ns = _checked_count(reader.message_count), _checked_count(reader.start_time)
         if len(by_topic) > _MAX_TOPICS or sum(by_topic.values()) != messages:
             raise ValueError(
-                f"its index counts {messages} messages, but the counts of its {len(by_topic)} topics differ"
+                f"its index counts {format_count(messages, 'message')}, but the sum of its topics differs, or it has "
+                f"more than {_MAX_TOPICS} topics"
             )
         # The duration of rosbags ends one nanosecond after the last message.
         duration_s = (_checked_count(reader.duration) - 1) / 1e9 if messages else 0.0
@@ -97,7 +99,7 @@ def topic_stats(reader: "rosbag1.Reader | rosbag2.Reader") -> Json:
 
 
 def battery_share(path: Path, topic: str) -> float:
-    """Return the charge in the last `sensor_msgs/BatteryState` of a topic; NaN if there is no such message."""
+    """Return the charge in the last `sensor_msgs/BatteryState` of a topic; NaN if it is unknown or there is none."""
     share = math.nan
     with _open_decoder(path) as reader:
         connections = [
@@ -117,11 +119,12 @@ def positions(path: Path, topic: str, child: str) -> Json:
     Args:
         path: The bag.
         topic: The topic.
-        child: Child frame whose position is returned, for a topic of transforms (tf2).
+        child: Child frame whose position is returned, for a topic of transforms; empty for all transforms.
 
     Returns:
         `types` and `frames` of the messages, and `rows`: time in the header and time of recording in ns, three
-        coordinates, and the yaw in radians. Fixes without a position are omitted.
+        coordinates, and the yaw in radians. For fixes, the coordinates are latitude and longitude in degrees and
+        altitude in metres. Fixes without a position and poses with NaN or infinite values are omitted.
     """
     rows: list[tuple[int, int, float, float, float, float]] = []
     types, frames = set[str](), set[str]()

@@ -42,10 +42,10 @@ class BagContents:
     Attributes:
         format: Its format.
         size_bytes: Size of its data files.
-        topics: Its topics, sorted by name; empty if its index cannot be read.
-        started_utc_ns: Time of the first message by the recorder's clock, nanoseconds since 1970.
-        duration_s: Time from the first message to the last, in seconds.
-        compression: Compression of a ROS 2 bag: `none` or `zstd`.
+        topics: Its topics, sorted by name; empty if it was not closed or its index cannot be read.
+        started_utc_ns: Time of the first message by the recorder's clock, nanoseconds since 1970; 0 without messages.
+        duration_s: Time from the first message to the last, in seconds; 0 without messages.
+        compression: Compression of a ROS 2 bag: `none` or `zstd`; always `none` for ROS 1.
         problems: Descriptions of its damage, one sentence each.
         recoverable_messages: Number of messages that can be recovered; None for a bag without problems.
     """
@@ -61,7 +61,7 @@ class BagContents:
 
     @property
     def messages(self) -> int:
-        """Number of messages according to its index."""
+        """Number of messages according to its index; 0 if the index cannot be read."""
         return sum(topic.messages for topic in self.topics)
 
 
@@ -87,7 +87,8 @@ def inspect(path: Path, *, read_all: bool = False) -> BagContents:
 
     Raises:
         ConfigurationError: There is no bag, or it cannot be opened.
-        EvidenceError: It is empty, or reading it exceeds the limits of memory or time for its size.
+        EvidenceError: It is empty or begins with zeros, or reading it exceeds the limits of memory or time for its
+            size.
     """
     bag = find(path)
     answer = _query_worker(bag, {"do": "inspect", "all": read_all})
@@ -107,8 +108,8 @@ def repair(path: Path, to: Path) -> WriteResult:
     """Write the readable messages of a damaged bag to a new bag of the same format; the damaged bag is not changed.
 
     Raises:
-        ConfigurationError: For the same reasons as `inspect`, or because `to` exists already, or because its name
-            does not fit the format.
+        ConfigurationError: For the same reasons as `inspect`, or because `to` exists already or cannot be written, or
+            because its name does not fit the format.
         EvidenceError: For the same reasons as `inspect`, or because no message can be read.
     """
     bag = find(path)
@@ -138,8 +139,8 @@ def convert(path: Path, to: Path, *, storage: BagFormat = BagFormat.MCAP, distri
         distribution: ROS distribution of its message types; Noetic or Jazzy if empty.
 
     Raises:
-        ConfigurationError: For the same reasons as `inspect`, or because `to` exists already, or because the
-            distribution does not fit its format.
+        ConfigurationError: For the same reasons as `inspect`, or because `to` exists already or cannot be written, or
+            because the distribution does not fit its format.
         EvidenceError: For the same reasons as `inspect`, or because the bag is damaged, or cannot be converted.
     """
     bag, is_ros1 = find(path), to.suffix == ".bag"

@@ -55,9 +55,11 @@ class BagFiles:
     """The files of a bag.
 
     Attributes:
-        path: The path given by the user: a file, or the folder of a ROS 2 bag.
+        path: The path that is opened: a file, or the folder of a ROS 2 bag. It is the folder also for a file that is
+            the only data file of a folder with metadata.
         format: Its format.
-        files: Its data files, sorted by name, which is the order of recording.
+        files: Its data files, sorted by name. For more than ten files this is not the order of recording, because
+            `bag_10.mcap` is before `bag_2.mcap`.
         closed: Whether the recorder has written the metadata of a ROS 2 bag: metadata.yaml, or the end of a single
             MCAP file. Always True for ROS 1, whose index is in the file and is checked later.
     """
@@ -77,7 +79,7 @@ def find(path: Path) -> BagFiles:
     """Return the bag at a path: a file of any format, or the folder of a ROS 2 bag.
 
     Raises:
-        ConfigurationError: The path does not exist, cannot be opened, or is not a bag.
+        ConfigurationError: The path does not exist, cannot be opened, is not a bag, or is a folder with several bags.
         EvidenceError: The file is empty or begins with zeros.
     """
     try:
@@ -94,7 +96,7 @@ def find(path: Path) -> BagFiles:
 
 
 def _bag_from_file(path: Path, bag_format: BagFormat) -> BagFiles:
-    """Return the bag of a data file: the bag of its folder if that has no other data file, else the file alone."""
+    """Return the bag of a data file: its folder if that has metadata and no other data file, else the file alone."""
     if bag_format is BagFormat.ROS1:
         if path.suffix not in _ROS1_SUFFIXES:
             raise ConfigurationError(

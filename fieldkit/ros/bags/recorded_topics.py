@@ -23,7 +23,10 @@ COLUMNS: Final = columns(
     (
         "bag_discovered",
         "bool",
-        "Whether a message of each recorded topic was received; empty without the recorder's log or a complete bag.",
+        (
+            "Whether a message of each recorded topic was received. Without a complete bag it is false if the "
+            "recorder did not subscribe to every topic, otherwise empty. Empty without the recorder's log."
+        ),
         Figure("topics discovered", Kind.FLAG),
     ),
     (
@@ -64,11 +67,13 @@ class RecordingReception:
     """Reception of the topics of a recording.
 
     Attributes:
-        discovered: Whether a message of each topic was received; None if unknown.
+        discovered: Whether a message of each topic was received; None without a complete bag, unless the recorder did
+            not subscribe to every topic: then it is False.
         messages: Number of messages of its topics; None without a complete bag.
         discovery_s: Time from the subscription to the first message, for the slowest topic; None if no message of a
             topic was received, or if the time of the subscription is unknown.
-        gap_s: Longest time without a message of a topic, in seconds; None if `discovery_s` is None.
+        gap_s: Longest time without a message of a topic from its first message to the end of the recording, in
+            seconds; None if `discovery_s` is None.
     """
 
     discovered: bool | None
@@ -143,7 +148,8 @@ def read(folder: Path, log: str, file: str, topics: Sequence[str], duration_s: f
 def subscription_ns(log: str, topics: Sequence[str]) -> dict[str, int]:
     """Return the time of subscription by topic, from the recorder's log, in nanoseconds since 1970 UTC.
 
-    For ROS 2 it is the start of discovery, which is the same for all topics.
+    For ROS 2 it is the start of discovery, which is the same for all topics. Topics whose time is not in the log are
+    omitted.
     """
     by_topic = {match["topic"]: _stamp_ns(match) for match in _ROS1.finditer(log)}
     ros2_start = _ROS2.search(log)

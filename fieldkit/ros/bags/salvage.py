@@ -26,7 +26,7 @@ from fieldkit.ros.bags.formats import BagFormat
 
 
 class DamagedError(Exception):
-    """A file is truncated or corrupt; the message contains position and reason."""
+    """A file is truncated or corrupt; the message contains the reason, and the position if it is known."""
 
 
 @dataclass(frozen=True)
@@ -207,7 +207,7 @@ def _rows(database: sqlite3.Connection) -> Iterator[RecoveredMessage]:
         yield connections[topic], int(at_ns), bytes(data)
     (last_id,) = database.execute("SELECT max(id) FROM messages").fetchone()
     if last_id is not None and last_id > last_read_id:
-        raise DamagedError(f"only {last_read_id} of {last_id} messages can be read")
+        raise DamagedError(f"the last message that can be read has number {last_read_id} of {last_id}")
 
 
 def _topics(database: sqlite3.Connection) -> Iterator[tuple[int, BagConnection]]:

@@ -21,6 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
+from fieldkit.core.units import format_count
 from fieldkit.measure.evidence import sandbox_process
 from fieldkit.measure.evidence.sandbox import Json
 from fieldkit.ros.bags import bag_paths, salvage
@@ -53,7 +54,10 @@ def answer(request: Json) -> Json:
 
 
 def inspect(bag: BagFiles, *, read_all: bool) -> Json:
-    """Return the contents of a bag from its index, and its problems; `read_all` reads and decodes all messages."""
+    """Return the contents of a bag from its index, and its problems.
+
+    With `read_all`, all messages of a closed bag are read, and those of known types are decoded.
+    """
     result: Json = {"topics": [], "started_utc_ns": 0, "duration_s": 0.0, "compression": "none"}
     problems = list(_unclosed_problems(bag))
     if not problems:
@@ -124,9 +128,10 @@ def _problems(bag: BagFiles) -> Iterator[str]:
                     f"{message_name} is not a valid {connection.msgtype}: {_error_text(error)}"
                 )
         if reader.message_count != sum(read_counts.values()):
-            yield f"its index counts {reader.message_count} messages, but it contains {sum(read_counts.values())}"
+            index_text = f"its index counts {format_count(reader.message_count, 'message')}"
+            yield f"{index_text}, but it contains {sum(read_counts.values())}"
         if outside_count:
-            yield f"{outside_count} messages are outside the time range of its index"
+            yield f"{format_count(outside_count, 'message')} outside the time range of its index"
     yield from errors_by_type.values()
 
 

@@ -105,7 +105,7 @@ class Forwarder:
         return [message for side, topic in sides for message in side.other_types(topic)]
 
     def counts(self) -> CrossingCounts:
-        """Return the counters of the forwarded samples."""
+        """Return the counters of the forwarded, refused and unreadable samples."""
         with self._lock:
             return self._tally.counts(self._crossing, self._source.middleware_name, self._target.middleware_name)
 

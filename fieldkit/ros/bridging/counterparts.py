@@ -40,7 +40,8 @@ class Counterparts:
     Attributes:
         ros1: Its name in ROS 1, for example `std_msgs/msg/Time`.
         ros2: Its name in ROS 2, for example `builtin_interfaces/msg/Time`.
-        added_bytes: Bytes that are appended to a message from ROS 1, in the serialization of ROS 1.
+        added_bytes: Bytes that are appended to a message from ROS 1, in the serialization of ROS 1. The same number
+            of bytes is removed from the end of a message to ROS 1.
     """
 
     ros1: str

@@ -93,10 +93,11 @@ class CrossingCounts:
         bytes: Their total size as received.
         refused: Number of messages that the target did not accept in time.
         unreadable: Number of dropped messages that are not valid for the type.
-        per_s: Messages per second between the first and the last; None for fewer than two.
-        bytes_per_s: Bytes per second in the same time, without the first message.
+        per_s: Messages per second between the first and the last; None for fewer than two, or if both have one time.
+        bytes_per_s: Bytes per second in the same time, without the first message; None if `per_s` is None.
         delay_median_s: Median time from the arrival of a message until the target accepted it; its precision is 1 %.
-        delay_p99_s: 99th percentile of this time; its precision is 1 %.
+            None if no message was forwarded.
+        delay_p99_s: 99th percentile of this time; its precision is 1 %. None if no message was forwarded.
     """
 
     topic: str
@@ -123,13 +124,19 @@ class CrossingTally:
         self._histogram: Counter[int] = Counter()
 
     def count(self, size_bytes: int, arrived_ns: int, forwarded_ns: int) -> None:
-        """Count a forwarded message."""
+        """Count a forwarded message.
+
+        Args:
+            size_bytes: Its size as received.
+            arrived_ns: Time of its arrival from the source.
+            forwarded_ns: Time at which the target had accepted it, by the same clock.
+        """
         if not self._messages:
             self._first_ns, self._first_bytes = forwarded_ns, size_bytes
         self._messages += 1
         self._bytes += size_bytes
         self._last_ns = forwarded_ns
-        # If the clock was set back, the delay counts as 0.
+        # If the clock was set back, the delay counts as 1 ns, because 0 has no logarithm.
         self._histogram[round(math.log(max(1, forwarded_ns - arrived_ns)) / _LOG_BUCKET_RATIO)] += 1
 
     def counts(self, crossing: Crossing, source: str, target: str) -> CrossingCounts:

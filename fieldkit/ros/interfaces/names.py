@@ -33,7 +33,10 @@ def dds_topic(topic: str) -> str:
 
 
 def user_data(rihs01: str) -> str:
-    """Return the user data of a DDS endpoint: the type hash, since ROS 2 Iron (rmw_dds_common, qos.cpp)."""
+    """Return the user data of a DDS endpoint: the type hash (rmw_dds_common, qos.cpp); empty for an empty hash.
+
+    Distributions before ROS 2 Iron have no type hashes.
+    """
     return f"typehash={rihs01};" if rihs01 else ""
 
 
@@ -57,7 +60,7 @@ class Endpoint:
     Attributes:
         topic: Name of the topic, for example `/scan`.
         type_name: Its type, for example `sensor_msgs/msg/LaserScan`.
-        rihs01: Hash of the type.
+        rihs01: Hash of the type, or `NO_HASH`.
         qos: Its quality of service.
     """
 

@@ -8,7 +8,7 @@ from fieldkit.ros.interfaces.qos import QosProfile
 from fieldkit.ros.interfaces.types import MessageTypes
 
 SESSION = "{zid}"
-"""Placeholder in a token for the id of the session, which is known on the robot only."""
+"""Placeholder in a token for the id of the Zenoh session. The agent replaces it when it has opened the session."""
 
 
 def describe(
@@ -23,7 +23,7 @@ def describe(
         qos: Its quality of service.
         domain: ROS domain.
         node: Name of the node.
-        number: Number of its endpoint in the node.
+        number: Number of its endpoint in the Zenoh session, from 1, different for each topic; 0 is the node.
 
     Raises:
         ConfigurationError: There is no such type.

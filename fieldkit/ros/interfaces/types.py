@@ -176,7 +176,7 @@ def standard_types(distribution: Distribution = Distribution.JAZZY) -> MessageTy
 
 
 def full_name(name: str) -> str:
-    """Return a type name in the spelling of ROS 2, for example `sensor_msgs/msg/LaserScan`."""
+    """Return a type name in the spelling of ROS 2, `sensor_msgs/msg/LaserScan`; unchanged if it has no package."""
     package, _, short_name = name.partition("/")
     return f"{package}/msg/{short_name}" if short_name and "/" not in short_name else name
 

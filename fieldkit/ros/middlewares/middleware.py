@@ -106,7 +106,10 @@ def invalid_setting_reason(name: str) -> str:
 
 
 def judge_binding(over: MiddlewareName, result: CommandResult) -> tuple[Verdict, str, str]:
-    """Return verdict, detail and remedy from the output of `Binding.load`; for ROS 2 the detail includes the RMW."""
+    """Return verdict, detail and remedy from the output of `Binding.load`.
+
+    If the package is present, the detail is its name, for ROS 2 with the RMW, and the remedy is empty.
+    """
     lines = [line for line in result.text.splitlines() if line.strip()]
     if result.ok:
         rmw = [line for line in lines if over is MiddlewareName.ROS2 and _RMW.fullmatch(line)]

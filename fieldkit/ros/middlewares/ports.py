@@ -16,7 +16,7 @@ _ROS1_FIRST: Final = 11500
 _ROS1_PORTS: Final = 3
 
 _PARTICIPANTS: Final = 4
-"""Maximum number of participants of a domain on a robot: one of fieldkit, and up to three of the robot."""
+"""Number of participants of a domain on a robot whose ports are included: one of fieldkit, and up to three others."""
 
 MAX_DOMAIN: Final = 101
 """Maximum domain: the DDS ports of higher domains are in the ephemeral port range of Linux."""
@@ -38,7 +38,7 @@ class MiddlewarePorts:
 
 
 def dds(domain: int, *, multicast: bool) -> MiddlewarePorts:
-    """Return the ports of a DDS domain."""
+    """Return the ports of a DDS domain; those of unicast for participants 0 to 3 on a robot."""
     base = 7400 + 250 * domain
     numbers = range(_PARTICIPANTS)
     return MiddlewarePorts(
@@ -67,7 +67,10 @@ def ros1_master(domain: int) -> int:
 
 
 def ros1_node(domain: int) -> dict[str, int]:
-    """Return the ports of a ROS 1 node of fieldkit's agent (the program that it runs on a robot), by setting name."""
+    """Return the ports of the node of fieldkit's agent in a ROS 1 domain, by the name of the agent's setting.
+
+    The agent is the program that fieldkit copies to a robot and runs there. ROS 1 itself has no domains.
+    """
     return {"xmlrpc_port": ros1_master(domain) + 1, "tcpros_port": ros1_master(domain) + 2}
 
 

@@ -144,6 +144,7 @@ class _Exchange:
             log="datagrams.log",
             stdout=_COUNTS_FILE,
             ready="log:up",
+            ready_s=jobs.AGENT_READY_S,
         )
 
     def _arguments(self, role: Role, *, peers: list[str] | None = None, limit_s: float = 0.0) -> str:

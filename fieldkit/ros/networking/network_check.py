@@ -22,7 +22,9 @@ _CHECK: Final = "ROS network"
 
 
 def check_network(plan: Plan, shells: Shells, reports: Mapping[Role, Report]) -> None:
-    """Add the findings on the network of all robots with ROS: the entry point `ros` of `fieldkit.fleet_checks`.
+    """Add the findings on the ROS network of the robots: the entry point `ros` of `fieldkit.fleet_checks`.
+
+    A robot whose profile has no ROS gets only a note.
 
     Args:
         plan: The plan of a trial.

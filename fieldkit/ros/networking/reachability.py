@@ -103,14 +103,15 @@ def judge_names(
 ) -> None:
     """Check that a robot with ROS 1 resolves the names of the other robots on its master to their radio addresses.
 
+    Robots use the same master if their ROS_MASTER_URI are equal. Nothing is resolved for a loopback address.
+
     Raises:
         LinkError: The robot did not answer.
     """
     master = states[role].variables.get("ROS_MASTER_URI", "")
     if _host(master) in _LOOPBACK_HOSTS:
-        report.ok(
-            "ROS network", f"its ROS master, {master}, runs on the robot itself: its topics do not reach other robots"
-        )
+        reason = f"its ROS master, {master}, runs on the robot itself" if master else "ROS_MASTER_URI is not set"
+        report.ok("ROS network", f"{reason}: its topics do not reach other robots")
         return
     for other, state in states.items():
         if other is role or settings.is_ros2(cast[other]) or state.variables.get("ROS_MASTER_URI") != master:

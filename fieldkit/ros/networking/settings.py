@@ -5,23 +5,26 @@ Server"; wiki.ros.org/ROS/NetworkSetup; github.com/ros2/rmw_zenoh, README.
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.config.locations import copy_profile_command
 from fieldkit.core.model import Role
+from fieldkit.core.units import format_count
 from fieldkit.ros.networking.exchange import multicast_port
 from fieldkit.ros.networking.state import RosProgram, RosState, Variables
 from fieldkit.trial.check.report import Report
 
 DEFAULT_RMW: Final = "rmw_fastrtps_cpp"
-"""Default RMW (ROS middleware implementation) of all distributions from Foxy to Kilted (REP 2000)."""
+"""Default RMW (ROS middleware implementation) of the distributions from Foxy to Kilted except Galactic (REP 2000)."""
+_GALACTIC_RMW: Final = "rmw_cyclonedds_cpp"
+"""Default RMW of Galactic (REP 2000)."""
 _ZENOH_PORT: Final = 7447
 _SERVER_PORT: Final = 11811
 """Default port of a discovery server of Fast DDS."""
 _RECOMMENDED_KERNEL: Final = {
-    # "DDS tuning information": CycloneDDS recommends 10 MB, Fast DDS and Connext recommend more.
+    # "DDS tuning information": it sets SocketReceiveBufferSize of Cyclone DDS to 10 MB, which rmem_max must allow.
     "net/core/rmem_max": (10_485_760, "at least", "a burst of fragments of a large sample exceeds the buffer"),
     "net/ipv4/ipfrag_time": (3, "at most", "incomplete datagrams of a lossy link occupy the reassembly buffer"),
     "net/ipv4/ipfrag_high_thresh": (134_217_728, "at least", "incomplete datagrams fill the reassembly buffer"),
@@ -34,14 +37,15 @@ def is_ros2(robot: Robot) -> bool:
 
 
 def domain(variables: Variables) -> int | None:
-    """Return the ROS domain of an environment; None if its value is invalid."""
+    """Return the ROS domain of an environment, 0 if it is not set; None unless it is a number of 1 to 3 digits."""
     text = variables.get("ROS_DOMAIN_ID") or "0"
     return int(text) if text.isascii() and text.isdecimal() and len(text) <= 3 else None
 
 
 def rmw(variables: Variables) -> str:
-    """Return the RMW of an environment."""
-    return variables.get("RMW_IMPLEMENTATION") or DEFAULT_RMW
+    """Return the RMW of an environment; if it is not set, the default of the distribution."""
+    default = _GALACTIC_RMW if variables.get("ROS_DISTRO") == "galactic" else DEFAULT_RMW
+    return variables.get("RMW_IMPLEMENTATION") or default
 
 
 def uses_zenoh(variables: Variables) -> bool:
@@ -93,9 +97,10 @@ def _judge_domain_and_rmw(robot: Robot, state: RosState, report: Report) -> None
     if own_domain is None:
         report.fail("ROS domain", f"ROS_DOMAIN_ID is {state.variables['ROS_DOMAIN_ID']!r}", "use a number, 0 to 101")
         return
-    count = len(state.programs)
+    running = [program.variables for program in state.programs]
     other_values = _differing_values(
-        state.programs, lambda variables: domain(variables) == own_domain, "ROS_DOMAIN_ID", "0"
+        [variables.get("ROS_DOMAIN_ID") or "0" for variables in running if domain(variables) != own_domain],
+        len(running),
     )
     if other_values:
         report.warn(
@@ -107,32 +112,36 @@ def _judge_domain_and_rmw(robot: Robot, state: RosState, report: Report) -> None
     else:
         report.ok(
             "ROS domain",
-            f"{own_domain}; {count} running ROS programs, all in this domain" if count else str(own_domain),
+            f"{own_domain}; {format_count(len(running), 'running ROS program')} in this domain, none in another"
+            if running
+            else str(own_domain),
         )
     own_rmw = rmw(state.variables)
     other_values = _differing_values(
-        state.programs, lambda variables: rmw(variables) == own_rmw, "RMW_IMPLEMENTATION", DEFAULT_RMW
+        [rmw(variables) for variables in running if rmw(variables) != own_rmw], len(running)
     )
     if other_values:
         report.warn(
             "RMW",
             f"its setup files and profile result in {own_rmw}, but {other_values}",
-            "set RMW_IMPLEMENTATION for all programs of the robot, and restart them: ros2 daemon stop",
+            "ros2 daemon stop   # then set RMW_IMPLEMENTATION for all programs of the robot, and restart them",
         )
     else:
         report.ok("RMW", own_rmw)
 
 
-def _differing_values(
-    programs: tuple[RosProgram, ...], is_equal: Callable[[Variables], bool], name: str, default: str
-) -> str:
-    """Return the number of programs for each other value of a variable as text; empty if no value differs."""
-    values = Counter(
-        program.variables.get(name) or default for program in programs if not is_equal(program.variables)
-    )
+def _differing_values(values: Sequence[str], program_count: int) -> str:
+    """Return the number of programs for each of the three most frequent values as text; empty without a value.
+
+    Args:
+        values: Value of a setting in each program that differs from the robot's setup files and profile.
+        program_count: Number of all running ROS programs of the robot.
+    """
+    if program_count == 1:
+        return "".join(f"its only running ROS program uses {value}" for value in values)
     return ", ".join(
-        f"{count} of its {len(programs)} running ROS programs {'uses' if count == 1 else 'use'} {value}"
-        for value, count in values.most_common(3)
+        f"{count} of its {program_count} running ROS programs {'uses' if count == 1 else 'use'} {value}"
+        for value, count in Counter(values).most_common(3)
     )
 
 
@@ -173,11 +182,12 @@ def _judge_router(state: RosState, report: Report) -> None:
     ):
         report.warn(
             "Zenoh router",
-            "a router runs with the default configuration, which does not connect to other routers",
+            "ZENOH_ROUTER_CONFIG_URI is not set: with the default configuration a router does not connect to other "
+            "routers",
             "list the other robots in connect.endpoints of the file ZENOH_ROUTER_CONFIG_URI   # on one side",
         )
     else:
-        report.ok("Zenoh router", f"listens on TCP port {_ZENOH_PORT}, with a separate configuration file")
+        report.ok("Zenoh router", f"TCP port {_ZENOH_PORT} is open; a separate configuration file is named")
 
 
 def _as_program(state: RosState) -> RosProgram:
@@ -226,7 +236,7 @@ def _judge_kernel(state: RosState, report: Report) -> None:
             commands.append(f"{name}={value}")
     if problems:
         report.warn(
-            "kernel buffers", "; ".join(problems), f"sudo sysctl -w {' '.join(commands)}   # for samples above 1 kB"
+            "kernel buffers", "; ".join(problems), f"sudo sysctl -w {' '.join(commands)}   # for samples above 1.5 kB"
         )
     elif state.kernel:
         report.ok("kernel buffers", "as ROS recommends")
@@ -248,12 +258,17 @@ def _judge_firewall(state: RosState, report: Report) -> None:
         report.ok("firewall", "no rule drops received packets")
 
 
+def _domain_text(variables: Variables) -> str:
+    """Return the domain as it is written in an environment, even if it is invalid."""
+    return variables.get("ROS_DOMAIN_ID") or "0"
+
+
 def _compare_domains(first_robot: Robot, expected: Variables, actual: Variables, report: Report) -> None:
     if domain(actual) != domain(expected):
         report.fail(
             "same ROS domain",
-            f"domain {domain(actual)}, but {first_robot.name} is in domain {domain(expected)}: their nodes do not "
-            "discover each other",
+            f"domain {_domain_text(actual)}, but {first_robot.name} is in domain {_domain_text(expected)}: their "
+            "nodes do not discover each other",
             "use one ROS_DOMAIN_ID on all robots",
         )
 
@@ -268,7 +283,7 @@ def _compare_rmws(first_robot: Robot, expected: Variables, actual: Variables, re
     elif rmw(actual) != rmw(expected):
         report.warn(
             "same RMW",
-            f"{rmw(actual)}, but {first_robot.name} has {rmw(expected)}: ROS does not support different RMWs",
+            f"{rmw(actual)}, but {first_robot.name} has {rmw(expected)}: such nodes may not communicate",
             "use one RMW_IMPLEMENTATION on all robots",
         )
     else:
@@ -280,7 +295,7 @@ def _compare_distributions(first_robot: Robot, expected: Variables, actual: Vari
     if own_distro and first_distro and own_distro != first_distro:
         report.warn(
             "same ROS distribution",
-            f"{own_distro}, but {first_robot.name} has {first_distro}: ROS does not support different distributions",
+            f"{own_distro}, but {first_robot.name} has {first_distro}: their nodes may not communicate",
             "install one distribution on all robots, or compare the types: ros2 topic info -v TOPIC",
         )
 

@@ -35,7 +35,7 @@ class Candidate:
 
     Attributes:
         middleware: Name of the middleware.
-        transport: Transport of Zenoh.
+        transport: Transport of Zenoh, `tcp` or `udp`; `tcp` for all other middlewares.
         settings: Its settings by path, as JSON with sorted keys.
         qos: Reliability, history and depth, with their names in ROS 2: `reliable keep_last 10`.
     """
@@ -73,12 +73,12 @@ class Assessment:
 
     @property
     def passed(self) -> bool:
-        """Whether every cell meets the criterion."""
+        """Whether every cell meets the criterion, and no evidence is missing."""
         return not self.failures and not self.missing_evidence
 
     @property
     def rank(self) -> tuple[float, float]:
-        """Largest loss of any cell and largest delay of any repeat; smaller is better.
+        """Largest loss of any cell and largest delay of any repeat, infinity if one is unknown; smaller is better.
 
         The ends of the intervals are not used: the interval of repeats without a loss is wider than the interval of
         repeats with few losses.

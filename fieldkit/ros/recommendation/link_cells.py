@@ -43,7 +43,7 @@ _DELAY: Final = Quantity(
 
 @dataclass(frozen=True)
 class LinkCriterion:
-    """The requirements that a middleware must meet on the link in each repeat.
+    """The requirements that a middleware must meet on the link, in each repeat or in a share of all repeats.
 
     Attributes:
         max_loss: Share of the samples that may be lost, 0 to 1; samples that were never sent count as lost.
@@ -110,7 +110,7 @@ class LinkCell:
 
     @property
     def delay(self) -> Estimate | None:
-        """The delay of 95 % of the samples; None if no valid repeat has one."""
+        """The 95th percentile of the sample delay; None if no valid repeat has one."""
         return self.cell.estimates.get(_DELAY.name)
 
     @property
@@ -166,7 +166,7 @@ def link_cell(place: str, size_bytes: float, tables: Sequence[Repeats]) -> LinkC
 
 
 def estimate_text(estimate: Estimate | None, factor: float) -> str:
-    """Return an estimate with its 95 % interval and the value of each repeat, multiplied by `factor`."""
+    """Return an estimate with its 95 % interval and the values of the repeats, times `factor`; `unknown` for None."""
     if estimate is None or estimate.sample is None:
         return "unknown"
     low, high = (f"{factor * end:.2f}" if end is not None else "unknown" for end in (estimate.low, estimate.high))

@@ -100,9 +100,12 @@ def recommend(arguments: argparse.Namespace) -> int:
     written_files = [_write(arguments, assessment, criterion) for assessment in best.values()]
     if any(written_files):
         return 0
-    print_text(
-        "nothing was written: no settings passed. Measure the undecided ones with more repeats, or other settings"
-    )
+    if best:
+        print_text("nothing was written: no configuration file can contain the settings that passed")
+    else:
+        print_text(
+            "nothing was written: no settings passed. Measure the undecided ones with more repeats, or other settings"
+        )
     return NOTHING_WRITTEN
 
 

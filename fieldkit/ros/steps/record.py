@@ -99,8 +99,8 @@ class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpa
             source="the bag",
             against=("the procedure: topics and duration", "duration of the recorder's job"),
             tolerance=(
-                "a bag may be shorter than planned by half of its duration, because a recorder needs time to "
-                "subscribe"
+                "a bag may be shorter than planned by half of the planned duration plus 1 s, because a recorder "
+                "needs time to subscribe"
             ),
         ),
     )
@@ -274,8 +274,10 @@ class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpa
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
         discovery_s = values.get("bag_discovery_s")
-        if "bag_discovered" in values:
-            yield f"received after {discovery_s:.2f} s" if isinstance(discovery_s, float) else "received nothing"
+        if isinstance(discovery_s, float):
+            yield f"received after {discovery_s:.2f} s"
+        elif values.get("bag_discovered") is False:
+            yield "a topic without messages"
 
     @override
     def expected_s(self, protocol: Protocol) -> float:

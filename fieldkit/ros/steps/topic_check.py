@@ -9,6 +9,7 @@ from typing import Final
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import RepeatId, Role
+from fieldkit.core.units import format_count
 from fieldkit.measure.evidence.recordings import RecordingContents
 from fieldkit.remote import evidence, fetching, jobs
 from fieldkit.remote.command import printable
@@ -25,7 +26,7 @@ from fieldkit.trial.plan import Plan
 
 RECORD_S: Final = 2.0
 LONGEST_S: Final = 20.0
-"""Shortest and longest duration of the recording."""
+"""Shortest and longest duration of the recording, without `_START_S`."""
 MESSAGES: Final = 2
 """The recording is long enough for this number of messages of the slowest topic, within these limits."""
 TOLERANCE: Final = 0.5
@@ -119,7 +120,10 @@ def rate_of(robot: Robot, topic: str) -> float | None:
 
 
 def recording_step(role: Role, robot: Robot, topics: Sequence[str]) -> RecordStep:
-    """Return the shortest recording step that covers every topic."""
+    """Return the step of a recording in which each topic of known rate should have `MESSAGES` messages.
+
+    The limits of its duration, `RECORD_S` and `LONGEST_S`, may result in more or fewer messages.
+    """
     slowest_s = max((1 / rate_hz for topic in topics if (rate_hz := rate_of(robot, topic))), default=0.0)
     duration_s = max(RECORD_S, min(MESSAGES * slowest_s, LONGEST_S))
     if robot.profile.ros and robot.profile.ros.command.ends == "sigint":
@@ -175,7 +179,8 @@ def judge(
                 f"{tool} {topic}   # start the node that publishes it, or correct the procedure",
             )
         elif rate_hz is None:
-            report.ok(check, f"{count} messages in {content.duration_s:.1f} s; the profile gives no rate")
+            text = f"{format_count(count, 'message')} in {content.duration_s:.1f} s"
+            report.ok(check, f"{text}; the profile gives no rate")
         else:
             _judge_rate(check, count, content.duration_s, rate_hz, report)
 
@@ -183,7 +188,7 @@ def judge(
 def _judge_rate(check: str, count: int, span_s: float, rate_hz: float, report: Report) -> None:
     # The span is from the first message of any topic to the last one, so the count may be wrong by one.
     low, high = ((count + sign) / max(span_s, 1e-9) for sign in (-1, 1))
-    detail = f"{count} messages in {span_s:.1f} s, expected {rate_hz:g} Hz"
+    detail = f"{format_count(count, 'message')} in {span_s:.1f} s, expected {rate_hz:g} Hz"
     if high < (1 - TOLERANCE) * rate_hz or (count > 1 and low > (1 + TOLERANCE) * rate_hz):
         report.warn(check, detail, "correct the rate in the profile, or find the program that slows it down: top")
     else:

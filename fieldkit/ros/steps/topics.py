@@ -57,7 +57,7 @@ BUFFER_KIB: Final = 32_768
 so 4 MiB hold 10,000 packets. Fast DDS sent 60,000 packets per second when it requested lost fragments again."""
 
 _GRACE_S: Final = 5
-"""Time in which a stopped subscriber, router or master must exit; then it is killed."""
+"""Time in which a subscriber, router or master must exit after it was stopped; otherwise it is killed."""
 _OVERHEAD_S: Final = 10.0
 """Time for the start of Python and the middleware, and for the publisher's wait at its end."""
 _RECORD_BYTES: Final = 32
@@ -111,6 +111,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
             limit_s=duration_s if publishes else 2 * duration_s,
             log=self._log(role),
             ready=None if publishes else "log:up,",
+            ready_s=jobs.AGENT_READY_S,
         )
         setup, program = agent_commands.setup(robot), robot.profile.tools.python
         return Planned(
@@ -137,6 +138,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
             limit_s=3 * (self.patience + self.duration + _OVERHEAD_S),
             log=self.prefixed_name(f"{role}-serve.log"),
             ready="log:up," if is_router else jobs.ready_when_bound(Protocol.TCP, self.listening_port),
+            ready_s=jobs.AGENT_READY_S,
         )
         remedy = "" if is_router else f"sudo apt-get install python3-{MASTER}"
         return Planned(role, job, program=program, setup=setup, permitted_causes=BY_FIELDKIT, remedy=remedy)
@@ -327,14 +329,14 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
         )
 
     def _both_logs(self, view: View) -> "tuple[TopicLog | None, TopicLog | None]":
-        """Return the complete logs of publisher and subscriber."""
+        """Return the logs of publisher and subscriber; None for each that is not complete."""
         from fieldkit.ros.streams import topic_evidence  # noqa: PLC0415 (needed only by this step)
 
         logs, _ = topic_evidence.read(self, view, self._logs)
         return logs.get(self.sender), logs.get(self.receiver)
 
     def _packets(self, view: View) -> "tuple[Packets | None, Packets | None]":
-        """Return the packets in the captures of sender and receiver."""
+        """Return the packets in the captures of sender and receiver; None for each without a complete capture."""
         sender, receiver = (view.capture(role) for role in (self.sender, self.receiver))
         return sender.packets if sender else None, receiver.packets if receiver else None
 

@@ -36,7 +36,7 @@ from fieldkit.steps.surroundings import EarlierStep, EnclosingStep
 from fieldkit.steps.view import View
 
 _EXTRA_PERIODS: Final = 1.5
-"""Recording time after the last step, in periods of the topic."""
+"""Waiting time before the first step inside and recording time after the last one, in periods of the topic."""
 ODOMETRY: Final = "nav_msgs/Odometry"
 
 # Shell script that runs the command after $1 and $2, and prints "recording" $2 s after the bag $1 has been opened,
@@ -99,10 +99,11 @@ class TrackedRobot(Strict):
         facing: Direction in which the robot faces when the step begins; required for odometry. `away`: away from the
             robot at the other end of its link; `towards`: towards that robot; `left` and `right`: to the left and to
             the right of the direction `away`.
-        child: Frame of the robot in a tree of transforms, whose parent is the tracker's frame.
+        child: Frame of the robot, for a topic of transforms: only transforms of this child frame are used. Their
+            parent frame is the tracker's frame.
         times: Time of a message: `header` for its stamp, or `received` for its time of reception, if the stamps are
             from another clock.
-        gap: If two consecutive messages are further apart than this, the position between them is unknown.
+        gap: If more than this time is between two consecutive messages, the position between them is unknown.
         at: A fixed position, instead of a topic.
     """
 
@@ -125,8 +126,8 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
 
     The distance and speed columns of the transfers and pings inside use these positions
     ([method](method-radio.md#where-robots-were)). Robots that are not listed are assumed to stay at their placement,
-    unless a step moves them. A repeat has at most one `track`; moves, faults and `together` are inside it. Adds the
-    columns `positions_from` and `positions_clock_error_s`. Writes `track_ROLE.bag` (ROS 2: a folder) and
+    unless a step inside moves them. A repeat has at most one `track`; moves, faults and `together` are inside it.
+    Adds the columns `positions_from` and `positions_clock_error_s`. Writes `track_ROLE.bag` (ROS 2: a folder) and
     `positions.json`, which records the source of each position, and the offset of each robot's clock from the
     laptop's clock.
 
@@ -148,13 +149,13 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
         yield from self.inside(scene)
 
     def _recordings(self, scene: Scene) -> list[Planned]:
-        """Return the jobs that record the topics until they are stopped."""
+        """Return the jobs that record the topics until they are stopped, after the steps inside, or reach a limit."""
         limit_s = position_recording.LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene))
         return [self._recording(scene, recorder) for recorder in self._recorders(limit_s).values()]
 
     def _recording(self, scene: Scene, recorder: RecordStep) -> Planned:
         (planned,) = recorder.jobs(scene)
-        arguments = (recorder.bag(scene.robot(planned.role)), str(self._period_s(scene, planned.role)))
+        arguments = (recorder.bag(scene.robot(planned.role)), str(self._wait_s(scene, planned.role)))
         job = replace(
             planned.job,
             name=self.prefixed_name("track"),
@@ -196,11 +197,11 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
             announce,
             self._recordings(scene),
             make_sources=partial(self._position_sources, scene),
-            extra_s=lambda recording: self._period_s(scene, recording.role),
+            extra_s=lambda recording: self._wait_s(scene, recording.role),
         )
 
-    def _period_s(self, scene: Scene, role: Role) -> int:
-        """Return a time, in whole seconds, in which the robot's topic has at least one message."""
+    def _wait_s(self, scene: Scene, role: Role) -> int:
+        """Return `_EXTRA_PERIODS` of the robot's topic, rounded up to seconds; 2 s if the profile gives no rate."""
         ros = scene.robot(role).profile.ros
         rates_hz = (
             [topic.rate for topic in ros.topics if topic.name == self.robots[role].topic and topic.rate]

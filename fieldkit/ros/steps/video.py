@@ -129,6 +129,7 @@ class VideoStep(AlongStep, Prepares, HasNeeds, UsesSpace, Listens, SendsTraffic,
             limit_s=duration_s if sends else 2 * duration_s,
             log=self._log(role),
             ready=None if sends else "log:up,",
+            ready_s=jobs.AGENT_READY_S,
         )
         setup, program = agent_commands.setup(robot), robot.profile.tools.python
         return Planned(role, job, program=program, setup=setup, permitted_causes=BY_EXIT if sends else BY_FIELDKIT)

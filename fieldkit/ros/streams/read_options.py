@@ -1,4 +1,4 @@
-"""Keys of steps whose receiver reads the newest sample at a rate, and sizes of images."""
+"""Keys of steps for reads of the newest sample by a program of the receiver, and for sizes of images."""
 
 from typing import Annotated, Final
 
@@ -19,7 +19,7 @@ class Reads(Strict):
     Attributes:
         rate: Reads per second: the rate of the control loop, or the refresh rate of the display.
         limit: Maximum age: an older sample counts as late, and a longer time without a newer sample counts as a gap.
-            For commands, use the time after which the robot stops.
+            For commands to a robot, use the time after which it stops if no new command arrives.
     """
 
     rate: Annotated[Hertz, Field(gt=0, le=1000)] = 60.0

@@ -32,8 +32,9 @@ class SampleArrivals:
 
     Attributes:
         record_delay_ns: Time of the sample's record in the log minus time of the first packet with the sample's head.
-        latency_s: Time of the record minus time of the packet that completed the sample and all earlier ones, for the
-            samples for which this packet is known. None if it is not known for any sample.
+        latency_s: Time of the record minus time of the packet that completed the sample, and all earlier ones if they
+            are delivered in order. Samples that may have waited for a sample that was not captured are omitted. None
+            if this packet is unknown for every sample.
     """
 
     record_delay_ns: Ints
@@ -67,7 +68,7 @@ class SampleArrivals:
         if early_ns > STAMP_NS:
             early_count = int((self.record_delay_ns < -STAMP_NS).sum())
             early_text = f"{format_count(early_count, 'sample')} in the subscriber's log arrived up to"
-            yield f"{early_text} {early_ns / 1e9:.6f} s earlier than their packets in its capture"
+            yield f"{early_text} {early_ns / 1e9:.6f} s earlier than the packets in its capture"
         if self.latency_s is not None and len(self.latency_s) > 2:
             min_latency_s = float(self.latency_s.min())
             if min_latency_s > (MAX_LATENCY_NS if len(self.latency_s) >= MIN_SAMPLES else MAX_LATENCY_FEW_NS) / 1e9:

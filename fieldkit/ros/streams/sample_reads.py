@@ -133,7 +133,7 @@ def measure(
         sent: Log of the publisher; None if it is incomplete.
         received: Log of the subscriber; None if it is incomplete.
         clocks: Offset of the subscriber's clock from the publisher's; None if it is unknown.
-        unknown_clocks: Reason why it is unknown.
+        unknown_clocks: Reason why it is unknown; ignored if it is known.
     """
     names = [column.name.removeprefix(f"{plan.prefix}_") for column in declare_columns(plan.prefix, "")]
     if sent is None or received is None:
@@ -171,7 +171,7 @@ def measure(
 def find_clocks(
     sender: Packets | None, receiver: Packets | None, sender_address: str, receiver_address: str
 ) -> tuple[Clocks | None, str]:
-    """Return the clock offset of two robots for `measure`, and the reason why it is unknown.
+    """Return the clock offset of two robots for `measure`, or None, and the reason that applies if it is None.
 
     Args:
         sender: Packets that the publisher's robot captured; None without a complete capture.
@@ -209,7 +209,7 @@ def _gaps_s(reads: SampleReads, window: tuple[int, int]) -> Floats:
 
 
 def _ages(reads: SampleReads, clocks: Clocks | None, unknown_clocks: str) -> dict[str, Value | None]:
-    """Return the ages whose clock error is small enough."""
+    """Return the ages whose clock error is small enough, this error, and the reason why other ages are withheld."""
     sample_reads = reads.where(reads.sequence >= 0)
     if not len(sample_reads):
         return {"withheld": "no sample arrived before a read"}

@@ -212,7 +212,7 @@ class StreamOptions(Strict):
 
     @property
     def listening_port(self) -> int:
-        """Port of the router, of the master, or of Zenoh's listeners; 0 for DDS, which has no fixed port."""
+        """Port of the router, of the master, or of Zenoh's listeners; 0 for `dds` and `ros2`: none is fixed."""
         if self.over in OVER_DDS:
             return 0
         return (

@@ -49,7 +49,8 @@ PROGRAM_DELAY_FIGURES: Final = {
     "topic_jitter_s": "95th percentile",
     "topic_deadline_misses": "largest",
 }
-"""Columns of times. Each is compared with this statistic of the delay in the subscriber's program."""
+"""Columns of times. Each is compared with this statistic of the delay in the subscriber's program; for
+`topic_deadline_misses`, the deadline is compared."""
 
 _GRACE_NS: Final = 300_000_000
 """The subscriber's log may lack samples that were captured within this time of the discovery of the publisher, or of
@@ -69,9 +70,9 @@ class CapturedTopic:
     """A topic in both captures.
 
     Attributes:
-        publisher: Packets in the publisher's capture; None without an undamaged capture.
-        subscriber: Packets in the subscriber's capture; None without an undamaged capture.
-        complete: True if all packets of its data that were sent are in the subscriber's capture.
+        publisher: Packets in the publisher's capture; None without a complete capture.
+        subscriber: Packets in the subscriber's capture; None without a complete capture.
+        complete: True if its data are sent over UDP, and all packets that were sent are in the subscriber's capture.
     """
 
     publisher: SampleFlow | None
@@ -80,7 +81,7 @@ class CapturedTopic:
 
 
 def is_complete(publisher: SampleFlow, subscriber: SampleFlow) -> bool:
-    """Return True if the subscriber's capture has every UDP packet of the topic that the publisher sent."""
+    """Return True if the publisher sent UDP packets of the topic, and all are in the subscriber's capture."""
     sent_packets, received_packets = (
         flow.packets.where(flow.packets.protocol == UDP) for flow in (publisher, subscriber)
     )
@@ -123,8 +124,8 @@ def _arrival_contradictions(
     yield from _surplus_copies(subscriber_log.samples, subscriber)
     yield from _uncaptured_samples(plan, arrivals, subscriber)
     if missing_count := _missing_count(plan, subscriber_log, subscriber, complete=complete):
-        missing_text = f"{format_count(missing_count, 'sample')} arrived according to the subscriber's capture"
-        yield f"{missing_text}, but are not in the subscriber's log"
+        missing_text = format_count(missing_count, "sample")
+        yield f"the subscriber's log lacks {missing_text} that arrived according to its capture"
 
 
 def withheld_columns(
@@ -192,12 +193,12 @@ def _content_contradictions(
         name: `publisher` or `subscriber`.
     """
     if numbers is not None and (unlogged_count := int((~np.isin(heads.sequence, numbers)).sum())):
-        yield f"{format_count(unlogged_count, 'sample')} in the {name}'s capture are not in its log"
+        yield f"the {name}'s log lacks {format_count(unlogged_count, 'sample')} of its capture"
     first_heads = heads.first()
     _, log_index, capture_index = np.intersect1d(samples.sequence, first_heads.sequence, return_indices=True)
     if different_count := int((samples.sent_ns[log_index] != first_heads.sent_ns[capture_index]).sum()):
         samples_text = format_count(different_count, "sample")
-        yield f"{samples_text} have different times of sending in the {name}'s log and in its capture"
+        yield f"{samples_text} with different times of sending in the {name}'s log and in its capture"
 
 
 def _sending_contradictions(publisher: SampleHeads) -> Iterator[str]:
@@ -224,7 +225,7 @@ def _surplus_copies(samples: TopicSamples, subscriber: SampleFlow) -> Iterator[s
     if not subscriber.is_tcp:  # TCP delivers every byte once, even if it arrived several times
         max_copies[is_captured] = captured_copies[np.searchsorted(captured_numbers, numbers[is_captured])]
     if surplus := int(((copies > max_copies) & (is_captured | subscriber.is_tcp)).sum()):
-        yield f"the subscriber's log has {format_count(surplus, 'sample')} more often than they arrived"
+        yield f"the subscriber's log has {format_count(surplus, 'sample')} more often than its capture"
 
 
 def _uncaptured_samples(plan: TopicPlan, arrivals: TopicSamples, subscriber: SampleFlow) -> Iterator[str]:
@@ -242,8 +243,8 @@ def _uncaptured_samples(plan: TopicPlan, arrivals: TopicSamples, subscriber: Sam
     else:
         capacity = int((payload_bytes // size_bytes).sum()) - len(subscriber.heads)
     if headless_count > max(capacity, 0):
-        missing_text = f"{format_count(headless_count - max(capacity, 0), 'sample')} in the subscriber's log"
-        yield f"{missing_text} are not in its capture"
+        missing_text = format_count(headless_count - max(capacity, 0), "sample")
+        yield f"the subscriber's capture lacks {missing_text} of its log"
     if not len(subscriber.heads):
         yield from _early_samples(arrivals, packets.time_ns, payload_bytes, size_bytes)
 
@@ -260,7 +261,7 @@ def _early_samples(samples: TopicSamples, times_ns: Ints, payload_bytes: Ints, s
     needed_bytes = size_bytes * np.arange(1, len(arrivals_ns) + 1)
     if early_count := int((captured_bytes < needed_bytes).sum()):
         early_text = f"{format_count(early_count, 'sample')} in the subscriber's log"
-        yield f"{early_text} arrived earlier than their bytes in its capture"
+        yield f"{early_text} arrived earlier than the bytes in its capture"
 
 
 def _missing_count(plan: TopicPlan, log: TopicLog, subscriber: SampleFlow, *, complete: bool) -> int:

@@ -121,7 +121,7 @@ _TRAFFIC: Final = columns(
     (
         "topic_discovery_packets",
         "count",
-        "IP packets of discovery between publisher and subscriber, at the publisher.",
+        "IP packets of discovery at the publisher.",
     ),
     (
         "topic_discovery_bytes",
@@ -215,7 +215,7 @@ def measure(
 
 
 def withheld_reasons(measured: Measured, reason: str) -> dict[str, str]:
-    """Return the reason for each column of a topic that is missing because packets were dropped before tcpdump.
+    """Return the reason for each missing column of a topic that depends on the captures, if packets were dropped.
 
     Args:
         measured: Columns measured without the captures.
@@ -280,7 +280,7 @@ def _times(arrivals: TopicSamples, clocks: Clocks | None, deadline_s: float | No
 
 
 def _clock_dependent_values(arrivals: TopicSamples, clocks: Clocks, sent_count: int) -> dict[str, float]:
-    """Return delays and ages whose clock error is small enough."""
+    """Return the clock error, and the delays and ages for which it is small enough."""
     delay_s, error_s = clocks.delays_s(arrivals.sent_ns, arrivals.at_ns), clocks.error_s(arrivals.at_ns)
     mean_s, peak_s = age_s((arrivals.at_ns - arrivals.at_ns[0]) / 1e9, delay_s)
     figures = {

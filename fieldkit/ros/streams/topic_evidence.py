@@ -107,7 +107,7 @@ def _flow(step: StreamOptions, view: View, role: Role) -> SampleFlow | None:
 def without_contradicted_times(
     step: StreamOptions, view: View, logs: Mapping[Role, TopicLog], measured: Measured
 ) -> Measured:
-    """Return the measurements without the times that the captures contradict."""
+    """Return the measurements without times that the captures contradict, or without a wrong discovery time."""
     if not {step.sender, step.receiver} <= logs.keys():
         return measured
     publisher_log, arrivals = logs[step.sender], first_arrivals(logs[step.receiver])

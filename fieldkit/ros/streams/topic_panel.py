@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 
+from fieldkit.core.units import format_count
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.report.attempt_timing import TIME_LABEL, AttemptTimes
 from fieldkit.report.charts import Panel, Series
@@ -22,7 +23,8 @@ _LOST: Final = Style("lost", "x", "none")
 def panels(step: Step, evidence: AttemptEvidence, times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
     """Yield a panel with the delays of received samples, and with lost samples, by the time of sending.
 
-    Each delay is shown relative to the delay of the fastest sample. See `DrawsPanels.panels`.
+    Each delay is shown relative to the delay of the fastest sample. Nothing is yielded if a log cannot be read or
+    nothing was sent. See `DrawsPanels.panels`.
     """
     logs = {
         role: evidence.read_or_none(topic_samples.read_log, step.prefixed_name(f"{role}-topic.bin"))
@@ -30,11 +32,11 @@ def panels(step: Step, evidence: AttemptEvidence, times: AttemptTimes, zero_ns: 
         for role, job in times.jobs
         if job == step.prefixed_name(verb)
     }
-    complete_logs = [log for log in logs.values() if log]
-    if len(complete_logs) != 2:
+    readable_logs = [log for log in logs.values() if log]
+    if len(readable_logs) != 2:
         return
     publisher, _ = logs
-    sent_samples, received_samples = (log.samples for log in complete_logs)
+    sent_samples, received_samples = (log.samples for log in readable_logs)
     if not len(sent_samples.sequence):
         return
     is_lost = ~np.isin(sent_samples.sequence, received_samples.sequence)
@@ -57,7 +59,7 @@ def panels(step: Step, evidence: AttemptEvidence, times: AttemptTimes, zero_ns: 
         y_label="[ms]",
         series=series,
         description=(
-            f"{len(sent_samples.sequence)} samples sent, {int(is_lost.sum())} lost, "
+            f"{format_count(len(sent_samples.sequence), 'sample')} sent, {int(is_lost.sum())} lost, "
             f"{len(received_samples.sequence)} received"
         ),
         top=None if len(excess_ms) else 1.0,  # without delays the y axis has no automatic end

@@ -126,8 +126,8 @@ def read_log(path: Path) -> TopicLog:
     """Read a log. A record that is truncated or has no time is ignored.
 
     Raises:
-        EvidenceError: The file is missing or not such a log, the number of samples in its end record is wrong, or its
-            checksum is wrong.
+        EvidenceError: The file is missing or not such a log, it has a record of an unknown kind, the number of
+            samples in its end record is wrong, or its checksum is wrong.
     """
     content = reading.mapped(path)
     if content[: len(LOG_MAGIC)] != LOG_MAGIC:

@@ -31,19 +31,19 @@ def check_captures(sent: TopicLog, received: TopicLog, sender: RtpPackets, recei
         yield f"{in_capture} of the video, but its log has {len(sent.samples)}"
         return
     if early := int((frames.sent_ns < sent.samples.sent_ns - STAMP_NS).sum()):
-        early_text = f"{format_count(early, 'frame')} in the sender's capture"
-        yield f"{early_text} were sent before the time of the frame in the sender's log"
+        early_text = f"the sender's capture has {format_count(early, 'frame')}"
+        yield f"{early_text} sent before the time of the frame in the sender's log"
     arrived = first_arrivals(received)
     sent_arrivals = arrived.where(np.isin(arrived.sequence, np.arange(len(frames))))
     numbers, arrived_ns = sent_arrivals.sequence, sent_arrivals.at_ns
     first_ns, last_ns = frames.first_ns[numbers], frames.last_ns[numbers]
     if lacking := int((first_ns == NO_PACKET).sum()):
-        yield f"{format_count(lacking, 'frame')} in the receiver's log have no packet in its capture"
+        yield f"the receiver's capture has no packet of {format_count(lacking, 'frame')} in its log"
     if early := int(((first_ns != NO_PACKET) & (arrived_ns < first_ns - STAMP_NS)).sum()):
-        yield f"{format_count(early, 'frame')} in the receiver's log arrived before their packets in its capture"
+        yield f"{format_count(early, 'frame')} in the receiver's log arrived before the packets in its capture"
     is_complete = frames.arrived[numbers] == frames.packets[numbers]
     if early := int((is_complete & (arrived_ns < last_ns - STAMP_NS)).sum()):
-        yield f"{format_count(early, 'frame')} in the receiver's log arrived before their last packet in its capture"
+        yield f"{format_count(early, 'frame')} in the receiver's log arrived before the last packet in its capture"
     returned, captured = len(received.samples) + received.unreadable, int((frames.arrived > 0).sum())
     if returned > captured:
         yield f"the receiver's log has {format_count(returned, 'frame')}, but its capture has packets of {captured}"

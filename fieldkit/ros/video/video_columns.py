@@ -42,8 +42,8 @@ _OF_CAPTURES: Final = columns(
         "video_undecoded",
         "count",
         (
-            "Frames whose packets all arrived, but which the receiver's pipeline did not return, because its socket "
-            "buffer was full, or packets were reordered."
+            "Frames whose packets all arrived, but which the receiver's pipeline did not return, for example because "
+            "its socket buffer was full, or packets were reordered."
         ),
     ),
 )

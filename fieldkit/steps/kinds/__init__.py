@@ -56,7 +56,7 @@ def find() -> Mapping[str, EntryPoint]:
             raise ConfigurationError(
                 f"there is already a kind of step {point.name!r}",
                 where=plugins.location(point),
-                remedy="uninstall it, or rename it",
+                remedy="uninstall this package, or rename its kind of step",
             )
         points[point.name] = point
     return MappingProxyType(points)

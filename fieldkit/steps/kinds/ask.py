@@ -58,7 +58,7 @@ class AskStep(Step, DescribesActions, AsksOperator, WritesOnLaptop, Summarizes):
         least: Smallest possible number.
         most: Largest possible number.
         usual: Default answer. It is used if the operator only presses Enter, and if no operator is asked.
-        each: `trial` asks once, before the first repeat that contains the step; `repeat` asks in each repeat.
+        each: `trial` asks in the first repeat, and the others use this answer; `repeat` asks in each repeat.
     """
 
     column: StepName

@@ -43,8 +43,9 @@ _RECORD_BYTES: Final = 16
 """Size of the header of each captured frame in the file."""
 
 RING_S: Final = 2
-"""Time before tcpdump is stopped if it does not support immediate mode. The kernel then passes packets to tcpdump
-with a delay of up to a second: of 215 packets, tcpdump had none after 0.5 s and all after 1.0 s."""
+"""Waiting time after the steps inside, before tcpdump is stopped, if it does not support immediate mode. The kernel
+then passes packets to tcpdump with a delay of up to a second: of 215 packets, tcpdump had none after 0.5 s and all
+after 1.0 s."""
 
 LAST_LINE: Final = "dropped by kernel"
 """Text of tcpdump's last line. After this line the kernel needs 15 to 31 ms to close the socket."""
@@ -301,7 +302,7 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
         return tuple(file for name in names for file in (name, tcpdump_log.capture_log_file(name)))
 
     def check(self, view: View) -> Iterator[str]:
-        """Yield a reason for each incomplete capture file, and for dropped packets; see `Step.check`.
+        """Yield a reason for each incomplete or contradictory capture, and for dropped packets; see `Step.check`.
 
         Dropped packets are permitted if each step inside leaves the columns that depend on them empty.
         """

@@ -208,7 +208,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
         if scene.laptop_folder is None:
             return
         now_ns = time.time_ns()
-        # A fault with a known duration started `duration_s` ago. Otherwise it lasted from the request until now.
+        # A fault with a known duration above 0 started `duration_s` ago. Another one started at the request.
         start_ns = now_ns - round(1e9 * duration_s) if duration_s else request_ns
         times = FaultTimes(start_ns, None if duration_s is None else now_ns, clock_offsets)
         path = scene.laptop_folder / self.prefixed_name(recoveries.fault_times_file(self.kind))

@@ -61,7 +61,10 @@ class Observer:
         return observer_role(self.fault)
 
     def watch(self, limit_s: float) -> Planned:
-        """Return the job that observes until it is stopped; it is ready when the robot has answered."""
+        """Return the job that observes until it is stopped.
+
+        It is ready when the robot has answered a ping, or for `kill` when its script has started.
+        """
         interval = f"{self._interval_s:g}"
         if self._is_kill:
             argv: tuple[str, ...] = ("sh", "-c", _WATCH_SCRIPT, "sh", self.fault.process, interval)

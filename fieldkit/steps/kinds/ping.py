@@ -50,8 +50,11 @@ Payload = Annotated[Int, Field(ge=0, le=65507)]
 
 
 def command_line(scene: Scene, role: Role, options: Iterable[str], address: str) -> tuple[str, ...]:
-    """Return the ping command of a robot. Its output is English, with numeric addresses and with time stamps."""
-    # busybox has no time stamps and never resolves names.
+    """Return the ping command of a robot. Its output is in English and has numeric addresses.
+
+    It has time stamps unless the ping is busybox's.
+    """
+    # busybox has no option for time stamps, and never resolves names.
     stamp_options = () if scene.tools(role).ping is PingTool.BUSYBOX else ("-n", "-D")
     return ("env", "LC_ALL=C", scene.robot(role).profile.tools.ping, *stamp_options, *options, address)
 
@@ -233,7 +236,8 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
             reasons = ping_duplicates.contradictions(result, self.interval, *self._captured_echoes(view))
             yield from (f"{self._file}: {reason}" for reason in reasons)
         if result.received is not None and result.received != len(result.answers):
-            yield f"{self._file}: ping counted {result.received} answers and printed {len(result.answers)}"
+            answers_text = format_count(result.received, "answer")
+            yield f"{self._file}: ping counted {answers_text} and printed {len(result.answers)}"
         # iputils reports 0 for a negative time, and "time of day goes back" in its log.
         if 0.0 in result.rtt_s:
             yield f"{self._file} has a round-trip time of 0: the clock was set back while ping waited"
@@ -314,7 +318,7 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
         if isinstance(gap_s := values.get("rtt_gap_s"), float):
             yield f"longest gap {gap_s:.1f} s with {values['rtt_gap_lost']} lost"
         if duplicates := values.get("rtt_duplicates"):
-            yield f"{format_count(int(duplicates), 'packet')} received over both links"
+            yield f"{format_count(int(duplicates), 'packet')} received again over another link"
         if isinstance(open_s := values.get("rtt_gap_at_least_s"), float):
             yield f"longest gap >= {open_s:.1f} s with {values['rtt_gap_lost_at_least']} lost"
         if isinstance(median_s := values.get("rtt_median_s"), float):

@@ -114,7 +114,7 @@ class Bounds(Strict):
     max: Number | Int | None = None
 
     def problem(self, value: Value) -> str | None:
-        """Return the reason why a value is out of bounds; None if it is within bounds."""
+        """Return the reason why a value is out of bounds; None if it is within bounds, or is a text."""
         if isinstance(value, str):
             return None
         if self.min is not None and value < self.min:

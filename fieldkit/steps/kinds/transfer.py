@@ -16,6 +16,7 @@ from fieldkit.config.schema import Duration, Field, Int
 from fieldkit.core.columns import Measured, Value
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Protocol, Role
+from fieldkit.core.units import format_count
 from fieldkit.measure.checks import transfer_checks
 from fieldkit.measure.checks.transfer_checks import CROSS_CHECKS
 from fieldkit.measure.evidence import host, oracle_delays, reading
@@ -72,8 +73,8 @@ _SEND: Final = "send"
 _START_S: Final = 0.3
 """Approximate duration of a transfer on a good link, without the idle time of UDP."""
 MAX_LATE_SHARE: Final = 0.1
-"""Maximum time between the start of a listener and the start of its sender, as a share of the listener's limit. It
-applies if the listener was stopped at its limit."""
+"""Maximum time between the start of a TCP listener and the start of its sender, as a share of the listener's limit.
+It applies if the listener did not exit with 0, for example because it was stopped at its limit."""
 
 _TRADITIONAL_REMEDY: Final = (
     "sudo apt-get install netcat-traditional, and write netcat: nc.traditional in its profile"
@@ -145,7 +146,8 @@ class TransferStep(
     def _file_to_send(self, scene: Scene) -> RecordedFile:
         """Return the recording to send.
 
-        If no recording has the name, the first one is returned, because `refusals` reports this error.
+        This is the first one if the step names no file, and also if no recording has the name, because `refusals`
+        reports this error.
         """
         recordings = scene.recordings[self.sender]
         return next((file for file in recordings if self.file in {file.name, file.alias}), recordings[0])
@@ -265,7 +267,7 @@ class TransferStep(
             )
 
     def _late_start(self, waited_s: float, reason: str, scene: Scene) -> RobotError:
-        """Return the error for a sender that started so late that the radio is not the cause of its loss."""
+        """Return the error for a sender that started so late that the radio need not be the cause of its loss."""
         return RobotError(
             f"the sender started up to {waited_s:.1f} s after the listener, but {reason}",
             where=scene.robot(self.sender).name,
@@ -402,7 +404,7 @@ class TransferStep(
             if name in values:
                 yield f"{layer} loss {100 * float(values[name]):.1f} %"
         if values.get("ip_packets_doubtful"):
-            yield f"{values['ip_packets_doubtful']} ambiguous packets"
+            yield format_count(int(values["ip_packets_doubtful"]), "ambiguous packet")
         if "tcp_retransmitted_segments" in values:
             yield f"{values['tcp_retransmitted_segments']} retransmitted"
 

@@ -7,6 +7,7 @@ from typing import Final
 from fieldkit.backends.protocols import Robot
 from fieldkit.config import locations
 from fieldkit.core.model import Control
+from fieldkit.core.units import format_count
 from fieldkit.steps.scene import CommandResult
 from fieldkit.trial.check.probe import MISSING_SECTION, Sections
 from fieldkit.trial.check.report import Report
@@ -109,7 +110,9 @@ def _judge_offloads(sections: Sections, report: Report) -> None:
     section = sections.get("offloads", MISSING_SECTION)
     states = {name: re.search(rf"^{long}: (on|off)", section.text, re.MULTILINE) for name, long in _OFFLOADS.items()}
     offloads = [f"{name} {state[1]}" for name, state in states.items() if state]
-    report.ok("offloads", ", ".join(offloads) or "unknown: ethtool is not installed")
+    is_missing = section.code == CommandResult.MISSING
+    unknown_text = f"unknown: ethtool {'is not installed' if is_missing else 'does not report them'}"
+    report.ok("offloads", ", ".join(offloads) or unknown_text)
 
 
 def facts(sections: Sections) -> Mapping[str, str]:
@@ -126,13 +129,13 @@ def _judge_wifi(robot: Robot, sections: Sections, report: Report) -> None:
     if "associated" not in wifi_facts and wifi_facts.get("type") == "managed":
         report.fail("Wi-Fi", "not associated with a network", f"sudo wpa_cli -i {interface} reconnect")
         return
-    stations = "wifi-stations" if is_access_point or "associated" not in wifi_facts else "wifi-link"
-    signals = [int(signal) for signal in _SIGNAL.findall(sections.get(stations, MISSING_SECTION).text)]
+    signal_section = "wifi-stations" if is_access_point or "associated" not in wifi_facts else "wifi-link"
+    signals = [int(signal) for signal in _SIGNAL.findall(sections.get(signal_section, MISSING_SECTION).text)]
     words = [
         f"{wifi_facts.get('type', 'unknown mode')} {wifi_facts.get('ssid', '')!r}",
         *([f"at {wifi_facts['associated']}"] if "associated" in wifi_facts else []),
         *([f"channel {wifi_facts['channel']}"] if "channel" in wifi_facts else []),
-        *([f"{len(signals)} stations"] if is_access_point else []),
+        *([format_count(len(signals), "station")] if is_access_point else []),
         *([f"{min(signals)} dBm"] if signals else []),
         *([wifi_facts["rate"]] if "rate" in wifi_facts else []),
     ]

@@ -56,7 +56,7 @@ def judge_laptop(plan: Plan, out: Path, report: Report) -> None:
         )
 
 
-def judge_disk_space(plan: Plan, free: int, folder: Path, report: Report) -> None:
+def judge_disk_space(plan: Plan, free_bytes: int, folder: Path, report: Report) -> None:
     """Report the free space on the laptop.
 
     The check fails if the space is not sufficient for one attempt. It gives a warning if the space is not sufficient
@@ -64,16 +64,16 @@ def judge_disk_space(plan: Plan, free: int, folder: Path, report: Report) -> Non
 
     Args:
         plan: The trial.
-        free: Free bytes in `folder`.
-        folder: Folder of the trial.
+        free_bytes: Free space in `folder`, or in its nearest existing parent.
+        folder: The folder that the remedy names.
         report: Receives the finding.
     """
-    attempt, whole_trial = size.attempt_bytes(plan), size.trial_bytes(plan)
-    detail = f"{format_bytes(free)} free, the trial needs {format_bytes(whole_trial)} at most"
+    attempt_bytes, trial_bytes = size.attempt_bytes(plan), size.trial_bytes(plan)
+    detail = f"{format_bytes(free_bytes)} free, the trial needs about {format_bytes(trial_bytes)} or less"
     remedy = f"du -sh {quote((str(folder),))}/*   # delete what is not needed, or choose another --out"
-    if free < attempt + size.RESERVE_BYTES:
+    if free_bytes < attempt_bytes + size.RESERVE_BYTES:
         report.fail("disk", detail, remedy)
-    elif free < whole_trial + size.RESERVE_BYTES:
+    elif free_bytes < trial_bytes + size.RESERVE_BYTES:
         report.warn("disk", detail, remedy)
     else:
         report.ok("disk", detail)
@@ -84,10 +84,10 @@ def _judge_disk(plan: Plan, role: Role, sections: Sections, report: Report) -> N
     if not lines:
         report.fail("disk", sections.get("disk", MISSING_SECTION).text, "df -Pk .")
         return
-    free = int(lines[-1]["free_kib"]) << 10
-    needed = size.evidence_bytes(plan, role) + size.reserve_bytes(plan, role)
-    detail = f"{format_bytes(free)} free, {format_bytes(needed)} needed"
-    if free < needed:
+    free_bytes = int(lines[-1]["free_kib"]) << 10
+    needed_bytes = size.evidence_bytes(plan, role) + size.reserve_bytes(plan, role)
+    detail = f"{format_bytes(free_bytes)} free, {format_bytes(needed_bytes)} needed"
+    if free_bytes < needed_bytes:
         report.fail(
             "disk", detail, "du -sh ~/.fieldkit/* ~/*.bag   # delete old bags, and evidence that was not fetched"
         )

@@ -32,9 +32,9 @@ _REMEDIES: Final[Mapping[str, str]] = {
     "ptp4l": "sudo pmc -u -b 0 'GET PORT_DATA_SET'   # its network needs a PTP master",
 }
 """Remedy by problem, or by program."""
-_STEP_REMEDIES: Final[Mapping[str, str]] = {"chrony": "sudo chronyc makestep"}
-_DEFAULT_STEP_REMEDY: Final = "wait until the program has corrected the clock, or restart the program"
-"""Remedy for a clock that differs from its time source, by program."""
+_OFFSET_REMEDIES: Final[Mapping[str, str]] = {"chrony": "sudo chronyc makestep"}
+_OFFSET_REMEDY: Final = "wait until the program has corrected the clock, or restart the program"
+"""Remedies for a clock that differs from its time source: by program, and for all other programs."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def read(shell: Shell) -> RobotTime:
 
 
 def judge(reports: Sequence[ClockReport], report: Report, *, is_required: bool = False) -> None:
-    """Add a finding for each program that sets a robot's clock.
+    """Add a finding for each report on the program that sets a robot's clock.
 
     Args:
         reports: Reports of the robot's programs.
@@ -84,7 +84,7 @@ def judge(reports: Sequence[ClockReport], report: Report, *, is_required: bool =
             error = "" if clock_report.error_s is None else f" \N{PLUS-MINUS SIGN} {clock_report.error_s:.6f} s"
             detail = f"{clock_report.program} follows {clock_report.reference}, {clock_report.offset_s:+.6f} s{error}"
             if exchanges.is_wrong(Offset(clock_report.offset_s or 0.0, clock_report.error_s or 0.0)):
-                report.warn(CHECK, detail, _STEP_REMEDIES.get(clock_report.program, _DEFAULT_STEP_REMEDY))
+                report.warn(CHECK, detail, _OFFSET_REMEDIES.get(clock_report.program, _OFFSET_REMEDY))
             else:
                 report.ok(CHECK, detail)
     if not reports and is_required:

@@ -86,7 +86,8 @@ def parse(output: bytes, profile: RobotProfile) -> Variants:
     """Return the variants of tools, from the output of `probe`. A tool that was not probed has the expected variant.
 
     Raises:
-        RobotError: A tool is missing, is of an unknown kind, or lacks a permission that it needs.
+        RobotError: A tool is missing, is of an unknown kind, did not exit in time, or lacks a permission. A missing
+            recorder is not an error: it has the variant `NONE`.
     """
     outputs = dict(_sections(output))
     if _USER not in outputs:

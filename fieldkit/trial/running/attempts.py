@@ -35,7 +35,7 @@ class Attempts:
         ledger: Records the result of each attempt.
         variants: Variants of the tools of each robot.
         sink: Receives the start of each phase.
-        motions: The robots that move without a person.
+        motions: The robots that move automatically.
         origins: Origins of the robots' motions; see `Scene.origins`.
     """
 
@@ -68,14 +68,15 @@ class Attempts:
         """Make another attempt at a repeat, and store it with any result.
 
         Returns:
-            The remedy of a failed step; empty if no step failed.
+            The remedy of a failed step, or of an exception in the code of a step; empty if there is no such error.
 
         Raises:
             ConfigurationError: This machine has no space for the evidence.
             FieldkitError: The trial cannot continue. The attempt is stored, but does not count as one of the
                 allowed attempts.
             KeyboardInterrupt: The user pressed Ctrl-C. The attempt is stored, but does not count as one of the
-                allowed attempts. If its steps have ended, `recover` completes the attempt.
+                allowed attempts. If its steps have ended on robots that remain, it is not stored, and `recover`
+                completes it when the trial is resumed.
             OSError: The disk is full or was removed.
         """
         self._robots.check_alive()
@@ -173,7 +174,8 @@ class Attempts:
     def _storing_interrupted(self, running_attempt: Attempt, partial_folder: Path) -> Iterator[None]:
         """If the body is interrupted, stop its jobs and store the attempt as void, without using an allowed attempt.
 
-        After a request to stop, nothing is fetched. The measurements stay on the robots, and the reason states this.
+        Nothing more is fetched. The evidence stays on the robots, which `ROLE-unfetched.txt` records. The attempt is
+        not stored if the disk fails, or if its steps had ended and `resume` can fetch the evidence.
         """
         try:
             yield

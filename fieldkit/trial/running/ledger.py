@@ -87,7 +87,7 @@ class Ledger:
 
     @property
     def last(self) -> tuple[Attempt, Row]:
-        """The last committed attempt and its row."""
+        """The last attempt that was committed in this run, and its row. There must be one."""
         assert self._last is not None
         return self._last
 
@@ -96,7 +96,7 @@ class Ledger:
         return self._counts[status]
 
     def is_finished(self, repeat: RepeatId) -> bool:
-        """Return True if a repeat is valid, or failed after its last attempt."""
+        """Return True if a repeat is valid or has failed, so that it needs no further attempt."""
         return repeat in self._finished
 
     @property
@@ -105,7 +105,7 @@ class Ledger:
         return len(self._finished)
 
     def is_last(self, repeat: RepeatId) -> bool:
-        """Return True if the procedure allows only one more attempt at a repeat."""
+        """Return True if the procedure allows at most one more attempt at a repeat."""
         return self._counted_attempts[repeat] + 1 >= self._plan.procedure.attempts
 
     def begin(self, repeat: RepeatId) -> Attempt:
@@ -137,6 +137,7 @@ class Ledger:
             measured: Measured values of the attempt.
 
         Raises:
+            KeyboardInterrupt: A stop was due while the files were being written; they are complete.
             OSError: For the same reasons as `begin`.
         """
         with self._stop.saving_files():
@@ -153,7 +154,7 @@ class Ledger:
     def summarize(self) -> tuple[Cell, ...]:
         """Write the table and the summary of all committed attempts, and return the summary.
 
-        Raises the same errors as `begin`.
+        Raises the same errors as `commit`.
         """
         with self._stop.saving_files():
             cells = rows.write_summary(self._folder, self._plan, self._table())
@@ -195,7 +196,10 @@ class Ledger:
         yield from verification.differences(self._folder).items()
 
     def _unchanged_lines(self, ended: int) -> list[str]:
-        """Return the unchanged lines of the table, or no lines if there are more lines than attempts that ended."""
+        """Return the unchanged lines of the table without its header.
+
+        The result is empty if the header differs from the plan, or there are more lines than attempts that ended.
+        """
         line_count = self._manifest.unchanged_lines(store.TRIAL_CSV)
         if not line_count:
             return []

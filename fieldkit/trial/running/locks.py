@@ -66,7 +66,7 @@ def locked_exclusively(shells: Shells, holder: Holder, *, sink: Sink) -> Iterato
 
 @contextmanager
 def locked(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) -> Iterator[None]:
-    """Lock all robots, and unlock them after the body. If a robot cannot be locked, no robot stays locked.
+    """Lock all robots, and unlock them after the body. If a robot cannot be locked, the others are unlocked again.
 
     Robots are contacted in parallel, but locked in the order of their names. If two trials need the same robots, one
     of them therefore locks all robots. After Ctrl-C, the program does not wait for robots that cannot be reached.

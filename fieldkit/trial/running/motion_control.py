@@ -47,7 +47,7 @@ class MotionSupport(Protocol):
     """The package that moves robots."""
 
     def require_one_place(self, plans: Sequence[Plan], backend: Backend, operator: Operator) -> None:
-        """Check that each robot that moves without a person has the same place in all trials.
+        """Check that each robot that moves automatically has the same place in all trials.
 
         The places may differ if a person brings the robots to them.
 

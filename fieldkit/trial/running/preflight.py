@@ -84,7 +84,8 @@ def check(
         shells: The robots.
         out: Folder of the trial.
         all_checks: True to check locks as well, and to run the checks that packages add (`plugins.CHECKS`).
-        fleet_checks: Checks of all robots together. They run last, and only if no robot is locked.
+        fleet_checks: Checks of all robots together. They run after the other checks of robots, and only if no robot
+            is locked.
     """
     reports = {role: Report(robot.name) for role, robot in plan.cast.items()}
     variants_by_role: dict[Role, Variants] = {}
@@ -147,7 +148,7 @@ def require_passed(findings: Sequence[Finding]) -> None:
 def _check_robot(
     plan: Plan, role: Role, shell: Shell, variants_by_role: dict[Role, Variants], report: Report, *, all_checks: bool
 ) -> bool:
-    """Add the findings about a robot. Return False if another user has locked it."""
+    """Add the findings about a robot. Return False if locks are checked and it is locked."""
     stage, robot = _CONNECTION, plan.cast[role]  # if an error is raised, it is reported as the check `stage`
     try:
         offset = contact.judge(shell, report)

@@ -187,7 +187,12 @@ class Robots:
         return [reason for _, reason, _ in failures]
 
     def _collect(self, role: Role, remote: str, into: Path, *, ended_normally: bool) -> tuple[str, bool] | None:
-        """Fetch the evidence of one robot. If this fails, return the reason and True if it is still on the robot."""
+        """Fetch the evidence of one robot.
+
+        Returns:
+            The problem, and True if unfetched evidence is on the robot; None without a problem. A reboot during an
+            attempt that did not end normally is a problem even if the evidence was fetched.
+        """
         shell, attempt = self.shells[role], remote.rpartition("/")[2]  # for example `udp-07-1`: repeat and attempt
 
         def announce(progress_text: str, remaining_s: float) -> None:

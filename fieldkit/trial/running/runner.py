@@ -47,7 +47,7 @@ class Outcome:
         folder: Folder of the trial.
         cells: Summary of the trial.
         valid: Number of valid repeats.
-        failed: Number of repeats without a valid attempt.
+        failed: Number of failed repeats.
         judgements: Judgements of the procedure's expectations.
     """
 

@@ -10,15 +10,18 @@ from fieldkit.steps.motions import Motions
 class Stop:
     """A request to stop.
 
-    It takes effect immediately while a robot moves without a person or may start to move (`motions`), and while no
-    repeat is running. Otherwise, it takes effect after the running repeat.
+    The first SIGINT takes effect after the running repeat. A second SIGINT, and SIGTERM and SIGHUP, stop during the
+    repeat. While a robot moves automatically or may start to move (`motions`), or no repeat is running, every signal
+    takes effect immediately: robots are ordered to stop at once. In all cases KeyboardInterrupt is raised only when
+    `saving` is False. `fieldkit.cli.interrupts` implements these rules for signals.
 
     Attributes:
         after_repeat: True if the trial must stop after the running repeat.
-        can_finish: True if a running repeat may finish before the trial stops.
+        can_finish: True while a repeat is running, which may finish before the trial stops.
         saving: True while files are being written that must not be left incomplete.
-        after_saving: True if the trial must stop when these files are written.
-        motions: The robots that move without a person.
+        after_saving: True after a stop that does not wait for the end of the repeat. `saving_files` then raises
+            KeyboardInterrupt when its files are complete.
+        motions: The robots that move automatically.
     """
 
     def __init__(self) -> None:
@@ -35,18 +38,19 @@ class Stop:
         return self._expected_end.remaining_s
 
     @contextmanager
-    def finishing(self, expected_s: float, motions: tuple[str, ...]) -> Iterator[None]:
-        """Delay a request to stop until the body has finished, unless robots move without a person in the body.
+    def finishing(self, expected_s: float, stop_notes: tuple[str, ...]) -> Iterator[None]:
+        """Permit the body, which is a repeat, to finish after a request to stop.
 
         Args:
             expected_s: Estimated duration of the body, in seconds.
-            motions: Value of `Motions.stop_notes`. If it is not empty, a request to stop takes effect immediately
-                until the body clears it.
+            stop_notes: A line for each robot that moves automatically in the body about its behaviour when it is
+                stopped; stored in `Motions.stop_notes`. While there are such lines, a stop does not wait for the end
+                of the body. The body deletes them when no robot moves any more.
 
         Raises:
-            KeyboardInterrupt: A stop was requested while the body was running.
+            KeyboardInterrupt: `after_repeat` was set while the body was running.
         """
-        self._expected_end, self.motions.stop_notes = Deadline.after(expected_s), motions
+        self._expected_end, self.motions.stop_notes = Deadline.after(expected_s), stop_notes
         self.can_finish = True
         try:
             yield
@@ -60,7 +64,7 @@ class Stop:
         """Delay a stop until the body, which must be short, has finished.
 
         Raises:
-            KeyboardInterrupt: A stop was due while the body was running.
+            KeyboardInterrupt: A stop is due (`after_saving`), and the body raised no exception.
         """
         self.saving = True
         try:

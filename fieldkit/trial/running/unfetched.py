@@ -1,4 +1,7 @@
-"""Evidence that was not fetched. It stays on its robot, and a file in the attempt's local folder records this."""
+"""Evidence that was not fetched, which a file in the attempt's local folder records.
+
+It stays on its robot, unless the robot itself is removed at the end of this run of fieldkit.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -11,7 +14,7 @@ from fieldkit.trial.plan import Plan
 
 
 def unfetched_file(role: Role) -> str:
-    """Return the name of the file with the reason why evidence was left on the robot in `role`."""
+    """Return the name of the file with the reason why the evidence of the robot in `role` was not fetched."""
     return f"{role}-{laptop_files.UNFETCHED}"
 
 
@@ -33,7 +36,10 @@ class UnfetchedEvidence:
         self.folders: dict[Role, list[str]] = {role: [] for role in roles}
 
     def mark(self, role: Role, remote: str, into: Path, reason: str) -> None:
-        """Leave an attempt's folder on a robot, and record the path and the reason in the attempt's local folder.
+        """Record that an attempt's evidence was not fetched from a robot, with its path and the reason.
+
+        The record is a file in the attempt's local folder, and an entry in `folders`, so that `Robots` does not
+        delete the folder on the robot.
 
         Args:
             role: Role of the robot.
@@ -49,19 +55,22 @@ class UnfetchedEvidence:
         (into / unfetched_file(role)).write_text(encodable(text), encoding="utf-8")
 
     def mark_all(self, remote: str, into: Path, reason: str) -> None:
-        """Leave an attempt's folder on all robots; see `mark` for the arguments."""
+        """Call `mark` for all robots, with the same arguments."""
         for role in self.folders:
             self.mark(role, remote, into, reason)
 
     def restore(self, ended: Attempt, stored_folder: Path) -> None:
-        """Mark the evidence of an attempt of an earlier run if its stored folder has a file that `mark` wrote."""
+        """Add an attempt of an earlier run to `folders` for each role with a file of `mark` in its stored folder.
+
+        Nothing is added for a valid attempt, whose evidence was fetched, or if robots are transient.
+        """
         if ended.status is not Status.VALID and not self._transient:
             for role, folders in self.folders.items():
                 if (stored_folder / unfetched_file(role)).is_file():
                     folders.append(ended.remote_folder(self._plan.trial))
 
     def by_robot(self) -> Mapping[str, Sequence[str]]:
-        """Return the remote folders with evidence that was not fetched, by the robot's name."""
+        """Return the remote folders with evidence that was not fetched, by the robot's name; none if transient."""
         if self._transient:
             return {}
         return {self._plan.cast[role].name: folders for role, folders in self.folders.items() if folders}

@@ -20,7 +20,7 @@ from fieldkit.trial.plan import PLAN_FILE
 from fieldkit.trial.stored.tables import expectation_texts, frozen_columns, other_names
 
 MIN_TABLES: Final = 100
-"""Smallest number of tables for which an index is created. Fewer tables are read faster without an index."""
+"""Smallest number of tables for which an index is used. Fewer tables are read faster without an index."""
 MIN_NEW: Final = 20
 """Smallest number of new or changed tables for which an index is written again. Fewer are read from their files."""
 MAX_TABLE_BYTES: Final = 1 << 25
@@ -37,10 +37,10 @@ class IndexedTables:
     """The tables that are in an index, and the tables that must be added to it.
 
     Attributes:
-        path: File of the index; None if there is no index.
-        index: Content of the index.
-        entries: Entries of the tables that are in the index.
-        new: Stamps and properties of the tables that `write` adds to the index.
+        path: File of the index, which may not exist yet; None if no index is used.
+        index: Content of the index; empty if the file does not exist yet.
+        entries: Entries of the tables that are in the index, by table.
+        new: Stamps and properties of the tables that `write` adds to the index, by table.
     """
 
     path: Path | None = None
@@ -54,7 +54,7 @@ class IndexedTables:
         return frozenset(table for table, entry in self.entries.items() if entry.rows >= 0)
 
     def facts(self, table: Path) -> TableFacts | None:
-        """Return the properties of a table, or None if they are unknown."""
+        """Return the properties of a table, or None if the table is neither in the index nor in `new`."""
         if table in self.new:
             return self.new[table][1]
         return self.entries[table].facts if table in self.entries else None
@@ -145,7 +145,7 @@ def _declarations(table: Path) -> str:
 
 
 def write(indexed: IndexedTables, columns: Sequence[Column], note: Note) -> IndexedTables:
-    """Write the index with its new tables, and return the tables that are in it.
+    """Add the new tables to the index, and return the tables that are in it. Without new tables, nothing is written.
 
     Args:
         indexed: The tables, as `find` returned them.
@@ -195,5 +195,5 @@ def _unchanged(new: Mapping[Path, tuple[TableStamp, TableFacts]]) -> Iterator[tu
 
 
 def _stamp(table: Path) -> TableStamp | None:
-    """Return the stamp of a table and its plan (their sizes and times of change), or None if it cannot be indexed."""
+    """Return the stamps (size and time of change) of a table and its plan, or None if the table cannot be indexed."""
     return table_index.stamp(table, table.parent / PLAN_FILE)

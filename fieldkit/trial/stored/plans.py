@@ -31,14 +31,18 @@ _TRIAL_FILES: Final = frozenset(
         laptop_files.POSITIONS,
     }
 )
-"""Files that fieldkit reads and writes in a trial's folder; other files in it are ignored."""
+"""Names of the files and folders that fieldkit reads and writes in a trial's folder.
+
+Files whose names start with `store.POSITIONS` are read as well; all others are ignored.
+"""
 
 
 def read_plan(folder: Path) -> Plan:
     """Return the plan of a trial.
 
     Raises:
-        ConfigurationError: The folder has no plan, or the plan was edited.
+        ConfigurationError: The folder has no plan, the plan is invalid (for example because it was edited), or a kind
+            of its steps is not installed.
         EvidenceError: For the same reasons as `require_plain`.
     """
     require_plain(folder)
@@ -75,7 +79,10 @@ def require_plain(folder: Path) -> None:
 
 
 def unexpected_files(folder: Path) -> Iterator[tuple[Path, str]]:
-    """Yield each path in a trial's folder that is neither a plain file nor a folder of evidence, with its type."""
+    """Yield each path in a trial's folder that is neither a plain file nor a folder, with a text about its type.
+
+    Below `repeats/`, folders deeper than the folders of evidence are yielded as well.
+    """
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         if file_type := files.unexpected_type(path):
             yield path, file_type
@@ -124,7 +131,7 @@ class _PlanColumns(schema.Strict):
 
 
 def read_columns(path: Path) -> tuple[Column, ...]:
-    """Return the columns listed in a `trial.yaml`, without loading the step kinds of its procedure.
+    """Return the columns listed in a `trial.yaml`, if any, without loading the step kinds of its procedure.
 
     Raises:
         ConfigurationError: The file cannot be read, or an entry is not a valid column.
@@ -143,7 +150,7 @@ class _ProcedureExpectations(schema.Strict):
 
 
 def read_expectations(path: Path) -> tuple[str, ...]:
-    """Return the expectations of the procedure in a `trial.yaml`, without loading its step kinds.
+    """Return the expectations of the procedure in a `trial.yaml`, if any, without loading its step kinds.
 
     Raises:
         ConfigurationError: The file cannot be read, or its expectations are invalid.

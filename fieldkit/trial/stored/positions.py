@@ -31,7 +31,8 @@ class AttemptPositions:
 
     Attributes:
         attempt: Name of the attempt's folder.
-        source: Sources of the positions as text; None if there is no source other than the testbed.
+        source: Sources of the positions as text, such as `sender as placed, receiver /odom`; None if the only source,
+            if any, is the testbed.
         distances_m: Smallest and largest distance by measurement, such as `transfer`, `rtt` or `up.rtt`.
         missing: Reasons for missing distances, by measurement.
     """
@@ -52,12 +53,13 @@ def set_positions(
         sources: GPX or CSV file, or a fixed place, by role; empty to remove positions that were added before.
         offset_s: Offset that is added to the times of the files to convert them to the laptop's clock, in seconds.
         gap_s: Longest time between two points over which positions are interpolated linearly, in seconds.
-        heights: True to use heights above the ellipsoid as well; False for horizontal distances.
+        heights: True to use the heights of positions in degrees as well; False for horizontal distances of such
+            positions. The heights of positions in metres are always used.
 
     Raises:
-        ConfigurationError: `folder` is not a trial, another process runs the trial, it has no such role, or a file is
-            missing.
-        EvidenceError: A file cannot be read, or the trial's evidence has changed.
+        ConfigurationError: `folder` is not a trial, another process runs the trial, the trial has no such role, or a
+            file is missing or too large.
+        EvidenceError: A file is not a valid GPX or CSV file, or the trial's evidence has changed.
     """
     plan = plans.read_plan(folder)
     for role, source in sources.items():
@@ -106,7 +108,10 @@ def _require_file(path: Path) -> None:
 def _store_source(
     folder: Path, role: Role, source: Path | PositionSource, offset_s: float, gap_s: float
 ) -> PositionSource:
-    """Copy the position file of a robot into the trial's folder and return it as a position source."""
+    """Copy the position file of a robot into the trial's folder and return it as a position source.
+
+    A fixed place is returned unchanged.
+    """
     if isinstance(source, PositionSource):
         return source
     name = f"{store.POSITIONS}{role}{source.suffix.lower()}"
@@ -124,8 +129,8 @@ def _remove_others(folder: Path, names: set[str]) -> None:
 def parse_source(text: str) -> tuple[Role, Path | PositionSource]:
     """Return a role and the position source of its robot.
 
-    Examples are `receiver=walk.gpx`, `sender=48.1,11.5` and `sender=0m,5m`. A third number is the height above the
-    ellipsoid in metres.
+    Examples are `receiver=walk.gpx`, `sender=48.1,11.5` (latitude and longitude) and `sender=0m,5m` (along two axes).
+    A third number is the height in metres; after degrees, it is the height above the ellipsoid.
 
     Raises:
         ConfigurationError: The text does not have this form.
@@ -136,7 +141,8 @@ def parse_source(text: str) -> tuple[Role, Path | PositionSource]:
     except ValueError:
         separator = ""
     if not separator or not source:
-        raise ConfigurationError(f"{text[:80]!r} is not ROLE=FILE", remedy="write for example receiver=walk.gpx")
+        problem = f"{text[:80]!r} is not ROLE=FILE or ROLE=PLACE"
+        raise ConfigurationError(problem, remedy="write for example receiver=walk.gpx or sender=0m,5m")
     return role, _place(source) or Path(source)
 
 
@@ -155,7 +161,10 @@ def _place(text: str) -> PositionSource | None:
 
 
 def _degrees_or_m(text: str) -> tuple[float, bool]:
-    """Return a number and True if it is a length; raises `ValueError` for any other text."""
+    """Return the value of a number without a unit and False, or a length in metres and True.
+
+    Raises `ValueError` for any other text.
+    """
     with suppress(ValueError):
         return float(text), False
     try:

@@ -75,8 +75,8 @@ def rebuild(folder: Path) -> RebuildResult:
 
 def problems_text(problems: Sequence[str]) -> str:
     """Return the text of a note on the problems of attempts that were valid when they ended."""
-    others = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-    return f"valid repeats may lack values now: {problems[0]}{others}"
+    more_text = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    return f"valid repeats may lack values now: {problems[0]}{more_text}"
 
 
 def measure_rows(folder: Path, plan: Plan) -> tuple[list[Row], list[str]]:

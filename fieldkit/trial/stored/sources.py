@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -19,15 +19,12 @@ from fieldkit.core.columns import Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError, did_you_mean, shell_command
 from fieldkit.core.executors import Workers
 from fieldkit.core.units import format_count
-from fieldkit.trial import rows, store
+from fieldkit.trial import store
 from fieldkit.trial.plan import PLAN_FILE
-from fieldkit.trial.stored import indexed_tables, plans, tables
+from fieldkit.trial.stored import indexed_tables, tables
 from fieldkit.trial.stored.indexed_tables import NO_INDEX, IndexedTables
 
 ALL_PROCESSORS: Final = Workers()
-
-_MIN_PARALLEL_TRIALS: Final = 8
-"""Smallest number of trials that are measured in parallel by default, because starting processes takes a second."""
 
 Note = Callable[[str], None]
 """Function that shows a sentence about data that is omitted or treated in an unexpected way."""
@@ -156,17 +153,17 @@ class Sources:
     def read(
         self, columns: Collection[str] | None = None, *, also: Collection[str] = (), undeclared: bool = False
     ) -> Repeats:
-        """Return the attempts in the tables without duplicates; see `table_files.read`.
+        """Return the attempts in the tables that the row filter selects, without duplicates; see `table_files.read`.
 
         Args:
-            columns: Columns to read; None for all declared columns.
-            also: Further columns to read, even if they are not declared.
-            undeclared: True to read all undeclared columns; a note lists them.
+            columns: Columns to read, besides the columns of the row filter; None for all declared columns.
+            also: With `columns` None, further columns to read, even if they are not declared.
+            undeclared: With `columns` None, True to read all undeclared columns; a note lists them.
 
         Raises:
             ConfigurationError: A file is not a table of repeats, two tables contradict each other, or there is no
                 evidence to rebuild from.
-            EvidenceError: A line or a journal is damaged, or no repeat has ended.
+            EvidenceError: A line or a journal is damaged, no repeat has ended, or the row filter selects no attempt.
         """
         undeclared_names = [column.name for column in self.columns if table_files.is_undeclared(column)]
         if undeclared_names and undeclared:
@@ -177,7 +174,11 @@ class Sources:
             columns = {column.name for column in self.columns} - omitted
         if self.row_filter is not None:
             columns = {*columns, *self.row_filter.names}
-        content = _remeasured_tables(self.tables, self.workers, self.note) if self.rebuild else Path.read_bytes
+        content: Callable[[Path], bytes] = Path.read_bytes
+        if self.rebuild:
+            from fieldkit.trial.stored import remeasured  # noqa: PLC0415 (loads all measuring code)
+
+            content = remeasured.table_reader(self.tables, self.workers, self.note)
         attempts, notes = deduplicated(self._rows(columns, content))
         for note in notes:
             self.note(note)
@@ -229,18 +230,19 @@ def find(
     workers: Workers = ALL_PROCESSORS,
     use_index: bool = True,
 ) -> Sources:
-    """Return the tables of the trials and CSV files at or below `paths`, with their columns.
+    """Return the tables at `paths`: CSV files, and the tables of trials and sweeps at or below folders.
 
     Args:
-        paths: Folders of trials, folders with trials at any depth, or CSV files with the columns of trial.csv.
+        paths: Folders of trials or sweeps, folders with them at any depth, or CSV files with the columns of
+            trial.csv.
         note: Receives notes.
         rebuild: True to measure raw evidence again.
         workers: Processes that measure evidence and read plans.
         use_index: True to read many tables from an index, which does not change the result.
 
     Raises:
-        ConfigurationError: A path does not exist or contains no trial, or the columns cannot be determined; see
-            `tables.declared_columns`.
+        ConfigurationError: A path does not exist or contains no trial, `rebuild` is True and there is a sweep, or the
+            columns cannot be determined; see `tables.declared_columns`.
         EvidenceError: No trial has a table.
     """
     return find_each([paths], note, rebuild=rebuild, workers=workers, use_index=use_index)[0]
@@ -282,7 +284,10 @@ def _paths_text(paths: Sequence[Path]) -> str:
 
 
 def _tables(path: Path, note: Note, *, rebuild: bool) -> Iterator[Path]:
-    """Yield the CSV file of each trial at or below a path."""
+    """Yield the path itself if it is a file, otherwise the table of each trial and sweep at or below the folder.
+
+    The table of a sweep is a folder.
+    """
     if path.is_file():
         yield path
         return
@@ -318,7 +323,7 @@ def _tables(path: Path, note: Note, *, rebuild: bool) -> Iterator[Path]:
 
 
 def trial_folders(path: Path) -> list[Path]:
-    """Return the folders of trials at or below a path; none if the path is not a folder."""
+    """Return the folders of trials and sweeps at or below a path; none if the path is not a folder."""
     return [Path(folder) for folder in _trials(str(path), set())] if path.is_dir() else []
 
 
@@ -329,7 +334,7 @@ _IDENTIFYING_FILES: Final = frozenset({PLAN_FILE, store.TRIAL_CSV, laptop_files.
 def _trials(folder: str, visited: set[tuple[int, int]]) -> Iterator[str]:
     """Yield the folders of trials and sweeps at or below a folder, sorted.
 
-    Links are followed. Each folder is visited once.
+    Links are followed. Each folder is visited once. Names that start with `.` or end with `.partial` are omitted.
     """
     status = os.stat(folder)  # noqa: PTH116 (a path object per folder takes longer than the call)
     if (status.st_dev, status.st_ino) in visited:
@@ -350,53 +355,3 @@ def _identity(table: Path) -> object:
     is_folder = table.name == store.TRIAL_CSV or table.is_dir()
     status = (table.parent if is_folder else table).stat()
     return status.st_dev, status.st_ino
-
-
-def _remeasured_tables(tables: Sequence[Path], workers: Workers, note: Note) -> Callable[[Path], bytes]:
-    """Return a function that returns the table of a trial, measured again from its raw evidence."""
-    if workers.is_default and len(tables) < _MIN_PARALLEL_TRIALS:
-        return partial(_remeasured_table, note=note)
-    from fieldkit.core.tasks import completed  # noqa: PLC0415 (needed only to measure again)
-
-    contents: dict[Path, bytes] = {}
-    absolute = [table.absolute() for table in tables]  # workers of a cluster have another working directory
-    for end in completed(_remeasure, absolute, workers, note):
-        if end.result is None:
-            raise end.error or EvidenceError("no table was measured", where=str(tables[end.number]))
-        contents[tables[end.number]], notes = end.result
-        for text in notes:
-            note(text)
-    return contents.__getitem__
-
-
-def _remeasure(table: Path) -> tuple[bytes, list[str]]:
-    """Return a trial's table, measured again, and the notes on it."""
-    notes: list[str] = []
-    return _remeasured_table(table, notes.append), notes
-
-
-def _remeasured_table(table: Path, note: Note) -> bytes:
-    """Return a trial's table, measured again from its raw evidence."""
-    from fieldkit.trial.stored import rebuild  # noqa: PLC0415 (loads all measuring code, which existing tables do not need)
-
-    folder = table.parent
-    if table.name != store.TRIAL_CSV or not (folder / PLAN_FILE).is_file():
-        raise ConfigurationError(
-            "a table alone has no raw evidence to rebuild from",
-            where=str(table),
-            remedy="name the folder of the trial, or leave out --rebuild",
-        )
-    plan = plans.read_plan(folder)
-    note_differences(folder, note)
-    measured_rows, problems = rebuild.measure_rows(folder, plan)
-    if problems:
-        note(f"{folder}: {rebuild.problems_text(problems)}")
-    return rows.to_csv(measured_rows, plan.table).encode()
-
-
-def note_differences(folder: Path, note: Note) -> None:
-    """Show a note if the evidence that is measured again has changed since it was first measured."""
-    from fieldkit.trial.stored import verification  # noqa: PLC0415 (needed only to measure again)
-
-    if differences := verification.differences(folder):
-        note(f"{folder}: measured from changed evidence: {verification.summarize(differences)}")

@@ -48,9 +48,11 @@ def declared_columns(tables: Sequence[Path], facts: Facts = no_facts) -> tuple[C
 
 
 def planned_columns(tables: Iterable[Path]) -> tuple[Column, ...]:
-    """Return all columns in the plans of tables.
+    """Return all columns in the plans of tables; tables without a plan are ignored.
 
-    Raises the same errors as `declared_columns`, and an error if a plan cannot be read.
+    Raises:
+        ConfigurationError: A plan cannot be read, or plans contradict each other.
+        EvidenceError: For the same reasons as `plans.require_plain`.
     """
     plan_files = [table.parent / PLAN_FILE for table in tables if (table.parent / PLAN_FILE).is_file()]
     common_columns = set(trial_columns())
@@ -62,7 +64,9 @@ def planned_columns(tables: Iterable[Path]) -> tuple[Column, ...]:
 
 
 def merge_columns(declared: Iterable[tuple[Path, Iterable[Column]]]) -> dict[str, Column]:
-    """Return the columns of several plans by name. Of compatible columns with the same name, the first is used.
+    """Return the columns of several plans by name.
+
+    Of compatible columns with the same name, the first is used, with bounds that include the bounds of all of them.
 
     Args:
         declared: Plans with their columns.
@@ -104,7 +108,9 @@ def other_names(names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def frozen_columns(table: Path) -> tuple[Column, ...]:
-    """Return the columns in the plan next to a table. For a dataset (a folder), return the columns that it declares.
+    """Return the columns in the plan next to a table; empty without a plan, or if the plan lists no columns.
+
+    For a dataset (a folder), return the columns that it declares.
 
     Raises:
         ConfigurationError: The plan cannot be read.

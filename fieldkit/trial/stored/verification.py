@@ -79,7 +79,7 @@ def _top_level_differences(folder: Path, sums: manifest.Sums) -> dict[str, str]:
 
 
 def summarize(problems: Mapping[str, str]) -> str:
-    """Return a sentence with the first differences and the number of further differences."""
+    """Return a sentence with the first differences (at most 5) and the number of further differences."""
     sentences = _sentences(problems)
     further = len(sentences) - _MAX_LISTED
     more_text = f"; and {further} more: fieldkit verify lists them" if further > 0 else ""

@@ -56,7 +56,7 @@ def _add_run(commands: Commands) -> None:
         "--realtime",
         metavar="FACTOR",
         help="simulate this number of seconds per second of wall time, for example 1; several runs are then not "
-        "parallel, and a run that is slower has no results",
+        "parallel, and a run that is later than --late-bound has no results",
     )
     parser.add_argument(
         "--late-bound",
@@ -122,7 +122,13 @@ def _add_shootout(commands: Commands) -> None:
     )
     _add_scenario(parser)
     _add_policy(parser, "sync policy; may be given more than once (default: all)", action="append", default=[])
-    _add_window(parser, "windows to compare", dest="windows", metavar="TIME,...")
+    _add_window(
+        parser,
+        "windows to compare",
+        dest="windows",
+        metavar="TIME,...",
+        help="windows to compare (default: the scenario's; with --orders 1 to 100 ms); --bias uses only the shortest",
+    )
     _add_seeds(parser)
     _add_federates(parser)
     modes = parser.add_mutually_exclusive_group()
@@ -138,7 +144,10 @@ def _add_shootout(commands: Commands) -> None:
         help="number of exchanges needed for the scenario's policy.bound, with error_bounded and with fixed windows",
     )
     parser.add_argument(
-        "--figure", type=Path, metavar="FILE", help="draw error against cost, or against the window: SVG, PDF or PNG"
+        "--figure",
+        type=Path,
+        metavar="FILE",
+        help="draw error against cost, with --orders error against the window, with --bias the bias: SVG, PDF or PNG",
     )
     add_workers(parser)
     _add_format(parser)

@@ -11,6 +11,7 @@ from typing import Any
 from fieldkit.cli.display import show_note
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.text import json_text, print_text
+from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.scenario.agent_setup import make_bodies
 from sim_backends.cosim.scenario.external import make_hello
@@ -33,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
         1 if a check failed, otherwise 0.
 
     Raises:
-        FieldkitError: The federate cannot be started or connected.
+        FieldkitError: The federate cannot be started or connected, or the scenario is invalid.
     """
     endpoint = arguments.federate[0] if len(arguments.federate) == 1 else shlex.join(arguments.federate)
     deadline_s = settings.parse_deadline_s(arguments.deadline)
@@ -53,7 +54,8 @@ def run(arguments: argparse.Namespace) -> int:
         print_text(json_text([vars(result) for result in results], indent=2))
     failed = sum(bool(result.failure) for result in results)
     skipped = sum(bool(result.skipped) for result in results)
-    show_note(f"{name}: {len(results) - failed - skipped} checks passed, {skipped} not applicable, {failed} failed")
+    passed = format_count(len(results) - failed - skipped, "check")
+    show_note(f"{name}: {passed} passed, {skipped} not applicable, {failed} failed")
     return 1 if failed else 0
 
 
@@ -66,7 +68,7 @@ def _role(endpoint: str, scenario: CosimScenario, requested_role: str | None, de
     """Return the role of a federate (the requested role, or the first that it accepts) and its name for messages.
 
     Raises:
-        FieldkitError: The federate accepts no role.
+        FieldkitError: The federate cannot be started or connected, or it accepts none of these roles.
     """
     roles = [role for role in (PHYSICS, NETWORK) if requested_role in {None, ROLES[role]}]
     if requested_role is None:

@@ -1,4 +1,4 @@
-"""Runs a scenario once per seed and reports the progress; SIGINT stops a run between two windows."""
+"""Runs a scenario once per seed and reports the progress; SIGINT stops a run, but not while it records a window."""
 
 import signal
 import threading
@@ -68,6 +68,8 @@ def simulate(
 ) -> SeedResult:
     """Run a scenario with a seed, and return the result, also if the run failed or was interrupted.
 
+    With a folder, the rows of the run are written to it.
+
     Args:
         scenario: The scenario.
         policy: Name of the sync policy.
@@ -76,6 +78,10 @@ def simulate(
         progress: Called with the simulated nanoseconds so far and the elapsed wall time in seconds, or None.
         deadline_s: Longest wait for an answer of a federate, in seconds of wall time; None for no deadline.
         pace: Pace of a run in real time; None to run as fast as possible.
+
+    Raises:
+        FieldkitError: The simulation cannot be built, or physics returns no states at time 0.
+        ConfigurationError: The run is complete, but its rows cannot be written.
     """
     recorder = None
     if folder is not None:
@@ -137,8 +143,9 @@ def simulate_all(
 ) -> tuple[list[SeedResult], bool]:
     """Run a scenario with each seed; return the results, and True if Ctrl-C interrupted the runs.
 
-    After an interrupt, there are no results for seeds whose runs had not finished. The runs are parallel unless a
-    federate serves one run at a time.
+    If the runs are not parallel, the last result after an interrupt may be that of the interrupted run. If they are
+    parallel, there are no results for seeds whose runs had not finished. The runs are parallel unless a federate
+    serves one run at a time, they run in real time, or they have few packets.
 
     Args:
         scenario: The scenario.

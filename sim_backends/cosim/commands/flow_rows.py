@@ -69,7 +69,7 @@ def _identity(
 
 
 def scenario_hashes(scenario: CosimScenario) -> dict[str, Value]:
-    """Return the columns with the hashes of the agents and of the procedure of a scenario."""
+    """Return the columns with the hashes of the agents and of the procedure of a scenario (16 hex digits each)."""
     scenario_data = scenario.model_dump(mode="json", by_alias=True)
     procedure = {key: value for key, value in scenario_data.items() if key not in _NOT_PROCEDURE}
     return {"profiles_sha256": _digest(scenario_data["agents"]), "procedure_sha256": _digest(procedure)}
@@ -153,7 +153,10 @@ def _is_missing(value: Value) -> bool:
 
 
 def _distance_m(flow: FlowResult, scenario: CosimScenario, starts_m: Mapping[str, Vector]) -> float:
-    """Return the distance from sender to relay, or to receiver without a relay, at time 0 in whole millimetres."""
+    """Return the distance in metres, rounded to millimetres, at which the sender and its peer start.
+
+    The peer is the relay if packets are relayed, otherwise the receiver.
+    """
     is_relayed = scenario.topology is Topology.MASTER and scenario.relay is not None
     peer = scenario.relay if is_relayed and scenario.relay else flow.destination
     return round(math.dist(starts_m[flow.source], starts_m[peer]), 3)

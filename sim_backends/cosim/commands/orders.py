@@ -98,7 +98,7 @@ def _measure(
     workers: Workers,
     sink: Sink,
 ) -> tuple[dict[str, LocalErrors], dict[str, PolicyError]]:
-    """Return the local errors of each policy over all seeds, and the exceptions of policies that failed."""
+    """Return the local errors of each policy over all seeds, and the errors of policies that failed with a seed."""
     tasks = [Task(name, seed) for name in policies for seed in seeds]
     report = partial(progress_reporter(sink), "local errors", len(tasks))
     report(0)

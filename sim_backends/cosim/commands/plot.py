@@ -96,12 +96,12 @@ def growth_panel(rows: Iterable[Row], title: str) -> LogPanel | None:
     """Return a panel of the distance of agents from the reference's path over time; None if all distances are 0.
 
     Args:
-        rows: The results of the policies; exact policies, which have no such distance, are omitted.
+        rows: The results of the policies; those whose distances are all 0, such as exact policies, are omitted.
         title: Title of the runs.
     """
     curves = []
     for row in rows:
-        times_s, distances_m = row.growth_m
+        times_s, distances_m = row.growth
         if distances_m.any():
             first = int(np.flatnonzero(distances_m)[0])
             curves.append(Curve(row.policy, times_s[first:].tolist(), (distances_m[first:] * 1e3).tolist()))

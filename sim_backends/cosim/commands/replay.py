@@ -16,7 +16,7 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the output of the recorded run."""
+    """Print the output of the recorded run, and write it as MCAP on request."""
     recording = recording_at(arguments.recording)
     scenario = scenario_of(recording)
     result = seed_result(scenario, recording.manifest.about.seed, recording.run, recording.states)

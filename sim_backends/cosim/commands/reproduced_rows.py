@@ -78,7 +78,7 @@ class ReproducedRows:
         """Check that the line of sight and the traffic of the scenario agree with the procedure.
 
         Raises:
-            ConfigurationError: They differ.
+            ConfigurationError: The scenario and the procedure differ.
         """
         procedure = trial.procedure
         remedy = "change the scenario, or remove `trial` from it"
@@ -136,7 +136,7 @@ class ReproducedRows:
             yield self._trial.row(simulated, identity)
 
     def _captures(self, repeat: ReproducedRepeat, recording: Path) -> dict[Role, bytes]:
-        """Return the captures of both ends, if the network wrote captures of its IP packets."""
+        """Return the capture of each end for which the network wrote one, with the packets of the repeat only."""
         if not self._has_captures:
             return {}
         paths = {role: recording / CAPTURES / f"{self._agents[role]}.pcap" for role in (Role.SENDER, Role.RECEIVER)}
@@ -187,7 +187,10 @@ class ReproducedRows:
 
 
 def _tcp_completion(capture: bytes, repeat: ReproducedRepeat, transfer: FlowResult) -> dict[str, Value]:
-    """Return the time from the arrival of the first segment until the program has received the complete file."""
+    """Return the time from the arrival of the first segment until the program has received the complete file.
+
+    The result is empty if the capture has no such segment, or the file is not complete.
+    """
     first_ns = None if repeat.transfer.port is None else first_tcp_packet_ns(capture, repeat.transfer.port)
     if first_ns is None or transfer.last_arrived_ns is None or transfer.arrived_bytes < repeat.transfer.size_bytes:
         return {}

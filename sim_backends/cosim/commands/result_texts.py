@@ -18,7 +18,10 @@ BIAS_LABELS: Final[Mapping[str, tuple[str, float]]] = MappingProxyType(
 
 
 def order_text(errors: LocalErrors, measure: str) -> str:
-    """Return the order of convergence of an error with its interval, `1.00 [0.98, 1.03]`; empty without an error."""
+    """Return the order of convergence of an error with its interval, `1.00 [0.98, 1.03]`.
+
+    The text is empty if the order is unknown, and has no interval if the interval is unknown.
+    """
     order = errors.order(measure)
     if math.isnan(order.value):
         return ""

@@ -66,7 +66,7 @@ def recoveries(scenario: CosimScenario, run: Run) -> list[FlowRecovery]:
 
 
 def _affects(fault: Fault, ends: set[str], scenario: CosimScenario) -> bool:
-    """Return True if a fault affects the path between two agents."""
+    """Return True if a fault can affect the path between two agents; a jammer can affect every path."""
     relay = scenario.relay if scenario.topology is Topology.MASTER else None
     hops = [ends] if relay is None or relay in ends else [{end, relay} for end in ends]
     match fault:
@@ -87,7 +87,7 @@ _JITTER_GAIN = 1 / 16
 
 @dataclass(frozen=True)
 class FlowSpread:
-    """Statistics of the times of packets that arrived, in seconds; nan if no packet arrived.
+    """Statistics of durations in seconds, such as the delays of the packets that arrived; nan without values.
 
     Attributes:
         minimum: The minimum.
@@ -141,7 +141,7 @@ class FlowResult:
         sent_bytes: Total size of sent packets.
         arrived_bytes: Total size of packets that arrived.
         delay_s: Time in the network of the packets that arrived.
-        first_to_last_s: Time from the first arrival to the last.
+        first_to_last_s: Time from the first arrival to the last; nan without arrivals.
         jitter_s: Interarrival jitter after the last packet (RFC 3550, section 6.4.1); nan for fewer than two packets.
         added_s: Mean delay that the sync policy added, before and after the network.
         distances_m: Distance between sender and receiver: at the first packet, then minimum, mean and maximum over
@@ -173,12 +173,12 @@ class FlowResult:
 
     @property
     def loss(self) -> float:
-        """Share of the packets that never arrived; nan without packets."""
+        """Share of `sent_packets` that never arrived; nan without such packets."""
         return 1 - self.arrived_packets / self.sent_packets if self.sent_packets else np.nan
 
 
 def flow_results(run: Run) -> tuple[FlowResult, ...]:
-    """Return the results of each flow, in the order of their names."""
+    """Return the results of each flow that sent a packet, in the order of their names."""
     flows: dict[str, list[Fate]] = {}
     for fate in run.fates.values():
         flows.setdefault(fate.packet.identity[0], []).append(fate)
@@ -284,7 +284,7 @@ FORMATION: Final = (
     SheetColumn(
         "amplification",
         "amplified",
-        "ratio of a follower's acceleration to its leader's; at most 1 if disturbances do not grow along the row",
+        "largest ratio of a follower's acceleration to its leader's; up to 1 if disturbances do not grow in the row",
     ),
 )
 """Columns of a `Formation`, in the order of `formation_values`."""
@@ -308,9 +308,9 @@ class SeedResult:
     Attributes:
         seed: The seed of the run.
         flows: The results of its flows.
-        simulated_s: Simulated time.
+        simulated_s: Simulated time in seconds.
         windows: Number of windows.
-        wall_s: Wall time by part.
+        wall_s: Wall time in seconds, by part.
         digest: Hash over all events.
         starts_m: Position of each agent at its start, metres east, north, up.
         recoveries: Recoveries of flows after faults.
@@ -355,7 +355,8 @@ def seed_result(
         scenario: The scenario.
         seed: The seed of the run.
         run: The record of the run.
-        states: States of agents in the form of `Recording.states`, at least for time 0.
+        states: States of agents in the form of `Recording.states`; empty without a recording if no agent is a
+            follower.
         ended_by: The exception that ended the run early, or None.
         starts: States of all agents at their starts; if None, the first state of each agent in `states` is used.
         lateness: Lateness of the run's windows; None if it was not a run in real time.

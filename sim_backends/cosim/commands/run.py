@@ -29,7 +29,9 @@ _COLUMNS: Final = (
     SheetColumn("protocol", "transport", "transport of the packets"),
     SheetColumn("sent", "sent", "packets whose fate is decided"),
     SheetColumn(
-        "under_way", "under way", "packets whose fate was not decided when the run ended; the other columns omit them"
+        "under_way",
+        "under way",
+        "packets whose fate was not decided when the run ended; the other columns, except the distance, omit them",
     ),
     SheetColumn("loss", "lost (%)", "share of the sent packets that never arrived", 100),
     SheetColumn("delay_mean_s", "delay (ms)", "mean time of a packet in the network", 1e3),
@@ -44,7 +46,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the scenario with each seed; print the results of its flows, and write them to a folder on request.
 
     Raises:
-        FieldkitError: A run failed; its results until the failure are printed and written.
+        ConfigurationError: An option or the scenario is invalid, or several runs would publish events of EMANE.
+        FieldkitError: A run failed. Its results until the failure are printed and written. A run that was slower than
+            real time has no printed results except its lateness.
     """
     scenario = settings.read_scenario(arguments)
     policy = settings.read_policy(arguments, scenario)
@@ -71,7 +75,8 @@ def run(arguments: argparse.Namespace) -> int:
     if results:
         show_results(arguments.format, f"{scenario.name}, {text}, {scenario.topology}", scenario, results)
     if len(results) < len(seeds):
-        show_note(f"interrupted: {len(results)} of {len(seeds)} seeds had finished")
+        finished = sum(not result.is_interrupted for result in results)
+        show_note(f"interrupted: the runs of {finished} of {len(seeds)} seeds had finished")
     if folder is not None:
         show_note(f"written to {folder.path}; next: fieldkit aggregate {folder.path}")
     if error := next((result.error for result in results if result.error is not None), None):
@@ -83,7 +88,7 @@ def show_results(form: str, title: str, scenario: CosimScenario, results: Sequen
     """Print the results of runs.
 
     Args:
-        form: The output format; CSV has the flows only.
+        form: The output format. CSV contains only the flows, or only the lateness if no run has other results.
         title: Title of the runs.
         scenario: The scenario.
         results: The results.
@@ -166,9 +171,9 @@ def _recovery_sheet(scenario: CosimScenario, results: Sequence[SeedResult]) -> S
 def _lateness_sheet(results: Sequence[SeedResult]) -> Sheet:
     columns = (
         SheetColumn("seed", "seed", ""),
-        SheetColumn("late_up_to_s", "late up to (ms)", "lateness of a window against real time; 0: in time", 1e3),
+        SheetColumn("late_up_to_s", "late up to (ms)", "upper limit of the lateness of windows; 0: in time", 1e3),
         SheetColumn(
-            "windows", "windows", "number of windows with this lateness at most, but more than in the previous row"
+            "windows", "windows", "number of windows with at most this lateness, but more than in the row above"
         ),
         SheetColumn("share", "share (%)", "share of all windows", 100),
     )
@@ -200,7 +205,7 @@ def _cost_text(results: Sequence[SeedResult]) -> str:
     exchanges = sum(result.windows for result in results) / simulated_s
     speed = f"{number_text(simulated_s / wall_s)} times as fast as real time"
     if any(result.lateness is not None for result in results):
-        speed = f"in real time; without waiting for it, {speed}"
+        speed = f"paced by --realtime; without its waits, {speed}"
     return (
         f"{number_text(simulated_s)} s simulated, {speed}\n"
         f"{number_text(exchanges)} exchanges per simulated second\n"

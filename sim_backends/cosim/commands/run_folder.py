@@ -20,7 +20,7 @@ class RunFolder:
     """The folder of the runs of one scenario with one sync policy: one recording, or one recording per seed.
 
     Args:
-        path: The folder, which must be empty or not exist; it is created.
+        path: The folder, which must be empty or not exist; it is created, and the scenario is written to it.
         scenario: The scenario.
         policy: The sync policy, as text.
         seeds: The seeds of the runs.
@@ -54,12 +54,12 @@ class RunFolder:
             ) from error
 
     def recording(self, seed: int) -> Path:
-        """Return the folder of the recording with a seed."""
+        """Return the folder of the recording with a seed: `path` itself if there is only one seed."""
         digits = len(str(max(self._seeds)))
         return self.path if len(self._seeds) == 1 else self.path / f"seed-{seed:0{digits}}"
 
     def write_rows(self, result: SeedResult) -> None:
-        """Write the rows of a finished run into the folder of its recording.
+        """Write the rows of a run, complete or not, into the folder of its recording.
 
         Raises:
             ConfigurationError: The file cannot be written.

@@ -27,8 +27,8 @@ NOT_SATISFIED: Final = 1
 
 _COLUMNS: Final = (
     SheetColumn("round", "round", ""),
-    SheetColumn("window_s", "w (ms)", "initial window", 1e3),
-    SheetColumn("median_window_s", "median (ms)", "median of the windows that the rule computed", 1e3),
+    SheetColumn("window_s", "w (ms)", "parameter w of the rule", 1e3),
+    SheetColumn("median_window_s", "median (ms)", "median of the windows of the round", 1e3),
     SheetColumn("loss", "lost (%)", "lost packets as a share of those whose fate is decided", 100),
     SheetColumn("fate_disagreement", "fate (%)", "lost in this run or in the reference, but not in both", 100),
     SheetColumn(
@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run rounds until a round is satisfactory, and print the errors of each round against the exact reference.
 
     Raises:
-        ConfigurationError: The threshold is above 100 %.
+        ConfigurationError: The scenario is invalid, or the threshold is not a share of at most 100 %.
     """
     scenario = settings.read_scenario(arguments)
     threshold = parse_quantity(arguments.threshold, {"%": 0.01}, "threshold")
@@ -78,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class _CountedRuns:
-    """Runs the same scenario and seed with a policy, and reports the number of runs."""
+    """Runs the same scenario and seed with different policies, and reports the number of earlier runs before each."""
 
     def __init__(self, scenario: CosimScenario, seed: int, report: partial[None]) -> None:
         self._scenario = scenario

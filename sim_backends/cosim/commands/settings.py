@@ -59,8 +59,8 @@ def read_scenario(arguments: argparse.Namespace) -> CosimScenario:
     """Return the scenario that the arguments name, with the changes of other arguments.
 
     Raises:
-        ConfigurationError: It does not exist, or a change is invalid; the message states the key and its line in the
-            file.
+        ConfigurationError: The scenario does not exist, or a change is invalid; the message states the key and its
+            line in the file.
     """
     return load_scenario(arguments.scenario, read_changes(arguments))
 
@@ -106,7 +106,7 @@ def read_policies(arguments: argparse.Namespace) -> list[str]:
     """Return the names of the sync policies without repetitions, in the order of `registry.policies`.
 
     Raises:
-        ConfigurationError: One of these names is not a policy.
+        ConfigurationError: There is no policy with one of the names.
     """
     for name in arguments.policy:
         make_policy(name)
@@ -114,10 +114,10 @@ def read_policies(arguments: argparse.Namespace) -> list[str]:
 
 
 def read_windows_s(arguments: argparse.Namespace, scenario: CosimScenario) -> list[float]:
-    """Return the windows of a comparison in seconds, in ascending order.
+    """Return the different windows of a comparison in seconds, in ascending order.
 
     Raises:
-        ConfigurationError: One of them is not a duration above 0.
+        ConfigurationError: A window is not a duration above 0.
     """
     if not arguments.windows:
         return [scenario.policy.window]
@@ -173,7 +173,7 @@ def parse_deadline_s(text: str | None) -> float:
     """Return the longest wait for the answer of a federate, in seconds of wall time.
 
     Raises:
-        ConfigurationError: It is not a duration above 0.
+        ConfigurationError: `text` is not a duration above 0.
     """
     if text is None:
         return DEADLINE_S
@@ -226,12 +226,13 @@ def note_commensurate_events(
 ) -> None:
     """Print a note on each window that is commensurate with a period of the scenario; suggest a better window.
 
-    Periodic events then occur only at few times within a window (phases), which are not typical of the policy.
+    Periodic events then occur only at few times within a window (phases), which are not typical of the policy. There
+    are no notes if there are at least `ENOUGH_SEEDS` seeds, or if no policy has a window.
 
     Args:
         scenario: The scenario.
         policies: Names of the sync policies that run it.
-        windows_s: Windows of the policies that have one.
+        windows_s: The windows with which the policies that have a window run.
         seeds: Number of seeds; each seed draws different phases.
     """
     if seeds >= ENOUGH_SEEDS:
@@ -256,7 +257,10 @@ def note_commensurate_events(
 
 
 def policy_text(name: str, scenario: CosimScenario) -> str:
-    """Return the name of a sync policy and the parameter that determines its windows: `sliding_window 10 ms`."""
+    """Return the name of a sync policy and the parameter that determines its windows: `sliding_window 10 ms`.
+
+    A policy without such a parameter is described by its name only.
+    """
     if has_window(name):
         return f"{name} {scenario.policy.window * 1e3:g} ms"
     if "bound_m" not in inspect.signature(registry.policies()[name]).parameters:

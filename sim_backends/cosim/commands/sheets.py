@@ -121,9 +121,10 @@ def show_all(sheets: Mapping[str, Sheet], form: str) -> None:
 
 
 def number_text(value: float, digits: int = 3) -> str:
-    """Return a number as text with at least `digits` significant digits: `0.0123`, `12.3`, `12,345`, `1.23e+08`.
+    """Return a number as text, rounded to `digits` significant digits: `0.0123`, `12.3`, `12,345`, `1.23e+08`.
 
-    Magnitudes from 1000 to 1e7 are rounded to whole numbers. Larger ones, and those below 1e-4, have an exponent.
+    Zeros at the end of the fraction are omitted. Magnitudes from 1000 to 1e7 are rounded to whole numbers. Larger
+    ones, and those below 1e-4, have an exponent and 3 digits.
     """
     if value == 0 or 1e-4 <= abs(value) < 1e3:
         text = f"{value:.{digits}g}"
@@ -133,7 +134,7 @@ def number_text(value: float, digits: int = 3) -> str:
 
 
 def wrapped(text: str) -> str:
-    """Return a text wrapped to the width of the terminal."""
+    """Return a text wrapped to the width of the terminal, with at most 98 characters per line."""
     return textwrap.fill(text, min(shutil.get_terminal_size().columns - 1, _MAX_WIDTH))
 
 

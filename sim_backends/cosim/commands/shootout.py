@@ -64,8 +64,6 @@ _COSTS: Final = (
     SheetColumn("real_time_factor", "speed", "simulated time over wall time"),
 )
 COLUMNS: Final = (*_ROW, *_TIMES, *_POSITIONS, *_COSTS, *FORMATION)
-_ROUNDING: Final = 1e-6
-"""A smaller excess over a bound, as a share of the bound, is a rounding error."""
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -134,7 +132,7 @@ def _exceeded_bound(scenario: CosimScenario, row: Row) -> str | None:
     if row.policy != ErrorBounded.name or row.errors is None or chosen_policy.bound_db is not None:
         return None
     largest_m = row.errors.position_error_m.largest
-    if math.isnan(largest_m) or largest_m <= chosen_policy.bound * (1 + _ROUNDING):
+    if math.isnan(largest_m) or largest_m <= chosen_policy.bound * (1 + bound.BOUND_ROUNDING):
         return None
     return (
         f"{row.policy} had a position error of {largest_m * 1e3:.3g} mm, more than its bound of "

@@ -37,8 +37,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the sweep; write a file per run, and the dataset of all results.
 
     Raises:
-        FieldkitError: A factor is invalid, the folder cannot be written, or runs failed; the exit code is the exit
-            code of the first failed run.
+        FieldkitError: A factor or a scenario is invalid, the folder cannot be written, or runs failed. If runs
+            failed, the exit code is the exit code of the first failed run.
     """
     factors = parse_factors(arguments.over)
     scenario = settings.read_scenario(arguments)

@@ -68,7 +68,7 @@ def paper_sheet(title: str, rows: Sequence[PaperRow], *, is_ping: bool) -> Sheet
     delay, loss = _columns("delay", 1e3 if is_ping else 1.0), _columns("loss", 100)
     columns = [*labels, *delay, *loss, _REASON]
     values = [(*row.labels.values(), *_values(row.delay), *_values(row.loss), row.reason) for row in rows]
-    # Labels that are equal in all rows are omitted, because the title contains them.
+    # Labels that are equal in all rows are omitted, because they do not distinguish rows.
     shown_labels = [label.name for label in labels if len({row.labels[label.name] for row in rows}) > 1]
     delay_name = "mean round trip (ms)" if is_ping else "sum of delays (s)"
     return Sheet(
@@ -116,7 +116,7 @@ def _values(cell: PaperCell) -> tuple[Value, ...]:
 
 
 def summary(rows: Sequence[PaperRow]) -> str:
-    """Return a sentence with the number of cells of a table that agree."""
+    """Return the number of cells of a table that agree, as text."""
     cells = [cell for row in rows for cell in (row.delay, row.loss)]
     agreeing_cells = [cell for cell in cells if cell.agreement is Agreement.AGREES]
     by_mean = sum(cell.agrees_by_mean for cell in agreeing_cells)

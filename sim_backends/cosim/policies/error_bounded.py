@@ -21,8 +21,9 @@ the error grows by u q between two steps. The step is the physics step if u q is
 bound; otherwise it is shorter.
 
 While no program sends and the network has no events, positions are not used, and the window extends to the last step
-before the next event. If a network cannot extrapolate, it assumes that agents do not move. Then x is the distance
-that they have moved. If one physics step moves them farther than the bound, the policy raises an error.
+at or before the next event, or to its maximum length. If a network cannot extrapolate, it assumes that agents do not
+move. Then x is the distance that they have moved relative to each other. If they can move farther than the bound in
+one physics step, the policy raises an error.
 
 The bound may be given in dB of path loss. By the log-distance law, the path loss at a distance d is a constant plus
 10 n log10(d). If two agents with the assumed distance d are nearer by x, their path loss is lower by
@@ -59,13 +60,14 @@ class ErrorBounded:
 
     Args:
         bound_m: Largest error of the network's relative position of two agents, in metres.
-        longest_s: Length of the longest window; it also applies if no agent moves.
-        bound_db: Largest error of the path loss between two agents in free line of sight, in dB; it replaces
-            `bound_m`.
+        longest_s: Length of the longest window, if that is at least a physics step; it also applies if no agent
+            moves.
+        bound_db: Largest error of the path loss in free line of sight, between two agents, or between an agent and a
+            fixed source of interference, in dB; it replaces `bound_m`.
         exponent: Exponent of the log-distance law for `bound_db`.
 
     Raises:
-        PolicyError: One of these values is not above 0.
+        PolicyError: One of these values is not a finite number above 0.
     """
 
     name = "error_bounded"
@@ -134,7 +136,10 @@ class ErrorBounded:
         return self._reckoning_step_ns
 
     def extended_end_ns(self, situation: Situation) -> int:
-        """Return the last physics step up to which no error can exceed its bound, or no position is used."""
+        """Return the last physics step up to which no error can exceed its bound, or no position is used.
+
+        It is within the longest window; if there is no such step after `situation.now_ns`, return `situation.now_ns`.
+        """
         pairs = self._pairs(situation)
         # A step of 1 ns is the resolution of time, so the extrapolation is then as good as continuous.
         allowed_s = pairs.allowed_s(0.0 if self._reckoning_step_ns == 1 else self._reckoning_step_ns / 1e9)
@@ -149,7 +154,7 @@ class ErrorBounded:
 
     @property
     def decided_by(self) -> str:
-        """The pair or the single agent whose error could reach the bound first in the last window."""
+        """The pair or agent whose error could reach the bound first in the last window; empty without agents."""
         return self._decided_by
 
     def _check_step(self, situation: Situation) -> None:

@@ -88,8 +88,8 @@ def make_policy(name: str, **parameters: float) -> SyncPolicy:
 
     Args:
         name: One of `policies()`.
-        parameters: `window_s`, `longest_s`, `bound_m`, `bound_db`, `exponent`; parameters that the policy does not
-            have are ignored.
+        parameters: `window_s` (default 1 ms), `longest_s`, `bound_m`, `bound_db`, `exponent`; parameters that the
+            policy does not have are ignored.
 
     Raises:
         ConfigurationError: There is no such policy, or the value of a parameter is invalid.

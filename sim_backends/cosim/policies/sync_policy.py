@@ -21,14 +21,15 @@ class Situation:
     """The input of a policy. A co-simulation has one object, which it updates as it advances.
 
     Attributes:
-        now_ns: Time that physics and network have reached.
-        states: States of the agents now.
-        pairs: Sender and receiver of each possible transmission.
+        now_ns: Time that physics has reached. While a policy extends a window, the network is still at its beginning.
+        states: States of the agents that are present now.
+        pairs: Sender and receiver of each possible transmission between agents that are present.
         next_wake_ns: A function; returns the next time at which a program wakes, or an agent appears or disappears;
             None without such a time.
         next_event_ns: A function; returns the time of the next event in the network, or None.
         physics_step_ns: Time step of the physics simulator.
-        limits_m_s2: Largest change of each agent's velocity per second.
+        limits_m_s2: Largest change of each agent's velocity per second; agents that appeared during the run may be
+            missing.
         next_send_ns: Time before which no program sends, or None if no program will send; only set for policies that
             look ahead.
         assumed_states: The current states of the agents as assumed by the network, which extrapolates from them; only
@@ -87,9 +88,10 @@ class SyncPolicy(Protocol):
     defers_arrivals: bool
 
     def next_window(self, situation: Situation) -> int | None:
-        """Return the end of the next window, an integer later than `situation.now_ns`; it is called once per window.
+        """Return the end of the next window, an integer of at least `situation.now_ns`; it is called once per window.
 
-        The end may be between physics steps. None means that the window lasts until the end of the run.
+        The end may be between physics steps. None means that the window lasts until the end of the run. The run fails
+        after more than 1000 successive windows of length 0.
 
         Raises:
             PolicyError: The policy cannot determine a window for this situation.
@@ -144,41 +146,14 @@ def missing_members(policy: object) -> list[str]:
 
 
 class PolicyError(ConfigurationError):
-    """A policy cannot determine a window; the message states the time, the pair and the reason."""
-
-
-_MAX_EMPTY_WINDOWS: Final = 1000
-"""Largest number of successive windows of length 0; after more, the run fails."""
-
-
-class EmptyWindows:
-    """Counts the successive windows in which time does not advance; a limited number is allowed."""
-
-    def __init__(self) -> None:
-        self._at_ns = self._count = 0
-
-    def add(self, policy: str, begin_ns: int, end_ns: int) -> None:
-        """Count a window.
-
-        Raises:
-            PolicyError: There are too many such windows, or time would run backwards.
-        """
-        if begin_ns != self._at_ns:
-            self._at_ns, self._count = begin_ns, 0
-        self._count += 1
-        if end_ns < begin_ns or self._count > _MAX_EMPTY_WINDOWS:
-            raise PolicyError(
-                f"time does not advance beyond {begin_ns} ns",
-                where=policy,
-                remedy="use another policy, or correct it",
-            )
+    """A policy cannot determine a window, or one of its parameters is invalid."""
 
 
 def window_ns(policy: str, window_s: float) -> float:
     """Return the length of a window in nanoseconds, which need not be a whole number.
 
     Raises:
-        PolicyError: It is not a positive time.
+        PolicyError: `window_s` is not a positive finite time.
     """
     if not 0 < window_s < math.inf:
         raise PolicyError(

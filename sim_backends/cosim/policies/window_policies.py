@@ -139,13 +139,14 @@ It is the constant 1/1000 s of the paper (cited in docs/index.md).
 class VelocityAwareRaw:
     """The smallest window `w + (Vp - Vs) / 1000` of any pair of publisher and subscriber: the rule of the paper.
 
-    Vp and Vs are the speeds of the publisher and the subscriber.
+    Vp and Vs are the speeds of the publisher and the subscriber in m/s; the window is in seconds. Without pairs, the
+    window is w.
 
     Args:
         window_s: w, in seconds.
 
     Raises:
-        PolicyError: It is not a positive time.
+        PolicyError: w is not a positive time.
     """
 
     name = "velocity_aware_raw"
@@ -163,7 +164,7 @@ class VelocityAwareRaw:
         """Return the end of the next window.
 
         Raises:
-            PolicyError: The window that the rule gives for a pair is not a positive time.
+            PolicyError: The window that the rule gives for a pair is shorter than 1 ns.
         """
         speeds_m_s = {name: math.hypot(*state.velocity_m_s) for name, state in situation.states.items()}
         length_ns, publisher, subscriber = min(
@@ -190,21 +191,21 @@ class VelocityAwareRaw:
 
     @property
     def decided_by(self) -> str:
-        """Publisher and subscriber of the pair that determined the last window."""
+        """Publisher and subscriber of the pair that determined the last window; empty without pairs."""
         return " to ".join(filter(None, self._pair))
 
 
 class VelocityAware:
     """The smallest window `w + |Vp - Vs| / 1000` of any pair, at least a physics step.
 
-    |Vp - Vs| is the relative speed of publisher and subscriber.
+    |Vp - Vs| is the relative speed of publisher and subscriber in m/s; the window is in seconds.
 
     Args:
         window_s: w, in seconds.
-        longest_s: Longest window, in seconds.
+        longest_s: Longest window, in seconds, if that is at least a physics step; it also applies without pairs.
 
     Raises:
-        PolicyError: One of them is not a positive time.
+        PolicyError: One of these values is not a positive time.
     """
 
     name = "velocity_aware"
@@ -234,5 +235,5 @@ class VelocityAware:
 
     @property
     def decided_by(self) -> str:
-        """The pair with the lowest relative velocity, which determined the last window."""
+        """The pair whose relative speed was the lowest at the beginning of the last window; empty without pairs."""
         return " and ".join(self._pair)

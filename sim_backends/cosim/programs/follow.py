@@ -3,7 +3,7 @@
 The age of a received state is its transmission delay, which follows from its time stamp. The state is extrapolated
 to the current time with its velocity. Every delay, and every error of a delivery time, therefore becomes a position
 error: after a time d, a leader with the acceleration a is a d^2 / 2 away from its extrapolated position. A follower
-stops if it receives no state for longer than a timeout.
+stops, or hovers, if no state of a leader has arrived for longer than a timeout.
 
 `FollowAtHeadway` keeps a constant time headway h: at the speed v, the distance is r + h v, where r is the distance at
 standstill. With the error e = gap - r - h v its acceleration is ((v_leader - v) + k e) / h, so that e decays as
@@ -85,7 +85,7 @@ class FollowAtHeadway(NeverSends):
         begin_ns: Time of the first command.
 
     Raises:
-        ConfigurationError: One of these numbers is not above 0.
+        ConfigurationError: One of these numbers, except `begin_ns`, is not above 0.
     """
 
     def __init__(
@@ -158,7 +158,7 @@ class HoldStation(NeverSends):
         begin_ns: Time of the first command.
 
     Raises:
-        ConfigurationError: There are no leaders, or one of these numbers is not above 0.
+        ConfigurationError: There are no leaders, or one of these numbers, except `begin_ns`, is not above 0.
     """
 
     def __init__(

@@ -44,7 +44,7 @@ class Periodic:
         self._number = 0
 
     def next_wake_ns(self) -> int | None:
-        """Return the time of the next packet, or None after `stop_ns`."""
+        """Return the time of the next packet, or None if no packet is left before `stop_ns`."""
         return None if self._stop_ns is not None and self._next_ns >= self._stop_ns else self._next_ns
 
     def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)

@@ -9,6 +9,7 @@ from typing import Final
 
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
+from fieldkit.core.units import format_count
 from sim_backends.cosim.federates import Action
 from sim_backends.network.packets import ReceivedDatagram
 from sim_backends.physics.body import Twist, Velocity
@@ -67,7 +68,7 @@ class DriveThrough(NeverSends):
 
     Args:
         points_m: The waypoints, metres east and north.
-        speed_m_s: Speed.
+        speed_m_s: Speed when it heads towards the next point, before it brakes.
         begin_ns: Time of the first command.
         period_ns: Time between commands.
         reached_m: Distance within which a point counts as reached.
@@ -125,7 +126,7 @@ class FlyThrough(NeverSends):
 
     Args:
         points_m: The waypoints, metres east, north, up.
-        speed_m_s: Speed.
+        speed_m_s: Speed, before it slows down at the last point.
         begin_ns: Time of the first command.
         period_ns: Time between commands.
         reached_m: Distance within which a point counts as reached.
@@ -210,8 +211,8 @@ def fly_towards(own_state: State, point_m: Vector, speed_m_s: float, *, stops: b
 def _check_path(points_m: Sequence[Sequence[float]], speed_m_s: float) -> None:
     if not points_m or not 0 < speed_m_s < math.inf:
         raise ConfigurationError(
-            f"a path of {len(points_m)} points at {speed_m_s:g} m/s is impossible",
-            remedy="add at least one point, and a speed above 0",
+            f"a path of {format_count(len(points_m), 'point')} at {speed_m_s:g} m/s is impossible",
+            remedy="use at least one point and a finite speed above 0",
         )
 
 
@@ -251,11 +252,11 @@ class VelocityProfile(NeverSends):
         self._next_index = 0
 
     def next_wake_ns(self) -> int | None:
-        """Return the beginning of the next leg, or None after the last."""
+        """Return the beginning of the next leg or, during the last leg, its end; None after the end."""
         return self._times_ns[self._next_index] if self._next_index < len(self._times_ns) else None
 
     def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
-        """Return the command of the leg that has begun, if any."""
+        """Return the command of a leg that has begun, or to stop if the last leg has ended; else no command."""
         begun_legs = bisect_right(self._times_ns, now_ns)
         if begun_legs == self._next_index:
             return Action()

@@ -21,12 +21,12 @@ class CombinedProgram:
         self._programs = tuple(programs)
 
     def next_wake_ns(self) -> int | None:
-        """Return the earliest time of any program."""
+        """Return the earliest time of any program, or None if no timer is set."""
         times_ns = (program.next_wake_ns() for program in self._programs)
         return min((at_ns for at_ns in times_ns if at_ns is not None), default=None)
 
     def next_send_ns(self) -> int | None:
-        """Return the earliest time before which no program sends."""
+        """Return the earliest time of any program (see `next_send_ns`), or None if all send only in reply."""
         times_ns = (next_send_ns(program) for program in self._programs)
         return min((at_ns for at_ns in times_ns if at_ns is not None), default=None)
 
@@ -67,14 +67,17 @@ class Outage:
         self._is_stopped = False
 
     def next_wake_ns(self) -> int | None:
-        """Return the program's next wake time, or the start of the outage if this is earlier and not yet passed."""
+        """Return the program's next wake time, or None if no timer is set.
+
+        Before the outage has stopped the body, the start of the outage is returned if it is earlier.
+        """
         wake_ns = self._program.next_wake_ns()
         if self._is_stopped:
             return wake_ns
         return self._begin_ns if wake_ns is None else min(wake_ns, self._begin_ns)
 
     def next_send_ns(self) -> int | None:
-        """Return the program's next send time."""
+        """Return the program's next send time (see `next_send_ns`), also during the outage."""
         return next_send_ns(self._program)
 
     def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:
@@ -162,12 +165,12 @@ class ProgramWithClock:
         self._clock = clock
 
     def next_wake_ns(self) -> int | None:
-        """Return the true time at which the program's timer fires."""
+        """Return the true time at which the program's timer fires, or None if no timer is set."""
         reading_ns = self._program.next_wake_ns()
         return None if reading_ns is None else self._clock.first_ns(reading_ns)
 
     def next_send_ns(self) -> int | None:
-        """Return the true time before which the program does not send."""
+        """Return the true time before which the program sends only in reply, or None if it always does."""
         reading_ns = next_send_ns(self._program)
         return None if reading_ns is None else self._clock.first_ns(reading_ns)
 

@@ -93,6 +93,9 @@ class IpEncoder:
     Args:
         names: The hosts, in the order of `assign_addresses`.
         flows: Flows with special headers, by name.
+
+    Attributes:
+        addresses: Address of each host, by name.
     """
 
     def __init__(self, names: Sequence[str], flows: Mapping[str, CapturedFlow] = NO_FLOWS) -> None:
@@ -331,8 +334,9 @@ def first_tcp_packet_ns(capture: bytes, port: int) -> int | None:
 class PacketObserver:
     """An observer that passes the packets of programs to the log of IP packets, and all calls to a recorder.
 
-    Each packet of a program is logged as one UDP datagram without fragments, also if its transport is not UDP. It is
-    logged at its source when it enters the network, and at its destination when it arrives.
+    Each packet of a program is logged as one IP packet without fragments: as an ICMP echo if its flow is a ping,
+    otherwise as a UDP datagram, also if its transport is not UDP. It is logged at its source when it enters the
+    network, and at its destination when it arrives.
 
     Args:
         recorder: The recorder, which accepts IP packets.

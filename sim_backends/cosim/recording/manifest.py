@@ -70,7 +70,8 @@ class RunManifest:
         ending: Status of the run.
         why: The error that ended the run; empty without an error.
         digest: Hash over all events (`EventDigest`); empty during the run.
-        parts: BLAKE2b of each file of a table, by its path in the folder; empty during the run.
+        parts: BLAKE2b (128 bits, in hexadecimal) of each file of a table, by its path in the folder; empty during the
+            run.
     """
 
     about: RunSettings
@@ -95,7 +96,7 @@ def write_manifest(folder: Path, manifest: RunManifest) -> None:
     """Write `run.json`; if this fails, the previous file remains.
 
     Raises:
-        OSError: It cannot be written.
+        OSError: The file cannot be written.
     """
     content = _CODEC.dump(manifest)
     content[_CHECKSUM] = _checksum(content)
@@ -133,7 +134,7 @@ def read_manifest(folder: Path) -> RunManifest:
     """Read `run.json`; the ending is `KILLED` if it contains `under way` but no process holds the lock.
 
     Raises:
-        EvidenceError: The file does not exist, is invalid, or was changed.
+        EvidenceError: The file does not exist, is invalid, was changed, or has another schema version.
     """
     manifest = _read_file(folder)
     if manifest.ending is RunEnding.UNDER_WAY and not _is_locked(folder):

@@ -86,8 +86,8 @@ _PACKET: Final = _object(
 def write_mcap(file: BinaryIO, recording: Recording) -> None:
     """Write a recording as MCAP; equal recordings give equal bytes. Times are simulated times, which start at 0.
 
-    The topics are `/tf` with the positions of the robots in the frame `world`, `/states/ROBOT` with positions and
-    velocities, and `/packets/FLOW` with each packet and its fate, at the time of sending.
+    The topics are `/tf` with the positions and headings of the robots in the frame `world`, `/states/ROBOT` with
+    positions and velocities, and `/packets/FLOW` with each packet and its fate, at the time of sending.
 
     Args:
         file: The file to write.

@@ -61,14 +61,14 @@ SCHEMAS: Final[Mapping[str, pa.Schema]] = {
                 "arrived_ns",
                 pa.int64(),
                 "ns",
-                "time at which the network delivered the packet; empty if the packet never arrived",
+                "time at which the network delivered the packet; empty if it was lost, or was under way at the end",
             ),
             _field(
                 "counted_ns",
                 pa.int64(),
                 "ns",
                 "time from which the sync policy counts the packet as arrived: `arrived_ns`, or the end of the "
-                "window if the policy defers arrivals; empty if the packet never arrived",
+                "window if the policy defers arrivals; empty if `arrived_ns` is empty",
             ),
             _field(
                 "late_ns",
@@ -82,7 +82,12 @@ SCHEMAS: Final[Mapping[str, pa.Schema]] = {
                 "",
                 "reason why the packet never arrived; empty if it did, or was under way at the end",
             ),
-            _field("ended_window", pa.int64(), "", "number of the window in which the packet arrived or was dropped"),
+            _field(
+                "ended_window",
+                pa.int64(),
+                "",
+                "number of the window in which the packet arrived or was dropped; empty if under way at the end",
+            ),
             *_end_fields("known", "that the network assumed when the packet entered it"),
             *_end_fields("true", "when the packet was sent (true value)"),
         ]
@@ -131,7 +136,7 @@ def write_part(folder: Path, table: str, number: int, rows: Sequence[Row]) -> st
     """Write a part of a table; it becomes visible when it is complete.
 
     Returns:
-        BLAKE2b of the file, in hexadecimal.
+        BLAKE2b of the file (128 bits), in hexadecimal.
 
     Raises:
         OSError: The part cannot be written; no incomplete file remains.
@@ -150,7 +155,7 @@ def file_checksum(path: Path) -> str:
     """Return the BLAKE2b of a file, computed as by `write_part`.
 
     Raises:
-        OSError: It cannot be read.
+        OSError: The file cannot be read.
     """
     return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
 

@@ -102,9 +102,9 @@ class RecordingError(ConfigurationError):
 class RunRecorder:
     """Records a run into a folder. The run is executed within this context manager.
 
-    Windows are collected in memory. About every two seconds of wall time they are written as one more part of each
-    table. The part of `windows` is written last. If it exists, the parts of the other tables with the same number are
-    complete. A run that is killed therefore loses only its last seconds.
+    Windows are collected in memory. About every two seconds of wall time (`part_every_s`), or after 50,000 windows,
+    they are written as one more part of each table. The part of `windows` is written last. If it exists, the parts of
+    the other tables with the same number are complete. A run that is killed therefore loses only its last seconds.
 
     Args:
         folder: The folder; it is created at the start of the run, so an invalid scenario creates none.
@@ -113,7 +113,7 @@ class RunRecorder:
         part_every_s: Interval at which parts are written, in seconds of wall time.
         snap_bytes: Number of bytes of each IP packet that are stored in `captures/`. That folder has a file for each
             robot if the network passes its packets to `log_ip`.
-        agents: The agents that are absent at time 0; `captures/` must also include their packets.
+        agents: Agents that may be absent at time 0; `captures/` must also include their packets.
         flows: Flows with special headers in the captures, by name.
     """
 
@@ -196,7 +196,7 @@ class RunRecorder:
         """Write the remaining windows and the end of the run.
 
         Raises:
-            RecordingError: They cannot be written.
+            RecordingError: Some windows or the end of the run cannot be written.
         """
         if not self._has_begun:
             return
@@ -238,8 +238,8 @@ class RunRecorder:
     def _write_part(self, *, is_last: bool = False) -> None:
         """Write the collected windows; an interrupt does not cause a window to be counted twice.
 
-        If the disk is full, the reserved space is used for tables, not for captures. As many windows are written as
-        fit into it.
+        If the disk is full, the reserved space is used for tables, not for captures. If the windows do not fit into
+        it, only the first half of them is tried, then the first quarter, and so on.
 
         Raises:
             RecordingError: Some windows or packets cannot be written.

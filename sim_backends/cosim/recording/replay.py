@@ -34,7 +34,7 @@ def read_recording(folder: Path) -> Recording:
     """Read a recording, also of a run that is under way or was killed.
 
     Raises:
-        EvidenceError: It does not exist, is damaged, or was changed or truncated after the run.
+        EvidenceError: The recording does not exist, is damaged, or was changed or truncated after the run.
     """
     manifest = read_manifest(folder)
     _check_parts(folder, manifest)

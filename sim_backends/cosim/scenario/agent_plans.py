@@ -169,7 +169,7 @@ class _Traffic(Strict, ABC):
         to: The receiving agent, or a list of several.
         protocol: Transport: `udp`, `tcp`, `topic` (DDS's publish-subscribe, without a master), `ros1` (TCPROS) or
             `ros1-udp` (UDPROS).
-        qos: Quality of service of a topic.
+        qos: Quality of service of a topic; the defaults of ROS 2 if omitted.
         start: Time when it begins. The first packet is sent at a random time within one period after it (a file:
             within 100 ms), because robots do not start at the same time.
     """

@@ -197,7 +197,7 @@ scenario's key `policy.longest`, the longest window."""
 def make_programs(
     scenario: CosimScenario, seed: int, controllers: Mapping[str, Program], stops: Mapping[str, Any]
 ) -> dict[str, Program]:
-    """Return the programs of all agents that have traffic or a controller, by the name of the agent.
+    """Return the programs of all agents that send traffic, reply to pings or have a controller, by agent.
 
     Args:
         scenario: The scenario.

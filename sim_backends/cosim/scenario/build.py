@@ -69,7 +69,7 @@ def radio_network(
         scenario: The scenario.
         world: Its world.
         seed: Seed of all random draws.
-        observer: Receives all IP packets if it has `log_ip`.
+        observer: Receives all IP packets if it has `log_ip`; or None.
         path_losses_db: Returns the mean losses that replace losses in the world, by transmitter and receiver; None if
             there are none. Fixed links ignore them.
         carrier: Network that carries its IP packets instead of the built-in radio, or None.
@@ -256,13 +256,16 @@ def build(
         scenario: The scenario.
         policy: A sync policy or its name; None for the policy of the scenario.
         seed: Seed of all random draws; None for the first seed of the scenario.
-        recorder: Receives every window, and every IP packet if it has `log_ip`; or None. With another network it
-            receives the programs' packets as IP packets.
+        recorder: Receives every window, and every IP packet if it has `log_ip`; or None. If a network other than the
+            built-in one has the transports, the recorder receives the programs' packets as IP packets.
         deadline_s: Longest wait for an answer of a federate, in seconds of wall time; None for no deadline.
-        physics: Replaces the scenario's physics, and receives the commands to bodies.
-        network: Replaces the scenario's network; it must then also apply the faults of the radio.
+        physics: Replaces the scenario's physics, and receives the commands to bodies; None for the scenario's
+            physics.
+        network: Replaces the scenario's network, and must then also apply the faults of the radio; None for the
+            scenario's network.
         measures_all: True to include all agents in the position error of every packet, as comparisons need.
-        captures: Folder of captures for a network that writes them itself; the recorder then receives no IP packets.
+        captures: Folder of captures for a network that writes them itself, or None. If the network writes captures,
+            the recorder receives no IP packets.
 
     Raises:
         ConfigurationError: The scenario cannot be run; the message states the reason.

@@ -164,7 +164,7 @@ def check(scenario: CosimScenario, world: World, where: Callable[[Location], str
         where: Returns the place of a value for the message, for example its line in the file, from its keys.
 
     Raises:
-        ConfigurationError: It cannot be run; the message has the first reason and its place.
+        ConfigurationError: The scenario cannot be run; the message has the first reason and its place.
     """
     for problem in problems(scenario, world):
         raise ConfigurationError(problem.message, where=where(problem.location), remedy=problem.remedy)

@@ -1,7 +1,7 @@
 """Starts, connects to or creates the external federates of a scenario.
 
-An external federate is a simulator of physics or network that replaces the built-in one. No other module of the
-co-simulation starts them.
+An external federate is a simulator of physics or network that replaces the built-in one. Runs start them only with
+this module; `fieldkit cosim conform` starts them itself.
 """
 
 import dataclasses
@@ -234,7 +234,7 @@ def _make_federate(federate: PythonFederate, name: str, hello: Hello) -> Any:  #
     """Return a federate in this process.
 
     Raises:
-        ConfigurationError: It does not support the scenario, or required software is not installed.
+        ConfigurationError: The federate does not support the scenario, or required software is not installed.
     """
     service = federate.load()
     try:

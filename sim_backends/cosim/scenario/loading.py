@@ -59,10 +59,10 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
     Args:
         name_or_path: Its name, or the path of a file that ends in `.yaml`.
         changes: Values that replace values of the file, by their keys: `{"policy.window": "2ms",
-            "agents.husky-2.along": "40m"}`.
+            "agents.husky-2.along": "40m"}`; None for no changes.
 
     Raises:
-        ConfigurationError: It does not exist, or is invalid; the message states the line in the file.
+        ConfigurationError: The scenario does not exist, or it is invalid; the message states the line in the file.
     """
     path = _path(str(name_or_path))
     document = schema.read(path)

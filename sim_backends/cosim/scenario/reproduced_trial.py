@@ -34,8 +34,8 @@ class ReproducedTrial(Strict):
         procedure: Name of the procedure.
         record: Duration of every recording, as with `--record` of `fieldkit trial`; if omitted, the duration that the
             procedure states.
-        tcp: The traffic under TCP.
-        udp: The traffic under UDP.
+        tcp: The traffic under TCP; if omitted, there are no rows for TCP.
+        udp: The traffic under UDP; if omitted, there are no rows for UDP.
     """
 
     procedure: str
@@ -92,7 +92,7 @@ class ReproducedTrial(Strict):
 
         Args:
             traffic: The traffic of the scenario.
-            duration_ns: Its duration.
+            duration_ns: Duration of the scenario.
         """
         by_name = {entry.title: entry for entry in traffic}
         selected_flows = [

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
 from fieldkit.config import schema
+from fieldkit.config.antennas import AntennaOptions
 from fieldkit.config.catalog import Named
 from fieldkit.config.schema import AfterValidator, Duration, Field, Int, Length, Location, Strict
 from fieldkit.config.wifi_phy import WifiPhy, check_standard
@@ -98,7 +99,7 @@ class NetworkOptions(Strict):
 
     Attributes:
         federate: An [external federate](federates.md) that replaces the built-in network, as for the physics. It is
-            then responsible for the radio, `tcp` and the faults of radios.
+            then responsible for the radio, the faults of radios and, unless `transports` is `builtin`, `tcp`.
         options: Options of the federate, as for the physics.
         transports: `federate`: the transports of the federate. `builtin`: the built-in UDP, TCP, topics and ROS 1,
             whose IP packets the federate carries with its transport `ip`.
@@ -116,13 +117,16 @@ class AgentRadio(Strict):
         standard: Its IEEE standard; with `phy` also its band, `802.11ac 5 GHz`.
         tx_power_dbm: Its transmit power.
         sensitivity_dbm: Power of the weakest frame that it detects.
-        phy: Physical layer of 802.11n, ac or ax, as `radio.phy` of a [robot profile](reference/robot-profile.md).
+        phy: Physical layer of 802.11n, ac or ax, as `radio.phy` of a [robot profile](reference/robot-profile.md); if
+            omitted, that of `standard` with one stream in 20 MHz.
+        antenna: Pattern and orientation of its antenna, as `radio.antenna` of a robot profile; isotropic if omitted.
     """
 
     standard: str = "802.11n"
     tx_power_dbm: Annotated[Real, Field(ge=-50, le=50)] = 17
     sensitivity_dbm: Annotated[Real, Field(ge=-120, le=0)] = -82
     phy: WifiPhy | None = None
+    antenna: AntennaOptions | None = None
 
     @schema.model_validator(mode="after")
     def _check_standard(self) -> "AgentRadio":
@@ -219,9 +223,8 @@ class CosimScenario(Named):
         network: The network simulator.
         radio: The radio model.
         tcp: The TCP of all agents, also for ROS 1 topics.
-        topology: `masterless`, or `master`: all packets go through the relay, which also runs
-            the ROS 1 master, if any.
-        relay: The agent whose access point relays packets.
+        topology: `masterless`, or `master`: all packets go through the relay.
+        relay: The agent that runs the ROS 1 master, if any; with `master`, its access point also relays all packets.
         policy: The [sync policy](method-cosim.md#sync-policies).
         emane: If given, a run publishes the positions of its agents to the network emulator [EMANE](emane.md). With
             the physics federate `emane`, it reads them from EMANE's events instead.

@@ -91,11 +91,11 @@ def longest_sufficient_window(
 ) -> tuple[float, Sequence[FixedCost]]:
     """Return the longest fixed window that keeps a bound in all runs, and its cost in each run.
 
-    This is the window that a user would choose for further runs; it is determined within 2 %. If there is no such
-    window, the result is nan and an empty sequence.
+    This is the window that a user would choose for further runs; it is determined within 2 %. If no window keeps the
+    bound in one of the runs, the result is nan and an empty sequence.
 
     Args:
-        longest_s: The longest window that keeps the bound in each run.
+        longest_s: The longest window that keeps the bound in each run; nan for a run without such a window.
         costs: Returns the cost of a window in each run.
         bound_m: The bound.
     """

@@ -68,6 +68,11 @@ class SampledPhysics:
     Args:
         physics: The physics federate.
         interval_ns: Sampling interval; it is rounded up to whole physics steps.
+
+    Attributes:
+        step_ns: Time step of the physics federate.
+        limits_m_s2: Acceleration limit of each agent.
+        agents_disappear: True if agents may disappear during the run.
     """
 
     def __init__(self, physics: PhysicsFederate, interval_ns: int) -> None:

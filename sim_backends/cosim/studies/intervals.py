@@ -50,7 +50,8 @@ def jackknife(value: float, leave_one_out: Floats) -> IntervalEstimate:
     """Return a statistic of repeats with its jackknife interval.
 
     The interval is computed from the statistics that omit one repeat each. Their variance is n - 1 times smaller than
-    the variance of the statistic itself (Efron and Stein 1981, Ann. Stat. 9:586).
+    the variance of the statistic itself (Efron and Stein 1981, Ann. Stat. 9:586). There is no interval if there are
+    fewer than two repeats, or if one of these statistics is not finite.
 
     Args:
         value: The statistic of all n repeats.
@@ -65,7 +66,7 @@ def jackknife(value: float, leave_one_out: Floats) -> IntervalEstimate:
 
 
 def repeats_needed(difference: float, deviation: float) -> int | None:
-    """Return the number of pairs of repeats that detect a difference in four of five studies; None if it is zero.
+    """Return the number of pairs of repeats that detect a difference in four of five studies; None if it is 0.
 
     It is ((z_0.975 + z_0.8) s / d)^2 + z_0.975^2 / 2; the second term is a correction, because the deviation is an
     estimate (Guenther 1981, Am. Stat. 35:243). Small numbers may be one too low.

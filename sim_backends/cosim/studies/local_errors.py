@@ -30,7 +30,7 @@ MEASURES: Final = ("delivery_s", "late_s", "position_m", "fates", "path_m")
 
 - `delivery_s`: error of the delivery time.
 - `late_s`: time by which an arrival was in the receiver's past.
-- `position_m`: error of the relative position that the network assumed for sender and receiver.
+- `position_m`: largest error of the relative positions that the network assumed for a packet (`Fate`).
 - `fates`: share of packets that arrived either in the fork or in the reference, but not in both.
 - `path_m`: position error of agents at the end of the window.
 """
@@ -46,7 +46,8 @@ class LocalErrors:
     """Local errors of one policy for several parameters, over windows that begin at the same times.
 
     Attributes:
-        window_s: Lengths of the windows, shape (parameters, times at which windows begin).
+        window_s: Lengths of the windows, shape (parameters, times at which windows begin); 0 for a window that no
+            event ended.
         sums: For each of `MEASURES`, the sum over the affected packets or agents, same shape.
         counts: The number of these packets or agents, same shape.
     """
@@ -138,9 +139,10 @@ def local_errors(
 
 
 def low_discrepancy_times_ns(start_ns: int, end_ns: int, count: int, step_ns: int) -> list[int]:
-    """Return evenly distributed times at whole steps, whose phases within any period are practically random.
+    """Return up to `count` evenly distributed times at whole steps; their phases within any period are nearly random.
 
-    They are multiples of the golden ratio modulo 1, the sequence of lowest discrepancy in one dimension.
+    Before they are rounded to steps, they are multiples of the golden ratio modulo 1, as shares of the interval. This
+    is the sequence of lowest discrepancy in one dimension.
     """
     golden = (5**0.5 - 1) / 2
     times_ns = {round((start_ns + (end_ns - start_ns) * (golden * k % 1)) / step_ns) * step_ns for k in range(count)}

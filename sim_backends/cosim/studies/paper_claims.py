@@ -124,8 +124,9 @@ def delay_change(adaptive_s: Floats, other_s: Floats) -> tuple[IntervalEstimate,
     """Return the relative change of delays, and the number of rows that it is based on.
 
     Each row compares the mean delays of the two systems over those seeds for which packets arrived in both. A row is
-    omitted if there are fewer than two such seeds. The total change is the geometric mean over the rows, so that each
-    row has the same weight. The interval is computed for the logarithm of the change.
+    omitted if there are fewer than two such seeds, or none if there is only one seed. The total change is the
+    geometric mean over the rows, so that each row has the same weight; it is nan if all rows are omitted. The
+    interval is computed for the logarithm of the change.
 
     Args:
         adaptive_s: Mean delay of a packet in the paper's system, shape (rows, seeds); nan if none arrived.

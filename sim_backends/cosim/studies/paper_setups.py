@@ -46,7 +46,8 @@ class FlowSample:
         arrived_packets: Number of packets that arrived or, for a ping, got a reply before the run ended.
         delay_sum_s: Sum of their delays, from sending to the arrival that counts for the receiver, or of round trips;
             nan if none arrived, because 0 would mean an immediate transmission.
-        reasons: Number of the other packets by the reason why they did not arrive.
+        reasons: Number of the packets that did not arrive, by reason. Requests of a ping whose reply did not arrive
+            are not included.
     """
 
     sent_packets: int
@@ -78,7 +79,7 @@ def flow_samples(
         setups: The setups by name.
         seeds: Seeds of the random draws.
         workers: The workers that run the simulations.
-        progress: Called with the number of finished runs.
+        progress: Called with the number of finished runs, or None.
 
     Raises:
         FieldkitError: A run failed.

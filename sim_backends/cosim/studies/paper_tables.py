@@ -192,7 +192,7 @@ class PaperCell:
 
     @property
     def agrees_by_mean(self) -> bool:
-        """True if the mean rounds to the printed number; False if only another value in its interval does."""
+        """True if the mean rounds to the printed number, not only another value in its interval."""
         mean_only = IntervalEstimate(self.measured.value, np.nan, np.nan)
         return compare(self.printed, mean_only) is Agreement.AGREES
 
@@ -210,7 +210,7 @@ class PaperRow:
         labels: Labels of the row.
         delay: Sum of the delays of a transmission, or mean round trip, in seconds.
         loss: Share of packets that did not arrive.
-        reason: The most frequent reason why packets did not arrive; empty if all arrived.
+        reason: The most frequent reason why packets did not arrive (`FlowSample.reasons`); empty without reasons.
     """
 
     labels: Labels

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fieldkit.core.units import format_count
 from sim_backends.cosim.comparison import Errors, compare_runs, lost_share
 from sim_backends.cosim.policies.sync_policy import PolicyError, SyncPolicy
 from sim_backends.cosim.policies.window_policies import EventDriven
@@ -27,7 +28,7 @@ class Round:
     Attributes:
         window_s: The parameter w of its policy.
         median_window_s: Median of the windows that the rule computed from w.
-        loss: Share of lost packets among the packets whose fate is decided.
+        loss: Share of lost packets among the packets whose fate is decided; nan without such packets.
         errors: Errors relative to the reference.
         exchanges: Number of windows.
     """
@@ -71,7 +72,7 @@ def satisfy(
     window_s: float = 0.001,
     max_rounds: int = 20,
 ) -> Satisfaction:
-    """Run rounds until a round is satisfactory, or until further rounds cannot change the result.
+    """Run rounds until a round is satisfactory, the rule fails or does not change the window, or all rounds were run.
 
     Args:
         run: Runs the same scenario and seed with a policy.
@@ -82,7 +83,7 @@ def satisfy(
     """
     reference = run(EventDriven())
     rounds: list[Round] = []
-    reason = f"{max_rounds} rounds were not enough"
+    reason = f"no loss was accepted in {format_count(max_rounds, 'round')}"
     for _ in range(max_rounds):
         try:
             result = run(rule(window_s))

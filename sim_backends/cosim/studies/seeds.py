@@ -61,7 +61,7 @@ def run_many(
         work: Executes a task; it must be picklable.
         tasks: The tasks.
         workers: The workers that run the tasks.
-        progress: Called with the number of finished tasks.
+        progress: Called with the number of finished tasks, or None.
 
     Raises:
         FieldkitError: A task failed, or its worker process terminated repeatedly; the error names the task. Errors of

@@ -1,4 +1,4 @@
-"""Compares sync policies: cost and errors with one seed, and bias (mean difference from the reference) over seeds."""
+"""Compares sync policies with the exact reference over seeds: cost, errors, and bias (mean of the differences)."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -91,7 +91,7 @@ def run_outcomes(
         policies: Names of policies.
         seeds: The seeds.
         workers: The workers that run the simulations.
-        progress: Called with the number of finished runs.
+        progress: Called with the number of finished runs, or None.
 
     Raises:
         FieldkitError: A run failed with an error other than `PolicyError`.
@@ -121,8 +121,8 @@ def _outcome(make_scenario: ScenarioFactory, task: Task) -> RunOutcome | PolicyE
         return error
 
 
-def delay_s(outcome: RunOutcome) -> float:
-    """Return the mean time from sending to the arrival that counts for the receiver; nan if no packet arrived."""
+def mean_delay_s(outcome: RunOutcome) -> float:
+    """Return the mean time, over packets, from sending to the arrival that counts; nan if no packet arrived."""
     delays_ns = [
         fate.counted_ns - fate.packet.sent_ns for fate in outcome.run.fates.values() if fate.counted_ns is not None
     ]
@@ -140,7 +140,7 @@ def mean_separation_m(outcome: RunOutcome) -> float:
 
 MEASURES: Final[Mapping[str, Callable[[RunOutcome], float]]] = {
     "loss": lambda outcome: lost_share(outcome.run),
-    "delay_s": delay_s,
+    "delay_s": mean_delay_s,
     "apart_m": mean_separation_m,
 }
 """The compared measures, by name."""
@@ -154,7 +154,7 @@ class Bias:
         values: The measure for each seed, in order; nan if a run has none.
         mean: Their mean.
         bias: Mean of the differences from the reference with the same seed.
-        deviation: Standard deviation of these differences.
+        deviation: Standard deviation of these differences; nan if there are fewer than two.
         seeds_needed: Number of seeds needed to detect the bias; None if the bias is 0 or unknown.
     """
 
@@ -190,17 +190,17 @@ class Row:
 
     Attributes:
         policy: Name of the policy.
-        by_seed: Its errors relative to the reference for each seed; empty if the policy could not be run.
-        formations: Position errors of the followers, for each seed.
-        growth_m: Two arrays of shape (times,): times in seconds, and the largest distance of an agent from its
-            position in the reference at that time, as a mean over seeds.
+        by_seed: Its errors relative to the reference, for each seed with which it could be run.
+        formations: Position errors of the followers, for each seed with which it could be run.
+        growth: Two arrays of shape (times,): times in seconds, and the largest distance in metres of an agent from
+            its position in the reference at that time, as a mean over these seeds; empty if there are none.
         failure: The reason why the policy could not be run with a seed; empty if it could be run with all seeds.
     """
 
     policy: str
     by_seed: Sequence[Errors]
     formations: Sequence[Formation]
-    growth_m: tuple[Floats, Floats]
+    growth: tuple[Floats, Floats]
     failure: str
 
     @property
@@ -226,15 +226,15 @@ def rows(outcomes: Outcomes, formation: Callable[[Tracks], Formation] = lambda _
             policy,
             tuple(outcomes.errors(policy, seed) for seed in outcomes.seeds if seed in runs),
             tuple(formation(runs[seed].tracks) for seed in outcomes.seeds if seed in runs),
-            _growth_m(outcomes, policy),
+            _growth(outcomes, policy),
             str(outcomes.failures.get(policy, "")),
         )
         for policy, runs in outcomes.runs.items()
     ]
 
 
-def _growth_m(outcomes: Outcomes, policy: str) -> tuple[Floats, Floats]:
-    """Return the value of `Row.growth_m` for a policy."""
+def _growth(outcomes: Outcomes, policy: str) -> tuple[Floats, Floats]:
+    """Return the value of `Row.growth` for a policy."""
     pairs = [(outcomes.reference[seed].tracks, outcome.tracks) for seed, outcome in outcomes.runs[policy].items()]
     largest_m = [np.fmax.reduce(tracks.distances_m(reference), axis=1) for reference, tracks in pairs]
     length = min(map(len, largest_m), default=0)

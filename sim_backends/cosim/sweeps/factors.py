@@ -62,7 +62,7 @@ def _parse_in_unit(text: str, unit: str, factors: dict[str, float]) -> float:
     """Parse a quantity and convert it to `unit`. Only levels in dB or dBm may be negative.
 
     Raises:
-        ConfigurationError: It is not a quantity of this kind.
+        ConfigurationError: `text` is not a quantity of this kind.
     """
     magnitude = text.removeprefix("-") if unit in {"dB", "dBm"} else text
     value = parse_quantity(magnitude, factors, "value")

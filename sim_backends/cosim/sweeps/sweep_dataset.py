@@ -42,7 +42,7 @@ def write_dataset(plan: SweepPlan, folder: SweepFolder) -> int:
     """Replace the dataset of a sweep by a dataset of the results so far, and return the number of its rows.
 
     Raises:
-        ConfigurationError: It cannot be written; an existing dataset is unchanged.
+        ConfigurationError: The new dataset cannot be written; an existing dataset is unchanged.
         EvidenceError: The file of a run is damaged.
     """
     rows = {setting.digest: _rows_of(setting, plan, folder) for setting in plan.settings}
@@ -76,14 +76,14 @@ def write_dataset(plan: SweepPlan, folder: SweepFolder) -> int:
 
 
 def _rows_of(setting: SweepSetting, plan: SweepPlan, folder: SweepFolder) -> list[dict[str, Value]]:
-    """Return the rows of all runs of a setting, with the values of the factors as numbers."""
+    """Return the rows of all runs of a setting, with the values of factors that are numbers (`Factor.numbers`)."""
     numbers: dict[str, Value] = {}
     for factor in plan.factors:
         if (number_column := factor.numbers) is not None:
             name, _, values = number_column
             numbers[name] = values[factor.values.index(setting.values[factor.name])]
     runs = (run for run in plan.runs if run.setting is setting)
-    hashes = scenario_hashes(plan.scenario)  # equal for all settings: factors do not change the procedure
+    hashes = scenario_hashes(plan.scenario)  # one for all settings: factors do not count as part of the procedure
     return [numbers | dict(row) | hashes for run in runs for row in folder.rows(run)]
 
 

@@ -74,6 +74,7 @@ class SweepFolder:
         Raises:
             ConfigurationError: The folder contains other files or another sweep, another process runs the sweep, or
                 the folder cannot be written.
+            EvidenceError: The file with the plan is damaged.
         """
         with self.error_conversion():
             self.path.mkdir(parents=True, exist_ok=True)
@@ -119,7 +120,7 @@ class SweepFolder:
         """Return a row of columns for each flow of a run; empty if the run has neither finished nor failed.
 
         Raises:
-            EvidenceError: Its file is damaged.
+            EvidenceError: The file of the run is damaged.
         """
         path = self.path / _RUNS / f"{run.name}.json"
         if path.exists():
@@ -132,13 +133,17 @@ class SweepFolder:
         """Write the result of a run.
 
         Raises:
-            ConfigurationError: It cannot be written.
+            ConfigurationError: The result cannot be written.
         """
         self._write(self.path / _RUNS / f"{run.name}.json", _identity(run) | dict(result))
         (self.path / _FAILED / f"{run.name}.json").unlink(missing_ok=True)
 
     def failure(self, run: SweepRun) -> RunFailure | None:
-        """Return the last failure of a run; None if it did not fail."""
+        """Return the last failure of a run; None if it did not fail, or has finished since.
+
+        Raises:
+            EvidenceError: The file of the failure is damaged.
+        """
         path = self.path / _FAILED / f"{run.name}.json"
         if not path.exists():
             return None

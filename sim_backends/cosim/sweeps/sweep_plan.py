@@ -1,6 +1,7 @@
 """The plan of a sweep: all its settings and runs.
 
-The name of a run is the hash of scenario, settings, seed and version of fieldkit.
+The name of a run is a hash of the scenario with its settings, the files that it names, the seed, and the version of
+fieldkit.
 """
 
 import hashlib
@@ -32,7 +33,7 @@ class SweepSetting:
     Attributes:
         values: The values by the name of their factor, as given on the command line.
         scenario: The scenario with these values.
-        digest: Hash of the scenario, of the files that it names, and of the version of fieldkit.
+        digest: Result of the function `digest` for this scenario.
     """
 
     values: Mapping[str, str]
@@ -114,9 +115,9 @@ def plan_sweep(
 
 
 def digest(scenario: CosimScenario) -> str:
-    """Return the hash of a scenario, of its world and robot profiles, and of the version of fieldkit.
+    """Return a hash of a scenario, of its world and robot profiles, and of the version of fieldkit.
 
-    A worker whose files differ computes another hash.
+    It is the first 24 hex digits of a SHA-256. A worker whose files differ computes another hash.
     """
     settings = {
         key: value

@@ -70,6 +70,7 @@ def execute(run: SweepRun, *, verify: bool = False) -> RunResult:
     Raises:
         ConfigurationError: The world or a robot profile differs.
         FieldkitError: The run could not start.
+        KeyboardInterrupt: Ctrl-C interrupted the run.
     """
     scenario = run.setting.scenario
     if verify and digest(scenario) != run.setting.digest:

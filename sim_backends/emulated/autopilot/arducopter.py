@@ -139,7 +139,7 @@ def _arming_errors(parameters: Parameters, battery: Battery) -> list[str]:
 
 
 def _mode_refusal(mode: Mode, conditions: ModeConditions) -> ModeRefusal | None:
-    """Return the refusal of a change of mode; a disarmed vehicle accepts any mode (Copter::set_mode)."""
+    """Return the refusal of a change of mode, or None; a disarmed vehicle accepts any mode (Copter::set_mode)."""
     if mode is not Mode.MISSION or not conditions.is_armed:
         return None
     text, commands = "Mode change to AUTO failed: init failed", conditions.mission_commands

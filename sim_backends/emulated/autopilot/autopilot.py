@@ -48,6 +48,9 @@ class Autopilot:
         now_ns: Time of power-on.
         boot_s: Time from power-on until its position estimate has an origin.
         make_airframe: Creates the airframe; None for an airframe that the autopilot itself moves.
+
+    Attributes:
+        vehicle: The vehicle.
     """
 
     def __init__(
@@ -115,7 +118,7 @@ class Autopilot:
         yield from self._port.frames(message for message in messages if message is not None)
 
     def next_ns(self) -> int | None:
-        """Return the time of the next frame that `advance` sends, or None if there are no clients."""
+        """Return the time of the next periodic frame that `advance` yields, or None if there are no clients."""
         return self._streams.next_ns if self._port.is_used else None
 
     def _reboot(self) -> None:
@@ -220,7 +223,7 @@ class Autopilot:
         return int(dialect.MAV_RESULT_ACCEPTED)
 
     def _accept_set_point(self, message: Message) -> None:
-        """Accept a position or a velocity; if a message has both, the velocity is used."""
+        """Accept a position or a velocity, which must be finite; if a message has both, the velocity is used."""
         if message.get_type() == "SET_POSITION_TARGET_GLOBAL_INT":
             args = message.coordinate_frame, message.lat_int, message.lon_int, message.alt
             position_m = goal_m(*args, self.vehicle.home_m)
@@ -245,4 +248,4 @@ _REQUESTED_MESSAGES: Final = {
     dialect.MAV_CMD_REQUEST_PROTOCOL_VERSION: mavlink_frames.PROTOCOL_VERSION,
     dialect.MAV_CMD_GET_HOME_POSITION: dialect.MAVLINK_MSG_ID_HOME_POSITION,
 }
-"""Commands that request one message."""
+"""Id of the message that a command requests, by command."""

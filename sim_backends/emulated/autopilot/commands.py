@@ -49,7 +49,7 @@ class Commands:
     def run(self, message: Message) -> int:
         """Execute the command in a COMMAND_LONG or COMMAND_INT; return its MAV_RESULT.
 
-        The reason for a refusal is added to the vehicle's status texts.
+        The reason for a refusal is added to the vehicle's status texts, if the firmware sends one.
         """
         handler = self._handlers.get(message.command)
         if handler is None:
@@ -141,7 +141,10 @@ class Commands:
         return _ACCEPTED
 
     def _reposition(self, message: Message) -> int:
-        """Fly to a position; NaN, or the largest integer, keeps a coordinate (MAV_CMD_DO_REPOSITION)."""
+        """Fly to a position (MAV_CMD_DO_REPOSITION).
+
+        NaN keeps the altitude; the largest integer, as latitude or longitude, keeps both of them.
+        """
         if message.get_type() != "COMMAND_INT":
             return int(dialect.MAV_RESULT_COMMAND_INT_ONLY)
         here_m = self._vehicle.body.position_m
@@ -180,7 +183,7 @@ _CURRENT_COORDINATE: Final = 0x7FFFFFFF
 
 
 def is_integer_up_to(value: float, maximum: int) -> bool:
-    """Return True if a float field, which may be NaN, holds an integer from 0 to `maximum`."""
+    """Return True if the value of a float field, which may be NaN, is an integer from 0 to `maximum`."""
     return math.isfinite(value) and value == int(value) and 0 <= value <= maximum
 
 

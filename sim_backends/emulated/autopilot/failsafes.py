@@ -1,10 +1,10 @@
 """Failsafes of the emulated autopilots for battery, ground station and fence, and the reactions of the vehicle.
 
-ArduCopter: https://ardupilot.org/copter/docs/failsafe-battery.html,
+Sources for ArduCopter: https://ardupilot.org/copter/docs/failsafe-battery.html,
 https://ardupilot.org/copter/docs/gcs-failsafe.html,
-https://ardupilot.org/copter/docs/common-ac2_simple_geofence.html. The fence is a cylinder around home. PX4:
-https://docs.px4.io/main/en/config/safety.html; it refuses goals outside its fence, and reacts before a vehicle that
-follows set-points crosses it.
+https://ardupilot.org/copter/docs/common-ac2_simple_geofence.html. Source for PX4:
+https://docs.px4.io/main/en/config/safety.html. The fence of both is a cylinder around home. ArduCopter reacts after a
+vehicle has crossed the fence, PX4 before a vehicle that follows set-points crosses it.
 """
 
 import math
@@ -92,7 +92,7 @@ class ArduCopterFailsafes:
     """Battery and ground-station (GCS) failsafes of ArduCopter.
 
     A triggered battery failsafe lasts until the next boot. A triggered ground-station failsafe lasts until a
-    heartbeat arrives.
+    heartbeat of the system SYSID_MYGCS arrives, or until FS_GCS_ENABLE is set to 0.
 
     Args:
         parameters: The vehicle's parameters; these failsafes read BATT_*, FS_GCS_* and SYSID_MYGCS.
@@ -102,7 +102,7 @@ class ArduCopterFailsafes:
 
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
-        # Number of the last stage in `_STAGES` that was triggered, from 1; 0 if none was.
+        # Number of the highest stage in `_STAGES` that was triggered, from 1; 0 if none was.
         self._stage = 0
         # Time since which the voltage has been below the limit of a stage, by its name.
         self._below_ns: dict[str, int] = {}
@@ -136,7 +136,7 @@ class ArduCopterFailsafes:
         yield from self._gcs(state)
 
     def _battery(self, state: VehicleState) -> Iterator[Reaction]:
-        """Yield the reactions to each stage of a low battery that is reached for the first time."""
+        """Yield the reactions to each stage of a low battery that is reached for the first time since the boot."""
         parameters = self._parameters
         for stage, (name, level_text) in enumerate(self._STAGES, 1):
             limit_v, limit_mah = parameters[f"BATT_{name}_VOLT"], parameters[f"BATT_{name}_MAH"]
@@ -175,7 +175,11 @@ class ArduCopterFailsafes:
     def _action_reactions(
         self, action: int, modes: dict[int, Mode], text: str, state: VehicleState
     ) -> Iterator[Reaction]:
-        """Yield the reaction of a failsafe whose parameter has the value `action`; `modes` is the mode by value."""
+        """Yield the reaction of a failsafe whose parameter has the value `action`.
+
+        `modes` has the mode to change to for each value that changes the mode. A disarmed vehicle only reports the
+        failsafe. On the ground, an armed vehicle is disarmed instead. While it lands, it continues to land.
+        """
         mode = modes.get(action)
         if not state.is_armed or mode is None:
             yield Reaction(text)
@@ -188,16 +192,21 @@ class ArduCopterFailsafes:
 
 
 _BATTERY_ACTIONS: Final = {1: Mode.LAND, 2: Mode.RTL, 3: Mode.RTL, 4: Mode.LAND, 6: Mode.RTL, 7: Mode.LAND}
-"""Mode by BATT_FS_LOW_ACT or BATT_FS_CRT_ACT; SmartRTL is RTL here, and 5 (terminate) is not emulated."""
+"""Mode by BATT_FS_LOW_ACT or BATT_FS_CRT_ACT.
+
+Modes that are not emulated are replaced by the mode that ArduCopter uses if they are not possible: SmartRTL by RTL
+(3) or LAND (4), the landing sequence of a mission by RTL (6), BRAKE by LAND (7). 5 (terminate) only reports the
+failsafe.
+"""
 _GCS_ACTIONS: Final = {1: Mode.RTL, 2: Mode.RTL, 3: Mode.RTL, 4: Mode.LAND, 5: Mode.LAND, 6: Mode.RTL, 7: Mode.LAND}
-"""Mode by FS_GCS_ENABLE."""
+"""Mode by FS_GCS_ENABLE, with the same replacements; 2 was removed in ArduCopter 4.0, and is RTL here."""
 
 
 class Px4Failsafes:
     """Ground-station (data-link) and battery failsafes of PX4.
 
-    The vehicle first holds its position for COM_FAIL_ACT_T, so that a pilot can take over. A change of mode ends a
-    failsafe.
+    The vehicle first holds its position for COM_FAIL_ACT_T, so that a pilot can take over, unless this time is below
+    1 s. A failsafe ends when a client changes the mode, or when the vehicle is disarmed.
 
     Args:
         parameters: The vehicle's parameters; these failsafes read NAV_DLL_ACT, COM_DL_LOSS_T, COM_LOW_BAT_ACT,
@@ -235,7 +244,7 @@ class Px4Failsafes:
         self._active, self._pending_change = False, None
 
     def on_lost_set_points(self) -> None:
-        """Implement `Failsafes.on_lost_set_points`: the failsafe lasts until a client changes the mode."""
+        """Implement `Failsafes.on_lost_set_points`: the failsafe lasts until the next call of `on_mode_change`."""
         self._active = True
 
     def advance(self, state: VehicleState) -> Iterator[Reaction]:
@@ -260,7 +269,7 @@ class Px4Failsafes:
             yield Reaction("Connection to ground station regained", _INFO)
 
     def _battery(self, state: VehicleState) -> Iterator[Reaction]:
-        """Yield the reactions to a battery warning that is higher than all before."""
+        """Yield the reactions to a battery warning that is higher than all since the boot."""
         parameters, charge = self._parameters, state.battery.charge
         warning = sum(charge < parameters[name] for name in ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR"))
         if warning <= self._warning:
@@ -271,7 +280,11 @@ class Px4Failsafes:
         yield from self._trigger(_LOW_BATTERY_ACTIONS.get((int(parameters["COM_LOW_BAT_ACT"]), warning)), state)
 
     def _trigger(self, mode: Mode | None, state: VehicleState) -> Iterator[Reaction]:
-        """Yield the change to a mode; nothing if the vehicle is on the ground, or already returns or lands."""
+        """Yield the change to a mode, or to Hold before it (see the class).
+
+        Nothing is yielded if `mode` is None, if the vehicle is not in flight, or if it already lands or, unless
+        `mode` is LAND, returns.
+        """
         if (
             mode is None
             or not state.is_armed
@@ -302,7 +315,7 @@ _LOW_BATTERY_ACTIONS: Final = {
 
 
 _FENCE_ACTIONS: Final = {0: None, 1: Mode.RTL, 2: Mode.LAND, 3: Mode.RTL, 4: Mode.BRAKE, 5: Mode.LAND}
-"""Mode after a breach, by FENCE_ACTION."""
+"""Mode after a breach, by FENCE_ACTION, with the same replacements; None if the breach is only reported."""
 _GEOFENCE_ACTIONS: Final = {
     1: ("warning", None),
     2: ("hold", Mode.LOITER),
@@ -337,13 +350,18 @@ class Fence:
         return is_within(position_m, self.limits_m)
 
     def nearest_inside(self, position_m: Vector) -> Vector:
-        """Return the position itself, or the point where the line from home to it crosses the fence."""
+        """Return the position itself, or the nearest point inside the fence if the position is outside.
+
+        The horizontal distance from home and the height are limited separately. A height below home is not changed.
+        """
         (east, north, up), (radius_m, height_m) = position_m, self.limits_m
         share = radius_m / max(math.hypot(east, north), radius_m)
         return share * east, share * north, min(up, height_m)
 
     def is_crossed(self, here_m: Vector, stop_m: Vector) -> bool:
-        """Return True if a vehicle that brakes now stops outside the fence, and farther from home than now.
+        """Return True if a vehicle that brakes now stops outside the fence, and farther outside than it is now.
+
+        This applies to the horizontal distance from home or to the height.
 
         Args:
             here_m: Position of the vehicle.
@@ -371,7 +389,8 @@ class Fence:
     def before_crossing(self, here_m: Vector, stop_m: Vector) -> Reaction | None:
         """Return the reaction of PX4 if `is_crossed` is True for these arguments, or None.
 
-        A warning is repeated only after the vehicle could again have stopped inside the fence.
+        A reaction without a change of mode (a warning) is returned only if `is_crossed` was False in the previous
+        call.
         """
         was_crossed, self._is_breached = self._is_breached, self.is_crossed(here_m, stop_m)
         text, mode = _GEOFENCE_ACTIONS.get(int(self._parameters["GF_ACTION"]), ("", None))
@@ -381,5 +400,5 @@ class Fence:
 
 
 def is_within(position_m: Vector, limits_m: tuple[float, float]) -> bool:
-    """Return True if a position relative to home is inside a cylinder, given by radius and height."""
+    """Return True if a position relative to home is in a cylinder, given by radius and height, or on its surface."""
     return math.hypot(*position_m[:2]) <= limits_m[0] and 0 <= position_m[2] <= limits_m[1]

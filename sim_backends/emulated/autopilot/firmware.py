@@ -79,8 +79,8 @@ class Firmware:
         prearm_prefixes: Prefixes of texts with reasons against arming: in answers to MAV_CMD_RUN_PREARM_CHECKS, and
             after a refused command to arm.
         arming_errors: Returns the reasons against arming.
-        parameters: Its parameters, within the limits of a profile.
-        failsafes: Its failsafes.
+        parameters: Returns its parameters, within the limits of a profile.
+        failsafes: Creates its failsafes.
         streams_hz: Default rates of messages on a telemetry port.
         groups: Groups of messages whose rates are set by parameters and REQUEST_DATA_STREAM; empty if the firmware
             has no such groups.
@@ -126,5 +126,5 @@ class Firmware:
         return bool(self.autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA)
 
     def mode_of(self, custom_mode: int) -> Mode | None:
-        """Return the mode with a custom mode number, or None if the firmware has no such mode."""
+        """Return the first of `modes` with a custom mode number, or None if the firmware has no such mode."""
         return next((mode for mode, number in self.modes.items() if number == custom_mode), None)

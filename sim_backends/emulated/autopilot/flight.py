@@ -24,7 +24,7 @@ _STEP_S: Final = STEP_NS / 1e9
 
 _APPROACH: Final = 0.5
 """Near its goal, the speed of the drone is the remaining distance, times the gain of velocity control, times this
-factor. If attitude control had no lag, the drone would overshoot by at most 4 %. The ratio of PX4's gains is similar:
+factor. If attitude control had no lag, the drone would overshoot by about 4 %. The ratio of PX4's gains is similar:
 0.95 for MPC_XY_P, 1.8 for MPC_XY_VEL_P_ACC."""
 
 _MIN_COURSE_M_S: Final = 0.3
@@ -77,7 +77,7 @@ class Airframe:
 
     @property
     def position_m(self) -> Vector:
-        """Position relative to home."""
+        """Position of its lowest point relative to home."""
         (east, north, up), home = self._pose.place_m, self.home_m
         return east - home[0], north - home[1], up - home[2]
 

@@ -51,7 +51,7 @@ AVAILABLE_MODES: Final = 435
 
 
 class _RawMessage(dialect.MAVLink_message):  # type: ignore[misc]  # pymavlink has no types
-    """A message whose payload is packed by this module.
+    """A message that pymavlink's dialect `common` lacks, with a payload that is already packed.
 
     Args:
         number: Message id.
@@ -108,7 +108,7 @@ def ekf_status_report(flags: int) -> Message:
 
 
 def read(datagram: bytes) -> Iterator[Message]:
-    """Yield the messages in a datagram; other bytes and incomplete frames are skipped.
+    """Yield the messages in a datagram; other bytes, incomplete frames and unknown messages are skipped.
 
     Each datagram is parsed separately, so that an incomplete frame does not affect the next datagram.
     """
@@ -120,7 +120,7 @@ def read(datagram: bytes) -> Iterator[Message]:
 
 
 def target_of(message: Message) -> tuple[int, int]:
-    """Return the target system and component of a message; both are 0 (broadcast) if it has no such fields."""
+    """Return the target system and component of a message, each 0 (broadcast) if the message has no such field."""
     return getattr(message, "target_system", 0), getattr(message, "target_component", 0)
 
 
@@ -193,7 +193,7 @@ class MavlinkPort:
         return bool(self._clients)
 
     def register(self, sender: Address, message: Message, now_ns: int) -> bool:
-        """Register the sender of a message as a client; return False if there are `MAX_CLIENTS` other clients."""
+        """Register the sender of a message as a client; return True unless there are `MAX_CLIENTS` other clients."""
         client = self._clients.get(sender)
         if client is None:
             if len(self._clients) == MAX_CLIENTS:

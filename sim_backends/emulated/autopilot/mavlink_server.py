@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from sim_backends.emulated.autopilot.mavlink_frames import Frame
 
 _TICK_NS: Final = 20_000_000
-"""Interval of flight steps while there are clients, or while the drone flies."""
+"""Longest wait for a datagram while there are clients, or while the drone is armed or in the air."""
 
 _MAX_BYTES: Final = 65_536
 _BURST: Final = 64
-"""Maximum number of datagrams between two flight steps, so that a flood of datagrams does not stop the flight."""
+"""Maximum number of datagrams between two calls that advance the flight, so that a flood does not stop the flight."""
 
 
 class PhysicsFiles(NamedTuple):
@@ -49,9 +49,10 @@ class Drone:
         profile: Name of the robot's profile, which determines its airframe.
         max_speed_m_s: Maximum ground speed of the profile.
         max_height_m: Maximum height above home; None if the profile does not limit it.
-        fence_m: Maximum distance from home; None if the profile does not limit it.
-        antenna_m: Height of the antenna, whose position the lab uses, above the lowest point of the drone.
-        world: World that it flies in, as JSON.
+        fence_m: Maximum horizontal distance from home; None if the profile does not limit it.
+        antenna_m: Height of the antenna above the lowest point of the drone; the lab's positions are those of
+            antennas.
+        world: World that it flies in, as JSON; empty if there are no obstacles.
         boot_s: Time from power-on until its position estimate has an origin.
         physics: The files for the physics simulator that moves the drone; None if the autopilot moves it.
     """
@@ -102,8 +103,8 @@ def _load(
 ) -> "tuple[Autopilot, DroneMotionReporter]":
     """Return the autopilot, which has been on since `power_on_ns`.
 
-    It is loaded when the first client connects, because the dialect and the world each need 50 ms and 40 MB, and in
-    most trials no client connects to the drone.
+    It is loaded when the first datagram has arrived, because the dialect and the world each need 50 ms and 40 MB, and
+    in most trials no client sends a datagram to the drone.
     """
     from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER  # noqa: PLC0415
     from sim_backends.emulated.autopilot.autopilot import Autopilot  # noqa: PLC0415
@@ -184,8 +185,14 @@ class DroneMotionReporter:
         self._was_flying = not body.on_ground
         east_m, north_m, up_m = body.place_m
         antenna_m = (east_m, north_m, up_m + self._antenna_m)
+        roll_rad, nose_up_rad = body.tilt_rad
         self._reporter.write(
-            body.now_ns, antenna_m, body.velocity_m_s, heading_rad=body.yaw_rad, turn_rad_s=body.turn_rad_s
+            body.now_ns,
+            antenna_m,
+            body.velocity_m_s,
+            heading_rad=body.yaw_rad,
+            turn_rad_s=body.turn_rad_s,
+            tilt_rad=(roll_rad, -nose_up_rad),
         )
 
 
@@ -206,7 +213,10 @@ def _send(endpoint: socket.socket, frames: "Iterable[Frame]") -> None:
 
 
 def _wait_s(autopilot: "Autopilot") -> float | None:
-    """Return the maximum time to wait for a datagram; None (no limit) for a drone on the ground without clients."""
+    """Return the maximum time to wait for a datagram.
+
+    There is no limit (None) for a disarmed drone on the ground without clients.
+    """
     vehicle = autopilot.vehicle
     if autopilot.next_ns() is None and not vehicle.is_armed and vehicle.body.on_ground:
         return None

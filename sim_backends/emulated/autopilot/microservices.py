@@ -76,7 +76,7 @@ class ParameterService:
             yield self.value(name)
 
     def _set(self, name: str, message: Message) -> None:
-        """Set a parameter to the value in a PARAM_SET message, unless the type is wrong."""
+        """Set a parameter to the value in a PARAM_SET message, unless its value or, with PX4, its type is wrong."""
         value = message.param_value
         if not self._firmware.is_ardupilot:
             expected_type = _INT if self._parameters.is_integer(name) else _FLOAT
@@ -180,7 +180,11 @@ class Streams:
         return min(self._due_ns.values())
 
     def set_interval(self, kind: int, interval_us: float, now_ns: int) -> None:
-        """Set the interval of a message: -1 disables it, 0 is the default (MAV_CMD_SET_MESSAGE_INTERVAL)."""
+        """Set the interval of a message (MAV_CMD_SET_MESSAGE_INTERVAL).
+
+        0 means the default rate; -1, or 0 without a default rate, disables the message. The heartbeat is not
+        disabled, but gets its default interval. The shortest interval is `MIN_INTERVAL_NS`.
+        """
         if interval_us == 0 and self._default_hz.get(kind):
             interval_us = 1e6 / self._default_hz[kind]
         self._due_ns.pop(kind, None)
@@ -196,7 +200,7 @@ class Streams:
         return self._interval_ns.get(kind, -1000) // 1000
 
     def set_default(self, kind: int, rate_hz: float, now_ns: int) -> None:
-        """Set the default rate of a message, and its current rate; 0 disables it."""
+        """Set the default rate of a message, and its current rate (see `set_interval`); 0 disables it."""
         self._default_hz[kind] = rate_hz
         self.set_interval(kind, 1e6 / rate_hz if rate_hz else -1, now_ns)
 
@@ -263,7 +267,7 @@ class MissionTransfer:
             self._upload = None  # cancelled by the client
 
     def retries(self, now_ns: int) -> Iterator[Message]:
-        """Yield the repeated request for an item that is overdue, if there is one."""
+        """Yield the repeated request for an overdue item, if any; after `TRIES` requests, the end of the upload."""
         upload = self._upload
         if upload is None or now_ns - upload.requested_ns < RETRY_NS:
             return

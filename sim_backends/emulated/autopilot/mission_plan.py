@@ -137,7 +137,7 @@ class Mission:
     Attributes:
         items: The items as uploaded.
         current: Number of the current item; after the end, the number of the last item.
-        speed_m_s: Ground speed that an item has set.
+        speed_m_s: Ground speed that an item has set; None if no item has set one.
     """
 
     def __init__(self, first: int = 0) -> None:
@@ -154,7 +154,7 @@ class Mission:
         self._arrived_ns: int | None = None
 
     def load(self, items: tuple[Item, ...]) -> None:
-        """Load new items; the first is the current one."""
+        """Load new items; the first that the vehicle executes is the current one."""
         self.items, self.speed_m_s = items, None
         self.set_current(0)
 
@@ -184,7 +184,7 @@ class Mission:
             self._next_repeat_ns = now_ns + REPEAT_NS
 
     def next_goal_or_mode(self, body: Airframe, home_m: Vector, near_m: float, *, has_landed: bool) -> Vector | str:
-        """Return the point to fly to, or the name of the mode to change to.
+        """Return the point to fly to, or the name of the mode to change to: `RTL`, or `LOITER` after the last item.
 
         The point is relative to home. A point below home means landing.
 

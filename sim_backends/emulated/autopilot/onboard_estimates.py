@@ -130,8 +130,8 @@ class LandDetector:
     Attributes:
         has_landed: True if it has detected that the drone is on the ground.
         has_flown: True if the drone was in the air since it was armed last.
-        grounded_ns: Time of the last contact with the ground, or of arming.
-        armed_ns: Time of arming.
+        grounded_ns: Last time at which the drone was in the air, or the time of `armed_ns` if that is later.
+        armed_ns: Time when the drone was armed last, or placed on the ground since then.
     """
 
     def __init__(self, landed_s: float) -> None:

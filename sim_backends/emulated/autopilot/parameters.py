@@ -81,7 +81,10 @@ class Parameters:
     """Current values of the parameters.
 
     Args:
-        parameters: All parameters; they are listed in the order of their names.
+        parameters: All parameters.
+
+    Attributes:
+        names: The firmware's names of the parameters, without internal constants, sorted.
     """
 
     def __init__(self, parameters: tuple[Parameter, ...]) -> None:

@@ -19,7 +19,7 @@ from sim_backends.emulated.autopilot.parameters import (
 
 _d = dialect
 _CRITICAL: Final = 0.07
-"""BAT_CRIT_THR, which is the arming limit if COM_ARM_BAT_MIN is negative."""
+"""Default of BAT_CRIT_THR, which is the arming limit if COM_ARM_BAT_MIN is negative."""
 
 
 def _custom(main: int, sub: int = 0) -> int:
@@ -101,7 +101,7 @@ def _arming_errors(parameters: Parameters, battery: Battery) -> list[str]:
 
 
 def _mode_refusal(mode: Mode, conditions: ModeConditions) -> ModeRefusal | None:
-    """Return the refusal of a change of mode."""
+    """Return the refusal of a change of mode; None if it is accepted."""
     is_on_ground = not conditions.is_armed or conditions.on_ground
     if mode in {Mode.LAND, Mode.RTL} and is_on_ground:
         return ModeRefusal(f"{mode.name} denied: not in the air")

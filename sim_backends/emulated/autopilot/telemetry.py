@@ -334,8 +334,8 @@ class Telemetry:
 
 _STANDARD: Final = {
     Mode.POSHOLD: 1,
-    Mode.ALT_HOLD: 3,
-    Mode.RTL: 4,
+    Mode.ALT_HOLD: 4,
+    Mode.RTL: 5,
     Mode.MISSION: 6,
     Mode.LAND: 7,
     Mode.TAKEOFF: 8,

@@ -25,8 +25,11 @@ _PREARM_NS: Final = 30_000_000_000
 _MIN_LIFT_OFF_M_S: Final = 0.02
 """A landed vehicle lifts off at a higher target velocity. Lower ones are caused by small errors of its position."""
 _OFFBOARD_LOST: Final = {3: Mode.RTL, 4: Mode.LAND}
-"""Mode when set-points are missing, by COM_OBL_RC_ACT. For values that name a mode of a remote control, PX4 holds the
-position instead, because such a mode needs the sticks."""
+"""Mode when set-points are missing, by COM_OBL_RC_ACT; with other values the vehicle holds its position (LOITER).
+
+The values 0 to 2 name modes of a remote control, which need the sticks; 5 is Hold; 6 and 7 (terminate, disarm) are
+not emulated.
+"""
 
 
 class Refused(Exception):  # noqa: N818 (an answer of the autopilot, not an error)
@@ -40,7 +43,7 @@ class Vehicle(VehicleBase):
         """Report the reasons why it cannot be armed.
 
         Raises:
-            Refused: It is armed.
+            Refused: The vehicle is armed.
         """
         if self.is_armed:
             raise self._refusal("Prearm checks denied: armed")
@@ -78,7 +81,7 @@ class Vehicle(VehicleBase):
             force: True to stop them even in the air, which makes the vehicle fall.
 
         Raises:
-            Refused: It is flying.
+            Refused: The vehicle is in the air, and `force` is False.
         """
         if self.is_armed and not self.body.on_ground and not force:
             raise self._refusal("Disarming denied: not landed")
@@ -90,13 +93,14 @@ class Vehicle(VehicleBase):
             self.mode = Mode.LOITER
 
     def take_off(self, height_m: float | None = None) -> None:
-        """Take off. If the command is repeated before the vehicle lifts off, it has no further effect.
+        """Take off. A repeated command has no effect before the vehicle lifts off; with PX4, until the take-off ends.
 
         Args:
             height_m: Height above home; None for the height in the parameter.
 
         Raises:
-            Refused: The motors are off, it is flying, or the height is not allowed.
+            Refused: The motors are off, it is flying, the height is not allowed, or ArduCopter is not in mode
+                OFFBOARD.
         """
         if self.mode is Mode.TAKEOFF and (self.land_detector.has_landed or not self.firmware.is_ardupilot):
             return
@@ -113,7 +117,8 @@ class Vehicle(VehicleBase):
         """Fly to a point relative to home, and stay there.
 
         Raises:
-            Refused: It is not flying, or the point is not allowed.
+            Refused: The vehicle is not flying, or the point is outside PX4's fence. ArduCopter ignores a point
+                outside its fence.
         """
         if self.body.on_ground:
             raise self._refusal("Reposition denied: not in the air")
@@ -127,8 +132,8 @@ class Vehicle(VehicleBase):
     def accept_set_point(self, set_point: SetPoint) -> None:
         """Accept a set-point for mode OFFBOARD.
 
-        ArduCopter ignores set-points in other modes and on the ground, and positions outside its fence. An accepted
-        set-point ends a take-off.
+        ArduCopter ignores set-points in other modes and on the ground, and positions outside its fence. With
+        ArduCopter, an accepted set-point ends a take-off.
         """
         if self.firmware.is_ardupilot:
             if self.mode not in {Mode.OFFBOARD, Mode.TAKEOFF} or self.body.on_ground:
@@ -142,7 +147,8 @@ class Vehicle(VehicleBase):
         """Change the mode at the request of a client; the current mode is kept if it is requested again.
 
         Raises:
-            Refused: A condition of the mode is not met: a mission, recent set-points, or that the vehicle is flying.
+            Refused: A condition of the mode is not met: a mission, recent set-points, that the vehicle is flying, or
+                the conditions of `take_off`.
         """
         self._switch(mode)
         self.failsafes.on_mode_change(self.body.now_ns)
@@ -172,7 +178,7 @@ class Vehicle(VehicleBase):
         self._run_failsafes()
 
     def _update_boot_state(self) -> None:
-        """Set the origin once the position estimate is good; until then, report why the vehicle cannot be armed."""
+        """Set the origin once the position estimate is good. ArduPilot also reports why it cannot be armed."""
         now_ns, estimate = self.body.now_ns, self.estimate
         if self.firmware.is_ardupilot and not self.is_armed and now_ns >= self._next_prearm_ns:
             self._next_prearm_ns = now_ns + _PREARM_NS

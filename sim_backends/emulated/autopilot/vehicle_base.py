@@ -35,6 +35,7 @@ class VehicleBase:
         make_airframe: Creates the airframe at a position; None for an airframe that the autopilot itself moves.
 
     Attributes:
+        firmware: Family of its autopilot.
         body: Position and motion, relative to home.
         is_armed: True if its motors turn.
         land_detector: Its detection of take-off and landing.
@@ -44,7 +45,9 @@ class VehicleBase:
         estimate: Its position estimate.
         fence: Its fence.
         guidance: Its goal and set-points.
-        home_m: Home in the world, metres east, north, up: the point where it was armed last, or where it booted.
+        home_m: Home in the world, metres east, north, up: the point where it was armed last. Before it is first
+            armed, it is the point where the position estimate got its origin or, before that, where the drone was
+            placed.
         failsafes: Its failsafes.
         status_texts: Texts that are not sent yet; the reader clears the list.
     """

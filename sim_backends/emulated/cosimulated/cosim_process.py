@@ -48,7 +48,7 @@ _MAX_SLEEP_NS: Final = 10_000_000
 _END_NS: Final = 1 << 62
 """A simulated time that no session reaches."""
 _WINDOWS: Final = 1000
-"""Number of windows after which the record of the coordinator is cleared."""
+"""Number of windows after which the ends of the windows are deleted from the record of the coordinator."""
 _MAX_LAG_NS: Final = 1_000_000_000
 """A simulation that lags behind real time by more than this does not catch up, so that its later results are usable.
 Packets that wait during the lag are delivered late, so their repeat is void."""
@@ -147,9 +147,8 @@ class CosimulatedMedium(MediumServer):
     def _poll(self, due_ns: int | None, *, answers: bool = True) -> None:
         """Wait until a time of the monotonic clock, a packet or a request; read the packets and answer the request.
 
-        If `answers` is False, a request is left for the next call.
-
-        `Medium._wait` explains the earliest time at which the packets can have arrived.
+        The wait also ends after about 10 ms (`_MAX_SLEEP_NS`). If `answers` is False, a request is left for the next
+        call. `Medium._wait` explains the earliest time at which the packets can have arrived.
         """
         polled_ns = time.monotonic_ns()
         ready = self._epoll.poll(0)
@@ -169,7 +168,7 @@ class CosimulatedMedium(MediumServer):
                 raise _Closed
 
     def _read_port(self, port: Port) -> None:
-        """Read the packets that wait at a port."""
+        """Read the packets that wait at a port, at most `BURST`; the next call reads the others."""
         if port.backlog <= 0:
             port.backlog, port.backlog_since_ns = DEVICE_PACKETS, self._arrived_after_ns
         framing, routes = self._framing, port.routes

@@ -49,6 +49,15 @@ class CosimSession:
         policy: Name and parameters of the sync policy.
         clock: Converts between simulated time and the monotonic clock.
 
+    Attributes:
+        settings: Simulators and their settings.
+        stations: Names of all stations.
+        physics: The physics simulator, with the robots that the lab has placed.
+        network: The network.
+        builtin: The built-in network with its radio; None with another network.
+        agents: The agents, whose packets come from real programs.
+        coordinator: Advances physics and network.
+
     Raises:
         ConfigurationError: A simulator cannot be used with these settings.
         FederateError: A simulator failed, or has not answered in time.
@@ -102,7 +111,9 @@ class CosimSession:
         self._arrival_delays.pop(packet.packet_id, None)
 
     def network_delay(self, fate: Fate) -> tuple[Delay, int]:
-        """Return the parts of a packet's delay in the network, and the rest of the delay, whose parts are unknown.
+        """Return the parts of a packet's delay in the network, and the rest in ns, whose parts are unknown.
+
+        It is called at most once per packet, because the stored parts are deleted.
 
         Args:
             fate: The record of the packet's arrival.

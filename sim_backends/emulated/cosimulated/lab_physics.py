@@ -223,7 +223,7 @@ class LabPhysics:
         return states
 
     def _poll_placements(self, now_ns: int) -> None:
-        """Stop the robots that the lab has placed at another position; they are at rest there until a new command."""
+        """Stop the robots that the lab has placed since the last call; they are at rest until a new command."""
         self._polled_ns = now_ns
         for name, steering in self._steerings.items():
             state = self._physics_states.get(name)

@@ -187,6 +187,7 @@ def start_network(settings: LabSettings, states: Mapping[str, State]) -> remote.
 
     Raises:
         ConfigurationError: The program cannot be started, or does not carry the packets of real programs.
+        FederateError: The program failed, or has not answered in time.
     """
     network = remote.open_network(settings.simulators.network, _hello(settings, NETWORK, states), DEADLINE_S)
     supported_transports = network.welcome.transports

@@ -53,7 +53,8 @@ class Steering(ABC):
         idle: The command that is applied if the last command has not been repeated for `TIMEOUT_NS`.
         is_driven: True if the robot has received a command since the lab last placed it.
         is_placed: True if the lab has placed it.
-        is_at_rest: True if the last entry of its record states that it is at rest, and no command is active.
+        is_at_rest: True if the last entry of its record states that it is at rest, and no command is active; also
+            before the first command after the lab has placed it.
     """
 
     idle: Command
@@ -77,7 +78,7 @@ class Steering(ABC):
         """Return the last command of the robot's programs, or None if there is none."""
 
     def poll_placement(self, now_ns: int) -> RobotMotionState | None:
-        """Return the state of the robot, at rest, if the lab has placed it elsewhere since the last call, or None.
+        """Return the state of the robot, at rest, if the lab has placed it since the last call, or None.
 
         Earlier commands are dropped.
         """

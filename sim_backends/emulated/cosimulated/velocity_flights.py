@@ -18,7 +18,7 @@ from sim_backends.world.motion import State
 from sim_backends.world.world import World
 
 CONTROL_NS: Final = 10_000_000
-"""Maximum time between two velocities; the autopilot has the same step."""
+"""Maximum time between two velocities, unless the physics step is longer; the autopilot has the same step."""
 _TOLERANCE_M_S: Final = 0.05
 """If a measured velocity differs by more than this from the last two commanded velocities, the drone has touched
 something. Two commands are compared, because Gazebo applies a command one step after it has received it."""
@@ -104,7 +104,9 @@ class _Drone:
 
     Attributes:
         command: The last command of its autopilot; None before the first one.
-        pose: Its measured position, and the velocity, attitude and heading of the model.
+        pose: Its measured position, and the velocity, attitude and heading of the model. A component of the velocity
+            is the measured one if the drone has touched something. The heading is measured unless a heading is
+            commanded.
         is_supported: True if it rests on something.
     """
 

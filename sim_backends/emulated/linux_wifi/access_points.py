@@ -41,8 +41,11 @@ table netdev fieldkit {{
 On robots, `wireless` has the same rule with the hook `output`, which forwarded frames do not pass.
 """
 _BEACON_INTERVALS_TU: Final = (100, 101, 103, 107, 109, 113)
-"""Intervals of the beacons in time units (1024 us). They differ because mac80211_hwsim derives the times of beacons
-from one clock: beacons of equal intervals would always collide."""
+"""Intervals of the beacons in time units (1024 us); the seventh access point has the first interval again.
+
+They differ because mac80211_hwsim derives the times of beacons from one clock: beacons of equal intervals would
+always collide.
+"""
 _ENABLED: Final = "AP-ENABLED"
 _START_S: Final = 60.0
 """Timeout for the start of all access points."""

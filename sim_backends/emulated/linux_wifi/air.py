@@ -24,6 +24,7 @@ from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.radio.rate_control import RateControl
 from sim_backends.radio.wifi import Wifi
 from sim_backends.radio.world_channel import WorldChannel
+from sim_backends.world.motion import Attitude
 from sim_backends.world.world import World
 
 _FCS_BYTES: Final = 4
@@ -40,12 +41,12 @@ class FrameOnAir:
     Attributes:
         sent_frame: The frame.
         source: Name of its transmitter.
-        receiver: Name of its receiver; None for a broadcast or multicast, `""` if no radio has the address.
+        receiver: Name of its receiver; None for a broadcast or multicast, `""` if no other radio has the address.
         chain: Its tries; a broadcast or multicast has one, in the basic mode.
         attempts: Number of tries that were made.
         is_acknowledged: True if an ACK was received.
-        signal_dbm: Signal of that ACK, at the start of the try.
-        mode: Mode of the first try that a receiver decoded.
+        signal_dbm: Signal of that ACK, at the start of the try; -120 without an ACK.
+        mode: Mode of the first try that a receiver decoded; the lowest mode of 802.11g if there is none.
         decoded_try: Number of that try, from 1; 0 if no receiver has decoded the frame.
         is_final: True if its status is known.
     """
@@ -84,8 +85,8 @@ class AirEvents:
     """Events on the air since the last call of `Air.pop_events`.
 
     Attributes:
-        receptions: Frames that arrived, in order.
-        statuses: Frames whose status is known, in order.
+        receptions: Frames that arrived, in order on each channel.
+        statuses: Frames whose status became known, in order on each channel.
     """
 
     receptions: list[FrameReception] = field(default_factory=list)
@@ -165,9 +166,15 @@ class _Channel:
         self.frames: dict[PacketIdentity, FrameOnAir] = {}
         self.events = AirEvents()
 
-    def place(self, now_ns: int, positions_m: Mapping[str, Vector], velocities_m_s: Mapping[str, Vector]) -> None:
+    def place(
+        self,
+        now_ns: int,
+        positions_m: Mapping[str, Vector],
+        velocities_m_s: Mapping[str, Vector],
+        attitudes: Mapping[str, Attitude],
+    ) -> None:
         self._wifi.advance(now_ns)
-        self._gains.move(now_ns, positions_m, velocities_m_s)
+        self._gains.move(now_ns, positions_m, velocities_m_s, attitudes)
 
     def transmit(self, now_ns: int, frame: FrameOnAir) -> None:
         """Send a frame. If none of its tries is possible, its status is reported immediately."""
@@ -243,12 +250,18 @@ class Air:
         self._tuned_mhz: dict[str, int] = {}
         self._positions_m: Mapping[str, Vector] = {}
         self._velocities_m_s: Mapping[str, Vector] = {}
+        self._attitudes: Mapping[str, Attitude] = {}
 
     def place(
-        self, now_ns: int, positions_m: Mapping[str, Vector], velocities_m_s: Mapping[str, Vector] | None = None
+        self,
+        now_ns: int,
+        positions_m: Mapping[str, Vector],
+        velocities_m_s: Mapping[str, Vector] | None = None,
+        attitudes: Mapping[str, Attitude] | None = None,
     ) -> None:
         """Set the positions of the radios, metres east, north, up; radios without a position are out of range."""
         self._positions_m, self._velocities_m_s = dict(positions_m), dict(velocities_m_s or {})
+        self._attitudes = {**self._attitudes, **(attitudes or {})}
         for frequency_mhz in self._channels:
             self._place(now_ns, frequency_mhz)
 
@@ -303,4 +316,4 @@ class Air:
             if self._tuned_mhz.get(name, frequency_mhz) == frequency_mhz
         }
         velocities_m_s = {name: velocity for name, velocity in self._velocities_m_s.items() if name in positions_m}
-        self._channels[frequency_mhz].place(now_ns, positions_m, velocities_m_s)
+        self._channels[frequency_mhz].place(now_ns, positions_m, velocities_m_s, self._attitudes)

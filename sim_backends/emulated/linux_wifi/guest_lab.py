@@ -34,8 +34,8 @@ _POLL_S: Final = 0.5
 _MAX_ANSWER_BYTES: Final = 8 << 20
 _LOGIN: Final = Codec(GuestLogin)
 _SUBJECT: Final = "the lab in the virtual machine"
-_LAB: Final = "/run/lab"
-"""Folder in the machine in which the lab is started."""
+_SITE: Final = "/run/lab.yaml"
+"""Path of the lab's site file in the machine."""
 
 
 class GuestLab:
@@ -47,6 +47,10 @@ class GuestLab:
         check_alive: Raises an error if the machine has ended.
         draw: Returns the plan view for the positions of the robots.
         deadline: Time by which the lab must answer for the first time.
+
+    Attributes:
+        members: The robots by name.
+        login: The login at the robots.
 
     Raises:
         LinkError: The lab does not answer.
@@ -96,7 +100,7 @@ class GuestLab:
         return self._draw({name: self.place_m(name) for name in self.members})
 
     def lateness(self) -> None:
-        """Implement `Lab.lateness`: the lab has no co-simulation."""
+        """Implement `Lab.lateness`: None, because the lab has no co-simulation."""
         return
 
     def _state(self, name: str) -> RobotState:
@@ -137,7 +141,7 @@ def _read_login(answer: bytes) -> GuestLogin:
 
 
 def _require_connection(stream: socket.socket) -> None:
-    """Read the answer to `connect`; raise ConnectionError if it is not `CONNECTED`."""
+    """Read the answer to `connect`; raise ConnectionError, with the text of the answer, if it is not `CONNECTED`."""
     answer = stream.recv(len(CONNECTED))
     if answer != CONNECTED:
         raise ConnectionError((answer + stream.recv(4096)).decode(errors="replace") or "the robot does not answer")
@@ -188,9 +192,9 @@ def _check(machine: Machine) -> None:
 
 def _script(site: Mapping[str, object], folder: Path, seed: int) -> str:
     relay = shlex.join((*worker.command("sim_backends.emulated.linux_wifi.lab_relay"), CHANNEL, str(folder)))
-    lab = ("lab", "up", "--foreground", "--seed", str(seed), "--site", f"{_LAB}.yaml")
+    lab = ("lab", "up", "--foreground", "--seed", str(seed), "--site", _SITE)
     return (
-        f"printf %s {shlex.quote(json.dumps(site))} > {_LAB}.yaml\n"
+        f"printf %s {shlex.quote(json.dumps(site))} > {_SITE}\n"
         + guest.prologue(folder)
         + f"{relay} &\nexec {shlex.join((*worker.command('fieldkit'), *lab))}\n"
     )

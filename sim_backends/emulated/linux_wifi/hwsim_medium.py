@@ -41,7 +41,7 @@ class LinkTotals:
         tries: Tries on the air.
         reported_tries: Tries reported to the kernel, including tries in modes that the radio model does not have.
             `tx retries` of `iw` is this number minus `frames`.
-        signal_dbm: Signal of the last frame that arrived; None before the first.
+        signal_dbm: Signal of the last frame that arrived, unicast or not; None before the first.
     """
 
     frames: int = 0
@@ -72,6 +72,7 @@ class HwsimMedium:
         radios: Name of each radio in the air, by its address.
 
     Attributes:
+        air: The air.
         counts: Counts of messages.
         totals: Totals of each directed link.
     """
@@ -105,7 +106,7 @@ class HwsimMedium:
                 self._update_address(event)
 
     def replies(self, now_ns: int) -> list[bytes]:
-        """Return the messages for the kernel that are due at `now_ns`, in order."""
+        """Return the messages for the kernel that are due at `now_ns`: received frames, then reports on sent ones."""
         events = self.air.pop_events(now_ns)
         messages = [self._reception_message(reception) for reception in events.receptions]
         messages += [self._status_message(frame) for frame in events.statuses]

@@ -64,7 +64,8 @@ class RateStage:
     """One stage of a rate chain.
 
     Attributes:
-        index: Index of the rate in the list of the band, or the MCS.
+        index: Index of the rate in the list of the band; with `RATE_MCS` the MCS; with `RATE_VHT` the MCS plus 16 for
+            each stream after the first.
         tries: Number of tries.
         flags: `RATE_*`.
     """
@@ -237,7 +238,7 @@ def _sent_frame(attributes: dict[int, bytes]) -> SentFrame:
 def _stages(rates: bytes, flags: bytes) -> tuple[RateStage, ...]:
     """Return the stages of a rate chain from the attributes TX_INFO and TX_INFO_FLAGS."""
     stages = []
-    # The flags have the same order; a kernel before 4.20 does not send them.
+    # The flags have the same order; old kernels do not send them.
     all_flags = (
         [bits for _, bits in _RATE_FLAGS.iter_unpack(flags)] if len(flags) == STAGES * _RATE_FLAGS.size else []
     )

@@ -32,7 +32,8 @@ MODULES: Final = (
 )
 """Modules that the machine loads, after their dependencies.
 
-libcrc32c, on which nf_tables depends, needs crc32c_generic; ccm, cmac and gcm are the ciphers of WPA2 and WPA3.
+libcrc32c, on which nf_tables depends, needs crc32c_generic; ccm, cmac and gcm are the ciphers of WPA2 and WPA3, and
+ccm and gcm need ctr.
 """
 
 _SUFFIX: Final = ".ko"
@@ -141,7 +142,7 @@ def without_signature(module: bytes) -> bytes:
 
 
 def shared_libraries(program: Path) -> list[Path]:
-    """Return the libraries of a program, including the dynamic linker, as `ldd` lists them; empty if it is static."""
+    """Return the libraries of a program, including the dynamic linker, as `ldd` lists them; empty if it has none."""
     result = subprocess.run(("/usr/bin/ldd", program), capture_output=True, text=True, check=False, timeout=60)
     return [Path(match) for match in re.findall(r"(/\S+) \(0x", result.stdout)]
 

@@ -9,6 +9,8 @@ Requests and replies are JSON objects, one per line. The first request is `Mediu
     {"do": "place", "positions": {"r1": [0, 0, 1]}, "velocities": {}}
     {"do": "totals"}
 
+The request `place` may also have `attitudes`: the yaw, pitch and roll of radios in radians, by name (`Attitude`).
+
 It exits when the requests end. When the last descriptor of the registered socket is closed, hwsim again delivers all
 frames without loss. A supervisor therefore opens the socket with `hwsim_socket.open_registered`, keeps it open, and
 passes its descriptor with `--fd`. If the medium is then killed, no frame is delivered until a new medium is started
@@ -35,7 +37,9 @@ from sim_backends.emulated.linux_wifi.netlink import NetlinkFormatError, Netlink
 from sim_backends.emulated.medium.timerfd import Timer
 from sim_backends.radio.antennas import Antenna
 from sim_backends.radio.modes import Standard
+from sim_backends.radio.propagation.antenna_patterns import decode_pattern
 from sim_backends.radio.radio_options import RadioOptions
+from sim_backends.world.motion import Attitude
 from sim_backends.world.world import World
 
 _BURST: Final = 64
@@ -62,12 +66,14 @@ class RadioSetup(Strict):
         standard: Standard of its radio.
         tx_power_dbm: Transmit power.
         sensitivity_dbm: Received power of the weakest frame that it detects.
+        pattern: Pattern of its antenna, as `dataclasses.asdict` returns it; None if it is isotropic.
     """
 
     address: Annotated[str, AfterValidator(_radio_address)]
     standard: Standard = "802.11n"
     tx_power_dbm: Number | Int = 15
     sensitivity_dbm: Number | Int = -92
+    pattern: dict[str, Any] | None = None
 
 
 class MediumSetup(Strict):
@@ -88,7 +94,12 @@ class MediumSetup(Strict):
     def medium(self) -> HwsimMedium:
         """Return the medium of this setup."""
         antennas = {
-            name: Antenna(radio.standard, float(radio.tx_power_dbm), float(radio.sensitivity_dbm))
+            name: Antenna(
+                radio.standard,
+                float(radio.tx_power_dbm),
+                float(radio.sensitivity_dbm),
+                pattern=None if radio.pattern is None else decode_pattern(radio.pattern),
+            )
             for name, radio in self.radios.items()
         }
         addresses = {
@@ -122,7 +133,8 @@ class RequestLines:
         fd: The descriptor.
 
     Attributes:
-        is_at_end: True if there are no more lines.
+        fd: The descriptor.
+        is_at_end: True if there is no more data.
     """
 
     def __init__(self, fd: int) -> None:
@@ -131,7 +143,7 @@ class RequestLines:
         self._buffer = b""
 
     def read(self) -> Iterator[bytes]:
-        """Wait for data, read once, and yield the complete lines.
+        """Wait for data, read once, and yield the complete lines; an incomplete line at the end is not yielded.
 
         Raises:
             ValueError: A line is too long.
@@ -192,7 +204,10 @@ def _receive(kernel: KernelSocket, medium: HwsimMedium | None, now_ns: int) -> N
 def _answer(
     medium: HwsimMedium | None, kernel: KernelSocket, line: bytes
 ) -> tuple[HwsimMedium | None, dict[str, Any]]:
-    """Return the medium after a request, and the reply; an invalid request changes nothing."""
+    """Return the medium after a request (None before a valid first request), and the reply.
+
+    An invalid request changes nothing.
+    """
     try:
         request = json.loads(line)
         if medium is None:
@@ -201,7 +216,8 @@ def _answer(
             case "place":
                 positions_m = {str(name): _vector(position_m) for name, position_m in request["positions"].items()}
                 velocities_m_s = {str(name): _vector(value) for name, value in request["velocities"].items()}
-                medium.air.place(time.monotonic_ns(), positions_m, velocities_m_s)
+                attitudes = {name: Attitude(*_vector(rad)) for name, rad in request.get("attitudes", {}).items()}
+                medium.air.place(time.monotonic_ns(), positions_m, velocities_m_s, attitudes)
                 return medium, {}
             case "totals":
                 links = [

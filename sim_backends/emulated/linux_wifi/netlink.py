@@ -1,8 +1,8 @@
 """Netlink messages in the generic netlink format, and a socket of one family.
 
 Formats: `include/uapi/linux/netlink.h` and `genetlink.h` of Linux; RFC 3549, section 2. Numbers are in the byte order
-of the host. The codec is written here because the medium needs four messages of one family: pyroute2, the maintained
-library, has no codec for this family, and would be a dependency of a program that runs inside of a virtual machine.
+of the host. The codec is written here because the medium needs few messages of one family, and a library such as
+pyroute2 would be a dependency of a program that runs inside of a virtual machine.
 """
 
 import errno
@@ -38,9 +38,9 @@ _SO_RCVBUFFORCE: Final = 33
 _TIMEOUT_S: Final = 60.0
 """Timeout of the request for the identifier of the family."""
 _FIRST_PORT: Final = 1 << 30
-"""Lowest port number that is above all process identifiers. The kernel uses the process identifier as port number of
-other netlink sockets, which for example `getaddrinfo` opens. hwsim ends the registration when any netlink socket with
-the same port number is closed."""
+"""Added to the process identifier to get a port number above all process identifiers (below 2^22). The kernel uses
+the process identifier as port number of other netlink sockets, which for example `getaddrinfo` opens. hwsim ends the
+registration when any netlink socket with the same port number is closed."""
 
 
 class NetlinkFormatError(ValueError):
@@ -64,7 +64,7 @@ class NetlinkMessage:
     payload: bytes
 
     def encode(self) -> bytes:
-        """Return the message with header and padding; its port number is 0, which the kernel replaces."""
+        """Return the message with header and padding. Its port number is 0, because the kernel uses the socket's."""
         size = _MESSAGE.size + len(self.payload)
         return _pad(_MESSAGE.pack(size, self.type, self.flags, self.sequence, 0) + self.payload)
 
@@ -84,7 +84,8 @@ def decode_messages(datagram: bytes) -> Iterator[NetlinkMessage]:
     """Yield the messages of a datagram.
 
     Raises:
-        NetlinkFormatError: A length exceeds the datagram, or is smaller than a header.
+        NetlinkFormatError: A length exceeds the datagram or is smaller than a header, or the datagram ends within a
+            header.
     """
     offset = 0
     while offset < len(datagram):
@@ -117,10 +118,13 @@ def encode_generic(command: int, version: int, attributes: Mapping[int, bytes]) 
 
 
 def decode_generic(payload: bytes) -> tuple[int, dict[int, bytes]]:
-    """Return the command and the attributes of a generic netlink message; a repeated attribute replaces the first.
+    """Return the command of a generic netlink message, and the value of each attribute by its type without flags.
+
+    If a type is repeated, its last value is returned.
 
     Raises:
-        NetlinkFormatError: A length exceeds the message, or is smaller than a header.
+        NetlinkFormatError: A length exceeds the message or is smaller than a header, or the message ends within its
+            header.
     """
     if len(payload) < _GENERIC.size:
         raise NetlinkFormatError(f"a generic message has {len(payload)} bytes, fewer than {_GENERIC.size}")
@@ -147,7 +151,7 @@ def family_identifier(name: str, reply: NetlinkMessage) -> int:
     """Return the identifier of a family from the reply to `family_request`.
 
     Raises:
-        ConfigurationError: The kernel does not have the family.
+        ConfigurationError: The reply is an error, because the kernel does not have the family.
         NetlinkFormatError: The message is not a reply to this request.
     """
     if reply.type == NLMSG_ERROR:
@@ -169,12 +173,14 @@ class FamilySocket:
         fd: Descriptor of a socket that another process has opened and bound; None to open one.
 
     Attributes:
-        overruns: Number of times that the kernel dropped messages because the socket was full.
-        foreign: Number of received datagrams that were not sent by the kernel; they are ignored.
+        overruns: Number of times that the kernel reported to `receive` that it dropped messages because the socket
+            was full.
+        foreign: Number of datagrams in `receive` that were not sent by the kernel; they are ignored.
 
     Raises:
         ConfigurationError: The kernel does not have the family.
-        OSError: The socket cannot be opened.
+        NetlinkFormatError: The kernel sent bytes that are not messages.
+        OSError: The socket cannot be opened, or the kernel did not answer in time.
     """
 
     def __init__(self, name: str, fd: int | None = None) -> None:

@@ -20,7 +20,7 @@ _RADIO_BIT: Final = 0x40
 _ARPHRD_IEEE80211_RADIOTAP: Final = "803"
 """Type of a monitor interface: linux/if_arp.h."""
 _RETURN_S: Final = 5.0
-"""Maximum time in which the kernel returns the radios of a network namespace, after its last process has exited."""
+"""Default wait until the kernel has moved the radios of a lab back, after the last process of the lab has exited."""
 _POLL_S: Final = 0.05
 _TIMEOUT_S: Final = 60.0
 """Timeout of `iw`."""
@@ -34,7 +34,7 @@ class HwsimRadio:
         phy: Name of its device, `phy0`.
         interface: Name of its network interface, `wlan0`.
         address: Address that identifies it in hwsim; it differs in one bit from the address of the interface.
-        monitors: Names of monitor interfaces that an earlier lab has left.
+        monitors: Names of its monitor interfaces, for example those that an earlier lab has left.
     """
 
     phy: str
@@ -43,7 +43,9 @@ class HwsimRadio:
     monitors: tuple[str, ...] = ()
 
     def move_to_namespace(self, pid: int) -> None:
-        """Move the radio into the network namespace of a process; the kernel moves it back when the namespace ends.
+        """Delete the monitor interfaces, and move the radio into the network namespace of a process.
+
+        When that namespace ends, the kernel moves the radio to the initial network namespace.
 
         Raises:
             RobotError: The kernel refused the move.
@@ -61,7 +63,9 @@ class HwsimRadio:
 
 
 def find_radios(folder: Path = _FOLDER) -> list[HwsimRadio]:
-    """Return the radios of hwsim in this network namespace that have an interface, in the order of their numbers.
+    """Return the radios of hwsim in this network namespace, in the order of their numbers.
+
+    A radio without an interface, or with monitor interfaces only, is omitted.
 
     Args:
         folder: Folder of the kernel's wireless devices.
@@ -81,7 +85,7 @@ def find_radios(folder: Path = _FOLDER) -> list[HwsimRadio]:
 
 
 def can_use_radios() -> bool:
-    """Return True if this process can use radios of hwsim: it is root, and the kernel has the module."""
+    """Return True if this process can use radios of hwsim: it is root, and the module is loaded."""
     return os.geteuid() == 0 and _MODULE.exists()
 
 

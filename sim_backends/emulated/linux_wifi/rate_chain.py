@@ -1,11 +1,13 @@
 """Rate chains of mac80211: the mode of each try of a frame, and the number of tries in each stage.
 
-The radio model has 802.11g and the modes of 802.11n with one stream in 20 MHz. Stages in other modes are mapped:
+The radio model has the modes of 802.11g (6 to 54 Mbit/s), and MCS 0 to 7 of 802.11n with one stream, in 20 MHz with
+the long guard interval. Stages in other modes are mapped or skipped:
 
 - DSSS and CCK (802.11b) have the airtime and the robustness of 6 Mbit/s.
 - A short guard interval counts as a long one.
-- Two or more streams, 40 MHz and wider, and modes of 802.11ac above MCS 7 are never tried: they fail without airtime,
-  so minstrel_ht avoids them, as on a radio with one antenna.
+- MCS 0 to 7 of 802.11ac with one stream in 20 MHz count as those of 802.11n.
+- Two or more streams, 40 MHz and wider, and modes of 802.11ac above MCS 7 are skipped: they are reported as failed
+  tries without airtime, so minstrel_ht avoids them, as on a radio with one antenna.
 """
 
 from collections import Counter
@@ -35,30 +37,41 @@ class RateChain:
     """The tries of a frame.
 
     Attributes:
-        modes: Mode of each try.
-        stages: For each try, the number of its stage.
+        modes: Mode of each try on the air; empty if all stages are skipped.
+        stages: For each try on the air, the index of its stage in the chain.
         is_skipped: For each stage, True if its mode is not in the radio model.
-        max_tries: For each stage, the number of tries that the chain has for it.
+        stage_tries: For each stage, the number of tries that mac80211 requested, at least 1.
     """
 
     modes: tuple[WifiMode, ...]
     stages: tuple[int, ...]
     is_skipped: tuple[bool, ...]
-    max_tries: tuple[int, ...]
+    stage_tries: tuple[int, ...]
 
     def tries_made(self, attempts: int) -> list[int]:
-        """Return the number of tries in each stage, after this number of attempts on the air.
+        """Return the number of tries in each stage, up to the stage of the last attempt on the air.
 
-        Skipped stages before the last attempt count as tried and failed. If no stage is in the radio model, all
-        stages count as tried and failed.
+        Skipped stages count with all their tries. With 0 attempts the list has all stages of the chain; this is the
+        result for a chain whose stages are all skipped.
+
+        Args:
+            attempts: Number of attempts on the air, at most the length of `modes`.
         """
         last_stage = self.stages[attempts - 1] if attempts else len(self.is_skipped) - 1
         on_air = Counter(self.stages[:attempts])
-        return [self.max_tries[stage] if self.is_skipped[stage] else on_air[stage] for stage in range(last_stage + 1)]
+        return [
+            self.stage_tries[stage] if self.is_skipped[stage] else on_air[stage] for stage in range(last_stage + 1)
+        ]
 
 
 def rate_chain(stages: Sequence[RateStage], frequency_mhz: int, *, max_tries: int = SHORT_RETRY_LIMIT) -> RateChain:
-    """Return the tries of a chain of stages, at most `max_tries`; without stages, one try in the basic mode."""
+    """Return the tries of a chain of stages.
+
+    Args:
+        stages: The stages; without stages the chain has one try at 6 Mbit/s.
+        frequency_mhz: Frequency of the channel.
+        max_tries: Maximum number of tries on the air; later tries are omitted.
+    """
     used_stages = list(stages) or [RateStage(0, 1)]
     modes: list[WifiMode] = []
     numbers: list[int] = []
@@ -70,8 +83,8 @@ def rate_chain(stages: Sequence[RateStage], frequency_mhz: int, *, max_tries: in
             tries = min(max(stage.tries, 1), max_tries - len(modes))
             modes += [mode] * tries
             numbers += [number] * tries
-    max_stage_tries = tuple(max(stage.tries, 1) for stage in used_stages)
-    return RateChain(tuple(modes), tuple(numbers), tuple(is_skipped), max_stage_tries)
+    stage_tries = tuple(max(stage.tries, 1) for stage in used_stages)
+    return RateChain(tuple(modes), tuple(numbers), tuple(is_skipped), stage_tries)
 
 
 def mode_of(stage: RateStage, frequency_mhz: int) -> WifiMode | None:
@@ -89,7 +102,7 @@ def mode_of(stage: RateStage, frequency_mhz: int) -> WifiMode | None:
 
 
 def legacy_index(mode: WifiMode, frequency_mhz: int) -> int:
-    """Return the index of a mode in the band's list of rates, which has no MCS (legacy rates).
+    """Return the index of a mode in the list of the band's legacy rates (those without an MCS).
 
     For an MCS this is the index of the rate with the same modulation and code rate, or of the fastest rate if no rate
     has them.

@@ -24,9 +24,13 @@ _MAX_PENDING: Final = 2048
 
 
 class _ChannelStream:
-    """One stream: a socket pair, and the data of received frames (empty at the end of the stream).
+    """One stream of the channel.
 
-    The user of the stream reads and writes the near end, and the threads of the channel the far end.
+    Attributes:
+        near: End of a socket pair that the user of the stream reads and writes.
+        far: Other end of the pair, which the threads of the channel read and write.
+        frames: Data of received frames; b"" at the end of the stream.
+        open_directions: Number of directions that have not ended.
     """
 
     def __init__(self) -> None:
@@ -41,6 +45,9 @@ class ChannelStreams:
     Args:
         descriptor: Descriptor of the channel.
         accept: Called in a new thread with the socket of each stream that the other side opens; None to accept none.
+
+    Attributes:
+        has_ended: True if the channel has ended.
     """
 
     def __init__(self, descriptor: int, accept: Callable[[socket.socket], None] | None = None) -> None:
@@ -88,7 +95,10 @@ class ChannelStreams:
                     stream.frames.put_nowait(b"")
 
     def _receive(self, number: int, kind: int, data: bytes) -> None:
-        """Handle a frame of the other side: it opens a stream, has data for one, or ends one."""
+        """Handle a frame of the other side: it opens a stream, has data for one, or ends one.
+
+        Frames of unknown streams, and streams beyond the limit, are ignored.
+        """
         with self._lock:
             stream = self._streams.get(number)
             if kind == _OPEN and stream is None and self._accept is not None and len(self._streams) < _MAX_STREAMS:

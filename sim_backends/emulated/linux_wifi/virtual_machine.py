@@ -65,7 +65,8 @@ _KERNEL_OPTIONS: Final = (
 _INSTRUCTION_CLOCK: Final = "fieldkit.clock=instructions"
 """Kernel option that marks a machine whose clock counts instructions."""
 _EMULATED_PROCESSOR: Final = "Nehalem"
-"""The first processor with all instructions that numpy needs. Later ones, for example with AVX2, are slower."""
+"""The oldest processor of QEMU with all instructions that numpy needs. Emulation of newer ones, for example with
+AVX2, is slower."""
 _NS_PER_INSTRUCTION_EXPONENT: Final = 1
 """An emulated instruction takes 2^1 ns: 500 million instructions per second, like a slow processor."""
 
@@ -89,7 +90,7 @@ class JobResult:
 
     Attributes:
         code: Exit code.
-        output: Standard output and standard error.
+        output: Standard output and standard error; at most the last 16 MiB.
     """
 
     code: int
@@ -97,7 +98,7 @@ class JobResult:
 
 
 def kernel_roots() -> tuple[Path, ...]:
-    """Return the folders with `boot/`, `lib/modules/` and programs: the folder in `ROOT_VARIABLE`, and `/`."""
+    """Return the folders with `boot/`, `lib/modules/` and programs: the folder in `ROOT_VARIABLE` if set, and `/`."""
     packages_folder = os.environ.get(ROOT_VARIABLE)
     return (Path(packages_folder).absolute(), Path("/")) if packages_folder else (Path("/"),)
 
@@ -109,7 +110,10 @@ def find_program(name: str, roots: Sequence[Path]) -> str | None:
 
 
 def find_kernel(roots: Sequence[Path] = (Path("/"),)) -> Kernel | None:
-    """Return the newest kernel with hwsim in `boot/` and `lib/modules/` of the first folder that has one, or None."""
+    """Return the newest kernel with hwsim of the first folder that has one in `boot/` and `lib/modules/`, or None.
+
+    A kernel whose modules are compressed is not found.
+    """
     for root in roots:
         for image in sorted(root.glob("boot/vmlinuz-*"), key=_version, reverse=True):
             modules = root / "lib/modules" / image.name.removeprefix("vmlinuz-")
@@ -121,7 +125,8 @@ def find_kernel(roots: Sequence[Path] = (Path("/"),)) -> Kernel | None:
 def uncompressed_kernel(image: bytes) -> bytes:
     """Return the ELF file in a boot image (Linux, Documentation/arch/x86/boot.rst), which QEMU boots by PVH.
 
-    The machine would need seconds to decompress it. An image with a compression other than xz is returned as it is.
+    The machine would need seconds to decompress it. An image with a compression other than xz, or without a header,
+    is returned unchanged.
     """
     if len(image) < _BOOT_HEADER_END or image[_BOOT_MAGIC_OFFSET:][:4] != b"HdrS":
         return image
@@ -177,10 +182,10 @@ class Machine:
 
         Args:
             deadline: Time by which the machine must have switched off.
-            on_output: Called with new output of the script.
+            on_output: Called several times per second with the new output of the script, which may be empty.
 
         Raises:
-            TestbedLostError: The machine did not run the script to its end before the deadline.
+            TestbedLostError: The machine ended before its script, or did not switch off before the deadline.
             KeyboardInterrupt: A second KeyboardInterrupt arrived.
         """
         is_interrupted = False
@@ -212,13 +217,16 @@ class Machine:
         return data
 
     def lost_error(self, cause: str) -> TestbedLostError:
-        """Return the error for a machine that cannot be used, with the last line of its output."""
+        """Return the error for a machine that cannot be used.
+
+        It has the last line of the script's output; if there is none, that of the console, or of QEMU's errors.
+        """
         texts = [_read_text(self._folder / name).strip() for name in (f"shared/{_OUTPUT}", "console", "errors")]
         last_line = next((text.rsplit("\n", 1)[-1] for text in texts if text), "")
         return TestbedLostError(
             f"{cause}; its last output: {last_line}" if last_line else cause,
             where="the virtual machine with Linux's Wi-Fi",
-            remedy="run it on a machine that is less busy, or that has KVM",
+            remedy="use a host that is less busy, or that has KVM",
         )
 
     def _has_ended(self, timeout_s: float, *, is_interrupted: bool) -> bool:
@@ -247,14 +255,14 @@ def started_machine(
 ) -> Iterator[Machine]:
     """Yield a new machine that runs a shell script as root; leaving the context ends it.
 
-    The machine also ends with this process, even if this process is killed. Its changes to files of the host are
-    lost, except those below `results`.
+    The machine also ends with the calling thread, even if this process is killed. Its changes to files of the host
+    are lost, except those below `results`.
 
     Args:
         kernel: Kernel of the machine.
         script: The script.
         radios: Number of radios of hwsim.
-        memory_mib: Memory of the machine.
+        memory_mib: Memory of the machine in MiB.
         results: An existing folder of the host in which the machine writes files, or None.
         channel: A stream socket that becomes the device `CHANNEL` in the machine, or None.
 

@@ -1,6 +1,7 @@
 """The lab's client of the medium of mac80211_hwsim: it has the socket that is registered with the kernel."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from types import MappingProxyType
 from typing import Any
 
@@ -17,6 +18,7 @@ from sim_backends.emulated.robot.spec import WifiSpec
 from sim_backends.radio.antennas import antenna_of
 from sim_backends.radio.infrastructure.infrastructure import station_place_m
 from sim_backends.radio.radio_options import RadioOptions
+from sim_backends.world.motion import Attitude
 from sim_backends.world.world import World
 
 
@@ -24,7 +26,8 @@ class WifiClient(MediumClient):
     """Starts the medium of the simulated radios (hwsim), and access points that are not robots.
 
     Arguments that are not described are those of `MediumClient`. This object keeps the registered socket open. If the
-    medium is killed or suspended, no frame is delivered.
+    medium is killed or suspended, no frame is delivered. After `place`, `robot_names` also has the names of the
+    access points.
 
     Args:
         radios: Radio of each robot and access point, by its name.
@@ -79,6 +82,9 @@ class WifiClient(MediumClient):
             "tx_power_dbm": antenna.tx_power_dbm,
             "sensitivity_dbm": antenna.sensitivity_dbm,
         }
+        if antenna.pattern is not None:
+            self._has_patterns = True
+            self._setups[name]["pattern"] = asdict(antenna.pattern)
         self._robots.add(name)
 
     @override
@@ -88,15 +94,17 @@ class WifiClient(MediumClient):
         *,
         relay: str | None = None,
         velocities_m_s: Mapping[str, Vector] = MappingProxyType({}),
+        attitudes: Mapping[str, Attitude] = MappingProxyType({}),
     ) -> None:
         """Implement `MediumClient.place`; access points that are not robots keep their positions in the site file."""
         self._robots |= self._access_points_m.keys()
-        super().place({**self._access_points_m, **positions_m}, relay=relay, velocities_m_s=velocities_m_s)
+        positions_m = {**self._access_points_m, **positions_m}
+        super().place(positions_m, relay=relay, velocities_m_s=velocities_m_s, attitudes=attitudes)
 
     @override
     def _configure(self) -> None:
-        # Access points have the radio of the first robot, except for the transmit power.
-        robot_setup = next(iter(self._setups.values()))
+        # Access points have the radio of the first robot, except for the transmit power and the antenna.
+        robot_setup = {**next(iter(self._setups.values())), "pattern": None}
         for name, access_point in self._options.access_points.items():
             power_dbm = float(access_point.tx_power_dbm)
             self._setups[name] = {**robot_setup, "address": self._radios[name].address, "tx_power_dbm": power_dbm}

@@ -13,7 +13,8 @@ NO_ROBOT: Final = ""
 """Value of the receiver of a packet if no robot has the destination address."""
 
 Routes = Mapping[bytes, str | None]
-"""Robot per destination address, None for broadcast; empty for a robot that is not placed."""
+"""Robot per destination address (IPv4, or MAC with Ethernet framing), None for IPv4 broadcast; empty for a robot that
+can reach no other robot."""
 
 _ETHERNET_BYTES: Final = 14
 _IPV4_TYPE: Final = b"\x08\x00"
@@ -32,8 +33,10 @@ class Framing:
         name: `ip` or `ethernet`.
         header_bytes: Length of the header before the packet; on the air the radio's MAC header replaces it.
         carries: Returns True if the radio carries this packet; raises IndexError if it is empty.
-        destination: Returns the receiver of this hop, None for broadcast, `NO_ROBOT` if no robot has the address.
-        routes: Returns the routes of a robot to others, by destination address.
+        destination: Returns the receiver of this hop; None for broadcast and multicast; `NO_ROBOT` if no robot has
+            the address, or if there are no routes.
+        routes: Returns the routes of a robot; its arguments are the robot's address, and the addresses of the robots
+            that it can reach, by name.
     """
 
     name: str

@@ -7,6 +7,7 @@ from types import MappingProxyType
 
 from fieldkit.core.model import Vector
 from sim_backends.emulated.medium.medium_client import MediumClient
+from sim_backends.world.motion import Attitude
 
 
 @dataclass(frozen=True)
@@ -31,21 +32,28 @@ class Media:
         *,
         relay: str | None = None,
         velocities_m_s: Mapping[str, Vector] = MappingProxyType({}),
+        attitudes: Mapping[str, Attitude] = MappingProxyType({}),
     ) -> None:
-        """Place the robots in all media. Only the radio under test has a relay.
+        """Place the robots in the medium of the radio, and in the medium of each link to which they are attached.
+
+        Only the radio under test has a relay.
 
         Arguments and errors are those of `MediumClient.place`.
         """
-        self.radio.place(positions_m, relay=relay, velocities_m_s=velocities_m_s)
+        self.radio.place(positions_m, relay=relay, velocities_m_s=velocities_m_s, attitudes=attitudes)
         for medium in self.links.values():
             attached_m = {name: position_m for name, position_m in positions_m.items() if name in medium.robot_names}
             medium.place(
                 attached_m,
                 velocities_m_s={name: velocities_m_s[name] for name in attached_m if name in velocities_m_s},
+                attitudes={name: attitudes[name] for name in attached_m if name in attitudes},
             )
 
     def lateness_counts(self) -> Mapping[int, int]:
-        """Return the number of packets of all media by lateness in ns. Raises the errors of `MediumClient.stats`."""
+        """Return the number of packets of all media by lateness in ns, rounded as in `MediumStats`.
+
+        Raises the errors of `MediumClient.stats`.
+        """
         counts: Counter[int] = Counter()
         for medium in (self.radio, *self.links.values()):
             counts.update(medium.stats().packet_lateness_counts)

@@ -16,6 +16,7 @@ from sim_backends.emulated.medium.ports import MediumStats, unpack_links, unpack
 from sim_backends.emulated.process.worker import Worker
 from sim_backends.radio.antennas import antenna_of
 from sim_backends.radio.radio_options import RadioOptions
+from sim_backends.world.motion import Attitude
 from sim_backends.world.world import World
 
 
@@ -45,6 +46,7 @@ class MediumClient:
         self._options = options
         self._world = world
         self._is_configured = False
+        self._has_patterns = False
         self._words = str(seed), framing.name
         self._worker = self._start()
         self._robots: set[str] = set()
@@ -65,7 +67,7 @@ class MediumClient:
 
     @property
     def robot_names(self) -> Set[str]:
-        """Names of the attached robots."""
+        """Names of the attached robots; with Linux Wi-Fi also those of the access points, after `place`."""
         return self._robots
 
     def attach(
@@ -92,9 +94,10 @@ class MediumClient:
             LinkError: The medium process exited or did not answer.
             RobotError: A robot with this name or address is already attached.
         """
-        antenna = asdict(antenna_of(radio))
+        antenna = antenna_of(radio)
+        self._has_patterns |= antenna.pattern is not None
         self._worker.request(
-            {"do": "attach", "name": name, "address": address, "antenna": antenna},
+            {"do": "attach", "name": name, "address": address, "antenna": asdict(antenna)},
             descriptors=[] if fd is None else [fd],
         )
         self._robots.add(name)
@@ -105,6 +108,7 @@ class MediumClient:
         *,
         relay: str | None = None,
         velocities_m_s: Mapping[str, Vector] = MappingProxyType({}),
+        attitudes: Mapping[str, Attitude] = MappingProxyType({}),
     ) -> None:
         """Place the robots; later packets cross the obstacles between these positions.
 
@@ -115,6 +119,7 @@ class MediumClient:
             positions_m: Position of each antenna, metres east, north, up. Robots that are not named are off the air.
             relay: The robot whose access point relays between the others; None if they communicate directly.
             velocities_m_s: Velocities, metres per second east, north, up; 0 for robots that are not named.
+            attitudes: Attitudes of robots, which matter if an antenna has a pattern; the others keep theirs.
 
         Raises:
             ConfigurationError: A named robot is not attached, or the relay has no position.
@@ -130,8 +135,10 @@ class MediumClient:
         if not self._is_configured:
             self._configure()
             self._is_configured = True
-        velocities = dict(velocities_m_s)
-        self._worker.request({"do": "place", "positions": positions_m, "relay": relay, "velocities": velocities})
+        message = {"do": "place", "positions": positions_m, "relay": relay, "velocities": dict(velocities_m_s)}
+        if self._has_patterns:
+            message["attitudes"] = dict(attitudes)
+        self._worker.request(message)
 
     def _configure(self) -> None:
         world = None if self._world is None else self._world.model_dump(mode="json")
@@ -145,8 +152,8 @@ class MediumClient:
             OSError: The files cannot be created.
         """
         with ExitStack() as stack:
-            names = () if folder is None else (folder / air_log.PCAP, folder / air_log.CSV)
-            files = [stack.enter_context(name.open("wb")) for name in names]
+            paths = () if folder is None else (folder / air_log.PCAP, folder / air_log.CSV)
+            files = [stack.enter_context(path.open("wb")) for path in paths]
             self._worker.request({"do": "record"}, descriptors=[file.fileno() for file in files])
 
     def stats(self) -> MediumStats:

@@ -22,7 +22,8 @@ FlowKey = bytes
 class FlowDelays:
     """Sums of the delays of each requested flow since the first request for it.
 
-    For other flows the cost is one lookup in `delays_by_flow`, which is empty until the first request.
+    `delays_by_flow` is empty until the first request. Until then the medium saves the calls of `note_first_fragment`
+    and `count`.
 
     Attributes:
         delays_by_flow: Sum of the delays of each requested flow.
@@ -30,7 +31,7 @@ class FlowDelays:
 
     def __init__(self) -> None:
         self.delays_by_flow: dict[FlowKey, Delay] = {}
-        # Only the first fragment has a port: it maps the identification of its datagram to the flow.
+        # Flow of each fragmented datagram, by the datagram's identification: only the first fragment has the port.
         self._datagrams: dict[bytes, FlowKey] = {}
 
     def delay_parts(self, source: IPv4Address, destination: IPv4Address, protocol: int, port: int) -> DelayParts:
@@ -61,6 +62,7 @@ class FlowDelays:
     def count(self, packet: bytes, delay: Delay, receiver: bytes) -> None:
         """Add the delay of a packet that crossed the radio, if its flow was requested.
 
+        The flow of a later fragment is known only if `note_first_fragment` stored it.
         The packet is counted if `receiver`, an address, is its destination. Any other receiver forwards it: the delay
         of that hop is added, even if the packet is lost on a later hop. A `Delay` contains the packet count;
         subtracting `PACKET` adds the delay without counting the packet.
@@ -93,7 +95,8 @@ class PortCounters:
         delivered_packets: Packets delivered to the robot.
         refused_packets: Packets that arrived but that the robot's kernel refused.
         unroutable_packets: Packets to an address that no robot has, or from or to a robot that is off the air.
-        other_packets: Packets of other protocols than IPv4, which a medium of bare IP packets does not carry.
+        other_packets: Packets that the medium does not carry: with IP framing those of other protocols than IPv4,
+            with Ethernet framing those that are shorter than an Ethernet header.
     """
 
     sent_packets: int
@@ -168,7 +171,7 @@ def unpack_links(message: Message) -> dict[str, list[LinkSample]]:
 
 
 def round_up(late_ns: int) -> int:
-    """Return the smallest number above `late_ns` with at most 4 significant bits; above 8 ns at most 1/8 larger."""
+    """Return the smallest number above `late_ns` with at most 4 significant bits; from 8 ns on at most 1/8 larger."""
     shift = late_ns.bit_length() - _KEPT_BITS
     return late_ns + 1 if shift <= 0 else ((late_ns >> shift) + 1) << shift
 
@@ -180,6 +183,14 @@ class Port:
         name: Name of the robot.
         address: Its address.
         fd: Descriptor of the device.
+
+    Attributes:
+        backlog: Number of packets in the device that may have waited since `backlog_since_ns`.
+        backlog_since_ns: Earliest time at which these packets can have arrived.
+        delays: Sum of the delays of the packets that were written to the device, by the robot that sent them.
+        routes: Routes to the other robots (`framing.Routes`).
+
+    The other attributes are those of `PortCounters`.
     """
 
     def __init__(self, name: str, address: IPv4Interface, fd: int) -> None:
@@ -190,11 +201,8 @@ class Port:
         self.refused_packets = 0
         self.unroutable_packets = 0
         self.other_packets = 0
-        # Number of packets in the device that may have waited since `backlog_since_ns`.
         self.backlog = 0
         self.backlog_since_ns = 0
-        # Delays of the written packets, by the robot that sent them. `refused_packets` counts packets that were not
-        # written.
         self.delays: defaultdict[str, Delay] = defaultdict(int)
         self.routes: Routes = {}
 

@@ -30,7 +30,7 @@ from sim_backends.radio.fixed_links import UniformLinks
 from sim_backends.radio.links import PACKET, LinkCounters, Pair, processing_ns
 from sim_backends.radio.model import RadioModel, WifiInWorld
 
-# Maximum sleep of the medium. If it sleeps longer, packets may have waited for the additional time.
+# Timeout of a poll. If the process sleeps longer, packets may have waited for the additional time.
 _MAX_SLEEP_NS: Final = 10_000_000
 
 
@@ -124,7 +124,7 @@ class Medium(MediumServer):
         port.backlog -= BURST
 
     def _deliver(self) -> None:
-        """Write arrived packets to the robots, and set the timer to the next arrival."""
+        """Write arrived packets to the robots, and set the timer to the next event of the model."""
         now_ns = time.monotonic_ns()
         deliveries = self._model.deliveries(now_ns)
         if deliveries:
@@ -160,7 +160,8 @@ class Medium(MediumServer):
             )
             self._model.use_meter()
             self._model.log_attempts(None if self._air_log is None else self._air_log.write)
-        self._model.place(time.monotonic_ns(), positions_m, relay, self._layout.velocities_m_s)
+        layout = self._layout
+        self._model.place(time.monotonic_ns(), positions_m, relay, layout.velocities_m_s, layout.attitudes)
 
     def _new_model(self) -> RadioModel[bytes]:
         if self._options.is_fixed:

@@ -27,6 +27,7 @@ from sim_backends.radio.antennas import Antenna, decode_antenna
 from sim_backends.radio.frames import TransmissionAttempt
 from sim_backends.radio.links import LinkCounters, Pair
 from sim_backends.radio.radio_options import RadioOptions
+from sim_backends.world.motion import Attitude
 from sim_backends.world.world import World
 
 BURST: Final = 64
@@ -54,12 +55,14 @@ class Layout:
 
     Attributes:
         positions_m: Position of each robot, metres east, north, up; empty before the first request.
-        velocities_m_s: Velocity of each robot.
+        velocities_m_s: Velocity of each robot, metres per second east, north, up; at rest without an entry.
+        attitudes: Attitude of each robot; empty if no antenna has a pattern.
         relay: The robot whose access point relays between the others; None if they communicate directly.
     """
 
     positions_m: dict[str, Vector] = field(default_factory=dict)
     velocities_m_s: dict[str, Vector] = field(default_factory=dict)
+    attitudes: dict[str, Attitude] = field(default_factory=dict)
     relay: str | None = None
 
     @classmethod
@@ -67,7 +70,8 @@ class Layout:
         """Return the layout from a request to place the robots."""
         positions_m = {name: tuple(position_m) for name, position_m in message["positions"].items()}
         velocities_m_s = {name: tuple(velocity) for name, velocity in message["velocities"].items()}
-        return cls(positions_m, velocities_m_s, message["relay"])
+        attitudes = {name: Attitude(*angles_rad) for name, angles_rad in message.get("attitudes", {}).items()}
+        return cls(positions_m, velocities_m_s, attitudes, message["relay"])
 
 
 class MediumServer(ABC):
@@ -184,7 +188,7 @@ class MediumServer(ABC):
         return {self._by_fd[fd].name for fd, events in self._writable.poll(0) if events & select.EPOLLOUT}
 
     def _update_interfaces(self) -> None:
-        """Update the set of robots on the air from the state of their interfaces."""
+        """Poll the robots' interfaces; if the robots on the air have changed, place the robots again."""
         on_air = self._robots_with_interface_up()
         if on_air != self._on_air_robots and self._layout.positions_m:
             self._on_air_robots = on_air
@@ -249,7 +253,9 @@ class MediumServer(ABC):
 
 
 def _raise_priority() -> str:
-    """Request the lowest real-time priority, so that other processes delay no packet; return the result as text.
+    """Request the lowest real-time priority, and return the result as text.
+
+    With this priority, no process of normal priority delays a packet.
 
     If the medium uses all time of its core, the kernel pauses it for 50 ms in each second (sched_rt_runtime_us),
     which increases the lateness.

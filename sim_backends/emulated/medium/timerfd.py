@@ -29,6 +29,9 @@ class Timer:
     The timeout of epoll has a resolution of 1 ms, which is too coarse for the delay of a link. Setting the timer
     makes the descriptor unreadable again, so with EPOLLET the descriptor need not be read.
 
+    Attributes:
+        fd: The descriptor.
+
     Raises:
         OSError: The kernel cannot create a timer.
     """

@@ -20,7 +20,7 @@ _AS_ROOT_INSIDE: Final = ("--user", "--map-root-user", "--map-auto")
 _PROBES: Final = (("--user", "--map-root-user"), _AS_ROOT_INSIDE)
 
 _SUBORDINATES: Final = 65534
-"""Number of subordinate ids that a node needs: one for each id up to the id of the account `nobody`."""
+"""Number of subordinate ids that a node needs: one for each id from 1 to that of the account `nobody`, 65534."""
 _USUAL_SUBORDINATES: Final = 65536
 """Number of subordinate ids that useradd assigns to a user (SUB_UID_COUNT of login.defs)."""
 _FIRST_SUBORDINATE: Final = 100_000
@@ -70,7 +70,7 @@ def check() -> None:
     """Check that this ordinary user can create namespaces, by creating them.
 
     Raises:
-        ConfigurationError: The user has no subordinate ids, or the kernel forbids namespaces.
+        ConfigurationError: The user has no account or too few subordinate ids, or the kernel forbids namespaces.
     """
     uid = os.geteuid()
     try:
@@ -88,7 +88,11 @@ def check() -> None:
 
 
 def forbidding_settings(settings: Path) -> dict[str, str]:
-    """Return the remedy for each kernel setting below `settings` that forbids user namespaces, as `name = value`."""
+    """Return the remedies for kernel settings that forbid user namespaces, each by its setting, `name = value`.
+
+    Args:
+        settings: Folder of the kernel settings, `/proc/sys`.
+    """
     remedies = {}
     for name, (forbids, allows) in _KERNEL_SETTINGS.items():
         path = settings / name.replace(".", "/")
@@ -104,7 +108,7 @@ def id_ranges(text: str) -> list[IdRange]:
 
 
 def _check_subordinates(user: str, uid: int) -> None:
-    """Raise ConfigurationError if the user has too few subordinate ids."""
+    """Raise ConfigurationError if a file has no range of this user with enough subordinate ids."""
     ranges_by_file = {path: id_ranges(_text(Path(path))) for path in _OPTION_OF}
     has_enough = {
         path: any(ids.owner in {user, str(uid)} and ids.count >= _SUBORDINATES for ids in ranges)

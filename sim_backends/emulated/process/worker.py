@@ -55,7 +55,7 @@ def send(channel: socket.socket, message: Message, deadline: Deadline, descripto
 
 
 def receive(channel: socket.socket, deadline: Deadline) -> tuple[Message, list[int]] | None:
-    """Return the next message and its file descriptors, or None if the peer has closed the socket.
+    """Return the next message and its file descriptors, or None if the peer closed the socket before its end.
 
     Raises:
         OSError: The message was not complete by the deadline, or the connection broke.
@@ -208,11 +208,14 @@ class Worker:
         self._log.close()
 
     def _exit_error(self, cause: str) -> TestbedLostError:
-        """Return the error for a process that does not answer, with the signal that killed it and its last output."""
+        """Return the error for a process that does not answer.
+
+        It has the signal that killed the process, if any, and the last line of its output.
+        """
         if self._log.closed:
             cause, last_line = "it was stopped", ""
         else:
-            last_line = os.pread(self._log.fileno(), 1 << 16, 0).decode(errors="replace").strip().rsplit("\n", 1)[-1]
+            last_line = last_line_of(self._log.fileno())
         with suppress(subprocess.TimeoutExpired):
             if (code := self._process.wait(_EXIT_STATUS_S if cause == _EXITED else 0)) < 0:
                 cause = f"it was killed by {signal.Signals(-code).name}"
@@ -222,3 +225,9 @@ class Worker:
             remedy="start it again: a trial by fieldkit resume TRIAL, a campaign by its command, a lab by "
             "fieldkit lab down and fieldkit lab up",
         )
+
+
+def last_line_of(fd: int) -> str:
+    """Return the last line of a file that is not empty, at most its last 64 KiB; "" if there is no such line."""
+    tail = os.pread(fd, 1 << 16, max(os.fstat(fd).st_size - (1 << 16), 0))
+    return tail.decode(errors="replace").strip().rsplit("\n", 1)[-1]

@@ -19,7 +19,7 @@ _MS_BIND: Final = 0x1000
 _MS_REC: Final = 0x4000
 _MNT_DETACH: Final = 0x2
 _MOUNT_ATTR_RDONLY: Final = 0x1
-# asm-generic/unistd.h, the same number on x86-64 and arm64; the libc of Debian 12 does not export it.
+# asm-generic/unistd.h: the same number on x86-64 and arm64. glibc has the function `mount_setattr` only since 2.36.
 _SYS_MOUNT_SETATTR: Final = 442
 _AT_FDCWD: Final = -100
 _AT_RECURSIVE: Final = 0x8000
@@ -35,13 +35,15 @@ ROBOT_FOLDERS: Final = {
     "/dev/shm": "1777",  # noqa: S108 (in the robot, initially empty)
     "/sys/class/power_supply": "0755",  # hides the battery of the host
 }
-"""Folders that each robot has separately, with their modes; their content is lost when the robot stops."""
+"""Folders that each robot has separately, with their modes, as far as this machine has them; their content is lost
+when the robot stops."""
 
 
 def isolate(*, replaced_files: Iterable[str] = ()) -> None:
-    """Mount the robot's folders in this process's mount namespace, and make everything of the host read-only.
+    """Mount the robot's folders in this process's mount namespace, and make the host's file systems read-only there.
 
-    All that the robot needs from the host remains visible: this Python, this package, and everything in `/opt`.
+    The robot's folders are empty, except for files of the host that the robot needs: this Python, its packages (also
+    this one), and the children of `/opt`, unless `replaced_files` replaces them. `/proc` and `/dev/pts` are new.
 
     Args:
         replaced_files: Files that the robot writes itself. Children of `/opt` that contain them are hidden; a
@@ -167,7 +169,11 @@ def writable_mirror(folder: Path, at: Path, *, without: Container[str] = ()) -> 
 
 
 def _python_folders() -> list[Path]:
-    """Return the folders of this interpreter and its modules, by every path that leads to them."""
+    """Return the folders of this interpreter and its modules.
+
+    They include each folder on the interpreter's chain of symbolic links. Each folder is returned both as it is
+    written and with all symbolic links resolved.
+    """
     folders = [Path(sys.prefix), Path(sys.base_prefix), *map(Path, sys.path)]
     program = Path(sys.executable)
     while True:

@@ -97,7 +97,7 @@ def open_tun(name: str, *, ethernet: bool = False) -> int:
     """Create the TUN interface `name` in this process's network namespace; return its non-blocking descriptor.
 
     The interface carries bare IP packets, or Ethernet frames (TAP), and exists as long as a process has the
-    descriptor open. Its queue holds 4096 packets, so that no packet is lost while the medium process pauses.
+    descriptor open. Its queue holds 4096 packets, so that no packet is lost in a short pause of the medium process.
 
     Raises:
         ConfigurationError: The device is missing, or this user may not open it or create an interface.
@@ -105,7 +105,7 @@ def open_tun(name: str, *, ethernet: bool = False) -> int:
     """
     if not 0 < len(name.encode()) <= _NAME_BYTES:
         raise ConfigurationError(
-            f"{name!r} is not a valid interface name", remedy=f"use 1 to {_NAME_BYTES} letters, for example wlan0"
+            f"{name!r} is not a valid interface name", remedy=f"use 1 to {_NAME_BYTES} characters, for example wlan0"
         )
     fd = open_device()
     try:
@@ -238,7 +238,7 @@ def configure(interface: str, address: str) -> None:
 
 
 def switch_off(interface: str) -> None:
-    """Take the radio interface down; it keeps its address. Raises the errors of `switch_on`."""
+    """Take an interface down; it keeps its address. Raises the errors of `switch_on`."""
     run_ip(f"link set {interface} down")
 
 
@@ -276,7 +276,7 @@ def run_ip(*commands: str) -> None:
 
 
 def has_listener(port: int) -> bool:
-    """Return True if a TCP socket listens on `port`, as the kernel's table shows; no connection is made."""
+    """Return True if an IPv4 TCP socket listens on `port`, as the kernel's table shows; no connection is made."""
     local = f":{port:04X} "
     listening = "0A"
     # The first 21 characters of a line are its number and the local address.

@@ -112,9 +112,10 @@ def write_files(spec: RobotSpec) -> None:
 
 
 def write_setup(spec: RobotSpec) -> None:
-    """Write the ROS setup files at their paths, and the built-in recorder beside them.
+    """Write the ROS setup files at their paths, and programs beside them: `python3`, `fieldkit`, a built-in recorder.
 
-    If the deepest existing folder of a path belongs to this machine, the files are added to a mirror of that folder.
+    A robot with Debian's ROS gets a `sitecustomize.py` instead of the recorder. If the deepest existing folder of a
+    path belongs to this machine, the files are added to a mirror of that folder.
 
     Raises:
         OSError: A file could not be written, or the kernel refused a mount.

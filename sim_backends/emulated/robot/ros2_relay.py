@@ -94,7 +94,9 @@ class Ros2Relay:
         )
 
     def relay_velocities(self, topic: str, kind: str) -> None:
-        """Send each velocity of a topic to the base; messages are dropped while the base restarts.
+        """Send each velocity of a topic to the base.
+
+        A message is dropped if it is outdated or has another type, or if the base is restarting.
 
         Args:
             topic: Name of the topic.

@@ -2,8 +2,8 @@
 
 The command line is `NODE VELOCITY_TOPIC VELOCITY_TYPE TOPIC...`; the two words about velocities are empty for a robot
 without a base. The master may run on another robot, over the radio. The sensors process creates and serializes each
-message; the relay publishes it unchanged while the topic has subscribers. It also sends received velocities to the
-base.
+message; the relay publishes it unchanged while the topic has subscribers, or always if the topic is latched. It also
+sends received velocities to the base.
 """
 
 import contextlib
@@ -31,7 +31,7 @@ _CONNECT_S: Final = 5.0
 _SENSORS_S: Final = 20.0
 """Timeout for the restart of the sensors process."""
 _QUEUE_MESSAGES: Final = 100
-"""Length of the queue of a topic's publisher; a slow subscriber loses further messages."""
+"""Length of the queue of a topic's publisher; if it is full, a slow subscriber loses the oldest messages."""
 _CHUNK_BYTES: Final = 1 << 16
 
 
@@ -100,7 +100,7 @@ class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no type
 
 
 def _relay_velocities(topic: str, kind: str) -> None:
-    """Send each velocity to the base; messages are dropped while the base restarts.
+    """Send each velocity to the base; outdated messages, and all messages while the base restarts, are dropped.
 
     Args:
         topic: Name of the topic.

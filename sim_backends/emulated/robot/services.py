@@ -192,7 +192,7 @@ def _debian_ros(spec: RobotSpec, topics: Sequence[str]) -> Iterator[Service]:
 
 
 def _velocity_topic(spec: RobotSpec) -> tuple[str, str]:
-    """Return the topic of velocities that the robot's base subscribes to, and its type; empty if it has no base."""
+    """Return the topic of velocities that the robot's base subscribes to, and its type; "" and "" without a base."""
     return (spec.base.topic, spec.base.type) if spec.base else ("", "")
 
 

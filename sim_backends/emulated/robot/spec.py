@@ -72,8 +72,8 @@ class Ros2Spec:
         middleware: `dds` or `zenoh`.
         distribution: ROS 2 distribution, which determines types and default behaviour.
         discovery: `multicast`, `peers` or `router`.
-        peers: Addresses of the other robots, for `peers`.
-        router: Address of the robot that runs the router, for `router`.
+        peers: Addresses of the other robots, for `peers`; otherwise empty.
+        router: Address of the robot that runs the router, for `router`; otherwise empty.
         domain: ROS domain.
     """
 
@@ -125,8 +125,8 @@ class RobotSpec:
         host_key: Private host key of its SSH server, OpenSSH PEM.
         authorized_key: Public key that may log in.
         ros: Source of its ROS programs: `builtin` for those of this package, `debian` for Debian's.
-        ros_version: 1 or 2.
-        distribution: ROS distribution that its profile names.
+        ros_version: 1 or 2; 1 for a robot without ROS.
+        distribution: ROS distribution that its profile names; empty for a robot without ROS.
         setup: Setup files that its profile names.
         ros_master: Address of its ROS master: `LOOPBACK`, or the radio address of this or of another robot.
         sensors: Its sensors, one per published topic.
@@ -213,7 +213,7 @@ class RobotSpec:
 
     @property
     def runs_master(self) -> bool:
-        """True if its ROS master runs on the robot itself."""
+        """True if its ROS master runs on the robot itself; also True for a robot without ROS."""
         return self.ros_master in {LOOPBACK, self.ip}
 
     @property
@@ -223,7 +223,11 @@ class RobotSpec:
 
     @property
     def waits_for_another(self) -> bool:
-        """True if its startup waits for another robot: its ROS master, its Zenoh router or its access point."""
+        """True if its startup may wait for another robot.
+
+        It uses a ROS master that other robots use too, a Zenoh router, or an access point. The robot that runs this
+        master or router is included.
+        """
         is_station = self.wifi is not None and self.wifi.mode == "station"
         return self.shares_master or bool(self.ros2 and self.ros2.router) or is_station
 

@@ -110,7 +110,9 @@ def bring_up(device: str, interface: str, address: str, wifi: WifiSpec) -> None:
 
 
 def rejoin(interface: str, wifi: WifiSpec) -> None:
-    """Join the ad hoc cell or the mesh after the interface was down; hostapd and wpa_supplicant do this themselves.
+    """Join the ad hoc cell or the mesh, at first and after the interface was down.
+
+    In other modes do nothing, because hostapd and wpa_supplicant connect by themselves.
 
     Raises:
         RobotError: The kernel rejected the command.

@@ -5,7 +5,8 @@ process. Each surface is intersected only with the beams in its direction, so co
 about as long as computing their noise.
 
 The lab writes the positions to anonymous shared memory, which each robot maps read-only before it starts its
-programs. Two slots are written alternately, each with its CRC, so that a reader always finds a complete slot.
+programs. Two slots are written alternately, each with its CRC, so that a reader finds a complete slot as soon as
+positions have been written once.
 """
 
 import math
@@ -128,6 +129,9 @@ class PositionsWriter:
 
     Args:
         names: Names of all robots, in the order of `Neighbour.number`.
+
+    Attributes:
+        fd: Descriptor of the memory.
 
     Raises:
         OSError: The memory cannot be allocated.

@@ -7,7 +7,7 @@ because the libraries that support all types would cost each robot 20 MB of memo
 The motion of the robot comes from `robot_motion`. Frames and units follow REP 103 and REP 105: metres, radians, x
 ahead, y to the left. In frames that are fixed to the world, x is east and y is north, as in the orientation of an IMU
 (REP 145). Covariances are the values that drivers of such robots report. The laser ranges are computed from the
-world. Numbers that vary in a real sensor contain noise, so that they compress no better than real data.
+world. Most numbers that vary in a real sensor contain noise, so that they compress no better than real data.
 """
 
 import math
@@ -52,7 +52,7 @@ _ONE_TRANSFORM: Final = struct.pack("<I", 1)
 
 
 Generator = Callable[[Sensor, Random, RobotMotionState], bytes]
-"""Returns the serialized fields that follow the header."""
+"""Returns the serialized fields that follow the header, or all fields of a type without a header."""
 
 
 class Source:
@@ -64,7 +64,7 @@ class Source:
         moving_targets: Returns the laser targets that move: the other robots at their current positions.
 
     Raises:
-        ConfigurationError: There is no generator for its type, or a property that its type needs is missing.
+        ConfigurationError: The error of `sensor_specs.check`.
     """
 
     def __init__(

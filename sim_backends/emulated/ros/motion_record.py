@@ -9,12 +9,12 @@ from typing import Any, Final, NamedTuple
 
 from fieldkit.core.model import Vector
 from sim_backends.emulated.ros.slots import Record
-from sim_backends.world.motion import STILL, State
+from sim_backends.world.motion import LEVEL, STILL, State, TiltedState
 
 SILENT_NS: Final = 500_000_000
 """A robot that has not written a record for this long counts as stopped. A moving robot writes much more often."""
 
-_LAYOUT: Final = "2q11d"
+_LAYOUT: Final = "2q13d"
 
 
 class RecordedMotion(NamedTuple):
@@ -30,6 +30,7 @@ class RecordedMotion(NamedTuple):
         turn_rad_s: Turn rate to the left.
         odometry: Metres ahead of the point where the robot was switched on, metres to the left of its heading at that
             time, and the angle to the left of that heading in radians.
+        tilt_rad: Roll (left side up) and pitch (nose down).
     """
 
     time_ns: int
@@ -39,6 +40,7 @@ class RecordedMotion(NamedTuple):
     heading_rad: float = 0.0
     turn_rad_s: float = 0.0
     odometry: Vector = (0.0, 0.0, 0.0)
+    tilt_rad: tuple[float, float] = LEVEL
 
     @property
     def speed_m_s(self) -> float:
@@ -48,8 +50,8 @@ class RecordedMotion(NamedTuple):
 
     @property
     def state(self) -> State:
-        """Position, velocity and heading as the lab uses them."""
-        return State(self.position_m, self.velocity_m_s, self.heading_rad)
+        """Position, velocity and attitude as the lab uses them."""
+        return TiltedState.of(self.position_m, self.velocity_m_s, self.heading_rad, self.tilt_rad)
 
     @property
     def is_moving(self) -> bool:
@@ -99,6 +101,7 @@ class MotionRecord(Record):
             motion.heading_rad,
             motion.turn_rad_s,
             *motion.odometry,
+            *motion.tilt_rad,
         )
 
     def read(self) -> RecordedMotion | None:
@@ -115,8 +118,11 @@ class MotionRecord(Record):
 
 def _to_motion(time_ns: int, path_start_ns: int, *values: float) -> RecordedMotion:
     position_m, velocity_m_s, odometry = (_vector(values[index : index + 3]) for index in (0, 3, 8))
-    heading_rad, turn_rad_s = values[6:8]
-    return RecordedMotion(time_ns, path_start_ns, position_m, velocity_m_s, heading_rad, turn_rad_s, odometry)
+    heading_rad, turn_rad_s, roll_rad, pitch_rad = (*values[6:8], *values[11:])
+    tilt_rad = roll_rad, pitch_rad
+    return RecordedMotion(
+        time_ns, path_start_ns, position_m, velocity_m_s, heading_rad, turn_rad_s, odometry, tilt_rad
+    )
 
 
 def _extrapolate(position_m: Vector, velocity_m_s: Vector, for_s: float) -> Vector:

@@ -20,7 +20,7 @@ from typing import Final
 
 from fieldkit.core.model import Vector
 from sim_backends.emulated.ros.motion_record import MotionRecord, RecordedMotion
-from sim_backends.world.motion import STILL, WayPoints
+from sim_backends.world.motion import LEVEL, STILL, WayPoints
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,8 @@ def append_path(file_path: Path, path: AssignedPath) -> None:
 
 class Odometer:
     """Odometry of a robot, which starts at 0 when the object is created.
+
+    While a robot steers itself, its odometry is read from its motion record, and may have started earlier.
 
     Args:
         paths_file: The file of assigned paths, which may be missing.
@@ -230,6 +232,7 @@ class MotionReporter:
         heading_rad: float = 0.0,
         turn_rad_s: float = 0.0,
         odometry: Vector = (0.0, 0.0, 0.0),
+        tilt_rad: tuple[float, float] = LEVEL,
     ) -> None:
         """Record the robot's position and motion. The arguments are the attributes of `RecordedMotion`.
 
@@ -240,5 +243,7 @@ class MotionReporter:
             OSError: There is no space for the record.
         """
         self._record.write(
-            RecordedMotion(now_ns, self.path_start_ns, position_m, velocity_m_s, heading_rad, turn_rad_s, odometry)
+            RecordedMotion(
+                now_ns, self.path_start_ns, position_m, velocity_m_s, heading_rad, turn_rad_s, odometry, tilt_rad
+            )
         )

@@ -93,7 +93,11 @@ def _record_options(argv: Sequence[str]) -> optparse.Values:
 
 
 def _seconds(text: str | None) -> float | None:
-    """Return a duration in seconds; error messages are as in the original's recorder."""
+    """Return a duration in seconds, or None for None.
+
+    Raises:
+        RecorderError: The text is not a duration; the message is that of the original's recorder.
+    """
     if text is None:
         return None
     number = text.rstrip("abcdefghijklmnopqrstuvwxyz")

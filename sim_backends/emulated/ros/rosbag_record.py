@@ -25,9 +25,9 @@ class Options:
     Attributes:
         topics: Names of the topics.
         all_topics: Record every published topic.
-        prefix: Prefix of the bag's name, before the date.
-        name: Name of the bag; if it is None, the name consists of the prefix and the date.
-        duration_s: Stop after this time.
+        prefix: Prefix of the bag's name, before the date; None or empty for none.
+        name: Name of the bag; if it is None, the name consists of the prefix (if there is one) and the date.
+        duration_s: Stop after this time; None for no limit.
         limit: Stop each topic after this number of messages; 0 for no limit.
         chunk_bytes: Size of a chunk of the bag.
     """
@@ -53,6 +53,9 @@ class RecorderError(Exception):
 
     Args:
         text: The error message of the original.
+
+    Attributes:
+        line: The message as a line for standard error, with the level and the time.
     """
 
     def __init__(self, text: str) -> None:
@@ -119,7 +122,7 @@ class Rosbag1Recorder:
         _print(f"Subscribing to {topic}")
 
     def _write(self, writer: Writer, start_ns: int) -> None:
-        """Write the messages that arrive within one tick."""
+        """Wait at most one tick, and write the messages that have arrived, but none after the end of the duration."""
         for header, message in self._listener.events(_TICK_S):
             connection = _connection(writer, header)
             if message is None:

@@ -33,9 +33,10 @@ class Template:
 
     Attributes:
         has_header: True if the message starts with a header.
-        head: Content between the header and the list that is filled, serialized, in hexadecimal digits.
+        head: Content before the list that is filled, without the header, serialized, in hexadecimal digits. It is the
+            whole content if no list is filled.
         tail: Content after the list, in the same form.
-        size_bytes: Size of the list.
+        size_bytes: Size of the list without its length field; 0 if no list is filled.
         floats: True if the list holds 4-byte floats; False if any bytes are valid values.
     """
 
@@ -55,9 +56,10 @@ class Sensor:
         type: ROS message type, `package/Name`.
         rate_hz: Messages per second.
         frame: `frame_id` of the header.
-        points: For a laser scan, beams per turn.
-        template: Parts of the messages of a type without a generator.
-        child_frame: Frame of the robot, for odometry and transforms; REP 105 calls it `base_link`.
+        points: For a laser scan, beams per turn; for a point cloud, its points; None if the profile has no number.
+        template: Parts of the messages of a type without a generator; None for a type with one.
+        child_frame: Frame of the robot, for odometry and transforms; REP 105 calls it `base_link`. Empty if the
+            profile names none.
     """
 
     topic: str
@@ -123,7 +125,8 @@ def check(sensor: Sensor) -> None:
     """Check that an emulated robot can publish `sensor`.
 
     Raises:
-        ConfigurationError: There is no generator for its type, or a property that its type needs is missing.
+        ConfigurationError: Its type has neither a generator nor a template, its rate is 0, or a laser scan has no
+            `points`.
     """
     if sensor.type not in GENERATED_TYPES and sensor.template is None:
         hint = did_you_mean(sensor.type, GENERATED_TYPES, f"known types: {', '.join(GENERATED_TYPES)}")

@@ -20,7 +20,7 @@ from sim_backends.emulated.ros.sensor_specs import Definition, LaserTarget, Sens
 from sim_backends.ros1 import framing
 
 QUEUE_BYTES: Final = 4 << 20
-"""Maximum unsent data of a slow subscriber; further messages are dropped for it, as by a ROS publisher's queue."""
+"""Amount of unsent data from which on further messages are dropped for a slow subscriber."""
 
 _CHUNK_BYTES: Final = 1 << 16
 
@@ -216,6 +216,7 @@ def publish(
         ready: File that is created when every topic can be subscribed to.
 
     Raises:
+        ConfigurationError: The error of `messages.Source`.
         OSError: A socket cannot be created.
     """
     start_s = time.monotonic()

@@ -1,7 +1,7 @@
 """A record in a file, with one writer and any number of readers.
 
-Two slots are written alternately, each with a number and a CRC. One of them therefore always has a complete record,
-even while the other one is being written, or after the writer was killed during a write.
+Two slots are written alternately, each with a number and a CRC. After the first record, one of them therefore always
+has a complete record, even while the other one is being written, or after the writer was killed during a write.
 """
 
 import os

@@ -46,7 +46,7 @@ Header = Mapping[str, str]
 
 @dataclass
 class _Subscription:
-    """Connection to the publisher of one topic."""
+    """Connection to the publisher of one topic; `header` is None until the publisher's connection header arrives."""
 
     topic: str
     stream: socket.socket
@@ -94,7 +94,10 @@ class Listener:
             stream.close()
 
     def events(self, within_s: float) -> Iterator[tuple[Header, bytes | None]]:
-        """Yield received data until a timeout: (header, None) once per publisher, then (header, message)."""
+        """Wait for data or a signal, at most `within_s`; then yield what has arrived.
+
+        Each publisher's connection header is yielded first, as (header, None); then (header, message) per message.
+        """
         for key, _ in self._selector.select(within_s):
             if isinstance(key.data, _Subscription):
                 yield from self._read(key.data)
@@ -118,7 +121,7 @@ class Listener:
         """Yield the content of complete packets.
 
         Raises:
-            ValueError: A packet is malformed, or the header is for another topic.
+            ValueError: A packet is malformed, or the header is not that of a publisher of the topic.
         """
         for payload in subscription.packets:
             if subscription.topic not in self._subscriptions:
@@ -149,7 +152,7 @@ def _header(payload: bytes, topic: str) -> Header:
     """Return the connection header of a publisher.
 
     Raises:
-        ValueError: A required field is missing, or the header is for another topic.
+        ValueError: A required field is missing or malformed, or the header is for another topic.
     """
     header = unpack_header(payload)
     missing = {"topic", "type", "md5sum", "message_definition"} - header.keys()

@@ -47,7 +47,10 @@ Values = Mapping[str, bytes]
 def definition_of(kind: str, text: str) -> Definition:
     """Return the definition that a publisher of the type `package/Name` announces; `text` is used if ROS has none.
 
-    Raises the errors of `template_of`, which first rejects types without a definition.
+    ROS or `text` must define the type and all types in it; `template_of` checks this.
+
+    Raises:
+        ConfigurationError: `text` cannot be parsed.
     """
     return Definition(*_types(kind, text).generate_msgdef(_full_name(kind), ros_version=1))
 
@@ -124,6 +127,10 @@ class _SerializedFields:
         store: Type definitions.
         size_bytes: Size of the list; 0 for an empty one.
         values: Values of fields of the outermost message.
+
+    Attributes:
+        parts: The fields before and after the gap; all fields are before it if there is no gap.
+        list_type: Type of the numbers in the gap; None if there is no gap yet.
     """
 
     def __init__(self, store: "Typestore", size_bytes: int, values: Values) -> None:

@@ -61,7 +61,12 @@ def _times_ns() -> list[int]:
 
 
 class _FateAccount:
-    """Records the fates of packets, and checks the reports of the network."""
+    """Records the fates of packets, and checks the reports of the network.
+
+    Attributes:
+        arrivals: All arrivals so far, in the order of the reports.
+        reasons: Reason of each drop, by the number of the packet.
+    """
 
     def __init__(self, probe: FederateProbe) -> None:
         self._probe = probe
@@ -163,7 +168,9 @@ def check_exactly_once(target: Target) -> None:
     """Each packet arrives or is dropped exactly once, in its window, in order of time; drops have reasons."""
     undecided = _run(target.open(), _WINDOW_NS).undecided()
     if undecided:
-        raise CheckError(f"after {_END_NS / 1e9:g} s, {len(undecided)} packets neither arrived nor were dropped")
+        raise CheckError(
+            f"number of packets that neither arrived nor were dropped after {_END_NS / 1e9:g} s: {len(undecided)}"
+        )
 
 
 def check_next_event(target: Target) -> None:
@@ -206,7 +213,9 @@ def check_window_length(target: Target) -> None:
         if short != long:
             raise CheckError(f"windows of another length changed an arrival: {short} and {long}")
     if len(arrivals[0]) != len(arrivals[1]):
-        raise CheckError(f"windows of another length changed {len(arrivals[0])} arrivals into {len(arrivals[1])}")
+        raise CheckError(
+            f"windows of another length changed the number of arrivals from {len(arrivals[0])} to {len(arrivals[1])}"
+        )
 
 
 def check_far_away(target: Target) -> None:

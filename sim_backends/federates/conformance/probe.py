@@ -35,7 +35,7 @@ class CheckError(Exception):
 
 
 class NotDeclaredError(Exception):
-    """A check does not apply, because the federate does not declare the capability; the message names it."""
+    """A check does not apply, for example because the federate does not declare a capability; the message is why."""
 
 
 class Opener(Protocol):
@@ -127,7 +127,11 @@ class FederateProbe:
     def advance_physics(
         self, to_ns: int, commands: Mapping[str, Any] | None = None, *, from_ns: int | None = None, copy: int = 0
     ) -> PhysicsAnswer:
-        """Advance a physics federate; the commands apply from the time of the last call, or from `from_ns`."""
+        """Advance a physics federate; the commands apply from the time of the last call, or from `from_ns`.
+
+        Raises:
+            CheckError: Agents appeared or disappeared, but the federate does not declare that they may.
+        """
         begin_ns = self.last_ns if from_ns is None else from_ns
         body = encode_advance_physics(to_ns, begin_ns, commands or {}, self.agents)
         names_before = set(self.agents.names)
@@ -222,6 +226,7 @@ class Target:
         opener: Starts or connects to it.
         hello: The hello that it receives.
         windows: Number of windows of the check for drift.
+        exchange: Descriptions of the last request and of its answer, with the keys `request` and `answer`.
     """
 
     opener: Opener
@@ -241,7 +246,7 @@ class Target:
         """Stop the last federate, and return a new one; a listening federate may serve only one run at a time.
 
         Args:
-            hello: The hello that it receives, if it is not the hello of the target.
+            hello: The hello that it receives; None for the hello of the target.
         """
         self.close()
         self.exchange |= {"request": "hello", "answer": "none"}

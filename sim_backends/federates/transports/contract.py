@@ -30,7 +30,7 @@ class ChannelListener(Protocol):
 
 
 class TransportAddress(Protocol):
-    """An address of a transport; `str` returns the text as the user wrote it.
+    """An address of a transport; `str` returns its text for messages.
 
     Attributes:
         listens: True if the side that has this address listens, False if it connects; None if the federate listens
@@ -101,7 +101,7 @@ def is_same_token(first: str, second: str) -> bool:
 
 
 def is_loopback(host: str) -> bool:
-    """Return True if a host is this machine's loopback address."""
+    """Return True if a host is `localhost` or a loopback address."""
     if host == "localhost":
         return True
     try:
@@ -139,7 +139,7 @@ def split_host_and_port(text: str) -> tuple[str, str, int, bool]:
     """Return scheme, host, port and `listens` of `SCHEME:HOST:PORT` or `SCHEME-listen:HOST:PORT`.
 
     Raises:
-        ValueError: Host or port is missing, or the port is not a number.
+        ValueError: The host is missing, or the port is not a number from 1 to 65535.
     """
     scheme, _, host_and_port = text.partition(":")
     host, _, port = host_and_port.rpartition(":")

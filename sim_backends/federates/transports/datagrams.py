@@ -31,7 +31,7 @@ from sim_backends.federates.channels import ClosedError, DeadlineError
 from sim_backends.federates.frames import HEADER_BYTES, MAX_FRAME_BYTES, ProtocolFrame, read_header
 
 MAX_DATAGRAM_BYTES: Final = 1200
-"""A size that passes every path without fragmentation (RFC 9000, section 14.1)."""
+"""A size that should pass every path without fragmentation: QUIC requires this of paths (RFC 9000, section 14.1)."""
 _MAGIC: Final = b"FKUD"
 _HEADER: Final = struct.Struct("<4sBBHQQQQ")
 DATAGRAM_HEADER_BYTES: Final = _HEADER.size
@@ -184,7 +184,7 @@ class DatagramChannel:
         return ProtocolFrame(header, body)
 
     def close(self) -> None:
-        """Implement `FrameChannel.close`; the last frames are resent for half a second."""
+        """Implement `FrameChannel.close`; unacknowledged data are resent for at most half a second."""
         if self._is_closed:
             return
         limit_s = time.monotonic() + _LINGER_S

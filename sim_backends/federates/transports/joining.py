@@ -36,7 +36,7 @@ def accept_federate(address: TransportAddress, expected_token: str, deadline_s: 
                 frame = channel.receive(min(deadline_s, time.monotonic() + _JOIN_S), MAX_JOIN_BYTES)
                 if frame.header.kind is MessageKind.JOIN and is_same_token(decode_join(frame.body), expected_token):
                     return channel
-                rejection = " (a program with a wrong token was rejected)"
+                rejection = " (a program without the right token was rejected)"
             except (ClosedError, DeadlineError, MalformedFrameError) as error:
                 rejection = f" (a connection was rejected: {error})"
             channel.close()

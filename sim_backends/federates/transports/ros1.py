@@ -24,7 +24,7 @@ from sim_backends.ros1.node_calls import MasterError
 _DEFAULT_MASTER: Final = "http://localhost:11311"
 _NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _MASTER_TIMEOUT_S: Final = 60.0
-"""Longest wait of a federate that listens for the master."""
+"""Longest wait for the master, if a federate listens."""
 # Name of the type, MD5 sum of its definition, and its definition.
 MESSAGE: Final = RosMessageType(
     "std_msgs/UInt8MultiArray",

@@ -40,7 +40,7 @@ class TcpAddress(HostAndPort):
     """A TCP address."""
 
     def connect(self, deadline_s: float) -> StreamChannel:
-        """Implement `TransportAddress.connect`; refused attempts are repeated."""
+        """Implement `TransportAddress.connect`; failed attempts are repeated until the deadline."""
         while True:
             remaining_s = deadline_s - time.monotonic()
             try:
@@ -60,7 +60,9 @@ class TcpAddress(HostAndPort):
                 (self.host, self.port), family=socket.AF_INET6 if ":" in self.host else socket.AF_INET
             )
         except OSError as error:
-            raise ConfigurationError(f"cannot listen at {self}: {error}", remedy="use another port") from error
+            raise ConfigurationError(
+                f"cannot listen at {self}: {error}", remedy="use another port or host"
+            ) from error
         with server:
             yield TcpListener(server)
 

@@ -104,7 +104,9 @@ class UdpAddress(HostAndPort):
             endpoint.bind((self.host, self.port))
         except OSError as error:
             endpoint.close()
-            raise ConfigurationError(f"cannot listen at {self}: {error}", remedy="use another port") from error
+            raise ConfigurationError(
+                f"cannot listen at {self}: {error}", remedy="use another port or host"
+            ) from error
         return endpoint
 
     def connect(self, deadline_s: float) -> DatagramChannel:

@@ -65,7 +65,8 @@ class NewReno:
 
         Args:
             flight_bytes: Bytes in flight.
-            is_repeated: True if there was no progress since the last timeout.
+            is_repeated: True if the threshold must stay, because there was no progress since the last timeout, or
+                because a recovery is in progress (see `reduces_in_recovery`).
         """
         if not is_repeated:
             self.threshold_bytes = self._reduced_threshold(flight_bytes)
@@ -73,7 +74,7 @@ class NewReno:
         self._credit = 0
 
     def on_restart(self) -> None:
-        """Reset the window to the initial window after an idle period (RFC 5681, 4.1)."""
+        """Reduce the window to the initial window after an idle period, unless it is smaller (RFC 5681, 4.1)."""
         initial_bytes = self._options.initial_window_segments * self._segment_bytes
         self.window_bytes = min(self.window_bytes, initial_bytes)
 
@@ -82,7 +83,11 @@ class NewReno:
         self.window_bytes = self._segment_bytes
 
     def _slow_start(self, acked_bytes: int) -> int:
-        """Increase the window up to the threshold; return the bytes acknowledged beyond that (RFC 5681, 3.1)."""
+        """Increase the window up to the threshold (RFC 5681, 3.1).
+
+        Returns:
+            The acknowledged bytes that remain for congestion avoidance; 0 with a limit of the increase per ACK.
+        """
         limit = self._options.bytes_counted_segments
         counted_bytes = acked_bytes if limit is None else min(acked_bytes, limit * self._segment_bytes)
         if self.threshold_bytes is not None:
@@ -139,7 +144,8 @@ class Cubic(NewReno):
         super().__init__(options)
         # The plateau (W_max); None before the first loss and after a timeout (4.8, 4.10).
         self._w_max_bytes: int | None = None
-        # The window before the last reduction for any reason (cwnd_prior); None before the first reduction.
+        # The window before the last reduction for any reason (cwnd_prior); before the first reduction, the window at
+        # the start of congestion avoidance, or None.
         self._cwnd_prior_bytes: int | None = None
         self._reset_epoch()
 

@@ -51,7 +51,7 @@ class TcpSample:
         window_bytes: Congestion window.
         threshold_bytes: Slow-start threshold; None if it is unlimited.
         flight_bytes: Estimate of the bytes in flight.
-        round_trip_ns: Smoothed round trip.
+        round_trip_ns: Smoothed round trip; None before the first measurement.
         timeout_ns: Retransmission timeout.
     """
 
@@ -186,7 +186,7 @@ class Tcp:
 
     Args:
         wire: The network below.
-        options: Options of all its connections.
+        options: Options of all its connections; None for the defaults.
         log: Called with the state of a sender after every event; None for no log.
     """
 

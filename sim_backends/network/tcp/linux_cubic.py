@@ -43,7 +43,8 @@ class LinuxCubic(NewReno):
 
     def __init__(self, options: TcpOptions) -> None:
         super().__init__(options)
-        # The window at the last loss (W_max), in segments; 0 before the first loss and after a timeout.
+        # The window at the last loss, or less by fast convergence (W_max), in segments; 0 before the first loss and
+        # after a timeout.
         self._w_max = 0
         self._min_round_trip_ns: int | None = None
         self._restart_epoch()

@@ -1,9 +1,9 @@
 """Loss detection and recovery: retransmission timeout (RFC 6298), RACK (RFC 8985), rate reduction (RFC 6937).
 
-Time-based loss detection, RACK, works as in Linux: a segment is lost if a segment that was sent later has arrived and
-a round trip has passed since. The loss of a retransmission is therefore also detected within a round trip, without a
-timeout. The wire does not reorder packets, so the reordering window is never increased above a quarter of the minimum
-round trip.
+Time-based loss detection, RACK, works as in Linux: a segment is lost if a segment that was sent later has arrived,
+and more than a round trip and the reordering window have passed since the segment was sent. The loss of a
+retransmission is therefore also detected without a timeout. The wire does not reorder packets, so the reordering
+window is never increased above a quarter of the minimum round trip.
 
 Proportional rate reduction gives the bytes that may be sent in a recovery, as in Linux. Times are whole nanoseconds.
 """
@@ -84,7 +84,8 @@ class RackScoreboard(Scoreboard):
         The limit is the sum of a round trip and the reordering window.
 
         Returns:
-            The time at which the segments that were sent more recently exceed the limit; None if there are none.
+            The time at which all other segments that were sent before an arrived segment reach the limit; None if
+            there are none.
         """
         limit_ns = self._round_trip_ns + self._reordering_window_ns(is_recovering=is_recovering)
         transmissions, undecided, due_ns = self._transmissions, list[tuple[SentSegment, int]](), None

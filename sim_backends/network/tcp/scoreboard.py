@@ -53,7 +53,7 @@ class Scoreboard:
         first_unacknowledged: The first unacknowledged sequence number (SND.UNA).
         pipe_bytes: Estimate of the bytes in flight (RFC 6675, 4, SetPipe).
         delivered_bytes: Bytes that have arrived so far according to ACKs and SACKs.
-        losses: Number of segments marked as lost so far.
+        losses: Number of times so far that a segment was marked as lost.
     """
 
     def __init__(self) -> None:

@@ -78,11 +78,11 @@ class Segment:
         syn: True if it opens the connection.
         first: Sequence number of its first byte.
         length: Number of data bytes.
-        acknowledges: Acknowledgement number; None only in the first SYN.
+        acknowledges: Acknowledgement number; None in a SYN of the end that opens the connection.
         sacks: Ranges beyond that number that the sender of the segment has received, most recent first.
         window_bytes: Receive window of its sender, after scaling.
         sent_ns: Transmission time: the timestamp's value (TSval).
-        echoes_ns: The echoed timestamp (TSecr); None in the first SYN.
+        echoes_ns: The echoed timestamp (TSecr); None if its sender has received no segment yet.
         number: Its number in the stream; for an ACK the number of the acknowledged segment.
         earlier_transmissions: Number of earlier transmissions of that segment.
     """

@@ -39,7 +39,7 @@ class Sender:
     Attributes:
         control: The congestion window.
         scoreboard: The segments that are not acknowledged.
-        round_trips: The retransmission timeout.
+        round_trips: The estimate of the round trip, and the retransmission timeout.
     """
 
     def __init__(
@@ -214,7 +214,7 @@ class Sender:
         return min(self.scoreboard.next_number - self.scoreboard.first_unacknowledged, self.control.window_bytes)
 
     def _on_timeout(self) -> None:
-        """Process a retransmission timeout: give up the connection, or send all missing segments again."""
+        """Process a retransmission timeout: give up the connection, or begin to send all missing segments again."""
         self._timeouts += 1
         if not self._is_open:
             self._on_syn_timeout()
@@ -296,7 +296,7 @@ class Sender:
             self._reduction.on_sent(length)
 
     def _restart_timer(self) -> None:
-        """Restart the timer if anything is in flight (RFC 6298, 5.1 to 5.3)."""
+        """Restart the timer if anything is not acknowledged, otherwise stop it (RFC 6298, 5.1 to 5.3)."""
         if self.scoreboard:
             self._timer.set(self._wire.now_ns + self.round_trips.timeout_ns)
         else:

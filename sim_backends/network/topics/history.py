@@ -42,7 +42,7 @@ class WriterHistory:
         return next(iter(self.samples), None)
 
     def insert(self, sample: Sample) -> Sample | None:
-        """Insert a sample that is sent now; return the sample that it evicts, or None."""
+        """Insert the newest sample; return the sample that it evicts, or None."""
         self.samples[sample.number] = sample
         self.unacknowledged_bytes += sample.size_bytes
         if self._depth is None or len(self.samples) <= self._depth:
@@ -85,7 +85,10 @@ class WriterHistory:
 
     @property
     def fill_level(self) -> int:
-        """Fill level: 0 below the middle between the watermarks, 1 below three quarters, 2 above."""
+        """Fill level: 0 below the middle between the watermarks, 1 below three quarters, otherwise 2.
+
+        With `keep_last` it is always 0.
+        """
         if self._depth is not None:
             return 0
         span_bytes = self._high_bytes - self._low_bytes

@@ -76,7 +76,7 @@ class RtpsTiming:
             (`HeartbeatInterval`).
         first_heartbeat_ns: Time from matching a reader to the first heartbeat.
         heartbeat_min_ns: Minimum heartbeat interval, used while much data is unacknowledged.
-        heartbeat_max_ns: Maximum heartbeat interval, reached if the reader does not respond.
+        heartbeat_max_ns: Upper limit of the heartbeat interval, which doubles while the reader does not respond.
         ack_request_min_ns: Minimum interval of heartbeats that require a response while much data is unacknowledged.
         heartbeat_response_ns: Time from a heartbeat to its response (Fast DDS 5 ms).
         nack_delay_ns: Minimum interval of two requests for the same data (`NackDelay`).
@@ -84,7 +84,7 @@ class RtpsTiming:
         nack_repeat_ns: Time from a request to the next if no heartbeat arrives (`AutoReschedNackDelay`).
         first_acknack_ns: Time from matching a writer to the reader's first ACKNACK (`PreEmptiveAckDelay`).
         first_acknack_repeat_ns: Initial interval at which the first ACKNACK is repeated.
-        low_bytes: Low watermark: unacknowledged data below which a blocked writer resumes (`WhcLow`).
+        low_bytes: Low watermark: unacknowledged data up to which a blocked writer resumes (`WhcLow`).
         high_bytes: Initial high watermark, above which a writer blocks (`WhcHighInit`).
         max_high_bytes: Maximum high watermark, reached while nothing is lost (`WhcHigh`).
     """

@@ -179,7 +179,7 @@ class TopicReader:
             self._response_timer.bring_forward(self._requested_ns + self._timing.nack_delay_ns)
 
     def _skip(self, first: int, end: int) -> None:
-        """Stop waiting for samples from `first` to `end`, exclusive."""
+        """Stop waiting for samples from `first` to `end`, exclusive; ignored if an earlier sample is expected."""
         if first > self._next_number:
             return
         for number in [number for number in self._fragments if number < end]:
@@ -196,7 +196,10 @@ class TopicReader:
             self._deliver(sample)
 
     def _find_missing(self) -> tuple[tuple[int, ...], _MissingFragments | None]:
-        """Return the missing samples before the first incomplete one, and the missing fragments of that sample."""
+        """Return the missing samples before the first incomplete one, and the missing fragments of that sample.
+
+        Both are limited to what one request can contain. The fragments are None if there is no incomplete sample.
+        """
         numbers: list[int] = []
         for number in range(self._next_number, min(self._last_number + 1, self._next_number + _MAX_BITS)):
             if number in self._complete_samples:

@@ -84,7 +84,7 @@ class TopicWriter:
 
     @property
     def last(self) -> int:
-        """The sequence number of its last sample."""
+        """The sequence number of its last sample; 0 if there is none."""
         return self._last_number
 
     @property
@@ -107,7 +107,7 @@ class TopicWriter:
         self._history.insert(sample)
 
     def remove_reader(self, reason: str) -> None:
-        """Remove the reader and give up all unacknowledged samples."""
+        """Remove the reader, and give up all samples that are unacknowledged or waiting."""
         self._is_matched = False
         self._heartbeat_timer.stop()
         waiting_samples, self._waiting_samples = self._waiting_samples, {}
@@ -221,8 +221,8 @@ class TopicWriter:
     def _interval_ns(self) -> int:
         """Return the time to the next heartbeat.
 
-        It is doubled after the seventh heartbeat since the last write, and again after every second one. It is
-        divided while much data is unacknowledged or samples wait.
+        It is doubled after the seventh heartbeat since the last write, and again after every second one, but
+        stays below its limit. It is divided while much data is unacknowledged or samples wait.
         """
         interval_ns = self._timing.heartbeat_ns
         for _ in range((self._heartbeats_since_write - _HEARTBEATS_AT_FULL_RATE) // 2):

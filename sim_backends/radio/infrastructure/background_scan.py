@@ -14,7 +14,7 @@ _MIN_BEACONS: Final = 4
 """Weight of the last beacon in the average signal, and number of beacons before the first event: ieee80211_i.h."""
 
 _DIFFERENCES_DB: Final = ((-85.0, 1.0), (-80.0, 2.0), (-75.0, 3.0), (-70.0, 4.0))
-"""Upper limits of the current signal in dBm, each with the margin in dB."""
+"""Limits below which the current signal is, in dBm, each with the margin in dB."""
 _LARGEST_DIFFERENCE_DB: Final = 5.0
 
 
@@ -34,7 +34,7 @@ class BackgroundScan:
         threshold_dbm: Signal below which scans have the short interval.
         short_ns: Short interval.
         long_ns: Long interval.
-        average_dbm: Average signal of beacons.
+        average_dbm: Average signal of beacons; before the first beacon the signal at the association.
         next_ns: Time of the next scan.
     """
 

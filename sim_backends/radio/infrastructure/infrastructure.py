@@ -69,7 +69,7 @@ class Infrastructure:
         self._seed = seed
         self._options = options
         self._world = world
-        # The other stations have the radio of the first robot, without power save.
+        # The other stations have the radio of the first robot, without power save and with an isotropic antenna.
         first = next(iter(robots.values()))
         phy = None if first.phy is None else replace(first.phy, power_save_timeout_ns=None)
         stations: dict[str, AccessPointOptions | NeighbourNetworkOptions] = {
@@ -77,7 +77,7 @@ class Infrastructure:
             **options.neighbours,
         }
         self.antennas: dict[str, Antenna] = dict(robots) | {
-            name: replace(first, tx_power_dbm=float(station.tx_power_dbm), phy=phy)
+            name: replace(first, tx_power_dbm=float(station.tx_power_dbm), phy=phy, pattern=None)
             for name, station in stations.items()
         }
         self.positions_m = {
@@ -128,7 +128,7 @@ class Infrastructure:
 
     @staticmethod
     def log_packet(log: Callable[[TransmissionAttempt], None], attempt: TransmissionAttempt) -> None:
-        """Pass an attempt to `log` if its frame is a packet of a robot; frames without a packet are omitted."""
+        """Pass an attempt to `log`, unless its frame is a management frame or a frame of a neighbour."""
         if not isinstance(attempt.payload, ManagementFrame):
             log(attempt)
 

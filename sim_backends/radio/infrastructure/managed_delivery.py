@@ -1,8 +1,8 @@
 """Delivers packets of robots that are stations of access points, and management frames of all stations.
 
 The access points share an ideal wired network: it takes no time and has no losses. A packet goes from a robot to its
-access point, over the wired network to the access point of its destination, and to the destination. The wired network
-sends to the access point at which a robot was last associated.
+access point, over the wired network to the access point of its destination, and to the destination. Packets from or
+to a robot without an access point, and packets to a robot that changes its access point, are lost.
 """
 
 from collections import defaultdict, deque
@@ -105,7 +105,7 @@ class ManagedDelivery(PacketDelivery[Payload]):
         self._put_first(station, frame)
 
     def count_waiting_management(self, transmitter: int) -> int:
-        """Return the number of management frames that a station has not sent yet."""
+        """Return the number of management frames in the queues of a station, including one that is being sent."""
         return sum(_is_management(frame) for queue in _queues(self._stations[transmitter]) for frame in queue)
 
     def _put_first(self, station: Station[Payload], frame: Frame[Payload]) -> None:
@@ -198,7 +198,7 @@ class ManagedDelivery(PacketDelivery[Payload]):
         return robot in self._held_packets and robot not in self._in_handover
 
     def _accepts(self, receiver: int, frame: Frame[Payload]) -> bool:
-        """Return False if the frame is a broadcast for stations of another network or access point."""
+        """Return False if the frame is a broadcast for other stations, or a broadcast to a robot off the channel."""
         if frame.receiver is not None:
             return True
         if not self.access_points:
@@ -310,7 +310,7 @@ class ManagedDelivery(PacketDelivery[Payload]):
         return receiver is not None and self.peer(station.index, receiver, frame.category).has_received(frame)
 
     def _end_session(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> None:
-        """Remove a frame from the Block Ack session with its receiver."""
+        """Remove a frame from the Block Ack session with its receiver, and set its number of attempts to 0."""
         receiver = frame.receiver
         if receiver is not None and frame.sequence >= 0:
             peer = self.peer(station.index, receiver, frame.category)

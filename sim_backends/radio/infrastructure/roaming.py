@@ -1,8 +1,8 @@
 """Association of robots with access points between which they roam: beacons, scans, association and its loss.
 
 All access points and robots share one channel here; a robot that scans another channel neither sends nor receives.
-Probe frames would be on the other channels, so they are omitted. A scan finds each access point whose signal reaches
-the sensitivity of the robot at that time. Beacons and the frames of an association are sent on the air with retries.
+Probe frames would be on the other channels, so they are omitted. A scan finds each access point that is linked with
+the robot when the scan ends. Beacons are sent on the air as broadcasts; the frames of an association have retries.
 """
 
 from collections.abc import Mapping
@@ -57,7 +57,7 @@ class _Association:
         index: Index of the robot.
         access_point: The access point with which the robot is associated or is being associated, or None.
         scan: Schedule of its scans; None without an association.
-        beacon_ns: Time of the last beacon.
+        beacon_ns: Time of the last beacon, or of a later association or return to the channel.
         is_busy: True during a scan or an association.
         exchange: Number of the current step of an association; events of other steps are ignored.
         step: Index of the frame that is sent next.
@@ -224,7 +224,7 @@ class Roaming:
         self._send_next(now_ns, client, client.exchange)
 
     def _send_next(self, now_ns: int, client: _Association, exchange: int) -> None:
-        """Send the next frame of an association, or complete it."""
+        """Send the next frame of an association, complete it, or scan again after the last attempt at a frame."""
         if exchange != client.exchange or client.access_point is None:
             return
         if client.step == len(self._steps):
@@ -261,7 +261,7 @@ class Roaming:
         return max(client.levels_dbm, key=client.levels_dbm.__getitem__, default=None)
 
     def _levels_dbm(self, now_ns: int, client: _Association) -> dict[int, float]:
-        """Return the signal of each access point that the robot receives."""
+        """Return the signal of each access point that is linked with the robot."""
         return {
             access_point: self._level_dbm(now_ns, client, access_point)
             for access_point in self._delivery.access_points

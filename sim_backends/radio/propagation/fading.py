@@ -24,7 +24,7 @@ class Fading:
     A gain is the sum of 12 multipath components (echoes), each with its own directions of departure and arrival, and
     a constant component of K times their power. When an end moves, the phase of each echo changes with the distance
     moved in the echo's direction, as in the model of a ring of scatterers around each end (Akki and Haber, IEEE
-    Trans. Veh. Technol. 35:2, 1986; Patel, Stuber and Pratt, IEEE Trans. Commun. 53:374, 2005). The autocorrelation
+    Trans. Veh. Technol. 35:2, 1986; Patel, Stuber and Pratt, IEEE Trans. Commun. 53:1876, 2005). The autocorrelation
     of the echoes is therefore J0(2 pi d / wavelength) over a distance d moved by one end (Clarke, Bell Syst. Tech. J.
     47:957, 1968). If both ends move, it is the product of the J0 of each end. Moving scatterers around two ends at
     rest give the same kind of autocorrelation, J0(2 pi v t / wavelength). One gain applies to the whole channel: over
@@ -181,7 +181,7 @@ class Shadowing:
 
     The shadowing of a path is sigma (F(a) + F(b)) / sqrt(2), where F is a field with mean 0, variance 1 and the
     autocorrelation exp(-d / d0) of Gudmundson (Electron. Lett. 27:2145, 1991); it is the same in both directions, and
-    paths with a common end are correlated (Agrawal and Patwari, IEEE Trans. Wirel. Commun. 8:5576, 2009). F is a sum
+    paths with a common end are correlated (Agrawal and Patwari, IEEE Trans. Wirel. Commun. 8:4024, 2009). F is a sum
     of 256 plane waves. Their wave numbers k follow the spectral density of that autocorrelation in two dimensions,
     with the cumulative distribution 1 - 1 / sqrt(1 + (k d0)^2).
 

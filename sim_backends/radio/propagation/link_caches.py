@@ -8,10 +8,10 @@ from sim_backends.world.shapes import Floats
 
 
 class LinkRow:
-    """The links of one station to all others, by index, valid until a station moves.
+    """The links of one station to all others, by index, valid for one revision of the channel.
 
     Args:
-        revision: Revision of the positions for which it was computed.
+        revision: Revision of positions, velocities, cuts and losses for which it was computed.
         mean_mw: Received power of the station at each other station, without fading, in mW.
 
     Attributes:
@@ -32,7 +32,7 @@ class LinkRow:
 
 
 class GainCache:
-    """The gains of some links, valid until a station moves or the time slot ends.
+    """The gains of some links, valid for one revision of the channel and one time slot.
 
     Args:
         links: Indices of the links.
@@ -40,9 +40,9 @@ class GainCache:
         echoes: Their echoes.
 
     Attributes:
-        revision: Revision of the positions for which `fades` was computed.
-        fades: Gains over time since then.
-        slot: Time slot for which `gains` was computed.
+        revision: Revision for which `fades` was computed; -1 before the first use.
+        fades: Gains over time in this revision; None before the first use.
+        slot: Time slot for which `gains` was computed; -1 if there are none.
         gains: Gains in that slot, in the order of `links`.
     """
 

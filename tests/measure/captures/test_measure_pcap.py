@@ -29,7 +29,7 @@ def test_a_capture_without_packets_is_undamaged(link_type: int) -> None:
         (b"#ROSBAG V2.0\n" + bytes(100), "not a pcap or pcapng file"),
         (file_bytes([])[:3], "not a pcap or pcapng file"),
         (file_bytes([])[:23], "ends inside its header"),
-        (file_bytes([], link_type=147), "link type 147"),
+        (file_bytes([], link_type=147), "no link type that fieldkit can read: 147"),
     ],
 )
 def test_a_file_that_is_not_a_capture_is_rejected_with_a_remedy(data: bytes, message: str) -> None:

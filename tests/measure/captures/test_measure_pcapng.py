@@ -95,7 +95,7 @@ def test_times_equal_exact_fractions(resolution: int, ticks: int, offset_s: int)
 def test_a_file_with_only_unsupported_link_types_is_rejected() -> None:
     data = section() + interface(147) + interface(148)
     assert pcap.parse(data, where="x").frames == 0
-    with pytest.raises(EvidenceError, match="link type 147, 148") as error_info:
+    with pytest.raises(EvidenceError, match="no link type that fieldkit can read: 147, 148") as error_info:
         pcap.parse(data + enhanced(_frame(1), ticks=1), where="x")
     assert error_info.value.remedy
 

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from statistics import fmean
@@ -273,3 +274,9 @@ def test_a_ping_with_half_of_its_echoes_lost_has_no_median_of_all_requests() -> 
     assert measure_values(3).values["rtt_median_sent_s"] == measure_values(3).values["rtt_median_s"]
     assert measure_values(5).values["rtt_median_sent_s"] == 1e-3
     assert "rtt_median_sent_s" in measure_values(6).missing
+
+
+def test_a_killed_ping_has_no_median_of_all_requests() -> None:
+    output = replace(ping_with_answers((1, 100), (2, 200), n_sent=2), transmitted=None, received=None)
+    assert "rtt_median_s" in ping.measure(output).values
+    assert "rtt_median_sent_s" in ping.measure(output).missing

@@ -1,8 +1,9 @@
 """Stalls and jitter of iperf3 streams, from captures with given gaps and delays."""
 
 import random
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -11,7 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldkit.core.columns import Measured
 from fieldkit.core.model import Protocol
+from fieldkit.measure.captures.arrays import NO_TIME
 from fieldkit.measure.transfers import delay, iperf3_load, stalls
 from fieldkit.measure.transfers.deliveries import FlowSchedule
 from fieldkit.measure.transfers.iperf3_load import COOKIE_BYTES, LoadStreams
@@ -122,6 +125,13 @@ def test_a_clock_that_is_set_forward_is_not_a_stall(end: str) -> None:
             for frame in frames
         ]
     assert not measure_values(UDP, streams)
+
+
+@pytest.mark.parametrize("measure", [iperf3_load.measure_jitter, partial(iperf3_load.measure_stalls, "iperf3")])
+def test_a_capture_without_times_is_not_regarded_as_a_set_clock(measure: Callable[..., Measured]) -> None:
+    sender, receiver = captured([control(), data()])
+    result = measure(UDP, sender, replace(receiver, time_ns=np.full(len(receiver), NO_TIME)))
+    assert set(result.missing.values()) == {"a capture lacks times"}
 
 
 def test_without_captures_or_packets_the_columns_are_empty() -> None:

@@ -151,6 +151,11 @@ def test_stamps_of_another_clock_are_rejected_unless_times_of_reception_are_used
         ([pose_stamped(BEGAN_NS, 0.0, 0.0)], "/other", "no position in /other"),
         ([TYPES["std_msgs/msg/String"]("here")], "/where", "contains no position"),
         ([pose_stamped(BEGAN_NS, 0.0, 0.0), pose_stamped(BEGAN_NS, 0.0, 0.0, "odom")], "/where", "frames: map, odom"),
+        (
+            [pose_stamped(BEGAN_NS, 0.0, 0.0), odometry(BEGAN_NS, 0.0, 0.0)],
+            "/where",
+            "/where has messages of several types: geometry_msgs/msg/PoseStamped, nav_msgs/msg/Odometry",
+        ),
     ],
 )
 def test_topics_without_positions_are_rejected(tmp_path: Path, messages: list[Any], topic: str, message: str) -> None:

@@ -31,7 +31,7 @@ from fieldkit.trial.check import software
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
-from sim_backends.emulated.nodes import running_robots
+from sim_backends.emulated.running_robots import running_robots
 from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import load_world

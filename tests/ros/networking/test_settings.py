@@ -73,8 +73,21 @@ OTHER_DOMAIN = RosProgram("talker", {"ROS_DISTRO": "humble", "ROS_DOMAIN_ID": "5
             "peers 10.0.0.2",
         ),
         (robot_state({"ROS_DOMAIN_ID": "five"}), "ROS domain", Verdict.FAIL, "'five'"),
-        (robot_state(programs=(OTHER_DOMAIN,)), "ROS domain", Verdict.WARN, "1 of its 1 running ROS programs uses 5"),
-        (robot_state(programs=(RosProgram("a", ZENOH),)), "RMW", Verdict.WARN, "programs uses rmw_zenoh_cpp"),
+        (robot_state(programs=(OTHER_DOMAIN,)), "ROS domain", Verdict.WARN, "its only running ROS program uses 5"),
+        (
+            robot_state(programs=(OTHER_DOMAIN,) * 2),
+            "ROS domain",
+            Verdict.WARN,
+            "2 of its 2 running ROS programs use 5",
+        ),
+        (
+            robot_state(programs=(RosProgram("a", {"ROS_DISTRO": "humble"}),)),
+            "ROS domain",
+            Verdict.OK,
+            "0; 1 running ROS program in this domain, none in another",
+        ),
+        (robot_state(programs=(RosProgram("a", ZENOH),)), "RMW", Verdict.WARN, "program uses rmw_zenoh_cpp"),
+        (robot_state({"ROS_DISTRO": "galactic"}), "RMW", Verdict.OK, "rmw_cyclonedds_cpp"),
         (robot_state(multicast_interface=None), "multicast route", Verdict.FAIL, "no route"),
         (robot_state(multicast_interface="eth0"), "multicast route", Verdict.WARN, "leave through eth0"),
         (robot_state(rmw_interfaces=("eth0",)), "RMW settings", Verdict.FAIL, "limited to eth0"),
@@ -131,6 +144,11 @@ def test_settings_that_differ_between_robots_are_reported(
     variables: Mapping[str, str], check: str, status: Verdict
 ) -> None:
     assert compare_states(robot_state({"ROS_DISTRO": "humble"}), robot_state(variables))[check][0] is status
+
+
+def test_an_invalid_domain_is_reported_as_it_is_written() -> None:
+    _, detail = compare_states(robot_state({}), robot_state({"ROS_DOMAIN_ID": "five"}))["same ROS domain"]
+    assert detail == "domain five, but a is in domain 0: their nodes do not discover each other"
 
 
 def test_a_discovery_server_that_runs_is_ok() -> None:

@@ -92,7 +92,7 @@ def test_void_and_failed_repeats_do_not_count() -> None:
 def test_a_valid_repeat_without_a_loss_never_passes() -> None:
     assessment = judge(cell([*5 * [0], UNKNOWN]))
     assert not assessment.passed
-    assert "1 of 6 repeats have no value" in assessment.missing_evidence[0]
+    assert "no value in 1 of 6 repeats" in assessment.missing_evidence[0]
     # No sample was sent because there was no subscription.
     assert judge(cell(5 * [0], sent=0)).missing_evidence
     assert not judge(cell(5 * [0], sent=0)).failures
@@ -118,7 +118,7 @@ def test_a_missing_delay_never_passes() -> None:
     measured_cell = cell(5 * [0], delay_s=[0.01, 0.02, UNKNOWN, 0.01, 0.01])
     assessment = judge(measured_cell, criterion=replace(ONE_PERCENT, max_delay_s=0.2))
     assert not assessment.failures
-    assert "1 of 5 repeats have no value" in assessment.missing_evidence[0]
+    assert "no value in 1 of 5 repeats" in assessment.missing_evidence[0]
     assert judge(measured_cell).passed  # no delay is needed without a delay limit
 
 

@@ -56,8 +56,8 @@ def test_invalid_keys_are_rejected(robots: str, message: str) -> None:
     [
         ("[{TRACK}, {TRACK}]", "a repeat can have only one track"),
         ("[{{move: {{robot: sender, path: [away: 1m], speed: 1m/s, during: [{TRACK}]}}}}]", "put the move into"),
-        ("[{{fault: {{robot: sender, kind: reboot, during: [{TRACK}]}}}}]", "put them into the track"),
-        ("[{{together: {{during: [{TRACK}, {WAIT}]}}}}]", "put them into the track"),
+        ("[{{fault: {{robot: sender, kind: reboot, during: [{TRACK}]}}}}]", "put that step into the track"),
+        ("[{{together: {{during: [{TRACK}, {WAIT}]}}}}]", "put that step into the track"),
     ],
 )
 def test_invalid_place_in_the_procedure_is_rejected(steps: str, message: str) -> None:

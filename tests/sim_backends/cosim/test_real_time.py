@@ -65,7 +65,7 @@ def test_the_command_marks_the_results_of_a_late_run_as_failed_and_shows_the_his
     paced_run = run_here(tmp_path, *words, "--realtime", "2", "--late-bound", "60s")
     assert paced_run.code == 0, paced_run.err
     assert "late up to (ms)" in paced_run.out
-    assert "0.4 s simulated, in real time; without waiting for it, " in paced_run.out
+    assert "0.4 s simulated, paced by --realtime; without its waits, " in paced_run.out
 
     for options, message in (
         (("--realtime", "-1"), "--realtime: '-1' is not a number above 0"),

@@ -306,7 +306,7 @@ def test_a_robot_uses_less_than_15_mb_of_unshared_memory() -> None:
             robot.build()
             robot.open_radio()
             robot.start()
-        assert Memory.of(robots[0].pid).own < 15e6
+        assert Memory.of(robots[0].pid).own_bytes < 15e6
 
 
 def test_a_rejected_address_is_reported() -> None:

@@ -20,7 +20,7 @@ from sim_backends.emulated.mobility import STEP_M, Mobility
 from sim_backends.emulated.nodes import EmulatedRobot
 from sim_backends.emulated.ros.motion_record import RecordedMotion
 from sim_backends.emulated.ros.robot_motion import AssignedPath
-from sim_backends.world.motion import STILL
+from sim_backends.world.motion import STILL, Attitude
 from sim_backends.world.world import load_world
 from tests.helpers.casts import CAST
 from tests.helpers.sshd import wait_until
@@ -34,15 +34,22 @@ class RecordingMedium:
     """A medium that records its calls."""
 
     calls: list[tuple[Mapping[str, Vector], Mapping[str, Vector]]] = field(default_factory=list)
+    attitudes: Mapping[str, Attitude] = field(default_factory=dict)
     fails: bool = False
 
     def place(
-        self, positions_m: Mapping[str, Vector], *, relay: str | None, velocities_m_s: Mapping[str, Vector]
+        self,
+        positions_m: Mapping[str, Vector],
+        *,
+        relay: str | None,
+        velocities_m_s: Mapping[str, Vector],
+        attitudes: Mapping[str, Attitude],
     ) -> None:
         if self.fails:
             raise LinkError("does not answer", where="medium", remedy="start the lab again")
         assert relay is None or relay in positions_m
         self.calls.append((dict(positions_m), dict(velocities_m_s)))
+        self.attitudes = attitudes
 
     def positions_of(self, role: Role) -> list[Vector | None]:
         return [positions.get(CAST[role].name) for positions, _ in self.calls]
@@ -246,6 +253,26 @@ def test_the_medium_follows_a_robot_that_steers_itself_until_the_lab_places_it(
     track = [point.position_m for point in mobility.track(0) if point.role is Role.RELAY]
     assert (7.0, 8.0, 12.0) in track
     assert track[0] == track[-1] == place
+
+
+def test_the_medium_receives_the_attitudes_of_robots(
+    medium: RecordingMedium, flying_drone: tuple[Mobility, SteeringRobot]
+) -> None:
+    mobility, robot = flying_drone
+    drone, sender, receiver = (CAST[role].name for role in (Role.RELAY, Role.SENDER, Role.RECEIVER))
+    east, west = Attitude(0.0), Attitude(math.pi)
+    assert [medium.attitudes[name].yaw_rad for name in (sender, receiver)] == pytest.approx(
+        [west.yaw_rad, east.yaw_rad]
+    ), "they face away from each other"
+    start_ns = robot.paths[-1].start_ns
+    robot.last_recorded_motion = RecordedMotion(
+        time.monotonic_ns(), start_ns, (7.0, 8.0, 9.0), heading_rad=1.0, tilt_rad=(0.1, 0.2)
+    )
+    with mobility.moving(Move(Role.SENDER, (Leg(left_m=0.2),), 2.0)):
+        wait(lambda: not motion_threads())
+        assert medium.attitudes[drone] == Attitude(yaw_rad=1.0, pitch_rad=0.2, roll_rad=0.1)
+        assert medium.attitudes[sender].yaw_rad == pytest.approx(-math.pi / 2), "left of west, also after the move"
+    assert medium.attitudes[sender].yaw_rad == pytest.approx(west.yaw_rad)
 
 
 def test_the_time_of_the_track_is_that_of_the_positions(

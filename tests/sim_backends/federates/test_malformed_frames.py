@@ -9,8 +9,10 @@ import pytest
 
 from docs.generator.federate_frames import agents, example_frames
 from sim_backends.federates import exchanges
+from sim_backends.federates.agent_states import AgentTable
 from sim_backends.federates.frames import (
     HEADER_BYTES,
+    MAX_AGENTS,
     MAX_FRAME_BYTES,
     FrameReader,
     MalformedFrameError,
@@ -89,6 +91,13 @@ def test_an_error_states_the_position_of_the_wrong_byte(
     with pytest.raises(MalformedFrameError) as error_info:
         DECODERS[name](bytes(body))
     assert str(error_info.value).startswith(message)
+
+
+def test_an_agent_above_the_limit_is_refused() -> None:
+    table = AgentTable(f"agent {number}" for number in range(MAX_AGENTS))
+    body = exchanges.encode_number(0) + struct.pack("<II", 1, MAX_AGENTS) + text_bytes("new") + struct.pack("<I", 0)
+    with pytest.raises(MalformedFrameError, match="byte 28: there are more than 10000 agents"):
+        exchanges.decode_states(body, table)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e308])

@@ -346,7 +346,7 @@ def test_the_error_about_a_missing_connection_has_the_reason_of_the_last_rejecti
         join(channel, "wrong", time.monotonic() + 20)
 
     threading.Timer(0.1, connect).start()
-    message = r"no federate has connected to \S+ \(a program with a wrong token was rejected\) within 2 s"
+    message = r"no federate has connected to \S+ \(a program without the right token was rejected\) within 2 s"
     with pytest.raises(UnansweredError, match=message):
         open_physics(f"tcp-listen:127.0.0.1:{port}", HELLO, 2.0)
 

@@ -90,6 +90,10 @@ TOPIC = {"protocol": "topic", "from": "ann", "to": ["bob"]}
     ("changes", "message"),
     [
         (
+            {"robots/ann/radio/pattern": {"axis": [0, 0, 1]}},
+            "the antenna of ann has a pattern, which this network does not model",
+        ),
+        (
             {"robots": {"ann": {"radio": None}}},
             "the configuration is incomplete (select the network by its name, ns3): ",
         ),

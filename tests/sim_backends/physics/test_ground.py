@@ -64,6 +64,9 @@ def test_the_grip_of_tires_limits_the_acceleration_on_a_slope(
     state = state_after(rover(10.0, heading_deg=heading_deg), 100, Twist(forward))
     assert math.hypot(*state.velocity_m_s) == pytest.approx(0.1 * expected_m_s2, rel=1e-9)
     assert state.position_m[2] == pytest.approx(RISE * (state.position_m[0] - 5), abs=1e-12)
+    roll_rad, pitch_rad = state.tilt_rad
+    assert math.tan(pitch_rad) == pytest.approx(-RISE * math.cos(math.radians(heading_deg)), abs=1e-12)
+    assert math.sin(roll_rad) == pytest.approx(-RISE * math.sin(math.radians(heading_deg)) / math.hypot(1, RISE))
 
 
 def test_a_turning_robot_stays_on_the_slope() -> None:

@@ -44,6 +44,7 @@ def test_the_tilt_balances_the_drag(limits: QuadrotorLimits, speed_m_s: float) -
     assert result["state"].velocity_m_s == pytest.approx((0.0, speed_m_s, 0.0), abs=1e-7)
     assert math.tan(result["pose"].pitch_rad) == pytest.approx(drag_n / (limits.mass_kg * GRAVITY_M_S2), abs=1e-7)
     assert result["pose"].roll_rad == pytest.approx(0.0, abs=1e-7)
+    assert result["state"].tilt_rad == (result["pose"].roll_rad, result["pose"].pitch_rad)
     assert result["state"].heading_rad == pytest.approx(math.pi / 2)
     assert result["state"].position_m[2] == pytest.approx(100.0, abs=0.05)
 

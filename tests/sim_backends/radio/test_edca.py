@@ -207,7 +207,7 @@ def test_the_counters_of_a_link_include_all_categories() -> None:
     ],
 )
 def test_dscps_are_mapped_as_by_linux_or_by_rfc_8325(dscp: int, linux: int, rfc8325: int) -> None:
-    """Linux up to 6.10: precedence; RFC 8325, figure 1: EF is voice, AF3x video, AF1x best effort, CS1 background."""
+    """Linux up to 6.7: precedence; RFC 8325, figure 1: EF is voice, AF3x video, AF1x best effort, CS1 background."""
     assert (category_of(dscp, "linux"), category_of(dscp, "rfc8325")) == (linux, rfc8325)
 
 

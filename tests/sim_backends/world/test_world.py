@@ -202,6 +202,24 @@ def test_an_invalid_world_is_reported_with_its_line(valid_text: str, message: st
     assert error_info.value.where.startswith("yard.yaml:")
 
 
+@pytest.mark.parametrize(
+    ("obstacle", "message"),
+    [
+        (
+            "kind: tree, at_m: [5, 5], height: 2m, crown_base: 2m, crown_radius: 1m, trunk_radius: 0.1m",
+            "the lower end of the crown must be below its top",
+        ),
+        (
+            "kind: building, centre_m: [5, 5], size_m: [6, 4, 3], thickness: 2m, material: brick",
+            "the walls or the roof fill the whole building",
+        ),
+    ],
+)
+def test_sizes_that_contradict_each_other_are_an_error(obstacle: str, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        world(text=f"{WORLD}  - {{name: extra, {obstacle}}}\n")
+
+
 def test_an_unknown_world_is_an_error_with_a_suggestion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigurationError, match="no world 'lwn'") as error_info:

@@ -120,7 +120,7 @@ def test_an_access_point_counts_its_stations_and_needs_no_power_save() -> None:
     findings = judge_radio(
         RELAY, wifi_info=read_result("iw/info-ap.txt"), wifi_stations=read_result("iw/stations-ap.txt")
     )
-    assert only(findings, "Wi-Fi").detail == "AP 'xx', channel 1, 1 stations, -57 dBm"
+    assert only(findings, "Wi-Fi").detail == "AP 'xx', channel 1, 1 station, -57 dBm"
     assert "power save" not in {finding.check for finding in findings}
 
 

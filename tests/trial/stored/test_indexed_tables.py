@@ -1,5 +1,6 @@
 """The index of tables: results with it equal results without it, even after changes of the trials or the index."""
 
+import errno
 import io
 import os
 import shutil
@@ -113,6 +114,11 @@ def test_a_replaced_table_of_the_same_size_and_time_is_read_again(tmp_path: Path
     after = path.stat()
     assert (after.st_size, after.st_mtime_ns, after.st_ino) == (before.st_size, before.st_mtime_ns, before.st_ino)
     assert outcome(tmp_path / "trials", use_index=True) == outcome(tmp_path / "trials", use_index=False)
+
+
+def test_a_pipe_without_a_plan_is_not_indexed(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "table.csv")
+    assert table_index.stamp(tmp_path / "table.csv", tmp_path / "trial.yaml") is None
 
 
 def test_a_table_that_has_just_changed_is_not_indexed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -242,7 +248,7 @@ EDITS: Final[dict[str, Callable[[Path, int], object]]] = {
     "removed": lambda trial, _: shutil.rmtree(trial),
     "table removed": lambda trial, _: (trial / "trial.csv").unlink(),
     "plan removed": lambda trial, _: (trial / "trial.yaml").unlink(missing_ok=True),
-    "renamed": lambda trial, draw: trial.rename(trial.with_name(f"renamed-{draw}")),
+    "renamed": lambda trial, draw: trial.rename(trial.with_name(f"{trial.name}-{draw}")),
     "hidden": lambda trial, draw: trial.rename(trial.with_name(f".hidden-{draw}")),
     "added": lambda trial, draw: add_trial(trial.parent, 1000 + draw),
     "copied": lambda trial, draw: shutil.copytree(trial, trial.with_name(f"copy-{draw}")),
@@ -264,7 +270,9 @@ def _check_edits(folder: Path, edits: list[tuple[str, int, int]]) -> None:
             return
         try:
             EDITS[name](trials[trial_index % len(trials)], draw)
-        except FileExistsError:  # the same edit with the same number
+        except OSError as error:
+            if error.errno not in {errno.EEXIST, errno.ENOTEMPTY}:  # the same edit with the same number
+                raise
             continue
         assert outcome(folder, use_index=True) == outcome(folder, use_index=False), name
 

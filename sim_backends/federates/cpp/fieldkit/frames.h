@@ -43,7 +43,7 @@ struct Frame
     std::string body;
 };
 
-// Read a frame; return false at the end of the stream.
+// Read a frame; return false at the end of the stream, also if it ends within the frame.
 inline bool
 ReadFrame(std::FILE* stream, Frame& frame)
 {

@@ -68,7 +68,7 @@ struct DelayParts
     int64_t propagation_ns = 0;
 };
 
-// Collects arrivals and drops, each in order of time, for the next answer.
+// Collects arrivals and drops for the next answer. Both must be added in order of time.
 class Outcomes
 {
   public:

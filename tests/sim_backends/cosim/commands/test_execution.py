@@ -63,7 +63,7 @@ def ignore(_: Event) -> None:
     """Ignore an event."""
 
 
-def test_ctrl_c_ends_all_seeds_on_a_single_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_ends_all_seeds_on_a_single_processor(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """On a single processor, the runs take place in the process that receives the signal."""
     started_seeds: list[int | None] = []
 
@@ -86,6 +86,10 @@ def test_ctrl_c_ends_all_seeds_on_a_single_processor(monkeypatch: pytest.MonkeyP
     assert (started_seeds, is_interrupted) == ([1, 2], True)
     assert [(result.seed, result.is_interrupted) for result in results] == [(1, False), (2, True)]
     assert results[1].simulated_s == 0.02
+    words = ("--policy", "scheduled", "--duration", "50ms", "--seeds", "3")
+    interrupted_run = run_here(tmp_path, "cosim", "run", "baylands", *words)
+    assert interrupted_run.code == 130
+    assert "interrupted: the runs of 1 of 3 seeds had finished" in interrupted_run.err
 
 
 def test_the_output_is_the_same_for_any_number_of_workers(tmp_path: Path) -> None:

@@ -4,12 +4,14 @@ import math
 
 import pytest
 
+from sim_backends.cosim import load_scenario
 from sim_backends.cosim.agents import Agents
+from sim_backends.cosim.commands import bound
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.policies.sync_policy import SyncPolicy
 from sim_backends.cosim.programs.senders import Periodic
 from sim_backends.cosim.run_record import Run
-from sim_backends.cosim.studies.bounds import FixedCost, bound_cost, longest_sufficient_window
+from sim_backends.cosim.studies.bounds import BoundCost, FixedCost, bound_cost, longest_sufficient_window
 from sim_backends.network.disc import Disc
 from sim_backends.physics.paths import Paths
 from sim_backends.world.motion import Motion, State, WayPoints
@@ -76,3 +78,13 @@ def test_the_window_for_all_runs_satisfies_the_bound_in_each_run() -> None:
     assert 0.00525 / 1.02 <= window_s <= 0.00525
     assert [cost.exchanges for cost in fixed] == [round(1 / window_s)] * 2
     assert longest_sufficient_window([0.01, math.nan], costs, 0.01)[1] == ()
+
+
+@pytest.mark.parametrize(
+    ("largest_m", "outcome"),
+    [(0.01, "keeps the bound of 10 mm"), (0.02, "exceeds the bound of 10 mm (largest error 20 mm)")],
+)
+def test_the_summary_states_if_the_bound_was_exceeded(largest_m: float, outcome: str) -> None:
+    cost = BoundCost(largest_m, exchanges=7, added_s=math.nan, window_s=math.nan, fixed_exchanges=0)
+    text = bound._summary(load_scenario("field_30ft"), [cost], math.nan, ()).replace("\n", " ")
+    assert text == f"error_bounded {outcome} with 7 exchanges, and no fixed window keeps the bound"

@@ -12,7 +12,9 @@ from sim_backends.emulated.autopilot import mavlink_frames
 from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
 from sim_backends.emulated.autopilot.firmware import Firmware
 from sim_backends.emulated.autopilot.mission_plan import degrees_e7
+from sim_backends.emulated.autopilot.parameters import Parameters
 from sim_backends.emulated.autopilot.px4 import PX4
+from sim_backends.emulated.autopilot.telemetry import Telemetry
 from tests.helpers.ground_station import HOME_M, SYSTEM, GroundStation
 
 OK, FAILED, DENIED = d.MAV_RESULT_ACCEPTED, d.MAV_RESULT_FAILED, d.MAV_RESULT_DENIED
@@ -70,9 +72,9 @@ def test_messages_that_pymavlink_does_not_have_have_valid_checksums() -> None:
         crc = d.x25crc(frame[1:-2])
         crc.accumulate(bytes([checksum_extra(message.get_type(), definitions[message.get_type()])]))
         assert int.from_bytes(frame[-2:], "little") == crc.crc
-    frame = pack_frame(mavlink_frames.available_modes(9, 2, 4, 0x05040000, "Return"))
+    frame = pack_frame(mavlink_frames.available_modes(9, 2, 5, 0x05040000, "Return"))
     (mode,) = development.MAVLink(None).parse_buffer(frame)
-    assert (mode.number_modes, mode.mode_index, mode.standard_mode) == (9, 2, 4)
+    assert (mode.number_modes, mode.mode_index, mode.standard_mode) == (9, 2, 5)
     assert (mode.custom_mode, mode.mode_name) == (0x05040000, "Return")
 
 
@@ -118,6 +120,19 @@ def test_each_mode_is_listed(firmware: Firmware) -> None:
     assert (result, message_ids) == (OK, [mavlink_frames.AVAILABLE_MODES] * len(firmware.names))
     assert gcs.answers(mavlink_frames.AVAILABLE_MODES, 1) == (OK, [mavlink_frames.AVAILABLE_MODES])
     assert gcs.answers(mavlink_frames.AVAILABLE_MODES, 200)[0] != OK
+
+
+def test_modes_have_the_standard_modes_of_the_dialect() -> None:
+    messages = Telemetry(station(PX4).autopilot.vehicle, Parameters(())).available_modes(0)
+    modes = [development.MAVLink(None).parse_buffer(pack_frame(message))[0] for message in messages]
+    assert {mode.mode_name: mode.standard_mode for mode in modes if mode.standard_mode} == {
+        "Position": development.MAV_STANDARD_MODE_POSITION_HOLD,
+        "Altitude": development.MAV_STANDARD_MODE_ALTITUDE_HOLD,
+        "Return": development.MAV_STANDARD_MODE_SAFE_RECOVERY,
+        "Mission": development.MAV_STANDARD_MODE_MISSION,
+        "Land": development.MAV_STANDARD_MODE_LAND,
+        "Takeoff": development.MAV_STANDARD_MODE_TAKEOFF,
+    }
 
 
 def test_attitude_and_acceleration_agree_in_flight() -> None:

@@ -21,7 +21,7 @@ from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.linux_wifi import medium_program
 from sim_backends.emulated.linux_wifi.radios import find_radios
 from sim_backends.emulated.linux_wifi.wifi_client import WifiClient
-from sim_backends.emulated.nodes import RunningRobots, running_robots
+from sim_backends.emulated.running_robots import RunningRobots, running_robots
 from sim_backends.world.world import load_world
 
 PROFILE = load_profile("turtlebot3_burger")

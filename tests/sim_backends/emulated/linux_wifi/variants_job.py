@@ -15,7 +15,7 @@ from fieldkit.backends.protocols import Robot
 from fieldkit.config.profiles import load_profile
 from fieldkit.core.model import Role, Vector
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
-from sim_backends.emulated.nodes import RunningRobots, running_robots
+from sim_backends.emulated.running_robots import RunningRobots, running_robots
 from sim_backends.world.world import load_world
 
 PROFILE = load_profile("turtlebot3_burger")

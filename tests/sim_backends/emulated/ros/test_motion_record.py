@@ -19,7 +19,12 @@ FLOATS = st.floats(-1e3, 1e3)
 VECTORS = st.tuples(FLOATS, FLOATS, FLOATS)
 TIMES = st.integers(0, 10**18)
 MOTIONS = st.builds(
-    RecordedMotion, TIMES, TIMES, VECTORS, VECTORS, heading_rad=FLOATS, turn_rad_s=st.floats(-3, 3), odometry=VECTORS
+    RecordedMotion,
+    *(TIMES, TIMES, VECTORS, VECTORS),
+    heading_rad=FLOATS,
+    turn_rad_s=st.floats(-3, 3),
+    odometry=VECTORS,
+    tilt_rad=st.tuples(FLOATS, FLOATS),
 )
 
 
