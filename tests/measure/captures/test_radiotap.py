@@ -9,7 +9,7 @@ from scapy.packet import Packet
 from scapy.utils import PcapReader
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.measure.captures import radiotap
+from fieldkit.measure.captures import pcap, radiotap
 from fieldkit.measure.captures.radiotap import NO_SIGNAL, RETRY, UNKNOWN, RadioCapture, RadioFrames
 from tests.helpers.captures import Frame, file_bytes
 from tests.helpers.paths import DATA
@@ -143,3 +143,12 @@ def test_real_captures_have_the_fields_that_scapy_reads(path: Path) -> None:
         assert frame.sequence[0] == packet.SC
         assert frame.receiver[0] == int(packet.addr1.replace(":", ""), 16)
         assert frame.is_retry[0] == bool(packet.FCfield & "retry")
+
+
+@pytest.mark.parametrize("role", ["sender", "receiver"])
+def test_packets_in_the_frames_of_a_mesh_are_those_of_the_radio_interface(role: str) -> None:
+    folder = DATA / "hwsim/6.1.176/mesh-trial"
+    monitor, radio = (pcap.read(folder / f"{role}{suffix}.pcap").packets for suffix in ("-monitor", ""))
+    assert len(monitor) == len(radio) == 135
+    for column in ("src", "dst", "protocol", "ip_id", "fragment_offset"):
+        assert sorted(getattr(monitor, column).tolist()) == sorted(getattr(radio, column).tolist())
