@@ -1,41 +1,26 @@
-"""Captures on monitor interfaces, which the step `capture` takes in addition to the captures of packets."""
+"""Captures on monitor interfaces, which the step `capture` takes in addition to the captures of packets.
+
+`capture` imports this module only if it has the key `monitor`, because few trials have such a capture.
+"""
 
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from fieldkit.core.columns import Column, Measured
-from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
+from fieldkit.core.columns import Measured
 from fieldkit.core.model import Role, Verdict
+from fieldkit.measure.captures import radiotap
+from fieldkit.measure.captures.radiotap import RadioFrames
+from fieldkit.measure.checks import monitor_checks, monitor_columns
 from fieldkit.measure.evidence import tcpdump_log
 from fieldkit.steps.scene import CommandResult, Need
 from fieldkit.steps.view import View
-
-if TYPE_CHECKING:
-    from fieldkit.measure.captures.radiotap import RadioFrames  # needed only for a capture on a monitor interface
 
 _DATA_LINK: Final = "IEEE802_11_RADIO"
 """tcpdump's name for frames of IEEE 802.11 with radiotap headers."""
 
 _NOT_CAPTURED: Final = "the {role} does not capture"
 _INCOMPLETE: Final = "the capture on its monitor interface is incomplete"
-
-CROSS_CHECK: Final = CrossCheck(
-    quantity="frames of a radio",
-    columns=("*_monitor_*",),
-    source="`ROLE-monitor.pcap`",
-    against=(
-        "`ROLE-link.txt`: counters, signal and rates",
-        "`ROLE.pcap`: packets that the robot received",
-        "`ROLE-monitor.pcap` of the other robot: sequence numbers and retry flags",
-    ),
-    tolerance=(
-        "iw reads the driver up to 0.5 s after the time of a sample; signals may differ by 1 dB, and rates by "
-        "0.1 Mbit/s; rates during retransmissions are not compared, because radiotap has the rate of the first "
-        "attempt and iw that of the last"
-    ),
-    outcome=CheckOutcome.WITHHELD,
-)
 
 
 def options(interface: str) -> tuple[str, ...]:
@@ -56,13 +41,6 @@ def need(role: Role, prefix: tuple[str, ...], program: str, interface: str) -> N
     return Need(role, f"monitor interface {interface}", argv, partial(_judge, interface), required_program=program)
 
 
-def columns() -> tuple[Column, ...]:
-    """Return the columns that only trials with a capture on a monitor interface have."""
-    from fieldkit.measure.checks import monitor_columns  # noqa: PLC0415 (few trials have such a capture)
-
-    return monitor_columns.COLUMNS
-
-
 def measure(view: View, files: Mapping[Role, Iterable[str]]) -> Measured:
     """Return the columns of the frames of the radios.
 
@@ -72,8 +50,6 @@ def measure(view: View, files: Mapping[Role, Iterable[str]]) -> Measured:
         view: The attempt.
         files: Files with the packets and with the frames of each robot that captures.
     """
-    from fieldkit.measure.checks import monitor_columns  # noqa: PLC0415 (as in `columns`)
-
     names = {role: tuple(role_files) for role, role_files in files.items()}
     captures = {role: _complete_frames(view, frames_file) for role, (_, frames_file) in names.items()}
     measured = Measured()
@@ -91,11 +67,9 @@ def measure(view: View, files: Mapping[Role, Iterable[str]]) -> Measured:
 
 
 def _contradictions(
-    view: View, role: Role, packets_file: str, frames: "RadioFrames", captures: "Mapping[Role, RadioFrames | None]"
+    view: View, role: Role, packets_file: str, frames: RadioFrames, captures: Mapping[Role, RadioFrames | None]
 ) -> Iterator[str]:
     """Yield each contradiction between a capture on a monitor interface and another source."""
-    from fieldkit.measure.checks import monitor_checks  # noqa: PLC0415 (as in `columns`)
-
     yield from monitor_checks.link_contradictions(frames, view.evidence.links(role))
     packets = view.evidence.undamaged_capture(packets_file)
     if packets is not None:
@@ -107,10 +81,8 @@ def _contradictions(
             yield from monitor_checks.peer_contradictions(frames, other_frames)
 
 
-def _complete_frames(view: View, name: str) -> "RadioFrames | None":
+def _complete_frames(view: View, name: str) -> RadioFrames | None:
     """Return the frames in a file, or None if it is missing or damaged, or frames were dropped."""
-    from fieldkit.measure.captures import radiotap  # noqa: PLC0415 (as in `columns`)
-
     capture = view.evidence.read_or_none(radiotap.read, name)
     log = view.evidence.read_or_none(tcpdump_log.read, tcpdump_log.capture_log_file(name))
     if capture is None or capture.damage or log is None or log.dropped_by_kernel or log.dropped_by_interface:
