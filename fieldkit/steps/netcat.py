@@ -13,10 +13,11 @@ Tested manually with each pair of sender and receiver and a receiver that reads 
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Final
 
-from fieldkit.core.model import Protocol
+from fieldkit.core.model import Protocol, Role
+from fieldkit.steps.scene import Refusal
 from fieldkit.steps.variants import Netcat
 
 DATAGRAM_BYTES: Final[Mapping[Netcat, int]] = {Netcat.TRADITIONAL: 8192, Netcat.OPENBSD: 16384, Netcat.NCAT: 8192}
@@ -86,6 +87,28 @@ def truncates_datagrams(sender: Netcat, receiver: Netcat, receiver_version: str 
     """
     both_have_udp = sender in DATAGRAM_BYTES and receiver in _READ_BYTES
     return both_have_udp and DATAGRAM_BYTES[sender] > _read_bytes(receiver, receiver_version)
+
+
+def udp_refusals(
+    netcats: Mapping[Role, Netcat], sender: Role, receiver: Role, receiver_version: str
+) -> Iterator[Refusal]:
+    """Yield the reasons why the netcats of two robots cannot transfer a file over UDP.
+
+    Args:
+        netcats: The netcat of both roles.
+        sender: Role of the sender.
+        receiver: Role of the receiver.
+        receiver_version: Version text of the receiver's netcat; empty if unknown.
+    """
+    for role, netcat in netcats.items():
+        if netcat is Netcat.BUSYBOX:
+            remedy = "sudo apt-get install netcat-traditional, and write netcat: nc.traditional in its profile"
+            yield Refusal(role, "busybox nc has no UDP", remedy)
+    if truncates_datagrams(netcats[sender], netcats[receiver], receiver_version):
+        size = DATAGRAM_BYTES[netcats[sender]]
+        reason = f"its netcat truncates the datagrams of {size} bytes from the sender's netcat"
+        remedy = "sudo apt-get install netcat-openbsd, and write netcat: nc.openbsd in its profile"
+        yield Refusal(receiver, reason, remedy)
 
 
 def _read_bytes(netcat: Netcat, version: str) -> int:

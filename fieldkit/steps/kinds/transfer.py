@@ -76,10 +76,6 @@ MAX_LATE_SHARE: Final = 0.1
 """Maximum time between the start of a TCP listener and the start of its sender, as a share of the listener's limit.
 It applies if the listener did not exit with 0, for example because it was stopped at its limit."""
 
-_TRADITIONAL_REMEDY: Final = (
-    "sudo apt-get install netcat-traditional, and write netcat: nc.traditional in its profile"
-)
-
 
 class TransferStep(
     Step,
@@ -200,24 +196,15 @@ class TransferStep(
         yield from self._file_refusals(scene)
         if scene.protocol is not Protocol.UDP:
             return
-        ends = {role: scene.tools(role).netcat for role in (self.sender, self.receiver)}
-        for role, kind in ends.items():
-            if kind is Netcat.BUSYBOX:
-                yield Refusal(role, "busybox nc has no UDP", _TRADITIONAL_REMEDY)
+        netcats = {role: scene.tools(role).netcat for role in (self.sender, self.receiver)}
         version = scene.tools(self.receiver).versions.get(Tool.NETCAT, "")
-        if netcat.truncates_datagrams(ends[self.sender], ends[self.receiver], version):
-            size = netcat.DATAGRAM_BYTES[ends[self.sender]]
-            reason = f"its netcat truncates the datagrams of {size} bytes from the sender's netcat"
-            remedy = "sudo apt-get install netcat-openbsd, and write netcat: nc.openbsd in its profile"
-            yield Refusal(self.receiver, reason, remedy)
+        yield from netcat.udp_refusals(netcats, self.sender, self.receiver, version)
 
     def _file_refusals(self, scene: Scene) -> Iterator[Refusal]:
         """Yield a reason if no recording has the name of the file to send."""
         recordings = [file.name for file in scene.recordings[self.sender]]
-        if self.file is not None and self.file not in {
-            self._file_to_send(scene).name,
-            self._file_to_send(scene).alias,
-        }:
+        file_to_send = self._file_to_send(scene)
+        if self.file not in {None, file_to_send.name, file_to_send.alias}:
             reason = f"it cannot send {self.file}: its recorder writes {', '.join(recordings)}"
             leave_out = "leave out file: in the transfer, or " if len(recordings) == 1 else ""
             yield Refusal(self.sender, reason, f"{leave_out}write file: {recordings[0]}")

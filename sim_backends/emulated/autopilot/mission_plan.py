@@ -7,7 +7,7 @@ from itertools import islice, repeat
 from typing import Final
 
 from fieldkit.core.model import Vector
-from sim_backends.emulated.autopilot.failsafes import is_within
+from sim_backends.emulated.autopilot.fence import is_within
 from sim_backends.emulated.autopilot.flight import Airframe
 from sim_backends.emulated.autopilot.mavlink_frames import Message, dialect
 from sim_backends.emulated.ros.messages import EAST_RADIUS_M, NORTH_RADIUS_M

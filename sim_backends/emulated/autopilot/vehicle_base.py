@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from fieldkit.core.model import Vector
-from sim_backends.emulated.autopilot.failsafes import Fence, VehicleState
+from sim_backends.emulated.autopilot.failsafes import VehicleState
+from sim_backends.emulated.autopilot.fence import Fence
 from sim_backends.emulated.autopilot.firmware import Firmware
 from sim_backends.emulated.autopilot.flight import Airframe, Guidance, MakeAirframe, limits_within, stop_m
 from sim_backends.emulated.autopilot.mission_plan import Mission

@@ -40,7 +40,6 @@ class Drone:
         self.offset_m = tuple(to - at for to, at in zip(start.position_m, self.state().position_m, strict=True))
 
     def state(self):
-        """Return the state of the drone."""
         fdm = self.fdm
         velocity_fps = fdm["velocities/v-east-fps"], fdm["velocities/v-north-fps"], -fdm["velocities/v-down-fps"]
         east_m, north_m = EAST_M * fdm["position/long-gc-rad"], NORTH_M * fdm["position/lat-geod-rad"]
