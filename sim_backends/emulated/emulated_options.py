@@ -246,6 +246,7 @@ class EmulatedOptions(Strict):
         excluded_options = {
             "physics": self.physics,
             "network": self.network,
+            "mesh": self.mesh,
             "record_air": self.record_air,
             "links": self.links,
             "radio": self.radio.is_fixed,
@@ -260,8 +261,6 @@ class EmulatedOptions(Strict):
         if self.has_linux_wifi and self.linux_wifi.mesh and self.radio.access_points:
             cause = "`linux_wifi: {mesh: true}` cannot be combined with `radio.access_points`"
             raise schema.validation_error(cause, "linux_wifi")
-        if self.has_linux_wifi and self.linux_wifi.mesh and self.mesh is not None:
-            raise schema.validation_error("`linux_wifi: {mesh: true}` cannot be combined with `mesh`", "linux_wifi")
         if self.mesh is not None and self.radio.access_points:
             raise schema.validation_error("`mesh` cannot be combined with `radio.access_points`", "mesh")
         return self

@@ -76,8 +76,7 @@ def running_robots(
         if options.has_linux_wifi:
             from sim_backends.emulated.linux_wifi import lab  # noqa: PLC0415 (only some labs use it)
 
-            forwards = options.mesh is not None
-            wifi = lab.wifi_specs(robots, options.linux_wifi, options.radio, forwards=forwards)
+            wifi = lab.wifi_specs(robots, options.linux_wifi, options.radio)
             radios = lab.radios_of(robots.values(), options.radio)
             medium: MediumClient = stack.enter_context(lab.medium(options.radio, world, seed, radios, wifi.values()))
         elif options.is_cosimulated:

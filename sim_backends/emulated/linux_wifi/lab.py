@@ -21,19 +21,12 @@ _PASSPHRASE_BYTES = 12
 
 
 def wifi_specs(
-    robots: Mapping[Key, Robot | LabRobot], settings: LinuxWifiOptions, radio: RadioOptions, *, forwards: bool
+    robots: Mapping[Key, Robot | LabRobot], settings: LinuxWifiOptions, radio: RadioOptions
 ) -> dict[Key, WifiSpec]:
     """Return the Wi-Fi settings of each robot.
 
-    In an 802.11s mesh, all robots are mesh points. If they run a routing daemon, all robots join an ad hoc cell. If
-    there are access points that are not robots, all robots are stations of these. Otherwise the relay of a trial runs
-    the access point; without a relay, all robots join an ad hoc cell.
-
-    Args:
-        robots: The robots.
-        settings: The key `linux_wifi`.
-        radio: The key `radio`.
-        forwards: True if the robots run a routing daemon and forward packets.
+    In a mesh, all robots are mesh points. If there are access points that are not robots, all robots are stations of
+    these. Otherwise the relay of a trial runs the access point; without a relay, all robots join an ad hoc cell.
     """
     if settings.mesh:
         return dict.fromkeys(robots, WifiSpec("mesh point", has_monitor=settings.monitor))
@@ -43,8 +36,8 @@ def wifi_specs(
         # The module `simple` of wpa_supplicant: a short interval below a signal threshold, a long one above it.
         scan = f"simple:{roaming.short:.0f}:{roaming.threshold_dbm:.0f}:{roaming.long:.0f}"
         return dict.fromkeys(robots, replace(station, background_scan=scan, channels=roaming.channels))
-    if forwards or Role.RELAY not in robots:
-        return dict.fromkeys(robots, WifiSpec("ad hoc", has_monitor=settings.monitor, forwards=forwards))
+    if Role.RELAY not in robots:
+        return dict.fromkeys(robots, WifiSpec("ad hoc", has_monitor=settings.monitor))
     return {key: replace(station, mode="access point") if key == Role.RELAY else station for key in robots}
 
 

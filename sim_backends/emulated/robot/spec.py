@@ -101,7 +101,6 @@ class WifiSpec:
         has_monitor: True if the robot has a monitor interface, which captures all frames of its radio.
         background_scan: Setting `bgscan` of wpa_supplicant, with which a station finds other access points; or empty.
         channels: Number of channels of the 2.4 GHz band, from the first, that a station scans.
-        forwards: True if the robot forwards packets, and its routing daemon finds the routes.
     """
 
     mode: Literal["ad hoc", "mesh point", "access point", "station"]
@@ -110,7 +109,6 @@ class WifiSpec:
     has_monitor: bool = False
     background_scan: str = ""
     channels: int = 1
-    forwards: bool = False
 
 
 @dataclass(frozen=True)

@@ -97,8 +97,6 @@ def bring_up(device: str, interface: str, address: str, wifi: WifiSpec) -> None:
     network.disable_ipv6()
     if device != interface:
         network.run_ip(f"link set {device} name {interface}")
-    if wifi.forwards:
-        network.prepare_mesh(interface)
     _run("nft", "-f", "-", text=_PRIORITY_RULE)
     if wifi.mode in _INTERFACE_TYPES:
         _run("iw", "dev", interface, "set", "type", _INTERFACE_TYPES[wifi.mode])

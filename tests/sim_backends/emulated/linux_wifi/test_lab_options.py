@@ -48,7 +48,7 @@ def test_lab_up_lists_all_missing_requirements(
     ("emulated", "other_lines", "cause"),
     [
         ("{wifi: linux, physics: kinematic}", "", "`physics`"),
-        ("{wifi: linux, linux_wifi: {mesh: true}, mesh: {daemon: babeld}}", "", "`mesh`"),
+        ("{wifi: linux, mesh: {daemon: babeld}}", "", "`mesh`"),
         ("{wifi: linux, record_air: true}", "", "`record_air`"),
         ("{wifi: linux, radio: {loss: 10%}}", "", "fixed link"),
         ("{wifi: linux}", "control: radio\n", "no radio"),

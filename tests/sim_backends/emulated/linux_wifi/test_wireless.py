@@ -32,7 +32,7 @@ def specs_of(
     robots: dict[Role, Robot], *, radio: Mapping[str, object] = MappingProxyType({}), **settings: object
 ) -> dict[Role, WifiSpec]:
     options = EmulatedOptions.model_validate({"wifi": "linux", "linux_wifi": settings, "radio": dict(radio)})
-    return lab.wifi_specs(robots, options.linux_wifi, options.radio, forwards=False)
+    return lab.wifi_specs(robots, options.linux_wifi, options.radio)
 
 
 def settings_of(text: str) -> dict[str, str]:
@@ -53,13 +53,6 @@ def test_the_relay_is_the_access_point_and_the_other_robots_have_its_passphrase(
 @pytest.mark.parametrize("robots", [TRIO, PAIR], ids=["with a relay", "without"])
 def test_in_a_mesh_all_robots_are_mesh_points(robots: dict[Role, Robot]) -> None:
     assert {(spec.mode, spec.passphrase) for spec in specs_of(robots, mesh=True).values()} == {("mesh point", "")}
-
-
-@pytest.mark.parametrize("robots", [TRIO, PAIR], ids=["with a relay", "without"])
-def test_with_a_routing_daemon_all_robots_forward_packets_in_an_ad_hoc_cell(robots: dict[Role, Robot]) -> None:
-    options = EmulatedOptions.model_validate({"wifi": "linux", "mesh": {"daemon": "babeld"}})
-    specs = lab.wifi_specs(robots, options.linux_wifi, options.radio, forwards=True)
-    assert {(spec.mode, spec.forwards) for spec in specs.values()} == {("ad hoc", True)}
 
 
 @pytest.mark.parametrize("mesh", [False, True])

@@ -37,7 +37,6 @@ ROAMING = {"short": "2s", "threshold_dbm": -65, "long": "60s", "channels": 3}
 START: dict[str, Vector] = {"r0": (5.0, 0.0, 1.0), "r1": (5.0, 5.0, 1.0)}
 END: dict[str, Vector] = {**START, "r0": (80.0, 0.0, 1.0)}
 JOIN_S = 60.0
-ROUTE = ("ip", "route", "get", ADDRESSES[Role.RECEIVER])
 CAPTURE = ("tcpdump", "-i", "mon0", "-y", "IEEE802_11_RADIO", "-c", "20", "-e", "-n", "--immediate-mode")
 
 FILE_CAPTURE = ("tcpdump", "-i", "mon0", "-y", "IEEE802_11_RADIO", "-U", "-w", "-", "--immediate-mode")
@@ -96,11 +95,10 @@ def lab(
     settings: dict[str, object],
     *,
     roles: Collection[Role] = tuple(CAST),
-    mesh: dict[str, object] | None = None,
     **radio: object,
 ) -> Iterator[Running]:
     options = EmulatedOptions.model_validate(
-        {"wifi": "linux", "ros": "builtin", "radio": {**RADIO, **radio}, "linux_wifi": settings, "mesh": mesh}
+        {"wifi": "linux", "ros": "builtin", "radio": {**RADIO, **radio}, "linux_wifi": settings}
     )
     world = load_world("open")
     cast = {role: robot for role, robot in CAST.items() if role in roles}
@@ -153,15 +151,6 @@ def main() -> None:
         running.robots[Role.SENDER].switch_off()
         running.robots[Role.SENDER].switch_on()
         record_result("mesh after switching", wait_for_link(running))
-    with lab({}, mesh={"daemon": "babeld", "hello": "500ms"}) as running:
-        running.medium.place(ROW)
-        record_result("babeld link", wait_for_link(running))
-        record_result("babeld ping", ping(running, 20))
-        record_result("babeld route", run_on_robot(running, Role.SENDER, *ROUTE))
-        running.medium.place(GAP)
-        record_result("babeld without relay", ping(running, 3))
-        running.medium.place(ROW)
-        record_result("babeld again", wait_for_link(running))
     pair = (Role.SENDER, Role.RECEIVER)
     with lab({"monitor": True}, roles=pair, access_points=ACCESS_POINTS, roaming=ROAMING) as running:
         running.medium.place(START)
