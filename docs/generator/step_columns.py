@@ -6,7 +6,7 @@ from typing import Final
 from docs.generator.markdown import page, table
 from fieldkit.core.columns import Column
 from fieldkit.core.model import FaultKind
-from fieldkit.measure.checks import ping_duplicates, ping_links
+from fieldkit.measure.checks import monitor_columns, ping_duplicates, ping_links
 from fieldkit.measure.evidence import handovers, iperf3, ping_gaps
 from fieldkit.measure.transfers import iperf3_load, recoveries, stalls
 from fieldkit.motion.logs import drive_log, fly_log, tlog
@@ -20,6 +20,7 @@ STEP_COLUMNS: Final[Mapping[str, tuple[Column, ...]]] = {
     "`ping` with `gap: true`": (*ping_gaps.GAP_COLUMNS, *ping_gaps.OPEN_GAP_COLUMNS),
     "`ping` with `duplicates: true`": ping_duplicates.COLUMNS,
     "`ping` with `links`": ping_links.declare_columns("LINK"),
+    "`capture` with `monitor`": monitor_columns.COLUMNS,
     "`roam`": handovers.COLUMNS,
     "`iperf3`": (*iperf3.COLUMNS, *iperf3_load.COLUMNS, *iperf3_load.JITTER),
     "`iperf3`, `soak`": stalls.declare_columns("FLOW", "FLOW", 0),

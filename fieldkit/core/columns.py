@@ -112,6 +112,10 @@ class Figure:
     of_sent: str | None = None
 
 
+PHY_RATE: Final = "phy_rate_bit_s"
+"""End of the names of columns of PHY rates. A clock that measures no real durations does not affect them."""
+
+
 @dataclass(frozen=True)
 class Column:
     """One declared column.

@@ -7,13 +7,13 @@ from typing import Final
 
 from fieldkit.backends.protocols import CLOCK, INSTRUCTIONS
 from fieldkit.config.profiles import TELEMETRY
-from fieldkit.core.columns import Column, Measured, cell_text, step_prefixed
+from fieldkit.core.columns import PHY_RATE, Column, Measured, cell_text, step_prefixed
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Lateness, RepeatId, Role, sort_roles
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import link, link_samples, oracle_delays, track
 from fieldkit.measure.positions import position_columns
-from fieldkit.measure.robot_state import attempt_states
+from fieldkit.measure.robot_state import attempt_states, state_columns
 from fieldkit.steps.capabilities import Roams
 from fieldkit.steps.scene import Scene
 from fieldkit.steps.view import View
@@ -95,7 +95,7 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
                 }
                 result = result.without(dependent)
             if has_no_times:
-                result = result.without({column.name: _NO_TIMES for column in columns if column.unit in _TIME_UNITS})
+                result = result.without({column.name: _NO_TIMES for column in columns if _depends_on_clock(column)})
         except MemoryError:
             raise
         except Exception as error:  # noqa: BLE001 (see the docstring)
@@ -109,11 +109,19 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
     fixed = {role: name for role, name in names.items() if role not in roaming}
     problems += attempt_states.problems(evidence, fixed, plan.radios)
     measured = attempt_states.measure(evidence, names, measured)
+    if has_no_times:
+        states = [column for role in names for column in state_columns.declare_columns(role)]
+        measured = measured.without({column.name: _NO_TIMES for column in states if _depends_on_clock(column)})
     # If the reader of an optional file raises an exception, the file counts as missing. This reports the exception.
     problems += (
         step_errors.add(f"{name} cannot be read", error) for name, error in tuple(evidence.unexpected_errors)
     )
     return EvidenceVerdict(tuple(problems), measured, tuple(step_errors.tracebacks), tuple(notes))
+
+
+def _depends_on_clock(column: Column) -> bool:
+    """Return True if a clock that measures no real durations makes a column invalid."""
+    return column.unit in _TIME_UNITS and not column.name.endswith(PHY_RATE)
 
 
 def roaming_roles(procedure: Procedure) -> frozenset[Role]:

@@ -12,12 +12,15 @@ from fieldkit.core.columns import Measured, cell_text
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import LinkSample, Role
 from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.captures import radiotap
+from fieldkit.measure.checks import monitor_checks, monitor_columns
 from fieldkit.measure.evidence import link, link_samples, program_output, robot_link_samples
 from fieldkit.measure.robot_state import attempt_states, interfaces, state_columns
 from tests.fuzz.harness import Target
 from tests.helpers.paths import DATA
 
 _IW: Final = DATA / "iw"
+_MESH_TRIAL: Final = DATA / "hwsim/6.1.176/mesh-trial"
 _CLOCK: Final = "==> clock <==\n100.00 1700000100.000000000 100.00\n==> iw station dump <==\n"
 _SAMPLES_TEXT: Final = "".join(
     f"==> 101.{at:02d} {name} <==\n{path.read_text(encoding='utf-8')}"
@@ -57,6 +60,20 @@ def _read_robot_samples(name: str, data: bytes, place: Path) -> None:
         (place / "sender-link.txt").write_text(_SAMPLES_TEXT, encoding="utf-8")
     (place / name).write_bytes(data)
     _measure(list(robot_link_samples.read(place, Role.SENDER)))
+
+
+def _read_radio_frames(data: bytes, place: Path) -> None:
+    """Measure a mutated capture on a monitor interface, and compare it with an intact one and with link samples."""
+    (place / "sender-monitor.pcap").write_bytes(data)
+    frames = radiotap.read(place / "sender-monitor.pcap").frames
+    measured = monitor_columns.measure(Role.SENDER, frames)
+    for column in monitor_columns.COLUMNS_BY_ROLE[Role.SENDER]:
+        assert column.invalid_value_reason(cell_text(measured.values.get(column.name))) is None, column.name
+    evidence = AttemptEvidence(_MESH_TRIAL)
+    list(monitor_checks.link_contradictions(frames, evidence.links(Role.SENDER)))
+    other_frames = radiotap.read(_MESH_TRIAL / "receiver-monitor.pcap").frames
+    list(monitor_checks.peer_contradictions(frames, other_frames))
+    list(monitor_checks.peer_contradictions(other_frames, frames))
 
 
 def _parse_iw(data: bytes, _: Path) -> None:
@@ -119,6 +136,7 @@ def radio_targets() -> Iterator[Target]:
     ):
         yield Target(f"own-{name}".replace(".", "_"), (seed,), partial(_read_robot_samples, name))
     outputs = (*sorted(path.read_bytes() for path in _IW.glob("*.txt")), _WIRELESS.encode())
+    yield Target("radiotap", ((_MESH_TRIAL / "sender-monitor.pcap").read_bytes(),), _read_radio_frames)
     yield Target("telemetry", outputs, _parse_iw)
     snapshots = (
         _snapshot(chrony="chrony/slow-2023.txt", ptp="linuxptp/current-1.2.txt"),

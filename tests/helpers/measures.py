@@ -60,7 +60,7 @@ def _captures(evidence: AttemptEvidence) -> Measured:
     measured = Measured()
     for role in (Role.SENDER, Role.RECEIVER):
         capture = evidence.undamaged_capture(tcpdump_log.capture_file(role))
-        log = evidence.read_or_none(tcpdump_log.read, tcpdump_log.log_file(role))
+        log = evidence.read_or_none(tcpdump_log.read, tcpdump_log.capture_log_file(tcpdump_log.capture_file(role)))
         frame_count = capture.frames if capture else None
         dropped = log.dropped_by_kernel if log else None
         measured |= Measured.from_optional(

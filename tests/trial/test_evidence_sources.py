@@ -8,6 +8,7 @@ import pytest
 
 from fieldkit.core.crosschecks import CheckOutcome
 from fieldkit.core.model import FaultKind
+from fieldkit.measure.checks import monitor_columns
 from fieldkit.measure.transfers import recoveries, stalls
 from fieldkit.steps import base
 from fieldkit.trial import evidence_sources
@@ -53,6 +54,7 @@ def test_all_columns_of_the_table_exist() -> None:
     columns |= {column.name for step in base.step_types().values() for column in step.columns}
     for name in ("drive_log", "fly_log"):
         columns |= {column.name for column in import_module(f"fieldkit.motion.logs.{name}").COLUMNS}
+    columns |= {column.name for column in monitor_columns.COLUMNS}  # only captures with `monitor` declare them
     # A procedure declares these columns only if it has such a flow, or such a fault during a flow.
     columns |= {column.name for flow in recoveries.FLOWS for column in stalls.declare_columns(flow, flow, 120)}
     recovery_columns = (recoveries.declare_columns(flow, fault) for flow in recoveries.FLOWS for fault in FaultKind)

@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from fieldkit.core.columns import Measured
-from fieldkit.core.model import Protocol
+from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import oracle_delays, track
+from fieldkit.measure.robot_state import exchanges
 from fieldkit.steps.kinds.ping import PingStep
 from fieldkit.steps.view import View
 from fieldkit.trial import gates
@@ -251,9 +252,12 @@ def test_times_are_missing_if_the_clock_counts_instructions(folder: Path) -> Non
         (repeat, *_) = plan.repeats_in_order()
         return gates.judge(plan, repeat, AttemptEvidence(folder)).measured
 
+    (folder / "sender-before.txt").write_text("==> clock <==\n100.00 1700000100.000000000 100.00\n==> end <==\n")
+    second_ns = 1_700_000_100 * 10**9
+    (folder / exchanges.FILE).write_text(exchanges.text({Role.SENDER: (second_ns - 10**7, second_ns + 10**7)}))
     values_of_real_clock, withheld = measured({}), measured({"wifi": "linux", "clock": "instructions"})
     missing_names = values_of_real_clock.values.keys() - withheld.values.keys()
-    assert "bag_duration_s" in missing_names
+    assert {"bag_duration_s", "sender_laptop_offset_s"} <= missing_names
     assert all(name.endswith(("_s", "_ppm")) for name in missing_names)
     assert {withheld.missing[name] for name in missing_names} == {
         "the backend's clock counts instructions of a virtual processor, so it measures no real durations"

@@ -113,9 +113,14 @@ def _after_mac_header(integers: Integers, frames: Frames, mac: Ints, *, padded: 
     qos = kind & 0x80 != 0
     four_addresses = flags & 0x03 == 0x03
     header = 24 + 6 * four_addresses + 2 * qos
-    aggregated = qos & (integers.u8(mac + header - 2) & 0x80 != 0)
-    header += 4 * (qos & (flags & 0x80 != 0))  # HT control
+    qos_at = header - 2
+    aggregated = qos & (integers.u8(mac + qos_at) & 0x80 != 0)
+    header = header + 4 * (qos & (flags & 0x80 != 0))  # HT control
     llc = mac + np.where(padded, (header + 3) // 4 * 4, header)
+    # In a mesh, a control field of 6 bytes and up to 2 addresses follow the MAC header (9.2.4.8.3). Outside of a
+    # mesh, the bit that announces it has another meaning.
+    may_be_mesh = qos & (integers.u8(mac + qos_at + 1) & 0x01 != 0) & (integers.u32(llc) != _SNAP)
+    llc += may_be_mesh * (6 + 6 * (integers.u8(llc) & 0x03))
     # The mask selects data frames of version 0, except null frames, encrypted frames, later fragments, and A-MSDUs,
     # which contain several packets.
     readable = (kind & 0x4F == 0x08) & (flags & 0x40 == 0) & (integers.u8(mac + 22) & 0x0F == 0) & ~aggregated

@@ -21,9 +21,9 @@ def capture_file(role: Role) -> str:
     return f"{role}.pcap"
 
 
-def log_file(role: Role) -> str:
-    """Return the name of the file with the standard error of a robot's tcpdump."""
-    return f"{role}-capture.log"
+def monitor_file(role: Role) -> str:
+    """Return the name of the file with a robot's capture on its monitor interface."""
+    return f"{role}-monitor.pcap"
 
 
 def capture_log_file(capture: str) -> str:

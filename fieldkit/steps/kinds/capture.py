@@ -5,25 +5,19 @@ from contextlib import suppress
 from functools import partial
 from typing import Annotated, Final
 
-import numpy as np
 from typing_extensions import override
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
-from fieldkit.config.profiles import RobotProfile
+from fieldkit.config.profiles import InterfaceName, RobotProfile
 from fieldkit.config.schema import Field, Int
-from fieldkit.core.columns import Measured, columns
-from fieldkit.core.crosschecks import CrossCheck
-from fieldkit.core.errors import EvidenceError, FieldkitError
+from fieldkit.core.columns import Column, Measured, columns
+from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
+from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import Protocol, Role, Verdict, sort_roles
 from fieldkit.core.threads import run_parallel
-from fieldkit.core.units import format_count
-from fieldkit.measure.captures import pcap
-from fieldkit.measure.captures.arrays import NO_TIME
-from fieldkit.measure.captures.pcap import Capture
-from fieldkit.measure.evidence import host, tcpdump_log
-from fieldkit.measure.evidence.tcpdump_log import capture_file, log_file
-from fieldkit.measure.transfers import altered_packets
+from fieldkit.measure.evidence import tcpdump_log
+from fieldkit.measure.evidence.tcpdump_log import capture_file
 from fieldkit.remote import jobs
 from fieldkit.remote.command import quote
 from fieldkit.remote.jobs import Job
@@ -56,12 +50,6 @@ after 1.0 s."""
 LAST_LINE: Final = "dropped by kernel"
 """Text of tcpdump's last line. After this line the kernel needs 15 to 31 ms to close the socket."""
 
-BACK_S: Final = 0.1
-"""Permitted step backwards between time stamps: packets received by two processors may be recorded out of order."""
-
-STAMP_NS: Final = 1_000
-"""Resolution of time stamps: tcpdump truncates them to microseconds."""
-
 
 class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
     """Runs tcpdump on each robot. It starts before the steps in `during` and ends after them.
@@ -75,11 +63,16 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
     use it on a robot with a bridge or bond, where each packet appears twice. Writes `ROLE.pcap` and
     `ROLE-capture.log`.
 
+    With `monitor`, a second tcpdump captures all frames of IEEE 802.11 on this interface, with radiotap headers: PHY
+    rate, signal and retransmissions. It writes `ROLE-monitor.pcap` and `ROLE-monitor-capture.log`. The interface must
+    be in monitor mode on the same radio: `iw dev wlan0 interface add mon0 type monitor`; `ip link set mon0 up`.
+
     Attributes:
         over: Link to capture, by its name in [the profiles of the robots](links.md); without it, the radio under
             test.
         robots: Roles that capture.
         port: A port to capture in addition to the ports of the steps inside.
+        monitor: Monitor interface of the radio under test, such as `mon0`, on each robot that captures.
         during: Steps to capture.
     """
 
@@ -108,16 +101,37 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
                 "them are empty"
             ),
         ),
+        CrossCheck(
+            quantity="frames of a radio",
+            columns=("*_monitor_*",),
+            source="`ROLE-monitor.pcap`",
+            against=(
+                "`ROLE-link.txt`: counters, signal and rates",
+                "`ROLE.pcap`: packets that the robot received",
+                "`ROLE-monitor.pcap` of the other robot: sequence numbers and retry flags",
+            ),
+            tolerance=(
+                "iw reads the driver up to 0.5 s after the time of a sample; signals may differ by 1 dB, and rates "
+                "by 0.1 Mbit/s; rates during retransmissions are not compared, because radiotap has the rate of the "
+                "first attempt and iw that of the last"
+            ),
+            outcome=CheckOutcome.WITHHELD,
+        ),
     )
 
     robots: Annotated[tuple[Role, ...], Field(min_length=1)] = (Role.SENDER, Role.RECEIVER)
     port: Annotated[Int, Field(gt=0, lt=65536)] | None = None
+    monitor: InterfaceName | None = Field(default=None, exclude_if=schema.is_empty)
     during: Annotated[tuple[StepEntry, ...], Field(min_length=1)]
 
     @schema.model_validator(mode="after")
     def _captures_once(self) -> "CaptureStep":
         if len(set(self.robots)) < len(self.robots):
             raise schema.validation_error("a robot is named twice", "robots")
+        if self.monitor and self.over:
+            raise schema.validation_error(
+                "`monitor` is an interface of the radio under test; remove `over`", "monitor"
+            )
         return self
 
     @override
@@ -135,22 +149,44 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
-        for role in self.robots:
-            yield self._planned_job(scene, role)
+        yield from (capture for capture, _ in self._planned_captures(scene))
         yield from self.inside(scene)
 
-    def _planned_job(self, scene: Scene, role: Role) -> Planned:
+    def _planned_captures(self, scene: Scene) -> Iterator[tuple[Planned, str]]:
+        """Yield the job and the file of each capture."""
+        for role in self.robots:
+            interface, packet_filter = self.capture_interface(scene, role), self._filter(scene)
+            file = self._file(role)
+            yield self._planned_job(scene, role, "capture", ("-i", interface), (file, packet_filter)), file
+        if self.monitor:
+            from fieldkit.steps import monitor_capture  # noqa: PLC0415 (few captures have a monitor interface)
+
+            for role in self.robots:
+                options, file = monitor_capture.options(self.monitor), self._monitor_file(role)
+                yield self._planned_job(scene, role, "monitor", options, (file,)), file
+
+    def _planned_job(
+        self, scene: Scene, role: Role, name: str, source: tuple[str, ...], destination: tuple[str, ...]
+    ) -> Planned:
+        """Return a job of tcpdump.
+
+        Args:
+            scene: The attempt.
+            role: Role of the robot.
+            name: Name of the job.
+            source: Options that select the interface.
+            destination: The file, then the filter if there is one.
+        """
         profile = scene.robot(role).profile
-        interface = self.capture_interface(scene, role)
         immediate = ("--immediate-mode",) if scene.tools(role).immediate_mode else ()
         options = ("-n", "-U", *immediate, "-s", str(self._snap_bytes), "-B", str(self._buffer_kib))
         job = Job(
             folder=scene.folder,
-            name=self.prefixed_name("capture"),
-            argv=(profile.tools.capture, "-i", interface, *options, "-w", self._file(role), self._filter(scene)),
+            name=self.prefixed_name(name),
+            argv=(profile.tools.capture, *source, *options, "-w", *destination),
             # The limit exceeds the captured jobs, because a capture that was stopped at its limit looks complete.
             limit_s=LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene)),
-            log=self._log(role),
+            log=tcpdump_log.capture_log_file(destination[0]),
             ready="log:listening on",
             as_root=profile.tools.capture_right == "sudo",
         )
@@ -202,12 +238,17 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
             argv = (*prefix, tools.capture, "-L", "-i", self.capture_interface(scene, role))
             name = f"right to capture{f' on {self.over}' if self.over else ''}"
             yield Need(role, name, argv, partial(_judge, profile), required_program=tools.capture)
+            if self.monitor:
+                from fieldkit.steps import monitor_capture  # noqa: PLC0415 (as in `_planned_captures`)
+
+                yield monitor_capture.need(role, prefix, tools.capture, self.monitor)
 
     @override
     def stored_bytes(self, scene: Scene, role: Role) -> float:
         if role not in self.robots:
             return 0.0
-        return (self._snap_bytes + _RECORD_BYTES) * sum(flow.frames for flow in flows_inside(self, scene))
+        captures = 2 if self.monitor else 1
+        return captures * (self._snap_bytes + _RECORD_BYTES) * sum(flow.frames for flow in flows_inside(self, scene))
 
     @override
     def captures(self) -> Mapping[Role, str]:
@@ -216,12 +257,17 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
     def _file(self, role: Role) -> str:
         return self.prefixed_name(capture_file(role))
 
-    def _log(self, role: Role) -> str:
-        return self.prefixed_name(log_file(role))
+    def _monitor_file(self, role: Role) -> str:
+        return self.prefixed_name(tcpdump_log.monitor_file(role))
+
+    def _capture_files(self, role: Role) -> Iterator[str]:
+        yield self._file(role)
+        if self.monitor:
+            yield self._monitor_file(role)
 
     @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        captures = [self._planned_job(scene, role) for role in self.robots]
+        captures = list(self._planned_captures(scene))
         first, *others = (entry.step for entry in self.during)
         first_actions: list[Callable[[Announce], None]] = []
 
@@ -229,11 +275,13 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
             first_actions.append(base.prepare(first, scene, testbed))
 
         starts: list[Callable[[], None]] = [
-            partial(jobs.start, testbed.shells[capture.role], capture.job) for capture in captures
+            partial(jobs.start, testbed.shells[capture.role], capture.job) for capture, _ in captures
         ]
         # With sudo the first step is prepared after the captures have started. sudo may take seconds if the robot's
         # host name cannot be resolved, and a UDP listener that the first step has started would stop waiting.
-        rounds = ([*starts], [prepare]) if any(capture.job.as_root for capture in captures) else ([*starts, prepare],)
+        rounds = (
+            ([*starts], [prepare]) if any(capture.job.as_root for capture, _ in captures) else ([*starts, prepare],)
+        )
         announce("start captures", None)
         try:
             for calls in rounds:
@@ -248,18 +296,18 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
                 self._stop(scene, testbed, captures)
             raise
         announce("drain captures", None)
-        for capture, code in zip(captures, self._stop(scene, testbed, captures), strict=True):
+        for (capture, _), code in zip(captures, self._stop(scene, testbed, captures), strict=True):
             if code != 0:
                 raise scene.failure(capture, f"tcpdump ended with exit code {code}")
 
-    def _stop(self, scene: Scene, testbed: Testbed, captures: Sequence[Planned]) -> list[int]:
-        """Stop the captures; return the exit code of each."""
+    def _stop(self, scene: Scene, testbed: Testbed, captures: Sequence[tuple[Planned, str]]) -> list[int]:
+        """Stop the captures, which are given with their files; return the exit code of each."""
 
-        def stop(capture: Planned) -> int:
+        def stop(capture_and_file: tuple[Planned, str]) -> int:
+            capture, file = capture_and_file
             if not scene.tools(capture.role).immediate_mode:
                 jobs.begin_wait(testbed.shells[capture.role], capture.job, RING_S).end(RING_S + jobs.REPLY_S)
-            shell, file = testbed.shells[capture.role], self._file(capture.role)
-            return jobs.stop(shell, capture.job, settle=file, end_text=LAST_LINE)
+            return jobs.stop(testbed.shells[capture.role], capture.job, settle=file, end_text=LAST_LINE)
 
         return run_parallel(stop, captures)
 
@@ -269,18 +317,23 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
 
     @override
     def files(self) -> tuple[str, ...]:
-        return tuple(name for role in self.robots for name in (self._file(role), self._log(role)))
+        names = (name for role in self.robots for name in self._capture_files(role))
+        return tuple(file for name in names for file in (name, tcpdump_log.capture_log_file(name)))
 
     def check(self, view: View) -> Iterator[str]:
         """Yield a reason for each incomplete or contradictory capture, and for dropped packets; see `Step.check`.
 
         Dropped packets are permitted if each step inside leaves the columns that depend on them empty.
         """
+        from fieldkit.steps import capture_problems  # noqa: PLC0415 (a dry run checks no evidence)
+
         for role in self.robots:
-            for problem in _problems(
-                role, self._file(role), self._log(role), view, needs_all=self._needs_all_packets
-            ):
+            for problem in capture_problems.find(role, self._file(role), view, needs_all=self._needs_all_packets):
                 yield f"{role} capture: {problem}"
+            if self.monitor:
+                # The columns are empty if frames were dropped; the repeat remains valid.
+                for problem in capture_problems.find(role, self._monitor_file(role), view, needs_all=False):
+                    yield f"{role} capture on {self.monitor}: {problem}"
 
     @override
     def measure(self, view: View) -> Measured:
@@ -291,68 +344,29 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
                 measured |= Measured.all_missing(role_columns, f"the {role} does not capture")
                 continue
             capture = view.evidence.undamaged_capture(self._file(role))
-            log = view.evidence.read_or_none(tcpdump_log.read, self._log(role))
+            log = view.evidence.read_or_none(tcpdump_log.read, tcpdump_log.capture_log_file(self._file(role)))
             values = {
                 f"{role}_captured": capture.frames if capture else None,
                 f"{role}_capture_dropped": log.dropped_by_kernel if log else None,
             }
             measured |= Measured.from_optional(values, "its capture is incomplete")
+        if self.monitor:
+            from fieldkit.steps import monitor_capture  # noqa: PLC0415 (as in `_planned_captures`)
+
+            measured |= monitor_capture.measure(view, {role: self._capture_files(role) for role in self.robots})
         return measured
+
+    @override
+    def output_columns(self) -> tuple[Column, ...]:
+        if not self.monitor:
+            return self.columns
+        from fieldkit.measure.checks import monitor_columns  # noqa: PLC0415 (as in `_planned_captures`)
+
+        return (*self.columns, *monitor_columns.COLUMNS)
 
     @override
     def expected_s(self, protocol: Protocol) -> float:
         return 0.2 + self.inside_s(protocol)
-
-
-def _problems(role: Role, file: str, log_file: str, view: View, *, needs_all: bool) -> Iterator[str]:
-    """Yield the reasons why a robot's capture cannot be used; with `needs_all`, also if packets were dropped."""
-    try:
-        log = view.evidence.read(tcpdump_log.read, log_file)
-        capture = view.evidence.read(pcap.read, file)
-    except EvidenceError as error:
-        yield error.what
-        return
-    if not log.listening:
-        yield "tcpdump was not listening"
-    if log.captured is None:
-        yield "tcpdump ended without its counters"
-        return
-    if needs_all and (log.dropped_by_kernel or log.dropped_by_interface):
-        dropped_text = format_count(log.dropped_by_kernel or 0, "packet")
-        yield f"its kernel dropped {dropped_text}, its interface {log.dropped_by_interface or 0}"
-    # The filter may have matched more packets than were written: see `CaptureLog.received_by_filter`.
-    if log.received_by_filter is not None and log.received_by_filter < log.captured:
-        yield f"{format_count(log.received_by_filter, 'packet')} matched the filter, but tcpdump wrote {log.captured}"
-    if capture.damage is not None:
-        yield capture.damage
-    elif capture.frames != log.captured:
-        yield f"the file has {format_count(capture.frames, 'packet')}, but tcpdump counted {log.captured}"
-    else:
-        if problem := altered_packets.header_problem(capture.packets):
-            yield problem
-        yield from _time_problems(role, capture, view)
-
-
-def _time_problems(role: Role, capture: Capture, view: View) -> Iterator[str]:
-    """Yield a reason for packet times that run backwards, or that the robot's clock excludes.
-
-    The clock is read before and after the attempt, so no packet can be earlier or later.
-    """
-    times_ns = capture.packets.time_ns[capture.packets.time_ns != NO_TIME]
-    if not len(times_ns):
-        return
-    back_s = float(-np.diff(times_ns).min(initial=0)) / 1e9
-    if back_s > BACK_S:
-        yield f"a packet is {back_s:.3f} s earlier than the one before it: the clock was set back"
-    before, after = (
-        view.evidence.read_or_none(host.read_state, file(role)) for file in (host.before_file, host.after_file)
-    )
-    if before and before.clock and times_ns.min() < before.clock.first_ns - STAMP_NS:
-        early_s = (before.clock.first_ns - int(times_ns.min())) / 1e9
-        yield f"has a packet from {early_s:.3f} s before the start of the attempt, by the robot's clock"
-    if after and after.clock and times_ns.max() > after.clock.last_ns + STAMP_NS:
-        late_s = (int(times_ns.max()) - after.clock.last_ns) / 1e9
-        yield f"has a packet from {late_s:.3f} s after the end of the attempt, by the robot's clock"
 
 
 def _judge(profile: RobotProfile, answer: CommandResult) -> tuple[Verdict, str, str]:

@@ -46,7 +46,8 @@ class FrameOnAir:
         attempts: Number of tries that were made.
         is_acknowledged: True if an ACK was received.
         signal_dbm: Signal of that ACK, at the start of the try; -120 without an ACK.
-        mode: Mode of the last try that a receiver decoded; the lowest mode of 802.11g if there is none.
+        mode: Mode of the first try that a receiver decoded; the lowest mode of 802.11g if there is none.
+        decoded_try: Number of that try, from 1; 0 if no receiver has decoded the frame.
         is_final: True if its status is known.
     """
 
@@ -58,6 +59,7 @@ class FrameOnAir:
     is_acknowledged: bool = False
     signal_dbm: int = _LOWEST_SIGNAL_DBM
     mode: WifiMode = G_MODES[0]
+    decoded_try: int = 0
     is_final: bool = False
 
 
@@ -209,12 +211,12 @@ class _Channel:
             self.events.statuses.append(frame)
 
     def _on_attempt(self, attempt: TransmissionAttempt) -> None:
-        """Store the mode of a received attempt. The status of a broadcast is known after its only attempt."""
+        """Store the first received attempt. The status of a broadcast is known after its only attempt."""
         frame = attempt.payload
         if not isinstance(frame, FrameOnAir):
             return  # an ACK
-        if attempt.received:
-            frame.mode = attempt.mode
+        if attempt.received and not frame.decoded_try:
+            frame.mode, frame.decoded_try = attempt.mode, attempt.number
         if attempt.receiver is None:
             frame.attempts = 1
             self.finish(frame)

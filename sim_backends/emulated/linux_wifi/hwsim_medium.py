@@ -151,7 +151,13 @@ class HwsimMedium:
         self._totals(frame.source, reception.receiver).signal_dbm = reception.signal_dbm
         rate_index = legacy_index(reception.mode, frame.sent_frame.frequency_mhz)
         radio = self._radio_of_name[reception.receiver]
-        return encode_reception(frame.sent_frame, radio, rate_index=rate_index, signal_dbm=reception.signal_dbm)
+        return encode_reception(
+            frame.sent_frame,
+            radio,
+            rate_index=rate_index,
+            signal_dbm=reception.signal_dbm,
+            is_retry=frame.decoded_try > 1,
+        )
 
     def _status_message(self, frame: FrameOnAir) -> bytes:
         """Return the report on a frame for its sender, and add the frame to the totals."""

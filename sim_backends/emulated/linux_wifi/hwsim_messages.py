@@ -49,6 +49,8 @@ MAX_FRAME_BYTES: Final = 11_454
 """Longest MPDU of 802.11ac (9.2.4.7.1): no frame of a kernel is longer."""
 _MIN_CLONED_BYTES: Final = 24
 """The kernel rejects shorter frames (control frames) from a medium."""
+_RETRY: Final = 0x08
+"""The retry flag in the second byte of a frame."""
 
 _RATE: Final = struct.Struct("=bB")
 _RATE_FLAGS: Final = struct.Struct("=bH")
@@ -172,7 +174,9 @@ def encode_status(frame: SentFrame, *, tries: Sequence[int], acknowledged: bool,
     )
 
 
-def encode_reception(frame: SentFrame, receiver: RadioAddress, *, rate_index: int, signal_dbm: int) -> bytes | None:
+def encode_reception(
+    frame: SentFrame, receiver: RadioAddress, *, rate_index: int, signal_dbm: int, is_retry: bool = False
+) -> bytes | None:
     """Return the message that passes a frame to a receiving radio; None if the frame is too short for the kernel.
 
     Args:
@@ -180,15 +184,18 @@ def encode_reception(frame: SentFrame, receiver: RadioAddress, *, rate_index: in
         receiver: The radio.
         rate_index: Index of the rate in the list of the band; the message has no field for an MCS.
         signal_dbm: Received signal.
+        is_retry: True if it was not the first try. Then the message has the retry flag (9.2.4.1.6), which a radio
+            sets in hardware. Encryption does not protect this flag (12.5.3.3.3).
     """
     if len(frame.frame) < _MIN_CLONED_BYTES:
         return None
+    flags = frame.frame[1] | (_RETRY if is_retry else 0)
     return encode_generic(
         CMD_FRAME,
         _VERSION,
         {
             _RECEIVER: receiver,
-            _FRAME: frame.frame,
+            _FRAME: frame.frame[:1] + bytes((flags,)) + frame.frame[2:],
             _RX_RATE: struct.pack("=I", rate_index),
             _SIGNAL: struct.pack("=i", signal_dbm),
             _FREQUENCY: struct.pack("=I", frame.frequency_mhz),

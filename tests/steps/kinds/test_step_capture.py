@@ -9,13 +9,13 @@ import pytest
 from fieldkit.config import schema
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import RobotError
-from fieldkit.core.model import Protocol, RepeatId, Role
+from fieldkit.core.model import Protocol, RepeatId, Role, Verdict
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 from fieldkit.steps import base
 from fieldkit.steps.kinds.capture import CaptureStep
-from fieldkit.steps.scene import Announce, Scene
+from fieldkit.steps.scene import Announce, CommandResult, Scene
 from tests.helpers.casts import CAST, los_plan
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.userlands import LocalShell
@@ -96,6 +96,50 @@ def test_captures_are_stopped_if_first_step_inside_cannot_start(
     events = run(tmp_path, monkeypatch, fail, threading.Barrier(3))
     assert (events[0], events[-1]) == ("start captures", "its port is taken")
     assert sorted(events[1:-1]) == [f"end on {role}" for role in sorted((Role.SENDER, Role.RECEIVER))]
+
+
+def capture_step(text: str) -> CaptureStep:
+    return schema.validate(schema.parse(text, source="x.yaml"), CaptureStep)
+
+
+def test_a_monitor_interface_is_captured_in_addition_to_the_radio_interface() -> None:
+    step, scene = capture_step(TEXT.replace("{during", "{monitor: mon0, during")), Scene(Protocol.TCP, CAST, "f")
+    plain = capture_step(TEXT)
+    new_jobs = [planned for planned in step.jobs(scene) if planned.job.name == "monitor"]
+    assert len(list(step.jobs(scene))) == len(list(plain.jobs(scene))) + 2
+    for planned, role in zip(new_jobs, (Role.SENDER, Role.RECEIVER), strict=True):
+        argv = list(planned.job.argv)
+        assert (planned.role, argv[1:5]) == (role, ["-i", "mon0", "-y", "IEEE802_11_RADIO"])
+        assert argv[-2:] == ["-w", f"{role}-monitor.pcap"]
+        assert planned.job.log == f"{role}-monitor-capture.log"
+    new_files = {"sender-monitor.pcap", "receiver-monitor.pcap"}
+    new_files |= {name.replace(".pcap", "-capture.log") for name in new_files}
+    assert set(step.files()) - set(plain.files()) == new_files
+    assert step.captures() == plain.captures()
+    assert {column.name for column in step.output_columns()} > {column.name for column in plain.output_columns()}
+    assert step.stored_bytes(scene, Role.SENDER) == 2 * plain.stored_bytes(scene, Role.SENDER)
+
+
+@pytest.mark.parametrize(
+    ("code", "text", "verdict"),
+    [
+        (0, "Data link types for mon0\n  IEEE802_11_RADIO (802.11 plus radiotap header)", Verdict.OK),
+        (0, "Data link types for wlan0\n  EN10MB (Ethernet)", Verdict.FAIL),
+        (1, "tcpdump: mon0: No such device exists", Verdict.FAIL),
+    ],
+)
+def test_the_monitor_interface_must_provide_radiotap_headers(code: int, text: str, verdict: Verdict) -> None:
+    step = capture_step(TEXT.replace("{during", "{monitor: mon0, during"))
+    needs = [need for need in step.needs(Scene(Protocol.TCP, CAST, "f")) if "mon0" in need.name]
+    assert [need.role for need in needs] == [Role.SENDER, Role.RECEIVER]
+    result, _, remedy = needs[0].judge(CommandResult(text, code))
+    assert result == verdict
+    assert ("type monitor" in remedy) == (verdict is Verdict.FAIL)
+
+
+def test_a_monitor_interface_belongs_to_the_radio_under_test() -> None:
+    with pytest.raises(schema.ValidationError, match="remove `over`"):
+        CaptureStep.model_validate({"over": "cell", "monitor": "mon0", "during": [{"wait": {"duration": "1s"}}]})
 
 
 @pytest.mark.emulated

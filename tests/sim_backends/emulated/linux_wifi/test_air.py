@@ -87,6 +87,8 @@ def test_tries_are_lost_as_often_as_the_packet_error_rate_of_their_mode() -> Non
     events, _ = run(air)
     assert len(events.statuses) == len(events.receptions) == frames
     retried = sum(status.attempts == 2 for status in events.statuses)
+    assert all(status.decoded_try == status.attempts for status in events.statuses)
+    assert all(status.mode == (G54, G6)[status.decoded_try - 1] for status in events.statuses)
     assert all(status.chain.tries_made(status.attempts) in ([1], [1, 1]) for status in events.statuses)
     assert abs(retried - frames * loss_probability) < 4 * math.sqrt(
         frames * loss_probability * (1 - loss_probability)

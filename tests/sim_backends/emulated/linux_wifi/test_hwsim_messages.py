@@ -55,6 +55,10 @@ def test_a_received_frame_has_the_bytes_computed_by_hand() -> None:
     )
     receiver = RadioAddress(bytes.fromhex("420000000000"))
     assert encode_reception(SENT, receiver, rate_index=11, signal_dbm=-80) == expected
+    retried_frame = SENT.frame[:1] + bytes((SENT.frame[1] | 0x08,)) + SENT.frame[2:]
+    assert encode_reception(SENT, receiver, rate_index=11, signal_dbm=-80, is_retry=True) == expected.replace(
+        SENT.frame, retried_frame
+    )
 
 
 def test_a_control_frame_is_not_passed_on_because_the_kernel_rejects_it() -> None:

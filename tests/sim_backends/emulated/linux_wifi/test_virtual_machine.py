@@ -23,7 +23,7 @@ pytestmark = pytest.mark.emulated
 BOOT_S = 1800.0
 IMPORTED = (
     "fieldkit.config.profiles",
-    "sim_backends.emulated.nodes",
+    "sim_backends.emulated.running_robots",
     "sim_backends.emulated.robot.init",
     "sim_backends.emulated.linux_wifi.lab",
     "sim_backends.emulated.linux_wifi.medium_program",

@@ -1,4 +1,4 @@
-"""WPA3, monitor interfaces, an 802.11s mesh, and roaming of Linux's Wi-Fi on fieldkit's medium: one boot."""
+"""WPA3, monitor interfaces, meshes, and roaming of Linux's Wi-Fi on fieldkit's medium: one boot."""
 
 import json
 import re
@@ -52,6 +52,15 @@ def test_the_monitor_interface_captures_frames_with_radiotap(results: dict[str, 
     assert len(frames) == 20
     assert any(re.search(r"-\d+dBm signal", line) and re.search(r"\d Mb/s", line) for line in frames)
     assert any("dBm signal" not in line for line in frames)
+
+
+def test_frames_that_were_lost_before_arrive_with_the_retry_flag(results: dict[str, Any]) -> None:
+    """Encrypted frames with this flag are decrypted, because encryption does not protect it."""
+    assert results["edge ping"] >= 10
+    controls = [bytes.fromhex(control) for control, _, _ in results["edge frames"]]
+    data = [control for control in controls if control[0] == 0x88]
+    assert any(control[1] & 0x08 for control in data), results
+    assert any(not control[1] & 0x08 for control in data), results
 
 
 def test_frames_are_forwarded_in_the_mesh_by_the_robot_in_between(results: dict[str, Any]) -> None:

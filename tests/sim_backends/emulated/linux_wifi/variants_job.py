@@ -1,4 +1,4 @@
-"""A job in the virtual machine of `test_wifi_variants.py`: WPA3, monitor interfaces, an 802.11s mesh, and roaming.
+"""A job in the virtual machine of `test_wifi_variants.py`: WPA3, monitor interfaces, meshes and roaming.
 
 It prints results as JSON. The labs have three robots in topology `master`, or two robots and two access points.
 """
@@ -26,6 +26,8 @@ CAST = {
 }
 RADIO = {"fading": False, "shadowing_db": 0.0}
 TRIANGLE: dict[str, Vector] = {"r0": (0.0, 0.0, 1.0), "r1": (10.0, 0.0, 1.0), "r2": (5.0, 5.0, 1.0)}
+# At this distance from the access point, frames at higher rates are lost.
+EDGE: dict[str, Vector] = {**TRIANGLE, "r2": (75.0, 0.0, 1.0)}
 # The range of these radios is 91 m in the open.
 ROW: dict[str, Vector] = {"r0": (0.0, 0.0, 1.0), "r1": (140.0, 0.0, 1.0), "r2": (70.0, 0.0, 1.0)}
 # The robot in the middle of the row is out of range.
@@ -37,7 +39,7 @@ END: dict[str, Vector] = {**START, "r0": (80.0, 0.0, 1.0)}
 JOIN_S = 60.0
 CAPTURE = ("tcpdump", "-i", "mon0", "-y", "IEEE802_11_RADIO", "-c", "20", "-e", "-n", "--immediate-mode")
 
-HANDOVER_CAPTURE = ("tcpdump", "-i", "mon0", "-y", "IEEE802_11_RADIO", "-U", "-w", "-", "--immediate-mode")
+FILE_CAPTURE = ("tcpdump", "-i", "mon0", "-y", "IEEE802_11_RADIO", "-U", "-w", "-", "--immediate-mode")
 
 Running = RunningRobots[Role]
 
@@ -89,7 +91,12 @@ def wait_for_handover(running: Running, left_access_point: str) -> str:
 
 
 @contextmanager
-def lab(settings: dict[str, object], *, roles: Collection[Role] = tuple(CAST), **radio: object) -> Iterator[Running]:
+def lab(
+    settings: dict[str, object],
+    *,
+    roles: Collection[Role] = tuple(CAST),
+    **radio: object,
+) -> Iterator[Running]:
     options = EmulatedOptions.model_validate(
         {"wifi": "linux", "ros": "builtin", "radio": {**RADIO, **radio}, "linux_wifi": settings}
     )
@@ -119,6 +126,16 @@ def main() -> None:
         )
         record_result("wpa3 ping", ping(running, 20))
         record_result("frames", capture.communicate(timeout=JOIN_S)[0])
+        running.medium.place(EDGE)
+        record_result("edge link", wait_for_link(running))
+        edge = subprocess.Popen(
+            ("nsenter", "-t", str(running.robots[Role.RELAY].pid), "-n", *FILE_CAPTURE),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+        )
+        record_result("edge ping", ping(running, 20))
+        edge.terminate()
+        record_result("edge frames", frames(edge.communicate()[0]))
     with lab({"mesh": True}) as running:
         running.medium.place(ROW)
         record_result("mesh link", wait_for_link(running))
@@ -145,7 +162,7 @@ def main() -> None:
             text=True,
         )
         handover = subprocess.Popen(
-            ("nsenter", "-t", str(running.robots[Role.SENDER].pid), "-n", *HANDOVER_CAPTURE),
+            ("nsenter", "-t", str(running.robots[Role.SENDER].pid), "-n", *FILE_CAPTURE),
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
         )
