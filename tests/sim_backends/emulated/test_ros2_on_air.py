@@ -188,17 +188,19 @@ def test_a_real_ros_2_reads_the_node_s_log(report: Mapping[str, Any]) -> None:
 
 
 @pytest.mark.emulated
-def test_the_documentation_lists_all_services_and_topics_that_the_node_lacks(report: Mapping[str, Any]) -> None:
+def test_the_documentation_describes_the_services_and_topics_that_the_node_lacks(report: Mapping[str, Any]) -> None:
     """The reference is a node of rclpy: the names of its services and topics start with the name of the node."""
     node_name = NODES[Role.SENDER]
     services_of_rclpy = {service.rpartition("/")[2] for service in report["services_of_node"]["listener"]}
     assert {"list_parameters", "get_type_description"} <= services_of_rclpy
     assert report["services_of_node"][node_name] == []
     topics_of_robot = {topic for topic, _ in report["topics_of_nodes"][node_name]}
-    missing_names = services_of_rclpy | (set(report["topics_of_listener"]) - topics_of_robot - {"/cmd_vel"})
+    missing_topics = set(report["topics_of_listener"]) - topics_of_robot - {"/cmd_vel"}
     page = (ROOT / "docs" / "add-a-robot.md").read_text(encoding="utf-8")
     section = page.partition("### What its node lacks")[2].partition("\n## ")[0]
-    assert [name for name in sorted(missing_names) if f"`{name}`" not in section] == []
+    assert [name for name in sorted(missing_topics) if f"`{name}`" not in section] == []
+    assert "no services (for parameters and type descriptions)" in section
+    assert all("parameter" in name or "type_description" in name for name in services_of_rclpy)
     assert "`/rosout`" in section
 
 
