@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import pytest
 
-from tests.helpers.host import NamespaceComparison, descendants, is_running, separate_namespaces
+from tests.helpers.host import LeakError, NamespaceComparison, descendants, is_running, separate_namespaces
 
 _PR_SET_CHILD_SUBREAPER: Final = 36  # linux/prctl.h: orphans become children of this process, not of init
 _KEY: Final = "processes left behind"
@@ -109,6 +109,24 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     """Register the process watch."""
     config.pluginmanager.register(_ProcessWatch(config))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item: pytest.Item) -> Iterator[None]:
+    """Check that Ctrl-C still has its effect after a test; otherwise later tests of interrupts would fail.
+
+    Raises:
+        LeakError: A test has changed the handling of SIGINT in this process, or has blocked it.
+    """
+    yield
+    handler, is_blocked = (
+        signal.getsignal(signal.SIGINT),
+        signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ()),
+    )
+    if handler is not signal.default_int_handler or is_blocked:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT,))
+        raise LeakError(f"{item.nodeid} changed SIGINT: handler {handler}, blocked: {is_blocked}")
 
 
 @pytest.fixture

@@ -123,6 +123,14 @@ SHARED_FIXTURE = """
         lab.append("node lost")
         assert not first_try("tried")
 """
+CHANGES_SIGINT = """
+    import signal
+    def test_it():
+        CHANGE
+    def test_after():
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        assert not signal.pthread_sigmask(signal.SIG_BLOCK, ())
+"""
 MANY_RERUNS = """
     @pytest.mark.parametrize("name", range({tests}))
     def test_it(name):
@@ -175,6 +183,18 @@ def test_a_first_try_that_leaves_network_state_always_fails(
     assert result.ret == pytest.ExitCode.TESTS_FAILED
     result.assert_outcomes(passed=1, errors=1)
     result.stdout.fnmatch_lines(["*LeakError*left*"])
+
+
+@pytest.mark.parametrize(
+    "change",
+    ["signal.signal(signal.SIGINT, signal.SIG_IGN)", "signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT,))"],
+)
+def test_a_test_that_changes_the_effect_of_ctrl_c_fails_and_later_tests_do_not(
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, change: str
+) -> None:
+    result = run(pytester, monkeypatch, CHANGES_SIGINT.replace("CHANGE", change), *SEQUENTIAL)
+    result.assert_outcomes(passed=2, errors=1)
+    result.stdout.fnmatch_lines(["*LeakError*test_it changed SIGINT*"])
 
 
 @pytest.mark.emulated

@@ -29,7 +29,7 @@ from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.ros.ros2_bag import Rosbag2Recorder
-from sim_backends.emulated.ros.tcpros import Header
+from sim_backends.emulated.ros.tcpros import Header, Listener
 from sim_backends.world.world import load_world
 from tests.helpers.casts import ros_of
 
@@ -252,7 +252,11 @@ def test_debian_s_ros_is_not_ros2(monkeypatch: pytest.MonkeyPatch) -> None:
             assert backend.cast(Topology.MASTER)
 
 
-def test_a_message_that_is_not_of_its_type_is_logged_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_message_that_is_not_of_its_type_is_logged_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # A recorder handles signals until its process exits; this process must still handle Ctrl-C after the test.
+    monkeypatch.setattr(Listener, "_stop_on_signals", lambda _: None)
     header = cast("Header", {"topic": "/scan", "type": "sensor_msgs/LaserScan"})
     recorder = Rosbag2Recorder(["/scan"], tmp_path / "bag", StoragePlugin.SQLITE3, "humble")
     with Writer(tmp_path / "bag", version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
