@@ -192,6 +192,28 @@ NetDeviceContainer Install(const Options& options, NodeContainer nodes,
     return devices;
 }
 
+// Run the simulation; return the goodput at each sink after the warm-up in Mbit/s.
+std::vector<double> RunAndMeasure(const std::vector<Ptr<PacketSink>>& sinks, double seconds)
+{
+    std::vector<double> bits(sinks.size());
+    auto count = [&](double sign) {
+        for (std::size_t number = 0; number < sinks.size(); number++)
+        {
+            bits[number] += sign * 8.0 * sinks[number]->GetTotalRx();
+        }
+    };
+    Simulator::Schedule(Seconds(2 * kWarmUpS), [&] { count(-1); });
+    Simulator::Stop(Seconds(2 * kWarmUpS + seconds));
+    Simulator::Run();
+    count(1);
+    Simulator::Destroy();
+    for (auto& value : bits)
+    {
+        value /= seconds * 1e6;
+    }
+    return bits;
+}
+
 // Goodput in Mbit/s of the stations of each traffic class.
 std::vector<double> Goodputs(const Options& options)
 {
@@ -256,23 +278,7 @@ std::vector<double> Goodputs(const Options& options)
         source.SetConstantRate(DataRate(offered_bit_s), options.payload);
         source.Install(nodes.Get(n)).Start(Seconds(kWarmUpS + 0.001 * n));
     }
-    std::vector<double> bits(sinks.size());
-    auto count = [&](double sign) {
-        for (std::size_t number = 0; number < sinks.size(); number++)
-        {
-            bits[number] += sign * 8.0 * sinks[number]->GetTotalRx();
-        }
-    };
-    Simulator::Schedule(Seconds(2 * kWarmUpS), [&] { count(-1); });
-    Simulator::Stop(Seconds(2 * kWarmUpS + options.seconds));
-    Simulator::Run();
-    count(1);
-    Simulator::Destroy();
-    for (auto& value : bits)
-    {
-        value /= options.seconds * 1e6;
-    }
-    return bits;
+    return RunAndMeasure(sinks, options.seconds);
 }
 
 // Goodputs in Mbit/s of two pairs of stations: 0 sends to 1, and 2 to 3. The losses are equal, except those from the first
@@ -310,23 +316,7 @@ std::vector<double> PairGoodputs(const Options& options)
         source.SetConstantRate(DataRate(70000000), options.payload);
         source.Install(nodes.Get(sender)).Start(Seconds(kWarmUpS + 0.001 * sender));
     }
-    std::vector<double> bits(sinks.size());
-    auto count = [&](double sign) {
-        for (std::size_t number = 0; number < sinks.size(); number++)
-        {
-            bits[number] += sign * 8.0 * sinks[number]->GetTotalRx();
-        }
-    };
-    Simulator::Schedule(Seconds(2 * kWarmUpS), [&] { count(-1); });
-    Simulator::Stop(Seconds(2 * kWarmUpS + options.seconds));
-    Simulator::Run();
-    count(1);
-    Simulator::Destroy();
-    for (auto& value : bits)
-    {
-        value /= options.seconds * 1e6;
-    }
-    return bits;
+    return RunAndMeasure(sinks, options.seconds);
 }
 
 // An error model that loses the packets with the given numbers: comma-separated, from 0, in the order of arrival.
