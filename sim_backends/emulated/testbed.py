@@ -259,7 +259,7 @@ def laptop_on_air(running: RunningRobots[RobotKey], mesh: MeshOptions | None) ->
     In a mesh it uses the routes of the robots, and forwards no packets.
     """
     with Laptop(f"{LAPTOP_ADDRESS}/{NETWORK.prefixlen}") as laptop:
-        laptop.open_radio(mesh=mesh is not None, guest_hello_s=None if mesh is None else mesh.hello)
+        laptop.open_radio(mesh=mesh is not None, guest_hello_s=None if mesh is None else mesh.hello_s)
         running.medium.attach(laptop.name, laptop.address, LAPTOP_RADIO, laptop.radio_fd)
         yield laptop
 

@@ -17,6 +17,7 @@ from fieldkit.core.model import Vector
 from fieldkit.lab.protocol import Login, Overview
 from fieldkit.lab.requests import RobotState, pack_destination, unpack_place_m, unpack_state
 from fieldkit.lab.robots import Destination, LabRobot
+from sim_backends.emulated.emulated_options import MeshOptions
 from sim_backends.emulated.linux_wifi import guest
 from sim_backends.emulated.linux_wifi.lab_relay import CONNECTED, GuestLogin
 from sim_backends.emulated.linux_wifi.streams import ChannelStreams
@@ -155,6 +156,7 @@ def bring_up(
     seed: int,
     radios: int,
     draw: Callable[[Mapping[str, Vector]], Overview],
+    mesh: MeshOptions | None = None,
 ) -> Iterator[GuestLab]:
     """Yield the lab in a new virtual machine.
 
@@ -164,12 +166,13 @@ def bring_up(
         seed: Seed of all random numbers of the lab.
         radios: Number of radios.
         draw: Returns the plan view for the positions of the robots.
+        mesh: The robots' mesh, which may need further programs and kernel modules.
 
     Raises:
         ConfigurationError: A program, or the kernel of the machine, is not installed.
         TestbedLostError: The machine, or the lab in it, ended.
     """
-    kernel = require_machine()
+    kernel = require_machine(mesh=mesh)
     host_end, machine_end = socket.socketpair()
     with host_end, machine_end:
         script = _script(site, Path.cwd(), seed)

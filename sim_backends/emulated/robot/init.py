@@ -242,8 +242,9 @@ class Init:
         """Execute a request that changes a network interface."""
         match request["do"]:
             case "open wifi":
-                self._wifi, self._interface = WifiSpec(**request["wifi"]), request["interface"]
-                wireless.bring_up(request["device"], request["interface"], request["address"], self._wifi)
+                wifi, interface = WifiSpec(**request["wifi"]), request["interface"]
+                self._wifi, self._interface = wifi, wifi.radio_interface(interface)
+                wireless.bring_up(request["device"], interface, request["address"], wifi)
             case "switch off":
                 network.switch_off(request["interface"])
             case "switch on":
@@ -252,9 +253,10 @@ class Init:
                 network.switch_on_link(request["interface"])
 
     def _switch_on(self, interface: str) -> None:
-        network.switch_on(interface)
-        if self._wifi is not None:
-            wireless.rejoin(interface, self._wifi)
+        if self._wifi is None:
+            network.switch_on(interface)
+        else:
+            wireless.switch_on(interface, self._wifi)
 
     def _spawn(self, spec: RobotSpec) -> list[Service]:
         """Start the robot's services without waiting for them, because requests are served one at a time."""
