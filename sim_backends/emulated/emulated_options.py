@@ -9,7 +9,8 @@ from fieldkit.config.profiles import LinkName
 from fieldkit.config.schema import Bool, Document, Duration, Field, Length, Strict
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.emulated.linux_wifi.linux_wifi_options import LinuxWifiOptions
-from sim_backends.emulated.robot.spec import HELLO_S, NETCATS, Netcat, Ping, SshServer, Userland
+from sim_backends.emulated.robot.mesh_options import MeshOptions
+from sim_backends.emulated.robot.spec import NETCATS, Netcat, Ping, SshServer, Userland
 from sim_backends.radio.radio_options import INFRASTRUCTURE, RadioOptions
 
 BOOT_S: Final = 2.0
@@ -72,40 +73,6 @@ class RobotOptions(Strict):
 
 HOST_TOOLS: Final = RobotOptions.defaults()
 """Options of a robot that the site file does not name under `robots`: it has the tools of this machine."""
-
-
-class MeshOptions(Strict):
-    """A mesh: robots forward packets for each other, and a routing protocol finds the routes.
-
-    Attributes:
-        protocol: `babel`: the daemon babeld on each robot finds routes of IP packets by Babel (RFC 8966).
-            `batman-adv`: the kernels forward Ethernet frames of the interface `bat0`, which has the robot's address
-            and is the interface under test; it needs `wifi: linux`.
-        hello: Interval of the messages by which neighbours detect each other: the hello interval of Babel (default 4
-            s), or the originator interval of batman-adv (default 1 s). A lost route is replaced after several
-            intervals.
-    """
-
-    protocol: Literal["babel", "batman-adv"]
-    hello: Annotated[Duration, Field(ge=0.1, le=60)] | None = None
-
-    @schema.model_validator(mode="before")
-    @classmethod
-    def _read_former_key(cls, value: object) -> object:
-        """Accept `daemon: babeld`, with which site files of earlier versions select Babel."""
-        if isinstance(value, dict) and value.get("daemon") == "babeld" and "protocol" not in value:
-            return {key: setting for key, setting in value.items() if key != "daemon"} | {"protocol": "babel"}
-        return value
-
-    @property
-    def hello_s(self) -> float:
-        """The interval in seconds; the default of the protocol if the site file has none."""
-        return HELLO_S[self.protocol] if self.hello is None else float(self.hello)
-
-    @property
-    def program(self) -> str:
-        """The program that each robot needs."""
-        return {"babel": "babeld", "batman-adv": "batctl"}[self.protocol]
 
 
 class Ros2Options(Strict):

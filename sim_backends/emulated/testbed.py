@@ -28,11 +28,12 @@ from fieldkit.core.prompts import DONE, UNATTENDED, Answer, Operator
 from fieldkit.remote.shell import Shell
 from fieldkit.remote.ssh import RECONNECT_TIMEOUT_S, SshShell
 from sim_backends.emulated import placement as positions
-from sim_backends.emulated.emulated_options import EmulatedOptions, MeshOptions, RosChoice
+from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.medium.media import Media
 from sim_backends.emulated.mobility import Mobility
 from sim_backends.emulated.nodes import LAPTOP_RADIO, Laptop, Node
 from sim_backends.emulated.provisioning import LAPTOP_ADDRESS, NETWORK, RobotKey
+from sim_backends.emulated.robot.mesh_options import MeshOptions
 from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.running_robots import RunningRobots, running_robots
 from sim_backends.world.world import World

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.core.deadline import Deadline
-from sim_backends.emulated.emulated_options import MeshOptions
 from sim_backends.emulated.linux_wifi.virtual_machine import (
     INTERRUPT,
     MESH_PACKAGE_OF,
@@ -21,6 +20,7 @@ from sim_backends.emulated.linux_wifi.virtual_machine import (
     run_in_machine,
 )
 from sim_backends.emulated.process import worker
+from sim_backends.emulated.robot.mesh_options import MeshOptions
 
 _MAX_DURATION_S: Final = 7 * 24 * 3600.0
 """Time limit of a command: a week."""

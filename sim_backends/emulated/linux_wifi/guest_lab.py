@@ -17,12 +17,12 @@ from fieldkit.core.model import Vector
 from fieldkit.lab.protocol import Login, Overview
 from fieldkit.lab.requests import RobotState, pack_destination, unpack_place_m, unpack_state
 from fieldkit.lab.robots import Destination, LabRobot
-from sim_backends.emulated.emulated_options import MeshOptions
 from sim_backends.emulated.linux_wifi import guest
 from sim_backends.emulated.linux_wifi.lab_relay import CONNECTED, GuestLogin
 from sim_backends.emulated.linux_wifi.streams import ChannelStreams
 from sim_backends.emulated.linux_wifi.virtual_machine import CHANNEL, Machine, require_machine, started_machine
 from sim_backends.emulated.process import worker
+from sim_backends.emulated.robot.mesh_options import MeshOptions
 from sim_backends.emulated.robot.spec import USER
 
 Answer = TypeVar("Answer")

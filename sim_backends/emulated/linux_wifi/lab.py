@@ -8,10 +8,10 @@ from typing import TypeVar
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.model import Role
 from fieldkit.lab.robots import LabRobot
-from sim_backends.emulated.emulated_options import MeshOptions
 from sim_backends.emulated.linux_wifi.linux_wifi_options import LinuxWifiOptions
 from sim_backends.emulated.linux_wifi.radios import HwsimRadio, require_radios
 from sim_backends.emulated.linux_wifi.wifi_client import WifiClient
+from sim_backends.emulated.robot.mesh_options import MeshOptions
 from sim_backends.emulated.robot.spec import WifiSpec
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import World

@@ -25,9 +25,9 @@ from typing import Final
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, TestbedLostError
-from sim_backends.emulated.emulated_options import MeshOptions
 from sim_backends.emulated.linux_wifi.initrd import build_initrd
 from sim_backends.emulated.process.worker import PATH
+from sim_backends.emulated.robot.mesh_options import MeshOptions
 
 PACKAGE_OF: Final = {
     "qemu-system-x86_64": "qemu-system-x86",

@@ -36,9 +36,6 @@ LOOPBACK: Final = "127.0.0.1"
 ANTENNA_M: Final = 0.2
 """Height of an antenna over the ground: a TurtleBot3 Burger is 0.19 m high (ROBOTIS e-Manual)."""
 
-HELLO_S: Final = {"babel": 4.0, "batman-adv": 1.0}
-"""Default hello interval of babeld on wireless interfaces, and default originator interval of batman-adv."""
-
 MESH_INTERFACE: Final = "bat0"
 """Mesh interface of batman-adv."""
 WIFI_INTERFACE: Final = "wlan0"

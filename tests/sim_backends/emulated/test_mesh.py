@@ -20,10 +20,11 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.lab.robots import LabRobot
 from fieldkit.remote.ssh import SshShell
 from sim_backends.emulated import requirements
-from sim_backends.emulated.emulated_options import EmulatedOptions, MeshOptions, RosChoice
+from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.nodes import Laptop
 from sim_backends.emulated.provisioning import LAPTOP_ADDRESS, LAPTOP_NAME, profile_in_lab
 from sim_backends.emulated.robot import network
+from sim_backends.emulated.robot.mesh_options import MeshOptions
 from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.running_robots import RunningRobots, running_robots
 from sim_backends.emulated.testbed import laptop_on_air

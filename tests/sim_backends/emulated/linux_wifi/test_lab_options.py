@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from fieldkit.cli import main
-from sim_backends.emulated.emulated_options import MeshOptions
 from sim_backends.emulated.linux_wifi import guest, virtual_machine
 from sim_backends.emulated.linux_wifi.virtual_machine import JobResult, Kernel
+from sim_backends.emulated.robot.mesh_options import MeshOptions
 
 SITE = """\
 backend: emulated

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.emulated.emulated_options import MeshOptions
 from sim_backends.emulated.linux_wifi.initrd import MODULES, build_initrd
 from sim_backends.emulated.linux_wifi.virtual_machine import (
     MESH_PACKAGE_OF,
@@ -17,6 +16,7 @@ from sim_backends.emulated.linux_wifi.virtual_machine import (
     require_machine,
     uncompressed_kernel,
 )
+from sim_backends.emulated.robot.mesh_options import MeshOptions
 
 
 def test_all_missing_programs_are_listed_with_their_packages(tmp_path: Path) -> None:

@@ -3,31 +3,41 @@
 Each mesh has three robots in a row, whose ends are out of range. `test_mesh_trials.py` has meshes in new machines.
 """
 
+import importlib
 import json
 import re
 import shlex
 import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.telemetry.source_outputs import mesh_values
-from sim_backends.emulated.emulated_options import MeshOptions
 from sim_backends.emulated.linux_wifi import guest
 from sim_backends.emulated.linux_wifi.virtual_machine import ROOT_VARIABLE, require_machine, run_in_machine
+from sim_backends.emulated.robot.mesh_options import MeshOptions
 from tests.helpers.paths import ROOT
+from tests.sim_backends.emulated.linux_wifi import mesh_job
 
 pytestmark = [pytest.mark.emulated, pytest.mark.nightly]
 
 BOOT_S = 3600.0
+# The machine cannot write compiled modules to the host, and would need minutes to compile them itself.
+IMPORTED = (
+    "sim_backends.emulated.robot.init",
+    "sim_backends.emulated.robot.wireless",
+    "sim_backends.emulated.linux_wifi.lab",
+    "sim_backends.emulated.linux_wifi.medium_program",
+)
 FIRST_TTL = 64
 
 
 @pytest.fixture(scope="module")
 def results() -> dict[str, Any]:
-    job = (sys.executable, str(Path(__file__).with_name("mesh_job.py")))
+    for module in IMPORTED:
+        importlib.import_module(module)
+    job = (sys.executable, mesh_job.__file__)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(ROOT_VARIABLE, str(ROOT / ".linux"))
         kernel = require_machine(mesh=MeshOptions(protocol="batman-adv"))
