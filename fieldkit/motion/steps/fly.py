@@ -89,17 +89,17 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
     its nose away from the robot at the other end of its link. Real drones need `--allow-motion`. A flight beyond
     `limits` of the profile is refused, and so is a robot whose profile has no `mavlink`. Before the trial and before
     each take-off its autopilot, PX4 or ArduCopter, must report [that it can be
-    armed](mavlink.md#checks-before-a-take-off). A `fault` or a `together` may be inside a flight; a
-    flight must not be inside a `fault` or a `together`. Adds columns of the flight (`fly_height_median_m` and others,
-    [MAVLink](mavlink.md#evidence-of-a-flight)). Writes `fly.jsonl`, `fly.log` and `fly.orders`.
+    armed](mavlink.md#checks-before-a-take-off). A `fault` or a `together` may be inside a flight; a flight must not
+    be inside a `fault` or a `together`. Adds columns of the flight (`fly_height_median_m` and others,
+    [MAVLink](mavlink.md#evidence-of-a-flight)). Writes `fly.jsonl`, and logs and orders: `fly.log`, `fly.orders`,
+    `guard.log`, `guard.orders`, `rescue.log`.
 
     Attributes:
         robot: Role that flies.
-        height: Height above the take-off point to which it climbs first; together with all segments upwards at most
-            `limits.max_height_m`.
+        height: Height above the take-off point to which it climbs first.
         path: Its path after the climb, a list of straight segments; forward is the direction of its nose before
-            take-off. Without a path it hovers; at the end of the path it waits. Every corner must be within
-            `limits.fence_m` of the take-off point.
+            take-off. Without a path it hovers; at the end of the path it waits. Every corner must be at most
+            `limits.max_height_m` above the take-off point, and within `limits.fence_m` of it.
         speed: Speed, at most `limits.max_speed_m_s`.
         climb: Rate of climb, at most `limits.max_speed_m_s`.
         then: End of the flight: `return` to the take-off point, or `land` at the current position.
