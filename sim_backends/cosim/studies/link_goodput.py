@@ -21,8 +21,8 @@ from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.seeds import ALL_PROCESSORS, Task, run_many
-from sim_backends.radio.high_throughput import mode_named
-from sim_backends.radio.modes import BANDS, OFDM_MODES, Band, WifiMode
+from sim_backends.radio.phy.high_throughput import mode_named
+from sim_backends.radio.phy.modes import BANDS, OFDM_MODES, Band, WifiMode
 from sim_backends.radio.propagation.path_loss import free_space_db
 
 SIGNAL_STEP_DB: Final = 0.5
