@@ -8,9 +8,9 @@ import pytest
 from sim_backends.emulated.linux_wifi.air import Air, AirEvents, FrameOnAir
 from sim_backends.emulated.linux_wifi.hwsim_messages import FLAG_NO_ACK, RATE_MCS, RadioAddress, RateStage, SentFrame
 from sim_backends.radio.antennas import Antenna
-from sim_backends.radio.error_rates import packet_error
-from sim_backends.radio.frames import decibel
-from sim_backends.radio.modes import ACK_BYTES, G_MODES, N_MODES, SIFS_NS, ack_ns, control_mode
+from sim_backends.radio.phy.error_rates import packet_error
+from sim_backends.radio.phy.modes import ACK_BYTES, G_MODES, N_MODES, SIFS_NS, ack_ns, control_mode
+from sim_backends.radio.phy.transmissions import decibel
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.world_channel import WorldChannel
 
