@@ -107,6 +107,24 @@ def test_step_with_positions_must_not_be_nested_in_a_move() -> None:
     assert schema.validate(schema.parse(head + without_positions, source="x.yaml"), Procedure)
 
 
+@pytest.mark.parametrize(
+    "steps",
+    [
+        "[{track: {robots: {sender: {at: {lat: 1, lon: 2}}}, during: [{MAVLINK}]}}]",
+        "[{MAVLINK}, {track: {robots: {sender: {at: {lat: 1, lon: 2}}}, during: [{PING}]}}]",
+        "[{MAVLINK}, {MAVLINK}]",
+    ],
+)
+def test_a_repeat_has_only_one_step_that_records_positions(steps: str) -> None:
+    """Neither a name of the step nor another file name solves the conflict, so the message suggests neither."""
+    head = "name: x\nsummary: x\nscenario: los\ntopology: masterless\nprotocols: [udp]\nrepeats: 1\nsteps: "
+    step = f"{{mavlink: {{name: m, robot: receiver, positions: global, during: [{PING}]}}}}"
+    text = steps.replace("{MAVLINK}", step).replace("{PING}", PING)
+    with pytest.raises(ConfigurationError, match="only one step that records positions") as caught:
+        schema.validate(schema.parse(head + text, source="x.yaml"), Procedure)
+    assert "name" not in caught.value.what
+
+
 def attempt(
     tmp_path: Path,
     step: MavlinkStep,
