@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from sim_backends.emulated.medium.framing import IP, Framing
-from sim_backends.radio.frames import ControlFrame, TransmissionAttempt
+from sim_backends.radio.mac.frames import ControlFrame, TransmissionAttempt
 
 PCAP: Final = "air.pcap"
 CSV: Final = "air.csv"

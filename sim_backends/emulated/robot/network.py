@@ -17,7 +17,7 @@ from sim_backends.emulated.medium.framing import mac_of
 from sim_backends.emulated.robot.spec import LOOPBACK_INTERFACE, SHARED_NETWORK, STATE
 
 PID_FILE: Final = Path(STATE, "babeld.pid")
-"""File that babeld writes when it has its socket and its interface, before its first hello."""
+"""File that babeld writes when it starts, before it opens its socket and sends its first hello."""
 
 LINK_COST: Final = 1024
 """Cost of a further link in Babel; a radio without loss costs 256, so that it is preferred."""
@@ -48,9 +48,9 @@ def babeld_command(interface: str, address: str, hello_s: float, links: Mapping[
 
 
 def guest_babeld_command(interface: str, address: str, hello_s: float) -> tuple[str, ...]:
-    """Return the command of the routing daemon of a node that uses the robots' routes, but announces only itself.
+    """Return the command of the routing daemon of a node that uses the robots' routes.
 
-    The daemon writes no files. The arguments are those of `babeld_command`.
+    The node announces only its own address. The daemon writes no files. The arguments are those of `babeld_command`.
     """
     filters = (f"out ip {IPv4Interface(address).ip}/32 allow", "out deny")
     return (*_program("", ""), *_settings(interface, address, hello_s, *filters), interface)
@@ -73,7 +73,7 @@ def _settings(interface: str, address: str, hello_s: float, *rules: str) -> tupl
 
 DEVICE: Final = "/dev/net/tun"
 QUEUE_PACKETS: Final = 4096
-"""Length of the queue of an interface."""
+"""Length of the transmit queue of an interface."""
 
 # linux/if_tun.h
 _TUNSETIFF: Final = 0x400454CA
@@ -90,7 +90,7 @@ _NAME_BYTES: Final = 15
 
 MTU_BYTES: Final = 1500
 _TIMEOUT_S: Final = 5.0
-"""Timeout of `ip`."""
+"""Maximum duration of an `ip` command."""
 
 
 def open_tun(name: str, *, ethernet: bool = False) -> int:
@@ -100,12 +100,14 @@ def open_tun(name: str, *, ethernet: bool = False) -> int:
     descriptor open. Its queue holds 4096 packets, so that no packet is lost in a short pause of the medium process.
 
     Raises:
-        ConfigurationError: The device is missing, or this user may not open it or create an interface.
+        ConfigurationError: The name is empty or too long, the device is missing, or this user may not open it or
+            create an interface.
         FieldkitError: The interface exists already or the kernel refuses its name.
     """
     if not 0 < len(name.encode()) <= _NAME_BYTES:
         raise ConfigurationError(
-            f"{name!r} is not a valid interface name", remedy=f"use 1 to {_NAME_BYTES} characters, for example wlan0"
+            f"{name!r} is not a valid interface name",
+            remedy=f"use 1 to {_NAME_BYTES} ASCII characters, for example wlan0",
         )
     fd = open_device()
     try:
@@ -131,7 +133,7 @@ def open_device() -> int:
 
 
 def _set_queue(index: int) -> None:
-    """Set the queue of the interface with this index to `QUEUE_PACKETS`."""
+    """Set the queue length of the interface with this index to `QUEUE_PACKETS`."""
     # Netlink is used, because the ioctl (also in busybox's ip) needs a capability that no user namespace grants. The
     # message consists of the structs nlmsghdr, ifinfomsg and rtattr.
     link = struct.pack("=BxHiII", socket.AF_UNSPEC, 0, index, 0, 0)
@@ -252,7 +254,8 @@ def switch_on(interface: str) -> None:
 
 
 def _routes(interface: str) -> tuple[str, ...]:
-    # The kernel removes these routes whenever the link goes down, unlike the route that comes with the address.
+    # When an interface is taken down, the kernel removes its routes. It restores only the route that belongs to the
+    # address when the interface is brought up again.
     return (f"route replace 224.0.0.0/4 dev {interface}", f"route replace 255.255.255.255/32 dev {interface}")
 
 
@@ -272,7 +275,10 @@ def run_ip(*commands: str) -> None:
             check=False,
         )
         if result.returncode != 0:
-            raise RobotError(f"ip rejected a setting: {result.stderr.strip()}", remedy="update iproute2")
+            raise RobotError(
+                f"ip rejected a setting: {result.stderr.strip()} (ip {command})",
+                remedy="correct the address or the interface of the robot, or update iproute2",
+            )
 
 
 def has_listener(port: int) -> bool:
