@@ -17,6 +17,7 @@ from fieldkit.core.model import Control, Topology
 from fieldkit.core.prompts import Operator
 from fieldkit.remote.shell import Shell
 from sim_backends.emulated.emulated_options import EmulatedOptions, Ros2Options, RosChoice, load_options
+from sim_backends.emulated.medium.air_files import LIMIT_BYTES
 from sim_backends.emulated.motion_sections import DRIVE, MAVLINK, drive_of, mavlink_of
 from sim_backends.emulated.provisioning import (
     LAPTOP_ADDRESS,
@@ -159,8 +160,6 @@ class EmulatedBackend:
         """
         if not self._options.record_air or self._options.radio.is_fixed:
             return 0
-        from sim_backends.emulated.medium.air_log import LIMIT_BYTES  # noqa: PLC0415 (it imports numpy, which is slow)
-
         return LIMIT_BYTES
 
     def cast(self, topology: Topology) -> Cast:

@@ -22,8 +22,7 @@ from sim_backends.emulated import placement
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.mobility import WATCH_S, MotionThread, self_steered_motions
 from sim_backends.emulated.motion_sections import mavlink_of
-from sim_backends.emulated.robot.spec import USER
-from sim_backends.emulated.ros.robot_motion import AssignedPath
+from sim_backends.emulated.robot.spec import USER, AssignedPath
 from sim_backends.emulated.running_robots import RunningRobots, running_robots
 from sim_backends.radio.antennas import antenna_of
 from sim_backends.radio.world_channel import WorldChannel

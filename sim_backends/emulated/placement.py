@@ -9,8 +9,7 @@ from fieldkit.core import geometry
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Move, Placement, Role, Topology, Vector
 from fieldkit.lab.robots import Destination
-from sim_backends.emulated.robot.spec import ANTENNA_M
-from sim_backends.emulated.ros.robot_motion import AssignedPath
+from sim_backends.emulated.robot.spec import ANTENNA_M, AssignedPath
 from sim_backends.world.motion import Motion, OnGround, State, WayPoints
 from sim_backends.world.world import Line, World
 

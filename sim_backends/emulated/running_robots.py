@@ -17,7 +17,7 @@ from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.emulated.nodes import EmulatedRobot
 from sim_backends.emulated.provisioning import KeyPair, RobotKey, robot_spec
 from sim_backends.emulated.robot.spec import WifiSpec
-from sim_backends.emulated.ros.laser import PositionsWriter
+from sim_backends.emulated.ros.lab_positions import PositionsWriter
 from sim_backends.radio.antennas import antenna_of, fixed_mode
 from sim_backends.world.world import World
 

@@ -12,34 +12,15 @@ place the robot at another position at any time; records that refer to an earlie
 
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
 from fieldkit.core.model import Vector
+from sim_backends.emulated.robot.spec import AssignedPath
 from sim_backends.emulated.ros.motion_record import MotionRecord, RecordedMotion
 from sim_backends.world.motion import LEVEL, STILL, WayPoints
-
-
-@dataclass(frozen=True)
-class AssignedPath:
-    """Path on which the lab moves a robot. The robot stops at the end of the path.
-
-    On a path of one point, the robot stays at this point.
-
-    Attributes:
-        start_ns: Start of the motion, as a time of the monotonic clock, which is common to all robots on one machine.
-        points_m: Points of the path, metres east, north, up.
-        speed_m_s: Horizontal speed.
-        facing_rad: Heading of the robot before the start, from east towards north.
-    """
-
-    start_ns: int
-    points_m: Sequence[Vector]
-    speed_m_s: float
-    facing_rad: float
 
 
 @dataclass(frozen=True)

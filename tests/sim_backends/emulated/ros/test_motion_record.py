@@ -10,9 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sim_backends.emulated.robot.spec import AssignedPath
 from sim_backends.emulated.ros import robot_motion
 from sim_backends.emulated.ros.motion_record import SILENT_NS, MotionRecord, RecordedMotion
-from sim_backends.emulated.ros.robot_motion import AssignedPath, MotionReporter, Odometer
+from sim_backends.emulated.ros.robot_motion import MotionReporter, Odometer
 
 S = 10**9
 FLOATS = st.floats(-1e3, 1e3)

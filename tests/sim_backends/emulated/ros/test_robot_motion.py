@@ -14,9 +14,10 @@ from rosbags.typesys import Stores, get_typestore
 from fieldkit.core.model import Leg, Move, Placement, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
 from sim_backends.emulated import placement as places
+from sim_backends.emulated.robot.spec import AssignedPath
 from sim_backends.emulated.ros import robot_motion
 from sim_backends.emulated.ros.messages import FIX_NOISE_M, Source
-from sim_backends.emulated.ros.robot_motion import AT_REST, AssignedPath, Odometer, RobotMotionState
+from sim_backends.emulated.ros.robot_motion import AT_REST, Odometer, RobotMotionState
 from sim_backends.emulated.ros.sensor_specs import Sensor
 from sim_backends.world.world import load_world
 from tests.helpers.casts import CAST
