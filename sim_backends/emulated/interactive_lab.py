@@ -18,7 +18,7 @@ from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Vector
 from fieldkit.lab.protocol import LabLateness, LabLink, Login, Outline, Overview
 from fieldkit.lab.robots import Destination, LabRobot
-from sim_backends.emulated import placement
+from sim_backends.emulated import interactive_placement, placement
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.mobility import WATCH_S, MotionThread, self_steered_motions
 from sim_backends.emulated.motion_sections import mavlink_of
@@ -53,7 +53,7 @@ class EmulatedLab:
         self._running = running
         self._options = options
         self._world = world
-        self._positions_m = placement.square_m(members, world)
+        self._positions_m = interactive_placement.square_m(members, world)
         self._path_starts_ns: dict[str, int] = {}
         self._states: dict[str, State] = {}
         self._watch: MotionThread | None = None
@@ -87,7 +87,7 @@ class EmulatedLab:
     def move(self, name: str, to: Destination) -> Vector:
         """Implement `Lab.move`: the robot arrives immediately."""
         with self._lock:
-            position_m = placement.destination_m(self._positions_m[name], to, self._world)
+            position_m = interactive_placement.destination_m(self._positions_m[name], to, self._world)
             positions_m = self._positions_m | {name: position_m}
             # As in a trial, the robot is updated before the medium, whose physics simulator refuses a position in an
             # obstacle.
