@@ -22,11 +22,13 @@ from sim_backends.emulated import interactive_placement, placement
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.mobility import WATCH_S, MotionThread, self_steered_motions
 from sim_backends.emulated.motion_sections import mavlink_of
-from sim_backends.emulated.robot.spec import USER, AssignedPath
+from sim_backends.emulated.robot.spec import USER
+from sim_backends.emulated.ros.assigned_path import AssignedPath
 from sim_backends.emulated.running_robots import RunningRobots, running_robots
 from sim_backends.radio.antennas import antenna_of
 from sim_backends.radio.world_channel import WorldChannel
 from sim_backends.world.motion import Attitude, State, attitude_of
+from sim_backends.world.penetration import Obstacles
 from sim_backends.world.world import World
 
 
@@ -206,7 +208,9 @@ def overview(
             channel.are_linked(first_index, second_index),
             tuple(dict.fromkeys(crossing.obstacle for crossing in crossings)),
         )
-        for (first_index, second_index), crossings in zip(pairs, world.crossings(first, second), strict=True)
+        for (first_index, second_index), crossings in zip(
+            pairs, Obstacles(world).crossings(first, second), strict=True
+        )
     ]
     # In drawing order: a higher part covers a lower one.
     parts = sorted(world.parts, key=lambda part: part.shape.top_m)

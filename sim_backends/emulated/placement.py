@@ -8,7 +8,8 @@ from fieldkit.backends.protocols import Cast
 from fieldkit.core import geometry
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Move, Placement, Role, Topology, Vector
-from sim_backends.emulated.robot.spec import ANTENNA_M, AssignedPath
+from sim_backends.emulated.robot.spec import ANTENNA_M
+from sim_backends.emulated.ros.assigned_path import AssignedPath
 from sim_backends.world.motion import Motion, OnGround, State, WayPoints
 from sim_backends.world.world import Line, World
 

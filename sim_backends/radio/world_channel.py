@@ -22,10 +22,10 @@ from sim_backends.radio.frames import decibel
 from sim_backends.radio.high_throughput import common_modes, mode_groups
 from sim_backends.radio.minstrel_ht import MinstrelHt
 from sim_backends.radio.modes import OFDM_MODES
-from sim_backends.radio.propagation.antenna_patterns import StationGains
 from sim_backends.radio.propagation.fading import Fading
 from sim_backends.radio.propagation.link_caches import GainCache, LinkRow
 from sim_backends.radio.propagation.mean_loss import MeanLoss
+from sim_backends.radio.propagation.station_gains import StationGains
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.rate_control import FixedRate, Minstrel, RateControl

@@ -23,17 +23,9 @@ from sim_backends.emulated.process import worker
 from sim_backends.emulated.process.worker import Message
 from sim_backends.emulated.robot import mounts, network, rootfs, services, wireless
 from sim_backends.emulated.robot.services import Service
-from sim_backends.emulated.robot.spec import (
-    HOME,
-    LOOPBACK_INTERFACE,
-    START_S,
-    STATE,
-    AssignedPath,
-    RobotSpec,
-    WifiSpec,
-)
+from sim_backends.emulated.robot.spec import HOME, LOOPBACK_INTERFACE, START_S, STATE, RobotSpec, WifiSpec
 from sim_backends.emulated.robot.velocity_command import VELOCITY_COMMAND
-from sim_backends.emulated.ros import robot_motion
+from sim_backends.emulated.ros.assigned_path import AssignedPath, append_path
 from sim_backends.emulated.ros.lab_positions import Neighbourhood
 
 RESTART_S: Final = 0.1
@@ -210,7 +202,7 @@ class Init:
             case "open wifi" | "switch off" | "switch on" | "switch link on":
                 self._change_radio(request)
             case "move":
-                robot_motion.append_path(services.ASSIGNED_PATHS, AssignedPath(**request["path"]))
+                append_path(services.ASSIGNED_PATHS, AssignedPath(**request["path"]))
             case "kill":
                 kill_processes(request["process"])
             case "halt":

@@ -1,11 +1,11 @@
 """Specification of an emulated robot: plain data that the lab sends to the robot's init process as JSON."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from ipaddress import IPv4Network
 from typing import Any, Final, Literal, Self
 
-from fieldkit.core.model import ROS_MASTER_PORT, Vector
+from fieldkit.core.model import ROS_MASTER_PORT
 from sim_backends.emulated.ros.sensor_specs import Definition, LaserTarget, Neighbour, Sensor, Template
 
 SshServer = Literal["openssh", "dropbear"]
@@ -256,25 +256,6 @@ class RobotSpec:
         parts = {"laser_targets": targets, "sensors": sensors, "definitions": definitions, "base": base, "ros2": ros2}
         links = {name: (interface, address) for name, (interface, address) in data["links"].items()}
         return cls(**{**data, **words, **parts, "neighbours": neighbours, "wifi": wifi, "links": links})
-
-
-@dataclass(frozen=True)
-class AssignedPath:
-    """Path on which the lab moves a robot. The robot stops at the end of the path.
-
-    On a path of one point, the robot stays at this point.
-
-    Attributes:
-        start_ns: Start of the motion, as a time of the monotonic clock, which is common to all robots on one machine.
-        points_m: Points of the path, metres east, north, up.
-        speed_m_s: Horizontal speed.
-        facing_rad: Heading of the robot before the start, from east towards north.
-    """
-
-    start_ns: int
-    points_m: Sequence[Vector]
-    speed_m_s: float
-    facing_rad: float
 
 
 def unsupported_paths(paths: Iterable[str]) -> list[str]:
