@@ -102,7 +102,7 @@ class Procedure(catalog.Named, Sectioned):
         topology: `master` or `masterless`; the command line may override it.
         protocols: List of `tcp`, `udp`; the command line may override it.
         repeats: Repeats per protocol; the command line may override it.
-        attempts: Maximum number of attempts at a repeat; another attempt is made if the evidence is incomplete.
+        attempts: Maximum number of attempts at a repeat; another attempt is made if an attempt is void.
         needs_ros_master: True if the procedure needs one ROS master for all robots. A site file without `ros_master`
             is then rejected.
         places: Positions of robots in additional roles, by role.

@@ -36,7 +36,7 @@ class RunningRobots(Generic[RobotKey]):
         robots: The robots.
         medium: The medium of the radio under test.
         media: This medium and those of further links.
-        positions_writer: Writer of the robots' positions, for the lasers of the other robots.
+        positions_writer: Writer of the robots' positions, for the laser scanners of the other robots.
         host_keys: Public host key of each robot.
         private_key: Private key that logs in on all robots, OpenSSH PEM.
     """

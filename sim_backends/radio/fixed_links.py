@@ -13,7 +13,6 @@ from typing import Generic
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import LinkSample, StationSample, Vector
 from sim_backends.radio.channel import Emitter
-from sim_backends.radio.frames import TransmissionAttempt
 from sim_backends.radio.links import (
     LOST,
     OUT_OF_RANGE,
@@ -32,6 +31,7 @@ from sim_backends.radio.links import (
     Payload,
     delay_parts,
 )
+from sim_backends.radio.mac.frames import TransmissionAttempt
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 from sim_backends.world.motion import Attitude

@@ -95,7 +95,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
         times: Time of a message: `header` for the autopilot's time, or `received` for the time of arrival.
         gap: If two consecutive messages are further apart than this, the position between them is unknown.
         heights: Whether heights above the sea are used, with `global`.
-        during: Steps that run at the same time.
+        during: Steps that run in order while the telemetry is recorded.
     """
 
     cross_checks = (*motion_sources.OF_TELEMETRY, *position_checks.POSITION_CHECKS)

@@ -73,7 +73,7 @@ class MoveStep(
             Otherwise the trial is refused.
         driven: Whether trials have columns of its [automatic drive](motion.md#evidence-of-a-drive). A robot that
             fieldkit drives always has them.
-        during: Steps that run at the same time.
+        during: Steps that run in order while the robot moves.
     """
 
     has_path = True

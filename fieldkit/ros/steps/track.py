@@ -134,7 +134,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
     Attributes:
         robots: Source of each robot's position, by role.
         heights: Whether heights above the ellipsoid are used; heights of satellite receivers are often wrong by 10 m.
-        during: Steps that run at the same time.
+        during: Steps that run in order while the positions are recorded.
     """
 
     cross_checks = position_checks.POSITION_CHECKS

@@ -32,7 +32,7 @@ class RoamStep(Nest, DescribesActions, Roams, Summarizes):
     Attributes:
         robot: Role of the robot that roams.
         ping_pong: A handover back to an access point within this time after leaving it is a ping-pong handover.
-        during: Steps that run at the same time, usually a `move` with the `ping`.
+        during: Steps that run in order, usually a `move` with the `ping`.
     """
 
     cross_checks = (

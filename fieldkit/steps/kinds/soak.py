@@ -51,7 +51,7 @@ class SoakStep(LoadOptions, Nest, Listens, SendsTraffic):
 
     Attributes:
         port: Port that the receiver listens on; it must differ from the port of an `iperf3` inside.
-        during: Steps that run at the same time.
+        during: Steps that run in order while the load is sent.
     """
 
     flow_kind: ClassVar[str] = "soak"

@@ -36,7 +36,7 @@ from sim_backends.emulated.linux_wifi.hwsim_socket import open_registered
 from sim_backends.emulated.linux_wifi.netlink import NetlinkFormatError, NetlinkMessage
 from sim_backends.emulated.medium.timerfd import Timer
 from sim_backends.radio.antennas import Antenna
-from sim_backends.radio.modes import Standard
+from sim_backends.radio.phy.modes import Standard
 from sim_backends.radio.propagation.antenna_patterns import decode_pattern
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.motion import Attitude

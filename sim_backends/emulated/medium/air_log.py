@@ -15,7 +15,7 @@ from typing import Final
 
 from sim_backends.emulated.medium.air_files import LIMIT_BYTES
 from sim_backends.emulated.medium.framing import IP, Framing
-from sim_backends.radio.frames import ControlFrame, TransmissionAttempt
+from sim_backends.radio.mac.frames import ControlFrame, TransmissionAttempt
 
 _SNAP_BYTES: Final = 160
 """Maximum number of bytes of a frame that the capture contains (snapshot length)."""

@@ -179,7 +179,7 @@ steps: [{ping: {from: sender, to: receiver}}]
 def test_abort_notes_describe_the_action() -> None:
     flight = step(f"robot: {DRONE}, height: 2m")
     assert list(flight.abort_notes(SCENE)) == [
-        f"{CAST[DRONE].name} lands, if it is in the air: this takes up to about 37 s, even if fieldkit has exited"
+        f"{CAST[DRONE].name} lands if it is in the air; this takes up to about 37 s, and continues if fieldkit exits"
     ]
     scene_with_return = Scene(
         Protocol.TCP, PERMITTED, "f", sections={ON_ABORT: AbortActions({DRONE: OnAbort.RETURN})}

@@ -17,8 +17,8 @@ from fieldkit.measure.captures import pcap
 from sim_backends.emulated.medium import air_files
 from sim_backends.emulated.medium.air_log import AirLog
 from sim_backends.emulated.medium.medium_client import MediumClient
-from sim_backends.radio.frames import ControlFrame, TransmissionAttempt
-from sim_backends.radio.modes import G_MODES
+from sim_backends.radio.mac.frames import ControlFrame, TransmissionAttempt
+from sim_backends.radio.phy.modes import G_MODES
 from sim_backends.radio.radio_options import RadioOptions
 from tests.helpers.known_radio import make_lab
 from tests.helpers.runs import only_trial, rows, run_here
