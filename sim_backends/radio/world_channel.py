@@ -266,7 +266,7 @@ class WorldChannel(RadioChannel):
         obstacles_db = self._mean_loss.obstacles_db(start, end)
         # Any obstacle on the path adds loss and removes the constant component.
         k = np.where(obstacles_db == 0, 10 ** (self._options.k_db / 10), 0.0)
-        loss_db = reverse_db = self._mean_loss.open_db(start, end) + obstacles_db
+        loss_db = reverse_db = self._mean_loss.loss_without_obstacles_db(start, end) + obstacles_db
         if self._station_gains is not None:
             k = self._add_antennas(stale, loss_db, k)
         if self._specified_db is not None:

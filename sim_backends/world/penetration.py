@@ -65,7 +65,7 @@ class Obstacles:
         ]
 
     def penetration_loss_db(self, start_m: Floats, end_m: Floats, frequency_hz: float) -> Floats:
-        """Return the loss by obstacles along straight paths, in dB, shape (n,).
+        """Return the loss caused by obstacles along straight paths, in dB, shape (n,).
 
         A solid causes its loss per metre and the reflection loss of two faces, at normal incidence and without
         multiple reflections inside; the loss of foliage depends on the total depth. Diffraction is not modelled, so

@@ -13,7 +13,7 @@ from sim_backends.emulated.robot.spec import LOOPBACK_INTERFACE, SHARED_NETWORK,
 from sim_backends.emulated.robot.tun_devices import open_tun
 
 PID_FILE: Final = Path(STATE, "babeld.pid")
-"""File that babeld writes when it has its socket and its interface, before its first hello."""
+"""File that babeld writes when it starts, before it opens its socket and sends its first hello."""
 
 LINK_COST: Final = 1024
 """Cost of a further link in Babel; a radio without loss costs 256, so that it is preferred."""
@@ -44,9 +44,9 @@ def babeld_command(interface: str, address: str, hello_s: float, links: Mapping[
 
 
 def guest_babeld_command(interface: str, address: str, hello_s: float) -> tuple[str, ...]:
-    """Return the command of the routing daemon of a node that uses the robots' routes, but announces only itself.
+    """Return the command of the routing daemon of a node that uses the robots' routes.
 
-    The daemon writes no files. The arguments are those of `babeld_command`.
+    The node announces only its own address. The daemon writes no files. The arguments are those of `babeld_command`.
     """
     filters = (f"out ip {IPv4Interface(address).ip}/32 allow", "out deny")
     return (*_program("", ""), *_settings(interface, address, hello_s, *filters), interface)
@@ -69,7 +69,7 @@ def _settings(interface: str, address: str, hello_s: float, *rules: str) -> tupl
 
 MTU_BYTES: Final = 1500
 _TIMEOUT_S: Final = 5.0
-"""Timeout of `ip`."""
+"""Maximum duration of an `ip` command."""
 
 
 def bring_up(interface: str, address: str, *, mesh: bool = False) -> int:
@@ -160,7 +160,8 @@ def switch_on(interface: str) -> None:
 
 
 def _routes(interface: str) -> tuple[str, ...]:
-    # The kernel removes these routes whenever the link goes down, unlike the route that comes with the address.
+    # When an interface is taken down, the kernel removes its routes. It restores only the route that belongs to the
+    # address when the interface is brought up again.
     return (f"route replace 224.0.0.0/4 dev {interface}", f"route replace 255.255.255.255/32 dev {interface}")
 
 
@@ -180,7 +181,10 @@ def run_ip(*commands: str) -> None:
             check=False,
         )
         if result.returncode != 0:
-            raise RobotError(f"ip rejected a setting: {result.stderr.strip()}", remedy="update iproute2")
+            raise RobotError(
+                f"ip rejected a setting: {result.stderr.strip()} (ip {command})",
+                remedy="correct the address or the interface of the robot, or update iproute2",
+            )
 
 
 def has_listener(port: int) -> bool:

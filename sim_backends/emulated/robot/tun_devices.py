@@ -11,7 +11,7 @@ from fieldkit.core.errors import ConfigurationError, FieldkitError
 
 DEVICE: Final = "/dev/net/tun"
 QUEUE_PACKETS: Final = 4096
-"""Length of the queue of an interface."""
+"""Length of the transmit queue of an interface."""
 
 # linux/if_tun.h
 _TUNSETIFF: Final = 0x400454CA
@@ -34,12 +34,14 @@ def open_tun(name: str, *, ethernet: bool = False) -> int:
     descriptor open. Its queue holds 4096 packets, so that no packet is lost in a short pause of the medium process.
 
     Raises:
-        ConfigurationError: The device is missing, or this user may not open it or create an interface.
+        ConfigurationError: The name is empty or too long, the device is missing, or this user may not open it or
+            create an interface.
         FieldkitError: The interface exists already or the kernel refuses its name.
     """
     if not 0 < len(name.encode()) <= _NAME_BYTES:
         raise ConfigurationError(
-            f"{name!r} is not a valid interface name", remedy=f"use 1 to {_NAME_BYTES} characters, for example wlan0"
+            f"{name!r} is not a valid interface name",
+            remedy=f"use 1 to {_NAME_BYTES} ASCII characters, for example wlan0",
         )
     fd = open_device()
     try:
@@ -65,7 +67,7 @@ def open_device() -> int:
 
 
 def _set_queue(index: int) -> None:
-    """Set the queue of the interface with this index to `QUEUE_PACKETS`."""
+    """Set the queue length of the interface with this index to `QUEUE_PACKETS`."""
     # Netlink is used, because the ioctl (also in busybox's ip) needs a capability that no user namespace grants. The
     # message consists of the structs nlmsghdr, ifinfomsg and rtattr.
     link = struct.pack("=BxHiII", socket.AF_UNSPEC, 0, index, 0, 0)

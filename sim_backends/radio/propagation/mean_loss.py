@@ -1,4 +1,4 @@
-"""Mean loss of paths in a world: path loss in the open, shadowing, obstacles."""
+"""Mean loss of paths in a world: path loss without obstacles, shadowing, and loss caused by obstacles."""
 
 import numpy as np
 
@@ -28,7 +28,7 @@ class MeanLoss:
             Shadowing(shadowing_seed, options.shadowing_db, options.decorrelation) if options.shadowing_db else None
         )
 
-    def open_db(self, start_m: Floats, end_m: Floats) -> Floats:
+    def loss_without_obstacles_db(self, start_m: Floats, end_m: Floats) -> Floats:
         """Return the loss of paths between points of shape (n, 3) with shadowing and without obstacles, in dB."""
         match self._options.propagation:
             case "free-space":
@@ -40,11 +40,11 @@ class MeanLoss:
         return loss_db if self._shadowing is None else loss_db + self._shadowing.loss_db(start_m, end_m)
 
     def obstacles_db(self, start_m: Floats, end_m: Floats) -> Floats:
-        """Return the loss by obstacles, in dB."""
+        """Return the loss caused by obstacles, in dB."""
         if self._obstacles is None:
             return np.zeros(len(start_m))
         return self._obstacles.penetration_loss_db(start_m, end_m, self._carrier_hz)
 
     def loss_db(self, start_m: Floats, end_m: Floats) -> Floats:
         """Return the loss with shadowing and obstacles, in dB."""
-        return self.open_db(start_m, end_m) + self.obstacles_db(start_m, end_m)
+        return self.loss_without_obstacles_db(start_m, end_m) + self.obstacles_db(start_m, end_m)
