@@ -24,7 +24,7 @@ from fieldkit.ros.interfaces.types import standard_types
 from sim_backends.emulated import emulated_options, placement, requirements
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice, load_options
-from sim_backends.emulated.medium.air_log import LIMIT_BYTES
+from sim_backends.emulated.medium.air_files import LIMIT_BYTES
 from sim_backends.emulated.provisioning import KeyPair, _sensor, definition, robot_spec
 from sim_backends.emulated.robot import mounts, rootfs
 from sim_backends.emulated.ros import messages, sensor_specs, tcpros
