@@ -31,7 +31,8 @@ from sim_backends.emulated.cosimulated.real_agents import RealPacket
 from sim_backends.emulated.cosimulated.simulators import LabSettings, RobotBody, Simulators
 from sim_backends.emulated.cosimulated.steering import FlightSteering, GroundSteering, Steering
 from sim_backends.emulated.medium.framing import FRAMINGS, NO_ROBOT, Framing
-from sim_backends.emulated.medium.ports import FlowDelays, MediumStats, Port, round_up
+from sim_backends.emulated.medium.medium_stats import MediumStats
+from sim_backends.emulated.medium.ports import FlowDelays, Port, round_up
 from sim_backends.emulated.medium.server import (
     BURST,
     DEVICE_PACKETS,

@@ -19,7 +19,7 @@ from fieldkit.core.model import Lateness, Vector
 from fieldkit.measure.evidence import oracle_delays
 from sim_backends.cosim.policies.registry import BUILTIN
 from sim_backends.emulated.emulated_options import SyncOptions
-from sim_backends.emulated.medium import air_log
+from sim_backends.emulated.medium import air_files
 from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.emulated.ros.motion_record import SILENT_NS
 from sim_backends.federates.frames import NETWORK
@@ -54,7 +54,7 @@ def test_a_recording_of_the_air_continues_in_a_new_session(tmp_path: Path) -> No
         bench.medium.place(PLACES, relay="b")
         bench.ping(count=3)
         bench.medium.record(None)
-    with (tmp_path / air_log.CSV).open(encoding="ascii", newline="") as file:
+    with (tmp_path / air_files.CSV).open(encoding="ascii", newline="") as file:
         frames = [(line["transmitter"], line["size_bytes"], line["attempt"]) for line in csv.DictReader(file)]
     assert frames.count(("a", str(84 + 36), "1")) == 5, "a packet of ping, with the headers of Wi-Fi"
 
