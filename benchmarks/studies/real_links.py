@@ -108,7 +108,7 @@ def errors(predictions: Sequence[Prediction], name: str) -> np.ndarray:
 
 
 def _cells(predictions: Sequence[Prediction]) -> Iterator[str]:
-    """Yield number of links; median error, median magnitude and 90th percentile with the logged, then selected mode."""
+    """Yield the number of links; for logged, then selected modes median error, median magnitude, 90th percentile."""
     yield str(len(predictions))
     for name in ("logged_bit_s", "selected_bit_s"):
         values = errors(predictions, name)
