@@ -13,8 +13,7 @@ from fieldkit.core.errors import LinkError, RobotError, TestbedLostError
 from sim_backends.emulated.process import namespaces
 from sim_backends.emulated.process.worker import REPLY_S, Worker
 from sim_backends.emulated.provisioning import LAPTOP_NAME
-from sim_backends.emulated.robot.spec import HOME, START_S, RobotSpec
-from sim_backends.emulated.robot.ssh_server import SSH_PORT
+from sim_backends.emulated.robot.spec import HOME, SSH_PORT, START_S, RobotSpec
 from sim_backends.emulated.ros.assigned_path import AssignedPath
 from sim_backends.emulated.ros.motion_record import MotionRecord, RecordedMotion
 

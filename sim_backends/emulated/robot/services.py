@@ -16,7 +16,7 @@ from fieldkit.remote.command import with_environment
 from sim_backends.emulated.autopilot import mavlink_server as autopilot
 from sim_backends.emulated.process import worker
 from sim_backends.emulated.robot import base_process, network, ssh_server, wireless
-from sim_backends.emulated.robot.spec import ANTENNA_M, HOME, ROSCORE, STATE, RobotSpec
+from sim_backends.emulated.robot.spec import ANTENNA_M, HOME, ROSCORE, SSH_PORT, STATE, RobotSpec
 from sim_backends.emulated.ros import sensors, static_frames, tcpros
 from sim_backends.emulated.ros.lab_positions import Neighbourhood
 
@@ -138,7 +138,7 @@ def services(spec: RobotSpec, neighbourhood: Neighbourhood | None = None) -> lis
     if neighbourhood is not None and spec.neighbours:
         publish = partial(publish, moving_targets=partial(neighbourhood.targets, spec.neighbours))
     result = [
-        _program("sshd", ssh_server.command(spec), {}, lambda: network.has_listener(ssh_server.SSH_PORT)),
+        _program("sshd", ssh_server.command(spec), {}, lambda: network.has_listener(SSH_PORT)),
         _motion_service("sensors", publish),
     ]
     if spec.mavlink_port is not None:

@@ -30,6 +30,7 @@ ROBOT_FILES: Final = tuple(f"/etc/{name}" for name in ("passwd", "group", "shado
 ROSCORE: Final = "/usr/bin/roscore"
 """Program of a ROS master that serves several robots."""
 
+SSH_PORT: Final = 22
 START_S: Final = 30.0
 """Timeout for the start of a robot's programs; Debian's ROS takes a few seconds on a busy machine."""
 
