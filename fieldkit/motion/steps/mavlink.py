@@ -160,7 +160,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
         if (mavlink := mavlink_of(robot.profile)) is None:
             raise ConfigurationError(
                 f"telemetry of {robot.name} cannot be recorded: its profile {robot.profile.name} has no mavlink",
-                remedy="write mavlink: {port: 14550} in the profile, or name another robot in the step mavlink",
+                remedy="write mavlink: {port: 14550} in the profile, or name another robot in the `mavlink` step",
             )
         if self.recorder != self.robot:
             return f"udpout:{robot.address}:{mavlink.port}"

@@ -1,4 +1,4 @@
-"""The step mavlink: valid keys, jobs of the recorder, and positions and checks from its files."""
+"""The `mavlink` step: valid keys, jobs of the recorder, and positions and checks from its files."""
 
 import json
 import math
@@ -208,7 +208,7 @@ def test_distances_of_global_positions_from_a_fixed_position(tmp_path: Path) -> 
         (flight(10), {"left_out": 4}, "lacks 4 received frames"),
         (flight(10), {"refused": {"1": 2}}, "refused the request for SYS_STATUS"),
         (flight(10), {}, "no SYS_STATUS, which was requested"),
-        (b"", {"frames": 0}, "no heartbeat of an autopilot"),
+        (b"", {"frames": 0}, "no heartbeat from an autopilot"),
     ],
 )
 def test_incomplete_log_makes_repeat_void(
