@@ -41,7 +41,7 @@ STATE_TEXTS: Final[Mapping[MotionState, str]] = {
     MotionState.NOTHING: "no program of fieldkit moves it; nothing was sent to it",
     MotionState.STATIONARY: "stopped (stationary)",
     MotionState.LANDED: "stopped (on the ground)",
-    MotionState.ENDED: "stopped (its program had not started to move it, or has ended)",
+    MotionState.ENDED: "its program has exited: it had not started to move the robot, or it did not confirm the stop",
     MotionState.LAND: "coming down (land)",
     MotionState.RETURN: "coming down (return)",
     MotionState.SILENT: "NOT CONFIRMED: stop it by hand; its program was signalled but has not confirmed the stop",
