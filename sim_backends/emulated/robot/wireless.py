@@ -27,7 +27,7 @@ _JOIN: Final = {
 }
 _TIMEOUT_S: Final = 15.0
 """Timeout of `iw` and `nft`."""
-_PRIORITY_RULE: Final = """\
+PRIORITY_RULE: Final = """\
 table inet fieldkit {
     chain output {
         type filter hook output priority 0
@@ -97,7 +97,7 @@ def bring_up(device: str, interface: str, address: str, wifi: WifiSpec) -> None:
     network.disable_ipv6()
     if device != interface:
         network.run_ip(f"link set {device} name {interface}")
-    _run("nft", "-f", "-", text=_PRIORITY_RULE)
+    _run("nft", "-f", "-", text=PRIORITY_RULE)
     if wifi.mode in _INTERFACE_TYPES:
         _run("iw", "dev", interface, "set", "type", _INTERFACE_TYPES[wifi.mode])
     network.configure(interface, address)

@@ -1,0 +1,439 @@
+"""Scans, roaming and power save compared with Linux: `python -m benchmarks.roaming_vs_kernel [--record]`.
+
+A robot is a station of two access points at the ends of a corridor. The events of Linux (mac80211_hwsim, hostapd and
+wpa_supplicant) were recorded in a virtual machine (`kernel_roaming`). Its clock counts instructions, so times between
+frames contain the time that programs need on an emulated processor, but timers of the kernel and of the programs are
+those of real devices. `--record` records the events again, as root. The events of fieldkit are computed here.
+"""
+
+import argparse
+import gzip
+import shlex
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from random import Random
+from statistics import fmean, median
+from typing import Final, cast
+
+import numpy as np
+
+from benchmarks import kernel_roaming as kernel
+from fieldkit.core.deadline import Deadline
+from sim_backends.emulated.linux_wifi import guest
+from sim_backends.emulated.linux_wifi.virtual_machine import require_machine, run_in_machine
+from sim_backends.radio.antennas import Antenna
+from sim_backends.radio.high_throughput import PhyCapability
+from sim_backends.radio.model import WifiInWorld
+from sim_backends.radio.radio_options import RadioOptions
+
+ROOT: Final = Path(__file__).resolve().parent.parent
+RECORDINGS: Final = ROOT / "tests/data/hwsim/6.1.176"
+RUNS: Final = 20
+"""Number of link losses of fieldkit, each with another seed."""
+PACKETS: Final = 400
+"""Number of packets to a sleeping robot, in fieldkit."""
+
+_NOISE_DBM: Final = -92
+"""Noise that hwsim reports to wpa_supplicant."""
+_LONGEST_S: Final = 2400.0  # time limit of a recording
+_PHY: Final = PhyCapability("n", "2.4 GHz", 20, 1, 800, power_save_timeout_ns=round(kernel.SILENT_S * 1e9))
+_CHANNEL_CHANGED: Final = 0x40
+"""Bit `IEEE80211_CONF_CHANGE_CHANNEL` of a trace event `drv_config`."""
+_ASSOCIATION_KINDS: Final = ("authentication", "association", "reassociation", "eapol")
+_MS, _S = 10**6, 10**9
+_STEP_NS: Final = 20 * _MS  # interval of packets to the robot
+_ABSENT_NS: Final = 30 * _MS  # a longer time without packets is an absence of the robot
+
+Interval = tuple[float, float]
+"""Start and end, in seconds."""
+
+
+@dataclass(frozen=True)
+class AirFrame:
+    """A frame of a recording.
+
+    Attributes:
+        time_s: Time at which the kernel has passed it to the medium.
+        source: Name of its transmitter.
+        receiver: Name of its receiver; `*` for a broadcast.
+        kind: Kind, as `kernel_roaming.frame_kind` returns it.
+        size_bytes: Size with FCS.
+        sleeps: True if it has the power management bit.
+    """
+
+    time_s: float
+    source: str
+    receiver: str
+    kind: str
+    size_bytes: int
+    sleeps: bool
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The events of a recording, or of one of its steps.
+
+    Attributes:
+        frames: The frames, in order.
+        changes: Time, and channel in MHz, of each change of the robot's channel; 0 at the end of a scan.
+        scans_s: Start of each scan.
+        marks: Time and text of each step.
+    """
+
+    frames: Sequence[AirFrame]
+    changes: Sequence[tuple[float, int]]
+    scans_s: Sequence[float]
+    marks: Sequence[tuple[float, str]]
+
+    def steps(self, text: str) -> "list[Recording]":
+        """Return the events of each step with this text."""
+        times_s = [time_s for time_s, _ in self.marks] + [float("inf")]
+        return [
+            self._between(start_s, times_s[number + 1])
+            for number, (start_s, mark) in enumerate(self.marks)
+            if mark == text
+        ]
+
+    def _between(self, start_s: float, end_s: float) -> "Recording":
+        return Recording(
+            [frame for frame in self.frames if start_s <= frame.time_s < end_s],
+            [change for change in self.changes if start_s <= change[0] < end_s],
+            [time_s for time_s in self.scans_s if start_s <= time_s < end_s],
+            [mark for mark in self.marks if start_s <= mark[0] < end_s],
+        )
+
+    def first(self, kind: str, source: str | None = None) -> AirFrame:
+        """Return the first frame of a kind, from a transmitter if it is given."""
+        return next(frame for frame in self.frames if frame.kind == kind and source in {None, frame.source})
+
+
+def read(text: str) -> Recording:
+    """Return the events of a recording."""
+    frames, changes, scans_s, marks = [], [], [], []
+    for line in text.splitlines():
+        time_us, subject, *fields = line.split(",")
+        time_s = int(time_us) / 1e6
+        if subject == "air":
+            source, receiver, kind, _, size, sleeps = fields
+            frames.append(AirFrame(time_s, source, receiver, kind, int(size), sleeps == "1"))
+        elif subject == "mark":
+            marks.append((time_s, fields[0]))
+        elif "phy0" in fields[0]:
+            words = fields[0].split()
+            if words[0] == "drv_sw_scan_start:":
+                scans_s.append(time_s)
+            elif words[0] == "drv_sw_scan_complete:":
+                changes.append((time_s, 0))
+            elif words[0] == "drv_config:" and int(words[2].removeprefix("ch:"), 16) & _CHANNEL_CHANGED:
+                changes.append((time_s, round(float(words[3].removeprefix("control:")))))
+    return Recording(sorted(frames, key=lambda frame: frame.time_s), sorted(changes), scans_s, marks)
+
+
+def recording(name: str) -> Path:
+    """Return the file of a recording."""
+    return RECORDINGS / f"roaming-{name}.csv.gz"
+
+
+def record(name: str) -> str:
+    """Return a recording that is made in a new virtual machine."""
+    with tempfile.TemporaryDirectory() as folder_name:
+        folder = Path(folder_name)
+        python = shlex.join((sys.executable, "-m", "benchmarks.kernel_roaming", name))
+        script = f"{guest.prologue(ROOT)}{python} >{shlex.quote(str(folder / 'events'))}\n"
+        radios = 1 + len(kernel.ACCESS_POINTS_M)
+        result = run_in_machine(require_machine(), script, Deadline.after(_LONGEST_S), radios=radios, results=folder)
+        if result.code:
+            sys.exit(result.output)
+        return (folder / "events").read_text(encoding="ascii")
+
+
+# Linux
+
+
+def absences(step: Recording) -> list[Interval]:
+    """Return the times between the null frames with which the robot leaves its channel and returns."""
+    nulls = [frame for frame in step.frames if frame.kind == "null" and frame.source == kernel.ROBOT]
+    return [(start.time_s, end.time_s) for start, end in pairwise(nulls) if start.sleeps and not end.sleeps]
+
+
+def visits_s(step: Recording) -> list[float]:
+    """Return the time on each channel of a scan."""
+    return [end_s - start_s for (start_s, channel), (end_s, _) in pairwise(step.changes) if channel]
+
+
+def associations(events: Recording) -> Iterator[list[AirFrame]]:
+    """Yield the frames of each complete association, from the robot's first authentication frame."""
+    frames: list[AirFrame] = []
+    for frame in events.frames:
+        if frame.kind == "authentication-1" and frame.source == kernel.ROBOT:
+            frames = []
+        if frame.kind.startswith(_ASSOCIATION_KINDS):
+            frames.append(frame)
+        if frame.kind == "eapol-4" and frames:
+            yield frames
+            frames = []
+
+
+def repetition_s(step: Recording) -> float:
+    """Return the time from a lost frame until another frame of the association is sent."""
+    lost_s = step.marks[0][0]
+    frames = (f for f in step.frames if f.kind.startswith(_ASSOCIATION_KINDS) and f.time_s > lost_s)
+    return next(frames).time_s - lost_s
+
+
+def link_losses_s(events: Recording) -> list[tuple[float, int, float]]:
+    """Return for each loss: time from the last beacon to a null frame, null frames, time from the end to a scan."""
+    losses = []
+    for step in events.steps("out of range"):
+        start_s = step.marks[0][0]
+        nulls = [frame for frame in step.frames if frame.kind == "null"]
+        beacons_s = [f.time_s for f in events.frames if f.kind == "beacon" and f.source == nulls[0].receiver]
+        scan_s = next(time_s for time_s in events.scans_s if time_s > nulls[-1].time_s)
+        disconnect_s = max(time_s for time_s, _ in events.changes if time_s < scan_s)
+        last_s = max(time_s for time_s in beacons_s if time_s < start_s)
+        losses.append((nulls[0].time_s - last_s, len(nulls), scan_s - disconnect_s))
+    return losses
+
+
+def handovers(step: Recording) -> list[tuple[float, str]]:
+    """Return position and new access point of each handover of a walk."""
+    start_s = step.marks[0][0]
+    return [
+        ((frame.time_s - start_s) * kernel.SPEED_M_S, frame.receiver)
+        for frame in step.frames
+        if frame.kind == "authentication-1" and frame.source == kernel.ROBOT
+    ]
+
+
+def delays_s(events: Recording, kind: str) -> list[float]:
+    """Return the times from the arrival of each packet at the access point until it is sent to a sleeping robot."""
+    receiver = kernel.ROBOT if kind == "packet" else "*"
+    start_s = next(time_s for time_s, text in events.marks if text == f"sleeping robot: {kind}")
+    sent_s = [time_s for time_s, text in events.marks if text == kind and time_s > start_s]
+    frames_s = np.array(
+        [f.time_s for f in events.frames if f.kind == "data" and f.source == "left" and f.receiver == receiver]
+    )
+    return [float(frames_s[np.searchsorted(frames_s, time_s)] - time_s) for time_s in sent_s]
+
+
+# fieldkit
+
+
+class Corridor:
+    """The same corridor in fieldkit: the robot, and a robot `base` near the left access point that sends packets.
+
+    Args:
+        seed: Seed of all random draws.
+        has_power_save: True if the robots sleep.
+        roaming: Options of roaming.
+    """
+
+    def __init__(self, seed: int, *, has_power_save: bool = False, **roaming: object) -> None:
+        access_points = {
+            name: {"at_m": [east_m, north_m], "height": f"{up_m}m", "tx_power_dbm": kernel.ACCESS_POINT_DBM}
+            for name, (east_m, north_m, up_m) in kernel.ACCESS_POINTS_M.items()
+        }
+        options = {
+            "fading": False,
+            "access_points": access_points,
+            "roaming": {"noise_dbm": _NOISE_DBM, "channels": kernel.CHANNELS, **roaming},
+        }
+        antenna = Antenna("802.11n", kernel.ROBOT_DBM, kernel.SENSITIVITY_DBM, _PHY if has_power_save else None)
+        self.model: WifiInWorld[int] = WifiInWorld(
+            seed, RadioOptions.model_validate(options), {"base": antenna, kernel.ROBOT: antenna}, None
+        )
+        self.model.use_meter()
+        self.sent_ns: list[int] = []
+        self.arrived_ns: dict[int, int] = {}
+        self.cells: list[tuple[int, str | None]] = []
+
+    def place(self, now_ns: int, east_m: float) -> None:
+        """Place the robot in the corridor."""
+        places_m = {"base": (0.0, 2.0, kernel.HEIGHT_M), kernel.ROBOT: (east_m, 0.0, kernel.HEIGHT_M)}
+        self.model.place(now_ns, places_m, None)
+
+    def send(self, now_ns: int, destination: str | None = kernel.ROBOT) -> None:
+        """Send a packet, and receive those that have arrived."""
+        self.model.send(now_ns, "base", len(self.sent_ns), 100, destination)
+        self.sent_ns.append(now_ns)
+        self.receive(now_ns)
+
+    def receive(self, now_ns: int) -> None:
+        """Receive packets, and examine with which access point the robot is associated."""
+        for at_ns, receiver, packet, _, _ in self.model.deliveries(now_ns):
+            if receiver == kernel.ROBOT:
+                self.arrived_ns[packet] = at_ns
+        cell = self.model.sample(now_ns, now_ns)[kernel.ROBOT].cell
+        if not self.cells or self.cells[-1][1] != cell:
+            self.cells.append((now_ns, cell))
+
+
+def model_absences(dwell: str) -> list[Interval]:
+    """Return the absences of a scan: the times without packets from `base`, which does not scan."""
+    corridor = Corridor(1, short="3s", long="300s", threshold_dbm=-45, dwell=dwell)
+    for now_ns in range(0, 7 * _S, 2 * _MS):
+        corridor.place(now_ns, 20.0)
+        corridor.send(now_ns)
+    times_s = sorted(at_ns / 1e9 for at_ns in corridor.arrived_ns.values())
+    return [(start_s, end_s) for start_s, end_s in pairwise(times_s) if end_s - start_s > _ABSENT_NS / 1e9]
+
+
+def model_link_loss_s(seed: int) -> float:
+    """Return the time from leaving the range until the link is lost."""
+    corridor = Corridor(seed, channels=1)
+    leave_ns = 2 * _S + Random(seed).randrange(_S)
+    for now_ns in range(0, leave_ns + 3 * _S, 10 * _MS):
+        corridor.place(now_ns, kernel.NEAR_M if now_ns < leave_ns else kernel.FAR_M)
+        corridor.receive(now_ns)
+    return next((at_ns - leave_ns) / 1e9 for at_ns, cell in corridor.cells if cell is None and at_ns > leave_ns)
+
+
+def model_walk(name: str, seed: int) -> tuple[list[tuple[float, str]], float]:
+    """Return position and new access point of each handover of a walk, and the longest gap of a handover in s."""
+    _, short, threshold, long = kernel.SCANS[name].split(":")
+    corridor = Corridor(seed, short=f"{short}s", long=f"{long}s", threshold_dbm=int(threshold))
+    wait_ns = 2 * _S
+    for now_ns in range(0, wait_ns + round(kernel.WALK_M / kernel.SPEED_M_S * _S), _STEP_NS):
+        corridor.place(now_ns, max(0.0, (now_ns - wait_ns) / _S * kernel.SPEED_M_S))
+        corridor.send(now_ns)
+    cells = [(at_ns, cell) for at_ns, cell in corridor.cells if cell is not None]
+    positions, gaps_ns = [], []
+    for (_, old), (at_ns, new) in pairwise(cells):
+        if new != old:
+            positions.append(((at_ns - wait_ns) / _S * kernel.SPEED_M_S, new))
+            gaps_ns.append(longest_gap_ns(sorted(corridor.arrived_ns.values()), at_ns - 2 * _STEP_NS))
+    return positions, max(gaps_ns, default=0) / 1e9
+
+
+def longest_gap_ns(arrivals_ns: Sequence[int], start_ns: int, span_ns: int = 200 * _MS) -> int:
+    """Return the longest time between two arrivals, of which the first is within a time span."""
+    return max(end - start for start, end in pairwise(arrivals_ns) if start_ns <= start < start_ns + span_ns)
+
+
+def model_delays_s(destination: str | None) -> list[float]:
+    """Return the delays of packets to a sleeping robot."""
+    corridor = Corridor(1, has_power_save=True, short="300s", long="300s")
+    random, now_ns = Random(2), _S
+    corridor.place(0, kernel.NEAR_M)
+    for _ in range(PACKETS):
+        now_ns += round(random.uniform(0.5, 0.9) * _S)
+        corridor.send(now_ns, destination)
+    corridor.receive(now_ns + _S)
+    return [(corridor.arrived_ns[packet] - sent_ns) / 1e9 for packet, sent_ns in enumerate(corridor.sent_ns)]
+
+
+def distance(first: Sequence[float], second: Sequence[float]) -> float:
+    """Return the largest difference of two empirical distribution functions (Kolmogorov and Smirnov)."""
+    values = np.sort(np.concatenate((first, second)))
+    shares = [np.searchsorted(np.sort(sample), values, side="right") / len(sample) for sample in (first, second)]
+    return float(np.max(np.abs(shares[0] - shares[1])))
+
+
+# Tables
+
+
+def _row(label: str, linux: str, model: str = "-") -> str:
+    return f"  {label}: {linux}; {model}"
+
+
+def _ms(values_s: Sequence[float]) -> str:
+    return f"{1e3 * median(values_s):.0f} ({1e3 * min(values_s):.0f} to {1e3 * max(values_s):.0f})"
+
+
+def _absence_rows(label: str, linux: Sequence[Interval], model: Sequence[Interval]) -> Iterator[str]:
+    for text, lengths_s in (
+        ("away (ms)", lambda intervals: [end - start for start, end in intervals]),
+        ("on its channel in between (ms)", lambda intervals: [b[0] - a[1] for a, b in pairwise(intervals)]),
+    ):
+        yield _row(f"{label}, {text}", _ms(lengths_s(linux)), _ms(lengths_s(model)) if model else "-")
+    totals = [f"{len(part)}, {part[-1][1] - part[0][0]:.2f}" if part else "-" for part in (linux, model)]
+    yield _row(f"{label}, absences, total (s)", *totals)
+
+
+def scan_lines(events: Recording) -> Iterator[str]:
+    """Yield the rows of scans."""
+    for words, dwell in (("", "64ms"), ("passive", "112ms")):
+        (step,) = events.steps(f"scan {words}")
+        total_s = step.changes[-1][0] - step.changes[0][0]
+        yield _row(f"{words or 'active'} scan, channel (ms); total (s)", f"{_ms(visits_s(step)[:-1])}; {total_s:.2f}")
+        (step,) = events.steps(f"associated scan {words}")
+        yield from _absence_rows(f"{words or 'active'} scan of a station", absences(step), model_absences(dwell))
+    for text in ("with packets to the robot", "with packets from the robot"):
+        (step,) = events.steps(f"associated scan {text}")
+        yield from _absence_rows(f"scan {text}", absences(step), [])
+
+
+def association_lines(events: Recording) -> Iterator[str]:
+    """Yield the rows of associations, losses of their frames, and losses of the link."""
+    for security, count, first_bytes in (("wpa2", 8, 34), ("wpa3", 10, 132)):
+        complete = [f for f in associations(events) if (len(f), f[0].size_bytes) == (count, first_bytes)]
+        times_s = [frames[-1].time_s - frames[0].time_s for frames in complete]
+        yield _row(f"{security}, {len(complete)} associations (ms)", _ms(times_s))
+        yield _row("frames", ", ".join(f"{frame.kind} {frame.size_bytes}" for frame in complete[-1]))
+    for text in dict.fromkeys(text for _, text in events.marks if text.startswith("lost ")):
+        yield _row(f"{text}, next frame after (ms)", f"{1e3 * repetition_s(*events.steps(text)):.0f}")
+    losses = link_losses_s(events)
+    linux_s = [loss[0] for loss in losses]
+    model_s = [model_link_loss_s(seed) for seed in range(RUNS)]
+    yield _row(
+        "loss of the link (s)",
+        *(f"{fmean(part):.2f} ({min(part):.2f} to {max(part):.2f})" for part in (linux_s, model_s)),
+    )
+    yield _row("null frames", str({loss[1] for loss in losses}))
+    yield _row("from the end of the association to a scan (ms)", _ms([loss[2] for loss in losses]))
+
+
+def walk_lines(events: Recording) -> Iterator[str]:
+    """Yield the rows of walks."""
+    for name in kernel.SCANS:
+        (step,) = events.steps(f"walk {name}")
+        moves, packets = handovers(step), [f for f in step.frames if f.kind == "data" and f.receiver == kernel.ROBOT]
+        positions, gap_s = model_walk(name, 1)
+        texts = [", ".join(f"{east_m:.1f} m to {new}" for east_m, new in part) for part in (moves, positions)]
+        yield _row(f"{name} scans, handovers", *texts)
+        gaps_s = [
+            after.time_s - before.time_s for before, after in pairwise(packets) if before.source != after.source
+        ]
+        yield _row("gap of the packets to the robot (ms)", _ms(gaps_s), f"{1e3 * gap_s:.0f}")
+
+
+def power_save_lines(events: Recording) -> Iterator[str]:
+    """Yield the rows of power save."""
+    start_s = next(time_s for time_s, text in events.marks if text == "power_save on")
+    end_s = next(time_s for time_s, text in events.marks if text.startswith("sleeping"))
+    nulls = [frame for frame in events.frames if frame.kind == "null" and start_s < frame.time_s < end_s]
+    yield _row("null frames with `iw set power_save on`", str(len(nulls)))
+    for kind, destination in (("packet", cast("str | None", kernel.ROBOT)), ("broadcast", None)):
+        linux, model = delays_s(events, kind), model_delays_s(destination)
+        yield _row(f"delay of a {kind} (ms)", _ms(linux), _ms(model))
+        yield _row(f"distance of the distributions of a {kind}", f"{distance(linux, model):.3f}")
+
+
+TABLES: Final[Mapping[str, Callable[[Recording], Iterator[str]]]] = {
+    "scans": scan_lines,
+    "associations": association_lines,
+    "walks": walk_lines,
+    "power-save": power_save_lines,
+}
+"""The rows by recording."""
+
+
+def main() -> None:
+    """Print the comparison."""
+    parser = argparse.ArgumentParser(description="Compare roaming and power save of Linux with fieldkit's.")
+    parser.add_argument("--record", action="store_true", help="record the events of Linux again, as root")
+    options = parser.parse_args()
+    for name, table in TABLES.items():
+        if options.record:
+            recording(name).write_bytes(gzip.compress(record(name).encode(), mtime=0))
+        sys.stdout.write(f"{name}: Linux; fieldkit\n")
+        events = read(gzip.decompress(recording(name).read_bytes()).decode())
+        sys.stdout.writelines(f"{line}\n" for line in table(events))
+
+
+if __name__ == "__main__":
+    main()
