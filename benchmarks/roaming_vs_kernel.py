@@ -199,14 +199,17 @@ def link_losses_s(events: Recording) -> list[tuple[float, int, float]]:
     return losses
 
 
-def handovers(step: Recording) -> list[tuple[float, str]]:
-    """Return position and new access point of each handover of a walk."""
-    start_s = step.marks[0][0]
-    return [
-        ((frame.time_s - start_s) * kernel.SPEED_M_S, frame.receiver)
-        for frame in step.frames
-        if frame.kind == "authentication-1" and frame.source == kernel.ROBOT
-    ]
+def handovers(step: Recording) -> list[tuple[float, str, float]]:
+    """Return position, new access point, and gap in s of the packets to the robot, of each handover of a walk."""
+    packets = [frame for frame in step.frames if frame.kind == "data" and frame.receiver == kernel.ROBOT]
+    moves = []
+    for frame in step.frames:
+        if frame.kind == "authentication-1" and frame.source == kernel.ROBOT:
+            last_s = max(packet.time_s for packet in packets if packet.time_s < frame.time_s)
+            first_s = min(f.time_s for f in packets if f.source == frame.receiver and f.time_s > frame.time_s)
+            position_m = (frame.time_s - step.marks[0][0]) * kernel.SPEED_M_S
+            moves.append((position_m, frame.receiver, first_s - last_s))
+    return moves
 
 
 def delays_s(events: Recording, kind: str) -> list[float]:
@@ -274,8 +277,9 @@ class Corridor:
 
 def model_absences(dwell: str) -> list[Interval]:
     """Return the absences of a scan: the times without packets from `base`, which does not scan."""
-    corridor = Corridor(1, short="3s", long="300s", threshold_dbm=-45, dwell=dwell)
-    for now_ns in range(0, 7 * _S, 2 * _MS):
+    corridor = Corridor(1, short="4s", long="300s", threshold_dbm=-45, dwell=dwell)
+    corridor.place(0, 20.0)
+    for now_ns in range(4 * _S, 8 * _S, 2 * _MS):  # from the first scan to the second one
         corridor.place(now_ns, 20.0)
         corridor.send(now_ns)
     times_s = sorted(at_ns / 1e9 for at_ns in corridor.arrived_ns.values())
@@ -292,24 +296,24 @@ def model_link_loss_s(seed: int) -> float:
     return next((at_ns - leave_ns) / 1e9 for at_ns, cell in corridor.cells if cell is None and at_ns > leave_ns)
 
 
-def model_walk(name: str, seed: int) -> tuple[list[tuple[float, str]], float]:
-    """Return position and new access point of each handover of a walk, and the longest gap of a handover in s."""
+def model_walk(name: str, seed: int) -> list[tuple[float, str, float]]:
+    """Return position, new access point, and gap in s of the packets to the robot, of each handover of a walk."""
     _, short, threshold, long = kernel.SCANS[name].split(":")
     corridor = Corridor(seed, short=f"{short}s", long=f"{long}s", threshold_dbm=int(threshold))
-    wait_ns = 2 * _S
+    wait_ns = 3 * _S  # time of Linux from the association to the start of the walk
     for now_ns in range(0, wait_ns + round(kernel.WALK_M / kernel.SPEED_M_S * _S), _STEP_NS):
         corridor.place(now_ns, max(0.0, (now_ns - wait_ns) / _S * kernel.SPEED_M_S))
         corridor.send(now_ns)
     cells = [(at_ns, cell) for at_ns, cell in corridor.cells if cell is not None]
-    positions, gaps_ns = [], []
-    for (_, old), (at_ns, new) in pairwise(cells):
-        if new != old:
-            positions.append(((at_ns - wait_ns) / _S * kernel.SPEED_M_S, new))
-            gaps_ns.append(longest_gap_ns(sorted(corridor.arrived_ns.values()), at_ns - 2 * _STEP_NS))
-    return positions, max(gaps_ns, default=0) / 1e9
+    arrivals_ns = sorted(corridor.arrived_ns.values())
+    return [
+        ((at_ns - wait_ns) / _S * kernel.SPEED_M_S, new, longest_gap_ns(arrivals_ns, at_ns - 60 * _MS) / 1e9)
+        for (_, old), (at_ns, new) in pairwise(cells)
+        if new != old
+    ]
 
 
-def longest_gap_ns(arrivals_ns: Sequence[int], start_ns: int, span_ns: int = 200 * _MS) -> int:
+def longest_gap_ns(arrivals_ns: Sequence[int], start_ns: int, span_ns: int = 80 * _MS) -> int:
     """Return the longest time between two arrivals, of which the first is within a time span."""
     return max(end - start for start, end in pairwise(arrivals_ns) if start_ns <= start < start_ns + span_ns)
 
@@ -391,14 +395,11 @@ def walk_lines(events: Recording) -> Iterator[str]:
     """Yield the rows of walks."""
     for name in kernel.SCANS:
         (step,) = events.steps(f"walk {name}")
-        moves, packets = handovers(step), [f for f in step.frames if f.kind == "data" and f.receiver == kernel.ROBOT]
-        positions, gap_s = model_walk(name, 1)
-        texts = [", ".join(f"{east_m:.1f} m to {new}" for east_m, new in part) for part in (moves, positions)]
-        yield _row(f"{name} scans, handovers", *texts)
-        gaps_s = [
-            after.time_s - before.time_s for before, after in pairwise(packets) if before.source != after.source
-        ]
-        yield _row("gap of the packets to the robot (ms)", _ms(gaps_s), f"{1e3 * gap_s:.0f}")
+        linux, model = (
+            ", ".join(f"{position_m:.1f} m to {new}, gap {1e3 * gap_s:.0f} ms" for position_m, new, gap_s in moves)
+            for moves in (handovers(step), model_walk(name, 1))
+        )
+        yield _row(f"{name} scans, handovers", linux, model)
 
 
 def power_save_lines(events: Recording) -> Iterator[str]:

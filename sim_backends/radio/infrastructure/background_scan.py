@@ -3,7 +3,6 @@
 The model follows bgscan_simple.c and events.c of wpa_supplicant 2.10, and the signal events of mac80211 (mlme.c).
 """
 
-import math
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
@@ -11,9 +10,11 @@ from typing import Final
 SIGNAL_HYSTERESIS_DB: Final = 4.0
 """Change of the signal after which mac80211 reports another event: bgscan_simple.c."""
 
-_AVERAGE_WEIGHT: Final = 0.25
+_AVERAGE_SHIFT: Final = 4
+_WEIGHT_SHIFT: Final = 2
 _MIN_BEACONS: Final = 4
-"""Weight of the last beacon in the average signal, and number of beacons before the first event: ieee80211_i.h."""
+"""Fractional bits of the average signal, negative binary logarithm of the weight of the last beacon in it, and number
+of beacons before the first event: ieee80211_i.h (`DECLARE_EWMA(beacon_signal, 4, 4)`)."""
 
 _DIFFERENCES_DB: Final = ((-85, 1), (-80, 2), (-75, 3), (-70, 4))
 """Limits below which the current signal is, in dBm, each with the margin in dB: events.c."""
@@ -87,20 +88,21 @@ class BackgroundScan:
         threshold_dbm: Signal below which scans have the short interval.
         short_ns: Short interval.
         long_ns: Long interval.
-        average_dbm: Average signal of beacons; before the first beacon the signal at the association.
+        level_dbm: Average signal of beacons; before the first beacon the signal at the association.
         next_ns: Time of the next scan.
     """
 
     threshold_dbm: float
     short_ns: int
     long_ns: int
-    average_dbm: float
+    level_dbm: int
     next_ns: int
     _interval_ns: int
     _last_ns: int
     _beacons: int = 0
+    _average: int = 0
     _short_scans: int = 0
-    _last_event_dbm: float | None = None
+    _last_event_dbm: int | None = None
 
     @classmethod
     def start(
@@ -116,17 +118,19 @@ class BackgroundScan:
             long_ns: Long interval.
         """
         interval_ns = long_ns if signal_dbm >= threshold_dbm else short_ns
-        return cls(threshold_dbm, short_ns, long_ns, signal_dbm, now_ns + interval_ns, interval_ns, now_ns)
+        return cls(threshold_dbm, short_ns, long_ns, round(signal_dbm), now_ns + interval_ns, interval_ns, now_ns)
 
     def on_beacon(self, now_ns: int, signal_dbm: float) -> None:
         """Update the average; a signal event may change `next_ns`."""
         self._beacons += 1
-        if self._beacons == 1:
-            self.average_dbm = signal_dbm
-        self.average_dbm += _AVERAGE_WEIGHT * (signal_dbm - self.average_dbm)
+        # mac80211 averages the negative signal, and rounds down.
+        last = -round(signal_dbm) << _AVERAGE_SHIFT
+        others = (self._average << _WEIGHT_SHIFT) - self._average
+        self._average = (others + last) >> _WEIGHT_SHIFT if self._average else last
+        self.level_dbm = average_dbm = -(self._average >> _AVERAGE_SHIFT)
         if self._beacons < _MIN_BEACONS:
             return
-        last_dbm, average_dbm = self._last_event_dbm, self.level_dbm
+        last_dbm = self._last_event_dbm
         if average_dbm < self.threshold_dbm and (last_dbm is None or average_dbm < last_dbm - SIGNAL_HYSTERESIS_DB):
             self._last_event_dbm = average_dbm
             self._on_weak_signal(now_ns)
@@ -135,11 +139,6 @@ class BackgroundScan:
             if self._interval_ns == self.short_ns:
                 self._interval_ns = self.long_ns
                 self.next_ns = now_ns + self.long_ns
-
-    @property
-    def level_dbm(self) -> int:
-        """The average signal as mac80211 reports it: without the fraction."""
-        return math.trunc(self.average_dbm)
 
     def _on_weak_signal(self, now_ns: int) -> None:
         """Use the short interval, and scan immediately unless scans were recent or many (bgscan_simple.c).
@@ -170,4 +169,7 @@ class BackgroundScan:
         elif self._short_scans:
             self._short_scans -= 1
         self._last_ns = now_ns
+
+    def on_scan_end(self, now_ns: int) -> None:
+        """Start the interval until the next scan."""
         self.next_ns = now_ns + self._interval_ns

@@ -77,6 +77,10 @@ is lost: mlme.c, `max_nullfunc_tries`."""
 _RECONNECT_NS: Final = 100_000_000
 """Time from the loss of a link until the next scan: events.c of wpa_supplicant."""
 
+_SELECTION_NS: Final = 10_000_000
+"""Time from the end of a scan until a robot leaves its access point: wpa_supplicant reads the results, and waiting
+packets are delivered. It is an assumption; on an emulated processor it was 31 ms."""
+
 _RESCAN_NS: Final = 5_000_000_000
 """Interval of scans without an association: the default of wpa_supplicant."""
 
@@ -288,8 +292,9 @@ class Roaming:
             else:
                 self._associate(now_ns, client, strongest)
             return
+        client.scan.on_scan_end(now_ns)
         if strongest is not None and self._prefers(client, client.scan, strongest):
-            self._associate(now_ns, client, strongest)
+            self._events.schedule(now_ns + _SELECTION_NS, self._associate, client, strongest)
         else:
             client.is_busy = False
 

@@ -29,10 +29,24 @@ def test_a_signal_that_falls_below_the_threshold_starts_a_scan() -> None:
     while schedule.next_ns == 300 * S:
         beacon_count += 1
         schedule.on_beacon(20 * S, -70.0)
-    # -70 + 20 (3/4)^n is at most -66 from n = 6 on: mac80211 drops the fraction of -65.7.
+    # 70 - 20 (3/4)^n is at least 66 from n = 6 on; it is rounded down to 65 before.
     assert (beacon_count, schedule.next_ns) == (6, 20 * S)
     schedule.on_scan(20 * S)
-    assert schedule.next_ns == 50 * S
+    schedule.on_scan_end(22 * S)
+    assert schedule.next_ns == 52 * S, "the interval starts at the end of a scan"
+
+
+def test_the_average_stays_below_a_constant_signal_like_that_of_mac80211() -> None:
+    """The fixed-point average of 65 and then 66 ends at 65 13/16, because each step is rounded down."""
+    schedule = start_schedule()
+    for signal_dbm in (-65.0, *[-66.4] * 100):
+        schedule.on_beacon(10 * S, signal_dbm)
+    assert schedule.level_dbm == -65
+    assert schedule.next_ns == 300 * S
+    for _ in range(4):
+        schedule.on_beacon(11 * S, -66.6)
+    assert schedule.level_dbm == -66
+    assert schedule.next_ns == 11 * S
 
 
 def test_a_signal_that_rises_above_the_threshold_by_the_hysteresis_ends_short_intervals() -> None:
@@ -55,6 +69,7 @@ def test_a_further_fall_scans_again_at_most_every_ten_seconds() -> None:
             schedule.on_beacon(at_s * S, signal_dbm)
         if schedule.next_ns == at_s * S:
             schedule.on_scan(at_s * S)
+            schedule.on_scan_end(at_s * S)
         assert schedule.next_ns == {1: 300, 5: 35, 8: 35, 16: 46}[at_s] * S
 
 
@@ -63,6 +78,7 @@ def test_many_short_scans_are_followed_by_a_long_interval() -> None:
     for _ in range(12):
         times_s.append(schedule.next_ns // S)
         schedule.on_scan(schedule.next_ns)
+        schedule.on_scan_end(schedule.next_ns)
     assert times_s == [30 * number for number in range(1, 12)] + [330 + 300]
 
 

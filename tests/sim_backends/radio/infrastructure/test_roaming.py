@@ -274,14 +274,16 @@ def test_the_times_of_link_losses_are_uniform_within_a_second() -> None:
     assert max(times_ns) - min(times_ns) > 0.6 * S
 
 
-def test_a_robot_that_only_misses_beacons_keeps_its_association() -> None:
-    """Its null frames are acknowledged."""
+def test_a_robot_that_only_misses_beacons_keeps_its_association_until_it_is_out_of_range() -> None:
+    """Its null frames are acknowledged, and sent again every second."""
     lab = Lab(channels=1, interval_ns=20 * MS)
     lab.run(2 * S, AT_WEST)
     delivery = lab.model._delivery
     delivery.count_waiting_management = lambda _: 1  # type: ignore[attr-defined]  # beacons are omitted
-    lab.run(8 * S, AT_WEST)
-    assert lab.access_points == ["west"]
+    lab.run(6 * S, AT_WEST)
+    assert [cell for _, cell in lab.cells] == ["west"]
+    lab.run(8 * S, FAR)
+    assert [cell for _, cell in lab.cells] == ["west", None]
 
 
 def test_a_robot_and_an_access_point_have_different_names() -> None:
