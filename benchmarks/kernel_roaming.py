@@ -22,7 +22,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from random import Random
-from typing import Final
+from typing import Final, Literal
 
 from fieldkit.core.model import Vector
 from sim_backends.emulated.linux_wifi.access_points import BRIDGE, configuration
@@ -38,6 +38,8 @@ from sim_backends.emulated.robot.spec import WifiSpec
 from sim_backends.radio.antennas import Antenna
 from sim_backends.radio.radio_options import RadioOptions
 
+Security = Literal["wpa2", "wpa3"]
+
 ROBOT: Final = "robot"
 ACCESS_POINTS_M: Final[Mapping[str, Vector]] = {"left": (0.0, 3.0, 2.5), "right": (100.0, 3.0, 2.5)}
 NEAR_M, WALK_M, FAR_M = 5.0, 100.0, 90_000.0
@@ -48,8 +50,6 @@ ROBOT_DBM, ACCESS_POINT_DBM, SENSITIVITY_DBM = 15.0, 20.0, -88.0
 CHANNELS: Final = 11
 SCANS: Final = {"default": "simple:30:-65:300", "frequent": "simple:3:-55:10"}
 """Background scans of a walk: NetworkManager's, and more frequent ones."""
-SILENT_S: Final = 0.1
-"""Time without frames after which the robot sleeps: `dynamic_ps_timeout` of mac80211."""
 
 _PASSPHRASE: Final = "fieldkit-roaming"
 _FIRST_MHZ, _STEP_MHZ = 2412, 5
@@ -59,7 +59,6 @@ _WAIT_S: Final = 60.0  # time limit of each step
 _PRIORITY: Final = 0x107
 """Access category VO, which has no block-ACK session."""
 _ETHERTYPE: Final = 0x88B5  # for experiments: IEEE 802
-_DEBUG: Final = Path("/sys/kernel/debug/ieee80211")
 _TRACING: Final = Path("/sys/kernel/tracing")
 _TRACED: Final = ("drv_sw_scan_start", "drv_sw_scan_complete", "drv_config")
 _TRACE_LINE: Final = re.compile(r"\s(\d+\.\d+): (\w+: .*)")
@@ -76,8 +75,6 @@ _SUBTYPES: Final = {
     12: "deauthentication",
     13: "action",
 }
-_AWAKE, _ASLEEP = "0", "2"
-"""Values of hwsim's file `ps`: no power save; power save in which all frames are received."""
 
 
 def frame_kind(frame: bytes) -> str:
@@ -100,18 +97,6 @@ def frame_kind(frame: bytes) -> str:
     return "eapol-4" if is_secure else "eapol-2"
 
 
-def announces_packets(beacon: bytes) -> bool:
-    """Return True if the TIM of a beacon announces packets for the station with the association ID 1."""
-    offset = 36
-    while offset + 2 <= len(beacon):
-        kind, size = beacon[offset : offset + 2]
-        if kind == 5:
-            _, _, control, first = beacon[offset + 2 : offset + 6]
-            return control < 2 and bool(first & 0x02)
-        offset += 2 + size
-    return False
-
-
 class Lab:
     """The radios, their medium, and the programs of the robot and of the access points.
 
@@ -120,8 +105,6 @@ class Lab:
 
     Attributes:
         lost: Transmitter and kind of the next frames that the medium loses.
-        uses_power_save: True if the robot sleeps after `SILENT_S`, until a beacon announces packets. hwsim sends the
-            null frames when a value is written to its file `ps`.
     """
 
     def __init__(self, radios: Sequence[HwsimRadio]) -> None:
@@ -145,11 +128,7 @@ class Lab:
         self._epoll.register(self._kernel.fileno(), select.EPOLLIN)
         self._folder = Path(tempfile.mkdtemp())
         self._programs: dict[str, subprocess.Popen[bytes]] = {}
-        self._sleep_file = _DEBUG / radios[0].phy / "hwsim/ps"
-        self._is_asleep = False
-        self._active_ns = 0
         self.lost: list[tuple[str, str]] = []
-        self.uses_power_save = False
         self.place(NEAR_M)
         self._namespace = subprocess.Popen(
             ("unshare", "--net", "sh", "-c", "ip link set lo up; echo; exec sleep infinity"), stdout=subprocess.PIPE
@@ -175,10 +154,8 @@ class Lab:
             if isinstance(event, SentFrame) and self._is_lost(now_ns, event):
                 continue
             self._medium.receive(now_ns, message)
-        for message in self._medium.replies(now_ns):
-            self._kernel.send(message)
-        if self.uses_power_save and not self._is_asleep and now_ns > self._active_ns + SILENT_S * 1e9:
-            self._set_asleep(is_asleep=True)
+        for reply in self._medium.replies(now_ns):
+            self._kernel.send(reply)
 
     def _is_lost(self, now_ns: int, event: SentFrame) -> bool:
         """Log a frame; return True if it is lost, which is reported to its transmitter."""
@@ -187,12 +164,6 @@ class Lab:
         kind = frame_kind(event.frame)
         fields = (source, receiver, kind, event.frequency_mhz, len(event.frame) + 4, event.frame[1] >> 4 & 1)
         log(now_ns, "air", *fields)
-        if self.uses_power_save:
-            if kind == "data" and ROBOT in {source, receiver}:
-                self._active_ns = now_ns
-            elif kind == "beacon" and source == "left" and self._is_asleep and announces_packets(event.frame):
-                self._active_ns = now_ns
-                self._set_asleep(is_asleep=False)
         if (source, kind) not in self.lost:
             return False
         self.lost.remove((source, kind))
@@ -200,20 +171,11 @@ class Lab:
         self._kernel.send(encode_status(event, tries=[event.stages[0].tries], acknowledged=False, signal_dbm=-120))
         return True
 
-    def _set_asleep(self, *, is_asleep: bool) -> None:
-        self._is_asleep = is_asleep
-        self._sleep_file.write_text(_ASLEEP if is_asleep else _AWAKE)
-
-    def stop_power_save(self) -> None:
-        """Wake the robot, which does not sleep again."""
-        self.uses_power_save = False
-        self._set_asleep(is_asleep=False)
-
     def wait(self, seconds: float) -> None:
         """Run the medium for this time."""
         end_s = time.monotonic() + seconds
         while (remaining_s := end_s - time.monotonic()) > 0:
-            self.poll(min(remaining_s, 0.01 if self.uses_power_save else remaining_s))
+            self.poll(remaining_s)
 
     def wait_for(self, condition: Callable[[], bool], what: str) -> None:
         """Run the medium until a condition is true; exit if it is not true in time."""
@@ -260,7 +222,7 @@ class Lab:
             sys.exit(f"{argv} failed: {output}")
         return output
 
-    def start_access_points(self, security: str) -> None:
+    def start_access_points(self, security: Security) -> None:
         """Start hostapd and wait until both access points are on."""
         files = []
         for number, name in enumerate(ACCESS_POINTS_M):
@@ -270,7 +232,7 @@ class Lab:
         self.start("hostapd", "hostapd", "-t", *files)
         self.wait_for(lambda: self._log("hostapd").count("AP-ENABLED") == len(files), "hostapd")
 
-    def connect(self, security: str, *, channels: int, scan: str = "") -> None:
+    def connect(self, security: Security, *, channels: int, scan: str = "") -> None:
         """Start wpa_supplicant and wait until the robot is associated."""
         wifi = WifiSpec("station", _PASSPHRASE, security, background_scan=scan, channels=channels)
         text = wireless.configuration(self._radios[ROBOT].interface, wifi)
@@ -331,10 +293,9 @@ def log_trace() -> None:
 
 
 def prepare() -> None:
-    """Mount the file systems of the kernel's debugging, select trace events, and create the bridge."""
-    for kind, folder in (("debugfs", "/sys/kernel/debug"), ("tracefs", str(_TRACING))):
-        if not any(Path(folder).iterdir()):
-            _run("mount", "-t", kind, kind, folder)
+    """Mount the kernel's trace events, select some, and create the bridge."""
+    if not any(_TRACING.iterdir()):
+        _run("mount", "-t", "tracefs", "tracefs", str(_TRACING))
     (_TRACING / "trace_clock").write_text("mono")
     for event in _TRACED:
         (_TRACING / "events/mac80211" / event / "enable").write_text("1")
@@ -401,10 +362,10 @@ def record_scans(lab: Lab, downlink: Downlink, random: Random) -> None:
     lab.stop(f"{ROBOT}-ping")
 
 
-def record_associations(lab: Lab, security: str, count: int) -> None:
+def record_associations(lab: Lab, count: int) -> None:
     """Associate again several times."""
     for _ in range(count):
-        mark(f"{security} association")
+        mark("association")
         lab.reassociate()
 
 
@@ -461,36 +422,31 @@ def record_walk(lab: Lab, downlink: Downlink, name: str) -> None:
 
 
 def record_power_save(lab: Lab, downlink: Downlink, random: Random) -> None:
-    """Send packets and broadcasts to the robot while it sleeps, and with `iw set power_save on` alone."""
+    """Send packets and broadcasts to the robot while it sleeps, and packets that keep it awake."""
     lab.connect("wpa2", channels=1)
-    mark("power_save on")
     lab.run_on_robot("iw", "dev", lab.interface, "set", "power_save", "on")
-    for _ in range(5):
-        lab.wait(random.uniform(0.4, 0.8))
-        mark("packet")
-        downlink.send(lab.robot_address)
-    lab.wait(0.5)
-    lab.uses_power_save = True
     for text, receiver, number in (("packet", lab.robot_address, 150), ("broadcast", b"\xff" * 6, 100)):
-        mark(f"sleeping robot: {text}")
         for _ in range(number):
             lab.wait(random.uniform(0.5, 0.9))
             mark(text)
             downlink.send(receiver)
-    lab.wait(0.5)
-    lab.stop_power_save()
+    lab.wait(1)
+    for _ in range(20):
+        mark("frequent packet")
+        downlink.send(lab.robot_address)
+        lab.wait(0.05)
+    lab.wait(1)
 
 
 def record_security(lab: Lab, downlink: Downlink, random: Random) -> None:
     """Associate with WPA2, with and without losses, lose the link, and associate with WPA3."""
     del downlink
     lab.connect("wpa2", channels=3)
-    record_associations(lab, "wpa2", 5)
+    record_associations(lab, 5)
     record_lost_frames(lab)
     record_link_losses(lab, random, 12)
     lab.start_access_points("wpa3")
     lab.connect("wpa3", channels=3)
-    record_associations(lab, "wpa3", 5)
 
 
 def record_walks(lab: Lab, downlink: Downlink, random: Random) -> None:

@@ -17,7 +17,7 @@ from itertools import pairwise
 from pathlib import Path
 from random import Random
 from statistics import fmean, median
-from typing import Final, cast
+from typing import Final
 
 import numpy as np
 
@@ -40,13 +40,18 @@ PACKETS: Final = 400
 _NOISE_DBM: Final = -92
 """Noise that hwsim reports to wpa_supplicant."""
 _LONGEST_S: Final = 2400.0  # time limit of a recording
-_PHY: Final = PhyCapability("n", "2.4 GHz", 20, 1, 800, power_save_timeout_ns=round(kernel.SILENT_S * 1e9))
+_SILENT_NS: Final = 100_000_000
+"""Time without frames after which a robot sleeps: `dynamic_ps_timeout` of mac80211, if power save is on."""
+_PHY: Final = PhyCapability("n", "2.4 GHz", 20, 1, 800, power_save_timeout_ns=_SILENT_NS)
 _CHANNEL_CHANGED: Final = 0x40
 """Bit `IEEE80211_CONF_CHANGE_CHANNEL` of a trace event `drv_config`."""
 _ASSOCIATION_KINDS: Final = ("authentication", "association", "reassociation", "eapol")
 _MS, _S = 10**6, 10**9
 _STEP_NS: Final = 20 * _MS  # interval of packets to the robot
 _ABSENT_NS: Final = 30 * _MS  # a longer time without packets is an absence of the robot
+
+DESTINATIONS: Final[Mapping[str, str | None]] = {"packet": kernel.ROBOT, "broadcast": None}
+"""Destinations of packets to sleeping robots, by kind."""
 
 Interval = tuple[float, float]
 """Start and end, in seconds."""
@@ -161,8 +166,10 @@ def absences(step: Recording) -> list[Interval]:
 
 
 def visits_s(step: Recording) -> list[float]:
-    """Return the time on each channel of a scan."""
-    return [end_s - start_s for (start_s, channel), (end_s, _) in pairwise(step.changes) if channel]
+    """Return the time on each channel of the first scan, of a robot without an access point."""
+    end = next(number for number, (_, channel) in enumerate(step.changes) if not channel)
+    # The last change is the return at the end of the scan.
+    return [end_s - start_s for (start_s, _), (end_s, _) in pairwise(step.changes[:end])]
 
 
 def associations(events: Recording) -> Iterator[list[AirFrame]]:
@@ -213,14 +220,23 @@ def handovers(step: Recording) -> list[tuple[float, str, float]]:
 
 
 def delays_s(events: Recording, kind: str) -> list[float]:
-    """Return the times from the arrival of each packet at the access point until it is sent to a sleeping robot."""
-    receiver = kernel.ROBOT if kind == "packet" else "*"
-    start_s = next(time_s for time_s, text in events.marks if text == f"sleeping robot: {kind}")
-    sent_s = [time_s for time_s, text in events.marks if text == kind and time_s > start_s]
+    """Return the times from the arrival of each packet at the access point until it is sent to the robot."""
+    receiver = "*" if kind == "broadcast" else kernel.ROBOT
     frames_s = np.array(
         [f.time_s for f in events.frames if f.kind == "data" and f.source == "left" and f.receiver == receiver]
     )
+    sent_s = [time_s for time_s, text in events.marks if text == kind]
     return [float(frames_s[np.searchsorted(frames_s, time_s)] - time_s) for time_s in sent_s]
+
+
+def awake_times_s(events: Recording) -> list[float]:
+    """Return the times from a packet to the robot until it announces that it sleeps, without other frames between."""
+    frames = [f for f in events.frames if f.kind != "beacon"]
+    return [
+        sleep.time_s - packet.time_s
+        for packet, sleep in pairwise(frames)
+        if packet.kind == "data" and packet.receiver == kernel.ROBOT and sleep.kind == "null" and sleep.sleeps
+    ]
 
 
 # fieldkit
@@ -286,6 +302,18 @@ def model_absences(dwell: str) -> list[Interval]:
     return [(start_s, end_s) for start_s, end_s in pairwise(times_s) if end_s - start_s > _ABSENT_NS / 1e9]
 
 
+def model_association_s(*, sae: bool) -> float:
+    """Return the time without an access point in a handover without other traffic."""
+    corridor = Corridor(1, short="2s", long="2s", channels=1, sae=sae)
+    corridor.place(0, 1.0)
+    corridor.receive(_S)
+    for now_ns in range(_S, 3 * _S, _MS // 4):
+        corridor.place(now_ns, 90.0)
+        corridor.receive(now_ns)
+    (leave_ns, _), (enter_ns, _) = corridor.cells[-2:]
+    return (enter_ns - leave_ns) / 1e9
+
+
 def model_link_loss_s(seed: int) -> float:
     """Return the time from leaving the range until the link is lost."""
     corridor = Corridor(seed, channels=1)
@@ -349,21 +377,19 @@ def _ms(values_s: Sequence[float]) -> str:
 
 
 def _absence_rows(label: str, linux: Sequence[Interval], model: Sequence[Interval]) -> Iterator[str]:
-    for text, lengths_s in (
-        ("away (ms)", lambda intervals: [end - start for start, end in intervals]),
-        ("on its channel in between (ms)", lambda intervals: [b[0] - a[1] for a, b in pairwise(intervals)]),
-    ):
-        yield _row(f"{label}, {text}", _ms(lengths_s(linux)), _ms(lengths_s(model)) if model else "-")
-    totals = [f"{len(part)}, {part[-1][1] - part[0][0]:.2f}" if part else "-" for part in (linux, model)]
-    yield _row(f"{label}, absences, total (s)", *totals)
+    parts = [linux, model] if model else [linux]
+    away_s = [[end_s - start_s for start_s, end_s in part] for part in parts]
+    returns_s = [[start_s - end_s for (_, end_s), (start_s, _) in pairwise(part)] for part in parts]
+    yield _row(f"{label}, away (ms)", *map(_ms, away_s))
+    yield _row(f"{label}, on its channel in between (ms)", *map(_ms, returns_s))
+    yield _row(f"{label}, absences, total (s)", *(f"{len(part)}, {part[-1][1] - part[0][0]:.2f}" for part in parts))
 
 
 def scan_lines(events: Recording) -> Iterator[str]:
     """Yield the rows of scans."""
     for words, dwell in (("", "64ms"), ("passive", "112ms")):
         (step,) = events.steps(f"scan {words}")
-        total_s = step.changes[-1][0] - step.changes[0][0]
-        yield _row(f"{words or 'active'} scan, channel (ms); total (s)", f"{_ms(visits_s(step)[:-1])}; {total_s:.2f}")
+        yield _row(f"{words or 'active'} scan, channel (ms)", _ms(visits_s(step)), dwell.removesuffix("ms"))
         (step,) = events.steps(f"associated scan {words}")
         yield from _absence_rows(f"{words or 'active'} scan of a station", absences(step), model_absences(dwell))
     for text in ("with packets to the robot", "with packets from the robot"):
@@ -376,17 +402,15 @@ def association_lines(events: Recording) -> Iterator[str]:
     for security, count, first_bytes in (("wpa2", 8, 34), ("wpa3", 10, 132)):
         complete = [f for f in associations(events) if (len(f), f[0].size_bytes) == (count, first_bytes)]
         times_s = [frames[-1].time_s - frames[0].time_s for frames in complete]
-        yield _row(f"{security}, {len(complete)} associations (ms)", _ms(times_s))
+        model_s = model_association_s(sae=security == "wpa3")
+        yield _row(f"{security}, {len(complete)} associations (ms)", _ms(times_s), f"{1e3 * model_s:.1f}")
         yield _row("frames", ", ".join(f"{frame.kind} {frame.size_bytes}" for frame in complete[-1]))
     for text in dict.fromkeys(text for _, text in events.marks if text.startswith("lost ")):
         yield _row(f"{text}, next frame after (ms)", f"{1e3 * repetition_s(*events.steps(text)):.0f}")
     losses = link_losses_s(events)
-    linux_s = [loss[0] for loss in losses]
-    model_s = [model_link_loss_s(seed) for seed in range(RUNS)]
-    yield _row(
-        "loss of the link (s)",
-        *(f"{fmean(part):.2f} ({min(part):.2f} to {max(part):.2f})" for part in (linux_s, model_s)),
-    )
+    parts_s = [loss[0] for loss in losses], [model_link_loss_s(seed) for seed in range(RUNS)]
+    texts = [f"{fmean(part):.2f} ({min(part):.2f} to {max(part):.2f})" for part in parts_s]
+    yield _row("loss of the link (s)", *texts)
     yield _row("null frames", str({loss[1] for loss in losses}))
     yield _row("from the end of the association to a scan (ms)", _ms([loss[2] for loss in losses]))
 
@@ -404,14 +428,14 @@ def walk_lines(events: Recording) -> Iterator[str]:
 
 def power_save_lines(events: Recording) -> Iterator[str]:
     """Yield the rows of power save."""
-    start_s = next(time_s for time_s, text in events.marks if text == "power_save on")
-    end_s = next(time_s for time_s, text in events.marks if text.startswith("sleeping"))
-    nulls = [frame for frame in events.frames if frame.kind == "null" and start_s < frame.time_s < end_s]
-    yield _row("null frames with `iw set power_save on`", str(len(nulls)))
-    for kind, destination in (("packet", cast("str | None", kernel.ROBOT)), ("broadcast", None)):
+    yield _row(
+        "time from a packet until the robot sleeps (ms)", _ms(awake_times_s(events)), f"{_SILENT_NS / _MS:.0f}"
+    )
+    for kind, destination in DESTINATIONS.items():
         linux, model = delays_s(events, kind), model_delays_s(destination)
         yield _row(f"delay of a {kind} (ms)", _ms(linux), _ms(model))
-        yield _row(f"distance of the distributions of a {kind}", f"{distance(linux, model):.3f}")
+        yield _row("distance of the distributions", f"{distance(linux, model):.3f}")
+    yield _row("delay of packets every 50 ms (ms)", _ms(delays_s(events, "frequent packet")[1:]))
 
 
 TABLES: Final[Mapping[str, Callable[[Recording], Iterator[str]]]] = {

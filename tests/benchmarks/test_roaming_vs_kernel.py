@@ -71,20 +71,23 @@ def test_a_walk_has_the_handovers_of_the_kernel(name: str, events: Callable[[str
     assert 0.01 < model_moves[0][2] <= kernel_moves[0][2] + 0.02 < 0.1
 
 
-@pytest.mark.parametrize(("kind", "destination"), [("packet", kernel.ROBOT), ("broadcast", None)])
+@pytest.mark.parametrize("kind", study.DESTINATIONS)
 def test_delays_of_a_sleeping_robot_have_the_distribution_of_the_kernel(
-    kind: str, destination: str | None, events: Callable[[str], Recording]
+    kind: str, events: Callable[[str], Recording]
 ) -> None:
-    kernel_s, model_s = study.delays_s(events("power-save"), kind), study.model_delays_s(destination)
+    kernel_s = study.delays_s(events("power-save"), kind)
+    model_s = study.model_delays_s(study.DESTINATIONS[kind])
     # Critical value of the test of Kolmogorov and Smirnov at 1 %.
     bound = 1.63 * ((len(kernel_s) + len(model_s)) / (len(kernel_s) * len(model_s))) ** 0.5
     assert study.distance(kernel_s, model_s) < bound
 
 
-def test_the_driver_of_simulated_radios_announces_no_power_save(events: Callable[[str], Recording]) -> None:
+def test_a_robot_of_the_kernel_sleeps_after_the_time_of_the_model(events: Callable[[str], Recording]) -> None:
     recording = events("power-save")
-    (step,) = recording.steps("power_save on")
-    assert not [frame for frame in step.frames if frame.kind == "null"]
+    times_s = study.awake_times_s(recording)
+    assert len(times_s) > 100
+    assert median(times_s) == pytest.approx(0.1, abs=0.008)  # two ticks
+    assert max(study.delays_s(recording, "frequent packet")[1:]) < 0.02, "frequent packets keep it awake"
 
 
 def test_the_distance_of_distributions() -> None:
@@ -110,13 +113,6 @@ def test_the_distance_of_distributions() -> None:
 )
 def test_kinds_of_frames(frame: bytes, kind: str) -> None:
     assert kernel.frame_kind(frame) == kind
-
-
-def test_a_beacon_announces_packets_for_the_first_station() -> None:
-    header, ssid = bytes(36), b"\x00\x03abc"
-    assert kernel.announces_packets(header + ssid + b"\x05\x04\x00\x02\x00\x02")
-    assert not kernel.announces_packets(header + ssid + b"\x05\x04\x00\x02\x01\x00")
-    assert not kernel.announces_packets(header + ssid)
 
 
 @pytest.mark.emulated

@@ -123,7 +123,7 @@ def test_each_packet_is_delivered_or_lost_once(phy: PhyCapability | None) -> Non
     ],
 )
 def test_the_gap_of_a_handover_is_the_sum_of_its_frames_and_processing_times(
-    settings: dict[str, bool], sizes: list[int]
+    settings: dict[str, Any], sizes: list[int]
 ) -> None:
     """Without other traffic: sum of (DIFS + backoff + frame + SIFS + ACK) and of the processing times."""
     processing_ns = 3 * MS
@@ -217,9 +217,9 @@ def test_a_scan_delays_packets_and_loses_none() -> None:
     assert delayed_packets == pytest.approx(5 * 2 * 2 * 118 / 20, rel=0.3)
 
 
-def absences_ms(**roaming: object) -> list[tuple[float, float]]:
+def absences_ms(channels: int, dwell: str = "64ms") -> list[tuple[float, float]]:
     """Return start and duration, in ms, of each absence of the walker during its first scan; `base` does not scan."""
-    lab = Lab(interval_ns=2 * MS, short="3s", long="300s", threshold_dbm=-45, **roaming)
+    lab = Lab(interval_ns=2 * MS, short="3s", long="300s", threshold_dbm=-45, channels=channels, dwell=dwell)
     lab.run(6 * S, (20.0, 0.0, 0.2))
     arrivals_ns = sorted(at_ns for (_, receiver), at_ns in lab.arrived_ns.items() if receiver == "walker")
     absences = [(start, end - start) for start, end in pairwise(arrivals_ns) if end - start > 15 * MS]
