@@ -20,9 +20,9 @@ import numpy as np
 
 from benchmarks.radio_vs_ns3 import NOISE_DBM, PAYLOAD_BYTES, SENSITIVITY_DBM, TX_POWER_DBM, Ns3, Row, build, shift_db
 from sim_backends.radio.antennas import Antenna
-from sim_backends.radio.error_rates import packet_error
-from sim_backends.radio.high_throughput import HighThroughput, PhyCapability, format_modes, guard_intervals_ns
-from sim_backends.radio.modes import WifiMode
+from sim_backends.radio.phy.error_rates import packet_error
+from sim_backends.radio.phy.high_throughput import HighThroughput, PhyCapability, format_modes, guard_intervals_ns
+from sim_backends.radio.phy.modes import WifiMode
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.wifi import Wifi
 from sim_backends.radio.world_channel import WorldChannel

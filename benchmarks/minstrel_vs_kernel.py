@@ -29,11 +29,11 @@ from fieldkit.core.deadline import Deadline
 from sim_backends.emulated.linux_wifi import guest
 from sim_backends.emulated.linux_wifi.hwsim_messages import RateStage
 from sim_backends.emulated.linux_wifi.virtual_machine import require_machine, run_in_machine
-from sim_backends.radio.error_rates import packet_error
-from sim_backends.radio.high_throughput import PhyCapability, format_modes, mode_groups
-from sim_backends.radio.minstrel_ht import MinstrelHt
-from sim_backends.radio.modes import WifiMode, ack_ns
+from sim_backends.radio.phy.error_rates import packet_error
+from sim_backends.radio.phy.high_throughput import PhyCapability, format_modes, mode_groups
+from sim_backends.radio.phy.modes import WifiMode, ack_ns
 from sim_backends.radio.random_streams import PacketDraws
+from sim_backends.radio.rate_control.minstrel_ht import MinstrelHt
 
 ROOT: Final = Path(__file__).resolve().parent.parent
 RECORDINGS: Final = ROOT / "tests/data/hwsim/6.1.176"
@@ -191,7 +191,7 @@ def frames_per_mcs(frames: Sequence[SelectedFrame]) -> Counter[str]:
 
 
 def rates_bit_s(frames: Sequence[SelectedFrame], window_ns: int = 1_000_000_000) -> list[float]:
-    """Return the mean rate of first tries in each window of time, without samples; other windows are omitted."""
+    """Return the mean rate of the first tries that are not samples, per window of time with such tries."""
     windows: dict[int, list[int]] = {}
     for frame in frames:
         if not frame.is_sample and (mode := frame.modes[0]) is not None:

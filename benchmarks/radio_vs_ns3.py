@@ -21,9 +21,9 @@ from typing_extensions import override
 from sim_backends.federates.compiling import CompiledProgram
 from sim_backends.ns3.federate import standard_flag, version
 from sim_backends.radio.antennas import Antenna
-from sim_backends.radio.error_rates import packet_error
-from sim_backends.radio.high_throughput import PhyCapability
-from sim_backends.radio.modes import CHANNEL_6_HZ, G_MODES, N_MODES, WifiMode
+from sim_backends.radio.phy.error_rates import packet_error
+from sim_backends.radio.phy.high_throughput import PhyCapability
+from sim_backends.radio.phy.modes import CHANNEL_6_HZ, G_MODES, N_MODES, WifiMode
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.wifi import Wifi
 from sim_backends.radio.world_channel import WorldChannel

@@ -11,7 +11,7 @@ is_motion_program() { # true if the job in $1 is a motion program; sets program 
     esac
 }
 
-halt_motion() { # stop the motion programs in the name of user $1; if folder $2 is given, only the programs of this folder
+halt_motion() { # stop the motion programs, and record that user $1 stopped them; if folder $2 is given, only the programs of this folder
     by=$1 programs=
     # The signals are sent first: they need no disk space and no wait.
     if [ -n "${2-}" ]; then
@@ -43,7 +43,7 @@ halt_motion() { # stop the motion programs in the name of user $1; if folder $2 
     [ -z "${has_failed-}" ] || fail_to_write "$base/lock"
 }
 
-signal_programs() { # signal each motion program in folders $@, and add it to programs: TRIAL/ATTEMPT/.jobs/NAME below the home
+signal_programs() { # signal each motion program in folders $@, and add it to programs: DIR/.jobs/NAME, DIR below the home
     for dir do
         # A starting program writes its pid and then checks for this file. Therefore this function detects the program, or
         # the program detects the file.

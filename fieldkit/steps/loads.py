@@ -3,15 +3,19 @@
 Only options of iperf3 3.1 are used.
 """
 
+from collections.abc import Iterator
 from typing import Annotated, Final
+
+from typing_extensions import override
 
 from fieldkit.config import schema
 from fieldkit.config.schema import Bits, Field, Int
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.transfers.deliveries import FlowSchedule
 from fieldkit.measure.transfers.iperf3_load import COOKIE_BYTES, LoadStreams
+from fieldkit.steps.capabilities import HasNeeds
 from fieldkit.steps.over_link import OverLink
-from fieldkit.steps.scene import GOOD_BIT_S, Flow, Scene, frames
+from fieldkit.steps.scene import GOOD_BIT_S, Flow, Need, Scene, frames
 
 PROGRAM: Final = "iperf3"
 
@@ -22,7 +26,7 @@ _BLOCK_BYTES: Final = 8192
 """Block size of TCP with a rate. With iperf3's default of 128 KiB, 2 Mbit/s would be two bursts per second."""
 
 
-class LoadOptions(OverLink):
+class LoadOptions(OverLink, HasNeeds):
     """A load from one robot to another.
 
     Attributes:
@@ -49,6 +53,10 @@ class LoadOptions(OverLink):
         if self.sender == self.receiver:
             raise schema.validation_error(f"{self.sender} cannot send to itself; name another robot", "to")
         return self
+
+    @override
+    def needs(self, scene: Scene) -> Iterator[Need]:
+        yield from self.route_needs(scene, self.sender, self.receiver)
 
     def transport_protocol(self, protocol: Protocol) -> Protocol:
         """Return the transport protocol of the load in repeats of `protocol`."""

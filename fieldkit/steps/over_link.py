@@ -36,15 +36,17 @@ class OverLink(Strict):
         interface = scene.link(role, self.over).interface
         return ANY if interface == LOOPBACK else interface
 
-    def route_need(self, scene: Scene, source: Role, destination: Role) -> Iterator[Need]:
-        """Yield the check that the route from a robot to another uses this link.
+    def route_needs(self, scene: Scene, first: Role, second: Role) -> Iterator[Need]:
+        """Yield the checks that the routes between two robots use this link, in both directions.
 
         There is no check for the radio under test, nor for a link whose packets may use any interface.
         """
-        source_link, destination_link = scene.link(source, self.over), scene.link(destination, self.over)
-        if self.over and source_link.interface != LOOPBACK:
-            argv = ("ip", "-o", "route", "get", destination_link.address)
-            yield Need(source, f"route over {self.over}", argv, partial(judge_route, source_link, destination_link))
+        for source, destination in ((first, second), (second, first)):
+            source_link, destination_link = scene.link(source, self.over), scene.link(destination, self.over)
+            if self.over and source_link.interface != LOOPBACK:
+                argv = ("ip", "-o", "route", "get", destination_link.address)
+                judge = partial(judge_route, source_link, destination_link)
+                yield Need(source, f"route over {self.over}", argv, judge)
 
 
 def judge_route(

@@ -119,14 +119,14 @@ class EventListener:
             self._socket.close()
             raise
 
-    def receive(self, limit_s: float) -> Sequence[SerializedEvent] | None:
+    def receive(self, deadline_s: float) -> Sequence[SerializedEvent] | None:
         """Return the events of the next valid datagram, or None if none arrives before the deadline.
 
         Args:
-            limit_s: The deadline, a time of `time.monotonic`.
+            deadline_s: The deadline, a time of `time.monotonic`.
         """
         while True:
-            wait_s = max(limit_s - time.monotonic(), 0.0)
+            wait_s = max(deadline_s - time.monotonic(), 0.0)
             if not select.select([self._socket], [], [], wait_s)[0]:
                 return None
             try:

@@ -17,6 +17,7 @@ from fieldkit.core.model import Control, Topology
 from fieldkit.core.prompts import Operator
 from fieldkit.remote.shell import Shell
 from sim_backends.emulated.emulated_options import EmulatedOptions, Ros2Options, RosChoice, load_options
+from sim_backends.emulated.medium.air_files import LIMIT_BYTES
 from sim_backends.emulated.motion_sections import DRIVE, MAVLINK, drive_of, mavlink_of
 from sim_backends.emulated.provisioning import (
     LAPTOP_ADDRESS,
@@ -159,8 +160,6 @@ class EmulatedBackend:
         """
         if not self._options.record_air or self._options.radio.is_fixed:
             return 0
-        from sim_backends.emulated.medium.air_log import LIMIT_BYTES  # noqa: PLC0415 (it imports numpy, which is slow)
-
         return LIMIT_BYTES
 
     def cast(self, topology: Topology) -> Cast:
@@ -259,20 +258,21 @@ class EmulatedBackend:
 
     def overview(self) -> "Overview":
         """Implement `LabBackend.overview`, without shadowing, which depends on the seed."""
-        from sim_backends.emulated import interactive_lab, placement  # noqa: PLC0415 (as in `open`)
+        from sim_backends.emulated import interactive_lab, interactive_placement  # noqa: PLC0415 (as in `open`)
 
         members = self._members()
-        return interactive_lab.overview(members, placement.square_m(members, self._world), self._options, self._world)
+        positions_m = interactive_placement.square_m(members, self._world)
+        return interactive_lab.overview(members, positions_m, self._options, self._world)
 
     def gazebo_world(self, version: str) -> str:
         """Implement `GazeboWorlds.gazebo_world`; the robots are at their positions in an interactive lab."""
-        from sim_backends.emulated import placement, simulator_choice  # noqa: PLC0415 (as in `open`)
+        from sim_backends.emulated import interactive_placement, simulator_choice  # noqa: PLC0415 (as in `open`)
         from sim_backends.gazebo.sdf import SdfRobot, world_sdf  # noqa: PLC0415 (as above)
 
         members = self._members()
-        places_m = placement.square_m(members, self._world)
+        places_m = interactive_placement.square_m(members, self._world)
         robots = {
-            name: SdfRobot(body.limits, placement.below_antenna_m(places_m[name]), 0.0)
+            name: SdfRobot(body.limits, interactive_placement.below_antenna_m(places_m[name]), 0.0)
             for name, body in simulator_choice.bodies_of(members.values()).items()
         }
         step_ns = simulator_choice.sync_of(self._options).step_ns

@@ -13,11 +13,9 @@ from fieldkit.core.errors import LinkError, RobotError, TestbedLostError
 from sim_backends.emulated.process import namespaces
 from sim_backends.emulated.process.worker import REPLY_S, Worker
 from sim_backends.emulated.provisioning import LAPTOP_NAME
-from sim_backends.emulated.robot.init import START_S
-from sim_backends.emulated.robot.spec import HOME, RobotSpec
-from sim_backends.emulated.robot.ssh_server import SSH_PORT
+from sim_backends.emulated.robot.spec import HOME, SSH_PORT, START_S, RobotSpec
+from sim_backends.emulated.ros.assigned_path import AssignedPath
 from sim_backends.emulated.ros.motion_record import MotionRecord, RecordedMotion
-from sim_backends.emulated.ros.robot_motion import AssignedPath
 
 # The radio of the shipped robot profiles, so that a link has the same quality in both directions.
 LAPTOP_RADIO: Final = Radio(interface="wlan0", standard="802.11n 2.4 GHz", tx_power_dbm=17, sensitivity_dbm=-82)
@@ -136,7 +134,7 @@ class EmulatedRobot(Node):
     Args:
         spec: Specification of the robot.
         positions_fd: Descriptor of the shared memory that holds the positions of all robots
-            (`laser.PositionsWriter`). It must stay open until `build` has returned; None for a robot without
+            (`lab_positions.PositionsWriter`). It must stay open until `build` has returned; None for a robot without
             neighbours.
 
     Attributes:

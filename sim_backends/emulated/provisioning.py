@@ -25,7 +25,7 @@ from sim_backends.emulated.robot.spec import (
     RobotSpec,
     Ros2Spec,
 )
-from sim_backends.emulated.ros import static_frames
+from sim_backends.emulated.ros import message_definitions, static_frames
 from sim_backends.emulated.ros.sensor_specs import (
     GENERATED_TYPES,
     LASER_SCAN,
@@ -85,11 +85,9 @@ class KeyPair:
 def definition(kind: str, text: str = "") -> Definition:
     """Return the definition of the ROS 1 message type `package/Name`; `text` is used if ROS has no such type.
 
-    Raises the errors of `templates.template_of`.
+    Raises the errors of `message_definitions.definition_of`.
     """
-    from sim_backends.emulated.ros import templates  # noqa: PLC0415 (it imports rosbags, which takes 50 ms)
-
-    return templates.definition_of(kind, text)
+    return message_definitions.definition_of(kind, text)
 
 
 def sensors_of(robot: "Robot | LabRobot") -> tuple[Sensor, ...]:
@@ -100,7 +98,7 @@ def sensors_of(robot: "Robot | LabRobot") -> tuple[Sensor, ...]:
 def _definitions(robot: "Robot | LabRobot") -> dict[str, Definition]:
     """Return the definitions of the message types that a robot publishes.
 
-    Raises the errors of `templates.template_of`.
+    Raises the errors of `message_definitions.definition_of` and of `sensors_of`.
     """
     definitions = {topic.type: definition(topic.type, topic.definition) for topic in robot.profile.topics}
     if static_frames.links(sensors_of(robot)):
@@ -112,7 +110,7 @@ def _sensor(topic: PublishedTopic) -> Sensor:
     sensor = Sensor(topic.name, topic.type, topic.rate, topic.frame, topic.points, child_frame=topic.child_frame)
     if topic.type in GENERATED_TYPES:
         return sensor
-    from sim_backends.emulated.ros import templates  # noqa: PLC0415 (as above)
+    from sim_backends.emulated.ros import templates  # noqa: PLC0415 (few topics have other types)
 
     return replace(sensor, template=templates.template_of(topic))
 

@@ -152,7 +152,7 @@ class EmulatedTestbed:
         return DONE
 
     def inject(self, fault: Fault) -> float | None:
-        """Implement `Testbed.inject`; after an interrupt, the link, the position or the power is restored at once."""
+        """Implement `Testbed.inject`; after an interrupt, the link, the position or the power is restored."""
         robot = self.robots[fault.role]
         match fault.kind:
             case FaultKind.LINK_DOWN:

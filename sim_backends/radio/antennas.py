@@ -7,8 +7,8 @@ from typing import Protocol
 from fieldkit.config.antennas import AntennaOptions
 from fieldkit.config.wifi_phy import WifiPhy
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.radio.high_throughput import PhyCapability, capability_of, common_modes, mode_named
-from sim_backends.radio.modes import BAND_2_4, G_MODES, MODES, OFDM_MODES, Band, Standard, WifiMode
+from sim_backends.radio.phy.high_throughput import PhyCapability, capability_of, common_modes, mode_named
+from sim_backends.radio.phy.modes import BAND_2_4, G_MODES, MODES, OFDM_MODES, Band, Standard, WifiMode
 from sim_backends.radio.propagation.antenna_patterns import Dipole, GainTable, decode_pattern, pattern_of
 
 

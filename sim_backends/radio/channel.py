@@ -6,9 +6,9 @@ from typing import Protocol
 
 from fieldkit.config.wifi_phy import DscpMapping
 from fieldkit.core.model import Vector
-from sim_backends.radio.aggregation import AmpduLimits
-from sim_backends.radio.modes import BAND_2_4, Band
-from sim_backends.radio.rate_control import RateControl
+from sim_backends.radio.mac.aggregation import AmpduLimits
+from sim_backends.radio.phy.modes import BAND_2_4, Band
+from sim_backends.radio.rate_control.rate_control import RateControl
 
 
 class RadioChannel(Protocol):

@@ -10,10 +10,10 @@ take no airtime here, every beacon is received, and a station wakes up in no tim
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Final, Generic
 
-from sim_backends.radio.contention import EventQueue
-from sim_backends.radio.frames import Frame
 from sim_backends.radio.links import Payload
-from sim_backends.radio.stations import Station
+from sim_backends.radio.mac.contention import EventQueue
+from sim_backends.radio.mac.frames import Frame
+from sim_backends.radio.mac.stations import Station
 
 BEACON_INTERVAL_NS: Final = 102_400_000
 """100 time units of 1.024 ms: the default of access points."""

@@ -16,7 +16,6 @@ from fieldkit.config.schema import (
 )
 from fieldkit.core import units
 from fieldkit.core.errors import ConfigurationError, did_you_mean
-from sim_backends.radio.high_throughput import mode_names
 from sim_backends.radio.infrastructure.infrastructure_options import (
     AccessPointOptions,
     MicrowaveOvenOptions,
@@ -24,7 +23,8 @@ from sim_backends.radio.infrastructure.infrastructure_options import (
     RoamingOptions,
 )
 from sim_backends.radio.links import LinkParameters
-from sim_backends.radio.modes import G_MODES, N_MODES
+from sim_backends.radio.phy.high_throughput import mode_names
+from sim_backends.radio.phy.modes import G_MODES, N_MODES
 
 UNLIMITED: Final = "unlimited"
 

@@ -12,9 +12,6 @@ from typing import Generic
 
 from fieldkit.core.model import LinkSample
 from sim_backends.radio.channel import RadioChannel
-from sim_backends.radio.driver_statistics import RadioMeter, link_samples
-from sim_backends.radio.frame_exchange import FrameExchange
-from sim_backends.radio.frames import Emission, Frame, TransmissionAttempt
 from sim_backends.radio.links import (
     PACKET,
     PROCESSING_NS,
@@ -26,11 +23,15 @@ from sim_backends.radio.links import (
     Pair,
     Payload,
 )
-from sim_backends.radio.modes import SHORT_RETRY_LIMIT
-from sim_backends.radio.packet_delivery import PacketDelivery
+from sim_backends.radio.mac.driver_statistics import RadioMeter, link_samples
+from sim_backends.radio.mac.frame_exchange import FrameExchange
+from sim_backends.radio.mac.frames import Frame, TransmissionAttempt
+from sim_backends.radio.mac.packet_delivery import PacketDelivery
+from sim_backends.radio.mac.stations import Station
+from sim_backends.radio.phy.modes import SHORT_RETRY_LIMIT
+from sim_backends.radio.phy.transmissions import Emission
 from sim_backends.radio.power_save import BEACON_INTERVAL_NS, DTIM_PERIOD, PowerSave
 from sim_backends.radio.random_streams import PacketIdentity, RandomStream
-from sim_backends.radio.stations import Station
 
 
 class Wifi(Generic[Payload]):
@@ -76,7 +77,8 @@ class Wifi(Generic[Payload]):
 
     def log_attempts(self, log: Callable[[TransmissionAttempt], None] | None) -> None:
         """Pass every transmission attempt that ends from now on to `log`; None stops logging."""
-        self._exchange.log = self._exchange.rts_cts.log = log
+        exchange = self._exchange
+        exchange.log = exchange.rts_cts.log = exchange.acknowledgements.log = log
 
     def log_losses(self, log: LossLog | None) -> None:
         """Pass every later loss to `log`; None stops logging."""
@@ -84,7 +86,8 @@ class Wifi(Generic[Payload]):
 
     def use_meter(self) -> None:
         """Start the counters of the radio drivers, for `sample`."""
-        self._exchange.meter = self._exchange.rts_cts.meter = RadioMeter(len(self._stations))
+        exchange = self._exchange
+        exchange.meter = exchange.rts_cts.meter = exchange.acknowledgements.meter = RadioMeter(len(self._stations))
 
     def sample(self, now_ns: int, utc_ns: int) -> dict[str, LinkSample]:
         """Implement `RadioModel.sample`."""

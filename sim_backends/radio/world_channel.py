@@ -12,23 +12,24 @@ from typing_extensions import override
 from fieldkit.config.wifi_phy import DscpMapping
 from fieldkit.core.model import Vector
 from fieldkit.core.seeds import place_seed
-from sim_backends.radio.aggregation import AMPDU_LIMITS, TYPICAL_FRAMES, AmpduLimits
-from sim_backends.radio.amsdu import limits_with_amsdu
 from sim_backends.radio.antennas import Antenna, band_of, fixed_mode, modes_between
 from sim_backends.radio.channel import RadioChannel
-from sim_backends.radio.error_rates import packet_error
-from sim_backends.radio.firmware_rate import FirmwareRate
-from sim_backends.radio.frames import decibel
-from sim_backends.radio.high_throughput import common_modes, mode_groups
-from sim_backends.radio.minstrel_ht import MinstrelHt
-from sim_backends.radio.modes import OFDM_MODES
-from sim_backends.radio.propagation.antenna_patterns import StationGains
+from sim_backends.radio.mac.aggregation import AMPDU_LIMITS, TYPICAL_FRAMES, AmpduLimits
+from sim_backends.radio.mac.amsdu import limits_with_amsdu
+from sim_backends.radio.phy.error_rates import packet_error
+from sim_backends.radio.phy.high_throughput import common_modes, mode_groups
+from sim_backends.radio.phy.modes import OFDM_MODES
+from sim_backends.radio.phy.transmissions import decibel
 from sim_backends.radio.propagation.fading import Fading
 from sim_backends.radio.propagation.link_caches import GainCache, LinkRow
 from sim_backends.radio.propagation.mean_loss import MeanLoss
+from sim_backends.radio.propagation.station_gains import StationGains
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.random_streams import PacketDraws
-from sim_backends.radio.rate_control import FixedRate, Minstrel, RateControl
+from sim_backends.radio.rate_control.firmware_rate import FirmwareRate
+from sim_backends.radio.rate_control.minstrel import Minstrel
+from sim_backends.radio.rate_control.minstrel_ht import MinstrelHt
+from sim_backends.radio.rate_control.rate_control import FixedRate, RateControl
 from sim_backends.world.materials import SPEED_OF_LIGHT_M_S
 from sim_backends.world.motion import STILL, Attitude
 from sim_backends.world.shapes import Floats
@@ -265,7 +266,7 @@ class WorldChannel(RadioChannel):
         obstacles_db = self._mean_loss.obstacles_db(start, end)
         # Any obstacle on the path adds loss and removes the constant component.
         k = np.where(obstacles_db == 0, 10 ** (self._options.k_db / 10), 0.0)
-        loss_db = reverse_db = self._mean_loss.open_db(start, end) + obstacles_db
+        loss_db = reverse_db = self._mean_loss.loss_without_obstacles_db(start, end) + obstacles_db
         if self._station_gains is not None:
             k = self._add_antennas(stale, loss_db, k)
         if self._specified_db is not None:

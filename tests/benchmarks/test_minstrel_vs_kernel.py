@@ -11,7 +11,7 @@ from benchmarks import minstrel_vs_kernel as study
 from benchmarks.kernel_minstrel import tries_of
 from benchmarks.minstrel_vs_kernel import SelectedFrame
 from sim_backends.emulated.linux_wifi.virtual_machine import ROOT_VARIABLE
-from sim_backends.radio import minstrel_ht
+from sim_backends.radio.rate_control import minstrel_ht
 from tests.helpers.paths import ROOT
 
 SEEDS = range(2)

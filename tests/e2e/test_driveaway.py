@@ -11,7 +11,7 @@ from fieldkit.config.profiles import load_profile
 from fieldkit.core.model import Role, TrackPoint
 from fieldkit.measure.evidence import track
 from sim_backends.radio.antennas import antenna_of
-from sim_backends.radio.modes import N_MODES
+from sim_backends.radio.phy.modes import N_MODES
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.world_channel import WorldChannel
 from tests.helpers.paths import ROOT

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 
 from sim_backends.radio.channel import RadioChannel
-from sim_backends.radio.frames import TransmissionAttempt
-from sim_backends.radio.modes import WifiMode
-from sim_backends.radio.rate_control import FixedRate, RateControl
+from sim_backends.radio.mac.frames import TransmissionAttempt
+from sim_backends.radio.phy.modes import WifiMode
+from sim_backends.radio.rate_control.rate_control import FixedRate, RateControl
 from sim_backends.radio.wifi import Wifi
 
 NOISE_MW = 1e-9

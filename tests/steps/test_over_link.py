@@ -14,6 +14,7 @@ from fieldkit.steps.kinds.fault import FaultStep
 from fieldkit.steps.kinds.iperf3 import Iperf3Step
 from fieldkit.steps.kinds.ping import PingStep
 from fieldkit.steps.kinds.send import SendStep
+from fieldkit.steps.kinds.soak import SoakStep
 from fieldkit.steps.over_link import judge_route
 from fieldkit.steps.scene import CommandResult, Scene
 from tests.helpers.casts import CAST, TURTLEBOT
@@ -153,6 +154,25 @@ def test_the_route_must_use_the_interface_of_the_link(output: str, code: int, ve
     actual, _, remedy = judge_route(sender_link, receiver_link, CommandResult(output, code))
     assert actual is verdict
     assert ("ip route replace 100.64.0.2 dev wwan0" in remedy) == (verdict is Verdict.FAIL)
+
+
+@pytest.mark.parametrize(
+    ("kind", "keys"),
+    [
+        (PingStep, "from: sender, to: receiver"),
+        (SendStep, "from: sender, to: receiver, size: 5kB"),
+        (Iperf3Step, "from: sender, to: receiver"),
+        (SoakStep, "from: sender, to: receiver, during: [{ping: {from: sender, to: receiver}}]"),
+    ],
+)
+def test_each_sending_step_checks_the_routes_in_both_directions(kind: type[Step], keys: str) -> None:
+    def routes(link: str) -> list[tuple[Role, str]]:
+        step = parse_step(kind, f"{keys}{link}")
+        assert isinstance(step, HasNeeds)
+        return [(need.role, need.argv[-1]) for need in step.needs(SCENE) if "route" in need.argv]
+
+    assert routes(", over: cell") == [(Role.SENDER, "100.64.0.2"), (Role.RECEIVER, "100.64.0.1")]
+    assert routes(", over: either") == routes("") == []
 
 
 def test_two_links_with_one_interface_are_rejected() -> None:

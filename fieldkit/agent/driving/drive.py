@@ -1,8 +1,8 @@
 """Drive a ground robot along its path through its velocity topic, in a closed loop with its odometry.
 
 The laptop renews its order repeatedly (`orders`). If no order arrives within the lease of the task, the robot stops,
-because the laptop or the link to it is probably lost. Velocities are published `RATE_HZ` times per second; the base
-of a robot stops if no more velocities arrive.
+because the laptop or the link to it is probably lost. Velocities are published `RATE_HZ` times per second. If this
+program is killed, only the base can stop the robot: it must have a timeout for velocities (docs/stopping.md).
 """
 
 from __future__ import annotations
@@ -174,7 +174,8 @@ def _report(
     The last state, which has an `end_reason`, is written to the log in any phase. Nothing is written before the
     origin is known. The status also contains `pose`, the pose in the frame of the odometry; `frame_id`, the boot ID,
     which identifies this frame because odometry restarts at each boot; `ready`, True if the robot is stationary and
-    may start; and `refused`, True if it did not start because it is not at the required place.
+    may start; and `refused`, True if it did not start because it is not at the required place, or because its
+    odometry uses another frame than its origin.
     """
     relative_pose, pose = driver.relative_pose, driver.pose
     if relative_pose is None or pose is None:

@@ -85,7 +85,7 @@ def bring_down(
         if now_s > start_s + _LANDING_TIMEOUT_S:
             raise FlightError(REFUSED, f"its motors are still running, although it was commanded to {action}")
         if min(drone.heartbeat_age_s, now_s - start_s) > NO_HEARTBEAT_S:
-            raise FlightError(REFUSED, f"no heartbeat of the autopilot for {NO_HEARTBEAT_S:g} s")
+            raise FlightError(REFUSED, f"no heartbeat from the autopilot for {NO_HEARTBEAT_S:g} s")
         if not drone.alive and not has_warned:
             log_line(alarm(drone))
         has_warned = not drone.alive

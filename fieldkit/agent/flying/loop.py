@@ -187,7 +187,7 @@ class FlightLoop:
         if drone.heartbeat_age_s > _FLIGHT_HEARTBEAT_TIMEOUT_S:
             connection_note = ", its connection is closed" if self.session.link.lost_since_s is not None else ""
             raise FlightError(
-                REFUSED, f"no heartbeat of the autopilot for {_FLIGHT_HEARTBEAT_TIMEOUT_S:g} s{connection_note}"
+                REFUSED, f"no heartbeat from the autopilot for {_FLIGHT_HEARTBEAT_TIMEOUT_S:g} s{connection_note}"
             )
         if not drone.guided:
             if self._liveness is not None and self._liveness.other_state == LANDING:
@@ -220,6 +220,6 @@ def wait_for_heartbeat(
         if stop_event.is_set():
             raise FlightError(CANCELLED, "the job was cancelled")
         if time.monotonic() > start_s + HEARTBEAT_S:
-            raise FlightError(REFUSED, f"no heartbeat of an autopilot at {connection} in {HEARTBEAT_S:g} s")
+            raise FlightError(REFUSED, f"no heartbeat from an autopilot at {connection} in {HEARTBEAT_S:g} s")
         each_iteration()
         session.exchange(1 / RATE_HZ)

@@ -90,7 +90,7 @@ def _wait_for_autopilot(session: AutopilotSession, deadline_s: float) -> None:
     warning_s = time.monotonic() + _ALARM_DELAY_S
     while not session.drone.alive:
         if time.monotonic() > deadline_s:
-            raise FlightError(REFUSED, f"no heartbeat of the autopilot in {NO_HEARTBEAT_S:g} s")
+            raise FlightError(REFUSED, f"no heartbeat from the autopilot in {NO_HEARTBEAT_S:g} s")
         if time.monotonic() > warning_s:
             log_line(alarm(session.drone))
             warning_s = deadline_s  # no second alarm

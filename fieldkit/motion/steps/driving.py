@@ -12,10 +12,10 @@ from typing import Any, Final
 from fieldkit.agent.driving import drive_plan
 from fieldkit.agent.driving.drive_plan import DriveTask
 from fieldkit.backends.protocols import Robot, Testbed
-from fieldkit.core import geometry
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, LinkError, MotionHeldError, RobotError, describe_exception
 from fieldkit.core.model import Move
+from fieldkit.motion import driven_paths
 from fieldkit.motion.logs import drive_log
 from fieldkit.motion.origins import RobotMotion, origins_of
 from fieldkit.motion.profile_sections import TWIST_STAMPED, Drive, drive_of
@@ -66,7 +66,7 @@ def middleware_of(robot: Robot) -> MiddlewareName:
 
 def limit_s(move: Move) -> float:
     """Return the maximum duration of a move in one direction, in seconds; the robot stops after this time."""
-    return 2 * geometry.length_m(move) / move.speed_m_s + _TURN_S * (len(move.legs) + 1) + _SLACK_S
+    return 2 * driven_paths.length_m(move) / move.speed_m_s + _TURN_S * (len(move.legs) + 1) + _SLACK_S
 
 
 def path_duration_s(robot: Robot, move: Move) -> float:
@@ -109,7 +109,7 @@ def refusals(scene: Scene, move: Move) -> Iterator[Refusal]:
     """Yield the reasons why a robot must not drive automatically."""
     robot = scene.robot(move.role)
     limits = robot.profile.limits
-    farthest_m = geometry.farthest_m(move.legs)
+    farthest_m = driven_paths.farthest_m(move.legs)
     if limits.fence_m is not None and farthest_m > limits.fence_m:
         yield Refusal(
             move.role,

@@ -1,6 +1,7 @@
 """Formats of bags, which are detected by the first bytes of their files."""
 
 import os
+import re
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -58,8 +59,8 @@ class BagFiles:
         path: The path that is opened: a file, or the folder of a ROS 2 bag. It is the folder also for a file that is
             the only data file of a folder with metadata.
         format: Its format.
-        files: Its data files, sorted by name. For more than ten files this is not the order of recording, because
-            `bag_10.mcap` is before `bag_2.mcap`.
+        files: Its data files in the order of their numbers, which is the order of recording: `bag_2.mcap` is before
+            `bag_10.mcap`.
         closed: Whether the recorder has written the metadata of a ROS 2 bag: metadata.yaml, or the end of a single
             MCAP file. Always True for ROS 1, whose index is in the file and is checked later.
     """
@@ -111,7 +112,7 @@ def _bag_from_file(path: Path, bag_format: BagFormat) -> BagFiles:
 
 def _bag_in_folder(folder: Path) -> BagFiles:
     """Return the bag in a folder: a ROS 2 bag with one or more data files, or a single file without metadata."""
-    files = sorted(file for file in folder.iterdir() if file.is_file())
+    files = sorted((file for file in folder.iterdir() if file.is_file()), key=_numbers_by_value)
     bag_files = [(file, bag_format) for file in files if (bag_format := _format_or_none(file)) is not None]
     if len(bag_files) == 1 and not (folder / METADATA).is_file():
         return _bag_from_file(*bag_files[0])
@@ -124,6 +125,11 @@ def _bag_in_folder(folder: Path) -> BagFiles:
             f"this folder contains several bags: {names}", where=str(folder), remedy="name one of them"
         )
     return BagFiles(folder, formats.pop(), tuple(file for file, _ in bag_files), (folder / METADATA).is_file())
+
+
+def _numbers_by_value(file: Path) -> tuple[str | int, ...]:
+    """Return a sort key of a file name that orders numbers by their value."""
+    return tuple(int(part) if index % 2 else part for index, part in enumerate(re.split(r"([0-9]+)", file.name)))
 
 
 def _is_closed_mcap(file: Path, bag_format: BagFormat) -> bool:

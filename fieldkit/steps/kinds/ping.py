@@ -178,7 +178,7 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
 
     @override
     def needs(self, scene: Scene) -> Iterator[Need]:
-        yield from self.route_need(scene, self.sender, self.receiver)
+        yield from self.route_needs(scene, self.sender, self.receiver)
         if self.forwarded:
             yield from routing.needs(scene)
 

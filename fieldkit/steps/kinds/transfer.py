@@ -150,7 +150,7 @@ class TransferStep(
 
     @override
     def needs(self, scene: Scene) -> Iterator[Need]:
-        yield from self.route_need(scene, self.sender, self.receiver)
+        yield from self.route_needs(scene, self.sender, self.receiver)
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:

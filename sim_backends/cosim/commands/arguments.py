@@ -25,6 +25,7 @@ def add(parser: Parser) -> None:
     _add_shootout(commands)
     _add_table(commands)
     _add_satisfy(commands)
+    _add_goodput(commands)
     _add_plot(commands)
     _add_replay(commands)
     _add_conform(commands)
@@ -205,6 +206,22 @@ def _add_satisfy(commands: Commands) -> None:
     _add_seed(parser, "the first seed of the scenario")
     _add_format(parser)
     parser.set_defaults(run=f"{_PACKAGE}.satisfy:run")
+
+
+def _add_goodput(commands: Commands) -> None:
+    parser: Parser = commands.add_parser(
+        "goodput",
+        help="predict the goodput of logged Wi-Fi links",
+        description="Predict the goodput of Wi-Fi links from a log of their signals, channel widths and MCS, and "
+        "compare it with measured goodputs. LOG is a CSV file with a row per link; its columns are signal_dbm and, "
+        "if known, standard, width_mhz, streams, guard_interval_ns, mcs, phy_rate_bit_s, protocol, goodput_bit_s.",
+        epilog="example: fieldkit cosim goodput links.csv --format csv > predicted.csv",
+    )
+    parser.add_argument("log", type=Path, metavar="LOG", help="CSV file of the links")
+    _add_changes(parser)
+    add_workers(parser)
+    _add_format(parser)
+    parser.set_defaults(run=f"{_PACKAGE}.goodput:run")
 
 
 def _add_plot(commands: Commands) -> None:

@@ -6,10 +6,12 @@ Documentation/driver-api/early-userspace/buffer-format.rst). This module writes 
 program `cpio` would have to be installed, and would need a copy of each file.
 """
 
+import gzip
+import lzma
 import re
 import stat
 import subprocess
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -36,7 +38,13 @@ libcrc32c, on which nf_tables depends, needs crc32c_generic; ccm, cmac and gcm a
 ccm and gcm need ctr.
 """
 
-_SUFFIX: Final = ".ko"
+_DECOMPRESSORS: Final[Mapping[str, Callable[[bytes], bytes]]] = {
+    ".ko": bytes,
+    ".ko.xz": lzma.decompress,
+    ".ko.gz": gzip.decompress,
+}
+"""Functions that decompress a module, by the end of its file name. Debian 13 uses xz, 12 nothing."""
+
 _DEPENDS: Final = re.compile(rb"\0depends=([^\0]*)\0")
 
 _SIGNED: Final = b"~Module signature appended~\n"
@@ -86,50 +94,61 @@ def build_initrd(modules: Path, *, radios: int, job: str, output: str) -> bytes:
     Raises:
         ConfigurationError: A program, library or module is missing.
     """
-    order = module_order(modules, MODULES)
+    ordered = module_order(modules, MODULES)
     files = {"init": (0o755, _START.format(radios=radios, job=job, output=output).encode())}
-    files["modules"] = 0o644, "\n".join(path.name.removesuffix(_SUFFIX) for path in order).encode()
-    files |= {f"lib/{path.name}": (0o644, without_signature(path.read_bytes())) for path in order}
+    files["modules"] = 0o644, "\n".join(ordered).encode()
+    files |= {f"lib/{name}.ko": (0o644, without_signature(module)) for name, module in ordered.items()}
     busybox = _program("busybox")
     files["bin/busybox"] = 0o755, busybox.read_bytes()
     files |= {str(path).lstrip("/"): (0o755, path.read_bytes()) for path in shared_libraries(busybox)}
     return cpio_archive(files, ("bin", "lib", "proc", "sys", "dev", "host", "changed"))
 
 
-def module_order(modules: Path, names: Iterable[str]) -> list[Path]:
-    """Return the files of modules and of their dependencies; a module follows its dependencies.
+def find_modules(folder: Path, pattern: str = "*") -> dict[str, Path]:
+    """Return the files of modules in a folder and its subfolders, by name with `_` for `-`; names match a pattern."""
+    return {_module_name(path): path for suffix in _DECOMPRESSORS for path in folder.rglob(f"{pattern}{suffix}")}
+
+
+def _module_name(path: Path) -> str:
+    """Return the name of a module: that of its file, without suffixes and with `_` for `-`."""
+    return path.name.partition(".")[0].replace("-", "_")
+
+
+def module_order(folder: Path, names: Iterable[str]) -> dict[str, bytes]:
+    """Return the decompressed modules and their dependencies, by name; a module follows its dependencies.
 
     Modules that are built into the kernel (`modules.builtin`) are omitted.
 
     Raises:
         ConfigurationError: A module is missing.
     """
-    paths = {path.name.removesuffix(_SUFFIX).replace("-", "_"): path for path in modules.rglob(f"*{_SUFFIX}")}
-    builtin_list = modules / "modules.builtin"
+    paths = find_modules(folder)
+    builtin_list = folder / "modules.builtin"
     builtin = set()
     if builtin_list.exists():
-        lines = builtin_list.read_text(encoding="ascii").split()
-        builtin = {Path(line).name.removesuffix(_SUFFIX).replace("-", "_") for line in lines}
-    order: dict[str, Path] = {}
+        builtin = {_module_name(Path(line)) for line in builtin_list.read_text(encoding="ascii").split()}
+    ordered: dict[str, bytes] = {}
 
     def add(name: str) -> None:
         """Add a module after its dependencies."""
-        if name in order or name in builtin:
+        if name in ordered or name in builtin:
             return
         if name not in paths:
             raise ConfigurationError(
-                f"the kernel module {name} is missing in {modules}",
+                f"the kernel module {name} is missing in {folder}",
                 remedy="install the distribution's standard kernel, on Debian: apt-get install linux-image-amd64",
             )
-        depends = _DEPENDS.search(paths[name].read_bytes())
+        path = paths[name]
+        module = _DECOMPRESSORS["." + path.name.partition(".")[2]](path.read_bytes())
+        depends = _DEPENDS.search(module)
         for dependency in depends[1].decode().split(",") if depends else []:
             if dependency:
                 add(dependency.replace("-", "_"))
-        order[name] = paths[name]
+        ordered[name] = module
 
     for name in names:
         add(name.replace("-", "_"))
-    return list(order.values())
+    return ordered
 
 
 def without_signature(module: bytes) -> bytes:

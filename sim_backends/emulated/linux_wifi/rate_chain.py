@@ -23,7 +23,7 @@ from sim_backends.emulated.linux_wifi.hwsim_messages import (
     RATE_VHT,
     RateStage,
 )
-from sim_backends.radio.modes import G_MODES, N_MODES, SHORT_RETRY_LIMIT, WifiMode
+from sim_backends.radio.phy.modes import G_MODES, N_MODES, SHORT_RETRY_LIMIT, WifiMode
 
 _DSSS_RATES: Final = 4
 """Number of DSSS and CCK rates (1, 2, 5.5 and 11 Mbit/s) at the beginning of the list of the 2.4 GHz band."""

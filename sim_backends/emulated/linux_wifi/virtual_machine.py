@@ -25,7 +25,7 @@ from typing import Final
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, TestbedLostError
-from sim_backends.emulated.linux_wifi.initrd import build_initrd
+from sim_backends.emulated.linux_wifi.initrd import build_initrd, find_modules
 from sim_backends.emulated.process.worker import PATH
 
 PACKAGE_OF: Final = {
@@ -110,14 +110,11 @@ def find_program(name: str, roots: Sequence[Path]) -> str | None:
 
 
 def find_kernel(roots: Sequence[Path] = (Path("/"),)) -> Kernel | None:
-    """Return the newest kernel with hwsim of the first folder that has one in `boot/` and `lib/modules/`, or None.
-
-    A kernel whose modules are compressed is not found.
-    """
+    """Return the newest kernel with hwsim of the first folder that has one in `boot/` and `lib/modules/`, or None."""
     for root in roots:
         for image in sorted(root.glob("boot/vmlinuz-*"), key=_version, reverse=True):
             modules = root / "lib/modules" / image.name.removeprefix("vmlinuz-")
-            if any(modules.rglob("mac80211_hwsim.ko")):
+            if find_modules(modules, "mac80211_hwsim"):
                 return Kernel(image, modules)
     return None
 

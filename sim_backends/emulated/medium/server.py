@@ -19,13 +19,14 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import LinkSample, Vector
 from sim_backends.emulated.medium.air_log import AirLog
 from sim_backends.emulated.medium.framing import Framing
-from sim_backends.emulated.medium.ports import FlowDelays, MediumStats, Port, pack_links, pack_stats
+from sim_backends.emulated.medium.medium_stats import MediumStats, pack_links, pack_stats
+from sim_backends.emulated.medium.ports import FlowDelays, Port
 from sim_backends.emulated.medium.timerfd import Timer
 from sim_backends.emulated.process import worker
 from sim_backends.emulated.process.worker import Message
 from sim_backends.radio.antennas import Antenna, decode_antenna
-from sim_backends.radio.frames import TransmissionAttempt
 from sim_backends.radio.links import LinkCounters, Pair
+from sim_backends.radio.mac.frames import TransmissionAttempt
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.motion import Attitude
 from sim_backends.world.world import World

@@ -16,9 +16,9 @@ from fieldkit.remote.command import with_environment
 from sim_backends.emulated.autopilot import mavlink_server as autopilot
 from sim_backends.emulated.process import worker
 from sim_backends.emulated.robot import base_process, network, ssh_server, wireless
-from sim_backends.emulated.robot.spec import ANTENNA_M, HOME, STATE, RobotSpec
+from sim_backends.emulated.robot.spec import ANTENNA_M, HOME, ROSCORE, SSH_PORT, STATE, RobotSpec
 from sim_backends.emulated.ros import sensors, static_frames, tcpros
-from sim_backends.emulated.ros.laser import Neighbourhood
+from sim_backends.emulated.ros.lab_positions import Neighbourhood
 
 _LOG_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_APPEND
 _LOG_MODE: Final = 0o600
@@ -37,7 +37,6 @@ FLIGHT: Final = Path(STATE, "flown")
 
 READY_FOLDER: Final = f"{STATE}/ready"
 
-ROSCORE: Final = "/usr/bin/roscore"
 _ROSMASTER: Final = "/usr/bin/rosmaster"
 _RELAY: Final = Path(__file__).with_name("ros_relay.py")
 
@@ -139,7 +138,7 @@ def services(spec: RobotSpec, neighbourhood: Neighbourhood | None = None) -> lis
     if neighbourhood is not None and spec.neighbours:
         publish = partial(publish, moving_targets=partial(neighbourhood.targets, spec.neighbours))
     result = [
-        _program("sshd", ssh_server.command(spec), {}, lambda: network.has_listener(ssh_server.SSH_PORT)),
+        _program("sshd", ssh_server.command(spec), {}, lambda: network.has_listener(SSH_PORT)),
         _motion_service("sensors", publish),
     ]
     if spec.mavlink_port is not None:

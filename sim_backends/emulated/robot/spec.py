@@ -25,6 +25,14 @@ USER: Final = "root"
 HOME: Final = "/root"
 STATE: Final = "/run/robot"
 """Folder in the robot that its init process writes to: files mounted over `/etc`, logs, readiness files."""
+ROBOT_FILES: Final = tuple(f"/etc/{name}" for name in ("passwd", "group", "shadow", "hostname", "hosts"))
+"""System files that each robot has separately."""
+ROSCORE: Final = "/usr/bin/roscore"
+"""Program of a ROS master that serves several robots."""
+
+SSH_PORT: Final = 22
+START_S: Final = 30.0
+"""Timeout for the start of a robot's programs; Debian's ROS takes a few seconds on a busy machine."""
 
 LOOPBACK_INTERFACE: Final = "lo"
 """Interface of a link without a device of its own: the robot has an address on its loopback interface, which the

@@ -71,7 +71,7 @@ _PROTECTION: Final = {"wpa2": 0, "wpa3": 2}
 MONITOR: Final = "mon0"
 """Name of the monitor interface, which captures all frames that the radio receives or sends.
 
-Sent frames contain the number of their transmission attempts.
+The radiotap header of a sent frame contains the number of its retransmissions.
 """
 _INTERFACE_TYPES: Final = {"ad hoc": "ibss", "mesh point": "mp"}
 

@@ -13,11 +13,11 @@ from typing import Final, Protocol
 from typing_extensions import override
 
 from sim_backends.radio.channel import RadioChannel
-from sim_backends.radio.contention import EventQueue
-from sim_backends.radio.frames import HEADER_BYTES, Frame
 from sim_backends.radio.links import NOT_ASSOCIATED, RADIO_OFF, Payload
-from sim_backends.radio.packet_delivery import PacketDelivery
-from sim_backends.radio.stations import Peer, Station
+from sim_backends.radio.mac.contention import EventQueue
+from sim_backends.radio.mac.frames import HEADER_BYTES, Frame
+from sim_backends.radio.mac.packet_delivery import PacketDelivery
+from sim_backends.radio.mac.stations import Peer, Station
 
 # Expedited forwarding: access category voice or video.
 _HIGHEST_DSCP: Final = 46

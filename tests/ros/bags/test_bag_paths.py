@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from fieldkit.ros.bags import bag, contents
+from fieldkit.ros.bags import bag, contents, formats
 from fieldkit.ros.bags.formats import BagFormat
 from tests.ros.bags.test_bag_command import data_file, expected, write_bag
 
@@ -62,3 +62,11 @@ def test_bag_is_written_at_any_path(bags: dict[BagFormat, Path], tmp_path: Path,
         assert (contents_of_bag.problems, contents_of_bag.messages) == ((), COUNT)
         assert data_file(tmp_path / name / name_of_bag).name == f"{name_of_bag}.db3"
     assert {path.name for path in tmp_path.iterdir()} == {name}
+
+
+def test_data_files_are_in_the_order_of_their_numbers(bags: dict[BagFormat, Path], tmp_path: Path) -> None:
+    names = [f"run_{number}.mcap" for number in range(12)]
+    for name in names:
+        shutil.copy(data_file(bags[BagFormat.MCAP]), tmp_path / name)
+    (tmp_path / "metadata.yaml").write_text("")
+    assert [file.name for file in formats.find(tmp_path).files] == names

@@ -17,7 +17,7 @@ from sim_backends.radio.links import (
     RETRIES_EXHAUSTED,
 )
 from sim_backends.radio.model import RadioModel, WifiInWorld
-from sim_backends.radio.modes import G_MODES, SHORT_RETRY_LIMIT
+from sim_backends.radio.phy.modes import G_MODES, SHORT_RETRY_LIMIT
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.wifi import Wifi
 from tests.helpers.nightly import examples

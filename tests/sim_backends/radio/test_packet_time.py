@@ -6,9 +6,9 @@ import pytest
 
 from fieldkit.config.profiles import Radio
 from sim_backends.radio.antennas import Antenna, antenna_of
-from sim_backends.radio.high_throughput import PhyCapability
 from sim_backends.radio.links import QUEUE_FULL, delay_parts
 from sim_backends.radio.model import WifiInWorld
+from sim_backends.radio.phy.high_throughput import PhyCapability
 from sim_backends.radio.radio_options import RadioOptions
 
 MS = 10**6

@@ -9,7 +9,7 @@ from typing_extensions import override
 from fieldkit.config.profiles import Radio
 from sim_backends.radio.antennas import antenna_of
 from sim_backends.radio.links import RADIO_OFF, delay_parts
-from sim_backends.radio.modes import G_MODES
+from sim_backends.radio.phy.modes import G_MODES
 from sim_backends.radio.power_save import BEACON_INTERVAL_NS, DTIM_PERIOD
 from sim_backends.radio.random_streams import RandomStream
 from sim_backends.radio.wifi import Wifi

@@ -19,7 +19,7 @@ from sim_backends.radio.links import (
     delay_parts,
     processing_ns,
 )
-from sim_backends.radio.modes import G_MODES
+from sim_backends.radio.phy.modes import G_MODES
 from sim_backends.radio.wifi import Wifi
 from tests.helpers.stations import FixedPowers
 

@@ -9,8 +9,8 @@ import scipy
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.radio.error_rates import bit_error, decoded_bit_error, packet_error
-from sim_backends.radio.modes import G_MODES, N_MODES, WifiMode, ack_ns, control_mode
+from sim_backends.radio.phy.error_rates import bit_error, decoded_bit_error, packet_error
+from sim_backends.radio.phy.modes import G_MODES, N_MODES, WifiMode, ack_ns, control_mode
 from sim_backends.radio.propagation import path_loss
 from sim_backends.radio.propagation.fading import Fading, Shadowing
 from sim_backends.world.materials import SPEED_OF_LIGHT_M_S

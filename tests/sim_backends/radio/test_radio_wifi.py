@@ -8,14 +8,14 @@ import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_backends.radio.contention import CCA_TIME_NS
-from sim_backends.radio.error_rates import packet_error
-from sim_backends.radio.frames import HEADER_BYTES, TransmissionAttempt
 from sim_backends.radio.links import (
     Delivery,
     delay_parts,
 )
-from sim_backends.radio.modes import (
+from sim_backends.radio.mac.contention import CCA_TIME_NS
+from sim_backends.radio.mac.frames import HEADER_BYTES, TransmissionAttempt
+from sim_backends.radio.phy.error_rates import packet_error
+from sim_backends.radio.phy.modes import (
     CW_MIN,
     DIFS_NS,
     G_MODES,

@@ -8,9 +8,9 @@ import pytest
 from sim_backends.emulated.linux_wifi.air import Air, AirEvents, FrameOnAir
 from sim_backends.emulated.linux_wifi.hwsim_messages import FLAG_NO_ACK, RATE_MCS, RadioAddress, RateStage, SentFrame
 from sim_backends.radio.antennas import Antenna
-from sim_backends.radio.error_rates import packet_error
-from sim_backends.radio.frames import decibel
-from sim_backends.radio.modes import ACK_BYTES, G_MODES, N_MODES, SIFS_NS, ack_ns, control_mode
+from sim_backends.radio.phy.error_rates import packet_error
+from sim_backends.radio.phy.modes import ACK_BYTES, G_MODES, N_MODES, SIFS_NS, ack_ns, control_mode
+from sim_backends.radio.phy.transmissions import decibel
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.world_channel import WorldChannel
 
@@ -51,6 +51,12 @@ def signal_dbm(distance_m: float) -> float:
     channel = WorldChannel(1, dict.fromkeys("ab", ANTENNA), STEADY)
     channel.move(0, {"a": (0.0, 0.0, 1.0), "b": (distance_m, 0.0, 1.0)})
     return decibel(channel.powers_mw(0, 0)[1])
+
+
+def test_a_fixed_mode_in_the_radio_options_has_no_effect() -> None:
+    air = air_with(3.0, options=RadioOptions(fading=False, mode="a54"))
+    air.transmit(START_NS, frame(RateStage(4, 1)), "a", "b")
+    assert [reception.mode for reception in run(air)[0].receptions] == [G6]
 
 
 @pytest.mark.parametrize(

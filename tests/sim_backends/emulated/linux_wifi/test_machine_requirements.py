@@ -19,14 +19,15 @@ def test_all_missing_programs_are_listed_with_their_packages(tmp_path: Path) -> 
         assert f" {package}" in error_info.value.remedy
 
 
-def test_the_newest_kernel_with_hwsim_is_used(tmp_path: Path) -> None:
+@pytest.mark.parametrize("suffix", [".ko", ".ko.xz"])
+def test_the_newest_kernel_with_hwsim_is_used(tmp_path: Path, suffix: str) -> None:
     for version, has_hwsim in (("6.1.0-9-amd64", True), ("6.1.0-50-amd64", True), ("6.12.0-1-cloud-amd64", False)):
         modules = tmp_path / "lib/modules" / version / "kernel"
         modules.mkdir(parents=True)
         (tmp_path / "boot").mkdir(exist_ok=True)
         (tmp_path / "boot" / f"vmlinuz-{version}").touch()
         if has_hwsim:
-            (modules / "mac80211_hwsim.ko").touch()
+            (modules / f"mac80211_hwsim{suffix}").touch()
     kernel = find_kernel((tmp_path / "missing", tmp_path))
     assert kernel is not None
     assert kernel.image.name == "vmlinuz-6.1.0-50-amd64"

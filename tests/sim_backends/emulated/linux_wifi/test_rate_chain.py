@@ -12,7 +12,7 @@ from sim_backends.emulated.linux_wifi.hwsim_messages import (
     RateStage,
 )
 from sim_backends.emulated.linux_wifi.rate_chain import legacy_index, mode_of, rate_chain
-from sim_backends.radio.modes import SHORT_RETRY_LIMIT
+from sim_backends.radio.phy.modes import SHORT_RETRY_LIMIT
 
 
 @pytest.mark.parametrize(

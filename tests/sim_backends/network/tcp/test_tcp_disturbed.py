@@ -7,7 +7,7 @@ from sim_backends.network.ip import Fragment
 from sim_backends.network.packets import Packet
 from sim_backends.network.radio import RadioNetwork
 from sim_backends.network.tcp.connection import Tcp
-from sim_backends.radio.modes import ENERGY_DETECTION_DBM
+from sim_backends.radio.phy.modes import ENERGY_DETECTION_DBM
 from tests.helpers.radio_networks import MS, fixed, packets, standing, wifi
 
 SECOND = 1000 * MS

@@ -1,0 +1,1 @@
+"""Medium access control (MAC): contention, frames and their acknowledgements, aggregation, access categories."""

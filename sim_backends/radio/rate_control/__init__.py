@@ -1,0 +1,1 @@
+"""Rate control: selects the mode of each attempt to send a frame."""

@@ -1,0 +1,49 @@
+"""The interface of rate control, which selects the mode of the next frame; and a fixed mode."""
+
+from typing import Protocol
+
+from sim_backends.radio.phy.modes import WifiMode
+from sim_backends.radio.random_streams import PacketIdentity
+
+
+class RateControl(Protocol):
+    """Selects the mode of each attempt on one directed link.
+
+    Attributes:
+        is_probing: True if the most recent new frame must not be aggregated, because it is a sample of another mode.
+            Always False for a rate control that aggregates samples.
+    """
+
+    is_probing: bool = False
+
+    def choose(self, now_ns: int, packet: PacketIdentity, attempt: int) -> WifiMode:
+        """Return the mode of an attempt that starts at `now_ns`.
+
+        Args:
+            now_ns: Start time.
+            packet: Identity of the packet.
+            attempt: Number of the attempt for this packet, from 1.
+        """
+        ...
+
+    def report(self, mode: WifiMode, *, acknowledged: int, attempts: int = 1) -> None:
+        """Record the number of frames of an attempt, and the number of these that were acknowledged."""
+        ...
+
+
+class FixedRate(RateControl):
+    """Rate control that always selects the same mode.
+
+    Args:
+        mode: The mode.
+    """
+
+    def __init__(self, mode: WifiMode) -> None:
+        self._mode = mode
+
+    def choose(self, now_ns: int, packet: PacketIdentity, attempt: int) -> WifiMode:  # noqa: ARG002 (see RateControl)
+        """Implement `RateControl.choose`."""
+        return self._mode
+
+    def report(self, mode: WifiMode, *, acknowledged: int, attempts: int = 1) -> None:
+        """Implement `RateControl.report`."""

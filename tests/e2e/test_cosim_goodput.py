@@ -1,0 +1,58 @@
+"""`fieldkit cosim goodput`: predictions of logged links, rows without a prediction, and wrong logs."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.test_cosim_run import cosim
+
+HEAD = "signal_dbm,standard,width_mhz,mcs,protocol,goodput_bit_s"
+
+
+def write_log(tmp_path: Path, *rows: str, head: str = HEAD) -> Path:
+    log = tmp_path / "links.csv"
+    log.write_text("\n".join((head, *rows)) + "\n")
+    return log
+
+
+def test_predictions_are_compared_with_measurements(tmp_path: Path) -> None:
+    log = write_log(
+        tmp_path,
+        "-50,802.11n 2.4 GHz,20,7.0,udp,50e6",
+        "-50.1,802.11n 2.4 GHz,20,7,udp,",
+        ",802.11n 2.4 GHz,20,7,udp,50e6",
+        "-50,802.11n 2.4 GHz,160,7,udp,50e6",
+    )
+    completed = cosim(tmp_path, "goodput", str(log), "--format", "json")
+    assert completed.code == 0, completed.err
+    sheets = json.loads(completed.out)
+    first, second, without_signal, too_wide = sheets["links"]
+    # 64 frames of 1,532 bytes at 65 Mbit/s last 12.1 ms; preamble, backoff, spaces and block ACK last 0.2 ms.
+    assert first["predicted_goodput_bit_s"] == pytest.approx(60e6, rel=0.02)
+    assert second["predicted_goodput_bit_s"] == first["predicted_goodput_bit_s"], "signals are rounded to 0.5 dB"
+    assert first["error"] == pytest.approx(first["predicted_goodput_bit_s"] / 50e6 - 1)
+    assert (second["error"], without_signal["predicted_goodput_bit_s"]) == (None, None)
+    assert (too_wide["predicted_goodput_bit_s"], "160 MHz" in too_wide["reason"]) == (None, True)
+    narrow, wide = sheets["errors"]
+    assert (narrow["width_mhz"], narrow["rows"], narrow["compared"]) == (20, 2, 1)
+    assert narrow["median_error"] == narrow["p90_error"] == pytest.approx(first["error"])
+    assert (wide["width_mhz"], wide["rows"], wide["compared"], wide["mean_error"]) == (160, 1, 0, None)
+    assert "no prediction for 1 row: the log has no signal" in completed.err
+
+
+@pytest.mark.parametrize(
+    ("rows", "head", "expected"),
+    [
+        ((), HEAD, "the log has no rows"),
+        (("-50,x",), "rssi,standard", "there is no column signal_dbm"),
+        (("-50", "-5O"), "signal_dbm", "links.csv:3: signal_dbm is '-5O'"),
+        (("-50,7.5",), "signal_dbm,mcs", "links.csv:2: mcs is '7.5'"),
+        (("-50,sctp",), "signal_dbm,protocol", "the protocol 'sctp' is unknown"),
+        (("-50,802.11be",), "signal_dbm,standard", "the standard '802.11be' is unknown"),
+    ],
+)
+def test_wrong_logs_are_errors(tmp_path: Path, rows: tuple[str, ...], head: str, expected: str) -> None:
+    log = write_log(tmp_path, *rows, head=head)
+    completed = cosim(tmp_path, "goodput", str(log))
+    assert (completed.code, expected in completed.err) == (2, True), completed.err
