@@ -128,7 +128,7 @@ class BackgroundScan:
         others = (self._average << _WEIGHT_SHIFT) - self._average
         self._average = (others + last) >> _WEIGHT_SHIFT if self._average else last
         self.level_dbm = average_dbm = -(self._average >> _AVERAGE_SHIFT)
-        if self._beacons < _MIN_BEACONS:
+        if self._beacons < _MIN_BEACONS or self.short_ns == self.long_ns:
             return
         last_dbm = self._last_event_dbm
         if average_dbm < self.threshold_dbm and (last_dbm is None or average_dbm < last_dbm - SIGNAL_HYSTERESIS_DB):
@@ -145,7 +145,7 @@ class BackgroundScan:
 
         A scan is recent for 1 s if the long interval was in use, otherwise for 10 s.
         """
-        if self._interval_ns == self.long_ns and self.long_ns != self.short_ns:
+        if self._interval_ns == self.long_ns:
             self._interval_ns = self.short_ns
             may_scan = now_ns > self._last_ns + 1_000_000_000 and self._short_scans <= self._max_short_scans
             self.next_ns = now_ns if may_scan else now_ns + self.short_ns

@@ -73,6 +73,13 @@ def test_a_further_fall_scans_again_at_most_every_ten_seconds() -> None:
         assert schedule.next_ns == {1: 300, 5: 35, 8: 35, 16: 46}[at_s] * S
 
 
+def test_with_one_interval_the_signal_has_no_effect() -> None:
+    schedule = BackgroundScan.start(0, -50.0, threshold_dbm=-65.0, short_ns=S, long_ns=S)
+    for number in range(20):
+        schedule.on_beacon(number, -50.0 - 2 * number)
+    assert schedule.next_ns == S
+
+
 def test_many_short_scans_are_followed_by_a_long_interval() -> None:
     schedule, times_s = start_schedule(-80.0), []
     for _ in range(12):
