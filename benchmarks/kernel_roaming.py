@@ -136,7 +136,7 @@ class Lab:
         assert self._namespace.stdout is not None
         self._namespace.stdout.readline()
         radios[0].move_to_namespace(self._namespace.pid)
-        self.run_on_robot("nft", "-f", "-", text=wireless.PRIORITY_RULE)
+        self.run_on_robot("nft", "-f", "-", text=wireless.priority_rules(radios[0].interface))
         self.run_on_robot("ip", "link", "set", radios[0].interface, "up")
         self.run_on_robot("ip", "address", "add", "10.42.0.2/24", "dev", radios[0].interface)
 
