@@ -24,7 +24,8 @@ from benchmarks.archive_trials import write_archive
 
 WHERE: Final = 'distance_m < 20 and topology == "master"'
 AGE_S: Final = 3.0
-"""Minimum age of the tables at the first run: fieldkit writes no index entry for a table that is newer."""
+"""Minimum age of the tables at the first run; fieldkit writes no index entry for a table that changed in the last 2 s
+(`table_index.SETTLED_S`)."""
 
 
 def _fieldkit(archive: Path, out: Path, *options: str) -> Run:
@@ -37,7 +38,7 @@ def _peer(name: str, archive: Path, out: Path) -> Run:
 
 
 def figures(output: Path) -> dict[tuple[str, ...], tuple[float, ...]]:
-    """Return number, mean and median by condition from the JSON of fieldkit or of a peer."""
+    """Return count, mean and median by condition from the JSON of fieldkit or of a peer."""
     content = json.loads(output.read_bytes())
     if isinstance(content, list):
         return {tuple(map(str, row[:-3])): tuple(row[-3:]) for row in content}
@@ -67,7 +68,11 @@ def check(fieldkit_output: Path, peer_output: Path) -> None:
 
 
 def run_round(archive: Path, work: Path) -> dict[str, Run]:
-    """Return the runs of one round by name."""
+    """Run all programs once, and compare their outputs; return the runs by name.
+
+    Raises:
+        RuntimeError: The figures of two programs differ, or the outputs of fieldkit are not equal.
+    """
     cache = work / "cache"
     for file in cache.rglob("*.index"):
         file.unlink()
@@ -95,7 +100,7 @@ def run_round(archive: Path, work: Path) -> dict[str, Run]:
 
 
 def show(rounds: Sequence[Mapping[str, Run]]) -> None:
-    """Print a table. A ratio is computed in each round, and the median of all rounds is printed."""
+    """Print a table. Ratios are computed in each round, and the median of a ratio over all rounds is printed."""
     names = list(rounds[0])
     print(
         "| | wall time (s), median (lowest to highest) | processor time (s) | peak memory (MB) "

@@ -17,8 +17,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Role
 from sim_backends.emulated.nodes import EmulatedRobot
 from sim_backends.emulated.provisioning import KeyPair
-from sim_backends.emulated.robot.spec import USER
-from sim_backends.emulated.robot.ssh_server import SSH_PORT
+from sim_backends.emulated.robot.spec import SSH_PORT, USER
 from sim_backends.emulated.testbed import EmulatedTestbed
 
 SCRIPT: Final = Path(__file__).with_name("trial_overhead.sh")

@@ -37,6 +37,7 @@ from sim_backends.radio.model import WifiInWorld
 from sim_backends.radio.phy.modes import CHANNEL_6_HZ
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.motion import State
+from sim_backends.world.penetration import Obstacles
 from sim_backends.world.world import World
 
 SECONDS: Final = 10.0
@@ -122,7 +123,8 @@ def places_m(distance_m: float) -> dict[str, tuple[float, float, float]]:
 def loss_db(distance_m: float, *, wall: bool) -> float:
     """Return the path loss for ns-3, including the wall."""
     start_m, end_m = (np.array([place]) for place in places_m(distance_m).values())
-    return path_loss_db(distance_m) + float(world(wall=wall).penetration_loss_db(start_m, end_m, CHANNEL_6_HZ)[0])
+    obstacles = Obstacles(world(wall=wall))
+    return path_loss_db(distance_m) + float(obstacles.penetration_loss_db(start_m, end_m, CHANNEL_6_HZ)[0])
 
 
 class Link:

@@ -191,7 +191,7 @@ def frames_per_mcs(frames: Sequence[SelectedFrame]) -> Counter[str]:
 
 
 def rates_bit_s(frames: Sequence[SelectedFrame], window_ns: int = 1_000_000_000) -> list[float]:
-    """Return the mean rate of first tries in each window of time, without samples; other windows are omitted."""
+    """Return the mean rate of the first tries that are not samples, per window of time with such tries."""
     windows: dict[int, list[int]] = {}
     for frame in frames:
         if not frame.is_sample and (mode := frame.modes[0]) is not None:

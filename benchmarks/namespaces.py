@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final, Self
 
-from sim_backends.emulated.robot.network import open_tun
+from sim_backends.emulated.robot.tun_devices import open_tun
 
 _ROOT: Final = Path(__file__).resolve().parents[1]
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)

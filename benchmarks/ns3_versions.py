@@ -47,7 +47,7 @@ def mirror() -> str:
 
 
 def extract_release(release: str, folder: Path) -> None:
-    """Extract libns3-dev of a Debian release, and all packages that it needs, into the subfolder `root`."""
+    """Extract `PACKAGES` of a Debian release, and all packages that they need, into the subfolder `root`."""
     apt, root = folder / "apt", folder / "root"
     for name in ("etc/apt/sources.list.d", "etc/apt/preferences.d", "state/lists/partial", "cache/archives/partial"):
         (apt / name).mkdir(parents=True, exist_ok=True)
@@ -61,7 +61,7 @@ def extract_release(release: str, folder: Path) -> None:
         "Dir::Cache": "cache",
     }
     options = [word for name, path in apt_directories.items() for word in ("-o", f"{name}={apt / path}")]
-    # Without root privileges apt cannot take its locks, and the user `_apt` might not be able to read the folder.
+    # Without root privileges apt cannot acquire its locks, and the user `_apt` might not be able to read the folder.
     options += ["-o", "Debug::NoLocking=1", "-o", "APT::Sandbox::User=root", "-q"]
     run("apt-get", *options, "update")
     run("apt-get", *options, "install", "--download-only", "--no-install-recommends", "-y", *PACKAGES)
@@ -155,7 +155,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Test the versions; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", default=NAMES, metavar="NAME", help="trixie, sid, wheel; by default all")
-    parser.add_argument("--folder", type=Path, default=cache_folder().parent / "ns3-versions")
+    parser.add_argument(
+        "--folder",
+        type=Path,
+        default=cache_folder().parent / "ns3-versions",
+        help="folder of the extracted files and of the test logs (default: %(default)s)",
+    )
     options = parser.parse_args(arguments)
     passed = [check(name, options.folder.resolve() / name) for name in options.names]
     return 0 if all(passed) else 1

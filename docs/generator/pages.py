@@ -142,7 +142,7 @@ def exit_codes() -> str:
     for family in families:
         if "exit_code" in vars(family) and family.__module__ == errors.__name__:
             meanings.setdefault(family.exit_code, []).append(class_description(family).partition("\n")[0])
-    codes = {code: relative(" ".join(texts)) for code, texts in meanings.items()} | dict(cli.EXIT_CODES)
+    codes = {code: relative(" Or: ".join(texts)) for code, texts in meanings.items()} | dict(cli.EXIT_CODES)
     lines = ((str(code), meaning) for code, meaning in sorted(codes.items()))
     return page(
         "Exit codes",

@@ -117,8 +117,8 @@ class Cell:
     Attributes:
         key: Value of each column that identifies the condition, in the requested order; "" or None if missing.
         n_valid: Number of valid repeats, from which all estimates are computed.
-        n_void: Number of attempts with incomplete evidence.
-        n_failed: Number of attempts that failed.
+        n_void: Number of void attempts; see `Status`.
+        n_failed: Number of failed attempts; see `Status`.
         estimates: Estimates by name of the quantity, in the order of `Repeats.quantities` or as requested.
             Quantities without a valid repeat are omitted.
         tallies: Counts of text values by name of the column, in the order of `Repeats.word_columns` or as requested.

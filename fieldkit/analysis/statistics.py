@@ -240,7 +240,10 @@ def _score_interval(share: Floats, trials: Floats, quantile: Floats) -> tuple[Fl
 
 
 def _squares_and_freedom(deviations: Floats) -> tuple[Floats, Floats]:
-    """Return the sum of squares of deviations, shape (cells, n), and its degrees of freedom, 2 to n - 1."""
+    """Return the sum of squares of deviations, shape (cells, n), and its degrees of freedom.
+
+    These are 2 to n - 1, or 1 if n is 2.
+    """
     squares = deviations**2
     total, most = squares.sum(axis=1), deviations.shape[1] - 1
     fourth = (squares**2).sum(axis=1)

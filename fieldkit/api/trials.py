@@ -57,8 +57,8 @@ class TrialCell:
     Attributes:
         condition: The condition, by column.
         n_valid: Number of valid repeats, from which all figures are computed.
-        n_void: Number of attempts whose evidence was incomplete.
-        n_failed: Number of attempts that failed.
+        n_void: Number of void attempts: not valid, for example because a step failed or evidence is incomplete.
+        n_failed: Number of failed attempts: not valid, and not followed by another attempt.
     """
 
     def __init__(self, cell: Cell) -> None:

@@ -17,7 +17,7 @@ class SshAccess(Protocol):
 
     @property
     def host(self) -> str | None:
-        """Host name or address."""
+        """Host name or address; None only for an emulated robot."""
         ...
 
     @property
@@ -27,17 +27,17 @@ class SshAccess(Protocol):
 
     @property
     def user(self) -> str | None:
-        """Login name."""
+        """Login name; None only for an emulated robot."""
         ...
 
     @property
     def host_key(self) -> str | None:
-        """Pinned host key."""
+        """Pinned host key; None only for an emulated robot."""
         ...
 
     @property
     def key(self) -> str | None:
-        """Path of the private key; None for the SSH agent."""
+        """Path of the private key; None for a key of the SSH agent, or for a password."""
         ...
 
     @property
@@ -49,9 +49,15 @@ class SshAccess(Protocol):
 def find_password(
     name: str, access: SshAccess, ask: passwords.PasswordSource = passwords.read_from_terminal
 ) -> str | None:
-    """Return the password of a robot from its source; None if it needs no password.
+    """Return the password of a robot from the source in its access data; None if it needs no password.
 
-    Raises the same errors as `passwords`.
+    Args:
+        name: Name of the robot.
+        access: Its SSH access data.
+        ask: Requests the password from the operator.
+
+    Raises:
+        ConfigurationError: The password cannot be requested, or the keyring does not have it.
     """
     source = access.password
     if source is None:

@@ -24,8 +24,8 @@ INTERRUPTED: Final = 130
 EXIT_CODES: Final[Mapping[int, str]] = MappingProxyType(
     {
         0: "Done; for `trial`: every repeat is valid, and every expectation is met.",
-        1: "A threshold or an expectation is not met, a simulator or a worker process failed, `clocks` found a "
-        "problem, or the operator skipped a request or answered no.",
+        1: "A threshold or an expectation is not met, a simulator, its check or a worker process failed, `clocks` "
+        "found a problem, no configuration of a middleware passed, or the operator skipped a request or answered no.",
         INTERRUPTED: "Interrupted by Ctrl-C or another signal; all finished repeats are saved.",
     }
 )

@@ -25,8 +25,8 @@ def interruptible() -> Iterator[Stop]:
     """Turn Ctrl-C into a request to stop while the body runs.
 
     While a robot moves automatically, or may start to move, the first SIGINT, SIGTERM or SIGHUP orders all robots
-    to stop and raises `KeyboardInterrupt`. At the end of the body the function waits for their confirmations; the
-    next signal cancels that wait.
+    to stop and raises `KeyboardInterrupt`. The step that moves a robot then waits for the confirmation of the robot
+    (`Motions.moving`); the next signal cancels that wait.
 
     While no robot moves, the first SIGINT during a repeat lets the repeat finish, and the second raises
     `KeyboardInterrupt`. SIGINT between repeats, SIGTERM and SIGHUP raise it immediately: after SIGTERM or SIGHUP the

@@ -1,4 +1,4 @@
-"""Arguments that several commands share. This module imports no code that the commands run."""
+"""Arguments that several commands share. Help and completion must start fast, so the imports are few."""
 
 import argparse
 from pathlib import Path
@@ -21,13 +21,13 @@ _MAX_DIGITS: Final = 15
 _PROTOCOL_HELP: Final = "may be given more than once (default: the procedure's)"
 
 
-def add_site(parser: Parser) -> None:
-    """Add the options that select robots."""
+def add_site(parser: Parser, default: str = "the site file's, or emulated without a site file") -> None:
+    """Add the options for the backend and the site file; `default` describes the default of `--backend`."""
     names = ", ".join(point.name for point in plugins.entry_points(plugins.BACKENDS))
     parser.add_argument(
         "--backend",
         metavar="NAME",
-        help=f"one of: {names} (default: the site file's, or emulated without a site file)",
+        help=f"one of: {names} (default: {default})",
     )
     parser.add_argument(
         "--site",
@@ -95,12 +95,14 @@ def add_overrides(parser: Parser) -> None:
 
 def add_robots(parser: Parser) -> None:
     """Add the options that select the robots of a lab."""
-    add_site(parser)
+    add_site(parser, "emulated")
     parser.add_argument(
         "--robots", type=int, metavar="N", help="use robots robot-1 to robot-N instead of those in the site file"
     )
     profile = "turtlebot3_burger"
-    parser.add_argument("--profile", metavar="NAME", default=profile, help=f"their profile (default {profile})")
+    parser.add_argument(
+        "--profile", metavar="NAME", default=profile, help=f"profile of the N robots (default {profile})"
+    )
 
 
 def add_trial(parser: Parser, help_line: str = "folder of a trial") -> None:
@@ -172,7 +174,7 @@ def add_workers(parser: Parser) -> None:
 
 
 def add_show(parser: Parser, dest: str, what: str) -> None:
-    """Add `show NAME` to a listing command. The argument `dest` is None if the command lists all items."""
+    """Add `show NAME` to a listing command. NAME is stored in the attribute `dest`, which is None without `show`."""
     parser.usage = "%(prog)s [-h] [show NAME]"
     show = parser.add_commands(metavar="show NAME", prog=parser.prog).add_parser("show", help=f"show one {what}")
     show.add_argument(dest, metavar="NAME", help=f"name of the {what}")
@@ -206,12 +208,12 @@ def positive(text: str) -> int:
 
 
 def repeats(text: str) -> int:
-    """Return a number of repeats from 1; argparse reports other texts."""
+    """Return a number of repeats from 1 to `MAX_REPEATS`; argparse reports other texts."""
     if not 1 <= natural(text, minimum=1) <= MAX_REPEATS:
         raise argparse.ArgumentTypeError(f"must be at least 1, and at most {MAX_REPEATS}")
     return int(text)
 
 
 def free_text(text: str) -> str:
-    """Return a text with `?` instead of bytes that are not UTF-8 and of control characters."""
+    """Return a text with `?` instead of bytes that are not UTF-8 and of unprintable characters; see `sanitized`."""
     return sanitized(text)

@@ -29,7 +29,8 @@ _MAX_INT: Final = 2**63 - 1
 _MAX_DIGITS: Final = 100
 """Maximum number of characters of a number. The time of Python's conversion grows with the square of the length."""
 _INVALID_CHARACTERS: Final = re.compile("[\0\ud800-\udfff]")
-"""Characters that an escape sequence can produce, but that file names, arguments and UTF-8 files cannot contain."""
+"""Characters that an escape sequence can produce, but that no file name and no argument can contain: NUL, and
+surrogates, which UTF-8 cannot encode."""
 
 Node = yaml.Node
 """A value in the syntax tree of a document."""
@@ -73,7 +74,7 @@ class _Loader(Reader, Scanner, Parser, Composer, SafeConstructor, Resolver):
         self._depth -= 1
         if isinstance(node, yaml.ScalarNode) and _INVALID_CHARACTERS.search(node.value):
             raise _marked_error(
-                "this text has a character that no file can contain (\\0, or half of a surrogate pair)", event
+                "this text has a character that is not supported (\\0, or half of a surrogate pair)", event
             )
         if isinstance(node, yaml.ScalarNode) and isinstance(parent, yaml.SequenceNode):
             self._require_one_item(node)

@@ -1,4 +1,4 @@
-"""Physical layer of a robot's Wi-Fi since 802.11n: the keys of `radio.phy` and their valid combinations."""
+"""Physical layer of a robot's Wi-Fi with 802.11n or later: the keys of `radio.phy` and their valid combinations."""
 
 import re
 from typing import Annotated, Final, Literal, cast
@@ -12,14 +12,13 @@ DscpMapping = Literal["linux", "rfc8325"]
 WifiRateControl = Literal["minstrel", "minstrel_ht", "firmware"]
 
 _STANDARD: Final = re.compile(r"802\.11(n|ac|ax) (2\.4 GHz|5 GHz|6 GHz)")
-_STANDARD_EXAMPLES: Final = "802.11n 2.4 GHz, 802.11n 5 GHz, 802.11ac 5 GHz, 802.11ax 2.4, 5 or 6 GHz"
-
 # IEEE 802.11-2020, 19.1.1 and 21.1.1; 802.11ax-2021, 27.1.1: VHT only at 5 GHz; 80 MHz of HE only at 5 and 6 GHz.
 _BANDS: Final[dict[WifiAmendment, tuple[WifiBand, ...]]] = {
     "n": ("2.4 GHz", "5 GHz"),
     "ac": ("5 GHz",),
     "ax": ("2.4 GHz", "5 GHz", "6 GHz"),
 }
+_STANDARDS: Final = tuple(f"802.11{amendment} {band}" for amendment, bands in _BANDS.items() for band in bands)
 _GUARD_INTERVALS_NS: Final[dict[WifiAmendment, tuple[int, ...]]] = {
     "n": (400, 800),
     "ac": (400, 800),
@@ -52,8 +51,8 @@ class WifiPhy(Strict):
             the upper three bits, as Linux up to 6.7 does) or `rfc8325`. Without this key all packets are best
             effort.
         amsdu_max_bytes: Maximum size of an A-MSDU (several packets in one frame of an aggregate): 3839, 7935 or 11454
-            (not 802.11n, not at 2.4 GHz). A-MSDUs are used between robots that both have this key, up to the smaller
-            of their sizes. Without this key each frame contains one packet.
+            (only 802.11ac, and 802.11ax at 5 or 6 GHz). A-MSDUs are used between robots that both have this key, up
+            to the smaller of their sizes. Without this key each frame contains one packet.
         power_save: True if it uses power save as a station of an access point (topology `master`), as Linux does by
             default, also on a Raspberry Pi (`iw dev wlan0 get power_save`).
         packet_time: Time that its bus (SDIO) and driver need for each packet that it sends, one after another, before
@@ -96,10 +95,10 @@ class WifiPhy(Strict):
         return self
 
     def incompatibility(self, standard: str) -> str | None:
-        """Return the reason why a radio of a standard, `802.11ac 5 GHz`, cannot have this layer; None if it can."""
+        """Return the reason why a radio of a standard, `802.11ac 5 GHz`, cannot have these values; None if it can."""
         match = _STANDARD.fullmatch(standard)
         if match is None:
-            return f"phy needs a standard with its band, not {standard!r}; write one of: {_STANDARD_EXAMPLES}"
+            return f"phy needs a standard with its band, not {standard!r}; write one of: {', '.join(_STANDARDS)}"
         amendment, band = cast("tuple[WifiAmendment, WifiBand]", match.groups())
         if band not in _BANDS[amendment]:
             return f"802.11{amendment} does not exist at {band}; it exists at {', '.join(_BANDS[amendment])}"
@@ -127,7 +126,7 @@ class WifiPhy(Strict):
 
 
 def check_standard(standard: str, phy: WifiPhy | None) -> None:
-    """Raise the validation error of a radio whose standard cannot have this physical layer."""
+    """Raise a validation error if a radio of this standard cannot have this physical layer."""
     if phy is not None and (reason := phy.incompatibility(standard)) is not None:
         raise schema.validation_error(reason, "standard")
 

@@ -11,7 +11,7 @@ Item = TypeVar("Item")
 
 
 class LazyMapping(Mapping[str, Item]):
-    """The objects of entry points by name. An object is loaded when its key is read.
+    """The objects of entry points by name. An object is loaded when it is read for the first time.
 
     Args:
         points: The entry points.

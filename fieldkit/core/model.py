@@ -33,7 +33,8 @@ class Role(str):
         if (role := cls._instances.get(name)) is None:
             if not re.fullmatch(cls.PATTERN, name):
                 raise ValueError(
-                    "the name of a role consists of lower-case letters, digits and _, and begins with a letter"
+                    "the name of a role consists of lower-case letters, digits and _, begins with a letter, and has "
+                    "at most 31 characters"
                 )
             role = cls._instances.setdefault(str(name), super().__new__(cls, name))
         return role
@@ -64,11 +65,11 @@ ROS_MASTER_PORT: Final = 11311
 """Default TCP port of a ROS 1 master (wiki.ros.org/roscore)."""
 
 BRIDGE_IS_UP: Final = "the bridge is up"
-"""Line that `fieldkit bridge` prints when it forwards packets; other programs wait for it."""
+"""Start of the line that `fieldkit bridge` prints when it is ready to forward messages; a trial waits for it."""
 
 
 class Protocol(StrEnum):
-    """The transport protocol that carries the file."""
+    """Transport protocol of the traffic of a repeat."""
 
     TCP = "tcp"
     UDP = "udp"
@@ -96,10 +97,11 @@ class Control(StrEnum):
 
 
 class Status(StrEnum):
-    """Status of a repeat.
+    """Status of a repeat, or of an attempt at it.
 
-    `measured`: the steps of the repeat are done and its evidence is still on the robots; `void`: its evidence is
-    incomplete.
+    `measured`: its steps have ended, and its evidence is still on the robots. `void`: the attempt is not valid, for
+    example because a step failed or evidence is incomplete or contradictory; another attempt is allowed. `failed`:
+    the attempt is not valid, and it was the last allowed one, or another attempt would have the same error.
     """
 
     PLANNED = "planned"
@@ -111,7 +113,7 @@ class Status(StrEnum):
 
 
 MAX_REPEATS: Final = 100_000
-"""Maximum number of repeats per protocol of one trial. So many repeats would take weeks."""
+"""Maximum number of repeats per protocol of one trial. A trial with this number would take weeks."""
 
 LOOP: Final = "for"
 """Key of a loop in a list of steps."""
@@ -119,7 +121,7 @@ MAX_STEPS: Final = 1000
 """Maximum number of steps of a procedure's file after its loops are expanded."""
 
 FINAL_STATUSES: Final = (Status.VALID, Status.VOID, Status.FAILED)
-"""Final states of an attempt."""
+"""Statuses of an attempt that has ended."""
 
 
 class Verdict(StrEnum):
@@ -266,7 +268,7 @@ class StationSample:
         rx_rate_bit_s: PHY rate of the last frame from it.
         tx_packets: Packets that were transmitted to it.
         rx_packets: Packets that were received from it.
-        tx_retries: Frames that were retransmitted to it.
+        tx_retries: Number of retransmissions of frames to it.
         tx_failures: Packets to it that were dropped after the last retry.
         beacon_losses: Number of times that its beacons were lost.
     """
@@ -290,7 +292,8 @@ class LinkSample:
         utc_ns: Time of the sample, nanoseconds since 1970 UTC by the robot's clock; by the laptop's clock for a
             sample of a modelled radio.
         stations: Statistics of its peer stations.
-        cell: BSSID of the access point with which it is associated.
+        cell: BSSID of the access point with which it is associated; for a modelled radio the name of this access
+            point.
         noise_dbm: Noise level in its channel.
         active_ns: Counter of the time for which it listened to its channel.
         busy_ns: Part of that time in which the channel was busy.
@@ -332,7 +335,7 @@ class DelayParts:
         propagation_ns: Propagation time on the medium.
         queuing_ns: Time that the packets waited for earlier packets.
         undivided_ns: Delay whose components the network does not report.
-        policy_ns: Time added by the sync policy of a co-simulation, not part of the delay; None without one.
+        policy_ns: Time added by the sync policy, not part of the delay; None without a co-simulation.
     """
 
     packets: int
@@ -349,7 +352,7 @@ class Lateness:
     """Lateness of the packets that an emulator delivered, relative to the delivery times of its radio model.
 
     Attributes:
-        bound_ns: Maximum lateness. If any packet is later, the emulation did not follow the model.
+        bound_ns: Maximum lateness. If any packet or window is later, the emulation did not follow the model.
         packets: Number of packets by lateness in ns (a histogram); a lateness is rounded up by at most an eighth.
         windows: Number of windows of a co-simulation by lateness in ns (a histogram). The lateness of a window is the
             time from its end in real time to the arrival of its results. None without a co-simulation.
@@ -362,7 +365,7 @@ class Lateness:
 
 @dataclass(frozen=True)
 class Interval:
-    """A point estimate with its interval.
+    """A point estimate with its confidence interval.
 
     Attributes:
         value: The estimate.

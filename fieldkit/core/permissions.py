@@ -38,7 +38,7 @@ def installed() -> Mapping[str, Permission]:
 
 
 def repeated(names: Iterable[str]) -> list[str]:
-    """Return the permissions among `names` that commands in remedies repeat, sorted."""
+    """Return the names of the permissions among `names` that commands in remedies repeat, sorted."""
     permissions = installed()
     return sorted(name for name in names if permissions[name].is_repeated)
 

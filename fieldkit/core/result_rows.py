@@ -23,8 +23,10 @@ class EstimateRow:
     )
     unit: str | None = _column("text", "Unit of the estimates and intervals, for example s, bit/s or share.")
     n_valid: int | None = _column("count", "Valid repeats.")
-    n_void: int | None = _column("count", "Attempts with incomplete evidence.")
-    n_failed: int | None = _column("count", "Attempts that failed.")
+    n_void: int | None = _column(
+        "count", "Void attempts: not valid, for example because a step failed or evidence is incomplete."
+    )
+    n_failed: int | None = _column("count", "Failed attempts: not valid, and not followed by another attempt.")
     n: int | None = _column(
         "count", "Valid repeats that have a value of the quantity; all numbers are computed from these."
     )

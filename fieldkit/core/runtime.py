@@ -21,6 +21,10 @@ from fieldkit.core.errors import ConfigurationError, shell_command
 _MAX_BASE_BYTES: Final = 60
 """Maximum length of the base folder's path. The path of a Unix socket can have at most 107 bytes (unix(7))."""
 
+_SET_RUNTIME_FOLDER: Final = (
+    f"set XDG_RUNTIME_DIR to your private folder (mode 700, absolute path of at most {_MAX_BASE_BYTES} bytes)"
+)
+
 _SUFFIX: Final = ".lock"
 
 _LOCK_TRIES: Final = 10
@@ -44,9 +48,10 @@ def user_at_host() -> str:
 def base_folder() -> Path:
     """Return the base folder for this user's files that exist only while a process runs.
 
-    The candidates are, in this order, `XDG_RUNTIME_DIR`, `/run/user/UID` (freedesktop.org Base Directory
-    Specification), `/run` for root, and `~/.cache`. The first folder that belongs to this user and to which no other
-    user can write is used. If there is none, the folder of temporary files is used.
+    The candidates are, in this order, `XDG_RUNTIME_DIR` (freedesktop.org Base Directory Specification),
+    `/run/user/UID`, `/run` for root, and `~/.cache`. The base folder is the first of them that belongs to this user,
+    is not writable for other users, and has an absolute path of at most `_MAX_BASE_BYTES`. If there is none, it is
+    the folder of temporary files.
     """
     user = os.geteuid()
     names = filter(None, (os.environ.get("XDG_RUNTIME_DIR"), f"/run/user/{user}", "/run" if user == 0 else ""))
@@ -81,9 +86,9 @@ def is_private(status: os.stat_result) -> bool:
 
 
 def not_private_error(path: Path) -> ConfigurationError:
-    """Return the error for a path that another user owns or has access to."""
-    remedy = f"remove it, or set XDG_RUNTIME_DIR to your private folder: {shell_command('ls', '-ld', path)}"
-    return ConfigurationError("other users own it or have access to it", where=str(path), remedy=remedy)
+    """Return the error for a path that is not a folder to which only this user has access."""
+    remedy = f"remove it, or {_SET_RUNTIME_FOLDER}: {shell_command('ls', '-ld', path)}"
+    return ConfigurationError("it is not a folder to which only you have access", where=str(path), remedy=remedy)
 
 
 @contextmanager
@@ -95,7 +100,7 @@ def hold_lock(name: str) -> Iterator[None]:
 
     Raises:
         NameHeldError: Another process holds the lock.
-        ConfigurationError: The folder of lock files cannot be created, or another user owns it.
+        ConfigurationError: The lock file or its folder cannot be created, or the folder is not private to this user.
     """
     path = base_folder() / f"fieldkit-{os.geteuid()}"
     try:
@@ -104,7 +109,7 @@ def hold_lock(name: str) -> Iterator[None]:
         raise ConfigurationError(
             f"cannot create a lock file there: {error.strerror or error}",
             where=str(path),
-            remedy="set XDG_RUNTIME_DIR to your private folder with mode 700",
+            remedy=_SET_RUNTIME_FOLDER,
         ) from error
     try:
         _remove_stale(folder)

@@ -98,15 +98,16 @@ def _contents(packets: Packets) -> Iterator[dict[str, object]]:
         yield {name: value for name, value in zip(columns, values, strict=True) if value != NO_PORT}
 
 
-# Largest IP payload of a frame that offload did not join: the MTU of Ethernet and Wi-Fi minus the shortest header.
+# Largest IP payload of a frame that offload did not join: the MTU of Ethernet and Wi-Fi minus the shortest header of
+# IPv4.
 _LARGEST_PAYLOAD_BYTES: Final = 1480
 
 
 def packet_fates(captures: Mapping[str, Capture], transfers: Iterable[Transfer]) -> Mapping[str, MarkedPackets]:
     """Return the packets of each capture, with their fates.
 
-    A fate is known only if the packet belongs to a transfer that both its sender and its receiver captured, and if
-    these captures can be matched without ambiguity.
+    A fate is known only if the packet belongs to a transfer that both its sender and its receiver captured, if these
+    captures can be matched, and if the match of the packet is not ambiguous.
 
     Args:
         captures: The captures by file.
@@ -207,7 +208,7 @@ def read(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> AttemptReco
 
 
 def omissions(record: AttemptRecord) -> Iterator[Json]:
-    """Yield a log message for each part of the recordings that `messages` omits."""
+    """Yield a log message for each damaged capture, and for each output of ping with replies without a time stamp."""
 
     def log_message(text: str, file: str) -> Json:
         name, t_ns = str(record.attempt.repeat), record.attempt.started_utc_ns
@@ -218,7 +219,7 @@ def omissions(record: AttemptRecord) -> Iterator[Json]:
             yield log_message(capture.damage, file)
     for file, pings in record.pings.items():
         if untimed := sum(reply.at_utc_ns is None for reply in pings.replies):
-            yield log_message(f"{untimed} replies have no time stamp and are omitted", file)
+            yield log_message(f"replies without a time stamp are omitted: {untimed}", file)
 
 
 def messages(record: AttemptRecord) -> Iterator[Message]:
@@ -229,7 +230,7 @@ def messages(record: AttemptRecord) -> Iterator[Message]:
         if file in record.captures:
             topic, meaning = (
                 _named("packets", _step(file)),
-                "IP packets in the robot's capture; with segmentation offload, larger frames.",
+                "IP packets in the robot's capture. With segmentation offload, one packet may have several segments.",
             )
             channel = _channel(record, role, topic, schemas.PACKET, meaning)
             streams.append(packet_messages(channel, record.attempt.folder, packets_by_file[file]))

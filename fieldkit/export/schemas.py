@@ -216,7 +216,7 @@ _STATION: Final = {
     "rx_rate_bit_s": _typed("number", "PHY rate of the last frame from this station, in bit/s."),
     "tx_packets": _typed("integer", "Packets sent to this station; counters may start at any number."),
     "rx_packets": _typed("integer", "Packets received from this station."),
-    "tx_retries": _typed("integer", "Frames retransmitted to this station."),
+    "tx_retries": _typed("integer", "Retransmissions of frames to this station."),
     "tx_failures": _typed("integer", "Packets to this station that were dropped after the last retry."),
     "beacon_losses": _typed("integer", "Number of times that beacons of this station were lost."),
 }

@@ -1,7 +1,7 @@
 """The timeline of a trial as messages of an MCAP file, from its journal and raw evidence.
 
-Laptop, sender and receiver have separate clocks. Times are not converted; the metadata of a channel contain its
-clock.
+Laptop, sender and receiver have separate clocks; the metadata of a channel contain its clock. Only the times of
+recorded positions are converted: to the laptop's clock.
 """
 
 import heapq

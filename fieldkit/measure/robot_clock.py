@@ -36,7 +36,7 @@ class Offset:
 
     Attributes:
         offset_s: Estimate in seconds; positive if the robot's clock is ahead.
-        error_s: Maximum error of the estimate in seconds, whatever the delays of request and response were.
+        error_s: Maximum error of the estimate in seconds, regardless of the delays of request and response.
     """
 
     offset_s: float

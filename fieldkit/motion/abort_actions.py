@@ -26,7 +26,7 @@ class OnAbort(StrEnum):
 class AbortActions(ProcedureSection, RootModel[dict[Role, OnAbort]]):
     """Action of each drone when a repeat is aborted, by role: `land` at its current position, or `return`.
 
-    See [MAVLink](mavlink.md#when-a-trial-is-cut-short).
+    See [MAVLink](mavlink.md#when-a-trial-is-aborted).
     """
 
     model_config = ConfigDict(frozen=True, hide_input_in_errors=True, defer_build=True)

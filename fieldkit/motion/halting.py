@@ -20,7 +20,7 @@ class HaltResult:
     """Result of a stop, or of a query of the states, on one robot.
 
     Attributes:
-        programs: State of each program that was stopped, by `TRIAL/ATTEMPT/.jobs/NAME` below the robot's home.
+        programs: State of each program that was stopped, by `FOLDER/.jobs/NAME` (`jobs.Job`).
         error: The error if the robot was not reached or its lock could not be written; None otherwise.
     """
 

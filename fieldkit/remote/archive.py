@@ -28,7 +28,7 @@ class TarMember:
 
     Attributes:
         name: Its name, at most 100 bytes of printable text; callers must check it further.
-        chunks: Its content, which must be read before the next member.
+        chunks: Its content. Parts that are not read before the next member are skipped.
     """
 
     name: str
@@ -70,7 +70,7 @@ def _parse(header: bytes, robot: str) -> tuple[str, int]:
     size = _octal(header[_SIZE])
     is_regular_file = header[_TYPE] in {b"0", b"\0"} and not any(header[_PREFIX])
     if not is_regular_file or size is None or name.encode() != raw:
-        raise EvidenceError(f"sent {name!r}, which is not a regular file of a repeat", where=robot)
+        raise EvidenceError(f"sent {name!r}, which is not a regular file with a valid name", where=robot)
     return name, size
 
 

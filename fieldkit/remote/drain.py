@@ -1,4 +1,4 @@
-"""Wait for an output of a remote command, or for its end, with a deadline. Both output streams are read."""
+"""Wait for output of a remote command, or for its end, with a deadline. Both output streams are read."""
 
 import select
 import time
@@ -19,7 +19,7 @@ def wait_for_output(channel: Execution, expected: bytes, *, deadline: Deadline, 
     """Wait until the command has written as many bytes as `expected` has; return False if it ended earlier.
 
     Raises:
-        ExpiredError, EOFError, RobotError: For the same reasons as `drain`.
+        ExpiredError, EOFError, OSError, SSHException, RobotError: For the same reasons as `drain`.
     """
     remaining_bytes = len(expected)
     while remaining_bytes and not deadline.expired:
@@ -35,7 +35,7 @@ def wait_for_output(channel: Execution, expected: bytes, *, deadline: Deadline, 
         if not chunk:
             if not channel.status_event.wait(deadline.remaining_s):
                 break
-            _exit_code(channel, b"", robot)  # raises an error if the link has ended, too
+            _exit_code(channel, b"", robot)  # raises an error if the connection has ended, too
             return False
     if remaining_bytes:
         raise ExpiredError("report")
@@ -45,9 +45,10 @@ def wait_for_output(channel: Execution, expected: bytes, *, deadline: Deadline, 
 def drain(
     channel: Execution, out: IO[bytes], *, stdin: bytes | None, deadline: Deadline, limit_bytes: int, robot: str
 ) -> tuple[int, bytes]:
-    """Feed `stdin`, write standard output to `out`, and return the exit code and the end of standard error.
+    """Send `stdin`, write standard output to `out`, and return the exit code and the end of standard error.
 
-    If `stdin` is None, nothing is sent, and standard input is not closed.
+    If `stdin` is None, nothing is sent, and standard input is not closed. A command in a persistent shell has no
+    standard input: `stdin` must be None.
 
     Raises:
         ExpiredError: The deadline passed.
@@ -107,5 +108,5 @@ def _exit_code(channel: Execution, stderr: bytes, robot: str) -> int:
     raise RobotError(
         f"a signal ended the command: {printable(stderr) or 'no message'}",
         where=robot,
-        remedy="on the robot: dmesg | tail; was memory short, or did it shut down?",
+        remedy="on the robot: dmesg | tail; did it run out of memory or shut down?",
     )

@@ -300,7 +300,9 @@ def _unpack(
                 for name in large_sizes:
                     _require_allowed_name(name, robot, forbidden_reason)
             elif not _SAFE_NAME.match(member.name):
-                raise EvidenceError(f"sent {member.name!r}, which is not a regular file of a repeat", where=robot)
+                raise EvidenceError(
+                    f"sent {member.name!r}, which is not a regular file with a valid name", where=robot
+                )
             else:
                 _require_allowed_name(member.name, robot, forbidden_reason)
                 received_hashes[member.name] = _write(member, destination, robot)
@@ -370,7 +372,8 @@ def _parse_sizes(content: bytes, robot: str) -> dict[str, int]:
     for name, size in sizes.items():
         if not _SAFE_NAME.match(name) or not _SIZE.match(size):
             raise EvidenceError(
-                f"lists {name!r} of {size!r} bytes, which is not a regular file of a repeat", where=robot
+                f"lists {name!r} of {size!r} bytes, which is not a regular file with a valid name and size",
+                where=robot,
             )
     if len(sizes) > archive.MAX_FILES:
         raise EvidenceError(f"lists more than {archive.MAX_FILES} files", where=robot)

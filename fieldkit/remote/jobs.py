@@ -181,7 +181,7 @@ class PendingJob:
     The control connection is silent until `end` is called or, for a job from `serve`, until the job ends.
 
     Attributes:
-        shell: The robot.
+        shell: Shell of the robot.
         job: The job.
         session: The remote command of the job or of the wait.
     """
@@ -219,11 +219,11 @@ def run(shell: Shell, job: Job) -> int:
         The job's exit code.
 
     Raises:
-        LinkError: The robot did not answer within the job's limit plus `REPLY_S`, and `READY_S` if it has `ready`.
+        LinkError: The robot did not answer within the job's limit plus `REPLY_S`, and `ready_s` if it has `ready`.
         RobotError: The job could not be started, or the robot rebooted while it ran.
     """
     session = shell.begin(command("run", job), deadline=Deadline.after(REPLY_S), until=b"")
-    return PendingJob(shell, job, session).end((READY_S if job.ready else 0) + job.limit_s + REPLY_S)
+    return PendingJob(shell, job, session).end((job.ready_s if job.ready else 0) + job.limit_s + REPLY_S)
 
 
 def serve(shell: Shell, job: Job) -> PendingJob:
@@ -267,8 +267,9 @@ def stop(
         shell: The robot.
         job: A started job, which may have ended.
         signal: Name without `SIG`.
-        grace_s: Time until SIGKILL, in whole seconds.
-        settle: File in the job's folder that must stop growing before the signal, but is waited for at most 2 s; None
+        grace_s: Time until SIGKILL, in whole seconds. With `end_text` it is up to twice this time: `stop` first waits
+            for the text, and then for the end.
+        settle: File in `job.folder` that must stop growing before the signal, but is waited for at most 2 s; None
             to send the signal immediately.
         end_text: Text in the log that shows that the job has finished its work. `stop` then does not wait for its
             end; `fetching.fetch` waits for it, and fails if its exit code is not 0. None to wait for the end.
@@ -297,7 +298,8 @@ def stop(
 def list_running(shell: Shell, deadline: Deadline) -> tuple[str, ...]:
     """Return one line per running job of fieldkit on the robot, from any trial and version.
 
-    There is also a line for each process in a deleted folder of a job.
+    There is also a line for each process in a deleted folder of a job. A line consists of `FOLDER/NAME`, the process
+    id and the command, separated by spaces; see `Job` for folder and name.
     """
     return _lines(call(shell, "left", deadline=deadline))
 
@@ -309,7 +311,7 @@ class AbortResult:
     Attributes:
         locked: Whether the robot was locked.
         jobs: A line per stopped or signalled job or process, in the format of `list_running`.
-        landing: Programs that still land a drone, `TRIAL/ATTEMPT/.jobs/NAME` below the robot's home, each with its
+        landing: Programs that still land a drone, as `FOLDER/.jobs/NAME` (see `Job`), each with its
             `motion_states.MotionState`.
         error: The error if a part failed; None otherwise.
     """
@@ -321,7 +323,7 @@ class AbortResult:
 
 
 def abort(shell: Shell, user: str, deadline: Deadline) -> AbortResult:
-    """Break the robot's lock in the name of `user`, and stop all jobs of all trials.
+    """Break the robot's lock, record that `user` broke it, and stop all jobs of all trials.
 
     The job script is not installed for this, because a full or read-only disk may be the reason for the abort.
 

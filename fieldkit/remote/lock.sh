@@ -121,7 +121,7 @@ holder() {
     return 0
 }
 
-# Break the lock in the name of $1, and stop all jobs. If the disk is full, try to break the lock again after the jobs, which
+# Break the lock, record that user $1 broke it, and stop all jobs. If the disk is full, try to break the lock again after the jobs, which
 # may have filled it, were stopped.
 abort() {
     by=$1

@@ -1,4 +1,4 @@
-"""Colours, markers and lines of all figures and of the page, in a light and a dark theme.
+"""Colours, markers and lines of all figures and of the HTML report, in a light and a dark theme.
 
 Series use the colours of Okabe and Ito (2008, Color Universal Design), which colour-blind people can distinguish.
 Each colour has a marker, so that no series is identified by colour alone. In the dark theme colours are lighter.
@@ -71,7 +71,7 @@ SETTINGS: Final[dict[Any, Any]] = {
     "lines.linewidth": 1.4,
     "pdf.fonttype": 42,  # TrueType, because IEEE accepts no Type 3 fonts
     "savefig.dpi": 300,
-    "svg.fonttype": "none",  # texts remain texts
+    "svg.fonttype": "none",  # text remains text, not paths
     "svg.hashsalt": "fieldkit",  # a fixed salt gives equal ids in each run
     "text.color": LIGHT["ink"],
     # Names from evidence must not be parsed as formulas.
@@ -106,7 +106,7 @@ def format_of(path: Path, option: str) -> Format:
         if path.suffix == f".{file_format}":
             return file_format
     raise ConfigurationError(
-        f"{option}: {path.name!r} has no known format", remedy=f"use the suffix .{', .'.join(FORMATS)}"
+        f"{option}: the suffix of {path.name!r} is unknown", remedy=f"use the suffix .{', .'.join(FORMATS)}"
     )
 
 

@@ -20,7 +20,7 @@ from fieldkit.steps import clocks
 from fieldkit.steps.capabilities import Moves
 from fieldkit.steps.nest import Nest, steps_inside
 from fieldkit.steps.scene import Announce, Planned, Scene
-from fieldkit.steps.surroundings import EnclosingStep
+from fieldkit.steps.surroundings import EarlierStep, EnclosingStep
 from fieldkit.steps.view import View
 
 LIMIT_S: Final = 900.0
@@ -127,13 +127,19 @@ def stationary_robots(nest: Nest, scene: Scene) -> Mapping[Role, PositionSource]
     return {role: PositionSource(place=places_m[role]) for role in nest.roles() if role in places_m}
 
 
-def placement_error(kind: str, within: Sequence[EnclosingStep]) -> str | None:
-    """Return the reason why a step that records positions must not be inside the steps around it; None if it may.
+def placement_error(kind: str, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
+    """Return the reason why a step that records positions must not be at its place in a procedure; None if it may.
 
     Args:
         kind: The kind of the step, for the message.
+        earlier: The steps that start before it.
         within: The steps that contain it.
     """
+    if any(position_sources.FILE in step.files() for step in earlier):
+        return (
+            "a repeat can have only one step that records positions (track, or mavlink with positions); add further "
+            "positions after the trial: fieldkit positions"
+        )
     if any(nest.has_path for nest in within):
         return f"a {kind} must start before robots move: put the move into the {kind}"
     if any(nest.disturbs or nest.parallel for nest in within):

@@ -33,7 +33,7 @@ IDENTITY: Final = columns.columns(
         "count",
         "Number of the attempt, from 1; above 1 after a void attempt. The last allowed attempt is valid or failed.",
     ),
-    ("status", "text", "valid, void (evidence is incomplete) or failed."),
+    ("status", "text", "valid, void (not valid, so the repeat is tried again) or failed (no valid attempt)."),
     ("reason", "text", "Reason why the attempt is not valid; empty if it is valid."),
     ("started_utc_ns", "ns", "Start by the laptop's clock, nanoseconds since 1970 UTC."),
     ("seed", "count", "The trial's seed."),

@@ -88,10 +88,11 @@ class Procedure(catalog.Named, Sectioned):
 
     Roles are `sender`, `receiver`, `relay`, and further roles for which the procedure gives places. See [add a
     procedure](add-a-procedure.md). Steps of a kind are distinguished by their `name`. Without names, a procedure can
-    have at most one `transfer`, one `ping`, one `record`, `capture` and `move` per robot, and one `fault` of each
-    kind. Files must have different names. Simultaneous steps must have different ports or different listening robots.
-    Steps in one capture must differ in port, sender or receiver. A procedure that cannot be measured is rejected when
-    it is loaded; the message contains the line.
+    have at most one step of a kind, where `send` counts as a `transfer`. Exceptions are `record` and `capture` (one
+    per robot), `fault` (one of each kind), `ask` (one per column), `wait` and `together` (any number). Files must
+    have different names. Simultaneous steps must have different ports or different listening robots. Steps in one
+    capture must differ in port, sender or receiver. A procedure that cannot be measured is rejected when it is
+    loaded; the message contains the line.
 
     In `master`, sender and receiver are on opposite sides of the relay, and the distance is between each of them and
     the relay. In `masterless`, it is between sender and receiver. Protocols alternate from repeat to repeat, so that
@@ -102,7 +103,7 @@ class Procedure(catalog.Named, Sectioned):
         topology: `master` or `masterless`; the command line may override it.
         protocols: List of `tcp`, `udp`; the command line may override it.
         repeats: Repeats per protocol; the command line may override it.
-        attempts: Maximum number of attempts at a repeat; another attempt is made if the evidence is incomplete.
+        attempts: Maximum number of attempts at a repeat; another attempt is made if an attempt is void.
         needs_ros_master: True if the procedure needs one ROS master for all robots. A site file without `ros_master`
             is then rejected.
         places: Positions of robots in additional roles, by role.

@@ -54,5 +54,8 @@ def reserve_bytes(plan: Plan, role: Role) -> int:
 
 
 def trial_bytes(plan: Plan) -> int:
-    """Return `attempt_bytes` times the number of repeats. `SPARE` includes the attempts that are repeated."""
+    """Return the estimated number of bytes that the trial leaves on the laptop.
+
+    It is `attempt_bytes` for each repeat of each protocol. `SPARE` covers the attempts that are repeated.
+    """
     return attempt_bytes(plan) * plan.repeats * len(plan.protocols)

@@ -31,7 +31,8 @@ from sim_backends.cosim.policies.window_ends import WindowEnds
 from sim_backends.cosim.run_record import EventDigest, Fate, Run, Window, WindowObserver
 from sim_backends.cosim.wall_time import Progress, WallTime, rate_limited
 from sim_backends.network.packets import Arrival, Drop, Packet, ReceivedDatagram
-from sim_backends.world.motion import DeadReckoned, State
+from sim_backends.world.dead_reckoning import DeadReckoned
+from sim_backends.world.motion import State
 
 _NOTHING: Final[tuple[Sequence[Fate], Sequence[Packet], Sequence[Fate], Sequence[Fate]]] = (), (), (), ()
 """Values for a window without packets: the three results of `Coordinator._enter`, and the decided fates."""

@@ -11,7 +11,8 @@ from sim_backends.cosim.federates import FederateError, advance_text, seconds_te
 from sim_backends.cosim.run_record import Fate
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.radio.random_streams import PacketIdentity
-from sim_backends.world.motion import STILL, DeadReckoned, State, extrapolate
+from sim_backends.world.dead_reckoning import DeadReckoned, extrapolate
+from sim_backends.world.motion import STILL, State
 
 ABSENT: Final = "agent absent"
 """Reason of a drop: source or destination had not appeared yet, or disappeared before the packet arrived."""

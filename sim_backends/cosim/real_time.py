@@ -1,7 +1,7 @@
 """Runs simulations in real time: each window has an absolute deadline in wall time, and late windows are counted.
 
-Sleeping for the length of each window would add the time of every computation to the duration of the run. A window
-that is late is therefore followed by windows without a pause until the run has caught up.
+Sleeping for the length of each window would add the time of every computation to the duration of the run. With
+absolute deadlines, a window that is late is followed by windows without a pause until the run has caught up.
 """
 
 import time
@@ -19,7 +19,7 @@ LATE_BOUND_S: Final = 0.1
 
 
 class RealTimeError(EvidenceError):
-    """A run was slower than real time, so its results are not valid."""
+    """A run was slower than its pace (`--realtime`), so its results are not valid."""
 
 
 @dataclass
@@ -96,8 +96,9 @@ class Pace:
                 report(window_end_ns)
             if late_ns > bound_ns:
                 raise RealTimeError(
-                    f"the run was slower than real time: the window that ends at {seconds_text(window_end_ns)} was "
-                    f"{late_ns / 1e9:.3f} s late, and the bound is {self.late_bound_s:g} s",
+                    f"the run was slower than --realtime {self.factor:g}: the window that ends at "
+                    f"{seconds_text(window_end_ns)} was {late_ns / 1e9:.3f} s late, and the bound is "
+                    f"{self.late_bound_s:g} s",
                     remedy="use a lower --realtime, a longer window, or a less busy machine",
                 )
             if late_ns < 0:

@@ -15,7 +15,8 @@ from sim_backends.emane_events.protobuf import MalformedEventError
 
 _MREQN: Final = struct.Struct("=4s4si")  # struct ip_mreqn (Linux, ip(7))
 _MAX_EVENT_BYTES: Final = 1200
-"""Maximum content of a datagram that fits into an Ethernet frame; a larger event is sent alone."""
+"""Maximum total content of the events of a datagram, which then fits into an Ethernet frame with all headers. A
+larger event is sent alone."""
 _RECEIVE_BYTES: Final = 1 << 16
 
 
@@ -119,14 +120,14 @@ class EventListener:
             self._socket.close()
             raise
 
-    def receive(self, limit_s: float) -> Sequence[SerializedEvent] | None:
+    def receive(self, deadline_s: float) -> Sequence[SerializedEvent] | None:
         """Return the events of the next valid datagram, or None if none arrives before the deadline.
 
         Args:
-            limit_s: The deadline, a time of `time.monotonic`.
+            deadline_s: The deadline, a time of `time.monotonic`.
         """
         while True:
-            wait_s = max(limit_s - time.monotonic(), 0.0)
+            wait_s = max(deadline_s - time.monotonic(), 0.0)
             if not select.select([self._socket], [], [], wait_s)[0]:
                 return None
             try:

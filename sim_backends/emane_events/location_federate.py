@@ -94,10 +94,10 @@ class EmaneLocations:
         """Close the channel."""
         self._listener.close()
 
-    def _wait_for_all(self, limit_s: float) -> None:
-        """Wait until a location of each agent has arrived."""
+    def _wait_for_all(self, deadline_s: float) -> None:
+        """Wait until a location of each agent has arrived, at most until `deadline_s`, a time of `time.monotonic`."""
         while len(self._states) < len(self._agents):
-            events = self._listener.receive(limit_s)
+            events = self._listener.receive(deadline_s)
             if events is None:
                 missing = ", ".join(
                     f"{name} (NEM {nem})" for nem, name in self._agents.items() if name not in self._states

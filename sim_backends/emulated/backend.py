@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -17,6 +18,7 @@ from fieldkit.core.model import Control, Topology
 from fieldkit.core.prompts import Operator
 from fieldkit.remote.shell import Shell
 from sim_backends.emulated.emulated_options import EmulatedOptions, Ros2Options, RosChoice, load_options
+from sim_backends.emulated.medium.air_files import LIMIT_BYTES
 from sim_backends.emulated.motion_sections import DRIVE, MAVLINK, drive_of, mavlink_of
 from sim_backends.emulated.provisioning import (
     LAPTOP_ADDRESS,
@@ -25,6 +27,7 @@ from sim_backends.emulated.provisioning import (
     RobotKey,
     drives_by_topic,
     link_addresses,
+    profile_in_lab,
     sensors_of,
 )
 from sim_backends.emulated.robot.spec import unsupported_paths
@@ -132,7 +135,7 @@ class EmulatedBackend:
         """Implement `Relocating.run_elsewhere`: the command runs in a virtual machine."""
         from sim_backends.emulated.linux_wifi import guest  # noqa: PLC0415 (as above)
 
-        return guest.run_command(argv, results, radios=self._radio_count)
+        return guest.run_command(argv, results, radios=self._radio_count, mesh=self._options.mesh)
 
     @property
     def _radio_count(self) -> int:
@@ -159,8 +162,6 @@ class EmulatedBackend:
         """
         if not self._options.record_air or self._options.radio.is_fixed:
             return 0
-        from sim_backends.emulated.medium.air_log import LIMIT_BYTES  # noqa: PLC0415 (it imports numpy, which is slow)
-
         return LIMIT_BYTES
 
     def cast(self, topology: Topology) -> Cast:
@@ -169,7 +170,13 @@ class EmulatedBackend:
         self._check_profiles(cast)
         self._check_infrastructure((robot.name for robot in cast.values()), has_relay=topology is Topology.MASTER)
         return {
-            role: robot.model_copy(update={"abilities": self._abilities(robot, cast)}) for role, robot in cast.items()
+            role: robot.model_copy(
+                update={
+                    "abilities": self._abilities(robot, cast),
+                    "profile": profile_in_lab(robot.profile, self._options),
+                }
+            )
+            for role, robot in cast.items()
         }
 
     def _link_addresses(self, topology: Topology) -> dict[str, dict[str, str]]:
@@ -245,9 +252,8 @@ class EmulatedBackend:
 
             sink(Note("starting a virtual machine, because mac80211_hwsim cannot be used here"))
             draw = partial(interactive_lab.overview, members, options=self._options, world=self._world)
-            with guest_lab.bring_up(
-                members, self._site_of_guest(), seed=seed, radios=self._radio_count, draw=draw
-            ) as lab:
+            site, mesh = self._site_of_guest(), self._options.mesh
+            with guest_lab.bring_up(members, site, seed=seed, radios=self._radio_count, draw=draw, mesh=mesh) as lab:
                 yield lab
             return
         ros = self._find_ros(members)
@@ -259,20 +265,21 @@ class EmulatedBackend:
 
     def overview(self) -> "Overview":
         """Implement `LabBackend.overview`, without shadowing, which depends on the seed."""
-        from sim_backends.emulated import interactive_lab, placement  # noqa: PLC0415 (as in `open`)
+        from sim_backends.emulated import interactive_lab, interactive_placement  # noqa: PLC0415 (as in `open`)
 
         members = self._members()
-        return interactive_lab.overview(members, placement.square_m(members, self._world), self._options, self._world)
+        positions_m = interactive_placement.square_m(members, self._world)
+        return interactive_lab.overview(members, positions_m, self._options, self._world)
 
     def gazebo_world(self, version: str) -> str:
         """Implement `GazeboWorlds.gazebo_world`; the robots are at their positions in an interactive lab."""
-        from sim_backends.emulated import placement, simulator_choice  # noqa: PLC0415 (as in `open`)
+        from sim_backends.emulated import interactive_placement, simulator_choice  # noqa: PLC0415 (as in `open`)
         from sim_backends.gazebo.sdf import SdfRobot, world_sdf  # noqa: PLC0415 (as above)
 
         members = self._members()
-        places_m = placement.square_m(members, self._world)
+        places_m = interactive_placement.square_m(members, self._world)
         robots = {
-            name: SdfRobot(body.limits, placement.below_antenna_m(places_m[name]), 0.0)
+            name: SdfRobot(body.limits, interactive_placement.below_antenna_m(places_m[name]), 0.0)
             for name, body in simulator_choice.bodies_of(members.values()).items()
         }
         step_ns = simulator_choice.sync_of(self._options).step_ns
@@ -286,7 +293,10 @@ class EmulatedBackend:
         members = interactive_lab.members_of(self._site, self._document, self._addresses)
         self._check_profiles(members)
         self._check_infrastructure(members, has_relay=False)
-        return members
+        return {
+            name: replace(robot, profile=profile_in_lab(robot.profile, self._options))
+            for name, robot in members.items()
+        }
 
     def _check_infrastructure(self, names: Iterable[str], *, has_relay: bool) -> None:
         """Raise ConfigurationError if the access points or neighbours in the options conflict with the robots."""
@@ -319,10 +329,12 @@ class EmulatedBackend:
 
         has_linux_wifi, variants = self._options.has_linux_wifi, self._options.robots
         robot_variants = (variants[name] for name in names if name in variants)
-        mesh = set() if self._options.mesh is None else {self._options.mesh.daemon}
+        mesh = set() if self._options.mesh is None else {self._options.mesh.program}
         wifi = {"hostapd", "iw", "nft", "wpa_supplicant"} if has_linux_wifi else set()
         programs = {program for options in robot_variants for program in options.programs()}
         requirements.check(programs | mesh | wifi, needs_tun=not has_linux_wifi)
+        if self._options.has_batman:
+            requirements.check_batman()
         return requirements.ros_in_use(self._options.ros)
 
 

@@ -18,16 +18,17 @@ from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Vector
 from fieldkit.lab.protocol import LabLateness, LabLink, Login, Outline, Overview
 from fieldkit.lab.robots import Destination, LabRobot
-from sim_backends.emulated import placement
+from sim_backends.emulated import interactive_placement, placement
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.mobility import WATCH_S, MotionThread, self_steered_motions
 from sim_backends.emulated.motion_sections import mavlink_of
 from sim_backends.emulated.robot.spec import USER
-from sim_backends.emulated.ros.robot_motion import AssignedPath
+from sim_backends.emulated.ros.assigned_path import AssignedPath
 from sim_backends.emulated.running_robots import RunningRobots, running_robots
 from sim_backends.radio.antennas import antenna_of
 from sim_backends.radio.world_channel import WorldChannel
 from sim_backends.world.motion import Attitude, State, attitude_of
+from sim_backends.world.penetration import Obstacles
 from sim_backends.world.world import World
 
 
@@ -54,7 +55,7 @@ class EmulatedLab:
         self._running = running
         self._options = options
         self._world = world
-        self._positions_m = placement.square_m(members, world)
+        self._positions_m = interactive_placement.square_m(members, world)
         self._path_starts_ns: dict[str, int] = {}
         self._states: dict[str, State] = {}
         self._watch: MotionThread | None = None
@@ -88,7 +89,7 @@ class EmulatedLab:
     def move(self, name: str, to: Destination) -> Vector:
         """Implement `Lab.move`: the robot arrives immediately."""
         with self._lock:
-            position_m = placement.destination_m(self._positions_m[name], to, self._world)
+            position_m = interactive_placement.destination_m(self._positions_m[name], to, self._world)
             positions_m = self._positions_m | {name: position_m}
             # As in a trial, the robot is updated before the medium, whose physics simulator refuses a position in an
             # obstacle.
@@ -207,7 +208,9 @@ def overview(
             channel.are_linked(first_index, second_index),
             tuple(dict.fromkeys(crossing.obstacle for crossing in crossings)),
         )
-        for (first_index, second_index), crossings in zip(pairs, world.crossings(first, second), strict=True)
+        for (first_index, second_index), crossings in zip(
+            pairs, Obstacles(world).crossings(first, second), strict=True
+        )
     ]
     # In drawing order: a higher part covers a lower one.
     parts = sorted(world.parts, key=lambda part: part.shape.top_m)

@@ -24,18 +24,20 @@ from sim_backends.world.motion import STILL, Attitude, Motion, State, attitude_o
 from sim_backends.world.world import World
 
 STEP_M: Final = 0.1
-"""Distance that a robot may move between two updates of the medium, at a speed of 1 to 5 m/s.
+"""Distance that a robot may move between two updates of the medium.
 
-At lower and higher speeds, `_MAX_PERIOD_S` and `_MIN_PERIOD_S` determine the distance.
+At speeds above 5 m/s, `_MIN_PERIOD_S` makes the distance longer. At speeds below 1 m/s, or below 2 m/s if the robot
+steers itself, `_MAX_PERIOD_S` or `WATCH_S` makes it shorter.
 
 At the distance d, the path loss increases by 10 n / (d ln 10) dB per metre, with the path-loss exponent n. At 10 m
-and n = 3 this is 1.3 dB/m, so a step changes it by 0.13 dB. Fading, which changes within a wavelength (0.12 m),
-continues between the updates.
+and n = 3 this is 1.3 dB/m, so a step changes it by 0.13 dB. Fading changes within a wavelength (0.12 m); between the
+updates the medium extrapolates it with the velocities.
 """
 
 _MIN_PERIOD_S: Final = 0.02
+"""Minimum time between two updates of the medium while a robot moves."""
 _MAX_PERIOD_S: Final = 0.1
-"""Limits of the time between two updates of the medium while the lab moves a robot."""
+"""Maximum time between two updates of the medium while the lab moves a robot."""
 
 WATCH_S: Final = 0.05
 """Polling interval for robots that steer themselves, while they are at rest or slow; a robot that starts to drive at
@@ -104,7 +106,7 @@ def self_steered_motions(
 
 
 class PlacesRobots(Protocol):
-    """One medium, or several media."""
+    """The part of a medium, or of several media, that places robots."""
 
     def place(
         self,
@@ -127,7 +129,7 @@ class Mobility:
         laptop: The operator's laptop, placed beside the robots; None if it is not on the air.
         robots: Handles of the robots, which receive their paths and report their motion if they steer themselves.
         write_positions: Called with the positions of the laptop and of the robots that are not out of range, metres
-            east, north, up, for the lasers of other robots.
+            east, north, up, for the laser scanners of other robots.
     """
 
     def __init__(
@@ -162,7 +164,9 @@ class Mobility:
         """Move all robots to their positions, immediately.
 
         Raises:
-            LinkError: The medium process exited or did not answer.
+            ConfigurationError: The world has no line for the scenario.
+            LinkError: The medium process or a robot exited or did not answer.
+            RobotError: A kernel call of a robot failed.
         """
         with self._lock:
             self._placement = placement
@@ -173,7 +177,7 @@ class Mobility:
             self._update_medium()
 
     def return_to_place(self, role: Role) -> None:
-        """Move one robot back to its position, immediately. Raises the errors of `set_out_of_range`."""
+        """Move one robot back to its position, immediately. Raises the errors of `moving`."""
         with self._lock:
             self._send_path(Move(role, (), speed_m_s=1.0), time.monotonic_ns())
             self._update_medium()
@@ -197,8 +201,8 @@ class Mobility:
         """Move a robot while the body runs; then move it back to its position, even after an error.
 
         Raises:
-            LinkError: The medium process exited or did not answer.
-            RobotError: The robots have not been placed yet.
+            LinkError: The medium process or the robot exited or did not answer.
+            RobotError: The robots have not been placed yet, or a kernel call of the robot failed.
         """
         motion = positions.motion(self._cast, self._require_placement(), move, self._world)
         entry = time.monotonic_ns(), motion

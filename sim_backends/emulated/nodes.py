@@ -13,11 +13,9 @@ from fieldkit.core.errors import LinkError, RobotError, TestbedLostError
 from sim_backends.emulated.process import namespaces
 from sim_backends.emulated.process.worker import REPLY_S, Worker
 from sim_backends.emulated.provisioning import LAPTOP_NAME
-from sim_backends.emulated.robot.init import START_S
-from sim_backends.emulated.robot.spec import HOME, RobotSpec
-from sim_backends.emulated.robot.ssh_server import SSH_PORT
+from sim_backends.emulated.robot.spec import HOME, SSH_PORT, START_S, RobotSpec
+from sim_backends.emulated.ros.assigned_path import AssignedPath
 from sim_backends.emulated.ros.motion_record import MotionRecord, RecordedMotion
-from sim_backends.emulated.ros.robot_motion import AssignedPath
 
 # The radio of the shipped robot profiles, so that a link has the same quality in both directions.
 LAPTOP_RADIO: Final = Radio(interface="wlan0", standard="802.11n 2.4 GHz", tx_power_dbm=17, sensitivity_dbm=-82)
@@ -136,7 +134,7 @@ class EmulatedRobot(Node):
     Args:
         spec: Specification of the robot.
         positions_fd: Descriptor of the shared memory that holds the positions of all robots
-            (`laser.PositionsWriter`). It must stay open until `build` has returned; None for a robot without
+            (`lab_positions.PositionsWriter`). It must stay open until `build` has returned; None for a robot without
             neighbours.
 
     Attributes:
@@ -200,7 +198,7 @@ class EmulatedRobot(Node):
 
         Raises the errors of `open_radio`.
         """
-        interface, _ = self.spec.links.get(link, (self.spec.interface, ""))
+        interface, _ = self.spec.links.get(link, (self.spec.radio_interface, ""))
         self._worker.request({"do": "switch off", "interface": interface})
 
     def switch_on(self, link: str = "") -> None:
@@ -208,11 +206,11 @@ class EmulatedRobot(Node):
         if link in self.spec.links:
             self._worker.request({"do": "switch link on", "interface": self.spec.links[link][0]})
         else:
-            self._worker.request({"do": "switch on", "interface": self.spec.interface})
+            self._worker.request({"do": "switch on", "interface": self.spec.radio_interface})
 
     @property
     def _interfaces(self) -> list[str]:
-        return [self.spec.interface, *(self.spec.links[name][0] for name in self.link_fds)]
+        return [self.spec.radio_interface, *(self.spec.links[name][0] for name in self.link_fds)]
 
     def kill(self, process: str) -> None:
         """Kill every process of this name.

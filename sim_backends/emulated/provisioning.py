@@ -20,12 +20,13 @@ from sim_backends.emulated.robot.spec import (
     ANTENNA_M,
     LOOPBACK,
     LOOPBACK_INTERFACE,
+    MESH_INTERFACE,
     SHARED_NETWORK,
     Base,
     RobotSpec,
     Ros2Spec,
 )
-from sim_backends.emulated.ros import static_frames
+from sim_backends.emulated.ros import message_definitions, static_frames
 from sim_backends.emulated.ros.sensor_specs import (
     GENERATED_TYPES,
     LASER_SCAN,
@@ -85,11 +86,9 @@ class KeyPair:
 def definition(kind: str, text: str = "") -> Definition:
     """Return the definition of the ROS 1 message type `package/Name`; `text` is used if ROS has no such type.
 
-    Raises the errors of `templates.template_of`.
+    Raises the errors of `message_definitions.definition_of`.
     """
-    from sim_backends.emulated.ros import templates  # noqa: PLC0415 (it imports rosbags, which takes 50 ms)
-
-    return templates.definition_of(kind, text)
+    return message_definitions.definition_of(kind, text)
 
 
 def sensors_of(robot: "Robot | LabRobot") -> tuple[Sensor, ...]:
@@ -100,7 +99,7 @@ def sensors_of(robot: "Robot | LabRobot") -> tuple[Sensor, ...]:
 def _definitions(robot: "Robot | LabRobot") -> dict[str, Definition]:
     """Return the definitions of the message types that a robot publishes.
 
-    Raises the errors of `templates.template_of`.
+    Raises the errors of `message_definitions.definition_of` and of `sensors_of`.
     """
     definitions = {topic.type: definition(topic.type, topic.definition) for topic in robot.profile.topics}
     if static_frames.links(sensors_of(robot)):
@@ -112,7 +111,7 @@ def _sensor(topic: PublishedTopic) -> Sensor:
     sensor = Sensor(topic.name, topic.type, topic.rate, topic.frame, topic.points, child_frame=topic.child_frame)
     if topic.type in GENERATED_TYPES:
         return sensor
-    from sim_backends.emulated.ros import templates  # noqa: PLC0415 (as above)
+    from sim_backends.emulated.ros import templates  # noqa: PLC0415 (few topics have other types)
 
     return replace(sensor, template=templates.template_of(topic))
 
@@ -204,6 +203,21 @@ def ros2_middleware(profile: RobotProfile, options: EmulatedOptions) -> str:
     return ros.middleware if find_spec(package) else ""
 
 
+def profile_in_lab(profile: RobotProfile, options: EmulatedOptions) -> RobotProfile:
+    """Return a profile with the interface under test that the robot has in the lab.
+
+    In a mesh of batman-adv this is the mesh interface, even if the profile names the Wi-Fi interface below it.
+    """
+    if not options.has_batman:
+        return profile
+    radio = profile.radio.model_copy(update={"interface": MESH_INTERFACE})
+    links = {
+        name: MESH_INTERFACE if interface == profile.radio.interface else interface
+        for name, interface in profile.links.items()
+    }
+    return profile.model_copy(update={"radio": radio, "links": links})
+
+
 def link_addresses(profile: RobotProfile, address: str, options: EmulatedOptions) -> dict[str, str]:
     """Return a robot's address on each further link that the lab emulates, by the link's name.
 
@@ -220,12 +234,12 @@ def link_addresses(profile: RobotProfile, address: str, options: EmulatedOptions
     networks = {name: NETWORK.network_address + 256 * number for number, name in enumerate(sorted(options.links), 1)}
     # In a mesh, a link on the loopback interface is a second address of the robot, reachable over all other links.
     for name, interface in profile.further_links.items():
-        if interface == LOOPBACK_INTERFACE and options.mesh is not None:
+        if interface == LOOPBACK_INTERFACE and options.babel_hello_s is not None:
             networks[name] = SHARED_NETWORK.network_address
         if name not in networks:
             has_address_only = interface == LOOPBACK_INTERFACE
             example = (
-                "mesh: {daemon: babeld, hello: 0.5s}"
+                "mesh: {protocol: babel, hello: 0.5s}"
                 if has_address_only
                 else f"links: {{{name}: {{rate: 20Mbit/s, delay: 40ms}}}}"
             )
@@ -345,7 +359,7 @@ def robot_spec(
         base=_base(robot.profile, is_simulated=options.is_cosimulated)
         if has_debian_ros1 or ros2_over_radio is not None
         else None,
-        mesh_hello_s=None if options.mesh is None else options.mesh.hello,
+        mesh_hello_s=options.babel_hello_s,
         ros2=ros2_over_radio,
         bridge=_bridge(robot),
         links={

@@ -10,7 +10,8 @@ from fieldkit.core.errors import ConfigurationError
 from sim_backends.emulated.emulated_options import RosChoice, uses_debian_ros
 from sim_backends.emulated.process import namespaces
 from sim_backends.emulated.process.worker import PATH
-from sim_backends.emulated.robot import network, rootfs, services
+from sim_backends.emulated.robot import tun_devices
+from sim_backends.emulated.robot.spec import ROBOT_FILES, ROSCORE
 
 PACKAGE_OF: Final = {
     "unshare": "util-linux",
@@ -33,6 +34,7 @@ VARIANT_PACKAGE_OF: Final = {
     "dropbear": "dropbear-bin",
     "dropbearconvert": "dropbear-bin",
     "babeld": "babeld",
+    "batctl": "batctl",
     "hostapd": "hostapd",
     "iw": "iw",
     "nft": "nftables",
@@ -40,8 +42,10 @@ VARIANT_PACKAGE_OF: Final = {
 }
 """Debian package of each program that only an option of the lab needs."""
 
+_BATMAN_MODULE: Final = Path("/sys/module/batman_adv")
+
 ROS_PACKAGES: Final = ("python3-rosmaster", "python3-rosbag", "python3-rospy", "python3-sensor-msgs")
-_MASTER_FILES: Final = {services.ROSCORE: "python3-roslaunch", "/usr/lib/rosout/rosout": "rosout"}
+_MASTER_FILES: Final = {ROSCORE: "python3-roslaunch", "/usr/lib/rosout/rosout": "rosout"}
 """Files that a ROS master for several robots needs in addition, and the Debian packages that contain them."""
 
 
@@ -69,12 +73,21 @@ def check(programs: Iterable[str] = (), *, needs_tun: bool = True) -> None:
         namespaces.check()
         _check_files()
     if needs_tun:
-        os.close(network.open_device())
+        os.close(tun_devices.open_device())
+
+
+def check_batman() -> None:
+    """Raise ConfigurationError if the module batman-adv is not loaded; a robot's namespace cannot load it."""
+    if not _BATMAN_MODULE.exists():
+        raise ConfigurationError(
+            "`mesh: {protocol: batman-adv}` needs the kernel module batman-adv, which is not loaded",
+            remedy="as root: modprobe batman-adv; or write protocol: babel",
+        )
 
 
 def _check_files() -> None:
     """Raise ConfigurationError if a file that each robot replaces by a mount is missing; only root can create it."""
-    missing = [path for path in rootfs.ROBOT_FILES if not Path(path).exists()]
+    missing = [path for path in ROBOT_FILES if not Path(path).exists()]
     if missing:
         raise ConfigurationError(
             f"this machine has no {', '.join(missing)}; each robot mounts a separate file there",

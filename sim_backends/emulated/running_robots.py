@@ -8,7 +8,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Final, Generic
 
 from fieldkit.backends.protocols import Robot
-from fieldkit.lab.robots import LabRobot
 from sim_backends.emulated import placement
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.medium.framing import ETHERNET, IP, Framing
@@ -17,11 +16,12 @@ from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.emulated.nodes import EmulatedRobot
 from sim_backends.emulated.provisioning import KeyPair, RobotKey, robot_spec
 from sim_backends.emulated.robot.spec import WifiSpec
-from sim_backends.emulated.ros.laser import PositionsWriter
+from sim_backends.emulated.ros.lab_positions import PositionsWriter
 from sim_backends.radio.antennas import antenna_of, fixed_mode
 from sim_backends.world.world import World
 
 if TYPE_CHECKING:
+    from fieldkit.lab.robots import LabRobot
     from sim_backends.emulated.linux_wifi.radios import HwsimRadio
 
 _MAX_PARALLEL_STARTS: Final = 16
@@ -36,7 +36,7 @@ class RunningRobots(Generic[RobotKey]):
         robots: The robots.
         medium: The medium of the radio under test.
         media: This medium and those of further links.
-        positions_writer: Writer of the robots' positions, for the lasers of the other robots.
+        positions_writer: Writer of the robots' positions, for the laser scanners of the other robots.
         host_keys: Public host key of each robot.
         private_key: Private key that logs in on all robots, OpenSSH PEM.
     """
@@ -51,7 +51,7 @@ class RunningRobots(Generic[RobotKey]):
 
 @contextmanager
 def running_robots(
-    robots: Mapping[RobotKey, Robot | LabRobot],
+    robots: "Mapping[RobotKey, Robot | LabRobot]",
     *,
     options: EmulatedOptions,
     world: World,
@@ -77,7 +77,7 @@ def running_robots(
         if options.has_linux_wifi:
             from sim_backends.emulated.linux_wifi import lab  # noqa: PLC0415 (only some labs use it)
 
-            wifi = lab.wifi_specs(robots, options.linux_wifi, options.radio)
+            wifi = lab.wifi_specs(robots, options.linux_wifi, options.radio, options.mesh)
             radios = lab.radios_of(robots.values(), options.radio)
             medium: MediumClient = stack.enter_context(lab.medium(options.radio, world, seed, radios, wifi.values()))
         elif options.is_cosimulated:
@@ -128,7 +128,7 @@ def running_robots(
 
 
 def _cosimulated_medium(
-    options: EmulatedOptions, world: World, robots: Mapping[RobotKey, Robot | LabRobot], seed: int, framing: Framing
+    options: EmulatedOptions, world: World, robots: "Mapping[RobotKey, Robot | LabRobot]", seed: int, framing: Framing
 ) -> MediumClient:
     """Start the medium of a lab on the co-simulation."""
     from sim_backends.emulated import simulator_choice  # noqa: PLC0415 (other labs import no simulator)
@@ -150,6 +150,6 @@ def _build(robot: EmulatedRobot, radios: "Mapping[str, HwsimRadio]") -> None:
     if radio is not None:
         radio.move_to_namespace(robot.pid)
         robot.open_wifi(radio.interface)
-        return
-    robot.open_radio(mesh=robot.spec.mesh_hello_s is not None)
+    else:
+        robot.open_radio(mesh=robot.spec.mesh_hello_s is not None)
     robot.open_links()

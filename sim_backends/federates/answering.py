@@ -42,7 +42,7 @@ from sim_backends.federates.frames import (
 from sim_backends.federates.handshake import NO_EVENT, FederateCapability, Hello, Welcome
 from sim_backends.federates.records import COMMAND_TYPES, command_type
 from sim_backends.federates.transports.contract import TOKEN_VARIABLE, is_same_token
-from sim_backends.world.motion import DeadReckoned
+from sim_backends.world.dead_reckoning import DeadReckoned
 
 _MAX_COPIES: Final = 1000
 """Largest number of copies of a federate in one run."""

@@ -31,7 +31,7 @@ class FrameChannel(Protocol):
             deadline_s: Time of `time.monotonic` until which to wait; None for no deadline.
 
         Raises:
-            ClosedError: The other side closed the channel.
+            ClosedError: The channel is closed.
             DeadlineError: The other side did not read in time.
         """
         ...
@@ -44,7 +44,7 @@ class FrameChannel(Protocol):
             max_bytes: Largest allowed size of a body.
 
         Raises:
-            ClosedError: The other side closed the channel.
+            ClosedError: The channel is closed.
             DeadlineError: No complete frame arrived before the deadline.
             MalformedFrameError: The header is malformed.
         """
@@ -154,8 +154,9 @@ def _wait(poll: select.poll, deadline_s: float | None) -> None:
 def socket_channel(connection: socket.socket) -> StreamChannel:
     """Return a channel over a connected TCP socket; the channel closes the socket.
 
-    Small frames are sent immediately (RFC 9293, section 3.7.4, on Nagle's algorithm), and a connection whose other
-    side has disappeared is closed after a minute.
+    Small frames are sent immediately (RFC 9293, section 3.7.4, on Nagle's algorithm), and an idle connection whose
+    other side has disappeared is closed after a minute (keepalive, RFC 9293, section 3.8.4). If sent data are
+    unacknowledged, Linux retransmits them for about 15 minutes before it closes the connection (`tcp_retries2`).
     """
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)

@@ -23,7 +23,8 @@ from sim_backends.federates.protocols import FederateError, advance_text, second
 from sim_backends.federates.records import ArrivalDelay, command_type
 from sim_backends.federates.session import FederateSession, open_session
 from sim_backends.network.packets import Arrival, Drop, Packet
-from sim_backends.world.motion import DeadReckoned, State
+from sim_backends.world.dead_reckoning import DeadReckoned
+from sim_backends.world.motion import State
 
 ArrivalDelayLog = Callable[[Arrival, ArrivalDelay], None]
 """Called with each arrival, and the parts of its delay."""

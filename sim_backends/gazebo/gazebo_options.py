@@ -20,8 +20,8 @@ Position = tuple[Coordinate, Coordinate, Coordinate]
 class GazeboOptions(SimulatorOptions):
     """Options of the physics simulator [Gazebo](gazebo.md).
 
-    In names of services and topics, `{world}` and `{model}` are replaced by the names of the world and of the agent's
-    model.
+    In names of services and topics, `{world}` is replaced by the name of the world. In topics of commands, `{model}`
+    is replaced by the name of the agent's model.
 
     Attributes:
         world: Name of Gazebo's world; if omitted, the name of the scenario's world.
@@ -33,25 +33,28 @@ class GazeboOptions(SimulatorOptions):
         pose_service: Service that places robots.
         create_service: Service that creates the model of an agent when it appears.
         remove_service: Service that removes the model of an agent when it disappears.
-        model_files: SDF file, on the machine of Gazebo, for each agent that appears with another model than the one
-            in `fieldkit cosim sdf`.
+        model_files: SDF file, on the machine of Gazebo, for each agent with `appears` or `disappears` whose model is
+            not the one in `fieldkit cosim sdf`. A model that disappears is created again at the end of the run.
         pose_topic: Topic of the poses of the models.
         clock_topic: Topic of the simulated time.
         command_topic: Topic of the commands to an agent.
         command_topics: Topic of the commands to each agent whose topic is not `command_topic`.
-        acknowledge: Acknowledgement of the commands before each window: `auto` if the world has a plugin for it,
-            `required`, or `off`; see [lock-step](gazebo.md#lock-step).
+        acknowledge: Acknowledgement of commands before the next step: `required` by a plugin of the world, `auto` by
+            the plugin or without it by requests to the control service, or `off`; see
+            [lock-step](gazebo.md#lock-step).
         fence_topic: Topic of requests for the acknowledgement.
         fence_answer: Topic of the acknowledgement.
         reset: Reset the world before a run.
         place: Set the poses of the robots before a run.
-        settle_s: Simulated time in which robots come to rest, before the reset and before time 0.
+        settle_s: Simulated time in which robots come to rest before time 0. Before the reset, it may be up to six
+            times as long.
         start_error_m: Largest permitted distance of a robot from its start position at the start of a run.
-        velocity: Velocities are the difference of positions over the last `step`, or over the `window`, which takes
-            one request to Gazebo per window instead of two.
+        velocity: Interval over which velocities are computed from positions: the last `step`, or the `window`, which
+            takes one request to Gazebo per window instead of two.
         gravity_m_s2: Gravity that is compensated for robots that fly; 0 if their links have no gravity.
         yaw_gain_per_s: Commanded yaw rate of robots that fly, per radian of heading error.
-        control_period_s: Interval between commands to robots that fly, in simulated time.
+        control_period_s: Interval, in simulated time, between repeated commands while a robot that flies turns to its
+            commanded heading.
         limit_m_s2: Largest acceleration, for the sync policy `error_bounded`; if omitted, this policy exchanges
             states after every step while an agent sends.
         deterministic: True to declare that equal requests give equal answers.

@@ -14,7 +14,7 @@ from sim_backends.network.wire import IpPacket, Wire
 UNICAST: Final = "ip"
 """Name of the transport of packets with one receiver."""
 BROADCAST: Final = "ip-broadcast"
-"""Name of the transport of packets to all stations."""
+"""Name of the transport of broadcasts and multicasts."""
 
 
 def broadcast_flow(source: str) -> str:
@@ -52,7 +52,7 @@ class _Group:
     """The packets of one broadcast.
 
     Attributes:
-        packet_ids: Packet number for each receiver that has neither received nor missed the frame.
+        packet_ids: ID of the packet to each receiver that has neither received nor missed the frame.
         miss_reasons: Reason for each receiver that missed the frame before the packet addressed to it was sent.
     """
 

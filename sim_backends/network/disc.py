@@ -5,7 +5,8 @@ import math
 from collections.abc import Mapping, Sequence
 
 from sim_backends.network.packets import Arrival, Drop, Packet
-from sim_backends.world.motion import DeadReckoned, State
+from sim_backends.world.dead_reckoning import DeadReckoned
+from sim_backends.world.motion import State
 
 
 class Disc:

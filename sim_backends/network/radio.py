@@ -17,7 +17,8 @@ from sim_backends.network.wire import CountsMisses, IpPacket, Transport, Wire
 from sim_backends.radio.channel import Emitter
 from sim_backends.radio.links import RADIO_OFF, Delay
 from sim_backends.radio.model import RadioModel
-from sim_backends.world.motion import STILL, Attitude, DeadReckoned, State, attitude_of
+from sim_backends.world.dead_reckoning import DeadReckoned
+from sim_backends.world.motion import STILL, Attitude, State, attitude_of
 
 TransportFactory = Callable[[Wire], Transport]
 

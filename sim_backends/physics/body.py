@@ -34,7 +34,7 @@ class Velocity:
 
     Attributes:
         velocity_m_s: Target velocity, metres per second east, north, up.
-        yaw_rad: Direction of its nose, from east towards north; None keeps the current direction.
+        yaw_rad: Target yaw, from east towards north; None keeps the current yaw.
     """
 
     velocity_m_s: Vector = (0.0, 0.0, 0.0)
@@ -79,7 +79,7 @@ class Course(Protocol[PoseT_co]):
 
     @property
     def moves(self) -> bool:
-        """True if the position changes; otherwise the body stays until its next command."""
+        """True if the position changes; otherwise only the orientation may change until the next command."""
         ...
 
     def at(self, steps: int) -> PoseT_co:

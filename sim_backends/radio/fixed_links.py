@@ -112,7 +112,7 @@ class FixedLink:
         self.count_lost()
 
     def clear_queue(self, now_ns: int) -> None:
-        """Empty the queue; packets already sent to the receiver arrive after at most the link's delay and jitter."""
+        """Empty the queue; the removed packets do not delay later packets."""
         parameters = self._parameters
         self._free_ns = now_ns
         self._starts_ns.clear()
@@ -171,8 +171,8 @@ class FixedLinks(Generic[Payload]):
 
     With a relay (the master topology) a packet between two other stations is sent to the relay first and forwarded
     from there; each hop has its own queue, rate, delay and loss. A broadcast of a station reaches the relay, which
-    repeats it to all other stations. Without a relay, and to and from the relay itself, packets go directly. Except
-    on the way to the relay, a broadcast is one packet per receiver, each with its own random draws.
+    repeats it to all other stations. Without a relay, and to and from the relay itself, packets are sent directly. A
+    broadcast is one packet per receiver, each with its own random draws; on the hop to the relay it is one packet.
 
     Args:
         seed: Seed of all random draws: equal seeds, links and packets give equal results.
@@ -254,7 +254,10 @@ class FixedLinks(Generic[Payload]):
         self._log_loss = log
 
     def disturb(self, now_ns: int, off: Set[str], cut: Set[Pair]) -> None:
-        """Implement `RadioModel.disturb`; packets that have left their transmitter are not affected."""
+        """Implement `RadioModel.disturb`.
+
+        Packets that have left their transmitter, and packets in the queue of a link that is cut, are not affected.
+        """
         self._advance(now_ns)
         newly_off = off - self._off
         self._off, self._cut = off, cut | {(receiver, transmitter) for transmitter, receiver in cut}
@@ -379,7 +382,7 @@ class UniformLinks(FixedLinks[Payload]):
         velocities_m_s: Mapping[str, Vector] | None = None,  # noqa: ARG002
         attitudes: Mapping[str, Attitude] | None = None,  # noqa: ARG002
     ) -> None:
-        """Implement `RadioModel.place`; only the set of stations matters."""
+        """Implement `RadioModel.place`; only the set of stations and the relay matter."""
         stations = frozenset(positions_m), relay
         if stations != self._stations:
             self._stations = stations

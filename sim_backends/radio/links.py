@@ -1,9 +1,9 @@
 """Directed links: their parameters and counters, the delays of packets over them, and reasons for losses.
 
-The module can be imported without the models that use it. Delays have four parts, in nanoseconds: processing,
-queuing, transmission and propagation. A `Delay` is one integer with five fields of 64 bits (584 years each): a number
-of packets, and the sum of each part. Delays are added with `+`. Updating the delay of a packet takes 45 ns; updating
-five separate counters takes 100 ns, and the radio of an emulated lab has only 4 us per packet.
+Delays have four parts, in nanoseconds: processing, queuing, transmission and propagation. A `Delay` is one integer
+with five fields of 64 bits (584 years each): a number of packets, and the sum of each part. Delays are added with
+`+`. Updating the delay of a packet takes 45 ns; updating five separate counters takes 100 ns, and the radio of an
+emulated lab has only 4 us per packet.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ class LinkParameters:
         rate_bit_s: Serialization rate in bit/s; None means unlimited.
         delay_ns: Delay in addition to queuing and serialization, in ns.
         jitter_ns: Width of the uniformly distributed extra delay, in ns.
-        loss: Share of lost packets, independent of their length.
+        loss: Probability that a packet is lost, independent of its length.
         queue_packets: Maximum number of queued packets, without the one on the air.
     """
 
@@ -43,12 +43,15 @@ class LinkParameters:
 class LinkCounters:
     """Counters of one directed link.
 
-    A packet is sent on the link or dropped by its queue; a sent packet is lost, delivered or still in flight. Packets
-    that a Wi-Fi station loses before it sends them for another reason, for example because it is switched off, are
-    not counted.
+    A packet is sent on the link or dropped by its queue; a sent packet is lost, delivered or still in flight. A
+    broadcast frame counts on the link to each station in range.
+
+    Three kinds of packets of a Wi-Fi station are not counted: packets in its queue when it is switched off,
+    broadcasts that its full queue drops, and packets that are lost because its bus is too slow.
 
     Attributes:
-        sent: Packets that were transmitted, or could not be because the receiver was out of range or a radio was off.
+        sent: Packets that were transmitted, and packets that were passed to the link while the receiver was out of
+            range or one of the two radios was off.
         queue_dropped: Packets dropped because the queue was full.
         lost: Packets in `sent` that did not arrive.
         delivered: Packets that arrived.

@@ -20,10 +20,10 @@ from sim_backends.radio.phy.error_rates import packet_error
 from sim_backends.radio.phy.high_throughput import common_modes, mode_groups
 from sim_backends.radio.phy.modes import OFDM_MODES
 from sim_backends.radio.phy.transmissions import decibel
-from sim_backends.radio.propagation.antenna_patterns import StationGains
 from sim_backends.radio.propagation.fading import Fading
 from sim_backends.radio.propagation.link_caches import GainCache, LinkRow
 from sim_backends.radio.propagation.mean_loss import MeanLoss
+from sim_backends.radio.propagation.station_gains import StationGains
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.rate_control.firmware_rate import FirmwareRate
@@ -266,7 +266,7 @@ class WorldChannel(RadioChannel):
         obstacles_db = self._mean_loss.obstacles_db(start, end)
         # Any obstacle on the path adds loss and removes the constant component.
         k = np.where(obstacles_db == 0, 10 ** (self._options.k_db / 10), 0.0)
-        loss_db = reverse_db = self._mean_loss.open_db(start, end) + obstacles_db
+        loss_db = reverse_db = self._mean_loss.loss_without_obstacles_db(start, end) + obstacles_db
         if self._station_gains is not None:
             k = self._add_antennas(stale, loss_db, k)
         if self._specified_db is not None:

@@ -1,39 +1,19 @@
-"""World files: obstacles, ground and lines for the robots; and the loss of radio paths through obstacles."""
+"""World files: obstacles, ground and lines for the robots."""
 
 import math
-from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Final
-
-import numpy as np
 
 from fieldkit.config import schema
 from fieldkit.config.catalog import Named
 from fieldkit.config.schema import Field, Strict
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.core.model import Scenario
-from sim_backends.world.materials import FOLIAGE, MATERIALS, Solid
 from sim_backends.world.obstacles import Obstacle, Part, Place, Raised, Ramp, Real
-from sim_backends.world.shapes import Floats, Solids
 
 SHIPPED: Final = Path(__file__).parent / "worlds"
 """Folder of the shipped worlds."""
-
-
-@dataclass(frozen=True)
-class ObstacleCrossing:
-    """The section of a path that is inside one shape of an obstacle.
-
-    Attributes:
-        obstacle: Name of the obstacle.
-        material: Name of the material.
-        length_m: Length of the section.
-    """
-
-    obstacle: str
-    material: str
-    length_m: float
 
 
 class Line(Strict):
@@ -83,70 +63,10 @@ class World(Named):
         """All shapes of all obstacles."""
         return tuple(part for obstacle in self.obstacles for part in obstacle.parts())
 
-    def crossings(self, start_m: Floats, end_m: Floats) -> list[tuple[ObstacleCrossing, ...]]:
-        """Return the shapes that each of n straight paths crosses, in the order of the file.
-
-        Args:
-            start_m: Starts of the paths, shape (n, 3).
-            end_m: Ends of the paths, shape (n, 3).
-        """
-        return [
-            tuple(
-                ObstacleCrossing(part.obstacle, part.material, length_m)
-                for part, length_m in zip(self.parts, lengths_m, strict=True)
-                if length_m > 0
-            )
-            for lengths_m in self._solids.depths_m(start_m, end_m).tolist()
-        ]
-
-    def penetration_loss_db(self, start_m: Floats, end_m: Floats, frequency_hz: float) -> Floats:
-        """Return the loss by obstacles along straight paths, in dB, shape (n,).
-
-        A solid causes its loss per metre and the reflection loss of two faces, at normal incidence and without
-        multiple reflections inside; the loss of foliage depends on the total depth. Diffraction is not modelled, so
-        that a thick obstacle casts a deeper shadow than a real one.
-
-        Args:
-            start_m: Starts of the paths, shape (n, 3).
-            end_m: Ends of the paths, shape (n, 3).
-            frequency_hz: Frequency of the wave.
-        """
-        depths = self._solids.depths_m(start_m, end_m)
-        if not depths.any():
-            return np.zeros(len(start_m))
-        db_per_m, faces_db, is_foliage = _material_losses(self._materials, frequency_hz)
-        loss_db: Floats = depths @ db_per_m + (depths > 0) @ faces_db
-        loss_db += [FOLIAGE.loss_db(depth_m, frequency_hz) for depth_m in (depths @ is_foliage).tolist()]
-        return loss_db
-
     def ground_m(self, place_m: tuple[float, float]) -> float:
         """Return the height of the ground at a point, metres east and north."""
         raised = [obstacle for obstacle in self.obstacles if isinstance(obstacle, Raised | Ramp)]
         return max((obstacle.height_m(place_m) for obstacle in raised if obstacle.covers(place_m)), default=0.0)
-
-    @cached_property
-    def _solids(self) -> Solids:
-        return Solids([part.shape for part in self.parts])
-
-    @cached_property
-    def _materials(self) -> tuple[str, ...]:
-        return tuple(part.material for part in self.parts)
-
-
-@cache
-def _material_losses(names: tuple[str, ...], frequency_hz: float) -> tuple[Floats, Floats, Floats]:
-    """Return three arrays with an item per material.
-
-    They contain the loss per metre in dB and the loss of two faces in dB, which are 0 for foliage, and a flag, which
-    is 1 for foliage and 0 for a solid.
-    """
-    materials = [MATERIALS[name] for name in names]
-    solids = [material if isinstance(material, Solid) else None for material in materials]
-    return (
-        np.array([solid.loss_db_per_m(frequency_hz) if solid else 0.0 for solid in solids]),
-        np.array([2 * solid.face_loss_db(frequency_hz) if solid else 0.0 for solid in solids]),
-        np.array([float(solid is None) for solid in solids]),
-    )
 
 
 def world_files() -> dict[str, Path]:

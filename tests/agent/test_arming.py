@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as d
 
 from fieldkit.agent.autopilots.autopilot import AutopilotState
 from fieldkit.agent.flying import arming
-from fieldkit.agent.flying.arming import ArmingCheck
+from fieldkit.agent.flying.arming import ArmingCheck, ArmingFault
 from fieldkit.agent.flying.flight_plan import FlightNeeds
 from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER
 from sim_backends.emulated.autopilot.firmware import Firmware
@@ -51,7 +51,11 @@ READY_MESSAGES: Mapping[str, Any] = {
 }
 
 
-def faults(needs: FlightNeeds = NEEDS, first_heartbeat: Any = None, **replacements: Any) -> list[str]:  # noqa: ANN401
+def reported_faults(
+    needs: FlightNeeds = NEEDS,
+    first_heartbeat: Any = None,  # noqa: ANN401
+    **replacements: Any,  # noqa: ANN401
+) -> list[ArmingFault]:
     """Return the faults if an autopilot sends the messages of a ready autopilot with replacements."""
     link, writer = MemoryLink(), d.MAVLink(None, srcSystem=7, srcComponent=1)
     autopilot = AutopilotState(link)
@@ -63,7 +67,12 @@ def faults(needs: FlightNeeds = NEEDS, first_heartbeat: Any = None, **replacemen
     autopilot.receive()
     reported = list(check.faults())
     assert all(item.remedy for item in reported)
-    return [item.what for item in reported]
+    return reported
+
+
+def faults(needs: FlightNeeds = NEEDS, first_heartbeat: Any = None, **replacements: Any) -> list[str]:  # noqa: ANN401
+    """Return the texts of `reported_faults`."""
+    return [fault.what for fault in reported_faults(needs, first_heartbeat, **replacements)]
 
 
 def test_no_faults_for_a_ready_autopilot() -> None:
@@ -107,6 +116,12 @@ def test_no_faults_for_a_ready_autopilot() -> None:
 )
 def test_each_fault_is_reported(replacements: dict[str, Any], fault: str) -> None:
     assert any(fault in item for item in faults(**replacements)), faults(**replacements)
+
+
+def test_the_remedy_for_a_small_fence_names_only_parameters_of_the_fence() -> None:
+    (fault,) = reported_faults(fence_height=parameter("FENCE_ALT_MAX", 2.5))
+    names = "FENCE_ENABLE, FENCE_TYPE, FENCE_ALT_MAX, FENCE_RADIUS"
+    assert fault.remedy == f"shorten the flight in the procedure, or enlarge the fence: {names}"
 
 
 def test_text_in_pieces_is_joined() -> None:

@@ -78,7 +78,7 @@ def test_all_programs_stop_in_time_after_a_signal(tmp_path: Path) -> None:
         assert autopilot.vehicle.is_armed, "the autopilot received no command"
     for log in logs:
         texts = log_texts(log)
-        assert texts[-1] == f"error: no heartbeat of the autopilot for {NO_HEARTBEAT_S:g} s"
+        assert texts[-1] == f"error: no heartbeat from the autopilot for {NO_HEARTBEAT_S:g} s"
         first_alarm = next(text for text in texts if text.startswith("ALARM: THE DRONE MAY STILL BE IN THE AIR"))
         assert "LAST HEARTBEAT 4 S AGO" in first_alarm
         assert first_alarm.endswith(landing.MANUAL_ACTION)

@@ -108,7 +108,7 @@ def test_log_on_a_full_disk_does_not_end_a_flight(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("lost_message", "reason"),
     [
-        (None, "no heartbeat of the autopilot for 2 s"),
+        (None, "no heartbeat from the autopilot for 2 s"),
         (LOCAL_POSITION_NED, "it has not reported its position for 2 s"),
     ],
     ids=["everything", "positions"],
@@ -169,9 +169,9 @@ def test_silent_autopilot_ends_the_flight_with_an_alarm(
     lines = capfd.readouterr().err.splitlines()
     texts = [line.partition(" ")[2] for line in lines]
     alarms = [number for number, text in enumerate(texts) if text.startswith("ALARM: THE DRONE MAY STILL BE")]
-    assert texts[alarms[0] - 1] == "land: no heartbeat of the autopilot for 5 s"
+    assert texts[alarms[0] - 1] == "land: no heartbeat from the autopilot for 5 s"
     assert all(text.endswith(landing.MANUAL_ACTION) for text in (texts[number] for number in alarms))
-    assert texts[-1] == "error: no heartbeat of the autopilot for 1 s"
+    assert texts[-1] == "error: no heartbeat from the autopilot for 1 s"
 
 
 def test_drone_with_stopped_motors_is_released(tmp_path: Path) -> None:

@@ -137,7 +137,7 @@ def test_missing_heartbeat_ends_with_an_alarm(
     errors = capfd.readouterr().err
     assert "ALARM: THE DRONE MAY STILL BE IN THE AIR" in errors
     assert landing.MANUAL_ACTION in errors
-    assert "no heartbeat of the autopilot" in errors
+    assert "no heartbeat from the autopilot" in errors
 
 
 def test_connection_that_cannot_be_opened_ends_with_an_alarm(

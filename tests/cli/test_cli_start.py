@@ -1,12 +1,9 @@
 """Commands import no unneeded library, and copies of values of libraries equal these values."""
 
-import ast
-import io
 import os
 import pkgutil
 import subprocess
 import sys
-import tokenize
 from collections.abc import Mapping
 from inspect import isfunction
 from pathlib import Path
@@ -56,8 +53,11 @@ def imported_packages(lab: Path, command_line: str, variables: Mapping[str, str]
 
 
 DRY_RUN, EMULATED = "--dry-run", "--repeats 1 --record 1s --yes"
-MAX_LINES = {DRY_RUN: (11_400, 2_000), EMULATED: (17_100, 6_200)}
-"""Maximum number of lines of code of `fieldkit` and `sim_backends` that a trial of `los` imports, by options."""
+MAX_LINES = {DRY_RUN: 23_000, EMULATED: 35_500}
+"""Maximum number of lines of the modules of `fieldkit` and `sim_backends` that a trial of `los` imports, by options.
+
+Lines are counted as by `wc -l`, including docstrings, comments and blank lines.
+"""
 
 MOTION = {"fieldkit.motion", "fieldkit.motion.permissions", "fieldkit.motion.profile_sections"}
 
@@ -69,20 +69,6 @@ modules = {n: m.__file__ for n, m in sys.modules.items() if n.split(".")[0] in {
 print("imported:", *(f"{name}={path}" for name, path in modules.items() if path), sep="\\n")
 sys.exit(code)
 """
-NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
-
-
-def lines_of_code(path: str) -> int:
-    """Return the number of lines of a module without blank lines, comments, docstrings and other bare strings."""
-    source = Path(path).read_text(encoding="utf-8")
-    lines: set[int] = set()
-    for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        if token.type not in NO_CODE:
-            lines.update(range(token.start[0], token.end[0] + 1))
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
-            lines.difference_update(range(node.lineno, (node.end_lineno or node.lineno) + 1))
-    return len(lines)
 
 
 @pytest.mark.parametrize("options", [DRY_RUN, pytest.param(EMULATED, marks=pytest.mark.emulated)])
@@ -97,10 +83,8 @@ def test_a_trial_imports_only_the_kinds_of_step_that_it_uses(tmp_path: Path, opt
         check=True,
     )
     modules_text = completed.stdout.partition("imported:\n")[2]
-    lines = {
-        name: lines_of_code(path) for name, _, path in (line.partition("=") for line in modules_text.splitlines())
-    }
-    names = lines.keys()
+    paths = dict(line.split("=", 1) for line in modules_text.splitlines())
+    names = paths.keys()
     kinds = {name for name in names if name.startswith("fieldkit.steps.kinds.")}
     assert kinds == {f"fieldkit.steps.kinds.{kind}" for kind in ("capture", "ping", "transfer")}
     assert {name for name in names if name.startswith("fieldkit.ros.steps.")} <= {
@@ -109,8 +93,7 @@ def test_a_trial_imports_only_the_kinds_of_step_that_it_uses(tmp_path: Path, opt
     assert {name for name in names if name.startswith("fieldkit.motion")} == MOTION, (
         "only the sections of the profiles are imported"
     )
-    for package, limit in zip(("fieldkit", "sim_backends"), MAX_LINES[options], strict=True):
-        assert sum(count for name, count in lines.items() if name.partition(".")[0] == package) <= limit, package
+    assert sum(Path(path).read_bytes().count(b"\n") for path in paths.values()) <= MAX_LINES[options]
 
 
 @pytest.mark.parametrize("command_line", ["--version", "--help"])

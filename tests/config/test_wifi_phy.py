@@ -36,6 +36,16 @@ def test_impossible_combinations_are_rejected(standard: str, phy: dict[str, int]
         radio(standard, **phy)
 
 
+def test_each_standard_that_the_remedy_lists_is_accepted() -> None:
+    with pytest.raises(ValidationError, match="write one of: ") as error_info:
+        radio("802.11ax")
+    text = str(error_info.value).partition("write one of: ")[2]
+    standards = [standard.partition(" [")[0].strip() for standard in text.splitlines()[0].split(", ")]
+    assert len(standards) == 6
+    for standard in standards:
+        assert radio(standard).standard == standard
+
+
 def test_possible_combinations_are_passed_to_the_model() -> None:
     for standard, width_mhz in (("802.11n 5 GHz", 40), ("802.11ac 5 GHz", 80), ("802.11ax 6 GHz", 80)):
         phy = antenna_of(radio(standard, width_mhz=width_mhz, streams=2)).phy

@@ -37,7 +37,7 @@ def test_abort_stops_the_jobs_and_names_the_unreachable_robot(tmp_path: Path) ->
             site.write_text(complete_site.replace(f"port: {port},", f"port: {free_port()},"), encoding="utf-8")
             run = run_here(tmp_path, "abort", "--yes")
             assert run.code == 3
-            assert f"{sender}: lock broken, 1 job terminated\n  {FOLDER}/capture " in run.out
+            assert f"{sender}: lock removed, 1 job terminated\n  {FOLDER}/capture " in run.out
             assert re.search(rf"error: {receiver}: .* cannot be reached", run.err)
             assert jobs.list_running(shells[Role.SENDER], Deadline.after(30)) == ()
             assert len(jobs.list_running(shells[Role.RECEIVER], Deadline.after(30))) == 1
@@ -45,7 +45,7 @@ def test_abort_stops_the_jobs_and_names_the_unreachable_robot(tmp_path: Path) ->
             site.write_text(complete_site, encoding="utf-8")
             run = run_here(tmp_path, "abort", "--yes")
             assert run.code == 0
-            assert f"{sender}: not locked, 0 jobs terminated\n{receiver}: lock broken, 1 job terminated\n" in run.out
+            assert f"{sender}: not locked, 0 jobs terminated\n{receiver}: lock removed, 1 job terminated\n" in run.out
             with pytest.raises(LockLostError, match=r"the trial was aborted by \S+@\S+ at") as caught:
                 evidence.begin(shells[Role.SENDER], FOLDER, Role.SENDER, "wlan0", token=ANNA.token)
             assert re.search(r"by \w+@", caught.value.what)

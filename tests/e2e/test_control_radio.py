@@ -14,7 +14,7 @@ from fieldkit.core.units import parse_distance
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
-from sim_backends.emulated.medium.ports import MediumStats
+from sim_backends.emulated.medium.medium_stats import MediumStats
 from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import load_world

@@ -219,7 +219,7 @@ def test_a_policy_that_finds_no_window_is_reported_and_the_others_continue(lab: 
         (("--window", "1"), "--window '1' has no unit", "1s or 1ms"),
         (("--window", "0ms"), "a window that is not above 0", "--window 1ms,10ms,100ms"),
         (("--bias",), "--bias compares several seeds, but there is only one", "add --seeds 20"),
-        (("--figure", "x.jpg"), "--figure: 'x.jpg' has no known format", ".svg, .pdf, .png"),
+        (("--figure", "x.jpg"), "--figure: the suffix of 'x.jpg' is unknown", ".svg, .pdf, .png"),
         (("--figure", "none/x.svg"), "none: there is no such folder", "mkdir -p none"),
     ],
 )

@@ -281,7 +281,7 @@ def test_replies_without_a_time_stamp_are_omitted_and_reported(trial: Path) -> N
         for message in messages_of(read_messages, "/trial/log")
         if message.content["file"].endswith("ping.txt")
     )
-    assert warning["message"] == "3 replies have no time stamp and are omitted"
+    assert warning["message"] == "replies without a time stamp are omitted: 3"
 
 
 def test_a_trial_without_an_ended_repeat_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

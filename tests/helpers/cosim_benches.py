@@ -18,8 +18,8 @@ from sim_backends.emulated.cosimulated.simulators import RobotBody, Simulators
 from sim_backends.emulated.emulated_options import SyncOptions
 from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.emulated.robot.velocity_command import VelocityCommand, VelocityCommandRecord
+from sim_backends.emulated.ros.assigned_path import AssignedPath, append_path
 from sim_backends.emulated.ros.motion_record import MotionRecord, RecordedMotion
-from sim_backends.emulated.ros.robot_motion import AssignedPath, append_path
 from sim_backends.physics.robot_limits import TURTLEBOT3_BURGER
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import World

@@ -310,6 +310,7 @@ CASES: Final[Mapping[str, MinimalRun]] = {
     "topics": MinimalRun("--rounds 1", {"PLAIN": {"zenoh": ("plain", "attached")}, "STREAM_S": 1.0, "BURST_S": 0.1}),
     "trial_overhead": MinimalRun("--rounds 1 --record 1s --round-trips 0s", emulated=True),
     "sweep": MinimalRun("--rounds 1 --seeds 1 --tasks 8 --duration 100ms", {"COUNTS": (1,), "PROCESSES": 1}),
+    "studies.real_links": MinimalRun("--links 1"),
     "studies.zenoh_images": MinimalRun(
         "--rounds 1", {"SAMPLES": 2, "BYTES": 10_000}, shrink=_one_setting, emulated=True
     ),

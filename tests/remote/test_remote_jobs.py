@@ -96,6 +96,21 @@ def test_job_keeps_streams_command_and_exit_code(shell: LocalShell) -> None:
     assert jobs.begin_wait(shell, job_spec, 20).end(30) == 7
 
 
+def test_run_waits_for_the_time_limit_and_the_time_to_become_ready(
+    shell: LocalShell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    end = LocalSession.end
+    waits_s: list[float] = []
+
+    def record_end(session: LocalSession, *, deadline: Deadline, check: bool = True) -> Completed:
+        waits_s.append(deadline.remaining_s)
+        return end(session, deadline=deadline, check=check)
+
+    monkeypatch.setattr(LocalSession, "end", record_end)
+    assert jobs.run(shell, replace(job("true", limit_s=500), ready="log:up", ready_s=700)) == 0
+    assert max(waits_s) > 1200
+
+
 def test_start_returns_when_the_log_contains_the_text(shell: LocalShell) -> None:
     job_spec = replace(job("sh", "-c", "sleep 0.2; echo now listening on x >&2; sleep 60"), ready="log:listening on")
     jobs.start(shell, job_spec)

@@ -1,8 +1,8 @@
 """Drive a ground robot along its path through its velocity topic, in a closed loop with its odometry.
 
 The laptop renews its order repeatedly (`orders`). If no order arrives within the lease of the task, the robot stops,
-because the laptop or the link to it is probably lost. Velocities are published `RATE_HZ` times per second; the base
-of a robot stops if no more velocities arrive.
+because the laptop or the link to it is probably lost. Velocities are published `RATE_HZ` times per second. If this
+program is killed, only the base can stop the robot: it must have a timeout for velocities (docs/stopping.md).
 """
 
 from __future__ import annotations
@@ -50,6 +50,7 @@ def drive(middleware: Middleware, arguments: Mapping[str, Any], log: Path, stop_
         The reason why the drive ended early; empty if the robot is back at its origin.
 
     Raises:
+        DriveCancelledError: `stop_event` was set before the start; no velocity was published.
         MiddlewareError: The velocity topic has no subscription, or no odometry arrives.
         OSError: The log or the status file cannot be written; the robot was stopped if it was driving.
     """
@@ -102,6 +103,10 @@ def drive(middleware: Middleware, arguments: Mapping[str, Any], log: Path, stop_
     return stop_reason
 
 
+class DriveCancelledError(Exception):
+    """`stop_event` was set before the start: the robot was not driven."""
+
+
 class _VelocityPublisher:
     """Publishes velocities with the time of the robot's clock."""
 
@@ -120,12 +125,13 @@ def _wait_for_subscription(
     """Wait until the base of the robot has subscribed to the velocity topic.
 
     Raises:
-        MiddlewareError: The base has not subscribed in time, or `stop_event` is set. If the topic has endpoints of
-            other types, the message lists these types.
+        DriveCancelledError: `stop_event` was set.
+        MiddlewareError: The base has not subscribed in time. If the topic has endpoints of other types, the message
+            lists these types.
     """
     if _wait_until(lambda: publisher.matched() > 0, stop_event):
         return
-    other_types = set() if stop_event.is_set() else middleware.other_types(command)
+    other_types = middleware.other_types(command)
     hint = (
         f", but it has endpoints of type {', '.join(sorted(other_types))}: change drive.type in the robot's profile"
     )
@@ -133,10 +139,16 @@ def _wait_for_subscription(
 
 
 def _wait_until(condition: Callable[[], bool], stop_event: threading.Event) -> bool:
-    """Return True when the condition is true, False after `_TIMEOUT_S` or when `stop_event` is set."""
+    """Return True when the condition is true, False after `_TIMEOUT_S`.
+
+    Raises:
+        DriveCancelledError: `stop_event` was set.
+    """
     deadline_s = time.monotonic() + _TIMEOUT_S
     while not condition():
-        if stop_event.wait(0.02) or time.monotonic() > deadline_s:
+        if stop_event.wait(0.02):
+            raise DriveCancelledError
+        if time.monotonic() > deadline_s:
             return False
     return True
 
@@ -174,7 +186,8 @@ def _report(
     The last state, which has an `end_reason`, is written to the log in any phase. Nothing is written before the
     origin is known. The status also contains `pose`, the pose in the frame of the odometry; `frame_id`, the boot ID,
     which identifies this frame because odometry restarts at each boot; `ready`, True if the robot is stationary and
-    may start; and `refused`, True if it did not start because it is not at the required place.
+    may start; and `refused`, True if it did not start because it is not at the required place, or because its
+    odometry uses another frame than its origin.
     """
     relative_pose, pose = driver.relative_pose, driver.pose
     if relative_pose is None or pose is None:

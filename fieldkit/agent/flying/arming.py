@@ -42,7 +42,7 @@ _SENSORS = {
     0x8: "barometer",
     0x20: "GPS",
     0x40: "optical flow",
-    0x80: "position by vision",
+    0x80: "vision position",
     0x10000: "remote control",
     0x100000: "fence",
     0x200000: "AHRS",
@@ -61,12 +61,13 @@ position; only the assumption that the vehicle does not move (CONST_POS_MODE).""
 
 @dataclass(frozen=True)
 class ArmingFault:
-    """A reason why a flight must not start.
+    """A reason why an autopilot cannot be armed, or why the flight must not start.
 
     Attributes:
         what: The reason, one sentence without a full stop.
         remedy: The remedy.
-        prevents_flight: True if the flight is refused; False if the fault may not apply in the mode of the flight.
+        prevents_flight: True if the flight is refused; False if it is only a warning, because the autopilot checked
+            its current mode, and the flight uses another mode.
     """
 
     what: str
@@ -93,7 +94,7 @@ class ArmingCheck:
         drone.command_results.pop(PREARM_CHECKS, None)
 
     def request_missing(self) -> None:
-        """Request the missing reports; must be called in each iteration of the loop."""
+        """Request the missing reports; must be called repeatedly until `is_complete` is True."""
         drone, now_s = self._drone, time.monotonic()
         if self._checks_done_s is None and PREARM_CHECKS in drone.command_results:
             self._checks_done_s = now_s
@@ -113,7 +114,7 @@ class ArmingCheck:
             drone.commands.request_parameter(name)
 
     def _missing_parameters(self) -> list[str]:
-        """Return the names of the needed parameters, with all alternative names of each that was not reported."""
+        """Return all alternative names of each needed parameter that the autopilot has not reported yet."""
         dialect = self._drone.dialect
         alternatives = [names.split("|") for names in dialect.limit_parameters] if dialect else []
         reported_names = self._drone.parameters.keys()
@@ -151,7 +152,7 @@ class ArmingCheck:
         drone = self._drone
         if drone.dialect is None:
             what = "its autopilot is neither PX4 nor ArduCopter (MAV_AUTOPILOT {}, MAV_TYPE {})".format(*drone.family)
-            yield ArmingFault(what, "fly it by other means; a step mavlink records the flight")
+            yield ArmingFault(what, "fly it by other means; a `mavlink` step records the flight")
             return
         if drone.armed:
             yield ArmingFault("its motors are running", "land it first")
@@ -207,6 +208,7 @@ class ArmingCheck:
         drone, needs = self._drone, self._needs
         assert drone.dialect is not None
         limits = drone.dialect.limits(drone.parameters)
+        *fence_parameters, return_parameter = drone.dialect.limit_parameters
         for limit_m, needed_m, direction in (
             (limits.height_m, needs.highest_m, "above home"),
             (limits.radius_m, needs.farthest_m, "from home"),
@@ -214,12 +216,11 @@ class ArmingCheck:
             if limit_m is not None and needed_m > limit_m:
                 yield ArmingFault(
                     f"the fence of its autopilot ends {limit_m:g} m {direction}, but the flight needs {needed_m:g} m",
-                    "shorten the flight in the procedure, or widen the fence: "
-                    + ", ".join(drone.dialect.limit_parameters),
+                    f"shorten the flight in the procedure, or enlarge the fence: {', '.join(fence_parameters)}",
                 )
         if needs.returns and limits.return_m is not None and limits.return_m > needs.ceiling_m:
             what = f"it returns at a height of {limits.return_m:g} m, but only {needs.ceiling_m:g} m are allowed"
-            remedy = f"write on_abort: land, or lower {drone.dialect.limit_parameters[-1].replace('|', ' or ')}"
+            remedy = f"write on_abort: land, or lower {return_parameter.replace('|', ' or ')}"
             yield ArmingFault(what, f"{remedy}; limits.max_height_m in its profile sets the allowed height")
 
 
@@ -238,7 +239,7 @@ def check_arming(connection: str, needs: FlightNeeds, stop_event: threading.Even
         while not session.drone.alive and not stop_event.is_set():
             if time.monotonic() > heartbeat_deadline_s:
                 sys.stderr.write(
-                    f"error: no heartbeat of an autopilot at {connection} in {_HEARTBEAT_TIMEOUT_S:g} s\n"
+                    f"error: no heartbeat from an autopilot at {connection} in {_HEARTBEAT_TIMEOUT_S:g} s\n"
                 )
                 return 1
             session.exchange(_POLL_S)

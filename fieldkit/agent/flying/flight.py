@@ -5,7 +5,7 @@ is the pilot. A second program on the drone, the guard (`flying.guard`), lands t
 
 The pilot lands the drone, or lets it return and land as its plan requires, if the flight cannot continue. Examples:
 an order is not renewed in time because the laptop or its link is lost, a signal cancels the job, the guard stops, or
-the drone is outside its fence. It sends nothing to a drone that a person or another program flies. If set-points are
+the drone is outside its fence. It does not control a drone that a person or another program flies. If set-points are
 missing, the autopilot reacts: PX4 has a failsafe (COM_OF_LOSS_T, COM_OBL_RC_ACT); ArduCopter holds its position.
 """
 
@@ -153,7 +153,14 @@ class OffboardPilot:
         log_line("landed")
 
     def _wait_until_ready(self) -> tuple[FlightDialect, Position]:
-        """Wait until the motors have stopped and the position is reported; return the dialect and the position."""
+        """Wait until the motors have stopped, and position and heading are reported.
+
+        Returns:
+            The dialect and the position.
+
+        Raises:
+            FlightError: The family of the autopilot is unknown, or for the same reasons as in `FlightLoop.iterate`.
+        """
         drone = self._drone
         if drone.dialect is None:
             raise FlightError(REFUSED, _fault_text(ArmingCheck(drone, self._plan.needs)))
@@ -164,7 +171,7 @@ class OffboardPilot:
         return drone.dialect, drone.position_m
 
     def _origin(self, start_m: Position) -> FlightOrigin:
-        """Return the origin in the coordinate frame that the autopilot has used since it was started.
+        """Return the origin in the current local frame of the autopilot, which is valid until it reboots.
 
         Raises:
             FlightError: The drone is not at the origin of its trial, it cannot be determined whether it is there, or
@@ -295,7 +302,7 @@ def fly(plan: FlightPlan, stop_event: threading.Event) -> int:
     """Run the pilot, the guard or the rescue program of a flight; return the exit code.
 
     Raises:
-        OSError: The connection cannot be opened.
+        OSError: The connection or the liveness file cannot be opened.
     """
     try:
         if plan.rescues:

@@ -10,7 +10,6 @@ from fieldkit.agent.autopilots.autopilot import AutopilotState, status_text
 from fieldkit.agent.autopilots.mavlink_frames import ATTITUDE, GLOBAL_POSITION_INT, HEARTBEAT, LOCAL_POSITION_NED
 from fieldkit.agent.flying.flight_plan import CLIMB, GO, HOME, LEAVE, STAY, FlightPlan
 from fieldkit.agent.flying.landing import (
-    CANCELLED,
     COMMAND_TIMEOUT_S,
     FENCE_BREACHED,
     LEASE_EXPIRED,
@@ -24,7 +23,7 @@ from fieldkit.agent.flying.landing import (
 from fieldkit.agent.flying.liveness import FLYING, IDLE, LANDING, PILOT, LivenessFile
 from fieldkit.agent.flying.origin import FlightFence, FlightOrigin, Position
 from fieldkit.agent.flying.session import AutopilotSession
-from fieldkit.agent.orders import Orders
+from fieldkit.agent.orders import CANCELLED, Orders
 
 RATE_HZ = 10.0
 """Rate of iterations, of set-points, and of the reports in `_STREAMS`."""
@@ -187,7 +186,7 @@ class FlightLoop:
         if drone.heartbeat_age_s > _FLIGHT_HEARTBEAT_TIMEOUT_S:
             connection_note = ", its connection is closed" if self.session.link.lost_since_s is not None else ""
             raise FlightError(
-                REFUSED, f"no heartbeat of the autopilot for {_FLIGHT_HEARTBEAT_TIMEOUT_S:g} s{connection_note}"
+                REFUSED, f"no heartbeat from the autopilot for {_FLIGHT_HEARTBEAT_TIMEOUT_S:g} s{connection_note}"
             )
         if not drone.guided:
             if self._liveness is not None and self._liveness.other_state == LANDING:
@@ -220,6 +219,6 @@ def wait_for_heartbeat(
         if stop_event.is_set():
             raise FlightError(CANCELLED, "the job was cancelled")
         if time.monotonic() > start_s + HEARTBEAT_S:
-            raise FlightError(REFUSED, f"no heartbeat of an autopilot at {connection} in {HEARTBEAT_S:g} s")
+            raise FlightError(REFUSED, f"no heartbeat from an autopilot at {connection} in {HEARTBEAT_S:g} s")
         each_iteration()
         session.exchange(1 / RATE_HZ)

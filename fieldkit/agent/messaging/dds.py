@@ -103,7 +103,13 @@ def _elements(settings: Mapping[str, str], fixed_elements: Mapping[str, str]) ->
 
 
 def quality(qos: Quality, user_data: str, *, writes: bool) -> Qos:
-    """Return a quality of service as DDS policies of a writer or a reader."""
+    """Return a quality of service as DDS policies.
+
+    Args:
+        qos: The quality of service.
+        user_data: User data of the endpoint; empty for none.
+        writes: True for a writer, False for a reader.
+    """
     policies = [Policy.DataRepresentation(use_cdrv0_representation=True)]
     if qos.reliability == "reliable":
         policies.append(Policy.Reliability.Reliable(MAX_BLOCKING_NS))
@@ -124,7 +130,10 @@ def quality(qos: Quality, user_data: str, *, writes: bool) -> Qos:
 
 
 def _durability(qos: Quality, *, writes: bool) -> list[Any]:
-    """Return the durability policies. The history for late readers is a separate policy, whose default depth is 1."""
+    """Return the durability policies.
+
+    The history for late-joining readers is a separate policy, whose default depth is 1.
+    """
     if qos.durability != "transient_local":
         return [Policy.Durability.Volatile] if qos.durability == "volatile" else []
     keeps_all = qos.history == "keep_all" and not qos.late_reader_depth
@@ -207,8 +216,8 @@ class DdsMiddleware:
         self._threads: list[threading.Thread] = []
         try:
             self._domain: Domain | None = Domain(network.domain, configuration(network))
-            node_info = Qos(Policy.Userdata(graph.PARTICIPANT_DATA.encode()))
-            self._participant: DomainParticipant | None = DomainParticipant(network.domain, qos=node_info)
+            participant_qos = Qos(Policy.Userdata(graph.PARTICIPANT_DATA.encode()))
+            self._participant: DomainParticipant | None = DomainParticipant(network.domain, qos=participant_qos)
         except DDSException as error:
             raise MiddlewareError(f"CycloneDDS does not start: {error}") from error
         self._topics: dict[str, DdsTopic] = {}
@@ -257,7 +266,7 @@ class DdsMiddleware:
         return lambda: len(reader.get_matched_publications())
 
     def other_types(self, topic: Topic) -> set[str]:
-        """Return the types of the discovered endpoints of a topic that differ from the type of `topic`."""
+        """Return the DDS type names that discovered endpoints of the topic have instead of its type in `topic`."""
         own_type = topic.dds_types[topic.type]
         return {
             endpoint.type_name

@@ -42,7 +42,7 @@ def topic(gid_bytes: int = GID_BYTES) -> Topic:
     return Topic(
         name="ros_discovery_info",
         type=f"{_PACKAGE}/ParticipantEntitiesInfo",
-        # The quality of service that rmw_dds_common uses: a late reader receives the last sample.
+        # The quality of service that rmw_dds_common uses: a late-joining reader receives the last sample.
         quality=Quality(depth=1, durability="transient_local"),
         members={
             f"{_PACKAGE}/{name}": [

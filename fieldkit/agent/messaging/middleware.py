@@ -53,8 +53,8 @@ class Topic:
         type: ROS type, for example `sensor_msgs/msg/LaserScan`.
         quality: Its quality of service.
         members: Members of its type, which is the first key, and of all nested types. Each member has its name, its
-            type, and a count: None for a single value, 0 for an unbounded sequence, the length of an array, or the
-            negative bound of a sequence.
+            type, and a count: None for a single value, 0 for an unbounded sequence, N for an array of N
+            values, or -N for a sequence of at most N values.
         dds_topic: DDS topic name, for example `rt/scan`.
         dds_types: DDS type name of each type in `members`.
         user_data: User data of DDS endpoints, which describe the type.
@@ -145,7 +145,7 @@ class Middleware(Protocol):
 
         Args:
             topic: The topic.
-            deliver: Called in a separate thread for each sample.
+            deliver: Called for each sample, in a background thread.
 
         Returns:
             A function that returns the number of matched publishers, or -1 for Zenoh.

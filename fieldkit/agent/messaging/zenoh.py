@@ -24,7 +24,8 @@ PORT = 7447
 GID_BYTES = 16
 ATTACHMENT = struct.Struct(f"<qqB{GID_BYTES}s")
 """Sequence number, time in nanoseconds since 1970 UTC, and identifier of the publisher, in the format of
-zenoh::ext::Serializer: little-endian integers, bytes after their count (attachment_helpers.cpp, rmw_zenoh >= 0.6)."""
+zenoh::ext::Serializer: little-endian integers, and the length of the identifier before its bytes
+(attachment_helpers.cpp, rmw_zenoh >= 0.6)."""
 
 
 def start(network: Network) -> ZenohMiddleware:

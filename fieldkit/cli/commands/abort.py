@@ -1,4 +1,4 @@
-"""`fieldkit abort`: stop all programs of fieldkit on the robots, from any laptop."""
+"""`fieldkit abort`: stop all programs of fieldkit on the robots; it can be run on any laptop."""
 
 import argparse
 from typing import Final
@@ -17,10 +17,10 @@ from fieldkit.core.units import format_count
 def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit abort`."""
     parser.description = (
-        "Stop every job of fieldkit on every robot of the site file, of any trial and from any laptop, and remove "
-        "the robots' locks. A program that lands a drone continues until the drone has landed; its state is printed. "
+        "Stop every job of fieldkit on every robot of the site file, of all trials and all laptops, and remove "
+        "the robots' locks. A program that lands a drone continues; its state is printed, and when it terminates. "
         "For each robot, print the stopped jobs, and stopped processes whose folder was deleted; `not locked` means "
-        "that no program held the lock. A trial on these robots stops, and "
+        "that no trial held the lock. A trial on these robots stops, and "
         "reports the user who aborted it. Exit code 3 if a robot was not reached, a job was not terminated or, on a "
         "full disk, a lock was not removed; 1 if you answer no. The other robots are processed nevertheless. "
         "Emulated robots stop with their lab, so nothing is done for them."
@@ -33,8 +33,8 @@ def add(parser: Parser) -> None:
 _NO_ROBOTS: Final = "the robots of this backend run only while their lab runs, so there is nothing to abort"
 
 _LANDING_END: Final = (
-    "It terminates when the drone has landed or another person or program flies it, 60 s after the last heartbeat of "
-    "its autopilot, or after 10 min"
+    "The program terminates when the drone has landed or a person or another program flies it, 60 s after the last "
+    "heartbeat of its autopilot, or after 10 min"
 )
 
 
@@ -58,7 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
     for robot, result in results.items():
         count = f"{format_count(len(result.jobs), 'job')} terminated"
         if result.error is None:
-            print_text(f"{robot}: {'lock broken' if result.locked else 'not locked'}, {count}")
+            print_text(f"{robot}: {'lock removed' if result.locked else 'not locked'}, {count}")
         elif result.jobs:
             print_text(f"{robot}: {count}")
         print_text("".join(f"  {job}\n" for job in result.jobs), end="")

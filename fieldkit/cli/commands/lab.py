@@ -125,7 +125,7 @@ def _add_move(actions: Commands) -> None:
         nargs="+",
         type=str.strip,
         metavar="LENGTH",
-        help="EAST NORTH [UP] from its position, UP above the ground",
+        help="EAST NORTH [UP] from its position; UP changes its height above the ground",
     )
     parser.set_defaults(run=move)
 

@@ -14,7 +14,7 @@ from fieldkit.measure.evidence.iperf3 import IperfInterval, IperfTest
 
 _ROUNDING_S: Final = 0.002
 """Tolerance for rounding: iperf3 prints times with 6 digits, and some versions print `seconds` with more."""
-_SUMMARY_DELAY_S: Final = 0.02
+_SUMMARY_EARLY_S: Final = 0.02
 """Maximum time by which the end in the summary may be earlier than the end of the last interval. iperf3 reads the
 clock for each of them."""
 _MAX_OMITTED_S: Final = 1.1
@@ -22,7 +22,7 @@ _MAX_OMITTED_S: Final = 1.1
 _ROUNDING: Final = 1e-3
 """Relative tolerance for rounding of rates and jitter values."""
 _EARLY_S: Final = 0.1
-"""The client's timer may end a test by up to this time before its full duration."""
+"""Maximum time by which the client's timer may end a test before its full duration."""
 _TIMESTAMP_S: Final = 2
 """Tolerance for start times, because `timesecs` has a resolution of whole seconds."""
 
@@ -129,11 +129,14 @@ def check_one_end(test: IperfTest, *, sends: bool) -> Iterator[str]:
 
 
 def _ends_near(last_s: float, total_s: float) -> bool:
-    return -_SUMMARY_DELAY_S < total_s - last_s < _MAX_OMITTED_S
+    return -_SUMMARY_EARLY_S < total_s - last_s < _MAX_OMITTED_S
 
 
 def _gaps(intervals: tuple[IperfInterval, ...]) -> Iterator[str]:
-    """Yield a contradiction for each interval that does not start at the end of the previous one, the first at 0."""
+    """Yield a contradiction for each interval that does not start at the end of the previous one.
+
+    The first interval must start at 0.
+    """
     previous_end_s = intervals[0].start_s if intervals else None
     if previous_end_s is not None and previous_end_s > _ROUNDING_S:
         yield f"its first interval begins at {previous_end_s:.3f} s"
@@ -219,7 +222,7 @@ def _totals(client: IperfTest, sender: IperfTest, receiver: IperfTest, settings:
     if settings.protocol is Protocol.TCP and (received_bytes or 0) > (
         sent_bytes if sent_bytes is not None else math.inf
     ):
-        yield f"{received_bytes} bytes were received of {sent_bytes} sent"
+        yield f"{received_bytes} bytes were received, but only {sent_bytes} were sent"
     comparisons = (
         ("bytes sent", totals.sent_bytes, (sent_bytes,)),
         ("bytes received", totals.received_bytes, (received_bytes,)),

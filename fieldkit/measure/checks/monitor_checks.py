@@ -18,7 +18,7 @@ from fieldkit.measure.captures.radiotap import NO_SIGNAL, RadioFrames
 from fieldkit.measure.checks.monitor_columns import own_addresses
 
 READ_NS: Final = 500_000_000
-"""Maximum time between the time of a sample, which is written before `iw` starts, and the reading by the driver."""
+"""Maximum time from the time of a sample, written before `iw` starts, until `iw` reads the driver's values."""
 
 SIGNAL_DB: Final = 1.0
 """Permitted difference between signals, because a driver may round them differently."""

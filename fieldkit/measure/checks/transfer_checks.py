@@ -277,7 +277,7 @@ CROSS_CHECKS: Final = (
     CrossCheck(
         quantity="distance and speed during the transfer",
         columns=("transfer_distance_*", "transfer_*_speed_m_s"),
-        source="`track.csv` of the emulator; without an emulator, `positions.json`",
+        source="`positions.json` if it lists one of the robots, otherwise `track.csv` of the emulator",
         against=(),
         tolerance="the positions are compared only if steps move robots or record positions",
         outcome=CheckOutcome.UNCHECKED,

@@ -1,4 +1,4 @@
-"""Reading of evidence files: errors contain a remedy, and incomplete files are detected."""
+"""Reading of evidence files. Every error is an `EvidenceError` that contains the path of the file."""
 
 import gzip
 import os
@@ -25,7 +25,7 @@ def size(path: Path) -> int:
     """Return the size of an evidence file in bytes.
 
     Raises:
-        EvidenceError: The file is missing or cannot be read.
+        EvidenceError: The file is missing, cannot be read, or is not a regular file.
     """
     with _open_regular(path) as file:
         return file.seek(0, 2)
@@ -65,7 +65,7 @@ def text(path: Path) -> str:
     """Return the text of a tool's output; bytes that are not UTF-8 are replaced.
 
     Raises:
-        EvidenceError: The file is missing, cannot be read, or is longer than `MAX_TEXT_BYTES`.
+        EvidenceError: The file is missing, cannot be read, is not a regular file, or is longer than `MAX_TEXT_BYTES`.
     """
     with _open_regular(path) as file:
         content = file.read(MAX_TEXT_BYTES + 1)
@@ -80,7 +80,7 @@ def compressed(path: Path) -> bytes:
     """Return the first `MAX_TEXT_BYTES` of the content of a file in gzip format.
 
     Raises:
-        EvidenceError: The file is missing, cannot be read, or has another format.
+        EvidenceError: The file is missing, cannot be read, is not a regular file, or has another format.
     """
     size(path)  # raises an error if the file cannot be read
     try:
@@ -128,7 +128,7 @@ def counted_csv_text(header: str, lines: Iterable[str]) -> str:
 def read_counted_csv(path: Path, header: str, pattern: re.Pattern[str], error: str) -> list[re.Match[str]]:
     """Return the data lines of a file that `counted_csv_text` created, as matches of a pattern.
 
-    A file without the number of lines is accepted, too; whole lines that are missing at its end are not detected.
+    A file without the number of lines is accepted, too; if whole lines at its end are missing, this is not detected.
 
     Args:
         path: The file.
@@ -137,7 +137,7 @@ def read_counted_csv(path: Path, header: str, pattern: re.Pattern[str], error: s
         error: Message if the file has another content, for example `is not a track of robots`.
 
     Raises:
-        EvidenceError: The file is missing, truncated, or has another content.
+        EvidenceError: For the same reasons as `text`, or the file is truncated or has another content.
     """
     content = text(path)
     count = _COUNT.match(content)

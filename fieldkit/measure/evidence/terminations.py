@@ -89,12 +89,10 @@ def termination_error(
         allowed: Acceptable causes.
         min_duration_s: Minimum duration of a job that exits without being stopped, in seconds.
     """
+    if termination.cause is Cause.RUNNING:
+        return "was still running when the evidence was collected"
     if termination.code is None:
-        return (
-            "was still running when the evidence was collected"
-            if termination.cause is Cause.RUNNING
-            else "was killed"
-        )
+        return "was killed"
     if termination.cause not in allowed:
         return _NOT_ALLOWED[termination.cause].format(termination.code)
     if termination.cause is Cause.EXITED and termination.code > _KILLED:

@@ -191,15 +191,20 @@ def _time_ns(name: str, text: str, where: str) -> int:
         text: The text in the cell.
         where: Place of the line, for the error message.
     """
-    invalid = EvidenceError(f"{text[:40]!r} is not a time", where=where, remedy="write it as 2026-11-22T10:00:00.5Z")
     if name != "t":
         if not _UNIX_TIME.fullmatch(text):  # also rejects times with an exponent, which have too few digits: 1.7e9
-            raise invalid
+            raise EvidenceError(
+                f"{text[:40]!r} is not a time",
+                where=where,
+                remedy=f"write all digits of the time since 1970 UTC, without an exponent; {name} is in {name[2:]}",
+            )
         return round(Decimal(text) * _NS_PER[name])  # a float cannot represent nanoseconds since 1970
     try:
         parsed = datetime.fromisoformat(text)
     except ValueError:
-        raise invalid from None
+        raise EvidenceError(
+            f"{text[:40]!r} is not a time", where=where, remedy="write it as 2026-11-22T10:00:00.5Z"
+        ) from None
     if parsed.tzinfo is None:
         raise EvidenceError(
             f"{text[:40]!r} has no time zone", where=where, remedy="append Z or an offset like +02:00"

@@ -90,7 +90,7 @@ def _pieces(frame: Ints, first: Ints, count: Ints, size_bytes: Ints) -> Pieces:
 
 
 LONGEST_BYTES: Final = 1 << 31
-"""32-bit sequence numbers are ambiguous in streams of this length or more."""
+"""Limit of the length of a stream: from this length on, 32-bit sequence numbers are ambiguous."""
 
 _CONNECTION_BITS: Final = 33
 """Number of bits of a position within a connection, including positions before its start."""
@@ -150,21 +150,21 @@ class Connections:
         return ByteIntervals(starts, starts + selected.tcp_payload_bytes)
 
     def numbers(self, frames: Packets) -> ByteIntervals:
-        """Return the sequence numbers of payload bytes and of FINs, which consume one sequence number each."""
+        """Return the positions of payload bytes and of FINs, which consume one sequence number each."""
         fin_frames = frames.where(self.includes(frames.sport) & (frames.tcp_flags & FIN != 0))
         stops = self._positions(fin_frames.sport, fin_frames.tcp_seq) + fin_frames.tcp_payload_bytes
         payload = self.payload(frames)
         return ByteIntervals(np.concatenate((payload.starts, stops)), np.concatenate((payload.stops, stops + 1)))
 
     def acknowledged(self, answers: Packets) -> ByteIntervals:
-        """Return the sequence numbers that frames from receiver to sender acknowledge."""
+        """Return the positions that frames from receiver to sender acknowledge."""
         selected = answers.where(self.includes(answers.dport) & (answers.tcp_flags & ACK != 0))
         starts = self._positions(selected.dport, self.first_seq[np.searchsorted(self.ports, selected.dport)])
         return ByteIntervals(starts, np.maximum(starts, self._positions(selected.dport, selected.tcp_ack)))
 
     def _positions(self, ports: Ints, numbers: Ints) -> Ints:
         index = np.searchsorted(self.ports, ports)
-        # The position is negative for numbers before the first byte. Each connection has its own range of positions.
+        # Relative to the first byte; negative for earlier numbers. Each connection has a separate range of positions.
         relative = (numbers - self.first_seq[index] + LONGEST_BYTES) % 2**32 - LONGEST_BYTES
         positions: Ints = (index + 1 << _CONNECTION_BITS) + relative
         return positions

@@ -83,11 +83,13 @@ def count_messages(
     loss if a number is missing at that time.
 
     Args:
-        numbers: Time of arrival (microseconds) and sequence number of each message of the autopilot, in this order.
-        streams: Messages with a time by message name, in order of arrival.
+        numbers: Time of arrival (microseconds) and sequence number of each message of the autopilot, in order of
+            arrival.
+        streams: Messages that contain `time_boot_ms`, in order of arrival, by message name.
         ended_us: End of the recording; 0 if unknown.
-        intervals_us: Requested intervals by message name; None if there are no requests. Other messages are counted
-            if their rate is an integer number of hertz up to 10.
+        intervals_us: Requested intervals in microseconds, by message name; None if there are no requests. A stream
+            without a request, or with a different period, is counted if its rate is an integer number of hertz up
+            to 10.
     """
     indices = _unwrap([number for _, number in numbers])
     received_count = lost_count = 0

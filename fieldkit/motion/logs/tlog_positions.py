@@ -23,7 +23,7 @@ def read_tlog(path: Path, position_source: PositionSource) -> Samples:
     rows = tlog.positions(path, position_source.system, position_source.topic)
     if not rows:
         raise EvidenceError(
-            f"no {position_source.topic}", where=str(path), remedy="request it: set `rates` in the step mavlink"
+            f"no {position_source.topic}", where=str(path), remedy="request it: set `rates` in the `mavlink` step"
         )
     received_ns = np.array([row[0] for row in rows], dtype=np.int64) * 1_000
     times_ns = received_ns
@@ -31,7 +31,7 @@ def read_tlog(path: Path, position_source: PositionSource) -> Samples:
         boot_ns = np.array([row[1] for row in rows], dtype=np.int64) * 1_000_000
         if (np.diff(boot_ns) < -MAX_STALE_S * 1e9).any():
             raise EvidenceError(
-                "the autopilot restarted", where=str(path), remedy="write times: received, in the step mavlink"
+                "the autopilot restarted", where=str(path), remedy="write times: received, in the `mavlink` step"
             )
         times_ns = boot_ns + (received_ns - boot_ns).min()
     times_ns, first = np.unique(times_ns, return_index=True)

@@ -143,7 +143,7 @@ def _autopilot(data: bytes, system_id: int) -> Source:
             heartbeats[frame.source] += is_autopilot
     heartbeats += Counter()  # removes senders with a count of 0
     if not heartbeats:
-        raise ValueError(f"no heartbeat of an autopilot{f' of system {system_id}' if system_id else ''}")
+        raise ValueError(f"no heartbeat from an autopilot{f' of system {system_id}' if system_id else ''}")
     if len(heartbeats) > 1:
         systems = ", ".join(str(system) for system, _ in sorted(heartbeats))
         raise ValueError(f"it has autopilots of systems {systems}: choose one with the key system")

@@ -12,10 +12,10 @@ from typing import Any, Final
 from fieldkit.agent.driving import drive_plan
 from fieldkit.agent.driving.drive_plan import DriveTask
 from fieldkit.backends.protocols import Robot, Testbed
-from fieldkit.core import geometry
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, LinkError, MotionHeldError, RobotError, describe_exception
 from fieldkit.core.model import Move
+from fieldkit.motion import driven_paths
 from fieldkit.motion.logs import drive_log
 from fieldkit.motion.origins import RobotMotion, origins_of
 from fieldkit.motion.profile_sections import TWIST_STAMPED, Drive, drive_of
@@ -66,7 +66,7 @@ def middleware_of(robot: Robot) -> MiddlewareName:
 
 def limit_s(move: Move) -> float:
     """Return the maximum duration of a move in one direction, in seconds; the robot stops after this time."""
-    return 2 * geometry.length_m(move) / move.speed_m_s + _TURN_S * (len(move.legs) + 1) + _SLACK_S
+    return 2 * driven_paths.length_m(move) / move.speed_m_s + _TURN_S * (len(move.legs) + 1) + _SLACK_S
 
 
 def path_duration_s(robot: Robot, move: Move) -> float:
@@ -109,7 +109,7 @@ def refusals(scene: Scene, move: Move) -> Iterator[Refusal]:
     """Yield the reasons why a robot must not drive automatically."""
     robot = scene.robot(move.role)
     limits = robot.profile.limits
-    farthest_m = geometry.farthest_m(move.legs)
+    farthest_m = driven_paths.farthest_m(move.legs)
     if limits.fence_m is not None and farthest_m > limits.fence_m:
         yield Refusal(
             move.role,
@@ -230,8 +230,9 @@ def _network(robot: Robot, middleware: MiddlewareName) -> dict[str, Any]:
 def drive_robot(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name_pattern: str) -> Iterator[DriveLease]:
     """Drive a robot along its path while the body runs, and back to its place afterwards; yield its lease.
 
-    After an error in the body the robot drives back, too. A real robot that cannot drive back stays where it is until
-    a person has confirmed that it is at its place. After an interruption (Ctrl-C) the robot stops where it is.
+    After an error in the body the robot drives back, too. A real robot that cannot drive back stays where it is; no
+    robot moves again before a person has put it at its place and confirmed this. After an interruption (Ctrl-C) the
+    robot stops where it is.
 
     Raises:
         LinkError: The robot did not answer.

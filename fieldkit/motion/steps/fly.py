@@ -45,14 +45,15 @@ from fieldkit.steps.view import View
 
 _Distance = Annotated[Length, Field(gt=0)] | None
 
-_MOTORS_OFF_S: Final = 60.0
-"""Timeout until the motors are off; after an aborted attempt the drone may still be landing."""
+_START_TIMEOUT_S: Final = 60.0
+"""Timeout until the motors are off and the position is known; after an aborted attempt the drone may still be
+landing."""
 _SLACK_S: Final = 30.0
 """Additional time of a take-off for the change of mode, the motors and the last metre; the same for a landing."""
 _SLOWEST_M_S: Final = 0.3
 """Lower bound of the landing speed. PX4 lands at 0.7 m/s (MPC_LAND_SPEED), slower near the ground (MPC_LAND_CRWL)."""
-_LIMIT_S: Final = 3600.0
-"""Time by which the limit of the pilot's job exceeds the expected duration of the flight."""
+_LIMIT_MARGIN_S: Final = 3600.0
+"""Difference between the time limit of the pilot's job and the expected duration of the flight."""
 _AT_REST_S: Final = 3.0
 """Approximate time that the log covers before the take-off and after the landing."""
 _LOG_BYTES_PER_S: Final = 2200.0
@@ -63,7 +64,7 @@ class FlyLeg(PathLeg):
     """A straight segment of a path in the air; several keys together are one diagonal segment.
 
     Attributes:
-        away: Distance forward, in the direction of the drone's nose before take-off.
+        away: Distance forward, in the direction of the drone's nose before its first take-off in the trial.
         towards: Distance backward.
         left: Distance to the left of that direction.
         right: Distance to the right of that direction.
@@ -85,27 +86,29 @@ class FlyLeg(PathLeg):
 class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNeeds, UsesSpace, Summarizes):
     """Makes a drone take off, fly its path while the steps in `during` run, and land.
 
-    See [MAVLink](mavlink.md#fly-in-a-procedure). Forward is the direction of its nose before take-off: place it with
-    its nose away from the robot at the other end of its link. Real drones need `--allow-motion`. A flight beyond
-    `limits` of the profile is refused, and so is a robot whose profile has no `mavlink`. Before the trial and before
-    each take-off its autopilot, PX4 or ArduCopter, must report [that it can be
+    See [MAVLink](mavlink.md#fly-in-a-procedure). When the steps in `during` have ended, the drone returns or lands,
+    even if it has not reached the end of its path. Forward is the direction of its nose before its first take-off in
+    the trial: place it with its nose away from the robot at the other end of its link. Real drones need
+    `--allow-motion`. A flight beyond `limits` of the profile is refused, and so is a robot whose profile has no
+    `mavlink`. Before the trial and before each take-off its autopilot, PX4 or ArduCopter, must report [that it can be
     armed](mavlink.md#checks-before-a-take-off). A `fault` or a `together` may be inside a flight; a
     flight must not be inside a `fault` or a `together`. Adds columns of the flight (`fly_height_median_m` and others,
-    [MAVLink](mavlink.md#evidence-of-a-flight)). Writes `fly.jsonl`, `fly.log` and `fly.orders`.
+    [MAVLink](mavlink.md#evidence-of-a-flight)). Writes `fly.jsonl`, and logs and orders of the programs on the drone:
+    `fly.log`, `fly.orders`, `guard.log`, `guard.orders` and, if it was needed, `rescue.log`.
 
     Attributes:
         robot: Role that flies.
-        height: Height above the take-off point to which it climbs first; together with all segments upwards at most
-            `limits.max_height_m`.
-        path: Its path after the climb, a list of straight segments; forward is the direction of its nose before
-            take-off. Without a path it hovers; at the end of the path it waits. Every corner must be within
-            `limits.fence_m` of the take-off point.
+        height: Height above the take-off point to which it climbs first. This height and the height of every corner
+            of the path must be at most `limits.max_height_m`.
+        path: Its path after the climb, a list of straight segments. Without a path it hovers; at the end of the path
+            it waits until the steps in `during` have ended. The horizontal distance of every corner from the take-off
+            point must be at most `limits.fence_m`.
         speed: Speed, at most `limits.max_speed_m_s`.
         climb: Rate of climb, at most `limits.max_speed_m_s`.
         then: End of the flight: `return` to the take-off point, or `land` at the current position.
         lease: Time for which it continues without contact to the laptop, 3 s to 10 min; then it performs the action
-            of `on_abort`, or lands.
-        during: Steps that run at the same time.
+            of `on_abort`, or lands. With `control: radio`, twice the expected time of the steps is added.
+        during: Steps that run in order while the drone flies its path.
     """
 
     cross_checks = motion_sources.OF_FLIGHT
@@ -179,7 +182,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
 
     def _pilot(self, scene: Scene) -> Planned:
         """Return the job of the pilot, the program that flies the drone."""
-        limit_s = _LIMIT_S + self.expected_s(scene.protocol)
+        limit_s = _LIMIT_MARGIN_S + self.expected_s(scene.protocol)
         return piloting.flight_job(scene, self.robot, self.prefixed_name("fly"), self._plan(scene), limit_s)
 
     @property
@@ -218,12 +221,12 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
     @override
     def abort_notes(self, scene: Scene) -> Iterator[str]:
         duration = format_duration(self._descent_s + _SLACK_S)
-        note = f"if it is in the air: this takes up to about {duration}, even if fieldkit has exited"
-        yield f"{scene.robot(self.robot).name} {self._abort_action(scene)}, {note}"
+        note = f"if it is in the air; this takes up to about {duration}, and continues if fieldkit exits"
+        yield f"{scene.robot(self.robot).name} {self._abort_action(scene)} {note}"
 
     @override
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
-        """Yield a reason for each limit of the profile that the flight exceeds or that is missing."""
+        """Yield a reason for a missing section `mavlink` or permission, and for each limit exceeded or missing."""
         profile, name = scene.robot(self.robot).profile, scene.robot(self.robot).profile.name
         limits = profile.limits
         if mavlink_of(profile) is None:
@@ -311,7 +314,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
     def _wait_for_start(self, scene: Scene, flight: piloting.FlightLease) -> None:
         """Wait until the drone is ready at its origin; record the origin before the first start."""
         try:
-            flight.wait_for(ON_GROUND, _MOTORS_OFF_S)
+            flight.wait_for(ON_GROUND, _START_TIMEOUT_S)
         except RobotError as error:
             if flight.is_misplaced:
                 origins_of(scene).refuse(self.robot, error.what)

@@ -56,5 +56,5 @@ def _judge(connection: str, programs: Sequence[str], result: CommandResult) -> t
     if error:
         return Verdict.FAIL, f"{connection} ({kind}) cannot be opened: {error}", remedy
     if not system:
-        return Verdict.FAIL, f"{connection} ({kind}): no heartbeat of an autopilot", remedy
+        return Verdict.FAIL, f"{connection} ({kind}): no heartbeat from an autopilot", remedy
     return Verdict.OK, f"{connection} ({kind}) reaches system {system}; {users}", ""

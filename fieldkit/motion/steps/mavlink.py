@@ -89,13 +89,14 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
             `GLOBAL_POSITION_INT`, `VFR_HUD`, `RADIO_STATUS`, `BATTERY_STATUS`, `ESTIMATOR_STATUS`, `HOME_POSITION`
             and `EXTENDED_SYS_STATE`: `{ATTITUDE: 20Hz}`. Every message received is recorded.
         positions: Message that fills the columns of distances and speeds: `local` for `LOCAL_POSITION_NED`, `global`
-            for `GLOBAL_POSITION_INT`. Such a step must not be inside a move, a fault or a `together`.
+            for `GLOBAL_POSITION_INT`. Such a step must not be inside a move, a fault or a `together`, or in a
+            procedure with a `track`.
         facing: With `local`, direction of the robot when the step begins: `away` from the robot at the other end of
             its link, `towards` that robot, or to the `left` or `right` of the direction `away`.
         times: Time of a message: `header` for the autopilot's time, or `received` for the time of arrival.
         gap: If two consecutive messages are further apart than this, the position between them is unknown.
         heights: Whether heights above the sea are used, with `global`.
-        during: Steps that run at the same time.
+        during: Steps that run in order while the telemetry is recorded.
     """
 
     cross_checks = (*motion_sources.OF_TELEMETRY, *position_checks.POSITION_CHECKS)
@@ -159,7 +160,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
         if (mavlink := mavlink_of(robot.profile)) is None:
             raise ConfigurationError(
                 f"telemetry of {robot.name} cannot be recorded: its profile {robot.profile.name} has no mavlink",
-                remedy="write mavlink: {port: 14550} in the profile, or name another robot in the step mavlink",
+                remedy="write mavlink: {port: 14550} in the profile, or name another robot in the `mavlink` step",
             )
         if self.recorder != self.robot:
             return f"udpout:{robot.address}:{mavlink.port}"
@@ -213,7 +214,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
 
     @override
     def exclusive_resources(self) -> tuple[str, ...]:
-        return ("a telemetry log", *(("a track",) if self.positions else ()))
+        return ("a telemetry log",)
 
     @override
     def files(self) -> tuple[str, ...]:
@@ -253,9 +254,9 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
 
     @override
     def placement_error(self, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
-        return (
-            None if self.positions is None else position_recording.placement_error("mavlink with positions", within)
-        )
+        if self.positions is None:
+            return None
+        return position_recording.placement_error("mavlink with positions", earlier, within)
 
     @override
     def check(self, view: View) -> Iterator[str]:

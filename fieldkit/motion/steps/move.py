@@ -13,6 +13,7 @@ from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.positions import recorded_positions
+from fieldkit.motion import driven_paths
 from fieldkit.motion.logs import drive_checks, drive_log, motion_log, motion_sources
 from fieldkit.motion.profile_sections import can_drive, drive_of
 from fieldkit.motion.steps import driving
@@ -73,7 +74,7 @@ class MoveStep(
             Otherwise the trial is refused.
         driven: Whether trials have columns of its [automatic drive](motion.md#evidence-of-a-drive). A robot that
             fieldkit drives always has them.
-        during: Steps that run at the same time.
+        during: Steps that run in order while the robot moves.
     """
 
     has_path = True
@@ -96,10 +97,10 @@ class MoveStep(
         path = self.path
         if self.within_limits:
             speed_m_s = min(speed_m_s, fastest_m_s)
-            if fence_m is not None and geometry.farthest_m(legs) > fence_m:
+            if fence_m is not None and driven_paths.farthest_m(legs) > fence_m:
                 margin_m = min(_FENCE_MARGIN_M, fence_m / 2)
                 # A path of which nothing remains is kept unchanged.
-                path = tuple(filter(None, map(PathLeg.of, geometry.clip_path(legs, fence_m - margin_m)))) or path
+                path = tuple(filter(None, map(PathLeg.of, driven_paths.clip_path(legs, fence_m - margin_m)))) or path
         update = {"path": path, "speed": speed_m_s, "within_limits": False, "driven": self.driven or can_drive(robot)}
         step = self.model_copy(update=update)
         return super(MoveStep, step).resolved(cast, step.path_s(robot))
@@ -131,7 +132,7 @@ class MoveStep(
     def straight_s(self) -> float:
         """Duration of the path at its speed, without turns, in seconds, rounded to milliseconds."""
         motion = self.motion
-        return round(geometry.length_m(motion) / motion.speed_m_s, 3)
+        return round(driven_paths.length_m(motion) / motion.speed_m_s, 3)
 
     def path_s(self, robot: Robot) -> float:
         """Return the duration of the path in seconds, including turns if the robot drives automatically."""

@@ -36,6 +36,7 @@ LEASE_S: Final = 15.0
 """Default time for which a drone continues without contact to the laptop."""
 
 READY: Final = " ready"
+"""End of the log line of a program that has received a heartbeat of the autopilot; its job is then ready."""
 _GUARD_S: Final = 86_400.0
 """Time limit of the guard's job: a day, longer than any attempt."""
 _RESCUE_S: Final = 900.0
@@ -48,7 +49,7 @@ _GUARD_EXIT_S: Final = 10.0
 _QUERY_S: Final = 5.0
 """Timeout of a query, so that a robot that does not answer delays an alarm for at most this time."""
 _END_LINE: Final = re.compile(r"(?:[0-9.]+ )?(?:error|land|return): (?P<reason>.+)")
-"""Line of the program when it aborts the flight or stops sending to the autopilot."""
+"""Log line with the reason why the program aborted the flight or exited with an error."""
 _SEPARATOR: Final = "\x1e"
 _TAILS: Final = 'for name do tail -c 2000 "$name" 2>/dev/null | tr "\\036" " "; printf "\\036"; done'
 """Shell script that prints the end of each file, followed by `_SEPARATOR` (octal 036)."""
@@ -74,7 +75,8 @@ def flight_job(scene: Scene, role: Role, name: str, plan: FlightPlan, limit_s: f
         scene: The attempt.
         role: Role of the drone.
         name: Name of the job; its log is `NAME.log`.
-        plan: Argument of the program; the file of its orders is in the folder of the attempt.
+        plan: Argument of the program, without `landing_marker`, which is added; the file of its orders is in the
+            folder of the attempt.
         limit_s: Time limit of the job.
     """
     robot, complete_plan = scene.robot(role), replace(plan, landing_marker=jobs.landing_marker_file(name))
@@ -102,7 +104,7 @@ def guard_job(
         role: Role of the drone.
         name: Name of the job.
         abort: Action if the attempt is aborted, a value of `OnAbort`.
-        lease_s: Time in seconds until an order expires.
+        lease_s: Timeout for the first order, in seconds; each order contains its lease.
         has_pilot: Whether a pilot program flies the drone. It then shares the liveness file with the guard.
     """
     plan = FlightPlan(
@@ -117,7 +119,9 @@ def guard_job(
 
 
 def rescue_job(scene: Scene, role: Role, name: str, guard_name: str, *, abort: str) -> Job:
-    """Return the job that ends the flight of a drone if neither its pilot nor its guard runs.
+    """Return the job of the rescue program, which kills the pilot and the guard of a drone and ends its flight.
+
+    It must be started only if neither of them runs.
 
     Args:
         scene: The attempt.
@@ -146,7 +150,7 @@ def liveness_file(guard_name: str) -> str:
 def guarding(
     scene: Scene, shell: Shell, program: Planned, *, lease_s: float = LEASE_S, body_s: float
 ) -> Iterator["FlightLease"]:
-    """Start the guard of a drone, yield its lease, and stop it after a successful body.
+    """Start the guard of a drone, yield its lease, and order the guard to exit after a successful body.
 
     After an error in the body, the guard continues; see `leased_program`. Raises the same errors.
     """
@@ -156,7 +160,7 @@ def guarding(
 
 
 class FlightLease(LeaseKeeper):
-    """Keeps the lease of a flight program on a drone.
+    """Renews the lease of a flight program on a drone.
 
     Args:
         shell: Connection to the robot.
@@ -166,7 +170,8 @@ class FlightLease(LeaseKeeper):
             does not cross the radio under test.
 
     Attributes:
-        lost_reason: The reason why the program cannot report its end; empty if it can.
+        lost_reason: Why the program has not written the reason of its end to its log, set if it was killed or
+            suspended; otherwise empty.
     """
 
     def __init__(self, shell: Shell, program: Planned, lease_s: float, silent_lease_s: float | None) -> None:
@@ -209,7 +214,7 @@ class FlightLease(LeaseKeeper):
 
     @property
     def is_aloft(self) -> bool:
-        """Whether the drone has taken off and not landed, according to the log of the program."""
+        """Whether the drone was armed for the take-off and has not landed, according to the log of the program."""
         marks = [line.rpartition(" ")[2] for line in self._lines]
         return CLIMBING in marks and "landed" not in marks
 
@@ -256,7 +261,7 @@ class FlightLease(LeaseKeeper):
         """Wait until the program reports that it has reached a state.
 
         Args:
-            mark: The state, which is the last word of a line of the log.
+            mark: The state, which is the end of a line of the log.
             within_s: Timeout in seconds.
 
         Raises:
@@ -310,7 +315,7 @@ def leased_program(
     robot = scene.robot(program.role)
     # The body may take up to twice its approximate duration.
     silent_lease_s = lease_s + 2 * body_s if robot.control is Control.RADIO else None
-    fallback = f"if it flies, it comes down automatically within {silent_lease_s or lease_s:g} s"
+    fallback = f"if it flies, it starts to come down automatically within {silent_lease_s or lease_s:g} s"
     mover = RobotMover(robot.name, shell, scene.folder, fallback)
     with (
         scene.motions.moving(mover),

@@ -96,13 +96,13 @@ class Forwarder:
         with self._lock:
             self._is_stopped = True
 
-    def other_types(self) -> Sequence[str]:
+    def type_conflicts(self) -> Sequence[str]:
         """Return an error message for each other type with which a node on either side uses the topic.
 
         Messages of these types are not forwarded.
         """
         sides = zip((self._source, self._target), self._topic_pair, strict=True)
-        return [message for side, topic in sides for message in side.other_types(topic)]
+        return [message for side, topic in sides for message in side.type_conflicts(topic)]
 
     def counts(self) -> CrossingCounts:
         """Return the counters of the forwarded, refused and unreadable samples."""
@@ -118,7 +118,7 @@ class _RunningSide:
     network: Network
     middleware: Middleware
 
-    def other_types(self, topic: Topic) -> Sequence[str]:
+    def type_conflicts(self, topic: Topic) -> Sequence[str]:
         """Return an error message for each other type with which a node on this side uses the topic."""
         types = sorted(self.middleware.other_types(topic))
         return [
@@ -225,8 +225,8 @@ def _create_forwarder(
         for side in sides
     ]
     for side, topic in zip(sides, topic_pair, strict=True):
-        # This finds only the endpoints that are already discovered; `Forwarder.other_types` reports later ones.
-        for message in side.other_types(topic):
+        # This finds only the endpoints that are already discovered; `Forwarder.type_conflicts` reports later ones.
+        for message in side.type_conflicts(topic):
             raise ConfigurationError(message, remedy="name the topic with that type")
     convert = _conversion(_uses_ros1(source), pair, types)
     return Forwarder(crossing, source, target, (topic_pair[0], topic_pair[1]), convert)

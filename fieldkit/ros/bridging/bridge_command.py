@@ -212,7 +212,7 @@ def _watch(forwarders: Sequence[Forwarder], stop_event: threading.Event) -> None
     """Wait for `stop_event`. If other nodes use a topic with another type, report this once."""
     reported: set[str] = set()
     while not stop_event.wait(_POLL_S):
-        for message in chain.from_iterable(forwarder.other_types() for forwarder in forwarders):
+        for message in chain.from_iterable(forwarder.type_conflicts() for forwarder in forwarders):
             if message not in reported:
                 reported.add(message)
                 show_error(

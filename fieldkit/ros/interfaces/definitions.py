@@ -1,4 +1,4 @@
-"""Definitions of standard ROS message types that rosbags lacks."""
+"""Definitions of standard ROS message types that the ROS 1 types of rosbags lack."""
 
 from collections.abc import Mapping
 from types import MappingProxyType

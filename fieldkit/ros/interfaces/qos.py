@@ -31,7 +31,7 @@ class History(Policy):
 
 
 class Durability(Policy):
-    """Whether late readers receive earlier samples."""
+    """Whether late-joining readers receive earlier samples."""
 
     SYSTEM_DEFAULT = 0
     TRANSIENT_LOCAL = 1
@@ -54,7 +54,7 @@ class QosProfile:
         reliability: Whether lost samples are sent again.
         history: Whether the last samples or all samples are kept.
         depth: Number of kept samples with `KEEP_LAST`; 0 for the middleware's default.
-        durability: Whether late readers receive earlier samples.
+        durability: Whether late-joining readers receive earlier samples.
         deadline_ns: Maximum expected time between two samples; None for no deadline.
         lifespan_ns: Time after which a sample expires; None for no limit.
         liveliness: Method by which a publisher asserts that it is alive.

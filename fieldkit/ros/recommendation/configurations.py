@@ -5,6 +5,7 @@ Formats: CycloneDDS, docs/manual/config/config_file_reference.rst (`CYCLONEDDS_U
 """
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 from xml.etree import ElementTree as ET
@@ -53,8 +54,8 @@ def _printable(comment: Sequence[str]) -> list[str]:
 
 
 def _xml(root: ET.Element, comment: Sequence[str]) -> str:
-    # `--` ends a comment in XML (section 2.5).
-    text = "\n".join(f"  {line.replace('--', '- -')}" for line in _printable(comment))
+    # `--` is not permitted in a comment (XML 1.0, section 2.5).
+    text = "\n".join(f"  {re.sub('-(?=-)', '- ', line)}" for line in _printable(comment))
     ET.indent(root)
     return f'<?xml version="1.0" encoding="UTF-8"?>\n<!--\n{text}\n-->\n{ET.tostring(root, encoding="unicode")}\n'
 

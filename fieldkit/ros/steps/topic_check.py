@@ -32,8 +32,8 @@ MESSAGES: Final = 2
 TOLERANCE: Final = 0.5
 """Allowed deviation of a topic's rate, as a fraction of the rate."""
 
-# Added for a recorder that has no option for the duration, because its start counts as recording time: ros2 takes 3 s
-# to load on a small computer.
+# Added for a recorder that has no option for the duration. Its duration starts with its first subscription; the other
+# subscriptions may take seconds on a small computer.
 _START_S: Final = 4.0
 # Limit of a recording that is needed only for the battery. A recorder would wait longer if its ROS master is missing.
 _SHORT_LIMIT_S: Final = 6.0

@@ -126,15 +126,15 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
 
     The distance and speed columns of the transfers and pings inside use these positions
     ([method](method-radio.md#where-robots-were)). Robots that are not listed are assumed to stay at their placement,
-    unless a step inside moves them. A repeat has at most one `track`; moves, faults and `together` are inside it.
-    Adds the columns `positions_from` and `positions_clock_error_s`. Writes `track_ROLE.bag` (ROS 2: a folder) and
-    `positions.json`, which records the source of each position, and the offset of each robot's clock from the
-    laptop's clock.
+    unless a step inside moves them. A repeat has at most one `track` or `mavlink` with `positions`. A `track` must
+    not be inside a move, a fault or a `together`. Adds the columns `positions_from` and `positions_clock_error_s`.
+    Writes `track_ROLE.bag` (ROS 2: a folder) and `positions.json`, which records the source of each position, and the
+    offset of each robot's clock from the laptop's clock.
 
     Attributes:
         robots: Source of each robot's position, by role.
         heights: Whether heights above the ellipsoid are used; heights of satellite receivers are often wrong by 10 m.
-        during: Steps that run at the same time.
+        during: Steps that run in order while the positions are recorded.
     """
 
     cross_checks = position_checks.POSITION_CHECKS
@@ -276,7 +276,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
     def placement_error(self, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
         if any(isinstance(step, TrackStep) for step in earlier):
             return "a repeat can have only one track: list all robots in it, and put all steps into it"
-        return position_recording.placement_error("track", within)
+        return position_recording.placement_error("track", earlier, within)
 
     @override
     def check(self, view: View) -> Iterator[str]:

@@ -24,15 +24,15 @@ from fieldkit.steps.view import View
 class RoamStep(Nest, DescribesActions, Roams, Summarizes):
     """Measures the handovers of a station between access points while the steps in `during` run.
 
-    One of these steps must be a `ping` that the robot sends, so that answers and link samples have times of the
-    same clock. The access points are read from the samples of the robot's radio, about five per second. The
-    resolution of a gap is the interval of the ping. A real robot needs `iw`; robots of a lab need
+    Exactly one `ping` from the robot must be inside, so that answers and link samples have times of the same clock.
+    The access points are read from the samples of the robot's radio, about five per second. The resolution of a gap
+    is the interval of the ping. A real robot needs `iw`; robots of a lab need
     [radio.access_points](method-radio.md#roaming) in the site file.
 
     Attributes:
         robot: Role of the robot that roams.
         ping_pong: A handover back to an access point within this time after leaving it is a ping-pong handover.
-        during: Steps that run at the same time, usually a `move` with the `ping`.
+        during: Steps that run in order, usually a `move` with the `ping`.
     """
 
     cross_checks = (

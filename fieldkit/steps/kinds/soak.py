@@ -46,12 +46,13 @@ _CLIENT_SCRIPT: Final = (
 class SoakStep(LoadOptions, Nest, Listens, SendsTraffic):
     """Loads the radio while the steps in `during` run: iperf3 sends until the last of them has ended.
 
-    Only the [stalls](method-delay.md#stalls-of-a-flow) of the load are measured. Both robots need iperf3 3.1 or
-    later. A load that ends early makes the repeat void. Writes `ROLE-soak.log`.
+    Only the [stalls](method-delay.md#stalls-of-a-flow) of the load, and its [recovery](method-delay.md#recovery) from
+    faults inside, are measured. Both robots need iperf3 3.1 or later. A load that ends early makes the repeat void.
+    Writes `ROLE-soak.log`.
 
     Attributes:
-        port: Port that the receiver listens on; it must differ from the port of an `iperf3` inside.
-        during: Steps that run at the same time.
+        port: Port that the receiver listens on; it must differ from the port of an `iperf3` inside to the same robot.
+        during: Steps that run in order while the load is sent.
     """
 
     flow_kind: ClassVar[str] = "soak"

@@ -93,7 +93,7 @@ def show_results(form: str, title: str, scenario: CosimScenario, results: Sequen
         scenario: The scenario.
         results: The results.
     """
-    # A run that was slower than real time has no results except its lateness.
+    # A run that was slower than --realtime has no results except its lateness.
     timely_results = [result for result in results if not isinstance(result.error, RealTimeError)]
     sheets = {"flows": _flow_sheet(title, timely_results)} if timely_results else {}
     if any(result.recoveries for result in timely_results):
@@ -107,7 +107,7 @@ def show_results(form: str, title: str, scenario: CosimScenario, results: Sequen
         print_text(_cost_text(timely_results))
     for result in results:
         if isinstance(result.error, RealTimeError):
-            show_note(f"seed {result.seed}: the run was slower than real time, so it has no results")
+            show_note(f"seed {result.seed}: the run was slower than --realtime, so it has no results")
         elif result.stop_reason:
             # The command reports the full error when it ends.
             reason = result.stop_reason if result.error is None else f"stopped at {result.simulated_s:g} s"

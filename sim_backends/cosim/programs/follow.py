@@ -27,7 +27,8 @@ from sim_backends.cosim.federates import Action
 from sim_backends.cosim.programs.way_points import PERIOD_NS, NeverSends, PeriodicTimer, drive_towards
 from sim_backends.network.packets import ReceivedDatagram
 from sim_backends.physics.body import Twist, Velocity
-from sim_backends.world.motion import State, extrapolate
+from sim_backends.world.dead_reckoning import extrapolate
+from sim_backends.world.motion import State
 
 TIMEOUT_NS: Final = 1_000_000_000
 """Default time without a state after which a follower stops."""

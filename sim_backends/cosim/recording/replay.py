@@ -21,7 +21,7 @@ class Recording:
         manifest: The scenario and its settings, and the end of the run.
         run: The run. If it is under way or was killed, the packets whose fate was not decided yet are missing.
         states: The recorded true states: time in nanoseconds, agent, state.
-        decided_by: Reason for the length of each window; empty if the policy does not report it.
+        decided_by: Reason for the length of each window; empty texts if the policy reports no reasons.
     """
 
     manifest: RunManifest
@@ -70,7 +70,7 @@ def _check_parts(folder: Path, manifest: RunManifest) -> None:
             is_same = packet_tables.file_checksum(folder / path) == checksum
         except OSError as error:
             raise EvidenceError(
-                f"the recording was truncated: this part cannot be read: {error.strerror}",
+                f"a part of the recording is missing or cannot be read: {error.strerror}",
                 where=str(folder / path),
                 remedy=RUN_AGAIN,
             ) from error

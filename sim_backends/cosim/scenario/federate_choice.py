@@ -56,11 +56,11 @@ PhysicsFederateOptions = Annotated[
 NetworkFederateOptions = Annotated[
     Options, PlainValidator(_options_of(NETWORK)), _SERIALIZER, _JSON_SCHEMA, _VALIDATED_DEFAULT
 ]
-"""Options of the network that `federate` names in the same mapping."""
+"""Options of the network federate that `federate` names in the same mapping."""
 
 
 def agent_references(options: Options) -> Iterator[tuple[str, Location]]:
-    """Yield every agent that options name, with its keys."""
+    """Yield every agent that options name, and the keys that lead to the name."""
     if isinstance(options, SimulatorOptions):
         yield from options.agent_names()
 
@@ -75,8 +75,8 @@ def drop_options_of_replaced_federates(data: Any, changes: Mapping[str, Any]) ->
     """Remove the options of each federate that a change replaces, because they are valid only for the old federate.
 
     Args:
-        data: A scenario file.
-        changes: Values that replace values of the file, by their keys.
+        data: Content of a scenario file, which is modified.
+        changes: New values of keys of the file, by dotted key, for example `network.federate`.
     """
     for role in ROLES.values():
         section = data.get(role) if isinstance(data, dict) else None
@@ -94,7 +94,7 @@ def add_options(definitions: dict[str, Any], sections: Mapping[str, str]) -> Non
 
     Args:
         definitions: The definitions of the JSON schema of scenarios.
-        sections: For each role, `physics` or `network`: the name of the definition of its section.
+        sections: Names of the definitions of the sections `physics` and `network`, by role.
     """
     for name, federate in federates().items():
         if federate.options is None:

@@ -15,7 +15,8 @@ def scenario_sdf(scenario: CosimScenario, version: Version = "fortress") -> str:
         version: Version of Gazebo, which determines the names of the plugins.
 
     Raises:
-        ConfigurationError: The world does not exist, or a robot starts within an obstacle.
+        ConfigurationError: The world does not exist or is invalid, or a robot starts within an obstacle or within
+            another robot.
     """
     world = load_world(scenario.world)
     scenario_bodies = make_bodies(scenario, world)

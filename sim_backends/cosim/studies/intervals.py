@@ -1,4 +1,4 @@
-"""Computes 95 % intervals over independent repeats in closed form, so that no result depends on a seed."""
+"""Computes 95 % confidence intervals over independent repeats without resampling, so no result depends on a seed."""
 
 import math
 from dataclasses import dataclass
@@ -18,10 +18,10 @@ POWER: Final = 0.8
 
 @dataclass(frozen=True)
 class IntervalEstimate:
-    """A number and its interval; unknown values are nan.
+    """An estimate and its confidence interval; unknown values are NaN.
 
     Attributes:
-        value: The number.
+        value: The estimate.
         low: Lower bound.
         high: Upper bound.
     """
@@ -31,13 +31,13 @@ class IntervalEstimate:
     high: float
 
     @property
-    def is_certain(self) -> bool:
-        """True if the interval excludes 0, so that the sign of the number is certain."""
+    def excludes_zero(self) -> bool:
+        """True if the interval excludes 0, so that the estimate differs significantly from 0."""
         return self.low > 0 or self.high < 0
 
 
 def mean(values: Floats) -> IntervalEstimate:
-    """Return the mean of repeats with Student's interval; fewer than two repeats have no interval."""
+    """Return the mean of repeats with Student's t interval; fewer than two repeats have no interval."""
     count = len(values)
     value = float(values.mean()) if count else math.nan
     if count < 2:
@@ -66,10 +66,10 @@ def jackknife(value: float, leave_one_out: Floats) -> IntervalEstimate:
 
 
 def repeats_needed(difference: float, deviation: float) -> int | None:
-    """Return the number of pairs of repeats that detect a difference in four of five studies; None if it is 0.
+    """Return the number of pairs of repeats that detect a difference in four of five studies, at least 2.
 
     It is ((z_0.975 + z_0.8) s / d)^2 + z_0.975^2 / 2; the second term is a correction, because the deviation is an
-    estimate (Guenther 1981, Am. Stat. 35:243). Small numbers may be one too low.
+    estimate (Guenther 1981, Am. Stat. 35:243). Small numbers may be one too low. Return None if the difference is 0.
 
     Args:
         difference: Mean of the differences within pairs.

@@ -44,8 +44,15 @@ _MEASURED_PACKETS: Final = 3000
 """Approximate number of packets that the PHY rate could carry while the goodput is measured."""
 _MEASURED_S: Final = (0.2, 2.0)
 """Shortest and longest time during which the goodput is measured."""
-_MEAN_RATE_BIT_S: Final = 50e6
-"""PHY rate from which this time is computed if the link selects its modes."""
+_SELECTED_S: Final = 1.0
+"""This time if the link selects its modes: 20 updates of minstrel_ht."""
+
+_QUEUE_S: Final = 1 / 128
+"""Time to which Linux limits the data of a connection in the queue of a Wi-Fi radio: mac80211 sets sk_pacing_shift
+(net/core/sock.c) to 7."""
+_MIN_QUEUE_PACKETS: Final = 64
+_PACKET_BITS: Final = 12_000
+"""Size of an IP packet of 1,500 bytes."""
 
 _DATAGRAM_BYTES: Final = 1460
 """Payload of a UDP datagram, so that a packet is as long as a segment of TCP without options."""
@@ -61,7 +68,8 @@ class LoggedLink:
         width_mhz: Channel width.
         streams: Number of spatial streams; with `phy_rate_bit_s`, the largest number.
         guard_interval_ns: Guard interval.
-        mcs: MCS as the standard numbers it: in 802.11n, 8 to 15 have two streams. None if it is not logged.
+        mcs: MCS as the standard numbers it: in 802.11n, 8 to 15 have two streams. None if it is not logged. 802.11a
+            and g have none.
         phy_rate_bit_s: PHY rate, or a mean of PHY rates; the link uses the mode with the nearest rate. None if it is
             not logged. Without MCS and PHY rate, the link selects its modes as Linux's minstrel_ht does.
         protocol: Transport, `tcp` or `udp`.
@@ -102,8 +110,20 @@ class LoggedLink:
         Raises:
             ConfigurationError: The radio model has no such mode.
         """
-        if self.mcs is None and self.phy_rate_bit_s is None:
+        modes = self._modelled_modes()
+        if self.mcs is not None:
+            return modes[0]
+        if self.phy_rate_bit_s is None:
             return None
+        rate_bit_s = self.phy_rate_bit_s
+        return min(modes, key=lambda mode: abs(mode.rate_bit_s - rate_bit_s))
+
+    def _modelled_modes(self) -> list[WifiMode]:
+        """Return the modes that the link can have: only that of the logged MCS, if there is one.
+
+        Raises:
+            ConfigurationError: The radio model has no such mode, or it cannot select among them.
+        """
         modes = list(self._modes())
         if not modes:
             mcs = "" if self.mcs is None else f"MCS {self.mcs}, "
@@ -111,16 +131,21 @@ class LoggedLink:
                 f"{self.standard} with {mcs}{self.width_mhz} MHz, {self.streams} streams and a guard interval of "
                 f"{self.guard_interval_ns} ns is not modelled"
             )
-        if self.mcs is not None or self.phy_rate_bit_s is None:
-            return modes[0]
-        rate_bit_s = self.phy_rate_bit_s
-        return min(modes, key=lambda mode: abs(mode.rate_bit_s - rate_bit_s))
+        if self._split_standard()[0] == "a" and self.phy_rate_bit_s is None:
+            raise ConfigurationError("802.11a without a PHY rate is not modelled")
+        return modes
+
+    def _fastest_bit_s(self) -> float:
+        """Return the PHY rate of the link, or the largest one if the link selects its modes."""
+        mode = self.mode()
+        return max(mode.rate_bit_s for mode in self._modelled_modes()) if mode is None else mode.rate_bit_s
 
     def _modes(self) -> Iterator[WifiMode]:
         """Yield the mode with the logged MCS; without MCS, all modes with up to `streams` streams."""
         amendment, band_name = self._split_standard()
         if amendment not in _PREFIXES:
-            yield from OFDM_MODES[band_name]
+            if self.mcs is None:
+                yield from OFDM_MODES[band_name]
             return
         all_streams = range(1, self.streams + 1) if self.mcs is None else (self._streams,)
         numbers = range(2 * _MCS_PER_STREAM) if self.mcs is None else (self.mcs,)
@@ -148,7 +173,7 @@ class LoggedLink:
         amendment, _ = self._split_standard()
         mode = self.mode()
         duration_s = _START_S + self.measured_s()
-        rate_bit_s = _MEAN_RATE_BIT_S if mode is None else mode.rate_bit_s
+        rate_bit_s = self._fastest_bit_s()
         loss_db = float(free_space_db(np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0]]), self.band.carrier_hz)[0])
         radio: dict[str, Any] = {"standard": self.standard, "tx_power_dbm": self.signal_dbm + loss_db}
         if amendment != "g":
@@ -161,7 +186,8 @@ class LoggedLink:
             }
         values: dict[str, Any] = {
             "duration": f"{duration_s:.3f}s",
-            "traffic": [self._traffic(max(rate_bit_s, _MEAN_RATE_BIT_S), duration_s)],
+            "traffic": [self._traffic(rate_bit_s, duration_s)],
+            "radio.queue_packets": max(_MIN_QUEUE_PACKETS, math.ceil(rate_bit_s * _QUEUE_S / _PACKET_BITS)),
         }
         for agent in ("sender", "receiver"):
             values |= {f"agents.{agent}.radio.{key}": value for key, value in radio.items()}
@@ -187,10 +213,10 @@ class LoggedLink:
 
     def measured_s(self) -> float:
         """Return the time during which the goodput is measured."""
-        mode = self.mode()
-        rate_bit_s = _MEAN_RATE_BIT_S if mode is None else mode.rate_bit_s
+        if (mode := self.mode()) is None:
+            return _SELECTED_S
         shortest_s, longest_s = _MEASURED_S
-        return min(max(_MEASURED_PACKETS * 12_000 / rate_bit_s, shortest_s), longest_s)
+        return min(max(_MEASURED_PACKETS * _PACKET_BITS / mode.rate_bit_s, shortest_s), longest_s)
 
 
 def predict_goodputs_bit_s(

@@ -101,7 +101,9 @@ class SweepFolder:
             if next(self.path.iterdir(), None) is not None:
                 raise ConfigurationError("this folder is not empty", where=str(self.path), remedy="choose another -o")
             return
-        stored_plan, current_plan = self._read(path), _description(plan)
+        # A folder without its plan is refused, so a damaged plan must not be deleted.
+        stored_plan = self._read(path, remedy="restore it from a copy, or choose another -o")
+        current_plan = _description(plan)
         for key in ("scenario", "factors"):
             # Of factors, only the names are compared (the keys), because a sweep may be continued with other values.
             old_value, new_value = (
@@ -170,13 +172,11 @@ class SweepFolder:
         with self.error_conversion():
             files.write(path, json.dumps(content, indent=1).encode() + b"\n")
 
-    def _read(self, path: Path) -> dict[str, Any]:
+    def _read(self, path: Path, remedy: str = "delete it, and run again") -> dict[str, Any]:
         try:
             content = json.loads(path.read_bytes())
         except (OSError, ValueError) as error:
-            raise EvidenceError(
-                f"cannot be read: {error}", where=str(path), remedy="delete it, and run again"
-            ) from error
+            raise EvidenceError(f"cannot be read: {error}", where=str(path), remedy=remedy) from error
         return dict(content)
 
 

@@ -75,7 +75,7 @@ def serve(drone: Drone, *, assigned_paths: Path, motion_record: Path, ready: Pat
 
     Args:
         drone: Settings of the drone.
-        assigned_paths: The file of the paths that the lab assigns (`robot_motion.append_path`).
+        assigned_paths: The file of the paths that the lab assigns (`assigned_path.append_path`).
         motion_record: The file in which the robot records its motion (`robot_motion.MotionReporter`).
         ready: File that is created when the port is open.
 

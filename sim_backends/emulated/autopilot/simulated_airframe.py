@@ -18,8 +18,9 @@ _MAX_EXTRAPOLATION_NS: Final = 100_000_000
 class SimulatedAirframe(Airframe):
     """An `Airframe` that a physics simulator moves.
 
-    On the ground, the autopilot commands no thrust (`FlightCommand.powered` is False) until the drone must climb. The
-    drone stays at the position at which the lab has placed it until the physics simulator records a state.
+    The autopilot commands no thrust (`FlightCommand.powered` is False) while its motors are off, and on the ground
+    until the drone must climb. The drone stays at the position at which the lab has placed it until the physics
+    simulator records a state.
 
     Args:
         limits: Limits of the airframe.

@@ -23,12 +23,12 @@ _CRITICAL: Final = dialect.MAV_SEVERITY_CRITICAL
 _PREARM_NS: Final = 30_000_000_000
 """ArduPilot repeats the reasons why it cannot be armed at this interval (AP_Arming)."""
 _MIN_LIFT_OFF_M_S: Final = 0.02
-"""A landed vehicle lifts off at a higher target velocity. Lower ones are caused by small errors of its position."""
+"""Minimum vertical target velocity at which a landed vehicle lifts off; small position errors cause lower values."""
 _OFFBOARD_LOST: Final = {3: Mode.RTL, 4: Mode.LAND}
 """Mode when set-points are missing, by COM_OBL_RC_ACT; with other values the vehicle holds its position (LOITER).
 
-The values 0 to 2 name modes of a remote control, which need the sticks; 5 is Hold; 6 and 7 (terminate, disarm) are
-not emulated.
+The values 0 to 2 are modes that need a remote control, which is not emulated. The value 5 is Hold. The values 6
+(terminate) and 7 (disarm) are not emulated.
 """
 
 
@@ -96,7 +96,7 @@ class Vehicle(VehicleBase):
         """Take off. A repeated command has no effect before the vehicle lifts off; with PX4, until the take-off ends.
 
         Args:
-            height_m: Height above home; None for the height in the parameter.
+            height_m: Height above home; None for the parameter MIS_TAKEOFF_ALT.
 
         Raises:
             Refused: The motors are off, it is flying, the height is not allowed, or ArduCopter is not in mode
@@ -147,8 +147,8 @@ class Vehicle(VehicleBase):
         """Change the mode at the request of a client; the current mode is kept if it is requested again.
 
         Raises:
-            Refused: A condition of the mode is not met: a mission, recent set-points, that the vehicle is flying, or
-                the conditions of `take_off`.
+            Refused: A condition of the mode is not met. A mode may require a mission, recent set-points, a flying
+                vehicle, or the conditions of `take_off`.
         """
         self._switch(mode)
         self.failsafes.on_mode_change(self.body.now_ns)

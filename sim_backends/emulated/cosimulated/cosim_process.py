@@ -5,8 +5,9 @@ requests as the process of a radio model, and two more: `simulate`, with simulat
 body of a robot.
 
 A session is one run of the coordinator, which advances physics and network together, in windows of simulated time.
-Its time is 0 when the session starts, and its windows end in real time. If the set of stations or the relay changes,
-a new session starts, and packets on the air of the old session are lost.
+Its time is 0 when the session starts, and each window lasts until the monotonic clock reaches its end. If the set of
+stations or the relay changes, a new session starts, and the packets on the air or in the queue of the old session are
+lost.
 """
 
 import gc
@@ -30,7 +31,8 @@ from sim_backends.emulated.cosimulated.real_agents import RealPacket
 from sim_backends.emulated.cosimulated.simulators import LabSettings, RobotBody, Simulators
 from sim_backends.emulated.cosimulated.steering import FlightSteering, GroundSteering, Steering
 from sim_backends.emulated.medium.framing import FRAMINGS, NO_ROBOT, Framing
-from sim_backends.emulated.medium.ports import FlowDelays, MediumStats, Port, round_up
+from sim_backends.emulated.medium.medium_stats import MediumStats
+from sim_backends.emulated.medium.ports import FlowDelays, Port, round_up
 from sim_backends.emulated.medium.server import (
     BURST,
     DEVICE_PACKETS,
@@ -48,7 +50,8 @@ _MAX_SLEEP_NS: Final = 10_000_000
 _END_NS: Final = 1 << 62
 """A simulated time that no session reaches."""
 _WINDOWS: Final = 1000
-"""Number of windows after which the ends of the windows are deleted from the record of the coordinator."""
+"""Number of windows after which the ends of the windows are deleted from the record of the coordinator, so that the
+record does not grow without limit."""
 _MAX_LAG_NS: Final = 1_000_000_000
 """A simulation that lags behind real time by more than this does not catch up, so that its later results are usable.
 Packets that wait during the lag are delivered late, so their repeat is void."""
@@ -78,7 +81,7 @@ class CosimulatedMedium(MediumServer):
         self._clock = RealTime()
         # Packets that were read and have not entered the network.
         self._queue: deque[RealPacket] = deque()
-        # As in `Medium`: a device that has packets now was still empty at `_arrived_after_ns`.
+        # If the previous poll read all packets, a device that has packets now was still empty at `_arrived_after_ns`.
         self._arrived_after_ns = self._previous_poll_ns = time.monotonic_ns()
         self._window_lateness_counts: Counter[int] = Counter()
         # Delays that the sync policy adds, as processing delay. Their transmission part contains another value: the
@@ -148,7 +151,7 @@ class CosimulatedMedium(MediumServer):
         """Wait until a time of the monotonic clock, a packet or a request; read the packets and answer the request.
 
         The wait also ends after about 10 ms (`_MAX_SLEEP_NS`). If `answers` is False, a request is left for the next
-        call. `Medium._wait` explains the earliest time at which the packets can have arrived.
+        call. `_arrived_after_ns` is determined as in `sim_backends.emulated.medium.process.Medium._wait`.
         """
         polled_ns = time.monotonic_ns()
         ready = self._epoll.poll(0)
@@ -309,7 +312,8 @@ class CosimulatedMedium(MediumServer):
                 self._simulators, self._seed, self._options, self._world, self._antennas, self._bodies, relay
             )
             session = CosimSession(self, settings, self._steerings, self._policy, self._clock)
-            self._log_attempts(None if self._air_log is None else self._air_log.write)
+            if self._air_log is not None and session.builtin is not None:
+                session.log_attempts(self._air_log.write)
         velocities_m_s = self._layout.velocities_m_s
         states = {
             name: State(position_m, velocities_m_s.get(name, STILL))

@@ -43,8 +43,8 @@ class FrameOnAir:
         sent_frame: The frame.
         source: Name of its transmitter.
         receiver: Name of its receiver; None for a broadcast or multicast, `""` if no other radio has the address.
-        chain: Its tries; a broadcast or multicast has one, in the basic mode.
-        attempts: Number of tries that were made.
+        chain: Its tries; a broadcast or multicast has one, at 6 Mbit/s.
+        attempts: Number of tries that have started.
         is_acknowledged: True if an ACK was received.
         signal_dbm: Signal of that ACK, at the start of the try; -120 without an ACK.
         mode: Mode of the first try that a receiver decoded; the lowest mode of 802.11g if there is none.
@@ -121,7 +121,7 @@ class _ChainRates(RateControl):
             self._channel.finish(frame)
 
 
-class _ChannelGains(WorldChannel):
+class _ChannelLinks(WorldChannel):
     """The links on one channel, with the rate chains of mac80211.
 
     All stations count as associated: mac80211 decides about associations, and its frames need airtime even if the
@@ -156,10 +156,10 @@ class _Channel:
     def __init__(
         self, seed: int, options: RadioOptions, antennas: Mapping[str, Antenna], world: World | None
     ) -> None:
-        self._gains = _ChannelGains(seed, {**antennas, _ABSENT: next(iter(antennas.values()))}, options, world)
-        self._gains.channel = self
-        self._index = {name: index for index, name in enumerate(self._gains.names)}
-        self._wifi: Wifi[FrameOnAir] = Wifi(self._gains, seed, queue_packets=options.queue_packets)
+        self._links = _ChannelLinks(seed, {**antennas, _ABSENT: next(iter(antennas.values()))}, options, world)
+        self._links.channel = self
+        self._index = {name: index for index, name in enumerate(self._links.names)}
+        self._wifi: Wifi[FrameOnAir] = Wifi(self._links, seed, queue_packets=options.queue_packets)
         self._wifi.log_attempts(self._on_attempt)
         self._wifi.log_losses(self._on_loss)
         self._numbers = dict.fromkeys(antennas, 0)
@@ -175,10 +175,10 @@ class _Channel:
         attitudes: Mapping[str, Attitude],
     ) -> None:
         self._wifi.advance(now_ns)
-        self._gains.move(now_ns, positions_m, velocities_m_s, attitudes)
+        self._links.move(now_ns, positions_m, velocities_m_s, attitudes)
 
     def transmit(self, now_ns: int, frame: FrameOnAir) -> None:
-        """Send a frame. If none of its tries is possible, its status is reported immediately."""
+        """Send a frame. If its chain has no try on the air, its status is reported immediately."""
         number = self._numbers[frame.source]
         self._numbers[frame.source] = number + 1
         identity = frame.source, number
@@ -201,7 +201,7 @@ class _Channel:
         return events
 
     def signal_dbm(self, transmitter: int, receiver: int, now_ns: int) -> int:
-        power_mw = self._gains.powers_mw(transmitter, now_ns)[receiver]
+        power_mw = self._links.powers_mw(transmitter, now_ns)[receiver]
         return max(_LOWEST_SIGNAL_DBM, round(decibel(power_mw)))
 
     def finish(self, frame: FrameOnAir) -> None:
@@ -212,7 +212,7 @@ class _Channel:
             self.events.statuses.append(frame)
 
     def _on_attempt(self, attempt: TransmissionAttempt) -> None:
-        """Store the first received attempt. The status of a broadcast is known after its only attempt."""
+        """Store mode and number of the first decoded try. The status of a broadcast is known after its only try."""
         frame = attempt.payload
         if not isinstance(frame, FrameOnAir):
             return  # an ACK
@@ -245,7 +245,7 @@ class Air:
     ) -> None:
         if not antennas or _ABSENT in antennas:
             raise ValueError("the air needs at least one radio, each with a name")
-        self._channel_arguments = seed, options, antennas, world
+        self._channel_arguments = seed, options.model_copy(update={"mode": None}), antennas, world
         self._channels: dict[int, _Channel] = {}
         # Channel of the last frame of each radio.
         self._tuned_mhz: dict[str, int] = {}
@@ -260,7 +260,14 @@ class Air:
         velocities_m_s: Mapping[str, Vector] | None = None,
         attitudes: Mapping[str, Attitude] | None = None,
     ) -> None:
-        """Set the positions of the radios, metres east, north, up; radios without a position are out of range."""
+        """Set the state of the radios, which is valid until the next call.
+
+        Args:
+            now_ns: Current time.
+            positions_m: Metres east, north, up; radios without a position are out of range.
+            velocities_m_s: Metres per second east, north, up; 0 for radios that are not named.
+            attitudes: Attitudes; the other radios keep theirs.
+        """
         self._positions_m, self._velocities_m_s = dict(positions_m), dict(velocities_m_s or {})
         self._attitudes = {**self._attitudes, **(attitudes or {})}
         for frequency_mhz in self._channels:

@@ -2,14 +2,17 @@
 
 The command is `python -m sim_backends.emulated.linux_wifi.medium_program [CHANNEL] [--fd FD]`; it needs root.
 
-It registers as the medium of all radios of mac80211_hwsim in its network namespace. It reads requests from the socket
-with the descriptor CHANNEL, or from standard input, and writes the replies to that socket or to standard output.
-Requests and replies are JSON objects, one per line. The first request is `MediumSetup`. Later requests are
+It registers as the medium of all radios of mac80211_hwsim that were created in its network namespace. It reads
+requests from the socket with the descriptor CHANNEL, or from standard input, and writes the replies to that socket or
+to standard output. Requests and replies are JSON objects, one per line. The first request is `MediumSetup`. Later
+requests are
 
     {"do": "place", "positions": {"r1": [0, 0, 1]}, "velocities": {}}
     {"do": "totals"}
 
-The request `place` may also have `attitudes`: the yaw, pitch and roll of radios in radians, by name (`Attitude`).
+Positions in metres and velocities in metres per second are east, north, up. A radio without a position is out of
+range. The request `place` may also have `attitudes`: the yaw, pitch and roll of radios in radians, by name
+(`Attitude`). The reply to an invalid request is `{"error": TEXT}`.
 
 It exits when the requests end. When the last descriptor of the registered socket is closed, hwsim again delivers all
 frames without loss. A supervisor therefore opens the socket with `hwsim_socket.open_registered`, keeps it open, and
@@ -63,7 +66,7 @@ class RadioSetup(Strict):
 
     Attributes:
         address: Its address, `42:00:00:00:NN:00` for radio NN.
-        standard: Standard of its radio.
+        standard: Its IEEE 802.11 amendment.
         tx_power_dbm: Transmit power.
         sensitivity_dbm: Received power of the weakest frame that it detects.
         pattern: Pattern of its antenna, as `dataclasses.asdict` returns it; None if it is isotropic.
@@ -109,7 +112,11 @@ class MediumSetup(Strict):
 
 
 class KernelSocket(Protocol):
-    """The interface of a netlink socket that the medium uses; `FamilySocket` implements it."""
+    """The interface of a netlink socket that the medium uses; `FamilySocket` implements it.
+
+    Attributes:
+        overruns: Number of times that the kernel reported dropped messages, because the socket was full.
+    """
 
     overruns: int
 
@@ -122,7 +129,11 @@ class KernelSocket(Protocol):
         ...
 
     def receive(self) -> list[NetlinkMessage]:
-        """Return messages; an empty list if there is none."""
+        """Return messages; an empty list if there is none.
+
+        Raises:
+            NetlinkFormatError: A message is malformed.
+        """
         ...
 
 
@@ -134,7 +145,7 @@ class RequestLines:
 
     Attributes:
         fd: The descriptor.
-        is_at_end: True if there is no more data.
+        is_at_end: True after the end of the data was read.
     """
 
     def __init__(self, fd: int) -> None:
@@ -143,7 +154,7 @@ class RequestLines:
         self._buffer = b""
 
     def read(self) -> Iterator[bytes]:
-        """Wait for data, read once, and yield the complete lines; an incomplete line at the end is not yielded.
+        """Wait for data, read once, and yield the complete lines; an incomplete line is kept for the next call.
 
         Raises:
             ValueError: A line is too long.

@@ -13,13 +13,9 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
+from sim_backends.emulated.medium.air_files import LIMIT_BYTES
 from sim_backends.emulated.medium.framing import IP, Framing
 from sim_backends.radio.mac.frames import ControlFrame, TransmissionAttempt
-
-PCAP: Final = "air.pcap"
-CSV: Final = "air.csv"
-LIMIT_BYTES: Final = 64 << 20
-"""Maximum size of both files together; later attempts are omitted."""
 
 _SNAP_BYTES: Final = 160
 """Maximum number of bytes of a frame that the capture contains (snapshot length)."""

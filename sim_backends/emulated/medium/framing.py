@@ -1,4 +1,4 @@
-"""Framing of packets on robots' devices: bare IP (TUN), or Ethernet (TAP), whose header names the next hop.
+"""Framing of packets on robots' devices: bare IP (TUN), or Ethernet (TAP), whose header has the MAC of the next hop.
 
 If robots communicate directly, the destination address of an IP packet identifies the receiver. If they forward for
 each other, the receiver is the next hop of the routing table, which the MAC address of the frame identifies.
@@ -68,7 +68,7 @@ def _is_ipv4(packet: bytes) -> bool:
 def _receiver_by_ip(packet: bytes, routes: Routes) -> str | None:
     address = packet[16:20]
     robot = routes.get(address, NO_ROBOT)
-    # Multicast: 224.0.0.0/4, RFC 5771. A robot without routes is off the air and reaches no other robot.
+    # Multicast: 224.0.0.0/4, RFC 5771. A robot without routes reaches no other robot.
     return None if robot == NO_ROBOT and address[0] >> 4 == 0xE and routes else robot
 
 

@@ -10,9 +10,9 @@ from typing import Self
 from fieldkit.config.profiles import Radio
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import DelayParts, LinkSample, Vector
-from sim_backends.emulated.medium import air_log
+from sim_backends.emulated.medium import air_files
 from sim_backends.emulated.medium.framing import IP, Framing
-from sim_backends.emulated.medium.ports import MediumStats, unpack_links, unpack_stats
+from sim_backends.emulated.medium.medium_stats import MediumStats, unpack_links, unpack_stats
 from sim_backends.emulated.process.worker import Worker
 from sim_backends.radio.antennas import antenna_of
 from sim_backends.radio.radio_options import RadioOptions
@@ -152,7 +152,7 @@ class MediumClient:
             OSError: The files cannot be created.
         """
         with ExitStack() as stack:
-            paths = () if folder is None else (folder / air_log.PCAP, folder / air_log.CSV)
+            paths = () if folder is None else (folder / air_files.PCAP, folder / air_files.CSV)
             files = [stack.enter_context(path.open("wb")) for path in paths]
             self._worker.request({"do": "record"}, descriptors=[file.fileno() for file in files])
 

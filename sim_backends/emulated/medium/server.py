@@ -19,7 +19,8 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import LinkSample, Vector
 from sim_backends.emulated.medium.air_log import AirLog
 from sim_backends.emulated.medium.framing import Framing
-from sim_backends.emulated.medium.ports import FlowDelays, MediumStats, Port, pack_links, pack_stats
+from sim_backends.emulated.medium.medium_stats import MediumStats, pack_links, pack_stats
+from sim_backends.emulated.medium.ports import FlowDelays, Port
 from sim_backends.emulated.medium.timerfd import Timer
 from sim_backends.emulated.process import worker
 from sim_backends.emulated.process.worker import Message

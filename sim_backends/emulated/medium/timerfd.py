@@ -24,7 +24,7 @@ class _Itimerspec(ctypes.Structure):
 
 
 class Timer:
-    """A one-shot timer whose descriptor becomes readable at a time of `time.monotonic_ns`.
+    """A one-shot timer on the clock of `time.monotonic_ns`, whose descriptor becomes readable when it fires.
 
     The timeout of epoll has a resolution of 1 ms, which is too coarse for the delay of a link. Setting the timer
     makes the descriptor unreadable again, so with EPOLLET the descriptor need not be read.

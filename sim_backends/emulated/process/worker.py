@@ -55,7 +55,7 @@ def send(channel: socket.socket, message: Message, deadline: Deadline, descripto
 
 
 def receive(channel: socket.socket, deadline: Deadline) -> tuple[Message, list[int]] | None:
-    """Return the next message and its file descriptors, or None if the peer closed the socket before its end.
+    """Return the next message and its file descriptors, or None if the peer closed the socket before it was complete.
 
     Raises:
         OSError: The message was not complete by the deadline, or the connection broke.
@@ -228,6 +228,6 @@ class Worker:
 
 
 def last_line_of(fd: int) -> str:
-    """Return the last line of a file that is not empty, at most its last 64 KiB; "" if there is no such line."""
+    """Return the last line that is not empty in the last 64 KiB of a file; "" if there is no such line."""
     tail = os.pread(fd, 1 << 16, max(os.fstat(fd).st_size - (1 << 16), 0))
     return tail.decode(errors="replace").strip().rsplit("\n", 1)[-1]

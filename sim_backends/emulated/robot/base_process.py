@@ -29,7 +29,7 @@ def serve(base: Base, *, assigned_paths: Path, motion_record: Path, ready: Path)
 
     Args:
         base: Settings of the robot's base.
-        assigned_paths: The file of the paths that the lab assigns (`robot_motion.append_path`).
+        assigned_paths: The file of the paths that the lab assigns (`assigned_path.append_path`).
         motion_record: The file in which the robot records its motion (`robot_motion.MotionReporter`).
         ready: File that is created when the base accepts velocities.
 

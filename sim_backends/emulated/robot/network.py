@@ -1,23 +1,19 @@
 """Network of an emulated robot: loopback, an interface with the radio's name, and the routing daemon babeld."""
 
-import errno
-import fcntl
-import os
 import shutil
-import socket
-import struct
 import subprocess
 from collections.abc import Mapping
 from ipaddress import IPv4Interface
 from pathlib import Path
 from typing import Final
 
-from fieldkit.core.errors import ConfigurationError, FieldkitError, RobotError
+from fieldkit.core.errors import RobotError
 from sim_backends.emulated.medium.framing import mac_of
 from sim_backends.emulated.robot.spec import LOOPBACK_INTERFACE, SHARED_NETWORK, STATE
+from sim_backends.emulated.robot.tun_devices import open_tun
 
 PID_FILE: Final = Path(STATE, "babeld.pid")
-"""File that babeld writes when it has its socket and its interface, before its first hello."""
+"""File that babeld writes when it starts, before it opens its socket and sends its first hello."""
 
 LINK_COST: Final = 1024
 """Cost of a further link in Babel; a radio without loss costs 256, so that it is preferred."""
@@ -48,9 +44,9 @@ def babeld_command(interface: str, address: str, hello_s: float, links: Mapping[
 
 
 def guest_babeld_command(interface: str, address: str, hello_s: float) -> tuple[str, ...]:
-    """Return the command of the routing daemon of a node that uses the robots' routes, but announces only itself.
+    """Return the command of the routing daemon of a node that uses the robots' routes.
 
-    The daemon writes no files. The arguments are those of `babeld_command`.
+    The node announces only its own address. The daemon writes no files. The arguments are those of `babeld_command`.
     """
     filters = (f"out ip {IPv4Interface(address).ip}/32 allow", "out deny")
     return (*_program("", ""), *_settings(interface, address, hello_s, *filters), interface)
@@ -71,97 +67,9 @@ def _settings(interface: str, address: str, hello_s: float, *rules: str) -> tupl
     return tuple(word for setting in settings for word in ("-C", setting))
 
 
-DEVICE: Final = "/dev/net/tun"
-QUEUE_PACKETS: Final = 4096
-"""Length of the queue of an interface."""
-
-# linux/if_tun.h
-_TUNSETIFF: Final = 0x400454CA
-_IFF_TUN: Final = 0x0001
-_IFF_TAP: Final = 0x0002
-_IFF_NO_PI: Final = 0x1000
-# linux/netlink.h, linux/rtnetlink.h and linux/if_link.h
-_NLM_F_REQUEST_ACK: Final = 0x1 | 0x4
-_RTM_NEWLINK: Final = 16
-_IFLA_TXQLEN: Final = 13
-_HEADER_BYTES: Final = 16
-_REPLY_BYTES: Final = 4096
-_NAME_BYTES: Final = 15
-
 MTU_BYTES: Final = 1500
 _TIMEOUT_S: Final = 5.0
-"""Timeout of `ip`."""
-
-
-def open_tun(name: str, *, ethernet: bool = False) -> int:
-    """Create the TUN interface `name` in this process's network namespace; return its non-blocking descriptor.
-
-    The interface carries bare IP packets, or Ethernet frames (TAP), and exists as long as a process has the
-    descriptor open. Its queue holds 4096 packets, so that no packet is lost in a short pause of the medium process.
-
-    Raises:
-        ConfigurationError: The device is missing, or this user may not open it or create an interface.
-        FieldkitError: The interface exists already or the kernel refuses its name.
-    """
-    if not 0 < len(name.encode()) <= _NAME_BYTES:
-        raise ConfigurationError(
-            f"{name!r} is not a valid interface name", remedy=f"use 1 to {_NAME_BYTES} characters, for example wlan0"
-        )
-    fd = open_device()
-    try:
-        kind = _IFF_TAP if ethernet else _IFF_TUN
-        fcntl.ioctl(fd, _TUNSETIFF, struct.pack("16sH22x", name.encode(), kind | _IFF_NO_PI))
-        _set_queue(socket.if_nametoindex(name))
-    except OSError as error:
-        os.close(fd)
-        raise _cannot_create(name, error) from error
-    return fd
-
-
-def open_device() -> int:
-    """Open the TUN device and return its non-blocking descriptor, which has no interface yet.
-
-    Raises:
-        ConfigurationError: The device is missing, or this user may not open it.
-    """
-    try:
-        return os.open(DEVICE, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
-    except OSError as error:
-        raise _cannot_open(error) from error
-
-
-def _set_queue(index: int) -> None:
-    """Set the queue of the interface with this index to `QUEUE_PACKETS`."""
-    # Netlink is used, because the ioctl (also in busybox's ip) needs a capability that no user namespace grants. The
-    # message consists of the structs nlmsghdr, ifinfomsg and rtattr.
-    link = struct.pack("=BxHiII", socket.AF_UNSPEC, 0, index, 0, 0)
-    length = struct.pack("=HHI", 8, _IFLA_TXQLEN, QUEUE_PACKETS)
-    size_bytes = _HEADER_BYTES + len(link) + len(length)
-    header = struct.pack("=IHHII", size_bytes, _RTM_NEWLINK, _NLM_F_REQUEST_ACK, 0, 0)
-    with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as kernel:
-        kernel.send(header + link + length)
-        (number,) = struct.unpack_from("=i", kernel.recv(_REPLY_BYTES), _HEADER_BYTES)
-    if number != 0:
-        raise OSError(-number, os.strerror(-number))
-
-
-def _cannot_open(error: OSError) -> ConfigurationError:
-    if error.errno in {errno.ENOENT, errno.ENODEV, errno.ENXIO}:
-        remedy = "load the module: modprobe tun; in a container, start it with --device /dev/net/tun"
-    else:
-        remedy = f"allow this user to open it: sudo chmod 666 {DEVICE}"
-    return ConfigurationError(f"cannot open the TUN device: {error.strerror}", where=DEVICE, remedy=remedy)
-
-
-def _cannot_create(name: str, error: OSError) -> FieldkitError:
-    if error.errno == errno.EPERM:
-        return ConfigurationError(
-            "no permission to create a TUN interface",
-            where=name,
-            remedy="run as root, or in a user namespace that owns the network namespace (CAP_NET_ADMIN)",
-        )
-    remedy = "stop the process that has it open, or use another name" if error.errno == errno.EBUSY else ""
-    return FieldkitError(f"cannot create the TUN interface: {error.strerror}", where=name, remedy=remedy)
+"""Maximum duration of an `ip` command."""
 
 
 def bring_up(interface: str, address: str, *, mesh: bool = False) -> int:
@@ -191,7 +99,7 @@ def bring_up(interface: str, address: str, *, mesh: bool = False) -> int:
 def _open_device(interface: str, address: str, *, mesh: bool) -> int:
     fd = open_tun(interface, ethernet=mesh)
     if mesh:
-        _prepare_mesh(interface)
+        prepare_mesh(interface)
         mac = mac_of(IPv4Interface(address).ip).hex(":")
         run_ip(f"link set {interface} address {mac}")
     return fd
@@ -252,7 +160,8 @@ def switch_on(interface: str) -> None:
 
 
 def _routes(interface: str) -> tuple[str, ...]:
-    # The kernel removes these routes whenever the link goes down, unlike the route that comes with the address.
+    # When an interface is taken down, the kernel removes its routes. It restores only the route that belongs to the
+    # address when the interface is brought up again.
     return (f"route replace 224.0.0.0/4 dev {interface}", f"route replace 255.255.255.255/32 dev {interface}")
 
 
@@ -272,7 +181,10 @@ def run_ip(*commands: str) -> None:
             check=False,
         )
         if result.returncode != 0:
-            raise RobotError(f"ip rejected a setting: {result.stderr.strip()}", remedy="update iproute2")
+            raise RobotError(
+                f"ip rejected a setting: {result.stderr.strip()} (ip {command})",
+                remedy="correct the address or the interface of the robot, or update iproute2",
+            )
 
 
 def has_listener(port: int) -> bool:
@@ -284,7 +196,7 @@ def has_listener(port: int) -> bool:
     return any(local in line[:21] and line.split()[3] == listening for line in lines)
 
 
-def _prepare_mesh(interface: str) -> None:
+def prepare_mesh(interface: str) -> None:
     """Enable forwarding, and link-local addresses without duplicate detection, since no other robot has this MAC."""
     settings = {
         "ipv4/conf/all/forwarding": 1,

@@ -13,7 +13,7 @@ from typing import Final
 
 from sim_backends.emulated.process import worker
 from sim_backends.emulated.robot import mounts, ssh_server
-from sim_backends.emulated.robot.spec import HOME, NETCATS, STATE, RobotSpec
+from sim_backends.emulated.robot.spec import HOME, NETCATS, ROBOT_FILES, STATE, RobotSpec
 
 SSHD_FOLDER: Final = "/run/sshd"
 BOOT_ID: Final = f"{STATE}/boot_id"
@@ -37,9 +37,6 @@ _GROUPS: Final = "root:x:0:\ntty:x:5:\nnogroup:x:65534:\ntcpdump:x:101:\n"
 # refuses any login to a locked account.
 _PASSWORDS: Final = "root:*:20000:0:99999:7:::\n"
 
-ROBOT_FILES: Final = tuple(f"/etc/{name}" for name in ("passwd", "group", "shadow", "hostname", "hosts"))
-"""System files that each robot has separately."""
-
 # On a real robot `python3` is Debian's, which searches this folder after PYTHONPATH. The folder is appended, so that
 # the packages of the Python that runs fieldkit are found first.
 _SITE_CUSTOMIZE: Final = """\
@@ -62,6 +59,7 @@ _ALL_NETCATS: Final = ("nc", "netcat", "nc.traditional", "nc.openbsd", "ncat")
 _KEPT_WITH_BUSYBOX: Final = (
     "babeld",
     "bash",
+    "batctl",
     "busybox",
     "dropbear",
     "hostapd",

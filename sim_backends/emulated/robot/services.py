@@ -15,10 +15,10 @@ from fieldkit.core.model import BRIDGE_IS_UP, ROS_MASTER_PORT
 from fieldkit.remote.command import with_environment
 from sim_backends.emulated.autopilot import mavlink_server as autopilot
 from sim_backends.emulated.process import worker
-from sim_backends.emulated.robot import base_process, network, ssh_server, wireless
-from sim_backends.emulated.robot.spec import ANTENNA_M, HOME, STATE, RobotSpec
+from sim_backends.emulated.robot import base_process, network, ssh_server
+from sim_backends.emulated.robot.spec import ANTENNA_M, HOME, ROSCORE, SSH_PORT, STATE, RobotSpec
 from sim_backends.emulated.ros import sensors, static_frames, tcpros
-from sim_backends.emulated.ros.laser import Neighbourhood
+from sim_backends.emulated.ros.lab_positions import Neighbourhood
 
 _LOG_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_APPEND
 _LOG_MODE: Final = 0o600
@@ -37,7 +37,6 @@ FLIGHT: Final = Path(STATE, "flown")
 
 READY_FOLDER: Final = f"{STATE}/ready"
 
-ROSCORE: Final = "/usr/bin/roscore"
 _ROSMASTER: Final = "/usr/bin/rosmaster"
 _RELAY: Final = Path(__file__).with_name("ros_relay.py")
 
@@ -139,7 +138,7 @@ def services(spec: RobotSpec, neighbourhood: Neighbourhood | None = None) -> lis
     if neighbourhood is not None and spec.neighbours:
         publish = partial(publish, moving_targets=partial(neighbourhood.targets, spec.neighbours))
     result = [
-        _program("sshd", ssh_server.command(spec), {}, lambda: network.has_listener(ssh_server.SSH_PORT)),
+        _program("sshd", ssh_server.command(spec), {}, lambda: network.has_listener(SSH_PORT)),
         _motion_service("sensors", publish),
     ]
     if spec.mavlink_port is not None:
@@ -166,9 +165,12 @@ def services(spec: RobotSpec, neighbourhood: Neighbourhood | None = None) -> lis
 def _network_services(spec: RobotSpec) -> Iterator[Service]:
     """Yield the programs of the robot's radio: hostapd or wpa_supplicant, and the routing daemon of a mesh."""
     wifi = spec.wifi
-    if wifi is not None and wifi.mode in wireless.PROGRAMS:
-        argv = wireless.prepare_command(spec.interface, wifi)
-        yield _program(wireless.PROGRAMS[wifi.mode], argv, {}, partial(wireless.is_connected, wifi))
+    if wifi is not None:
+        from sim_backends.emulated.robot import wireless  # noqa: PLC0415 (only some labs use it)
+
+        if wifi.mode in wireless.PROGRAMS:
+            argv = wireless.prepare_command(spec.interface, wifi)
+            yield _program(wireless.PROGRAMS[wifi.mode], argv, {}, partial(wireless.is_connected, wifi))
     if spec.mesh_hello_s is not None:
         argv = network.babeld_command(spec.interface, spec.address, spec.mesh_hello_s, dict(spec.links.values()))
         yield _program("babeld", argv, {}, network.PID_FILE.exists)

@@ -3,9 +3,8 @@
 import subprocess
 from typing import Final
 
-from sim_backends.emulated.robot.spec import STATE, RobotSpec
+from sim_backends.emulated.robot.spec import SSH_PORT, STATE, RobotSpec
 
-SSH_PORT: Final = 22
 HOST_KEY: Final = f"{STATE}/ssh_host_ed25519_key"
 
 _DROPBEAR_KEY: Final = f"{STATE}/dropbear_ed25519_host_key"

@@ -12,34 +12,15 @@ place the robot at another position at any time; records that refer to an earlie
 
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
 from fieldkit.core.model import Vector
+from sim_backends.emulated.ros.assigned_path import AssignedPath
 from sim_backends.emulated.ros.motion_record import MotionRecord, RecordedMotion
 from sim_backends.world.motion import LEVEL, STILL, WayPoints
-
-
-@dataclass(frozen=True)
-class AssignedPath:
-    """Path on which the lab moves a robot. The robot stops at the end of the path.
-
-    On a path of one point, the robot stays at this point.
-
-    Attributes:
-        start_ns: Start of the motion, as a time of the monotonic clock, which is common to all robots on one machine.
-        points_m: Points of the path, metres east, north, up.
-        speed_m_s: Horizontal speed.
-        facing_rad: Heading of the robot before the start, from east towards north.
-    """
-
-    start_ns: int
-    points_m: Sequence[Vector]
-    speed_m_s: float
-    facing_rad: float
 
 
 @dataclass(frozen=True)
@@ -66,12 +47,6 @@ class RobotMotionState:
 
 
 AT_REST: Final = RobotMotionState()
-
-
-def append_path(file_path: Path, path: AssignedPath) -> None:
-    """Append a path to the file that a robot's sensors read."""
-    with file_path.open("a", encoding="ascii") as file:
-        file.write(json.dumps(asdict(path)) + "\n")
 
 
 class Odometer:
@@ -191,7 +166,7 @@ class MotionReporter:
     Only the process that steers the robot may create one.
 
     Args:
-        paths: The file of the paths that the lab assigns (`robot_motion.append_path`).
+        paths: The file of the paths that the lab assigns (`assigned_path.append_path`).
         record: The file in which the robot records its motion.
         now_ns: Time of creation, from the monotonic clock.
 

@@ -210,7 +210,7 @@ def publish(
         frames: Links in `/tf_static`, which is published once and latched; empty for a robot without it.
         targets: Laser targets in the robot's world.
         moving_targets: Returns the laser targets that move: the other robots at their current positions.
-        assigned_paths: The file of the paths that the lab assigns (`robot_motion.append_path`).
+        assigned_paths: The file of the paths that the lab assigns (`assigned_path.append_path`).
         motion_record: The file in which a robot that steers itself records its motion
             (`robot_motion.MotionReporter`).
         ready: File that is created when every topic can be subscribed to.

@@ -7,12 +7,12 @@ identity. The fields that describe an image, a compressed image or a point cloud
 
 import struct
 from collections.abc import Mapping
-from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
 from fieldkit.config.profiles import PublishedTopic
 from fieldkit.core.errors import ConfigurationError, did_you_mean
-from sim_backends.emulated.ros.sensor_specs import GENERATED_TYPES, Definition, Template, packed_string
+from sim_backends.emulated.ros.message_definitions import full_name, types_with
+from sim_backends.emulated.ros.sensor_specs import GENERATED_TYPES, Template, packed_string
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -44,26 +44,15 @@ Values = Mapping[str, bytes]
 """Serialized values of fields that are not zero or empty, by name."""
 
 
-def definition_of(kind: str, text: str) -> Definition:
-    """Return the definition that a publisher of the type `package/Name` announces; `text` is used if ROS has none.
-
-    ROS or `text` must define the type and all types in it; `template_of` checks this.
-
-    Raises:
-        ConfigurationError: `text` cannot be parsed.
-    """
-    return Definition(*_types(kind, text).generate_msgdef(_full_name(kind), ros_version=1))
-
-
 def template_of(topic: PublishedTopic) -> Template:
     """Return the template of a topic's messages.
 
     Raises:
         ConfigurationError: The definition is missing or cannot be parsed, or no list can have the required size.
     """
-    fields = _SerializedFields(_types(topic.type, topic.definition), topic.payload_bytes, _field_values(topic))
+    fields = _SerializedFields(types_with(topic.type, topic.definition), topic.payload_bytes, _field_values(topic))
     try:
-        has_header = fields.add_message(_full_name(topic.type))
+        has_header = fields.add_message(full_name(topic.type))
     except KeyError as error:
         raise _unknown_type_error(topic) from error
     if topic.payload_bytes and fields.list_type is None:
@@ -80,35 +69,6 @@ def template_of(topic: PublishedTopic) -> Template:
 def _field_values(topic: PublishedTopic) -> Values:
     values_of = _VALUES.get(topic.type)
     return values_of(topic) if values_of else {}
-
-
-def _full_name(kind: str) -> str:
-    return kind.replace("/", "/msg/")
-
-
-@cache
-def _types(kind: str, definition: str) -> "Typestore":
-    """Return ROS 1's types and the types in a definition.
-
-    The definition has the fields of the type, then `MSG: package/Name` and the fields of each type in it.
-    """
-    from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore  # noqa: PLC0415 (slow)
-
-    from fieldkit.ros.interfaces.definitions import EXTRA_DEFINITIONS  # noqa: PLC0415 (as above)
-
-    store = get_typestore(Stores.ROS1_NOETIC)
-    for name, text in EXTRA_DEFINITIONS.items():
-        store.register(get_types_from_msg(text, name))
-    if definition:
-        try:
-            types = get_types_from_msg(definition, _full_name(kind))
-            store.register({name: fields for name, fields in types.items() if name not in store.fielddefs})
-        except TypesysError as error:
-            raise ConfigurationError(
-                f"the definition of {kind} cannot be read: {error}",
-                remedy=f"write what `rosmsg show -r {kind}` prints",
-            ) from error
-    return store
 
 
 def _unknown_type_error(topic: PublishedTopic) -> ConfigurationError:

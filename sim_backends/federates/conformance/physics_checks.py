@@ -19,7 +19,8 @@ from sim_backends.federates.frames import MessageKind, count_bytes
 from sim_backends.federates.handshake import AgentStart, FederateCapability
 from sim_backends.federates.records import TWIST, VELOCITY
 from sim_backends.physics.body import Twist, Velocity
-from sim_backends.world.motion import State, extrapolate
+from sim_backends.world.dead_reckoning import extrapolate
+from sim_backends.world.motion import State
 
 _START_M: Final = 0.5
 """Largest distance of an agent from its requested start."""

@@ -96,7 +96,7 @@ def read_token(address: TransportAddress) -> str:
 
 
 def is_same_token(first: str, second: str) -> bool:
-    """Return True if two tokens are equal. The comparison takes constant time, so that it reveals no token."""
+    """Return True if two tokens are equal. The duration of the comparison reveals no token."""
     return hmac.compare_digest(first.encode(), second.encode())
 
 
@@ -139,10 +139,12 @@ def split_host_and_port(text: str) -> tuple[str, str, int, bool]:
     """Return scheme, host, port and `listens` of `SCHEME:HOST:PORT` or `SCHEME-listen:HOST:PORT`.
 
     Raises:
-        ValueError: The host is missing, or the port is not a number from 1 to 65535.
+        ValueError: The host or the port is missing, or the port is not a number from 1 to 65535.
     """
     scheme, _, host_and_port = text.partition(":")
     host, _, port = host_and_port.rpartition(":")
-    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+    if not host or not port:
         raise ValueError("host or port is missing")
+    if not port.isdecimal() or not 0 < int(port) < 65536:
+        raise ValueError(f"{port!r} is not a port from 1 to 65535")
     return scheme.removesuffix("-listen"), host.strip("[]"), int(port), scheme.endswith("-listen")

@@ -1,4 +1,4 @@
-"""Options of TCP, with the defaults of Linux."""
+"""Options of TCP. The defaults are those of Linux, except `nagle`."""
 
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -26,21 +26,25 @@ class TcpOptions:
         congestion: Congestion control and loss recovery; `cubic` is Linux's default.
         receive_window_bytes: Bytes that a receiver can buffer while earlier data is missing. 3 MiB is the limit of
             Linux's autotuning: half of the maximum of 6 MiB in `tcp_rmem`, by `tcp_adv_win_scale`.
-        min_timeout_ns: Minimum retransmission timeout: 200 ms in Linux, 1 s in RFC 6298.
+        min_timeout_ns: Minimum retransmission timeout: 1 s in RFC 6298. The default is the 200 ms of Linux
+            (TCP_RTO_MIN), but Linux applies them to the variance term, so its timeouts are longer by up to a round
+            trip.
         max_timeout_ns: Maximum retransmission timeout (Linux: TCP_RTO_MAX).
         initial_timeout_ns: Timeout until the first round trip has been measured (RFC 6298, 2.1).
         clock_granularity_ns: Clock granularity G of RFC 6298: the minimum of the variance term of a timeout.
         syn_retries: Maximum number of SYN retransmissions (Linux: tcp_syn_retries).
         retries: Maximum number of consecutive retransmission timeouts without progress before the connection is given
             up (Linux: tcp_retries2).
-        delayed_ack_ns: Maximum delay of an ACK by the receiver (Linux: 40 ms).
+        delayed_ack_ns: Maximum delay of an ACK by the receiver. Linux adapts it, between 40 and 200 ms.
         segments_per_ack: Number of received segments after which an ACK is sent immediately (RFC 5681, 4.2); with 1,
             no ACK is delayed.
-        nagle: If True, a small segment waits while others are in flight (RFC 896). DDS over TCP disables it by
-            TCP_NODELAY; TCPROS does so only if the subscriber requests it, which is assumed here.
-        restart_after_idle: If True, the window is reset to the initial window after an idle period (RFC 5681, 4.1).
-        bytes_counted_segments: Maximum increase of the window per ACK in slow start, in segments; None for all
-            acknowledged bytes, as in Linux. RFC 5681 has 1, RFC 3465 up to 2.
+        nagle: If True, a small segment waits while others are in flight (RFC 896), as in Linux without TCP_NODELAY.
+            TCPROS sets TCP_NODELAY only if the subscriber requests it, which is assumed here.
+        restart_after_idle: If True, a congestion window above the initial window is reduced to it when data is sent
+            after an idle time of more than a retransmission timeout (RFC 5681, 4.1). Linux halves the window for each
+            timeout of the idle time.
+        bytes_counted_segments: Maximum increase of the congestion window per ACK in slow start, in segments; None for
+            all acknowledged bytes, as in Linux. RFC 5681 has 1, RFC 3465 up to 2.
 
     Raises:
         ConfigurationError: A value is below its minimum.

@@ -90,7 +90,7 @@ class TopicSession:
             self._settle(sample)
 
     def unmatch_reader(self) -> None:
-        """Remove the writer from the reader."""
+        """Unmatch the reader from its writer; samples that wait at the reader for an earlier sample are discarded."""
         for sample in self.reader.remove_writer():
             self._settle(sample)
 

@@ -55,8 +55,8 @@ AMPDU_LIMITS: Final[dict[PhyFormat, AmpduLimits]] = {
     "VHT": AmpduLimits(64, 1_048_575),
     "HE": AmpduLimits(256, 4_194_303),
 }
-"""Limits for the largest exponents of the A-MPDU length: 9.4.2.55.3, 9.4.2.157.2 and 9.4.2.248 (without its
-extension)."""
+"""Limits by the exponent of the maximum A-MPDU length: the largest exponent of HT (9.4.2.55.3) and VHT (9.4.2.157.2),
+and exponent extension 2 of HE (9.4.2.248). At all modelled rates of VHT and HE, `MAX_PPDU_NS` is reached first."""
 
 
 @dataclass(eq=False, slots=True)
@@ -64,11 +64,12 @@ class Aggregate(Generic[Payload]):
     """Frames that are sent together.
 
     Attributes:
-        frames: The packets, in the order of the sequence numbers of their frames.
+        frames: A `Frame` for each packet, in the order of sequence numbers. The packets of an A-MSDU have the same
+            sequence number.
         size_bytes: Size of the PSDU.
         response_bytes: Size of the Block Ack, or of the ACK to a single frame.
-        frame_count: Number of frames, each with one packet or an A-MSDU.
-        decoded_frames: The frames that the receiver decoded; empty until the aggregate ends.
+        frame_count: Number of MPDUs, each with one packet or an A-MSDU.
+        decoded_frames: The items of `frames` that the receiver decoded; empty until the aggregate ends.
     """
 
     frames: Sequence[Frame[Payload]]
@@ -141,7 +142,7 @@ class BlockAckSession(Generic[Payload]):
         return Aggregate(frames, size_bytes - (DELIMITER_BYTES if mode.phy_format == "HT" else 0), ACK_BYTES, 1)
 
     def first_frame_bytes(self, queue: deque[Frame[Payload]]) -> int:
-        """Return the smallest size of the next frame to the receiver of a queue's first packet."""
+        """Return the minimum size of the MPDU that contains a queue's first packet; it may contain more packets."""
         return queue[0].size_bytes + QOS_HEADER_BYTES
 
     def receive(self, frames: Iterable[Frame[Payload]]) -> list[Frame[Payload]]:

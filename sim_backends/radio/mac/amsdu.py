@@ -36,7 +36,8 @@ FRAME_OVERHEAD_BYTES: Final = QOS_HEADER_BYTES - _LLC_BYTES
 _MAX_FRAME_BYTES: Final[dict[PhyFormat, int]] = {"HT": 4_095, "VHT": 11_454, "HE": 11_454}
 """Largest frame in an A-MPDU: 9.4.2.55.3 (length in the delimiter), table 9-34."""
 HT_AMSDU_BYTES: Final = 3_839
-"""Largest A-MSDU in an A-MPDU of HT, because of the maximum frame size."""
+"""Limit of A-MSDUs in an A-MPDU of HT: the smaller of the two limits of HT. With the larger one, 7,935 bytes, a frame
+would exceed its maximum size."""
 
 
 def limits_with_amsdu(phy_format: PhyFormat, max_bytes: int) -> AmpduLimits:

@@ -1,7 +1,8 @@
-"""Bands, and modulation and coding of 802.11a/g and of 802.11n with one stream in 20 MHz: airtime of frames.
+"""Frequency bands and modes (modulation and coding) of 802.11, and the airtime of frames.
 
-Clauses refer to IEEE 802.11-2020: 17 (OFDM), 18 (ERP-OFDM, 802.11g: clause 17 at 2.4 GHz), 19 (HT, 802.11n); clause
-27 (HE) is in IEEE 802.11ax-2021. Modes with more streams or wider channels are in `high_throughput`.
+This module contains the modes of 802.11a/g, and those of 802.11n with one stream in 20 MHz at 2.4 GHz. All other
+modes of 802.11n, ac and ax are in `high_throughput`. Clauses refer to IEEE 802.11-2020: 17 (OFDM), 18 (ERP-OFDM,
+802.11g: clause 17 at 2.4 GHz), 19 (HT, 802.11n), 21 (VHT, 802.11ac); clause 27 (HE) is in IEEE 802.11ax-2021.
 """
 
 from dataclasses import dataclass
@@ -63,18 +64,20 @@ CHANNEL_6_HZ: Final = 2.437e9
 BAND_2_4: Final = Band("2.4 GHz", CHANNEL_6_HZ, 10_000, 6_000)
 BANDS: Final[dict[BandName, Band]] = {
     "2.4 GHz": BAND_2_4,
-    # The centres of 80 MHz around channels 36 (5 GHz) and 5 (6 GHz).
+    # Channel 42 at 5 GHz and channel 7 at 6 GHz, which are 80 MHz wide.
     "5 GHz": Band("5 GHz", 5.21e9, 16_000, 0),
     "6 GHz": Band("6 GHz", 5.985e9, 16_000, 0),
 }
 
 SIFS_NS: Final = BAND_2_4.sifs_ns
 DIFS_NS: Final = BAND_2_4.difs_ns
+"""Inter-frame spaces at 2.4 GHz."""
 
 CW_MIN: Final = 15
 CW_MAX: Final = 1023
+"""Smallest and largest contention window (table 18-5)."""
 SHORT_RETRY_LIMIT: Final = 7
-"""Smallest and largest contention window (table 18-5); largest number of attempts (dot11ShortRetryLimit, annex C)."""
+"""Largest number of attempts (dot11ShortRetryLimit, annex C)."""
 
 ENERGY_DETECTION_DBM: Final = -62.0
 """Any signal of at least this power keeps a station from sending: 17.3.10.6, 20 dB above -82 dBm."""
@@ -91,7 +94,7 @@ _HT_PREAMBLE_NS: Final = 36_000
 
 @dataclass(frozen=True, eq=False)
 class WifiMode:
-    """A combination of modulation and coding. Each mode is one object, so comparing and hashing use its identity.
+    """Modulation, coding and format of a frame. Each mode is one object, so comparing and hashing use its identity.
 
     Attributes:
         name: Its name, for example `g54`, `n7` or `vht80-mcs9-2ss-400ns`.
@@ -132,7 +135,7 @@ class WifiMode:
 
     @property
     def rate_bit_s(self) -> int:
-        """Data bits per second within symbols."""
+        """PHY data rate: data bits per symbol divided by the symbol duration."""
         return self.bits_per_symbol * 1_000_000_000 // self.symbol_ns
 
     @property
@@ -215,7 +218,7 @@ _MANDATORY: Final = (4, 2, 0)
 
 
 def basic_mode(band: Band) -> WifiMode:
-    """Return the mode of broadcasts: the lowest basic rate, which every station receives (10.6.5.3)."""
+    """Return the mode of broadcasts: the lowest basic rate, which every station supports (10.6.5.3)."""
     return OFDM_MODES[band.name][0]
 
 

@@ -1,4 +1,4 @@
-"""Caches of computed properties of links, each with the time or the positions for which it is valid."""
+"""Caches of computed properties of links, each with the revision and the time slot for which it is valid."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,7 @@ class GainCache:
 
     Args:
         links: Indices of the links.
-        ends: Indices of their first ends, and of their second ends.
+        ends: Indices of the stations at their first ends, and at their second ends, shape (2, n).
         echoes: Their echoes.
 
     Attributes:

@@ -1,10 +1,11 @@
-"""Mean loss of paths in a world: path loss in the open, shadowing, obstacles."""
+"""Mean loss of paths in a world: path loss without obstacles, shadowing, and loss caused by obstacles."""
 
 import numpy as np
 
 from sim_backends.radio.propagation import path_loss
 from sim_backends.radio.propagation.fading import Shadowing
 from sim_backends.radio.radio_options import RadioOptions
+from sim_backends.world.penetration import Obstacles
 from sim_backends.world.shapes import Floats
 from sim_backends.world.world import World
 
@@ -22,12 +23,12 @@ class MeanLoss:
     def __init__(self, options: RadioOptions, carrier_hz: float, world: World | None, shadowing_seed: int) -> None:
         self._options = options
         self._carrier_hz = carrier_hz
-        self._world = world
+        self._obstacles = None if world is None else Obstacles(world)
         self._shadowing = (
             Shadowing(shadowing_seed, options.shadowing_db, options.decorrelation) if options.shadowing_db else None
         )
 
-    def open_db(self, start_m: Floats, end_m: Floats) -> Floats:
+    def loss_without_obstacles_db(self, start_m: Floats, end_m: Floats) -> Floats:
         """Return the loss of paths between points of shape (n, 3) with shadowing and without obstacles, in dB."""
         match self._options.propagation:
             case "free-space":
@@ -39,11 +40,11 @@ class MeanLoss:
         return loss_db if self._shadowing is None else loss_db + self._shadowing.loss_db(start_m, end_m)
 
     def obstacles_db(self, start_m: Floats, end_m: Floats) -> Floats:
-        """Return the loss by obstacles, in dB."""
-        if self._world is None:
+        """Return the loss caused by obstacles, in dB."""
+        if self._obstacles is None:
             return np.zeros(len(start_m))
-        return self._world.penetration_loss_db(start_m, end_m, self._carrier_hz)
+        return self._obstacles.penetration_loss_db(start_m, end_m, self._carrier_hz)
 
     def loss_db(self, start_m: Floats, end_m: Floats) -> Floats:
         """Return the loss with shadowing and obstacles, in dB."""
-        return self.open_db(start_m, end_m) + self.obstacles_db(start_m, end_m)
+        return self.loss_without_obstacles_db(start_m, end_m) + self.obstacles_db(start_m, end_m)

@@ -47,6 +47,7 @@ def test_other_lines_are_ignored(line: str) -> None:
         ("job itself 0 100 9.00", {Cause.EXITED}, 15.0, "exited after 8.0 s instead of 15 s"),
         ("job itself - 100 -", {Cause.EXITED}, 15.0, "was killed"),
         ("job running - 100 -", {Cause.EXITED}, 0.0, "was still running when the evidence was collected"),
+        ("job running 0 100 9.00", {Cause.EXITED}, 0.0, "was still running when the evidence was collected"),
     ],
 )
 def test_a_termination_that_is_not_allowed_is_an_error(

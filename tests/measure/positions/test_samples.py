@@ -97,6 +97,16 @@ def test_invalid_positions_and_times_are_rejected_with_their_line(tmp_path: Path
         read_csv(write_file(tmp_path, text))
 
 
+@pytest.mark.parametrize(
+    ("text", "remedy"),
+    [("t,x_m,y_m\nnoon,1,2\n", "2026-11-22T10:00:00.5Z"), ("t_ms,x_m,y_m\n1.7e12,1,2\n", "t_ms is in ms")],
+)
+def test_the_remedy_for_an_invalid_time_fits_its_column(tmp_path: Path, text: str, remedy: str) -> None:
+    with pytest.raises(EvidenceError) as error_info:
+        read_csv(write_file(tmp_path, text))
+    assert remedy in error_info.value.remedy
+
+
 @given(st.text(alphabet='t_snxy,m\n"1.-eZ:latlo', max_size=60))
 def test_any_content_raises_only_evidence_error(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
     path = write_file(tmp_path_factory.getbasetemp(), text)

@@ -136,14 +136,14 @@ def test_one_of_two_autopilots_must_be_named(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="autopilots of systems 3, 4: choose one"):
         tlog.read(path, 0, 0)
     assert tlog.read(path, 4, 0).frames == 2
-    with pytest.raises(EvidenceError, match="no heartbeat of an autopilot of system 5"):
+    with pytest.raises(EvidenceError, match="no heartbeat from an autopilot of system 5"):
         tlog.read(path, 5, 0)
 
 
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (b"", "no heartbeat of an autopilot"),
+        (b"", "no heartbeat from an autopilot"),
         (b"\0" * 40, "no frame starts at offset 8"),
         (flight(1)[:-1], "it is truncated after"),
         (flight(1) + b"\0" * 9, "it is truncated after"),

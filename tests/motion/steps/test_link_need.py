@@ -43,7 +43,7 @@ def test_detail_names_connection_and_programs(connection: str, kind: str) -> Non
             "cannot be opened: Connection refused",
             "the robot's computer has TCP port 5760, /dev/ttyACM0; write",
         ),
-        (NO_AUTOPILOT, "no heartbeat of an autopilot", "no other common connection"),
+        (NO_AUTOPILOT, "no heartbeat from an autopilot", "no other common connection"),
         ("error: MAVLink over usb: is not a connection", "is not a connection", "mavlink.connection"),
         ("", "no answer", "mavlink.connection"),
         ("[]", "[]", "mavlink.connection"),

@@ -117,7 +117,7 @@ def test_shipped_drone_profiles_have_limits() -> None:
         (f'{LOW_BATTERY}\n{{"autopilot": "PX4", "charge": 0.1}}\n', 0, Verdict.FAIL),
         (f'{WRONG_MODE}\n{{"autopilot": "PX4", "charge": 1}}\n', 0, Verdict.WARN),
         (f'{WRONG_MODE}\n{LOW_BATTERY}\n{{"autopilot": "PX4", "charge": 0.1}}\n', 0, Verdict.FAIL),
-        ("error: no heartbeat of an autopilot at udpout:127.0.0.1:14550 in 5 s\n", 1, Verdict.FAIL),
+        ("error: no heartbeat from an autopilot at udpout:127.0.0.1:14550 in 5 s\n", 1, Verdict.FAIL),
         ("", 1, Verdict.FAIL),
         ('["PX4"]', 0, Verdict.FAIL),
         ('{"autopilot": 4, "charge": 1}', 0, Verdict.FAIL),
@@ -179,7 +179,7 @@ steps: [{ping: {from: sender, to: receiver}}]
 def test_abort_notes_describe_the_action() -> None:
     flight = step(f"robot: {DRONE}, height: 2m")
     assert list(flight.abort_notes(SCENE)) == [
-        f"{CAST[DRONE].name} lands, if it is in the air: this takes up to about 37 s, even if fieldkit has exited"
+        f"{CAST[DRONE].name} lands if it is in the air; this takes up to about 37 s, and continues if fieldkit exits"
     ]
     scene_with_return = Scene(
         Protocol.TCP, PERMITTED, "f", sections={ON_ABORT: AbortActions({DRONE: OnAbort.RETURN})}

@@ -1,4 +1,4 @@
-"""The step mavlink: valid keys, jobs of the recorder, and positions and checks from its files."""
+"""The `mavlink` step: valid keys, jobs of the recorder, and positions and checks from its files."""
 
 import json
 import math
@@ -107,6 +107,24 @@ def test_step_with_positions_must_not_be_nested_in_a_move() -> None:
     assert schema.validate(schema.parse(head + without_positions, source="x.yaml"), Procedure)
 
 
+@pytest.mark.parametrize(
+    "steps",
+    [
+        "[{track: {robots: {sender: {at: {lat: 1, lon: 2}}}, during: [{MAVLINK}]}}]",
+        "[{MAVLINK}, {track: {robots: {sender: {at: {lat: 1, lon: 2}}}, during: [{PING}]}}]",
+        "[{MAVLINK}, {MAVLINK}]",
+    ],
+)
+def test_a_repeat_has_only_one_step_that_records_positions(steps: str) -> None:
+    """Neither a name of the step nor another file name solves the conflict, so the message suggests neither."""
+    head = "name: x\nsummary: x\nscenario: los\ntopology: masterless\nprotocols: [udp]\nrepeats: 1\nsteps: "
+    step = f"{{mavlink: {{name: m, robot: receiver, positions: global, during: [{PING}]}}}}"
+    text = steps.replace("{MAVLINK}", step).replace("{PING}", PING)
+    with pytest.raises(ConfigurationError, match="only one step that records positions") as caught:
+        schema.validate(schema.parse(head + text, source="x.yaml"), Procedure)
+    assert "name" not in caught.value.what
+
+
 def attempt(
     tmp_path: Path,
     step: MavlinkStep,
@@ -190,7 +208,7 @@ def test_distances_of_global_positions_from_a_fixed_position(tmp_path: Path) -> 
         (flight(10), {"left_out": 4}, "lacks 4 received frames"),
         (flight(10), {"refused": {"1": 2}}, "refused the request for SYS_STATUS"),
         (flight(10), {}, "no SYS_STATUS, which was requested"),
-        (b"", {"frames": 0}, "no heartbeat of an autopilot"),
+        (b"", {"frames": 0}, "no heartbeat from an autopilot"),
     ],
 )
 def test_incomplete_log_makes_repeat_void(

@@ -18,6 +18,7 @@ from fieldkit.core import geometry, model
 from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import FIXED_ROLES, Leg, Protocol, Role, Topology
 from fieldkit.core.units import parse_distance
+from fieldkit.motion import driven_paths
 from fieldkit.motion.logs import drive_log
 from fieldkit.motion.steps.move import MoveStep
 from fieldkit.steps.legs import PathLeg
@@ -89,7 +90,7 @@ def test_move_nested_in_a_fault_is_refused_with_its_line() -> None:
 def test_motion_is_in_metres_and_seconds() -> None:
     step = move(f"robot: receiver, path: [{{towards: 2km}}, {{away: 3m, right: 4m}}], speed: 3.6km/h, {PING}")
     assert step.motion == model.Move(Role.RECEIVER, (Leg(-2000.0), Leg(3.0, -4.0)), 1.0)
-    assert geometry.length_m(step.motion) == pytest.approx(2005.0)
+    assert driven_paths.length_m(step.motion) == pytest.approx(2005.0)
     assert geometry.describe_move(step.motion) == "2000 m towards, then 3 m away and 4 m right, at 1 m/s"
     assert step.roles() == {Role.SENDER, Role.RECEIVER}
     assert [shell_line(planned.job) for planned in step.jobs(SCENE)] == [
@@ -227,9 +228,9 @@ legs = st.lists(st.builds(Leg, lengths, lengths).filter(lambda leg: leg != Leg()
 
 @given(legs, st.floats(0.5, 40))
 def test_path_is_shortened_at_the_fence(path: list[Leg], fence_m: float) -> None:
-    shortened = geometry.clip_path(path, fence_m)
-    assert geometry.farthest_m(shortened) <= fence_m + 1e-6
-    if geometry.farthest_m(path) <= fence_m:
+    shortened = driven_paths.clip_path(path, fence_m)
+    assert driven_paths.farthest_m(shortened) <= fence_m + 1e-6
+    if driven_paths.farthest_m(path) <= fence_m:
         assert list(shortened) == path
         return
     n_complete = len(shortened) - 1
@@ -245,7 +246,7 @@ def test_path_is_shortened_at_the_fence(path: list[Leg], fence_m: float) -> None
 
 @given(legs, st.floats(0.5, 40))
 def test_shortened_path_is_valid_in_a_procedure(path: list[Leg], fence_m: float) -> None:
-    segments = [PathLeg.of(leg) for leg in geometry.clip_path(path, fence_m)]
+    segments = [PathLeg.of(leg) for leg in driven_paths.clip_path(path, fence_m)]
     for segment, leg in zip(segments, path, strict=False):
         if segment is not None:
             parsed = schema.validate(schema.parse(schema.dump(segment), source="x.yaml"), PathLeg)

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import pytest
 
@@ -13,7 +14,7 @@ from fieldkit.ros.middlewares import tuning
 from fieldkit.ros.recommendation import configurations
 from tests.helpers.paths import ROOT
 
-COMMENT = ["a trial -- with dashes -->", "loss 0 %\n*/ of 5 repeats"]
+COMMENT = ["a trial -- with --- dashes -->", "loss 0 %\n*/ of 5 repeats"]
 
 
 SOCKETS = """
@@ -49,6 +50,12 @@ def test_cyclonedds_reads_its_file(tmp_path: Path, settings: dict[str, str]) -> 
     assert (completed.returncode == 0) == is_known, completed.stderr
     for name, value in settings.items():
         assert value in path.read_text(encoding="utf-8"), name
+
+
+@pytest.mark.parametrize("middleware", ["dds", "ros2"])
+def test_any_comment_leaves_the_xml_well_formed(middleware: str) -> None:
+    text = configurations.configuration_text(middleware, "udp", {}, COMMENT)
+    assert ET.fromstring(text.encode()).tag
 
 
 @pytest.mark.parametrize("transport", ["tcp", "udp"])

@@ -24,12 +24,13 @@ from fieldkit.ros.interfaces.types import standard_types
 from sim_backends.emulated import emulated_options, placement, requirements
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice, load_options
-from sim_backends.emulated.medium.air_log import LIMIT_BYTES
+from sim_backends.emulated.medium.air_files import LIMIT_BYTES
 from sim_backends.emulated.provisioning import KeyPair, _sensor, definition, robot_spec
 from sim_backends.emulated.robot import mounts, rootfs
 from sim_backends.emulated.ros import messages, sensor_specs, tcpros
 from sim_backends.emulated.ros.sensor_specs import LaserTarget, Sensor
 from sim_backends.ros1 import framing
+from sim_backends.world.penetration import Obstacles
 from sim_backends.world.world import load_world
 from tests.helpers.labs import replace_text
 
@@ -185,7 +186,7 @@ class TestPlacement:
         }
         assert placement.relay(cast, nlos) is None
         endpoints = (np.array([positions[name]]) for name in ("turtlebot-1", "duckiedrone-1"))
-        assert self.LAWN.crossings(*endpoints) != [()], "the sender is behind the wall"
+        assert Obstacles(self.LAWN).crossings(*endpoints) != [()], "the sender is behind the wall"
 
     def test_a_world_without_a_line_for_the_scenario_is_refused(self) -> None:
         without_lines = self.LAWN.model_copy(update={"lines": {}})

@@ -21,8 +21,9 @@ from fieldkit.report import figures
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.emulated_options import EmulatedOptions
 from sim_backends.emulated.interactive_lab import members_of, overview
-from sim_backends.emulated.placement import destination_m, square_m
-from sim_backends.world.shapes import Box, Cylinder, Solids
+from sim_backends.emulated.interactive_placement import destination_m, square_m
+from sim_backends.world.penetration import Solids
+from sim_backends.world.shapes import Box, Cylinder
 from sim_backends.world.world import World, load_world
 
 SITE = """\

@@ -18,8 +18,8 @@ from fieldkit.core.units import parse_distance
 from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.emulated.mobility import STEP_M, Mobility
 from sim_backends.emulated.nodes import EmulatedRobot
+from sim_backends.emulated.ros.assigned_path import AssignedPath
 from sim_backends.emulated.ros.motion_record import RecordedMotion
-from sim_backends.emulated.ros.robot_motion import AssignedPath
 from sim_backends.world.motion import STILL, Attitude
 from sim_backends.world.world import load_world
 from tests.helpers.casts import CAST

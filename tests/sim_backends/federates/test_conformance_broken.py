@@ -17,7 +17,8 @@ from sim_backends.federates.frames import NETWORK, PHYSICS, MessageKind
 from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.physics.body import Twist, Velocity
-from sim_backends.world.motion import DeadReckoned, State
+from sim_backends.world.dead_reckoning import DeadReckoned
+from sim_backends.world.motion import State
 from tests.helpers.federate_examples import carts
 from tests.helpers.federate_pairs import HELLO, Alter, Pair
 

@@ -14,7 +14,8 @@ from fieldkit.core.model import Vector
 from sim_backends.radio.antennas import Antenna
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.world_channel import WorldChannel
-from sim_backends.world.world import World, load_world
+from sim_backends.world.penetration import Obstacles
+from sim_backends.world.world import load_world
 
 NAMES = ("a", "b", "c", "d")
 ANTENNAS = {name: Antenna("802.11n", 17.0, -82.0) for name in NAMES}
@@ -52,13 +53,13 @@ def test_links_depend_only_on_the_last_positions(moves: list[dict[str, Vector]])
 def count_computed_links(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Return a list that receives the number of links of each loss computation from now on."""
     computed_counts: list[int] = []
-    original: Callable[..., Any] = World.penetration_loss_db
+    original: Callable[..., Any] = Obstacles.penetration_loss_db
 
-    def counting_loss(world: World, start_m: Any, *others: Any) -> Any:  # noqa: ANN401 (the original signature)
+    def counting_loss(obstacles: Obstacles, start_m: Any, *others: Any) -> Any:  # noqa: ANN401 (the original signature)
         computed_counts.append(len(start_m))
-        return original(world, start_m, *others)
+        return original(obstacles, start_m, *others)
 
-    monkeypatch.setattr(World, "penetration_loss_db", counting_loss)
+    monkeypatch.setattr(Obstacles, "penetration_loss_db", counting_loss)
     return computed_counts
 
 

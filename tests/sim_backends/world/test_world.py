@@ -14,7 +14,8 @@ from fieldkit.config.schema import parse, validate
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Scenario, Vector
 from sim_backends.world.materials import MATERIALS, Foliage, Solid
-from sim_backends.world.shapes import Box, Cylinder, Floats, Shape, Solids
+from sim_backends.world.penetration import Obstacles, Solids
+from sim_backends.world.shapes import Box, Cylinder, Floats, Shape
 from sim_backends.world.world import World, load_world
 
 WIFI_HZ = 2.437e9
@@ -35,12 +36,12 @@ def world(x: float = 5, text: str = WORLD) -> World:
 
 
 def loss_db(yard: World, start: Vector, end: Vector) -> float:
-    return float(yard.penetration_loss_db(np.array([start]), np.array([end]), WIFI_HZ)[0])
+    return float(Obstacles(yard).penetration_loss_db(np.array([start]), np.array([end]), WIFI_HZ)[0])
 
 
 def crossed_parts(yard: World, start: Vector, end: Vector) -> list[tuple[str, float]]:
     """Return the material and the rounded length in metres of each part that a path crosses."""
-    (crossings,) = yard.crossings(np.array([start]), np.array([end]))
+    (crossings,) = Obstacles(yard).crossings(np.array([start]), np.array([end]))
     return [(crossing.material, round(crossing.length_m, 9)) for crossing in crossings]
 
 
@@ -79,19 +80,19 @@ def test_the_loss_depends_on_the_position_of_a_wall() -> None:
 def test_a_path_above_or_beside_a_wall_has_no_crossings() -> None:
     starts = np.array([[0, 5, 0.2], [0, 5, 3.0], [0, 1, 0.2], [0, 8.5, 0.2]])
     ends = np.array([[10, 5, 0.2], [10, 5, 3.0], [10, 1, 0.2], [10, 8.5, 0.2]])
-    assert [not parts for parts in world().crossings(starts, ends)] == [False, True, True, True]
+    assert [not parts for parts in Obstacles(world()).crossings(starts, ends)] == [False, True, True, True]
 
 
 def test_crossings_are_computed_separately_for_each_path() -> None:
     starts = np.array([[0, 5, 0.2], [0, 5, 3.0], [0, 5, 0.2]])
     ends = np.array([[10, 5, 0.2], [10, 5, 3.0], [20, 5, 0.2]])
-    first, second, third = world().crossings(starts, ends)
+    first, second, third = Obstacles(world()).crossings(starts, ends)
     assert [(crossing.obstacle, crossing.material, round(crossing.length_m, 9)) for crossing in first] == [
         ("wall", "concrete", 0.2)
     ]
     assert second == ()
     assert [crossing.obstacle for crossing in third] == ["wall", "hill"]
-    losses_db = world().penetration_loss_db(starts, ends, WIFI_HZ)
+    losses_db = Obstacles(world()).penetration_loss_db(starts, ends, WIFI_HZ)
     assert [not path_db for path_db in losses_db] == [not crossings for crossings in (first, second, third)]
 
 
@@ -134,7 +135,7 @@ def test_lines_of_shipped_worlds_have_the_stated_line_of_sight(name: str, scenar
     line = yard.lines[scenario]
     places = [line.at(distance) for distance in (0.0, 18.3)]
     start, end = (np.array([[*place, yard.ground_m(place) + ANTENNA_M]]) for place in places)
-    assert yard.crossings(start, end).count(()) == (scenario is Scenario.LOS)
+    assert Obstacles(yard).crossings(start, end).count(()) == (scenario is Scenario.LOS)
 
 
 COORDINATE = st.floats(-10, 10).map(lambda value: round(value, 3))

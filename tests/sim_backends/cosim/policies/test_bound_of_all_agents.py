@@ -23,7 +23,8 @@ from sim_backends.cosim.programs.senders import Periodic
 from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Arrival, Drop, Packet
 from sim_backends.physics.paths import Paths
-from sim_backends.world.motion import DeadReckoned, State, WayPoints
+from sim_backends.world.dead_reckoning import DeadReckoned
+from sim_backends.world.motion import State, WayPoints
 from tests.helpers.nightly import examples
 
 STEP_NS: Final = 1_000_000

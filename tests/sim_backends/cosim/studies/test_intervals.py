@@ -27,9 +27,9 @@ def test_a_mean_has_students_interval_and_a_single_value_has_none() -> None:
     assert math.isnan(mean(np.array([3.0])).low)
 
 
-@pytest.mark.parametrize(("low", "high", "is_certain"), [(0.1, 0.3, True), (-0.3, -0.1, True), (-0.1, 0.1, False)])
-def test_a_sign_is_certain_if_the_interval_excludes_0(low: float, high: float, is_certain: bool) -> None:
-    assert IntervalEstimate((low + high) / 2, low, high).is_certain is is_certain
+@pytest.mark.parametrize(("low", "high", "excludes_zero"), [(0.1, 0.3, True), (-0.3, -0.1, True), (-0.1, 0.1, False)])
+def test_an_interval_excludes_zero_if_both_bounds_have_one_sign(low: float, high: float, excludes_zero: bool) -> None:
+    assert IntervalEstimate((low + high) / 2, low, high).excludes_zero is excludes_zero
 
 
 def test_the_jackknife_of_a_mean_is_students_interval() -> None:

@@ -45,6 +45,10 @@ def test_without_mcs_and_rate_the_link_selects_its_modes() -> None:
         LoggedLink(-50, width_mhz=160, phy_rate_bit_s=100e6),
         LoggedLink(-50, streams=4),
         LoggedLink(-50, guard_interval_ns=3200, mcs=3),
+        LoggedLink(-50, "802.11g", mcs=5),
+        LoggedLink(-50, "802.11a", mcs=5, phy_rate_bit_s=48e6),
+        LoggedLink(-50, width_mhz=160),
+        LoggedLink(-50, "802.11a"),
     ],
 )
 def test_links_beyond_the_radio_model_have_a_reason_instead_of_a_goodput(link: LoggedLink) -> None:
@@ -68,6 +72,25 @@ def test_goodputs_equal_closed_forms_and_fall_with_the_signal() -> None:
     values = [goodputs[link] for link in (strong, weak, lost)]
     assert all(isinstance(value, float) for value in values)
     assert 60e6 > values[0] > values[1] > values[2] == 0  # type: ignore[operator]
+
+
+def test_a_fast_link_that_selects_its_modes_is_nearly_as_fast_as_its_best_mode() -> None:
+    best, selecting = (LoggedLink(-40, "802.11ac 5 GHz", 40, 2, 400, mcs) for mcs in (9, None))
+    goodputs = predict_goodputs_bit_s([best, selecting], {}, workers=IN_PROCESS)
+    assert 0.6 * 400e6 < goodputs[best] < 0.85 * 400e6  # type: ignore[operator]
+    assert goodputs[selecting] == pytest.approx(goodputs[best], rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("link", "packets"),
+    [
+        (LoggedLink(-50, mcs=7), 64),  # 65 Mbit/s
+        (LoggedLink(-50, "802.11ac 5 GHz", 40, 2, 400, mcs=9), 261),  # 400 Mbit/s
+        (LoggedLink(-50, "802.11ac 5 GHz", 40, 2, 400), 261),
+    ],
+)
+def test_the_queue_contains_packets_of_1500_bytes_for_8_ms_but_at_least_64(link: LoggedLink, packets: int) -> None:
+    assert link.scenario({}).radio.queue_packets == packets
 
 
 def test_changes_of_the_scenario_apply() -> None:

@@ -171,6 +171,16 @@ def test_another_sweep_is_refused(lab: Path) -> None:
     assert (result.code, "this is a sweep with other factors" in result.err) == (2, True)
 
 
+def test_a_damaged_plan_has_a_remedy_that_works(tmp_path: Path) -> None:
+    (tmp_path / "pair.yaml").write_text(PAIR, encoding="utf-8")
+    (tmp_path / "sweep").mkdir()
+    (tmp_path / "sweep" / "sweep.json").write_text("{", encoding="utf-8")
+    result = run_here(tmp_path, *SWEEP, "-o", "sweep")
+    assert result.code == EvidenceError.exit_code
+    # A sweep without its plan is refused, so the plan must not be deleted.
+    assert "restore it from a copy, or choose another -o" in result.err
+
+
 def test_pandas_polars_and_duckdb_read_the_dataset(lab: Path) -> None:
     import duckdb  # noqa: PLC0415 (these take 0.3 s, which each worker would need at its start)
     import pandas as pd  # noqa: PLC0415

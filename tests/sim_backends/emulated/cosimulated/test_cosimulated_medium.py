@@ -1,5 +1,6 @@
 """The co-simulated medium between real namespaces: every policy, delays, motion in physics simulators, lateness."""
 
+import csv
 import math
 import os
 import re
@@ -18,6 +19,7 @@ from fieldkit.core.model import Lateness, Vector
 from fieldkit.measure.evidence import oracle_delays
 from sim_backends.cosim.policies.registry import BUILTIN
 from sim_backends.emulated.emulated_options import SyncOptions
+from sim_backends.emulated.medium import air_files
 from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.emulated.ros.motion_record import SILENT_NS
 from sim_backends.federates.frames import NETWORK
@@ -42,6 +44,19 @@ def test_pings_cross_the_network_with_every_policy(policy: str, tmp_path: Path) 
         assert stats.links["a", "b"].delivered == 20
         assert sum(stats.packet_lateness_counts.values()) == 40
         assert sum(stats.window_lateness_counts.values()) > 2
+
+
+def test_a_recording_of_the_air_continues_in_a_new_session(tmp_path: Path) -> None:
+    """A relay makes the medium start a new session."""
+    with cosim_bench(tmp_path) as bench:
+        bench.medium.record(tmp_path)
+        bench.ping(count=2)
+        bench.medium.place(PLACES, relay="b")
+        bench.ping(count=3)
+        bench.medium.record(None)
+    with (tmp_path / air_files.CSV).open(encoding="ascii", newline="") as file:
+        frames = [(line["transmitter"], line["size_bytes"], line["attempt"]) for line in csv.DictReader(file)]
+    assert frames.count(("a", str(84 + 36), "1")) == 5, "a packet of ping, with the headers of Wi-Fi"
 
 
 def test_ns3_carries_unicast_and_broadcast_packets(tmp_path: Path) -> None:

@@ -53,6 +53,12 @@ def signal_dbm(distance_m: float) -> float:
     return decibel(channel.powers_mw(0, 0)[1])
 
 
+def test_a_fixed_mode_in_the_radio_options_has_no_effect() -> None:
+    air = air_with(3.0, options=RadioOptions(fading=False, mode="a54"))
+    air.transmit(START_NS, frame(RateStage(4, 1)), "a", "b")
+    assert [reception.mode for reception in run(air)[0].receptions] == [G6]
+
+
 @pytest.mark.parametrize(
     ("stage", "mode"), [(RateStage(11, 1), G54), (RateStage(4, 1), G6), (RateStage(7, 1, RATE_MCS), N7)]
 )

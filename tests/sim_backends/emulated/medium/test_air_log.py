@@ -14,7 +14,7 @@ from scapy.utils import rdpcap
 from benchmarks.namespaces import Namespace
 from fieldkit.config.profiles import Radio
 from fieldkit.measure.captures import pcap
-from sim_backends.emulated.medium import air_log
+from sim_backends.emulated.medium import air_files
 from sim_backends.emulated.medium.air_log import AirLog
 from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.radio.mac.frames import ControlFrame, TransmissionAttempt
@@ -29,7 +29,7 @@ MAC = {"a": "02:00:00:00:00:01", "b": "02:00:00:00:00:02", "r": "02:00:00:00:00:
 
 
 def table(folder: Path) -> list[dict[str, str]]:
-    with (folder / air_log.CSV).open(encoding="ascii", newline="") as file:
+    with (folder / air_files.CSV).open(encoding="ascii", newline="") as file:
         return list(csv.DictReader(file))
 
 
@@ -38,7 +38,7 @@ def attempt(number: int, payload: bytes = b"\x45" + bytes(99)) -> TransmissionAt
 
 
 def test_both_files_stop_at_their_limit(tmp_path: Path) -> None:
-    paths = [tmp_path / air_log.PCAP, tmp_path / air_log.CSV]
+    paths = [tmp_path / air_files.PCAP, tmp_path / air_files.CSV]
     log = AirLog([os.open(path, os.O_WRONLY | os.O_CREAT) for path in paths], ("a", "b"), limit_bytes=10_000)
     for _ in range(100):
         log.write(attempt(1))
@@ -49,7 +49,7 @@ def test_both_files_stop_at_their_limit(tmp_path: Path) -> None:
 
 
 def test_a_retry_is_marked_and_long_frames_are_cut(tmp_path: Path) -> None:
-    paths = [tmp_path / air_log.PCAP, tmp_path / air_log.CSV]
+    paths = [tmp_path / air_files.PCAP, tmp_path / air_files.CSV]
     log = AirLog([os.open(path, os.O_WRONLY | os.O_CREAT) for path in paths], ("a", "b"))
     for number in (1, 2):
         log.write(attempt(number, b"\x45" + bytes(1499)))
@@ -60,7 +60,7 @@ def test_a_retry_is_marked_and_long_frames_are_cut(tmp_path: Path) -> None:
 
 
 def test_control_frames_have_their_type_and_addresses(tmp_path: Path) -> None:
-    paths = [tmp_path / air_log.PCAP, tmp_path / air_log.CSV]
+    paths = [tmp_path / air_files.PCAP, tmp_path / air_files.CSV]
     log = AirLog([os.open(path, os.O_WRONLY | os.O_CREAT) for path in paths], ("a", "b"))
     frames_sent: tuple[tuple[ControlFrame, int], ...] = (("RTS", 20), ("CTS", 14), ("ACK", 14))
     for control, size_bytes in frames_sent:
@@ -100,15 +100,15 @@ def test_each_hop_of_a_ping_is_in_both_files(
     hops = [("a", "r"), ("r", "b"), ("b", "r"), ("r", "a")]
     assert [(line["transmitter"], line["receiver"]) for line in lines] == hops
     assert [line["received"] for line in lines] == [receiver for _, receiver in hops]
-    frames = [frame for frame in rdpcap(str(tmp_path / air_log.PCAP)) if ICMP in frame]
+    frames = [frame for frame in rdpcap(str(tmp_path / air_files.PCAP)) if ICMP in frame]
     assert [(frame.addr2, frame.addr1) for frame in frames] == [
         (MAC[sender], MAC[receiver]) for sender, receiver in hops
     ]
     assert [frame[ICMP].type for frame in frames] == [8, 8, 0, 0]
-    acks = [frame for frame in rdpcap(str(tmp_path / air_log.PCAP)) if (frame.type, frame.subtype) == (1, 13)]
+    acks = [frame for frame in rdpcap(str(tmp_path / air_files.PCAP)) if (frame.type, frame.subtype) == (1, 13)]
     assert {(frame.addr1, len(frame)) for frame in acks} >= {(MAC[sender], 10) for sender, _ in hops}
     assert len(acks) == sum(line["attempt"] == "0" for line in all_lines)
-    capture = pcap.read(tmp_path / air_log.PCAP)
+    capture = pcap.read(tmp_path / air_files.PCAP)
     assert capture.damage is None
     assert capture.frames == len(table(tmp_path))
     starts_ns = [int(line["start_ns"]) for line in all_lines if line["attempt"] != "0"]
@@ -122,10 +122,10 @@ def test_a_site_file_with_record_air_adds_the_files_to_the_evidence(tmp_path: Pa
     run = run_here(lab, "trial", "quick", "5m", "--repeats", "1", "--protocol", "udp")
     assert run.code == 0, run.err
     trial = only_trial(lab)
-    assert f"lab_bytes: {air_log.LIMIT_BYTES}" in (trial / "trial.yaml").read_text(encoding="utf-8")
+    assert f"lab_bytes: {air_files.LIMIT_BYTES}" in (trial / "trial.yaml").read_text(encoding="utf-8")
     (row,) = [row for row in rows(trial) if row["status"] == "valid"]
     (folder,) = (trial / "repeats").glob("udp-01")
     sent_lines = [line for line in table(folder) if line["transmitter"] == row["sender"] and line["attempt"] == "1"]
     assert len(sent_lines) >= int(row["ip_packets_sent"]) > 0
-    assert pcap.read(folder / air_log.PCAP).frames == len(table(folder))
+    assert pcap.read(folder / air_files.PCAP).frames == len(table(folder))
     assert run_here(lab, "verify", str(trial)).code == 0

@@ -22,7 +22,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, LinkError, RobotError
 from fieldkit.core.model import DelayParts, Vector
 from sim_backends.emulated.medium.medium_client import MediumClient
-from sim_backends.emulated.robot.network import open_tun
+from sim_backends.emulated.robot.tun_devices import open_tun
 from sim_backends.radio.antennas import antenna_of
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.world_channel import WorldChannel
@@ -440,7 +440,7 @@ def test_the_medium_exits_if_its_control_socket_is_closed() -> None:
 
 OPEN_AGAIN = """
 from fieldkit.core.errors import FieldkitError
-from sim_backends.emulated.robot.network import open_tun
+from sim_backends.emulated.robot.tun_devices import open_tun
 try:
     open_tun("wlan0")
 except FieldkitError as error:

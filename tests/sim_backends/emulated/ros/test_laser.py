@@ -16,11 +16,13 @@ from fieldkit.core.model import Vector
 from fieldkit.ros.interfaces.types import standard_types
 from sim_backends.emulated.provisioning import laser_targets, neighbour
 from sim_backends.emulated.robot.spec import ANTENNA_M
-from sim_backends.emulated.ros.laser import Neighbourhood, PositionsWriter, ranges_m
+from sim_backends.emulated.ros.lab_positions import Neighbourhood, PositionsWriter
+from sim_backends.emulated.ros.laser import ranges_m
 from sim_backends.emulated.ros.messages import LASER_NOISE_M, Source
 from sim_backends.emulated.ros.robot_motion import RobotMotionState
 from sim_backends.emulated.ros.sensor_specs import LASER_SCAN, LaserTarget, Neighbour, Sensor
-from sim_backends.world.shapes import Box, Cylinder, Solids
+from sim_backends.world.penetration import Solids
+from sim_backends.world.shapes import Box, Cylinder
 from sim_backends.world.world import World, load_world
 
 BEAMS = 360

@@ -19,7 +19,7 @@ from fieldkit.core.units import parse_distance
 from fieldkit.ros.interfaces.types import standard_types
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.provisioning import _sensor
-from sim_backends.emulated.ros import robot_motion
+from sim_backends.emulated.ros.assigned_path import append_path
 from sim_backends.emulated.ros.messages import GENERATORS, Source
 from sim_backends.emulated.ros.robot_motion import AT_REST, Odometer, RobotMotionState
 from sim_backends.emulated.ros.sensor_specs import GENERATED_TYPES, LaserTarget, Sensor
@@ -299,7 +299,7 @@ def test_the_magnetic_field_points_north_for_any_heading(heading_rad: float) -> 
 def test_the_speed_of_odometry_integrates_to_its_pose_and_to_the_path(sensor: Sensor, tmp_path: Path) -> None:
     placement = Placement(Scenario.LOS, Topology.MASTERLESS, parse_distance("10m"))
     world, move = load_world("lawn"), Move(Role.SENDER, (Leg(away_m=2.0), Leg(left_m=1.0), Leg(away_m=1.0)), 0.5)
-    robot_motion.append_path(tmp_path / "motion", places.assigned_path(placement, move, world, 0))
+    append_path(tmp_path / "motion", places.assigned_path(placement, move, world, 0))
     odometer, source = Odometer(tmp_path / "motion", 0), Source(sensor)
     period_s, path_s = 1 / sensor.rate_hz, 8.0
     samples = [

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_backends.emulated.ros import robot_motion
+from sim_backends.emulated.ros.assigned_path import AssignedPath, append_path
 from sim_backends.emulated.ros.motion_record import SILENT_NS, MotionRecord, RecordedMotion
-from sim_backends.emulated.ros.robot_motion import AssignedPath, MotionReporter, Odometer
+from sim_backends.emulated.ros.robot_motion import MotionReporter, Odometer
 
 S = 10**9
 FLOATS = st.floats(-1e3, 1e3)
@@ -94,7 +94,7 @@ def test_motion_is_extrapolated_until_the_timeout(motion: RecordedMotion, age_ns
 
 def test_the_reporter_reads_its_placement_and_sensors_follow_the_reported_motion(tmp_path: Path) -> None:
     paths, record = tmp_path / "motion", tmp_path / "steered"
-    robot_motion.append_path(paths, AssignedPath(5 * S, [(3.0, 6.0, 0.2)], 1.0, math.pi / 2))
+    append_path(paths, AssignedPath(5 * S, [(3.0, 6.0, 0.2)], 1.0, math.pi / 2))
     reporter, odometer = MotionReporter(paths, record, 6 * S), Odometer(paths, 6 * S, record)
     placement = reporter.poll_placement(6 * S)
     assert placement is not None
@@ -106,7 +106,7 @@ def test_the_reporter_reads_its_placement_and_sensors_follow_the_reported_motion
     motion_now = odometer.at(7 * S + S // 10)
     assert motion_now.position_m == pytest.approx((3.0, 7.05, 0.2))
     assert (motion_now.x_m, motion_now.speed_m_s, motion_now.turn_rad_s) == pytest.approx((1.05, 0.5, 0.1))
-    robot_motion.append_path(paths, AssignedPath(8 * S, [(3.0, 6.0, 0.2)], 1.0, math.pi / 2))
+    append_path(paths, AssignedPath(8 * S, [(3.0, 6.0, 0.2)], 1.0, math.pi / 2))
     placed_motion = odometer.at(9 * S)
     assert placed_motion.position_m == (3.0, 6.0, 0.2)
     assert placed_motion.x_m > 1.0, "odometry continues"
@@ -122,7 +122,7 @@ def test_the_reporter_reads_its_placement_and_sensors_follow_the_reported_motion
 
 def test_a_restarted_reporter_continues_at_the_last_position(tmp_path: Path) -> None:
     paths, record = tmp_path / "motion", tmp_path / "steered"
-    robot_motion.append_path(paths, AssignedPath(S, [(0.0, 0.0, 0.2)], 1.0, 0.0))
+    append_path(paths, AssignedPath(S, [(0.0, 0.0, 0.2)], 1.0, 0.0))
     reporter = MotionReporter(paths, record, 2 * S)
     reporter.poll_placement(2 * S)
     reporter.write(3 * S, (4.0, 0.0, 0.2), (1.0, 0.0, 0.0), odometry=(4.0, 0.0, 0.0))

@@ -14,9 +14,9 @@ from rosbags.typesys import Stores, get_typestore
 from fieldkit.core.model import Leg, Move, Placement, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
 from sim_backends.emulated import placement as places
-from sim_backends.emulated.ros import robot_motion
+from sim_backends.emulated.ros.assigned_path import AssignedPath, append_path
 from sim_backends.emulated.ros.messages import FIX_NOISE_M, Source
-from sim_backends.emulated.ros.robot_motion import AT_REST, AssignedPath, Odometer, RobotMotionState
+from sim_backends.emulated.ros.robot_motion import AT_REST, Odometer, RobotMotionState
 from sim_backends.emulated.ros.sensor_specs import Sensor
 from sim_backends.world.world import load_world
 from tests.helpers.casts import CAST
@@ -33,7 +33,7 @@ def write_paths(folder: Path, *assigned_paths: AssignedPath) -> Path:
     path = folder / "motion"
     path.unlink(missing_ok=True)
     for assigned_path in assigned_paths:
-        robot_motion.append_path(path, assigned_path)
+        append_path(path, assigned_path)
     return path
 
 
@@ -53,11 +53,11 @@ def test_a_robot_that_is_placed_again_keeps_its_odometry(tmp_path: Path) -> None
     path = write_paths(tmp_path, AssignedPath(0, CORNER, 2.0, 0.0))
     odometer = Odometer(path, 0)
     odometer.at(2 * S)
-    robot_motion.append_path(path, AssignedPath(4 * S, CORNER[:1], 2.0, 0.0))
+    append_path(path, AssignedPath(4 * S, CORNER[:1], 2.0, 0.0))
     placed_motion = odometer.at(5 * S)
     assert (placed_motion.x_m, placed_motion.y_m) == pytest.approx((4.0, 2.0))
     assert placed_motion.position_m == CORNER[0]
-    robot_motion.append_path(path, AssignedPath(6 * S, CORNER, 2.0, 0.0))
+    append_path(path, AssignedPath(6 * S, CORNER, 2.0, 0.0))
     second_drive = odometer.at(7 * S)
     # The robot was turned to its first heading, which its odometry has not recorded: ahead is to the left of the
     # start in its odometry frame.

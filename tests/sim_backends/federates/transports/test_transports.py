@@ -73,6 +73,20 @@ def test_an_invalid_address_is_an_error(text: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("tcp:localhost", "host or port is missing"),
+        ("tcp:localhost:", "host or port is missing"),
+        ("udp:localhost:65536", "'65536' is not a port from 1 to 65535"),
+        ("tcp-listen:localhost:x", "'x' is not a port from 1 to 65535"),
+    ],
+)
+def test_the_error_of_an_invalid_address_has_the_reason(text: str, reason: str) -> None:
+    with pytest.raises(ConfigurationError, match=re.escape(reason)):
+        parse_address(text)
+
+
+@pytest.mark.parametrize(
     "address",
     ["tcp:192.0.2.1:7000", "udp:192.0.2.1:7000", "udp-listen:0.0.0.0:7000", "dds:carts:0:192.0.2.1", "ros1:carts"],
 )
