@@ -46,7 +46,7 @@ emulated:
   ros: builtin
   world: open
   radio: {{fading: false}}
-  mesh: {{daemon: babeld, hello: {hello_s}s}}
+  mesh: {{protocol: babel, hello: {hello_s}s}}
 """
 
 

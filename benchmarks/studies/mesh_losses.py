@@ -109,7 +109,7 @@ def lab(detour: Detour) -> Iterator[DetourLab]:
     """Yield the robots of a detour."""
     profile = schema.load(Path(__file__).parent / "mesh" / "box.yaml", RobotProfile)
     robots = {name: LabRobot(name, profile, f"10.42.0.{number}", ()) for number, name in enumerate(detour.places, 1)}
-    mesh = {"daemon": "babeld", "hello": f"{HELLO_S}s"}
+    mesh = {"protocol": "babel", "hello": f"{HELLO_S}s"}
     options = EmulatedOptions.model_validate({"radio": {"fading": detour.fading}, "mesh": mesh})
     with running_robots(
         robots, options=options, world=load_world("open"), ros=RosChoice.BUILTIN, seed=1

@@ -22,6 +22,7 @@ from fieldkit.agent.messaging import middleware, records, stream
 from fieldkit.agent.messaging.middleware import MiddlewareError, Network, Topic
 from fieldkit.agent.messaging.records import Log, LogError
 from fieldkit.agent.messaging.stream import Stream
+from fieldkit.agent.orders import CANCELLED
 
 _USAGE = (
     "usage: agent.pyz publish|subscribe|send-video|receive-video|mavlink|drive JSON LOG, "
@@ -95,11 +96,18 @@ def _record(arguments: Arguments, stop_event: threading.Event, path: str) -> int
 
 
 def _drive(arguments: Arguments, stop_event: threading.Event, path: str) -> int:
-    """Drive a robot along its path; return the exit code: 0 if it is back at its origin, 4 if it stopped earlier."""
+    """Drive a robot along its path; return the exit code.
+
+    It is 0 if the robot is back at its origin, 4 if it stopped earlier, and `CANCELLED` if a signal arrived before it
+    started.
+    """
     session = middleware.adapter(arguments["over"])(Network(**arguments["network"]))
     try:
         _report(f"up, {session.version}")
         stop_reason = drive.drive(session, arguments, Path(path), stop_event)
+    except drive.DriveCancelledError:
+        _report("cancelled before the start")
+        return CANCELLED
     except OSError as error:
         raise MiddlewareError(f"the robot was stopped, because {path} cannot be written: {error.strerror}") from error
     finally:

@@ -10,6 +10,9 @@ from typing import Sequence
 
 from fieldkit.agent.boot_clock import now_s
 
+CANCELLED = 7
+"""Exit code of a program that a signal stopped while it did not move its robot: before it started to drive or fly, or
+after the landing. `fieldkit stop` relies on this (`motion_state` in fieldkit/remote/motion.sh)."""
 _MAX_LEASE_S = 86_400.0
 _MAX_BYTES = 100
 

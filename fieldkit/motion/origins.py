@@ -11,7 +11,10 @@ from fieldkit.steps.scene import Scene
 
 @dataclass(frozen=True)
 class MotionOrigin:
-    """Position and heading of a robot. At its first start at a place: centre of its fence, reference of directions.
+    """Position and heading of a robot.
+
+    Those before its first start at a place are its origin there: the centre of its fence, and the reference of the
+    directions of its paths.
 
     Attributes:
         frame: Frame of the coordinates: `odometry`, or `local` for MAVLink's LOCAL_POSITION_NED.

@@ -24,7 +24,7 @@ from fieldkit.core.text import print_text
 from fieldkit.lab import folder
 from fieldkit.motion import halting
 from fieldkit.motion.halting import HaltResult
-from fieldkit.remote.motion_states import STATE_TEXTS, MotionState
+from fieldkit.remote.motion_states import STATE_TEXTS, UNCONFIRMED_STATES
 from fieldkit.remote.shell import Shell
 
 
@@ -127,7 +127,7 @@ def _other_robots(backend: str | None, path: Path | None) -> Iterator[Robots]:
 
 
 def _has_failed(result: HaltResult) -> bool:
-    return result.error is not None or result.state in {MotionState.SILENT, MotionState.ALARM}
+    return result.error is not None or result.state in UNCONFIRMED_STATES
 
 
 def _state_text(result: HaltResult) -> str:

@@ -48,8 +48,8 @@
 #                                        the programs of DIR, without the lock; then list them: DIR/.jobs/NAME STATE, as
 #                                        `motion_states`
 #   job.sh motion_states DIR/.jobs/NAME...
-#                                        list the states: `stationary`, `landed`, `land` or `return` (in progress), `ended`,
-#                                        `silent`, or `alarm` (a drone may be in the air)
+#                                        list the states: `idle`, `stationary`, `landed`, `land` or `return` (in progress),
+#                                        `ended`, `silent`, or `alarm` (a drone may be in the air)
 #   job.sh life_signs FILE               print FILE and the time since boot
 #   job.sh snapshot                      print the outputs of all sources of the robot's state, see `snapshot.sh`
 #   job.sh sample INTERFACE TOKEN        print the state of the Wi-Fi link until it is stopped, see telemetry.sh

@@ -61,7 +61,7 @@ signal_programs() { # signal each motion program in folders $@, and add it to pr
     done
 }
 
-signal_strays() { # signal motion programs whose folder was deleted; they have no record, so they are listed as ended
+signal_strays() { # signal motion programs whose folder was deleted; they have no record, so they are listed as silent
     home=$(cd "$base" 2>/dev/null && pwd -P) || return 0
     ls -ld /proc/[0-9]*/cwd 2>/dev/null | while read -r line; do
         case $line in *"/cwd -> $home/"*" (deleted)") ;; *) continue ;; esac
@@ -73,7 +73,7 @@ signal_strays() { # signal motion programs whose folder was deleted; they have n
         esac
         kill -INT "$pid" 2>/dev/null
         kill -CONT "$pid" 2>/dev/null
-        echo "${base##*/}/$where/.jobs/$pid ended"
+        echo "${base##*/}/$where/.jobs/$pid silent"
     done
 }
 
@@ -99,7 +99,11 @@ motion_state() { # set state to the state of the program in $1; program must be 
             esac
         done 2>/dev/null <"${1%/.jobs/*}/${1##*/}.log"
     fi
-    case $state in silent | land | return) alive "$1" || state=ended ;; esac
+    case $state in silent | land | return) ;; *) return 0 ;; esac
+    ! alive "$1" || return 0
+    code=
+    read -r code 2>/dev/null <"$1/exit"
+    case $state$code in silent7) state=idle ;; *) state=ended ;; esac # 7: CANCELLED in fieldkit/agent/orders.py
 }
 
 list_landing() { # list the programs of all trials that still land a drone: DIR/.jobs/NAME STATE

@@ -12,10 +12,11 @@ class MotionState(StrEnum):
 
     Attributes:
         NOTHING: No program of fieldkit moves it; nothing is sent to it.
+        IDLE: The program had not started to move the robot, and has exited (`CANCELLED` in `fieldkit.agent.orders`).
         STATIONARY: Its odometry shows no motion.
         LANDED: Its motors have stopped.
-        ENDED: The program has exited and did not report that the robot is stationary or on the ground, for example
-            because it had not started to move the robot.
+        ENDED: The program has exited and did not report that the robot is stationary or on the ground, or that it
+            had not started to move the robot.
         LAND: A drone is landing at its position.
         RETURN: A drone is returning, and will then land.
         SILENT: The program received a signal and has not reported a state. A program that drives the robot was then
@@ -25,6 +26,7 @@ class MotionState(StrEnum):
     """
 
     NOTHING = "nothing"
+    IDLE = "idle"
     STATIONARY = "stationary"
     LANDED = "landed"
     ENDED = "ended"
@@ -35,13 +37,16 @@ class MotionState(StrEnum):
 
 
 BY_SEVERITY: Final = tuple(MotionState)
+UNCONFIRMED_STATES: Final = frozenset({MotionState.ENDED, MotionState.SILENT, MotionState.ALARM})
+"""States in which a person must stop the robot, or check that it has stopped."""
 DESCENDING_STATES: Final = frozenset({MotionState.LAND, MotionState.RETURN})
 
 STATE_TEXTS: Final[Mapping[MotionState, str]] = {
     MotionState.NOTHING: "no program of fieldkit moves it; nothing was sent to it",
+    MotionState.IDLE: "its program has exited; it had not started to move the robot",
     MotionState.STATIONARY: "stopped (stationary)",
     MotionState.LANDED: "stopped (on the ground)",
-    MotionState.ENDED: "stopped (its program had not started to move it, or has ended)",
+    MotionState.ENDED: "NOT CONFIRMED: stop it by hand; its program has exited and has not confirmed the stop",
     MotionState.LAND: "coming down (land)",
     MotionState.RETURN: "coming down (return)",
     MotionState.SILENT: "NOT CONFIRMED: stop it by hand; its program was signalled but has not confirmed the stop",

@@ -100,7 +100,8 @@ def read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> A
         if (packet_fates := fates.read(evidence, transfer)) is not None
     ]
     sent_bags = {
-        transfer.sent_file: evidence.read_or_none(recordings.read, transfer.sent_file) for transfer in transfers
+        transfer.sent_file: (transfer.source, evidence.read_or_none(recordings.read, transfer.sent_file))
+        for transfer in transfers
     }
     outputs = [
         (source.name, source.role, evidence.read_or_none(ping.read, source.file))
@@ -112,7 +113,11 @@ def read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> A
     clock_offset_ns = dict.fromkeys((*plan.cast, *ends), 0) | {ends[1]: offset_ns}
     links = {role: link.link_history(evidence.links(role)) for role in ends}
     times = AttemptTimes(
-        bags={file: contents for file, contents in sent_bags.items() if contents},
+        bags={
+            file: replace(contents, started_utc_ns=contents.started_utc_ns - clock_offset_ns[role])
+            for file, (role, contents) in sent_bags.items()
+            if contents
+        },
         transfers=[
             (transfer, _correct_clocks(packet_fates, transfer, clock_offset_ns)) for transfer, packet_fates in packets
         ],

@@ -241,7 +241,7 @@ def _panel_title(title: str, quantity: Quantity | None, cells: Sequence[Cell], e
     return ", ".join((quantity.step, title, *sizes))
 
 
-_NO_LOSS_NOTE: Final = ", dotted if nothing was lost, because each repeat then counts as one trial"
+_NO_LOSS_NOTE: Final = ", dotted if nothing was lost, because its width then depends only on the number of repeats"
 _CUT_NOTE: Final = "an arrow if an interval continues beyond the axis; no repeat is drawn there"
 _ABSENCE_NOTE: Final = "a cross at the edge, with the reason, if a condition has no value"
 _COUNT_NOTE: Final = "next to a point, the number of valid repeats with a value, if not all have one"

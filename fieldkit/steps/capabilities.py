@@ -200,7 +200,7 @@ class SendsFile(Capability):
 
     @abstractmethod
     def transfer(self, scene: Scene, within: Sequence[EnclosingStep]) -> Transfer | None:
-        """Return the packet filter of the file transfer; None if the step sends no file.
+        """Return the transfer of the file, with its ports, addresses and captures; None if the step sends no file.
 
         Args:
             scene: The attempt.

@@ -42,10 +42,6 @@ class View:
         )
         return 0 if log is None else (log.dropped_by_kernel or 0) + (log.dropped_by_interface or 0)
 
-    def has_captures(self, *roles: Role) -> bool:
-        """Return True if all of these robots captured while the step ran."""
-        return all(capture_around(self.within, role) is not None for role in roles)
-
     def attempt_window(self, role: Role) -> tuple[int, int] | None:
         """Return a robot's clock before and after the attempt, in ns since 1970; None if it was not recorded."""
         before, after = (

@@ -15,7 +15,8 @@ from sim_backends.emane_events.protobuf import MalformedEventError
 
 _MREQN: Final = struct.Struct("=4s4si")  # struct ip_mreqn (Linux, ip(7))
 _MAX_EVENT_BYTES: Final = 1200
-"""Maximum content of a datagram that fits into an Ethernet frame; a larger event is sent alone."""
+"""Maximum total content of the events of a datagram, which then fits into an Ethernet frame with all headers. A
+larger event is sent alone."""
 _RECEIVE_BYTES: Final = 1 << 16
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -26,6 +27,7 @@ from sim_backends.emulated.provisioning import (
     RobotKey,
     drives_by_topic,
     link_addresses,
+    profile_in_lab,
     sensors_of,
 )
 from sim_backends.emulated.robot.spec import unsupported_paths
@@ -133,7 +135,7 @@ class EmulatedBackend:
         """Implement `Relocating.run_elsewhere`: the command runs in a virtual machine."""
         from sim_backends.emulated.linux_wifi import guest  # noqa: PLC0415 (as above)
 
-        return guest.run_command(argv, results, radios=self._radio_count)
+        return guest.run_command(argv, results, radios=self._radio_count, mesh=self._options.mesh)
 
     @property
     def _radio_count(self) -> int:
@@ -168,7 +170,13 @@ class EmulatedBackend:
         self._check_profiles(cast)
         self._check_infrastructure((robot.name for robot in cast.values()), has_relay=topology is Topology.MASTER)
         return {
-            role: robot.model_copy(update={"abilities": self._abilities(robot, cast)}) for role, robot in cast.items()
+            role: robot.model_copy(
+                update={
+                    "abilities": self._abilities(robot, cast),
+                    "profile": profile_in_lab(robot.profile, self._options),
+                }
+            )
+            for role, robot in cast.items()
         }
 
     def _link_addresses(self, topology: Topology) -> dict[str, dict[str, str]]:
@@ -244,9 +252,8 @@ class EmulatedBackend:
 
             sink(Note("starting a virtual machine, because mac80211_hwsim cannot be used here"))
             draw = partial(interactive_lab.overview, members, options=self._options, world=self._world)
-            with guest_lab.bring_up(
-                members, self._site_of_guest(), seed=seed, radios=self._radio_count, draw=draw
-            ) as lab:
+            site, mesh = self._site_of_guest(), self._options.mesh
+            with guest_lab.bring_up(members, site, seed=seed, radios=self._radio_count, draw=draw, mesh=mesh) as lab:
                 yield lab
             return
         ros = self._find_ros(members)
@@ -286,7 +293,10 @@ class EmulatedBackend:
         members = interactive_lab.members_of(self._site, self._document, self._addresses)
         self._check_profiles(members)
         self._check_infrastructure(members, has_relay=False)
-        return members
+        return {
+            name: replace(robot, profile=profile_in_lab(robot.profile, self._options))
+            for name, robot in members.items()
+        }
 
     def _check_infrastructure(self, names: Iterable[str], *, has_relay: bool) -> None:
         """Raise ConfigurationError if the access points or neighbours in the options conflict with the robots."""
@@ -319,10 +329,12 @@ class EmulatedBackend:
 
         has_linux_wifi, variants = self._options.has_linux_wifi, self._options.robots
         robot_variants = (variants[name] for name in names if name in variants)
-        mesh = set() if self._options.mesh is None else {self._options.mesh.daemon}
+        mesh = set() if self._options.mesh is None else {self._options.mesh.program}
         wifi = {"hostapd", "iw", "nft", "wpa_supplicant"} if has_linux_wifi else set()
         programs = {program for options in robot_variants for program in options.programs()}
         requirements.check(programs | mesh | wifi, needs_tun=not has_linux_wifi)
+        if self._options.has_batman:
+            requirements.check_batman()
         return requirements.ros_in_use(self._options.ros)
 
 

@@ -9,7 +9,8 @@ from fieldkit.config.profiles import LinkName
 from fieldkit.config.schema import Bool, Document, Duration, Field, Length, Strict
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.emulated.linux_wifi.linux_wifi_options import LinuxWifiOptions
-from sim_backends.emulated.robot.spec import HELLO_S, NETCATS, Netcat, Ping, SshServer, Userland
+from sim_backends.emulated.robot.mesh_options import MeshOptions
+from sim_backends.emulated.robot.spec import NETCATS, Netcat, Ping, SshServer, Userland
 from sim_backends.radio.radio_options import INFRASTRUCTURE, RadioOptions
 
 BOOT_S: Final = 2.0
@@ -72,18 +73,6 @@ class RobotOptions(Strict):
 
 HOST_TOOLS: Final = RobotOptions.defaults()
 """Options of a robot that the site file does not name under `robots`: it has the tools of this machine."""
-
-
-class MeshOptions(Strict):
-    """A mesh: robots forward packets for each other, and a routing daemon on each robot finds the routes.
-
-    Attributes:
-        daemon: `babeld`, which implements Babel (RFC 8966).
-        hello: Hello interval; the daemon's default is 4 s. A lost route is replaced after several hello intervals.
-    """
-
-    daemon: Literal["babeld"]
-    hello: Annotated[Duration, Field(ge=0.1, le=60)] = HELLO_S
 
 
 class Ros2Options(Strict):
@@ -163,7 +152,7 @@ class EmulatedOptions(Strict):
         record_air: True to write every transmission attempt and ACK to `air.pcap` and `air.csv` of each repeat;
             fixed links have none.
         boot: Time for which a robot that reboots is off before its programs start.
-        mesh: Robots forward packets for each other, and a routing daemon on each finds the routes: [a mesh](mesh.md).
+        mesh: Robots forward packets for each other, and a routing protocol finds the routes: [a mesh](mesh.md).
         physics: Physics simulator of [the co-simulation](lab-cosim.md) that moves the robots: `kinematic`, `mujoco`
             or `gazebo`. The default is `kinematic` if `network` is given.
         network: The network of the co-simulation: `builtin` or `ns3`. The default is `builtin` if `physics`
@@ -196,6 +185,16 @@ class EmulatedOptions(Strict):
     def has_linux_wifi(self) -> bool:
         """True if the robots have Linux Wi-Fi."""
         return self.wifi == "linux"
+
+    @property
+    def babel_hello_s(self) -> float | None:
+        """Hello interval of the robots' babeld; None if they run no babeld."""
+        return self.mesh.hello_s if self.mesh is not None and self.mesh.protocol == "babel" else None
+
+    @property
+    def has_batman(self) -> bool:
+        """True if the robots form a mesh of batman-adv."""
+        return self.mesh is not None and self.mesh.protocol == "batman-adv"
 
     @property
     def is_cosimulated(self) -> bool:
@@ -246,7 +245,6 @@ class EmulatedOptions(Strict):
         excluded_options = {
             "physics": self.physics,
             "network": self.network,
-            "mesh": self.mesh,
             "record_air": self.record_air,
             "links": self.links,
             "radio": self.radio.is_fixed,
@@ -261,6 +259,11 @@ class EmulatedOptions(Strict):
         if self.has_linux_wifi and self.linux_wifi.mesh and self.radio.access_points:
             cause = "`linux_wifi: {mesh: true}` cannot be combined with `radio.access_points`"
             raise schema.validation_error(cause, "linux_wifi")
+        if self.has_linux_wifi and self.linux_wifi.mesh and self.mesh is not None:
+            raise schema.validation_error("`linux_wifi: {mesh: true}` cannot be combined with `mesh`", "linux_wifi")
+        if self.has_batman and not self.has_linux_wifi:
+            cause = "`mesh: {protocol: batman-adv}` needs `wifi: linux`; otherwise write `protocol: babel`"
+            raise schema.validation_error(cause, "mesh")
         if self.mesh is not None and self.radio.access_points:
             raise schema.validation_error("`mesh` cannot be combined with `radio.access_points`", "mesh")
         return self

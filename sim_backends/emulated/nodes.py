@@ -198,7 +198,7 @@ class EmulatedRobot(Node):
 
         Raises the errors of `open_radio`.
         """
-        interface, _ = self.spec.links.get(link, (self.spec.interface, ""))
+        interface, _ = self.spec.links.get(link, (self.spec.radio_interface, ""))
         self._worker.request({"do": "switch off", "interface": interface})
 
     def switch_on(self, link: str = "") -> None:
@@ -206,11 +206,11 @@ class EmulatedRobot(Node):
         if link in self.spec.links:
             self._worker.request({"do": "switch link on", "interface": self.spec.links[link][0]})
         else:
-            self._worker.request({"do": "switch on", "interface": self.spec.interface})
+            self._worker.request({"do": "switch on", "interface": self.spec.radio_interface})
 
     @property
     def _interfaces(self) -> list[str]:
-        return [self.spec.interface, *(self.spec.links[name][0] for name in self.link_fds)]
+        return [self.spec.radio_interface, *(self.spec.links[name][0] for name in self.link_fds)]
 
     def kill(self, process: str) -> None:
         """Kill every process of this name.

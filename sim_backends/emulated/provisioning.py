@@ -20,6 +20,7 @@ from sim_backends.emulated.robot.spec import (
     ANTENNA_M,
     LOOPBACK,
     LOOPBACK_INTERFACE,
+    MESH_INTERFACE,
     SHARED_NETWORK,
     Base,
     RobotSpec,
@@ -202,6 +203,21 @@ def ros2_middleware(profile: RobotProfile, options: EmulatedOptions) -> str:
     return ros.middleware if find_spec(package) else ""
 
 
+def profile_in_lab(profile: RobotProfile, options: EmulatedOptions) -> RobotProfile:
+    """Return a profile with the interface under test that the robot has in the lab.
+
+    In a mesh of batman-adv this is the mesh interface, even if the profile names the Wi-Fi interface below it.
+    """
+    if not options.has_batman:
+        return profile
+    radio = profile.radio.model_copy(update={"interface": MESH_INTERFACE})
+    links = {
+        name: MESH_INTERFACE if interface == profile.radio.interface else interface
+        for name, interface in profile.links.items()
+    }
+    return profile.model_copy(update={"radio": radio, "links": links})
+
+
 def link_addresses(profile: RobotProfile, address: str, options: EmulatedOptions) -> dict[str, str]:
     """Return a robot's address on each further link that the lab emulates, by the link's name.
 
@@ -218,12 +234,12 @@ def link_addresses(profile: RobotProfile, address: str, options: EmulatedOptions
     networks = {name: NETWORK.network_address + 256 * number for number, name in enumerate(sorted(options.links), 1)}
     # In a mesh, a link on the loopback interface is a second address of the robot, reachable over all other links.
     for name, interface in profile.further_links.items():
-        if interface == LOOPBACK_INTERFACE and options.mesh is not None:
+        if interface == LOOPBACK_INTERFACE and options.babel_hello_s is not None:
             networks[name] = SHARED_NETWORK.network_address
         if name not in networks:
             has_address_only = interface == LOOPBACK_INTERFACE
             example = (
-                "mesh: {daemon: babeld, hello: 0.5s}"
+                "mesh: {protocol: babel, hello: 0.5s}"
                 if has_address_only
                 else f"links: {{{name}: {{rate: 20Mbit/s, delay: 40ms}}}}"
             )
@@ -343,7 +359,7 @@ def robot_spec(
         base=_base(robot.profile, is_simulated=options.is_cosimulated)
         if has_debian_ros1 or ros2_over_radio is not None
         else None,
-        mesh_hello_s=None if options.mesh is None else options.mesh.hello,
+        mesh_hello_s=options.babel_hello_s,
         ros2=ros2_over_radio,
         bridge=_bridge(robot),
         links={

@@ -34,12 +34,15 @@ VARIANT_PACKAGE_OF: Final = {
     "dropbear": "dropbear-bin",
     "dropbearconvert": "dropbear-bin",
     "babeld": "babeld",
+    "batctl": "batctl",
     "hostapd": "hostapd",
     "iw": "iw",
     "nft": "nftables",
     "wpa_supplicant": "wpasupplicant",
 }
 """Debian package of each program that only an option of the lab needs."""
+
+_BATMAN_MODULE: Final = Path("/sys/module/batman_adv")
 
 ROS_PACKAGES: Final = ("python3-rosmaster", "python3-rosbag", "python3-rospy", "python3-sensor-msgs")
 _MASTER_FILES: Final = {ROSCORE: "python3-roslaunch", "/usr/lib/rosout/rosout": "rosout"}
@@ -71,6 +74,15 @@ def check(programs: Iterable[str] = (), *, needs_tun: bool = True) -> None:
         _check_files()
     if needs_tun:
         os.close(tun_devices.open_device())
+
+
+def check_batman() -> None:
+    """Raise ConfigurationError if the module batman-adv is not loaded; a robot's namespace cannot load it."""
+    if not _BATMAN_MODULE.exists():
+        raise ConfigurationError(
+            "`mesh: {protocol: batman-adv}` needs the kernel module batman-adv, which is not loaded",
+            remedy="as root: modprobe batman-adv; or write protocol: babel",
+        )
 
 
 def _check_files() -> None:

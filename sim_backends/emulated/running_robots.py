@@ -77,7 +77,7 @@ def running_robots(
         if options.has_linux_wifi:
             from sim_backends.emulated.linux_wifi import lab  # noqa: PLC0415 (only some labs use it)
 
-            wifi = lab.wifi_specs(robots, options.linux_wifi, options.radio)
+            wifi = lab.wifi_specs(robots, options.linux_wifi, options.radio, options.mesh)
             radios = lab.radios_of(robots.values(), options.radio)
             medium: MediumClient = stack.enter_context(lab.medium(options.radio, world, seed, radios, wifi.values()))
         elif options.is_cosimulated:
@@ -150,6 +150,6 @@ def _build(robot: EmulatedRobot, radios: "Mapping[str, HwsimRadio]") -> None:
     if radio is not None:
         radio.move_to_namespace(robot.pid)
         robot.open_wifi(radio.interface)
-        return
-    robot.open_radio(mesh=robot.spec.mesh_hello_s is not None)
+    else:
+        robot.open_radio(mesh=robot.spec.mesh_hello_s is not None)
     robot.open_links()

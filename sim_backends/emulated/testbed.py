@@ -28,11 +28,12 @@ from fieldkit.core.prompts import DONE, UNATTENDED, Answer, Operator
 from fieldkit.remote.shell import Shell
 from fieldkit.remote.ssh import RECONNECT_TIMEOUT_S, SshShell
 from sim_backends.emulated import placement as positions
-from sim_backends.emulated.emulated_options import EmulatedOptions, MeshOptions, RosChoice
+from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.medium.media import Media
 from sim_backends.emulated.mobility import Mobility
 from sim_backends.emulated.nodes import LAPTOP_RADIO, Laptop, Node
 from sim_backends.emulated.provisioning import LAPTOP_ADDRESS, NETWORK, RobotKey
+from sim_backends.emulated.robot.mesh_options import MeshOptions
 from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.running_robots import RunningRobots, running_robots
 from sim_backends.world.world import World
@@ -259,7 +260,7 @@ def laptop_on_air(running: RunningRobots[RobotKey], mesh: MeshOptions | None) ->
     In a mesh it uses the routes of the robots, and forwards no packets.
     """
     with Laptop(f"{LAPTOP_ADDRESS}/{NETWORK.prefixlen}") as laptop:
-        laptop.open_radio(mesh=mesh is not None, guest_hello_s=None if mesh is None else mesh.hello)
+        laptop.open_radio(mesh=mesh is not None, guest_hello_s=None if mesh is None else mesh.hello_s)
         running.medium.attach(laptop.name, laptop.address, LAPTOP_RADIO, laptop.radio_fd)
         yield laptop
 

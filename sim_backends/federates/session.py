@@ -85,6 +85,7 @@ class FederateSession:
         self._copies = 0
         self._released_copies: list[int] = []
         self._busy_ns: int | None = None
+        self._final_limit_s = 0.0
         self._is_closed = False
         self.name = f"{ROLES[role]} ({endpoint})"
         self.reached_ns: int | None = None
@@ -157,6 +158,7 @@ class FederateSession:
         """
         if self._is_closed:
             raise FederateError(f"the connection to {self.name} is closed")
+        self._busy_ns = None
         try:
             for number in self._released_copies:
                 self._channel.send(encode(MessageKind.RELEASE, 0, number), time.monotonic() + self._deadline_s)
@@ -188,8 +190,7 @@ class FederateSession:
     def _exchange(self, request: bytes, expected_header: Header) -> ProtocolFrame:
         """Send a request, and return the answer or the error; each `busy` message extends the wait for it."""
         start_s = time.monotonic()
-        limit_s, final_limit_s = start_s + self._deadline_s, start_s + BUSY_DEADLINE_FACTOR * self._deadline_s
-        self._busy_ns = None
+        limit_s, self._final_limit_s = start_s + self._deadline_s, start_s + BUSY_DEADLINE_FACTOR * self._deadline_s
         if self.observer is not None:
             self.observer(request, None)
         self._channel.send(request, limit_s)
@@ -199,7 +200,7 @@ class FederateSession:
             if kind is MessageKind.BUSY:
                 if number == expected_header.request:  # otherwise it belongs to an earlier request
                     self._busy_ns = decode_number(frame.body)
-                    limit_s = min(time.monotonic() + self._deadline_s, final_limit_s)
+                    limit_s = min(time.monotonic() + self._deadline_s, self._final_limit_s)
                 continue
             if self.observer is not None:
                 self.observer(request, frame)
@@ -226,10 +227,15 @@ class FederateSession:
         raise error
 
     def _fail_unanswered(self, request_text: str) -> NoReturn:
-        limit_s = self._deadline_s if self._busy_ns is None else BUSY_DEADLINE_FACTOR * self._deadline_s
-        busy_text = "" if self._busy_ns is None else f"; it last reported {seconds_text(self._busy_ns)}"
+        failure, limit_s, busy_text = "has not answered", self._deadline_s, ""
+        if self._busy_ns is not None:
+            busy_text = f"; it last reported {seconds_text(self._busy_ns)}"
+            if time.monotonic() < self._final_limit_s:
+                failure = "has sent neither an answer nor a heartbeat"
+            else:
+                limit_s *= BUSY_DEADLINE_FACTOR
         error = UnansweredError(
-            f"{self.name} has not answered for {limit_s:g} s: request to {request_text}{self._progress()}{busy_text}"
+            f"{self.name} {failure} for {limit_s:g} s: request to {request_text}{self._progress()}{busy_text}"
             f"{self._output_text()}",
             remedy="find out why it waits, or set a longer deadline",
         )

@@ -232,6 +232,14 @@ def test_signal_stops_the_robot(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
     assert world.sent[-8:] == [DriveVelocity()] * 8
 
 
+def test_signal_before_the_start_cancels_the_drive(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    world = World(tmp_path / "orders")
+    world.count_subscribers, world.is_stopped = lambda: 0, True
+    with pytest.raises(drive.DriveCancelledError):
+        run(world, monkeypatch, tmp_path)
+    assert not world.sent
+
+
 def test_missing_subscription_and_odometry_are_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     world = World(tmp_path / "orders")
     world.count_subscribers = lambda: 0

@@ -110,11 +110,15 @@ def test_plain_ssh_scp_and_sftp_reach_the_robots(lab: Path) -> None:
 DRIVE_SCRIPT: Final = "trap 'touch .jobs/drive/stationary; exit' INT; echo up; while :; do sleep 0.05; done"
 
 
+def driving_job(attempt: str, script: str) -> Job:
+    argv = ("sh", "-c", script, "python3", "../../agent-0123456789ab.pyz", "drive", '{"over": "ros1"}')
+    return Job(attempt, "drive", argv, TIMEOUT_S, "drive.log", ready="log:up")
+
+
 def test_stop_reaches_the_robots_of_a_lab(lab: Path) -> None:
-    """The program has the command line of the driver, by which `fieldkit stop` recognizes it."""
+    """The programs have the command line of the driver, by which `fieldkit stop` recognizes them."""
     attempt = jobs.work_folder("trial-a", "tcp-01-1")
-    argv = ("sh", "-c", DRIVE_SCRIPT, "python3", "../../agent-0123456789ab.pyz", "drive", '{"over": "ros1"}')
-    driver = Job(attempt, "drive", argv, TIMEOUT_S, "drive.log", ready="log:up")
+    driver = driving_job(attempt, DRIVE_SCRIPT)
     with lab_shells.open_shells(folder.of_directory(lab)) as shells:
         jobs.install(shells["ground-1"], Deadline.after(TIMEOUT_S))
         evidence.begin(shells["ground-1"], attempt, "sender", "lo")
@@ -125,6 +129,14 @@ def test_stop_reaches_the_robots_of_a_lab(lab: Path) -> None:
             ["air-1: no program of fieldkit moves it; nothing was sent to it", "ground-1: stopped (stationary)"],
         )
         assert not jobs.list_running(shells["ground-1"], Deadline.after(TIMEOUT_S))
+        next_attempt = jobs.work_folder("trial-a", "tcp-01-2")
+        evidence.begin(shells["ground-1"], next_attempt, "sender", "lo")
+        jobs.start(shells["ground-1"], driving_job(next_attempt, "trap 'exit 1' INT; echo up; sleep 60 & wait"))
+        crashed = run_here(lab, "stop", "ground-1", "--backend", "emulated")
+        assert (crashed.code, crashed.out) == (
+            3,
+            "ground-1: NOT CONFIRMED: stop it by hand; its program has exited and has not confirmed the stop\n",
+        )
     second_run = run_here(lab, "stop", "ground-1", "--backend", "emulated")
     assert (second_run.code, second_run.out) == (
         0,

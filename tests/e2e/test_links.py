@@ -19,7 +19,7 @@ roles:
 emulated:
   ros: builtin
   late_bound: 2s
-  mesh: {daemon: babeld, hello: 0.3s}
+  mesh: {protocol: babel, hello: 0.3s}
   links:
     cell: {rate: 20Mbit/s, delay: 100ms}
 """

@@ -34,7 +34,7 @@ emulated:
   ros: builtin
   world: open
   radio: {{fading: false}}
-  mesh: {{daemon: babeld, hello: {HELLO_S}s}}
+  mesh: {{protocol: babel, hello: {HELLO_S}s}}
 """
 
 

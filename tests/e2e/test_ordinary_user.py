@@ -36,7 +36,7 @@ roles:
   masterless: {{sender: robot-1, receiver: robot-2}}
 emulated:
   ros: builtin
-  mesh: {{daemon: babeld, hello: 0.5s}}
+  mesh: {{protocol: babel, hello: 0.5s}}
 EOF
 "$@" lab up
 "$@" lab ps

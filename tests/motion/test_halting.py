@@ -4,13 +4,14 @@ from pathlib import Path
 
 import pytest
 
+from fieldkit.agent.orders import CANCELLED
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LinkError, LockLostError, RobotError
 from fieldkit.core.model import Role
 from fieldkit.motion import halting
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.remote.motion_states import MotionState
+from fieldkit.remote.motion_states import UNCONFIRMED_STATES, MotionState
 from fieldkit.trial.running.locks import Holder, locked
 from tests.helpers.sshd import wait_until
 from tests.helpers.userlands import USERLANDS, LocalShell, userland_path
@@ -27,6 +28,7 @@ ALARM_SCRIPT = (
     "trap 'touch .jobs/fly/unhurried; echo 1.0 land: x >&2; echo 1.2 ALARM: IT MAY FALL >&2; trap : INT' INT; "
     "echo up; while :; do sleep 0.05; done"
 )
+IDLE_LOOP = "while :; do sleep 0.05; done"
 HANGING_SCRIPT = "trap '' INT; echo up; while :; do sleep 0.05; done"
 
 
@@ -87,6 +89,25 @@ def test_alarm_is_the_state_of_a_drone_that_does_not_land(robot: LocalShell) -> 
     (robot.home / FOLDER / ".jobs/fly/unhurried").unlink()
     assert jobs.abort(robot, "bert@two", Deadline.after(60)).landing == ()
     assert running_jobs(robot) == []
+
+
+@pytest.mark.parametrize("verb", ["drive", "fly"])
+@pytest.mark.parametrize(("exit_code", "state"), [(CANCELLED, MotionState.IDLE), (1, MotionState.ENDED)])
+def test_exit_without_a_confirmation_is_only_safe_before_the_start(
+    robot: LocalShell, verb: str, exit_code: int, state: MotionState
+) -> None:
+    evidence.begin(robot, FOLDER, "sender", "lo")
+    start(robot, verb, verb, f"trap 'exit {exit_code}' INT; echo up; {IDLE_LOOP}")
+    halted = halting.halt(robot, "bert@two", Deadline.after(60))
+    assert halted.programs == ((f"{FOLDER}/.jobs/{verb}", state),)
+    assert (halted.state in UNCONFIRMED_STATES) == (state is MotionState.ENDED)
+
+
+def test_landed_drone_is_confirmed_although_its_guard_had_nothing_to_land(robot: LocalShell) -> None:
+    evidence.begin(robot, FOLDER, "sender", "lo")
+    start(robot, "fly", "fly", f"trap 'echo 1.0 landed >&2; exit {CANCELLED}' INT; echo up; {IDLE_LOOP}")
+    start(robot, "guard", "fly", f"trap 'exit {CANCELLED}' INT; echo up; {IDLE_LOOP}")
+    assert halting.halt(robot, "bert@two", Deadline.after(60)).state is MotionState.LANDED
 
 
 def test_liveness_file_and_time_since_boot_are_read(robot: LocalShell) -> None:

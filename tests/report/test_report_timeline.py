@@ -20,6 +20,7 @@ from fieldkit.trial import procedure
 from fieldkit.trial.plan import PLAN_FILE
 from fieldkit.trial.stored import plans, sources
 from tests.helpers import recorded
+from tests.ros.bags.test_measure_bag import write_bag
 
 STARTED_NS = recorded.START_NS + 10 * recorded.SECOND_NS
 """Start of the recording; the transfer starts 2 s later, the ping 3 s later."""
@@ -111,20 +112,32 @@ def test_a_ping_without_any_reply_shows_all_its_losses(trial: Path) -> None:
     assert trips.description == "0 round trips; 10 without a reply"
 
 
-def add_step(trial: Path, text: str) -> None:
-    """Add a step to the trial's procedure."""
+def add_steps(trial: Path, *texts: str) -> None:
+    """Add steps to the trial's procedure."""
     plan = plans.read_plan(trial)
     extra = procedure.Procedure.model_validate(
         {"name": "los", "summary": "s", "scenario": "los", "topology": "master", "protocols": ["udp"], "repeats": 1}
-        | {"steps": [json.loads(text)]}
+        | {"steps": [json.loads(text) for text in texts]}
     )
     steps = (*plan.procedure.steps, *extra.steps)
     changed = plan.model_copy(update={"procedure": plan.procedure.model_copy(update={"steps": steps})})
     (trial / PLAN_FILE).write_text(schema.dump(changed), encoding="utf-8")
 
 
+def test_recordings_of_both_robots_are_drawn_on_the_clock_of_the_first(trial: Path) -> None:
+    add_steps(
+        trial,
+        '{"record": {"robot": "receiver", "topics": ["/scan"], "duration": "1s", "name": "back"}}',
+        '{"transfer": {"from": "receiver", "to": "sender", "file": "back", "name": "up"}}',
+    )
+    write_bag(trial / "repeats" / "udp-01" / "back.bag", {"/scan": 11})  # with the same time stamps as scan.bag
+    drawn_bars = bars(panels(trial)[0])
+    ahead_s = drawn_bars["record scan"][0] - drawn_bars["record back"][0]
+    assert ahead_s == pytest.approx(recorded.AHEAD_NS / 1e9, abs=0.02), "the clock of the receiver is ahead"
+
+
 def test_iperf3_has_a_panel_of_its_rate_per_second(trial: Path) -> None:
-    add_step(trial, '{"iperf3": {"from": "sender", "to": "receiver", "duration": "3s"}}')
+    add_steps(trial, '{"iperf3": {"from": "sender", "to": "receiver", "duration": "3s"}}')
     folder = write_jobs(trial, iperf3_client=(4.0, 7.0))
     intervals = [{"sum": {"seconds": 1.0, "bytes": size}} for size in (125_000, 250_000, 0)]
     test = {"start": {}, "intervals": intervals, "end": {}}
@@ -136,7 +149,7 @@ def test_iperf3_has_a_panel_of_its_rate_per_second(trial: Path) -> None:
 
 
 def test_a_topic_has_a_panel_of_its_delays_and_losses(trial: Path) -> None:
-    add_step(
+    add_steps(
         trial, '{"topics": {"from": "sender", "to": "receiver", "over": "dds", "rate": "10Hz", "bytes": "100B"}}'
     )
     folder = write_jobs(trial, publish=(4.0, 7.0))

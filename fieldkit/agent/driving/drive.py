@@ -50,6 +50,7 @@ def drive(middleware: Middleware, arguments: Mapping[str, Any], log: Path, stop_
         The reason why the drive ended early; empty if the robot is back at its origin.
 
     Raises:
+        DriveCancelledError: `stop_event` was set before the start; no velocity was published.
         MiddlewareError: The velocity topic has no subscription, or no odometry arrives.
         OSError: The log or the status file cannot be written; the robot was stopped if it was driving.
     """
@@ -102,6 +103,10 @@ def drive(middleware: Middleware, arguments: Mapping[str, Any], log: Path, stop_
     return stop_reason
 
 
+class DriveCancelledError(Exception):
+    """`stop_event` was set before the start: the robot was not driven."""
+
+
 class _VelocityPublisher:
     """Publishes velocities with the time of the robot's clock."""
 
@@ -120,12 +125,13 @@ def _wait_for_subscription(
     """Wait until the base of the robot has subscribed to the velocity topic.
 
     Raises:
-        MiddlewareError: The base has not subscribed in time, or `stop_event` is set. If the topic has endpoints of
-            other types, the message lists these types.
+        DriveCancelledError: `stop_event` was set.
+        MiddlewareError: The base has not subscribed in time. If the topic has endpoints of other types, the message
+            lists these types.
     """
     if _wait_until(lambda: publisher.matched() > 0, stop_event):
         return
-    other_types = set() if stop_event.is_set() else middleware.other_types(command)
+    other_types = middleware.other_types(command)
     hint = (
         f", but it has endpoints of type {', '.join(sorted(other_types))}: change drive.type in the robot's profile"
     )
@@ -133,10 +139,16 @@ def _wait_for_subscription(
 
 
 def _wait_until(condition: Callable[[], bool], stop_event: threading.Event) -> bool:
-    """Return True when the condition is true, False after `_TIMEOUT_S` or when `stop_event` is set."""
+    """Return True when the condition is true, False after `_TIMEOUT_S`.
+
+    Raises:
+        DriveCancelledError: `stop_event` was set.
+    """
     deadline_s = time.monotonic() + _TIMEOUT_S
     while not condition():
-        if stop_event.wait(0.02) or time.monotonic() > deadline_s:
+        if stop_event.wait(0.02):
+            raise DriveCancelledError
+        if time.monotonic() > deadline_s:
             return False
     return True
 

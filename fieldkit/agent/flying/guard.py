@@ -16,7 +16,6 @@ from fieldkit.agent.autopilots.mavlink_frames import HEARTBEAT, LOCAL_POSITION_N
 from fieldkit.agent.flying import liveness
 from fieldkit.agent.flying.flight_plan import LEAVE, STAY, FlightPlan
 from fieldkit.agent.flying.landing import (
-    CANCELLED,
     LEASE_EXPIRED,
     PEER_STOPPED,
     FlightError,
@@ -28,7 +27,7 @@ from fieldkit.agent.flying.landing import (
 from fieldkit.agent.flying.liveness import ENDED, FLYING, LANDING, LivenessFile
 from fieldkit.agent.flying.loop import GAP_S, RATE_HZ, wait_for_heartbeat
 from fieldkit.agent.flying.session import AutopilotSession
-from fieldkit.agent.orders import Orders
+from fieldkit.agent.orders import CANCELLED, Orders
 
 
 class FlightGuard:

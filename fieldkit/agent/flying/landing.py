@@ -16,10 +16,10 @@ from fieldkit.agent.autopilots.mavlink_frames import ACCEPTED
 from fieldkit.agent.autopilots.px4 import Px4
 from fieldkit.agent.flying.session import AutopilotSession
 
-LEASE_EXPIRED, REFUSED, TAKEN_OVER, CANCELLED, PEER_STOPPED, FENCE_BREACHED = 4, 5, 6, 7, 8, 9
+LEASE_EXPIRED, REFUSED, TAKEN_OVER, PEER_STOPPED, FENCE_BREACHED = 4, 5, 6, 8, 9
 """Exit codes: the lease expired (4); the autopilot refused a command or did not answer (5); a person or another
-program flies the drone (6); the job was cancelled (7); the guard has stopped, or in the guard: the pilot has stopped
-(8); the drone was outside its fence (9)."""
+program flies the drone (6); the guard has stopped, or in the guard: the pilot has stopped (8); the drone was outside
+its fence (9). `orders.CANCELLED` is 7."""
 
 RETRY_S = 0.4
 """Retry interval of a command without an answer."""

@@ -10,7 +10,6 @@ from fieldkit.agent.autopilots.autopilot import AutopilotState, status_text
 from fieldkit.agent.autopilots.mavlink_frames import ATTITUDE, GLOBAL_POSITION_INT, HEARTBEAT, LOCAL_POSITION_NED
 from fieldkit.agent.flying.flight_plan import CLIMB, GO, HOME, LEAVE, STAY, FlightPlan
 from fieldkit.agent.flying.landing import (
-    CANCELLED,
     COMMAND_TIMEOUT_S,
     FENCE_BREACHED,
     LEASE_EXPIRED,
@@ -24,7 +23,7 @@ from fieldkit.agent.flying.landing import (
 from fieldkit.agent.flying.liveness import FLYING, IDLE, LANDING, PILOT, LivenessFile
 from fieldkit.agent.flying.origin import FlightFence, FlightOrigin, Position
 from fieldkit.agent.flying.session import AutopilotSession
-from fieldkit.agent.orders import Orders
+from fieldkit.agent.orders import CANCELLED, Orders
 
 RATE_HZ = 10.0
 """Rate of iterations, of set-points, and of the reports in `_STREAMS`."""

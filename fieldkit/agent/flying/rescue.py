@@ -27,9 +27,10 @@ _ALARM_DELAY_S = 4.0
 
 
 def rescue(plan: FlightPlan) -> None:
-    """Kill the pilot and the guard, and land the drone if it is still under their control (`is_under_control`).
+    """Land the drone if it is still under the control of the pilot and the guard (`is_under_control`).
 
-    The file with the laptop's orders to the pilot is not read.
+    Both are killed first, so that a suspended one cannot continue. The file with the laptop's orders to the pilot is
+    not read.
 
     Args:
         plan: A plan with the liveness file that the pilot and the guard share.

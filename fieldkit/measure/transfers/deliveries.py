@@ -102,7 +102,7 @@ def udp_stream_deliveries(packets: UdpPackets, in_stream: Mask, schedule: FlowSc
     if (received_packets & matched.possible_copy).any():
         raise EvidenceError("packets of the flow cannot be distinguished, and received packets may be copies")
     sent_ns = packets.sent.time_ns[stream_packets]
-    _require_times(sent_ns, packets.received.time_ns[received_packets])
+    require_times(sent_ns, packets.received.time_ns[received_packets])
     complete_ns = arrivals_ns(packets)[in_stream]
     at_ns = np.sort(complete_ns[complete_ns != NO_TIME])
     index = np.flatnonzero(stream_packets & matched.arrived)
@@ -130,7 +130,7 @@ def tcp_stream_deliveries(frames: TcpFrames, answers: Packets, schedule: FlowSch
         EvidenceError: The deliveries cannot be determined from the captures.
     """
     sent, received = frames.sent, frames.received
-    _require_times(sent.time_ns, received.time_ns)
+    require_times(sent.time_ns, received.time_ns)
     advancing, received_contiguous = advancing_frames(received)
     _, sent_contiguous = advancing_frames(sent)
     has_payload = received_contiguous > schedule.head_bytes
@@ -230,8 +230,12 @@ def _sender_to_receiver_ns(pairs: StampPairs) -> tuple[int, int]:
     return start_offset_ns, end_offset_ns
 
 
-def _require_times(sent_ns: Ints, received_ns: Ints) -> None:
-    """Raise an error if the times in the captures cannot be used to compute durations."""
+def require_times(sent_ns: Ints, received_ns: Ints) -> None:
+    """Check that the times in the captures can be used to compute durations.
+
+    Raises:
+        EvidenceError: The sender's capture has no packet of the flow, a time is missing, or a clock was set back.
+    """
     if not len(sent_ns):
         raise EvidenceError("no packet of the flow is in the sender's capture")
     for times_ns in (sent_ns, received_ns):

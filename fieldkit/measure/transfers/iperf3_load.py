@@ -162,8 +162,8 @@ JITTER_CROSS_CHECKS: Final = (
         source="both captures: times of sending and arrival of each datagram",
         against=("both captures: packets of the other direction, and the clock offset that fits all packets",),
         tolerance=(
-            "an unknown clock drift of 0.1 ms per second; no other source records the time of a single datagram, but "
-            "because packets are captured in order, this time can be wrong by at most 0.1 s"
+            "an unknown clock drift of 0.1 ms per second; packets may be out of order by 0.1 s, because two "
+            "processors capture them; no other source records the time of a single datagram"
         ),
         outcome=CheckOutcome.WITHHELD,
     ),
@@ -341,8 +341,7 @@ def _transits_ns(load: LoadStreams, sender: Packets, receiver: Packets) -> Itera
     if clocks is None:
         raise EvidenceError("no packet from receiver to sender is in both captures")
     matched = _udp_packets(load, sender, receiver)
-    if any((packets.time_ns == NO_TIME).any() for packets in (matched.sent, matched.received)):
-        raise EvidenceError("a capture lacks times")
+    deliveries.require_times(matched.sent.time_ns, matched.received.time_ns)
     first, arrived_ns = matched.sent.where(matched.first), deliveries.arrivals_ns(matched)
     for mask in load.datagram_masks(first):
         if (np.append(mask, False)[matched.datagram] & matched.match.ambiguous).any():

@@ -27,8 +27,8 @@ class FlyPlan:
     """Commanded flight of a drone.
 
     Attributes:
-        highest_m: Largest height.
-        farthest_m: Largest horizontal distance from the take-off position.
+        highest_m: Largest height over the ground from which the drone takes off.
+        farthest_m: Largest horizontal distance from the origin of the trial's flights (see `fly_log`).
         fastest_m_s: Speed limit.
         window: Readings of the clock of the drone's computer before and after the attempt, nanoseconds since 1970
             UTC; None if unknown.

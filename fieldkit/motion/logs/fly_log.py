@@ -2,8 +2,9 @@
 
 fieldkit's agent on the drone writes a JSON object per line, ten times a second (`fieldkit.agent.flying.flight_log`):
 time, phase of the flight, and the autopilot's position estimate. Horizontal positions are relative to the origin of
-the trial's flights, which is the position and heading of the first start. Heights are relative to the ground before
-this take-off. All values are measurements of the drone. The first line contains the origin.
+the trial's flights, which is the position and heading before the first take-off of the trial. Heights are relative to
+the ground from which the drone took off for the flight of the log. All values are measurements of the drone. The
+first line contains the origin.
 """
 
 import math
@@ -75,7 +76,7 @@ class FlightMoment:
         phase: Phase of the flight, for example `flying`.
         ahead_m: Position ahead of the origin.
         left_m: Position to the left of the origin.
-        up_m: Height over the ground on which the drone was before this take-off.
+        up_m: Height over the ground from which the drone took off for this flight.
         speed_m_s: Speed of the drone.
         utc_ns: Time by the clock of the drone's computer, nanoseconds since 1970 UTC; 0 if the line does not have it.
     """

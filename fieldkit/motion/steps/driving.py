@@ -230,8 +230,9 @@ def _network(robot: Robot, middleware: MiddlewareName) -> dict[str, Any]:
 def drive_robot(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name_pattern: str) -> Iterator[DriveLease]:
     """Drive a robot along its path while the body runs, and back to its place afterwards; yield its lease.
 
-    After an error in the body the robot drives back, too. A real robot that cannot drive back stays where it is until
-    a person has confirmed that it is at its place. After an interruption (Ctrl-C) the robot stops where it is.
+    After an error in the body the robot drives back, too. A real robot that cannot drive back stays where it is; no
+    robot moves again before a person has put it at its place and confirmed this. After an interruption (Ctrl-C) the
+    robot stops where it is.
 
     Raises:
         LinkError: The robot did not answer.

@@ -90,8 +90,8 @@ class Sources:
     def sweep_columns(self) -> Mapping[str, str]:
         """The columns that define a condition of a sweep (co-simulations with varied parameters).
 
-        The value of each is the column with its values as the user typed them (`datasets.condition`). The mapping is
-        empty if a table is not a sweep.
+        Maps each column to the column that has the same values as the user typed them (`datasets.condition`). The
+        mapping is empty if a table is not a sweep.
         """
         if not all(table.is_dir() for table in self.tables):
             return {}

@@ -68,7 +68,8 @@ class LoggedLink:
         width_mhz: Channel width.
         streams: Number of spatial streams; with `phy_rate_bit_s`, the largest number.
         guard_interval_ns: Guard interval.
-        mcs: MCS as the standard numbers it: in 802.11n, 8 to 15 have two streams. None if it is not logged.
+        mcs: MCS as the standard numbers it: in 802.11n, 8 to 15 have two streams. None if it is not logged. 802.11a
+            and g have none.
         phy_rate_bit_s: PHY rate, or a mean of PHY rates; the link uses the mode with the nearest rate. None if it is
             not logged. Without MCS and PHY rate, the link selects its modes as Linux's minstrel_ht does.
         protocol: Transport, `tcp` or `udp`.
@@ -143,7 +144,8 @@ class LoggedLink:
         """Yield the mode with the logged MCS; without MCS, all modes with up to `streams` streams."""
         amendment, band_name = self._split_standard()
         if amendment not in _PREFIXES:
-            yield from OFDM_MODES[band_name]
+            if self.mcs is None:
+                yield from OFDM_MODES[band_name]
             return
         all_streams = range(1, self.streams + 1) if self.mcs is None else (self._streams,)
         numbers = range(2 * _MCS_PER_STREAM) if self.mcs is None else (self.mcs,)

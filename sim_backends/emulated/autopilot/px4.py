@@ -18,8 +18,6 @@ from sim_backends.emulated.autopilot.parameters import (
 )
 
 _d = dialect
-_CRITICAL: Final = 0.07
-"""Default of BAT_CRIT_THR, which is the arming limit if COM_ARM_BAT_MIN is negative."""
 
 
 def _custom(main: int, sub: int = 0) -> int:
@@ -60,7 +58,7 @@ def _parameters_within(limits: FlightLimits) -> tuple[Parameter, ...]:
     """Return PX4's parameters (https://docs.px4.io/main/en/advanced_config/parameter_reference)."""
     return (
         *_WITHOUT_EFFECT,
-        Parameter("BAT_CRIT_THR", _CRITICAL, 0.05, 0.5),
+        Parameter("BAT_CRIT_THR", 0.07, 0.05, 0.5),
         Parameter("BAT_EMERGEN_THR", 0.05, 0.03, 0.5),
         Parameter("BAT_LOW_THR", 0.15, 0.12, 0.5),
         Parameter("COM_ARM_BAT_MIN", -1.0, -1.0, 0.9),
@@ -96,8 +94,9 @@ def _parameters_within(limits: FlightLimits) -> tuple[Parameter, ...]:
 
 
 def _arming_errors(parameters: Parameters, battery: Battery) -> list[str]:
-    minimum = parameters["COM_ARM_BAT_MIN"]
-    return ["Low battery"] if battery.charge < (minimum if minimum >= 0 else _CRITICAL) else []
+    # A negative COM_ARM_BAT_MIN means that only a critical battery prevents arming.
+    minimum = parameters["COM_ARM_BAT_MIN"] if parameters["COM_ARM_BAT_MIN"] >= 0 else parameters["BAT_CRIT_THR"]
+    return ["Low battery"] if battery.charge < minimum else []
 
 
 def _mode_refusal(mode: Mode, conditions: ModeConditions) -> ModeRefusal | None:

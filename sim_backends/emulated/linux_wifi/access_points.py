@@ -28,18 +28,6 @@ ip link add name {bridge} type bridge && ip link set {bridge} up || exit
 exec hostapd {files}
 """
 """Shell script of the process; it waits for an input line, which is sent when the radios are in its namespace."""
-_RULES: Final = """\
-table netdev fieldkit {{
-    chain output {{
-        type filter hook egress devices = {{ {interfaces} }} priority 0
-        meta priority set 0:0107
-    }}
-}}
-"""
-"""nftables rules that assign the frames that the bridge forwards to access category VO.
-
-On robots, `wireless` has the same rule with the hook `output`, which forwarded frames do not pass.
-"""
 _BEACON_INTERVALS_TU: Final = (100, 101, 103, 107, 109, 113)
 """Intervals of the beacons in time units (1024 us); the seventh access point has the first interval again.
 
@@ -74,8 +62,7 @@ class AccessPoints:
         for number, radio in enumerate(radios.values()):
             files.append(f"{number}.conf")
             (folder / files[-1]).write_text(configuration(radio.interface, wifi, number), encoding="ascii")
-        interfaces = ", ".join(radio.interface for radio in radios.values())
-        (folder / "rules").write_text(_RULES.format(interfaces=interfaces))
+        (folder / "rules").write_text(wireless.priority_rules(*(radio.interface for radio in radios.values())))
         self._log = folder / "hostapd.log"
         argv = ("setpriv", "--pdeathsig", "KILL", "--", "unshare", "--net", "--", "sh", "-c")
         with self._log.open("wb") as log:

@@ -12,6 +12,7 @@ from typing import Final
 from fieldkit.core.deadline import Deadline
 from sim_backends.emulated.linux_wifi.virtual_machine import (
     INTERRUPT,
+    MESH_PACKAGE_OF,
     PACKAGE_OF,
     find_program,
     kernel_roots,
@@ -19,6 +20,7 @@ from sim_backends.emulated.linux_wifi.virtual_machine import (
     run_in_machine,
 )
 from sim_backends.emulated.process import worker
+from sim_backends.emulated.robot.mesh_options import MeshOptions
 
 _MAX_DURATION_S: Final = 7 * 24 * 3600.0
 """Time limit of a command: a week."""
@@ -34,13 +36,14 @@ exec """
 """Beginning of the line that runs the command: when the file `INTERRUPT` appears, a loop sends the command SIGINT."""
 
 
-def run_command(argv: Sequence[str], results: Path, *, radios: int) -> int:
+def run_command(argv: Sequence[str], results: Path, *, radios: int, mesh: MeshOptions | None = None) -> int:
     """Run a command of fieldkit in a new virtual machine; this process writes the output of the command.
 
     Args:
         argv: The words after `fieldkit`.
         results: Folder of the host that the command may change, created if it is missing. Other changes are lost.
         radios: Number of radios.
+        mesh: The robots' mesh, which may need further programs and kernel modules.
 
     Returns:
         Exit code of the command.
@@ -49,7 +52,7 @@ def run_command(argv: Sequence[str], results: Path, *, radios: int) -> int:
         ConfigurationError: A program, or the kernel of the machine, is not installed.
         TestbedLostError: The machine ended before the command.
     """
-    kernel = require_machine()
+    kernel = require_machine(mesh=mesh)
     results.mkdir(parents=True, exist_ok=True)
     # Ctrl-C interrupts the command in the machine, which finishes its repeat. A second Ctrl-C ends the machine.
     previous_handler = signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -73,7 +76,7 @@ def prologue(folder: Path) -> str:
     # are created in /usr/local/sbin, which is in this PATH.
     links = [
         shlex.join(("ln", "-sf", path, f"/usr/local/sbin/{name}"))
-        for name in PACKAGE_OF
+        for name in PACKAGE_OF | MESH_PACKAGE_OF
         if shutil.which(name, path=worker.PATH) is None and (path := find_program(name, kernel_roots())) is not None
     ]
     variables = {

@@ -22,6 +22,7 @@ from sim_backends.emulated.linux_wifi.lab_relay import CONNECTED, GuestLogin
 from sim_backends.emulated.linux_wifi.streams import ChannelStreams
 from sim_backends.emulated.linux_wifi.virtual_machine import CHANNEL, Machine, require_machine, started_machine
 from sim_backends.emulated.process import worker
+from sim_backends.emulated.robot.mesh_options import MeshOptions
 from sim_backends.emulated.robot.spec import USER
 
 Answer = TypeVar("Answer")
@@ -155,6 +156,7 @@ def bring_up(
     seed: int,
     radios: int,
     draw: Callable[[Mapping[str, Vector]], Overview],
+    mesh: MeshOptions | None = None,
 ) -> Iterator[GuestLab]:
     """Yield the lab in a new virtual machine.
 
@@ -164,12 +166,13 @@ def bring_up(
         seed: Seed of all random numbers of the lab.
         radios: Number of radios.
         draw: Returns the plan view for the positions of the robots.
+        mesh: The robots' mesh, which may need further programs and kernel modules.
 
     Raises:
         ConfigurationError: A program, or the kernel of the machine, is not installed.
         TestbedLostError: The machine, or the lab in it, ended.
     """
-    kernel = require_machine()
+    kernel = require_machine(mesh=mesh)
     host_end, machine_end = socket.socketpair()
     with host_end, machine_end:
         script = _script(site, Path.cwd(), seed)

@@ -80,11 +80,12 @@ poweroff -f
 """
 
 
-def build_initrd(modules: Path, *, radios: int, job: str, output: str) -> bytes:
+def build_initrd(modules: Path, extra_modules: Iterable[str] = (), *, radios: int, job: str, output: str) -> bytes:
     """Return the archive.
 
     Args:
         modules: Folder of the kernel's modules, `/lib/modules/VERSION`.
+        extra_modules: Names of modules that the machine loads in addition to `MODULES`.
         radios: Number of radios of hwsim.
         job: Name of a shell script in the folder that the machine shares; it runs on the host's files, and the
             machine switches off at its end.
@@ -94,7 +95,7 @@ def build_initrd(modules: Path, *, radios: int, job: str, output: str) -> bytes:
     Raises:
         ConfigurationError: A program, library or module is missing.
     """
-    ordered = module_order(modules, MODULES)
+    ordered = module_order(modules, (*MODULES, *extra_modules))
     files = {"init": (0o755, _START.format(radios=radios, job=job, output=output).encode())}
     files["modules"] = 0o644, "\n".join(ordered).encode()
     files |= {f"lib/{name}.ko": (0o644, without_signature(module)) for name, module in ordered.items()}

@@ -11,6 +11,7 @@ from typing import Final
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError
 from sim_backends.emulated.process.worker import PATH
+from sim_backends.emulated.robot.network import MTU_BYTES
 
 _FOLDER: Final = Path("/sys/class/ieee80211")
 _CLASS: Final = "mac80211_hwsim"
@@ -23,7 +24,7 @@ _RETURN_S: Final = 5.0
 """Default wait until the kernel has moved the radios of a lab back, after the last process of the lab has exited."""
 _POLL_S: Final = 0.05
 _TIMEOUT_S: Final = 60.0
-"""Timeout of `iw`."""
+"""Timeout of `iw` and `ip`."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class HwsimRadio:
     monitors: tuple[str, ...] = ()
 
     def move_to_namespace(self, pid: int) -> None:
-        """Delete the monitor interfaces, and move the radio into the network namespace of a process.
+        """Remove the settings of an earlier lab, and move the radio into the network namespace of a process.
 
         When that namespace ends, the kernel moves the radio to the initial network namespace.
 
@@ -51,15 +52,29 @@ class HwsimRadio:
             RobotError: The kernel refused the move.
         """
         for monitor in self.monitors:
-            self._run("dev", monitor, "del")
-        self._run("phy", self.phy, "set", "netns", str(pid))
+            _run("iw", "dev", monitor, "del")
+        reset_link(self.interface)
+        _run("iw", "phy", self.phy, "set", "netns", str(pid))
 
-    def _run(self, *words: str) -> None:
-        argv = (shutil.which("iw", path=PATH) or "iw", *words)
-        result = subprocess.run(argv, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
-        if result.returncode:
-            cause = result.stderr.strip()
-            raise RobotError(f"cannot move {self.phy} to a robot: {cause}", remedy="start the lab again")
+
+def reset_link(interface: str) -> None:
+    """Give an interface the default link mode and MTU, which it keeps when it is moved between namespaces.
+
+    A station's wpa_supplicant sets the link mode `dormant` (RFC 2863) and does not reset it when it is killed. The
+    interface would then be dormant in an ad hoc cell, too, and would have no IPv6 address, which babeld needs.
+
+    Raises:
+        RobotError: The kernel refused the settings.
+    """
+    _run("ip", "link", "set", interface, "mode", "default", "mtu", str(MTU_BYTES))
+
+
+def _run(program: str, *words: str) -> None:
+    argv = (shutil.which(program, path=PATH) or program, *words)
+    result = subprocess.run(argv, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
+    if result.returncode:
+        cause = result.stderr.strip()
+        raise RobotError(f"cannot move a radio to a robot: {program}: {cause}", remedy="start the lab again")
 
 
 def find_radios(folder: Path = _FOLDER) -> list[HwsimRadio]:

@@ -19,7 +19,7 @@ import subprocess
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -27,6 +27,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, TestbedLostError
 from sim_backends.emulated.linux_wifi.initrd import build_initrd, find_modules
 from sim_backends.emulated.process.worker import PATH
+from sim_backends.emulated.robot.mesh_options import MeshOptions
 
 PACKAGE_OF: Final = {
     "qemu-system-x86_64": "qemu-system-x86",
@@ -37,7 +38,11 @@ PACKAGE_OF: Final = {
     "hostapd": "hostapd",
     "wpa_supplicant": "wpasupplicant",
 }
-"""Debian package of each program."""
+"""Debian package of each program that every machine needs."""
+
+MESH_PACKAGE_OF: Final = {"babeld": "babeld", "batctl": "batctl"}
+"""Debian package of each program that only a mesh needs."""
+_BATMAN_MODULE: Final = "batman_adv"
 
 ROOT_VARIABLE: Final = "FIELDKIT_WIFI_ROOT"
 """Environment variable with a folder in which packages were extracted instead of being installed."""
@@ -78,10 +83,12 @@ class Kernel:
     Attributes:
         image: Its boot image.
         modules: Folder of its modules.
+        extra_modules: Modules that a machine loads in addition to `initrd.MODULES`.
     """
 
     image: Path
     modules: Path
+    extra_modules: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -136,17 +143,20 @@ def uncompressed_kernel(image: bytes) -> bytes:
     return lzma.LZMADecompressor(lzma.FORMAT_XZ).decompress(payload)
 
 
-def require_machine(roots: Sequence[Path] | None = None) -> Kernel:
+def require_machine(roots: Sequence[Path] | None = None, *, mesh: MeshOptions | None = None) -> Kernel:
     """Return the kernel of the machine.
 
     Args:
         roots: Folders with `boot/`, `lib/modules/` and programs; None for the folders of `kernel_roots`.
+        mesh: The robots' mesh, which needs further programs or modules.
 
     Raises:
         ConfigurationError: The kernel or a program is missing; the message lists everything that is missing.
     """
     roots = kernel_roots() if roots is None else roots
-    missing = {name: package for name, package in PACKAGE_OF.items() if find_program(name, roots) is None}
+    mesh_programs = () if mesh is None else (mesh.program,)
+    package_of = PACKAGE_OF | {program: MESH_PACKAGE_OF[program] for program in mesh_programs}
+    missing = {name: package for name, package in package_of.items() if find_program(name, roots) is None}
     kernel = find_kernel(roots)
     if kernel is None:
         missing["a kernel with mac80211_hwsim"] = "linux-image-amd64"
@@ -156,6 +166,8 @@ def require_machine(roots: Sequence[Path] | None = None) -> Kernel:
             f"Linux's Wi-Fi needs programs that are not installed: {', '.join(missing)}",
             remedy=f"on Debian, as root: apt-get install --no-install-recommends {packages}",
         )
+    if mesh is not None and mesh.protocol == "batman-adv":
+        return replace(kernel, extra_modules=(_BATMAN_MODULE,))
     return kernel
 
 
@@ -274,7 +286,9 @@ def started_machine(
             script = _mount_command(results) + script
         (shared / _JOB).write_text(script, encoding="utf-8")
         (folder / "kernel").write_bytes(uncompressed_kernel(kernel.image.read_bytes()))
-        (folder / "initrd").write_bytes(build_initrd(kernel.modules, radios=radios, job=_JOB, output=_OUTPUT))
+        (folder / "initrd").write_bytes(
+            build_initrd(kernel.modules, kernel.extra_modules, radios=radios, job=_JOB, output=_OUTPUT)
+        )
         descriptors = () if channel is None else (channel.fileno(),)
         with (folder / "errors").open("wb") as errors:
             process = subprocess.Popen(

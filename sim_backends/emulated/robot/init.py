@@ -21,7 +21,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, RobotError
 from sim_backends.emulated.process import worker
 from sim_backends.emulated.process.worker import Message
-from sim_backends.emulated.robot import mounts, network, rootfs, services, wireless
+from sim_backends.emulated.robot import mounts, network, rootfs, services
 from sim_backends.emulated.robot.services import Service
 from sim_backends.emulated.robot.spec import HOME, LOOPBACK_INTERFACE, START_S, STATE, RobotSpec, WifiSpec
 from sim_backends.emulated.robot.velocity_command import VELOCITY_COMMAND
@@ -238,8 +238,11 @@ class Init:
         """Execute a request that changes a network interface."""
         match request["do"]:
             case "open wifi":
-                self._wifi, self._interface = WifiSpec(**request["wifi"]), request["interface"]
-                wireless.bring_up(request["device"], request["interface"], request["address"], self._wifi)
+                from sim_backends.emulated.robot import wireless  # noqa: PLC0415 (only some labs use it)
+
+                wifi, interface = WifiSpec(**request["wifi"]), request["interface"]
+                self._wifi, self._interface = wifi, wifi.radio_interface(interface)
+                wireless.bring_up(request["device"], interface, request["address"], wifi)
             case "switch off":
                 network.switch_off(request["interface"])
             case "switch on":
@@ -248,9 +251,12 @@ class Init:
                 network.switch_on_link(request["interface"])
 
     def _switch_on(self, interface: str) -> None:
-        network.switch_on(interface)
-        if self._wifi is not None:
-            wireless.rejoin(interface, self._wifi)
+        if self._wifi is None:
+            network.switch_on(interface)
+        else:
+            from sim_backends.emulated.robot import wireless  # noqa: PLC0415 (only some labs use it)
+
+            wireless.switch_on(interface, self._wifi)
 
     def _spawn(self, spec: RobotSpec) -> list[Service]:
         """Start the robot's services without waiting for them, because requests are served one at a time."""

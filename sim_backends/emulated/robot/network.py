@@ -99,7 +99,7 @@ def bring_up(interface: str, address: str, *, mesh: bool = False) -> int:
 def _open_device(interface: str, address: str, *, mesh: bool) -> int:
     fd = open_tun(interface, ethernet=mesh)
     if mesh:
-        _prepare_mesh(interface)
+        prepare_mesh(interface)
         mac = mac_of(IPv4Interface(address).ip).hex(":")
         run_ip(f"link set {interface} address {mac}")
     return fd
@@ -196,7 +196,7 @@ def has_listener(port: int) -> bool:
     return any(local in line[:21] and line.split()[3] == listening for line in lines)
 
 
-def _prepare_mesh(interface: str) -> None:
+def prepare_mesh(interface: str) -> None:
     """Enable forwarding, and link-local addresses without duplicate detection, since no other robot has this MAC."""
     settings = {
         "ipv4/conf/all/forwarding": 1,

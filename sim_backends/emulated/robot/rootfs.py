@@ -59,6 +59,7 @@ _ALL_NETCATS: Final = ("nc", "netcat", "nc.traditional", "nc.openbsd", "ncat")
 _KEPT_WITH_BUSYBOX: Final = (
     "babeld",
     "bash",
+    "batctl",
     "busybox",
     "dropbear",
     "hostapd",

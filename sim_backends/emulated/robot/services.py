@@ -15,7 +15,7 @@ from fieldkit.core.model import BRIDGE_IS_UP, ROS_MASTER_PORT
 from fieldkit.remote.command import with_environment
 from sim_backends.emulated.autopilot import mavlink_server as autopilot
 from sim_backends.emulated.process import worker
-from sim_backends.emulated.robot import base_process, network, ssh_server, wireless
+from sim_backends.emulated.robot import base_process, network, ssh_server
 from sim_backends.emulated.robot.spec import ANTENNA_M, HOME, ROSCORE, SSH_PORT, STATE, RobotSpec
 from sim_backends.emulated.ros import sensors, static_frames, tcpros
 from sim_backends.emulated.ros.lab_positions import Neighbourhood
@@ -165,9 +165,12 @@ def services(spec: RobotSpec, neighbourhood: Neighbourhood | None = None) -> lis
 def _network_services(spec: RobotSpec) -> Iterator[Service]:
     """Yield the programs of the robot's radio: hostapd or wpa_supplicant, and the routing daemon of a mesh."""
     wifi = spec.wifi
-    if wifi is not None and wifi.mode in wireless.PROGRAMS:
-        argv = wireless.prepare_command(spec.interface, wifi)
-        yield _program(wireless.PROGRAMS[wifi.mode], argv, {}, partial(wireless.is_connected, wifi))
+    if wifi is not None:
+        from sim_backends.emulated.robot import wireless  # noqa: PLC0415 (only some labs use it)
+
+        if wifi.mode in wireless.PROGRAMS:
+            argv = wireless.prepare_command(spec.interface, wifi)
+            yield _program(wireless.PROGRAMS[wifi.mode], argv, {}, partial(wireless.is_connected, wifi))
     if spec.mesh_hello_s is not None:
         argv = network.babeld_command(spec.interface, spec.address, spec.mesh_hello_s, dict(spec.links.values()))
         yield _program("babeld", argv, {}, network.PID_FILE.exists)

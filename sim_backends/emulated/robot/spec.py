@@ -44,8 +44,10 @@ LOOPBACK: Final = "127.0.0.1"
 ANTENNA_M: Final = 0.2
 """Height of an antenna over the ground: a TurtleBot3 Burger is 0.19 m high (ROBOTIS e-Manual)."""
 
-HELLO_S: Final = 4.0
-"""Default hello interval of babeld on wireless interfaces."""
+MESH_INTERFACE: Final = "bat0"
+"""Mesh interface of batman-adv."""
+WIFI_INTERFACE: Final = "wlan0"
+"""Wi-Fi interface below that mesh interface."""
 
 _KERNEL_FOLDERS: Final = ("/proc/", "/sys/", "/dev/")
 
@@ -109,6 +111,9 @@ class WifiSpec:
         has_monitor: True if the robot has a monitor interface, which captures all frames of its radio.
         background_scan: Setting `bgscan` of wpa_supplicant, with which a station finds other access points; or empty.
         channels: Number of channels of the 2.4 GHz band, from the first, that a station scans.
+        forwards: True if the robot forwards IP packets, and its routing daemon finds the routes.
+        originator_s: Originator interval of batman-adv, whose mesh interface then has the robot's address; None
+            without batman-adv.
     """
 
     mode: Literal["ad hoc", "mesh point", "access point", "station"]
@@ -117,6 +122,12 @@ class WifiSpec:
     has_monitor: bool = False
     background_scan: str = ""
     channels: int = 1
+    forwards: bool = False
+    originator_s: float | None = None
+
+    def radio_interface(self, interface: str) -> str:
+        """Return the name of the Wi-Fi interface of a robot with this interface under test."""
+        return interface if self.originator_s is None else WIFI_INTERFACE
 
 
 @dataclass(frozen=True)
@@ -158,7 +169,7 @@ class RobotSpec:
         netcat: Its only netcat, as `nc` and by its full name; None for the netcat of this machine or of the userland.
         scripts: Programs that only this robot has: shell scripts by name.
         ping: Its `ping`; None for the `ping` of this machine or of the userland.
-        mesh_hello_s: Hello interval of its routing daemon; None for a robot that does not forward packets.
+        mesh_hello_s: Hello interval of its routing daemon; None for a robot without a routing daemon.
         ros2: Settings of its ROS 2 nodes; None if no ROS 2 node communicates over the radio.
         routes_zenoh: True if it runs the Zenoh router.
         wifi: Settings of its Linux Wi-Fi; None for a robot whose radio is a TUN or TAP device.
@@ -211,6 +222,11 @@ class RobotSpec:
     def ip(self) -> str:
         """The address without the prefix length."""
         return self.address.partition("/")[0]
+
+    @property
+    def radio_interface(self) -> str:
+        """The interface of the radio itself; in a mesh of batman-adv, `interface` is the mesh interface above it."""
+        return self.interface if self.wifi is None else self.wifi.radio_interface(self.interface)
 
     @property
     def shares_master(self) -> bool:

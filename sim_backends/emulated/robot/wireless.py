@@ -1,14 +1,17 @@
 """Linux Wi-Fi on an emulated robot.
 
 The robot joins an ad hoc cell or an 802.11s mesh, runs an access point (hostapd), or is a station (wpa_supplicant).
+Above an ad hoc cell, it may have a mesh interface of batman-adv.
 """
 
 import shutil
 import subprocess
+from ipaddress import IPv4Interface
 from pathlib import Path
 from typing import Final
 
 from fieldkit.core.errors import RobotError
+from sim_backends.emulated.medium.framing import mac_of
 from sim_backends.emulated.robot import network
 from sim_backends.emulated.robot.spec import STATE, WifiSpec
 
@@ -25,21 +28,23 @@ _JOIN: Final = {
     "ad hoc": ("ibss", "join", SSID, str(_FREQUENCY_MHZ), "HT20", "fixed-freq", _CELL),
     "mesh point": ("mesh", "join", SSID, "freq", str(_FREQUENCY_MHZ), "HT20"),
 }
+_BATMAN_MTU_BYTES: Final = network.MTU_BYTES + 32
+"""With the header of batman-adv, packets of the usual size need no fragments."""
 _TIMEOUT_S: Final = 15.0
-"""Timeout of `iw` and `nft`."""
-_PRIORITY_RULE: Final = """\
-table inet fieldkit {
-    chain output {
-        type filter hook output priority 0
+"""Timeout of `iw`, `nft` and `batctl`."""
+_PRIORITY_RULES: Final = """\
+table netdev fieldkit {{
+    chain output {{
+        type filter hook egress devices = {{ {interfaces} }} priority 0
         meta priority set 0:0107
-    }
-}
+    }}
+}}
 """
-"""nftables rules that assign all sent packets to access category VO (mac80211 reads 0x107 as the priority 7).
+"""nftables rules that assign all frames to access category VO (mac80211 reads 0x107 as the priority 7).
 
-The other categories would use block-ACK sessions, in which mac80211 ignores the transmission attempts that the driver
-of the simulated radios (mac80211_hwsim) reports. The driver has no queues per category, so the rules change nothing
-else.
+They include frames that Linux forwards as a router, as a bridge, or by batman-adv. The other categories would use
+block-ACK sessions, in which mac80211 ignores the transmission attempts that the driver of the simulated radios
+(mac80211_hwsim) reports. The driver has no queues per category, so the rules change nothing else.
 """
 
 _ACCESS_POINT: Final = """\
@@ -87,36 +92,67 @@ def bring_up(device: str, interface: str, address: str, wifi: WifiSpec) -> None:
 
     Args:
         device: Current name of the interface.
-        interface: Its new name.
-        address: Its address with the prefix length.
+        interface: Interface with the robot's address: the Wi-Fi interface, which gets this name, or the mesh
+            interface of batman-adv above it.
+        address: The robot's address with the prefix length.
         wifi: Mode of the robot in the Wi-Fi network; the program of this mode is started later.
 
     Raises:
         RobotError: A tool rejected a setting.
     """
     network.disable_ipv6()
-    if device != interface:
-        network.run_ip(f"link set {device} name {interface}")
-    _run("nft", "-f", "-", text=_PRIORITY_RULE)
+    radio = wifi.radio_interface(interface)
+    if device != radio:
+        network.run_ip(f"link set {device} name {radio}")
+    if wifi.forwards:
+        network.prepare_mesh(radio)
+    _run("nft", "-f", "-", text=priority_rules(radio))
     if wifi.mode in _INTERFACE_TYPES:
-        _run("iw", "dev", interface, "set", "type", _INTERFACE_TYPES[wifi.mode])
+        _run("iw", "dev", radio, "set", "type", _INTERFACE_TYPES[wifi.mode])
+    if wifi.originator_s is not None:
+        network.run_ip(f"link set {radio} mtu {_BATMAN_MTU_BYTES} up")
+        for words in batctl_commands(interface, radio, wifi.originator_s):
+            _run("batctl", *words)
+        network.run_ip(f"link set {interface} address {mac_of(IPv4Interface(address).ip).hex(':')}")
     network.configure(interface, address)
-    rejoin(interface, wifi)
+    _join(radio, wifi)
     if wifi.has_monitor:
-        _run("iw", "dev", interface, "interface", "add", MONITOR, "type", "monitor")
+        _run("iw", "dev", radio, "interface", "add", MONITOR, "type", "monitor")
         network.run_ip(f"link set {MONITOR} up")
 
 
-def rejoin(interface: str, wifi: WifiSpec) -> None:
-    """Join the ad hoc cell or the mesh, at first and after the interface was down.
+def priority_rules(*interfaces: str) -> str:
+    """Return nftables rules that assign all frames that leave by these interfaces to access category VO."""
+    return _PRIORITY_RULES.format(interfaces=", ".join(interfaces))
 
-    In other modes do nothing, because hostapd and wpa_supplicant connect by themselves.
+
+def batctl_commands(mesh_interface: str, radio: str, originator_s: float) -> tuple[tuple[str, ...], ...]:
+    """Return the words of the `batctl` commands that create a mesh interface above a Wi-Fi interface."""
+    mesh = ("meshif", mesh_interface)
+    return (
+        (*mesh, "interface", "create", "routing_algo", "BATMAN_IV"),
+        (*mesh, "interface", "-M", "add", radio),
+        (*mesh, "orig_interval", str(round(1000 * originator_s))),
+    )
+
+
+def switch_on(radio: str, wifi: WifiSpec) -> None:
+    """Bring the Wi-Fi interface up again, and join the ad hoc cell or the mesh.
 
     Raises:
-        RobotError: The kernel rejected the command.
+        RobotError: A tool rejected a setting.
     """
+    if wifi.originator_s is None:
+        network.switch_on(radio)
+    else:
+        network.switch_on_link(radio)  # the routes are those of the mesh interface, which stayed up
+    _join(radio, wifi)
+
+
+def _join(radio: str, wifi: WifiSpec) -> None:
+    # In other modes, hostapd and wpa_supplicant connect.
     if wifi.mode in _JOIN:
-        _run("iw", "dev", interface, *_JOIN[wifi.mode])
+        _run("iw", "dev", radio, *_JOIN[wifi.mode])
 
 
 def prepare_command(interface: str, wifi: WifiSpec) -> tuple[str, ...]:

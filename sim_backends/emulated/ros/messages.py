@@ -5,9 +5,10 @@ bytes before it (wiki.ros.org/msg). Each generator packs the fields of its type 
 because the libraries that support all types would cost each robot 20 MB of memory.
 
 The motion of the robot comes from `robot_motion`. Frames and units follow REP 103 and REP 105: metres, radians, x
-ahead, y to the left. In frames that are fixed to the world, x is east and y is north, as in the orientation of an IMU
-(REP 145). Covariances are the values that drivers of such robots report. The laser ranges are computed from the
-world. Most numbers that vary in a real sensor contain noise, so that they compress no better than real data.
+ahead, y to the left. In the frame `map`, x is east and y is north, as in the orientation of an IMU (REP 145).
+Odometry starts at 0 where the robot was switched on, with x along its heading at that time. Covariances are the
+values that drivers of such robots report. The laser ranges are computed from the world. Most numbers that vary in a
+real sensor contain noise, so that they compress no better than real data.
 """
 
 import math

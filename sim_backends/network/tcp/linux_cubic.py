@@ -127,7 +127,7 @@ class LinuxCubic(NewReno):
         self._acked_per_segment = max(acked_per_segment, _MIN_ACKED_PER_SEGMENT)
 
     def _start_epoch(self, now_ns: int, acked_bytes: int) -> None:
-        """Start an epoch: compute W_max, and the time at which the window will reach it again (K)."""
+        """Start an epoch: compute the window at the plateau of the cubic function, and the time until then (K)."""
         window = self._window
         self._epoch_ns = now_ns
         self._reno, self._reno_acked_bytes = window, acked_bytes

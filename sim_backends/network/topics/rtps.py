@@ -129,7 +129,7 @@ class AckNack:
 
 @dataclass(frozen=True, slots=True)
 class NackFrag:
-    """NACK_FRAG: the fragments of a sample that a reader lacks (8.3.8.11).
+    """NACK_FRAG: the fragments of a sample that a reader lacks (8.3.8.12).
 
     Attributes:
         number: Number of the sample.

@@ -346,7 +346,7 @@ class FrameExchange(Generic[Payload]):
             acknowledged_count = len(acknowledged_frames)
             if count < len(frames):
                 acknowledged_count = len({packet.sequence for packet in acknowledged_frames})
-            peer.rate.report(peer.mode, acknowledged=acknowledged_count, attempts=count)
+            peer.rate.report(peer.mode, acknowledged=acknowledged_count, frames=count)
         if acknowledged:
             station.contention.on_success()
             peer.failed_exchanges = 0

@@ -62,9 +62,9 @@ class FirmwareRate(RateControl):
             self._select(now_ns)
         return self._modes[max(self._mode_index - self._steps_down - (attempt - 1), 0)]
 
-    def report(self, mode: WifiMode, *, acknowledged: int, attempts: int = 1) -> None:  # noqa: ARG002 (see RateControl)
+    def report(self, mode: WifiMode, *, acknowledged: int, frames: int = 1) -> None:  # noqa: ARG002 (see RateControl)
         """Implement `RateControl.report`."""
-        self._frames += attempts
+        self._frames += frames
         self._acknowledged += acknowledged
 
     def _select(self, now_ns: int) -> None:

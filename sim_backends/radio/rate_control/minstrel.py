@@ -83,9 +83,9 @@ class Minstrel(RateControl):
             )
         return self._rate_chain[attempt - 1]
 
-    def report(self, mode: WifiMode, *, acknowledged: int, attempts: int = 1) -> None:
+    def report(self, mode: WifiMode, *, acknowledged: int, frames: int = 1) -> None:
         """Implement `RateControl.report`."""
-        self._attempts[mode] += attempts
+        self._attempts[mode] += frames
         self._acknowledged[mode] += acknowledged
         if self._frames_per_exchange > 1 and self._is_failing(mode):
             self._updated_ns = -_UPDATE_NS

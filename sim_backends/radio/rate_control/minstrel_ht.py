@@ -149,12 +149,12 @@ class MinstrelHt(RateControl):
                     self._chain = _fill_chain([samples.pop(0), *self._fallback])
         return self._chain[attempt - 1]
 
-    def report(self, mode: WifiMode, *, acknowledged: int, attempts: int = 1) -> None:
+    def report(self, mode: WifiMode, *, acknowledged: int, frames: int = 1) -> None:
         """Implement `RateControl.report`."""
         statistics = self._statistics[mode]
-        statistics.frames += attempts
+        statistics.frames += frames
         statistics.acknowledged += acknowledged
-        self._aggregate_frames += attempts
+        self._aggregate_frames += frames
         self._aggregates += 1
         # Replace a mode of the chain that fails by a mode of a lower group.
         is_failing = False

@@ -26,8 +26,14 @@ class RateControl(Protocol):
         """
         ...
 
-    def report(self, mode: WifiMode, *, acknowledged: int, attempts: int = 1) -> None:
-        """Record the number of frames of an attempt, and the number of these that were acknowledged."""
+    def report(self, mode: WifiMode, *, acknowledged: int, frames: int = 1) -> None:
+        """Record the result of an attempt.
+
+        Args:
+            mode: Mode of the attempt.
+            acknowledged: Number of its frames that were acknowledged.
+            frames: Number of its frames, above 1 for an aggregate.
+        """
         ...
 
 
@@ -45,5 +51,5 @@ class FixedRate(RateControl):
         """Implement `RateControl.choose`."""
         return self._mode
 
-    def report(self, mode: WifiMode, *, acknowledged: int, attempts: int = 1) -> None:
+    def report(self, mode: WifiMode, *, acknowledged: int, frames: int = 1) -> None:
         """Implement `RateControl.report`."""

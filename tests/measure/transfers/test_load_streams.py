@@ -134,6 +134,16 @@ def test_a_capture_without_times_is_not_regarded_as_a_set_clock(measure: Callabl
     assert set(result.missing.values()) == {"a capture lacks times"}
 
 
+def test_a_packet_earlier_than_the_one_before_it_leaves_the_jitter_empty() -> None:
+    sender, receiver = captured([control(), data()])
+    times_ns = receiver.time_ns.copy()
+    times_ns[200] += 50 * MS
+    assert iperf3_load.measure_jitter(UDP, sender, replace(receiver, time_ns=times_ns)).values
+    times_ns[200] += SECOND
+    result = iperf3_load.measure_jitter(UDP, sender, replace(receiver, time_ns=times_ns))
+    assert set(result.missing.values()) == {"a packet is earlier than the one before it: a clock was set back"}
+
+
 def test_without_captures_or_packets_the_columns_are_empty() -> None:
     assert not iperf3_load.measure_stalls("iperf3", UDP, None, captured([data()])[1]).values
     assert not measure_values(UDP, [])

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
@@ -21,8 +22,9 @@ from fieldkit.remote.ssh import SshShell
 from sim_backends.emulated import requirements
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.nodes import Laptop
-from sim_backends.emulated.provisioning import LAPTOP_ADDRESS, LAPTOP_NAME
+from sim_backends.emulated.provisioning import LAPTOP_ADDRESS, LAPTOP_NAME, profile_in_lab
 from sim_backends.emulated.robot import network
+from sim_backends.emulated.robot.mesh_options import MeshOptions
 from sim_backends.emulated.robot.spec import USER
 from sim_backends.emulated.running_robots import RunningRobots, running_robots
 from sim_backends.emulated.testbed import laptop_on_air
@@ -49,7 +51,7 @@ class Row:
 @pytest.fixture(scope="module")
 def row() -> Iterator[Row]:
     profile = schema.validate(schema.parse(BOX, source="box.yaml"), RobotProfile)
-    mesh = f"{{daemon: babeld, hello: {HELLO_S}s}}"
+    mesh = f"{{protocol: babel, hello: {HELLO_S}s}}"
     text = f"{{radio: {{fading: false}}, mesh: {mesh}, robots: {{r3: {{userland: busybox}}}}}}"
     options = schema.validate(schema.parse(text, source="fieldkit.yaml"), EmulatedOptions)
     members = {name: LabRobot(name, profile, address, ()) for name, address in ADDRESSES.items()}
@@ -169,3 +171,42 @@ def test_a_missing_daemon_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         requirements.check({"babeld"})
     assert error_info.value.what == "emulated robots need programs that are not installed: babeld"
     assert error_info.value.remedy.endswith("apt-get install --no-install-recommends babeld")
+
+
+def test_the_former_key_selects_babel() -> None:
+    for text, expected in (
+        ("{daemon: babeld}", MeshOptions(protocol="babel")),
+        ("{daemon: babeld, hello: 0.5s}", MeshOptions.model_validate({"protocol": "babel", "hello": "500ms"})),
+    ):
+        assert schema.validate(schema.parse(text, source="x.yaml"), MeshOptions) == expected
+    for text in ("{daemon: olsrd}", "{daemon: babeld, protocol: babel}", "{}"):
+        with pytest.raises(ConfigurationError, match=r"daemon|protocol"):
+            schema.validate(schema.parse(text, source="x.yaml"), MeshOptions)
+
+
+def test_the_default_interval_is_that_of_the_protocol() -> None:
+    assert MeshOptions(protocol="babel").hello_s == 4.0
+    assert MeshOptions(protocol="batman-adv").hello_s == 1.0
+
+
+def test_only_a_mesh_of_batman_changes_the_interface_under_test() -> None:
+    text = BOX.strip() + "\nlinks: {wifi: wlan0, cell: wwan0}\n"
+    profile = schema.validate(schema.parse(text, source="box.yaml"), RobotProfile)
+    babel = EmulatedOptions.model_validate({"wifi": "linux", "mesh": {"protocol": "babel"}})
+    assert profile_in_lab(profile, babel) == profile
+    batman = EmulatedOptions.model_validate({"wifi": "linux", "mesh": {"protocol": "batman-adv"}})
+    in_lab = profile_in_lab(profile, batman)
+    assert in_lab.radio.interface == "bat0"
+    assert in_lab.further_links == profile.further_links == {"cell": "wwan0"}
+    assert profile_in_lab(in_lab, batman) == in_lab
+
+
+def test_a_kernel_without_batman_is_reported_with_the_command_that_loads_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(requirements, "_BATMAN_MODULE", tmp_path / "batman_adv")
+    with pytest.raises(ConfigurationError) as error_info:
+        requirements.check_batman()
+    assert "modprobe batman-adv" in error_info.value.remedy
+    (tmp_path / "batman_adv").mkdir()
+    requirements.check_batman()

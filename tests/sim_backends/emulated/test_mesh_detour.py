@@ -24,7 +24,7 @@ from tests.helpers.sshd import wait_until
 
 pytestmark = pytest.mark.emulated
 
-OPTIONS = {"radio": {"fading": False}, "mesh": {"daemon": "babeld", "hello": "0.3s"}}
+OPTIONS = {"radio": {"fading": False}, "mesh": {"protocol": "babel", "hello": "0.3s"}}
 FIRST_TTL = 64
 # babeld repeats a lost request for a sequence number only after 65 s (docs/mesh.md).
 LONG_S = 120.0

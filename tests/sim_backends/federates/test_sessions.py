@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, suppress
 from dataclasses import replace
@@ -141,6 +142,23 @@ def test_a_federate_that_sends_heartbeats_may_need_longer_than_the_deadline(monk
     physics_without_patience.advance(2 * MS, {})
     with pytest.raises(UnansweredError, match=r"its last time is 0.002 s; it last reported 0.002 s"):
         physics_without_patience.advance(3 * MS, {})
+
+
+def test_a_federate_whose_heartbeats_end_is_reported_after_one_deadline() -> None:
+    counts = Counter[int]()
+
+    def drop_later_frames(frame: bytes) -> bytes | None:
+        counts[frame[4]] += 1
+        is_late = counts[MessageKind.STATES] == 2 and counts[MessageKind.BUSY] > 1
+        return None if is_late or counts[MessageKind.STATES] > 2 else frame
+
+    service = FederateService(SlowPhysics)
+    physics = RemotePhysics(*Pair(service, deadline_s=1.5, alter=drop_later_frames)(replace(HELLO, heartbeat_ms=50)))
+    physics.advance(0, {})
+    physics.advance(2 * MS, {})
+    counts[MessageKind.BUSY] = 0
+    with pytest.raises(UnansweredError, match=r"has sent neither an answer nor a heartbeat for 1\.5 s: request to"):
+        physics.advance(3 * MS, {})
 
 
 @pytest.mark.parametrize(

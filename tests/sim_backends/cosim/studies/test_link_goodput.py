@@ -45,6 +45,8 @@ def test_without_mcs_and_rate_the_link_selects_its_modes() -> None:
         LoggedLink(-50, width_mhz=160, phy_rate_bit_s=100e6),
         LoggedLink(-50, streams=4),
         LoggedLink(-50, guard_interval_ns=3200, mcs=3),
+        LoggedLink(-50, "802.11g", mcs=5),
+        LoggedLink(-50, "802.11a", mcs=5, phy_rate_bit_s=48e6),
         LoggedLink(-50, width_mhz=160),
         LoggedLink(-50, "802.11a"),
     ],

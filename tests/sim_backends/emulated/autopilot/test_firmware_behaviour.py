@@ -348,6 +348,15 @@ def test_px4_lands_with_a_low_battery_as_its_parameter_requires(px4: Station, ac
     assert px4.autopilot.vehicle.is_armed != lands
 
 
+@pytest.mark.parametrize(("name", "value"), [("BAT_CRIT_THR", 0.5), ("COM_ARM_BAT_MIN", 0.5)])
+def test_px4_is_not_armed_below_the_charge_of_its_parameters(px4: Station, name: str, value: float) -> None:
+    px4.autopilot.vehicle.battery.charge = 0.4
+    px4.set(name, value)
+    assert px4.arm() != OK
+    px4.set(name, 0.3)
+    assert px4.arm() == OK
+
+
 @pytest.mark.parametrize(
     ("action", "texts", "mode"),
     [(0, [], Mode.OFFBOARD), (1, ["Geofence: warning"], Mode.OFFBOARD), (5, ["Geofence: land"], Mode.LAND)],

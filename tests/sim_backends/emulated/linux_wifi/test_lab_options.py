@@ -8,6 +8,7 @@ import pytest
 from fieldkit.cli import main
 from sim_backends.emulated.linux_wifi import guest, virtual_machine
 from sim_backends.emulated.linux_wifi.virtual_machine import JobResult, Kernel
+from sim_backends.emulated.robot.mesh_options import MeshOptions
 
 SITE = """\
 backend: emulated
@@ -48,7 +49,8 @@ def test_lab_up_lists_all_missing_requirements(
     ("emulated", "other_lines", "cause"),
     [
         ("{wifi: linux, physics: kinematic}", "", "`physics`"),
-        ("{wifi: linux, mesh: {daemon: babeld}}", "", "`mesh`"),
+        ("{wifi: linux, linux_wifi: {mesh: true}, mesh: {protocol: babel}}", "", "`mesh`"),
+        ("{mesh: {protocol: batman-adv}}", "", "needs `wifi: linux`"),
         ("{wifi: linux, record_air: true}", "", "`record_air`"),
         ("{wifi: linux, radio: {loss: 10%}}", "", "fixed link"),
         ("{wifi: linux}", "control: radio\n", "no radio"),
@@ -87,6 +89,7 @@ def test_a_trial_runs_its_command_line_in_the_machine_and_returns_its_exit_code(
     assert calls["radios"] == 3
     assert calls["results"] == folder / "my results"
     assert (folder / "my results").is_dir()
+    assert calls["mesh"] is None
     script = str(calls["script"])
     assert shlex.split(script.splitlines()[-1])[-len(words) :] == words
     assert f"cd {shlex.quote(str(folder))} || exit" in script
@@ -103,9 +106,27 @@ def record_calls(monkeypatch: pytest.MonkeyPatch) -> dict[str, object]:
         on_output(b"1 void\n")
         return JobResult(4, "")
 
-    monkeypatch.setattr(guest, "require_machine", lambda: Kernel(Path("vmlinuz"), Path("modules")))
+    def require_machine(*, mesh: MeshOptions | None) -> Kernel:
+        calls["mesh"] = mesh
+        return Kernel(Path("vmlinuz"), Path("modules"))
+
+    monkeypatch.setattr(guest, "require_machine", require_machine)
     monkeypatch.setattr(guest, "run_in_machine", run_in_machine)
     return calls
+
+
+def test_the_machine_gets_what_the_mesh_needs(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = record_calls(monkeypatch)
+    write_site("{wifi: linux, mesh: {protocol: batman-adv, hello: 2s}}")
+    assert main(["check", "los"]) == 4
+    assert calls["mesh"] == MeshOptions.model_validate({"protocol": "batman-adv", "hello": "2s"})
+
+
+def test_in_a_mesh_of_batman_the_interface_under_test_is_bat0(capsys: pytest.CaptureFixture[str]) -> None:
+    for mesh, interface in (("batman-adv", "bat0"), ("babel", "wlan0")):
+        write_site(f"{{wifi: linux, mesh: {{protocol: {mesh}}}}}")
+        assert main(["trial", "los", "30ft", "--dry-run"]) == 0
+        assert f"tcpdump -i {interface} " in capsys.readouterr().out
 
 
 def test_check_and_campaign_run_in_the_machine_too(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,15 @@ from pathlib import Path
 import pytest
 
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.emulated.linux_wifi.virtual_machine import find_kernel, require_machine, uncompressed_kernel
+from sim_backends.emulated.linux_wifi.initrd import MODULES, build_initrd
+from sim_backends.emulated.linux_wifi.virtual_machine import (
+    MESH_PACKAGE_OF,
+    PACKAGE_OF,
+    find_kernel,
+    require_machine,
+    uncompressed_kernel,
+)
+from sim_backends.emulated.robot.mesh_options import MeshOptions
 
 
 def test_all_missing_programs_are_listed_with_their_packages(tmp_path: Path) -> None:
@@ -17,6 +25,42 @@ def test_all_missing_programs_are_listed_with_their_packages(tmp_path: Path) -> 
     assert "qemu-system-x86_64" in error_info.value.what
     for package in ("qemu-system-x86", "linux-image-amd64", "iw", "hostapd", "wpasupplicant", "busybox"):
         assert f" {package}" in error_info.value.remedy
+
+
+@pytest.mark.parametrize(("protocol", "program"), [("babel", "babeld"), ("batman-adv", "batctl")])
+def test_a_mesh_needs_its_program(tmp_path: Path, protocol: str, program: str) -> None:
+    mesh = MeshOptions.model_validate({"protocol": protocol})
+    with pytest.raises(ConfigurationError) as error_info:
+        require_machine((tmp_path,), mesh=mesh)
+    assert f" {program}" in error_info.value.remedy
+    with pytest.raises(ConfigurationError) as error_info:
+        require_machine((tmp_path,))
+    assert program not in error_info.value.remedy
+
+
+@pytest.mark.parametrize(("protocol", "modules"), [("babel", ()), ("batman-adv", ("batman_adv",))])
+def test_the_module_batman_adv_is_loaded_only_for_its_mesh(
+    tmp_path: Path, protocol: str, modules: tuple[str, ...]
+) -> None:
+    for program in (*PACKAGE_OF, *MESH_PACKAGE_OF):
+        path = tmp_path / "usr/sbin" / program
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch(mode=0o755)
+    (tmp_path / "boot").mkdir()
+    (tmp_path / "boot/vmlinuz-6.1.0-50-amd64").touch()
+    (tmp_path / "lib/modules/6.1.0-50-amd64").mkdir(parents=True)
+    (tmp_path / "lib/modules/6.1.0-50-amd64/mac80211_hwsim.ko").touch()
+    kernel = require_machine((tmp_path,), mesh=MeshOptions.model_validate({"protocol": protocol}))
+    assert kernel.extra_modules == modules
+
+
+def test_a_kernel_without_the_module_batman_adv_is_reported(tmp_path: Path) -> None:
+    for name in MODULES:
+        (tmp_path / f"{name}.ko").touch()
+    build_initrd(tmp_path, radios=1, job="job", output="output")
+    with pytest.raises(ConfigurationError, match="batman_adv is missing") as error_info:
+        build_initrd(tmp_path, ("batman_adv",), radios=1, job="job", output="output")
+    assert "linux-image-amd64" in error_info.value.remedy
 
 
 @pytest.mark.parametrize("suffix", [".ko", ".ko.xz"])

@@ -1,5 +1,8 @@
 """Radios of hwsim among the wireless devices of a kernel."""
 
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -46,3 +49,17 @@ def test_too_few_radios_are_an_error_with_the_command_that_adds_them(
     with pytest.raises(ConfigurationError) as error_info:
         radios.require_radios(3, wait_s=0.0)
     assert "radios=3" in error_info.value.remedy
+
+
+@pytest.mark.emulated
+def test_link_mode_and_mtu_of_an_earlier_lab_are_reset() -> None:
+    code = f"from {radios.__name__} import reset_link; reset_link('d0')"
+    show = "ip -o link show d0"
+    script = f"ip tuntap add d0 mode tap && ip link set d0 mtu 1532 mode dormant && {show}"
+    script += f" && {shlex.join((sys.executable, '-c', code))} && {show}"
+    output = subprocess.run(("unshare", "--net", "sh", "-c", script), capture_output=True, text=True, check=True)
+    before, after = output.stdout.splitlines()
+    assert "mtu 1532" in before
+    assert "mode DORMANT" in before
+    assert "mtu 1500" in after
+    assert "mode DEFAULT" in after

@@ -29,10 +29,15 @@ RADIO = {
 
 
 def specs_of(
-    robots: dict[Role, Robot], *, radio: Mapping[str, object] = MappingProxyType({}), **settings: object
+    robots: dict[Role, Robot],
+    *,
+    radio: Mapping[str, object] = MappingProxyType({}),
+    mesh_of: Mapping[str, object] | None = None,
+    **settings: object,
 ) -> dict[Role, WifiSpec]:
-    options = EmulatedOptions.model_validate({"wifi": "linux", "linux_wifi": settings, "radio": dict(radio)})
-    return lab.wifi_specs(robots, options.linux_wifi, options.radio)
+    keys = {"linux_wifi": settings, "radio": dict(radio), "mesh": mesh_of}
+    options = EmulatedOptions.model_validate({"wifi": "linux", **keys})
+    return lab.wifi_specs(robots, options.linux_wifi, options.radio, options.mesh)
 
 
 def settings_of(text: str) -> dict[str, str]:
@@ -53,6 +58,26 @@ def test_the_relay_is_the_access_point_and_the_other_robots_have_its_passphrase(
 @pytest.mark.parametrize("robots", [TRIO, PAIR], ids=["with a relay", "without"])
 def test_in_a_mesh_all_robots_are_mesh_points(robots: dict[Role, Robot]) -> None:
     assert {(spec.mode, spec.passphrase) for spec in specs_of(robots, mesh=True).values()} == {("mesh point", "")}
+
+
+@pytest.mark.parametrize("robots", [TRIO, PAIR], ids=["with a relay", "without"])
+def test_in_a_mesh_of_another_protocol_all_robots_join_an_ad_hoc_cell(robots: dict[Role, Robot]) -> None:
+    (babel,) = set(specs_of(robots, mesh_of={"protocol": "babel"}).values())
+    assert (babel.mode, babel.forwards, babel.originator_s) == ("ad hoc", True, None)
+    assert babel.radio_interface("wlan0") == "wlan0"
+    (batman,) = set(specs_of(robots, mesh_of={"protocol": "batman-adv", "hello": "500ms"}).values())
+    assert (batman.mode, batman.forwards, batman.originator_s) == ("ad hoc", False, 0.5)
+    assert batman.radio_interface("bat0") == "wlan0"
+    assert {spec.forwards for spec in specs_of(PAIR).values()} == {False}
+
+
+def test_batctl_creates_the_mesh_interface_above_the_wifi_interface() -> None:
+    commands = [" ".join(words) for words in wireless.batctl_commands("bat0", "wlan0", 0.5)]
+    assert commands == [
+        "meshif bat0 interface create routing_algo BATMAN_IV",
+        "meshif bat0 interface -M add wlan0",
+        "meshif bat0 orig_interval 500",
+    ]
 
 
 @pytest.mark.parametrize("mesh", [False, True])

@@ -15,6 +15,7 @@ from fieldkit.backends.protocols import Robot
 from fieldkit.config.profiles import load_profile
 from fieldkit.core.model import Role, Vector
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
+from sim_backends.emulated.provisioning import profile_in_lab
 from sim_backends.emulated.running_robots import RunningRobots, running_robots
 from sim_backends.world.world import load_world
 
@@ -95,13 +96,15 @@ def lab(
     settings: dict[str, object],
     *,
     roles: Collection[Role] = tuple(CAST),
+    mesh: dict[str, object] | None = None,
     **radio: object,
 ) -> Iterator[Running]:
     options = EmulatedOptions.model_validate(
-        {"wifi": "linux", "ros": "builtin", "radio": {**RADIO, **radio}, "linux_wifi": settings}
+        {"wifi": "linux", "ros": "builtin", "radio": {**RADIO, **radio}, "linux_wifi": settings, "mesh": mesh}
     )
     world = load_world("open")
-    cast = {role: robot for role, robot in CAST.items() if role in roles}
+    profile = profile_in_lab(PROFILE, options)
+    cast = {role: robot.model_copy(update={"profile": profile}) for role, robot in CAST.items() if role in roles}
     with running_robots(cast, options=options, world=world, ros=RosChoice.BUILTIN, seed=1) as running:
         yield running
 
@@ -178,4 +181,5 @@ def main() -> None:
     sys.stdout.write(f"RESULTS {json.dumps(results)}\n")
 
 
-main()
+if __name__ == "__main__":
+    main()

@@ -243,8 +243,8 @@ def test_frames_are_sent_again_until_their_block_ack_arrives() -> None:
             return super().choose(now_ns, packet, attempt)
 
         @override
-        def report(self, mode: WifiMode, *, acknowledged: int, attempts: int = 1) -> None:
-            rates.append((acknowledged, attempts))
+        def report(self, mode: WifiMode, *, acknowledged: int, frames: int = 1) -> None:
+            rates.append((acknowledged, frames))
 
     channel.rate_control = lambda transmitter, receiver: RecordedRate(HT20_7)  # type: ignore[method-assign]
     wifi: Wifi[int] = Wifi(channel, 1)

@@ -52,7 +52,7 @@ def first_modes(
             modes += [mode] * (attempt == 1)
             frames = 1 if rate.is_probing and attempt == 1 else length
             acknowledged_frames = sum(random.random() < share_of(mode) for _ in range(frames))
-            rate.report(mode, acknowledged=acknowledged_frames, attempts=frames)
+            rate.report(mode, acknowledged=acknowledged_frames, frames=frames)
     return modes
 
 
@@ -118,7 +118,7 @@ def test_a_mode_is_sampled_at_most_every_20_ms_and_once_per_frame() -> None:
     chains = []
     for number in range(500, 1500):
         chain = [rate.choose(number * STEP_NS, ("a", number), attempt) for attempt in range(1, 8)]
-        rate.report(chain[0], acknowledged=16 * (HT20.index(chain[0]) <= 3), attempts=16)
+        rate.report(chain[0], acknowledged=16 * (HT20.index(chain[0]) <= 3), frames=16)
         chains.append([HT20.index(mode) for mode in chain])
     samples = [number for number, chain in enumerate(chains) if chain[0] > 3]
     assert 50 <= len(samples) <= 100
@@ -162,4 +162,4 @@ def test_any_results_leave_a_chain_of_known_modes(results: list[tuple[int, int]]
         now_ns += step_ns
         chain = [rate.choose(now_ns, ("a", number), attempt) for attempt in range(1, 8)]
         assert set(chain) <= modes
-        rate.report(chain[number % 7], acknowledged=acknowledged_frames, attempts=16)
+        rate.report(chain[number % 7], acknowledged=acknowledged_frames, frames=16)

@@ -117,7 +117,7 @@ def test_aggregates_that_fail_lower_the_rate_within_the_interval() -> None:
     chosen_modes = []
     for number in range(60):
         mode = control.choose(number * 500_000, ("flow", number), 1)
-        control.report(mode, acknowledged=64 * (mode.rate_bit_s < 200e6), attempts=64)
+        control.report(mode, acknowledged=64 * (mode.rate_bit_s < 200e6), frames=64)
         chosen_modes.append(mode.rate_bit_s)
     assert chosen_modes[0] > 500e6
     assert sorted(chosen_modes[-20:])[10] < 200e6, "the median of the last frames, some of which are samples"
