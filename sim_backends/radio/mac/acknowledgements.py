@@ -88,12 +88,13 @@ class Acknowledgements(Generic[Payload]):
         """Start the ACK or Block Ack to a transmission of `station`, unless the receiver is transmitting itself."""
         receiver = self._stations[peer.receiver]
         if receiver.sending_until_ns > now_ns:
+            self._reception.start_response(transmission, None)
             return
         mode, size_bytes = transmission.mode, transmission.response_bytes
         end_ns = now_ns + response_ns(mode, size_bytes)
         packet, number = transmission.packet, transmission.attempt
         ack = Transmission(receiver.index, now_ns, end_ns, control_mode(mode), size_bytes, packet, number)
-        self._reception.start(ack, end_ns)
+        self._reception.start_response(transmission, ack)
         if self.meter is not None:
             self.meter.on_start(ack, None)
         ack_exchange_id = 0

@@ -170,11 +170,13 @@ class FrameExchange(Generic[Payload]):
         """Determine which stations decode a frame that ends now, and wait for the ACK if it has one receiver."""
         receivers = sorted(transmission.receivers) if peer is None else [peer.receiver]
         received = [index for index in receivers if self.reception.decodes(index, transmission, "data")]
-        self.reception.end(now_ns, transmission)
+        is_aborted = not station.queue or station.queue[0] is not frame
+        is_answered = bool(received) and peer is not None and not is_aborted
+        self.reception.end(now_ns, transmission, is_answered=is_answered)
         if self.log is not None:
             self.log(attempt_record(self._names, transmission, frame, received, transmission.size_bytes))
-        if not station.queue or station.queue[0] is not frame:
-            return  # aborted: its radio was switched off
+        if is_aborted:
+            return  # its radio was switched off
         if peer is None:
             self._end_broadcast(now_ns, station, frame, received)
             return
@@ -271,7 +273,7 @@ class FrameExchange(Generic[Payload]):
         decoded_frames = aggregate.decoded_frames = self.reception.decode_frames(
             peer.receiver, transmission, aggregate
         )
-        self.reception.end(now_ns, transmission)
+        self.reception.end(now_ns, transmission, is_answered=bool(decoded_frames) and station.aggregate is aggregate)
         if self.log is not None:
             for frame in aggregate.frames:
                 received = [peer.receiver] if frame in decoded_frames else []

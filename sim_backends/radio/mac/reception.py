@@ -127,7 +127,9 @@ class Reception(Generic[Payload]):
                 events.schedule_start(neighbour.contention.postpone(now_ns, reserved_ns), index)
         on_air.append(transmission)
 
-    def end(self, now_ns: int, transmission: Transmission, *, reserved_ns: int = 0) -> None:
+    def end(
+        self, now_ns: int, transmission: Transmission, *, reserved_ns: int = 0, is_answered: bool = False
+    ) -> None:
         """End a transmission.
 
         Stations that detected it and did not decode it defer their next frame (EIFS). At a station that decoded it,
@@ -137,6 +139,8 @@ class Reception(Generic[Payload]):
             now_ns: Current time.
             transmission: The transmission.
             reserved_ns: End of the reservation; 0 if `start` has made it.
+            is_answered: True if its receiver has decoded it and will respond. EIFS after it then starts with
+                `start_response`.
         """
         self._on_air.remove(transmission)
         receivers: Set[int] = transmission.receivers
@@ -157,14 +161,37 @@ class Reception(Generic[Payload]):
             undetermined = self._defer_unsynchronized(now_ns, transmission)
             if not reserved_ns:
                 receivers = receivers - undetermined
+        if is_answered:
+            decoded = receivers & self._results.keys()
+            transmission.undetermined = receivers - decoded
+            self._use_decoded(now_ns, decoded, 0)
+        else:
+            self._determine(now_ns, transmission, receivers, reserved_ns)
+        self._results.clear()
+        self._has_failed = False
+
+    def start_response(self, transmission: Transmission, response: Transmission | None) -> None:
+        """Start the response to a transmission, or only EIFS after the transmission if there is no response.
+
+        Stations that are synchronized to the response do not need EIFS after the transmission: they cannot send
+        before the end of the response, and its decoding determines their EIFS.
+        """
+        undetermined = transmission.undetermined
+        if response is not None:
+            self.start(response, response.end_ns)
+            undetermined = undetermined - response.receivers
+        if undetermined:
+            self._determine(transmission.end_ns, transmission, undetermined, 0)
+        transmission.interferers.clear()
+
+    def _determine(self, now_ns: int, transmission: Transmission, receivers: Set[int], reserved_ns: int) -> None:
+        """Determine which receivers have decoded a transmission that has ended; start or end their EIFS."""
         undecoded = self._undecoded(transmission, receivers)
         for index in undecoded:
-            self._defer(now_ns, index)
+            self._defer(now_ns, index, transmission.end_ns)
         if reserved_ns or self._eifs_ends_ns > now_ns:
             self._use_decoded(now_ns, receivers - set(undecoded), reserved_ns)
         transmission.interferers.clear()
-        self._results.clear()
-        self._has_failed = False
 
     def _always_decoded_ratio(self, mode: WifiMode) -> float:
         """Return the ratio of signal to noise in 20 MHz at which a station certainly decodes any frame in a mode."""
@@ -186,13 +213,14 @@ class Reception(Generic[Payload]):
                 and index not in undetermined
                 and self._stations[index].sending_until_ns < now_ns
             ):
-                self._defer(now_ns, index)
+                self._defer(now_ns, index, now_ns)
         return undetermined
 
-    def _defer(self, now_ns: int, index: int) -> None:
+    def _defer(self, now_ns: int, index: int, end_ns: int) -> None:
         """Start EIFS of a station: the inter-frame space of its queue after SIFS and an ACK at the basic rate."""
         contention = self._stations[index].contention
-        self._eifs_ends_ns = self._deferring[index] = ends_ns = now_ns + self._eifs_extra_ns
+        self._deferring[index] = ends_ns = end_ns + self._eifs_extra_ns
+        self._eifs_ends_ns = max(self._eifs_ends_ns, ends_ns)
         contention.defer_until(ends_ns + contention.ifs_ns)
         if index in self._events.starts:
             self._events.schedule_start(contention.earliest_start_ns(now_ns), index)

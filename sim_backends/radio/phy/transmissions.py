@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -50,6 +50,7 @@ class Transmission:
         receivers: Indices of the stations that are synchronized to it, and so receive it.
         response_bytes: Size of the ACK or Block Ack to it.
         frame_count: Number of frames, if it is an aggregate.
+        undetermined: Indices of the receivers for which it is not determined yet if they have decoded it.
         weakest_ratio: Smallest ratio of signal to noise in 20 MHz at the stations that detect it; infinite if none
             detects it.
     """
@@ -67,6 +68,7 @@ class Transmission:
     receivers: set[int] = field(default_factory=set)
     response_bytes: int = ACK_BYTES
     frame_count: int = 1
+    undetermined: Set[int] = frozenset()
     weakest_ratio: float = math.inf
 
 
