@@ -104,7 +104,8 @@ def predict(links: Sequence[MeasuredLink]) -> list[Prediction]:
 def errors(predictions: Sequence[Prediction], name: str) -> np.ndarray:
     """Return the relative errors of the predictions in an attribute, without links that are not modelled."""
     ratios = np.array([getattr(each, name) / each.measured.goodput_bit_s for each in predictions])
-    return ratios[np.isfinite(ratios)] - 1
+    finite: np.ndarray = ratios[np.isfinite(ratios)]
+    return finite - 1
 
 
 def _cells(predictions: Sequence[Prediction]) -> Iterator[str]:

@@ -27,6 +27,7 @@ SUPPORT_MODULES = {
     "cosim_peers",
     "footprint",
     "kernel_minstrel",
+    "kernel_roaming",
     "lifetimes",
     "mujoco_fleet",
     "namespaces",

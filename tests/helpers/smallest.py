@@ -302,6 +302,7 @@ CASES: Final[Mapping[str, MinimalRun]] = {
     "moves": MinimalRun("--sizes 2", {"STEPS": 10, "WORLDS": ("lawn",)}, emulated=True),
     "pcap": MinimalRun("--rounds 1", {"PACKETS": 6_000, "SCAPY_PACKETS": 100, "BIG_BYTES": 100_000_000}),
     "radio_vs_ns3": MinimalRun("", {"DISTANCES_M": (5,), "STATIONS": (1,), "PAIR_RATIOS_DB": (8.0,), "SECONDS": 0.1}),
+    "roaming_vs_kernel": MinimalRun("", {"RUNS": 1, "PACKETS": 5}),
     "startup": MinimalRun("--rounds 1", shrink=_two_commands),
     "stop": MinimalRun("--rounds 1", emulated=True),
     "swarm": MinimalRun("--sizes 2 --seconds 1", {"PINGS": 5}, shrink=_small_swarm, emulated=True),

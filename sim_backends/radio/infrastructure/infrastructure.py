@@ -11,7 +11,7 @@ from sim_backends.radio.channel import Emitter
 from sim_backends.radio.infrastructure.infrastructure_options import AccessPointOptions, NeighbourNetworkOptions
 from sim_backends.radio.infrastructure.interference import MicrowaveOven, NeighbourTraffic
 from sim_backends.radio.infrastructure.managed_delivery import ManagedDelivery, ManagementFrame
-from sim_backends.radio.infrastructure.roaming import Roaming
+from sim_backends.radio.infrastructure.roaming import MONITOR_NS, Roaming
 from sim_backends.radio.mac.frame_exchange import FrameExchange
 from sim_backends.radio.mac.frames import TransmissionAttempt
 from sim_backends.radio.phy.modes import BAND_2_4, ENERGY_DETECTION_DBM
@@ -104,8 +104,19 @@ class Infrastructure:
             phases_ns = {
                 index[name]: int(RandomStream(self._seed, name, "beacon").draw(0) * BEACON_INTERVAL_NS)
                 for name in options.access_points
+            } | {
+                robot: int(RandomStream(self._seed, channel.names[robot], "beacon monitor").draw(0) * MONITOR_NS)
+                for robot in self.robots
             }
-            delivery.handler = self.roaming = Roaming(channel, exchange.events, delivery, options.roaming, phases_ns)
+            first = next(iter(self.antennas.values()))
+            delivery.handler = self.roaming = Roaming(
+                channel,
+                exchange.events,
+                delivery,
+                options.roaming,
+                phases_ns,
+                high_throughput=first.phy is not None or first.standard == "802.11n",
+            )
         if options.neighbours:
             duties = {index[name]: neighbour.duty for name, neighbour in options.neighbours.items()}
             # The scheduled events keep a reference to the object.

@@ -26,29 +26,37 @@ class AccessPointOptions(Strict):
 class RoamingOptions(Strict):
     """Roaming like wpa_supplicant with `bgscan="simple:SHORT:THRESHOLD:LONG"` on mac80211.
 
-    The defaults are those of NetworkManager for a network with several known access points, and the constants of
-    mac80211 for an active scan (`IEEE80211_PROBE_DELAY` and `IEEE80211_CHANNEL_TIME`, 1/33 s each).
+    The defaults are those of NetworkManager for a network with several known access points, and those of mac80211
+    (scan.c) for an active scan in a kernel with 250 ticks per second, which expects 56 ms per channel and returns so
+    that it is away for at most 124 ms.
 
     Attributes:
         short: Interval between scans while the signal is below the threshold.
         threshold_dbm: Threshold of the signal of beacons.
         long: Interval between scans while the signal is above the threshold.
         channels: Number of channels that a scan visits, including the current one.
-        dwell: Time on each other channel, during which the access point buffers packets.
-        home: Time on the current channel between two others.
+        dwell: Time on each channel, during which the access point buffers packets: two timers of eight ticks.
+        away: Time after which the robot returns to the current channel before it visits another one.
+        home: Time of such a return.
         handshake: True for the 4-way handshake of WPA2 after each association; `false` for an open network.
+        sae: True for WPA3: each association starts with the four frames of SAE.
         processing: Time of a station or access point from the reception of a frame of an association until it sends
             the next one. The default is an assumption.
+        noise_dbm: Noise that the robots' driver reports, which affects the margin of a handover; -89 dBm is
+            wpa_supplicant's value for drivers that report none.
     """
 
     short: Annotated[Duration, Field(gt=0)] = 30.0
     threshold_dbm: Annotated[Number | Int, Field(ge=-100, le=0)] = -65.0
     long: Annotated[Duration, Field(gt=0)] = 300.0
     channels: Annotated[Int, Field(ge=1, le=60)] = 11
-    dwell: Annotated[Duration, Field(gt=0, le=1)] = 0.061
-    home: Annotated[Duration, Field(ge=0, le=10)] = 0.2
+    dwell: Annotated[Duration, Field(gt=0, le=1)] = 0.064
+    away: Annotated[Duration, Field(ge=0, le=10)] = 0.068
+    home: Annotated[Duration, Field(ge=0, le=10)] = 0.204
     handshake: Bool = True
+    sae: Bool = False
     processing: Annotated[Duration, Field(ge=0, le=1)] = 0.001
+    noise_dbm: Annotated[Number | Int, Field(ge=-120, le=0)] = -89.0
 
     @schema.model_validator(mode="after")
     def _check_intervals(self) -> "RoamingOptions":
@@ -77,7 +85,7 @@ class NeighbourNetworkOptions(Strict):
 class MicrowaveOvenOptions(Strict):
     """A domestic microwave oven. It sends noise once per mains cycle (Kamerman and Erkocevic, PIMRC 1997).
 
-    Here the noise lasts half of the cycle. Robots above 2.4 GHz do not receive it.
+    Here the noise lasts half of the cycle. Robots in another band than 2.4 GHz do not receive it.
 
     Attributes:
         at_m: Its position, metres east and north.

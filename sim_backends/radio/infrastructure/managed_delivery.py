@@ -43,6 +43,10 @@ class ManagementHandler(Protocol):
         """Process a frame that a station has received; `transmitter` and `receiver` are indices of stations."""
         ...
 
+    def on_management_lost(self, now_ns: int, transmitter: int, frame: ManagementFrame) -> None:
+        """Process a frame that the station with this index could not send."""
+        ...
+
 
 class ManagedDelivery(PacketDelivery[Payload]):
     """Packets of robots that may be stations of access points. The arguments are those of the base class.
@@ -219,6 +223,8 @@ class ManagedDelivery(PacketDelivery[Payload]):
         if not isinstance(frame.payload, ManagementFrame):
             super().lose(now_ns, transmitter, frame, reason)
             self._broadcast_receivers.pop(frame, None)
+        elif self.handler is not None:
+            self.handler.on_management_lost(now_ns, transmitter, frame.payload)
 
     @override
     def _intended_receivers(self, transmitter: int, frame: Frame[Payload]) -> Iterable[str]:

@@ -1,16 +1,17 @@
 """Association of robots with access points between which they roam: beacons, scans, association and its loss.
 
-All access points and robots share one channel here; a robot that scans another channel neither sends nor receives.
-Probe frames would be on the other channels, so they are omitted. A scan finds each access point that is linked with
-the robot when the scan ends. Beacons are sent on the air as broadcasts; the frames of an association have retries.
+All access points and robots share one channel here; a robot that scans neither sends nor receives packets. Probe
+frames are omitted. A scan finds each access point that is linked with the robot when the scan ends. Beacons are sent
+on the air as broadcasts; the frames of an association have retries. `benchmarks.roaming_vs_kernel` compares the times
+with those of Linux 6.1.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from sim_backends.radio.channel import RadioChannel
-from sim_backends.radio.infrastructure.background_scan import BackgroundScan, required_difference_db
+from sim_backends.radio.infrastructure.background_scan import BackgroundScan, prefers_other
 from sim_backends.radio.infrastructure.infrastructure_options import RoamingOptions
 from sim_backends.radio.infrastructure.managed_delivery import ManagedDelivery, ManagementFrame
 from sim_backends.radio.mac.contention import EventQueue
@@ -18,32 +19,67 @@ from sim_backends.radio.phy.transmissions import decibel
 from sim_backends.radio.power_save import BEACON_INTERVAL_NS
 
 BEACON: Final = "beacon"
+_NULL: Final = "null"
 
-_BEACON_BYTES: Final = 250
-"""Size of a beacon of hostapd with 802.11n and WPA2, estimated from its elements."""
+_BEACON_BYTES: Final = 192
+"""Size with FCS of a beacon of hostapd with 802.11n and WPA2. This and the following sizes were recorded."""
 
-# Kind, size with MAC header and FCS, and True if the robot sends it. 802.11-2020: 9.3.3.6 to 9.3.3.12 with the
-# elements of 802.11n and WPA2; 12.7.6 (an EAPOL-Key frame has 99 bytes and key data, and 8 bytes of LLC and SNAP).
-_ASSOCIATION: Final = (
-    ("authentication", 34, True),
-    ("authentication", 34, False),
-    ("reassociation request", 130, True),
-    ("reassociation response", 140, False),
-)
-_HANDSHAKE: Final = (
-    ("EAPOL-Key 1", 135, False),
-    ("EAPOL-Key 2", 157, True),
-    ("EAPOL-Key 3", 191, False),
-    ("EAPOL-Key 4", 135, True),
-)
-_STEP_TIMEOUT_NS: Final = 200_000_000
+
+class _Step(NamedTuple):
+    """A frame of an association.
+
+    Attributes:
+        kind: Its kind.
+        size_bytes: Its size with MAC header and FCS.
+        is_from_robot: True if the robot sends it.
+        timeout_ns: Time after which it is sent again if it was not received: for responses and requests
+            `IEEE80211_AUTH_TIMEOUT_SHORT` and `IEEE80211_ASSOC_TIMEOUT_SHORT` of mlme.c, for others the timeouts of
+            hostapd's wpa_auth.c.
+    """
+
+    kind: str
+    size_bytes: int
+    is_from_robot: bool
+    timeout_ns: int = 100_000_000
+
+
+_AUTHENTICATION: Final = "authentication"
+_REQUEST: Final = "reassociation request"
+_OPEN: Final = (_Step(_AUTHENTICATION, 34, True), _Step(_AUTHENTICATION, 34, False))
+_SAE: Final = tuple(_Step(_AUTHENTICATION, size, is_robot) for size in (132, 68) for is_robot in (True, False))
+_REASSOCIATION: Final = (_Step(_REQUEST, 159, True), _Step("reassociation response", 143, False))
+
+
+def _handshake(*sizes_bytes: int) -> tuple[_Step, ...]:
+    """Return the EAPOL-Key frames; hostapd waits for the second one longer, because the first was acknowledged."""
+    first, second, third, fourth = sizes_bytes
+    return (
+        _Step("EAPOL-Key 1", first, False),
+        _Step("EAPOL-Key 2", second, True, 1_000_000_000),
+        _Step("EAPOL-Key 3", third, False),
+        _Step("EAPOL-Key 4", fourth, True),
+    )
+
+
+_HANDSHAKE: Final = _handshake(137, 159, 193, 137)
+_SAE_HANDSHAKE: Final = _handshake(159, 165, 225, 137)
 _MAX_TRIES: Final = 3
-"""Time after which a frame of an association is sent again, and number of attempts: IEEE80211_AUTH_TIMEOUT,
-IEEE80211_ASSOC_TIMEOUT and their MAX_TRIES in mlme.c."""
+"""Number of attempts at each frame: `IEEE80211_AUTH_MAX_TRIES` and `IEEE80211_ASSOC_MAX_TRIES` of mlme.c."""
 
-LINK_LOSS_NS: Final = 7 * BEACON_INTERVAL_NS + 2 * 500_000_000
-"""Time without beacons after which a link is lost: 7 beacon intervals, and 2 null frames with a timeout of 500 ms
-each, as in mlme.c."""
+BEACON_LOSS_NS: Final = 7 * BEACON_INTERVAL_NS
+MONITOR_NS: Final = 1_000_000_000
+"""Time without beacons after which a station tests its link, and the interval at which it examines this time: mlme.c
+has one timer for this time, and `round_jiffies_up` rounds it up to a whole second."""
+_NULL_BYTES: Final = 30
+_NULL_FRAMES: Final = 2
+"""Size with FCS of the null frame of such a test, and the number of null frames without an ACK after which the link
+is lost: mlme.c, `max_nullfunc_tries`."""
+_RECONNECT_NS: Final = 100_000_000
+"""Time from the loss of a link until the next scan: events.c of wpa_supplicant."""
+
+_SELECTION_NS: Final = 10_000_000
+"""Time from the end of a scan until a robot leaves its access point: wpa_supplicant reads the results, and waiting
+packets are delivered. It is an assumption; on an emulated processor it was 31 ms."""
 
 _RESCAN_NS: Final = 5_000_000_000
 """Interval of scans without an association: the default of wpa_supplicant."""
@@ -57,7 +93,9 @@ class _Association:
         index: Index of the robot.
         access_point: The access point with which the robot is associated or is being associated, or None.
         scan: Schedule of its scans; None without an association.
-        beacon_ns: Time of the last beacon, or of a later association or return to the channel.
+        beacon_ns: Time of the last beacon, or of a later association, return to the channel, or ACK of a null frame.
+        left_ns: Time at which the current scan has left the channel.
+        null_frames: Number of null frames since the last beacon.
         is_busy: True during a scan or an association.
         exchange: Number of the current step of an association; events of other steps are ignored.
         step: Index of the frame that is sent next.
@@ -69,6 +107,8 @@ class _Association:
     access_point: int | None = None
     scan: BackgroundScan | None = None
     beacon_ns: int = 0
+    left_ns: int = 0
+    null_frames: int = 0
     is_busy: bool = False
     exchange: int = 0
     step: int = 0
@@ -84,7 +124,9 @@ class Roaming:
         events: Scheduled events.
         delivery: The packets, with robots and access points.
         options: Options of roaming.
-        phases_ns: Time of the first beacon of each access point, by index.
+        phases_ns: Time of the first beacon of each access point, and first time at which each robot examines its
+            link, by index.
+        high_throughput: True if the radios are of 802.11n or later.
     """
 
     def __init__(
@@ -94,19 +136,24 @@ class Roaming:
         delivery: ManagedDelivery[Any],
         options: RoamingOptions,
         phases_ns: Mapping[int, int],
+        *,
+        high_throughput: bool,
     ) -> None:
         self._channel = channel
         self._events = events
         self._delivery = delivery
         self._options = options
-        self._steps = _ASSOCIATION + (_HANDSHAKE if options.handshake else ())
+        self._steps = _association_steps(options)
         self._clients = {robot: _Association(robot) for robot in delivery.robots}
+        self._phases_ns = phases_ns
+        self._high_throughput = high_throughput
         self._dwell_ns, self._home_ns = round(options.dwell * 1e9), round(options.home * 1e9)
+        self._away_ns = round(options.away * 1e9)
         self._processing_ns = round(options.processing * 1e9)
         self._has_started = False
         delivery.serving_access_point = dict.fromkeys(delivery.robots)
-        for access_point, phase_ns in phases_ns.items():
-            events.schedule(phase_ns, self._send_beacon, access_point)
+        for access_point in delivery.access_points:
+            events.schedule(phases_ns[access_point], self._send_beacon, access_point)
 
     @property
     def cells(self) -> Mapping[int, int | None]:
@@ -131,7 +178,7 @@ class Roaming:
             else:
                 client.access_point = strongest
                 self._complete_association(now_ns, client)
-            self._events.schedule(now_ns + LINK_LOSS_NS, self._check_link, client)
+            self._events.schedule(self._monitor_ns(client), self._check_link, client)
 
     def on_management(self, now_ns: int, transmitter: int, receiver: int, frame: ManagementFrame) -> None:
         """Implement `ManagementHandler`."""
@@ -141,7 +188,12 @@ class Roaming:
                 self._on_beacon(now_ns, client, client.scan)
             return
         client = self._clients.get(receiver) or self._clients.get(transmitter)
-        if client is not None and frame.number == client.exchange and client.scan is None:
+        if client is None:
+            return
+        if frame.kind == _NULL:
+            client.beacon_ns = now_ns
+            client.null_frames = 0
+        elif frame.number == client.exchange and client.scan is None:
             client.exchange += 1
             client.step += 1
             client.tries = 0
@@ -154,47 +206,81 @@ class Roaming:
 
     def _on_beacon(self, now_ns: int, client: _Association, scan: BackgroundScan) -> None:
         client.beacon_ns = now_ns
+        client.null_frames = 0
         scan.on_beacon(now_ns, self._level_dbm(now_ns, client, client.access_point))
         if not client.is_busy and scan.next_ns <= now_ns:
             self._scan(now_ns, client)
 
+    def on_management_lost(self, now_ns: int, transmitter: int, frame: ManagementFrame) -> None:
+        """Implement `ManagementHandler`: a robot sends a request or null frame again, or its link is lost."""
+        client = self._clients.get(transmitter)
+        if client is None:
+            return
+        if frame.kind in {_AUTHENTICATION, _REQUEST}:
+            self._events.schedule(now_ns, self._send_next, client, frame.number)
+        elif frame.kind == _NULL and client.null_frames and client.scan is not None:
+            repeat = self._send_null if client.null_frames < _NULL_FRAMES else self._lose_link
+            self._events.schedule(now_ns, repeat, client)
+
+    def _monitor_ns(self, client: _Association) -> int:
+        """Return the time at which the robot tests its link if no further beacon arrives."""
+        phase_ns = self._phases_ns[client.index]
+        periods = -((phase_ns - client.beacon_ns - BEACON_LOSS_NS) // MONITOR_NS)
+        return phase_ns + periods * MONITOR_NS
+
     def _check_link(self, now_ns: int, client: _Association) -> None:
-        """End the association if no beacons arrive; the time of a scan, which misses beacons, does not count."""
-        if client.scan is not None and not client.is_busy and now_ns >= client.beacon_ns + LINK_LOSS_NS:
-            self._lose_link(now_ns, client)
-        next_ns = max(client.beacon_ns + LINK_LOSS_NS, now_ns + BEACON_INTERVAL_NS)
+        """Test the link if no beacons arrive; the time of a scan, which misses beacons, does not count."""
+        is_idle = client.scan is not None and not client.is_busy and not client.null_frames
+        if is_idle and now_ns >= self._monitor_ns(client):
+            self._send_null(now_ns, client)
+        next_ns = max(self._monitor_ns(client), now_ns + BEACON_INTERVAL_NS)
         self._events.schedule(next_ns, self._check_link, client)
+
+    def _send_null(self, now_ns: int, client: _Association) -> None:
+        if client.access_point is not None:
+            client.null_frames += 1
+            frame = ManagementFrame(_NULL, client.exchange)
+            self._delivery.send_management(now_ns, client.index, client.access_point, frame, _NULL_BYTES)
 
     def _lose_link(self, now_ns: int, client: _Association) -> None:
         client.access_point = client.scan = None
+        client.is_busy = True
+        client.null_frames = 0
         self._delivery.start_handover(now_ns, client.index)
         self._delivery.associate(now_ns, client.index, None)
-        self._scan(now_ns, client)
+        self._events.schedule(now_ns + _RECONNECT_NS, self._scan, client)
 
     def _scan(self, now_ns: int, client: _Association) -> None:
         client.is_busy = True
         client.levels_dbm = {}
         if client.scan is not None:
             client.scan.on_scan(now_ns)
-        # Channel 0 is the current channel. An associated robot visits only the others.
-        self._visit_channel(now_ns, client, 0 if client.scan is None else 1)
-
-    def _visit_channel(self, now_ns: int, client: _Association, channel: int) -> None:
-        """Scan a channel, or end the scan after the last channel."""
-        if channel >= self._options.channels:
-            self._finish_scan(now_ns, client)
-            return
-        if client.scan is not None:
-            self._delivery.hold(now_ns, client.index)
-        self._events.schedule(now_ns + self._dwell_ns, self._leave_channel, client, channel)
+            if self._options.channels == 1:
+                # The robot continues to send and receive. It sends a probe request without the first half of `dwell`.
+                self._events.schedule(now_ns + self._dwell_ns // 2, self._finish_scan, client)
+                return
+        self._leave_channel(now_ns, client, 0)
 
     def _leave_channel(self, now_ns: int, client: _Association, channel: int) -> None:
-        pause_ns = 0
+        """Visit channels of a scan, from the one of this number; one of them is the robot's channel."""
+        client.left_ns = now_ns
+        if client.scan is not None:
+            self._delivery.hold(now_ns, client.index)
+        self._events.schedule(now_ns + self._dwell_ns, self._end_visit, client, channel + 1)
+
+    def _end_visit(self, now_ns: int, client: _Association, channel: int) -> None:
+        """End the scan or visit the next channel; an associated robot returns first if it is away too long."""
+        is_last = channel >= self._options.channels
+        if not is_last and (client.scan is None or now_ns <= client.left_ns + self._away_ns):
+            self._events.schedule(now_ns + self._dwell_ns, self._end_visit, client, channel + 1)
+            return
         if client.scan is not None:
             self._delivery.release(now_ns, client.index)
             client.beacon_ns = now_ns
-            pause_ns = self._home_ns if channel + 1 < self._options.channels else 0
-        self._events.schedule(now_ns + pause_ns, self._visit_channel, client, channel + 1)
+        if is_last:
+            self._finish_scan(now_ns, client)
+        else:
+            self._events.schedule(now_ns + self._home_ns, self._leave_channel, client, channel)
 
     def _finish_scan(self, now_ns: int, client: _Association) -> None:
         """Associate with the strongest access point, if the robot has none or this one is sufficiently stronger."""
@@ -206,15 +292,19 @@ class Roaming:
             else:
                 self._associate(now_ns, client, strongest)
             return
-        current_dbm = client.scan.average_dbm
-        if (
-            strongest is not None
-            and strongest != client.access_point
-            and client.levels_dbm[strongest] >= current_dbm + required_difference_db(current_dbm)
-        ):
-            self._associate(now_ns, client, strongest)
+        client.scan.on_scan_end(now_ns)
+        if strongest is not None and self._prefers(client, client.scan, strongest):
+            self._events.schedule(now_ns + _SELECTION_NS, self._associate, client, strongest)
         else:
             client.is_busy = False
+
+    def _prefers(self, client: _Association, scan: BackgroundScan, access_point: int) -> bool:
+        return access_point != client.access_point and prefers_other(
+            scan.level_dbm,
+            round(client.levels_dbm[access_point]),
+            round(self._options.noise_dbm),
+            high_throughput=self._high_throughput,
+        )
 
     def _associate(self, now_ns: int, client: _Association, access_point: int) -> None:
         client.access_point, client.scan = access_point, None
@@ -236,18 +326,20 @@ class Roaming:
             self._scan(now_ns, client)
             return
         client.tries += 1
-        kind, size_bytes, is_from_robot = self._steps[client.step]
+        client.exchange += 1
+        step = self._steps[client.step]
         ends = client.index, client.access_point
-        transmitter, receiver = ends if is_from_robot else ends[::-1]
-        content = ManagementFrame(kind, exchange)
-        self._delivery.send_management(now_ns, transmitter, receiver, content, size_bytes)
-        self._events.schedule(now_ns + _STEP_TIMEOUT_NS, self._send_next, client, exchange)
+        transmitter, receiver = ends if step.is_from_robot else ends[::-1]
+        self._events.schedule(now_ns + step.timeout_ns, self._send_next, client, client.exchange)
+        content = ManagementFrame(step.kind, client.exchange)
+        self._delivery.send_management(now_ns, transmitter, receiver, content, step.size_bytes)
 
     def _complete_association(self, now_ns: int, client: _Association) -> None:
         options = self._options
         client.is_busy = False
         client.exchange += 1
         client.beacon_ns = now_ns
+        client.null_frames = 0
         client.scan = BackgroundScan.start(
             now_ns,
             self._level_dbm(now_ns, client, client.access_point),
@@ -271,3 +363,8 @@ class Roaming:
     def _level_dbm(self, now_ns: int, client: _Association, access_point: int | None) -> float:
         assert access_point is not None
         return decibel(self._channel.powers_mw(access_point, now_ns)[client.index])
+
+
+def _association_steps(options: RoamingOptions) -> tuple[_Step, ...]:
+    handshake = _SAE_HANDSHAKE if options.sae else _HANDSHAKE
+    return (*(_SAE if options.sae else _OPEN), *_REASSOCIATION, *(handshake if options.handshake else ()))

@@ -2,7 +2,11 @@
 
 import pytest
 
-from sim_backends.radio.infrastructure.background_scan import BackgroundScan, required_difference_db
+from sim_backends.radio.infrastructure.background_scan import (
+    BackgroundScan,
+    estimated_throughput_kbit_s,
+    prefers_other,
+)
 
 S = 10**9
 
@@ -25,10 +29,24 @@ def test_a_signal_that_falls_below_the_threshold_starts_a_scan() -> None:
     while schedule.next_ns == 300 * S:
         beacon_count += 1
         schedule.on_beacon(20 * S, -70.0)
-    # -70 + 20 (3/4)^n is below -65 from n = 5 on.
-    assert (beacon_count, schedule.next_ns) == (5, 20 * S)
+    # 70 - 20 (3/4)^n is at least 66 from n = 6 on; it is rounded down to 65 before.
+    assert (beacon_count, schedule.next_ns) == (6, 20 * S)
     schedule.on_scan(20 * S)
-    assert schedule.next_ns == 50 * S
+    schedule.on_scan_end(22 * S)
+    assert schedule.next_ns == 52 * S, "the interval starts at the end of a scan"
+
+
+def test_the_average_stays_below_a_constant_signal_like_that_of_mac80211() -> None:
+    """The fixed-point average of 65 and then 66 ends at 65 13/16, because each step is rounded down."""
+    schedule = start_schedule()
+    for signal_dbm in (-65.0, *[-66.4] * 100):
+        schedule.on_beacon(10 * S, signal_dbm)
+    assert schedule.level_dbm == -65
+    assert schedule.next_ns == 300 * S
+    for _ in range(4):
+        schedule.on_beacon(11 * S, -66.6)
+    assert schedule.level_dbm == -66
+    assert schedule.next_ns == 11 * S
 
 
 def test_a_signal_that_rises_above_the_threshold_by_the_hysteresis_ends_short_intervals() -> None:
@@ -51,7 +69,15 @@ def test_a_further_fall_scans_again_at_most_every_ten_seconds() -> None:
             schedule.on_beacon(at_s * S, signal_dbm)
         if schedule.next_ns == at_s * S:
             schedule.on_scan(at_s * S)
+            schedule.on_scan_end(at_s * S)
         assert schedule.next_ns == {1: 300, 5: 35, 8: 35, 16: 46}[at_s] * S
+
+
+def test_with_one_interval_the_signal_has_no_effect() -> None:
+    schedule = BackgroundScan.start(0, -50.0, threshold_dbm=-65.0, short_ns=S, long_ns=S)
+    for number in range(20):
+        schedule.on_beacon(number, -50.0 - 2 * number)
+    assert schedule.next_ns == S
 
 
 def test_many_short_scans_are_followed_by_a_long_interval() -> None:
@@ -59,9 +85,54 @@ def test_many_short_scans_are_followed_by_a_long_interval() -> None:
     for _ in range(12):
         times_s.append(schedule.next_ns // S)
         schedule.on_scan(schedule.next_ns)
+        schedule.on_scan_end(schedule.next_ns)
     assert times_s == [30 * number for number in range(1, 12)] + [330 + 300]
 
 
-@pytest.mark.parametrize(("current_dbm", "margin_db"), [(-86, 1), (-85, 2), (-80, 3), (-75, 4), (-70, 5), (-40, 5)])
-def test_the_required_margin_increases_with_the_current_signal(current_dbm: float, margin_db: float) -> None:
-    assert required_difference_db(current_dbm) == margin_db
+# The expected throughputs were computed with the lines of scan.c of wpa_supplicant 2.10.
+@pytest.mark.parametrize(
+    ("ratio_db", "n_kbit_s", "g_kbit_s"),
+    [
+        (-1, 1000, 1000),
+        (3, 8666, 2000),
+        (10, 24000, 24000),
+        (12, 30000, 30000),
+        (17, 47666, 45000),
+        (18, 52000, 48000),
+        (21, 59800, 54000),
+        (24, 63700, 54000),
+        (25, 65000, 54000),
+        (60, 65000, 54000),
+    ],
+)
+def test_the_estimated_throughput_is_that_of_wpa_supplicant(ratio_db: int, n_kbit_s: int, g_kbit_s: int) -> None:
+    assert estimated_throughput_kbit_s(ratio_db) == n_kbit_s
+    assert estimated_throughput_kbit_s(ratio_db, high_throughput=False) == g_kbit_s
+
+
+MARGINS: dict[tuple[int, bool], str] = {
+    (-92, True): "11111111111111122212223334445",
+    (-89, True): "11111111111111111122222223444445",
+    (-92, False): "11111111111111122222223445555",
+    (-89, False): "11111111111111111122222224555555",
+}
+"""Smallest difference with which wpa_supplicant 2.10 roams, in dB, at signals of -95 dBm, -94 dBm and so on.
+
+The keys are the noise, and True for 802.11n or false for 802.11g. The values were computed with a program that
+contains the lines of its scan.c and events.c. At stronger signals it does not roam.
+"""
+
+
+@pytest.mark.parametrize(("noise_dbm", "high_throughput"), MARGINS)
+def test_a_handover_needs_the_difference_of_signals_of_wpa_supplicant(
+    *, noise_dbm: int, high_throughput: bool
+) -> None:
+    margins_db = list(map(int, MARGINS[noise_dbm, high_throughput]))
+    for current_dbm in range(-95, -40):
+        index = current_dbm + 95
+        levels_dbm = range(current_dbm + margins_db[index], -20) if index < len(margins_db) else ()
+        assert [
+            level
+            for level in range(-100, -20)
+            if prefers_other(current_dbm, level, noise_dbm, high_throughput=high_throughput)
+        ] == list(levels_dbm)
