@@ -141,6 +141,15 @@ def errors_table(predictions: Sequence[Prediction]) -> Iterator[str]:
             yield f"| {' | '.join((name, *_errors_cells(groups[name])))} |"
 
 
+def summary(predictions: Sequence[Prediction]) -> str:
+    """Return how many links, radios and places there are."""
+    numbers = [len({each.measured.cells[name] for each in predictions}) for name in ("radio", "place")]
+    return (
+        f"{len(predictions)} links of {numbers[0]} radios at {numbers[1]} places, selected by rules in the program "
+        "that precede the first prediction:"
+    )
+
+
 def links_table(predictions: Sequence[Prediction]) -> Iterator[str]:
     """Yield the lines of the table of links."""
     yield "| radio | PHY rate (Mbit/s) | measured (Mbit/s) | logged mode | selected modes |"
@@ -173,7 +182,7 @@ def main() -> None:
     parser.add_argument("--page", type=Path, help="page into which the tables are written")
     options = parser.parse_args()
     predictions = predict(read_links(TABLE)[: options.links])
-    lines = [*errors_table(predictions), ""]
+    lines = [summary(predictions), "", *errors_table(predictions), ""]
     if options.page is None:
         print("\n".join((*lines, *links_table(predictions))))
         return
