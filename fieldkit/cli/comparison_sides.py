@@ -81,7 +81,7 @@ def read(arguments: argparse.Namespace) -> Sides:
 def _columns_by_factor(run: Sources) -> list[frozenset[str]]:
     """Return the columns of each factor (a setting that a sweep varies).
 
-    The first column has the values as text, as written in the command; the second has them as numbers.
+    One has the values as text, as written in the command. If they are numbers, another column has them as numbers.
     """
     return [frozenset(names) for names in run.sweep_columns.items()]
 

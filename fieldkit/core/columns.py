@@ -113,7 +113,8 @@ class Figure:
 
 
 PHY_RATE: Final = "phy_rate_bit_s"
-"""End of the names of columns of PHY rates. A clock that measures no real durations does not affect them."""
+"""End of the names of columns of PHY rates. Their values remain valid if the clock of the robots does not measure
+real durations (`backends.protocols.INSTRUCTIONS`)."""
 
 
 @dataclass(frozen=True)

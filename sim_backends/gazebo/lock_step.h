@@ -272,7 +272,8 @@ class LockStep
         m_monitor.awaited_ns = time_ns;
     }
 
-    // Gazebo publishes the time of a step before it makes the step, so this waits for poses with that time stamp.
+    // Gazebo publishes the time of a step before it makes the step, so this waits for poses with that time stamp. It also
+    // waits for the time itself: messages of different topics can arrive in any order.
     void WaitForPoses(WorldMonitor::Lock& lock, int64_t target_ns, int64_t before_ns, const Connection::Answer& answer)
     {
         auto have_arrived = [&] {
@@ -286,10 +287,10 @@ class LockStep
             {
                 m_monitor.Fail("it was reset" + m_monitor.LastMessage());
             }
-            return m_monitor.pose_ns == target_ns && NewAgents().empty();
+            return m_monitor.pose_ns == target_ns && m_monitor.clock_ns == target_ns && NewAgents().empty();
         };
         m_monitor.Wait(lock, have_arrived, [&]() -> std::string {
-            if (m_monitor.pose_ns == target_ns)
+            if (m_monitor.pose_ns == target_ns && m_monitor.clock_ns == target_ns)
             {
                 return "the models of " + NewAgents() + " have not been created by " +
                        m_options.Name(m_options.create_service);

@@ -75,7 +75,8 @@ class WorldMonitor
         {
             return; // a paused world repeats its clock
         }
-        bool is_expected = clock_ns <= time_ns && time_ns <= awaited_ns;
+        // The awaited time notifies only if its poses have arrived before it.
+        bool is_expected = clock_ns <= time_ns && (pose_ns < awaited_ns ? time_ns <= awaited_ns : time_ns < awaited_ns);
         clock_ns = time_ns;
         if (!is_expected)
         {

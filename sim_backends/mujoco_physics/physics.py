@@ -50,7 +50,7 @@ class SensedStates(Mapping[str, State]):
     """The states of the present agents at a step, each created on request.
 
     Args:
-        rows: Position of each present agent in the order of the sensors.
+        rows: Index of each present agent in the order of the sensors.
         numbers: The values of all sensors, `SENSED_NUMBERS` for each agent, also for absent agents.
     """
 

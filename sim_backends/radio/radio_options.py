@@ -86,9 +86,9 @@ class RadioOptions(Strict):
             time of about 0.5 s.
         noise_floor_dbm: Noise and interference at a receiver, in dBm. -95 dBm is thermal noise in 20 MHz (-101 dBm)
             and a noise figure of 6 dB.
-        mode: Fixed transmission mode: `g6` to `g54` (Mbit/s), `a6` to `a54` above 2.4 GHz, `n0` to `n7` (MCS). If the
-            robots' profiles have `radio.phy`, it can also be format, width in MHz, MCS, streams and guard interval,
-            `vht80-mcs9-2ss-400ns`. If it is omitted, stations adapt the rate to acknowledgements.
+        mode: Fixed transmission mode: `g6` to `g54` (Mbit/s), `a6` to `a54` (5 and 6 GHz), `n0` to `n7` (MCS).
+            If the robots' profiles have `radio.phy`, it can also be format, width in MHz, MCS, streams and guard
+            interval, `vht80-mcs9-2ss-400ns`. If it is omitted, stations adapt the rate to acknowledgements.
         queue_packets: Queue length per station, or per fixed link, in packets, without the packet on the air; 1000 is
             Linux's default.
         access_points: Access points that are not robots, by name: a robot is a station of one of them and

@@ -11,7 +11,7 @@
  *
  * With `--reset world`, a reset builds the world and its plugins again, as in later versions. A fault is an action of
  * another program at a simulated time: `pause`, `reset`, `step` (one more step than requested), `remove` (the first
- * model that moves), `exit`. */
+ * model that moves), `exit`. `late-clock`: from this time on the clock of a step arrives 5 ms after its poses. */
 
 #include <ignition/msgs/boolean.pb.h>
 #include <ignition/msgs/clock.pb.h>
@@ -316,7 +316,8 @@ private:
         } else if (!is_paused_) {
             time_ns_ += step_ns_;
         }
-        publish_clock();
+        if (!is_clock_late_)
+            publish_clock();
         create_and_remove_models();
         place_models();
         if (!is_paused_) {
@@ -331,6 +332,10 @@ private:
                 model->post_update(double(step_ns_) / 1e9);
         }
         publish_poses();
+        if (is_clock_late_) {
+            std::this_thread::sleep_for(std::chrono::milliseconds(5));
+            publish_clock();
+        }
         if (!is_paused_ && pending_steps_ > 0 && --pending_steps_ == 0)
             is_paused_ = true;
         cause_fault();
@@ -361,6 +366,8 @@ private:
             remove(models_.front()->name);
         else if (fault_ == "exit")
             _exit(1);
+        else if (fault_ == "late-clock")
+            is_clock_late_ = true;
         fault_.clear();
     }
 
@@ -470,6 +477,7 @@ private:
 
     bool resets_world_;
     std::string fault_;
+    bool is_clock_late_ = false;
     int64_t fault_ns_, step_ns_ = 0, period_ns_ = 0, time_ns_ = 0;
     int64_t pending_steps_ = 0;
     bool is_paused_ = true, resets_time_ = false;

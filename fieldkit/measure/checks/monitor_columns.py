@@ -42,7 +42,7 @@ def _role_columns(role: Role) -> tuple[Column, ...]:
         (
             f"{role}_monitor_retry_flags",
             "count",
-            f"Frames in {role}_monitor_received with the retry flag: an earlier attempt of the frame was lost.",
+            f"Frames in {role}_monitor_received with the retry flag: an earlier attempt, or its ACK, was lost.",
         ),
         (
             f"{role}_monitor_signal_dbm",

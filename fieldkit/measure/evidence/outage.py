@@ -1,7 +1,8 @@
 """Outage of a robot caused by an injected fault, computed from the file of an observer.
 
-The observer is the robot at the other end of the link, which pings the robot with the fault. If a process is killed,
-the observer is the robot itself, which polls the process; a poll that finds the process running counts as an answer.
+The observer is the sender, or the receiver if the sender has the fault; it pings the robot with the fault. If a
+process is killed, the observer is the robot itself, which polls the process; a poll that finds the process running
+counts as an answer.
 
 All times are by the observer's clock, and the resolution is the interval of pings or polls: if two consecutive
 answers are a time G apart, the outage lasted at most G, and at least G minus two intervals.

@@ -22,11 +22,14 @@ def _observer(kind: FaultKind) -> str:
 def fault_columns(kind: FaultKind) -> tuple[Column, ...]:
     """Return the columns of a kind of fault."""
     outage_column = fault_column_name(kind, "outage_s")
-    outage_meaning = f"Longest time without a reply around the fault {kind}; empty if the robot did not recover."
+    target, missing_text = (
+        ("process", "without a running process") if kind is FaultKind.KILL else ("robot", "without a reply")
+    )
+    outage_meaning = f"Longest time {missing_text} around the fault {kind}; empty if the {target} did not recover."
     recovery_meaning = f"Part of {outage_column} after the end of the cause of {kind}; empty if either is unknown."
-    recovered_meaning = f"True if the robot recovered from the fault {kind} within the time limit."
+    recovered_meaning = f"True if the {target} recovered from the fault {kind} within the time limit."
     bound_meaning = (
-        f"Lower bound of the recovery time if the robot did not recover from {kind} and the end of its cause is "
+        f"Lower bound of the recovery time if the {target} did not recover from {kind} and the end of its cause is "
         "known; otherwise empty."
     )
     index, bound = list(FaultKind).index(kind), fault_column_name(kind, "recovery_at_least_s")

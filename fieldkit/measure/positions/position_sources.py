@@ -83,7 +83,7 @@ class PositionSources:
     Attributes:
         robots: Sources by role.
         clocks: Offsets of the robots' clocks from the laptop's, if they were measured.
-        heights: True if heights above the ellipsoid are used. Their errors are often 10 m.
+        heights: True if the heights of places in degrees are used. Their errors are often 10 m.
     """
 
     robots: Mapping[Role, PositionSource] = field(default_factory=lambda: MappingProxyType({}))

@@ -93,7 +93,8 @@ class CrossingCounts:
         bytes: Their total size as received.
         refused: Number of messages that the target did not accept in time.
         unreadable: Number of dropped messages that are not valid for the type.
-        per_s: Messages per second between the first and the last; None for fewer than two, or if both have one time.
+        per_s: Messages per second between the first and the last; None for fewer than two, or if both have the same
+            time.
         bytes_per_s: Bytes per second in the same time, without the first message; None if `per_s` is None.
         delay_median_s: Median time from the arrival of a message until the target accepted it; its precision is 1 %.
             None if no message was forwarded.

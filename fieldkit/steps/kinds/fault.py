@@ -62,10 +62,10 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     - `kill`: every process named `process` ends at the same moment.
 
     An observer records when the robot answers. It starts before the fault, and ends when the robot has answered again
-    for a second. It sends a ping every 100 ms (200 ms if an old iputils requires it) from the robot at the other end
-    of the link, or for `kill` polls the robot's processes. Writes `fault-KIND-ping.txt` or `fault-kill-watch.txt`,
-    `fault-KIND.txt` (duration of the fault, and interval of the pings or polls), and `fault-KIND-times.txt` (start
-    and end of the fault, see [recovery](method-delay.md#recovery)).
+    for a second. It sends a ping every 100 ms (200 ms if an old iputils requires it) from the sender, or from the
+    receiver if the sender has the fault; for `kill` it polls the robot's processes. Writes `fault-KIND-ping.txt` or
+    `fault-kill-watch.txt`, `fault-KIND.txt` (duration of the fault, and interval of the pings or polls), and
+    `fault-KIND-times.txt` (start and end of the fault, see [recovery](method-delay.md#recovery)).
 
     Attributes:
         robot: Role of the robot with the fault.

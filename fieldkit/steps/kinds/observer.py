@@ -35,7 +35,10 @@ _RECOVERY_SCRIPT: Final = (
 
 
 def observer_role(fault: Fault) -> Role:
-    """Return the role of the observing robot: the other end of the pair, or the robot itself for `kill`."""
+    """Return the role of the observing robot.
+
+    For `kill`, it is the robot with the fault; otherwise the sender, or the receiver if the sender has the fault.
+    """
     if fault.kind is FaultKind.KILL:
         return fault.role
     return Role.RECEIVER if fault.role == Role.SENDER else Role.SENDER
@@ -43,7 +46,7 @@ def observer_role(fault: Fault) -> Role:
 
 @dataclass(frozen=True)
 class Observer:
-    """Records when a robot answers, by pings from the other end, or by polls of its process on the robot itself.
+    """Records when a robot answers, by pings from another robot, or by polls of its process on the robot itself.
 
     Attributes:
         scene: The attempt.

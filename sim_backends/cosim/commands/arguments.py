@@ -212,12 +212,12 @@ def _add_goodput(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "goodput",
         help="predict the goodput of logged Wi-Fi links",
-        description="Predict the goodput of Wi-Fi links from a log of their signals, channel widths and MCS, and "
-        "compare it with measured goodputs. LOG is a CSV file with a row per link; its columns are signal_dbm and, "
-        "if known, standard, width_mhz, streams, guard_interval_ns, mcs, phy_rate_bit_s, protocol, goodput_bit_s.",
-        epilog="example: fieldkit cosim goodput links.csv --format csv > predicted.csv",
+        description="Predict the goodput of the Wi-Fi links in LOG, a CSV file with a row per link. Its columns are "
+        "signal_dbm and, if known, standard, width_mhz, streams, guard_interval_ns, mcs or phy_rate_bit_s, protocol, "
+        "and goodput_bit_s, the measured goodput.",
+        epilog="example: fieldkit cosim goodput links.csv --format csv",
     )
-    parser.add_argument("log", type=Path, metavar="LOG", help="CSV file of the links")
+    parser.add_argument("log", type=Path, metavar="LOG", help="the CSV file")
     _add_changes(parser)
     add_workers(parser)
     _add_format(parser)

@@ -18,7 +18,7 @@ from fieldkit.core import files
 from fieldkit.core.errors import EvidenceError
 
 SCHEMA_VERSION: Final = 2
-RUN_AGAIN: Final = "use a copy of the folder if there is one, or run the scenario in it again"
+RUN_AGAIN: Final = "use a copy of the folder if there is one, or run the scenario again with another --out"
 """The remedy for a damaged recording."""
 _NAME: Final = "run.json"
 _CHECKSUM: Final = "content_hash"

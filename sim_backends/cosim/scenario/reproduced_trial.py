@@ -88,7 +88,7 @@ class ReproducedTrial(Strict):
             yield "the traffic of one protocol starts before all traffic of the other protocol has started", ()
 
     def repeats(self, traffic: Sequence[Traffic], duration_ns: int) -> tuple["ReproducedRepeat", ...]:
-        """Return the part of a run for each protocol, in order of time.
+        """Return the part of a run for each protocol: first TCP, then UDP, even if UDP runs first.
 
         Args:
             traffic: The traffic of the scenario.

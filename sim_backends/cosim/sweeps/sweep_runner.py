@@ -161,7 +161,7 @@ def run_sweep(
                 folder.write_failure(run, failure)
                 if failure.is_final:
                     final_failures.add(run.name)
-            report.report_end(run, failure)
+            report.report_end(run, attempts[run.name], failure)
     failures = [
         (run, failure) for run in missing_runs if run.name not in finished and (failure := folder.failure(run))
     ]
@@ -193,24 +193,20 @@ class _Reporter:
         self._start_s = time.monotonic()
         sink(Progress("sweep", finished_count, total, "runs"))
 
-    def report_end(self, run: SweepRun, failure: RunFailure | None) -> None:
+    def report_end(self, run: SweepRun, attempt: int, failure: RunFailure | None) -> None:
         self._finished_count += failure is None
         spent_s, new_count = time.monotonic() - self._start_s, self._finished_count - self._initial_count
         remaining_s = spent_s / new_count * (self._total - self._finished_count) if new_count else None
-        if failure is None:
-            self._sink(
-                SweepRunEnded(str(run.setting), run.seed, run.name, "", "", 1, self._finished_count, self._total)
-            )
-        else:
-            event = SweepRunEnded(
+        self._sink(
+            SweepRunEnded(
                 str(run.setting),
                 run.seed,
                 run.name,
-                failure.reason,
-                failure.remedy,
-                failure.attempts,
+                "" if failure is None else failure.reason,
+                "" if failure is None else failure.remedy,
+                attempt,
                 self._finished_count,
                 self._total,
             )
-            self._sink(event)
+        )
         self._sink(Progress("sweep", self._finished_count, self._total, "runs", remaining_s))

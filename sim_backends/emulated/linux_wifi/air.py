@@ -110,7 +110,7 @@ class _ChainRates(RateControl):
         return self._frame.chain.modes[attempt - 1]
 
     @override
-    def report(self, mode: WifiMode, *, acknowledged: int, attempts: int = 1) -> None:
+    def report(self, mode: WifiMode, *, acknowledged: int, frames: int = 1) -> None:
         frame = self._frame
         assert frame is not None
         frame.is_acknowledged = bool(acknowledged)

@@ -85,7 +85,7 @@ class NeighbourNetworkOptions(Strict):
 class MicrowaveOvenOptions(Strict):
     """A domestic microwave oven. It sends noise once per mains cycle (Kamerman and Erkocevic, PIMRC 1997).
 
-    Here the noise lasts half of the cycle. Robots above 2.4 GHz do not receive it.
+    Here the noise lasts half of the cycle. Robots in another band than 2.4 GHz do not receive it.
 
     Attributes:
         at_m: Its position, metres east and north.

@@ -141,6 +141,12 @@ def test_poses_of_an_older_time_are_not_used(rebuilding_server: GazeboServer, tm
         assert state.position_m == pytest.approx(expected[-1][name].position_m, abs=1e-6)
 
 
+def test_the_clock_may_arrive_after_the_poses_of_its_step(tmp_path: Path) -> None:
+    with gazebo_server(tmp_path, SDF, "--fault", "late-clock@0") as gazebo, open_federate(gazebo) as physics:
+        states = drive(physics, 20)
+    assert states[-1]["leader"].position_m[0] > states[0]["leader"].position_m[0]
+
+
 def test_the_federate_reports_that_it_is_busy_if_gazebo_is_slow(tmp_path: Path) -> None:
     assert "<real_time_factor>5<" in SDF
     slow_sdf = SDF.replace("<real_time_factor>5<", "<real_time_factor>0.05<")

@@ -304,7 +304,7 @@ def test_a_recording_that_was_truncated_or_damaged_anywhere_is_refused(
             path.write_bytes(content[:offset])
         else:
             path.write_bytes(content[:offset] + bytes([content[offset] ^ 1]) + content[offset + 1 :])
-        with pytest.raises(EvidenceError, match=r"truncated|changed"):
+        with pytest.raises(EvidenceError, match=r"truncated|changed|missing"):
             read_recording(recorded_folder)
     finally:
         path.write_bytes(content)

@@ -115,6 +115,22 @@ def test_a_failed_run_states_its_reason_and_is_tried_a_limited_number_of_times(
     assert dataset(lab / "failing") == dataset(lab / "sweep")
 
 
+def test_event_of_a_repeated_run_has_the_number_of_its_attempt(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[int] = []
+
+    def fail_first(scenario: CosimScenario, policy: str, seed: int, folder: None) -> Any:  # noqa: ANN401 (as simulate)
+        calls.append(seed)
+        if len(calls) == 1:
+            raise LinkError("no answer", where="network", remedy="start it")
+        return simulate(scenario, policy, seed, folder)
+
+    monkeypatch.setattr(sweep_runner, "simulate", fail_first)
+    result = run_here(lab, *SWEEP[:4], "policy=scheduled", "--seeds", "1", "--jobs", "1", "--json", "-o", "repeated")
+    events = [json.loads(line) for line in result.out.splitlines()]
+    ends = [(event["attempt"], bool(event["reason"])) for event in events if event["event"] == "sweep_run_ended"]
+    assert ends == [(1, True), (2, False)]
+
+
 @pytest.mark.parametrize("error", [EvidenceError("no such flow"), ValueError("a defect"), ConfigurationError("bad")])
 def test_a_failure_that_would_occur_again_is_tried_once(
     lab: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, error: Exception
