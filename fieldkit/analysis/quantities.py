@@ -78,7 +78,7 @@ class Quantity:
 
     @property
     def is_builtin(self) -> bool:
-        """True if tables and charts treat the quantity as built-in: its rank determines this (`columns.Figure.rank`)."""
+        """True if tables and charts treat the quantity as built-in; see `columns.Figure.rank`."""
         return not FIRST_EXTERNAL_RANK <= self.rank < BACKGROUND
 
     @property
