@@ -1,4 +1,4 @@
-"""The overhead of a repeat by phase: its wall time minus the time of the tools on the robots."""
+"""The overhead of a repeat by phase: its wall time minus the times of rosbag, nc and ping on the robots."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,7 +33,9 @@ class Repeat:
 
 
 def overhead_ms(start_ns: int, phases: dict[str, int], end_ns: int, tools: Sequence[Lifetime]) -> dict[str, float]:
-    """Return the wall time of a repeat minus the time of the tools, in ms, by phase.
+    """Return the wall time of a repeat minus the times of rosbag, nc and ping, in ms, by phase.
+
+    The times in which captures start and end, and in which tar transports files, are part of the overhead.
 
     Args:
         start_ns: Start of the repeat.

@@ -2,9 +2,11 @@
 
 The program runs trials of four layouts and two hello intervals in sequence, unless FOLDER already has them, on
 emulated robots without fading, with five repeats each. This takes 2 hours. Then it prints a table of the gap
-(`rtt_gap_s`: the longest time without a reply to a ping), with its upper bound of 13.7 hello intervals
-(docs/studies/mesh.md), and draws a figure. In each repeat a robot on the path is switched off, and the mesh must find
-another path. The layout `row` has no other path, so its healing time starts when the robot is switched on again.
+(`rtt_gap_s`: the longest time without a reply to a ping) with the bound of 13.7 hello intervals, and draws a figure.
+In each repeat a robot on the path is switched off, and the mesh must find another path. The bound is valid only if
+the other path has at most as many hops; in `detour` and `ring` it has more, so healing may take longer
+(docs/studies/mesh.md). The layout `row` has no other path, so its healing time starts when the robot is switched on
+again.
 """
 
 import argparse

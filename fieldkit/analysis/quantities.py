@@ -78,8 +78,7 @@ class Quantity:
 
     @property
     def is_builtin(self) -> bool:
-        """True for a built-in quantity, False if another package or a lab declares it."""
-        # Ranks from `BACKGROUND` on belong to built-in quantities that every trial has.
+        """True if tables and charts treat the quantity as built-in; see `columns.Figure.rank`."""
         return not FIRST_EXTERNAL_RANK <= self.rank < BACKGROUND
 
     @property

@@ -78,7 +78,10 @@ class Kind(StrEnum):
 
 
 FIRST_EXTERNAL_RANK: Final = 100
-"""Lowest rank of a figure that another package declares."""
+"""Default rank of a figure.
+
+It is the rank of figures of other packages and labs, and of several of fieldkit's steps, such as `roam` and `fly`.
+"""
 BACKGROUND: Final = 1000
 """Lowest rank of fieldkit's background figures, which every trial has; they are listed last."""
 
@@ -92,8 +95,9 @@ class Figure:
         kind: Kind of aggregation.
         arrived: Column with the number of received items; None unless the kind is `counted`.
         sent: Column with the number of sent items; None unless the kind is `counted`.
-        rank: Sort key among the figures of a table; figures of equal rank keep the order of columns. The ranks of
-            fieldkit's figures are below `FIRST_EXTERNAL_RANK`, or `BACKGROUND` and above.
+        rank: Sort key among the figures of a table; figures of equal rank keep the order of columns. With a rank
+            from `FIRST_EXTERNAL_RANK` to below `BACKGROUND`, fieldkit's own figures are displayed like those of other
+            packages (`Quantity.is_builtin` is False).
         at_least: Column with the duration observed so far, for repeats in which the event had not ended (a
             right-censored value); in these repeats the figure's own column is empty. Allowed only for medians. The
             column must have the same unit and no figure.
@@ -127,7 +131,7 @@ class Column:
         meaning: What the value is, and when it is empty.
         rank: Sort key among the columns of trial.csv, from the left; columns of equal rank keep the order of
             declaration. Columns of schema versions 1 and 2 have ranks below 100, so that their order never changes.
-        bounds: Smallest and largest possible value, if narrower than the bounds of the unit.
+        bounds: Smallest and largest possible value; None for the bounds of the unit.
         figure: How the repeats are aggregated; None if they are not.
     """
 

@@ -1,7 +1,8 @@
-"""Times and flows in one attempt on the clock of the first sending robot.
+"""Times and flows in one attempt.
 
-The times are of packets, pings, jobs, faults and moves. Flows are drawn as panels over time: the payload rate that
-iperf3 measured, and the panels of steps that implement `DrawsPanels`.
+The times are of packets, pings, jobs, faults and moves. Those of the first transfer's receiver are converted to the
+clock of its sender; other times are not converted. Flows are drawn as panels over time: the payload rate that iperf3
+measured, and the panels of steps that implement `DrawsPanels`.
 """
 
 import math
@@ -58,14 +59,18 @@ class Activity:
 
 @dataclass(frozen=True, eq=False)
 class AttemptTimes:
-    """Times from the evidence of one attempt, all of them on the clock of the first sending robot.
+    """Times from the evidence of one attempt.
+
+    Times of the second end are converted to the clock of the first end. Times of other robots are by their own
+    clocks, and times of moves by the clock of the testbed's track.
 
     Attributes:
         bags: Contents of the bags that were sent, by file.
         transfers: Transfers with known fates of their packets.
         pings: Step name, role and output of each ping with an output.
-        clock_offset_ns: Clock offset of each role relative to the first sending robot; 0 if it is unknown and no
-            packet gives an estimate, see `clock_note`.
+        clock_offset_ns: Offset that is subtracted from the times of each role. For the second end, it is the offset
+            of its clock relative to the first end; 0 if it is unknown and no packet gives an estimate, see
+            `clock_note`. For all other roles it is 0.
         clock_note: A sentence about the source of the clock offset.
         links: Samples of the radio link at each end.
         telemetry: Values from telemetry sources at each end by quantity (`telemetry_samples.series`).
@@ -188,7 +193,7 @@ def _clock_offset(
 
 
 def _correct_clocks(packet_fates: Fates, transfer: Transfer, clock_offset_ns: Mapping[Role, int]) -> Fates:
-    """Return the packets with times on the clock of the first sending robot."""
+    """Return the packets with corrected times; `clock_offset_ns` is described in `AttemptTimes`."""
     return replace(
         packet_fates,
         sent_ns=packet_fates.sent_ns - clock_offset_ns[transfer.source],

@@ -38,9 +38,10 @@ def columns(run: Run) -> dict[str, NDArray[Any]]:
     `flow`, `source`, `destination`, `protocol` and `reason` are texts; `reason` is the reason why the packet never
     arrived, and is empty if it arrived or is under way. `number`, `size_bytes` and the times `sent_ns`, `enters_ns`,
     `arrived_ns`, `counted_ns` and `late_ns`, in nanoseconds of simulated time, are 64-bit integers; a missing time is
-    `NEVER`. `arrived_ns` is the time at which the network delivers the packet. The receiver can read it from
-    `counted_ns`, which is later if the policy defers arrivals to the end of a window. If the receiver has already
-    been simulated beyond `counted_ns` when it gets the packet, `late_ns` is the difference; otherwise it is 0.
+    `NEVER`. `arrived_ns` is the time at which the network delivers the packet. `counted_ns` is the earliest time at
+    which the receiver can read the packet; it is later than `arrived_ns` if the policy defers arrivals to the end of
+    a window. If the receiver has already been simulated beyond `counted_ns` when it gets the packet, `late_ns` is the
+    difference; otherwise it is 0.
     """
     fates = list(run.fates.values())
     texts = {name: np.array([value_of(fate) for fate in fates], dtype=np.str_) for name, value_of in _TEXTS.items()}

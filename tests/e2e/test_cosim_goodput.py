@@ -41,6 +41,14 @@ def test_predictions_are_compared_with_measurements(tmp_path: Path) -> None:
     assert "no prediction for 1 row: the log has no signal" in completed.err
 
 
+def test_a_measurement_above_the_phy_rate_shows_that_the_rate_is_of_another_time(tmp_path: Path) -> None:
+    log = write_log(tmp_path, "-50,802.11n 2.4 GHz,20,7,tcp,66e6", "-50,802.11n 2.4 GHz,20,7,tcp,64e6")
+    completed = cosim(tmp_path, "goodput", str(log))
+    assert "the measured goodput of 1 row exceeds the PHY rate" in completed.err
+    assert "ht20-mcs7-1ss-800ns" in completed.out
+    assert "protocol" not in completed.out.split("errors of the predictions")[0], "all rows have the same protocol"
+
+
 @pytest.mark.parametrize(
     ("rows", "head", "expected"),
     [

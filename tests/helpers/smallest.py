@@ -286,6 +286,7 @@ CASES: Final[Mapping[str, MinimalRun]] = {
             "DSCPS": {"voice": 48},
             "QUEUED": 150,
             "SECONDS": 0.1,
+            "SEEDS": (1,),
         },
     ),
     "layers": MinimalRun("--rounds 1 --packets 20", {"PINGS": 5, "STATIONS": (2,)}, shrink=_one_layer, emulated=True),

@@ -67,6 +67,11 @@ def run(arguments: argparse.Namespace) -> int:
     show_all(sheets, arguments.format)
     for reason, count in reasons.most_common():
         show_note(f"no prediction for {format_count(count, 'row')}: {reason}")
+    if count := sum(_exceeds_phy_rate(row, goodputs_bit_s) for row in rows):
+        show_note(
+            f"the measured goodput of {format_count(count, 'row')} exceeds the PHY rate, so this rate was not logged "
+            "during the measurement"
+        )
     return 0
 
 
@@ -127,6 +132,13 @@ def _reason(row: _Row, goodputs_bit_s: Mapping[LoggedLink, float | Configuration
     return goodput_bit_s.what if isinstance(goodput_bit_s, ConfigurationError) else None
 
 
+def _exceeds_phy_rate(row: _Row, goodputs_bit_s: Mapping[LoggedLink, float | ConfigurationError]) -> bool:
+    """Return True if the measured goodput is impossible with the logged mode."""
+    if row.link is None or _reason(row, goodputs_bit_s) is not None or (mode := row.link.mode()) is None:
+        return False
+    return row.measured_bit_s > mode.rate_bit_s
+
+
 def _predicted_bit_s(row: _Row, goodputs_bit_s: Mapping[LoggedLink, float | ConfigurationError]) -> float:
     """Return the predicted goodput of a row; nan if it has none."""
     goodput_bit_s = math.nan if row.link is None else goodputs_bit_s[row.link]
@@ -158,8 +170,8 @@ _ERROR_COLUMNS: Final = (
     SheetColumn("mean_goodput_bit_s", "measured (Mbit/s)", "mean", 1e-6),
     SheetColumn("mean_predicted_bit_s", "predicted (Mbit/s)", "mean", 1e-6),
     SheetColumn("mean_error", "error of mean (%)", "mean prediction relative to the mean measurement", 100.0),
-    SheetColumn("median_error", "median error (%)", "median of the magnitudes of the relative errors", 100.0),
-    SheetColumn("p90_error", "90th percentile (%)", "of these magnitudes", 100.0),
+    SheetColumn("median_error", "median |error| (%)", "median of the magnitudes of the relative errors", 100.0),
+    SheetColumn("p90_error", "90th percentile |error| (%)", "of these magnitudes", 100.0),
 )
 
 
@@ -183,8 +195,14 @@ def _links_sheet(rows: Sequence[_Row], goodputs_bit_s: Mapping[LoggedLink, float
             )
         )
     cells_by_name = zip(_names(_LINK_COLUMNS), zip(*values, strict=True), strict=True)
-    empty = {name for name, cells in cells_by_name if all(map(_is_empty, cells))}
-    shown = [name for name in _names(_LINK_COLUMNS) if name not in empty | {"reason"}]  # notes show the reasons
+    hidden = {"reason"} | {
+        name for name, cells in cells_by_name if all(map(_is_empty, cells))
+    }  # notes show the reasons
+    if len({row.link.protocol for row in rows if row.link is not None}) == 1:
+        hidden.add("protocol")
+    if all(value[_names(_LINK_COLUMNS).index("mode")] for value in values):
+        hidden.add("width_mhz")  # the modes contain it
+    shown = [name for name in _names(_LINK_COLUMNS) if name not in hidden]
     return Sheet(_LINK_COLUMNS, values, [SheetPart("predicted goodput of each link", shown)])
 
 

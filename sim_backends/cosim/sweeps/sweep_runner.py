@@ -28,8 +28,9 @@ _TRANSIENT: Final = (LinkError, FederateError, WorkerDiedError, OSError, MemoryE
 """Errors after which a run is tried again: a worker or simulator terminated or did not answer, or a resource was
 exhausted. Other errors would occur again, because a run depends only on its settings and seed."""
 
-_IN_OTHER_COLUMNS: Final = frozenset({"policy", DISTANCE, "line", "topology"})
-"""Factors that the name of the procedure does not contain, because they are in other columns."""
+_NOT_LISTED: Final = frozenset({"policy", DISTANCE, "line", "topology"})
+"""Factors that `_settings_text` does not list by name: its text starts with the policy, and other columns contain the
+distance, the line and the topology."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ def _settings_text(run: SweepRun) -> str:
     """Return the settings as text for the name of the procedure, so that all conditions have different names."""
     scenario = run.setting.scenario
     text = settings.policy_text(scenario.policy.name, scenario)
-    omitted = _IN_OTHER_COLUMNS | ({"window"} if settings.has_window(scenario.policy.name) else set())
+    omitted = _NOT_LISTED | ({"window"} if settings.has_window(scenario.policy.name) else set())
     return ", ".join(
         [text, *(f"{name} {value}" for name, value in run.setting.values.items() if name not in omitted)]
     )

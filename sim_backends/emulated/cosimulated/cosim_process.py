@@ -56,9 +56,6 @@ _MAX_LAG_NS: Final = 1_000_000_000
 """A simulation that lags behind real time by more than this does not catch up, so that its later results are usable.
 Packets that wait during the lag are delivered late, so their repeat is void."""
 
-_MIN_START_NS: Final = 5_000_000
-"""A request to place robots that takes longer has started a simulator."""
-
 
 class _NewSession(BaseException):
     """Raised to leave the coordinator of a session that another session has replaced."""
@@ -112,13 +109,13 @@ class CosimulatedMedium(MediumServer):
         """Implement `Devices.wait`: read packets and answer requests until a simulated time."""
         session = self._session
         while True:
-            due_ns = self._clock.monotonic_ns(until_ns)
-            self._poll(due_ns)
+            self._poll(self._clock.monotonic_ns(until_ns))
             if time.monotonic_ns() - self._polled_ns > INTERFACE_POLL_NS:
                 self._update_interfaces()
             if self._session is not session:
                 raise _NewSession
-            if time.monotonic_ns() >= due_ns:
+            # The answer to a request may have delayed simulated time.
+            if self._clock.now_ns() >= until_ns:
                 break
         if self._sample_ns is not None and time.monotonic_ns() >= self._sample_ns:
             self._sample()
@@ -320,10 +317,10 @@ class CosimulatedMedium(MediumServer):
             for name, position_m in self._layout.positions_m.items()
         }
         session.physics.place(states, frozenset(positions_m))
-        self._session = session
-        if (spent_ns := time.monotonic_ns() - start_ns) > _MIN_START_NS:
-            # A simulator was started. The lab waits for this, so no measurement is in progress.
-            self._skip_lag(spent_ns)
+        if self._session is not session:
+            # Simulators were started. The lab waits for this, so no measurement is in progress.
+            self._session = session
+            self._skip_lag(time.monotonic_ns() - start_ns)
 
     @override
     def _log_attempts(self, log: AttemptLog | None) -> None:

@@ -9,7 +9,10 @@ import signal
 import socket
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 
@@ -18,12 +21,17 @@ from fieldkit.core.errors import RobotError, TestbedLostError
 from fieldkit.core.model import Lateness, Vector
 from fieldkit.measure.evidence import oracle_delays
 from sim_backends.cosim.policies.registry import BUILTIN
+from sim_backends.emulated.cosimulated.clock import RealTime
+from sim_backends.emulated.cosimulated.cosim_process import CosimulatedMedium
+from sim_backends.emulated.cosimulated.cosim_session import CosimSession
 from sim_backends.emulated.emulated_options import SyncOptions
 from sim_backends.emulated.medium import air_files
+from sim_backends.emulated.medium.server import Layout
 from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.emulated.ros.motion_record import SILENT_NS
 from sim_backends.federates.frames import NETWORK
 from sim_backends.federates.named import command_line, default_options
+from sim_backends.world.motion import State
 from sim_backends.world.world import load_world
 from tests.helpers.cosim_benches import BODY, PLACES, cosim_bench, distance_m
 from tests.helpers.nightly import mark_nightly
@@ -217,3 +225,16 @@ def test_a_driven_robot_stops_without_commands_and_at_its_next_place(tmp_path: P
         assert distance_m(later_motion, PLACES["a"]) == pytest.approx(0.2, abs=0.1)
         assert later_motion.heading_rad == pytest.approx(0)
         assert later_motion.odometry[0] == pytest.approx(distance_m(later_motion, PLACES["a"]))
+
+
+def test_a_slow_placement_does_not_delay_simulated_time() -> None:
+    def place(_states: Mapping[str, State], _on_air: frozenset[str]) -> None:
+        time.sleep(0.02)
+
+    medium = object.__new__(CosimulatedMedium)
+    medium._clock, medium._ports, medium._layout = RealTime(), {}, Layout()
+    session = SimpleNamespace(stations=(), settings=SimpleNamespace(relay=None), physics=SimpleNamespace(place=place))
+    medium._session = cast("CosimSession", session)
+    epoch_ns = medium._clock.epoch_ns
+    medium._place_stations({}, None)
+    assert medium._clock.epoch_ns == epoch_ns, "windows would end early, and packets would be late by less"
