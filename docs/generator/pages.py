@@ -314,9 +314,9 @@ def json_events() -> str:
     """Return the page of the events of `--json`."""
     blocks = [
         (
-            "`fieldkit trial`, `resume`, `campaign` and `check` with `--json` print one JSON object per line, with "
-            "`event`, `utc_ns` and the fields below. [Automation](../automation.md) describes how a program answers "
-            "requests."
+            "`fieldkit trial`, `resume`, `campaign`, `check`, `clocks` and `cosim sweep` with `--json` print one "
+            "JSON object per line, with `event`, `utc_ns` and the fields below. [Automation](../automation.md) "
+            "describes how a program answers requests."
         ),
     ]
     for record in _event_types():

@@ -8,11 +8,13 @@ class CheckOutcome(StrEnum):
     """Consequence of a contradiction.
 
     `void`: the repeat does not count; `withheld`: the values could be wrong, so the columns are empty, and the reason
-    is reported; `unchecked`: the quantity has only one source.
+    is reported; `marked`: the repeat is valid, and the column `marks` names the contradiction; `unchecked`: the
+    quantity has only one source.
     """
 
     VOID = "void"
     WITHHELD = "withheld"
+    MARKED = "marked"
     UNCHECKED = "unchecked"
 
 

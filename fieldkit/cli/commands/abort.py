@@ -18,10 +18,10 @@ def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit abort`."""
     parser.description = (
         "Stop every job of fieldkit on every robot of the site file, of all trials and all laptops, and remove "
-        "the robots' locks. A program that lands a drone continues; its state is printed, and when it terminates. "
-        "For each robot, print the stopped jobs, and stopped processes whose folder was deleted; `not locked` means "
-        "that no trial held the lock. A trial on these robots stops, and "
-        "reports the user who aborted it. Exit code 3 if a robot was not reached, a job was not terminated or, on a "
+        "the robots' locks. A program that lands a drone continues; abort prints its state and the conditions "
+        "under which it ends. For each robot, print the stopped jobs, and stopped processes whose folder was "
+        "deleted; `not locked` means that no trial held the lock. A trial on these robots stops, and reports the "
+        "user who aborted it. Exit code 3 if a robot was not reached, a job was not terminated or, on a "
         "full disk, a lock was not removed; 1 if you answer no. The other robots are processed nevertheless. "
         "Emulated robots stop with their lab, so nothing is done for them."
     )

@@ -30,7 +30,7 @@ def add(parser: Parser) -> None:
     actions = parser.add_commands(title="commands", metavar="COMMAND")
     action = actions.add_parser("info", help="list the contents of a bag from its index")
     shared.add_bag(action)
-    shared.add_json(action)
+    action.add_argument("--json", action="store_true", help="print the contents as one JSON object")
     action.set_defaults(run=f"{__name__}:info")
     action = actions.add_parser("check", help="read every message of bags and report all problems")
     action.add_argument("bags", type=Path, nargs="+", metavar="BAG", help=shared.BAG_HELP)

@@ -10,6 +10,7 @@ from fieldkit.cli.shared_arguments import add_jobs, add_json, add_workers, natur
 
 _PACKAGE: Final = "sim_backends.cosim.commands"
 _FORMATS: Final = ("table", "csv", "json", "markdown")
+_RECORDING_HELP: Final = "folder that `fieldkit cosim run --out` made"
 _TABLES: Final = ("1", "2", "3", "emane", "claims")
 
 
@@ -107,7 +108,9 @@ def _add_sweep(commands: Commands) -> None:
         metavar="FOLDER",
         help="folder of the sweep: a new folder, or the folder of a sweep to continue",
     )
-    parser.add_argument("--again", action="store_true", help="also repeat runs that have failed three times")
+    parser.add_argument(
+        "--again", action="store_true", help="repeat all failed runs, not only those with attempts left"
+    )
     add_workers(parser)
     add_json(parser)
     parser.set_defaults(run=f"{_PACKAGE}.sweep:run")
@@ -218,7 +221,7 @@ def _add_goodput(commands: Commands) -> None:
         epilog="example: fieldkit cosim goodput links.csv --format csv",
     )
     parser.add_argument("log", type=Path, metavar="LOG", help="the CSV file")
-    _add_changes(parser)
+    _add_changes(parser, "change a value of the scenario that simulates a link, for example radio.queue_packets=100")
     add_workers(parser)
     _add_format(parser)
     parser.set_defaults(run=f"{_PACKAGE}.goodput:run")
@@ -232,7 +235,7 @@ def _add_plot(commands: Commands) -> None:
         "Or draw the CSV table of `fieldkit cosim shootout`: errors against cost.",
         epilog="example: fieldkit cosim plot runs/baylands --out baylands.pdf",
     )
-    _add_recording(parser)
+    _add_recording(parser, f"{_RECORDING_HELP}, or CSV table of a shootout")
     parser.add_argument(
         "-o", "--out", type=Path, default=Path("run.svg"), metavar="FILE", help="SVG, PDF or PNG (default run.svg)"
     )
@@ -332,20 +335,14 @@ def _add_scenario(parser: Parser) -> None:
     _add_changes(parser)
 
 
-def _add_changes(parser: Parser) -> None:
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="change a value of the scenario's file, for example agents.husky-2.along=40m; may be repeated",
-    )
+def _add_changes(
+    parser: Parser, meaning: str = "change a value of the scenario's file, for example agents.husky-2.along=40m"
+) -> None:
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help=f"{meaning}; may be repeated")
 
 
-def _add_recording(parser: Parser) -> None:
-    parser.add_argument(
-        "recording", type=Path, metavar="RECORDING", help="folder that `fieldkit cosim run --out` made"
-    )
+def _add_recording(parser: Parser, meaning: str = _RECORDING_HELP) -> None:
+    parser.add_argument("recording", type=Path, metavar="RECORDING", help=meaning)
 
 
 def _add_federates(parser: Parser) -> None:
