@@ -161,7 +161,7 @@ def test_the_first_ctrl_c_lets_an_arducopter_return_and_waits_for_the_ground(fie
     stop_line, return_line, ground_line = map(
         stopped_run.err.index,
         (
-            "stopping: copter-1 returns automatically, if it is in the air: this takes up to about ",
+            "stopping: copter-1 returns automatically if it is in the air; this takes up to about ",
             "copter-1: coming down (return)",
             "copter-1: stopped (on the ground)",
         ),

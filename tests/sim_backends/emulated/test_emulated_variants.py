@@ -145,7 +145,8 @@ def offers_sftp(link: paramiko.Transport) -> bool:
     try:
         client = paramiko.SFTPClient.from_transport(link)
         return client is not None and client.normalize(".") == "/root"
-    except (paramiko.SSHException, EOFError):  # the server refuses the subsystem, or its program exits immediately
+    except (paramiko.SSHException, EOFError, OSError):
+        # The server refuses the subsystem, or its program exits before or after the first request is sent.
         return False
 
 
