@@ -6,13 +6,9 @@
 unexport PYTHONDONTWRITEBYTECODE
 
 FIELDKIT := .venv/bin/fieldkit
-# Tests mostly wait, so there are more workers than cores. Long files come first (tests/conftest.py), and examples of
+# Tests mostly wait, so there are more workers than cores. tests/helpers/priority.py orders the files. Examples of
 # hypothesis are the same in each run, so that results are reproducible.
 TOGETHER := --numprocesses 10 --dist loadscope --no-loadscope-reorder --hypothesis-profile ci
-
-# Reruns of both parts of `make test` are counted together. The option needs a `=`: before pytest has registered it, a
-# separate existing path would be parsed as a path of tests.
-RERUNS := .venv/reruns.txt
 
 # Files with tests that run alone. They are named so that pytest does not import all files again.
 QUIET = $(shell grep -rl --include='test_*.py' 'mark\.quiet' tests)
@@ -23,9 +19,8 @@ trial: ## a trial on emulated robots, shortened to about a minute
 
 test: ## all tests except for nightly ones
 	@MAKE_TARGET=$@ .ci/install --dev
-	@rm -f $(RERUNS)
-	@.venv/bin/python -m pytest --rerun-log=$(RERUNS) $(TOGETHER) -m "not quiet and not nightly"
-	@.venv/bin/python -m pytest --rerun-log=$(RERUNS) -m "quiet and not nightly" $(QUIET)
+	@.venv/bin/python -m pytest $(TOGETHER) -m "not quiet and not nightly"
+	@.venv/bin/python -m pytest -m "quiet and not nightly" $(QUIET)
 
 nightly: ## long tests, each with a small example in `make test`, and new examples of all properties
 	@MAKE_TARGET=$@ .ci/install --dev

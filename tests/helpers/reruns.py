@@ -1,68 +1,54 @@
-"""A pytest plugin that repeats failed tests of real programs once, and fails a run that has too many repetitions."""
+"""A pytest plugin that repeats failed tests of real programs once, to show whether the failure is random.
+
+A run with a second try fails even if it succeeds, because the cause of a random failure must be found, too.
+"""
 
 from collections.abc import Generator
-from pathlib import Path
 from typing import Final
 
 import pytest
 
 from tests.helpers.host import LeakError
 
-ALLOWED: Final = 1
-"""Number of second tries that a run may have."""
-
 _FAILED: Final = pytest.StashKey[bool]()
 
 
-class _Count:
-    """Counts second tries in the process that collects all reports.
+class _SecondTries:
+    """Collects second tries in the process that receives all reports.
 
     Attributes:
-        tries: The tests that had a second try, in order, starting with those of earlier parts of the run.
+        tests: The tests that had a second try, in order.
     """
 
-    def __init__(self, log: Path | None) -> None:
-        self.tries = log.read_text(encoding="utf-8").splitlines() if log is not None and log.exists() else []
-        self._log = log
+    def __init__(self) -> None:
+        self.tests: list[str] = []
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Count a failed first try once, even if both the test and its teardown failed."""
-        if str(report.outcome) == "rerun" and report.nodeid not in self.tries:
-            self.tries.append(report.nodeid)
-            if self._log is not None:
-                self._log.write_text("".join(f"{test}\n" for test in self.tries), encoding="utf-8")
+        """Store a test with a failed first try once, even if both the test and its teardown failed."""
+        if str(report.outcome) == "rerun" and report.nodeid not in self.tests:
+            self.tests.append(report.nodeid)
 
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
-        """Fail the run if there were too many second tries."""
-        if len(self.tries) > ALLOWED and session.exitstatus == pytest.ExitCode.OK:
+        """Fail the run if a test had a second try."""
+        if self.tests and session.exitstatus == pytest.ExitCode.OK:
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
     @pytest.hookimpl(trylast=True)
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
-        """Show why tests ran twice, and list them if they are too many."""
+        """Show why tests ran twice, and list them."""
         for report in terminalreporter.stats.get("rerun", []):
             terminalreporter.section(f"first try of {report.nodeid}")
             terminalreporter.write_line(report.longreprtext)
-        if len(self.tries) > ALLOWED:
-            terminalreporter.section(f"{len(self.tries)} tests ran twice; the limit is {ALLOWED}", red=True)
-            for test in self.tries:
+        if self.tests:
+            terminalreporter.section("tests that ran twice; none may", red=True)
+            for test in self.tests:
                 terminalreporter.write_line(test)
 
 
-def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the option for the file that counts second tries over all parts of a run."""
-    parser.addoption(
-        "--rerun-log",
-        type=Path,
-        metavar="FILE",
-        help="tests that ran twice, one per line; existing lines count as well",
-    )
-
-
 def pytest_configure(config: pytest.Config) -> None:
-    """Register the counter, but not in an xdist worker, whose reports are sent to the controller."""
+    """Register the collector, but not in an xdist worker, whose reports are sent to the controller."""
     if not hasattr(config, "workerinput"):
-        config.pluginmanager.register(_Count(config.getoption("--rerun-log")))
+        config.pluginmanager.register(_SecondTries())
 
 
 @pytest.hookimpl(wrapper=True)
@@ -82,7 +68,7 @@ def pytest_runtest_teardown(item: pytest.Item) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Allow a second try of tests of real programs and of timing, except after a `LeakError`."""
+    """Give tests of real programs and of timing a second try, except after a `LeakError`."""
     for item in items:
         if item.get_closest_marker("emulated") or item.get_closest_marker("quiet"):
             item.add_marker(pytest.mark.flaky(reruns=1, rerun_except=LeakError.__name__))

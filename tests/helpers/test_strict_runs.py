@@ -1,4 +1,4 @@
-"""Tests of the pytest plugins that make a run fail after leaks or many second tries; they run pytest."""
+"""Tests of the pytest plugins that make a run fail after leaks or second tries; they run pytest."""
 
 import os
 from pathlib import Path
@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from tests.helpers.paths import ROOT
-from tests.helpers.reruns import ALLOWED
 
 CONFTEST = """
     pytest_plugins = ("tests.helpers.leaks", "tests.helpers.reruns")
@@ -131,8 +130,8 @@ CHANGES_SIGINT = """
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
         assert not signal.pthread_sigmask(signal.SIG_BLOCK, ())
 """
-MANY_RERUNS = """
-    @pytest.mark.parametrize("name", range({tests}))
+RANDOM_FAILURE = """
+    @pytest.mark.parametrize("name", range(2))
     def test_it(name):
         assert not first_try(str(name))
 """
@@ -218,7 +217,6 @@ def test_a_process_that_does_not_exit_gets_no_second_try(
 
 def test_a_second_try_uses_new_module_fixtures(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
     result = run(pytester, monkeypatch, SHARED_FIXTURE, *SEQUENTIAL, "-s")
-    assert result.ret == pytest.ExitCode.OK
     result.stdout.fnmatch_lines(["*2 passed, 1 rerun*"])
     assert str(result.stdout).count("taken down ['node lost']") == 2
 
@@ -233,33 +231,9 @@ def test_changes_by_other_processes_of_the_machine_do_not_fail_a_test(
 
 
 @pytest.mark.parametrize("mode", [SEQUENTIAL, PARALLEL], ids=["sequential", "parallel"])
-def test_more_second_tries_than_allowed_fail_a_run(
+def test_a_second_try_that_passes_fails_the_run(
     pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, mode: tuple[str, ...]
 ) -> None:
-    result = run(pytester, monkeypatch, MANY_RERUNS.format(tests=ALLOWED + 1), *mode)
+    result = run(pytester, monkeypatch, RANDOM_FAILURE, *mode)
     assert result.ret == pytest.ExitCode.TESTS_FAILED
-    result.stdout.fnmatch_lines(
-        [
-            f"*{ALLOWED + 1} tests ran twice; the limit is {ALLOWED}*",
-            "*test_it?0?",
-            f"*{ALLOWED + 1} passed, {ALLOWED + 1} rerun*",
-        ]
-    )
-
-
-def test_the_allowed_number_of_second_tries_does_not_fail_a_run(
-    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    result = run(pytester, monkeypatch, MANY_RERUNS.format(tests=ALLOWED), *SEQUENTIAL)
-    assert result.ret == pytest.ExitCode.OK
-    result.stdout.fnmatch_lines([f"*{ALLOWED} passed, {ALLOWED} rerun*"])
-
-
-def test_second_tries_are_counted_over_all_parts_of_a_run(
-    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    arguments = (*SEQUENTIAL, "--rerun-log", "reruns.txt")
-    assert run(pytester, monkeypatch, MANY_RERUNS.format(tests=ALLOWED), *arguments).ret == pytest.ExitCode.OK
-    second = run(pytester, monkeypatch, MANY_RERUNS.format(tests=ALLOWED + 1), *arguments)
-    assert second.ret == pytest.ExitCode.TESTS_FAILED, "one more than allowed, including those of the first part"
-    second.stdout.fnmatch_lines([f"*{ALLOWED + 1} tests ran twice; the limit is {ALLOWED}*"])
+    result.stdout.fnmatch_lines(["*tests that ran twice; none may*", "*test_it?0?", "*2 passed, 2 rerun*"])
