@@ -161,7 +161,8 @@ def state(folder: LabFolder) -> LabState:
     """Return the state of the lab.
 
     Raises:
-        NoLabError: The socket of a lab of this directory does not exist, or does not accept connections.
+        NoLabError: The socket of a lab of this directory does not exist or does not accept connections, or the lab
+            exited before it accepted this one.
         LinkError: The lab does not answer, its answer is invalid, or is another error than a `ConfigurationError`.
         ConfigurationError: The answer of the lab is this error.
     """
@@ -195,7 +196,10 @@ def end(folder: LabFolder) -> None:
     with _lab_connection(folder) as lab:
         # The kernel reports which process listens on the socket, so that no other process is killed.
         credentials = lab.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
-        process = os.pidfd_open(struct.unpack("3i", credentials)[0])
+        try:
+            process = os.pidfd_open(struct.unpack("3i", credentials)[0])
+        except ProcessLookupError as error:
+            raise NoLabError(_NO_LAB, remedy="fieldkit lab up") from error
     try:
         for signal_number in (signal.SIGTERM, signal.SIGKILL):
             signal.pidfd_send_signal(process, signal_number)
@@ -212,6 +216,9 @@ def _request(folder: LabFolder, request: str, unpack: Callable[[bytes], Answer])
             lab.sendall(f"{request}\n".encode())
             # The lab closes the connection after its answer, so an empty chunk is the end.
             return unpack(b"".join(iter(lambda: lab.recv(1 << 16), b"")))
+        except ConnectionError as error:
+            # A lab reads each request before it closes the connection, so it exited before it accepted this one.
+            raise NoLabError(_NO_LAB, remedy="fieldkit lab up") from error
         except (OSError, ValueError) as error:
             raise LinkError(f"the lab does not answer: {error}", remedy="fieldkit lab down") from error
 

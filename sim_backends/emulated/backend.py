@@ -290,6 +290,12 @@ class EmulatedBackend:
     def _members(self) -> "dict[str, LabRobot]":
         from sim_backends.emulated import interactive_lab  # noqa: PLC0415 (as in `open`)
 
+        if not self._site.robots:
+            raise ConfigurationError(
+                "a lab has at least one robot, and this site file has none",
+                where=self._document.where(("robots",)) if self._document else "",
+                remedy="fieldkit lab up --robots 2",
+            )
         members = interactive_lab.members_of(self._site, self._document, self._addresses)
         self._check_profiles(members)
         self._check_infrastructure(members, has_relay=False)

@@ -342,6 +342,16 @@ def test_a_lab_in_the_foreground_ends_with_ctrl_c(tmp_path: Path) -> None:
     wait_for_end(process_ids, within_s=0.0)
 
 
+def test_a_site_file_without_robots_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "fieldkit.yaml").write_text("emulated: {}\nrobots: {}\nroles: {}\n", encoding="utf-8")
+    outcome = fieldkit(tmp_path, "lab", "up")
+    assert (outcome.code, outcome.out) == (2, "")
+    assert outcome.err == (
+        "error: fieldkit.yaml:2: a lab has at least one robot, and this site file has none\n"
+        "  remedy: fieldkit lab up --robots 2\n"
+    )
+
+
 @pytest.mark.parametrize("robots", mark_nightly([("--robots", "1"), ()]))
 def test_a_lab_rejects_control_over_the_radio(tmp_path: Path, robots: tuple[str, ...]) -> None:
     (tmp_path / "fieldkit.yaml").write_text(f"control: radio\n{SITE}", encoding="utf-8")

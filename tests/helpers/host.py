@@ -131,12 +131,14 @@ def owners(pids: set[int]) -> set[int]:
 
 
 def is_running(pid: int) -> bool:
-    """Return True if a process runs."""
+    """Return True if a process runs, which is the case until its last thread has exited."""
+    process = Path("/proc", str(pid))
     try:
-        state = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
+        state = (process / "stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
+        # A main thread that has exited is a zombie until the other threads have exited, too.
+        return state not in EXITED_STATES or len(list((process / "task").iterdir())) > 1
     except OSError:
         return False
-    return state not in EXITED_STATES
 
 
 def wait_for_end(pids: set[int], *, within_s: float) -> None:

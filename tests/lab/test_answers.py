@@ -1,11 +1,17 @@
 """Messages of the lab process: packed messages are unpacked unchanged, and invalid messages are refused."""
 
-from collections.abc import Callable
+import os
+import socket
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
 from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError, RobotError
 from fieldkit.lab import requests
+from fieldkit.lab.folder import LabFolder
 from fieldkit.lab.protocol import LabLateness, LabLink, Outline, Overview
 from fieldkit.lab.requests import LabState, RobotState
 from fieldkit.lab.robots import Destination
@@ -67,3 +73,37 @@ def test_invalid_answer_is_value_error(unpack: Callable[[bytes], object], answer
 def test_invalid_destination_is_value_error(request_: str) -> None:
     with pytest.raises(ValueError, match=r"\S"):
         requests.unpack_destination(request_)
+
+
+@pytest.fixture
+def listener() -> Iterator[tuple[LabFolder, socket.socket]]:
+    """Socket of a lab that accepts no connection, in a folder with a short path."""
+    with tempfile.TemporaryDirectory() as path, socket.socket(socket.AF_UNIX) as lab:
+        lab.bind(str(LabFolder(Path(path)).socket))
+        lab.listen()
+        yield LabFolder(Path(path)), lab
+
+
+def test_a_lab_that_exits_before_it_accepts_the_connection_is_no_lab(
+    listener: tuple[LabFolder, socket.socket],
+) -> None:
+    """The kernel closes the sockets of a killed lab a few milliseconds after its main thread has exited."""
+    folder, lab = listener
+    exit_of_lab = threading.Timer(0.2, lab.close)
+    exit_of_lab.start()
+    try:
+        with pytest.raises(requests.NoLabError, match="no lab is running"):
+            requests.state(folder)
+    finally:
+        exit_of_lab.join()
+
+
+def test_the_end_of_a_lab_that_has_just_exited_is_no_lab(
+    listener: tuple[LabFolder, socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_such_process(_pid: int, _flags: int = 0) -> int:
+        raise ProcessLookupError
+
+    monkeypatch.setattr(os, "pidfd_open", no_such_process)
+    with pytest.raises(requests.NoLabError, match="no lab is running"):
+        requests.end(listener[0])
