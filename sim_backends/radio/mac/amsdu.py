@@ -34,16 +34,14 @@ FRAME_OVERHEAD_BYTES: Final = QOS_HEADER_BYTES - _LLC_BYTES
 """MAC header and FCS of a frame."""
 
 _MAX_FRAME_BYTES: Final[dict[PhyFormat, int]] = {"HT": 4_095, "VHT": 11_454, "HE": 11_454}
-"""Largest frame in an A-MPDU: 9.4.2.55.3 (length in the delimiter), table 9-34."""
-HT_AMSDU_BYTES: Final = 3_839
-"""Limit of A-MSDUs in an A-MPDU of HT: the smaller of the two limits of HT. With the larger one, 7,935 bytes, a frame
-would exceed its maximum size."""
+"""Largest frame in an A-MPDU: 9.7.1 (length in the delimiter, 12 bits for HT), table 9-34. An A-MSDU in an A-MPDU of
+HT therefore has at most 4,065 bytes, also between stations whose limit is 7,935 bytes."""
 
 
 def limits_with_amsdu(phy_format: PhyFormat, max_bytes: int) -> AmpduLimits:
     """Return the limits of aggregates whose frames have A-MSDUs up to `max_bytes`."""
-    format_bytes = HT_AMSDU_BYTES if phy_format == "HT" else _MAX_FRAME_BYTES[phy_format] - FRAME_OVERHEAD_BYTES
-    return replace(AMPDU_LIMITS[phy_format], amsdu_bytes=min(max_bytes, format_bytes))
+    largest_bytes = _MAX_FRAME_BYTES[phy_format] - FRAME_OVERHEAD_BYTES
+    return replace(AMPDU_LIMITS[phy_format], amsdu_bytes=min(max_bytes, largest_bytes))
 
 
 def amsdu_bytes(packet_sizes_bytes: Iterable[int]) -> int:
