@@ -187,13 +187,17 @@ class LoggedLink:
         values: dict[str, Any] = {
             "duration": f"{duration_s:.3f}s",
             "traffic": [self._traffic(rate_bit_s, duration_s)],
-            "radio.queue_packets": max(_MIN_QUEUE_PACKETS, math.ceil(rate_bit_s * _QUEUE_S / _PACKET_BITS)),
+            "radio.queue_packets": _queue_packets(rate_bit_s / _PACKET_BITS),
         }
         for agent in ("sender", "receiver"):
             values |= {f"agents.{agent}.radio.{key}": value for key, value in radio.items()}
         if mode is not None:
             values["radio.mode"] = mode.name
-        return load_scenario(_SCENARIO, values | dict(changes))
+        scenario = load_scenario(_SCENARIO, values | dict(changes))
+        if packet_s := _packet_s(scenario):
+            values["radio.queue_packets"] = _queue_packets(min(rate_bit_s / _PACKET_BITS, 1 / packet_s))
+            scenario = load_scenario(_SCENARIO, values | dict(changes))
+        return scenario
 
     def _traffic(self, rate_bit_s: float, duration_s: float) -> dict[str, Any]:
         """Return traffic that is never slower than `rate_bit_s`: a file for TCP, a stream of datagrams for UDP.
@@ -217,6 +221,17 @@ class LoggedLink:
             return _SELECTED_S
         shortest_s, longest_s = _MEASURED_S
         return min(max(_MEASURED_PACKETS * _PACKET_BITS / mode.rate_bit_s, shortest_s), longest_s)
+
+
+def _packet_s(scenario: CosimScenario) -> float:
+    """Return the time that the sender's bus and driver need per packet."""
+    radio = scenario.agents["sender"].radio
+    return 0.0 if radio is None or radio.phy is None else float(radio.phy.packet_time)
+
+
+def _queue_packets(packets_per_s: float) -> int:
+    """Return the length of the queue of a radio that sends at most this number of packets per second."""
+    return max(_MIN_QUEUE_PACKETS, math.ceil(packets_per_s * _QUEUE_S))
 
 
 def predict_goodputs_bit_s(

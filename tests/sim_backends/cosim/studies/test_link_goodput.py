@@ -97,3 +97,11 @@ def test_changes_of_the_scenario_apply() -> None:
     link = LoggedLink(-50, mcs=7, protocol="udp")
     noisy = predict_goodputs_bit_s([link], {"radio.noise_floor_dbm": -60}, workers=IN_PROCESS)
     assert noisy[link] == 0
+
+
+@pytest.mark.parametrize(("changes", "packets"), [({}, 157), ({"radio.queue_packets": 70}, 70)])
+def test_the_queue_of_a_slow_bus_contains_packets_for_8_ms(changes: dict[str, int], packets: int) -> None:
+    """With a longer queue, TCP would recover from the losses of slow start only after the measurement."""
+    link = LoggedLink(-50, "802.11ac 5 GHz", 40, 2, 400, mcs=9)
+    scenario = link.scenario({"agents.sender.radio.phy.packet_time": "50us", **changes})
+    assert scenario.radio.queue_packets == packets
