@@ -2,8 +2,9 @@
 
 PIECE=4194304 # as PIECE_BYTES of fetching.py
 
-print_state() { # print the state of the host and of interface $1
+print_state() { # print the state of the host, of interface $1 and of its radio
     interface=$1
+    find_radio "$1"
     set --
     for file in /proc/net/snmp /proc/net/netstat /proc/net/dev /proc/net/wireless /proc/loadavg \
         /proc/sys/net/ipv4/tcp_congestion_control; do
@@ -17,10 +18,10 @@ print_state() { # print the state of the host and of interface $1
         echo "==> ethtool -k <==" && ethtool -k "$interface"
     fi
     if command -v iw >/dev/null; then
-        echo "==> iw info <==" && timeout -s KILL "$SOURCE_S" iw dev "$interface" info
+        echo "==> iw info <==" && timeout -s KILL "$SOURCE_S" iw dev "$radio" info
         if [ "$?" != "$KILLED" ]; then # a driver that does not answer would delay the attempt
-            echo "==> iw station dump <==" && iw dev "$interface" station dump
-            echo "==> iw power save <==" && iw dev "$interface" get power_save
+            echo "==> iw station dump <==" && iw dev "$radio" station dump
+            echo "==> iw power save <==" && iw dev "$radio" get power_save
         fi
     fi
     echo "==> end <==" # missing if the disk is full
@@ -85,7 +86,8 @@ fail_to_write() { # fail with the reason why file $1 cannot be written
 }
 
 write_snapshot() { # write file $1 with a snapshot of the sources of this robot with interface $2, unless it exists
-    [ -e "$1" ] || snapshot ".sources-$$" "$2" ../.hung-sources >"$1" 2>/dev/null || fail_to_write "$1"
+    find_radio "$2"
+    [ -e "$1" ] || snapshot ".sources-$$" "$radio" ../.hung-sources >"$1" 2>/dev/null || fail_to_write "$1"
 }
 
 begin() {
