@@ -29,10 +29,10 @@ from fieldkit.core.deadline import Deadline
 from sim_backends.emulated.linux_wifi import guest
 from sim_backends.emulated.linux_wifi.hwsim_messages import RateStage
 from sim_backends.emulated.linux_wifi.virtual_machine import require_machine, run_in_machine
+from sim_backends.radio.core.random_streams import PacketDraws
 from sim_backends.radio.phy.error_rates import packet_error
 from sim_backends.radio.phy.high_throughput import PhyCapability, format_modes, mode_groups
 from sim_backends.radio.phy.modes import WifiMode, ack_ns
-from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.rate_control.minstrel_ht import MinstrelHt
 
 ROOT: Final = Path(__file__).resolve().parent.parent

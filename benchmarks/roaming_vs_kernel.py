@@ -26,7 +26,7 @@ from fieldkit.core.deadline import Deadline
 from sim_backends.emulated.linux_wifi import guest
 from sim_backends.emulated.linux_wifi.virtual_machine import require_machine, run_in_machine
 from sim_backends.radio.antennas import Antenna
-from sim_backends.radio.model import WifiInWorld
+from sim_backends.radio.models.radio_model import WifiInWorld
 from sim_backends.radio.phy.high_throughput import PhyCapability
 from sim_backends.radio.radio_options import RadioOptions
 

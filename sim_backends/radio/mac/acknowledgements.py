@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Final, Protocol
 
-from sim_backends.radio.links import Payload
+from sim_backends.radio.core.links import Payload
 from sim_backends.radio.mac.contention import EventQueue
 from sim_backends.radio.mac.control_frames import ControlFrames
 from sim_backends.radio.mac.reception import Reception

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import Generic
 
-from sim_backends.radio.links import Payload
+from sim_backends.radio.core.links import Payload
 from sim_backends.radio.mac.contention import EventQueue
 from sim_backends.radio.mac.driver_statistics import RadioMeter
 from sim_backends.radio.mac.frames import ControlFrame, TransmissionAttempt, control_record

@@ -4,13 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Generic
 
-from sim_backends.radio.channel import RadioChannel
-from sim_backends.radio.links import Payload
+from sim_backends.radio.core.links import Payload
+from sim_backends.radio.core.random_streams import PacketIdentity
+from sim_backends.radio.mac.channel import RadioChannel
 from sim_backends.radio.mac.control_frames import ControlFrames
 from sim_backends.radio.mac.stations import Station
 from sim_backends.radio.phy.modes import SLOT_NS, WifiMode, control_mode
 from sim_backends.radio.phy.transmissions import Transmission
-from sim_backends.radio.random_streams import PacketIdentity
 
 _NO_RTS_BYTES: Final = 1 << 62
 """Threshold of a station that never sends RTS."""
