@@ -104,7 +104,7 @@ PACKET_TIME = "agents.sender.radio.phy.packet_time"
 
 @pytest.mark.parametrize(("changes", "packets"), [({}, 157), ({"radio.queue_packets": 70}, 70)])
 def test_the_queue_of_a_slow_bus_contains_packets_for_8_ms(changes: dict[str, int], packets: int) -> None:
-    """With a longer queue, TCP would recover from the losses of slow start only after the start of the measurement."""
+    """With a longer queue, TCP would recover from the losses of slow start during the measurement."""
     link = LoggedLink(-50, "802.11ac 5 GHz", 40, 2, 400, mcs=9)
     assert link.scenario({PACKET_TIME: "50us", **changes}).radio.queue_packets == packets
 
