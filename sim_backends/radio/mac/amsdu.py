@@ -27,21 +27,20 @@ from sim_backends.radio.mac.frames import Frame
 from sim_backends.radio.phy.modes import ACK_BYTES, PhyFormat, WifiMode
 
 SUBFRAME_HEADER_BYTES: Final = 14
-"""Destination, source and length before each packet: figure 9-71."""
+"""Destination, source and length before each packet: 9.3.2.2.2."""
 _LLC_BYTES: Final = 8
 """LLC and SNAP of each packet: RFC 1042."""
 FRAME_OVERHEAD_BYTES: Final = QOS_HEADER_BYTES - _LLC_BYTES
 """MAC header and FCS of a frame."""
 
 _MAX_FRAME_BYTES: Final[dict[PhyFormat, int]] = {"HT": 4_095, "VHT": 11_454, "HE": 11_454}
-"""Largest frame in an A-MPDU: 9.7.1 (length in the delimiter, 12 bits for HT), table 9-34. An A-MSDU in an A-MPDU of
-HT therefore has at most 4,065 bytes, also between stations whose limit is 7,935 bytes."""
+"""Largest frame in an A-MPDU: table 9-25; in HT, the largest length in the delimiter (10.12.2)."""
 
 
 def limits_with_amsdu(phy_format: PhyFormat, max_bytes: int) -> AmpduLimits:
     """Return the limits of aggregates whose frames have A-MSDUs up to `max_bytes`."""
-    largest_bytes = _MAX_FRAME_BYTES[phy_format] - FRAME_OVERHEAD_BYTES
-    return replace(AMPDU_LIMITS[phy_format], amsdu_bytes=min(max_bytes, largest_bytes))
+    format_bytes = _MAX_FRAME_BYTES[phy_format] - FRAME_OVERHEAD_BYTES
+    return replace(AMPDU_LIMITS[phy_format], amsdu_bytes=min(max_bytes, format_bytes))
 
 
 def amsdu_bytes(packet_sizes_bytes: Iterable[int]) -> int:
