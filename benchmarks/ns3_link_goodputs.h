@@ -108,10 +108,7 @@ inline std::vector<double> Goodputs(const Options& options)
     uint64_t offered_bit_s = 70000000;
     if (options.ampdu)
     {
-        // ns-3 3.43 has other types for guard intervals, so the rate with one of 800 ns and one stream is scaled.
-        double symbol_ns = options.mode.rfind("He", 0) == 0 ? 12800 : 3200;
-        double rate_bit_s = WifiMode(options.mode).GetDataRate(options.width) * options.streams * (symbol_ns + 800) /
-                            (symbol_ns + options.guard_ns);
+        double rate_bit_s = WifiMode(options.mode).GetDataRate(Vector(options));
         offered_bit_s = rate_bit_s * std::min(1.1, 3.0 / options.stations);
     }
     TypeId::AttributeInformation information;

@@ -9,6 +9,9 @@
 #include "ns3/propagation-module.h"
 #include "ns3/wifi-module.h"
 
+#include <map>
+#include <type_traits>
+
 namespace fieldkit {
 
 using namespace ns3;
@@ -127,6 +130,36 @@ inline NetDeviceContainer Install(const Options& options, NodeContainer nodes,
                     "BK_MaxAmpduSize", ampdu, "VI_MaxAmpduSize", ampdu, "VO_MaxAmpduSize", ampdu);
     devices.Add(wifi.Install(phy, mac, nodes.Get(nodes.GetN() - 1)));
     return devices;
+}
+
+// A guard interval is a number of nanoseconds in ns-3 3.37, and a Time in 3.43.
+template <typename Interval>
+void SetGuardInterval(WifiTxVector& vector, void (WifiTxVector::*set)(Interval), uint16_t guard_ns)
+{
+    if constexpr (std::is_same_v<Interval, Time>)
+    {
+        (vector.*set)(NanoSeconds(guard_ns));
+    }
+    else
+    {
+        (vector.*set)(guard_ns);
+    }
+}
+
+// Settings of a transmission.
+inline WifiTxVector Vector(const Options& options)
+{
+    const std::map<WifiStandard, WifiPreamble> preambles{{WIFI_STANDARD_80211n, WIFI_PREAMBLE_HT_MF},
+                                                         {WIFI_STANDARD_80211ac, WIFI_PREAMBLE_VHT_SU},
+                                                         {WIFI_STANDARD_80211ax, WIFI_PREAMBLE_HE_SU}};
+    auto preamble = preambles.find(StandardOf(options.mode));
+    WifiTxVector vector;
+    vector.SetMode(WifiMode(options.mode));
+    vector.SetChannelWidth(options.width);
+    vector.SetNss(options.streams);
+    SetGuardInterval(vector, &WifiTxVector::SetGuardInterval, options.guard_ns);
+    vector.SetPreambleType(preamble == preambles.end() ? WIFI_PREAMBLE_LONG : preamble->second);
+    return vector;
 }
 
 } // namespace fieldkit
